@@ -1,0 +1,123 @@
+"""What the hardware is: the target's faces and circles, and the dot board. Files: ``design_file.py``."""
+
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+
+from stcal.errors import InputError
+from stcal.geometry.arrays import frozen
+
+Polarity = Literal["bright", "dark"]
+BOARD = "board"
+
+
+def board_label(row: int, column: int) -> str:
+    """``board:row:column``."""
+    return f"{BOARD}:{row}:{column}"
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class FaceDesign:
+    """One face: circles in the face frame (origin circle at 0, X through the x circle, Z out of the box).
+
+    ``ids`` : n circle ids; ``xy_mm`` : (n, 2); ``radius_mm`` : (n,);
+    ``origin``, ``x``, ``y`` : ids of the circles that define the frame.
+    """
+
+    id: str
+    ids: tuple[str, ...]
+    xy_mm: np.ndarray
+    radius_mm: np.ndarray
+    origin: str
+    x: str
+    y: str
+
+    def __post_init__(self):
+        object.__setattr__(self, "xy_mm", frozen(self.xy_mm, (len(self.ids), 2), f"face {self.id}: circles"))
+        object.__setattr__(self, "radius_mm", frozen(self.radius_mm, (len(self.ids),), f"face {self.id}: radii"))
+
+    def labels(self) -> list[str]:
+        """``face:circle`` for every circle, in order."""
+        return [f"{self.id}:{circle}" for circle in self.ids]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class TargetDesign:
+    """The target: faces, and whether its circles are brighter or darker than what surrounds them."""
+
+    name: str
+    polarity: Polarity
+    faces: tuple[FaceDesign, ...]
+
+    def face(self, face_id: str) -> FaceDesign:
+        """The face of that id."""
+        for face in self.faces:
+            if face.id == face_id:
+                return face
+        known = ", ".join(face.id for face in self.faces)
+        raise InputError(f"target {self.name}: no face {face_id}; the design has {known}")
+
+    def radius_of(self) -> dict[str, float]:
+        """Radius in mm by label."""
+        return {
+            label: float(radius)
+            for face in self.faces
+            for label, radius in zip(face.labels(), face.radius_mm, strict=True)
+        }
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class BoardDesign:
+    """A rectangular grid of dots; X along a row, Y down the columns, Z into the board, origin at dot (0, 0).
+
+    ``corner`` : (row, column) of the one larger dot, with ``corner_radius_mm``, or None for a plain board.
+    ``sigma_mm`` : standard deviation of the dots' positions about the grid, per axis.
+    """
+
+    rows: int
+    columns: int
+    pitch_mm: float
+    radius_mm: float
+    polarity: Polarity
+    sigma_mm: float
+    corner: tuple[int, int] | None = None
+    corner_radius_mm: float | None = None
+
+    def xy_mm(self) -> np.ndarray:
+        """Grid positions, (rows·columns, 2), row-major, mm."""
+        row, column = np.divmod(np.arange(self.rows * self.columns), self.columns)
+        return self.pitch_mm * np.column_stack([column, row]).astype(float)
+
+    def radii_mm(self) -> np.ndarray:
+        """Dot radii, (rows·columns,), row-major, mm."""
+        radii = np.full(self.rows * self.columns, self.radius_mm)
+        if self.corner is not None:
+            radii[self.corner[0] * self.columns + self.corner[1]] = self.corner_radius_mm
+        return radii
+
+    def labels(self) -> list[str]:
+        """``board:row:column``, row-major."""
+        return [board_label(r, c) for r in range(self.rows) for c in range(self.columns)]
+
+    def radius_of(self) -> dict[str, float]:
+        """Radius in mm by label."""
+        return dict(zip(self.labels(), self.radii_mm().tolist(), strict=True))
+
+
+def reference_target() -> TargetDesign:
+    """The reference design: five faces of seven big and three small circles (after Zhang & Wei 2017, fig. 1)."""
+    common = {"1": (0, 0), "2": (40, 0), "3": (80, 0), "4": (0, 40), "5": (0, 80), "6": (40, 40), "7": (80, 80)}
+    small = {"a": (20, 0), "b": (0, 20)}
+    naming = {"1": (94.142, 65.858), "2": (100, 80), "3": (60, 80), "4": (80, 100), "5": (80, 60)}
+    faces = []
+    for face_id, xy_c in naming.items():
+        places = common | small | {"c": xy_c}
+        radius = [8.0 if circle in common else 4.0 for circle in places]
+        faces.append(FaceDesign(face_id, tuple(places), list(places.values()), radius, "1", "3", "5"))
+    return TargetDesign("reference six-face target", "bright", tuple(faces))
+
+
+def reference_board() -> BoardDesign:
+    """The reference board: 9 columns × 7 rows, 30 mm pitch, radius 7.5 mm, bright, plain, σ 5 µm."""
+    return BoardDesign(7, 9, 30.0, 7.5, "bright", 0.005)

@@ -1,0 +1,124 @@
+"""Rigid and similarity transforms: ``a_from_b @ b_from_c == a_from_c`` and ``xyz_a = a_from_b @ xyz_b``."""
+
+from dataclasses import dataclass, field
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from stcal.errors import InputError
+from stcal.geometry.arrays import frozen
+
+
+def skew(v: np.ndarray) -> np.ndarray:
+    """Cross-product matrices, shape (..., 3, 3), of vectors of shape (..., 3)."""
+    v = np.asarray(v, float)
+    m = np.zeros((*v.shape[:-1], 3, 3))
+    m[..., 0, 1], m[..., 0, 2], m[..., 1, 2] = -v[..., 2], v[..., 1], -v[..., 0]
+    return m - np.swapaxes(m, -1, -2)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Rigid:
+    """A rigid transform a_from_b: ``xyz_a = rotation @ xyz_b + translation``.
+
+    Parameters
+    ----------
+    rotation : (3, 3) array
+        A proper rotation; checked to 1e-6, then projected onto SO(3).
+    translation : (3,) array
+        Origin of b in a, mm.
+    """
+
+    rotation: np.ndarray = field(default_factory=lambda: np.eye(3))
+    translation: np.ndarray = field(default_factory=lambda: np.zeros(3))
+
+    def __post_init__(self):
+        object.__setattr__(self, "rotation", frozen(self.rotation, (3, 3), "rotation"))
+        object.__setattr__(self, "translation", frozen(self.translation, (3,), "translation"))
+        r = self.rotation
+        deviation = np.abs(r @ r.T - np.eye(3)).max()
+        if deviation > 1e-6 or np.linalg.det(r) < 0:
+            raise InputError("rotation: not a proper rotation matrix; orthogonal with determinant +1 needed")
+        if deviation > 1e-12:  # brought onto SO(3), or a product of accepted rotations could fail the check above
+            u, _, vt = np.linalg.svd(r)
+            object.__setattr__(self, "rotation", frozen(u @ vt))
+
+    @classmethod
+    def from_matrix(cls, matrix) -> "Rigid":
+        """From a 4×4 (or 3×4) homogeneous matrix; the rotation part is projected onto SO(3)."""
+        m = frozen(matrix, what="rigid transform")
+        if m.shape not in ((4, 4), (3, 4)):
+            raise InputError(f"rigid transform: shape {m.shape}, 4×4 needed")
+        if (m[3:] != [0, 0, 0, 1]).any():
+            raise InputError(f"rigid transform: last row {m[3].tolist()}, 0 0 0 1 needed; is the matrix transposed?")
+        u, s, vt = np.linalg.svd(m[:3, :3])
+        if np.linalg.det(m[:3, :3]) <= 0 or np.abs(s - 1).max() > 1e-3:
+            raise InputError("rigid transform: the 3×3 part is not a rotation (left-handed or scaled)")
+        return cls(u @ vt, m[:3, 3])
+
+    @classmethod
+    def exp(cls, twist) -> "Rigid":
+        """From a rotation vector (rad) and a translation (mm), (6,): not the SE(3) exponential of the twist,
+        but the product perturbation ``(exp(w), t)`` in which the package states pose covariances."""
+        twist = np.asarray(twist, float)
+        return cls(Rotation.from_rotvec(twist[:3]).as_matrix(), twist[3:])
+
+    def log(self) -> np.ndarray:
+        """Inverse of :meth:`exp`: rotation vector (rad) and translation (mm), (6,)."""
+        return np.concatenate([Rotation.from_matrix(self.rotation).as_rotvec(), self.translation])
+
+    def matrix(self) -> np.ndarray:
+        """Homogeneous 4×4 matrix."""
+        m = np.eye(4)
+        m[:3, :3], m[:3, 3] = self.rotation, self.translation
+        return m
+
+    def inverse(self) -> "Rigid":
+        """b_from_a."""
+        return Rigid(self.rotation.T, -self.rotation.T @ self.translation)
+
+    def __matmul__(self, other):
+        if isinstance(other, Rigid):
+            return Rigid(self.rotation @ other.rotation, self.rotation @ other.translation + self.translation)
+        if isinstance(other, Similarity):
+            return NotImplemented
+        return np.asarray(other, float) @ self.rotation.T + self.translation
+
+    def angle_rad(self) -> float:
+        """Angle of the rotation, in [0, π]."""
+        return float(Rotation.from_matrix(self.rotation).magnitude())
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Similarity:
+    """A similarity a_from_b: ``xyz_a = scale * rotation @ xyz_b + translation``.
+
+    COLMAP's world has no unit; a transform out of it is a Similarity, so that forgetting the scale is a type error.
+    """
+
+    scale: float
+    rigid: Rigid
+
+    def __post_init__(self):
+        if not (np.isfinite(self.scale) and self.scale > 0):
+            raise InputError(f"similarity: scale {self.scale}, a positive number needed")
+
+    def inverse(self) -> "Similarity":
+        """b_from_a."""
+        inverse = self.rigid.inverse()
+        return Similarity(1 / self.scale, Rigid(inverse.rotation, inverse.translation / self.scale))
+
+    def __matmul__(self, other):
+        if isinstance(other, Similarity):
+            return Similarity(
+                self.scale * other.scale,
+                Rigid(self.rigid.rotation @ other.rigid.rotation, self @ other.rigid.translation),
+            )
+        if isinstance(other, Rigid):
+            return self @ Similarity(1.0, other)
+        return self.scale * (np.asarray(other, float) @ self.rigid.rotation.T) + self.rigid.translation
+
+    def __rmatmul__(self, other):
+        if isinstance(other, Rigid):
+            return Similarity(1.0, other) @ self
+        return NotImplemented

@@ -1,0 +1,61 @@
+"""Run one function over many jobs on all cores."""
+
+import contextlib
+import multiprocessing
+import os
+import sys
+from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import ProcessPoolExecutor, as_completed
+
+ONE_THREAD = ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS")
+
+
+def run_parallel(function: Callable, jobs: Sequence[tuple], workers: int | None = None) -> Iterator[tuple[int, object]]:
+    """Yield (index of the job, result of ``function(*job)``) as results come in, in any order.
+
+    Processes are started afresh (forking a process with threads can hang) and do not import the caller's main
+    module, so that a script needs no ``if __name__ == "__main__"``. One worker, or one job, runs right here.
+    """
+    workers = min(workers or os.cpu_count() or 1, len(jobs))
+    if workers <= 1:
+        for i, job in enumerate(jobs):
+            yield i, function(*job)
+        return
+    with (
+        _plain_main(),
+        ProcessPoolExecutor(workers, mp_context=multiprocessing.get_context("spawn"), initializer=_one_thread) as pool,
+    ):
+        futures = {pool.submit(function, *job): i for i, job in enumerate(jobs)}
+        try:
+            for future in as_completed(futures):
+                yield futures[future], future.result()
+        except BaseException:
+            pool.shutdown(cancel_futures=True)
+            raise
+
+
+def _one_thread() -> None:
+    import cv2
+
+    cv2.setNumThreads(1)
+
+
+@contextlib.contextmanager
+def _plain_main():
+    """Hide the main module's file from new processes, and keep their linear algebra to one thread."""
+    main = sys.modules["__main__"]
+    hidden = {name: getattr(main, name) for name in ("__file__", "__spec__") if getattr(main, name, None) is not None}
+    before = {name: os.environ.get(name) for name in ONE_THREAD}
+    for name in hidden:
+        setattr(main, name, None)
+    os.environ.update(dict.fromkeys(ONE_THREAD, "1"))
+    try:
+        yield
+    finally:
+        for name, value in hidden.items():
+            setattr(main, name, value)
+        for name, value in before.items():
+            if value is None:
+                os.environ.pop(name, None)
+            else:
+                os.environ[name] = value

@@ -1,0 +1,121 @@
+"""Errors of a run against a known truth, in the format of ``truth.json`` (``data_layout.md``)."""
+
+import json
+from pathlib import Path
+
+import numpy as np
+
+from stcal.errors import DegenerateError, InputError
+from stcal.geometry.align import align_rigid
+from stcal.geometry.rigid import Rigid
+from stcal.sfm.observations import face_of
+
+FACES = "faces.json"
+
+
+def compare(run: str | Path, truth: str | Path) -> dict:
+    """Errors of ``RUN/faces.json`` (or of the file itself) against a truth file.
+
+    Returns
+    -------
+    dict
+        ``faces`` : by face ``translation_um`` and ``rotation_mdeg`` of target_from_face, ``circles_mean_um`` and
+        ``circles_max_um`` after a rigid fit of the face, ``circles`` compared, and where the run states σ,
+        ``translation_sigma_um``, ``rotation_sigma_mdeg`` and ``normalised_error`` (√(eᵀC⁻¹e/6), about 1 when σ is
+        true); ``missing`` faces of the truth; ``worst`` over all faces.
+
+    Raises
+    ------
+    InputError
+        A file is missing or has another form, or the reference faces differ.
+    """
+    run = Path(run)
+    found = _read(run / FACES if run.is_dir() else run, "run")
+    known = _read(Path(truth), "truth")
+    if found["reference_face"] != known["reference_face"]:
+        raise InputError(
+            f"reference face {found['reference_face']} in the run, {known['reference_face']} in the truth; "
+            f"run again with --reference-face {known['reference_face']}"
+        )
+    faces = {
+        face_id: _face(face_id, found, known)
+        for face_id in known["target_from_face"]
+        if face_id in found["target_from_face"]
+    }
+    measures = ("translation_um", "rotation_mdeg", "circles_mean_um")
+    return {
+        "reference_face": known["reference_face"],
+        "faces": faces,
+        "missing": [face_id for face_id in known["target_from_face"] if face_id not in faces],
+        "worst": {m: max((f[m] for f in faces.values() if f[m] is not None), default=None) for m in measures},
+    }
+
+
+def _read(path: Path, what: str) -> dict:
+    try:
+        content = json.loads(path.read_text(encoding="utf-8"))
+    except OSError as error:
+        raise InputError(f"{what} {path}: {error.strerror or error}; give a finished run, and truth.json") from error
+    except ValueError as error:
+        raise InputError(f"{what} {path}: not JSON ({error}); give faces.json of a run, and truth.json") from error
+    wanted = ("unit", "reference_face", "target_from_face", "circles")
+    missing = [key for key in wanted if not isinstance(content, dict) or key not in content]
+    if missing:
+        raise InputError(f"{what} {path}: no {', '.join(missing)}; its form is in data_layout.md")
+    if content["unit"] != "mm":
+        raise InputError(f"{what} {path}: unit {content['unit']}, mm needed")
+    return content
+
+
+def _face(face_id: str, found: dict, known: dict) -> dict:
+    try:
+        estimate = Rigid.from_matrix(found["target_from_face"][face_id])
+        true = Rigid.from_matrix(known["target_from_face"][face_id])
+        labels = [label for label in known["circles"] if face_of(label) == face_id and label in found["circles"]]
+        a = np.array([known["circles"][label] for label in labels], float).reshape(-1, 3)
+        b = np.array([found["circles"][label] for label in labels], float).reshape(-1, 3)
+    except (ValueError, TypeError) as error:
+        raise InputError(f"face {face_id}: {error}; a 4×4 matrix and circles of three numbers needed") from error
+    shift = estimate.translation - true.translation
+    turn = Rigid(estimate.rotation @ true.rotation.T)
+    row = {
+        "translation_um": 1e3 * float(np.linalg.norm(shift)),
+        "rotation_mdeg": 1e3 * float(np.degrees(turn.angle_rad())),
+        "circles": len(labels),
+        "circles_mean_um": None,
+        "circles_max_um": None,
+    }
+    try:
+        error = 1e3 * np.linalg.norm(align_rigid(a, b) @ b - a, axis=1)
+        row |= {"circles_mean_um": float(error.mean()), "circles_max_um": float(error.max())}
+    except DegenerateError:
+        pass  # fewer than three circles in common: there is no rigid fit, and the row says how many there were
+    covariance = found.get("target_from_face_covariance", {}).get(face_id)
+    if covariance is not None:
+        c = np.array(covariance, float)
+        sigma = np.sqrt(np.maximum(np.diag(c), 0))
+        row |= {
+            "translation_sigma_um": (1e3 * sigma[3:]).tolist(),
+            "rotation_sigma_mdeg": (1e3 * np.degrees(sigma[:3])).tolist(),
+        }
+        if np.linalg.eigvalsh(c)[0] > 0 and face_id != known["reference_face"]:
+            e = np.concatenate([turn.log()[:3], shift])
+            row["normalised_error"] = float(np.sqrt(e @ np.linalg.solve(c, e) / 6))
+    return row
+
+
+def comparison_table(comparison: dict) -> str:
+    """The comparison as a text table."""
+    lines = [
+        f"{'face':>6} {'position':>10} {'rotation':>10} {'circles':>10} {'worst':>8} {'of':>4}  error / σ",
+        f"{'':>6} {'µm':>10} {'mdeg':>10} {'mean µm':>10} {'µm':>8}",
+    ]
+    for face_id, row in comparison["faces"].items():
+        mean, worst = (f"{row[k]:.2f}" if row[k] is not None else "–" for k in ("circles_mean_um", "circles_max_um"))
+        ratio = f"{row['normalised_error']:.2f}" if "normalised_error" in row else "–"
+        place = "reference" if face_id == comparison["reference_face"] else f"{row['translation_um']:.1f}"
+        turn = "" if face_id == comparison["reference_face"] else f"{row['rotation_mdeg']:.2f}"
+        lines.append(f"{face_id:>6} {place:>10} {turn:>10} {mean:>10} {worst:>8} {row['circles']:>4}  {ratio:>9}")
+    if comparison["missing"]:
+        lines.append(f"not in the run: face {', '.join(comparison['missing'])}")
+    return "\n".join(lines)

@@ -1,0 +1,1 @@
+"""From pixels to labelled circle centres: candidates, centring, faces, board."""

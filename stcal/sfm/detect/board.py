@@ -1,0 +1,238 @@
+"""The dot board: a grid is grown from neighbour to neighbour, fitted by a homography, and numbered.
+
+A plain board looks the same after half a turn (a square one after a quarter), and a hidden strip may leave open
+which rows or columns are seen. A reading therefore carries every numbering that fits the image; the group decides
+(``stcal.sfm.labels``).
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from stcal.design import BoardDesign
+from stcal.errors import DegenerateError
+from stcal.geometry.plane import apply_homography, fit_homography, homography_jacobian
+from stcal.sfm.detect.candidates import MAX_AXIS_RATIO, Candidates, match_pattern, singular_values
+
+NEIGHBOURS = 20
+STEP_TOLERANCE = 0.3
+"""How far a dot may be from where the step between its neighbours puts it, in steps."""
+MIN_SHARE = 0.35
+"""Smallest share of the board's dots that makes a board."""
+MIN_SIDE = 3
+"""Fewest rows and columns."""
+CORNER_MARGIN = 0.4
+"""A dot is the larger one when its radius is past this fraction of the way from the normal to the larger one."""
+MAX_UNEXPLAINED = 2
+"""Dots that a numbering may expect inside the image and not find, more than the best numbering does."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class BoardReading:
+    """One board in one image.
+
+    ``candidates`` : (n,) the dots found; ``numberings`` : (k, n, 2) row and column of each, one array for each
+    numbering that the image admits, the likeliest first; ``homographies`` : (k, 3, 3) from the board plane (mm) into
+    normalised coordinates.
+    """
+
+    candidates: np.ndarray
+    numberings: np.ndarray
+    homographies: np.ndarray
+
+
+def find_boards(candidates: Candidates, board: BoardDesign, image_corners: np.ndarray) -> list[BoardReading]:
+    """Boards in the image, the one with the most dots first.
+
+    ``image_corners`` : (4, 2) corners of the image in normalised ideal coordinates, in order around it.
+    """
+    if len(candidates) < MIN_SIDE**2:
+        return []
+    links, steps = _links(candidates, board)
+    readings = []
+    free = np.ones(len(candidates), bool)
+    for seed in np.argsort(-(links >= 0).sum(1), kind="stable"):
+        if not free[seed] or (links[seed] >= 0).sum() < 3:
+            continue
+        cells = _grow(candidates, links, steps, seed, free)
+        free[list(cells)] = False
+        if len(cells) < MIN_SHARE * board.rows * board.columns:
+            continue
+        reading = _number(candidates, cells, board, image_corners)
+        if reading is not None:
+            free[reading.candidates] = False
+            readings.append(reading)
+    return sorted(readings, key=lambda r: -len(r.candidates))
+
+
+def _links(candidates: Candidates, board: BoardDesign) -> tuple[np.ndarray, np.ndarray]:
+    """For every candidate, mapped to a circle of the board's radius: the dot one pitch away in the four directions
+    that most neighbours agree on. Returns (n, 4) indices or −1, and (n, 2, 2) whose columns are the two steps."""
+    n = len(candidates)
+    k = min(NEIGHBOURS + 1, n)
+    near = candidates.tree.query(candidates.xy, k=k)[1][:, 1:]
+    inverse = np.linalg.inv(candidates.shape)
+    largest, smallest = singular_values(inverse[:, None] @ candidates.shape[near])
+    step = np.einsum("nij,nkj->nki", inverse, candidates.xy[near] - candidates.xy[:, None])
+    length = np.linalg.norm(step, axis=2) * board.radius_mm / board.pitch_mm
+    ok = (np.abs(length - 1) < STEP_TOLERANCE) & (largest < MAX_AXIS_RATIO) & (smallest > 1 / MAX_AXIS_RATIO)
+    angle = np.arctan2(step[..., 1], step[..., 0])
+    quarter = np.where(ok, np.exp(4j * angle), 0).sum(1)
+    agreed = np.angle(quarter) / 4
+    turns = (angle - agreed[:, None]) / (np.pi / 2)
+    direction = np.round(turns).astype(int) % 4
+    error = np.abs(turns - np.round(turns)) + np.abs(length - 1)
+    ok &= np.abs(turns - np.round(turns)) < STEP_TOLERANCE
+    links = np.full((n, 4), -1)
+    for side in range(4):
+        cost = np.where(ok & (direction == side), error, np.inf)
+        best = cost.argmin(1)
+        links[:, side] = np.where(np.isfinite(cost.min(1)), near[np.arange(n), best], -1)
+    pitch = board.pitch_mm / board.radius_mm
+    axes = np.stack([np.cos(agreed), -np.sin(agreed), np.sin(agreed), np.cos(agreed)], 1).reshape(n, 2, 2) * pitch
+    return links, candidates.shape @ axes
+
+
+def _grow(candidates: Candidates, links, steps, seed: int, free) -> dict[int, tuple[int, int]]:
+    """Cells (u, v) by candidate, from neighbour to neighbour; the steps are carried along and renewed."""
+    start = np.array(steps[seed])
+    for axis, (ahead, behind) in enumerate(((0, 2), (1, 3))):
+        found = [
+            s * (candidates.xy[links[seed][d]] - candidates.xy[seed])
+            for d, s in ((ahead, 1), (behind, -1))
+            if links[seed][d] >= 0
+        ]
+        if found:
+            start[:, axis] = np.mean(found, axis=0)
+    cells = {int(seed): (0, 0)}
+    taken = {(0, 0)}
+    queue = [(int(seed), start)]
+    for node, step in queue:
+        u, v = cells[node]
+        ahead = np.array([step[:, 0], step[:, 1], -step[:, 0], -step[:, 1]])
+        _, index = candidates.tree.query(candidates.xy[node] + ahead)
+        largest, smallest = singular_values(np.linalg.solve(candidates.shape[node], candidates.shape[index]))
+        for side, (du, dv) in enumerate(((1, 0), (0, 1), (-1, 0), (0, -1))):
+            other = int(index[side])
+            cell = (u + du, v + dv)
+            if cell in taken or other in cells or not free[other]:
+                continue
+            # Distances are judged along the step itself: the other step may be foreshortened.
+            error = np.linalg.solve(step, candidates.xy[other] - candidates.xy[node] - ahead[side])
+            if np.abs(error).max() > STEP_TOLERANCE or largest[side] > 2 or smallest[side] < 0.5:
+                continue
+            moved = step.copy()
+            moved[:, side % 2] = (candidates.xy[other] - candidates.xy[node]) * (1 if side < 2 else -1)
+            cells[other] = cell
+            taken.add(cell)
+            queue.append((other, 0.5 * (moved + step)))
+    return cells
+
+
+def _number(candidates: Candidates, cells, board: BoardDesign, image_corners) -> BoardReading | None:
+    """Fit the homography over the grown cells, match all dots by it, and list the numberings that fit."""
+    index = np.array(list(cells))
+    uv = np.array(list(cells.values()))
+    homography = _robust_homography(uv, candidates, index)
+    if homography is None:
+        return None
+    lowest, highest = uv.min(0) - 2, uv.max(0) + 2
+    sides = [np.arange(a, b + 1) for a, b in zip(lowest, highest, strict=True)]
+    grid = np.stack(np.meshgrid(*sides), -1).reshape(-1, 2)
+    centre = uv.mean(0)
+    depth = np.column_stack([grid, np.ones(len(grid))]) @ homography[2]
+    grid = grid[depth * np.sign(homography[2] @ [*centre, 1]) > 0]
+    radius = np.full(len(grid), board.radius_mm / board.pitch_mm)
+    matched = match_pattern(candidates, homography, grid, radius)
+    if board.corner is not None:
+        large = match_pattern(candidates, homography, grid, radius * board.corner_radius_mm / board.radius_mm)
+        matched = np.where(matched >= 0, matched, large)
+    uv, index = grid[matched >= 0], matched[matched >= 0]
+    if np.linalg.det(homography) < 0:
+        uv, homography = uv[:, ::-1], homography[:, [1, 0, 2]]
+    if len(uv) < max(MIN_SHARE * board.rows * board.columns, MIN_SIDE**2):
+        return None
+    readings = [_place(candidates, uv, index, turn, board, homography, image_corners) for turn in range(4)]
+    placements = sorted((p for reading in readings for p in reading), key=lambda p: (p[0], -len(p[1])))
+    if not placements:
+        return None
+    fewest = placements[0][0]
+    placements = [p for p in placements if p[0] <= fewest + MAX_UNEXPLAINED]
+    return _reading(placements, candidates, board)
+
+
+def _robust_homography(uv, candidates: Candidates, index) -> np.ndarray | None:
+    """Homography over the cells that agree with it; None where they do not span the plane."""
+    keep = np.ones(len(uv), bool)
+    for _ in range(5):
+        if keep.sum() < MIN_SIDE**2 or min(np.ptp(uv[keep], axis=0)) < MIN_SIDE - 1:
+            return None
+        try:
+            homography = fit_homography(uv[keep], candidates.xy[index[keep]])
+        except DegenerateError:
+            return None
+        step = homography_jacobian(homography, uv)
+        error = candidates.xy[index] - apply_homography(homography, uv)
+        distance = np.linalg.norm(np.linalg.solve(step, error[..., None])[..., 0], axis=1)
+        again = distance < max(0.1, 3 * np.median(distance))
+        if (again == keep).all():
+            return homography
+        keep = again
+    return homography
+
+
+def _place(candidates: Candidates, uv, index, turn: int, board: BoardDesign, homography, image_corners) -> list[tuple]:
+    """Placements (unexplained, inside mask, row and column) of the grid turned by ``turn`` quarters."""
+    rotation = np.array([[1, 0], [0, 1]])
+    for _ in range(turn):
+        rotation = rotation @ np.array([[0, -1], [1, 0]])
+    turned = uv @ rotation.T
+    size = np.array([board.columns, board.rows])
+    low, high = -turned.max(0), size - turned.min(0)
+    offsets = np.stack(np.meshgrid(np.arange(low[0], high[0]), np.arange(low[1], high[1])), -1).reshape(-1, 2)
+    cells = turned + offsets[:, None]
+    inside = ((cells >= 0) & (cells < size)).all(2)
+    outside_count = (~inside).sum(1)
+    large = _large_dots(candidates, uv, index, board, homography)
+    all_cells = np.stack(np.meshgrid(np.arange(size[0]), np.arange(size[1])), -1).reshape(-1, 2)
+    placements = []
+    for k in np.flatnonzero(outside_count <= MAX_UNEXPLAINED):
+        column_row = cells[k]
+        if board.corner is not None:
+            at_corner = (column_row == board.corner[::-1]).all(1)
+            if (large != at_corner)[inside[k]].any():
+                continue
+        back = (all_cells - offsets[k]) @ rotation
+        missing = np.ones(len(all_cells), bool)
+        missing[column_row[inside[k]] @ [1, board.columns]] = False
+        expected = _inside_image(apply_homography(homography, back[missing]), homography, back[missing], image_corners)
+        placements.append((int(expected.sum() + outside_count[k]), inside[k], column_row[:, ::-1], index))
+    return placements
+
+
+def _large_dots(candidates: Candidates, uv, index, board: BoardDesign, homography) -> np.ndarray:
+    """Mask of the dots that are larger than the others, as the larger corner dot is."""
+    if board.corner is None:
+        return np.zeros(len(uv), bool)
+    local = np.sqrt(np.abs(np.linalg.det(homography_jacobian(homography, uv))))
+    size = candidates.radius[index] / local
+    return size / np.median(size) > 1 + CORNER_MARGIN * (board.corner_radius_mm / board.radius_mm - 1)
+
+
+def _inside_image(xy: np.ndarray, homography, uv, image_corners) -> np.ndarray:
+    """Mask of the predicted dots that lie in the image with their whole rim and some margin."""
+    margin = 0.35 * np.sqrt(np.abs(np.linalg.det(homography_jacobian(homography, uv))))
+    edge = np.roll(image_corners, -1, axis=0) - image_corners
+    normal = np.column_stack([-edge[:, 1], edge[:, 0]]) / np.linalg.norm(edge, axis=1)[:, None]
+    normal *= np.sign((image_corners.mean(0) - image_corners[0]) @ normal[0])
+    distance = np.einsum("ned,ed->ne", xy[:, None] - image_corners, normal)
+    return (distance > margin[:, None]).all(1)
+
+
+def _reading(placements: list[tuple], candidates: Candidates, board: BoardDesign) -> BoardReading:
+    """The dots that all placements number, with their numberings and homographies."""
+    common = np.logical_and.reduce([p[1] for p in placements])
+    index = placements[0][3][common]
+    numberings = np.stack([p[2][common] for p in placements])
+    homographies = [fit_homography(board.pitch_mm * n[:, ::-1].astype(float), candidates.xy[index]) for n in numberings]
+    return BoardReading(index, numberings, np.stack(homographies))

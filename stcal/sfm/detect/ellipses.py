@@ -1,0 +1,153 @@
+"""Candidates: blobs of either polarity whose outline is an ellipse, over a pyramid of scales."""
+
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from scipy.spatial import cKDTree
+
+from stcal.design import Polarity
+from stcal.geometry.arrays import frozen
+
+WINDOWS_PX = (41, 193)
+"""Sides of the windows whose mean is the threshold, at every level of the pyramid."""
+WINDOW_OVER_DIAMETER = 3.0
+"""A blob must be this much smaller than the window, or it pulls the mean up to itself."""
+HALF_SCALE_FROM_PX = 8_000_000
+"""Images of more pixels start the pyramid at half scale: what is 6 px across is still 3 px there."""
+MIN_LEVEL_DIAMETER_PX = 3.0
+MAX_OUTLINE_DEVIATION = 0.10
+"""RMS deviation of the outline from the ellipse, in units of its radius, on top of half a pixel."""
+
+
+@dataclass(frozen=True, slots=True)
+class EllipseOptions:
+    """What counts as a candidate.
+
+    ``min_diameter_px``, ``max_diameter_px`` : mean diameter in the image;
+    ``min_axis_ratio`` : minor over major axis (cos 70° is 0.34; blur and pixels take some more);
+    ``min_contrast`` : inside against surroundings, as a fraction of the image's grey range.
+    """
+
+    min_diameter_px: float = 6.0
+    max_diameter_px: float = 450.0
+    min_axis_ratio: float = 0.2
+    min_contrast: float = 0.08
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Ellipses:
+    """n candidates.
+
+    ``centre_px`` : (n, 2); ``shape_px`` : (n, 2, 2), symmetric, rim = centre + shape @ unit circle.
+    """
+
+    centre_px: np.ndarray
+    shape_px: np.ndarray
+
+    def __post_init__(self):
+        n = len(self.centre_px)
+        object.__setattr__(self, "centre_px", frozen(self.centre_px, (n, 2), "centres"))
+        object.__setattr__(self, "shape_px", frozen(self.shape_px, (n, 2, 2), "shapes"))
+
+    def __len__(self) -> int:
+        return len(self.centre_px)
+
+    def radius_px(self) -> np.ndarray:
+        """Radius of the circle of the same area, (n,)."""
+        return np.sqrt(np.abs(np.linalg.det(self.shape_px)))
+
+    def select(self, keep: np.ndarray) -> "Ellipses":
+        """Those of the indices or mask ``keep``."""
+        return Ellipses(self.centre_px[keep], self.shape_px[keep])
+
+
+def find_ellipses(image: np.ndarray, polarity: Polarity, options: EllipseOptions) -> Ellipses:
+    """Blobs of one polarity with an elliptic outline, in an 8-bit grey image; centres good to about 0.1 px."""
+    low, high = np.percentile(image[::8, ::8], [0.5, 99.9])
+    threshold = max(4.0, options.min_contrast * (max(high, 1.0) - low))
+    scale = 1
+    found = []
+    while True:
+        if not (scale == 1 and image.size > HALF_SCALE_FROM_PX):
+            found.append(_level(image, scale, polarity, threshold, options))
+        if options.max_diameter_px / scale <= WINDOWS_PX[-1] / WINDOW_OVER_DIAMETER or min(image.shape) < 16:
+            break
+        scale *= 2
+        image = cv2.resize(image, None, fx=0.5, fy=0.5, interpolation=cv2.INTER_AREA)
+    return _distinct(np.concatenate(found))
+
+
+def _level(image, scale: int, polarity: Polarity, threshold: float, options: EllipseOptions) -> np.ndarray:
+    """Rows (x, y, full axis 1, full axis 2, angle of axis 1 in degrees) in px of the full image."""
+    smooth = cv2.GaussianBlur(image, (3, 3), 0)
+    lowest = max(options.min_diameter_px / scale, MIN_LEVEL_DIAMETER_PX)
+    rows = []
+    for window in WINDOWS_PX:
+        highest = min(options.max_diameter_px / scale, window / WINDOW_OVER_DIAMETER)
+        mean = cv2.blur(smooth, (window, window), borderType=cv2.BORDER_REFLECT)
+        difference = cv2.subtract(smooth, mean) if polarity == "bright" else cv2.subtract(mean, smooth)
+        mask = cv2.compare(difference, threshold, cv2.CMP_GT)
+        rows += _outlines(mask, lowest, highest, options.min_axis_ratio)
+    table = np.array(rows).reshape(-1, 5)
+    table[:, :2] = table[:, :2] * scale + (scale - 1) / 2
+    table[:, 2:4] *= scale
+    return table
+
+
+def _outlines(mask, lowest: float, highest: float, min_axis_ratio: float) -> list[tuple[float, ...]]:
+    height, width = mask.shape
+    contours, hierarchy = cv2.findContours(mask, cv2.RETR_CCOMP, cv2.CHAIN_APPROX_NONE)
+    shortest, longest = max(6.0, 2 * lowest), 4 * highest / np.sqrt(min_axis_ratio)
+    rows = []
+    for i, contour in enumerate(contours):
+        if hierarchy[0, i, 3] >= 0:  # the rim of a hole
+            continue
+        if not shortest <= len(contour) <= longest:
+            continue
+        x, y, w, h = cv2.boundingRect(contour)
+        if x == 0 or y == 0 or x + w == width or y + h == height:
+            continue
+        (cx, cy), (d1, d2), angle = cv2.fitEllipseDirect(contour)
+        if not np.isfinite(d1 + d2 + cx + cy):
+            continue
+        # The outline runs through the centres of the outermost pixels, half a pixel inside the edge.
+        d1, d2 = d1 + 1, d2 + 1
+        if min(d1, d2) < min_axis_ratio * max(d1, d2) or not lowest <= np.sqrt(d1 * d2) <= highest:
+            continue
+        area = cv2.contourArea(contour) + 0.5 * cv2.arcLength(contour, True) + 1
+        if abs(area / (np.pi / 4 * d1 * d2) - 1) > 0.15:
+            continue
+        if _outline_deviation(contour[:, 0, :], cx, cy, d1 - 1, d2 - 1, angle) > 1:
+            continue
+        rows.append((cx, cy, d1, d2, angle))
+    return rows
+
+
+def _outline_deviation(points, cx, cy, d1, d2, angle_deg) -> float:
+    """RMS distance of the outline from the ellipse over what is allowed."""
+    angle = np.radians(angle_deg)
+    c, s = np.cos(angle), np.sin(angle)
+    dx, dy = points[:, 0] - cx, points[:, 1] - cy
+    rho = np.hypot((c * dx + s * dy) * 2 / max(d1, 1e-6), (c * dy - s * dx) * 2 / max(d2, 1e-6))
+    size = np.sqrt(d1 * d2) / 2
+    return float(np.sqrt(np.mean((rho - 1) ** 2)) * size / (0.5 + MAX_OUTLINE_DEVIATION * size * 0.5))
+
+
+def _distinct(table: np.ndarray) -> Ellipses:
+    """One of each: rows come finest level first, and the first of those that coincide stays."""
+    if not len(table):
+        return Ellipses(np.zeros((0, 2)), np.zeros((0, 2, 2)))
+    centre = table[:, :2]
+    radius = np.sqrt(table[:, 2] * table[:, 3]) / 2
+    pairs = cKDTree(centre).query_pairs(0.5 * radius.max(), output_type="ndarray")
+    smaller = np.minimum(radius[pairs[:, 0]], radius[pairs[:, 1]])
+    larger = np.maximum(radius[pairs[:, 0]], radius[pairs[:, 1]])
+    near = np.linalg.norm(centre[pairs[:, 0]] - centre[pairs[:, 1]], axis=1) < 0.3 * smaller + 0.5
+    keep = np.ones(len(table), bool)
+    keep[pairs[near & (smaller > 0.75 * larger), 1]] = False
+    table = table[keep]
+    angle = np.radians(table[:, 4])
+    axes = np.stack([np.stack([np.cos(angle), np.sin(angle)], 1), np.stack([-np.sin(angle), np.cos(angle)], 1)], 2)
+    shape = (axes * table[:, None, 2:4] / 2) @ np.swapaxes(axes, 1, 2)
+    return Ellipses(table[:, :2], shape)

@@ -1,0 +1,202 @@
+"""Faces of the target: the pattern is found in the face plane, after a homography, and the face named there.
+
+Document 000 walks along image directions and decides by dot products, which perspective breaks. Here two
+neighbouring candidates that could be two neighbouring circles of a design fix a map of the plane; it is grown to
+all circles of a face and every reading of the same candidates competes with it. A face is named only when one
+reading explains more circles than every other.
+"""
+
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+
+from stcal.design import FaceDesign, TargetDesign
+from stcal.sfm.detect.candidates import MAX_AXIS_RATIO, Candidates, grow_match, singular_values
+
+NEIGHBOURS_IN_DESIGN = 3
+NEIGHBOURS_IN_IMAGE = 12
+PAIR_TOLERANCE = 0.3
+"""Relative tolerance of distance and size of a pair after the map of one ellipse to a circle."""
+SUPPORT = 5
+"""So many nearest circles are predicted from a pair …"""
+MIN_SUPPORT = 2
+"""… and so many of them must be there before the hypothesis is grown."""
+MAX_HYPOTHESES = 300
+MAX_HIDDEN = 2
+MIN_CIRCLES = 6
+"""A homography takes four circles; two more confirm it."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class FaceReading:
+    """One face in one image: ``index`` (n circles,) into the candidates, −1 where missing; ``homography`` from the
+    face plane (mm) into normalised coordinates."""
+
+    face: FaceDesign
+    index: np.ndarray
+    homography: np.ndarray
+
+    def count(self) -> int:
+        """Circles found."""
+        return int((self.index >= 0).sum())
+
+    def used(self) -> np.ndarray:
+        """Candidates that it uses."""
+        return self.index[self.index >= 0]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class FaceFinding:
+    """``faces`` : named with certainty, at most one reading each; ``notes`` : what was seen and left out, and why;
+    ``repeated`` : ids of faces seen more than once."""
+
+    faces: tuple[FaceReading, ...]
+    notes: tuple[str, ...]
+    repeated: tuple[str, ...]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Pair:
+    """Two neighbouring circles of a design, and the faces that have them at these places."""
+
+    first: np.ndarray
+    step: np.ndarray
+    radii: tuple[float, float]
+    faces: tuple[FaceDesign, ...]
+
+
+class FaceFinder:
+    """Finds the faces of one design."""
+
+    def __init__(self, target: TargetDesign):
+        self.target = target
+
+    @cached_property
+    def _pairs(self) -> list[_Pair]:
+        pairs: dict[tuple, list[FaceDesign]] = {}
+        for face in self.target.faces:
+            for k, near in enumerate(_neighbours(face)):
+                for other in near[:NEIGHBOURS_IN_DESIGN]:
+                    key = (*face.xy_mm[k], *(face.xy_mm[other] - face.xy_mm[k]), *face.radius_mm[[k, other]])
+                    pairs.setdefault(tuple(np.round(key, 6)), []).append(face)
+        return [_Pair(np.array(k[:2]), np.array(k[2:4]), k[4:], tuple(faces)) for k, faces in pairs.items()]
+
+    def find(self, candidates: Candidates) -> FaceFinding:
+        """All faces among the candidates."""
+        readings: list[FaceReading] = []
+        if len(candidates) >= MIN_CIRCLES:
+            for face, index in self._hypotheses(candidates):
+                matched = index >= 0
+                if any(r.face is face and (r.index == index)[matched].sum() >= 2 for r in readings):
+                    continue
+                grown = grow_match(candidates, index, face.xy_mm, face.radius_mm)
+                if grown is not None and _seen_from_outside(grown[1], face):
+                    readings.append(FaceReading(face, *grown))
+        return _decide(readings)
+
+    def _hypotheses(self, candidates: Candidates) -> list[tuple[FaceDesign, np.ndarray]]:
+        """Starts (face, index), the best supported first."""
+        first, step, ratio = _candidate_pairs(candidates)
+        length = np.linalg.norm(step, axis=1)
+        found = []
+        for pair in self._pairs:
+            distance, radii = np.linalg.norm(pair.step), pair.radii
+            ok = np.abs(length * radii[0] / distance - 1) < PAIR_TOLERANCE
+            ok &= np.abs(ratio * radii[0] / radii[1] - 1) < PAIR_TOLERANCE
+            if not ok.any():
+                continue
+            linear = candidates.shape[first[ok]] @ _turn(pair.step * [1, -1], step[ok]) * [1, -1]
+            for face in pair.faces:
+                index = _support(candidates, face, pair.first, candidates.xy[first[ok]], linear)
+                hits = (index >= 0).sum(1)
+                found += [(hits[h], face, index[h]) for h in np.flatnonzero(hits >= 2 + MIN_SUPPORT)]
+        found.sort(key=lambda item: -item[0])
+        return [(face, index) for _, face, index in found[:MAX_HYPOTHESES]]
+
+
+def _neighbours(face: FaceDesign) -> np.ndarray:
+    """For every circle the others by distance, (n, n − 1)."""
+    distance = np.linalg.norm(face.xy_mm[:, None] - face.xy_mm, axis=2)
+    return np.argsort(distance, axis=1, kind="stable")[:, 1:]
+
+
+def _candidate_pairs(candidates: Candidates):
+    """Neighbours of like shape: the first, the step to the second where the first is a unit circle, size ratio."""
+    k = min(NEIGHBOURS_IN_IMAGE + 1, len(candidates))
+    second = candidates.tree.query(candidates.xy, k=k)[1][:, 1:].ravel()
+    first = np.repeat(np.arange(len(candidates)), k - 1)
+    to_circle = np.linalg.inv(candidates.shape)[first]
+    largest, smallest = singular_values(to_circle @ candidates.shape[second])
+    ratio = candidates.radius[second] / candidates.radius[first]
+    ok = (largest < MAX_AXIS_RATIO * ratio) & (smallest * MAX_AXIS_RATIO > ratio)
+    first, second, ratio = first[ok], second[ok], ratio[ok]
+    step = np.einsum("nij,nj->ni", to_circle[ok], candidates.xy[second] - candidates.xy[first])
+    return first, step, ratio
+
+
+def _turn(step_plane: np.ndarray, step_image: np.ndarray) -> np.ndarray:
+    """Turn and scale, (n, 2, 2), that takes one plane vector to each image vector."""
+    a, b = step_plane
+    s = step_image @ np.array([[a, -b], [b, a]]) / (a * a + b * b)
+    return np.stack([np.stack([s[:, 0], -s[:, 1]], 1), np.stack([s[:, 1], s[:, 0]], 1)], 1)
+
+
+def _support(candidates: Candidates, face: FaceDesign, origin, xy, linear) -> np.ndarray:
+    """Candidates near the affine prediction of the circles nearest to ``origin``: (h, n circles), −1 elsewhere."""
+    k = int(np.argmin(np.linalg.norm(face.xy_mm - origin, axis=1)))
+    near = np.concatenate([[k], _neighbours(face)[k][: SUPPORT + 1]])
+    offset = face.xy_mm[near] - face.xy_mm[k]
+    predicted = xy[:, None] + np.einsum("hij,mj->hmi", linear, offset)
+    _, nearest = candidates.tree.query(predicted)
+    error = np.linalg.solve(linear[:, None], (candidates.xy[nearest] - predicted)[..., None])[..., 0]
+    radius = face.radius_mm[near]
+    size = candidates.radius[nearest] / np.sqrt(np.abs(np.linalg.det(linear)))[:, None]
+    ok = np.linalg.norm(error, axis=2) < 0.4 * radius + 0.12 * np.linalg.norm(offset, axis=1)
+    ok &= np.abs(size / radius - 1) < 0.5
+    index = np.full((len(xy), len(face.ids)), -1)
+    index[:, near] = np.where(ok, nearest, -1)
+    return index
+
+
+def _seen_from_outside(homography: np.ndarray, face: FaceDesign) -> bool:
+    """Whether the face's Z points to the camera; the mirror image of a face has it point away."""
+    depth = face.xy_mm[0] @ homography[2, :2] + homography[2, 2]
+    return np.linalg.det(homography) * depth < 0
+
+
+def _needed(face: FaceDesign) -> int:
+    """Fewest circles that make a reading of the face."""
+    return max(len(face.ids) - MAX_HIDDEN, min(MIN_CIRCLES, len(face.ids)))
+
+
+def _decide(readings: list[FaceReading]) -> FaceFinding:
+    """Keep the readings that explain more than every other reading of the same candidates."""
+    readings = [r for r in readings if r.count() >= _needed(r.face)]
+    readings.sort(key=lambda r: -r.count())
+    named: list[FaceReading] = []
+    notes: list[str] = []
+    settled: set[int] = set()
+    for reading in readings:
+        if settled & set(reading.used()):
+            continue
+        settled |= set(reading.used())
+        rivals = [
+            r
+            for r in readings
+            if r is not reading
+            and set(r.used()) & set(reading.used())
+            and r.count() >= reading.count()
+            and not (r.face is reading.face and (r.index == reading.index).all())
+        ]
+        if rivals:
+            ids = ", ".join(sorted({r.face.id for r in (reading, *rivals)}))
+            notes.append(
+                f"a face of {reading.count()} circles can be read as {ids}; left out, "
+                "show the circles that tell them apart"
+            )
+        else:
+            named.append(reading)
+    ids = [r.face.id for r in named]
+    repeated = tuple(sorted({i for i in ids if ids.count(i) > 1}))
+    return FaceFinding(tuple(r for r in named if r.face.id not in repeated), tuple(notes), repeated)

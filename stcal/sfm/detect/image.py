@@ -1,0 +1,118 @@
+"""One image: candidates → board → faces → centres. What only the group can decide stays open."""
+
+from dataclasses import dataclass, field
+
+import cv2
+import numpy as np
+
+from stcal.design import BoardDesign, TargetDesign
+from stcal.geometry.camera import Camera
+from stcal.sfm.detect.board import find_boards
+from stcal.sfm.detect.candidates import Candidates
+from stcal.sfm.detect.centres import Centres, measure_centres
+from stcal.sfm.detect.ellipses import EllipseOptions, find_ellipses
+from stcal.sfm.detect.faces import FaceFinder
+
+SECOND_BOARD_SHARE = 0.8
+"""A second board is one with at least this share of the dots of the first."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class ImageDetection:
+    """What one image shows.
+
+    ``centres`` : the measured circles, n = t + b of them, the target's first;
+    ``target_labels`` : (t,) their labels;
+    ``numberings`` : (k, b, 2) row and column of the board's dots in each of the k numberings that the image admits,
+    k = 0 without a board;
+    ``notes`` : what was seen and left out, and why; ``repeated`` : what is in view more than once.
+    """
+
+    centres: Centres
+    target_labels: tuple[str, ...]
+    numberings: np.ndarray
+    notes: tuple[str, ...] = ()
+    repeated: tuple[str, ...] = ()
+    candidates: int = field(default=0)
+
+    def face_ids(self) -> list[str]:
+        """Faces seen, in order of their labels."""
+        return list(dict.fromkeys(label.split(":")[0] for label in self.target_labels))
+
+
+def grey_8bit(image: np.ndarray) -> np.ndarray:
+    """The image in 8 bit; deeper images are scaled so that their bright end just fits."""
+    if image.dtype == np.uint8:
+        return image
+    return cv2.convertScaleAbs(image, alpha=255.0 / _bright_end(image))
+
+
+def _bright_end(image: np.ndarray) -> float:
+    return max(float(np.percentile(image[::4, ::4], 99.95)), 255.0)
+
+
+def detect_image(
+    image: np.ndarray, camera: Camera, target: TargetDesign, board: BoardDesign | None, options: EllipseOptions
+) -> ImageDetection:
+    """Find and measure all circles of the target and the board in one grey image of the camera's size."""
+    grey = grey_8bit(image)
+    found = {
+        p: find_ellipses(grey, p, options) for p in {target.polarity, board.polarity if board else target.polarity}
+    }
+    notes: list[str] = []
+    repeated: list[str] = []
+    reading = None
+    free = {p: np.ones(len(e), bool) for p, e in found.items()}
+    if board is not None:
+        ellipses = found[board.polarity]
+        boards = find_boards(Candidates.of(ellipses, camera), board, _corners(camera))
+        if len(boards) > 1 and len(boards[1].candidates) >= SECOND_BOARD_SHARE * len(boards[0].candidates):
+            repeated.append("board")
+        elif boards:
+            reading = boards[0]
+        for each in boards:
+            free[board.polarity][each.candidates] = False
+    ellipses = found[target.polarity].select(free[target.polarity])
+    finding = FaceFinder(target).find(Candidates.of(ellipses, camera))
+    repeated += [f"face {face_id}" for face_id in finding.repeated]
+    notes += finding.notes
+
+    scaled = image if image.dtype == np.uint8 else image * np.float32(255.0 / _bright_end(image))
+    labels = [
+        label for face in finding.faces for label, i in zip(face.face.labels(), face.index, strict=True) if i >= 0
+    ]
+    used = np.concatenate([face.used() for face in finding.faces]) if finding.faces else np.zeros(0, int)
+    target_centres = measure_centres(scaled, camera, ellipses.select(used), found[target.polarity])
+    notes += [_rim_note(label, c) for label, c, ok in _rows(labels, target_centres) if not ok]
+    kept = np.flatnonzero(target_centres.ok)
+    parts = [target_centres.select(kept)]
+    numberings = np.zeros((0, 0, 2), int)
+    if reading is not None:
+        dots = measure_centres(scaled, camera, found[board.polarity].select(reading.candidates), found[board.polarity])
+        notes += [_rim_note("a board dot", rim) for _, rim, ok in _rows(range(len(dots)), dots) if not ok]
+        parts.append(dots.select(np.flatnonzero(dots.ok)))
+        numberings = reading.numberings[:, dots.ok]
+    return ImageDetection(
+        Centres.concatenate(parts),
+        tuple(labels[i] for i in kept),
+        numberings,
+        tuple(notes),
+        tuple(repeated),
+        sum(len(e) for e in found.values()),
+    )
+
+
+def _rows(labels, centres: Centres):
+    return zip(labels, centres.rim, centres.ok, strict=True)
+
+
+def _rim_note(label: str, rim: float) -> str:
+    return (
+        f"{label}: {100 * rim:.0f} % of its rim follows an ellipse, 80 % needed; partly hidden or disturbed, left out"
+    )
+
+
+def _corners(camera: Camera) -> np.ndarray:
+    """Corners of the image, around it, in normalised ideal coordinates."""
+    right, bottom = camera.width - 0.5, camera.height - 0.5
+    return camera.normalised_from_pixel([[-0.5, -0.5], [right, -0.5], [right, bottom], [-0.5, bottom]])

@@ -1,0 +1,227 @@
+"""Mapping with pycolmap: incremental, seeded with our pair, intrinsics fixed, few points."""
+
+import shutil
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import pycolmap
+
+from stcal.errors import MappingError
+from stcal.geometry.camera import Camera
+from stcal.geometry.rigid import Rigid
+from stcal.sfm.database import CAMERA_ID, colmap_camera, to_colmap_px
+from stcal.sfm.model import GroupModel
+from stcal.sfm.observations import ImageObservations
+from stcal.sfm.pairs import PairScore
+
+SEED = 1
+MIN_POINTS = 6
+"""Labelled points that register an image; thousands are what COLMAP's own defaults expect."""
+MAX_REPROJECTION_PX = 4.0
+"""Observations further off than this from their label's point are left out of the model (COLMAP's filter)."""
+LOG_ERRORS_ONLY = 3
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Mapping:
+    """``model`` of a group; ``left_out`` : image name → reason; ``seeded`` : how the initial pair was registered."""
+
+    model: GroupModel
+    left_out: dict[str, str]
+    seeded: str
+
+
+def map_group(
+    database: Path,
+    scratch: Path,
+    group: list[ImageObservations],
+    ids: dict[str, int],
+    pairs: list[PairScore],
+    camera: Camera,
+    colmap_model: str,
+) -> Mapping:
+    """Map one group of the database.
+
+    The chosen pair seeds COLMAP; where COLMAP's gates refuse it, our own relative pose is registered instead.
+
+    Raises
+    ------
+    MappingError
+        No model of two or more images.
+    """
+    pycolmap.logging.minloglevel = LOG_ERRORS_ONLY
+    names = [image.name for image in group]
+    seeded = "COLMAP's estimate of the chosen pair"
+    reconstruction = _seeded_mapping(database, scratch, names, ids, pairs[0])
+    if reconstruction is None:
+        seeded = "our relative pose of the chosen pair (COLMAP's gates refused its own)"
+        reconstruction = _own_mapping(database, names, ids, pairs[0])
+    if reconstruction is None:
+        raise MappingError(
+            f"group {group[0].group}: no model from the pair {pairs[0].first}, {pairs[0].second} "
+            f"({pairs[0].shared} circles in common); add views between the two, or change --max-angle"
+        )
+    model = _labelled_model(reconstruction, group, ids, camera)
+    left_out = {
+        image.name: f"{_seen(image, model)} of its circles are in the model, {MIN_POINTS} needed; "
+        "photograph faces and board together"
+        for image in group
+        if image.name not in model.images
+    }
+    return Mapping(model, left_out, seeded)
+
+
+def _seen(image: ImageObservations, model: GroupModel) -> int:
+    return len(set(image.labels) & set(model.labels))
+
+
+def pipeline_options(names: list[str], pair: tuple[int, int]) -> pycolmap.IncrementalPipelineOptions:
+    """COLMAP's options for few labelled points and a known camera."""
+    options = pycolmap.IncrementalPipelineOptions()
+    options.image_names = names
+    options.init_image_id1, options.init_image_id2 = pair
+    options.min_num_matches = MIN_POINTS
+    options.multiple_models = False
+    options.min_model_size = 2
+    options.extract_colors = False
+    options.ba_refine_focal_length = options.ba_refine_extra_params = options.ba_refine_principal_point = False
+    options.constant_cameras = {CAMERA_ID}
+    options.random_seed = SEED
+    options.init_num_trials = 20
+    options.structure_less_registration_fallback = False
+    options.mapper.init_min_num_inliers = 8
+    options.mapper.init_min_tri_angle = 1.0
+    options.mapper.abs_pose_min_num_inliers = MIN_POINTS
+    options.mapper.abs_pose_refine_focal_length = options.mapper.abs_pose_refine_extra_params = False
+    options.mapper.filter_max_reproj_error = MAX_REPROJECTION_PX
+    options.mapper.filter_min_tri_angle = 0.5
+    options.triangulation.min_angle = 0.5
+    options.triangulation.ignore_two_view_tracks = False
+    return options
+
+
+def _seeded_mapping(database: Path, scratch: Path, names, ids, pair: PairScore) -> pycolmap.Reconstruction | None:
+    shutil.rmtree(scratch, ignore_errors=True)
+    scratch.mkdir(parents=True)
+    options = pipeline_options(names, (ids[pair.first], ids[pair.second]))
+    models = pycolmap.incremental_mapping(str(database), str(scratch), str(scratch), options)
+    shutil.rmtree(scratch, ignore_errors=True)
+    best = max(models.values(), key=lambda m: m.num_reg_images(), default=None)
+    return best if best is not None and best.num_reg_images() >= 2 else None
+
+
+def _own_mapping(database: Path, names, ids, pair: PairScore) -> pycolmap.Reconstruction | None:
+    """COLMAP's incremental mapper driven from here, starting from our relative pose of the pair."""
+    options = pipeline_options(names, (ids[pair.first], ids[pair.second]))
+    with pycolmap.Database.open(str(database)) as opened:
+        cache = pycolmap.DatabaseCache.create(
+            opened, pycolmap.DatabaseCacheOptions(min_num_matches=MIN_POINTS, image_names=set(names))
+        )
+    reconstruction = pycolmap.Reconstruction()
+    mapper = pycolmap.IncrementalMapper(cache)
+    mapper.begin_reconstruction(reconstruction)
+    mapper_options, triangulation = options.get_mapper(), options.get_triangulation()
+    pose = pycolmap.Rigid3d(pycolmap.Rotation3d(pair.second_from_first.rotation), pair.second_from_first.translation)
+    first, second = ids[pair.first], ids[pair.second]
+    mapper.register_initial_image_pair(mapper_options, first, second, pose)
+    for image_id in (first, second):
+        mapper.triangulate_image(triangulation, image_id)
+    mapper.adjust_global_bundle(mapper_options, options.get_global_bundle_adjustment())
+    mapper.filter_points(mapper_options)
+    while True:
+        nearest = mapper.find_next_images(mapper_options, False)
+        for image_id in nearest:
+            if mapper.register_next_image(mapper_options, image_id):
+                mapper.triangulate_image(triangulation, image_id)
+                mapper.adjust_global_bundle(mapper_options, options.get_global_bundle_adjustment())
+                mapper.filter_points(mapper_options)
+                break
+        else:
+            break
+    mapper.end_reconstruction(False)
+    return reconstruction if reconstruction.num_reg_images() >= 2 and reconstruction.num_points3D() >= 4 else None
+
+
+def rigid_from_colmap(pose: pycolmap.Rigid3d) -> Rigid:
+    """Our transform of COLMAP's."""
+    return Rigid(pose.rotation.matrix(), pose.translation)
+
+
+def _labelled_model(
+    reconstruction: pycolmap.Reconstruction, group: list[ImageObservations], ids: dict[str, int], camera: Camera
+) -> GroupModel:
+    """One point for each label, with every observation of the label that agrees with it."""
+    registered = [image for image in group if reconstruction.image(ids[image.name]).has_pose] if group else []
+    poses = [rigid_from_colmap(reconstruction.image(ids[image.name]).cam_from_world()) for image in registered]
+    places: dict[str, dict[int, int]] = {}
+    for image in registered:
+        record = reconstruction.image(ids[image.name])
+        for k, point in enumerate(record.points2D):
+            if point.has_point3D():
+                votes = places.setdefault(image.labels[k], {})
+                votes[point.point3D_id] = votes.get(point.point3D_id, 0) + 1
+    xyz = {label: reconstruction.point3D(max(votes, key=votes.get)).xyz for label, votes in places.items()}
+    labels = sorted(xyz)
+    index = {label: i for i, label in enumerate(labels)}
+    rows = [
+        (i, index[label], k)
+        for i, image in enumerate(registered)
+        for k, label in enumerate(image.labels)
+        if label in index
+    ]
+    image_index, point_index, keypoint = np.array(rows, int).reshape(-1, 3).T
+    model = GroupModel(
+        group[0].group,
+        tuple(image.name for image in registered),
+        tuple(poses),
+        tuple(labels),
+        np.array([xyz[label] for label in labels]).reshape(-1, 3),
+        image_index,
+        point_index,
+        keypoint,
+        np.array([registered[i].centre_px[k] for i, k in zip(image_index, keypoint, strict=True)]).reshape(-1, 2),
+        np.zeros((len(rows), 2)),
+        np.array([registered[i].sigma_px()[k] for i, k in zip(image_index, keypoint, strict=True)]),
+    )
+    off = np.linalg.norm(model.residuals_px(camera), axis=1) > MAX_REPROJECTION_PX
+    return model.without(off)
+
+
+def to_reconstruction(
+    model: GroupModel,
+    ids: dict[str, int],
+    camera: Camera,
+    colmap_model: str,
+    keypoints_px: dict[str, np.ndarray],
+) -> pycolmap.Reconstruction:
+    """COLMAP's form of a model; ``keypoints_px`` : all keypoints by image, (k, 2), in the database's order."""
+    reconstruction = pycolmap.Reconstruction()
+    reconstruction.add_camera_with_trivial_rig(colmap_camera(camera, colmap_model))
+    tracks = [pycolmap.Track() for _ in model.labels]
+    for i, (name, pose) in enumerate(zip(model.images, model.camera_from_world, strict=True)):
+        rows = np.flatnonzero(model.image_index == i)
+        image = pycolmap.Image(name=name, camera_id=CAMERA_ID, image_id=ids[name])
+        image.points2D = [pycolmap.Point2D(each) for each in to_colmap_px(keypoints_px[name])]
+        reconstruction.add_image_with_trivial_frame(
+            image, pycolmap.Rigid3d(pycolmap.Rotation3d(pose.rotation), pose.translation)
+        )
+        for row in rows:
+            tracks[model.point_index[row]].add_element(ids[name], int(model.keypoint[row]))
+    for xyz, track in zip(model.xyz_world, tracks, strict=True):
+        reconstruction.add_point3D(xyz, track)
+    return reconstruction
+
+
+def write_model(
+    folder: Path,
+    model: GroupModel,
+    observations: list[ImageObservations],
+    ids: dict[str, int],
+    camera: Camera,
+    colmap_model: str,
+) -> None:
+    """Write a model as COLMAP's binary files: no unit, corrected centres, keypoints as the database has them."""
+    folder.mkdir(parents=True, exist_ok=True)
+    keypoints = {image.name: model.keypoints_px(image) for image in observations if image.name in model.images}
+    to_reconstruction(model, ids, camera, colmap_model, keypoints).write_binary(str(folder))

@@ -1,0 +1,94 @@
+"""The model of one group: cameras and labelled points in a world without unit, and the observations they explain."""
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from stcal.geometry.arrays import frozen
+from stcal.geometry.camera import Camera
+from stcal.geometry.rigid import Rigid, Similarity
+from stcal.sfm.observations import ImageObservations, face_of, is_board
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class GroupModel:
+    """m images, p points, n observations of one group.
+
+    ``images`` : (m,) names; ``camera_from_world`` : (m,) poses; ``labels`` : (p,); ``xyz_world`` : (p, 3), no unit;
+    ``image_index``, ``point_index`` : (n,); ``keypoint`` : (n,) place among the image's observations;
+    ``measured_px`` : (n, 2) ellipse centres; ``shift_px`` : (n, 2) what eccentricity adds to the image of a circle's
+    centre, zero until it is known; ``sigma_px`` : (n,).
+    """
+
+    group: str
+    images: tuple[str, ...]
+    camera_from_world: tuple[Rigid, ...]
+    labels: tuple[str, ...]
+    xyz_world: np.ndarray
+    image_index: np.ndarray
+    point_index: np.ndarray
+    keypoint: np.ndarray
+    measured_px: np.ndarray
+    shift_px: np.ndarray
+    sigma_px: np.ndarray
+
+    def __post_init__(self):
+        n = len(self.image_index)
+        object.__setattr__(self, "xyz_world", frozen(self.xyz_world, (len(self.labels), 3), "points"))
+        for name, shape in (("measured_px", (n, 2)), ("shift_px", (n, 2)), ("sigma_px", (n,))):
+            object.__setattr__(self, name, frozen(getattr(self, name), shape, name))
+        for name in ("image_index", "point_index", "keypoint"):
+            object.__setattr__(self, name, frozen(getattr(self, name), (n,), name, dtype=int))
+
+    def corrected_px(self) -> np.ndarray:
+        """Images of the circles' centres, (n, 2): the measured ellipse centres less their eccentricity."""
+        return self.measured_px - self.shift_px
+
+    def keypoints_px(self, image: ImageObservations) -> np.ndarray:
+        """All keypoints of one image, (k, 2): corrected where the model has them, measured elsewhere."""
+        xy = image.centre_px.copy()
+        if image.name in self.images:
+            rows = self.image_index == self.images.index(image.name)
+            xy[self.keypoint[rows]] = self.corrected_px()[rows]
+        return xy
+
+    def xyz_camera(self) -> np.ndarray:
+        """The observed points in the frames of the cameras that observe them, (n, 3)."""
+        rotation = np.stack([pose.rotation for pose in self.camera_from_world])
+        translation = np.stack([pose.translation for pose in self.camera_from_world])
+        xyz = self.xyz_world[self.point_index]
+        return np.einsum("nij,nj->ni", rotation[self.image_index], xyz) + translation[self.image_index]
+
+    def residuals_px(self, camera: Camera) -> np.ndarray:
+        """Corrected minus projected, (n, 2)."""
+        return self.corrected_px() - camera.project(self.xyz_camera())
+
+    def moved(self, a_from_world: Similarity) -> "GroupModel":
+        """The same model in another world, its unit included."""
+        rotation, scale = a_from_world.rigid.rotation, a_from_world.scale
+        poses = tuple(
+            Rigid(
+                pose.rotation @ rotation.T,
+                scale * pose.translation - pose.rotation @ rotation.T @ a_from_world.rigid.translation,
+            )
+            for pose in self.camera_from_world
+        )
+        return replace(self, camera_from_world=poses, xyz_world=a_from_world @ self.xyz_world)
+
+    def points_by_face(self) -> dict[str, np.ndarray]:
+        """Indices of the points of every face, and of the board under ``board``."""
+        members: dict[str, list[int]] = {}
+        for i, label in enumerate(self.labels):
+            members.setdefault("board" if is_board(label) else face_of(label), []).append(i)
+        return {key: np.array(indices) for key, indices in members.items()}
+
+    def without(self, drop: np.ndarray) -> "GroupModel":
+        """The model without the observations of mask ``drop``."""
+        keep = ~drop
+        return replace(
+            self,
+            **{
+                name: getattr(self, name)[keep]
+                for name in ("image_index", "point_index", "keypoint", "measured_px", "shift_px", "sigma_px")
+            },
+        )

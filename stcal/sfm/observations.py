@@ -1,0 +1,70 @@
+"""Labelled circle centres: what detection hands to everything after it, and ``detections.csv``."""
+
+import csv
+import io
+from dataclasses import dataclass, fields
+
+import numpy as np
+
+from stcal.design import BOARD
+from stcal.geometry.arrays import frozen
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class ImageObservations:
+    """The labelled circles of one image, n of them.
+
+    ``centre_px`` : (n, 2) ellipse centres in the image as it is, OpenCV pixel origin; ``centre`` : (n, 2) and
+    ``shape`` : (n, 2, 2) the ideal ellipse in normalised coordinates; ``covariance_px2`` : (n, 2, 2).
+    """
+
+    name: str
+    group: str
+    labels: tuple[str, ...]
+    centre_px: np.ndarray
+    centre: np.ndarray
+    shape: np.ndarray
+    covariance_px2: np.ndarray
+
+    def __post_init__(self):
+        n = len(self.labels)
+        for field, shape in (("centre_px", (n, 2)), ("centre", (n, 2)), ("shape", (n, 2, 2))):
+            object.__setattr__(self, field, frozen(getattr(self, field), shape, field))
+        object.__setattr__(self, "covariance_px2", frozen(self.covariance_px2, (n, 2, 2), "covariance_px2"))
+
+    def __len__(self) -> int:
+        return len(self.labels)
+
+    def sigma_px(self) -> np.ndarray:
+        """Standard deviation per axis (RMS of the two), (n,)."""
+        return np.sqrt(np.trace(self.covariance_px2, axis1=1, axis2=2) / 2)
+
+    def face_ids(self) -> list[str]:
+        """Faces of the target that the labels name, in order."""
+        return list(dict.fromkeys(face_of(label) for label in self.labels if not is_board(label)))
+
+    def select(self, keep) -> "ImageObservations":
+        """Those of the indices ``keep``."""
+        arrays = [getattr(self, f.name)[keep] for f in fields(self)[3:]]
+        return ImageObservations(self.name, self.group, tuple(self.labels[i] for i in keep), *arrays)
+
+
+def is_board(label: str) -> bool:
+    """Whether a label names a dot of the board."""
+    return label.startswith(BOARD + ":")
+
+
+def face_of(label: str) -> str:
+    """Face id of a target label."""
+    return label.split(":", 1)[0]
+
+
+def detections_csv(observations: list[ImageObservations]) -> str:
+    """Text of ``detections.csv``."""
+    stream = io.StringIO()
+    writer = csv.writer(stream, lineterminator="\n")
+    writer.writerow(["image", "label", "x_px", "y_px", "sigma_px"])
+    for image in observations:
+        for label, (x, y), sigma in zip(image.labels, image.centre_px, image.sigma_px(), strict=True):
+            writer.writerow([image.name, label, f"{x:.5f}", f"{y:.5f}", f"{sigma:.5f}"])
+    return stream.getvalue()

@@ -1,0 +1,334 @@
+"""The main job: from a folder of images to the calibrated target. Each call is a stage; its result is saved."""
+
+import json
+import shutil
+from collections.abc import Callable
+from dataclasses import asdict, dataclass, field, replace
+from pathlib import Path
+
+import stcal
+from stcal.camera_file import CameraModel, read_camera
+from stcal.design import BoardDesign, TargetDesign, reference_board, reference_target
+from stcal.design_file import load_board, load_target
+from stcal.errors import InputError
+from stcal.geometry.camera import Camera
+from stcal.geometry.rigid import Rigid, Similarity
+from stcal.sfm.chain import CalibratedTarget, Chain, chain_faces, measure_chains
+from stcal.sfm.database import image_ids, labels_csv, remove_database, write_database
+from stcal.sfm.detect.ellipses import EllipseOptions
+from stcal.sfm.detection import DetectionResult, detect_files, require_single, write_bytes
+from stcal.sfm.faces import FaceInGroup, FrameKind, faces_of_group
+from stcal.sfm.images import RUN_MARKER, find_images
+from stcal.sfm.joint import JointResult, adjust_jointly, calibrated_target
+from stcal.sfm.labels import LabelledImage, label_group
+from stcal.sfm.mapping import write_model
+from stcal.sfm.metric import Scale, find_scale
+from stcal.sfm.observations import ImageObservations, detections_csv
+from stcal.sfm.output import faces_json, report_json
+from stcal.sfm.overlay import draw_overlay
+from stcal.sfm.pairs import PairOptions
+from stcal.sfm.refine import eccentricity_px
+from stcal.sfm.report import report_html
+from stcal.sfm.solve import GroupSolution, image_sigma_factor, require_usable, solve_group, with_sigma
+
+RESULTS = ("faces.json", "report.json", "report.html")
+JOINT_ROUNDS = 2
+"""Eccentricity moves by nanometres between the first and the second joint adjustment."""
+
+Progress = Callable[[str, int, int], None]
+"""Called with (stage, done, total)."""
+
+
+@dataclass(frozen=True, slots=True)
+class RunOptions:
+    """``solve`` : ``joint`` (one adjustment over all groups) or ``chain`` (as in document 000, group by group);
+    ``frame`` : Z from the plane of all circles, or frames from three points; ``eccentricity`` : off for the uncorrected
+    control; ``reference_face`` : the design's first one where None; ``workers`` : processes, one per core where None.
+    """
+
+    solve: str = "joint"
+    frame: FrameKind = "plane"
+    eccentricity: bool = True
+    reference_face: str | None = None
+    pairs: PairOptions = field(default_factory=PairOptions)
+    ellipses: EllipseOptions = field(default_factory=EllipseOptions)
+    workers: int | None = None
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class RunResult:
+    """Everything a run found; ``target`` is the answer."""
+
+    out: Path
+    camera: Camera
+    colmap_model: str
+    target_design: TargetDesign
+    board_design: BoardDesign
+    options: RunOptions
+    detection: DetectionResult
+    labelled: tuple[LabelledImage, ...]
+    solutions: tuple[GroupSolution, ...]
+    scales: dict[str, Scale]
+    faces: tuple[FaceInGroup, ...]
+    target: CalibratedTarget
+    chains: dict[str, tuple[Chain, ...]]
+    joint: JointResult | None
+    sigma_factor: float
+    notes: tuple[str, ...]
+
+    def observations(self) -> list[ImageObservations]:
+        """Labelled centres of all images, in the database's order."""
+        return [each.observations for each in self.labelled]
+
+
+def run(
+    images: str | Path,
+    camera: str | Path | CameraModel,
+    out: str | Path,
+    target: str | Path | TargetDesign | None = None,
+    board: str | Path | BoardDesign | None = None,
+    options: RunOptions | None = None,
+    progress: Progress | None = None,
+) -> RunResult:
+    """Calibrate a target from photographs.
+
+    Parameters
+    ----------
+    images : folder with one folder of images for each group
+    camera : COLMAP's cameras.txt, OpenCV's YAML or XML, or what :func:`stcal.camera_file.read_camera` returned
+    out : the run's folder, new, empty, or of an earlier run
+    target, board : designs or their TOML files; the reference design where None
+
+    Raises
+    ------
+    StcalError
+        One of its kinds, with a one-line message that says what to do.
+    """
+    options = options or RunOptions()
+    tell = progress or (lambda *_: None)
+    model = camera if isinstance(camera, CameraModel) else read_camera(camera)
+    target = load_design(target, reference_target, load_target)
+    board = load_design(board, reference_board, load_board)
+    reference = options.reference_face or target.faces[0].id
+    target.face(reference)
+    out = claim_folder(out)
+
+    detection, labelled = detect(images, model, out, target, board, options, tell)
+    require_single(detection.images)
+    observations = [each.observations for each in labelled]
+    groups: dict[str, list[ImageObservations]] = {}
+    for image in observations:
+        groups.setdefault(image.group, []).append(image)
+    for group in groups.values():
+        require_usable(group)
+
+    tell("map", 0, len(groups))
+    solutions = _solve_groups(groups, observations, out, detection.camera, model, target, board, options, tell)
+    scales = {s.model.group: find_scale(s.model, board) for s in solutions}
+
+    tell("faces", 0, 1)
+    faces, notes = [], []
+    for s in solutions:
+        found, missing = faces_of_group(
+            s.model, scales[s.model.group].mm_per_unit, detection.camera, target, options.frame
+        )
+        faces += found
+        notes += missing
+    calibrated = chain_faces(faces, target, reference)
+    factor = image_sigma_factor([s.model for s in solutions], detection.camera)
+    joint = None
+    if options.solve == "joint":
+        joint = _adjust_all(solutions, scales, calibrated, factor, detection.camera, target, board, options)
+        calibrated = calibrated_target(joint, calibrated, target, options.frame)
+    tell("faces", 1, 1)
+
+    result = RunResult(
+        out,
+        detection.camera,
+        model.colmap_model,
+        target,
+        board,
+        options,
+        detection,
+        tuple(labelled),
+        tuple(solutions),
+        scales,
+        tuple(faces),
+        calibrated,
+        measure_chains(faces, calibrated),
+        joint,
+        factor,
+        tuple(notes),
+    )
+    _write(result, tell)
+    return result
+
+
+def detect(
+    images: str | Path,
+    camera: CameraModel,
+    out: Path,
+    target: TargetDesign,
+    board: BoardDesign | None,
+    options: RunOptions,
+    tell: Progress,
+) -> tuple[DetectionResult, list[LabelledImage]]:
+    """Detection, labels, ``detections.csv`` and overlays, into a claimed folder."""
+    files, other = find_images(images)
+    done = 0
+
+    def step(_name: str) -> None:
+        nonlocal done
+        done += 1
+        tell("detect", done, len(files))
+
+    tell("detect", 0, len(files))
+    detection = detect_files(files, camera, target, board, options.ellipses, out / "cache", options.workers, step)
+    detection = replace(detection, skipped=(*other, *detection.skipped))
+    groups: dict[str, list] = {}
+    for image in detection.images:
+        groups.setdefault(image.file.group, []).append((image.file.name, image.file.group, image.detection))
+    labelled = [each for group in groups.values() for each in label_group(group, target, board)]
+    write_bytes(out / "detections.csv", detections_csv([each.observations for each in labelled]).encode())
+    _write_overlays(detection, labelled, target, out, tell)
+    return detection, labelled
+
+
+def load_design(given, default: Callable, load: Callable):
+    """A design given as an object, a file, or not at all."""
+    if given is None:
+        return default()
+    return load(given) if isinstance(given, (str, Path)) else given
+
+
+def claim_folder(out: str | Path) -> Path:
+    """Make the run's folder, mark it as ours, and remove results that will be made anew.
+
+    Raises
+    ------
+    InputError
+        The folder holds something else.
+    """
+    out = Path(out)
+    marker = out / RUN_MARKER
+    try:
+        if out.exists() and not out.is_dir():
+            raise InputError(f"output {out}: not a folder; give a new folder with --out")
+        if out.is_dir() and any(out.iterdir()) and not marker.exists():
+            raise InputError(f"output folder {out}: not empty and not of an earlier run; give a new folder with --out")
+        out.mkdir(parents=True, exist_ok=True)
+        write_bytes(marker, json.dumps({"program": "stcal-sfm", "version": stcal.__version__}).encode())
+        for name in RESULTS:
+            (out / name).unlink(missing_ok=True)
+        remove_database(out / "database.db")
+    except OSError as error:
+        raise InputError(f"output folder {out}: {error.strerror or error}; give a writable folder") from error
+    return out
+
+
+def _write_overlays(detection: DetectionResult, labelled: list[LabelledImage], target, out: Path, tell) -> None:
+    folder = out / "overlays"
+    shutil.rmtree(folder, ignore_errors=True)
+    face_ids = [face.id for face in target.faces]
+    for i, (image, each) in enumerate(zip(_in_order(detection, labelled), labelled, strict=True)):
+        path = overlay_path(out, image.file.name)
+        path.parent.mkdir(parents=True, exist_ok=True)
+        picture = draw_overlay(
+            image.thumbnail,
+            image.thumbnail_scale,
+            each.observations,
+            face_ids,
+            detection.camera.focal,
+            len(each.notes),
+        )
+        write_bytes(path, picture)
+        tell("overlays", i + 1, len(labelled))
+
+
+def _in_order(detection: DetectionResult, labelled: list[LabelledImage]):
+    by_name = {image.file.name: image for image in detection.images}
+    return [by_name[each.observations.name] for each in labelled]
+
+
+def overlay_path(out: Path, name: str) -> Path:
+    """The overlay of an image."""
+    return out / "overlays" / f"{name}.jpg"
+
+
+def _solve_groups(groups, observations, out: Path, camera, model, target, board, options, tell) -> list[GroupSolution]:
+    scratch = out / "scratch"
+    shutil.rmtree(scratch, ignore_errors=True)
+    scratch.mkdir()
+    ids = image_ids(observations)
+    database = scratch / "mapping.db"
+    write_database(database, camera, model.colmap_model, observations)
+    solutions = []
+    try:
+        for group in groups.values():
+            solutions.append(
+                solve_group(
+                    group,
+                    database,
+                    scratch / "models",
+                    ids,
+                    camera,
+                    model.colmap_model,
+                    target,
+                    board,
+                    options.pairs,
+                    options.eccentricity,
+                    out / "cache",
+                )
+            )
+            tell("map", len(solutions), len(groups))
+    finally:
+        shutil.rmtree(scratch, ignore_errors=True)
+    return solutions
+
+
+def _adjust_all(solutions, scales, start: CalibratedTarget, factor, camera, target, board, options) -> JointResult:
+    """The joint adjustment from the chained result; eccentricity follows."""
+    radius = target.radius_of() | board.radius_of()
+    models = []
+    for s in solutions:
+        group = s.model.group
+        if group not in start.target_from_group:
+            continue
+        metric = Similarity(1.0, start.target_from_group[group]) @ Similarity(scales[group].mm_per_unit, Rigid())
+        models.append(with_sigma(s.model.moved(metric), factor))
+    for _ in range(JOINT_ROUNDS):
+        if options.eccentricity:
+            models = [replace(m, shift_px=eccentricity_px(m, camera, radius, 1.0)) for m in models]
+        result = adjust_jointly(models, board, camera)
+        models = list(result.models)
+    return result
+
+
+def _write(result: RunResult, tell: Progress) -> None:
+    """The database with corrected centres, models, faces and report; ``faces.json`` comes last but for the report."""
+    out = result.out
+    observations = result.observations()
+    ids = image_ids(observations)
+    models = {s.model.group: s.model for s in result.solutions}
+    corrected = [models[image.group].keypoints_px(image) for image in observations]
+    write_database(out / "database.db", result.camera, result.colmap_model, observations, corrected)
+    write_bytes(out / "labels.csv", labels_csv(observations, corrected).encode())
+    shutil.rmtree(out / "models", ignore_errors=True)
+    for name, model in models.items():
+        folder = out / "models" / ("top" if name == "." else name)
+        write_model(folder, model, observations, ids, result.camera, result.colmap_model)
+    report = report_json(result)
+    write_bytes(out / "faces.json", _json(faces_json(result)))
+    write_bytes(out / "report.json", _json(report))
+    overlays = {image.name: overlay_path(out, image.name).read_bytes() for image in observations}
+    write_bytes(out / "report.html", report_html(report, overlays).encode())
+    tell("report", 1, 1)
+
+
+def _json(value: dict) -> bytes:
+    return (json.dumps(value, indent=1, ensure_ascii=False, allow_nan=False) + "\n").encode()
+
+
+def options_json(options: RunOptions) -> dict:
+    """The options as plain values."""
+    return asdict(options)

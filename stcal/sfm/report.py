@@ -1,0 +1,5 @@
+"""``report.html``."""
+
+
+def report_html(report: dict, overlays: dict[str, bytes]) -> str:
+    return "<html></html>"

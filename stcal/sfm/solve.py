@@ -1,0 +1,165 @@
+"""One group from labels to a corrected model: pairs, mapping, refinement; kept by its inputs."""
+
+import hashlib
+import io
+import json
+from dataclasses import asdict, dataclass, fields, replace
+from pathlib import Path
+
+import numpy as np
+
+from stcal.design import BoardDesign, TargetDesign
+from stcal.errors import MappingError
+from stcal.geometry.camera import Camera
+from stcal.geometry.rigid import Rigid
+from stcal.sfm.detection import write_bytes
+from stcal.sfm.mapping import map_group
+from stcal.sfm.model import GroupModel
+from stcal.sfm.observations import ImageObservations, is_board
+from stcal.sfm.pairs import PairOptions, PairScore, rank_pairs
+from stcal.sfm.refine import Outlier, refine
+
+CACHE_VERSION = 1
+_ARRAYS = ("xyz_world", "image_index", "point_index", "keypoint", "measured_px", "shift_px", "sigma_px")
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class GroupSolution:
+    """One group solved in a world without unit.
+
+    ``pairs`` : the ranking, the chosen pair first; ``model`` ; ``seeded`` : how the pair was registered; ``rounds`` of
+    refinement; ``left_out`` : image → reason; ``outliers`` : observations left out.
+    """
+
+    pairs: tuple[PairScore, ...]
+    model: GroupModel
+    seeded: str
+    rounds: int
+    left_out: dict[str, str]
+    outliers: tuple[Outlier, ...]
+
+
+def require_usable(group: list[ImageObservations]) -> None:
+    """Refuse a group that cannot be solved, before anything is mapped.
+
+    Raises
+    ------
+    MappingError
+        One image, no board, or no face in the whole group.
+    """
+    where = f"group {group[0].group}"
+    if len(group) < 2:
+        raise MappingError(f"{where}: 1 usable image ({group[0].name}), 2 needed; add photographs from other places")
+    if not any(image.face_ids() for image in group):
+        raise MappingError(
+            f"{where}: no face of the target recognised in {len(group)} images; look at the overlays, "
+            "check target.toml (radii, polarity) and the exposure"
+        )
+    if not any(is_board(label) for image in group for label in image.labels):
+        raise MappingError(
+            f"{where}: no board recognised in {len(group)} images; keep the whole board in view, "
+            "check board.toml (rows, columns, polarity)"
+        )
+
+
+def solve_group(
+    group: list[ImageObservations],
+    database: Path,
+    scratch: Path,
+    ids: dict[str, int],
+    camera: Camera,
+    colmap_model: str,
+    target: TargetDesign,
+    board: BoardDesign,
+    pair_options: PairOptions,
+    eccentricity: bool,
+    cache: Path,
+) -> GroupSolution:
+    """Solve one group, or take the solution of an earlier run with the same inputs.
+
+    Raises
+    ------
+    MappingError, ScaleError, ConvergenceError
+    """
+    key = _key(group, ids, camera, target, board, pair_options, eccentricity)
+    path = cache / f"group-{key}.npz"
+    kept = _load(path)
+    if kept is not None:
+        return kept
+    pairs = rank_pairs(group, camera, pair_options)
+    mapping = map_group(database, scratch, group, ids, pairs, camera, colmap_model)
+    refined = refine(mapping.model, camera, target, board, eccentricity)
+    solution = GroupSolution(
+        tuple(pairs), refined.model, mapping.seeded, refined.rounds, mapping.left_out, refined.outliers
+    )
+    _save(path, solution)
+    return solution
+
+
+def _key(group, ids, camera: Camera, target: TargetDesign, board: BoardDesign, pair_options, eccentricity: bool) -> str:
+    hasher = hashlib.sha256()
+    for image in group:
+        hasher.update(f"{image.name}\0{ids[image.name]}\0{image.labels}\0".encode())
+        hasher.update(image.centre_px.tobytes() + image.covariance_px2.tobytes())
+    plain = [CACHE_VERSION, asdict(camera), asdict(target), asdict(board), asdict(pair_options), eccentricity]
+    hasher.update(json.dumps(plain, default=lambda v: v.tolist() if isinstance(v, np.ndarray) else str(v)).encode())
+    return hasher.hexdigest()[:40]
+
+
+def _save(path: Path, solution: GroupSolution) -> None:
+    model = solution.model
+    meta = {
+        "group": model.group,
+        "images": model.images,
+        "labels": model.labels,
+        "seeded": solution.seeded,
+        "rounds": solution.rounds,
+        "left_out": solution.left_out,
+        "outliers": [asdict(o) for o in solution.outliers],
+        "pairs": [
+            {f.name: getattr(p, f.name) for f in fields(PairScore) if f.name != "second_from_first"}
+            for p in solution.pairs
+        ],
+        "pair_poses": [
+            None if p.second_from_first is None else p.second_from_first.matrix().tolist() for p in solution.pairs
+        ],
+    }
+    stream = io.BytesIO()
+    poses = np.stack([pose.matrix() for pose in model.camera_from_world])
+    arrays = {name: getattr(model, name) for name in _ARRAYS}
+    np.savez(stream, poses=poses, meta=np.frombuffer(json.dumps(meta).encode(), np.uint8), **arrays)
+    write_bytes(path, stream.getvalue())
+
+
+def _load(path: Path) -> GroupSolution | None:
+    """What was kept; None where there is nothing, or it is damaged."""
+    try:
+        with np.load(path) as stored:
+            meta = json.loads(stored["meta"].tobytes())
+            model = GroupModel(
+                meta["group"],
+                tuple(meta["images"]),
+                tuple(Rigid(m[:3, :3], m[:3, 3]) for m in stored["poses"]),
+                tuple(meta["labels"]),
+                **{name: stored[name] for name in _ARRAYS},
+            )
+            pairs = tuple(
+                PairScore(**p, second_from_first=None if m is None else Rigid.from_matrix(m))
+                for p, m in zip(meta["pairs"], meta["pair_poses"], strict=True)
+            )
+            outliers = tuple(Outlier(**o) for o in meta["outliers"])
+            return GroupSolution(pairs, model, meta["seeded"], meta["rounds"], meta["left_out"], outliers)
+    except (OSError, ValueError, KeyError, EOFError):
+        return None
+
+
+def image_sigma_factor(models: list[GroupModel], camera: Camera) -> float:
+    """How much larger the residuals of free networks are than the centres' own σ (one variance component)."""
+    square = sum(float(((m.residuals_px(camera) / m.sigma_px[:, None]) ** 2).sum()) for m in models)
+    redundancy = sum(2 * len(m.image_index) - 6 * len(m.images) - 3 * len(m.labels) + 7 for m in models)
+    return float(np.sqrt(square / redundancy)) if redundancy > 0 else 1.0
+
+
+def with_sigma(model: GroupModel, factor: float) -> GroupModel:
+    """The model with its observations' σ scaled."""
+    return replace(model, sigma_px=factor * model.sigma_px)

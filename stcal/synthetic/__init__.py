@@ -1,0 +1,1 @@
+"""Simulated targets, boards and photographs with known truth."""

@@ -1,0 +1,107 @@
+"""Designs to simulate: where the faces of the reference target nominally are, and a second, quite different target."""
+
+import numpy as np
+
+from stcal.design import BoardDesign, FaceDesign, TargetDesign
+from stcal.geometry.rigid import Rigid
+
+REFERENCE_GROUPS = (("1", "2"), ("1", "4"), ("1", "5"), ("2", "3"))
+"""The groups of Zhang & Wei (2017), sec. 2."""
+
+
+def nominal_target_from_face() -> dict[str, Rigid]:
+    """Nominal face poses of the reference design, target frame = frame of face 1, mm.
+
+    Close to table 2 of Zhang & Wei (2017) where that is consistent. For simulation only: the calibration
+    does not use them.
+    """
+    x, y, z = np.eye(3)
+    poses = {
+        "1": ((x, y, z), (0, 0, 0)),
+        "2": ((-z, y, x), (138.4, 0, -58.0)),
+        "3": ((-x, y, -z), (78.6, 0, -198.4)),
+        "4": ((z, y, -x), (-58.4, 0, -138.4)),
+        "5": ((x, z, -y), (0, -46.0, -138.4)),
+    }
+    return {face: Rigid(np.column_stack(axes), origin) for face, (axes, origin) in poses.items()}
+
+
+# Drawings of the second design: id, x, y, radius in mm, in a drawing frame with the origin in a corner of the face.
+_TOP = [
+    ("A", 15, 16, 6.0),
+    ("B", 50, 18, 6.0),
+    ("C", 85, 14, 6.0),
+    ("D", 17, 60, 6.0),
+    ("E", 62, 55, 6.0),
+    ("F", 34, 38, 3.5),
+    ("G", 84, 50, 3.5),
+    ("H", 40, 84, 3.5),
+    ("I", 76, 82, 3.5),
+]
+_LEFT = [
+    ("p", 15, 26, 6.0),
+    ("q", 46, 15, 6.0),
+    ("r", 82, 40, 6.0),
+    ("s", 24, 82, 6.0),
+    ("t", 60, 78, 6.0),
+    ("u", 32, 52, 3.5),
+    ("v", 56, 44, 3.5),
+    ("w", 85, 80, 3.5),
+]
+_RIGHT = [
+    ("21", 20, 15, 6.0),
+    ("22", 82, 18, 6.0),
+    ("23", 18, 85, 6.0),
+    ("24", 50, 52, 6.0),
+    ("25", 52, 26, 3.5),
+    ("26", 68, 70, 3.5),
+    ("27", 34, 66, 3.5),
+    ("28", 86, 58, 3.5),
+    ("29", 74, 86, 3.5),
+]
+_EDGE_MM = 140.0
+
+
+def second_design() -> tuple[TargetDesign, BoardDesign, dict[str, Rigid]]:
+    """A cube with dark circles on three white faces, its board with one larger corner dot, and nominal face poses.
+
+    Nothing of the reference design recurs: face and circle ids, pattern, number of circles, radii, polarity, frame
+    circles, board. The poses are in the cube's own frame, origin at its centre.
+    """
+    x, y, z = np.eye(3)
+    drawings = {
+        "top": (_TOP, ("A", "C", "D"), (x, y, z)),
+        "left": (_LEFT, ("q", "r", "s"), (y, z, x)),
+        "right": (_RIGHT, ("24", "22", "29"), (z, x, y)),
+    }
+    faces, poses = [], {}
+    for face_id, (circles, frame, axes) in drawings.items():
+        face, drawing_from_face = face_of_drawing(face_id, circles, *frame)
+        middle = np.array([50.0, 50.0, 0.0])
+        rotation = np.column_stack(axes)
+        cube_from_drawing = Rigid(rotation, rotation @ ([0, 0, _EDGE_MM / 2] - middle))
+        faces.append(face)
+        poses[face_id] = cube_from_drawing @ drawing_from_face
+    target = TargetDesign("second target", "dark", tuple(faces))
+    return target, BoardDesign(6, 8, 20.0, 5.0, "dark", 0.005, (0, 7), 7.5), poses
+
+
+def face_of_drawing(face_id: str, circles, origin: str, x: str, y: str) -> tuple[FaceDesign, Rigid]:
+    """A face from (id, x, y, radius) rows in any drawing frame, and drawing_from_face.
+
+    The face frame has its origin at circle ``origin``, X through circle ``x``, Y on the side of circle ``y``.
+    """
+    ids = tuple(row[0] for row in circles)
+    xy = np.array([row[1:3] for row in circles], float)
+    zero, on_x, on_y = (np.append(xy[ids.index(circle)], 0.0) for circle in (origin, x, y))
+    drawing_from_face = three_point_frame(zero, on_x, on_y)
+    xy_face = (drawing_from_face.inverse() @ np.column_stack([xy, np.zeros(len(xy))]))[:, :2]
+    return FaceDesign(face_id, ids, xy_face, [row[3] for row in circles], origin, x, y), drawing_from_face
+
+
+def three_point_frame(origin: np.ndarray, on_x: np.ndarray, on_y: np.ndarray) -> Rigid:
+    """a_from_face of the frame through three points of frame a: X through the second, Y on the third's side."""
+    x = (on_x - origin) / np.linalg.norm(on_x - origin)
+    z = np.cross(x, on_y - origin)
+    z /= np.linalg.norm(z)
+    return Rigid(np.column_stack([x, np.cross(z, x), z]), origin)

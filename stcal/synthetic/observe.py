@@ -1,0 +1,110 @@
+"""What one image shows: the circles in view, and measured centres without pixels."""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from stcal.design import BOARD
+from stcal.geometry.arrays import frozen
+from stcal.geometry.conic import circle_image_offset
+from stcal.synthetic.scene import Scene
+
+MAX_FOUND_TILT_RAD = np.radians(70)
+"""Circles tilted more than this need not be found."""
+MAX_SHOWN_TILT_RAD = np.radians(89)
+RIM_POINTS = 72
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class ImageCircles:
+    """The circles that one image shows, true values; camera frame, mm.
+
+    ``labels`` : n labels; ``xyz_camera``, ``normal_camera`` : (n, 3), normals towards the camera; ``radius_mm`` :
+    (n,); ``tilt_rad`` : (n,) angle between normal and line of sight; ``centre_px`` : (n, 2) image of the circle's
+    centre; ``must_find`` : (n,) bool, of the group's faces or the board, tilt up to 70°, all of it in the image.
+    """
+
+    labels: tuple[str, ...]
+    xyz_camera: np.ndarray
+    normal_camera: np.ndarray
+    radius_mm: np.ndarray
+    tilt_rad: np.ndarray
+    centre_px: np.ndarray
+    must_find: np.ndarray
+
+    def __post_init__(self):
+        n = len(self.labels)
+        for name, shape in {
+            "xyz_camera": (n, 3),
+            "normal_camera": (n, 3),
+            "radius_mm": (n,),
+            "tilt_rad": (n,),
+            "centre_px": (n, 2),
+        }.items():
+            object.__setattr__(self, name, frozen(getattr(self, name), shape, name))
+        object.__setattr__(self, "must_find", frozen(self.must_find, (n,), "must_find", bool))
+
+
+def image_circles(scene: Scene, group: str, image: int) -> ImageCircles:
+    """The circles that face the camera and whose centres lie in the image."""
+    g = scene.groups[group]
+    camera_from_target = g.camera_from_target[image]
+    labels, xyz, normal, radius, wanted = [], [], [], [], []
+    for face in scene.target.faces:
+        labels += face.labels()
+        xyz.append(scene.face_circles(face.id))
+        normal.append(np.tile(scene.target_from_face[face.id].rotation[:, 2], (len(face.ids), 1)))
+        radius.append(face.radius_mm)
+        wanted += [face.id in g.faces] * len(face.ids)
+    labels += scene.board.labels()
+    xyz.append(g.board_circles_target)
+    normal.append(np.tile(-g.target_from_board.rotation[:, 2], (len(g.board_circles_target), 1)))
+    radius.append(scene.board.radii_mm())
+    wanted += [True] * len(g.board_circles_target)
+
+    xyz = camera_from_target @ np.vstack(xyz)
+    normal = np.vstack(normal) @ camera_from_target.rotation.T
+    radius = np.concatenate(radius)
+    cosine = -(xyz * normal).sum(1) / np.linalg.norm(xyz, axis=1)
+    tilt = np.arccos(np.clip(cosine, -1, 1))
+    size = np.array([scene.camera.width, scene.camera.height])
+    centre = scene.camera.project(xyz)
+    rim = scene.camera.project(rim_points(xyz, normal, radius))
+    shown = (tilt <= MAX_SHOWN_TILT_RAD) & ((centre > -0.5) & (centre < size - 0.5)).all(1)
+    whole = ((rim > 0) & (rim < size - 1)).all((1, 2))
+    must = np.array(wanted) & (tilt <= MAX_FOUND_TILT_RAD) & whole
+    return ImageCircles(
+        tuple(label for label, keep in zip(labels, shown, strict=True) if keep),
+        xyz[shown],
+        normal[shown],
+        radius[shown],
+        tilt[shown],
+        centre[shown],
+        must[shown],
+    )
+
+
+def rim_points(xyz: np.ndarray, normal: np.ndarray, radius: np.ndarray, count: int = RIM_POINTS) -> np.ndarray:
+    """Points on the rims of n circles, (n, count, 3), in the frame of the arguments (n, 3), (n, 3), (n,)."""
+    helper = np.where(np.abs(normal[:, :1]) < 0.9, [[1.0, 0, 0]], [[0, 1.0, 0]])
+    e1 = np.cross(normal, helper)
+    e1 /= np.linalg.norm(e1, axis=1, keepdims=True)
+    e2 = np.cross(normal, e1)
+    angle = 2 * np.pi * np.arange(count) / count
+    circle = np.cos(angle)[:, None] * e1[:, None] + np.sin(angle)[:, None] * e2[:, None]
+    return xyz[:, None] + radius[:, None, None] * circle
+
+
+def simulate_centres(
+    scene: Scene, group: str, image: int, noise_px: float, rng: np.random.Generator
+) -> dict[str, np.ndarray]:
+    """Measured ellipse centres by label, (2,) px, of one image: what a detector with that noise would give.
+
+    The centre of the ideal ellipse (not the image of the circle's centre), distorted by the lens, plus Gaussian
+    noise of ``noise_px`` per axis; circles of all faces and the board tilted up to 70°.
+    """
+    seen = image_circles(scene, group, image)
+    ellipse_centre = scene.camera.project(circle_image_offset(seen.xyz_camera, seen.normal_camera, seen.radius_mm))
+    measured = ellipse_centre + noise_px * rng.standard_normal(ellipse_centre.shape)
+    keep = (seen.tilt_rad <= MAX_FOUND_TILT_RAD) | np.array([label.startswith(f"{BOARD}:") for label in seen.labels])
+    return {label: xy for label, xy, k in zip(seen.labels, measured, keep, strict=True) if k}

@@ -1,0 +1,196 @@
+"""Where the board stands and where the photographs are taken from: rejection sampling until all is in view."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from stcal.errors import DegenerateError
+from stcal.geometry.camera import Camera
+from stcal.geometry.rigid import Rigid
+
+MAX_FACE_TILT_RAD = np.radians(67)
+MAX_BOARD_TILT_RAD = np.radians(50)
+CANDIDATES = 600
+PLACES = 60
+GOOD_SHARE = 0.5
+"""A board place is taken at once if this share of the views that show both faces also shows the board."""
+IMAGE_MARGIN = 0.03
+"""Free border of the image, in widths."""
+BODY_GAP = 0.01
+"""Free space between target and board in the image, in focal lengths."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class GroupShape:
+    """What has to be seen in one group; target frame unless named otherwise, mm.
+
+    ``circles``, ``normals`` : (n, 3), circles of the two faces; ``axes`` : (3, 3), see :func:`viewing_axes`;
+    ``body`` : (k, 3) corners of the target's faces; ``dots_board`` : (m, 3); ``outline_board`` : (4, 3) corners.
+    """
+
+    name: str
+    circles: np.ndarray
+    normals: np.ndarray
+    axes: np.ndarray
+    body: np.ndarray
+    dots_board: np.ndarray
+    outline_board: np.ndarray
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Views:
+    """Candidate views: camera_from_target as rotations (n, 3, 3) and camera centres (n, 3) in the target frame."""
+
+    rotations: np.ndarray
+    centres: np.ndarray
+
+    def to_camera(self, xyz_target: np.ndarray) -> np.ndarray:
+        """Points (k, 3) in every camera, (n, k, 3)."""
+        return np.einsum("nij,nkj->nki", self.rotations, xyz_target - self.centres[:, None])
+
+    def tilt_rad(self, xyz_target: np.ndarray, normals: np.ndarray) -> np.ndarray:
+        """Angles between normals and lines of sight, (n, k)."""
+        ray = self.centres[:, None] - xyz_target
+        return np.arccos(np.clip((ray * normals).sum(-1) / np.linalg.norm(ray, axis=-1), -1, 1))
+
+    def pose(self, i: int) -> Rigid:
+        """camera_from_target of view i."""
+        return Rigid(self.rotations[i], -self.rotations[i] @ self.centres[i])
+
+
+def viewing_axes(normal_a: np.ndarray, normal_b: np.ndarray, where: str) -> np.ndarray:
+    """Rows right, up and towards the camera, (3, 3), of the view that shows two faces equally well.
+
+    Raises
+    ------
+    DegenerateError
+        If the faces are nearly parallel or opposite, so that no such view exists.
+    """
+    angle = np.degrees(np.arctan2(np.linalg.norm(np.cross(normal_a, normal_b)), normal_a @ normal_b))
+    if not 5 <= angle <= 130:
+        raise DegenerateError(
+            f"{where}: {angle:.0f}° between the faces, 5° to 130° needed to photograph both; pair other faces"
+        )
+    up, towards = np.cross(normal_a, normal_b), normal_a + normal_b
+    up, towards = up / np.linalg.norm(up), towards / np.linalg.norm(towards)
+    return np.array([np.cross(up, towards), up, towards])
+
+
+def place_group(
+    shape: GroupShape, camera: Camera, count: int, distance_mm: float, spread_rad: float, rng: np.random.Generator
+) -> tuple[Rigid, list[Rigid]]:
+    """target_from_board and ``count`` camera_from_target.
+
+    In every view both faces are tilted by up to 67° and the board by up to 50°, all of target and board is inside
+    the image, and neither covers the other. Of the views that satisfy this the ones farthest apart are taken.
+
+    Raises
+    ------
+    DegenerateError
+        If no place of the board leaves enough such views.
+    """
+    best, shown = None, 0
+    for _ in range(PLACES):
+        target_from_board = _board_place(shape, rng)
+        views = _candidate_views(shape, target_from_board, camera, distance_mm, spread_rad, rng)
+        faces_seen = (views.tilt_rad(shape.circles, shape.normals) <= MAX_FACE_TILT_RAD).all(1)
+        valid = np.flatnonzero(faces_seen & _board_seen(shape, target_from_board, views, camera))
+        shown = max(shown, int(faces_seen.sum()))
+        if best is None or len(valid) > len(best[2]):
+            best = target_from_board, views, valid
+        if len(valid) >= max(count, GOOD_SHARE * faces_seen.sum()):
+            break
+    target_from_board, views, valid = best
+    if len(valid) < count:
+        raise DegenerateError(
+            f"{shape.name}: {len(valid)} of {CANDIDATES} views show faces and board ({shown} show the faces), "
+            f"{count} needed; enlarge distance_mm or reduce the focal length"
+        )
+    picked = rng.permutation(_farthest(views.centres[valid] - shape.circles.mean(0), count))
+    return target_from_board, [views.pose(i) for i in valid[picked]]
+
+
+def _board_place(shape: GroupShape, rng) -> Rigid:
+    right, up, towards = shape.axes
+    middle = shape.circles.mean(0)
+    outline = shape.outline_board - shape.outline_board.mean(0)
+    half_width, side = np.abs(outline[:, 0]).max(), rng.choice([-1.0, 1.0])
+    body_reach = ((shape.body - middle) @ right * side).max()
+    shift = [side * (body_reach + half_width + rng.uniform(10, 120)), rng.uniform(-50, 50), rng.uniform(-80, 60)]
+    facing = Rotation.from_matrix(np.column_stack([right, -up, -towards]))
+    turn = Rotation.from_euler("zxy", rng.uniform([-12, -12, -12], [12, 12, 12]), degrees=True)
+    rotation = (facing * turn).as_matrix()
+    return Rigid(rotation, middle + shift @ shape.axes - rotation @ shape.outline_board.mean(0))
+
+
+def _candidate_views(shape, target_from_board, camera, distance_mm, spread_rad, rng) -> _Views:
+    n = CANDIDATES
+    azimuth, elevation = rng.uniform(-spread_rad, spread_rad, (2, n))
+    local = [np.cos(elevation) * np.sin(azimuth), np.sin(elevation), np.cos(elevation) * np.cos(azimuth)]
+    direction = np.column_stack(local) @ shape.axes
+    roll = np.radians(rng.uniform(-15, 15, n)) + np.pi / 2 * rng.choice([-1, 0, 1], n, p=[0.08, 0.84, 0.08])
+    points = np.vstack([shape.body, target_from_board @ shape.outline_board])
+    aim = (points.min(0) + points.max(0)) / 2
+    views = _Views(
+        _look_along(-direction, shape.axes[1], roll),
+        aim + direction * (distance_mm * rng.uniform(0.9, 1.1, n))[:, None],
+    )
+    free = np.array([camera.width, camera.height]) / camera.focal / 2 - IMAGE_MARGIN * camera.width / camera.focal
+    place = rng.uniform(-0.7, 0.7, (n, 2))
+    for step in range(3):
+        xyz = views.to_camera(points)
+        xy = xyz[..., :2] / xyz[..., 2:]
+        low, high = xy.min(1), xy.max(1)
+        offset = place * np.maximum(free - (high - low) / 2, 0) if step == 2 else 0
+        ahead = np.column_stack([(low + high) / 2 - offset, np.ones(n)])
+        forward = np.einsum("nji,nj->ni", views.rotations, ahead)
+        forward /= np.linalg.norm(forward, axis=1, keepdims=True)
+        views = _Views(_look_along(forward, shape.axes[1], roll), views.centres)
+    return views
+
+
+def _look_along(forward: np.ndarray, up: np.ndarray, roll: np.ndarray) -> np.ndarray:
+    x = np.cross(forward, up)
+    x /= np.linalg.norm(x, axis=1, keepdims=True)
+    y = np.cross(forward, x)
+    c, s = np.cos(roll)[:, None], np.sin(roll)[:, None]
+    return np.stack([c * x - s * y, s * x + c * y, forward], axis=1)
+
+
+def _board_seen(shape, target_from_board, views: _Views, camera: Camera) -> np.ndarray:
+    outline = target_from_board @ shape.outline_board
+    dots = target_from_board @ shape.dots_board
+    facing = -target_from_board.rotation[:, 2]
+    seen = (views.tilt_rad(dots, np.broadcast_to(facing, dots.shape)) <= MAX_BOARD_TILT_RAD).all(1)
+    body, plate = views.to_camera(shape.body), views.to_camera(outline)
+    seen &= (body[..., 2].min(1) > 0) & (plate[..., 2].min(1) > 0)
+    body, plate = body[..., :2] / body[..., 2:], plate[..., :2] / plate[..., 2:]
+    # Far outside the image the distortion may fold back into it.
+    seen &= (np.abs(np.concatenate([body, plate], 1)) < np.array([camera.width, camera.height]) / camera.focal).all(
+        (1, 2)
+    )
+    pixel = camera.pixel_from_normalised(np.concatenate([body, plate], 1))
+    margin = IMAGE_MARGIN * camera.width
+    inside = (pixel > margin) & (pixel < np.array([camera.width, camera.height]) - 1 - margin)
+    return seen & inside.all((1, 2)) & _apart(body, plate)
+
+
+def _apart(a: np.ndarray, b: np.ndarray) -> np.ndarray:
+    """Whether a line with room on both sides separates point sets (n, k, 2) and (n, m, 2); exact to 2°."""
+    angle = np.radians(np.arange(0, 360, 2))
+    direction = np.array([np.cos(angle), np.sin(angle)])
+    return ((b @ direction).min(1) - (a @ direction).max(1) > BODY_GAP).any(1)
+
+
+def _farthest(directions: np.ndarray, count: int) -> np.ndarray:
+    """Greedy farthest-point choice among directions (n, 3): indices (count,)."""
+    unit = directions / np.linalg.norm(directions, axis=1, keepdims=True)
+    cosine = unit @ unit.T
+    chosen = [int(np.argmin(unit @ unit.mean(0)))]
+    nearest = cosine[chosen[0]].copy()
+    while len(chosen) < count:
+        nearest[chosen] = 2.0
+        chosen.append(int(np.argmin(nearest)))
+        nearest = np.maximum(nearest, cosine[chosen[-1]])
+    return np.array(chosen)

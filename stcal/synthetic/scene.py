@@ -1,0 +1,275 @@
+"""A scene with known truth: the target and the board as really made, where they stand, and the cameras."""
+
+from dataclasses import dataclass
+from itertools import combinations
+
+import numpy as np
+
+from stcal.design import BoardDesign, FaceDesign, TargetDesign, reference_board, reference_target
+from stcal.errors import DegenerateError, InputError
+from stcal.geometry.arrays import frozen
+from stcal.geometry.camera import Camera
+from stcal.geometry.rigid import Rigid
+from stcal.synthetic.designs import REFERENCE_GROUPS, nominal_target_from_face, second_design, three_point_frame
+from stcal.synthetic.placement import GroupShape, place_group, viewing_axes
+
+__all__ = ["Group", "Scene", "SceneOptions", "make_scene", "nominal_target_from_face", "second_design"]
+
+FACE_MARGIN_MM = 15.0
+BOARD_MARGIN_MM = 15.0
+FOCAL_PER_WIDTH = 24 / 22.3
+"""A 24 mm lens on a sensor 22.3 mm wide."""
+CONVEX_TOLERANCE_MM = 5.0
+
+
+@dataclass(frozen=True, slots=True)
+class SceneOptions:
+    """What to simulate.
+
+    Parameters
+    ----------
+    seed : int
+    width, height : int
+        Image size, px.
+    focal_px : float, optional
+        Default: a 24 mm lens on a 22.3 mm wide sensor.
+    distortion : tuple of up to 8 floats
+        k1, k2, p1, p2, k3, k4, k5, k6.
+    centre_sigma : float
+        Standard deviation of the principal point about the middle of the image, in image widths.
+    distance_mm : float
+        Camera to target and board; varies by ±10 %.
+    spread_deg : float
+        The views spread this far to every side, as far as both faces stay visible.
+    images_per_group : int
+    groups : tuple of pairs of face ids, optional
+        Default: those of the paper for the reference design, else all pairs that can be seen together.
+    circle_sigma_mm : float
+        In-plane placement error of the target's circles, per axis. The board's is in its design.
+    face_shift_mm, face_turn_deg : float
+        RMS length and angle by which the true face poses differ from the nominal ones.
+    """
+
+    seed: int = 0
+    width: int = 5184
+    height: int = 3456
+    focal_px: float | None = None
+    distortion: tuple[float, ...] = (-0.06, 0.045, 1.5e-4, -1e-4)
+    centre_sigma: float = 0.002
+    distance_mm: float = 1000.0
+    spread_deg: float = 40.0
+    images_per_group: int = 10
+    groups: tuple[tuple[str, str], ...] | None = None
+    circle_sigma_mm: float = 0.02
+    face_shift_mm: float = 0.5
+    face_turn_deg: float = 0.5
+
+    def __post_init__(self):
+        for name in ("width", "height", "images_per_group", "distance_mm", "spread_deg"):
+            if getattr(self, name) <= 0:
+                raise InputError(f"scene: {name} {getattr(self, name)}, a positive number needed")
+        if self.spread_deg > 80:
+            raise InputError(f"scene: spread_deg {self.spread_deg:g}, at most 80 possible")
+        if len(self.distortion) > 8:
+            raise InputError(f"scene: {len(self.distortion)} distortion coefficients, at most 8 possible")
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Group:
+    """Photographs between which only the camera moves.
+
+    ``faces`` : the two faces the group is for; ``axes`` : (3, 3) rows right, up, towards the camera of the middle
+    view, target frame; ``board_circles_target`` : (n, 3) mm, row-major; ``camera_from_target`` : one per image.
+    """
+
+    name: str
+    faces: tuple[str, str]
+    axes: np.ndarray
+    target_from_board: Rigid
+    board_circles_target: np.ndarray
+    camera_from_target: tuple[Rigid, ...]
+
+    def __post_init__(self):
+        object.__setattr__(self, "axes", frozen(self.axes, (3, 3), "axes"))
+        object.__setattr__(self, "board_circles_target", frozen(self.board_circles_target, (None, 3), "board circles"))
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Scene:
+    """The truth of a simulated measurement.
+
+    ``target_from_face`` : three-point frames through the circles as really placed, by face id; the first face of
+    the design is the reference, its frame is the target frame. ``circles_target`` : (3,) mm by label.
+    """
+
+    target: TargetDesign
+    board: BoardDesign
+    camera: Camera
+    colmap_model: str
+    target_from_face: dict[str, Rigid]
+    circles_target: dict[str, np.ndarray]
+    groups: dict[str, Group]
+    seed: int
+
+    @property
+    def reference_face(self) -> str:
+        """Id of the face whose frame is the target frame."""
+        return self.target.faces[0].id
+
+    def face_circles(self, face_id: str) -> np.ndarray:
+        """Circle centres of a face, (n, 3), target frame, in the design's order."""
+        return np.array([self.circles_target[label] for label in self.target.face(face_id).labels()])
+
+    def face_outline(self, face_id: str) -> np.ndarray:
+        """Corners of the visible side of a face, (4, 3), target frame."""
+        return self.target_from_face[face_id] @ _face_rectangle(self.target.face(face_id))
+
+    def board_outline(self, group: str) -> np.ndarray:
+        """Corners of the board's plate, (4, 3), target frame."""
+        return self.groups[group].target_from_board @ _board_rectangle(self.board)
+
+
+def make_scene(
+    options: SceneOptions | None = None,
+    target: TargetDesign | None = None,
+    board: BoardDesign | None = None,
+    nominal: dict[str, Rigid] | None = None,
+) -> Scene:
+    """Make a scene; the same arguments give the same scene.
+
+    Parameters
+    ----------
+    options : SceneOptions, optional
+    target : TargetDesign, optional
+        Default: the reference design.
+    board : BoardDesign, optional
+        Default: the reference board.
+    nominal : dict of Rigid, optional
+        Nominal pose of every face in one common frame, by face id; needed unless ``target`` is the reference design.
+
+    Raises
+    ------
+    InputError
+        A group names an unknown face, or a nominal pose is missing.
+    DegenerateError
+        The faces do not bound a convex body, or a group cannot be photographed.
+    """
+    options = options or SceneOptions()
+    if target is None:
+        target, nominal = reference_target(), nominal or nominal_target_from_face()
+    board = board or reference_board()
+    missing = [face.id for face in target.faces if face.id not in (nominal or {})]
+    if missing:
+        raise InputError(f"scene: no nominal pose of face {missing[0]}; give one pose per face")
+    rng = np.random.default_rng(options.seed)
+    target_from_face, circles = _made_target(target, nominal, options, rng)
+    _check_convex(target, target_from_face)
+    camera, colmap_model = _made_camera(options, rng)
+    groups = {}
+    for pair in options.groups or _default_groups(target, target_from_face):
+        group = _made_group(pair, target, board, camera, target_from_face, circles, options, rng)
+        if group.name in groups:
+            raise InputError(f"scene: group {group.name} occurs twice; give different pairs")
+        groups[group.name] = group
+    return Scene(target, board, camera, colmap_model, target_from_face, circles, groups, options.seed)
+
+
+def group_name(pair: tuple[str, str]) -> str:
+    """Folder name of a group: ``12``, or ``top-left`` where ids are longer than one character."""
+    return ("" if all(len(face) == 1 for face in pair) else "-").join(pair)
+
+
+def _made_target(target, nominal, options, rng) -> tuple[dict[str, Rigid], dict[str, np.ndarray]]:
+    """True poses and circles, in the frame of the reference face."""
+    placed, frames = {}, {}
+    for face in target.faces:
+        turn, shift = rng.standard_normal((2, 3)) / np.sqrt(3)
+        moved = Rigid.exp([*(np.radians(options.face_turn_deg) * turn), *(options.face_shift_mm * shift)])
+        # Turned about the face's own origin: the shift is what moves it.
+        pose = Rigid(
+            moved.rotation @ nominal[face.id].rotation, nominal[face.id].translation + options.face_shift_mm * shift
+        )
+        xy = face.xy_mm + options.circle_sigma_mm * rng.standard_normal(face.xy_mm.shape)
+        xyz = pose @ np.column_stack([xy, np.zeros(len(xy))])
+        placed[face.id] = xyz
+        frames[face.id] = three_point_frame(*(xyz[face.ids.index(circle)] for circle in (face.origin, face.x, face.y)))
+    target_from_any = frames[target.faces[0].id].inverse()
+    circles = {
+        label: frozen(xyz, (3,), label)
+        for face in target.faces
+        for label, xyz in zip(face.labels(), target_from_any @ placed[face.id], strict=True)
+    }
+    return {face: target_from_any @ frame for face, frame in frames.items()}, circles
+
+
+def _made_camera(options: SceneOptions, rng) -> tuple[Camera, str]:
+    focal = options.focal_px or FOCAL_PER_WIDTH * options.width
+    centre = (np.array([options.width, options.height]) - 1) / 2
+    centre = centre + options.centre_sigma * options.width * rng.standard_normal(2)
+    distortion = np.zeros(8)
+    distortion[: len(options.distortion)] = options.distortion
+    model = "FULL_OPENCV" if distortion[4:].any() else "OPENCV" if distortion.any() else "PINHOLE"
+    return Camera(options.width, options.height, np.array([focal, focal]), centre, distortion), model
+
+
+def _default_groups(target: TargetDesign, target_from_face: dict[str, Rigid]) -> list[tuple[str, str]]:
+    known = set(target_from_face)
+    if known == {face for pair in REFERENCE_GROUPS for face in pair}:
+        return list(REFERENCE_GROUPS)
+    pairs = combinations([face.id for face in target.faces], 2)
+    normal = {face: pose.rotation[:, 2] for face, pose in target_from_face.items()}
+    return [(a, b) for a, b in pairs if np.cos(np.radians(120)) <= normal[a] @ normal[b] <= np.cos(np.radians(20))]
+
+
+def _made_group(pair, target, board, camera, target_from_face, circles, options, rng) -> Group:
+    name = group_name(pair)
+    labels = [target.face(face).labels() for face in pair]
+    normals = [target_from_face[face].rotation[:, 2] for face in pair]
+    axes = viewing_axes(*normals, f"group {name}")
+    dots = np.column_stack([board.xy_mm(), np.zeros(board.rows * board.columns)])
+    shape = GroupShape(
+        f"group {name}",
+        np.array([circles[label] for row in labels for label in row]),
+        np.repeat(normals, [len(row) for row in labels], axis=0),
+        axes,
+        np.vstack([target_from_face[face.id] @ _face_rectangle(face) for face in target.faces]),
+        dots,
+        _board_rectangle(board),
+    )
+    target_from_board, views = place_group(
+        shape, camera, options.images_per_group, options.distance_mm, np.radians(options.spread_deg), rng
+    )
+    made = target_from_board @ (dots + board.sigma_mm * rng.standard_normal(dots.shape))
+    return Group(name, tuple(pair), axes, target_from_board, made, tuple(views))
+
+
+def _rectangle(xy: np.ndarray, radius: np.ndarray, margin: float) -> np.ndarray:
+    """Corners, (4, 3), of the smallest rectangle (to 3°) about circles, in their plane z = 0."""
+    best = None
+    for angle in np.radians(np.arange(0, 90, 3)):
+        turned_from_plane = np.array([[np.cos(angle), np.sin(angle)], [-np.sin(angle), np.cos(angle)]])
+        turned = xy @ turned_from_plane.T
+        (x0, y0), (x1, y1) = (turned - radius[:, None]).min(0) - margin, (turned + radius[:, None]).max(0) + margin
+        if best is None or (x1 - x0) * (y1 - y0) < best[0]:
+            best = (x1 - x0) * (y1 - y0), np.array([[x0, y0], [x1, y0], [x1, y1], [x0, y1]]) @ turned_from_plane
+    return np.column_stack([best[1], np.zeros(4)])
+
+
+def _face_rectangle(face: FaceDesign) -> np.ndarray:
+    return _rectangle(face.xy_mm, face.radius_mm, FACE_MARGIN_MM)
+
+
+def _board_rectangle(board: BoardDesign) -> np.ndarray:
+    return _rectangle(board.xy_mm(), board.radii_mm(), BOARD_MARGIN_MM)
+
+
+def _check_convex(target: TargetDesign, target_from_face: dict[str, Rigid]) -> None:
+    for front in target.faces:
+        for face in target.faces:
+            face_from_target = target_from_face[front.id].inverse()
+            height = (face_from_target @ (target_from_face[face.id] @ _face_rectangle(face)))[:, 2].max()
+            if height > CONVEX_TOLERANCE_MM:
+                raise DegenerateError(
+                    f"scene: face {face.id} reaches {height:.0f} mm in front of face {front.id} and may cover it; "
+                    "simulated targets must be convex, check the nominal poses"
+                )

@@ -1,0 +1,156 @@
+"""The camera against OpenCV, its inverse and its derivative, and the folds it must refuse."""
+
+import cv2
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from stcal.errors import ConvergenceError, InputError
+from stcal.geometry.camera import Camera
+
+WIDTH, HEIGHT = 5184, 3456
+
+small = st.floats(-1, 1)
+# Lenses from strong barrel to strong pincushion that do not fold within ±0.5 (27° off axis).
+lenses = st.tuples(small, small, small, small, small, small, small, small).map(
+    lambda c: np.array(c) * [0.2, 0.1, 2e-3, 2e-3, 0.05, 0.1, 0.05, 0.02]
+)
+coordinate = st.floats(-0.5, 0.5)
+normalised = st.lists(st.tuples(coordinate, coordinate), min_size=1, max_size=8).map(np.array)
+
+
+def camera_of(distortion) -> Camera:
+    return Camera(WIDTH, HEIGHT, [5580.0, 5570.0], [2600.0, 1700.0], np.resize([*distortion, *[0.0] * 8], 8))
+
+
+def matrix_of(camera: Camera) -> np.ndarray:
+    (fx, fy), (cx, cy) = camera.focal, camera.centre
+    return np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1]])
+
+
+BARREL = camera_of([-0.3])  # r − 0.3 r³ turns back at r = 1.054, where it is 0.703
+
+
+@given(lenses, normalised, st.floats(100, 5000))
+def test_projection_is_opencvs(distortion, xy, depth_mm):
+    camera = camera_of(distortion)
+    xyz = np.column_stack([xy, np.ones(len(xy))]) * depth_mm
+    expected = cv2.projectPoints(xyz, np.zeros(3), np.zeros(3), matrix_of(camera), distortion)[0].reshape(-1, 2)
+    np.testing.assert_allclose(camera.project(xyz), expected, atol=1e-9)  # px; rounding at 5000 px is 1e-12
+
+
+@given(lenses, normalised)
+def test_inverse_is_opencvs_with_tight_criteria(distortion, xy):
+    camera = camera_of(distortion)
+    pixels = camera.pixel_from_normalised(xy)
+    criteria = (cv2.TERM_CRITERIA_EPS | cv2.TERM_CRITERIA_COUNT, 1000, 1e-13)
+    found = camera.normalised_from_pixel(pixels)
+    opencv = cv2.undistortPointsIter(pixels[:, None], matrix_of(camera), distortion, None, None, criteria)[:, 0]
+    # Where OpenCV's fixed-point iteration diverges it returns the distorted point: not a value to compare with.
+    settled = np.abs(camera.pixel_from_normalised(opencv) - pixels).max(-1) < 1e-8
+    np.testing.assert_allclose(found[settled], opencv[settled], atol=1e-11)
+    np.testing.assert_allclose(found, xy, atol=1e-11)  # 1e-12 through a slope of at least 0.1
+
+
+def test_opencvs_iteration_does_settle_on_a_common_lens():
+    # So that the comparison above compares something: a consumer lens, all points of the image.
+    camera = camera_of([-0.12, 0.08, 1e-3, -5e-4, 0.01])
+    grid = np.stack(np.meshgrid(np.linspace(0, WIDTH, 20), np.linspace(0, HEIGHT, 15)), -1).reshape(-1, 1, 2)
+    criteria = (cv2.TERM_CRITERIA_EPS | cv2.TERM_CRITERIA_COUNT, 1000, 1e-13)
+    opencv = cv2.undistortPointsIter(grid, matrix_of(camera), camera.distortion, None, None, criteria)
+    np.testing.assert_allclose(camera.normalised_from_pixel(grid), opencv, atol=1e-12)
+    ideal = (grid - camera.centre) / camera.focal
+    assert 0.005 < np.abs(opencv - ideal).max() < 0.1  # and there is distortion to remove: 30 px and more
+
+
+@given(lenses, normalised)
+def test_distort_and_undistort_are_inverse_in_either_order(distortion, xy):
+    camera = camera_of(distortion)
+    np.testing.assert_allclose(camera.distort(camera.undistort(0.5 * xy)), 0.5 * xy, atol=1.1e-12)
+    np.testing.assert_allclose(camera.undistort(camera.distort(xy)), xy, atol=1e-11)
+
+
+@given(lenses, normalised)
+def test_jacobian_is_the_derivative(distortion, xy):
+    camera, step = camera_of(distortion), 1e-5
+    value, jac = camera.distort_jacobian(xy)
+    np.testing.assert_array_equal(value, camera.distort(xy))
+    for axis in range(2):
+        d = np.eye(2)[axis] * step
+        numeric = (camera.distort(xy + d) - camera.distort(xy - d)) / (2 * step)
+        # Central differences: step² times the third derivative (about 3), and rounding of 1e-16 / 1e-5.
+        np.testing.assert_allclose(jac[..., axis], numeric, atol=2e-9)
+
+
+def test_without_distortion_it_is_the_pinhole():
+    camera = camera_of([])
+    np.testing.assert_allclose(camera.project([100.0, -50, 1000]), [2600 + 558, 1700 - 278.5], atol=1e-9)
+    np.testing.assert_allclose(camera.normalised_from_pixel([2600.0, 1700]), [0, 0], atol=1e-15)
+
+
+def test_points_keep_their_shape():
+    for shape in [(2,), (0, 2), (3, 2), (3, 4, 2)]:
+        assert BARREL.normalised_from_pixel(np.full(shape, 2000.0)).shape == shape
+        assert BARREL.pixel_from_normalised(np.zeros(shape)).shape == shape
+
+
+def test_undistort_copies():
+    xy = np.array([[0.1, 0.2]])
+    assert camera_of([]).undistort(xy) is not xy
+
+
+@pytest.mark.parametrize("radius", [0.1, 0.5, 0.69, 0.7])
+def test_barrel_inverts_up_to_its_fold(radius):
+    for angle in np.linspace(0, 2 * np.pi, 7):
+        direction = np.array([np.cos(angle), np.sin(angle)])
+        ideal = BARREL.undistort(radius * direction) @ direction
+        # The branch before the fold, outwards from the distorted radius: r = 1 gives exactly 0.7.
+        assert radius < ideal < 1.0000001
+        assert ideal - 0.3 * ideal**3 == pytest.approx(radius, abs=2e-12)
+
+
+@pytest.mark.parametrize("radius", np.linspace(0.71, 3, 30))
+def test_barrel_refuses_every_point_beyond_its_fold(radius):
+    # The cubic has a root there too, at −2.1 and less: the mirrored side of the image, and Newton finds it.
+    for xy in ([radius, 0.0], [-0.6 * radius, 0.8 * radius], [[0.1, 0.2], [0.0, radius]]):
+        with pytest.raises(ConvergenceError, match="fold the image over"):
+            BARREL.undistort(xy)
+
+
+def test_the_fold_is_reported_with_its_pixel():
+    with pytest.raises(ConvergenceError, match=r"pixel \(8180, 1700\)"):
+        BARREL.normalised_from_pixel([[2600.0, 1700], [8180, 1700]])
+
+
+def test_rational_pole_and_overflow_are_refused():
+    with pytest.raises(ConvergenceError, match="fold the image over"):
+        camera_of([0, 0, 0, 0, 0, -1.0]).undistort([2.0, 0.0])
+    with pytest.raises(ConvergenceError, match="fold the image over"):
+        BARREL.undistort([1e200, 1e200])
+
+
+@pytest.mark.parametrize("bad", [np.nan, np.inf])
+def test_pixels_that_are_not_finite_are_refused(bad):
+    with pytest.raises(ConvergenceError, match="not finite"):
+        BARREL.normalised_from_pixel([[100.0, 100], [bad, 100]])
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"width": 0}, "size 0×3456 px, a positive size needed"),
+        ({"height": -5}, "size 5184×-5 px, a positive size needed"),
+        ({"focal": [0, 1000]}, "focal length .* positive numbers needed"),
+        ({"focal": [1000, -1]}, "focal length .* positive numbers needed"),
+        ({"focal": [1000]}, r"focal length: shape \(1,\)"),
+        ({"focal": [np.nan, 1000]}, "focal length: holds values that are not finite"),
+        ({"centre": [1, np.inf]}, "principal point: holds values that are not finite"),
+        ({"distortion": np.zeros(5)}, r"distortion: shape \(5,\)"),
+        ({"distortion": np.full(8, np.nan)}, "distortion: holds values that are not finite"),
+    ],
+)
+def test_camera_refuses(change, message):
+    good = {"width": WIDTH, "height": HEIGHT, "focal": [1e3, 1e3], "centre": [0, 0], "distortion": np.zeros(8)}
+    with pytest.raises(InputError, match=message):
+        Camera(**(good | change))

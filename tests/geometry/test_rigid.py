@@ -1,0 +1,196 @@
+"""Rigid and similarity transforms: group axioms, the action on points, and what the constructors refuse."""
+
+import numpy as np
+import pytest
+from hypothesis import assume, given
+from hypothesis import strategies as st
+
+from stcal.errors import InputError
+from stcal.geometry.rigid import Rigid, Similarity, skew
+
+TOLERANCE_MM = 1e-9
+"""Rounding: three products of coordinates below 1e4 mm lose about 1e4 · 1e-16 · 10 = 1e-11 mm."""
+
+length_mm = st.floats(-1000, 1000)
+vectors = st.tuples(length_mm, length_mm, length_mm).map(np.array)
+unit = st.floats(-1, 1)
+
+
+@st.composite
+def rotation_vectors(draw, max_angle_rad=3.1):
+    axis = np.array(draw(st.tuples(unit, unit, unit)))
+    assume(np.linalg.norm(axis) > 0.1)
+    return axis / np.linalg.norm(axis) * draw(st.floats(0, max_angle_rad))
+
+
+rigids = st.builds(lambda w, t: Rigid.exp(np.concatenate([w, t])), rotation_vectors(), vectors)
+similarities = st.builds(Similarity, st.floats(0.1, 10), rigids)
+
+
+def assert_same(one: Rigid, other: Rigid):
+    np.testing.assert_allclose(one.matrix(), other.matrix(), rtol=0, atol=TOLERANCE_MM)
+
+
+def assert_same_similarity(one: Similarity, other: Similarity):
+    assert one.scale == pytest.approx(other.scale, rel=1e-12)
+    # Scales up to 100 and translations up to 1e5 here: 100 times the rounding above.
+    np.testing.assert_allclose(one.rigid.matrix(), other.rigid.matrix(), rtol=0, atol=100 * TOLERANCE_MM)
+
+
+@given(rigids, rigids, rigids)
+def test_rigid_is_a_group(a_from_b, b_from_c, c_from_d):
+    assert_same((a_from_b @ b_from_c) @ c_from_d, a_from_b @ (b_from_c @ c_from_d))
+    assert_same(a_from_b @ Rigid(), a_from_b)
+    assert_same(Rigid() @ a_from_b, a_from_b)
+    assert_same(a_from_b @ a_from_b.inverse(), Rigid())
+    assert_same(a_from_b.inverse() @ a_from_b, Rigid())
+
+
+@given(similarities, similarities, similarities)
+def test_similarity_is_a_group(a_from_b, b_from_c, c_from_d):
+    left, right = (a_from_b @ b_from_c) @ c_from_d, a_from_b @ (b_from_c @ c_from_d)
+    assert left.scale == pytest.approx(right.scale, rel=1e-12)
+    np.testing.assert_allclose(left.rigid.matrix(), right.rigid.matrix(), rtol=0, atol=100 * TOLERANCE_MM)
+    assert_same_similarity(a_from_b @ a_from_b.inverse(), Similarity(1.0, Rigid()))
+    assert_same_similarity(a_from_b.inverse() @ a_from_b, Similarity(1.0, Rigid()))
+
+
+@given(rigids, rigids, vectors)
+def test_composition_acts_as_one_after_the_other(a_from_b, b_from_c, xyz_c):
+    np.testing.assert_allclose((a_from_b @ b_from_c) @ xyz_c, a_from_b @ (b_from_c @ xyz_c), atol=TOLERANCE_MM)
+    np.testing.assert_allclose(a_from_b.inverse() @ (a_from_b @ xyz_c), xyz_c, atol=TOLERANCE_MM)
+
+
+@given(similarities, rigids, vectors)
+def test_similarity_and_rigid_compose_in_either_order(a_from_b, b_from_c, xyz):
+    np.testing.assert_allclose(
+        (a_from_b @ b_from_c) @ xyz, a_from_b @ (b_from_c @ xyz), rtol=1e-12, atol=100 * TOLERANCE_MM
+    )
+    c_from_a = b_from_c.inverse()
+    mixed = c_from_a @ a_from_b
+    assert isinstance(mixed, Similarity)
+    np.testing.assert_allclose(mixed @ xyz, c_from_a @ (a_from_b @ xyz), rtol=1e-12, atol=100 * TOLERANCE_MM)
+
+
+@given(rigids, vectors, vectors)
+def test_rigid_keeps_lengths(a_from_b, p, q):
+    moved = a_from_b @ np.array([p, q])
+    assert np.linalg.norm(moved[0] - moved[1]) == pytest.approx(np.linalg.norm(p - q), abs=TOLERANCE_MM)
+
+
+@given(similarities, vectors, vectors)
+def test_similarity_multiplies_lengths_by_its_scale(a_from_b, p, q):
+    moved = a_from_b @ np.array([p, q])
+    expected = a_from_b.scale * np.linalg.norm(p - q)
+    assert np.linalg.norm(moved[0] - moved[1]) == pytest.approx(expected, abs=10 * TOLERANCE_MM)
+
+
+@given(rotation_vectors(), vectors)
+def test_exp_and_log_are_inverse_below_half_a_turn(w, t):
+    twist = np.concatenate([w, t])
+    a_from_b = Rigid.exp(twist)
+    np.testing.assert_allclose(a_from_b.log(), twist, atol=1e-9)  # near π, log loses about half the digits of π − θ
+    assert a_from_b.angle_rad() == pytest.approx(np.linalg.norm(w), abs=1e-7)  # arccos near 0: √ε
+
+
+@given(rigids)
+def test_matrix_round_trip(a_from_b):
+    assert_same(Rigid.from_matrix(a_from_b.matrix()), a_from_b)
+    assert_same(Rigid.from_matrix(a_from_b.matrix()[:3]), a_from_b)
+
+
+def test_quarter_turn_about_z_by_hand():
+    a_from_b = Rigid.exp([0, 0, np.pi / 2, 10, 20, 30])
+    np.testing.assert_allclose(a_from_b @ [1.0, 0, 0], [10, 21, 30], atol=1e-14)
+    np.testing.assert_allclose(a_from_b.inverse() @ [10, 21, 30], [1, 0, 0], atol=1e-14)
+    assert (a_from_b @ np.zeros((4, 5, 3))).shape == (4, 5, 3)
+
+
+def test_similarity_by_hand():
+    a_from_b = Similarity(2.0, Rigid.exp([0, 0, np.pi / 2, 10, 20, 30]))
+    np.testing.assert_allclose(a_from_b @ [1.0, 0, 0], [10, 22, 30], atol=1e-14)
+
+
+@given(vectors, vectors)
+def test_skew_is_the_cross_product(v, w):
+    np.testing.assert_allclose(skew(v) @ w, np.cross(v, w), atol=1e-9)  # products up to 1e6
+    np.testing.assert_array_equal(skew(v), -skew(v).T)
+
+
+def test_skew_of_a_stack():
+    v = np.arange(12.0).reshape(2, 2, 3)
+    w = np.array([1.0, -2, 3])
+    np.testing.assert_allclose(skew(v) @ w, np.cross(v, w), atol=1e-14)
+
+
+def test_products_of_accepted_rotations_are_accepted():
+    # Seven printed digits: each factor passes the 1e-6 check; unprojected, the third product would not.
+    rotation = np.eye(3) * (1 + 4e-7)
+    product = Rigid(rotation)
+    for _ in range(10):
+        product = product @ Rigid(rotation)
+    np.testing.assert_allclose(product.rotation @ product.rotation.T, np.eye(3), atol=1e-12)
+
+
+def test_fields_are_read_only_copies():
+    rotation = np.eye(3)
+    a_from_b = Rigid(rotation)
+    rotation[0, 0] = 5
+    assert a_from_b.rotation[0, 0] == 1
+    with pytest.raises(ValueError, match="read-only"):
+        a_from_b.translation[0] = 1
+    with pytest.raises(AttributeError):
+        a_from_b.translation = np.ones(3)
+
+
+@pytest.mark.parametrize(
+    ("rotation", "translation", "message"),
+    [
+        (np.diag([1.0, 1, -1]), np.zeros(3), "not a proper rotation"),
+        (np.eye(3) * 1.0001, np.zeros(3), "not a proper rotation"),
+        (np.full((3, 3), np.nan), np.zeros(3), "rotation: holds values that are not finite"),
+        (np.eye(4), np.zeros(3), r"rotation: shape \(4, 4\)"),
+        (np.eye(3), np.zeros(2), r"translation: shape \(2,\)"),
+        (np.eye(3), [0, np.inf, 0], "translation: holds values that are not finite"),
+    ],
+)
+def test_rigid_refuses(rotation, translation, message):
+    with pytest.raises(InputError, match=message):
+        Rigid(rotation, translation)
+
+
+def _changed(row, column, value):
+    matrix = np.eye(4)
+    matrix[row, column] = value
+    return matrix
+
+
+@pytest.mark.parametrize(
+    ("matrix", "message"),
+    [
+        (np.eye(3), r"shape \(3, 3\), 4×4 needed"),
+        (np.diag([1.0, 1, -1, 1]), "left-handed or scaled"),
+        (np.diag([2.0, 2, 2, 1]), "left-handed or scaled"),
+        (np.diag([0.0, 0, 0, 1]), "left-handed or scaled"),
+        (_changed(0, 3, np.nan), "not finite"),
+        (_changed(3, 0, 100.0), "transposed"),  # the translation in the last row: the row-vector convention
+        (_changed(3, 3, 0.0), "0 0 0 1 needed"),
+    ],
+)
+def test_from_matrix_refuses(matrix, message):
+    with pytest.raises(InputError, match=message):
+        Rigid.from_matrix(matrix)
+
+
+def test_from_matrix_repairs_the_rounding_of_a_text_file():
+    exact = Rigid.exp([0.3, -0.2, 0.9, 1, 2, 3])
+    repaired = Rigid.from_matrix(np.round(exact.matrix(), 4))
+    error = np.abs(repaired.rotation - exact.rotation).max()
+    assert 0 < error < 1e-4  # four decimals were lost, and no more than that comes back
+    np.testing.assert_allclose(repaired.rotation @ repaired.rotation.T, np.eye(3), atol=1e-14)
+
+
+@pytest.mark.parametrize("scale", [0.0, -1.0, np.nan, np.inf])
+def test_similarity_refuses(scale):
+    with pytest.raises(InputError, match=r"similarity: scale .* a positive number needed"):
+        Similarity(scale, Rigid())

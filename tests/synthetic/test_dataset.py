@@ -1,0 +1,111 @@
+"""Data sets on disk: complete, readable by the package itself, and in the form of the shared data."""
+
+import json
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from stcal.camera_file import read_camera
+from stcal.design_file import load_board, load_target
+from stcal.errors import InputError
+from stcal.synthetic.dataset import truth, write_dataset
+from stcal.synthetic.render import RenderOptions, render
+from stcal.synthetic.scene import SceneOptions, make_scene, second_design
+
+SHARED = Path(__file__).resolve().parents[2] / ".." / "shared" / "data" / "stereo_target"
+OPTIONS = SceneOptions(seed=5, width=324, height=216, images_per_group=2)
+
+
+@pytest.fixture(scope="module")
+def scene():
+    return make_scene(OPTIONS)
+
+
+def _keys(value):
+    """The form of a JSON value: keys, types, and lengths of arrays; names that data choose become ``*``."""
+    if isinstance(value, dict):
+        fixed = {key: _keys(v) for key, v in value.items() if not any(c in key for c in ":/") and not key.isdigit()}
+        free = [_keys(v) for key, v in value.items() if key not in fixed]
+        return fixed | ({"*": free[0]} if free else {})
+    if isinstance(value, list):
+        return [_keys(value[0]), len(value)]
+    return type(value).__name__
+
+
+@pytest.mark.parametrize("name", ["clean", "clutter"])
+def test_truth_has_the_form_of_the_shared_data(scene, name):
+    path = SHARED / name / "truth.json"
+    if not path.exists():
+        pytest.skip("shared data not beside the repository")
+    shared, ours = json.loads(path.read_text()), json.loads(json.dumps(truth(scene)))
+    assert _keys(ours) == _keys(shared)
+    assert list(ours["circles"]) == list(shared["circles"])
+    assert list(ours["target_from_face"]) == list(shared["target_from_face"])
+    image, other = (data["groups"]["12"]["images"]["12/IMG_1001.jpg"]["circles"] for data in (ours, shared))
+    assert list(image)[-63:] == list(other)[-63:]
+
+
+def test_truth_predicts_its_own_pixels(scene):
+    data = truth(scene)
+    name, image = next(iter(data["groups"]["15"]["images"].items()))
+    assert name == "15/IMG_1000.jpg"
+    camera_from_target = np.array(image["camera_from_target"])
+    focal, centre, d = scene.camera.focal[0], scene.camera.centre, scene.camera.distortion
+    known = data["circles"] | {f"board:{i}": xyz for i, xyz in enumerate(data["groups"]["15"]["board_circles_target"])}
+    for label, circle in image["circles"].items():
+        x, y, z = (camera_from_target @ [*known[label], 1])[:3]
+        x, y = x / z, y / z
+        r2 = x * x + y * y
+        radial = 1 + d[0] * r2 + d[1] * r2**2
+        u = x * radial + 2 * d[2] * x * y + d[3] * (r2 + 2 * x * x)
+        v = y * radial + d[2] * (r2 + 2 * y * y) + 2 * d[3] * x * y
+        # The file rounds to 1e-5 px.
+        np.testing.assert_allclose(circle["centre_px"], focal * np.array([u, v]) + centre, atol=1.1e-5)
+
+
+def test_data_set_on_disk(tmp_path):
+    scene = make_scene(OPTIONS, *second_design())
+    finished = []
+    paths = write_dataset(tmp_path / "new", scene, RenderOptions(), workers=2, progress=finished.append)
+    folder = tmp_path / "new"
+    assert [str(p.relative_to(folder / "images")) for p in paths] == [
+        f"{group}/IMG_100{i}.jpg" for group in ("top-left", "top-right", "left-right") for i in (0, 1)
+    ]
+    assert sorted(finished) == sorted(str(p.relative_to(folder / "images")) for p in paths)
+    picture = cv2.imread(str(paths[3]), cv2.IMREAD_GRAYSCALE).astype(float)
+    rendered = render(scene, "top-right", 1).astype(float)
+    assert 0.1 < np.sqrt(((picture - rendered) ** 2).mean()) < 3  # JPEG at quality 95
+    camera = read_camera(folder / "cameras.txt")
+    assert camera.colmap_model == "OPENCV"
+    np.testing.assert_allclose(camera.centre, scene.camera.centre, atol=1e-9)
+    np.testing.assert_array_equal(camera.distortion, scene.camera.distortion)
+    target, board = load_target(folder / "target.toml"), load_board(folder / "board.toml")
+    assert target.polarity == "dark"
+    for read, made in zip(target.faces, scene.target.faces, strict=True):
+        assert read.ids == made.ids
+        np.testing.assert_allclose(read.xy_mm, made.xy_mm, atol=1e-8)
+    assert (board.corner, board.corner_radius_mm, board.columns) == ((0, 7), 7.5, 8)
+    assert json.loads((folder / "truth.json").read_text()) == truth(scene)
+
+
+def test_png_holds_the_image_exactly(tmp_path):
+    scene = make_scene(SceneOptions(seed=5, width=324, height=216, images_per_group=1, groups=(("1", "2"),)))
+    (path,) = write_dataset(tmp_path, scene, RenderOptions(bit_depth=16), image_format="png", workers=1)
+    picture = cv2.imread(str(path), cv2.IMREAD_UNCHANGED)
+    assert picture.dtype == np.uint16
+    np.testing.assert_array_equal(picture, render(scene, "12", 0, RenderOptions(bit_depth=16)))
+
+
+def test_refusals(tmp_path, scene):
+    (tmp_path / "mine.txt").write_text("keep")
+    with pytest.raises(InputError, match="not empty"):
+        write_dataset(tmp_path, scene)
+    with pytest.raises(InputError, match="not empty"):
+        write_dataset(tmp_path / "mine.txt", scene)
+    assert [p.name for p in tmp_path.iterdir()] == ["mine.txt"]
+    with pytest.raises(InputError, match="image format tif"):
+        write_dataset(tmp_path / "new", scene, image_format="tif")
+    with pytest.raises(InputError, match="JPEG holds 8 bits"):
+        write_dataset(tmp_path / "new", scene, RenderOptions(bit_depth=16))

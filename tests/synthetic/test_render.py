@@ -1,0 +1,129 @@
+"""Rendered circles lie where exact projection puts them; photographs look as the options say."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from stcal.errors import InputError
+from stcal.synthetic.observe import image_circles, rim_points
+from stcal.synthetic.render import RenderOptions, render
+from stcal.synthetic.scene import SceneOptions, make_scene, second_design
+
+OPTIONS = SceneOptions(seed=1, width=648, height=432, images_per_group=2, groups=(("1", "2"), ("1", "5")))
+PLAIN = RenderOptions(noise=0, vignetting=0, gradient=0, spread=0)
+EDGE_PX = 3.6  # five sigma of the default blur
+
+
+@pytest.fixture(scope="module")
+def scene():
+    return make_scene(OPTIONS)
+
+
+@pytest.fixture(scope="module")
+def second():
+    return make_scene(replace(OPTIONS, groups=None), *second_design())
+
+
+def _green(polygon):
+    """Area and centroid of a polygon (n, 2) by Green's theorem."""
+    middle = polygon.mean(0)
+    p, q = polygon - middle, np.roll(polygon - middle, -1, axis=0)
+    cross = p[:, 0] * q[:, 1] - p[:, 1] * q[:, 0]
+    return abs(cross.sum()) / 2, middle + ((p + q) * cross[:, None]).sum(0) / (3 * cross.sum())
+
+
+def _blobs(scene, group, image, options):
+    """Measured and exact area and centroid (n, 3), and the images of the centres (n, 2), of free-standing circles."""
+    picture = render(scene, group, image, options).astype(float)
+    seen = image_circles(scene, group, image)
+    rims = scene.camera.project(rim_points(seen.xyz_camera, seen.normal_camera, seen.radius_mm, 360))
+    measured, exact, centres = [], [], []
+    for i, rim in enumerate(rims):
+        others = np.delete(rims, i, axis=0).reshape(-1, 2)
+        room = np.sqrt(((others[:, None] - rim[::10]) ** 2).sum(-1).min())
+        if not seen.must_find[i] or room < 2 * EDGE_PX:
+            continue
+        (x0, y0), (x1, y1) = np.floor(rim.min(0) - EDGE_PX).astype(int), np.ceil(rim.max(0) + EDGE_PX).astype(int) + 1
+        y, x = np.mgrid[y0:y1, x0:x1]
+        area, centroid = _green(rim)
+        window = picture[y0:y1, x0:x1]
+        distance = np.sqrt((x[..., None] - rim[:, 0]) ** 2 + (y[..., None] - rim[:, 1]) ** 2).min(-1)
+        bright = window - np.median(window[(distance > EDGE_PX - 1) & (distance < EDGE_PX)])
+        # Far from the rim and outside: other circles and the edge of the plate.
+        bright[(distance > EDGE_PX) & (np.hypot(x - centroid[0], y - centroid[1]) > np.sqrt(area / np.pi))] = 0
+        level = 180 * 257 - np.median(window[(distance > EDGE_PX - 1) & (distance < EDGE_PX)])
+        measured.append([bright.sum() / level, (bright * x).sum() / bright.sum(), (bright * y).sum() / bright.sum()])
+        exact.append([area, *centroid])
+        centres.append(seen.centre_px[i])
+    return np.array(measured), np.array(exact), np.array(centres)
+
+
+def test_centroids_and_areas_agree_with_the_exact_rim():
+    scene = make_scene(replace(OPTIONS, width=1296, height=864, distortion=(-0.15, 0.05, 1e-3, -5e-4)))
+    measured, exact, centres = _blobs(scene, "12", 0, replace(PLAIN, bit_depth=16))
+    assert len(measured) > 60
+    # 16-bit rounding of about 150 pixels at 5 px from the middle: 1e-4 px.
+    assert np.abs(measured[:, 1:] - exact[:, 1:]).max() < 2e-3
+    assert np.sqrt(((measured[:, 1:] - exact[:, 1:]) ** 2).mean()) < 5e-4
+    assert np.abs(measured[:, 0] / exact[:, 0] - 1).max() < 2e-3
+    # The agreement is with the distorted ellipse, not with the image of the circle's centre.
+    assert 0.02 < np.abs(centres - exact[:, 1:]).max() < 0.3
+
+
+def test_determined_by_the_seeds(scene):
+    options = RenderOptions(clutter=True)
+    first = render(scene, "12", 1, options)
+    np.testing.assert_array_equal(first, render(scene, "12", 1, options))
+    assert 0.3 < (first != render(scene, "12", 1, replace(options, seed=1))).mean() < 1
+
+
+def test_noise_has_the_spread_asked_for(second):
+    quiet = render(second, "top-left", 0, PLAIN).astype(float)
+    noisy = render(second, "top-left", 0, replace(PLAIN, noise=0.02)).astype(float)
+    middle = (quiet > 20) & (quiet < 235)
+    assert 0.98 < np.std((noisy - quiet)[middle]) / (0.02 * 255) < 1.02  # rounding adds 0.3 %
+
+
+def test_circles_are_bright_or_dark_as_designed(scene, second):
+    for made, group, low, high in ((scene, "15", 170, 190), (second, "top-right", 15, 35)):
+        picture, seen = render(made, group, 0, PLAIN), image_circles(made, group, 0)
+        x, y = np.rint(seen.centre_px[seen.must_find]).astype(int).T
+        big = seen.radius_mm[seen.must_find] > 4.5
+        assert low < picture[y, x][big].min() <= picture[y, x][big].max() < high
+        rim = made.camera.project(
+            rim_points(seen.xyz_camera, seen.normal_camera, seen.radius_mm + 4000 / made.camera.focal[0], 12)
+        )
+        x, y = np.rint(rim[seen.must_find]).astype(int).reshape(-1, 2).T
+        around = np.median(picture[y, x])
+        assert around < 20 if made is scene else around > 160
+
+
+def test_clutter_adds_objects_behind_but_leaves_circles_alone(scene):
+    plain, full = render(scene, "12", 0, PLAIN), render(scene, "12", 0, replace(PLAIN, clutter=True))
+    assert 0.3 < (plain != full).mean() < 0.99
+    assert (full > 100).sum() > 1.2 * (plain > 100).sum()
+    seen = image_circles(scene, "12", 0)
+    x, y = np.rint(seen.centre_px).astype(int).T
+    np.testing.assert_array_equal(plain[y, x], full[y, x])
+
+
+def test_vignetting_gradient_blur_and_exposure(second):
+    def picture(**changes):
+        return render(second, "top-left", 1, replace(PLAIN, bit_depth=16, **changes)).astype(float)
+
+    base = picture()
+    corner = picture(vignetting=0.3)[0, 0] / base[0, 0]
+    assert 0.69 < corner < 0.71
+    ratio = picture(gradient=0.1) / base
+    assert 0.88 < ratio.min() < 0.95 < 1.05 < ratio.max() < 1.12
+    assert 1.99 < np.median(picture(exposure=2.0)[base < 30000] / base[base < 30000]) < 2.01
+    assert picture(exposure=2.0).max() == 65535
+    assert np.abs(np.diff(picture(blur_px=2.0), axis=1)).max() < 0.6 * np.abs(np.diff(base, axis=1)).max()
+
+
+def test_options_are_checked():
+    with pytest.raises(InputError, match="bit depth 12"):
+        RenderOptions(bit_depth=12)
+    with pytest.raises(InputError, match="noise -1"):
+        RenderOptions(noise=-1)
