@@ -207,6 +207,7 @@ WRONG = {
     "COLMAP: two cameras": ("1 PINHOLE 9 9 1 1 1 1\n2 PINHOLE 9 9 1 1 1 1\n", "2 cameras, 1 needed"),
     "COLMAP: fisheye": ("1 OPENCV_FISHEYE 9 9 1 1 1 1 0 0 0 0", "OPENCV_FISHEYE is not supported; use one of SIMPLE_"),
     "COLMAP: too few": ("1 PINHOLE 9 9 1 1 1", "3 parameters for PINHOLE, 4 needed"),
+    "COLMAP: far too few": ("1 SIMPLE_PINHOLE 9 9 1", "1 parameters for SIMPLE_PINHOLE, 3 needed"),
     "COLMAP: too many": ("1 SIMPLE_PINHOLE 9 9 1 1 1 1", "4 parameters for SIMPLE_PINHOLE, 3 needed"),
     "COLMAP: a word": ("1 PINHOLE 9 9 1 one 1 1", "'one'; numbers needed"),
     "COLMAP: width a word": ("1 PINHOLE wide 9 1 1 1 1", "'wide'; numbers needed"),

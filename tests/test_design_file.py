@@ -146,11 +146,20 @@ def test_byte_order_mark_and_windows_line_ends(tmp_path):
 
 def test_a_frame_just_inside_the_smallest_angle_is_taken(tmp_path):
     def bent(sine):
-        return changed("x_mm = 0, y_mm = 40", f"x_mm = 80, y_mm = {80 * sine}")
+        # Origin at (100, 50): the angle is at the origin circle, wherever it was drawn.
+        xy = np.array([[0, 0], [40, 0], [80 * np.sqrt(1 - sine**2), 80 * sine], [40, 40]]) + np.array([100, 50])
+        face = FaceDesign("f", ("1", "2", "3", "4"), xy, [5.0] * 4, "1", "2", "3")
+        return target_toml(TargetDesign("bent", "dark", (face,)))
 
-    assert target_of(tmp_path, bent(1.01 * MIN_SINE)).faces[0].xy_mm[2, 1] > 0
+    # y of the third circle is 80 mm times the sine
+    assert target_of(tmp_path, bent(1.01 * MIN_SINE)).faces[0].xy_mm[2, 1] == pytest.approx(80.8 * MIN_SINE, abs=1e-8)
     with pytest.raises(InputError, match="collinear"):
         target_of(tmp_path, bent(0.99 * MIN_SINE))
+
+
+def test_no_negative_zero_is_written():
+    face = FaceDesign("f", ("1", "2", "3", "4"), [[-0.0, 0], [40, -1e-12], [0, 40], [40, 40]], [5.0] * 4, "1", "2", "3")
+    assert "-0.0" not in target_toml(TargetDesign("t", "dark", (face,)))
 
 
 # fmt: off
@@ -195,6 +204,8 @@ WRONG_TARGETS = {
     "position of a kilometre": (changed("y_mm = 40, radius_mm = 4", "y_mm = 1e7, radius_mm = 4"),
                                 "circles.4.y_mm: 10000000.0: input should be less than or equal to"),
     "overlapping": (changed("x_mm = 40, y_mm = 0", "x_mm = 10, y_mm = 0"), "face 1: circles 1 and 2 overlap"),
+    "overlapping far from zero": (changed("x_mm = 40, y_mm = 40", "x_mm = 10, y_mm = 40"),
+                                  "face 1: circles 3 and 4 overlap"),
     "touching": (changed("x_mm = 40, y_mm = 0", "x_mm = 16, y_mm = 0"), "face 1: circles 1 and 2 overlap"),
     "on one another": (changed("x_mm = 40, y_mm = 0", "x_mm = 0, y_mm = 0"), "face 1: circles 1 and 2 overlap"),
     "frame circle missing": (changed('y = "3"', 'y = "9"'), "face 1: y circle 9 is not among the circles 1, 2, 3, 4"),

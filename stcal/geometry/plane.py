@@ -131,6 +131,6 @@ def refine_planar_pose(camera_from_plane: Rigid, xy_plane: np.ndarray, xy_normal
         residual = (p[:, :2] / p[:, 2:] - xy_normalised).ravel()
         step = -np.linalg.lstsq(jac, residual, rcond=None)[0]
         pose = Rigid(Rotation.from_rotvec(step[:3]).as_matrix() @ pose.rotation, pose.translation + step[3:])
-        if np.abs(step[:3]).max() < 1e-10:
+        if np.abs(step[:3]).max() < 1e-10 and np.abs(step[3:]).max() < 1e-10 * pose.translation[2]:
             break
     return pose

@@ -7,7 +7,7 @@ from stcal.design import BOARD
 from stcal.sfm.observations import ImageObservations, face_of, is_board
 
 # OpenCV's order: blue, green, red. The palette of Okabe & Ito (2008), for all kinds of colour vision.
-PALETTE = [(0, 159, 230), (233, 180, 86), (115, 158, 0), (66, 228, 240), (167, 121, 204), (0, 94, 213), (178, 114, 0)]
+PALETTE = [(0, 159, 230), (115, 158, 0), (66, 228, 240), (167, 121, 204), (0, 94, 213), (178, 114, 0)]
 BOARD_COLOUR = (233, 180, 86)
 QUALITY = 82
 

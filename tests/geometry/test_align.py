@@ -88,6 +88,7 @@ def test_mirrored_points_give_a_rotation_not_a_reflection():
 
 
 LINE = np.arange(5.0)[:, None] * [1.0, 2, 3]
+OFF_ZERO = LINE + np.array([1000.0, 0, 0])  # a line that misses the origin
 
 
 @pytest.mark.parametrize("align", [align_rigid, align_similarity])
@@ -97,7 +98,8 @@ LINE = np.arange(5.0)[:, None] * [1.0, 2, 3]
         (cloud(0, 2), cloud(0, 2), None, "2 and 2 points, 3 or more pairs needed"),
         (cloud(0, 5), cloud(0, 4), None, "5 and 4 points"),
         (LINE, cloud(0, 5), None, "collinear"),
-        (cloud(0, 5), LINE + 1000, None, "collinear"),
+        (OFF_ZERO, cloud(0, 5), None, "collinear"),
+        (cloud(0, 5), OFF_ZERO, None, "collinear"),
         (np.ones((4, 3)), np.ones((4, 3)), None, "collinear"),
         (cloud(0, 4), cloud(0, 4), [1, 1, 0, 0], "collinear"),  # two points carry all the weight
         (cloud(0, 4), cloud(0, 4), [1, 0, 0, 0], "collinear"),

@@ -17,8 +17,17 @@ from stcal.sfm.detect.candidates import MAX_AXIS_RATIO, Candidates, match_patter
 NEIGHBOURS = 20
 STEP_TOLERANCE = 0.3
 """How far a dot may be from where the step between its neighbours puts it, in steps."""
+DIAGONAL = 1.22
+"""Between one, a step along a row, and √2, a step along a diagonal."""
 MIN_SHARE = 0.35
 """Smallest share of the board's dots that makes a board."""
+MAX_BOARDS = 3
+MAX_COSINE = 0.35
+"""Of the angle between the two first steps, mapped to the board plane; 45° has 0.7."""
+MIN_LINKS = 3
+"""Neighbours that a dot needs to start a grid."""
+NEARLY_ALL = 0.9
+"""Share of the board that ends the search for a larger grid."""
 MIN_SIDE = 3
 """Fewest rows and columns."""
 CORNER_MARGIN = 0.4
@@ -49,20 +58,37 @@ def find_boards(candidates: Candidates, board: BoardDesign, image_corners: np.nd
     if len(candidates) < MIN_SIDE**2:
         return []
     links, steps = _links(candidates, board)
-    readings = []
+    count = (links >= 0).sum(1)
+    seeds = [int(i) for i in np.argsort(-count, kind="stable") if count[i] >= MIN_LINKS]
     free = np.ones(len(candidates), bool)
-    for seed in np.argsort(-(links >= 0).sum(1), kind="stable"):
-        if not free[seed] or (links[seed] >= 0).sum() < 3:
-            continue
-        cells = _grow(candidates, links, steps, seed, free)
-        free[list(cells)] = False
+    readings: list[BoardReading] = []
+    for _ in range(MAX_BOARDS):
+        cells = _largest_grid(candidates, links, steps, seeds, free, board)
         if len(cells) < MIN_SHARE * board.rows * board.columns:
-            continue
+            break
+        free[list(cells)] = False
         reading = _number(candidates, cells, board, image_corners)
         if reading is not None:
             free[reading.candidates] = False
             readings.append(reading)
     return sorted(readings, key=lambda r: -len(r.candidates))
+
+
+def _largest_grid(candidates: Candidates, links, steps, seeds, free, board: BoardDesign) -> dict[int, tuple[int, int]]:
+    """The largest grid grown from any of the seeds; a complete one ends the search."""
+    best: dict[int, tuple[int, int]] = {}
+    inside = np.zeros(len(candidates), int)
+    for seed in seeds:
+        # A dot that has been in two grids is not likely to start a better third one.
+        if not free[seed] or inside[seed] >= 2:
+            continue
+        cells = _grow(candidates, links, steps, seed, free)
+        inside[list(cells)] += 1
+        if len(cells) > len(best):
+            best = cells
+        if len(best) >= NEARLY_ALL * board.rows * board.columns:
+            break
+    return best
 
 
 def _links(candidates: Candidates, board: BoardDesign) -> tuple[np.ndarray, np.ndarray]:
@@ -76,6 +102,8 @@ def _links(candidates: Candidates, board: BoardDesign) -> tuple[np.ndarray, np.n
     step = np.einsum("nij,nkj->nki", inverse, candidates.xy[near] - candidates.xy[:, None])
     length = np.linalg.norm(step, axis=2) * board.radius_mm / board.pitch_mm
     ok = (np.abs(length - 1) < STEP_TOLERANCE) & (largest < MAX_AXIS_RATIO) & (smallest > 1 / MAX_AXIS_RATIO)
+    # Blur makes small dots look larger, and diagonal neighbours then pass for direct ones: the nearest tell.
+    ok &= length < DIAGONAL * np.where(ok, length, np.inf).min(1, initial=np.inf)[:, None]
     angle = np.arctan2(step[..., 1], step[..., 0])
     quarter = np.where(ok, np.exp(4j * angle), 0).sum(1)
     agreed = np.angle(quarter) / 4
@@ -104,6 +132,10 @@ def _grow(candidates: Candidates, links, steps, seed: int, free) -> dict[int, tu
         ]
         if found:
             start[:, axis] = np.mean(found, axis=0)
+    across = np.linalg.solve(candidates.shape[seed], start)
+    lengths = np.linalg.norm(across, axis=0)
+    if abs(across[:, 0] @ across[:, 1]) > MAX_COSINE * lengths.prod() or lengths.max() > DIAGONAL * lengths.min():
+        return {}
     cells = {int(seed): (0, 0)}
     taken = {(0, 0)}
     queue = [(int(seed), start)]

@@ -24,12 +24,13 @@ class Candidates:
     """n ellipses in normalised ideal coordinates.
 
     ``xy`` : (n, 2) centres; ``shape`` : (n, 2, 2), rim = xy + shape @ unit circle; ``radius`` : (n,) of equal area;
-    ``px`` : size of a pixel in these coordinates; ``tree`` : over ``xy``.
+    ``contrast`` : (n,) grey values; ``px`` : size of a pixel in these coordinates; ``tree`` : over ``xy``.
     """
 
     xy: np.ndarray
     shape: np.ndarray
     radius: np.ndarray
+    contrast: np.ndarray
     px: float
     tree: cKDTree
 
@@ -40,7 +41,7 @@ class Candidates:
         _, distorted_by_ideal = camera.distort_jacobian(xy)
         shape = np.linalg.solve(distorted_by_ideal, ellipses.shape_px / camera.focal[:, None])
         radius = np.sqrt(np.abs(np.linalg.det(shape))) if len(xy) else np.zeros(0)
-        return cls(xy, shape, radius, 1 / float(np.sqrt(camera.focal.prod())), cKDTree(xy))
+        return cls(xy, shape, radius, ellipses.contrast, 1 / float(np.sqrt(camera.focal.prod())), cKDTree(xy))
 
     def __len__(self) -> int:
         return len(self.xy)

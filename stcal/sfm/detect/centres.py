@@ -293,6 +293,8 @@ class _Fit:
         sector = (angle * (SECTORS / (2 * np.pi))).astype(int) % SECTORS
         total = np.bincount(sector, minlength=SECTORS)
         square = np.bincount(sector, self.residual[near] ** 2, minlength=SECTORS)
-        rim = float((square <= (MAX_RIM_RESIDUAL * self.contrast) ** 2 * total).mean())
+        noise = 1.4826 * np.median(np.abs(self.residual))
+        allowed = (MAX_RIM_RESIDUAL * self.contrast) ** 2 + (2 * noise) ** 2
+        rim = float((square <= allowed * total).mean())
         shape = np.linalg.inv(self.inverse_shape)
         return self.centre, shape, self.covariance, self.blur, self.contrast, rim, rim >= MIN_RIM

@@ -16,8 +16,10 @@ WINDOW_OVER_DIAMETER = 3.0
 HALF_SCALE_FROM_PX = 8_000_000
 """Images of more pixels start the pyramid at half scale: what is 6 px across is still 3 px there."""
 MIN_LEVEL_DIAMETER_PX = 3.0
-MAX_OUTLINE_DEVIATION = 0.10
-"""RMS deviation of the outline from the ellipse, in units of its radius, on top of half a pixel."""
+MAX_OUTLINE_DEVIATION = 0.025
+"""RMS deviation of the outline from the ellipse, in units of its radius (a square has 0.07) …"""
+MAX_OUTLINE_DEVIATION_PX = 0.45
+"""… on top of what pixels and noise do to any outline."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -39,16 +41,19 @@ class EllipseOptions:
 class Ellipses:
     """n candidates.
 
-    ``centre_px`` : (n, 2); ``shape_px`` : (n, 2, 2), symmetric, rim = centre + shape @ unit circle.
+    ``centre_px`` : (n, 2); ``shape_px`` : (n, 2, 2), symmetric, rim = centre + shape @ unit circle; ``contrast`` :
+    (n,) middle against surroundings, grey values of the 8-bit image, positive.
     """
 
     centre_px: np.ndarray
     shape_px: np.ndarray
+    contrast: np.ndarray
 
     def __post_init__(self):
         n = len(self.centre_px)
         object.__setattr__(self, "centre_px", frozen(self.centre_px, (n, 2), "centres"))
         object.__setattr__(self, "shape_px", frozen(self.shape_px, (n, 2, 2), "shapes"))
+        object.__setattr__(self, "contrast", frozen(self.contrast, (n,), "contrasts"))
 
     def __len__(self) -> int:
         return len(self.centre_px)
@@ -59,7 +64,7 @@ class Ellipses:
 
     def select(self, keep: np.ndarray) -> "Ellipses":
         """Those of the indices or mask ``keep``."""
-        return Ellipses(self.centre_px[keep], self.shape_px[keep])
+        return Ellipses(self.centre_px[keep], self.shape_px[keep], self.contrast[keep])
 
 
 def find_ellipses(image: np.ndarray, polarity: Polarity, options: EllipseOptions) -> Ellipses:
@@ -68,6 +73,7 @@ def find_ellipses(image: np.ndarray, polarity: Polarity, options: EllipseOptions
     threshold = max(4.0, options.min_contrast * (max(high, 1.0) - low))
     scale = 1
     found = []
+    full = image
     while True:
         if not (scale == 1 and image.size > HALF_SCALE_FROM_PX):
             found.append(_level(image, scale, polarity, threshold, options))
@@ -75,7 +81,24 @@ def find_ellipses(image: np.ndarray, polarity: Polarity, options: EllipseOptions
             break
         scale *= 2
         image = cv2.resize(image, None, fx=0.5, fy=0.5, interpolation=cv2.INTER_AREA)
-    return _distinct(np.concatenate(found))
+    centre, shape = _distinct(np.concatenate(found))
+    contrast = _contrast(full, centre, shape) * (1 if polarity == "bright" else -1)
+    keep = contrast > threshold
+    return Ellipses(centre[keep], shape[keep], contrast[keep])
+
+
+def _contrast(image: np.ndarray, centre: np.ndarray, shape: np.ndarray) -> np.ndarray:
+    """Median grey value in the middle less the median around, (n,)."""
+    angle = np.arange(16) * (np.pi / 8)
+    unit = np.column_stack([np.cos(angle), np.sin(angle)])
+
+    def sample(factor: float, margin_px: float) -> np.ndarray:
+        wide = factor * shape + margin_px * np.eye(2)
+        at = np.round(centre[:, None] + np.einsum("nij,kj->nki", wide, unit)).astype(int)
+        x, y = (np.clip(at[..., k], 0, image.shape[1 - k] - 1) for k in range(2))
+        return np.median(image[y, x], axis=1) if len(at) else np.zeros(0)
+
+    return sample(0.4, 0.0) - sample(1.25, 2.0)
 
 
 def _level(image, scale: int, polarity: Polarity, threshold: float, options: EllipseOptions) -> np.ndarray:
@@ -131,13 +154,13 @@ def _outline_deviation(points, cx, cy, d1, d2, angle_deg) -> float:
     dx, dy = points[:, 0] - cx, points[:, 1] - cy
     rho = np.hypot((c * dx + s * dy) * 2 / max(d1, 1e-6), (c * dy - s * dx) * 2 / max(d2, 1e-6))
     size = np.sqrt(d1 * d2) / 2
-    return float(np.sqrt(np.mean((rho - 1) ** 2)) * size / (0.5 + MAX_OUTLINE_DEVIATION * size * 0.5))
+    return float(np.sqrt(np.mean((rho - 1) ** 2)) * size / (MAX_OUTLINE_DEVIATION_PX + MAX_OUTLINE_DEVIATION * size))
 
 
-def _distinct(table: np.ndarray) -> Ellipses:
-    """One of each: rows come finest level first, and the first of those that coincide stays."""
+def _distinct(table: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Centres and shapes, one of each: rows come finest level first, and the first of those that coincide stays."""
     if not len(table):
-        return Ellipses(np.zeros((0, 2)), np.zeros((0, 2, 2)))
+        return np.zeros((0, 2)), np.zeros((0, 2, 2))
     centre = table[:, :2]
     radius = np.sqrt(table[:, 2] * table[:, 3]) / 2
     pairs = cKDTree(centre).query_pairs(0.5 * radius.max(), output_type="ndarray")
@@ -150,4 +173,4 @@ def _distinct(table: np.ndarray) -> Ellipses:
     angle = np.radians(table[:, 4])
     axes = np.stack([np.stack([np.cos(angle), np.sin(angle)], 1), np.stack([-np.sin(angle), np.cos(angle)], 1)], 2)
     shape = (axes * table[:, None, 2:4] / 2) @ np.swapaxes(axes, 1, 2)
-    return Ellipses(table[:, :2], shape)
+    return table[:, :2], shape

@@ -13,6 +13,7 @@ import numpy as np
 
 from stcal.design import FaceDesign, TargetDesign
 from stcal.sfm.detect.candidates import MAX_AXIS_RATIO, Candidates, grow_match, singular_values
+from stcal.sfm.detect.likeness import is_named
 
 NEIGHBOURS_IN_DESIGN = 3
 NEIGHBOURS_IN_IMAGE = 12
@@ -23,6 +24,8 @@ SUPPORT = 5
 MIN_SUPPORT = 2
 """… and so many of them must be there before the hypothesis is grown."""
 MAX_HYPOTHESES = 300
+MAX_CONTRAST_RATIO = 2.0
+"""Between circles of one target; a reflection of it is fainter."""
 MAX_HIDDEN = 2
 MIN_CIRCLES = 6
 """A homography takes four circles; two more confirm it."""
@@ -82,8 +85,12 @@ class FaceFinder:
                     pairs.setdefault(tuple(np.round(key, 6)), []).append(face)
         return [_Pair(np.array(k[:2]), np.array(k[2:4]), k[4:], tuple(faces)) for k, faces in pairs.items()]
 
-    def find(self, candidates: Candidates) -> FaceFinding:
-        """All faces among the candidates."""
+    def find(self, candidates: Candidates, contrast: float = 0.0) -> FaceFinding:
+        """All faces among the candidates.
+
+        ``contrast`` : of what is certainly no reflection, the board say. The mirror image of a face can pass for
+        another face; it is told by its faintness, against ``contrast`` and against the brightest face.
+        """
         readings: list[FaceReading] = []
         if len(candidates) >= MIN_CIRCLES:
             for face, index in self._hypotheses(candidates):
@@ -93,7 +100,7 @@ class FaceFinder:
                 grown = grow_match(candidates, index, face.xy_mm, face.radius_mm)
                 if grown is not None and _seen_from_outside(grown[1], face):
                     readings.append(FaceReading(face, *grown))
-        return _decide(readings)
+        return _decide(readings, candidates, contrast, self.target)
 
     def _hypotheses(self, candidates: Candidates) -> list[tuple[FaceDesign, np.ndarray]]:
         """Starts (face, index), the best supported first."""
@@ -110,9 +117,10 @@ class FaceFinder:
             for face in pair.faces:
                 index = _support(candidates, face, pair.first, candidates.xy[first[ok]], linear)
                 hits = (index >= 0).sum(1)
-                found += [(hits[h], face, index[h]) for h in np.flatnonzero(hits >= 2 + MIN_SUPPORT)]
-        found.sort(key=lambda item: -item[0])
-        return [(face, index) for _, face, index in found[:MAX_HYPOTHESES]]
+                contrast = candidates.contrast[first[ok]]
+                found += [(hits[h], contrast[h], face, index[h]) for h in np.flatnonzero(hits >= 2 + MIN_SUPPORT)]
+        found.sort(key=lambda item: (-item[0], -item[1]))
+        return [(face, index) for _, _, face, index in found[:MAX_HYPOTHESES]]
 
 
 def _neighbours(face: FaceDesign) -> np.ndarray:
@@ -130,6 +138,8 @@ def _candidate_pairs(candidates: Candidates):
     largest, smallest = singular_values(to_circle @ candidates.shape[second])
     ratio = candidates.radius[second] / candidates.radius[first]
     ok = (largest < MAX_AXIS_RATIO * ratio) & (smallest * MAX_AXIS_RATIO > ratio)
+    contrast = candidates.contrast[second] / candidates.contrast[first]
+    ok &= (contrast < MAX_CONTRAST_RATIO) & (contrast > 1 / MAX_CONTRAST_RATIO)
     first, second, ratio = first[ok], second[ok], ratio[ok]
     step = np.einsum("nij,nj->ni", to_circle[ok], candidates.xy[second] - candidates.xy[first])
     return first, step, ratio
@@ -170,12 +180,19 @@ def _needed(face: FaceDesign) -> int:
     return max(len(face.ids) - MAX_HIDDEN, min(MIN_CIRCLES, len(face.ids)))
 
 
-def _decide(readings: list[FaceReading]) -> FaceFinding:
-    """Keep the readings that explain more than every other reading of the same candidates."""
+def _decide(readings: list[FaceReading], candidates: Candidates, contrast: float, target: TargetDesign) -> FaceFinding:
+    """Keep the readings that explain more than every other reading of the same candidates, and no reflections."""
     readings = [r for r in readings if r.count() >= _needed(r.face)]
     readings.sort(key=lambda r: -r.count())
     named: list[FaceReading] = []
     notes: list[str] = []
+    own = [float(np.median(candidates.contrast[r.used()])) for r in readings]
+    least = max([contrast, *own]) / MAX_CONTRAST_RATIO
+    for reading, value in zip(readings, own, strict=True):
+        if value < least:
+            notes.append(f"face {reading.face.id}: contrast {value:.0f}, {least:.0f} needed; a reflection, left out")
+    readings = [r for r, value in zip(readings, own, strict=True) if value >= least]
+    notes = sorted(set(notes))
     settled: set[int] = set()
     for reading in readings:
         if settled & set(reading.used()):
@@ -189,11 +206,11 @@ def _decide(readings: list[FaceReading]) -> FaceFinding:
             and r.count() >= reading.count()
             and not (r.face is reading.face and (r.index == reading.index).all())
         ]
-        if rivals:
+        if rivals or not is_named(reading.face, reading.index >= 0, target):
             ids = ", ".join(sorted({r.face.id for r in (reading, *rivals)}))
             notes.append(
-                f"a face of {reading.count()} circles can be read as {ids}; left out, "
-                "show the circles that tell them apart"
+                f"a face of {reading.count()} circles reads as {ids}, and not only so; left out, "
+                "show the circles that tell the faces apart"
             )
         else:
             named.append(reading)

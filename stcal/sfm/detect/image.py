@@ -11,7 +11,7 @@ from stcal.sfm.detect.board import find_boards
 from stcal.sfm.detect.candidates import Candidates
 from stcal.sfm.detect.centres import Centres, measure_centres
 from stcal.sfm.detect.ellipses import EllipseOptions, find_ellipses
-from stcal.sfm.detect.faces import FaceFinder
+from stcal.sfm.detect.faces import MAX_CONTRAST_RATIO, FaceFinder
 
 SECOND_BOARD_SHARE = 0.8
 """A second board is one with at least this share of the dots of the first."""
@@ -66,14 +66,25 @@ def detect_image(
     if board is not None:
         ellipses = found[board.polarity]
         boards = find_boards(Candidates.of(ellipses, camera), board, _corners(camera))
-        if len(boards) > 1 and len(boards[1].candidates) >= SECOND_BOARD_SHARE * len(boards[0].candidates):
+        boards.sort(key=lambda r: -float(np.median(ellipses.contrast[r.candidates])))
+        contrast = [float(np.median(ellipses.contrast[r.candidates])) for r in boards]
+        rivals = [
+            r
+            for r, c in zip(boards[1:], contrast[1:], strict=True)
+            if len(r.candidates) >= SECOND_BOARD_SHARE * len(boards[0].candidates)
+            and c * MAX_CONTRAST_RATIO > contrast[0]
+        ]
+        if rivals:
             repeated.append("board")
         elif boards:
             reading = boards[0]
         for each in boards:
             free[board.polarity][each.candidates] = False
     ellipses = found[target.polarity].select(free[target.polarity])
-    finding = FaceFinder(target).find(Candidates.of(ellipses, camera))
+    bright = 0.0
+    if reading is not None and board.polarity == target.polarity:
+        bright = float(np.median(found[board.polarity].contrast[reading.candidates]))
+    finding = FaceFinder(target).find(Candidates.of(ellipses, camera), bright)
     repeated += [f"face {face_id}" for face_id in finding.repeated]
     notes += finding.notes
 
