@@ -7,7 +7,8 @@ import sys
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor, as_completed
 
-ONE_THREAD = ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS")
+ONE_THREAD = ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS", "OPENCV_FOR_THREADS_NUM")
+"""Libraries take their number of threads from these: processes that run side by side need one each."""
 
 
 def run_parallel(function: Callable, jobs: Sequence[tuple], workers: int | None = None) -> Iterator[tuple[int, object]]:
@@ -23,7 +24,7 @@ def run_parallel(function: Callable, jobs: Sequence[tuple], workers: int | None 
         return
     with (
         _plain_main(),
-        ProcessPoolExecutor(workers, mp_context=multiprocessing.get_context("spawn"), initializer=_one_thread) as pool,
+        ProcessPoolExecutor(workers, mp_context=multiprocessing.get_context("spawn")) as pool,
     ):
         futures = {pool.submit(function, *job): i for i, job in enumerate(jobs)}
         try:
@@ -34,15 +35,9 @@ def run_parallel(function: Callable, jobs: Sequence[tuple], workers: int | None 
             raise
 
 
-def _one_thread() -> None:
-    import cv2
-
-    cv2.setNumThreads(1)
-
-
 @contextlib.contextmanager
 def _plain_main():
-    """Hide the main module's file from new processes, and keep their linear algebra to one thread."""
+    """Hide the main module's file from new processes, and keep their libraries to one thread."""
     main = sys.modules["__main__"]
     hidden = {name: getattr(main, name) for name in ("__file__", "__spec__") if getattr(main, name, None) is not None}
     before = {name: os.environ.get(name) for name in ONE_THREAD}

@@ -76,13 +76,14 @@ def run(
 ) -> None:
     """Calibrate: detect, map, scale, chain and adjust; writes faces.json and report.html."""
     from stcal.sfm import pipeline
+    from stcal.sfm.pairs import PairOptions
 
     options = pipeline.RunOptions(
         solve=solve.value,
         frame=frame.value,
         eccentricity=eccentricity,
         reference_face=reference_face,
-        pairs=pipeline.PairOptions(float(np.radians(max_angle))),
+        pairs=PairOptions(float(np.radians(max_angle))),
         ellipses=_ellipses(min_diameter, max_diameter),
         workers=workers,
     )

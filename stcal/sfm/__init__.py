@@ -1,5 +1,6 @@
 """From a folder of images to the calibrated target; read ``pipeline.py`` first."""
 
-from stcal.sfm.pipeline import RunOptions, RunResult, run
+from stcal.sfm.pipeline import run
+from stcal.sfm.result import RunOptions, RunResult
 
 __all__ = ["RunOptions", "RunResult", "run"]

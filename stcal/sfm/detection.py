@@ -8,7 +8,6 @@ from collections.abc import Callable
 from dataclasses import asdict, dataclass, fields
 from pathlib import Path
 
-import cv2
 import numpy as np
 
 from stcal.camera_file import CameraModel
@@ -20,11 +19,10 @@ from stcal.sfm.detect.centres import Centres
 from stcal.sfm.detect.ellipses import EllipseOptions
 from stcal.sfm.detect.image import ImageDetection, detect_image, grey_8bit
 from stcal.sfm.images import ImageFile, Skipped, decode
+from stcal.sfm.overlay import thumbnail
 
 CACHE_VERSION = 1
 """Raised whenever detection gives other results for the same image: what was kept is then not used again."""
-THUMBNAIL_PX = 1400
-THUMBNAIL_QUALITY = 80
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -169,12 +167,10 @@ def _detect_file(
 
 
 def _save(path: Path, detection: ImageDetection, digest: str, image: np.ndarray) -> None:
-    scale = min(1.0, THUMBNAIL_PX / image.shape[1])
-    small = cv2.resize(grey_8bit(image), None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA)
-    _, jpeg = cv2.imencode(".jpg", small, [cv2.IMWRITE_JPEG_QUALITY, THUMBNAIL_QUALITY])
+    jpeg, scale = thumbnail(grey_8bit(image))
     meta = {
         "digest": digest,
-        "scale": small.shape[1] / image.shape[1],
+        "scale": scale,
         "target_labels": detection.target_labels,
         "notes": detection.notes,
         "repeated": detection.repeated,
@@ -185,7 +181,7 @@ def _save(path: Path, detection: ImageDetection, digest: str, image: np.ndarray)
     np.savez(
         stream,
         numberings=detection.numberings,
-        thumbnail=jpeg.ravel(),
+        thumbnail=jpeg,
         meta=np.frombuffer(json.dumps(meta).encode(), np.uint8),
         **arrays,
     )

@@ -1,7 +1,6 @@
 """``faces.json`` and ``report.json``: the result and everything that tells how far to trust it, as plain values."""
 
 from itertools import combinations
-from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -9,14 +8,12 @@ import stcal
 from stcal.geometry.plane import fit_plane
 from stcal.sfm.model import GroupModel
 from stcal.sfm.observations import face_of, is_board
-
-if TYPE_CHECKING:
-    from stcal.sfm.pipeline import RunResult
+from stcal.sfm.result import RunResult
 
 MICRO = 1e3
 
 
-def faces_json(result: "RunResult") -> dict:
+def faces_json(result: RunResult) -> dict:
     """The content of ``faces.json``: mm and rad, target frame, 4×4 row-major."""
     target = result.target
     radius = result.target_design.radius_of()
@@ -37,7 +34,7 @@ def faces_json(result: "RunResult") -> dict:
     return content
 
 
-def report_json(result: "RunResult") -> dict:
+def report_json(result: RunResult) -> dict:
     """The content of ``report.json``."""
     models = _final_models(result)
     residual = {name: model.residuals_px(result.camera) for name, model in models.items()}
@@ -97,14 +94,14 @@ def report_json(result: "RunResult") -> dict:
     }
 
 
-def _final_models(result: "RunResult") -> dict[str, GroupModel]:
+def _final_models(result: RunResult) -> dict[str, GroupModel]:
     """The models that the answer rests on."""
     if result.joint:
         return {model.group: model for model in result.joint.models}
     return {solution.model.group: solution.model for solution in result.solutions}
 
 
-def _face(result: "RunResult", face_id: str) -> dict:
+def _face(result: RunResult, face_id: str) -> dict:
     pose = result.target.target_from_face[face_id]
     labels = [label for label in result.target.circles if face_of(label) == face_id]
     members = [each for each in result.faces if each.face == face_id]
@@ -124,7 +121,7 @@ def _face(result: "RunResult", face_id: str) -> dict:
     }
 
 
-def _between(result: "RunResult") -> list[dict]:
+def _between(result: RunResult) -> list[dict]:
     rows = []
     poses = result.target.target_from_face
     for a, b in combinations(poses, 2):
@@ -140,7 +137,7 @@ def _between(result: "RunResult") -> list[dict]:
     return rows
 
 
-def _group(result: "RunResult", solution) -> dict:
+def _group(result: RunResult, solution) -> dict:
     name = solution.model.group
     scale = result.scales[name]
     return {
@@ -218,7 +215,7 @@ def _by_label(models: dict[str, GroupModel], residual: dict[str, np.ndarray]) ->
     ]
 
 
-def _left_out(result: "RunResult") -> dict:
+def _left_out(result: RunResult) -> dict:
     observed = {(each.observations.name): each for each in result.labelled}
     mapped = {s.model.group: set(s.model.labels) for s in result.solutions}
     circles = []
@@ -244,7 +241,7 @@ def _left_out(result: "RunResult") -> dict:
     }
 
 
-def _scene(result: "RunResult", models: dict[str, GroupModel]) -> dict:
+def _scene(result: RunResult, models: dict[str, GroupModel]) -> dict:
     """Cameras, board outlines and circles in the target frame, for the picture in space."""
     cameras, boards = [], {}
     for name, model in models.items():

@@ -10,6 +10,16 @@ from stcal.sfm.observations import ImageObservations, face_of, is_board
 PALETTE = [(0, 159, 230), (115, 158, 0), (66, 228, 240), (167, 121, 204), (0, 94, 213), (178, 114, 0)]
 BOARD_COLOUR = (233, 180, 86)
 QUALITY = 82
+THUMBNAIL_PX = 1400
+THUMBNAIL_QUALITY = 80
+
+
+def thumbnail(grey: np.ndarray) -> tuple[np.ndarray, float]:
+    """A small JPEG (bytes as a uint8 array) of an 8-bit grey image, and its size over the image's."""
+    scale = min(1.0, THUMBNAIL_PX / grey.shape[1])
+    small = cv2.resize(grey, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA)
+    _, jpeg = cv2.imencode(".jpg", small, [cv2.IMWRITE_JPEG_QUALITY, THUMBNAIL_QUALITY])
+    return jpeg.ravel(), small.shape[1] / grey.shape[1]
 
 
 def draw_overlay(

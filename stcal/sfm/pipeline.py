@@ -3,7 +3,7 @@
 import json
 import shutil
 from collections.abc import Callable
-from dataclasses import asdict, dataclass, field, replace
+from dataclasses import replace
 from pathlib import Path
 
 import stcal
@@ -11,24 +11,22 @@ from stcal.camera_file import CameraModel, read_camera
 from stcal.design import BoardDesign, TargetDesign, reference_board, reference_target
 from stcal.design_file import load_board, load_target
 from stcal.errors import InputError
-from stcal.geometry.camera import Camera
 from stcal.geometry.rigid import Rigid, Similarity
-from stcal.sfm.chain import CalibratedTarget, Chain, chain_faces, measure_chains
+from stcal.sfm.chain import CalibratedTarget, chain_faces, measure_chains
 from stcal.sfm.database import image_ids, labels_csv, remove_database, write_database
-from stcal.sfm.detect.ellipses import EllipseOptions
 from stcal.sfm.detection import DetectionResult, detect_files, require_single, write_bytes
-from stcal.sfm.faces import FaceInGroup, FrameKind, faces_of_group
+from stcal.sfm.faces import faces_of_group
 from stcal.sfm.images import RUN_MARKER, find_images
 from stcal.sfm.joint import JointResult, adjust_jointly, calibrated_target
 from stcal.sfm.labels import LabelledImage, label_group
 from stcal.sfm.mapping import write_model
-from stcal.sfm.metric import Scale, find_scale
+from stcal.sfm.metric import find_scale
 from stcal.sfm.observations import ImageObservations, detections_csv
 from stcal.sfm.output import faces_json, report_json
 from stcal.sfm.overlay import draw_overlay
-from stcal.sfm.pairs import PairOptions
 from stcal.sfm.refine import eccentricity_px
 from stcal.sfm.report import report_html
+from stcal.sfm.result import RunOptions, RunResult
 from stcal.sfm.solve import GroupSolution, image_sigma_factor, require_usable, solve_group, with_sigma
 
 RESULTS = ("faces.json", "report.json", "report.html")
@@ -37,48 +35,6 @@ JOINT_ROUNDS = 2
 
 Progress = Callable[[str, int, int], None]
 """Called with (stage, done, total)."""
-
-
-@dataclass(frozen=True, slots=True)
-class RunOptions:
-    """``solve`` : ``joint`` (one adjustment over all groups) or ``chain`` (as in document 000, group by group);
-    ``frame`` : Z from the plane of all circles, or frames from three points; ``eccentricity`` : off for the uncorrected
-    control; ``reference_face`` : the design's first one where None; ``workers`` : processes, one per core where None.
-    """
-
-    solve: str = "joint"
-    frame: FrameKind = "plane"
-    eccentricity: bool = True
-    reference_face: str | None = None
-    pairs: PairOptions = field(default_factory=PairOptions)
-    ellipses: EllipseOptions = field(default_factory=EllipseOptions)
-    workers: int | None = None
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class RunResult:
-    """Everything a run found; ``target`` is the answer."""
-
-    out: Path
-    camera: Camera
-    colmap_model: str
-    target_design: TargetDesign
-    board_design: BoardDesign
-    options: RunOptions
-    detection: DetectionResult
-    labelled: tuple[LabelledImage, ...]
-    solutions: tuple[GroupSolution, ...]
-    scales: dict[str, Scale]
-    faces: tuple[FaceInGroup, ...]
-    target: CalibratedTarget
-    chains: dict[str, tuple[Chain, ...]]
-    joint: JointResult | None
-    sigma_factor: float
-    notes: tuple[str, ...]
-
-    def observations(self) -> list[ImageObservations]:
-        """Labelled centres of all images, in the database's order."""
-        return [each.observations for each in self.labelled]
 
 
 def run(
@@ -327,8 +283,3 @@ def _write(result: RunResult, tell: Progress) -> None:
 
 def _json(value: dict) -> bytes:
     return (json.dumps(value, indent=1, ensure_ascii=False, allow_nan=False) + "\n").encode()
-
-
-def options_json(options: RunOptions) -> dict:
-    """The options as plain values."""
-    return asdict(options)
