@@ -1,12 +1,17 @@
 """``stcal``, the umbrella command, and ``stcal-sfm``, its shortcut: errors become one line and an exit code."""
 
 import sys
+from typing import NoReturn
 
 import typer
 
 import stcal
 from stcal.cli import sfm
 from stcal.errors import StcalError
+
+INTERRUPTED = 130
+# Of Click, which newer versions of Typer carry inside.
+UsageError = next(c for c in typer.BadParameter.__mro__ if c.__name__ == "ClickException")
 
 app = typer.Typer(
     name="stcal",
@@ -40,21 +45,36 @@ def main_sfm() -> None:
 def _guarded(application: typer.Typer) -> None:
     debug = "--debug" in sys.argv
     arguments = [a for a in sys.argv[1:] if a != "--debug"]
+    for stream in (sys.stdout, sys.stderr):
+        if hasattr(stream, "reconfigure"):  # a terminal that has no µ must not end a run
+            stream.reconfigure(errors="replace")
     try:
-        application(args=arguments)
+        # Not standalone: Typer hands its errors on in place of drawing a box of several lines.
+        code = application(args=arguments, prog_name=application.info.name, standalone_mode=False)
+        if code == INTERRUPTED:  # Typer makes this of a KeyboardInterrupt
+            raise KeyboardInterrupt
+        sys.exit(code if isinstance(code, int) else 0)
     except StcalError as error:
         if debug:
             raise
-        print(f"error: {error}", file=sys.stderr)
-        sys.exit(error.exit_code)
-    except KeyboardInterrupt:
+        _fail(str(error), error.exit_code)
+    except UsageError as error:
+        if not error.format_message():  # no arguments at all: the answer is the help text
+            error.show()
+            sys.exit(error.exit_code)
+        where = error.ctx.command_path if error.ctx else application.info.name
+        _fail(f"{error.format_message().rstrip('.')}; `{where} --help` lists what there is", error.exit_code)
+    except (KeyboardInterrupt, typer.Abort):
         print("interrupted; finished detections are kept, run the same command again to go on", file=sys.stderr)
-        sys.exit(130)
+        sys.exit(INTERRUPTED)
     except OSError as error:
         if debug:
             raise
         where = f"{error.filename}: " if error.filename else ""
-        print(
-            f"error: {where}{error.strerror or error}; check the path, its rights and the free space", file=sys.stderr
-        )
-        sys.exit(2)
+        _fail(f"{where}{error.strerror or error}; check the path, its rights and the free space", 2)
+
+
+def _fail(message: str, code: int) -> NoReturn:
+    """One line, and the exit code."""
+    print(f"error: {' '.join(message.split())}", file=sys.stderr)
+    sys.exit(code)

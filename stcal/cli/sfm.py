@@ -28,7 +28,12 @@ CameraFile = Annotated[Path, typer.Option("--camera", help="COLMAP cameras.txt, 
 TargetFile = Annotated[Path | None, typer.Option("--target", help="target.toml; the reference design if not given.")]
 BoardFile = Annotated[Path | None, typer.Option("--board", help="board.toml; the reference board if not given.")]
 Workers = Annotated[int | None, typer.Option("--workers", min=1, help="Processes; one per core if not given.")]
-MinDiameter = Annotated[float, typer.Option("--min-diameter", min=4, help="Smallest circle sought, px.")]
+MinDiameter = Annotated[
+    float | None,
+    typer.Option(
+        "--min-diameter", min=4, help="Smallest circle sought, px; 4.5, and 9 over 8 megapixels, if not given."
+    ),
+]
 MaxDiameter = Annotated[float, typer.Option("--max-diameter", min=8, help="Largest circle sought, px.")]
 
 
@@ -54,23 +59,30 @@ def run(
     target: TargetFile = None,
     board: BoardFile = None,
     solve: Annotated[
-        Solve, typer.Option(help="joint: one adjustment over all groups; chain: group by group, as in the paper.")
-    ] = Solve.joint,
+        Solve | None,
+        typer.Option(
+            help="joint: one adjustment over all groups, the default; chain: group by group, as in the paper."
+        ),
+    ] = None,
     frame: Annotated[
-        Frame, typer.Option(help="Z from the plane of all circles of a face, or from three.")
-    ] = Frame.plane,
+        Frame | None,
+        typer.Option(
+            help="plane: Z from the plane of all circles of a face, the default; three-point: as in the paper."
+        ),
+    ] = None,
     reference_face: Annotated[
         str | None,
         typer.Option("--reference-face", help="Face whose frame is the target frame; the first if not given."),
     ] = None,
     eccentricity: Annotated[
-        bool, typer.Option("--eccentricity/--no-eccentricity", help="Off: the uncorrected result, as a control.")
+        bool,
+        typer.Option("--eccentricity/--no-eccentricity", help="Off: the uncorrected control, chained as in the paper."),
     ] = True,
     max_angle: Annotated[
         float,
         typer.Option("--max-angle", min=2, max=170, help="Largest median ray angle of the initial pair, degrees."),
     ] = 60.0,
-    min_diameter: MinDiameter = 6.0,
+    min_diameter: MinDiameter = None,
     max_diameter: MaxDiameter = 450.0,
     workers: Workers = None,
 ) -> None:
@@ -79,8 +91,8 @@ def run(
     from stcal.sfm.pairs import PairOptions
 
     options = pipeline.RunOptions(
-        solve=solve.value,
-        frame=frame.value,
+        solve=solve and solve.value,
+        frame=frame and frame.value,
         eccentricity=eccentricity,
         reference_face=reference_face,
         pairs=PairOptions(float(np.radians(max_angle))),
@@ -99,7 +111,7 @@ def detect(
     out: Annotated[Path, typer.Option("--out", help="Folder for detections.csv and overlays/.")] = Path("detect"),
     target: TargetFile = None,
     board: BoardFile = None,
-    min_diameter: MinDiameter = 6.0,
+    min_diameter: MinDiameter = None,
     max_diameter: MaxDiameter = 450.0,
     workers: Workers = None,
 ) -> None:
@@ -249,10 +261,10 @@ def demo(
     print(comparison_table(against(folder / "run", data / "truth.json")))
 
 
-def _ellipses(min_diameter: float, max_diameter: float):
+def _ellipses(min_diameter: float | None, max_diameter: float):
     from stcal.sfm.detect.ellipses import EllipseOptions
 
-    if max_diameter <= min_diameter:
+    if min_diameter is not None and max_diameter <= min_diameter:
         raise InputError(f"--max-diameter {max_diameter:g} px, more than --min-diameter {min_diameter:g} px needed")
     return EllipseOptions(min_diameter_px=min_diameter, max_diameter_px=max_diameter)
 

@@ -7,6 +7,7 @@ import numpy as np
 
 from stcal.errors import DegenerateError, InputError
 from stcal.geometry.align import align_rigid
+from stcal.geometry.arrays import frozen
 from stcal.geometry.rigid import Rigid
 from stcal.sfm.observations import face_of
 
@@ -37,6 +38,8 @@ def compare(run: str | Path, truth: str | Path) -> dict:
             f"reference face {found['reference_face']} in the run, {known['reference_face']} in the truth; "
             f"run again with --reference-face {known['reference_face']}"
         )
+    if not set(known["target_from_face"]) & set(found["target_from_face"]):
+        raise InputError(f"run {run}, truth {truth}: no face in common; give the truth of the same target")
     faces = {
         face_id: _face(face_id, found, known)
         for face_id in known["target_from_face"]
@@ -58,13 +61,17 @@ def _read(path: Path, what: str) -> dict:
         raise InputError(f"{what} {path}: {error.strerror or error}; give a finished run, and truth.json") from error
     except ValueError as error:
         raise InputError(f"{what} {path}: not JSON ({error}); give faces.json of a run, and truth.json") from error
-    wanted = ("unit", "reference_face", "target_from_face", "circles")
-    missing = [key for key in wanted if not isinstance(content, dict) or key not in content]
+    wanted = {"unit": str, "reference_face": str, "target_from_face": dict, "circles": dict}
+    missing = [key for key, kind in wanted.items() if not (isinstance(content, dict) and _is(content, key, kind))]
     if missing:
-        raise InputError(f"{what} {path}: no {', '.join(missing)}; its form is in data_layout.md")
+        raise InputError(f"{what} {path}: no {', '.join(missing)} as data_layout.md has it; give the right file")
     if content["unit"] != "mm":
-        raise InputError(f"{what} {path}: unit {content['unit']}, mm needed")
+        raise InputError(f"{what} {path}: unit {content['unit']}, mm needed; convert it")
     return content
+
+
+def _is(content: dict, key: str, kind: type) -> bool:
+    return isinstance(content.get(key), kind)
 
 
 def _face(face_id: str, found: dict, known: dict) -> dict:
@@ -72,10 +79,10 @@ def _face(face_id: str, found: dict, known: dict) -> dict:
         estimate = Rigid.from_matrix(found["target_from_face"][face_id])
         true = Rigid.from_matrix(known["target_from_face"][face_id])
         labels = [label for label in known["circles"] if face_of(label) == face_id and label in found["circles"]]
-        a = np.array([known["circles"][label] for label in labels], float).reshape(-1, 3)
-        b = np.array([found["circles"][label] for label in labels], float).reshape(-1, 3)
-    except (ValueError, TypeError) as error:
-        raise InputError(f"face {face_id}: {error}; a 4×4 matrix and circles of three numbers needed") from error
+        a, b = (frozen([each["circles"][k] for k in labels], what="circles").reshape(-1, 3) for each in (known, found))
+    except (ValueError, TypeError, InputError) as error:
+        reason = str(error)[:120]
+        raise InputError(f"face {face_id}: {reason}; a 4×4 matrix and circles of three numbers needed") from error
     shift = estimate.translation - true.translation
     turn = Rigid(estimate.rotation @ true.rotation.T)
     row = {

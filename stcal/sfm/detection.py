@@ -5,6 +5,7 @@ import io
 import json
 import os
 from collections.abc import Callable
+from concurrent.futures.process import BrokenProcessPool
 from dataclasses import asdict, dataclass, fields
 from pathlib import Path
 
@@ -72,7 +73,8 @@ def detect_files(
     camera = _sized(camera_model, files)
     cache.mkdir(parents=True, exist_ok=True)
     settings = _fingerprint(camera, target, board, options)
-    jobs = [(file, camera, target, board, options, settings, cache) for file in files]
+    size_from = "the camera file" if camera_model.width and camera_model.height else "the first readable image"
+    jobs = [(file, camera, size_from, target, board, options, settings, cache) for file in files]
     found: list[DetectedImage | Skipped | None] = [None] * len(files)
     pending = []
     for i, file in enumerate(files):
@@ -81,11 +83,17 @@ def detect_files(
             pending.append(i)
         elif progress:
             progress(file.name)
-    for k, outcome in run_parallel(_detect_file, [jobs[i] for i in pending], workers):
-        i = pending[k]
-        found[i] = outcome if isinstance(outcome, Skipped) else _load(files[i], cache / f"{outcome}.npz", reused=False)
-        if progress:
-            progress(files[i].name)
+    try:
+        for k, outcome in run_parallel(_detect_file, [jobs[i] for i in pending], workers):
+            i, skipped = pending[k], isinstance(outcome, Skipped)
+            found[i] = outcome if skipped else _load(files[i], cache / f"{outcome}.npz", reused=False)
+            if progress:
+                progress(files[i].name)
+    except BrokenProcessPool as error:
+        raise DetectionError(
+            f"detection in {len(pending)} images: a process was ended from outside, for lack of memory perhaps; "
+            "run again with fewer --workers, finished detections are kept"
+        ) from error
     images, skipped = _without_copies([f for f in found if f is not None])
     if not images:
         first = skipped[0]
@@ -135,6 +143,7 @@ def _kept(file: ImageFile, settings: str, cache: Path) -> DetectedImage | None:
 def _detect_file(
     file: ImageFile,
     camera: Camera,
+    size_from: str,
     target: TargetDesign,
     board: BoardDesign | None,
     options: EllipseOptions,
@@ -154,7 +163,7 @@ def _detect_file(
     if (width, height) != (camera.width, camera.height):
         return Skipped(
             file.name,
-            f"{width}×{height} px, but the camera file says {camera.width}×{camera.height} px; "
+            f"{width}×{height} px, but {size_from} says {camera.width}×{camera.height} px; "
             "use images as the camera took them, or the camera file that belongs to them",
         )
     try:

@@ -1,5 +1,11 @@
 """Find the image files, group by group, and decode them: pixels as the sensor gave them."""
 
+import contextlib
+import os
+import re
+import tempfile
+import zlib
+from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -13,6 +19,13 @@ TOP_GROUP = "."
 """Name of the group that images lying directly in the folder form."""
 RUN_MARKER = "stcal-run.json"
 """A folder that holds this file is a run's output and never a group of images."""
+
+_JPEG_MARKER = re.compile(rb"\xff[\x01-\xcf\xd8-\xfe]")
+"""A marker other than a restart, which stands inside a scan."""
+_DAMAGE = re.compile(
+    rb"(Corrupt JPEG data(?!: \d+ extraneous bytes before marker 0xd9)|Premature end|TIFF_Error)[^\n]*"
+)
+"""What decoders write to standard error and then go on; stray bytes before the end of a JPEG do no harm."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -54,8 +67,12 @@ def find_images(folder: str | Path) -> tuple[list[ImageFile], list[Skipped]]:
         else:
             _sort_in(path, path.name, TOP_GROUP, files, skipped)
     if not files:
+        # A folder in a folder says most: the images lie deeper than they should.
+        left_out = sorted(skipped, key=lambda s: not s.reason.startswith("a folder"))[:1]
+        hint = "".join(f" (left out {s.name}: {s.reason})" for s in left_out)
         raise InputError(
-            f"image folder {root}: no image ({', '.join(s[1:] for s in SUFFIXES)}); put them into {root}/<group>/"
+            f"image folder {root}: no image, one of {', '.join(s[1:] for s in SUFFIXES)}{hint}; "
+            f"put them into {root}/<group>/"
         )
     return files, skipped
 
@@ -63,12 +80,18 @@ def find_images(folder: str | Path) -> tuple[list[ImageFile], list[Skipped]]:
 def _sort_in(path: Path, name: str, group: str, files: list, skipped: list) -> None:
     if path.name.startswith("."):
         return
+    plain = name.encode("utf-8", "backslashreplace").decode()
     if path.is_dir():
-        skipped.append(Skipped(name, "a folder inside a group; images lie in <group>/ directly"))
-    elif path.suffix.lower() in SUFFIXES:
-        files.append(ImageFile(path, name, group))
+        skipped.append(Skipped(plain, "a folder inside a group; images lie in <group>/ directly"))
+    elif path.suffix.lower() not in SUFFIXES:
+        skipped.append(Skipped(plain, "not an image file"))
+    elif plain != name or any(ord(c) < 32 for c in name):
+        # No file of results could hold such a name.
+        skipped.append(Skipped(repr(plain)[1:-1], "its name is not UTF-8, or holds a control character; rename it"))
+    elif not path.is_file():
+        skipped.append(Skipped(name, "cannot be read: not a file, or a broken link"))
     else:
-        skipped.append(Skipped(name, "not an image file"))
+        files.append(ImageFile(path, name, group))
 
 
 def decode(data: bytes, name: str) -> np.ndarray:
@@ -83,25 +106,78 @@ def decode(data: bytes, name: str) -> np.ndarray:
         raise InputError(f"{name}: empty file (0 bytes); copy it again")
     if not _ends_properly(data):
         raise InputError(f"{name}: truncated ({len(data)} bytes); copy it again")
+    if _is_png(data) and not _png_intact(data):
+        raise InputError(f"{name}: damaged (a checksum is wrong); copy it again")
     flags = cv2.IMREAD_GRAYSCALE | cv2.IMREAD_ANYDEPTH | cv2.IMREAD_IGNORE_ORIENTATION
-    try:
-        image = cv2.imdecode(np.frombuffer(data, np.uint8), flags)
-    except cv2.error:
-        image = None
+    with _decoder_messages() as messages:
+        try:
+            image = cv2.imdecode(np.frombuffer(data, np.uint8), flags)
+        except cv2.error:
+            image = None
     if image is None:
-        raise InputError(f"{name}: not readable as an image; convert it to one of {', '.join(SUFFIXES)}")
+        raise InputError(f"{name}: not readable as an image; copy it again, or convert it to {', '.join(SUFFIXES)}")
+    if damage := _DAMAGE.search(messages):
+        raise InputError(f"{name}: damaged ({damage[0].decode(errors='replace').strip()}); copy it again")
     if image.dtype not in (np.uint8, np.uint16):
         raise InputError(f"{name}: pixels of type {image.dtype}; 8 or 16 bit needed")
     return image
 
 
+@contextlib.contextmanager
+def _decoder_messages() -> Iterator[bytearray]:
+    """What libraries in C write to standard error meanwhile: the only sign that a decoder made something up."""
+    messages = bytearray()
+    try:
+        kept = os.dup(2)
+    except OSError:  # there is no standard error
+        yield messages
+        return
+    with tempfile.TemporaryFile() as caught:
+        os.dup2(caught.fileno(), 2)
+        try:
+            yield messages
+        finally:
+            os.dup2(kept, 2)
+            os.close(kept)
+            caught.seek(0)
+            messages += caught.read()
+
+
+def _is_png(data: bytes) -> bool:
+    return data[:8] == b"\x89PNG\r\n\x1a\n"
+
+
+def _png_intact(data: bytes) -> bool:
+    """Whether every chunk has the checksum that it states."""
+    at = 8
+    while at + 12 <= len(data):
+        end = at + 8 + int.from_bytes(data[at : at + 4], "big")
+        if zlib.crc32(data[at + 4 : end]) != int.from_bytes(data[end : end + 4], "big"):
+            return False
+        if data[at + 4 : at + 8] == b"IEND":
+            return True
+        at = end + 4
+    return False
+
+
 def _ends_properly(data: bytes) -> bool:
     """Whether a JPEG, PNG or BMP is there to its end: decoders fill up what is missing without a word."""
     if data[:2] == b"\xff\xd8":
-        # A marker inside entropy-coded data is escaped: the last scan must be followed by an end of image.
-        return data.rfind(b"\xff\xd9") > data.rfind(b"\xff\xda")
-    if data[:8] == b"\x89PNG\r\n\x1a\n":
+        return _jpeg_ends(data)
+    if _is_png(data):
         return data.rfind(b"IEND") > 0
     if data[:2] == b"BM" and len(data) >= 6:
         return len(data) >= int.from_bytes(data[2:6], "little")
     return True
+
+
+def _jpeg_ends(data: bytes) -> bool:
+    """Whether the image's own end marker is there; a thumbnail before it, or a video after it, has others."""
+    at = 2
+    while marker := _JPEG_MARKER.search(data, at):
+        kind, at = data[marker.end() - 1], marker.end()
+        if kind == 0xD9:
+            return True
+        if kind not in (0x01, 0xD8):
+            at += max(int.from_bytes(data[at : at + 2], "big"), 2)
+    return False

@@ -73,6 +73,13 @@ def _no_pair(group, scores: list[PairScore], options: PairOptions) -> str:
             f"{where}: the camera did not move (largest median ray angle {np.degrees(angle):.2f}°, "
             f"{np.degrees(MIN_ANGLE_RAD):.0f}° needed); take the photographs from different places"
         )
+    behind = [s for s in scores if MIN_ANGLE_RAD <= s.median_angle_rad <= options.max_angle_rad]
+    if behind:
+        best = max(behind, key=lambda s: s.in_front)
+        return (
+            f"{where}: {best.first}, {best.second}: {best.verdict}; check that the camera file belongs to the images, "
+            "and that nothing but the camera moved"
+        )
     smallest = min(s.median_angle_rad for s in scores if s.median_angle_rad > 0)
     return (
         f"{where} with a median ray angle of {np.degrees(MIN_ANGLE_RAD):.0f}° to "
@@ -95,12 +102,14 @@ def _score(a: ImageObservations, b: ImageObservations, camera: Camera, options: 
     cosine = (to_a * to_b).sum(1) / np.maximum(np.linalg.norm(to_a, axis=1) * np.linalg.norm(to_b, axis=1), 1e-300)
     angle = float(np.median(np.arccos(np.clip(cosine, -1, 1))))
     in_front, forward = float(front.mean()), float(abs(pose.translation[2]))
-    # Points that hardly move between the images leave the translation undetermined: pure rotation looks like this.
-    if in_front < MIN_IN_FRONT and angle >= MIN_ANGLE_RAD:
-        verdict = f"{100 * in_front:.0f} % of the points in front of both cameras, {100 * MIN_IN_FRONT:.0f} % needed"
-    elif angle < MIN_ANGLE_RAD or _is_rotation(xy_a, xy_b, camera):
+    # Where a rotation explains the pair, noise alone fixes the translation: angles and depths mean nothing then.
+    if _is_rotation(xy_a, xy_b, camera):
         angle = min(angle, MIN_ANGLE_RAD / 2)
+        verdict = "a mere rotation explains the pair: the camera hardly moved"
+    elif angle < MIN_ANGLE_RAD:
         verdict = f"median angle under {np.degrees(MIN_ANGLE_RAD):.0f}°: the camera hardly moved"
+    elif in_front < MIN_IN_FRONT:
+        verdict = f"{100 * in_front:.0f} % of the points in front of both cameras, {100 * MIN_IN_FRONT:.0f} % needed"
     elif angle > options.max_angle_rad:
         verdict = f"median angle over the limit of {np.degrees(options.max_angle_rad):.0f}°"
     else:

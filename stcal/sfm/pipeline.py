@@ -60,13 +60,11 @@ def run(
     StcalError
         One of its kinds, with a one-line message that says what to do.
     """
-    options = options or RunOptions()
     tell = progress or (lambda *_: None)
     model = camera if isinstance(camera, CameraModel) else read_camera(camera)
     target = load_design(target, reference_target, load_target)
     board = load_design(board, reference_board, load_board)
-    reference = options.reference_face or target.faces[0].id
-    target.face(reference)
+    options = (options or RunOptions()).settled(target)
     out = claim_folder(out)
 
     detection, labelled = detect(images, model, out, target, board, options, tell)
@@ -90,7 +88,7 @@ def run(
         )
         faces += found
         notes += missing
-    calibrated = chain_faces(faces, target, reference)
+    calibrated = chain_faces(faces, target, options.reference_face)
     factor = image_sigma_factor([s.model for s in solutions], detection.camera)
     joint = None
     if options.solve == "joint":

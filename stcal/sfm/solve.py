@@ -3,6 +3,7 @@
 import hashlib
 import io
 import json
+from collections.abc import Sequence
 from dataclasses import asdict, dataclass, fields, replace
 from pathlib import Path
 
@@ -13,6 +14,7 @@ from stcal.errors import MappingError
 from stcal.geometry.camera import Camera
 from stcal.geometry.rigid import Rigid
 from stcal.sfm.detection import write_bytes
+from stcal.sfm.images import SUFFIXES, TOP_GROUP, Skipped
 from stcal.sfm.mapping import map_group
 from stcal.sfm.model import GroupModel
 from stcal.sfm.observations import ImageObservations, is_board
@@ -37,6 +39,29 @@ class GroupSolution:
     rounds: int
     left_out: dict[str, str]
     outliers: tuple[Outlier, ...]
+
+
+def require_groups(groups: dict[str, list[ImageObservations]], skipped: Sequence[Skipped]) -> None:
+    """Refuse groups that cannot be solved, those of which every image was skipped included; before anything is mapped.
+
+    Raises
+    ------
+    MappingError
+        No image or one, no board, or no face in a whole group.
+    """
+    lost: dict[str, list[Skipped]] = {}
+    for each in skipped:
+        # A folder of mere copies is no group of its own.
+        group = each.name.rpartition("/")[0] or TOP_GROUP
+        if each.name.lower().endswith(SUFFIXES) and (group in groups or not each.reason.startswith("the same image")):
+            lost.setdefault(group, []).append(each)
+    for name in sorted(groups.keys() | lost.keys()):
+        group, first = groups.get(name, []), lost.get(name, [])[:1]
+        if len(group) < 2:
+            usable = f"1 usable image ({group[0].name})" if group else "0 usable images"
+            why = "".join(f", not {s.name}: {s.reason}" for s in first)
+            raise MappingError(f"group {name}: {usable}, 2 needed{why}; add photographs from other places")
+        require_usable(group)
 
 
 def require_usable(group: list[ImageObservations]) -> None:

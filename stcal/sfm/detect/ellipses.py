@@ -14,8 +14,19 @@ WINDOWS_PX = (41, 193)
 WINDOW_OVER_DIAMETER = 3.0
 """A blob must be this much smaller than the window, or it pulls the mean up to itself."""
 HALF_SCALE_FROM_PX = 8_000_000
-"""Images of more pixels start the pyramid at half scale: what is 6 px across is still 3 px there."""
+"""Images of more pixels start the pyramid at half scale, unless smaller circles are asked for …"""
+MIN_DIAMETER_AT_HALF_SCALE_PX = 9.0
+"""… than these."""
+MIN_DIAMETER_PX = 4.5
+"""Of the circle of the same area: a circle 8 px across at 70° has 4.7."""
+DOUBLE_SCALE_BELOW_PX = 1_500_000
+"""Images of fewer pixels start at double scale: the outline of a small ellipse is coarse."""
+REACH_PX = 11
+OUTLINE_LEVEL = 0.45
+"""Outlines run at this fraction of the highest value within reach."""
 MIN_LEVEL_DIAMETER_PX = 3.0
+MIN_COARSE_DIAMETER_PX = 24.0
+"""Smaller ones were sought on the level before, where outlines tell more."""
 MAX_OUTLINE_DEVIATION = 0.025
 """RMS deviation of the outline from the ellipse, in units of its radius (a square has 0.07) …"""
 MAX_OUTLINE_DEVIATION_PX = 0.45
@@ -26,12 +37,13 @@ MAX_OUTLINE_DEVIATION_PX = 0.45
 class EllipseOptions:
     """What counts as a candidate.
 
-    ``min_diameter_px``, ``max_diameter_px`` : mean diameter in the image;
+    ``min_diameter_px``, ``max_diameter_px`` : diameter of the circle of the same area; where None, the smallest is
+    4.5 px, and 9 px in images over 8 megapixels;
     ``min_axis_ratio`` : minor over major axis (cos 70° is 0.34; blur and pixels take some more);
     ``min_contrast`` : inside against surroundings, as a fraction of the image's grey range.
     """
 
-    min_diameter_px: float = 6.0
+    min_diameter_px: float | None = None
     max_diameter_px: float = 450.0
     min_axis_ratio: float = 0.2
     min_contrast: float = 0.08
@@ -71,12 +83,19 @@ def find_ellipses(image: np.ndarray, polarity: Polarity, options: EllipseOptions
     """Blobs of one polarity with an elliptic outline, in an 8-bit grey image; centres good to about 0.1 px."""
     low, high = np.percentile(image[::8, ::8], [0.5, 99.9])
     threshold = max(4.0, options.min_contrast * (max(high, 1.0) - low))
-    scale = 1
+    full, scale, minimum = image, 1.0, options.min_diameter_px
+    if image.size > HALF_SCALE_FROM_PX and (minimum is None or minimum >= MIN_DIAMETER_AT_HALF_SCALE_PX):
+        minimum = minimum or MIN_DIAMETER_AT_HALF_SCALE_PX
+        image, scale = cv2.resize(image, None, fx=0.5, fy=0.5, interpolation=cv2.INTER_AREA), 2.0
+    elif image.size < DOUBLE_SCALE_BELOW_PX:
+        image, scale = cv2.resize(image, None, fx=2, fy=2, interpolation=cv2.INTER_CUBIC), 0.5
+    minimum = minimum or MIN_DIAMETER_PX
     found = []
-    full = image
     while True:
-        if not (scale == 1 and image.size > HALF_SCALE_FROM_PX):
-            found.append(_level(image, scale, polarity, threshold, options))
+        # Both of the first two levels of a small image look for everything: the coarser one sees less noise.
+        fine = not found or scale <= 1
+        smallest = max(MIN_LEVEL_DIAMETER_PX, minimum / scale) if fine else MIN_COARSE_DIAMETER_PX
+        found.append(_level(image, scale, polarity, threshold, smallest, options))
         if options.max_diameter_px / scale <= WINDOWS_PX[-1] / WINDOW_OVER_DIAMETER or min(image.shape) < 16:
             break
         scale *= 2
@@ -101,16 +120,23 @@ def _contrast(image: np.ndarray, centre: np.ndarray, shape: np.ndarray) -> np.nd
     return sample(0.4, 0.0) - sample(1.25, 2.0)
 
 
-def _level(image, scale: int, polarity: Polarity, threshold: float, options: EllipseOptions) -> np.ndarray:
+def _level(
+    image, scale: float, polarity: Polarity, threshold: float, smallest: float, options: EllipseOptions
+) -> np.ndarray:
     """Rows (x, y, full axis 1, full axis 2, angle of axis 1 in degrees) in px of the full image."""
     smooth = cv2.GaussianBlur(image, (3, 3), 0)
-    lowest = max(options.min_diameter_px / scale, MIN_LEVEL_DIAMETER_PX)
+    lowest = max((options.min_diameter_px or 0) / scale, smallest)
     rows = []
     for window in WINDOWS_PX:
         highest = min(options.max_diameter_px / scale, window / WINDOW_OVER_DIAMETER)
         mean = cv2.blur(smooth, (window, window), borderType=cv2.BORDER_REFLECT)
         difference = cv2.subtract(smooth, mean) if polarity == "bright" else cv2.subtract(mean, smooth)
-        mask = cv2.compare(difference, threshold, cv2.CMP_GT)
+        # An outline at half the blob's own height neither grows with blur nor runs into a neighbour.
+        height = cv2.dilate(difference, np.ones((REACH_PX, REACH_PX), np.uint8))
+        mask = cv2.bitwise_and(
+            cv2.compare(difference, threshold, cv2.CMP_GT),
+            cv2.compare(difference, cv2.convertScaleAbs(height, alpha=OUTLINE_LEVEL), cv2.CMP_GT),
+        )
         rows += _outlines(mask, lowest, highest, options.min_axis_ratio)
     table = np.array(rows).reshape(-1, 5)
     table[:, :2] = table[:, :2] * scale + (scale - 1) / 2

@@ -1,0 +1,105 @@
+"""Small data sets with pixels, made once, and the command line in this process."""
+
+import shutil
+import sys
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import pytest
+
+from stcal.cli.main import main_sfm
+from stcal.sfm.pipeline import RunOptions, run
+from stcal.synthetic.dataset import write_dataset
+from stcal.synthetic.scene import Scene, SceneOptions, make_scene
+
+SMALL = SceneOptions(seed=3, width=1296, height=864, images_per_group=4, groups=(("1", "2"), ("1", "4")))
+
+
+@pytest.fixture(scope="session")
+def small_scene() -> Scene:
+    """The reference design in groups 12 and 14, four images of 1296×864 px each."""
+    return make_scene(SMALL)
+
+
+@pytest.fixture(scope="session")
+def small_dataset(small_scene, tmp_path_factory) -> Path:
+    """``small_scene`` as a folder. Not to be written to: see ``small_set``."""
+    folder = tmp_path_factory.mktemp("small") / "data"
+    write_dataset(folder, small_scene, workers=1)
+    return folder
+
+
+@pytest.fixture(scope="session")
+def small_run(small_dataset, tmp_path_factory) -> Path:
+    """A finished run of ``small_dataset``. Not to be written to."""
+    out = tmp_path_factory.mktemp("small_run") / "run"
+    data = small_dataset
+    run(data / "images", data / "cameras.txt", out, data / "target.toml", data / "board.toml", RunOptions(workers=1))
+    return out
+
+
+@pytest.fixture(scope="session")
+def other_pair_scene(small_scene) -> Scene:
+    """The same target and camera, faces 3 and 4 in view."""
+    scene = make_scene(replace(SMALL, images_per_group=3, groups=(("3", "4"),)))
+    assert scene.circles_target["1:1"].tolist() == small_scene.circles_target["1:1"].tolist()
+    return scene
+
+
+@dataclass(frozen=True)
+class SmallSet:
+    """A data set of one's own to spoil."""
+
+    folder: Path
+
+    @property
+    def images(self) -> Path:
+        return self.folder / "images"
+
+    @property
+    def camera(self) -> Path:
+        return self.folder / "cameras.txt"
+
+    @property
+    def out(self) -> Path:
+        return self.folder / "run"
+
+    def image(self, i: int = 0, group: str = "12") -> Path:
+        return self.images / group / f"IMG_{1000 + i}.jpg"
+
+    def arguments(self, *more) -> list:
+        """Of ``stcal-sfm run``."""
+        return ["run", self.images, "--camera", self.camera, "--out", self.out, "--workers", 1, *more]
+
+
+@pytest.fixture
+def small_set(small_dataset, small_run, tmp_path):
+    """Factory: a copy of ``small_dataset`` with some of its groups, its images detected already if asked for."""
+
+    def copy(*groups: str, detected: bool = True) -> SmallSet:
+        own = SmallSet(tmp_path / "set")
+        own.images.mkdir(parents=True)
+        for group in groups:
+            shutil.copytree(small_dataset / "images" / group, own.images / group)
+        for name in ("cameras.txt", "target.toml", "board.toml", "truth.json"):
+            shutil.copy(small_dataset / name, own.folder / name)
+        if detected:
+            shutil.copytree(small_run / "cache", own.out / "cache")
+            shutil.copy(small_run / "stcal-run.json", own.out)
+        return own
+
+    return copy
+
+
+@pytest.fixture
+def stcal_sfm(monkeypatch, capfd):
+    """``stcal-sfm`` with arguments, in this process: exit code, text on standard output and on standard error."""
+
+    def call(*arguments) -> tuple[int, str, str]:
+        monkeypatch.setattr(sys, "argv", ["stcal-sfm", *map(str, arguments)])
+        with pytest.raises(SystemExit) as ended:
+            main_sfm()
+        streams = capfd.readouterr()
+        return ended.value.code or 0, streams.out, streams.err
+
+    return call

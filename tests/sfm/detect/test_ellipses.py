@@ -1,0 +1,78 @@
+"""Candidates of either polarity, from 8 to 400 px across, and what is none."""
+
+import cv2
+import numpy as np
+import pytest
+
+from stcal.sfm.detect.ellipses import EllipseOptions, find_ellipses
+
+
+def picture(size=(900, 1200), level=40):
+    return np.full(size, level, np.uint8)
+
+
+def add_ellipse(image, centre, axes, angle=0.0, value=200):
+    """Anti-aliased: drawn eight times finer and averaged."""
+    big = np.zeros((int(2 * max(axes)) + 12, int(2 * max(axes)) + 12))
+    half = big.shape[0] // 2
+    fine = np.zeros((big.shape[0] * 8,) * 2, np.uint8)
+    cv2.ellipse(fine, (half * 8, half * 8), (int(axes[0] * 8), int(axes[1] * 8)), angle, 0, 360, 255, -1)
+    share = cv2.resize(fine, big.shape[::-1], interpolation=cv2.INTER_AREA) / 255.0
+    y, x = int(centre[1]) - half, int(centre[0]) - half
+    patch = image[y : y + big.shape[0], x : x + big.shape[1]]
+    patch[:] = np.round(patch + share * (float(value) - patch)).astype(np.uint8)
+    return image
+
+
+@pytest.mark.parametrize("polarity", ["bright", "dark"])
+@pytest.mark.parametrize("diameter", [8, 15, 40, 120, 400])
+def test_every_size_is_found(polarity, diameter):
+    level, value = (40, 200) if polarity == "bright" else (200, 40)
+    image = add_ellipse(picture(level=level), (600, 450), (diameter / 2, diameter / 2), value=value)
+    found = find_ellipses(cv2.GaussianBlur(image, (3, 3), 0.8), polarity, EllipseOptions())
+    assert len(found) == 1
+    assert np.linalg.norm(found.centre_px[0] - [600, 450]) < 0.02 * diameter + 1
+    assert found.radius_px()[0] == pytest.approx(diameter / 2, rel=0.1, abs=0.8)
+    assert found.contrast[0] == pytest.approx(160, abs=40)
+
+
+@pytest.mark.parametrize("tilt_deg", [30, 60, 70])
+def test_a_tilted_circle_keeps_its_shape(tilt_deg):
+    image = add_ellipse(picture(), (600, 450), (30, 30 * np.cos(np.radians(tilt_deg))), angle=35)
+    found = find_ellipses(image, "bright", EllipseOptions())
+    assert len(found) == 1
+    axes = np.linalg.eigvalsh(found.shape_px[0])
+    assert axes[0] / axes[1] == pytest.approx(np.cos(np.radians(tilt_deg)), abs=0.06)
+
+
+def test_the_other_polarity_is_not_seen():
+    image = add_ellipse(picture(), (600, 450), (20, 20))
+    assert len(find_ellipses(image, "dark", EllipseOptions())) == 0
+
+
+def test_squares_and_bars_are_no_ellipses():
+    image = picture()
+    cv2.rectangle(image, (200, 200), (260, 260), 200, -1)
+    cv2.rectangle(image, (500, 200), (700, 215), 200, -1)
+    assert len(find_ellipses(image, "bright", EllipseOptions())) == 0
+
+
+def test_what_is_cut_by_the_border_is_left_out():
+    image = picture()
+    cv2.circle(image, (5, 400), 25, 200, -1)
+    assert len(find_ellipses(image, "bright", EllipseOptions())) == 0
+
+
+def test_size_limits_are_kept():
+    image = add_ellipse(add_ellipse(picture(), (300, 300), (10, 10)), (700, 500), (60, 60))
+    found = find_ellipses(image, "bright", EllipseOptions(min_diameter_px=40))
+    assert [round(r) for r in found.radius_px()] == [60]
+
+
+def test_faint_blobs_are_left_out_against_bright_ones():
+    image = add_ellipse(add_ellipse(picture(), (300, 300), (20, 20), value=240), (700, 500), (20, 20), value=48)
+    assert len(find_ellipses(image, "bright", EllipseOptions())) == 1
+
+
+def test_a_plain_image_has_none():
+    assert len(find_ellipses(picture(), "bright", EllipseOptions())) == 0

@@ -1,0 +1,225 @@
+"""Faces and boards among candidates, without pixels: naming, hiding, reflections, clutter, numbering."""
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from stcal.design import BoardDesign, FaceDesign, TargetDesign, reference_board, reference_target
+from stcal.geometry.camera import Camera
+from stcal.geometry.conic import circle_conic, ellipse_of_conic
+from stcal.geometry.rigid import Rigid
+from stcal.sfm.detect.board import find_boards
+from stcal.sfm.detect.candidates import Candidates
+from stcal.sfm.detect.ellipses import Ellipses
+from stcal.sfm.detect.faces import FaceFinder
+from stcal.sfm.detect.likeness import confusable, is_named
+
+CAMERA = Camera(2592, 1728, [2785.0, 2785.0], [1295.5, 863.5], np.zeros(8))
+TARGET = reference_target()
+BOARD = reference_board()
+
+
+def pose(tilt_deg=40.0, azimuth_deg=30.0, roll_deg=0.0, x=0.0, y=0.0, depth=1000.0, facing=True):
+    """camera_from_plane with the plane's Z towards the camera (faces) or away from it (boards)."""
+    base = Rotation.from_euler("x", 180 if facing else 0, degrees=True)
+    tilt = Rotation.from_rotvec(
+        np.radians(tilt_deg) * np.array([np.cos(np.radians(azimuth_deg)), np.sin(np.radians(azimuth_deg)), 0])
+    )
+    return Rigid((tilt * base * Rotation.from_euler("z", roll_deg, degrees=True)).as_matrix(), [x, y, depth])
+
+
+def ellipses_of(camera_from_plane, xy_mm, radius_mm, contrast=100.0):
+    """Exact ellipses of circles in a plane."""
+    centres, shapes = [], []
+    for (x, y), r in zip(xy_mm, radius_mm, strict=True):
+        conic = circle_conic(camera_from_plane @ np.array([x, y, 0.0]), camera_from_plane.rotation[:, 2], r)
+        centre, shape = ellipse_of_conic(conic)
+        centres.append(centre * CAMERA.focal + CAMERA.centre)
+        shapes.append(shape * CAMERA.focal[0])
+    return Ellipses(np.array(centres), np.array(shapes), np.full(len(centres), contrast))
+
+
+def joined(*parts):
+    return Ellipses(
+        np.concatenate([p.centre_px for p in parts]),
+        np.concatenate([p.shape_px for p in parts]),
+        np.concatenate([p.contrast for p in parts]),
+    )
+
+
+def junk(count, seed=0, contrast=100.0):
+    rng = np.random.default_rng(seed)
+    size = rng.uniform(4, 40, count)
+    return Ellipses(
+        rng.uniform(20, [2570, 1700], (count, 2)), size[:, None, None] * np.eye(2), np.full(count, contrast)
+    )
+
+
+def face_ellipses(face_id, camera_from_face, hidden=(), **kwargs):
+    face = TARGET.face(face_id)
+    keep = [i for i, circle in enumerate(face.ids) if circle not in hidden]
+    return ellipses_of(camera_from_face, face.xy_mm[keep], face.radius_mm[keep], **kwargs)
+
+
+def find_faces(ellipses, **kwargs):
+    return FaceFinder(TARGET).find(Candidates.of(ellipses, CAMERA), **kwargs)
+
+
+@pytest.mark.parametrize("face_id", ["1", "2", "3", "4", "5"])
+@pytest.mark.parametrize(("tilt", "azimuth", "roll"), [(0, 0, 0), (45, 80, 100), (68, 200, 250)])
+def test_every_face_is_named_at_any_tilt(face_id, tilt, azimuth, roll):
+    finding = find_faces(face_ellipses(face_id, pose(tilt, azimuth, roll)))
+    assert [r.face.id for r in finding.faces] == [face_id]
+    assert finding.faces[0].index.tolist() == list(range(10))
+
+
+@pytest.mark.parametrize("hidden", [("1",), ("a",), ("3", "5"), ("6", "7"), ("b", "4")])
+def test_up_to_two_hidden_circles_leave_the_name(hidden):
+    finding = find_faces(face_ellipses("4", pose(50, 120, 30), hidden))
+    assert [r.face.id for r in finding.faces] == ["4"]
+    assert finding.faces[0].count() == 10 - len(hidden)
+    missing = [TARGET.face("4").ids[i] for i in np.flatnonzero(finding.faces[0].index < 0)]
+    assert set(missing) == set(hidden)
+
+
+def test_without_the_circle_that_tells_the_faces_apart_nothing_is_named():
+    finding = find_faces(face_ellipses("3", pose(), hidden=("c",)))
+    assert finding.faces == ()
+    assert any("tell the faces apart" in note for note in finding.notes)
+
+
+def test_three_hidden_circles_are_too_many():
+    assert find_faces(face_ellipses("3", pose(), hidden=("1", "2", "6"))).faces == ()
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_random_discs_are_no_faces_and_hide_none(seed):
+    assert find_faces(junk(150, seed)).faces == ()
+    finding = find_faces(joined(junk(150, seed), face_ellipses("2", pose(60, 40, 200))))
+    assert [r.face.id for r in finding.faces] == ["2"]
+    assert (finding.faces[0].index >= 150).all()
+
+
+def test_a_mirror_image_is_not_seen_as_another_face():
+    """Swapping x and y turns the pattern of face 5 into that of face 3: its faint reflection must not be named."""
+    mirrored = TARGET.face("5").xy_mm[:, ::-1]
+    reflection = ellipses_of(pose(40, 10, 0, x=-250), mirrored, TARGET.face("5").radius_mm, contrast=30.0)
+    finding = find_faces(joined(face_ellipses("5", pose(30, 0, 0, x=200)), reflection))
+    assert [r.face.id for r in finding.faces] == ["5"]
+    assert any("reflection" in note for note in finding.notes)
+    assert find_faces(reflection, contrast=100.0).faces == ()
+
+
+def test_a_face_in_view_twice_is_reported_and_not_labelled():
+    finding = find_faces(joined(face_ellipses("1", pose(x=-200)), face_ellipses("1", pose(x=150))))
+    assert finding.repeated == ("1",)
+    assert finding.faces == ()
+
+
+def test_which_circles_name_a_face():
+    face = TARGET.face("2")
+    found = np.ones(10, bool)
+    assert is_named(face, found, TARGET)
+    found[face.ids.index("c")] = False
+    assert not is_named(face, found, TARGET)
+    assert all(any(len(s) == 9 for s in sets) for sets in confusable(TARGET).values())
+
+
+def test_a_face_that_looks_the_same_after_half_a_turn_is_never_named():
+    xy = [[0, 0], [30, 0], [60, 0], [0, 40], [30, 40], [60, 40]]
+    square = FaceDesign("s", tuple("abcdef"), xy, [5.0] * 6, "a", "c", "d")
+    target = TargetDesign("symmetric", "bright", (square,))
+    finding = FaceFinder(target).find(Candidates.of(ellipses_of(pose(), square.xy_mm, square.radius_mm), CAMERA))
+    assert finding.faces == ()
+
+
+# Boards ---------------------------------------------------------------------------------------------------------
+
+CORNERS = (np.array([[-0.5, -0.5], [2591.5, -0.5], [2591.5, 1727.5], [-0.5, 1727.5]]) - CAMERA.centre) / CAMERA.focal
+
+
+def board_ellipses(board, camera_from_board, hidden=()):
+    keep = [i for i in range(board.rows * board.columns) if divmod(i, board.columns) not in hidden]
+    centred = board.xy_mm() - board.xy_mm().mean(0)
+    return keep, ellipses_of(camera_from_board, centred[keep], board.radii_mm()[keep])
+
+
+def find(ellipses, board):
+    return find_boards(Candidates.of(ellipses, CAMERA), board, CORNERS)
+
+
+def cells_of(reading, keep, board, numbering=0):
+    return {keep[c]: tuple(rc) for c, rc in zip(reading.candidates, reading.numberings[numbering], strict=True)}
+
+
+@pytest.mark.parametrize(("tilt", "azimuth", "roll"), [(0, 0, 0), (45, 80, 100), (65, 200, 30)])
+def test_a_plain_board_is_numbered_up_to_half_a_turn(tilt, azimuth, roll):
+    keep, ellipses = board_ellipses(BOARD, pose(tilt, azimuth, roll, facing=False))
+    (reading,) = find(ellipses, BOARD)
+    assert reading.numberings.shape == (2, 63, 2)
+    truth = {i: divmod(i, 9) for i in range(63)}
+    turned = {i: (6 - r, 8 - c) for i, (r, c) in truth.items()}
+    both = [cells_of(reading, keep, BOARD, k) for k in range(2)]
+    assert truth in both
+    assert turned in both
+
+
+def test_a_square_plain_board_has_four_numberings():
+    square = BoardDesign(7, 7, 30.0, 7.5, "bright", 0.005)
+    _, ellipses = board_ellipses(square, pose(30, 20, 10, facing=False))
+    (reading,) = find(ellipses, square)
+    assert len(reading.numberings) == 4
+
+
+@pytest.mark.parametrize("corner", [(0, 0), (0, 9), (9, 0), (9, 9)])
+def test_a_larger_corner_dot_settles_the_numbering(corner):
+    board = BoardDesign(10, 10, 20.0, 5.0, "dark", 0.05, corner, 7.5)
+    keep, ellipses = board_ellipses(board, pose(40, 60, 70, facing=False))
+    (reading,) = find(ellipses, board)
+    assert len(reading.numberings) == 1
+    assert cells_of(reading, keep, board) == {i: divmod(i, 10) for i in range(100)}
+
+
+def test_hidden_dots_do_not_shift_the_numbering():
+    hidden = {(0, 0), (3, 4)}
+    keep, ellipses = board_ellipses(BOARD, pose(45, 80, 20, facing=False), hidden)
+    (reading,) = find(ellipses, BOARD)
+    truth = {i: divmod(i, 9) for i in keep}
+    assert truth in [cells_of(reading, keep, BOARD, k) for k in range(len(reading.numberings))]
+
+
+def test_a_hidden_strip_leaves_both_readings_open():
+    """Nothing in the image tells on which side the hidden column was."""
+    hidden = {(r, 0) for r in range(7)}
+    keep, ellipses = board_ellipses(BOARD, pose(20, 80, 0, facing=False), hidden)
+    (reading,) = find(ellipses, BOARD)
+    numberings = [cells_of(reading, keep, BOARD, k) for k in range(len(reading.numberings))]
+    assert {i: divmod(i, 9) for i in keep} in numberings
+    assert len(numberings) == 4
+
+
+def test_a_strip_cut_off_by_the_image_is_known():
+    """The column beyond the border is the missing one: the other side is in view and empty."""
+    camera_from_board = pose(0, 0, 0, x=-365, facing=False)
+    keep, ellipses = board_ellipses(BOARD, camera_from_board)
+    inside = ellipses.centre_px[:, 0] - ellipses.radius_px() > 0
+    keep = [k for k, ok in zip(keep, inside, strict=True) if ok]
+    assert 0 < 63 - len(keep) <= 14
+    (reading,) = find(ellipses.select(inside), BOARD)
+    numberings = [cells_of(reading, keep, BOARD, k) for k in range(len(reading.numberings))]
+    truth = {i: divmod(i, 9) for i in keep}
+    assert truth in numberings
+    # The other one is the same place after half a turn of the board; no numbering is shifted by a column.
+    assert len(numberings) == 2
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_discs_around_the_board_are_not_taken_into_it(seed):
+    keep, ellipses = board_ellipses(BOARD, pose(45, 80, 20, facing=False))
+    readings = find(joined(ellipses, junk(120, seed)), BOARD)
+    assert len(readings) == 1
+    assert set(readings[0].candidates) == set(range(len(keep)))
+
+
+def test_random_discs_are_no_board():
+    assert find(junk(300, 1), BOARD) == []

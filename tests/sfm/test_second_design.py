@@ -1,0 +1,55 @@
+"""Another maker's target is a file and not a code change: the second design through its TOML files alone."""
+
+import numpy as np
+import pytest
+
+from stcal.design_file import load_board, load_target
+from stcal.sfm import run
+from stcal.sfm.compare import compare
+from stcal.synthetic.dataset import write_dataset
+from stcal.synthetic.scene import SceneOptions, make_scene, second_design
+
+
+@pytest.fixture(scope="module")
+def calibrated(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("second")
+    options = SceneOptions(seed=5, width=1728, height=1152, images_per_group=4)
+    scene = make_scene(options, *second_design())
+    write_dataset(folder / "data", scene)
+    data = folder / "data"
+    result = run(data / "images", data / "cameras.txt", folder / "run", data / "target.toml", data / "board.toml")
+    return scene, data, folder / "run", result
+
+
+def test_the_design_differs_in_everything(calibrated):
+    _, data, _, _ = calibrated
+    target, board = load_target(data / "target.toml"), load_board(data / "board.toml")
+    assert target.polarity == board.polarity == "dark"
+    assert len(target.faces) == 3
+    assert board.corner is not None
+    assert not {"1", "2", "3"} & {face.id for face in target.faces}
+
+
+def test_every_label_is_right(calibrated):
+    from stcal.synthetic.observe import image_circles
+
+    scene, _, _, result = calibrated
+    for image in result.observations():
+        number = int(image.name.split("_")[-1].split(".")[0]) - 1000
+        seen = image_circles(scene, image.group, number)
+        truth = dict(zip(seen.labels, seen.centre_px, strict=True))
+        for label, centre in zip(image.labels, image.centre_px, strict=True):
+            assert np.linalg.norm(centre - truth[label]) < 1.5, f"{image.name} {label}"
+
+
+def test_faces_are_right_within_their_own_sigma(calibrated):
+    _, data, out, result = calibrated
+    comparison = compare(out, data / "truth.json")
+    assert not comparison["missing"]
+    for face_id, row in comparison["faces"].items():
+        if face_id == comparison["reference_face"]:
+            continue
+        # √(eᵀC⁻¹e/6) of a true covariance exceeds 2 about once in 2000 draws (χ² with 6 degrees of freedom).
+        assert 0.1 < row["normalised_error"] < 2.0, face_id
+        assert row["translation_um"] < 30, face_id
+    assert result.joint.sigma0 == pytest.approx(1.0, abs=0.2)
