@@ -3,7 +3,9 @@
 import contextlib
 import multiprocessing
 import os
+import signal
 import sys
+import threading
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor, as_completed
 
@@ -24,7 +26,7 @@ def run_parallel(function: Callable, jobs: Sequence[tuple], workers: int | None 
         return
     with (
         _plain_main(),
-        ProcessPoolExecutor(workers, mp_context=multiprocessing.get_context("spawn")) as pool,
+        ProcessPoolExecutor(workers, multiprocessing.get_context("spawn"), initializer=_follow_parent) as pool,
     ):
         futures = {pool.submit(function, *job): i for i, job in enumerate(jobs)}
         try:
@@ -33,6 +35,18 @@ def run_parallel(function: Callable, jobs: Sequence[tuple], workers: int | None 
         except BaseException:
             pool.shutdown(cancel_futures=True)
             raise
+
+
+def _follow_parent() -> None:
+    """In a worker: leave Ctrl-C to the parent, which stops the pool in order; end when the parent is killed."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    parent = multiprocessing.parent_process()
+
+    def watch() -> None:
+        parent.join()
+        os._exit(1)
+
+    threading.Thread(target=watch, daemon=True).start()
 
 
 @contextlib.contextmanager

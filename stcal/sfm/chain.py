@@ -3,7 +3,6 @@
 from dataclasses import dataclass, field
 
 import numpy as np
-from scipy.optimize import least_squares
 
 from stcal.design import TargetDesign
 from stcal.errors import MappingError
@@ -12,6 +11,9 @@ from stcal.sfm.faces import FaceInGroup
 
 MAX_CHAIN_STEPS = 4
 MAX_CHAINS = 12
+MAX_STEPS = 20
+SETTLED = 1e-9
+"""Of a step in rad and mm."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -131,7 +133,10 @@ def _pose_information(each: FaceInGroup) -> np.ndarray:
 
 
 def _adjust(faces: list[FaceInGroup], chains, reference: str) -> tuple[dict[str, Rigid], dict[str, Rigid]]:
-    """Poses of faces and groups in the target frame by weighted least squares over all (group, face)."""
+    """Poses of faces and groups in the target frame by weighted Gauss–Newton over all (group, face).
+
+    Poses are perturbed on the right, so that a face's own step is minus its residual.
+    """
     start = {face_id: _along(found[0], faces) for face_id, found in chains.items()}
     groups = list(dict.fromkeys(each.group for each in faces))
     start_group = {}
@@ -140,24 +145,28 @@ def _adjust(faces: list[FaceInGroup], chains, reference: str) -> tuple[dict[str,
     free = [face_id for face_id in start if face_id != reference]
     roots = [np.linalg.cholesky(_pose_information(each) + 1e-12 * np.eye(6)).T for each in faces]
 
-    def poses(x):
-        twists = x.reshape(-1, 6)
-        face = {reference: Rigid()}
-        face |= {f: start[f] @ Rigid.exp(t) for f, t in zip(free, twists, strict=False)}
-        group = {g: start_group[g] @ Rigid.exp(t) for g, t in zip(groups, twists[len(free) :], strict=True)}
-        return face, group
-
-    def residuals(x):
-        face, group = poses(x)
-        return np.concatenate(
-            [
-                root @ (face[each.face].inverse() @ group[each.group] @ each.group_from_face).log()
-                for each, root in zip(faces, roots, strict=True)
-            ]
-        )
-
-    solution = least_squares(residuals, np.zeros(6 * (len(free) + len(groups))), x_scale="jac", xtol=1e-14, ftol=1e-14)
-    return poses(solution.x)
+    face = {face_id: start[face_id] for face_id in (reference, *free)}
+    group = dict(start_group)
+    column = {("face", f): 6 * i for i, f in enumerate(free)}
+    column |= {("group", g): 6 * (len(free) + i) for i, g in enumerate(groups)}
+    for _ in range(MAX_STEPS):
+        jacobian, residual = np.zeros((6 * len(faces), 6 * len(column))), np.zeros(6 * len(faces))
+        for k, (each, root) in enumerate(zip(faces, roots, strict=True)):
+            rows = slice(6 * k, 6 * k + 6)
+            residual[rows] = root @ (face[each.face].inverse() @ group[each.group] @ each.group_from_face).log()
+            r, t = each.group_from_face.rotation.T, each.group_from_face.translation
+            at = column["group", each.group]
+            jacobian[rows, at : at + 6] = root @ np.block([[r, np.zeros((3, 3))], [-r @ skew(t), r]])
+            if each.face != reference:
+                at = column["face", each.face]
+                jacobian[rows, at : at + 6] = -root
+        step = -np.linalg.lstsq(jacobian, residual, rcond=1e-13)[0]
+        for (kind, name), at in column.items():
+            poses = face if kind == "face" else group
+            poses[name] = poses[name] @ Rigid.exp(step[at : at + 6])
+        if np.abs(step).max() < SETTLED:
+            break
+    return face, group
 
 
 def _circles(faces: list[FaceInGroup], target_from_face: dict[str, Rigid], target: TargetDesign) -> dict:

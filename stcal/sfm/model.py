@@ -9,6 +9,8 @@ from stcal.geometry.camera import Camera
 from stcal.geometry.rigid import Rigid, Similarity
 from stcal.sfm.observations import ImageObservations, face_of, is_board
 
+_PER_OBSERVATION = ("image_index", "point_index", "keypoint", "measured_px", "shift_px", "sigma_px")
+
 
 @dataclass(frozen=True, slots=True, eq=False)
 class GroupModel:
@@ -83,12 +85,13 @@ class GroupModel:
         return {key: np.array(indices) for key, indices in members.items()}
 
     def without(self, drop: np.ndarray) -> "GroupModel":
-        """The model without the observations of mask ``drop``."""
+        """The model without the observations of mask ``drop``, and without points that fewer than two then see."""
         keep = ~drop
-        return replace(
-            self,
-            **{
-                name: getattr(self, name)[keep]
-                for name in ("image_index", "point_index", "keypoint", "measured_px", "shift_px", "sigma_px")
-            },
-        )
+        count = np.bincount(self.point_index[keep], minlength=len(self.labels))
+        kept = np.flatnonzero(count >= 2)
+        keep &= count[self.point_index] >= 2
+        arrays = {name: getattr(self, name)[keep] for name in _PER_OBSERVATION}
+        renumbered = np.full(len(self.labels), -1)
+        renumbered[kept] = np.arange(len(kept))
+        arrays["point_index"] = renumbered[arrays["point_index"]]
+        return replace(self, labels=tuple(self.labels[i] for i in kept), xyz_world=self.xyz_world[kept], **arrays)

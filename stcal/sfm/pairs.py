@@ -84,7 +84,7 @@ def _no_pair(group, scores: list[PairScore], options: PairOptions) -> str:
     return (
         f"{where} with a median ray angle of {np.degrees(MIN_ANGLE_RAD):.0f}° to "
         f"{np.degrees(options.max_angle_rad):.0f}° (measured {np.degrees(smallest):.1f}° to {np.degrees(angle):.1f}°); "
-        "add views in between or raise --max-angle"
+        "add views in between, raise --max-angle, or check that the camera file belongs to the images"
     )
 
 

@@ -27,9 +27,10 @@ from stcal.sfm.overlay import draw_overlay
 from stcal.sfm.refine import eccentricity_px
 from stcal.sfm.report import report_html
 from stcal.sfm.result import RunOptions, RunResult
-from stcal.sfm.solve import GroupSolution, image_sigma_factor, require_usable, solve_group, with_sigma
+from stcal.sfm.solve import GroupSolution, image_sigma_factor, require_groups, solve_group, with_sigma
 
-RESULTS = ("faces.json", "report.json", "report.html")
+RESULTS = ("faces.json", "report.json", "report.html", "labels.csv", "detections.csv", "compare.json")
+RESULT_FOLDERS = ("models", "overlays", "scratch")
 JOINT_ROUNDS = 2
 """Eccentricity moves by nanometres between the first and the second joint adjustment."""
 
@@ -65,6 +66,7 @@ def run(
     target = load_design(target, reference_target, load_target)
     board = load_design(board, reference_board, load_board)
     options = (options or RunOptions()).settled(target)
+    find_images(images)  # before anything of an earlier run is removed
     out = claim_folder(out)
 
     detection, labelled = detect(images, model, out, target, board, options, tell)
@@ -73,8 +75,7 @@ def run(
     groups: dict[str, list[ImageObservations]] = {}
     for image in observations:
         groups.setdefault(image.group, []).append(image)
-    for group in groups.values():
-        require_usable(group)
+    require_groups(groups, detection.skipped)
 
     tell("map", 0, len(groups))
     solutions = _solve_groups(groups, observations, out, detection.camera, model, target, board, options, tell)
@@ -168,12 +169,14 @@ def claim_folder(out: str | Path) -> Path:
     try:
         if out.exists() and not out.is_dir():
             raise InputError(f"output {out}: not a folder; give a new folder with --out")
-        if out.is_dir() and any(out.iterdir()) and not marker.exists():
+        if out.is_dir() and not marker.exists() and any(not p.name.startswith(RUN_MARKER) for p in out.iterdir()):
             raise InputError(f"output folder {out}: not empty and not of an earlier run; give a new folder with --out")
         out.mkdir(parents=True, exist_ok=True)
         write_bytes(marker, json.dumps({"program": "stcal-sfm", "version": stcal.__version__}).encode())
         for name in RESULTS:
             (out / name).unlink(missing_ok=True)
+        for name in RESULT_FOLDERS:
+            shutil.rmtree(out / name, ignore_errors=True)
         remove_database(out / "database.db")
     except OSError as error:
         raise InputError(f"output folder {out}: {error.strerror or error}; give a writable folder") from error

@@ -19,6 +19,7 @@ SETTLED_PX = 1e-5
 OUTLIER_RMS = 6.0
 """Observations beyond this multiple of the residuals' robust spread (and of their own σ) are named and left out."""
 MIN_OUTLIER_PX = 0.1
+WORST_SHARE = 0.5
 
 
 @dataclass(frozen=True, slots=True)
@@ -108,16 +109,18 @@ def eccentricity_px(model: GroupModel, camera: Camera, radius_mm: dict[str, floa
 
 
 def _outliers(model: GroupModel, camera: Camera) -> tuple[np.ndarray, list[Outlier]]:
-    """The worst observation of every image that is beyond the limit: one bad one pulls on its neighbours."""
+    """The worst observation of every image that is beyond the limit, and not much better than the worst of all: one
+    bad observation pulls on all that share a point or a camera with it."""
     residual = np.linalg.norm(model.residuals_px(camera), axis=1)
     spread = 1.4826 * np.median(residual) / np.sqrt(2 * np.log(2)) * np.sqrt(2)
     limit = np.maximum(np.maximum(OUTLIER_RMS * spread, 2 * OUTLIER_RMS * model.sigma_px), MIN_OUTLIER_PX)
+    least = max(1.0, WORST_SHARE * float((residual / limit).max(initial=0.0)))
     off = np.zeros(len(residual), bool)
     named = []
     for i, name in enumerate(model.images):
         rows = np.flatnonzero(model.image_index == i)
         worst = rows[np.argmax(residual[rows] / limit[rows])]
-        if residual[worst] > limit[worst]:
+        if residual[worst] > least * limit[worst]:
             off[worst] = True
             label = model.labels[model.point_index[worst]]
             named.append(Outlier(name, label, float(residual[worst]), float(limit[worst])))

@@ -174,7 +174,7 @@ def test_bad_files_among_good_ones_are_left_out_and_listed(small_set, stcal_sfm)
     (folder / "link.jpg").symlink_to(folder / "gone.jpg")
     (folder / "more.jpg").mkdir()
     bad |= {"link.jpg": (b"", "broken link"), "more.jpg": (b"", "a folder inside a group")}
-    # "12/copy.jpg" sorts after the capitals, so the original is the one that is used.
+    # "copy.jpg" sorts after the capitals, so the original is the one that is used.
     out = assert_success(stcal_sfm(*small.arguments()))
     report = (small.out / "report.json").read_text(encoding="utf-8")
     for name, (_, reason) in bad.items():
@@ -215,6 +215,15 @@ def test_a_group_of_copies_of_one_image(small_set, stcal_sfm):
         shutil.copy(small.image(0, "14"), small.image(i, "14"))
     parts = ("group 14: 1 usable image", "the same image as 14/IMG_1000.jpg", "add photographs from other places")
     assert_error(stcal_sfm(*small.arguments()), COMPUTATION, *parts)
+
+
+def test_a_folder_of_copies_is_no_group(small_set, stcal_sfm):
+    small = small_set("12")
+    shutil.copytree(small.images / "12", small.images / "12 copy")
+    out = assert_success(stcal_sfm(*small.arguments()))
+    assert "skipped 12 copy/IMG_1003.jpg: the same image as 12/IMG_1003.jpg" in out
+    assert out.count("skipped") == 4
+    assert out.count("4 images") == 1
 
 
 def test_a_group_of_which_nothing_is_left(small_set, stcal_sfm):
@@ -376,6 +385,35 @@ def test_a_camera_file_that_is_none(small_set, stcal_sfm, case):
     if content is not None:
         small.camera.write_text(content, encoding="utf-8")
     assert_error(stcal_sfm(*small.arguments()), INPUT, f"camera file {small.camera}", *parts)
+
+
+def opencv_yaml(focal: float, x: float, y: float, distortion: list[float]) -> str:
+    """A camera file that does not state the image size."""
+    matrix = [float(v) for v in (focal, 0, x, 0, focal, y, 0, 0, 1)]
+    return f"%YAML:1.0\n---\ncamera_matrix: {matrix}\ndistortion_coefficients: {distortion}\n"
+
+
+def test_a_camera_of_opencv_for_larger_images(small_set, stcal_sfm):
+    small = small_set("12")
+    path = small.folder / "camera.yml"
+    path.write_text(opencv_yaml(5580, 2592, 1728, []), encoding="utf-8")
+    outcome = stcal_sfm(*small.arguments("--camera", path))
+    parts = ("(2592, 1728) px is outside of 12/IMG_1000.jpg (1296×864 px)", "use the camera file that belongs")
+    assert_error(outcome, INPUT, f"camera file {path}", *parts)
+
+
+def test_another_camera_than_took_the_images(small_set, stcal_sfm):
+    small = small_set("12")
+    path = small.folder / "camera.yml"
+    path.write_text(opencv_yaml(3000, 648, 432, []), encoding="utf-8")
+    outcome = stcal_sfm(*small.arguments("--camera", path))
+    assert_error(outcome, COMPUTATION, "group 12: no initial pair", "check that the camera file belongs to the images")
+
+
+def test_no_pair_within_the_limit(small_set, stcal_sfm):
+    small = small_set("12")
+    outcome = stcal_sfm(*small.arguments("--max-angle", 5))
+    assert_error(outcome, COMPUTATION, "group 12: no initial pair", "of 1° to 5° (measured", "raise --max-angle")
 
 
 # --- the output ---
@@ -618,13 +656,9 @@ def test_formats(small_set, small_run, stcal_sfm, convert, tolerance_px):
 def test_a_camera_of_opencv_without_a_size(small_set, small_run, stcal_sfm):
     small = small_set("12")
     camera = read_camera(small.camera)
-    matrix = [camera.focal[0], 0, camera.centre[0], 0, camera.focal[1], camera.centre[1], 0, 0, 1]
     path = small.folder / "camera.yml"
-    path.write_text(
-        f"%YAML:1.0\n---\ncamera_matrix: {[float(v) for v in matrix]}\n"
-        f"distortion_coefficients: {camera.distortion[:5].tolist()}\n",
-        encoding="utf-8",
-    )
+    text = opencv_yaml(camera.focal[0], *camera.centre, camera.distortion[:5].tolist())
+    path.write_text(text, encoding="utf-8")
     small.image(3).write_bytes(encoded(".jpg", pixels(small.image(3))[:-100]))
     out = assert_success(stcal_sfm(*small.arguments("--camera", path)))
     assert "skipped 12/IMG_1003.jpg: 1296×764 px, but the first readable image says 1296×864 px" in out

@@ -16,11 +16,11 @@ CAMERA = Camera(400, 300, [1400.0, 1400.0], [199.5, 149.5], [-0.15, 0.1, 1e-3, -
 
 @lru_cache(maxsize=4)
 def fine_rays(camera, factor):
-    """Subpixel coordinates and their rays, from the exact inverse distortion."""
+    """Subpixel columns and their rays, from the exact inverse distortion."""
     h, w = camera.height * factor, camera.width * factor
     x, y = np.meshgrid((np.arange(w) + 0.5) / factor - 0.5, (np.arange(h) + 0.5) / factor - 0.5)
     rays = camera.normalised_from_pixel(np.stack([x, y], -1))
-    return x, y, np.concatenate([rays, np.ones((h, w, 1))], -1)
+    return x, np.concatenate([rays, np.ones((h, w, 1))], -1)
 
 
 def draw(camera, circles, blur=0.9, gradient=0.0, bright=True, factor=8):
@@ -28,7 +28,7 @@ def draw(camera, circles, blur=0.9, gradient=0.0, bright=True, factor=8):
 
     Independent of the detector's edge model: a subpixel is inside or it is not.
     """
-    x, y, rays = fine_rays(camera, factor)
+    x, rays = fine_rays(camera, factor)
     h, w = x.shape
     fine = np.full((h, w), 30.0 if bright else 200.0)
     for centre, normal, radius in circles:
