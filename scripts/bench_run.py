@@ -18,16 +18,13 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from stcal.design_file import load_board
+from stcal.camera_file import read_camera
+from stcal.design_file import load_board, load_target
 from stcal.parallel import run_parallel
 
-FLAGS = cv2.IMREAD_GRAYSCALE | cv2.IMREAD_ANYDEPTH | cv2.IMREAD_IGNORE_ORIENTATION
-"""As :func:`stcal.sfm.images.decode` has them."""
+FLAGS = cv2.IMREAD_GRAYSCALE | cv2.IMREAD_ANYDEPTH | cv2.IMREAD_IGNORE_ORIENTATION  # as stcal.sfm.images.decode
 GROUPS = 4
-SAMPLE_S = 0.05
-RIGHT_PX = 3.0
-"""A board is right when every centre is this close to the image of a true dot."""
-MIB = 2**20
+RIGHT_PX = 3.0  # a board is right when every centre is this close to the image of a true dot
 THRESHOLDS = {
     "OpenCV, its own 17 thresholds": (50, 220, 10, 2),
     "OpenCV, 3 thresholds": (60, 180, 40, 2),
@@ -64,10 +61,9 @@ def render(folder: Path, images: int, width: int) -> None:
         print(f"rendering {images} images {width}×{width * 2 // 3} …", file=sys.stderr)
         options = SceneOptions(width=width, height=width * 2 // 3, images_per_group=images // GROUPS)
         write_dataset(folder, make_scene(options))
-    count = len(list((folder / "images").glob("*/*")))
-    found = (folder / "cameras.txt").read_text(encoding="utf-8").splitlines()[-1].split()[2]
-    if (count, found) != (images, str(width)):
-        sys.exit(f"error: {folder} holds {count} images {found} px wide, {images} of {width} px asked for")
+    held = len(list((folder / "images").glob("*/*"))), read_camera(folder / "cameras.txt").width
+    if held != (images, width):
+        sys.exit("error: {} holds {} images {} px wide; give another folder".format(folder, *held))
 
 
 def timed(function, jobs: list[tuple]) -> tuple[float, list]:
@@ -86,7 +82,7 @@ def timed_run(data: Path, out: Path) -> tuple[float, float, float]:
         run = subprocess.Popen([*program, "run", data / "images", *files, "--out", out], stdout=log, stderr=log)
         together, done = 0, 0
         while not done:
-            time.sleep(SAMPLE_S)
+            time.sleep(0.05)
             together = max(together, resident(run.pid))
             done, status, usage = os.wait4(run.pid, os.WNOHANG)
     seconds = time.perf_counter() - start
@@ -94,16 +90,14 @@ def timed_run(data: Path, out: Path) -> tuple[float, float, float]:
     if run.returncode:
         sys.exit(f"error: the run failed\n{(out.parent / 'run.log').read_text()}")
     largest = usage.ru_maxrss * (1 if sys.platform == "darwin" else 1024)
-    return seconds, largest / MIB, together / MIB
+    return seconds, largest / 2**20, together / 2**20
 
 
 def resident(pid: int) -> int:
     """Resident bytes of a process and all that it started, as far as /proc tells."""
     try:
         own = int(Path(f"/proc/{pid}/statm").read_text().split()[1]) * resource.getpagesize()
-        children = [
-            child for each in Path(f"/proc/{pid}/task").glob("*/children") for child in each.read_text().split()
-        ]
+        children = " ".join(each.read_text() for each in Path(f"/proc/{pid}/task").glob("*/children")).split()
     except OSError:
         return 0  # no /proc, or ended meanwhile
     return own + sum(resident(int(child)) for child in children)
@@ -111,8 +105,6 @@ def resident(pid: int) -> int:
 
 def timed_detection(data: Path, cache: Path):
     """Seconds of detection alone, and the centres of the board's dots by image."""
-    from stcal.camera_file import read_camera
-    from stcal.design_file import load_target
     from stcal.sfm.detect.ellipses import EllipseOptions
     from stcal.sfm.detection import detect_files
     from stcal.sfm.images import find_images
@@ -121,12 +113,9 @@ def timed_detection(data: Path, cache: Path):
     camera, (files, _) = read_camera(data / "cameras.txt"), find_images(data / "images")
     start = time.perf_counter()
     result = detect_files(files, camera, *designs, EllipseOptions(), cache)
-    seconds, dots = time.perf_counter() - start, {}
-    for image in result.images:
-        found = image.detection
-        if len(found.numberings):
-            dots[image.file.name] = found.centres.centre_px[len(found.target_labels) :]
-    return seconds, dots
+    seconds = time.perf_counter() - start
+    found = {i.file.name: i.detection for i in result.images if len(i.detection.numberings)}
+    return seconds, {name: d.centres.centre_px[len(d.target_labels) :] for name, d in found.items()}
 
 
 def boards(found: dict[str, np.ndarray], true: dict[str, np.ndarray]) -> dict[str, int]:
@@ -138,6 +127,7 @@ def boards(found: dict[str, np.ndarray], true: dict[str, np.ndarray]) -> dict[st
 
 def measure(data: Path, scratch: Path) -> dict:
     """All measurements, once."""
+    scratch.mkdir()
     truth = json.loads((data / "truth.json").read_text(encoding="utf-8"))
     true = {
         name: np.array([c["centre_px"] for label, c in image["circles"].items() if label.startswith("board:")])
@@ -187,16 +177,11 @@ def main() -> None:
     given = parser.parse_args()
     if given.images % GROUPS or given.images < 2 * GROUPS:
         parser.error(f"--images {given.images}: a multiple of {GROUPS}, at least {2 * GROUPS}, needed")
-    with tempfile.TemporaryDirectory() as folder:
-        data = given.keep or Path(folder) / "data"
+    with tempfile.TemporaryDirectory() as scratch:
+        data = given.keep or Path(scratch) / "data"
         render(data, given.images, given.width)
-        rounds = []
-        for _ in range(max(given.rounds, 1)):
-            with tempfile.TemporaryDirectory(dir=folder) as scratch:
-                rounds.append(measure(data, Path(scratch)))
-    result = best_of(rounds)
-    width, height = result["size_px"]
-    print(f"{result['images']} images {width}×{height}, {result['megabytes']:.0f} MB, {result['workers']} workers")
+        result = best_of([measure(data, Path(scratch) / str(i)) for i in range(max(given.rounds, 1))])
+    print("{images} images of {size_px} px, {megabytes:.0f} MB, {workers} workers".format(**result))
     print(f"{'':34} {'seconds':>8} {'ratio':>6}   boards found, complete, right")
     for name, row in result["rows"].items():
         counts = f"{row['found']:8} {row['complete']:9} {row['right']:6}" if "found" in row else ""

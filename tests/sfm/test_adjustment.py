@@ -15,6 +15,13 @@ from stcal.synthetic.scene import SceneOptions, make_scene
 NOISE_PX = 0.005
 
 
+@pytest.fixture(scope="module")
+def scenes():
+    return [
+        make_scene(SceneOptions(seed=seed, width=2592, height=1728, images_per_group=4)) for seed in range(100, 103)
+    ]
+
+
 def pose_errors(scene, target):
     """Rotation (rad) and translation (mm) errors by face but the reference, in the target frame."""
     errors = {}
@@ -87,15 +94,15 @@ def test_the_joint_adjustment_is_exact_without_noise(labels_only):
         assert np.abs(error[:3]).max() < 5e-6
 
 
-def test_predicted_covariances_are_true(labels_only):
+def test_predicted_covariances_are_true(scenes, labels_only):
     """Normalised squared error of 4 faces over 24 draws: mean of χ²₆/6, standard deviation 0.06 if independent.
 
     The faces of one draw share circles and cameras, which widens that to about 0.1.
     """
     values, sigma0 = [], []
     for seed in range(24):
-        scene = make_scene(SceneOptions(seed=100 + seed % 4, width=2592, height=1728, images_per_group=4))
-        target, joint = labels_only.calibrate(_with_new_board(scene, seed), NOISE_PX, seed)
+        scene = _with_new_board(scenes[seed % len(scenes)], seed)
+        target, joint = labels_only.calibrate(scene, NOISE_PX, seed)
         sigma0.append(joint.sigma0)
         for face_id, error in pose_errors(scene, target).items():
             values.append(error @ np.linalg.solve(target.face_covariance[face_id], error) / 6)
@@ -114,11 +121,11 @@ def _with_new_board(scene, seed):
     return replace(scene, groups=groups)
 
 
-def test_joint_beats_the_chain(labels_only):
+def test_joint_beats_the_chain(scenes, labels_only):
     """One target over all groups: RMS face error at least 1.2 times smaller."""
     square = {"joint": [], "chain": []}
     for seed in range(8):
-        scene = make_scene(SceneOptions(seed=200 + seed, width=2592, height=1728, images_per_group=4))
+        scene = scenes[seed % len(scenes)]
         for solve, values in square.items():
             target, _ = labels_only.calibrate(scene, NOISE_PX, seed, solve)
             values += [float((e[3:] ** 2).sum()) for e in pose_errors(scene, target).values()]
