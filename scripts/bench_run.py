@@ -175,8 +175,8 @@ def main() -> None:
     parser.add_argument("--rounds", type=int, default=3, help="measure so often; the smallest times count")
     parser.add_argument("--json", type=Path, help="also write the numbers here")
     given = parser.parse_args()
-    if given.images % GROUPS or given.images < 2 * GROUPS:
-        parser.error(f"--images {given.images}: a multiple of {GROUPS}, at least {2 * GROUPS}, needed")
+    if given.images % GROUPS or given.images < 4 * GROUPS:
+        parser.error(f"--images {given.images}: a multiple of {GROUPS}, at least {4 * GROUPS}, needed")
     with tempfile.TemporaryDirectory() as scratch:
         data = given.keep or Path(scratch) / "data"
         render(data, given.images, given.width)

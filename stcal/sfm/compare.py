@@ -1,17 +1,22 @@
 """Errors of a run against a known truth, in the format of ``truth.json`` (``data_layout.md``)."""
 
+import csv
 import json
 from pathlib import Path
 
 import numpy as np
 
+from stcal.design import BOARD
 from stcal.errors import DegenerateError, InputError
 from stcal.geometry.align import align_rigid
 from stcal.geometry.arrays import frozen
 from stcal.geometry.rigid import Rigid
-from stcal.sfm.observations import face_of
+from stcal.sfm.observations import face_of, is_board
 
 FACES = "faces.json"
+DETECTIONS = "detections.csv"
+NEAR_PX = 1.5
+"""A label is right when its ellipse centre is this near to the image of the circle's centre; eccentricity makes 0.2."""
 
 
 def compare(run: str | Path, truth: str | Path) -> dict:
@@ -23,7 +28,8 @@ def compare(run: str | Path, truth: str | Path) -> dict:
         ``faces`` : by face ``translation_um`` and ``rotation_mdeg`` of target_from_face, ``circles_mean_um`` and
         ``circles_max_um`` after a rigid fit of the face, ``circles`` compared, and where the run states σ,
         ``translation_sigma_um``, ``rotation_sigma_mdeg`` and ``normalised_error`` (√(eᵀC⁻¹e/6), about 1 when σ is
-        true); ``missing`` faces of the truth; ``worst`` over all faces.
+        true); ``missing`` faces of the truth; ``worst`` over all faces; and, where the truth lists images and the run
+        is a folder, ``labels`` : ``wrong``, and ``found`` of the ``visible`` circles (those the truth calls must_find).
 
     Raises
     ------
@@ -45,13 +51,55 @@ def compare(run: str | Path, truth: str | Path) -> dict:
         for face_id in known["target_from_face"]
         if face_id in found["target_from_face"]
     }
+    labels = _labels(run / DETECTIONS, known["groups"]) if run.is_dir() and _is(known, "groups", dict) else None
     measures = ("translation_um", "rotation_mdeg", "circles_mean_um")
     return {
         "reference_face": known["reference_face"],
         "faces": faces,
         "missing": [face_id for face_id in known["target_from_face"] if face_id not in faces],
         "worst": {m: max((f[m] for f in faces.values() if f[m] is not None), default=None) for m in measures},
+        **({"labels": labels} if labels else {}),
     }
+
+
+def _labels(path: Path, groups: dict) -> dict | None:
+    """Labels of ``detections.csv`` against the truth; a board's numbers are known up to its own symmetry, but for a
+    whole group at once."""
+    try:
+        with open(path, encoding="utf-8", newline="") as stream:
+            rows = list(csv.DictReader(stream))
+        measured: dict[str, dict[str, tuple[float, float]]] = {}
+        for row in rows:
+            measured.setdefault(row["image"], {})[row["label"]] = (float(row["x_px"]), float(row["y_px"]))
+        total = np.zeros(3, int)
+        for group in groups.values():
+            count = len(group["board_circles_target"])
+            columns = 1 + max((int(k.split(":")[2]) for m in measured.values() for k in m if is_board(k)), default=0)
+            grid = np.arange(count - count % columns).reshape(-1, columns)
+            turns = [grid, np.rot90(grid, 2)]
+            turns += [np.rot90(grid), np.rot90(grid, 3)] if grid.shape[0] == columns else []
+            counts = [_count(measured, group["images"], turn) for turn in turns]
+            total += min(counts, key=lambda c: (c[0], -c[1]))
+    except (OSError, KeyError, ValueError, TypeError, IndexError):
+        return None
+    return dict(zip(("wrong", "found", "visible"), total.tolist(), strict=True))
+
+
+def _count(measured: dict, images: dict, numbers: np.ndarray) -> tuple[int, int, int]:
+    """(wrong, found, visible) with the board's dots numbered as ``numbers``, (rows, columns), has them."""
+    wrong = found = visible = 0
+    for name, image in images.items():
+        circles = image["circles"]
+        visible += sum(bool(c["must_find"]) for c in circles.values())
+        for label, centre in measured.get(name, {}).items():
+            key = label
+            if is_board(label):
+                row, column = (int(v) for v in label.split(":")[1:])
+                key = f"{BOARD}:{numbers[row, column]}"
+            near = key in circles and np.linalg.norm(np.subtract(centre, circles[key]["centre_px"])) < NEAR_PX
+            wrong += not near
+            found += near and bool(circles[key]["must_find"])
+    return wrong, found, visible
 
 
 def _read(path: Path, what: str) -> dict:
@@ -123,6 +171,9 @@ def comparison_table(comparison: dict) -> str:
         place = "reference" if face_id == comparison["reference_face"] else f"{row['translation_um']:.1f}"
         turn = "" if face_id == comparison["reference_face"] else f"{row['rotation_mdeg']:.2f}"
         lines.append(f"{face_id:>6} {place:>10} {turn:>10} {mean:>10} {worst:>8} {row['circles']:>4}  {ratio:>9}")
+    if "labels" in comparison:
+        n = comparison["labels"]
+        lines.append(f"labels: {n['wrong']} wrong; {n['found']} of {n['visible']} visible circles found")
     if comparison["missing"]:
         lines.append(f"not in the run: face {', '.join(comparison['missing'])}")
     return "\n".join(lines)

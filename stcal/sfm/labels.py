@@ -15,7 +15,6 @@ from stcal.sfm.observations import ImageObservations
 MAX_SHIFT_PITCHES = 0.3
 """board_from_face may differ by this much between images (pitches, at the face); a wrong numbering is one off."""
 MIN_POSE_CIRCLES = 5
-MAX_NOTES = 3
 
 
 @dataclass(frozen=True, slots=True, eq=False)
