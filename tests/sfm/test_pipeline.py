@@ -1,0 +1,120 @@
+"""The whole chain on simulated photographs: what the run's folder holds, and that any COLMAP can use it."""
+
+import csv
+import json
+
+import numpy as np
+import pycolmap
+import pytest
+
+from stcal.errors import InputError
+from stcal.sfm import RunOptions, run
+from stcal.sfm.adjust import adjust
+from stcal.sfm.compare import compare
+from stcal.sfm.database import from_colmap_px, image_ids
+from stcal.sfm.mapping import map_group
+from stcal.sfm.metric import find_scale
+from stcal.sfm.pairs import PairOptions, rank_pairs
+from stcal.synthetic.dataset import write_dataset
+from stcal.synthetic.render import RenderOptions
+from stcal.synthetic.scene import SceneOptions, make_scene
+
+
+@pytest.fixture(scope="module")
+def calibrated(tmp_path_factory):
+    """The reference design in clutter, at half the paper's width."""
+    folder = tmp_path_factory.mktemp("pipeline")
+    scene = make_scene(SceneOptions(seed=11, width=1944, height=1296, images_per_group=4))
+    write_dataset(folder / "data", scene, RenderOptions(clutter=True, seed=11))
+    data = folder / "data"
+    result = run(data / "images", data / "cameras.txt", folder / "run", data / "target.toml", data / "board.toml")
+    return scene, data, result
+
+
+def test_cluttered_photographs_are_labelled_without_a_mistake(calibrated):
+    _, data, result = calibrated
+    labels = compare(result.out, data / "truth.json")["labels"]
+    assert labels["wrong"] == 0
+    assert labels["found"] / labels["visible"] >= 0.97
+
+
+def test_errors_are_those_that_sigma_predicts(calibrated):
+    _, data, result = calibrated
+    faces = compare(result.out, data / "truth.json")["faces"]
+    assert set(faces) == {"1", "2", "3", "4", "5"}
+    for face_id in ("2", "3", "4", "5"):
+        # χ²₆/6 of a true covariance exceeds 4 once in 2000 draws.
+        assert 0.1 < faces[face_id]["normalised_error"] < 2.0
+        assert faces[face_id]["translation_um"] < 25
+    assert result.joint.sigma0 == pytest.approx(1.0, abs=0.15)
+
+
+def test_every_promised_file_is_there_and_agrees(calibrated):
+    _, _, result = calibrated
+    out = result.out
+    faces = json.loads((out / "faces.json").read_text())
+    for face_id, pose in result.target.target_from_face.items():
+        np.testing.assert_array_equal(faces["target_from_face"][face_id], pose.matrix())
+    np.testing.assert_allclose(faces["circles"]["1:1"], 0, atol=0.01)
+    with open(out / "detections.csv", newline="") as stream:
+        rows = list(csv.DictReader(stream))
+    assert list(rows[0]) == ["image", "label", "x_px", "y_px", "sigma_px"]
+    assert len(rows) == sum(len(o) for o in result.observations())
+    report = json.loads((out / "report.json").read_text())
+    assert report["summary"]["images_mapped"] == 16
+    assert len(report["groups"][0]["pairs"]) == 6
+    assert (out / "report.html").stat().st_size > 100_000
+    assert {p.name for p in (out / "models").iterdir()} == {"12", "14", "15", "23"}
+    assert not list(out.rglob("*.partial"))
+    assert not (out / "scratch").exists()
+
+
+def test_the_database_holds_corrected_centres_and_the_file_beside_it_both(calibrated):
+    scene, _, result = calibrated
+    with open(result.out / "labels.csv", newline="") as stream:
+        rows = list(csv.DictReader(stream))
+    moved = [
+        np.hypot(float(r["x_px"]) - float(r["corrected_x_px"]), float(r["y_px"]) - float(r["corrected_y_px"]))
+        for r in rows
+    ]
+    assert 0.01 < np.max(moved) < 0.15
+    with pycolmap.Database.open(str(result.out / "database.db")) as database:
+        for r in rows[::97]:
+            stored = from_colmap_px(database.read_keypoints(int(r["image_id"]))[int(r["keypoint"]), :2])
+            corrected = [float(r["corrected_x_px"]), float(r["corrected_y_px"])]
+            assert np.abs(stored - corrected).max() < 1.3e-4  # float32 near 2000 px
+    assert scene.camera.width == 1944
+
+
+def test_any_colmap_makes_an_unbiased_model_of_the_database(calibrated, tmp_path):
+    """Mapped again from the file alone, without any correction: the board keeps its shape and the faces their place."""
+    _, _, result = calibrated
+    observations = result.observations()
+    ids = image_ids(observations)
+    group = [o for o in observations if o.group == "12"]
+    pairs = rank_pairs(group, result.camera, PairOptions())
+    mapping = map_group(
+        result.out / "database.db", tmp_path / "scratch", group, ids, pairs, result.camera, result.colmap_model
+    )
+    ours = next(s.model for s in result.solutions if s.model.group == "12")
+    from dataclasses import replace
+
+    with pycolmap.Database.open(str(result.out / "database.db")) as database:
+        keypoints = {o.name: from_colmap_px(database.read_keypoints(ids[o.name])[:, :2]) for o in group}
+    model = mapping.model
+    rows = zip(model.image_index, model.keypoint, strict=True)
+    plain = np.array([keypoints[model.images[i]][k] for i, k in rows])
+    theirs = adjust(replace(model, measured_px=plain), result.camera)
+    distances = []
+    for each in (ours, theirs):
+        scale = find_scale(each, result.board_design).mm_per_unit
+        place = {label: scale * xyz for label, xyz in zip(each.labels, each.xyz_world, strict=True)}
+        distances.append(np.linalg.norm(place["1:1"] - place["2:1"]))
+    assert distances[0] == pytest.approx(distances[1], abs=2e-4)  # float32 keypoints; the bias would be 0.05 mm
+
+
+def test_options_that_do_not_exist_are_refused(calibrated, tmp_path):
+    _, data, _ = calibrated
+    with pytest.raises(InputError, match="solve 'both': not a choice; use joint or chain"):
+        run(data / "images", data / "cameras.txt", tmp_path / "x", options=RunOptions(solve="both"))
+    assert not (tmp_path / "x").exists()
