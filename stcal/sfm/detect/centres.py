@@ -24,11 +24,15 @@ BAND_BLURS = 4.0
 START_BLUR_PX = 0.8
 BLUR_LIMITS_PX = (0.25, 12.0)
 STEPS = 12
-RESELECTIONS = 2
-"""The band follows the fit for so many steps; after that its pixels stay."""
+RESELECTIONS = 4
+"""In so many first steps the band is laid anew …"""
+RESELECT_PX = 0.3
+RESELECT_BAND = 0.15
+"""… when the centre or the width of the band has changed by more than this."""
 PARAMETERS = 12
 MIN_PIXELS = 30
-CONVERGED_PX = 2e-4
+CONVERGED_PX = 2e-3
+"""The step after one of this size is a tenth of it at most: what is left is far below any σ."""
 ROBUST_WIDTH = 5.0
 """Residuals beyond this many standard deviations lose weight (Geman–McClure)."""
 SECTORS = 16
@@ -171,8 +175,8 @@ class _Fit:
         low = np.maximum(np.floor(centre_px - half).astype(int), 0)
         high = np.minimum(np.ceil(centre_px + half).astype(int) + 1, image.shape[::-1])
         self.patch = image[low[1] : high[1], low[0] : high[0]]
-        self.dx = np.arange(low[0], high[0], dtype=float) - centre_px[0]
-        self.dy = np.arange(low[1], high[1], dtype=float)[:, None] - centre_px[1]
+        self.dx = (np.arange(low[0], high[0]) - centre_px[0]).astype(np.float32)
+        self.dy = (np.arange(low[1], high[1]) - centre_px[1]).astype(np.float32)[:, None]
         self.place, self.half, self.to_ideal, self.intruders = centre_px, half, to_ideal, intruders
         jacobian = to_ideal[:, 1:3] / half
         value, vector = np.linalg.eigh((m := jacobian @ shape_px) @ m.T)
@@ -185,22 +189,26 @@ class _Fit:
         self.failed = not self._run()
 
     def _run(self) -> bool:
+        band, selected = 0.0, self.centre
         for step in range(STEPS):
-            if step < RESELECTIONS:
-                self._select(max(BAND_PX, BAND_BLURS * self.blur))
+            wanted = max(BAND_PX, BAND_BLURS * self.blur)
+            moved = np.abs(self.centre - selected).max()
+            if step == 0 or (step < RESELECTIONS and (moved > RESELECT_PX or abs(wanted / band - 1) > RESELECT_BAND)):
+                band, selected = wanted, self.centre
+                self._select(band)
                 if len(self.grey) < MIN_PIXELS:
                     return False
-            move = self._step(robust=step >= RESELECTIONS - 1)
+            move = self._step(robust=step >= 1)
             if not np.isfinite(move) or np.linalg.norm(self.centre - self.start) > MAX_SHIFT * self.radius + 1:
                 return False
-            if step >= RESELECTIONS and move < CONVERGED_PX:
+            if step >= 2 and move < CONVERGED_PX:
                 break
         return True
 
     def _select(self, band: float):
         """The pixels within ``band`` of the rim, less those of intruders."""
-        inverse = self.inverse_shape @ self.jacobian
-        shift = np.linalg.solve(self.jacobian, self.centre - self.start)
+        inverse = (self.inverse_shape @ self.jacobian).astype(np.float32)
+        shift = np.linalg.solve(self.jacobian, self.centre - self.start).astype(np.float32)
         dx, dy = self.dx - shift[0], self.dy - shift[1]
         vx = inverse[0, 0] * dx + inverse[0, 1] * dy
         vy = inverse[1, 0] * dx + inverse[1, 1] * dy
@@ -209,30 +217,35 @@ class _Fit:
         gy = inverse[0, 1] * vx + inverse[1, 1] * vy
         chosen = (square - np.sqrt(square)) ** 2 < band**2 * (gx * gx + gy * gy)
         for place, shape in self.intruders:
-            ex, ey = self.dx + (self.place[0] - place[0]), self.dy + (self.place[1] - place[1])
+            ex = self.dx + np.float32(self.place[0] - place[0])
+            ey = self.dy + np.float32(self.place[1] - place[1])
             chosen &= (shape[0, 0] * ex + shape[0, 1] * ey) ** 2 + (shape[1, 0] * ex + shape[1, 1] * ey) ** 2 > 1
         rows, columns = np.nonzero(chosen)
-        self.grey = self.patch[rows, columns].astype(float)
-        self.ideal = self.to_ideal @ _monomials(self.dx[columns] / self.half[0], self.dy[rows, 0] / self.half[1])
-        self.weight = np.ones(len(self.grey))
+        # Single precision is enough here: coordinates are taken from the start of the centre.
+        self.grey = self.patch[rows, columns].astype(np.float32)
+        at = _monomials(self.dx[columns].astype(float) / self.half[0], self.dy[rows, 0].astype(float) / self.half[1])
+        self.ideal = (self.to_ideal @ at - self.start[:, None]).astype(np.float32)
+        self.weight = np.ones(len(self.grey), np.float32)
+        self.levels = None
 
     def _step(self, robust: bool) -> float:
         """One Gauss–Newton step over all twelve parameters; returns the move of the centre, NaN where it breaks."""
-        p, q = offset = self.ideal - self.centre[:, None]
-        a, b = v = self.inverse_shape @ offset
-        rho = np.sqrt(a * a + b * b) + 1e-12
-        gradient = self.inverse_shape @ v
-        slope_rho = np.sqrt(gradient[0] ** 2 + gradient[1] ** 2) + 1e-12
-        reduced = (rho - 1) * rho / slope_rho / self.blur
+        inverse_shape = self.inverse_shape.astype(np.float32)
+        p, q = offset = self.ideal - (self.centre - self.start).astype(np.float32)[:, None]
+        a, b = v = inverse_shape @ offset
+        rho = np.sqrt(a * a + b * b)
+        gradient = inverse_shape @ v
+        slope_rho = np.sqrt(gradient[0] * gradient[0] + gradient[1] * gradient[1])
+        reduced = (rho - 1) * rho / (slope_rho * np.float32(self.blur))
         inside = ndtr(-reduced)
-        x, y = offset / self.radius
-        jacobian = np.empty((12, len(rho)))
+        x, y = offset * np.float32(1 / self.radius)
+        jacobian = np.empty((PARAMETERS, len(rho)), np.float32)
         planes = jacobian[6:]
         planes[0], planes[1], planes[2], planes[3], planes[4], planes[5] = 1, x, y, inside, inside * x, inside * y
-        levels = self._levels(planes)
+        levels = self._levels(planes) if self.levels is None else self.levels
         amplitude = levels[3] + levels[4] * x + levels[5] * y
         # d(distance)/d(rho) = rho/slope_rho; the change of the slope itself is of second order on the rim.
-        density = amplitude * np.exp(-0.5 * reduced * reduced) / (np.sqrt(2 * np.pi) * self.blur)
+        density = amplitude * np.exp(-0.5 * reduced * reduced) * np.float32(1 / (np.sqrt(2 * np.pi) * self.blur))
         push = density / slope_rho
         jacobian[0], jacobian[1] = push * gradient[0], push * gradient[1]
         jacobian[2], jacobian[3], jacobian[4] = -push * a * p, -push * (a * q + b * p), -push * b * q
@@ -240,37 +253,35 @@ class _Fit:
         self.residual, self.rim_angle, self.reduced = self.grey - levels @ planes, (a, b), reduced
         self._weigh(inside, robust)
         weighted = jacobian * self.weight
-        normal = weighted @ jacobian.T
+        normal = (weighted @ jacobian.T).astype(float)
         scale = 1 / np.sqrt(np.maximum(np.diag(normal), 1e-300))
         try:
             inverse = np.linalg.inv(normal * scale[:, None] * scale) * scale[:, None] * scale
         except np.linalg.LinAlgError:
             return float("nan")
         step = inverse @ (weighted @ self.residual)
-        # Errors sit on the edge more than beside it: the sandwich form (White 1980) weighs them where they act.
-        score = (jacobian * (self.weight * self.residual)) @ (jacobian * (self.weight * self.residual)).T
-        covariance = (inverse[:2] @ score @ inverse[:, :2]) * len(self.residual) / (len(self.residual) - PARAMETERS)
-        return self._apply(step, covariance, levels)
+        self.scores, self.inverse = weighted, inverse
+        return self._apply(step, levels)
 
-    def _apply(self, step, covariance, levels) -> float:
+    def _apply(self, step, levels) -> float:
         matrix = self.inverse_shape + np.array([[step[2], step[3]], [step[3], step[4]]])
         if not np.isfinite(step).all() or np.linalg.det(matrix) <= 0 or np.trace(matrix) <= 0:
             return float("nan")
         self.inverse_shape = matrix
         self.centre = self.centre + step[:2]
         self.blur = float(np.clip(self.blur + np.clip(step[5], -0.4 * self.blur, 0.6 * self.blur), *BLUR_LIMITS_PX))
-        self.covariance = covariance
-        self.contrast = float(levels[3])
+        self.levels = (levels + step[6:]).astype(np.float32)
+        self.contrast = float(self.levels[3])
         return float(np.abs(step[:2]).max())
 
     def _levels(self, planes) -> np.ndarray:
         weighted = planes * self.weight
-        normal = weighted @ planes.T
+        normal = (weighted @ planes.T).astype(float)
         normal[np.diag_indices(6)] *= 1 + 1e-9
         try:
-            return np.linalg.solve(normal, weighted @ self.grey)
+            return np.linalg.solve(normal, weighted @ self.grey).astype(np.float32)
         except np.linalg.LinAlgError:
-            return np.full(6, np.nan)
+            return np.full(6, np.nan, np.float32)
 
     def _weigh(self, inside, robust: bool):
         """Weights of the pixels: equal but for outliers, which are judged by the spread on the edge itself.
@@ -280,9 +291,17 @@ class _Fit:
         edge = (inside > 0.08) & (inside < 0.92)
         size = np.abs(self.residual[edge]) if edge.any() else np.abs(self.residual)
         spread = max(1.4826 * float(np.median(size)), MIN_SPREAD)
-        self.weight = np.ones(len(self.residual))
+        self.weight = np.ones(len(self.residual), np.float32)
         if robust:
-            self.weight = 1 / (1 + (self.residual / (ROBUST_WIDTH * spread)) ** 2) ** 2
+            self.weight = 1 / (1 + (self.residual * np.float32(1 / (ROBUST_WIDTH * spread))) ** 2) ** 2
+
+    def _covariance(self) -> np.ndarray:
+        """Of the centre: errors sit on the edge more than beside it, and the sandwich form (White 1980) weighs them
+        where they act."""
+        score = (self.scores * self.residual).astype(float)
+        half = self.inverse[:2] @ score
+        n = len(self.residual)
+        return half @ half.T * (n / (n - PARAMETERS))
 
     def result(self):
         """(centre, shape, covariance, blur, contrast, rim share, ok), ideal px."""
@@ -297,4 +316,4 @@ class _Fit:
         allowed = (MAX_RIM_RESIDUAL * self.contrast) ** 2 + (2 * noise) ** 2
         rim = float((square <= allowed * total).mean())
         shape = np.linalg.inv(self.inverse_shape)
-        return self.centre, shape, self.covariance, self.blur, self.contrast, rim, rim >= MIN_RIM
+        return self.centre, shape, self._covariance(), self.blur, self.contrast, rim, rim >= MIN_RIM

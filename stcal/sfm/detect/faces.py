@@ -7,7 +7,6 @@ reading explains more circles than every other.
 """
 
 from dataclasses import dataclass
-from functools import cached_property
 
 import numpy as np
 
@@ -61,12 +60,31 @@ class FaceFinding:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Pair:
-    """Two neighbouring circles of a design, and the faces that have them at these places."""
+    """Two neighbouring circles of a design with the circles around the first, and the faces that have all of them.
 
-    first: np.ndarray
-    step: np.ndarray
-    radii: tuple[float, float]
-    faces: tuple[FaceDesign, ...]
+    ``offset`` : (s, 2) places of the circles around, from the first; ``radius`` : (s,), the first's own in front;
+    ``second`` : which of them is the neighbour; ``faces`` : with the circles' numbers (s,) in each.
+    """
+
+    offset: np.ndarray
+    radius: np.ndarray
+    second: int
+    faces: list[tuple[FaceDesign, np.ndarray]]
+
+
+def _pairs(target: TargetDesign) -> list[_Pair]:
+    """All pairs of a design, alike ones of several faces once."""
+    pairs: dict[tuple, _Pair] = {}
+    for face in target.faces:
+        distance = np.linalg.norm(face.xy_mm[:, None] - face.xy_mm, axis=2)
+        for row in np.argsort(distance, axis=1, kind="stable"):
+            near = row[: SUPPORT + 2]
+            offset, radius = face.xy_mm[near] - face.xy_mm[near[0]], face.radius_mm[near]
+            same = (*np.round(offset, 6).ravel(), *np.round(radius, 6))
+            for second in range(1, min(NEIGHBOURS_IN_DESIGN, len(near) - 1) + 1):
+                pair = pairs.setdefault((second, *same), _Pair(offset, radius, second, []))
+                pair.faces.append((face, near))
+    return list(pairs.values())
 
 
 class FaceFinder:
@@ -74,16 +92,6 @@ class FaceFinder:
 
     def __init__(self, target: TargetDesign):
         self.target = target
-
-    @cached_property
-    def _pairs(self) -> list[_Pair]:
-        pairs: dict[tuple, list[FaceDesign]] = {}
-        for face in self.target.faces:
-            for k, near in enumerate(_neighbours(face)):
-                for other in near[:NEIGHBOURS_IN_DESIGN]:
-                    key = (*face.xy_mm[k], *(face.xy_mm[other] - face.xy_mm[k]), *face.radius_mm[[k, other]])
-                    pairs.setdefault(tuple(np.round(key, 6)), []).append(face)
-        return [_Pair(np.array(k[:2]), np.array(k[2:4]), k[4:], tuple(faces)) for k, faces in pairs.items()]
 
     def find(self, candidates: Candidates, contrast: float = 0.0) -> FaceFinding:
         """All faces among the candidates.
@@ -107,26 +115,22 @@ class FaceFinder:
         first, step, ratio = _candidate_pairs(candidates)
         length = np.linalg.norm(step, axis=1)
         found = []
-        for pair in self._pairs:
-            distance, radii = np.linalg.norm(pair.step), pair.radii
-            ok = np.abs(length * radii[0] / distance - 1) < PAIR_TOLERANCE
-            ok &= np.abs(ratio * radii[0] / radii[1] - 1) < PAIR_TOLERANCE
+        for pair in _pairs(self.target):
+            first_radius, distance = pair.radius[0], np.linalg.norm(pair.offset[pair.second])
+            ok = np.abs(length * first_radius / distance - 1) < PAIR_TOLERANCE
+            ok &= np.abs(ratio * first_radius / pair.radius[pair.second] - 1) < PAIR_TOLERANCE
             if not ok.any():
                 continue
-            linear = candidates.shape[first[ok]] @ _turn(pair.step * [1, -1], step[ok]) * [1, -1]
-            for face in pair.faces:
-                index = _support(candidates, face, pair.first, candidates.xy[first[ok]], linear)
-                hits = (index >= 0).sum(1)
-                contrast = candidates.contrast[first[ok]]
-                found += [(hits[h], contrast[h], face, index[h]) for h in np.flatnonzero(hits >= 2 + MIN_SUPPORT)]
+            linear = candidates.shape[first[ok]] @ _turn(pair.offset[pair.second] * [1, -1], step[ok]) * [1, -1]
+            support = _support(candidates, pair, candidates.xy[first[ok]], linear)
+            hits, contrast = (support >= 0).sum(1), candidates.contrast[first[ok]]
+            for h in np.flatnonzero(hits >= 2 + MIN_SUPPORT):
+                for face, near in pair.faces:
+                    index = np.full(len(face.ids), -1)
+                    index[near] = support[h]
+                    found.append((hits[h], contrast[h], face, index))
         found.sort(key=lambda item: (-item[0], -item[1]))
         return [(face, index) for _, _, face, index in found[:MAX_HYPOTHESES]]
-
-
-def _neighbours(face: FaceDesign) -> np.ndarray:
-    """For every circle the others by distance, (n, n − 1)."""
-    distance = np.linalg.norm(face.xy_mm[:, None] - face.xy_mm, axis=2)
-    return np.argsort(distance, axis=1, kind="stable")[:, 1:]
 
 
 def _candidate_pairs(candidates: Candidates):
@@ -152,21 +156,15 @@ def _turn(step_plane: np.ndarray, step_image: np.ndarray) -> np.ndarray:
     return np.stack([np.stack([s[:, 0], -s[:, 1]], 1), np.stack([s[:, 1], s[:, 0]], 1)], 1)
 
 
-def _support(candidates: Candidates, face: FaceDesign, origin, xy, linear) -> np.ndarray:
-    """Candidates near the affine prediction of the circles nearest to ``origin``: (h, n circles), −1 elsewhere."""
-    k = int(np.argmin(np.linalg.norm(face.xy_mm - origin, axis=1)))
-    near = np.concatenate([[k], _neighbours(face)[k][: SUPPORT + 1]])
-    offset = face.xy_mm[near] - face.xy_mm[k]
-    predicted = xy[:, None] + np.einsum("hij,mj->hmi", linear, offset)
+def _support(candidates: Candidates, pair: _Pair, xy: np.ndarray, linear: np.ndarray) -> np.ndarray:
+    """Candidates near the affine prediction of the circles around the first: (h, s), −1 where there is none."""
+    predicted = xy[:, None] + np.einsum("hij,mj->hmi", linear, pair.offset)
     _, nearest = candidates.tree.query(predicted)
     error = np.linalg.solve(linear[:, None], (candidates.xy[nearest] - predicted)[..., None])[..., 0]
-    radius = face.radius_mm[near]
     size = candidates.radius[nearest] / np.sqrt(np.abs(np.linalg.det(linear)))[:, None]
-    ok = np.linalg.norm(error, axis=2) < 0.4 * radius + 0.12 * np.linalg.norm(offset, axis=1)
-    ok &= np.abs(size / radius - 1) < 0.5
-    index = np.full((len(xy), len(face.ids)), -1)
-    index[:, near] = np.where(ok, nearest, -1)
-    return index
+    ok = np.linalg.norm(error, axis=2) < 0.4 * pair.radius + 0.12 * np.linalg.norm(pair.offset, axis=1)
+    ok &= np.abs(size / pair.radius - 1) < 0.5
+    return np.where(ok, nearest, -1)
 
 
 def _seen_from_outside(homography: np.ndarray, face: FaceDesign) -> bool:
