@@ -285,16 +285,20 @@ def calibrated_target(
     functions of all circles, whatever the datum; covariances are propagated by central differences.
     """
     step = 1e-3
+    own = _frames(result, result.xyz_world, start, target, kind)
+    origin = _in_target_frame(own, result.xyz_world, start)
     twists, circles = [], []
-    origin = _in_target_frame(result.labels, result.xyz_world, start, target, kind)
-    for i in range(result.xyz_world.size):
-        shift = np.zeros(result.xyz_world.size)
-        shift[i] = step
-        shift = shift.reshape(-1, 3)
-        ahead = _in_target_frame(result.labels, result.xyz_world + shift, start, target, kind)
-        behind = _in_target_frame(result.labels, result.xyz_world - shift, start, target, kind)
-        twists.append({f: _perturbation(ahead[0][f], behind[0][f]) / (2 * step) for f in origin[0]})
-        circles.append((ahead[1] - behind[1]) / (2 * step))
+    for i, label in enumerate(result.labels):
+        for axis in range(3):
+            ends = []
+            for sign in (1, -1):
+                xyz = result.xyz_world.copy()
+                xyz[i, axis] += sign * step
+                moved = _frames(result, xyz, start, target, kind, only=face_of(label))
+                ends.append(_in_target_frame(own | moved, xyz, start))
+            ahead, behind = ends
+            twists.append({f: _perturbation(ahead[0][f], behind[0][f]) / (2 * step) for f in own})
+            circles.append((ahead[1] - behind[1]) / (2 * step))
     by_circle = np.stack(circles, axis=-1)
     covariance = result.covariance_mm2
     face_covariance = {}
@@ -319,17 +323,24 @@ def _perturbation(ahead: Rigid, behind: Rigid) -> np.ndarray:
     return np.concatenate([rotation, ahead.translation - behind.translation])
 
 
-def _in_target_frame(labels, xyz_world, start: CalibratedTarget, target: TargetDesign, kind: FrameKind):
-    """target_from_face, circles (c, 3) in the target frame, and target_from_world."""
-    world_from_face = {}
+def _frames(
+    result: JointResult, xyz_world, start: CalibratedTarget, target: TargetDesign, kind: FrameKind, only=None
+) -> dict[str, Rigid]:
+    """world_from_face of all faces, or of one."""
+    frames = {}
     for face in target.faces:
-        if face.id in start.target_from_face:
+        if face.id in start.target_from_face and only in (None, face.id):
             own = {
                 label.split(":", 1)[1]: xyz
-                for label, xyz in zip(labels, xyz_world, strict=True)
+                for label, xyz in zip(result.labels, xyz_world, strict=True)
                 if face_of(label) == face.id
             }
-            world_from_face[face.id] = face_frame(face, own, kind, start.target_from_face[face.id].rotation[:, 2])
+            frames[face.id] = face_frame(face, own, kind, start.target_from_face[face.id].rotation[:, 2])
+    return frames
+
+
+def _in_target_frame(world_from_face: dict[str, Rigid], xyz_world: np.ndarray, start: CalibratedTarget):
+    """target_from_face, circles (c, 3) in the target frame, and target_from_world."""
     target_from_world = world_from_face[start.reference_face].inverse()
     return (
         {face_id: target_from_world @ pose for face_id, pose in world_from_face.items()},

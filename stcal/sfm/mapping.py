@@ -224,4 +224,6 @@ def write_model(
     """Write a model as COLMAP's binary files: no unit, corrected centres, keypoints as the database has them."""
     folder.mkdir(parents=True, exist_ok=True)
     keypoints = {image.name: model.keypoints_px(image) for image in observations if image.name in model.images}
-    to_reconstruction(model, ids, camera, colmap_model, keypoints).write_binary(str(folder))
+    reconstruction = to_reconstruction(model, ids, camera, colmap_model, keypoints)
+    reconstruction.update_point_3d_errors()
+    reconstruction.write_binary(str(folder))

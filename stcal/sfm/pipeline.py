@@ -3,6 +3,7 @@
 import json
 import shutil
 from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from pathlib import Path
 
@@ -184,10 +185,9 @@ def claim_folder(out: str | Path) -> Path:
 
 
 def _write_overlays(detection: DetectionResult, labelled: list[LabelledImage], target, out: Path, tell) -> None:
-    folder = out / "overlays"
-    shutil.rmtree(folder, ignore_errors=True)
     face_ids = [face.id for face in target.faces]
-    for i, (image, each) in enumerate(zip(_in_order(detection, labelled), labelled, strict=True)):
+
+    def draw(image, each: LabelledImage) -> None:
         path = overlay_path(out, image.file.name)
         path.parent.mkdir(parents=True, exist_ok=True)
         picture = draw_overlay(
@@ -199,7 +199,10 @@ def _write_overlays(detection: DetectionResult, labelled: list[LabelledImage], t
             len(each.notes),
         )
         write_bytes(path, picture)
-        tell("overlays", i + 1, len(labelled))
+
+    with ThreadPoolExecutor() as pool:  # drawing and JPEG release the interpreter
+        for i, _ in enumerate(pool.map(draw, _in_order(detection, labelled), labelled)):
+            tell("overlays", i + 1, len(labelled))
 
 
 def _in_order(detection: DetectionResult, labelled: list[LabelledImage]):
@@ -272,7 +275,7 @@ def _write(result: RunResult, tell: Progress) -> None:
     write_bytes(out / "labels.csv", labels_csv(observations, corrected).encode())
     shutil.rmtree(out / "models", ignore_errors=True)
     for name, model in models.items():
-        folder = out / "models" / ("top" if name == "." else name)
+        folder = out / "models" / name  # "models/." where the images lie directly in their folder
         write_model(folder, model, observations, ids, result.camera, result.colmap_model)
     report = report_json(result)
     write_bytes(out / "faces.json", _json(faces_json(result)))

@@ -147,4 +147,4 @@ def test_the_written_model_is_colmaps_and_keeps_the_keypoints(scene, observed, d
         assert np.abs(np.array([p.xy for p in stored.points2D]) - 0.5 - image.centre_px).max() < 1e-9
     # COLMAP's own residuals over the corrected points agree with ours.
     ours = np.linalg.norm(mapping.model.residuals_px(scene.camera), axis=1).mean()
-    assert read.compute_mean_reprojection_error() == pytest.approx(ours, rel=0.02) or read.points3D
+    assert read.compute_mean_reprojection_error() == pytest.approx(ours, rel=0.05)
