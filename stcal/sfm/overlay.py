@@ -10,6 +10,9 @@ from stcal.sfm.observations import ImageObservations, face_of, is_board
 PALETTE = [(0, 159, 230), (115, 158, 0), (66, 228, 240), (167, 121, 204), (0, 94, 213), (178, 114, 0)]
 BOARD_COLOUR = (233, 180, 86)
 QUALITY = 82
+MIN_WIDTH_PX = 1000
+MIN_LABEL_GAP = 70.0
+"""Between numbered dots, px at text size 1."""
 THUMBNAIL_PX = 1400
 THUMBNAIL_QUALITY = 80
 
@@ -42,8 +45,11 @@ def draw_overlay(
     notes : number of things left out, for the caption
     """
     picture = cv2.imdecode(np.frombuffer(thumbnail, np.uint8), cv2.IMREAD_COLOR)
+    if picture.shape[1] < MIN_WIDTH_PX:  # room for the labels of small circles
+        picture, scale = cv2.resize(picture, None, fx=2, fy=2, interpolation=cv2.INTER_CUBIC), 2 * scale
     size = max(0.4, picture.shape[1] / 2800)
     colours = {face: PALETTE[i % len(PALETTE)] for i, face in enumerate(faces)} | {BOARD: BOARD_COLOUR}
+    numbered = _numbered_dots(observations, MIN_LABEL_GAP * size / scale)
     for label, centre, shape in zip(observations.labels, observations.centre_px, observations.shape, strict=True):
         key = BOARD if is_board(label) else face_of(label)
         rim = _rim(centre, shape * focal_px[:, None], scale)
@@ -51,7 +57,7 @@ def draw_overlay(
         at = ((centre + 0.5) * scale - 0.5).round().astype(int)
         cv2.drawMarker(picture, at.tolist(), colours[key], cv2.MARKER_CROSS, 5, 1, cv2.LINE_AA)
         text = label.split(":", 1)[1].replace(":", ",")
-        if not is_board(label) or text.split(",")[0] == "0" or text.split(",")[1] == "0":
+        if label in numbered or not is_board(label):
             reach = np.abs(shape * focal_px[:, None]).sum(1).max() * scale
             _text(picture, text, (at[0] + int(0.75 * reach) + 1, at[1] - int(0.75 * reach)), size, colours[key])
     _name_faces(picture, observations, scale, colours, size)
@@ -59,6 +65,19 @@ def draw_overlay(
     _text(picture, counts + (f", {notes} notes" if notes else ""), (8, picture.shape[0] - 10), 1.2 * size, (255,) * 3)
     _, jpeg = cv2.imencode(".jpg", picture, [cv2.IMWRITE_JPEG_QUALITY, QUALITY])
     return jpeg.tobytes()
+
+
+def _numbered_dots(observations: ImageObservations, gap_px: float) -> set[str]:
+    """Dots of the first row and column that carry their number: the first and last, and all where there is room."""
+    place = {x: p for x, p in zip(observations.labels, observations.centre_px, strict=True) if is_board(x)}
+    chosen = set()
+    for axis in (1, 2):
+        line = [x for x in sorted(place, key=lambda x: int(x.split(":")[axis])) if x.split(":")[3 - axis] == "0"]
+        if line:
+            steps = np.linalg.norm(np.diff([place[x] for x in line], axis=0), axis=1)
+            roomy = len(line) > 1 and np.median(steps) > gap_px
+            chosen |= set(line if roomy else (line[0], line[-1]))
+    return chosen
 
 
 def _rim(centre_px: np.ndarray, shape_px: np.ndarray, scale: float) -> np.ndarray:
