@@ -56,7 +56,7 @@ class TargetDesign:
             if face.id == face_id:
                 return face
         known = ", ".join(face.id for face in self.faces)
-        raise InputError(f"target {self.name}: no face {face_id}; the design has {known}")
+        raise InputError(f"target {self.name}: no face {face_id}; the design has {known}, choose one of them")
 
     def radius_of(self) -> dict[str, float]:
         """Radius in mm by label."""

@@ -292,6 +292,9 @@ def _print_run(result) -> None:
             print(f"left out {outlier.image} {outlier.label}: residual {outlier.residual_px:.3f} px")
     for note in result.notes:
         print(note)
+    told = sum(bool(each.notes) for each in result.labelled)
+    if told:
+        print(f"something was left out in {told} of {len(result.labelled)} images; the report says what and why")
     if not result.options.eccentricity:
         print("uncorrected control: without the eccentricity faces are off by tens of µm, and no residual shows it")
     print(f"{'face':>6} {'x':>11} {'y':>11} {'z':>11} mm   σ position µm      σ rotation mdeg")

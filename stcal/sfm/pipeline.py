@@ -28,7 +28,7 @@ from stcal.sfm.overlay import draw_overlay
 from stcal.sfm.refine import eccentricity_px
 from stcal.sfm.report import report_html
 from stcal.sfm.result import RunOptions, RunResult
-from stcal.sfm.solve import GroupSolution, image_sigma_factor, require_groups, solve_group, with_sigma
+from stcal.sfm.solve import GroupSolution, image_sigma_factor, require_groups, solve_group, unseen_board, with_sigma
 
 RESULTS = ("faces.json", "report.json", "report.html", "labels.csv", "detections.csv", "compare.json")
 RESULT_FOLDERS = ("models", "overlays", "scratch")
@@ -91,6 +91,7 @@ def run(
         faces += found
         notes += missing
     calibrated = chain_faces(faces, target, options.reference_face)
+    notes += unseen_board(solutions, board)
     factor = image_sigma_factor([s.model for s in solutions], detection.camera)
     joint = None
     if options.solve == "joint":

@@ -188,3 +188,14 @@ def image_sigma_factor(models: list[GroupModel], camera: Camera) -> float:
 def with_sigma(model: GroupModel, factor: float) -> GroupModel:
     """The model with its observations' σ scaled."""
     return replace(model, sigma_px=factor * model.sigma_px)
+
+
+def unseen_board(solutions: list[GroupSolution], board: BoardDesign) -> list[str]:
+    """Rows and columns of the board that no image shows: hidden everywhere, or not there at all."""
+    seen = {label for s in solutions for label in s.model.labels if is_board(label)}
+    notes = []
+    for what, count, place in (("row", board.rows, 1), ("column", board.columns, 2)):
+        missing = [str(i) for i in range(count) if not any(int(x.split(":")[place]) == i for x in seen)]
+        if missing:
+            notes.append(f"board {what} {', '.join(missing)}: not seen in any image; check {what}s in the board file")
+    return notes
