@@ -79,9 +79,14 @@ def run(
         typer.Option("--eccentricity/--no-eccentricity", help="Off: the uncorrected control, chained as in the paper."),
     ] = True,
     max_angle: Annotated[
-        float,
-        typer.Option("--max-angle", min=2, max=170, help="Largest median ray angle of the initial pair, degrees."),
-    ] = 60.0,
+        float | None,
+        typer.Option(
+            "--max-angle",
+            min=2,
+            max=170,
+            help="Largest median ray angle of the initial pair, degrees; 60, and the smallest beyond it, if not given.",
+        ),
+    ] = None,
     min_diameter: MinDiameter = None,
     max_diameter: MaxDiameter = 450.0,
     workers: Workers = None,
@@ -95,7 +100,7 @@ def run(
         frame=frame and frame.value,
         eccentricity=eccentricity,
         reference_face=reference_face,
-        pairs=PairOptions(float(np.radians(max_angle))),
+        pairs=PairOptions(None if max_angle is None else float(np.radians(max_angle))),
         ellipses=_ellipses(min_diameter, max_diameter),
         workers=workers,
     )

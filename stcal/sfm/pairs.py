@@ -1,6 +1,6 @@
 """The initial pair, as in document 000: the pair of images with the largest median ray angle that is still safe."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import combinations
 
 import cv2
@@ -16,15 +16,24 @@ RANSAC_PX = 1.0
 MIN_LABELS = 8
 """Shared labels that a pair needs: five fix an essential matrix, the others choose among its solutions."""
 MIN_IN_FRONT = 0.9
+OVER_LIMIT = "median angle over the limit"
+SAFE_ANGLE_RAD = np.radians(60.0)
 MIN_ANGLE_RAD = np.radians(1.0)
 """Below this median angle the camera has not moved as far as reconstruction is concerned."""
 
 
 @dataclass(frozen=True, slots=True)
 class PairOptions:
-    """``max_angle_rad`` : largest median ray angle that is still safe."""
+    """``max_angle_rad`` : largest median ray angle that is still safe.
 
-    max_angle_rad: float = np.radians(60.0)
+    Where None, 60°; and should every pair of a group be beyond that, the one with the smallest angle is taken.
+    """
+
+    max_angle_rad: float | None = None
+
+    def limit_rad(self) -> float:
+        """The limit in force."""
+        return SAFE_ANGLE_RAD if self.max_angle_rad is None else self.max_angle_rad
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -53,11 +62,13 @@ def rank_pairs(group: list[ImageObservations], camera: Camera, options: PairOpti
     """
     scores = [_score(a, b, camera, options) for a, b in combinations(group, 2)]
     scores.sort(key=lambda s: (s.verdict != "usable", -round(s.median_angle_rad, 9), -s.shared, s.first, s.second))
+    over = [s for s in scores if s.verdict.startswith(OVER_LIMIT)]
+    if over and scores[0].verdict != "usable" and options.max_angle_rad is None:
+        scores.remove(over[-1])
+        return [replace(over[-1], verdict=f"chosen: the smallest {OVER_LIMIT}, none is under it"), *scores]
     if not scores or scores[0].verdict != "usable":
         raise MappingError(_no_pair(group, scores, options))
-    best = scores[0]
-    chosen = PairScore(*(getattr(best, name) for name in PairScore.__slots__[:-1]), "chosen")
-    return [chosen, *scores[1:]]
+    return [replace(scores[0], verdict="chosen"), *scores[1:]]
 
 
 def _no_pair(group, scores: list[PairScore], options: PairOptions) -> str:
@@ -73,7 +84,7 @@ def _no_pair(group, scores: list[PairScore], options: PairOptions) -> str:
             f"{where}: the camera did not move (largest median ray angle {np.degrees(angle):.2f}°, "
             f"{np.degrees(MIN_ANGLE_RAD):.0f}° needed); take the photographs from different places"
         )
-    behind = [s for s in scores if MIN_ANGLE_RAD <= s.median_angle_rad <= options.max_angle_rad]
+    behind = [s for s in scores if MIN_ANGLE_RAD <= s.median_angle_rad <= options.limit_rad()]
     if behind:
         best = max(behind, key=lambda s: s.in_front)
         return (
@@ -83,7 +94,7 @@ def _no_pair(group, scores: list[PairScore], options: PairOptions) -> str:
     smallest = min(s.median_angle_rad for s in scores if s.median_angle_rad > 0)
     return (
         f"{where} with a median ray angle of {np.degrees(MIN_ANGLE_RAD):.0f}° to "
-        f"{np.degrees(options.max_angle_rad):.0f}° (measured {np.degrees(smallest):.1f}° to {np.degrees(angle):.1f}°); "
+        f"{np.degrees(options.limit_rad()):.0f}° (measured {np.degrees(smallest):.1f}° to {np.degrees(angle):.1f}°); "
         "add views in between, raise --max-angle, or check that the camera file belongs to the images"
     )
 
@@ -110,8 +121,8 @@ def _score(a: ImageObservations, b: ImageObservations, camera: Camera, options: 
         verdict = f"median angle under {np.degrees(MIN_ANGLE_RAD):.0f}°: the camera hardly moved"
     elif in_front < MIN_IN_FRONT:
         verdict = f"{100 * in_front:.0f} % of the points in front of both cameras, {100 * MIN_IN_FRONT:.0f} % needed"
-    elif angle > options.max_angle_rad:
-        verdict = f"median angle over the limit of {np.degrees(options.max_angle_rad):.0f}°"
+    elif angle > options.limit_rad():
+        verdict = f"{OVER_LIMIT} of {np.degrees(options.limit_rad()):.0f}°"
     else:
         verdict = "usable"
     return PairScore(a.name, b.name, n, angle, in_front, forward, pose, verdict)

@@ -84,6 +84,14 @@ def test_every_angle_over_the_limit(scene, group):
         rank_pairs(group[:2], scene.camera, PairOptions(np.radians(1.5)))
 
 
+def test_the_smallest_angle_serves_where_all_are_beyond_the_default(scene, group, monkeypatch):
+    monkeypatch.setattr("stcal.sfm.pairs.SAFE_ANGLE_RAD", np.radians(2.0))
+    ranked = rank_pairs(group, scene.camera, PairOptions())
+    assert ranked[0].median_angle_rad == min(p.median_angle_rad for p in ranked)
+    assert ranked[0].verdict.startswith("chosen")
+    assert len(ranked) == 10
+
+
 def test_triangulation_returns_the_points():
     rng = np.random.default_rng(0)
     xyz = rng.uniform(-0.2, 0.2, (20, 3)) + np.array([0, 0, 1.5])
