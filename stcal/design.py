@@ -115,7 +115,7 @@ def reference_target() -> TargetDesign:
         places = common | small | {"c": xy_c}
         radius = [8.0 if circle in common else 4.0 for circle in places]
         faces.append(FaceDesign(face_id, tuple(places), list(places.values()), radius, "1", "3", "5"))
-    return TargetDesign("reference six-face target", "bright", tuple(faces))
+    return TargetDesign("reference target", "bright", tuple(faces))
 
 
 def reference_board() -> BoardDesign:

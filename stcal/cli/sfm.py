@@ -127,13 +127,15 @@ def detect(
     target_design = pipeline.load_design(target, reference_target, load_target)
     board_design = pipeline.load_design(board, reference_board, load_board)
     options = pipeline.RunOptions(ellipses=_ellipses(min_diameter, max_diameter), workers=workers)
+    if (out / "faces.json").exists():
+        raise InputError(f"output folder {out}: holds a finished calibration; give another folder with --out")
     folder = pipeline.claim_folder(out)
     with StageProgress() as progress:
         detection, labelled = pipeline.detect(images, model, folder, target_design, board_design, options, progress)
     for each in labelled:
         image = each.observations
         dots = sum(label.startswith("board:") for label in image.labels)
-        faces = ", ".join(image.face_ids()) or "none"
+        faces = ", ".join(sorted(image.face_ids())) or "none"
         print(f"{image.name}: faces {faces} ({len(image) - dots} circles), board {dots} dots")
         for note in each.notes:
             print(f"  {note}")
@@ -302,7 +304,11 @@ def _print_run(result) -> None:
         print(f"something was left out in {told} of {len(result.labelled)} images; the report says what and why")
     if not result.options.eccentricity:
         print("uncorrected control: without the eccentricity faces are off by tens of µm, and no residual shows it")
-    print(f"{'face':>6} {'x':>11} {'y':>11} {'z':>11} mm   σ position µm      σ rotation mdeg")
+    reused = sum(image.reused for image in result.detection.images)
+    if reused:
+        print(f"detections kept from an earlier run: {reused} of {len(result.detection.images)}")
+    sigma_heading = "   σ position µm      σ rotation mdeg" if result.target.face_covariance else ""
+    print(f"{'face':>6} {'x':>11} {'y':>11} {'z':>11} mm{sigma_heading}")
     for face_id, pose in result.target.target_from_face.items():
         x, y, z = pose.translation
         line = f"{face_id:>6} {x:11.4f} {y:11.4f} {z:11.4f}"

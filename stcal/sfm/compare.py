@@ -29,7 +29,8 @@ def compare(run: str | Path, truth: str | Path) -> dict:
         ``circles_max_um`` after a rigid fit of the face, ``circles`` compared, and where the run states σ,
         ``translation_sigma_um``, ``rotation_sigma_mdeg`` and ``normalised_error`` (√(eᵀC⁻¹e/6), about 1 when σ is
         true); ``missing`` faces of the truth; ``worst`` over all faces; and, where the truth lists images and the run
-        is a folder, ``labels`` : ``wrong``, and ``found`` of the ``visible`` circles (those the truth calls must_find).
+        is a folder, ``labels`` : ``wrong``, and ``found`` of the ``visible`` circles (those the truth calls
+        must_find) in the images that both have.
 
     Raises
     ------
@@ -51,7 +52,7 @@ def compare(run: str | Path, truth: str | Path) -> dict:
         for face_id in known["target_from_face"]
         if face_id in found["target_from_face"]
     }
-    labels = _labels(run / DETECTIONS, known["groups"]) if run.is_dir() and _is(known, "groups", dict) else None
+    labels = _labels(run / DETECTIONS, known) if run.is_dir() and _is(known, "groups", dict) else None
     measures = ("translation_um", "rotation_mdeg", "circles_mean_um")
     return {
         "reference_face": known["reference_face"],
@@ -62,7 +63,7 @@ def compare(run: str | Path, truth: str | Path) -> dict:
     }
 
 
-def _labels(path: Path, groups: dict) -> dict | None:
+def _labels(path: Path, known: dict) -> dict | None:
     """Labels of ``detections.csv`` against the truth; a board's numbers are known up to its own symmetry, but for a
     whole group at once."""
     try:
@@ -71,8 +72,11 @@ def _labels(path: Path, groups: dict) -> dict | None:
         measured: dict[str, dict[str, tuple[float, float]]] = {}
         for row in rows:
             measured.setdefault(row["image"], {})[row["label"]] = (float(row["x_px"]), float(row["y_px"]))
+        for labels in measured.values():  # circles that the truth does not know are neither right nor wrong
+            for label in [x for x in labels if not is_board(x) and x not in known["circles"]]:
+                del labels[label]
         total = np.zeros(3, int)
-        for group in groups.values():
+        for group in known["groups"].values():
             count = len(group["board_circles_target"])
             columns = 1 + max((int(k.split(":")[2]) for m in measured.values() for k in m if is_board(k)), default=0)
             grid = np.arange(count - count % columns).reshape(-1, columns)
@@ -82,16 +86,18 @@ def _labels(path: Path, groups: dict) -> dict | None:
             total += min(counts, key=lambda c: (c[0], -c[1]))
     except (OSError, KeyError, ValueError, TypeError, IndexError):
         return None
+    if not total.any():
+        return None
     return dict(zip(("wrong", "found", "visible"), total.tolist(), strict=True))
 
 
 def _count(measured: dict, images: dict, numbers: np.ndarray) -> tuple[int, int, int]:
     """(wrong, found, visible) with the board's dots numbered as ``numbers``, (rows, columns), has them."""
     wrong = found = visible = 0
-    for name, image in images.items():
-        circles = image["circles"]
+    for name in images.keys() & measured.keys():
+        circles = images[name]["circles"]
         visible += sum(bool(c["must_find"]) for c in circles.values())
-        for label, centre in measured.get(name, {}).items():
+        for label, centre in measured[name].items():
             key = label
             if is_board(label):
                 row, column = (int(v) for v in label.split(":")[1:])

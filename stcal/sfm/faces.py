@@ -39,7 +39,7 @@ class FaceInGroup:
 
 
 def face_frame(face: FaceDesign, xyz: dict[str, np.ndarray], kind: FrameKind, towards: np.ndarray) -> Rigid:
-    """world_from_face from circle centres, by document 000's Gram–Schmidt (eqs. 8–10).
+    """world_from_face from circle centres, by Zhang & Wei's Gram–Schmidt (eqs. 8–10).
 
     Parameters
     ----------

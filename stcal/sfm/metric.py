@@ -19,7 +19,7 @@ class Scale:
     """The scale of one group.
 
     ``board_from_world`` : least-squares similarity over all dots; its scale is λ (mm per unit);
-    ``rows_mm_per_unit`` : λ as in document 000 (first and last row, all pairs), ``rows`` those two rows;
+    ``rows_mm_per_unit`` : λ as in Zhang & Wei (2017) (first and last row, all pairs), ``rows`` those two rows;
     ``labels`` : (n,) the dots; ``residuals_mm`` : (n, 3) reconstructed minus design, board frame;
     ``sigma_mm_per_unit`` : of λ, from the stated σ of the dots' positions.
     """
@@ -44,7 +44,7 @@ class Scale:
         return float(np.sqrt((self.residuals_mm**2).sum(1).mean()))
 
     def mean_mm(self) -> float:
-        """Mean of the residuals' lengths: the measure of document 000's Table 1."""
+        """Mean of the residuals' lengths: the measure of Zhang & Wei's Table 1."""
         return float(np.linalg.norm(self.residuals_mm, axis=1).mean())
 
 
@@ -60,8 +60,8 @@ def find_scale(model: GroupModel, board: BoardDesign) -> Scale:
     where = f"group {model.group}: scale"
     if len(members) < MIN_DOTS:
         raise ScaleError(
-            f"{where}: {len(members)} board dots mapped, {MIN_DOTS} needed; photograph the board with the faces, and if it "
-            "was, check that the camera file belongs to the images, the board file to the board, and that nothing moved"
+            f"{where}: {len(members)} board dots mapped, {MIN_DOTS} needed; photograph the board with the faces; "
+            "check that the camera file belongs to the images and the board file to the board"
         )
     labels = [model.labels[i] for i in members]
     cells = np.array([[int(v) for v in label.split(":")[1:]] for label in labels])
@@ -84,7 +84,7 @@ def find_scale(model: GroupModel, board: BoardDesign) -> Scale:
 
 
 def _by_rows(xyz_board, xyz_world, row) -> tuple[float, tuple[int, int]]:
-    """Document 000, eq. 7, with the mean over pairs as it must be: 2/(n(n−1)), not 1/(n−1)!."""
+    """Zhang & Wei (2017), eq. 7, with the mean over pairs as it must be: 2/(n(n−1)), not 1/(n−1)!."""
     first, last = int(row.min()), int(row.max())
     chosen = (row == first) | (row == last)
     i, j = np.triu_indices(int(chosen.sum()), 1)

@@ -48,7 +48,7 @@ def report_json(result: RunResult) -> dict:
             "solve": result.options.solve,
             "frame": result.options.frame,
             "eccentricity": result.options.eccentricity,
-            "max_pair_angle_deg": float(np.degrees(result.options.pairs.limit_rad())),
+            "max_pair_angle_deg": round(float(np.degrees(result.options.pairs.limit_rad())), 9),
         },
         "camera": {
             "model": result.colmap_model,

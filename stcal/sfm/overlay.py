@@ -62,7 +62,13 @@ def draw_overlay(
             _text(picture, text, (at[0] + int(0.75 * reach) + 1, at[1] - int(0.75 * reach)), size, colours[key])
     _name_faces(picture, observations, scale, colours, size)
     counts = f"{observations.name}: {len(observations)} circles labelled"
-    _text(picture, counts + (f", {notes} notes" if notes else ""), (8, picture.shape[0] - 10), 1.2 * size, (255,) * 3)
+    _text(
+        picture,
+        counts + (f", {notes} note{'s' * (notes > 1)}" if notes else ""),
+        (8, picture.shape[0] - 10),
+        1.2 * size,
+        (255,) * 3,
+    )
     _, jpeg = cv2.imencode(".jpg", picture, [cv2.IMWRITE_JPEG_QUALITY, QUALITY])
     return jpeg.tobytes()
 

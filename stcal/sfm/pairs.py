@@ -1,4 +1,4 @@
-"""The initial pair, as in document 000: the pair of images with the largest median ray angle that is still safe."""
+"""The initial pair, as in Zhang & Wei (2017): of all pairs the largest median ray angle that is still safe."""
 
 from dataclasses import dataclass, replace
 from itertools import combinations

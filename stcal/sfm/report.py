@@ -79,6 +79,7 @@ def _worst_chain(report: dict, key: str) -> tuple[float, str] | None:
     return _worst(
         (chain[key], f"face {face} by {' → '.join(chain['groups'])}")
         for face, chains in report["chains"].items()
+        if len(chains) > 1
         for chain in chains
     )
 
@@ -119,7 +120,8 @@ def _result(report: dict) -> str:
 
 def _trust(report: dict) -> str:
     summary = report["summary"]
-    sigma = "<strong>σ hold for the given intrinsics.</strong> An error of the camera calibration is not in them,"
+    sigma = "<strong>σ hold for the given intrinsics and the given pitch of the board.</strong> An error of the camera "
+    sigma += "calibration, or of the pitch as a whole (100 ppm is 4 K on aluminium), is not in them,"
     if report["options"]["solve"] != "joint":
         sigma = "<strong>No σ were computed,</strong> because the solve was group by group; look at the chains. All "
         sigma += "holds for the given intrinsics: an error of the camera calibration goes into the faces,"
@@ -251,8 +253,8 @@ def _scale(report: dict) -> str:
         for name, scale in scales.items()
     )
     return (
-        "<p>λ turns a group's model into mm, by least squares over all dots of the board, and by rows as in document "
-        "000 (first and last row, all pairs). σ is that of λ from the board's stated σ.</p>\n"
+        "<p>λ turns a group's model into mm, by least squares over all dots of the board, and by rows as "
+        "published (first and last row, all pairs). σ is that of λ from the board's stated σ.</p>\n"
         f"{table(columns, rows)}<h3>Board residuals</h3>\n<p>Reconstructed minus design, in the board's frame, on the "
         "board's grid; one scale for all groups. Arrows show x and y, colour shows z.</p>\n"
         f'<div class="plots">{plots}</div>\n'

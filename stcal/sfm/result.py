@@ -25,8 +25,8 @@ Solve = Literal["joint", "chain"]
 class RunOptions:
     """What to do.
 
-    ``solve`` : ``joint`` (one adjustment over all groups) or ``chain`` (as in document 000, group by group);
-    ``frame`` : ``plane`` (Z from the plane of all circles of a face) or ``three-point`` (as in document 000);
+    ``solve`` : ``joint`` (one adjustment over all groups) or ``chain`` (as in Zhang & Wei (2017), group by group);
+    ``frame`` : ``plane`` (Z from the plane of all circles of a face) or ``three-point`` (as in Zhang & Wei (2017));
     ``eccentricity`` : off for the uncorrected control, which then is chained with three-point frames as in the
     document unless the two are given; ``reference_face`` : the design's first one where None; ``workers`` :
     processes, one per core where None.

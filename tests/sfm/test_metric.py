@@ -1,4 +1,4 @@
-"""λ from the board: least squares, and document 000's rows with its erratum."""
+"""λ from the board: least squares, and Zhang & Wei's rows with its erratum."""
 
 import numpy as np
 import pytest

@@ -269,10 +269,19 @@ def test_what_was_not_computed_is_a_dash(chained):
 def test_trust_names_the_worst(joint):
     trust = {row[0]: row[1:3] for row in rows_of(joint, "trust")}
     assert trust["σ of a face's position (µm)"][0] == "3.1"
-    assert trust["Disagreement of chains, position (µm)"] == ["13.1", "face 2 by a"]
+    # The only way to a face agrees with itself: that is no check.
+    assert trust["Disagreement of chains, position (µm)"] == ["–", "–"]
     assert trust["λ by rows against least squares (ppm)"] == ["0.5", "group a"]
     assert "σ hold for the given intrinsics" in joint
     assert "no second way confirms them: face 2." in joint
+
+
+def test_two_ways_to_a_face_are_a_check():
+    two = make()
+    (way,) = two["chains"]["2"]
+    two["chains"]["2"] = [way, way | {"groups": ["b"], "translation_um": 20.04}]
+    trust = {row[0]: row[1:3] for row in rows_of(report_html(two, OVERLAYS), "trust")}
+    assert trust["Disagreement of chains, position (µm)"] == ["20.0", "face 2 by b"]
 
 
 def test_long_rankings_are_folded(joint):

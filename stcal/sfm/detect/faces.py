@@ -186,11 +186,15 @@ def _decide(readings: list[FaceReading], candidates: Candidates, contrast: float
     notes: list[str] = []
     own = [float(np.median(candidates.contrast[r.used()])) for r in readings]
     least = max([contrast, *own]) / MAX_CONTRAST_RATIO
+    faint: set[int] = set()
     for reading, value in zip(readings, own, strict=True):
-        if value < least:
-            notes.append(f"face {reading.face.id}: contrast {value:.0f}, {least:.0f} needed; a reflection, left out")
+        if value < least and not faint & set(reading.used()):
+            faint |= set(reading.used())
+            notes.append(
+                f"a pattern like face {reading.face.id}: contrast {value:.0f}, {least:.0f} needed; a reflection, "
+                "left out"
+            )
     readings = [r for r, value in zip(readings, own, strict=True) if value >= least]
-    notes = sorted(set(notes))
     settled: set[int] = set()
     for reading in readings:
         if settled & set(reading.used()):
@@ -207,7 +211,7 @@ def _decide(readings: list[FaceReading], candidates: Candidates, contrast: float
         if rivals or not is_named(reading.face, reading.index >= 0, target):
             ids = ", ".join(sorted({r.face.id for r in (reading, *rivals)}))
             notes.append(
-                f"a face of {reading.count()} circles reads as {ids}, and not only so; left out, "
+                f"a pattern of {reading.count()} circles that fits face {ids} but may be another; left out, "
                 "show the circles that tell the faces apart"
             )
         else:
