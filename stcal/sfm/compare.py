@@ -78,10 +78,9 @@ def _labels(path: Path, known: dict) -> dict | None:
         total = np.zeros(3, int)
         for group in known["groups"].values():
             count = len(group["board_circles_target"])
-            columns = 1 + max((int(k.split(":")[2]) for m in measured.values() for k in m if is_board(k)), default=0)
-            grid = np.arange(count - count % columns).reshape(-1, columns)
+            grid = np.arange(count).reshape(-1, _columns(group["board_circles_target"]))
             turns = [grid, np.rot90(grid, 2)]
-            turns += [np.rot90(grid), np.rot90(grid, 3)] if grid.shape[0] == columns else []
+            turns += [np.rot90(grid), np.rot90(grid, 3)] if grid.shape[0] == grid.shape[1] else []
             counts = [_count(measured, group["images"], turn) for turn in turns]
             total += min(counts, key=lambda c: (c[0], -c[1]))
     except (OSError, KeyError, ValueError, TypeError, IndexError):
@@ -89,6 +88,13 @@ def _labels(path: Path, known: dict) -> dict | None:
     if not total.any():
         return None
     return dict(zip(("wrong", "found", "visible"), total.tolist(), strict=True))
+
+
+def _columns(dots: list) -> int:
+    """Columns of a board from its dots in row-major order: where the first step back to the row's begin is."""
+    steps = np.diff(np.asarray(dots, float), axis=0)
+    turned = np.flatnonzero(steps @ steps[0] < 0)
+    return int(turned[0]) + 1 if len(turned) else len(dots)
 
 
 def _count(measured: dict, images: dict, numbers: np.ndarray) -> tuple[int, int, int]:
@@ -101,7 +107,8 @@ def _count(measured: dict, images: dict, numbers: np.ndarray) -> tuple[int, int,
             key = label
             if is_board(label):
                 row, column = (int(v) for v in label.split(":")[1:])
-                key = f"{BOARD}:{numbers[row, column]}"
+                inside = 0 <= row < numbers.shape[0] and 0 <= column < numbers.shape[1]
+                key = f"{BOARD}:{numbers[row, column]}" if inside else label
             near = key in circles and np.linalg.norm(np.subtract(centre, circles[key]["centre_px"])) < NEAR_PX
             wrong += not near
             found += near and bool(circles[key]["must_find"])

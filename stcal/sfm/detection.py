@@ -4,6 +4,8 @@ import hashlib
 import io
 import json
 import os
+import zipfile
+import zlib
 from collections.abc import Callable
 from concurrent.futures.process import BrokenProcessPool
 from dataclasses import asdict, dataclass, fields
@@ -22,7 +24,7 @@ from stcal.sfm.detect.image import ImageDetection, detect_image, grey_8bit
 from stcal.sfm.images import ImageFile, Skipped, decode
 from stcal.sfm.overlay import thumbnail
 
-CACHE_VERSION = 1
+CACHE_VERSION = 2
 """Raised whenever detection gives other results for the same image: what was kept is then not used again."""
 
 
@@ -217,7 +219,7 @@ def write_bytes(path: Path, data: bytes) -> None:
 def _load(file: ImageFile, path: Path, reused: bool) -> DetectedImage | None:
     """Read what was kept; None where the file is damaged."""
     try:
-        with np.load(path) as stored:
+        with np.load(io.BytesIO(path.read_bytes())) as stored:
             meta = json.loads(stored["meta"].tobytes())
             detection = ImageDetection(
                 Centres(*(stored[f.name] for f in fields(Centres))),
@@ -228,7 +230,7 @@ def _load(file: ImageFile, path: Path, reused: bool) -> DetectedImage | None:
                 meta["candidates"],
             )
             return DetectedImage(file, detection, meta["digest"], stored["thumbnail"].tobytes(), meta["scale"], reused)
-    except (OSError, ValueError, KeyError, EOFError):
+    except (OSError, ValueError, KeyError, EOFError, TypeError, zipfile.BadZipFile, zlib.error):
         if not reused:
             raise
         return None

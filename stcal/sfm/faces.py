@@ -62,6 +62,8 @@ def face_frame(face: FaceDesign, xyz: dict[str, np.ndarray], kind: FrameKind, to
         origin, x, y = plane.project(origin), plane.project(x), plane.project(y)
     axis_x = (x - origin) / np.linalg.norm(x - origin)
     across = (y - origin) - (y - origin) @ axis_x * axis_x
+    if np.linalg.norm(across) < 1e-6 * np.linalg.norm(y - origin):
+        raise DegenerateError(f"face {face.id}: its frame circles are mapped in one line; check their labels")
     axis_y = across / np.linalg.norm(across)
     return Rigid(np.column_stack([axis_x, axis_y, np.cross(axis_x, axis_y)]), origin)
 
@@ -97,6 +99,10 @@ def faces_of_group(
                 r.T @ information[members] @ r,
                 len(seen_by),
             )
+        )
+    if not faces and not notes:
+        notes.append(
+            f"group {model.group}: no face mapped (two images must see it); add views that show faces and board"
         )
     return faces, notes
 

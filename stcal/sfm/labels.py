@@ -78,9 +78,10 @@ def _choose(detections: list[ImageDetection], target: TargetDesign, board: Board
             if best is not None:
                 queue.append((j, best))
                 break
-    # A numbering that the image alone makes certain needs no witness, unless a witness contradicts it.
+    # Where the group's numbering is no convention, one that the image alone makes certain needs no witness, unless a
+    # witness contradicts it.
     for j in sorted(open_images):
-        if len(boards[j]) == 1 and not set(faces[j]) & set(known):
+        if len(boards[first]) == len(boards[j]) == 1 and not set(faces[j]) & set(known):
             chosen[j] = 0
     return chosen
 

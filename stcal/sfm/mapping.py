@@ -11,13 +11,11 @@ from stcal.errors import MappingError
 from stcal.geometry.camera import Camera
 from stcal.geometry.rigid import Rigid
 from stcal.sfm.database import CAMERA_ID, colmap_camera, to_colmap_px
-from stcal.sfm.model import GroupModel
+from stcal.sfm.model import MIN_POINTS, GroupModel, Outlier
 from stcal.sfm.observations import ImageObservations
 from stcal.sfm.pairs import PairScore
 
 SEED = 1
-MIN_POINTS = 6
-"""Labelled points that register an image; thousands are what COLMAP's own defaults expect."""
 MAX_REPROJECTION_PX = 4.0
 """Observations further off than this from their label's point are left out of the model (COLMAP's filter)."""
 MIN_AGREEMENT = 0.5
@@ -27,9 +25,11 @@ LOG_ERRORS_ONLY = 3
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Mapping:
-    """``model`` of a group; ``left_out`` : image name → reason; ``seeded`` : how the initial pair was registered."""
+    """``model`` of a group; ``left_out`` : image name → reason; ``seeded`` : how the initial pair was registered;
+    ``outliers`` : observations far off their label's point."""
 
     model: GroupModel
+    outliers: tuple[Outlier, ...]
     left_out: dict[str, str]
     seeded: str
 
@@ -64,15 +64,24 @@ def map_group(
             f"group {group[0].group}: no model from the pair {pairs[0].first}, {pairs[0].second} "
             f"({pairs[0].shared} circles in common); add views between the two, or change --max-angle"
         )
-    model = _labelled_model(reconstruction, group, ids, camera)
+    model, outliers = _labelled_model(reconstruction, group, ids, camera)
     _require_agreement(model, group)
-    left_out = {
-        image.name: f"{_seen(image, model)} of its circles are in the model, {MIN_POINTS} needed; "
-        "photograph faces and board together"
-        for image in group
-        if image.name not in model.images
-    }
-    return Mapping(model, left_out, seeded)
+    return Mapping(model, outliers, left_out(group, model), seeded)
+
+
+def left_out(group: list[ImageObservations], model: GroupModel) -> dict[str, str]:
+    """Reason by name of every image that the model does not have."""
+    reasons = {}
+    for image in group:
+        if image.name not in model.images:
+            known = len(set(image.labels) & set(model.labels))
+            reasons[image.name] = (
+                f"{known} of its circles are in the model, {MIN_POINTS} needed; photograph faces and board together"
+                if known < MIN_POINTS
+                else f"fewer than {MIN_POINTS} of its {known} circles fit the model to {MAX_REPROJECTION_PX:g} px; "
+                "check that it is sharp, and that nothing but the camera moved"
+            )
+    return reasons
 
 
 def _require_agreement(model: GroupModel, group: list[ImageObservations]) -> None:
@@ -87,10 +96,6 @@ def _require_agreement(model: GroupModel, group: list[ImageObservations]) -> Non
             f"{MAX_REPROJECTION_PX:g} px, {MIN_AGREEMENT * wanted:.0f} needed; "
             "check that the camera file belongs to the images, and that nothing but the camera moved"
         )
-
-
-def _seen(image: ImageObservations, model: GroupModel) -> int:
-    return len(set(image.labels) & set(model.labels))
 
 
 def pipeline_options(names: list[str], pair: tuple[int, int]) -> pycolmap.IncrementalPipelineOptions:
@@ -167,9 +172,10 @@ def rigid_from_colmap(pose: pycolmap.Rigid3d) -> Rigid:
 
 def _labelled_model(
     reconstruction: pycolmap.Reconstruction, group: list[ImageObservations], ids: dict[str, int], camera: Camera
-) -> GroupModel:
-    """One point for each label, with every observation of the label that agrees with it."""
-    registered = [image for image in group if reconstruction.image(ids[image.name]).has_pose] if group else []
+) -> tuple[GroupModel, tuple[Outlier, ...]]:
+    """One point for each label, with every observation of the label that agrees with it; and those that do not."""
+    known = reconstruction.images  # COLMAP forgets images that share nothing with the others
+    registered = [image for image in group if ids[image.name] in known and known[ids[image.name]].has_pose]
     poses = [rigid_from_colmap(reconstruction.image(ids[image.name]).cam_from_world()) for image in registered]
     places: dict[str, dict[int, int]] = {}
     for image in registered:
@@ -201,8 +207,18 @@ def _labelled_model(
         np.zeros((len(rows), 2)),
         np.array([registered[i].sigma_px()[k] for i, k in zip(image_index, keypoint, strict=True)]),
     )
-    off = np.linalg.norm(model.residuals_px(camera), axis=1) > MAX_REPROJECTION_PX
-    return model.without(off)
+    residual = np.linalg.norm(model.residuals_px(camera), axis=1)
+    off = residual > MAX_REPROJECTION_PX
+    outliers = [
+        Outlier(
+            model.images[model.image_index[k]],
+            model.labels[model.point_index[k]],
+            float(residual[k]),
+            MAX_REPROJECTION_PX,
+        )
+        for k in np.flatnonzero(off)
+    ]
+    return model.without(off), tuple(outliers)
 
 
 def to_reconstruction(

@@ -10,6 +10,18 @@ from stcal.geometry.rigid import Rigid, Similarity
 from stcal.sfm.observations import ImageObservations, face_of, is_board
 
 _PER_OBSERVATION = ("image_index", "point_index", "keypoint", "measured_px", "shift_px", "sigma_px")
+MIN_POINTS = 6
+"""Labelled points that hold an image; thousands are what COLMAP's own defaults expect."""
+
+
+@dataclass(frozen=True, slots=True)
+class Outlier:
+    """An observation that is left out: it contradicts all others."""
+
+    image: str
+    label: str
+    residual_px: float
+    limit_px: float
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -85,13 +97,25 @@ class GroupModel:
         return {key: np.array(indices) for key, indices in members.items()}
 
     def without(self, drop: np.ndarray) -> "GroupModel":
-        """The model without the observations of mask ``drop``, and without points that fewer than two then see."""
+        """The model without the observations of mask ``drop``, and then without points that fewer than two images
+        see and images that see fewer than six points."""
         keep = ~drop
-        count = np.bincount(self.point_index[keep], minlength=len(self.labels))
-        kept = np.flatnonzero(count >= 2)
-        keep &= count[self.point_index] >= 2
+        while True:
+            points = np.bincount(self.point_index[keep], minlength=len(self.labels))
+            images = np.bincount(self.image_index[keep], minlength=len(self.images))
+            again = keep & (points[self.point_index] >= 2) & (images[self.image_index] >= MIN_POINTS)
+            if (again == keep).all():
+                break
+            keep = again
+        kept_points, kept_images = np.flatnonzero(points), np.flatnonzero(images)
         arrays = {name: getattr(self, name)[keep] for name in _PER_OBSERVATION}
-        renumbered = np.full(len(self.labels), -1)
-        renumbered[kept] = np.arange(len(kept))
-        arrays["point_index"] = renumbered[arrays["point_index"]]
-        return replace(self, labels=tuple(self.labels[i] for i in kept), xyz_world=self.xyz_world[kept], **arrays)
+        arrays["point_index"] = np.searchsorted(kept_points, arrays["point_index"])
+        arrays["image_index"] = np.searchsorted(kept_images, arrays["image_index"])
+        return replace(
+            self,
+            images=tuple(self.images[i] for i in kept_images),
+            camera_from_world=tuple(self.camera_from_world[i] for i in kept_images),
+            labels=tuple(self.labels[i] for i in kept_points),
+            xyz_world=self.xyz_world[kept_points],
+            **arrays,
+        )

@@ -11,7 +11,7 @@ from stcal.geometry.conic import circle_image_offset
 from stcal.geometry.plane import fit_plane
 from stcal.sfm.adjust import adjust
 from stcal.sfm.metric import find_scale
-from stcal.sfm.model import GroupModel
+from stcal.sfm.model import GroupModel, Outlier
 
 MAX_ROUNDS = 20
 SETTLED_PX = 1e-5
@@ -21,16 +21,6 @@ OUTLIER_RMS = 6.0
 MIN_OUTLIER_PX = 0.1
 WORST_SHARE = 0.5
 MAX_OUTLIER_SHARE = 0.1
-
-
-@dataclass(frozen=True, slots=True)
-class Outlier:
-    """An observation that is left out: it contradicts all others."""
-
-    image: str
-    label: str
-    residual_px: float
-    limit_px: float
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -3,6 +3,8 @@
 import hashlib
 import io
 import json
+import zipfile
+import zlib
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, fields, replace
 from pathlib import Path
@@ -15,13 +17,13 @@ from stcal.geometry.camera import Camera
 from stcal.geometry.rigid import Rigid
 from stcal.sfm.detection import write_bytes
 from stcal.sfm.images import SUFFIXES, TOP_GROUP, Skipped
-from stcal.sfm.mapping import map_group
-from stcal.sfm.model import GroupModel
+from stcal.sfm.mapping import left_out, map_group
+from stcal.sfm.model import GroupModel, Outlier
 from stcal.sfm.observations import ImageObservations, is_board
 from stcal.sfm.pairs import PairOptions, PairScore, rank_pairs
-from stcal.sfm.refine import Outlier, refine
+from stcal.sfm.refine import refine
 
-CACHE_VERSION = 1
+CACHE_VERSION = 2
 _ARRAYS = ("xyz_world", "image_index", "point_index", "keypoint", "measured_px", "shift_px", "sigma_px")
 
 
@@ -115,7 +117,12 @@ def solve_group(
     mapping = map_group(database, scratch, group, ids, pairs, camera, colmap_model)
     refined = refine(mapping.model, camera, target, board, eccentricity)
     solution = GroupSolution(
-        tuple(pairs), refined.model, mapping.seeded, refined.rounds, mapping.left_out, refined.outliers
+        tuple(pairs),
+        refined.model,
+        mapping.seeded,
+        refined.rounds,
+        mapping.left_out | left_out([i for i in group if i.name in mapping.model.images], refined.model),
+        (*mapping.outliers, *refined.outliers),
     )
     _save(path, solution)
     return solution
@@ -159,7 +166,7 @@ def _save(path: Path, solution: GroupSolution) -> None:
 def _load(path: Path) -> GroupSolution | None:
     """What was kept; None where there is nothing, or it is damaged."""
     try:
-        with np.load(path) as stored:
+        with np.load(io.BytesIO(path.read_bytes())) as stored:
             meta = json.loads(stored["meta"].tobytes())
             model = GroupModel(
                 meta["group"],
@@ -174,7 +181,7 @@ def _load(path: Path) -> GroupSolution | None:
             )
             outliers = tuple(Outlier(**o) for o in meta["outliers"])
             return GroupSolution(pairs, model, meta["seeded"], meta["rounds"], meta["left_out"], outliers)
-    except (OSError, ValueError, KeyError, EOFError):
+    except (OSError, ValueError, KeyError, EOFError, TypeError, zipfile.BadZipFile, zlib.error):
         return None
 
 
