@@ -122,6 +122,7 @@ def detect(
 ) -> None:
     """Detection alone: detections.csv and an overlay picture of every image."""
     from stcal.sfm import pipeline
+    from stcal.sfm.images import find_images
 
     model = read_camera(camera)
     target_design = pipeline.load_design(target, reference_target, load_target)
@@ -129,6 +130,7 @@ def detect(
     options = pipeline.RunOptions(ellipses=_ellipses(min_diameter, max_diameter), workers=workers)
     if (out / "faces.json").exists():
         raise InputError(f"output folder {out}: holds a finished calibration; give another folder with --out")
+    find_images(images)
     folder = pipeline.claim_folder(out)
     with StageProgress() as progress:
         detection, labelled = pipeline.detect(images, model, folder, target_design, board_design, options, progress)

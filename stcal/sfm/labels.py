@@ -59,7 +59,7 @@ def _choose(detections: list[ImageDetection], target: TargetDesign, board: Board
     """Numbering by image."""
     faces = [_face_poses(d, target) for d in detections]
     boards = [_board_poses(d, board) for d in detections]
-    open_images = {i for i, d in enumerate(detections) if len(d.numberings)}
+    open_images = {i for i, poses in enumerate(boards) if poses}
     chosen: dict[int, int] = {}
     if not open_images:
         return chosen
@@ -118,13 +118,10 @@ def _face_poses(detection: ImageDetection, target: TargetDesign) -> dict[str, Ri
 
 
 def _board_poses(detection: ImageDetection, board: BoardDesign) -> list[Rigid]:
-    """camera_from_board by numbering."""
+    """camera_from_board by numbering; none where the dots do not fix it."""
     dots = detection.centres.centre[len(detection.target_labels) :]
-    poses = []
-    for numbering in detection.numberings:
-        pose = _planar_pose(board.pitch_mm * numbering[:, ::-1].astype(float), dots)
-        poses.append(pose if pose is not None else Rigid())
-    return poses
+    poses = [_planar_pose(board.pitch_mm * n[:, ::-1].astype(float), dots) for n in detection.numberings]
+    return [] if any(pose is None for pose in poses) else poses
 
 
 def _planar_pose(xy_mm: np.ndarray, xy_normalised: np.ndarray) -> Rigid | None:

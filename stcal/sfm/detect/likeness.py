@@ -3,6 +3,7 @@
 from functools import lru_cache
 
 import numpy as np
+from scipy.spatial import cKDTree
 
 from stcal.design import FaceDesign, TargetDesign
 
@@ -11,6 +12,8 @@ MAX_GAP = 0.5
 MAX_RADIUS_RATIO = 1.3
 """… and their radii differ by less than this factor."""
 MIN_COMMON = 4
+BLOCK = 4000
+"""Motions looked at together: bounds the memory for patterns of many circles."""
 
 
 def confusable(target: TargetDesign) -> dict[str, tuple[frozenset[int], ...]]:
@@ -35,7 +38,7 @@ def _confusable(key) -> dict[str, tuple[frozenset[int], ...]]:
     return found
 
 
-def _common(xy, radius, other_xy, other_radius, same: bool) -> list[frozenset[int]]:
+def _common(xy, radius, other_xy, other_radius, same: bool) -> set[frozenset[int]]:
     """Sets of circles that coincide under some rigid motion of the plane that puts two circles onto two."""
     n, m = len(xy), len(other_xy)
     k, near = (g.ravel() for g in np.meshgrid(np.arange(n), np.arange(n)))
@@ -46,26 +49,27 @@ def _common(xy, radius, other_xy, other_radius, same: bool) -> list[frozenset[in
     slack = MAX_GAP * min(radius.min(), other_radius.min())
     like = _alike(radius[k][:, None], other_radius[p]) & _alike(radius[near][:, None], other_radius[q])
     a, b = np.nonzero((np.abs(length[:, None] - other_length) < slack) & like)
-    turn = np.arctan2(other_step[b, 1], other_step[b, 0]) - np.arctan2(step[a, 1], step[a, 0])
-    c, s = np.cos(turn), np.sin(turn)
-    offset = xy - xy[k[a]][:, None]
-    moved = (
-        np.stack(
-            [
-                c[:, None] * offset[..., 0] - s[:, None] * offset[..., 1],
-                s[:, None] * offset[..., 0] + c[:, None] * offset[..., 1],
-            ],
-            -1,
+    sets: set[frozenset[int]] = set()
+    for start in range(0, len(a), BLOCK):
+        block = slice(start, start + BLOCK)
+        fits = _coincide(
+            xy, radius, other_xy, other_radius, (k[a[block]], p[b[block]]), step[a[block]], other_step[b[block]], same
         )
-        + other_xy[p[b]][:, None]
-    )
-    gap = np.linalg.norm(moved[:, :, None] - other_xy, axis=3)
-    nearest = gap.argmin(2)
-    fits = gap.min(2) < MAX_GAP * np.minimum(radius, other_radius[nearest])
-    fits &= _alike(radius[None], other_radius[nearest])
+        sets |= {frozenset(np.flatnonzero(row).tolist()) for row in np.unique(fits, axis=0) if row.sum() >= MIN_COMMON}
+    return sets
+
+
+def _coincide(xy, radius, other_xy, other_radius, origin, step, other_step, same: bool) -> np.ndarray:
+    """For every motion, given by two circles put onto two, the mask (motions, n) of circles that coincide."""
+    turn = np.arctan2(other_step[:, 1], other_step[:, 0]) - np.arctan2(step[:, 1], step[:, 0])
+    c, s = np.cos(turn)[:, None], np.sin(turn)[:, None]
+    x, y = np.moveaxis(xy - xy[origin[0]][:, None], 2, 0)
+    moved = np.stack([c * x - s * y, s * x + c * y], -1) + other_xy[origin[1]][:, None]
+    gap, nearest = cKDTree(other_xy).query(moved)
+    fits = (gap < MAX_GAP * np.minimum(radius, other_radius[nearest])) & _alike(radius[None], other_radius[nearest])
     if same:  # the reading itself is no rival
-        fits = fits[~((nearest == np.arange(n)) | ~fits).all(1)]
-    return [frozenset(np.flatnonzero(row).tolist()) for row in np.unique(fits, axis=0) if row.sum() >= MIN_COMMON]
+        fits = fits[~((nearest == np.arange(len(xy))) | ~fits).all(1)]
+    return fits
 
 
 def _alike(a, b):
