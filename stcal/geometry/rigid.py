@@ -65,7 +65,7 @@ class Rigid:
 
     def log(self) -> np.ndarray:
         """Inverse of :meth:`exp`: rotation vector (rad) and translation (mm), (6,)."""
-        return np.concatenate([Rotation.from_matrix(self.rotation).as_rotvec(), self.translation])
+        return np.concatenate([Rotation.from_matrix(np.array(self.rotation)).as_rotvec(), self.translation])
 
     def matrix(self) -> np.ndarray:
         """Homogeneous 4×4 matrix."""
@@ -86,7 +86,7 @@ class Rigid:
 
     def angle_rad(self) -> float:
         """Angle of the rotation, in [0, π]."""
-        return float(Rotation.from_matrix(self.rotation).magnitude())
+        return float(Rotation.from_matrix(np.array(self.rotation)).magnitude())
 
 
 @dataclass(frozen=True, slots=True, eq=False)
