@@ -64,6 +64,17 @@ def test_a_swapped_label_is_left_out_by_name(scene, labels_only):
     assert [(o.image, o.label) for o in refined.outliers] == [(start.images[2], start.labels[start.point_index[row]])]
 
 
+@pytest.mark.parametrize(("shift_px", "named"), [(0.3, 1), (0.015, 0)])
+def test_only_what_contradicts_is_left_out(scene, labels_only, shift_px, named):
+    """60 times the noise is named, three times the noise is noise."""
+    observed = labels_only.observations(scene, NOISE_PX, np.random.default_rng(1))
+    start = labels_only.models(scene, observed)[0]
+    measured = start.measured_px.copy()
+    measured[int(np.flatnonzero(start.image_index == 1)[7])] += [shift_px, 0]
+    refined = refine(replace(start, measured_px=measured), scene.camera, scene.target, reference_board())
+    assert len(refined.outliers) == named
+
+
 def test_adjustment_does_not_depend_on_the_world_or_the_order_of_images(scene, labels_only):
     observed = labels_only.observations(scene, NOISE_PX, np.random.default_rng(2))
     start = labels_only.models(scene, observed)[0]
