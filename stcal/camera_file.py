@@ -116,20 +116,32 @@ def _from_colmap(rows: list[list[str]], path: Path) -> CameraModel:
     if len(rows) != 1:
         raise InputError(f"camera file {path}: {len(rows)} cameras, 1 needed; leave the one that took the images")
     _, name, width, height, *params = rows[0]
-    if name not in _COLMAP_LAYOUT:
-        raise InputError(f"camera file {path}: model {name} is not supported; use one of {', '.join(_COLMAP_LAYOUT)}")
-    layout = _COLMAP_LAYOUT[name]
-    if len(params) != len(layout):
-        raise InputError(f"camera file {path}: {len(params)} parameters for {name}, {len(layout)} needed")
-    flat = np.zeros(12)
     try:
-        size = float(width), float(height)
-        for place, value in zip(layout, params, strict=True):
-            flat[list(place) if isinstance(place, tuple) else place] = float(value)
+        numbers = [float(value) for value in (width, height, *params)]
     except ValueError as error:
         raise InputError(f"camera file {path}: {' '.join(str(error).split())[:150]}; numbers needed") from error
+    return camera_from_colmap(name, *numbers[:2], numbers[2:], path)
+
+
+def camera_from_colmap(colmap_model: str, width: float, height: float, params, source: str | Path) -> CameraModel:
+    """The camera of COLMAP's ``params`` (its order, its pixel origin); ``source`` : where they come from.
+
+    Raises
+    ------
+    InputError
+        A camera model that stcal does not support, a wrong number of parameters, or impossible values.
+    """
+    if colmap_model not in _COLMAP_LAYOUT:
+        known = ", ".join(_COLMAP_LAYOUT)
+        raise InputError(f"camera file {source}: model {colmap_model} is not supported; use one of {known}")
+    layout = _COLMAP_LAYOUT[colmap_model]
+    if len(params) != len(layout):
+        raise InputError(f"camera file {source}: {len(params)} parameters for {colmap_model}, {len(layout)} needed")
+    flat = np.zeros(12)
+    for place, value in zip(layout, params, strict=True):
+        flat[list(place) if isinstance(place, tuple) else place] = value
     flat[2:4] -= COLMAP_PIXEL_ORIGIN
-    return _model(flat, name, *size, path)
+    return _model(flat, colmap_model, width, height, Path(source))
 
 
 def _from_opencv(values: dict, path: Path) -> CameraModel:

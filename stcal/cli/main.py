@@ -6,7 +6,7 @@ from typing import NoReturn
 import typer
 
 import stcal
-from stcal.cli import sfm
+from stcal.cli import colmap, sfm
 from stcal.errors import StcalError
 
 INTERRUPTED = 130
@@ -20,6 +20,7 @@ app = typer.Typer(
     add_completion=False,
     pretty_exceptions_enable=False,
 )
+sfm.app.add_typer(colmap.app)
 app.add_typer(sfm.app, name="sfm")
 
 

@@ -123,6 +123,7 @@ def detect(
     """Detection alone: detections.csv and an overlay picture of every image."""
     from stcal.sfm import pipeline
     from stcal.sfm.images import find_images
+    from stcal.sfm.saved import marker_json
 
     model = read_camera(camera)
     target_design = pipeline.load_design(target, reference_target, load_target)
@@ -131,7 +132,7 @@ def detect(
     if (out / "faces.json").exists():
         raise InputError(f"output folder {out}: holds a finished calibration; give another folder with --out")
     find_images(images)
-    folder = pipeline.claim_folder(out)
+    folder = pipeline.claim_folder(out, marker_json(images, None))
     with StageProgress() as progress:
         detection, labelled = pipeline.detect(images, model, folder, target_design, board_design, options, progress)
     for each in labelled:
@@ -288,7 +289,7 @@ def _print_run(result) -> None:
     _print_skipped(result.detection.skipped)
     for solution in result.solutions:
         group = solution.model.group
-        scale = result.scales[group]
+        scale = result.calibration.scales[group]
         pair = solution.pairs[0]
         print(
             f"group {group}: {len(solution.model.images)} images, {len(solution.model.labels)} circles, "

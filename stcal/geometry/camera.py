@@ -43,6 +43,11 @@ class Camera:
         if self.width < 1 or self.height < 1:
             raise InputError(f"camera: size {self.width}×{self.height} px, a positive size needed")
 
+    def same_as(self, other: "Camera") -> bool:
+        """Whether all numbers are equal."""
+        a, b = (np.concatenate([[c.width, c.height], c.focal, c.centre, c.distortion]) for c in (self, other))
+        return bool((a == b).all())
+
     def distort(self, xy: np.ndarray) -> np.ndarray:
         """Normalised distorted coordinates (..., 2) of normalised ideal ones."""
         return self._distort(np.asarray(xy, float), jacobian=False)[0]

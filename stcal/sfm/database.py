@@ -121,15 +121,14 @@ def _write(database, camera, colmap_model, observations, keypoints_px) -> None:
 
 
 def labels_csv(observations: Sequence[ImageObservations], corrected_px: Sequence[np.ndarray]) -> str:
-    """Text of ``labels.csv``: label, float64 measured and corrected centre of every (image, keypoint)."""
+    """Text of ``labels.csv``: label, float64 measured and corrected centre and σ of every (image, keypoint)."""
     stream = io.StringIO()
     writer = csv.writer(stream, lineterminator="\n")
-    writer.writerow(
-        ["image_id", "keypoint", "image", "group", "label", "x_px", "y_px", "corrected_x_px", "corrected_y_px"]
-    )
+    columns = "image_id keypoint image group label x_px y_px corrected_x_px corrected_y_px sigma_px"
+    writer.writerow(columns.split())
     ids = image_ids(observations)
     for image, corrected in zip(observations, corrected_px, strict=True):
+        values = np.column_stack([image.centre_px, corrected, image.sigma_px()]).tolist()
         for k, label in enumerate(image.labels):
-            row = [ids[image.name], k, image.name, image.group, label]
-            writer.writerow([*row, *(repr(float(v)) for v in (*image.centre_px[k], *corrected[k]))])
+            writer.writerow([ids[image.name], k, image.name, image.group, label, *map(repr, values[k])])
     return stream.getvalue()

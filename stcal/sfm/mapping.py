@@ -9,8 +9,8 @@ import pycolmap
 
 from stcal.errors import MappingError
 from stcal.geometry.camera import Camera
-from stcal.geometry.rigid import Rigid
-from stcal.sfm.database import CAMERA_ID, colmap_camera, to_colmap_px
+from stcal.sfm.colmap_model import rigid_from_colmap
+from stcal.sfm.database import CAMERA_ID
 from stcal.sfm.model import MIN_POINTS, GroupModel, Outlier
 from stcal.sfm.observations import ImageObservations
 from stcal.sfm.pairs import PairScore
@@ -41,7 +41,6 @@ def map_group(
     ids: dict[str, int],
     pairs: list[PairScore],
     camera: Camera,
-    colmap_model: str,
 ) -> Mapping:
     """Map one group of the database.
 
@@ -165,11 +164,6 @@ def _own_mapping(database: Path, names, ids, pair: PairScore) -> pycolmap.Recons
     return reconstruction if reconstruction.num_reg_images() >= 2 and reconstruction.num_points3D() >= 4 else None
 
 
-def rigid_from_colmap(pose: pycolmap.Rigid3d) -> Rigid:
-    """Our transform of COLMAP's."""
-    return Rigid(pose.rotation.matrix(), pose.translation)
-
-
 def _labelled_model(
     reconstruction: pycolmap.Reconstruction, group: list[ImageObservations], ids: dict[str, int], camera: Camera
 ) -> tuple[GroupModel, tuple[Outlier, ...]]:
@@ -219,44 +213,3 @@ def _labelled_model(
         for k in np.flatnonzero(off)
     ]
     return model.without(off), tuple(outliers)
-
-
-def to_reconstruction(
-    model: GroupModel,
-    ids: dict[str, int],
-    camera: Camera,
-    colmap_model: str,
-    keypoints_px: dict[str, np.ndarray],
-) -> pycolmap.Reconstruction:
-    """COLMAP's form of a model; ``keypoints_px`` : all keypoints by image, (k, 2), in the database's order."""
-    reconstruction = pycolmap.Reconstruction()
-    reconstruction.add_camera_with_trivial_rig(colmap_camera(camera, colmap_model))
-    tracks = [pycolmap.Track() for _ in model.labels]
-    for i, (name, pose) in enumerate(zip(model.images, model.camera_from_world, strict=True)):
-        rows = np.flatnonzero(model.image_index == i)
-        image = pycolmap.Image(name=name, camera_id=CAMERA_ID, image_id=ids[name])
-        image.points2D = [pycolmap.Point2D(each) for each in to_colmap_px(keypoints_px[name])]
-        reconstruction.add_image_with_trivial_frame(
-            image, pycolmap.Rigid3d(pycolmap.Rotation3d(pose.rotation), pose.translation)
-        )
-        for row in rows:
-            tracks[model.point_index[row]].add_element(ids[name], int(model.keypoint[row]))
-    for xyz, track in zip(model.xyz_world, tracks, strict=True):
-        reconstruction.add_point3D(xyz, track)
-    return reconstruction
-
-
-def write_model(
-    folder: Path,
-    model: GroupModel,
-    observations: list[ImageObservations],
-    ids: dict[str, int],
-    camera: Camera,
-    colmap_model: str,
-) -> None:
-    """Write a model as COLMAP's binary files: no unit, corrected centres, keypoints as the database has them."""
-    folder.mkdir(parents=True, exist_ok=True)
-    keypoints = {image.name: model.keypoints_px(image) for image in observations if image.name in model.images}
-    reconstruction = to_reconstruction(model, ids, camera, colmap_model, keypoints)
-    reconstruction.update_point_3d_errors()
-    reconstruction.write_binary(str(folder))

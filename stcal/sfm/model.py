@@ -58,12 +58,15 @@ class GroupModel:
         """Images of the circles' centres, (n, 2): the measured ellipse centres less their eccentricity."""
         return self.measured_px - self.shift_px
 
-    def keypoints_px(self, image: ImageObservations) -> np.ndarray:
-        """All keypoints of one image, (k, 2): corrected where the model has them, measured elsewhere."""
+    def rows_by_image(self) -> list[np.ndarray]:
+        """Observations of every image, in the order of ``images``."""
+        order = np.argsort(self.image_index, kind="stable")
+        return np.split(order, np.searchsorted(self.image_index[order], np.arange(1, len(self.images))))
+
+    def keypoints_px(self, image: ImageObservations, rows: np.ndarray) -> np.ndarray:
+        """All keypoints of one image, (k, 2): corrected where the model has them (``rows``), measured elsewhere."""
         xy = image.centre_px.copy()
-        if image.name in self.images:
-            rows = self.image_index == self.images.index(image.name)
-            xy[self.keypoint[rows]] = self.corrected_px()[rows]
+        xy[self.keypoint[rows]] = self.measured_px[rows] - self.shift_px[rows]
         return xy
 
     def xyz_camera(self) -> np.ndarray:

@@ -67,9 +67,9 @@ def report_json(result: RunResult) -> dict:
             "observations": len(everything),
             "residual_rms_px": float(np.sqrt((everything**2).mean())),
             "centre_sigma_rms_px": float(np.sqrt(np.concatenate([m.sigma_px**2 for m in models.values()]).mean())),
-            "sigma_factor": result.sigma_factor,
-            "sigma0": result.joint.sigma0 if result.joint else None,
-            "redundancy": result.joint.redundancy if result.joint else None,
+            "sigma_factor": result.calibration.sigma_factor,
+            "sigma0": result.calibration.joint.sigma0 if result.calibration.joint else None,
+            "redundancy": result.calibration.joint.redundancy if result.calibration.joint else None,
         },
         "faces": {face: _face(result, face) for face in result.target.target_from_face},
         "between_faces": _between(result),
@@ -90,21 +90,25 @@ def report_json(result: RunResult) -> dict:
         "residuals_by_label": _by_label(models, residual),
         "left_out": _left_out(result),
         "notes": list(result.notes),
-        "scene": _scene(result, models),
+        "images": [
+            {"image_id": i, "name": image.name, "group": image.group, "circles": len(image)}
+            for i, image in enumerate(result.observations(), start=1)
+        ],
+        "scene": _scene(result),
     }
 
 
 def _final_models(result: RunResult) -> dict[str, GroupModel]:
     """The models that the answer rests on."""
-    if result.joint:
-        return {model.group: model for model in result.joint.models}
+    if result.calibration.joint:
+        return {model.group: model for model in result.calibration.joint.models}
     return {solution.model.group: solution.model for solution in result.solutions}
 
 
 def _face(result: RunResult, face_id: str) -> dict:
     pose = result.target.target_from_face[face_id]
     labels = [label for label in result.target.circles if face_of(label) == face_id]
-    members = [each for each in result.faces if each.face == face_id]
+    members = [each for each in result.calibration.faces if each.face == face_id]
     covariance = result.target.face_covariance.get(face_id)
     sigma = None if covariance is None else np.sqrt(np.maximum(np.diag(covariance), 0))
     return {
@@ -139,11 +143,11 @@ def _between(result: RunResult) -> list[dict]:
 
 def _group(result: RunResult, solution) -> dict:
     name = solution.model.group
-    scale = result.scales[name]
+    scale = result.calibration.scales[name]
     return {
         "name": name,
         "images": list(solution.model.images),
-        "faces": [each.face for each in result.faces if each.group == name],
+        "faces": [each.face for each in result.calibration.faces if each.group == name],
         "points": len(solution.model.labels),
         "seeded": solution.seeded,
         "rounds": solution.rounds,
@@ -241,26 +245,22 @@ def _left_out(result: RunResult) -> dict:
     }
 
 
-def _scene(result: RunResult, models: dict[str, GroupModel]) -> dict:
+def _scene(result: RunResult) -> dict:
     """Cameras, board outlines and circles in the target frame, for the picture in space."""
     cameras, boards = [], {}
-    for name, model in models.items():
-        to_target = result.target.target_from_group.get(name)
-        if to_target is None:
-            continue
-        scale = 1.0 if result.joint else result.scales[name].mm_per_unit
+    for model in result.calibration.models:
         for image, pose in zip(model.images, model.camera_from_world, strict=True):
-            from_camera = pose.inverse()
+            target_from_camera = pose.inverse()
             cameras.append(
                 {
                     "image": image,
-                    "group": name,
-                    "position_mm": (to_target @ (scale * from_camera.translation)).tolist(),
-                    "axes": (to_target.rotation @ from_camera.rotation).T.tolist(),
+                    "group": model.group,
+                    "position_mm": target_from_camera.translation.tolist(),
+                    "axes": target_from_camera.rotation.T.tolist(),
                 }
             )
         dots = [i for i, label in enumerate(model.labels) if is_board(label)]
-        boards[name] = (to_target @ (scale * model.xyz_world[dots])).tolist()
+        boards[model.group] = model.xyz_world[dots].tolist()
     return {
         "cameras": cameras,
         "boards": boards,

@@ -7,34 +7,33 @@ from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from pathlib import Path
 
+import numpy as np
+
 import stcal
-from stcal.camera_file import CameraModel, read_camera
+from stcal.camera_file import CameraModel, read_camera, write_cameras_txt
 from stcal.design import BoardDesign, TargetDesign, reference_board, reference_target
-from stcal.design_file import load_board, load_target
+from stcal.design_file import board_toml, load_board, load_target, target_toml
 from stcal.errors import InputError
-from stcal.geometry.rigid import Rigid, Similarity
-from stcal.sfm.chain import CalibratedTarget, chain_faces, measure_chains
+from stcal.sfm.calibration import calibrate
+from stcal.sfm.chain import measure_chains
+from stcal.sfm.colmap_model import write_model
 from stcal.sfm.database import image_ids, labels_csv, remove_database, write_database
 from stcal.sfm.detection import DetectionResult, detect_files, require_single, write_bytes
-from stcal.sfm.faces import faces_of_group
 from stcal.sfm.images import RUN_MARKER, find_images
-from stcal.sfm.joint import JointResult, adjust_jointly, calibrated_target
 from stcal.sfm.labels import LabelledImage, label_group
-from stcal.sfm.mapping import write_model
-from stcal.sfm.metric import find_scale
+from stcal.sfm.model import GroupModel
 from stcal.sfm.observations import ImageObservations, detections_csv
+from stcal.sfm.options import RunOptions
 from stcal.sfm.output import faces_json, report_json
 from stcal.sfm.overlay import draw_overlay
-from stcal.sfm.refine import eccentricity_px
 from stcal.sfm.report import report_html
-from stcal.sfm.result import RunOptions, RunResult
-from stcal.sfm.solve import GroupSolution, image_sigma_factor, require_groups, solve_group, unseen_board, with_sigma
+from stcal.sfm.result import RunResult
+from stcal.sfm.saved import BOARD, CAMERA, TARGET, marker_json
+from stcal.sfm.solve import GroupSolution, require_groups, solve_group, unseen_board
 
 RESULTS = ("faces.json", "report.json", "report.html", "labels.csv", "detections.csv", "compare.json")
-RESULT_FOLDERS = ("models", "overlays", "scratch")
-JOINT_ROUNDS = 2
-"""Eccentricity moves by nanometres between the first and the second joint adjustment."""
-
+RESULTS += (CAMERA, TARGET, BOARD)
+RESULT_FOLDERS = ("models", "target_model", "overlays", "scratch")
 Progress = Callable[[str, int, int], None]
 """Called with (stage, done, total)."""
 
@@ -68,7 +67,7 @@ def run(
     board = load_design(board, reference_board, load_board)
     options = (options or RunOptions()).settled(target)
     find_images(images)  # before anything of an earlier run is removed
-    out = claim_folder(out)
+    out = claim_folder(out, marker_json(images, options))
 
     detection, labelled = detect(images, model, out, target, board, options, tell)
     require_single(detection.images)
@@ -80,25 +79,9 @@ def run(
 
     tell("map", 0, len(groups))
     solutions = _solve_groups(groups, observations, out, detection.camera, model, target, board, options, tell)
-    scales = {s.model.group: find_scale(s.model, board) for s in solutions}
-
     tell("faces", 0, 1)
-    faces, notes = [], []
-    for s in solutions:
-        found, missing = faces_of_group(
-            s.model, scales[s.model.group].mm_per_unit, detection.camera, target, options.frame
-        )
-        faces += found
-        notes += missing
-    calibrated = chain_faces(faces, target, options.reference_face)
-    notes += unseen_board(solutions, board)
-    factor = image_sigma_factor([s.model for s in solutions], detection.camera)
-    joint = None
-    if options.solve == "joint":
-        joint = _adjust_all(solutions, scales, calibrated, factor, detection.camera, target, board, options)
-        calibrated = calibrated_target(joint, calibrated, target, options.frame)
+    calibration = calibrate([s.model for s in solutions], detection.camera, target, board, options)
     tell("faces", 1, 1)
-
     result = RunResult(
         out,
         detection.camera,
@@ -109,13 +92,9 @@ def run(
         detection,
         tuple(labelled),
         tuple(solutions),
-        scales,
-        tuple(faces),
-        calibrated,
-        measure_chains(faces, calibrated),
-        joint,
-        factor,
-        tuple(notes),
+        calibration,
+        measure_chains(calibration.faces, calibration.target),
+        (*calibration.notes, *unseen_board(solutions, board)),
     )
     _write(result, tell)
     return result
@@ -158,8 +137,8 @@ def load_design(given, default: Callable, load: Callable):
     return load(given) if isinstance(given, (str, Path)) else given
 
 
-def claim_folder(out: str | Path) -> Path:
-    """Make the run's folder, mark it as ours, and remove results that will be made anew.
+def claim_folder(out: str | Path, contents: dict) -> Path:
+    """Make the run's folder, mark it as ours with ``contents``, and remove results that will be made anew.
 
     Raises
     ------
@@ -174,7 +153,7 @@ def claim_folder(out: str | Path) -> Path:
         if out.is_dir() and not marker.exists() and any(not p.name.startswith(RUN_MARKER) for p in out.iterdir()):
             raise InputError(f"output folder {out}: not empty and not of an earlier run; give a new folder with --out")
         out.mkdir(parents=True, exist_ok=True)
-        write_bytes(marker, json.dumps({"program": "stcal-sfm", "version": stcal.__version__}).encode())
+        write_bytes(marker, _json({"program": "stcal-sfm", "version": stcal.__version__} | contents))
         for name in RESULTS:
             (out / name).unlink(missing_ok=True)
         for name in RESULT_FOLDERS:
@@ -233,7 +212,6 @@ def _solve_groups(groups, observations, out: Path, camera, model, target, board,
                     scratch / "models",
                     ids,
                     camera,
-                    model.colmap_model,
                     target,
                     board,
                     options.pairs,
@@ -247,43 +225,36 @@ def _solve_groups(groups, observations, out: Path, camera, model, target, board,
     return solutions
 
 
-def _adjust_all(solutions, scales, start: CalibratedTarget, factor, camera, target, board, options) -> JointResult:
-    """The joint adjustment from the chained result; eccentricity follows."""
-    radius = target.radius_of() | board.radius_of()
-    models = []
-    for s in solutions:
-        group = s.model.group
-        if group not in start.target_from_group:
-            continue
-        metric = Similarity(1.0, start.target_from_group[group]) @ Similarity(scales[group].mm_per_unit, Rigid())
-        models.append(with_sigma(s.model.moved(metric), factor))
-    for _ in range(JOINT_ROUNDS):
-        if options.eccentricity:
-            models = [replace(m, shift_px=eccentricity_px(m, camera, radius, 1.0)) for m in models]
-        result = adjust_jointly(models, board, camera)
-        models = list(result.models)
-    return result
-
-
 def _write(result: RunResult, tell: Progress) -> None:
     """The database with corrected centres, models, faces and report; ``faces.json`` comes last but for the report."""
     out = result.out
     observations = result.observations()
     ids = image_ids(observations)
     models = {s.model.group: s.model for s in result.solutions}
-    corrected = [models[image.group].keypoints_px(image) for image in observations]
+    corrected = _corrected_px(models, observations)
     write_database(out / "database.db", result.camera, result.colmap_model, observations, corrected)
     write_bytes(out / "labels.csv", labels_csv(observations, corrected).encode())
     shutil.rmtree(out / "models", ignore_errors=True)
     for name, model in models.items():
         folder = out / "models" / name  # "models/." where the images lie directly in their folder
-        write_model(folder, model, observations, ids, result.camera, result.colmap_model)
+        write_model(folder, [model], observations, ids, result.camera, result.colmap_model)
+    write_model(out / "target_model", result.calibration.models, observations, ids, result.camera, result.colmap_model)
+    write_cameras_txt(out / CAMERA, result.camera, result.colmap_model)
+    write_bytes(out / TARGET, target_toml(result.target_design).encode())
+    write_bytes(out / BOARD, board_toml(result.board_design).encode())
     report = report_json(result)
     write_bytes(out / "faces.json", _json(faces_json(result)))
     write_bytes(out / "report.json", _json(report))
     overlays = {image.name: overlay_path(out, image.name).read_bytes() for image in observations}
     write_bytes(out / "report.html", report_html(report, overlays).encode())
     tell("report", 1, 1)
+
+
+def _corrected_px(models: dict[str, GroupModel], observations: list[ImageObservations]) -> list[np.ndarray]:
+    """All keypoints of every image as the models of the groups correct them."""
+    rows = {name: rows for m in models.values() for name, rows in zip(m.images, m.rows_by_image(), strict=True)}
+    none = np.zeros(0, int)
+    return [models[image.group].keypoints_px(image, rows.get(image.name, none)) for image in observations]
 
 
 def _json(value: dict) -> bytes:

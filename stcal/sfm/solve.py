@@ -6,7 +6,7 @@ import json
 import zipfile
 import zlib
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass, fields, replace
+from dataclasses import asdict, dataclass, fields
 from pathlib import Path
 
 import numpy as np
@@ -95,7 +95,6 @@ def solve_group(
     scratch: Path,
     ids: dict[str, int],
     camera: Camera,
-    colmap_model: str,
     target: TargetDesign,
     board: BoardDesign,
     pair_options: PairOptions,
@@ -114,7 +113,7 @@ def solve_group(
     if kept is not None:
         return kept
     pairs = rank_pairs(group, camera, pair_options)
-    mapping = map_group(database, scratch, group, ids, pairs, camera, colmap_model)
+    mapping = map_group(database, scratch, group, ids, pairs, camera)
     refined = refine(mapping.model, camera, target, board, eccentricity)
     solution = GroupSolution(
         tuple(pairs),
@@ -183,18 +182,6 @@ def _load(path: Path) -> GroupSolution | None:
             return GroupSolution(pairs, model, meta["seeded"], meta["rounds"], meta["left_out"], outliers)
     except (OSError, ValueError, KeyError, EOFError, TypeError, zipfile.BadZipFile, zlib.error):
         return None
-
-
-def image_sigma_factor(models: list[GroupModel], camera: Camera) -> float:
-    """How much larger the residuals of free networks are than the centres' own σ (one variance component)."""
-    square = sum(float(((m.residuals_px(camera) / m.sigma_px[:, None]) ** 2).sum()) for m in models)
-    redundancy = sum(2 * len(m.image_index) - 6 * len(m.images) - 3 * len(m.labels) + 7 for m in models)
-    return float(np.sqrt(square / redundancy)) if redundancy > 0 else 1.0
-
-
-def with_sigma(model: GroupModel, factor: float) -> GroupModel:
-    """The model with its observations' σ scaled."""
-    return replace(model, sigma_px=factor * model.sigma_px)
 
 
 def unseen_board(solutions: list[GroupSolution], board: BoardDesign) -> list[str]:

@@ -8,6 +8,7 @@ import pytest
 
 from stcal.errors import MappingError
 from stcal.geometry.align import align_similarity
+from stcal.sfm.colmap_model import write_model
 from stcal.sfm.database import (
     from_colmap_px,
     image_ids,
@@ -16,7 +17,7 @@ from stcal.sfm.database import (
     to_colmap_px,
     write_database,
 )
-from stcal.sfm.mapping import map_group, write_model
+from stcal.sfm.mapping import map_group
 from stcal.sfm.pairs import PairOptions, rank_pairs
 
 
@@ -95,7 +96,7 @@ def map_one(scene, observed, database, tmp_path, group, pairs=None):
     own = [o for o in observed if o.group == group]
     pairs = pairs or rank_pairs(own, scene.camera, PairOptions())
     ids = image_ids(observed)
-    return own, map_group(database, tmp_path / "scratch", own, ids, pairs, scene.camera, scene.colmap_model)
+    return own, map_group(database, tmp_path / "scratch", own, ids, pairs, scene.camera)
 
 
 def truth_of(scene, model):
@@ -137,7 +138,7 @@ def test_the_same_seed_gives_the_same_model(scene, observed, database, tmp_path)
 
 def test_the_written_model_is_colmaps_and_keeps_the_keypoints(scene, observed, database, tmp_path):
     own, mapping = map_one(scene, observed, database, tmp_path, "12")
-    write_model(tmp_path / "model", mapping.model, observed, image_ids(observed), scene.camera, scene.colmap_model)
+    write_model(tmp_path / "model", [mapping.model], observed, image_ids(observed), scene.camera, scene.colmap_model)
     read = pycolmap.Reconstruction(str(tmp_path / "model"))
     assert read.num_reg_images() == len(own)
     assert read.num_points3D() == len(mapping.model.labels)

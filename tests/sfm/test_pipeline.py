@@ -46,7 +46,7 @@ def test_errors_are_those_that_sigma_predicts(calibrated):
         # χ²₆/6 of a true covariance exceeds 4 once in 2000 draws.
         assert 0.1 < faces[face_id]["normalised_error"] < 2.0
         assert faces[face_id]["translation_um"] < 25
-    assert result.joint.sigma0 == pytest.approx(1.0, abs=0.15)
+    assert result.calibration.joint.sigma0 == pytest.approx(1.0, abs=0.15)
 
 
 def test_every_promised_file_is_there_and_agrees(calibrated):
@@ -93,9 +93,7 @@ def test_any_colmap_makes_an_unbiased_model_of_the_database(calibrated, tmp_path
     ids = image_ids(observations)
     group = [o for o in observations if o.group == "12"]
     pairs = rank_pairs(group, result.camera, PairOptions())
-    mapping = map_group(
-        result.out / "database.db", tmp_path / "scratch", group, ids, pairs, result.camera, result.colmap_model
-    )
+    mapping = map_group(result.out / "database.db", tmp_path / "scratch", group, ids, pairs, result.camera)
     ours = next(s.model for s in result.solutions if s.model.group == "12")
     from dataclasses import replace
 

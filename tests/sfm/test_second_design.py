@@ -52,4 +52,4 @@ def test_faces_are_right_within_their_own_sigma(calibrated):
         # √(eᵀC⁻¹e/6) of a true covariance exceeds 2 about once in 2000 draws (χ² with 6 degrees of freedom).
         assert 0.1 < row["normalised_error"] < 2.0, face_id
         assert row["translation_um"] < 30, face_id
-    assert result.joint.sigma0 == pytest.approx(1.0, abs=0.2)
+    assert result.calibration.joint.sigma0 == pytest.approx(1.0, abs=0.2)

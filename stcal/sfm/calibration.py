@@ -1,0 +1,95 @@
+"""From the models of the groups to the calibrated target: scale, faces, chaining, joint adjustment."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from stcal.design import BoardDesign, TargetDesign
+from stcal.geometry.camera import Camera
+from stcal.geometry.rigid import Rigid, Similarity
+from stcal.sfm.chain import CalibratedTarget, chain_faces
+from stcal.sfm.faces import FaceInGroup, faces_of_group
+from stcal.sfm.joint import JointResult, adjust_jointly, calibrated_target
+from stcal.sfm.metric import Scale, find_scale
+from stcal.sfm.model import GroupModel
+from stcal.sfm.options import RunOptions
+from stcal.sfm.refine import eccentricity_px
+
+JOINT_ROUNDS = 2
+"""Eccentricity moves by nanometres between the first and the second joint adjustment."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Calibration:
+    """``target`` is the answer; ``scales`` by group; ``faces`` of the single groups; ``joint`` where it was asked for;
+    ``sigma_factor`` : by how much residuals of the single groups exceed the centres' own σ; ``models`` : those that
+    the answer rests on, mm, target frame, groups that are not linked to it absent; ``notes`` : faces without a frame,
+    and why."""
+
+    target: CalibratedTarget
+    scales: dict[str, Scale]
+    faces: tuple[FaceInGroup, ...]
+    joint: JointResult | None
+    sigma_factor: float
+    models: tuple[GroupModel, ...]
+    notes: tuple[str, ...]
+
+
+def calibrate(
+    models: Sequence[GroupModel], camera: Camera, target: TargetDesign, board: BoardDesign, options: RunOptions
+) -> Calibration:
+    """Calibrate the target from the groups' models (worlds without unit, corrections settled).
+
+    Raises
+    ------
+    ScaleError
+        A group's board is not mapped.
+    MappingError
+        No face is, or the reference face is not, or a face is not linked to it.
+    ConvergenceError
+        The adjustment finds no minimum.
+    """
+    scales = {model.group: find_scale(model, board) for model in models}
+    faces, notes = [], []
+    for model in models:
+        found, missing = faces_of_group(model, scales[model.group].mm_per_unit, camera, target, options.frame)
+        faces += found
+        notes += missing
+    calibrated = chain_faces(faces, target, options.reference_face)
+    factor = image_sigma_factor(models, camera)
+    metric = [_placed(m, scales[m.group], calibrated) for m in models if m.group in calibrated.target_from_group]
+    joint = None
+    if options.solve == "joint":
+        joint = _adjust_all([with_sigma(m, factor) for m in metric], camera, target, board, options.eccentricity)
+        calibrated = calibrated_target(joint, calibrated, target, options.frame)
+        metric = [m.moved(Similarity(1.0, calibrated.target_from_group[m.group])) for m in joint.models]
+    return Calibration(calibrated, scales, tuple(faces), joint, factor, tuple(metric), tuple(notes))
+
+
+def _placed(model: GroupModel, scale: Scale, start: CalibratedTarget) -> GroupModel:
+    """The model in mm in the target frame, by its chain."""
+    return model.moved(Similarity(1.0, start.target_from_group[model.group]) @ Similarity(scale.mm_per_unit, Rigid()))
+
+
+def _adjust_all(models: list[GroupModel], camera, target, board, eccentricity: bool) -> JointResult:
+    """The joint adjustment from the chained result; eccentricity follows."""
+    radius = target.radius_of() | board.radius_of()
+    for _ in range(JOINT_ROUNDS):
+        if eccentricity:
+            models = [replace(m, shift_px=eccentricity_px(m, camera, radius, 1.0)) for m in models]
+        result = adjust_jointly(models, board, camera)
+        models = list(result.models)
+    return result
+
+
+def image_sigma_factor(models: Sequence[GroupModel], camera: Camera) -> float:
+    """How much larger the residuals of free networks are than the centres' own σ (one variance component)."""
+    square = sum(float(((m.residuals_px(camera) / m.sigma_px[:, None]) ** 2).sum()) for m in models)
+    redundancy = sum(2 * len(m.image_index) - 6 * len(m.images) - 3 * len(m.labels) + 7 for m in models)
+    return float(np.sqrt(square / redundancy)) if redundancy > 0 else 1.0
+
+
+def with_sigma(model: GroupModel, factor: float) -> GroupModel:
+    """The model with its observations' σ scaled."""
+    return replace(model, sigma_px=factor * model.sigma_px)

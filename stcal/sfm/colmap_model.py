@@ -1,0 +1,232 @@
+"""COLMAP's models: ours written in its form, and models that COLMAP made or someone edited read back with labels."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import pycolmap
+
+from stcal.camera_file import camera_from_colmap
+from stcal.errors import InputError
+from stcal.geometry.camera import Camera
+from stcal.geometry.rigid import Rigid
+from stcal.sfm.database import CAMERA_ID, colmap_camera, from_colmap_px, to_colmap_px
+from stcal.sfm.model import GroupModel
+from stcal.sfm.observations import ImageObservations, is_board
+
+KEYPOINT_TOLERANCE_PX = 0.002
+"""A model's keypoints are the database's: float32 has steps of 0.0005 px at x = 5000 and 0.002 px at x = 30 000."""
+
+
+def rigid_from_colmap(pose: pycolmap.Rigid3d) -> Rigid:
+    """Our transform of COLMAP's."""
+    return Rigid(pose.rotation.matrix(), pose.translation)
+
+
+def to_reconstruction(
+    models: Sequence[GroupModel],
+    observations: Sequence[ImageObservations],
+    ids: dict[str, int],
+    camera: Camera,
+    colmap_model: str,
+) -> tuple[pycolmap.Reconstruction, dict[int, tuple[str, str]]]:
+    """COLMAP's form of models that share one world, and (group, label) of every point id.
+
+    Keypoints are all of the image, in the database's order, corrected where the model has them. A circle that two
+    groups have in the same place is one point; its group is then empty.
+    """
+    reconstruction = pycolmap.Reconstruction()
+    reconstruction.add_camera_with_trivial_rig(colmap_camera(camera, colmap_model))
+    by_name = {image.name: image for image in observations}
+    tracks: dict[tuple[str, tuple[float, ...]], pycolmap.Track] = {}
+    groups: dict[tuple[str, tuple[float, ...]], set[str]] = {}
+    for model in models:
+        places = [(label, tuple(xyz)) for label, xyz in zip(model.labels, model.xyz_world.tolist(), strict=True)]
+        for place in places:
+            tracks.setdefault(place, pycolmap.Track())
+            groups.setdefault(place, set()).add(model.group)
+        for name, pose, rows in zip(model.images, model.camera_from_world, model.rows_by_image(), strict=True):
+            image = pycolmap.Image(name=name, camera_id=CAMERA_ID, image_id=ids[name])
+            keypoints = to_colmap_px(model.keypoints_px(by_name[name], rows))
+            image.points2D = [pycolmap.Point2D(each) for each in keypoints]
+            reconstruction.add_image_with_trivial_frame(
+                image, pycolmap.Rigid3d(pycolmap.Rotation3d(pose.rotation), pose.translation)
+            )
+            for row in rows:
+                tracks[places[model.point_index[row]]].add_element(ids[name], int(model.keypoint[row]))
+    names = {}
+    for (label, xyz), track in tracks.items():
+        own = groups[label, xyz]
+        names[reconstruction.add_point3D(np.array(xyz), track)] = (own.pop() if len(own) == 1 else "", label)
+    reconstruction.update_point_3d_errors()
+    return reconstruction, names
+
+
+def write_model(
+    folder: Path,
+    models: Sequence[GroupModel],
+    observations: Sequence[ImageObservations],
+    ids: dict[str, int],
+    camera: Camera,
+    colmap_model: str,
+) -> None:
+    """Write models that share one world as COLMAP's binary files."""
+    folder.mkdir(parents=True, exist_ok=True)
+    to_reconstruction(models, observations, ids, camera, colmap_model)[0].write_binary(str(folder))
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class ReadModel:
+    """A COLMAP model with labels: one :class:`GroupModel` for each group that it has images of, all in its world.
+
+    ``camera`` : the model's own, refined perhaps; ``unlabelled`` : points whose keypoints name no label, or several;
+    ``split`` : labels that more than one point stands for, the longest track was taken.
+    """
+
+    path: Path
+    camera: Camera
+    groups: tuple[GroupModel, ...]
+    unlabelled: int
+    split: int
+
+
+def find_models(folder: str | Path) -> list[Path]:
+    """Folders with a COLMAP model: this one, or those in it (as the mapper writes them: 0, 1, …).
+
+    Raises
+    ------
+    InputError
+        There is none.
+    """
+    folder = Path(folder)
+    found = []
+    if folder.is_dir():
+        inner = sorted(p for p in folder.glob("**/") if len(p.relative_to(folder).parts) <= 2)
+        found = [p for p in inner if (p / "images.bin").exists() or (p / "images.txt").exists()]
+    if not found:
+        raise InputError(
+            f"model {folder}: no COLMAP model (cameras, images and points3D as .bin or .txt) there; "
+            "give the folder that the mapper or the GUI wrote"
+        )
+    return found
+
+
+def read_model(
+    path: Path, observations: Sequence[ImageObservations], ids: dict[str, int], corrected_px: Sequence[np.ndarray]
+) -> ReadModel:
+    """Read a model that rests on the keypoints of our database; labels come by (image, keypoint).
+
+    Raises
+    ------
+    InputError
+        A damaged model, more than one camera, an image that is not of the run, or keypoints of another database.
+    """
+    reconstruction = _open(path)
+    cameras = list(reconstruction.cameras.values())
+    if len(cameras) != 1:
+        raise InputError(f"model {path}: {len(cameras)} cameras, 1 needed; map the exported database as it is")
+    native = cameras[0]
+    camera = camera_from_colmap(native.model.name, native.width, native.height, list(native.params), path)
+    place = {image.name: i for i, image in enumerate(observations)}
+    members: dict[str, list] = {}
+    for image in reconstruction.images.values():
+        if not image.has_pose:
+            continue
+        if image.name not in place:
+            raise InputError(
+                f"model {path}: image {image.name} is not of this run ({observations[0].name} … "
+                f"{observations[-1].name}); give the run that the model's database came from"
+            )
+        i = place[image.name]
+        _require_keypoints(path, image, corrected_px[i])
+        members.setdefault(observations[i].group, []).append((observations[i], corrected_px[i], image))
+    point_label, unlabelled = _labels_of_points(reconstruction, place, observations)
+    groups, split = [], 0
+    for name, images in sorted(members.items()):
+        images.sort(key=lambda each: ids[each[0].name])
+        model, several = _group_model(name, images, reconstruction, point_label)
+        split += several
+        if model is not None:
+            groups.append(model)
+    if not groups:
+        raise InputError(f"model {path}: no image with a pose and labelled points; map again")
+    return ReadModel(path, camera.sized(0, 0), tuple(groups), unlabelled, split)
+
+
+def _open(path: Path) -> pycolmap.Reconstruction:
+    pycolmap.logging.minloglevel = pycolmap.logging.FATAL.value if hasattr(pycolmap.logging, "FATAL") else 3
+    try:
+        return pycolmap.Reconstruction(str(path))
+    except (RuntimeError, ValueError, IndexError, MemoryError, OverflowError) as error:
+        reason = " ".join(str(error).split())[-150:]
+        raise InputError(f"model {path}: damaged or incomplete ({reason}); write or copy it again") from error
+
+
+def _require_keypoints(path: Path, image, corrected_px: np.ndarray) -> None:
+    """The model must rest on our keypoints, or (image, keypoint) names nothing."""
+    xy = from_colmap_px(np.array([point.xy for point in image.points2D]).reshape(-1, 2))
+    if len(xy) != len(corrected_px):
+        raise InputError(
+            f"model {path}: image {image.name} has {len(xy)} keypoints, the run {len(corrected_px)}; "
+            "give the run that the model's database came from"
+        )
+    off = np.abs(xy - corrected_px).max(initial=0.0)
+    if off > KEYPOINT_TOLERANCE_PX:
+        raise InputError(
+            f"model {path}: image {image.name}: keypoints up to {off:.4f} px off the run's, {KEYPOINT_TOLERANCE_PX:g} "
+            "allowed; give the run that the model's database came from"
+        )
+
+
+def _labels_of_points(reconstruction, place, observations) -> tuple[dict[int, tuple[str, str]], int]:
+    """(group, label) of each point by its track; the group is empty for circles, which are the same in all groups."""
+    found, unlabelled = {}, 0
+    for point_id, point in reconstruction.points3D.items():
+        names = set()
+        for element in point.track.elements:
+            image = observations[place[reconstruction.image(element.image_id).name]]
+            label = image.labels[element.point2D_idx]
+            names.add((image.group if is_board(label) else "", label))
+        if len(names) == 1:
+            found[point_id] = names.pop()
+        else:
+            unlabelled += 1
+    return found, unlabelled
+
+
+def _group_model(group: str, images, reconstruction, point_label) -> tuple[GroupModel | None, int]:
+    """One group of the model, and how many labels had several points."""
+    rows = []  # image, keypoint, point id
+    for i, (_, _, image) in enumerate(images):
+        for k, point in enumerate(image.points2D):
+            if point.has_point3D() and point.point3D_id in point_label:
+                rows.append((i, k, point.point3D_id))
+    if not rows:
+        return None, 0
+    length: dict[str, dict[int, int]] = {}
+    for _, _, point_id in rows:
+        votes = length.setdefault(point_label[point_id][1], {})
+        votes[point_id] = votes.get(point_id, 0) + 1
+    chosen = {label: max(sorted(votes), key=votes.get) for label, votes in length.items()}
+    labels = sorted(chosen)
+    index = {chosen[label]: i for i, label in enumerate(labels)}
+    image_index, keypoint, point_id = np.array([row for row in rows if row[2] in index]).T
+    observed = [images[i][0] for i in image_index]
+    measured = np.array([o.centre_px[k] for o, k in zip(observed, keypoint, strict=True)])
+    corrected = np.array([images[i][1][k] for i, k in zip(image_index, keypoint, strict=True)])
+    sigma = [o.sigma_px() for o, _, _ in images]
+    model = GroupModel(
+        group,
+        tuple(o.name for o, _, _ in images),
+        tuple(rigid_from_colmap(image.cam_from_world()) for _, _, image in images),
+        tuple(labels),
+        np.array([reconstruction.point3D(chosen[label]).xyz for label in labels]),
+        image_index,
+        np.array([index[p] for p in point_id.tolist()]),
+        keypoint,
+        measured,
+        measured - corrected,
+        np.array([sigma[i][k] for i, k in zip(image_index, keypoint, strict=True)]),
+    )
+    return model, sum(len(votes) > 1 for votes in length.values())

@@ -1,0 +1,48 @@
+"""Scale and faces from COLMAP models that someone made or edited elsewhere: the native mapper, the GUI."""
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+from stcal.errors import InputError
+from stcal.sfm.calibration import Calibration, calibrate
+from stcal.sfm.colmap_model import ReadModel
+from stcal.sfm.model import GroupModel
+from stcal.sfm.saved import SavedRun
+
+
+def faces_from_models(read: Sequence[ReadModel], run: SavedRun) -> Calibration:
+    """Our scale and face stages, group by group and chained, on models of the run's groups as they are.
+
+    Raises
+    ------
+    InputError
+        The models state different cameras.
+    ScaleError
+        A group's board is not in its model.
+    MappingError
+        The reference face is in none of the models, or a face is not linked to it.
+    """
+    models: dict[str, GroupModel] = {}
+    notes = []
+    for source in read:
+        if not source.camera.same_as(read[0].camera):
+            raise InputError(
+                f"models {read[0].path}, {source.path}: different cameras; keep the intrinsics fixed in the mapper, "
+                "or give one model at a time"
+            )
+        if source.unlabelled:
+            notes.append(
+                f"model {source.path}: {source.unlabelled} points left out: their keypoints name no one circle"
+            )
+        if source.split:
+            notes.append(f"model {source.path}: {source.split} circles are several points each; longest tracks taken")
+        for model in source.groups:
+            if model.group in models:
+                notes.append(f"group {model.group}: in several models; the one with the most images was taken")
+            if model.group not in models or len(model.images) > len(models[model.group].images):
+                models[model.group] = model
+    notes += [f"group {name}: in none of the models" for name in run.groups() if name not in models]
+    options = replace(run.options, solve="chain")
+    ordered = [models[name] for name in run.groups() if name in models]
+    calibration = calibrate(ordered, read[0].camera, run.target, run.board, options)
+    return replace(calibration, notes=(*notes, *calibration.notes))
