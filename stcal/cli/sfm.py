@@ -44,6 +44,13 @@ class Frame(StrEnum):
     three_point = "three-point"
 
 
+class Pairs(StrEnum):
+    """Which pairs of images are matched."""
+
+    all = "all"
+    sparse = "sparse"
+
+
 class Solve(StrEnum):
     """How the groups are solved."""
 
@@ -87,6 +94,13 @@ def run(
             help="Largest median ray angle of the initial pair, degrees; 60, and the smallest beyond it, if not given.",
         ),
     ] = None,
+    pairs: Annotated[
+        Pairs | None,
+        typer.Option(
+            help="Pairs of images to match: all, or sparse, as many as hold every circle together; "
+            "sparse above 80 images if not given."
+        ),
+    ] = None,
     min_diameter: MinDiameter = None,
     max_diameter: MaxDiameter = 450.0,
     workers: Workers = None,
@@ -100,6 +114,7 @@ def run(
         frame=frame and frame.value,
         eccentricity=eccentricity,
         reference_face=reference_face,
+        graph=pairs and pairs.value,
         pairs=PairOptions(None if max_angle is None else float(np.radians(max_angle))),
         ellipses=_ellipses(min_diameter, max_diameter),
         workers=workers,

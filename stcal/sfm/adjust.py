@@ -1,4 +1,4 @@
-"""Weighted bundle adjustment of one group: Gauss–Newton over poses and points, the points eliminated (Schur).
+"""Weighted bundle adjustment of one group: Gauss–Newton over poses and points, the more numerous eliminated (Schur).
 
 COLMAP's adjustment weighs all observations alike; centres differ in σ by a factor of ten, and that is worth a factor
 of two in the faces. Intrinsics are fixed. The seven free directions of the world (no board is used here) are left to
@@ -8,6 +8,8 @@ a vanishing damping, so that the model stays where it is.
 from dataclasses import replace
 
 import numpy as np
+from numpy.linalg import LinAlgError
+from scipy.linalg import cho_factor, cho_solve
 from scipy.spatial.transform import Rotation
 
 from stcal.errors import ConvergenceError
@@ -79,29 +81,52 @@ def _step(model: GroupModel, camera: Camera, damping: float) -> tuple[GroupModel
     weight = 1 / model.sigma_px[:, None]
     a, b = by_pose * weight[..., None], by_point * weight[..., None]
     residual = model.residuals_px(camera) * weight
-    pose_block, point_block = np.zeros((m, 6, 6)), np.zeros((p, 3, 3))
-    pose_right, point_right = np.zeros((m, 6)), np.zeros((p, 3))
-    np.add.at(pose_block, model.image_index, np.swapaxes(a, 1, 2) @ a)
-    np.add.at(point_block, model.point_index, np.swapaxes(b, 1, 2) @ b)
-    np.add.at(pose_right, model.image_index, np.einsum("nki,nk->ni", a, residual))
-    np.add.at(point_right, model.point_index, np.einsum("nki,nk->ni", b, residual))
-    pose_block += damping * pose_block * np.eye(6)
-    point_block += damping * point_block * np.eye(3)
+    poses = _normal_blocks(a, residual, model.image_index, m, damping)
+    points = _normal_blocks(b, residual, model.point_index, p, damping)
     cross = np.zeros((m, p, 6, 3))
-    np.add.at(cross, (model.image_index, model.point_index), np.swapaxes(a, 1, 2) @ b)
-    inverse = np.linalg.inv(point_block)
-    weighted = cross @ inverse
-    reduced = -np.einsum("apij,bpkj->aibk", weighted, cross, optimize=True)
-    reduced[np.arange(m), :, np.arange(m)] += pose_block
-    right = pose_right - np.einsum("apij,pj->ai", weighted, point_right)
-    pose_step = np.linalg.lstsq(reduced.reshape(6 * m, 6 * m), right.ravel(), rcond=1e-14)[0].reshape(m, 6)
-    point_step = np.einsum("pij,pj->pi", inverse, point_right - np.einsum("apij,ai->pj", cross, pose_step))
+    cross[model.image_index, model.point_index] = np.swapaxes(a, 1, 2) @ b
+    if 6 * m <= 3 * p:
+        pose_step, point_step = _solve(*poses, *points, cross)
+    else:
+        point_step, pose_step = _solve(*points, *poses, cross.transpose(1, 0, 3, 2))
     move = np.einsum("nij,nj->ni", by_pose, pose_step[model.image_index])
     move += np.einsum("nij,nj->ni", by_point, point_step[model.point_index])
     turned = Rotation.from_rotvec(pose_step[:, :3]).as_matrix()
-    poses = tuple(
+    moved_poses = tuple(
         Rigid(turn @ pose.rotation, pose.translation + step[3:])
         for turn, pose, step in zip(turned, model.camera_from_world, pose_step, strict=True)
     )
-    moved = replace(model, camera_from_world=poses, xyz_world=model.xyz_world + point_step)
+    moved = replace(model, camera_from_world=moved_poses, xyz_world=model.xyz_world + point_step)
     return moved, float(np.abs(move).max()) if n else 0.0
+
+
+def _normal_blocks(jacobian, residual, index, count: int, damping: float) -> tuple[np.ndarray, np.ndarray]:
+    """Diagonal blocks (count, k, k) of the normal matrix, damped, and right-hand side (count, k)."""
+    k = jacobian.shape[2]
+    block, right = np.zeros((count, k, k)), np.zeros((count, k))
+    np.add.at(block, index, np.swapaxes(jacobian, 1, 2) @ jacobian)
+    np.add.at(right, index, np.einsum("nki,nk->ni", jacobian, residual))
+    return block + damping * block * np.eye(k), right
+
+
+def _solve(kept, kept_right, dropped, dropped_right, cross) -> tuple[np.ndarray, np.ndarray]:
+    """Steps of the kept blocks (a, i) and the dropped ones (b, j), the latter eliminated; ``cross`` : (a, b, i, j)."""
+    a, b, i, j = cross.shape
+    inverse = np.linalg.inv(dropped)
+    flat = cross.transpose(0, 2, 1, 3).reshape(a * i, b * j)
+    weighted = (cross @ inverse).transpose(0, 2, 1, 3).reshape(a * i, b * j)
+    reduced = -weighted @ flat.T
+    blocks = reduced.reshape(a, i, a, i)
+    blocks[np.arange(a), :, np.arange(a)] += kept
+    right = kept_right.ravel() - weighted @ dropped_right.ravel()
+    step = _solve_symmetric(reduced, right)
+    back = np.einsum("bij,bj->bi", inverse, dropped_right - (flat.T @ step).reshape(b, j))
+    return step.reshape(a, i), back
+
+
+def _solve_symmetric(matrix: np.ndarray, right: np.ndarray) -> np.ndarray:
+    """By Cholesky where the damping makes it possible, else the shortest solution."""
+    try:
+        return cho_solve(cho_factor(matrix), right)
+    except LinAlgError:
+        return np.linalg.lstsq(matrix, right, rcond=1e-14)[0]

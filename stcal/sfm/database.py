@@ -4,7 +4,6 @@ import csv
 import io
 import os
 from collections.abc import Sequence
-from itertools import combinations
 from pathlib import Path
 
 import numpy as np
@@ -17,8 +16,6 @@ from stcal.sfm.observations import ImageObservations, is_board
 
 CAMERA_ID = 1
 RIG_ID = 1
-MIN_SHARED = 6
-"""Pairs of images with fewer labels in common are not written."""
 
 
 def colmap_camera(camera: Camera, colmap_model: str) -> pycolmap.Camera:
@@ -63,12 +60,14 @@ def write_database(
     camera: Camera,
     colmap_model: str,
     observations: Sequence[ImageObservations],
+    pairs: np.ndarray,
     keypoints_px: Sequence[np.ndarray] | None = None,
 ) -> None:
     """Write a new database at once: it appears complete or not at all.
 
     Parameters
     ----------
+    pairs : (n, 2) indices of the images to match, see :func:`stcal.sfm.graph.image_graph`
     keypoints_px : one (n, 2) array for each image, OpenCV pixel origin; the measured centres where not given
     """
     path = Path(path)
@@ -76,7 +75,7 @@ def write_database(
     remove_database(partial)
     try:
         with pycolmap.Database.open(str(partial)) as database:
-            _write(database, camera, colmap_model, observations, keypoints_px)
+            _write(database, camera, colmap_model, observations, pairs, keypoints_px)
     except RuntimeError as error:
         remove_database(partial)
         raise InputError(
@@ -93,7 +92,7 @@ def remove_database(path: Path) -> None:
         Path(f"{path}{suffix}").unlink(missing_ok=True)
 
 
-def _write(database, camera, colmap_model, observations, keypoints_px) -> None:
+def _write(database, camera, colmap_model, observations, pairs, keypoints_px) -> None:
     with pycolmap.DatabaseTransaction(database):
         native = colmap_camera(camera, colmap_model)
         database.write_camera(native, use_camera_id=True)
@@ -109,10 +108,9 @@ def _write(database, camera, colmap_model, observations, keypoints_px) -> None:
             database.write_frame(frame, use_frame_id=True)
             xy = image.centre_px if keypoints_px is None else keypoints_px[i]
             database.write_keypoints(ids[image.name], to_colmap_px(xy).astype(np.float32))
-        for a, b in combinations(observations, 2):
+        for i, j in pairs:
+            a, b = observations[i], observations[j]
             matches = match_labels(a, b)
-            if len(matches) < MIN_SHARED:
-                continue
             database.write_matches(ids[a.name], ids[b.name], matches)
             geometry = pycolmap.TwoViewGeometry(inlier_matches=matches)
             # 4.x skips pairs of configuration UNDEFINED without a word.

@@ -1,6 +1,7 @@
 """Mapping with pycolmap: incremental, seeded with our pair, intrinsics fixed, few points."""
 
 import shutil
+from collections.abc import Collection
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -14,6 +15,7 @@ from stcal.sfm.database import CAMERA_ID
 from stcal.sfm.model import MIN_POINTS, GroupModel, Outlier
 from stcal.sfm.observations import ImageObservations
 from stcal.sfm.pairs import PairScore
+from stcal.sfm.resect import assemble, complete
 
 SEED = 1
 MAX_REPROJECTION_PX = 4.0
@@ -38,11 +40,12 @@ def map_group(
     database: Path,
     scratch: Path,
     group: list[ImageObservations],
+    skeleton: Collection[str],
     ids: dict[str, int],
     pairs: list[PairScore],
     camera: Camera,
 ) -> Mapping:
-    """Map one group of the database.
+    """Map one group of the database: the ``skeleton`` by COLMAP, the other images resected by their labels.
 
     The chosen pair seeds COLMAP; where COLMAP's gates refuse it, our own relative pose is registered instead.
 
@@ -52,7 +55,7 @@ def map_group(
         No model of two or more images.
     """
     pycolmap.logging.minloglevel = LOG_ERRORS_ONLY
-    names = [image.name for image in group]
+    names = [image.name for image in group if image.name in skeleton]
     seeded = "COLMAP's estimate of the chosen pair"
     reconstruction = _seeded_mapping(database, scratch, names, ids, pairs[0])
     if reconstruction is None:
@@ -63,7 +66,7 @@ def map_group(
             f"group {group[0].group}: no model from the pair {pairs[0].first}, {pairs[0].second} "
             f"({pairs[0].shared} circles in common); add views between the two, or change --max-angle"
         )
-    model, outliers = _labelled_model(reconstruction, group, ids, camera)
+    model, outliers = labelled_model(reconstruction, group, ids, camera)
     _require_agreement(model, group)
     return Mapping(model, outliers, left_out(group, model), seeded)
 
@@ -164,43 +167,26 @@ def _own_mapping(database: Path, names, ids, pair: PairScore) -> pycolmap.Recons
     return reconstruction if reconstruction.num_reg_images() >= 2 and reconstruction.num_points3D() >= 4 else None
 
 
-def _labelled_model(
+def labelled_model(
     reconstruction: pycolmap.Reconstruction, group: list[ImageObservations], ids: dict[str, int], camera: Camera
 ) -> tuple[GroupModel, tuple[Outlier, ...]]:
-    """One point for each label, with every observation of the label that agrees with it; and those that do not."""
+    """One point for each label, with every observation of the label that agrees with it; and those that do not.
+
+    Images of the group that the reconstruction lacks are resected by their labels.
+    """
     known = reconstruction.images  # COLMAP forgets images that share nothing with the others
     registered = [image for image in group if ids[image.name] in known and known[ids[image.name]].has_pose]
-    poses = [rigid_from_colmap(reconstruction.image(ids[image.name]).cam_from_world()) for image in registered]
+    poses = [rigid_from_colmap(known[ids[image.name]].cam_from_world()) for image in registered]
     places: dict[str, dict[int, int]] = {}
     for image in registered:
-        record = reconstruction.image(ids[image.name])
-        for k, point in enumerate(record.points2D):
+        for k, point in enumerate(known[ids[image.name]].points2D):
             if point.has_point3D():
                 votes = places.setdefault(image.labels[k], {})
                 votes[point.point3D_id] = votes.get(point.point3D_id, 0) + 1
     xyz = {label: reconstruction.point3D(max(votes, key=votes.get)).xyz for label, votes in places.items()}
-    labels = sorted(xyz)
-    index = {label: i for i, label in enumerate(labels)}
-    rows = [
-        (i, index[label], k)
-        for i, image in enumerate(registered)
-        for k, label in enumerate(image.labels)
-        if label in index
-    ]
-    image_index, point_index, keypoint = np.array(rows, int).reshape(-1, 3).T
-    model = GroupModel(
-        group[0].group,
-        tuple(image.name for image in registered),
-        tuple(poses),
-        tuple(labels),
-        np.array([xyz[label] for label in labels]).reshape(-1, 3),
-        image_index,
-        point_index,
-        keypoint,
-        np.array([registered[i].centre_px[k] for i, k in zip(image_index, keypoint, strict=True)]).reshape(-1, 2),
-        np.zeros((len(rows), 2)),
-        np.array([registered[i].sigma_px()[k] for i, k in zip(image_index, keypoint, strict=True)]),
-    )
+    model = assemble(group[0].group, registered, poses, xyz)
+    if len(registered) < len(group):
+        model = complete(model, group, camera, MAX_REPROJECTION_PX)
     residual = np.linalg.norm(model.residuals_px(camera), axis=1)
     off = residual > MAX_REPROJECTION_PX
     outliers = [

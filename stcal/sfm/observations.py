@@ -2,6 +2,7 @@
 
 import csv
 import io
+from collections.abc import Sequence
 from dataclasses import dataclass, fields
 
 import numpy as np
@@ -47,6 +48,14 @@ class ImageObservations:
         """Those of the indices ``keep``."""
         arrays = [getattr(self, f.name)[keep] for f in fields(self)[3:]]
         return ImageObservations(self.name, self.group, tuple(self.labels[i] for i in keep), *arrays)
+
+
+def by_group(observations: Sequence[ImageObservations]) -> dict[str, list[ImageObservations]]:
+    """Observations by group, in order."""
+    groups: dict[str, list[ImageObservations]] = {}
+    for image in observations:
+        groups.setdefault(image.group, []).append(image)
+    return groups
 
 
 def is_board(label: str) -> bool:

@@ -7,6 +7,7 @@ from stcal.design import TargetDesign
 from stcal.errors import InputError
 from stcal.sfm.detect.ellipses import EllipseOptions
 from stcal.sfm.faces import FrameKind
+from stcal.sfm.graph import GraphKind
 from stcal.sfm.pairs import PairOptions
 
 Solve = Literal["joint", "chain"]
@@ -19,14 +20,15 @@ class RunOptions:
     ``solve`` : ``joint`` (one adjustment over all groups) or ``chain`` (as in Zhang & Wei (2017), group by group);
     ``frame`` : ``plane`` (Z from the plane of all circles of a face) or ``three-point`` (as in Zhang & Wei (2017));
     ``eccentricity`` : off for the uncorrected control, which then is chained with three-point frames as in the
-    document unless the two are given; ``reference_face`` : the design's first one where None; ``workers`` :
-    processes, one per core where None.
+    document unless the two are given; ``reference_face`` : the design's first one where None; ``graph`` : which pairs
+    of images are matched, see :func:`stcal.sfm.graph.image_graph`; ``workers`` : processes, one per core where None.
     """
 
     solve: Solve | None = None
     frame: FrameKind | None = None
     eccentricity: bool = True
     reference_face: str | None = None
+    graph: GraphKind | None = None
     pairs: PairOptions = field(default_factory=PairOptions)
     ellipses: EllipseOptions = field(default_factory=EllipseOptions)
     workers: int | None = None

@@ -2,7 +2,7 @@
 
 import json
 import shutil
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from pathlib import Path
@@ -14,15 +14,17 @@ from stcal.camera_file import CameraModel, read_camera, write_cameras_txt
 from stcal.design import BoardDesign, TargetDesign, reference_board, reference_target
 from stcal.design_file import board_toml, load_board, load_target, target_toml
 from stcal.errors import InputError
+from stcal.geometry.camera import Camera
 from stcal.sfm.calibration import calibrate
 from stcal.sfm.chain import measure_chains
 from stcal.sfm.colmap_model import write_model
 from stcal.sfm.database import image_ids, labels_csv, remove_database, write_database
 from stcal.sfm.detection import DetectionResult, detect_files, require_single, write_bytes
+from stcal.sfm.graph import ImageGraph, image_graph
 from stcal.sfm.images import RUN_MARKER, find_images
 from stcal.sfm.labels import LabelledImage, label_group
 from stcal.sfm.model import GroupModel
-from stcal.sfm.observations import ImageObservations, detections_csv
+from stcal.sfm.observations import ImageObservations, by_group, detections_csv
 from stcal.sfm.options import RunOptions
 from stcal.sfm.output import faces_json, report_json
 from stcal.sfm.overlay import draw_overlay
@@ -72,13 +74,14 @@ def run(
     detection, labelled = detect(images, model, out, target, board, options, tell)
     require_single(detection.images)
     observations = [each.observations for each in labelled]
-    groups: dict[str, list[ImageObservations]] = {}
-    for image in observations:
-        groups.setdefault(image.group, []).append(image)
+    groups = by_group(observations)
     require_groups(groups, detection.skipped)
 
     tell("map", 0, len(groups))
-    solutions = _solve_groups(groups, observations, out, detection.camera, model, target, board, options, tell)
+    graph = image_graph(observations, board, options.graph)
+    solutions = solve_groups(
+        observations, graph, out, detection.camera, model.colmap_model, target, board, options, tell
+    )
     tell("faces", 0, 1)
     calibration = calibrate([s.model for s in solutions], detection.camera, target, board, options)
     tell("faces", 1, 1)
@@ -91,6 +94,7 @@ def run(
         options,
         detection,
         tuple(labelled),
+        graph,
         tuple(solutions),
         calibration,
         measure_chains(calibration.faces, calibration.target),
@@ -195,19 +199,32 @@ def overlay_path(out: Path, name: str) -> Path:
     return out / "overlays" / f"{name}.jpg"
 
 
-def _solve_groups(groups, observations, out: Path, camera, model, target, board, options, tell) -> list[GroupSolution]:
+def solve_groups(
+    observations: Sequence[ImageObservations],
+    graph: ImageGraph,
+    out: Path,
+    camera: Camera,
+    colmap_model: str,
+    target: TargetDesign,
+    board: BoardDesign,
+    options: RunOptions,
+    tell: Progress,
+) -> list[GroupSolution]:
+    """Map and refine group by group, in ``out/scratch``, which is removed again."""
     scratch = out / "scratch"
     shutil.rmtree(scratch, ignore_errors=True)
     scratch.mkdir()
     ids = image_ids(observations)
     database = scratch / "mapping.db"
-    write_database(database, camera, model.colmap_model, observations)
+    groups = by_group(observations)
     solutions = []
     try:
-        for group in groups.values():
+        write_database(database, camera, colmap_model, observations, graph.pairs)
+        for name, group in groups.items():
             solutions.append(
                 solve_group(
                     group,
+                    [observations[i].name for i in graph.skeleton[name]],
                     database,
                     scratch / "models",
                     ids,
@@ -232,7 +249,7 @@ def _write(result: RunResult, tell: Progress) -> None:
     ids = image_ids(observations)
     models = {s.model.group: s.model for s in result.solutions}
     corrected = _corrected_px(models, observations)
-    write_database(out / "database.db", result.camera, result.colmap_model, observations, corrected)
+    write_database(out / "database.db", result.camera, result.colmap_model, observations, result.graph.pairs, corrected)
     write_bytes(out / "labels.csv", labels_csv(observations, corrected).encode())
     shutil.rmtree(out / "models", ignore_errors=True)
     for name, model in models.items():

@@ -120,8 +120,7 @@ def _outliers(model: GroupModel, camera: Camera) -> tuple[np.ndarray, list[Outli
     least = max(1.0, WORST_SHARE * float((residual / limit).max(initial=0.0)))
     off = np.zeros(len(residual), bool)
     named = []
-    for i, name in enumerate(model.images):
-        rows = np.flatnonzero(model.image_index == i)
+    for name, rows in zip(model.images, model.rows_by_image(), strict=True):
         worst = rows[np.argmax(residual[rows] / limit[rows])]
         if residual[worst] > least * limit[worst]:
             off[worst] = True

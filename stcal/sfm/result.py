@@ -8,6 +8,7 @@ from stcal.geometry.camera import Camera
 from stcal.sfm.calibration import Calibration
 from stcal.sfm.chain import Chain
 from stcal.sfm.detection import DetectionResult
+from stcal.sfm.graph import ImageGraph
 from stcal.sfm.labels import LabelledImage
 from stcal.sfm.observations import ImageObservations
 from stcal.sfm.options import RunOptions
@@ -26,6 +27,7 @@ class RunResult:
     options: RunOptions
     detection: DetectionResult
     labelled: tuple[LabelledImage, ...]
+    graph: ImageGraph
     solutions: tuple[GroupSolution, ...]
     calibration: Calibration
     chains: dict[str, tuple[Chain, ...]]

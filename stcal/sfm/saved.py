@@ -14,7 +14,7 @@ from stcal.errors import InputError
 from stcal.geometry.camera import Camera
 from stcal.sfm.detect.ellipses import EllipseOptions
 from stcal.sfm.images import RUN_MARKER
-from stcal.sfm.observations import ImageObservations
+from stcal.sfm.observations import ImageObservations, by_group
 from stcal.sfm.options import RunOptions
 from stcal.sfm.pairs import PairOptions
 
@@ -50,10 +50,7 @@ class SavedRun:
 
     def groups(self) -> dict[str, list[ImageObservations]]:
         """Observations by group, in order."""
-        groups: dict[str, list[ImageObservations]] = {}
-        for image in self.observations:
-            groups.setdefault(image.group, []).append(image)
-        return groups
+        return by_group(self.observations)
 
 
 def marker_json(images: str | Path, options: RunOptions | None) -> dict:

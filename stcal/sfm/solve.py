@@ -23,7 +23,7 @@ from stcal.sfm.observations import ImageObservations, is_board
 from stcal.sfm.pairs import PairOptions, PairScore, rank_pairs
 from stcal.sfm.refine import refine
 
-CACHE_VERSION = 2
+CACHE_VERSION = 3
 _ARRAYS = ("xyz_world", "image_index", "point_index", "keypoint", "measured_px", "shift_px", "sigma_px")
 
 
@@ -91,6 +91,7 @@ def require_usable(group: list[ImageObservations]) -> None:
 
 def solve_group(
     group: list[ImageObservations],
+    skeleton: Sequence[str],
     database: Path,
     scratch: Path,
     ids: dict[str, int],
@@ -103,17 +104,19 @@ def solve_group(
 ) -> GroupSolution:
     """Solve one group, or take the solution of an earlier run with the same inputs.
 
+    The initial pair is chosen among the images of the ``skeleton``, which are mapped first.
+
     Raises
     ------
     MappingError, ScaleError, ConvergenceError
     """
-    key = _key(group, ids, camera, target, board, pair_options, eccentricity)
+    key = _key(group, skeleton, ids, camera, target, board, pair_options, eccentricity)
     path = cache / f"group-{key}.npz"
     kept = _load(path)
     if kept is not None:
         return kept
-    pairs = rank_pairs(group, camera, pair_options)
-    mapping = map_group(database, scratch, group, ids, pairs, camera)
+    pairs = rank_pairs([image for image in group if image.name in skeleton], camera, pair_options)
+    mapping = map_group(database, scratch, group, skeleton, ids, pairs, camera)
     refined = refine(mapping.model, camera, target, board, eccentricity)
     solution = GroupSolution(
         tuple(pairs),
@@ -127,12 +130,22 @@ def solve_group(
     return solution
 
 
-def _key(group, ids, camera: Camera, target: TargetDesign, board: BoardDesign, pair_options, eccentricity: bool) -> str:
+def _key(
+    group, skeleton, ids, camera: Camera, target: TargetDesign, board: BoardDesign, pair_options, eccentricity: bool
+) -> str:
     hasher = hashlib.sha256()
     for image in group:
         hasher.update(f"{image.name}\0{ids[image.name]}\0{image.labels}\0".encode())
         hasher.update(image.centre_px.tobytes() + image.covariance_px2.tobytes())
-    plain = [CACHE_VERSION, asdict(camera), asdict(target), asdict(board), asdict(pair_options), eccentricity]
+    plain = [
+        CACHE_VERSION,
+        list(skeleton),
+        asdict(camera),
+        asdict(target),
+        asdict(board),
+        asdict(pair_options),
+        eccentricity,
+    ]
     hasher.update(json.dumps(plain, default=lambda v: v.tolist() if isinstance(v, np.ndarray) else str(v)).encode())
     return hasher.hexdigest()[:40]
 

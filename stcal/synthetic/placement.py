@@ -12,6 +12,9 @@ from stcal.geometry.rigid import Rigid
 MAX_FACE_TILT_RAD = np.radians(67)
 MAX_BOARD_TILT_RAD = np.radians(50)
 CANDIDATES = 600
+CANDIDATES_PER_VIEW = 8
+AT_ONCE = 600
+"""Views tested at a time: what that takes of memory does not grow with their number."""
 PLACES = 60
 GOOD_SHARE = 0.5
 """A board place is taken at once if this share of the views that show both faces also shows the board."""
@@ -93,7 +96,8 @@ def place_group(
     best, shown = None, 0
     for _ in range(PLACES):
         target_from_board = _board_place(shape, rng)
-        views = _candidate_views(shape, target_from_board, camera, distance_mm, spread_rad, rng)
+        tried = max(CANDIDATES, CANDIDATES_PER_VIEW * count)
+        views = _candidate_views(shape, target_from_board, camera, tried, distance_mm, spread_rad, rng)
         faces_seen = (views.tilt_rad(shape.circles, shape.normals) <= MAX_FACE_TILT_RAD).all(1)
         valid = np.flatnonzero(faces_seen & _board_seen(shape, target_from_board, views, camera))
         shown = max(shown, int(faces_seen.sum()))
@@ -104,7 +108,7 @@ def place_group(
     target_from_board, views, valid = best
     if len(valid) < count:
         raise DegenerateError(
-            f"{shape.name}: {len(valid)} of {CANDIDATES} views show faces and board ({shown} show the faces), "
+            f"{shape.name}: {len(valid)} of {tried} views show faces and board ({shown} show the faces), "
             f"{count} needed; enlarge distance_mm or reduce the focal length"
         )
     picked = rng.permutation(_farthest(views.centres[valid] - shape.circles.mean(0), count))
@@ -124,8 +128,7 @@ def _board_place(shape: GroupShape, rng) -> Rigid:
     return Rigid(rotation, middle + shift @ shape.axes - rotation @ shape.outline_board.mean(0))
 
 
-def _candidate_views(shape, target_from_board, camera, distance_mm, spread_rad, rng) -> _Views:
-    n = CANDIDATES
+def _candidate_views(shape, target_from_board, camera, n: int, distance_mm, spread_rad, rng) -> _Views:
     azimuth, elevation = rng.uniform(-spread_rad, spread_rad, (2, n))
     local = [np.cos(elevation) * np.sin(azimuth), np.sin(elevation), np.cos(elevation) * np.cos(azimuth)]
     direction = np.column_stack(local) @ shape.axes
@@ -180,7 +183,8 @@ def _apart(a: np.ndarray, b: np.ndarray) -> np.ndarray:
     """Whether a line with room on both sides separates point sets (n, k, 2) and (n, m, 2); exact to 2°."""
     angle = np.radians(np.arange(0, 360, 2))
     direction = np.array([np.cos(angle), np.sin(angle)])
-    return ((b @ direction).min(1) - (a @ direction).max(1) > BODY_GAP).any(1)
+    parts = [slice(at, at + AT_ONCE) for at in range(0, len(a), AT_ONCE)]
+    return np.concatenate([((b[k] @ direction).min(1) - (a[k] @ direction).max(1) > BODY_GAP).any(1) for k in parts])
 
 
 def _farthest(directions: np.ndarray, count: int) -> np.ndarray:

@@ -17,6 +17,7 @@ from stcal.sfm.database import (
     to_colmap_px,
     write_database,
 )
+from stcal.sfm.graph import image_graph
 from stcal.sfm.mapping import map_group
 from stcal.sfm.pairs import PairOptions, rank_pairs
 
@@ -29,7 +30,7 @@ def observed(scene, labels_only):
 @pytest.fixture(scope="module")
 def database(scene, observed, tmp_path_factory):
     path = tmp_path_factory.mktemp("database") / "database.db"
-    write_database(path, scene.camera, scene.colmap_model, observed)
+    write_database(path, scene.camera, scene.colmap_model, observed, image_graph(observed, scene.board, "all").pairs)
     return path
 
 
@@ -96,7 +97,7 @@ def map_one(scene, observed, database, tmp_path, group, pairs=None):
     own = [o for o in observed if o.group == group]
     pairs = pairs or rank_pairs(own, scene.camera, PairOptions())
     ids = image_ids(observed)
-    return own, map_group(database, tmp_path / "scratch", own, ids, pairs, scene.camera)
+    return own, map_group(database, tmp_path / "scratch", own, list(ids), ids, pairs, scene.camera)
 
 
 def truth_of(scene, model):

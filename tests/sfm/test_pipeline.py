@@ -93,7 +93,7 @@ def test_any_colmap_makes_an_unbiased_model_of_the_database(calibrated, tmp_path
     ids = image_ids(observations)
     group = [o for o in observations if o.group == "12"]
     pairs = rank_pairs(group, result.camera, PairOptions())
-    mapping = map_group(result.out / "database.db", tmp_path / "scratch", group, ids, pairs, result.camera)
+    mapping = map_group(result.out / "database.db", tmp_path / "scratch", group, list(ids), ids, pairs, result.camera)
     ours = next(s.model for s in result.solutions if s.model.group == "12")
     from dataclasses import replace
 
