@@ -15,6 +15,8 @@ from stcal.sfm.database import CAMERA_ID, colmap_camera, from_colmap_px, to_colm
 from stcal.sfm.model import GroupModel
 from stcal.sfm.observations import ImageObservations, is_board
 
+LOG_NOTHING = 4
+"""Errors come as exceptions."""
 KEYPOINT_TOLERANCE_PX = 0.002
 """A model's keypoints are the database's: float32 has steps of 0.0005 px at x = 5000 and 0.002 px at x = 30 000."""
 
@@ -122,7 +124,7 @@ def read_model(
     InputError
         A damaged model, more than one camera, an image that is not of the run, or keypoints of another database.
     """
-    reconstruction = _open(path)
+    reconstruction = open_model(path)
     cameras = list(reconstruction.cameras.values())
     if len(cameras) != 1:
         raise InputError(f"model {path}: {len(cameras)} cameras, 1 needed; map the exported database as it is")
@@ -154,8 +156,15 @@ def read_model(
     return ReadModel(path, camera.sized(0, 0), tuple(groups), unlabelled, split)
 
 
-def _open(path: Path) -> pycolmap.Reconstruction:
-    pycolmap.logging.minloglevel = pycolmap.logging.FATAL.value if hasattr(pycolmap.logging, "FATAL") else 3
+def open_model(path: Path) -> pycolmap.Reconstruction:
+    """A model's files as COLMAP's object.
+
+    Raises
+    ------
+    InputError
+        They are damaged, or one is missing.
+    """
+    pycolmap.logging.minloglevel = LOG_NOTHING
     try:
         return pycolmap.Reconstruction(str(path))
     except (RuntimeError, ValueError, IndexError, MemoryError, OverflowError) as error:

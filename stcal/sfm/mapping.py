@@ -54,10 +54,9 @@ def map_group(
     MappingError
         No model of two or more images.
     """
-    pycolmap.logging.minloglevel = LOG_ERRORS_ONLY
     names = [image.name for image in group if image.name in skeleton]
     seeded = "COLMAP's estimate of the chosen pair"
-    reconstruction = _seeded_mapping(database, scratch, names, ids, pairs[0])
+    reconstruction = seeded_mapping(database, scratch, names, (ids[pairs[0].first], ids[pairs[0].second]))
     if reconstruction is None:
         seeded = "our relative pose of the chosen pair (COLMAP's gates refused its own)"
         reconstruction = _own_mapping(database, names, ids, pairs[0])
@@ -125,10 +124,14 @@ def pipeline_options(names: list[str], pair: tuple[int, int]) -> pycolmap.Increm
     return options
 
 
-def _seeded_mapping(database: Path, scratch: Path, names, ids, pair: PairScore) -> pycolmap.Reconstruction | None:
+def seeded_mapping(
+    database: Path, scratch: Path, names: list[str], pair: tuple[int, int]
+) -> pycolmap.Reconstruction | None:
+    """The largest model that COLMAP's mapper makes of the named images from a pair (ids); None where it makes none."""
+    pycolmap.logging.minloglevel = LOG_ERRORS_ONLY
     shutil.rmtree(scratch, ignore_errors=True)
     scratch.mkdir(parents=True)
-    options = pipeline_options(names, (ids[pair.first], ids[pair.second]))
+    options = pipeline_options(names, pair)
     models = pycolmap.incremental_mapping(str(database), str(scratch), str(scratch), options)
     shutil.rmtree(scratch, ignore_errors=True)
     best = max(models.values(), key=lambda m: m.num_reg_images(), default=None)

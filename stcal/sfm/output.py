@@ -5,25 +5,27 @@ from itertools import combinations
 import numpy as np
 
 import stcal
+from stcal.design import TargetDesign
 from stcal.geometry.plane import fit_plane
+from stcal.sfm.chain import CalibratedTarget
 from stcal.sfm.model import GroupModel
 from stcal.sfm.observations import face_of, is_board
+from stcal.sfm.options import RunOptions
 from stcal.sfm.result import RunResult
 
 MICRO = 1e3
 
 
-def faces_json(result: RunResult) -> dict:
+def faces_json(target: CalibratedTarget, design: TargetDesign, options: RunOptions) -> dict:
     """The content of ``faces.json``: mm and rad, target frame, 4×4 row-major."""
-    target = result.target
-    radius = result.target_design.radius_of()
+    radius = design.radius_of()
     content = {
         "format": "stcal faces 1",
         "unit": "mm",
         "reference_face": target.reference_face,
-        "frame": result.options.frame,
-        "solve": result.options.solve,
-        "eccentricity": result.options.eccentricity,
+        "frame": options.frame,
+        "solve": options.solve,
+        "eccentricity": options.eccentricity,
         "target_from_face": {face: pose.matrix().tolist() for face, pose in target.target_from_face.items()},
         "circles": {label: xyz.tolist() for label, xyz in target.circles.items()},
         "radius_mm": {label: radius[label] for label in target.circles},

@@ -15,11 +15,13 @@ from stcal.design import BoardDesign, TargetDesign, reference_board, reference_t
 from stcal.design_file import board_toml, load_board, load_target, target_toml
 from stcal.errors import InputError
 from stcal.geometry.camera import Camera
-from stcal.sfm.calibration import calibrate
+from stcal.sfm.calibration import Calibration, calibrate
 from stcal.sfm.chain import measure_chains
-from stcal.sfm.colmap_model import write_model
+from stcal.sfm.colmap_model import find_models, read_model, write_model
+from stcal.sfm.crosscheck import Tolerances, crosscheck
 from stcal.sfm.database import image_ids, labels_csv, remove_database, write_database
 from stcal.sfm.detection import DetectionResult, detect_files, require_single, write_bytes
+from stcal.sfm.foreign import faces_from_models
 from stcal.sfm.graph import ImageGraph, image_graph
 from stcal.sfm.images import RUN_MARKER, find_images
 from stcal.sfm.labels import LabelledImage, label_group
@@ -28,9 +30,9 @@ from stcal.sfm.observations import ImageObservations, by_group, detections_csv
 from stcal.sfm.options import RunOptions
 from stcal.sfm.output import faces_json, report_json
 from stcal.sfm.overlay import draw_overlay
-from stcal.sfm.report import report_html
+from stcal.sfm.report import report_html, shown_overlays
 from stcal.sfm.result import RunResult
-from stcal.sfm.saved import BOARD, CAMERA, TARGET, marker_json
+from stcal.sfm.saved import BOARD, CAMERA, TARGET, SavedRun, marker_json
 from stcal.sfm.solve import GroupSolution, require_groups, solve_group, unseen_board
 
 RESULTS = ("faces.json", "report.json", "report.html", "labels.csv", "detections.csv", "compare.json")
@@ -132,6 +134,28 @@ def detect(
     write_bytes(out / "detections.csv", detections_csv([each.observations for each in labelled]).encode())
     _write_overlays(detection, labelled, target, out, tell)
     return detection, labelled
+
+
+def crosscheck_run(
+    saved: SavedRun, colmap: Path | None, tolerances: Tolerances, timeout_s: float, progress: Progress | None = None
+) -> dict:
+    """Cross-check a finished run with the native COLMAP; the comparison is added to its report."""
+    check = crosscheck(saved, colmap, tolerances, timeout_s, progress)
+    write_report(saved.folder, saved.report | {"crosscheck": check})
+    return check
+
+
+def calibrate_models(model: Path, saved: SavedRun) -> Calibration:
+    """Scale and faces from a COLMAP model, or the models in a folder, that rest on the run's database."""
+    ids = image_ids(saved.observations)
+    read = [read_model(path, saved.observations, ids, saved.corrected_px) for path in find_models(model)]
+    return faces_from_models(read, saved)
+
+
+def write_faces(path: Path, calibration: Calibration, saved: SavedRun) -> None:
+    """``faces.json`` of models that were chained."""
+    options = replace(saved.options, solve="chain")
+    write_bytes(path, _json(faces_json(calibration.target, saved.target, options)))
 
 
 def load_design(given, default: Callable, load: Callable):
@@ -260,11 +284,16 @@ def _write(result: RunResult, tell: Progress) -> None:
     write_bytes(out / TARGET, target_toml(result.target_design).encode())
     write_bytes(out / BOARD, board_toml(result.board_design).encode())
     report = report_json(result)
-    write_bytes(out / "faces.json", _json(faces_json(result)))
-    write_bytes(out / "report.json", _json(report))
-    overlays = {image.name: overlay_path(out, image.name).read_bytes() for image in observations}
-    write_bytes(out / "report.html", report_html(report, overlays).encode())
+    write_bytes(out / "faces.json", _json(faces_json(result.target, result.target_design, result.options)))
+    write_report(out, report)
     tell("report", 1, 1)
+
+
+def write_report(out: Path, report: dict) -> None:
+    """``report.json`` and ``report.html`` of a run's folder."""
+    write_bytes(out / "report.json", _json(report))
+    overlays = {name: overlay_path(out, name).read_bytes() for name in shown_overlays(report)}
+    write_bytes(out / "report.html", report_html(report, overlays).encode())
 
 
 def _corrected_px(models: dict[str, GroupModel], observations: list[ImageObservations]) -> list[np.ndarray]:

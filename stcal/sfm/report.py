@@ -7,8 +7,11 @@ from html import escape
 from stcal.sfm import figures
 from stcal.sfm.figures import NONE, PAGE, STYLE, Html, cells, fold, join, legend, number, plot, swatch, table
 from stcal.sfm.observations import face_of, is_board
+from stcal.sfm.report_crosscheck import crosscheck_section
 
 FIRST_PAIRS = 15
+FIRST_IMAGES = 100
+"""Rows and overlays that the page has room for."""
 
 
 def report_html(report: dict, overlays: dict[str, bytes]) -> str:
@@ -29,6 +32,7 @@ def report_html(report: dict, overlays: dict[str, bytes]) -> str:
         ("residuals", "Residuals", _residuals(report, colours)),
         ("pairs", "Initial pairs", _pairs(report)),
         ("left-out", "Left out", _left_out(report)),
+        *([("crosscheck", "Cross-check", crosscheck_section(report["crosscheck"]))] if "crosscheck" in report else []),
         ("overlays", "Overlays", _overlays(report, overlays)),
     ]
     links = "".join(f'<li><a href="#{key}">{title}</a></li>' for key, title, _ in sections)
@@ -304,8 +308,11 @@ def _residuals(report: dict, colours: dict[str, str]) -> str:
     chart = plot(
         figures.image_bars(images, colours), "Residuals by image", "Bars: RMS of the image; ticks: its largest", "wide"
     )
+    listing = table(columns, rows)
+    if len(rows) > FIRST_IMAGES:
+        listing = fold(f"All {len(rows)} images", listing)
     return (
-        f"<p>{escape(text)}</p>\n<h3>By image</h3>\n{legend(colours)}{chart}{table(columns, rows)}"
+        f"<p>{escape(text)}</p>\n<h3>By image</h3>\n{legend(colours)}{chart}{listing}"
         f'<h3>By label</h3>\n<div class="columns small">{target}</div>\n'
         + fold("Dots of the board, by group", f'<div class="columns small">{board}</div>')
     )
@@ -374,6 +381,18 @@ def _left_out(report: dict) -> str:
     return "".join(parts) or "<p>Nothing was left out.</p>\n"
 
 
+def shown_overlays(report: dict) -> list[str]:
+    """Names of the images whose overlays the page shows: all, or of a large set those that most deserve a look."""
+    names = [image["name"] for image in report["images"]]
+    if len(names) <= FIRST_IMAGES:
+        return names
+    worst = {row["image"]: row["max_px"] for row in report["residuals_by_image"]}
+    told = {each["image"] for each in report["left_out"]["notes"]}
+    ranked = sorted(names, key=lambda name: (name in worst, name not in told, -worst.get(name, 0.0)))
+    chosen = set(ranked[:FIRST_IMAGES])
+    return [name for name in names if name in chosen]
+
+
 def _overlays(report: dict, overlays: dict[str, bytes]) -> str:
     mapped = {row["image"]: row for row in report["residuals_by_image"]}
     names = list(overlays)
@@ -392,4 +411,8 @@ def _overlays(report: dict, overlays: dict[str, bytes]) -> str:
         )
     if not frames:
         return "<p>There are none.</p>\n"
-    return f'<p>Circles found and their labels; click to enlarge.</p>\n<div class="grid">{"".join(frames)}</div>\n'
+    rest = len(report["images"]) - len(names)
+    more = f" Images left out, with notes or with large residuals; the other {rest} are in overlays/." if rest else ""
+    return (
+        f'<p>Circles found and their labels; click to enlarge.{more}</p>\n<div class="grid">{"".join(frames)}</div>\n'
+    )

@@ -9,7 +9,7 @@ from html.parser import HTMLParser
 import pytest
 
 from stcal.sfm import figures
-from stcal.sfm.report import report_html
+from stcal.sfm.report import FIRST_IMAGES, report_html, shown_overlays
 
 NASTY = 'a/<script>alert("1")</script>&$_.jpg'
 VOID = {"meta", "img", "br", "link", "hr", "input"}
@@ -131,6 +131,7 @@ def make(sigma: bool = True, eccentricity: bool = True) -> dict:
         "residuals_by_label": [*(by_label(c, None) for c in CIRCLES), by_label("board:0:0", "a")],
         "left_out": {"files": [], "images": [], "circles": [], "notes": []},
         "notes": [],
+        "images": [{"image_id": i, "name": n, "group": "a", "circles": 12} for i, n in enumerate(OVERLAYS, start=1)],
         "scene": {
             "cameras": [camera_in_space(NASTY, -100.0), camera_in_space("a/1.jpg", 400.0)],
             "boards": {"a": [[200.0, 0.0, 0.0], [230.0, 0.0, 0.0], [200.0, 30.0, 0.0], [230.0, 30.0, 0.0]]},
@@ -355,3 +356,56 @@ def test_table_escapes_all_but_markup():
     page = figures.table(["<Name", "x < y (mm)"], [["<b>", figures.Html("<i>1</i>")]])
     assert '<th scope="row" class="l">&lt;b&gt;</th><td><i>1</i></td>' in page
     assert '<th scope="col">x &lt; y (mm)</th>' in page
+
+
+def test_a_large_set_shows_the_overlays_that_deserve_a_look():
+    report = make()
+    names = [f"a/{i}.jpg" for i in range(FIRST_IMAGES + 50)]
+    report["images"] = [{"image_id": i, "name": n, "group": "a", "circles": 12} for i, n in enumerate(names, 1)]
+    report["residuals_by_image"] = [by_image(n) | {"max_px": 0.01 + 1e-5 * i} for i, n in enumerate(names)][:-1]
+    report["left_out"]["notes"] = [{"image": "a/3.jpg", "note": "board left out"}]
+    shown = shown_overlays(report)
+    assert len(shown) == FIRST_IMAGES
+    assert {"a/3.jpg", names[-1], names[-2]} <= set(shown)  # a note, not mapped, the largest residual
+    assert "a/4.jpg" not in shown
+    assert shown == sorted(shown, key=names.index)
+    page = report_html(report, dict.fromkeys(shown, JPEG))
+    assert "the other 50 are in overlays/" in page
+    assert f"All {len(names) - 1} images" in page
+
+
+def crosscheck(differences: list[str]) -> dict:
+    row = {"translation_um": 0.7631, "rotation_mdeg": 0.3037}
+    faces = {"1": {"translation_um": 0.0, "rotation_mdeg": 0.0}, "2": row}
+    return {
+        "native": "3.8",
+        "pycolmap": "4.2.1",
+        "schema": "3.8",
+        "tolerances": {"face_um": 2, "face_mdeg": 1, "circle_um": 2, "camera_um": 20, "camera_mdeg": 2},
+        "images": {"native": 2, "pycolmap": 2, "run": 2},
+        "residual_rms_px": {"native": 0.00356, "pycolmap": 0.00357, "run": 0.00386},
+        "mapping": {
+            "faces": faces,
+            "circles_um": {"1:0": 0.1, "2:0": 0.765},
+            "cameras": [{"image": NASTY, "position_um": 9.184, "rotation_mdeg": 0.536}],
+        },
+        "result": {"faces": faces, "circles_um": {}},
+        "plain": {"faces": faces | {"2": None}},
+        "notes": ["group b: <none>"],
+        "differences": differences,
+    }
+
+
+def test_the_crosscheck_is_a_section_of_its_own():
+    page = report_html(make() | {"crosscheck": crosscheck([])}, OVERLAYS)
+    parsed = Page(page)
+    assert parsed.tags.count("h2") == 10
+    assert "They agree." in parsed.text
+    rows = rows_of(page, "crosscheck")
+    assert ["COLMAP 3.8", "2", "0.0036"] in rows
+    assert ["2", "0.763", "0.304", "0.763", "0.304", "–", "–"] in rows
+    assert [NASTY, "9.18", "0.536"] in rows
+    assert "group b: <none>" in parsed.text
+    differing = Page(report_html(make() | {"crosscheck": crosscheck(["face <2> 5 µm"])}, OVERLAYS)).text
+    assert "They differ: face <2> 5 µm." in differing
+    assert "They agree." not in differing
