@@ -10,6 +10,8 @@ from stcal.sfm.model import MIN_POINTS, GroupModel
 from stcal.sfm.observations import ImageObservations
 
 SEED = 1
+MIN_SHARE = 0.25
+"""Of an image's known circles that must fit, as COLMAP's own registration asks (abs_pose_min_inlier_ratio)."""
 MIN_RAY_ANGLE_RAD = np.radians(0.5)
 """Between some two rays of a new point, or its depth is a guess."""
 
@@ -17,9 +19,9 @@ MIN_RAY_ANGLE_RAD = np.radians(0.5)
 def complete(model: GroupModel, group: list[ImageObservations], camera: Camera, max_error_px: float) -> GroupModel:
     """The model with every further image of the group that its points place, and with the circles that these add.
 
-    An image is placed by six or more labelled points within ``max_error_px`` (RANSAC and refinement of pycolmap on
-    ideal coordinates); circles that the model lacks are triangulated from all images then placed. Observations are
-    all of each placed image.
+    An image is placed by six or more labelled points, and a quarter of those that it shows, within ``max_error_px``
+    (RANSAC and refinement of pycolmap on ideal coordinates); circles that the model lacks are triangulated from all
+    images then placed. Observations are all of each placed image.
     """
     xyz = dict(zip(model.labels, model.xyz_world, strict=True))
     poses = dict(zip(model.images, model.camera_from_world, strict=True))
@@ -69,7 +71,7 @@ def _resect(image: ImageObservations, xyz: dict[str, np.ndarray], camera: Camera
     answer = pycolmap.estimate_and_refine_absolute_pose(
         focal * image.centre[known], np.array([xyz[image.labels[k]] for k in known]), ideal, options
     )
-    if answer is None or answer["num_inliers"] < MIN_POINTS:
+    if answer is None or answer["num_inliers"] < max(MIN_POINTS, MIN_SHARE * len(known)):
         return None
     return rigid_from_colmap(answer["cam_from_world"])
 
