@@ -59,6 +59,15 @@ def colmap_params(camera: Camera, colmap_model: str) -> list[float]:
     return [float(flat[place[0] if isinstance(place, tuple) else place]) for place in _COLMAP_LAYOUT[colmap_model]]
 
 
+def intrinsic_basis(colmap_model: str) -> np.ndarray:
+    """Derivative (12, q) of fx, fy, cx, cy, k1, k2, p1, p2, k3 … k6 by the q parameters of a COLMAP model."""
+    layout = _COLMAP_LAYOUT[colmap_model]
+    basis = np.zeros((12, len(layout)))
+    for column, place in enumerate(layout):
+        basis[list(place) if isinstance(place, tuple) else place, column] = 1
+    return basis
+
+
 def read_camera(path: str | Path) -> CameraModel:
     """Read a camera file of any supported kind, told apart by content.
 

@@ -10,7 +10,8 @@ from stcal.geometry.rigid import Rigid, Similarity
 from stcal.sfm.adjust import adjust
 from stcal.sfm.chain import chain_faces
 from stcal.sfm.faces import faces_of_group
-from stcal.sfm.joint import adjust_jointly, calibrated_target
+from stcal.sfm.joint import adjust_jointly
+from stcal.sfm.uncertainty import calibrated_target
 from stcal.sfm.metric import find_scale
 from stcal.sfm.model import GroupModel
 from stcal.sfm.observations import ImageObservations
@@ -98,7 +99,7 @@ class LabelsOnly:
                 keypoint,
                 np.concatenate([o.centre_px for o in images]),
                 np.zeros((len(rows), 2)),
-                np.concatenate([o.sigma_px() for o in images]),
+                np.concatenate([o.covariance_px2 for o in images]),
             )
             models.append(model.moved(world_from_target))
         return models

@@ -45,8 +45,34 @@ class Camera:
 
     def same_as(self, other: "Camera") -> bool:
         """Whether all numbers are equal."""
-        a, b = (np.concatenate([[c.width, c.height], c.focal, c.centre, c.distortion]) for c in (self, other))
-        return bool((a == b).all())
+        size = (self.width, self.height) == (other.width, other.height)
+        return size and bool((self.parameters() == other.parameters()).all())
+
+    def parameters(self) -> np.ndarray:
+        """fx, fy, cx, cy, k1, k2, p1, p2, k3, k4, k5, k6, (12,)."""
+        return np.concatenate([self.focal, self.centre, self.distortion])
+
+    def with_parameters(self, parameters: np.ndarray) -> "Camera":
+        """The camera of the same size with other :meth:`parameters`."""
+        return Camera(self.width, self.height, parameters[:2], parameters[2:4], parameters[4:])
+
+    def parameter_jacobian(self, xy: np.ndarray) -> np.ndarray:
+        """Derivative (n, 2, 12) of the pixels of ideal normalised coordinates (n, 2) by :meth:`parameters`."""
+        k1, k2, _, _, k3, k4, k5, k6 = self.distortion
+        x, y = xy[:, 0], xy[:, 1]
+        r2 = x * x + y * y
+        top = 1 + r2 * (k1 + r2 * (k2 + r2 * k3))
+        bottom = 1 + r2 * (k4 + r2 * (k5 + r2 * k6))
+        powers = np.stack([r2, r2**2, r2**3], axis=1)
+        jacobian = np.zeros((len(xy), 2, 12))
+        jacobian[:, [0, 1], [0, 1]] = self.distort(xy)
+        jacobian[:, [0, 1], [2, 3]] = 1
+        jacobian[:, :, [4, 5, 8]] = xy[:, :, None] * (powers / bottom[:, None])[:, None]
+        jacobian[:, :, [9, 10, 11]] = -xy[:, :, None] * (powers * (top / bottom**2)[:, None])[:, None]
+        jacobian[:, :, 6] = np.stack([2 * x * y, r2 + 2 * y * y], axis=1)
+        jacobian[:, :, 7] = np.stack([r2 + 2 * x * x, 2 * x * y], axis=1)
+        jacobian[:, :, 4:] *= self.focal[:, None]
+        return jacobian
 
     def distort(self, xy: np.ndarray) -> np.ndarray:
         """Normalised distorted coordinates (..., 2) of normalised ideal ones."""

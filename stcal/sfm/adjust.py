@@ -58,7 +58,7 @@ def adjust(model: GroupModel, camera: Camera) -> GroupModel:
 def _cost(model: GroupModel, camera: Camera) -> float:
     if (model.xyz_camera()[:, 2] <= 0).any():
         return np.inf
-    return float(((model.residuals_px(camera) / model.sigma_px[:, None]) ** 2).sum())
+    return float((model.whiten(model.residuals_px(camera)) ** 2).sum())
 
 
 def projection_jacobians(model: GroupModel, camera: Camera) -> tuple[np.ndarray, np.ndarray]:
@@ -78,9 +78,8 @@ def _step(model: GroupModel, camera: Camera, damping: float) -> tuple[GroupModel
     """One step, and the largest move of a projection in px."""
     m, p, n = len(model.images), len(model.labels), len(model.image_index)
     by_pose, by_point = projection_jacobians(model, camera)
-    weight = 1 / model.sigma_px[:, None]
-    a, b = by_pose * weight[..., None], by_point * weight[..., None]
-    residual = model.residuals_px(camera) * weight
+    a, b = model.whiten(by_pose), model.whiten(by_point)
+    residual = model.whiten(model.residuals_px(camera))
     poses = _normal_blocks(a, residual, model.image_index, m, damping)
     points = _normal_blocks(b, residual, model.point_index, p, damping)
     cross = np.zeros((m, p, 6, 3))

@@ -10,11 +10,12 @@ from stcal.geometry.camera import Camera
 from stcal.geometry.rigid import Rigid, Similarity
 from stcal.sfm.chain import CalibratedTarget, chain_faces
 from stcal.sfm.faces import FaceInGroup, faces_of_group
-from stcal.sfm.joint import JointResult, adjust_jointly, calibrated_target
+from stcal.sfm.joint import JointResult, adjust_jointly
 from stcal.sfm.metric import Scale, find_scale
 from stcal.sfm.model import GroupModel
 from stcal.sfm.options import RunOptions
 from stcal.sfm.refine import eccentricity_px
+from stcal.sfm.uncertainty import calibrated_target
 
 JOINT_ROUNDS = 2
 """Eccentricity moves by nanometres between the first and the second joint adjustment."""
@@ -85,11 +86,11 @@ def _adjust_all(models: list[GroupModel], camera, target, board, eccentricity: b
 
 def image_sigma_factor(models: Sequence[GroupModel], camera: Camera) -> float:
     """How much larger the residuals of free networks are than the centres' own σ (one variance component)."""
-    square = sum(float(((m.residuals_px(camera) / m.sigma_px[:, None]) ** 2).sum()) for m in models)
+    square = sum(float((m.whiten(m.residuals_px(camera)) ** 2).sum()) for m in models)
     redundancy = sum(2 * len(m.image_index) - 6 * len(m.images) - 3 * len(m.labels) + 7 for m in models)
     return float(np.sqrt(square / redundancy)) if redundancy > 0 else 1.0
 
 
 def with_sigma(model: GroupModel, factor: float) -> GroupModel:
     """The model with its observations' σ scaled."""
-    return replace(model, sigma_px=factor * model.sigma_px)
+    return replace(model, covariance_px2=factor**2 * model.covariance_px2)

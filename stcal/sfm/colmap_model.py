@@ -224,7 +224,6 @@ def _group_model(group: str, images, reconstruction, point_label) -> tuple[Group
     observed = [images[i][0] for i in image_index]
     measured = np.array([o.centre_px[k] for o, k in zip(observed, keypoint, strict=True)])
     corrected = np.array([images[i][1][k] for i, k in zip(image_index, keypoint, strict=True)])
-    sigma = [o.sigma_px() for o, _, _ in images]
     model = GroupModel(
         group,
         tuple(o.name for o, _, _ in images),
@@ -236,6 +235,6 @@ def _group_model(group: str, images, reconstruction, point_label) -> tuple[Group
         keypoint,
         measured,
         measured - corrected,
-        np.array([sigma[i][k] for i, k in zip(image_index, keypoint, strict=True)]),
+        np.array([o.covariance_px2[k] for o, k in zip(observed, keypoint, strict=True)]),
     )
     return model, sum(len(votes) > 1 for votes in length.values())

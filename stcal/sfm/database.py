@@ -122,11 +122,14 @@ def labels_csv(observations: Sequence[ImageObservations], corrected_px: Sequence
     """Text of ``labels.csv``: label, float64 measured and corrected centre and σ of every (image, keypoint)."""
     stream = io.StringIO()
     writer = csv.writer(stream, lineterminator="\n")
-    columns = "image_id keypoint image group label x_px y_px corrected_x_px corrected_y_px sigma_px"
+    columns = (
+        "image_id keypoint image group label x_px y_px corrected_x_px corrected_y_px var_x_px2 cov_xy_px2 var_y_px2"
+    )
     writer.writerow(columns.split())
     ids = image_ids(observations)
     for image, corrected in zip(observations, corrected_px, strict=True):
-        values = np.column_stack([image.centre_px, corrected, image.sigma_px()]).tolist()
+        covariance = image.covariance_px2.reshape(-1, 4)[:, [0, 1, 3]]
+        values = np.column_stack([image.centre_px, corrected, covariance]).tolist()
         for k, label in enumerate(image.labels):
             writer.writerow([ids[image.name], k, image.name, image.group, label, *map(repr, values[k])])
     return stream.getvalue()

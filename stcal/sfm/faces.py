@@ -11,6 +11,7 @@ from stcal.geometry.arrays import frozen
 from stcal.geometry.camera import Camera
 from stcal.geometry.plane import fit_plane
 from stcal.geometry.rigid import Rigid
+from stcal.sfm.adjust import projection_jacobians
 from stcal.sfm.model import GroupModel
 
 FrameKind = Literal["plane", "three-point"]
@@ -109,13 +110,7 @@ def faces_of_group(
 
 def _point_information(model: GroupModel, camera: Camera) -> np.ndarray:
     """Inverse covariance (p, 3, 3) of each point, given the cameras, world units."""
-    xyz = model.xyz_camera()
-    ideal = xyz[:, :2] / xyz[:, 2:]
-    _, distorted = camera.distort_jacobian(ideal)
-    by_ideal = distorted * camera.focal[:, None]
-    by_camera = np.concatenate([by_ideal, -by_ideal @ ideal[..., None]], axis=2) / xyz[:, 2, None, None]
-    rotation = np.stack([pose.rotation for pose in model.camera_from_world])[model.image_index]
-    jacobian = by_camera @ rotation / model.sigma_px[:, None, None]
+    jacobian = model.whiten(projection_jacobians(model, camera)[1])
     information = np.zeros((len(model.labels), 3, 3))
     np.add.at(information, model.point_index, np.swapaxes(jacobian, 1, 2) @ jacobian)
     return information

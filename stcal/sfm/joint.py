@@ -1,24 +1,24 @@
-"""One adjustment over all groups: one target, one board shape with a pose for each group, all cameras.
+"""One adjustment over all groups: one target, one board with a pose for each group, all cameras, intrinsics if asked.
 
-Board positions are observations with their stated σ, so scale is part of the estimate. Cameras are eliminated image
-by image and boards group by group (Helmert blocking), which leaves one small normal matrix over the target's circles
-however many images there are; its inverse is the marginal covariance of the circles, everything else accounted for.
+Board positions are observations with their stated σ, so scale is part of the estimate. The circles of a face are
+coplanar within a stated σ. Residuals far beyond their σ weigh less (Huber). The inverse of the condensed normal matrix
+is the marginal covariance of the circles, everything else accounted for.
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from scipy.spatial.transform import Rotation
 
-from stcal.design import BoardDesign, TargetDesign
+from stcal.camera_file import intrinsic_basis
+from stcal.design import BoardDesign
 from stcal.errors import ConvergenceError
 from stcal.geometry.align import align_rigid
 from stcal.geometry.arrays import frozen
 from stcal.geometry.camera import Camera
+from stcal.geometry.plane import fit_plane
 from stcal.geometry.rigid import Rigid, skew
-from stcal.sfm.adjust import projection_jacobians
-from stcal.sfm.chain import CalibratedTarget
-from stcal.sfm.faces import FrameKind, face_frame
+from stcal.sfm.blocks import Block, Shared, condense, moved, robust_weights
 from stcal.sfm.model import GroupModel
 from stcal.sfm.observations import face_of, is_board
 
@@ -27,6 +27,29 @@ MAX_HALVINGS = 8
 SETTLED_PX = 1e-7
 FREE_DIRECTIONS = 6
 """The world may be anywhere: a rigid motion of everything changes nothing."""
+HUBER = 3.0
+"""In σ of a residual's length: one honest residual in ninety is beyond, and loses hardly anything."""
+MIN_COMMON = 0.1
+MAX_COMMON = 0.99
+"""Share of the board's variance that is common to all groups: below the first it is taken as none, above the second
+what is left to a single group would be smaller than anything a board does."""
+
+
+@dataclass(frozen=True, slots=True)
+class JointOptions:
+    """``flatness_mm`` : σ of a circle's distance from the plane of its face, None for no such knowledge;
+    ``refine_camera`` : adjust the intrinsics too, those given being observations with ``camera_sigma``."""
+
+    flatness_mm: float | None = None
+    refine_camera: bool = False
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class CameraPrior:
+    """The given intrinsics as observations: ``colmap_model`` ; ``covariance`` : (q, q) of that model's parameters."""
+
+    colmap_model: str
+    covariance: np.ndarray
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -36,7 +59,9 @@ class JointResult:
     ``models`` : one for each group, mm; ``world_from_board`` by group; ``labels`` : (c,) of the target's circles;
     ``xyz_world`` : (c, 3) mm; ``covariance_mm2`` : (3c, 3c) marginal, in the datum of smallest trace, scaled by
     ``sigma0``²; ``sigma0`` : residuals against the centres' own σ; ``board_residuals_mm`` by group: (n, 3), board
-    frame; ``redundancy`` : degrees of freedom.
+    frame; ``board_common`` : share of the board's variance that all groups have in common; ``camera`` : adjusted where
+    asked, with ``camera_covariance`` (q, q) of the parameters of its COLMAP model, else empty; ``weights`` by group:
+    (n,) Huber's; ``redundancy`` : degrees of freedom.
     """
 
     models: tuple[GroupModel, ...]
@@ -46,6 +71,10 @@ class JointResult:
     covariance_mm2: np.ndarray
     sigma0: float
     board_residuals_mm: dict[str, np.ndarray]
+    board_common: float
+    camera: Camera
+    camera_covariance: np.ndarray
+    weights: dict[str, np.ndarray]
     redundancy: int
 
     def __post_init__(self):
@@ -55,53 +84,74 @@ class JointResult:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class _Block:
-    """One group: its model and board, and which of its points are which circles of the target."""
+class _Setting:
+    """What stays the same in one minimisation."""
 
-    model: GroupModel
-    board: Rigid
-    design: np.ndarray
-    sigma_mm: float
-    dots: np.ndarray
-    circles: np.ndarray
-    place: np.ndarray
+    labels: tuple[str, ...]
+    board: BoardDesign
+    common: float
+    flatness_mm: float | None
+    given: Camera
+    prior: np.ndarray
 
-    def board_residual(self) -> np.ndarray:
-        """Reconstructed minus design, (d, 3), board frame, mm."""
-        return self.board.inverse() @ self.model.xyz_world[self.dots] - self.design
+    def own_sigma_mm(self) -> float:
+        return self.board.sigma_mm * float(np.sqrt(1 - self.common))
 
-    def cost(self, camera: Camera) -> float:
-        if (self.model.xyz_camera()[:, 2] <= 0).any():
-            return np.inf
-        image = (self.model.residuals_px(camera) / self.model.sigma_px[:, None]) ** 2
-        return float(image.sum() + ((self.board_residual() / self.sigma_mm) ** 2).sum())
+    def shape_sigma_mm(self) -> float:
+        return self.board.sigma_mm * float(np.sqrt(self.common))
 
 
-def adjust_jointly(models: list[GroupModel], board: BoardDesign, camera: Camera) -> JointResult:
+def adjust_jointly(
+    models: Sequence[GroupModel],
+    board: BoardDesign,
+    camera: Camera,
+    options: JointOptions = JointOptions(),
+    prior: CameraPrior | None = None,
+) -> JointResult:
     """Adjust metric models that share one world (mm), all observations weighted by their σ.
+
+    Whether the board kept its shape between the groups (one plate) or not (a film, a screen) is estimated from its
+    dots: first every group has its own deviations from the design, and where these agree a common shape follows.
 
     Raises
     ------
     ConvergenceError
         No minimum is reached.
     """
-    labels = sorted({label for model in models for label in model.labels if not is_board(label)})
-    blocks = [_block(model, board, labels) for model in models]
+    labels = tuple(sorted({label for model in models for label in model.labels if not is_board(label)}))
+    refine = options.refine_camera and prior is not None
+    basis = intrinsic_basis(prior.colmap_model) if refine else np.zeros((12, 0))
+    weight = np.linalg.inv(prior.covariance) if refine else np.zeros((0, 0))
+    setting = _Setting(labels, board, 0.0, options.flatness_mm, camera, weight)
+    blocks = [_block(model, board, labels, 0.0) for model in models]
     xyz = _shared_circles(blocks, len(labels))
+    shared = Shared(xyz, np.zeros((board.rows * board.columns, 3)), camera, basis)
     blocks = [replace(b, model=_with_circles(b, xyz)) for b in blocks]
-    cost = sum(b.cost(camera) for b in blocks)
+    blocks, shared = _minimise(blocks, shared, setting)
+    common = _common_share(blocks, board)
+    if common > 0:
+        setting = replace(setting, common=common)
+        blocks = [
+            replace(b, sigma_mm=setting.own_sigma_mm(), dot_place=_dot_place(b.model, b.dots, board)) for b in blocks
+        ]
+        blocks, shared = _minimise(blocks, shared, setting)
+    return _result(blocks, shared, setting)
+
+
+def _minimise(blocks: list[Block], shared: Shared, setting: _Setting) -> tuple[list[Block], Shared]:
+    cost = _cost(blocks, shared, setting)
     move = np.inf
     for _ in range(MAX_STEPS):
-        normal, right, condensed = _condense(blocks, camera, len(labels))
-        step = (_inverse(normal) @ right).reshape(-1, 3)
+        normal, right, condensed = _normal_equations(blocks, shared, setting)
+        step = _inverse(normal, shared, setting) @ right
         for halving in range(MAX_HALVINGS):
-            trial = [_moved(b, c, step, 0.5**halving) for b, c in zip(blocks, condensed, strict=True)]
-            trial_cost = sum(b.cost(camera) for b in trial)
+            trial, trial_shared = _step(blocks, shared, condensed, step, 0.5**halving, setting)
+            trial_cost = _cost(trial, trial_shared, setting)
             if trial_cost <= cost * (1 + 1e-9):
                 break
-        move = max(_largest_move(old, new, camera) for old, new in zip(blocks, trial, strict=True))
+        move = max(_largest_move(old, shared, new, trial_shared) for old, new in zip(blocks, trial, strict=True))
         if trial_cost <= cost * (1 + 1e-9):
-            blocks, xyz, cost = trial, xyz + 0.5**halving * step, trial_cost
+            blocks, shared, cost = trial, trial_shared, trial_cost
         if move < SETTLED_PX or halving == MAX_HALVINGS - 1:
             break
     if move > 1e3 * SETTLED_PX:
@@ -109,241 +159,192 @@ def adjust_jointly(models: list[GroupModel], board: BoardDesign, camera: Camera)
             f"joint adjustment: projections still move by {move:.1g} px after {MAX_STEPS} steps; "
             "compare with --solve chain and look at the outliers"
         )
-    return _result(blocks, labels, xyz, camera)
+    return blocks, shared
 
 
-def _block(model: GroupModel, board: BoardDesign, labels: list[str]) -> _Block:
+def _block(model: GroupModel, board: BoardDesign, labels: tuple[str, ...], common: float) -> Block:
     place = {label: i for i, label in enumerate(labels)}
     dots = np.array([i for i, label in enumerate(model.labels) if is_board(label)])
-    circles = np.array([i for i, label in enumerate(model.labels) if not is_board(label)])
+    circles = np.array([i for i, label in enumerate(model.labels) if not is_board(label)], int)
     cells = np.array([[int(v) for v in model.labels[i].split(":")[1:]] for i in dots])
     design = np.column_stack([board.pitch_mm * cells[:, ::-1], np.zeros(len(cells))])
-    return _Block(
+    return Block(
         model,
         align_rigid(model.xyz_world[dots], design),
         design,
         board.sigma_mm,
         dots,
         circles,
+        np.zeros(0, int),
         np.array([place[model.labels[i]] for i in circles], int),
     )
 
 
-def _shared_circles(blocks: list[_Block], count: int) -> np.ndarray:
+def _dot_place(model: GroupModel, dots: np.ndarray, board: BoardDesign) -> np.ndarray:
+    cells = np.array([[int(v) for v in model.labels[i].split(":")[1:]] for i in dots])
+    return cells[:, 0] * board.columns + cells[:, 1]
+
+
+def _common_share(blocks: list[Block], board: BoardDesign) -> float:
+    """Covariance between the groups' board residuals over their variance; 0 where it is no more than chance."""
+    by_dot = np.full((len(blocks), board.rows * board.columns, 3), np.nan)
+    for k, b in enumerate(blocks):
+        by_dot[k, _dot_place(b.model, b.dots, board)] = b.board_residual()
+    product, square, count = 0.0, 0.0, 0
+    for i in range(len(blocks)):
+        for j in range(i):
+            both = np.isfinite(by_dot[i]) & np.isfinite(by_dot[j])
+            product += float((by_dot[i][both] * by_dot[j][both]).sum())
+            square += float((by_dot[i][both] ** 2 + by_dot[j][both] ** 2).sum()) / 2
+            count += int(both.sum())
+    if not count or square == 0:
+        return 0.0
+    share = product / square
+    return 0.0 if share < max(MIN_COMMON, 3 / np.sqrt(count)) else min(share, MAX_COMMON)
+
+
+def _shared_circles(blocks: list[Block], count: int) -> np.ndarray:
     """Start values: the mean over the groups."""
     total, seen = np.zeros((count, 3)), np.zeros(count)
     for b in blocks:
-        np.add.at(total, b.place, b.model.xyz_world[b.circles])
-        np.add.at(seen, b.place, 1)
+        np.add.at(total, b.circle_place, b.model.xyz_world[b.circles])
+        np.add.at(seen, b.circle_place, 1)
     return total / seen[:, None]
 
 
-def _with_circles(block: _Block, xyz: np.ndarray) -> GroupModel:
+def _with_circles(block: Block, xyz: np.ndarray) -> GroupModel:
     points = block.model.xyz_world.copy()
-    points[block.circles] = xyz[block.place]
+    points[block.circles] = xyz[block.circle_place]
     return replace(block.model, xyz_world=points)
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class _Condensed:
-    """What brings a step of the circles back to the board and the cameras of one group."""
-
-    inner_inverse: np.ndarray
-    inner_right: np.ndarray
-    inner_from_circles: np.ndarray
-    camera_inverse: np.ndarray
-    camera_right: np.ndarray
-    camera_from_points: np.ndarray
+def _outer(block: Block, setting: _Setting, q: int) -> np.ndarray:
+    """Places of a group's outer unknowns among all: circles, shape, intrinsics."""
+    c = 3 * len(setting.labels)
+    s = 3 * setting.board.rows * setting.board.columns if setting.common else 0
+    circles = (3 * block.circle_place[:, None] + np.arange(3)).ravel()
+    shape = c + (3 * block.dot_place[:, None] + np.arange(3)).ravel()
+    return np.concatenate([circles, shape, c + s + np.arange(q)]).astype(int)
 
 
-def _condense(blocks: list[_Block], camera: Camera, count: int):
-    """Normal equations over all circles, the rest eliminated."""
-    normal, right = np.zeros((count, 3, count, 3)), np.zeros((count, 3))
+def _normal_equations(blocks: list[Block], shared: Shared, setting: _Setting):
+    """Over circles, common shape and intrinsics; everything else condensed."""
+    q = shared.basis.shape[1]
+    c = 3 * len(setting.labels)
+    s = 3 * len(shared.shape_mm) if setting.common else 0
+    normal, right = np.zeros((c + s + q, c + s + q)), np.zeros(c + s + q)
     condensed = []
     for b in blocks:
-        each, small, small_right = _condense_group(b, camera)
-        k = len(b.place)
-        normal[np.ix_(b.place, range(3), b.place, range(3))] += small.reshape(k, 3, k, 3)
-        right[b.place] += small_right.reshape(k, 3)
+        each = condense(b, shared, HUBER)
+        place = _outer(b, setting, q)
+        normal[np.ix_(place, place)] += each.normal
+        right[place] += each.right
         condensed.append(each)
-    return normal.reshape(3 * count, 3 * count), right.ravel(), condensed
+    if s:
+        shape = np.arange(c, c + s)
+        normal[shape, shape] += 1 / setting.shape_sigma_mm() ** 2
+        right[shape] -= shared.shape_mm.ravel() / setting.shape_sigma_mm() ** 2
+    if q:
+        normal[c + s :, c + s :] += setting.prior
+        right[c + s :] -= setting.prior @ _away(shared, setting)
+    for members, across, normal_world in _planes(shared, setting):
+        jacobian = across[:, :, None] * normal_world  # distances from the plane by the circles
+        flat = jacobian.reshape(len(members), -1)
+        place = (3 * members[:, None] + np.arange(3)).ravel()
+        distance = across @ (shared.xyz_world[members] @ normal_world)
+        normal[np.ix_(place, place)] += flat.T @ flat / setting.flatness_mm**2
+        right[place] -= flat.T @ distance / setting.flatness_mm**2
+    return normal, right, condensed
 
 
-def _condense_group(b: _Block, camera: Camera) -> tuple[_Condensed, np.ndarray, np.ndarray]:
-    model = b.model
-    m, p = len(model.images), len(model.labels)
-    by_pose, by_point = projection_jacobians(model, camera)
-    weight = 1 / model.sigma_px[:, None]
-    a, c = by_pose * weight[..., None], by_point * weight[..., None]
-    residual = model.residuals_px(camera) * weight
-    camera_block, camera_right = np.zeros((m, 6, 6)), np.zeros((m, 6))
-    np.add.at(camera_block, model.image_index, np.swapaxes(a, 1, 2) @ a)
-    np.add.at(camera_right, model.image_index, np.einsum("nki,nk->ni", a, residual))
-    cross = np.zeros((m, p, 6, 3))
-    np.add.at(cross, (model.image_index, model.point_index), np.swapaxes(a, 1, 2) @ c)
-    cross = np.moveaxis(cross, 2, 1).reshape(m, 6, 3 * p)
-    point_block, right = np.zeros((p, 3, 3)), np.zeros((p, 3))
-    np.add.at(point_block, model.point_index, np.swapaxes(c, 1, 2) @ c)
-    np.add.at(right, model.point_index, np.einsum("nki,nk->ni", c, residual))
-
-    inverse = np.linalg.inv(camera_block)
-    eliminated = inverse @ cross
-    normal = -np.tensordot(cross, eliminated, axes=([0, 1], [0, 1])).reshape(p, 3, p, 3)
-    normal[np.arange(p), :, np.arange(p)] += point_block
-    right = right.ravel() - np.tensordot(eliminated, camera_right, axes=([0, 1], [0, 1]))
-
-    full, full_right = _add_board(b, normal.reshape(3 * p, 3 * p), right)
-    outer = (3 * b.circles[:, None] + np.arange(3)).ravel()
-    inner = np.setdiff1d(np.arange(len(full)), outer)
-    inner_inverse = np.linalg.inv(full[np.ix_(inner, inner)])
-    coupling = full[np.ix_(inner, outer)]
-    back = inner_inverse @ coupling
-    condensed = _Condensed(inner_inverse, full_right[inner], back, inverse, camera_right, eliminated)
-    return condensed, full[np.ix_(outer, outer)] - coupling.T @ back, full_right[outer] - back.T @ full_right[inner]
+def _planes(shared: Shared, setting: _Setting):
+    """For every face: its circles, the projector that takes heights to distances from the best plane, its normal."""
+    if setting.flatness_mm is None:
+        return
+    faces: dict[str, list[int]] = {}
+    for i, label in enumerate(setting.labels):
+        faces.setdefault(face_of(label), []).append(i)
+    for own in faces.values():
+        if len(own) > 3:
+            members = np.array(own)
+            xyz = shared.xyz_world[members]
+            normal = fit_plane(xyz).normal
+            base = np.linalg.svd(np.eye(3) - np.outer(normal, normal))[0][:, :2]
+            design = np.column_stack([np.ones(len(own)), (xyz - xyz.mean(0)) @ base])
+            yield members, np.eye(len(own)) - design @ np.linalg.pinv(design), normal
 
 
-def _add_board(b: _Block, normal: np.ndarray, right: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Append the board's pose (rotation, translation) and the observations dot = pose · (design ± σ)."""
-    size, d = len(right), len(b.dots)
-    full, full_right = np.zeros((size + 6, size + 6)), np.zeros(size + 6)
-    full[:size, :size], full_right[:size] = normal, right
-    turned = b.design @ b.board.rotation.T
-    gap = b.model.xyz_world[b.dots] - (turned + b.board.translation)
-    by_pose = np.concatenate([skew(turned), -np.broadcast_to(np.eye(3), (d, 3, 3))], axis=2)
-    weight = 1 / b.sigma_mm**2
-    rows = (3 * b.dots[:, None] + np.arange(3)).ravel()
-    flat = by_pose.reshape(3 * d, 6)
-    full[rows, rows] += weight
-    full[size:, size:] += weight * flat.T @ flat
-    full[rows, size:] += weight * flat
-    full[size:, rows] += weight * flat.T
-    full_right[rows] -= weight * gap.ravel()
-    full_right[size:] -= weight * flat.T @ gap.ravel()
-    return full, full_right
+def _away(shared: Shared, setting: _Setting) -> np.ndarray:
+    """Adjusted minus given intrinsics, (q,)."""
+    return np.linalg.pinv(shared.basis) @ (shared.camera.parameters() - setting.given.parameters())
 
 
-def _inverse(normal: np.ndarray) -> np.ndarray:
-    """Inverse on the complement of the free directions (inner constraints: the datum of smallest trace)."""
-    value, vector = np.linalg.eigh(normal)
-    return (vector[:, FREE_DIRECTIONS:] / value[FREE_DIRECTIONS:]) @ vector[:, FREE_DIRECTIONS:].T
+def _cost(blocks: list[Block], shared: Shared, setting: _Setting) -> float:
+    cost = sum(b.cost(shared, HUBER) for b in blocks)
+    if setting.common:
+        cost += float(((shared.shape_mm / setting.shape_sigma_mm()) ** 2).sum())
+    if shared.basis.shape[1]:
+        away = _away(shared, setting)
+        cost += float(away @ setting.prior @ away)
+    for members, across, normal in _planes(shared, setting):
+        cost += float(((across @ (shared.xyz_world[members] @ normal)) ** 2).sum()) / setting.flatness_mm**2
+    return cost
 
 
-def _moved(b: _Block, condensed: _Condensed, circle_step: np.ndarray, factor: float) -> _Block:
-    """The group after a step of the circles, everything else following."""
-    model = b.model
-    p = len(model.labels)
-    outer_step = circle_step[b.place].ravel()
-    inner_step = condensed.inner_inverse @ condensed.inner_right - condensed.inner_from_circles @ outer_step
-    outer = (3 * b.circles[:, None] + np.arange(3)).ravel()
-    full = np.zeros(3 * p + 6)
-    full[outer] = outer_step
-    full[np.setdiff1d(np.arange(3 * p + 6), outer)] = inner_step
-    poses = np.einsum("mij,mj->mi", condensed.camera_inverse, condensed.camera_right)
-    poses = factor * (poses - condensed.camera_from_points @ full[: 3 * p])
-    turned = Rotation.from_rotvec(poses[:, :3]).as_matrix()
-    cameras = tuple(
-        Rigid(turn @ pose.rotation, pose.translation + step[3:])
-        for turn, pose, step in zip(turned, model.camera_from_world, poses, strict=True)
+def _inverse(normal: np.ndarray, shared: Shared, setting: _Setting) -> np.ndarray:
+    """Inverse with inner constraints on the circles: of all datums that of smallest trace (S-transformation)."""
+    middle = shared.xyz_world - shared.xyz_world.mean(0)
+    free = np.zeros((len(normal), FREE_DIRECTIONS))
+    rows = 3 * len(middle)
+    free[:rows] = np.concatenate([-skew(middle), np.broadcast_to(np.eye(3), (len(middle), 3, 3))], axis=2).reshape(
+        rows, 6
     )
-    board_step = factor * full[3 * p :]
-    board = Rigid(
-        Rotation.from_rotvec(board_step[:3]).as_matrix() @ b.board.rotation, b.board.translation + board_step[3:]
-    )
-    xyz = model.xyz_world + factor * full[: 3 * p].reshape(p, 3)
-    return replace(b, model=replace(model, camera_from_world=cameras, xyz_world=xyz), board=board)
+    free[:rows] = np.linalg.qr(free[:rows])[0]
+    scale = float(np.median(np.diag(normal)[:rows]))
+    return np.linalg.inv(normal + scale * free @ free.T) - free @ free.T / scale
 
 
-def _largest_move(old: _Block, new: _Block, camera: Camera) -> float:
-    return float(np.abs(new.model.residuals_px(camera) - old.model.residuals_px(camera)).max(initial=0.0))
+def _step(blocks, shared: Shared, condensed, step: np.ndarray, factor: float, setting: _Setting):
+    q, c = shared.basis.shape[1], 3 * len(setting.labels)
+    s = 3 * len(shared.shape_mm) if setting.common else 0
+    intrinsics = step[c + s :]
+    new = [
+        moved(b, each, step[_outer(b, setting, q)], intrinsics, factor)
+        for b, each in zip(blocks, condensed, strict=True)
+    ]
+    shape = shared.shape_mm + factor * step[c : c + s].reshape(-1, 3) if s else shared.shape_mm
+    camera = shared.camera
+    if q:
+        camera = camera.with_parameters(camera.parameters() + factor * shared.basis @ intrinsics)
+    return new, Shared(shared.xyz_world + factor * step[:c].reshape(-1, 3), shape, camera, shared.basis)
 
 
-def _result(blocks: list[_Block], labels: list[str], xyz: np.ndarray, camera: Camera) -> JointResult:
-    normal, _, _ = _condense(blocks, camera, len(labels))
-    cost = sum(b.cost(camera) for b in blocks)
-    observations = sum(2 * len(b.model.image_index) + 3 * len(b.dots) for b in blocks)
-    unknowns = 3 * len(labels) + sum(6 * len(b.model.images) + 3 * len(b.dots) + 6 for b in blocks)
+def _largest_move(old: Block, shared: Shared, new: Block, new_shared: Shared) -> float:
+    before, after = old.model.residuals_px(shared.camera), new.model.residuals_px(new_shared.camera)
+    return float(np.abs(after - before).max(initial=0.0))
+
+
+def _result(blocks: list[Block], shared: Shared, setting: _Setting) -> JointResult:
+    normal, _, _ = _normal_equations(blocks, shared, setting)
+    inverse = _inverse(normal, shared, setting)
+    q, c = shared.basis.shape[1], 3 * len(setting.labels)
+    flat = sum(len(members) - 3 for members, _, _ in _planes(shared, setting))
+    observations = sum(2 * len(b.model.image_index) + 3 * len(b.dots) for b in blocks) + flat
+    unknowns = c + sum(6 * len(b.model.images) + 3 * len(b.dots) + 6 for b in blocks)
     redundancy = observations - unknowns + FREE_DIRECTIONS
-    sigma0 = float(np.sqrt(cost / max(redundancy, 1)))
+    sigma0 = float(np.sqrt(_cost(blocks, shared, setting) / max(redundancy, 1)))
+    covariance = sigma0**2 * inverse
     return JointResult(
         tuple(b.model for b in blocks),
-        {b.model.group: b.board for b in blocks},
-        tuple(labels),
-        xyz,
-        sigma0**2 * _inverse(normal),
+        {b.model.group: b.world_from_board for b in blocks},
+        setting.labels,
+        shared.xyz_world,
+        covariance[:c, :c],
         sigma0,
         {b.model.group: b.board_residual() for b in blocks},
+        setting.common,
+        shared.camera,
+        covariance[len(inverse) - q :, len(inverse) - q :],
+        {b.model.group: robust_weights(b, shared.camera, HUBER) for b in blocks},
         redundancy,
-    )
-
-
-def calibrated_target(
-    result: JointResult, start: CalibratedTarget, target: TargetDesign, kind: FrameKind
-) -> CalibratedTarget:
-    """Faces and circles of the adjusted target in the target frame, with their marginal covariances.
-
-    ``start`` tells the reference face and to which side each face looks. Poses and circles in the target frame are
-    functions of all circles, whatever the datum; covariances are propagated by central differences.
-    """
-    step = 1e-3
-    own = _frames(result, result.xyz_world, start, target, kind)
-    origin = _in_target_frame(own, result.xyz_world, start)
-    twists, circles = [], []
-    for i, label in enumerate(result.labels):
-        for axis in range(3):
-            ends = []
-            for sign in (1, -1):
-                xyz = result.xyz_world.copy()
-                xyz[i, axis] += sign * step
-                moved = _frames(result, xyz, start, target, kind, only=face_of(label))
-                ends.append(_in_target_frame(own | moved, xyz, start))
-            ahead, behind = ends
-            twists.append({f: _perturbation(ahead[0][f], behind[0][f]) / (2 * step) for f in own})
-            circles.append((ahead[1] - behind[1]) / (2 * step))
-    by_circle = np.stack(circles, axis=-1)
-    covariance = result.covariance_mm2
-    face_covariance = {}
-    for face_id in origin[0]:
-        jacobian = np.column_stack([twist[face_id] for twist in twists])
-        face_covariance[face_id] = jacobian @ covariance @ jacobian.T
-    blocks = np.einsum("cip,pq,cjq->cij", by_circle, covariance, by_circle, optimize=True)
-    reference_from_world = origin[2]
-    return CalibratedTarget(
-        start.reference_face,
-        origin[0],
-        dict(zip(result.labels, origin[1], strict=True)),
-        dict.fromkeys(start.target_from_group, reference_from_world),
-        face_covariance,
-        dict(zip(result.labels, blocks, strict=True)),
-    )
-
-
-def _perturbation(ahead: Rigid, behind: Rigid) -> np.ndarray:
-    """Rotation (rad) and translation (mm) between two close poses, in the frame they lead to, about the origin of b."""
-    rotation = Rotation.from_matrix(ahead.rotation @ behind.rotation.T).as_rotvec()
-    return np.concatenate([rotation, ahead.translation - behind.translation])
-
-
-def _frames(
-    result: JointResult, xyz_world, start: CalibratedTarget, target: TargetDesign, kind: FrameKind, only=None
-) -> dict[str, Rigid]:
-    """world_from_face of all faces, or of one."""
-    frames = {}
-    for face in target.faces:
-        if face.id in start.target_from_face and only in (None, face.id):
-            own = {
-                label.split(":", 1)[1]: xyz
-                for label, xyz in zip(result.labels, xyz_world, strict=True)
-                if face_of(label) == face.id
-            }
-            frames[face.id] = face_frame(face, own, kind, start.target_from_face[face.id].rotation[:, 2])
-    return frames
-
-
-def _in_target_frame(world_from_face: dict[str, Rigid], xyz_world: np.ndarray, start: CalibratedTarget):
-    """target_from_face, circles (c, 3) in the target frame, and target_from_world."""
-    target_from_world = world_from_face[start.reference_face].inverse()
-    return (
-        {face_id: target_from_world @ pose for face_id, pose in world_from_face.items()},
-        target_from_world @ xyz_world,
-        target_from_world,
     )

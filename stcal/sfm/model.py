@@ -9,7 +9,7 @@ from stcal.geometry.camera import Camera
 from stcal.geometry.rigid import Rigid, Similarity
 from stcal.sfm.observations import ImageObservations, face_of, is_board
 
-_PER_OBSERVATION = ("image_index", "point_index", "keypoint", "measured_px", "shift_px", "sigma_px")
+_PER_OBSERVATION = ("image_index", "point_index", "keypoint", "measured_px", "shift_px", "covariance_px2")
 MIN_POINTS = 6
 """Labelled points that hold an image; thousands are what COLMAP's own defaults expect."""
 
@@ -31,7 +31,7 @@ class GroupModel:
     ``images`` : (m,) names; ``camera_from_world`` : (m,) poses; ``labels`` : (p,); ``xyz_world`` : (p, 3), no unit;
     ``image_index``, ``point_index`` : (n,); ``keypoint`` : (n,) place among the image's observations;
     ``measured_px`` : (n, 2) ellipse centres; ``shift_px`` : (n, 2) what eccentricity adds to the image of a circle's
-    centre, zero until it is known; ``sigma_px`` : (n,).
+    centre, zero until it is known; ``covariance_px2`` : (n, 2, 2) of the measured centres.
     """
 
     group: str
@@ -44,12 +44,12 @@ class GroupModel:
     keypoint: np.ndarray
     measured_px: np.ndarray
     shift_px: np.ndarray
-    sigma_px: np.ndarray
+    covariance_px2: np.ndarray
 
     def __post_init__(self):
         n = len(self.image_index)
         object.__setattr__(self, "xyz_world", frozen(self.xyz_world, (len(self.labels), 3), "points"))
-        for name, shape in (("measured_px", (n, 2)), ("shift_px", (n, 2)), ("sigma_px", (n,))):
+        for name, shape in (("measured_px", (n, 2)), ("shift_px", (n, 2)), ("covariance_px2", (n, 2, 2))):
             object.__setattr__(self, name, frozen(getattr(self, name), shape, name))
         for name in ("image_index", "point_index", "keypoint"):
             object.__setattr__(self, name, frozen(getattr(self, name), (n,), name, dtype=int))
@@ -57,6 +57,19 @@ class GroupModel:
     def corrected_px(self) -> np.ndarray:
         """Images of the circles' centres, (n, 2): the measured ellipse centres less their eccentricity."""
         return self.measured_px - self.shift_px
+
+    def sigma_px(self) -> np.ndarray:
+        """Standard deviation per axis (RMS of the two), (n,)."""
+        return np.sqrt(np.trace(self.covariance_px2, axis1=1, axis2=2) / 2)
+
+    def whiten(self, values_px: np.ndarray) -> np.ndarray:
+        """Values (n, 2) or (n, 2, k) in pixels, in units of σ along axes that are independent."""
+        (xx, xy), (_, yy) = np.moveaxis(self.covariance_px2, (1, 2), (0, 1))
+        across = np.sqrt(np.maximum(yy - xy * xy / xx, 1e-12 * yy))
+        first, second = values_px[:, 0], values_px[:, 1]
+        expand = (...,) if values_px.ndim == 2 else (..., None)
+        slope, along, across = (xy / xx)[expand], np.sqrt(xx)[expand], across[expand]
+        return np.stack([first / along, (second - slope * first) / across], axis=1)
 
     def rows_by_image(self) -> list[np.ndarray]:
         """Observations of every image, in the order of ``images``."""

@@ -68,7 +68,7 @@ def report_json(result: RunResult) -> dict:
             "faces_not_seen": [f.id for f in result.target_design.faces if f.id not in result.target.target_from_face],
             "observations": len(everything),
             "residual_rms_px": float(np.sqrt((everything**2).mean())),
-            "centre_sigma_rms_px": float(np.sqrt(np.concatenate([m.sigma_px**2 for m in models.values()]).mean())),
+            "centre_sigma_rms_px": float(np.sqrt(np.concatenate([m.sigma_px() ** 2 for m in models.values()]).mean())),
             "sigma_factor": result.calibration.sigma_factor,
             "sigma0": result.calibration.joint.sigma0 if result.calibration.joint else None,
             "redundancy": result.calibration.joint.redundancy if result.calibration.joint else None,

@@ -116,7 +116,7 @@ def _outliers(model: GroupModel, camera: Camera) -> tuple[np.ndarray, list[Outli
     bad observation pulls on all that share a point or a camera with it."""
     residual = np.linalg.norm(model.residuals_px(camera), axis=1)
     spread = 1.4826 * np.median(residual) / np.sqrt(2 * np.log(2)) * np.sqrt(2)
-    limit = np.maximum(np.maximum(OUTLIER_RMS * spread, 2 * OUTLIER_RMS * model.sigma_px), MIN_OUTLIER_PX)
+    limit = np.maximum(np.maximum(OUTLIER_RMS * spread, 2 * OUTLIER_RMS * model.sigma_px()), MIN_OUTLIER_PX)
     least = max(1.0, WORST_SHARE * float((residual / limit).max(initial=0.0)))
     off = np.zeros(len(residual), bool)
     named = []

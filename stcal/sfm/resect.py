@@ -55,7 +55,7 @@ def assemble(group: str, images: list[ImageObservations], poses: list[Rigid], xy
         keypoint,
         np.concatenate([image.centre_px for image in images])[first],
         np.zeros((len(rows), 2)),
-        np.concatenate([image.sigma_px() for image in images])[first],
+        np.concatenate([image.covariance_px2 for image in images])[first],
     )
 
 

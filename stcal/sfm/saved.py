@@ -22,6 +22,9 @@ CAMERA, TARGET, BOARD = "cameras.txt", "target.toml", "board.toml"
 """Copies of what the run was given."""
 
 
+COVARIANCE = ("var_x_px2", "cov_xy_px2", "var_y_px2")
+
+
 @dataclass(frozen=True, slots=True, eq=False)
 class SavedRun:
     """What a run's folder holds.
@@ -119,7 +122,7 @@ def _labels(path: Path, names: list[tuple[str, str]], camera: Camera):
                 np.array([[row[f"{kind}x_px"], row[f"{kind}y_px"]] for row in own], float).reshape(-1, 2)
                 for kind in ("", "corrected_")
             )
-            sigma = np.array([row["sigma_px"] for row in own], float)
+            xx, xy_, yy = (np.array([row[key] for row in own], float) for key in COVARIANCE)
             observations.append(
                 ImageObservations(
                     name,
@@ -128,7 +131,7 @@ def _labels(path: Path, names: list[tuple[str, str]], camera: Camera):
                     xy,
                     camera.normalised_from_pixel(xy),
                     np.zeros((len(own), 2, 2)),
-                    sigma[:, None, None] ** 2 * np.eye(2),
+                    np.stack([xx, xy_, xy_, yy], axis=1).reshape(-1, 2, 2),
                 )
             )
             corrected.append(xy_corrected)

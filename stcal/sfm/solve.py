@@ -23,8 +23,8 @@ from stcal.sfm.observations import ImageObservations, is_board
 from stcal.sfm.pairs import PairOptions, PairScore, rank_pairs
 from stcal.sfm.refine import refine
 
-CACHE_VERSION = 3
-_ARRAYS = ("xyz_world", "image_index", "point_index", "keypoint", "measured_px", "shift_px", "sigma_px")
+CACHE_VERSION = 4
+_ARRAYS = ("xyz_world", "image_index", "point_index", "keypoint", "measured_px", "shift_px", "covariance_px2")
 
 
 @dataclass(frozen=True, slots=True, eq=False)
