@@ -2,7 +2,7 @@
 
 import re
 import xml.etree.ElementTree as ElementTree
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -13,6 +13,9 @@ from stcal.geometry.camera import Camera
 
 COLMAP_PIXEL_ORIGIN = 0.5
 """COLMAP's coordinate of the centre of the top-left pixel; OpenCV's, and ours, is 0."""
+
+SIGMA, CORRELATION = "# SIGMA[]", "# CORRELATION[]"
+"""Comments of ``cameras.txt`` that state the uncertainty of its parameters."""
 
 MAX_SIDE_PX = 1_000_000
 """Longest image side that a camera file may state, px."""
@@ -37,7 +40,8 @@ class CameraModel:
 
     ``focal``, ``centre``, ``distortion`` : as in :class:`Camera`, pixel origin already OpenCV's;
     ``colmap_model`` : the COLMAP model that holds it exactly;
-    ``width``, ``height`` : px, or None where the file states none (see :meth:`sized`).
+    ``width``, ``height`` : px, or None where the file states none (see :meth:`sized`);
+    ``covariance`` : (q, q) of the parameters of ``colmap_model``, in its order, or None where the file states none.
     """
 
     focal: np.ndarray
@@ -47,6 +51,7 @@ class CameraModel:
     width: int | None
     height: int | None
     source: str
+    covariance: np.ndarray | None = None
 
     def sized(self, width: int, height: int) -> Camera:
         """The camera; a size that the file does not state is taken from the arguments."""
@@ -57,6 +62,35 @@ def colmap_params(camera: Camera, colmap_model: str) -> list[float]:
     """Parameters of ``camera`` in COLMAP's order and pixel origin for ``colmap_model``."""
     flat = np.concatenate([camera.focal, camera.centre + COLMAP_PIXEL_ORIGIN, camera.distortion])
     return [float(flat[place[0] if isinstance(place, tuple) else place]) for place in _COLMAP_LAYOUT[colmap_model]]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class CameraPrior:
+    """Intrinsics as observations: ``covariance`` (q, q) of the parameters of ``colmap_model``, in its order."""
+
+    colmap_model: str
+    covariance: np.ndarray
+
+
+PRIOR_FOCAL = 1e-3
+"""σ of the focal lengths where the camera file states none, relative …"""
+PRIOR_CENTRE = 2e-3
+"""… of the principal point, in image widths …"""
+PRIOR_RADIAL = 0.01
+"""… of k1 … k6 (and a tenth of each) …"""
+PRIOR_TANGENTIAL = 1e-3
+"""… and of p1, p2: what a calibration of some weeks ago, or of another copy of the lens, is worth."""
+
+
+def camera_prior(model: "CameraModel", camera: Camera) -> CameraPrior:
+    """The intrinsics as observations with the covariance of their file, or with that of a calibration of some age."""
+    if model.covariance is not None:
+        return CameraPrior(model.colmap_model, model.covariance)
+    radial = np.maximum(PRIOR_RADIAL, 0.1 * np.abs(camera.distortion))
+    radial[2:4] = PRIOR_TANGENTIAL
+    flat = np.concatenate([PRIOR_FOCAL * camera.focal, [PRIOR_CENTRE * camera.width] * 2, radial])
+    first = intrinsic_basis(model.colmap_model).argmax(0)
+    return CameraPrior(model.colmap_model, np.diag(flat[first] ** 2))
 
 
 def intrinsic_basis(colmap_model: str) -> np.ndarray:
@@ -88,7 +122,8 @@ def read_camera(path: str | Path) -> CameraModel:
             return _from_opencv(_xml_values(text), path)
         rows = [line.split() for line in text.splitlines() if line.strip() and not line.lstrip().startswith("#")]
         if rows and len(rows[0]) >= 5 and re.fullmatch(r"[A-Z][A-Z0-9_]+", rows[0][1]):
-            return _from_colmap(rows, path)
+            model = _from_colmap(rows, path)
+            return replace(model, covariance=_stated_covariance(text, len(rows[0]) - 4, path))
         return _from_opencv(_yaml_values(text), path)
     except InputError:
         raise
@@ -99,14 +134,39 @@ def read_camera(path: str | Path) -> CameraModel:
         ) from error
 
 
-def write_cameras_txt(path: str | Path, camera: Camera, colmap_model: str = "FULL_OPENCV") -> None:
-    """Write ``cameras.txt`` with one camera of id 1."""
+def write_cameras_txt(
+    path: str | Path, camera: Camera, colmap_model: str = "FULL_OPENCV", covariance: np.ndarray | None = None
+) -> None:
+    """Write ``cameras.txt`` with one camera of id 1; σ and correlations of its parameters as comments."""
     params = " ".join(repr(p) for p in colmap_params(camera, colmap_model))
-    Path(path).write_text(
-        "# CAMERA_ID, MODEL, WIDTH, HEIGHT, PARAMS[] (centre of the first pixel at 0.5, 0.5)\n"
-        f"1 {colmap_model} {camera.width} {camera.height} {params}\n",
-        encoding="utf-8",
-    )
+    lines = ["# CAMERA_ID, MODEL, WIDTH, HEIGHT, PARAMS[] (centre of the first pixel at 0.5, 0.5)"]
+    if covariance is not None:
+        sigma = np.sqrt(np.diag(covariance))
+        correlation = covariance / np.outer(sigma, sigma)
+        lines.append(f"{SIGMA} {' '.join(repr(float(s)) for s in sigma)}")
+        lines += [f"{CORRELATION} {' '.join(repr(float(c)) for c in row)}" for row in correlation]
+    lines.append(f"1 {colmap_model} {camera.width} {camera.height} {params}")
+    Path(path).write_text("\n".join(lines) + "\n", encoding="utf-8")
+
+
+def _stated_covariance(text: str, count: int, path: Path) -> np.ndarray | None:
+    """Covariance (count, count) of the comments that :func:`write_cameras_txt` makes; None without them."""
+    rows = {
+        key: [line.split()[2:] for line in text.splitlines() if line.startswith(key)] for key in (SIGMA, CORRELATION)
+    }
+    if not rows[SIGMA]:
+        return None
+    try:
+        sigma = np.array(rows[SIGMA][0], float)
+        correlation = np.array(rows[CORRELATION], float).reshape(count, count)
+        covariance = correlation * np.outer(sigma, sigma)
+        np.linalg.cholesky(covariance)
+    except (ValueError, np.linalg.LinAlgError) as error:
+        raise InputError(
+            f"camera file {path}: SIGMA and CORRELATION do not state a covariance of {count} parameters; "
+            "write it again, or remove these comments"
+        ) from error
+    return covariance
 
 
 def _model(flat: np.ndarray, colmap_model: str, width, height, path: Path) -> CameraModel:

@@ -94,6 +94,15 @@ def run(
             help="Largest median ray angle of the initial pair, degrees; 60, and the smallest beyond it, if not given.",
         ),
     ] = None,
+    flatness: Annotated[
+        str, typer.Option(help="σ of a circle about the plane of its face, mm, for --solve joint; or off.")
+    ] = "0.02",
+    refine_camera: Annotated[
+        bool,
+        typer.Option(
+            "--refine-camera", help="Adjust the intrinsics too; the given ones are observations with their σ."
+        ),
+    ] = False,
     pairs: Annotated[
         Pairs | None,
         typer.Option(
@@ -114,6 +123,8 @@ def run(
         frame=frame and frame.value,
         eccentricity=eccentricity,
         reference_face=reference_face,
+        flatness_mm=_flatness(flatness),
+        refine_camera=refine_camera,
         graph=pairs and pairs.value,
         pairs=PairOptions(None if max_angle is None else float(np.radians(max_angle))),
         ellipses=_ellipses(min_diameter, max_diameter),
@@ -284,6 +295,18 @@ def demo(
     _print_run(result)
     print("\nagainst the truth:")
     print(comparison_table(against(folder / "run", data / "truth.json")))
+
+
+def _flatness(text: str) -> float | None:
+    if text == "off":
+        return None
+    try:
+        value = float(text)
+    except ValueError:
+        value = 0.0
+    if not 0 < value < 1e6:
+        raise InputError(f"--flatness {text}: a σ in mm, more than 0, or off")
+    return value
 
 
 def _ellipses(min_diameter: float | None, max_diameter: float):

@@ -5,9 +5,11 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from stcal.camera_file import CameraPrior
 from stcal.design import BoardDesign, TargetDesign
 from stcal.geometry.camera import Camera
 from stcal.geometry.rigid import Rigid, Similarity
+from stcal.sfm.adjust import adjust
 from stcal.sfm.chain import CalibratedTarget, chain_faces
 from stcal.sfm.faces import FaceInGroup, faces_of_group
 from stcal.sfm.joint import JointResult, adjust_jointly
@@ -25,8 +27,8 @@ JOINT_ROUNDS = 2
 class Calibration:
     """``target`` is the answer; ``scales`` by group; ``faces`` of the single groups; ``joint`` where it was asked for;
     ``sigma_factor`` : by how much residuals of the single groups exceed the centres' own σ; ``models`` : those that
-    the answer rests on, mm, target frame, groups that are not linked to it absent; ``notes`` : faces without a frame,
-    and why."""
+    the answer rests on, mm, target frame, groups that are not linked to it absent; ``camera`` : as refined where it
+    was, else as given; ``notes`` : faces without a frame, and why."""
 
     target: CalibratedTarget
     scales: dict[str, Scale]
@@ -34,13 +36,21 @@ class Calibration:
     joint: JointResult | None
     sigma_factor: float
     models: tuple[GroupModel, ...]
+    camera: Camera
     notes: tuple[str, ...]
 
 
 def calibrate(
-    models: Sequence[GroupModel], camera: Camera, target: TargetDesign, board: BoardDesign, options: RunOptions
+    models: Sequence[GroupModel],
+    camera: Camera,
+    target: TargetDesign,
+    board: BoardDesign,
+    options: RunOptions,
+    prior: CameraPrior | None = None,
 ) -> Calibration:
     """Calibrate the target from the groups' models (worlds without unit, corrections settled).
+
+    ``prior`` : the camera's intrinsics as observations, for options that refine them.
 
     Raises
     ------
@@ -62,10 +72,11 @@ def calibrate(
     metric = [_placed(m, scales[m.group], calibrated) for m in models if m.group in calibrated.target_from_group]
     joint = None
     if options.solve == "joint":
-        joint = _adjust_all([with_sigma(m, factor) for m in metric], camera, target, board, options.eccentricity)
+        joint, factor = _adjust_all(metric, factor, camera, target, board, options, prior)
         calibrated = calibrated_target(joint, calibrated, target, options.frame)
         metric = [m.moved(Similarity(1.0, calibrated.target_from_group[m.group])) for m in joint.models]
-    return Calibration(calibrated, scales, tuple(faces), joint, factor, tuple(metric), tuple(notes))
+        camera = joint.camera
+    return Calibration(calibrated, scales, tuple(faces), joint, factor, tuple(metric), camera, tuple(notes))
 
 
 def _placed(model: GroupModel, scale: Scale, start: CalibratedTarget) -> GroupModel:
@@ -73,15 +84,25 @@ def _placed(model: GroupModel, scale: Scale, start: CalibratedTarget) -> GroupMo
     return model.moved(Similarity(1.0, start.target_from_group[model.group]) @ Similarity(scale.mm_per_unit, Rigid()))
 
 
-def _adjust_all(models: list[GroupModel], camera, target, board, eccentricity: bool) -> JointResult:
-    """The joint adjustment from the chained result; eccentricity follows."""
+def _adjust_all(
+    models: list[GroupModel], factor: float, camera: Camera, target, board, options: RunOptions, prior
+) -> tuple[JointResult, float]:
+    """The joint adjustment from the chained result, and the factor on the centres' σ; eccentricity follows, and with
+    refined intrinsics that factor too: a wrong camera makes residuals of its own."""
     radius = target.radius_of() | board.radius_of()
-    for _ in range(JOINT_ROUNDS):
-        if eccentricity:
-            models = [replace(m, shift_px=eccentricity_px(m, camera, radius, 1.0)) for m in models]
-        result = adjust_jointly(models, board, camera)
-        models = list(result.models)
-    return result
+    own = [m.covariance_px2 for m in models]
+    prior = prior if options.refine_camera else None
+    current = camera
+    for _ in range(JOINT_ROUNDS + (prior is not None)):
+        if options.eccentricity:
+            models = [replace(m, shift_px=eccentricity_px(m, current, radius, 1.0)) for m in models]
+        models = [replace(m, covariance_px2=factor**2 * c) for m, c in zip(models, own, strict=True)]
+        result = adjust_jointly(models, board, camera, options.flatness_mm, prior, current)
+        models, current = list(result.models), result.camera
+        if prior is not None:
+            plain = [replace(m, covariance_px2=c) for m, c in zip(models, own, strict=True)]
+            factor = image_sigma_factor([adjust(m, current) for m in plain], current)
+    return result, factor
 
 
 def image_sigma_factor(models: Sequence[GroupModel], camera: Camera) -> float:

@@ -10,7 +10,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from stcal.camera_file import intrinsic_basis
+from stcal.camera_file import CameraPrior, intrinsic_basis
 from stcal.design import BoardDesign
 from stcal.errors import ConvergenceError
 from stcal.geometry.align import align_rigid
@@ -28,28 +28,11 @@ SETTLED_PX = 1e-7
 FREE_DIRECTIONS = 6
 """The world may be anywhere: a rigid motion of everything changes nothing."""
 HUBER = 3.0
-"""In σ of a residual's length: one honest residual in ninety is beyond, and loses hardly anything."""
+"""In units of the residuals' robust spread: one honest residual in ninety is longer, and loses hardly anything."""
 MIN_COMMON = 0.1
 MAX_COMMON = 0.99
 """Share of the board's variance that is common to all groups: below the first it is taken as none, above the second
 what is left to a single group would be smaller than anything a board does."""
-
-
-@dataclass(frozen=True, slots=True)
-class JointOptions:
-    """``flatness_mm`` : σ of a circle's distance from the plane of its face, None for no such knowledge;
-    ``refine_camera`` : adjust the intrinsics too, those given being observations with ``camera_sigma``."""
-
-    flatness_mm: float | None = None
-    refine_camera: bool = False
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class CameraPrior:
-    """The given intrinsics as observations: ``colmap_model`` ; ``covariance`` : (q, q) of that model's parameters."""
-
-    colmap_model: str
-    covariance: np.ndarray
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -93,6 +76,7 @@ class _Setting:
     flatness_mm: float | None
     given: Camera
     prior: np.ndarray
+    huber: float
 
     def own_sigma_mm(self) -> float:
         return self.board.sigma_mm * float(np.sqrt(1 - self.common))
@@ -105,10 +89,14 @@ def adjust_jointly(
     models: Sequence[GroupModel],
     board: BoardDesign,
     camera: Camera,
-    options: JointOptions = JointOptions(),
+    flatness_mm: float | None = None,
     prior: CameraPrior | None = None,
+    start: Camera | None = None,
 ) -> JointResult:
     """Adjust metric models that share one world (mm), all observations weighted by their σ.
+
+    ``flatness_mm`` : σ of a circle's distance from the plane of its face, None for no such knowledge; ``prior`` : the
+    intrinsics of ``camera`` are observations with this covariance and are adjusted, from ``start``; fixed where None.
 
     Whether the board kept its shape between the groups (one plate) or not (a film, a screen) is estimated from its
     dots: first every group has its own deviations from the design, and where these agree a common shape follows.
@@ -119,14 +107,14 @@ def adjust_jointly(
         No minimum is reached.
     """
     labels = tuple(sorted({label for model in models for label in model.labels if not is_board(label)}))
-    refine = options.refine_camera and prior is not None
-    basis = intrinsic_basis(prior.colmap_model) if refine else np.zeros((12, 0))
-    weight = np.linalg.inv(prior.covariance) if refine else np.zeros((0, 0))
-    setting = _Setting(labels, board, 0.0, options.flatness_mm, camera, weight)
+    basis = intrinsic_basis(prior.colmap_model) if prior else np.zeros((12, 0))
+    weight = np.linalg.inv(prior.covariance) if prior else np.zeros((0, 0))
+    setting = _Setting(labels, board, 0.0, flatness_mm, camera, weight, np.inf)
     blocks = [_block(model, board, labels, 0.0) for model in models]
     xyz = _shared_circles(blocks, len(labels))
-    shared = Shared(xyz, np.zeros((board.rows * board.columns, 3)), camera, basis)
+    shared = Shared(xyz, np.zeros((board.rows * board.columns, 3)), start or camera, basis)
     blocks = [replace(b, model=_with_circles(b, xyz)) for b in blocks]
+    setting = replace(setting, huber=HUBER * _spread(blocks, shared.camera))
     blocks, shared = _minimise(blocks, shared, setting)
     common = _common_share(blocks, board)
     if common > 0:
@@ -139,6 +127,7 @@ def adjust_jointly(
 
 
 def _minimise(blocks: list[Block], shared: Shared, setting: _Setting) -> tuple[list[Block], Shared]:
+    """Gauss–Newton with step halving."""
     cost = _cost(blocks, shared, setting)
     move = np.inf
     for _ in range(MAX_STEPS):
@@ -183,6 +172,12 @@ def _block(model: GroupModel, board: BoardDesign, labels: tuple[str, ...], commo
 def _dot_place(model: GroupModel, dots: np.ndarray, board: BoardDesign) -> np.ndarray:
     cells = np.array([[int(v) for v in model.labels[i].split(":")[1:]] for i in dots])
     return cells[:, 0] * board.columns + cells[:, 1]
+
+
+def _spread(blocks: list[Block], camera: Camera) -> float:
+    """Robust σ of the normalised residuals per axis, from the median of their lengths (Rayleigh)."""
+    length = np.concatenate([np.linalg.norm(b.normalised(camera), axis=1) for b in blocks])
+    return max(float(np.median(length) / np.sqrt(2 * np.log(2))), 1e-6)
 
 
 def _common_share(blocks: list[Block], board: BoardDesign) -> float:
@@ -235,7 +230,7 @@ def _normal_equations(blocks: list[Block], shared: Shared, setting: _Setting):
     normal, right = np.zeros((c + s + q, c + s + q)), np.zeros(c + s + q)
     condensed = []
     for b in blocks:
-        each = condense(b, shared, HUBER)
+        each = condense(b, shared, setting.huber)
         place = _outer(b, setting, q)
         normal[np.ix_(place, place)] += each.normal
         right[place] += each.right
@@ -280,7 +275,7 @@ def _away(shared: Shared, setting: _Setting) -> np.ndarray:
 
 
 def _cost(blocks: list[Block], shared: Shared, setting: _Setting) -> float:
-    cost = sum(b.cost(shared, HUBER) for b in blocks)
+    cost = sum(b.cost(shared, setting.huber) for b in blocks)
     if setting.common:
         cost += float(((shared.shape_mm / setting.shape_sigma_mm()) ** 2).sum())
     if shared.basis.shape[1]:
@@ -345,6 +340,6 @@ def _result(blocks: list[Block], shared: Shared, setting: _Setting) -> JointResu
         setting.common,
         shared.camera,
         covariance[len(inverse) - q :, len(inverse) - q :],
-        {b.model.group: robust_weights(b, shared.camera, HUBER) for b in blocks},
+        {b.model.group: robust_weights(b, shared.camera, setting.huber) for b in blocks},
         redundancy,
     )

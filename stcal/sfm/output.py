@@ -39,7 +39,7 @@ def faces_json(target: CalibratedTarget, design: TargetDesign, options: RunOptio
 def report_json(result: RunResult) -> dict:
     """The content of ``report.json``."""
     models = _final_models(result)
-    residual = {name: model.residuals_px(result.camera) for name, model in models.items()}
+    residual = {name: model.residuals_px(result.calibration.camera) for name, model in models.items()}
     everything = np.concatenate(list(residual.values()))
     return {
         "format": "stcal report 1",
@@ -55,9 +55,9 @@ def report_json(result: RunResult) -> dict:
         "camera": {
             "model": result.colmap_model,
             "size_px": [result.camera.width, result.camera.height],
-            "focal_px": result.camera.focal.tolist(),
-            "centre_px": result.camera.centre.tolist(),
-            "distortion": result.camera.distortion.tolist(),
+            "focal_px": result.calibration.camera.focal.tolist(),
+            "centre_px": result.calibration.camera.centre.tolist(),
+            "distortion": result.calibration.camera.distortion.tolist(),
         },
         "summary": {
             "files": len(result.detection.images) + len(result.detection.skipped),

@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 
 import stcal
-from stcal.camera_file import CameraModel, read_camera, write_cameras_txt
+from stcal.camera_file import CameraModel, camera_prior, read_camera, write_cameras_txt
 from stcal.design import BoardDesign, TargetDesign, reference_board, reference_target
 from stcal.design_file import board_toml, load_board, load_target, target_toml
 from stcal.errors import InputError
@@ -85,7 +85,8 @@ def run(
         observations, graph, out, detection.camera, model.colmap_model, target, board, options, tell
     )
     tell("faces", 0, 1)
-    calibration = calibrate([s.model for s in solutions], detection.camera, target, board, options)
+    prior = camera_prior(model, detection.camera)
+    calibration = calibrate([s.model for s in solutions], detection.camera, target, board, options, prior)
     tell("faces", 1, 1)
     result = RunResult(
         out,
@@ -279,7 +280,14 @@ def _write(result: RunResult, tell: Progress) -> None:
     for name, model in models.items():
         folder = out / "models" / name  # "models/." where the images lie directly in their folder
         write_model(folder, [model], observations, ids, result.camera, result.colmap_model)
-    write_model(out / "target_model", result.calibration.models, observations, ids, result.camera, result.colmap_model)
+    write_model(
+        out / "target_model",
+        result.calibration.models,
+        observations,
+        ids,
+        result.calibration.camera,
+        result.colmap_model,
+    )
     write_cameras_txt(out / CAMERA, result.camera, result.colmap_model)
     write_bytes(out / TARGET, target_toml(result.target_design).encode())
     write_bytes(out / BOARD, board_toml(result.board_design).encode())
