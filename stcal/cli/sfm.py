@@ -99,9 +99,7 @@ def run(
     ] = "0.02",
     refine_camera: Annotated[
         bool,
-        typer.Option(
-            "--refine-camera", help="Adjust the intrinsics too; the given ones are observations with their σ."
-        ),
+        typer.Option("--refine-camera", help="Adjust the intrinsics too, from the given ones with their σ."),
     ] = False,
     pairs: Annotated[
         Pairs | None,

@@ -20,9 +20,10 @@ class RunOptions:
     ``solve`` : ``joint`` (one adjustment over all groups) or ``chain`` (as in Zhang & Wei (2017), group by group);
     ``frame`` : ``plane`` (Z from the plane of all circles of a face) or ``three-point`` (as in Zhang & Wei (2017));
     ``eccentricity`` : off for the uncorrected control, which then is chained with three-point frames as in the
-    document unless the two are given; ``reference_face`` : the design's first one where None; ``flatness_mm`` : σ of a circle about the plane of its face,
-    None for no such knowledge; ``refine_camera`` : adjust the intrinsics, the given ones being observations; ``graph`` : which pairs
-    of images are matched, see :func:`stcal.sfm.graph.image_graph`; ``workers`` : processes, one per core where None.
+    document unless the two are given; ``reference_face`` : the design's first one where None; ``flatness_mm`` : σ of a
+    circle about the plane of its face, None for no such knowledge; ``refine_camera`` : adjust the intrinsics, the
+    given ones being observations; ``graph`` : which pairs of images are matched, see
+    :func:`stcal.sfm.graph.image_graph`; ``workers`` : processes, one per core where None.
     """
 
     solve: Solve | None = None
