@@ -56,19 +56,10 @@ class Block:
         """Adjusted minus design, (e, 3), board frame, mm."""
         return self.world_from_board.inverse() @ self.model.xyz_world[self.dots] - self.design
 
-    def normalised(self, camera: Camera) -> np.ndarray:
-        """Residuals over σ, (n, 2)."""
-        return self.model.whiten(self.model.residuals_px(camera))
-
     def cost(self, shared: Shared, huber: float) -> float:
         """Squared residuals over σ², Huber's beyond ``huber``; infinite behind a camera."""
-        if (self.model.xyz_camera()[:, 2] <= 0).any():
-            return np.inf
-        square = (self.normalised(shared.camera) ** 2).sum(1)
-        length = np.sqrt(square)
-        image = np.where(length <= huber, square, 2 * huber * length - huber**2)
         own = self.board_residual() + self.design - self.expected_dots(shared)
-        return float(image.sum() + ((own / self.sigma_mm) ** 2).sum())
+        return image_cost(self.model, shared.camera, huber) + float(((own / self.sigma_mm) ** 2).sum())
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -84,15 +75,29 @@ class Condensed:
     camera_from_kept: np.ndarray
 
 
-def robust_weights(block: Block, camera: Camera, huber: float) -> np.ndarray:
+def normalised(model: GroupModel, camera: Camera) -> np.ndarray:
+    """Residuals over σ, (n, 2)."""
+    return model.whiten(model.residuals_px(camera))
+
+
+def image_cost(model: GroupModel, camera: Camera, huber: float) -> float:
+    """Squared residuals over σ², Huber's beyond ``huber``; infinite behind a camera."""
+    if (model.xyz_camera()[:, 2] <= 0).any():
+        return np.inf
+    square = (normalised(model, camera) ** 2).sum(1)
+    length = np.sqrt(square)
+    return float(np.where(length <= huber, square, 2 * huber * length - huber**2).sum())
+
+
+def robust_weights(model: GroupModel, camera: Camera, huber: float) -> np.ndarray:
     """Huber's weights, (n,), of the lengths of the residuals over σ."""
-    length = np.linalg.norm(block.normalised(camera), axis=1)
+    length = np.linalg.norm(normalised(model, camera), axis=1)
     return np.minimum(1.0, huber / np.maximum(length, 1e-12))
 
 
 def condense(block: Block, shared: Shared, huber: float) -> Condensed:
     """Eliminate cameras, dots and the board's pose."""
-    normal, right, camera_step, camera_from_kept = _without_cameras(block, shared, huber)
+    normal, right, camera_step, camera_from_kept = without_cameras(block.model, shared.camera, shared.basis, huber)
     full, full_right, inner, outer = _with_board(block, shared, normal, right)
     inverse = np.linalg.inv(full[np.ix_(inner, inner)])
     coupling = full[np.ix_(inner, outer)]
@@ -107,14 +112,13 @@ def condense(block: Block, shared: Shared, huber: float) -> Condensed:
     )
 
 
-def _without_cameras(block: Block, shared: Shared, huber: float):
+def without_cameras(model: GroupModel, camera: Camera, basis: np.ndarray, huber: float):
     """Normal equations over points (3p) and intrinsics (q), and the way back to the cameras."""
-    model, camera = block.model, shared.camera
-    m, p, q = len(model.images), len(model.labels), shared.basis.shape[1]
+    m, p, q = len(model.images), len(model.labels), basis.shape[1]
     by_pose, by_point = projection_jacobians(model, camera)
-    root = np.sqrt(robust_weights(block, camera, huber))[:, None]
+    root = np.sqrt(robust_weights(model, camera, huber))[:, None]
     a, c = model.whiten(by_pose) * root[..., None], model.whiten(by_point) * root[..., None]
-    residual = block.normalised(camera) * root
+    residual = normalised(model, camera) * root
     at = np.swapaxes(a, 1, 2)
     camera_block, camera_right = np.zeros((m, 6, 6)), np.zeros((m, 6))
     np.add.at(camera_block, model.image_index, at @ a)
@@ -131,7 +135,7 @@ def _without_cameras(block: Block, shared: Shared, huber: float):
     right[: 3 * p] = rights.ravel()
     if q:
         xyz = model.xyz_camera()
-        by_intrinsics = camera.parameter_jacobian(xyz[:, :2] / xyz[:, 2:]) @ shared.basis
+        by_intrinsics = camera.parameter_jacobian(xyz[:, :2] / xyz[:, 2:]) @ basis
         e = model.whiten(by_intrinsics) * root[..., None]
         np.add.at(cross[:, :, 3 * p :], model.image_index, at @ e)
         coupled = np.zeros((p, 3, q))

@@ -32,7 +32,9 @@ class CalibratedTarget:
 
     ``target_from_face`` by face; ``circles`` : label → (3,) mm in the target frame; ``target_from_group`` : metric
     group frames; ``face_covariance`` : 6×6 by face (rotation rad, translation mm; perturbation in the target frame
-    about the face's origin) and ``circle_covariance`` : 3×3 mm² by label, empty where none was computed.
+    about the face's origin), ``circle_covariance`` : 3×3 mm² by label, ``distance_sigma_mm`` : of the distance between
+    the origins of two faces, and ``scale_sigma`` : relative, of all lengths together; empty and None where none was
+    computed.
     """
 
     reference_face: str
@@ -41,6 +43,8 @@ class CalibratedTarget:
     target_from_group: dict[str, Rigid]
     face_covariance: dict[str, np.ndarray] = field(default_factory=dict)
     circle_covariance: dict[str, np.ndarray] = field(default_factory=dict)
+    distance_sigma_mm: dict[tuple[str, str], float] = field(default_factory=dict)
+    scale_sigma: float | None = None
 
 
 def chain_faces(faces: list[FaceInGroup], target: TargetDesign, reference: str) -> CalibratedTarget:

@@ -18,7 +18,7 @@ from stcal.geometry.arrays import frozen
 from stcal.geometry.camera import Camera
 from stcal.geometry.plane import fit_plane
 from stcal.geometry.rigid import Rigid, skew
-from stcal.sfm.blocks import Block, Shared, condense, moved, robust_weights
+from stcal.sfm.blocks import Block, Shared, condense, moved, normalised, robust_weights
 from stcal.sfm.model import GroupModel
 from stcal.sfm.observations import face_of, is_board
 
@@ -106,24 +106,51 @@ def adjust_jointly(
     ConvergenceError
         No minimum is reached.
     """
-    labels = tuple(sorted({label for model in models for label in model.labels if not is_board(label)}))
-    basis = intrinsic_basis(prior.colmap_model) if prior else np.zeros((12, 0))
-    weight = np.linalg.inv(prior.covariance) if prior else np.zeros((0, 0))
-    setting = _Setting(labels, board, 0.0, flatness_mm, camera, weight, np.inf)
-    blocks = [_block(model, board, labels, 0.0) for model in models]
-    xyz = _shared_circles(blocks, len(labels))
-    shared = Shared(xyz, np.zeros((board.rows * board.columns, 3)), start or camera, basis)
-    blocks = [replace(b, model=_with_circles(b, xyz)) for b in blocks]
+    blocks, shared, setting = _start(models, board, camera, flatness_mm, prior, start or camera)
     setting = replace(setting, huber=HUBER * _spread(blocks, shared.camera))
     blocks, shared = _minimise(blocks, shared, setting)
     common = _common_share(blocks, board)
     if common > 0:
-        setting = replace(setting, common=common)
-        blocks = [
-            replace(b, sigma_mm=setting.own_sigma_mm(), dot_place=_dot_place(b.model, b.dots, board)) for b in blocks
-        ]
+        blocks, setting = _with_common(blocks, setting, common)
         blocks, shared = _minimise(blocks, shared, setting)
     return _result(blocks, shared, setting)
+
+
+def covariance_of(
+    models: Sequence[GroupModel],
+    board: BoardDesign,
+    camera: Camera,
+    flatness_mm: float | None = None,
+    prior: CameraPrior | None = None,
+    common: float = 0.0,
+) -> JointResult:
+    """What :func:`adjust_jointly` is to report of models that are where they should be: nothing is moved, σ₀ is 1.
+
+    Arguments as there; ``common`` : share of the board's variance that all groups have in common.
+    """
+    blocks, shared, setting = _start(models, board, camera, flatness_mm, prior, camera)
+    if common > 0:
+        blocks, setting = _with_common(blocks, setting, common)
+    return _result(blocks, shared, setting, 1.0)
+
+
+def _start(models, board: BoardDesign, camera: Camera, flatness_mm, prior: CameraPrior | None, start: Camera):
+    """Groups, what they share, and the setting: each group with its own board, no residual too long."""
+    labels = tuple(sorted({label for model in models for label in model.labels if not is_board(label)}))
+    basis = intrinsic_basis(prior.colmap_model) if prior else np.zeros((12, 0))
+    weight = np.linalg.inv(prior.covariance) if prior else np.zeros((0, 0))
+    blocks = [_block(model, board, labels) for model in models]
+    xyz = _shared_circles(blocks, len(labels))
+    shared = Shared(xyz, np.zeros((board.rows * board.columns, 3)), start, basis)
+    blocks = [replace(b, model=_with_circles(b, xyz)) for b in blocks]
+    return blocks, shared, _Setting(labels, board, 0.0, flatness_mm, camera, weight, np.inf)
+
+
+def _with_common(blocks: list[Block], setting: _Setting, common: float) -> tuple[list[Block], _Setting]:
+    """The same with a shape of the board that the groups have in common."""
+    setting = replace(setting, common=common)
+    own, board = setting.own_sigma_mm(), setting.board
+    return [replace(b, sigma_mm=own, dot_place=_dot_place(b.model, b.dots, board)) for b in blocks], setting
 
 
 def _minimise(blocks: list[Block], shared: Shared, setting: _Setting) -> tuple[list[Block], Shared]:
@@ -151,7 +178,7 @@ def _minimise(blocks: list[Block], shared: Shared, setting: _Setting) -> tuple[l
     return blocks, shared
 
 
-def _block(model: GroupModel, board: BoardDesign, labels: tuple[str, ...], common: float) -> Block:
+def _block(model: GroupModel, board: BoardDesign, labels: tuple[str, ...]) -> Block:
     place = {label: i for i, label in enumerate(labels)}
     dots = np.array([i for i, label in enumerate(model.labels) if is_board(label)])
     circles = np.array([i for i, label in enumerate(model.labels) if not is_board(label)], int)
@@ -176,7 +203,7 @@ def _dot_place(model: GroupModel, dots: np.ndarray, board: BoardDesign) -> np.nd
 
 def _spread(blocks: list[Block], camera: Camera) -> float:
     """Robust σ of the normalised residuals per axis, from the median of their lengths (Rayleigh)."""
-    length = np.concatenate([np.linalg.norm(b.normalised(camera), axis=1) for b in blocks])
+    length = np.concatenate([np.linalg.norm(normalised(b.model, camera), axis=1) for b in blocks])
     return max(float(np.median(length) / np.sqrt(2 * np.log(2))), 1e-6)
 
 
@@ -319,7 +346,8 @@ def _largest_move(old: Block, shared: Shared, new: Block, new_shared: Shared) ->
     return float(np.abs(after - before).max(initial=0.0))
 
 
-def _result(blocks: list[Block], shared: Shared, setting: _Setting) -> JointResult:
+def _result(blocks: list[Block], shared: Shared, setting: _Setting, sigma0: float | None = None) -> JointResult:
+    """``sigma0`` : estimated from the residuals where None."""
     normal, _, _ = _normal_equations(blocks, shared, setting)
     inverse = _inverse(normal, shared, setting)
     q, c = shared.basis.shape[1], 3 * len(setting.labels)
@@ -327,7 +355,8 @@ def _result(blocks: list[Block], shared: Shared, setting: _Setting) -> JointResu
     observations = sum(2 * len(b.model.image_index) + 3 * len(b.dots) for b in blocks) + flat
     unknowns = c + sum(6 * len(b.model.images) + 3 * len(b.dots) + 6 for b in blocks)
     redundancy = observations - unknowns + FREE_DIRECTIONS
-    sigma0 = float(np.sqrt(_cost(blocks, shared, setting) / max(redundancy, 1)))
+    if sigma0 is None:
+        sigma0 = float(np.sqrt(_cost(blocks, shared, setting) / max(redundancy, 1)))
     covariance = sigma0**2 * inverse
     return JointResult(
         tuple(b.model for b in blocks),
@@ -340,6 +369,6 @@ def _result(blocks: list[Block], shared: Shared, setting: _Setting) -> JointResu
         setting.common,
         shared.camera,
         covariance[len(inverse) - q :, len(inverse) - q :],
-        {b.model.group: robust_weights(b, shared.camera, setting.huber) for b in blocks},
+        {b.model.group: robust_weights(b.model, shared.camera, setting.huber) for b in blocks},
         redundancy,
     )

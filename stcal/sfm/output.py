@@ -32,6 +32,8 @@ def faces_json(target: CalibratedTarget, design: TargetDesign, options: RunOptio
     }
     if target.face_covariance:
         content["target_from_face_covariance"] = {f: c.tolist() for f, c in target.face_covariance.items()}
+        content["distance_sigma_mm"] = {f"{a} {b}": sigma for (a, b), sigma in target.distance_sigma_mm.items()}
+        content["scale_sigma_ppm"] = 1e6 * target.scale_sigma
         content["circle_covariance_mm2"] = {label: c.tolist() for label, c in target.circle_covariance.items()}
     return content
 
@@ -70,6 +72,7 @@ def report_json(result: RunResult) -> dict:
             "residual_rms_px": float(np.sqrt((everything**2).mean())),
             "centre_sigma_rms_px": float(np.sqrt(np.concatenate([m.sigma_px() ** 2 for m in models.values()]).mean())),
             "sigma_factor": result.calibration.sigma_factor,
+            "scale_sigma_ppm": None if result.target.scale_sigma is None else 1e6 * result.target.scale_sigma,
             "sigma0": result.calibration.joint.sigma0 if result.calibration.joint else None,
             "redundancy": result.calibration.joint.redundancy if result.calibration.joint else None,
         },
@@ -129,7 +132,7 @@ def _face(result: RunResult, face_id: str) -> dict:
 
 def _between(result: RunResult) -> list[dict]:
     rows = []
-    poses = result.target.target_from_face
+    poses, sigma = result.target.target_from_face, result.target.distance_sigma_mm
     for a, b in combinations(poses, 2):
         cosine = poses[a].rotation[:, 2] @ poses[b].rotation[:, 2]
         rows.append(
@@ -137,6 +140,7 @@ def _between(result: RunResult) -> list[dict]:
                 "a": a,
                 "b": b,
                 "distance_mm": float(np.linalg.norm(poses[a].translation - poses[b].translation)),
+                "distance_sigma_um": MICRO * sigma[a, b] if (a, b) in sigma else None,
                 "angle_deg": float(np.degrees(np.arccos(np.clip(cosine, -1, 1)))),
             }
         )

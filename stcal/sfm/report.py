@@ -203,7 +203,8 @@ def _faces(report: dict) -> str:
         axes[-1].append(number(face["angle_to_reference_deg"], 4))
     spans = [("", 1), ("X axis of the face", 3), ("Y axis of the face", 3), ("Z axis: outward normal", 3), ("", 1)]
     between = [
-        [f"{row['a']} – {row['b']}", *cells(row, "distance_mm:4 angle_deg:4")] for row in report["between_faces"]
+        [f"{row['a']} – {row['b']}", *cells(row, "distance_mm:4 distance_sigma_um:1 angle_deg:4")]
+        for row in report["between_faces"]
     ]
     return (
         f"<p>Pose of each face in the target frame, which is the frame of face {escape(report['reference_face'])}: "
@@ -212,7 +213,7 @@ def _faces(report: dict) -> str:
         "<h3>Rotation</h3>\n<p>The axes of each face in the target frame: the columns of its rotation matrix.</p>\n"
         f"{table(['<Face', *('x', 'y', 'z') * 3, 'Angle to datum (°)'], axes, spans)}"
         '<div class="columns"><div><h3>Between faces</h3>\n<p>Distance of the origins, angle of the normals.</p>\n'
-        f"{table(['<Faces', 'Distance (mm)', 'Angle (°)'], between)}</div>"
+        f"{table(['<Faces', 'Distance (mm)', 'σ (µm)', 'Angle (°)'], between)}</div>"
         f"<div><h3>Chains</h3>\n{_chains(report)}</div></div>\n"
     )
 

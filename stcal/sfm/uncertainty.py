@@ -1,5 +1,8 @@
 """The calibrated target of a joint adjustment with its marginal covariances."""
 
+from dataclasses import dataclass
+from itertools import combinations
+
 import numpy as np
 from scipy.spatial.transform import Rotation
 
@@ -11,14 +14,67 @@ from stcal.sfm.joint import JointResult
 from stcal.sfm.observations import face_of
 
 
+@dataclass(frozen=True, slots=True, eq=False)
+class Derivatives:
+    """The target in its own frame, and what moves it: derivatives by the circles in the world, mm.
+
+    ``target_from_face`` by face; ``xyz_target`` : (c, 3); ``target_from_world`` ; ``faces`` by face: (6, 3c) rotation
+    (rad) and translation (mm), perturbation in the target frame; ``circles`` : (c, 3, 3c).
+    """
+
+    target_from_face: dict[str, Rigid]
+    xyz_target: np.ndarray
+    target_from_world: Rigid
+    faces: dict[str, np.ndarray]
+    circles: np.ndarray
+
+    def face_covariance(self, covariance_mm2: np.ndarray) -> dict[str, np.ndarray]:
+        """6×6 by face, of the circles' (3c, 3c), whatever their datum."""
+        return {face_id: jacobian @ covariance_mm2 @ jacobian.T for face_id, jacobian in self.faces.items()}
+
+    def distance_sigma_mm(self, covariance_mm2: np.ndarray) -> dict[tuple[str, str], float]:
+        """σ of the distance between the origins of every two faces."""
+        sigma = {}
+        for a, b in combinations(self.target_from_face, 2):
+            way = self.target_from_face[b].translation - self.target_from_face[a].translation
+            gradient = way / np.linalg.norm(way) @ (self.faces[b][3:] - self.faces[a][3:])
+            sigma[a, b] = float(np.sqrt(max(gradient @ covariance_mm2 @ gradient, 0.0)))
+        return sigma
+
+    def circle_covariance(self, covariance_mm2: np.ndarray) -> np.ndarray:
+        """(c, 3, 3) mm², target frame, of the circles' (3c, 3c)."""
+        return np.einsum("cip,pq,cjq->cij", self.circles, covariance_mm2, self.circles, optimize=True)
+
+
 def calibrated_target(
     result: JointResult, start: CalibratedTarget, target: TargetDesign, kind: FrameKind
 ) -> CalibratedTarget:
     """Faces and circles of the adjusted target in the target frame, with their marginal covariances.
 
-    ``start`` tells the reference face and to which side each face looks. Poses and circles in the target frame are
-    functions of all circles, whatever the datum; covariances are propagated by central differences.
+    ``start`` tells the reference face and to which side each face looks.
     """
+    own = derivatives(result, start, target, kind)
+    return CalibratedTarget(
+        start.reference_face,
+        own.target_from_face,
+        dict(zip(result.labels, own.xyz_target, strict=True)),
+        dict.fromkeys(start.target_from_group, own.target_from_world),
+        own.face_covariance(result.covariance_mm2),
+        dict(zip(result.labels, own.circle_covariance(result.covariance_mm2), strict=True)),
+        own.distance_sigma_mm(result.covariance_mm2),
+        scale_sigma(result.xyz_world, result.covariance_mm2),
+    )
+
+
+def scale_sigma(xyz_world: np.ndarray, covariance_mm2: np.ndarray) -> float:
+    """Relative σ of the scale of the circles: of the similarity's scale between them as adjusted and as they are."""
+    middle = xyz_world - xyz_world.mean(0)
+    gradient = (middle / (middle**2).sum()).ravel()
+    return float(np.sqrt(gradient @ covariance_mm2 @ gradient))
+
+
+def derivatives(result: JointResult, start: CalibratedTarget, target: TargetDesign, kind: FrameKind) -> Derivatives:
+    """Poses and circles in the target frame are functions of all circles; derivatives by central differences."""
     step = 1e-3
     own = _frames(result, result.xyz_world, start, target, kind)
     origin = _in_target_frame(own, result.xyz_world, start)
@@ -34,22 +90,8 @@ def calibrated_target(
             ahead, behind = ends
             twists.append({f: _perturbation(ahead[0][f], behind[0][f]) / (2 * step) for f in own})
             circles.append((ahead[1] - behind[1]) / (2 * step))
-    by_circle = np.stack(circles, axis=-1)
-    covariance = result.covariance_mm2
-    face_covariance = {}
-    for face_id in origin[0]:
-        jacobian = np.column_stack([twist[face_id] for twist in twists])
-        face_covariance[face_id] = jacobian @ covariance @ jacobian.T
-    blocks = np.einsum("cip,pq,cjq->cij", by_circle, covariance, by_circle, optimize=True)
-    reference_from_world = origin[2]
-    return CalibratedTarget(
-        start.reference_face,
-        origin[0],
-        dict(zip(result.labels, origin[1], strict=True)),
-        dict.fromkeys(start.target_from_group, reference_from_world),
-        face_covariance,
-        dict(zip(result.labels, blocks, strict=True)),
-    )
+    by_face = {face_id: np.column_stack([twist[face_id] for twist in twists]) for face_id in own}
+    return Derivatives(*origin, by_face, np.stack(circles, axis=-1))
 
 
 def _perturbation(ahead: Rigid, behind: Rigid) -> np.ndarray:

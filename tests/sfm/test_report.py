@@ -121,7 +121,7 @@ def make(sigma: bool = True, eccentricity: bool = True) -> dict:
             "redundancy": 17 if sigma else None,
         },
         "faces": {"1": face(IDENTITY, sigma), "2": face(TURNED, sigma)},
-        "between_faces": [{"a": "1", "b": "2", "distance_mm": 161.59991, "angle_deg": 90.0}],
+        "between_faces": [{"a": "1", "b": "2", "distance_mm": 161.59991, "distance_sigma_um": 3.2, "angle_deg": 90.0}],
         "chains": {
             "1": [],
             "2": [{"faces": ["1", "2"], "groups": ["a"], "translation_um": 13.137, "rotation_mdeg": 7.2508}],
@@ -247,7 +247,7 @@ def test_numbers_have_their_digits(joint):
     assert ["1 (datum)", "0.0000", "0.0000", "0.0000", *["0"] * 6, "4", "10", "0.4", "2", "a"] in faces
     pose, sigma = ["150.0000", "0.0000", "-60.1235"], ["1.0", "2.1", "3.1", "0.50", "0.61", "0.72"]
     assert ["2", *pose, *sigma, "4", "10", "0.4", "2", "a"] in faces
-    assert ["1 – 2", "161.5999", "90.0000"] in faces
+    assert ["1 – 2", "161.5999", "3.2", "90.0000"] in faces
     assert ["2", "1 → 2", "a", "13.1", "7.25"] in faces
     scale = ["a", "116.217538", "116.217598", "0 and 1", "-0.5", "6.4", "4", "3.0", "3.6", "5.0"]
     assert scale in rows_of(joint, "scale")
