@@ -32,6 +32,9 @@ _COLMAP_LAYOUT = {
     "OPENCV": list(range(8)),
     "FULL_OPENCV": list(range(12)),
 }
+COLMAP_MODELS = tuple(_COLMAP_LAYOUT)
+"""Camera models that stcal supports."""
+PARAMETER_NAMES = ("fx", "fy", "cx", "cy", "k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6")
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -96,10 +99,16 @@ def camera_prior(model: "CameraModel", camera: Camera) -> CameraPrior:
 def intrinsic_basis(colmap_model: str) -> np.ndarray:
     """Derivative (12, q) of fx, fy, cx, cy, k1, k2, p1, p2, k3 … k6 by the q parameters of a COLMAP model."""
     layout = _COLMAP_LAYOUT[colmap_model]
-    basis = np.zeros((12, len(layout)))
+    basis = np.zeros((len(PARAMETER_NAMES), len(layout)))
     for column, place in enumerate(layout):
         basis[list(place) if isinstance(place, tuple) else place, column] = 1
     return basis
+
+
+def parameter_names(colmap_model: str) -> list[str]:
+    """Names of the parameters of a COLMAP model, in its order."""
+    layout = _COLMAP_LAYOUT[colmap_model]
+    return ["f" if isinstance(place, tuple) else PARAMETER_NAMES[place] for place in layout]
 
 
 def read_camera(path: str | Path) -> CameraModel:

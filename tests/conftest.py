@@ -11,11 +11,11 @@ from stcal.sfm.adjust import adjust
 from stcal.sfm.chain import chain_faces
 from stcal.sfm.faces import faces_of_group
 from stcal.sfm.joint import adjust_jointly
-from stcal.sfm.uncertainty import calibrated_target
 from stcal.sfm.metric import find_scale
 from stcal.sfm.model import GroupModel
 from stcal.sfm.observations import ImageObservations
 from stcal.sfm.refine import eccentricity_px
+from stcal.sfm.uncertainty import calibrated_target
 from stcal.synthetic.observe import image_circles
 from stcal.synthetic.scene import Scene, SceneOptions, make_scene
 

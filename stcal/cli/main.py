@@ -6,7 +6,7 @@ from typing import NoReturn
 import typer
 
 import stcal
-from stcal.cli import colmap, sfm
+from stcal.cli import camera, capture, colmap, sfm
 from stcal.errors import StcalError
 
 INTERRUPTED = 130
@@ -21,6 +21,8 @@ app = typer.Typer(
     pretty_exceptions_enable=False,
 )
 sfm.app.add_typer(colmap.app)
+sfm.app.add_typer(capture.app)
+sfm.app.add_typer(camera.app)
 app.add_typer(sfm.app, name="sfm")
 
 

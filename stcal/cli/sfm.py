@@ -320,6 +320,17 @@ def _print_skipped(skipped) -> None:
         print(f"skipped {each.name}: {each.reason}")
 
 
+def _print_checks(checks) -> None:
+    """How many checks came out how, and those that did not pass."""
+    from stcal.sfm.report_checks import count_verdicts
+
+    print(f"checks: {count_verdicts([check.verdict for check in checks])}")
+    for check in checks:
+        if check.verdict != "passed":
+            remedy = f"; {check.remedy}" if check.remedy else ""
+            print(f"  {check.verdict}: {check.title}: {check.reason}{remedy}")
+
+
 def _print_run(result) -> None:
     """The answer in a few lines."""
     _print_skipped(result.detection.skipped)
@@ -363,4 +374,5 @@ def _print_run(result) -> None:
     unseen = [f.id for f in result.target_design.faces if f.id not in result.target.target_from_face]
     if unseen:
         print(f"not seen in any image: face {', '.join(unseen)}")
+    _print_checks(result.checks)
     print(f"faces:  {result.out / 'faces.json'}\nreport: {result.out / 'report.html'}")

@@ -84,9 +84,9 @@ def image_cost(model: GroupModel, camera: Camera, huber: float) -> float:
     """Squared residuals over σ², Huber's beyond ``huber``; infinite behind a camera."""
     if (model.xyz_camera()[:, 2] <= 0).any():
         return np.inf
-    square = (normalised(model, camera) ** 2).sum(1)
-    length = np.sqrt(square)
-    return float(np.where(length <= huber, square, 2 * huber * length - huber**2).sum())
+    length = np.linalg.norm(normalised(model, camera), axis=1)
+    short = np.minimum(length, huber)
+    return float((short * (2 * length - short)).sum())
 
 
 def robust_weights(model: GroupModel, camera: Camera, huber: float) -> np.ndarray:

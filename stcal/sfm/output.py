@@ -1,5 +1,6 @@
 """``faces.json`` and ``report.json``: the result and everything that tells how far to trust it, as plain values."""
 
+from dataclasses import asdict
 from itertools import combinations
 
 import numpy as np
@@ -8,6 +9,7 @@ import stcal
 from stcal.design import TargetDesign
 from stcal.geometry.plane import fit_plane
 from stcal.sfm.chain import CalibratedTarget
+from stcal.sfm.check import Check
 from stcal.sfm.model import GroupModel
 from stcal.sfm.observations import face_of, is_board
 from stcal.sfm.options import RunOptions
@@ -90,6 +92,7 @@ def report_json(result: RunResult) -> dict:
             ]
             for face, chains in result.chains.items()
         },
+        "checks": [_check(check) for check in result.checks],
         "groups": [_group(result, solution) for solution in result.solutions],
         "residuals_by_image": _by_image(models, residual),
         "residuals_by_label": _by_label(models, residual),
@@ -101,6 +104,12 @@ def report_json(result: RunResult) -> dict:
         ],
         "scene": _scene(result),
     }
+
+
+def _check(check: Check) -> dict:
+    """A check as plain values."""
+    content = asdict(check)
+    return content | {"measured": list(content["measured"]), "names": list(check.names)}
 
 
 def _final_models(result: RunResult) -> dict[str, GroupModel]:

@@ -10,13 +10,14 @@ from pathlib import Path
 import numpy as np
 
 import stcal
-from stcal.camera_file import CameraModel, camera_prior, read_camera, write_cameras_txt
+from stcal.camera_file import CameraModel, CameraPrior, camera_prior, read_camera, write_cameras_txt
 from stcal.design import BoardDesign, TargetDesign, reference_board, reference_target
 from stcal.design_file import board_toml, load_board, load_target, target_toml
 from stcal.errors import InputError
 from stcal.geometry.camera import Camera
 from stcal.sfm.calibration import Calibration, calibrate
 from stcal.sfm.chain import measure_chains
+from stcal.sfm.checks import Evidence, run_checks
 from stcal.sfm.colmap_model import find_models, read_model, write_model
 from stcal.sfm.crosscheck import Tolerances, crosscheck
 from stcal.sfm.database import image_ids, labels_csv, remove_database, write_database
@@ -92,6 +93,7 @@ def run(
         out,
         detection.camera,
         model.colmap_model,
+        model.covariance,
         target,
         board,
         options,
@@ -103,8 +105,29 @@ def run(
         measure_chains(calibration.faces, calibration.target),
         (*calibration.notes, *unseen_board(solutions, board)),
     )
+    tell("check", 0, 1)
+    result = replace(result, checks=run_checks(_evidence(result, prior)))
+    tell("check", 1, 1)
     _write(result, tell)
     return result
+
+
+def _evidence(result: RunResult, prior: CameraPrior) -> Evidence:
+    """What the checks look at."""
+    blur = {i.file.name: i.detection.centres.blur_px for i in result.detection.images}
+    return Evidence(
+        tuple(s.model for s in result.solutions),
+        tuple(o for s in result.solutions for o in s.outliers),
+        tuple(result.observations()),
+        result.camera,
+        result.colmap_model,
+        result.target_design,
+        result.board_design,
+        result.options,
+        result.calibration,
+        prior if result.options.refine_camera else None,
+        {name: float(np.median(each)) for name, each in blur.items() if len(each)},
+    )
 
 
 def detect(
@@ -288,7 +311,7 @@ def _write(result: RunResult, tell: Progress) -> None:
         result.calibration.camera,
         result.colmap_model,
     )
-    write_cameras_txt(out / CAMERA, result.camera, result.colmap_model)
+    write_cameras_txt(out / CAMERA, result.camera, result.colmap_model, result.camera_covariance)
     write_bytes(out / TARGET, target_toml(result.target_design).encode())
     write_bytes(out / BOARD, board_toml(result.board_design).encode())
     report = report_json(result)

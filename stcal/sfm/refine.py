@@ -52,7 +52,9 @@ def refine(
     model = adjust(model, camera)
     observations = len(model.image_index)
     outliers: list[Outlier] = []
-    for rounds in range(1, MAX_ROUNDS + 1):
+    rounds = 0
+    while rounds < MAX_ROUNDS:  # rounds that name outliers do not count: these are limited on their own
+        rounds += 1
         shift = np.zeros_like(model.shift_px)
         if eccentricity:
             shift = eccentricity_px(model, camera, radius, find_scale(model, board).mm_per_unit)
@@ -66,6 +68,7 @@ def refine(
                 outliers += named
                 _require_few(outliers, observations, model.group)
                 model = adjust(model.without(off), camera)
+                rounds -= 1
                 continue
         if change <= SETTLED_PX:
             return Refined(model, rounds, tuple(outliers))

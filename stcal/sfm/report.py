@@ -7,6 +7,7 @@ from html import escape
 from stcal.sfm import figures
 from stcal.sfm.figures import NONE, PAGE, STYLE, Html, cells, fold, join, legend, number, plot, swatch, table
 from stcal.sfm.observations import face_of, is_board
+from stcal.sfm.report_checks import checks_section
 from stcal.sfm.report_crosscheck import crosscheck_section
 
 FIRST_PAIRS = 15
@@ -25,6 +26,7 @@ def report_html(report: dict, overlays: dict[str, bytes]) -> str:
     colours = figures.group_colours([group["name"] for group in report["groups"]])
     sections = [
         ("result", "Result", _result(report)),
+        *([("checks", "Checks", checks_section(report["checks"]))] if "checks" in report else []),
         ("trust", "How far to trust it", _trust(report)),
         ("faces", "Faces", _faces(report)),
         ("scale", "Scale", _scale(report)),

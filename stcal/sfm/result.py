@@ -3,10 +3,13 @@
 from dataclasses import dataclass
 from pathlib import Path
 
+import numpy as np
+
 from stcal.design import BoardDesign, TargetDesign
 from stcal.geometry.camera import Camera
 from stcal.sfm.calibration import Calibration
 from stcal.sfm.chain import Chain
+from stcal.sfm.check import Check
 from stcal.sfm.detection import DetectionResult
 from stcal.sfm.graph import ImageGraph
 from stcal.sfm.labels import LabelledImage
@@ -17,11 +20,12 @@ from stcal.sfm.solve import GroupSolution
 
 @dataclass(frozen=True, slots=True, eq=False)
 class RunResult:
-    """Everything a run found; ``calibration.target`` is the answer."""
+    """Everything a run found; ``camera_covariance`` as the camera file states it; ``calibration.target`` is the answer."""
 
     out: Path
     camera: Camera
     colmap_model: str
+    camera_covariance: np.ndarray | None
     target_design: TargetDesign
     board_design: BoardDesign
     options: RunOptions
@@ -32,6 +36,7 @@ class RunResult:
     calibration: Calibration
     chains: dict[str, tuple[Chain, ...]]
     notes: tuple[str, ...]
+    checks: tuple[Check, ...] = ()
 
     @property
     def target(self):

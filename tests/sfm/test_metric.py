@@ -16,7 +16,9 @@ WORLD_FROM_BOARD = Rigid.exp([0.4, -0.2, 0.9, 3.0, 1.0, 20.0])
 def model_of(xyz_board, labels, mm_per_unit=25.0):
     xyz = (WORLD_FROM_BOARD @ xyz_board) / mm_per_unit
     none = np.zeros(0)
-    return GroupModel("g", (), (), tuple(labels), xyz, none, none, none, np.zeros((0, 2)), np.zeros((0, 2)), np.zeros((0, 2, 2)))
+    return GroupModel(
+        "g", (), (), tuple(labels), xyz, none, none, none, np.zeros((0, 2)), np.zeros((0, 2)), np.zeros((0, 2, 2))
+    )
 
 
 def board_xyz():

@@ -11,8 +11,8 @@ from stcal.sfm.calibration import image_sigma_factor, with_sigma
 from stcal.sfm.compare import compare
 from stcal.sfm.detect.ellipses import EllipseOptions
 from stcal.sfm.joint import adjust_jointly
-from stcal.sfm.uncertainty import calibrated_target
 from stcal.sfm.mapping import left_out
+from stcal.sfm.uncertainty import calibrated_target
 
 
 def calibrate(folder, out, **options):
