@@ -24,6 +24,7 @@ from stcal.sfm.crosscheck import Tolerances, crosscheck, mapper_options
 from stcal.sfm.database import image_ids
 from stcal.sfm.mapping import pipeline_options
 from stcal.sfm.native import NativeColmap, find_colmap, map_natively, require_listable
+from stcal.sfm.pipeline import write_report
 from stcal.sfm.saved import load_run
 
 INPUT, COMPUTATION, INTERRUPTED = 2, 3, 130
@@ -592,6 +593,15 @@ def test_a_report_that_cannot_be_added_to(own_run, refused, tmp_path, case):
     spoil, part = SPOILT_REPORTS[case]
     spoil(own_run)
     refused(never(tmp_path), INPUT, part, "run it again")
+
+
+def test_no_half_of_a_report(own_run):
+    """Should an overlay go meanwhile, neither file is written."""
+    (own_run / "overlays/12/IMG_1000.jpg.jpg").unlink()
+    before = state_of(own_run)
+    with pytest.raises(FileNotFoundError):
+        write_report(own_run, load_run(own_run).report | {"notes": ["new"]})
+    assert state_of(own_run) == before
 
 
 def test_a_run_that_cannot_be_written_to(own_run, refused, tmp_path, monkeypatch):
