@@ -1,15 +1,19 @@
-"""The figures of the README on the rendered data sets beside the repository: errors, labels found, the control.
+"""The figures of the README on the rendered data sets beside the repository: errors, labels found, the control, and
+the cross-check with the native COLMAP where that is installed.
 
 .venv/bin/python scripts/measure_shared.py [../shared/data/stereo_target]
 """
 
 import json
+import shutil
 import sys
 import tempfile
 from pathlib import Path
 
 from stcal.sfm import RunOptions, run
 from stcal.sfm.compare import compare, comparison_table
+from stcal.sfm.crosscheck import comparison_text, crosscheck
+from stcal.sfm.saved import load_run
 
 
 def main() -> None:
@@ -33,6 +37,9 @@ def main() -> None:
                     f"residual RMS {summary['residual_rms_px']:.4f} px"
                 )
                 print(comparison_table(compare(out, folder / "truth.json")))
+                if options == RunOptions() and shutil.which("colmap"):
+                    print(f"\n{name}, cross-check with the native COLMAP:")
+                    print(comparison_text(crosscheck(load_run(out))))
 
 
 if __name__ == "__main__":

@@ -10,6 +10,7 @@ import stcal
 ROOT = Path(stcal.__file__).parent
 SYSTEMS = ("sfm", "robot", "register", "handeye", "locate")
 COLMAP_FILES = {"database.py", "mapping.py", "colmap_model.py", "resect.py", "export.py", "crosscheck.py"}
+COLMAP_FILES |= {"export_model.py", "gates.py"}
 CV2_FILES = {"images.py", "overlay.py", "pairs.py"}
 
 

@@ -1,5 +1,7 @@
 """``stcal-sfm``: what goes to and comes from COLMAP, and why something was left out."""
 
+import json
+import os
 from pathlib import Path
 from typing import Annotated
 
@@ -11,6 +13,7 @@ from stcal.errors import InputError, MappingError
 app = typer.Typer()
 
 Run = Annotated[Path, typer.Argument(metavar="RUN", help="Folder of a finished run.")]
+SHOWN_PAIRS = 10
 
 
 @app.command(name="export-database")
@@ -51,9 +54,9 @@ def export_model(
     if written.focal_px is not None:
         x, y = written.centre_px
         print(
-            f"{kind} knows neither this camera's distortion nor its principal point: the keypoints are those of an "
-            f"ideal camera, f = {written.focal_px:.4f} px, principal point at the image's centre ({x:g}, {y:g}); "
-            "undistort the photographs to it to match"
+            f"{kind} knows one focal length and a principal point at the centre: the keypoints are those of an ideal "
+            f"camera without distortion, f = {written.focal_px:.4f} px, principal point ({x:g}, {y:g}) px; undistort "
+            "the photographs to it to match"
         )
 
 
@@ -63,11 +66,19 @@ def crosscheck(
     colmap: Annotated[
         Path | None, typer.Option("--colmap", help="The native program; `colmap` on the PATH if not given.")
     ] = None,
-    tolerance_um: Annotated[float, typer.Option(min=0, help="Faces and circles may differ by this, µm.")] = 2.0,
-    tolerance_mdeg: Annotated[float, typer.Option(min=0, help="Faces may differ by this, millidegrees.")] = 1.0,
-    camera_tolerance_um: Annotated[float, typer.Option(min=0, help="Camera positions may differ by this, µm.")] = 20.0,
-    camera_tolerance_mdeg: Annotated[float, typer.Option(min=0, help="Camera attitudes, millidegrees.")] = 2.0,
-    timeout: Annotated[float, typer.Option(min=1, help="Longest time for one group in the native mapper, s.")] = 600.0,
+    tolerance_um: Annotated[
+        float, typer.Option(min=0, max=1e6, help="Faces and circles may differ by this, µm.")
+    ] = 2.0,
+    tolerance_mdeg: Annotated[
+        float, typer.Option(min=0, max=1e6, help="Faces may differ by this, millidegrees.")
+    ] = 1.0,
+    camera_tolerance_um: Annotated[
+        float, typer.Option(min=0, max=1e6, help="Camera positions may differ by this, µm.")
+    ] = 20.0,
+    camera_tolerance_mdeg: Annotated[float, typer.Option(min=0, max=1e6, help="Camera attitudes, millidegrees.")] = 2.0,
+    timeout: Annotated[
+        float, typer.Option(min=1, max=1e6, help="Longest time for one group in the native mapper, s.")
+    ] = 600.0,
 ) -> None:
     """Map the same database with the native COLMAP and compare faces, circles and cameras; into the report."""
     from stcal.sfm import pipeline
@@ -99,8 +110,10 @@ def faces(
     from stcal.sfm.crosscheck import face_differences
     from stcal.sfm.saved import load_run
 
-    if out is not None and out.exists():
+    if out is not None and os.path.lexists(out):
         raise InputError(f"{out}: exists; give a new file with --out")
+    if out is not None and not out.parent.is_dir():
+        raise InputError(f"{out}: no folder {out.parent}; make it, or give another place with --out")
     saved = load_run(run)
     calibration = pipeline.calibrate_models(model, saved)
     for note in calibration.notes:
@@ -121,3 +134,52 @@ def faces(
     if out is not None:
         pipeline.write_faces(out, calibration, saved)
         print(f"faces: {out}")
+
+
+@app.command()
+def pairs(
+    run: Run,
+    group: Annotated[str | None, typer.Option("--group", help="One group only.")] = None,
+    everything: Annotated[bool, typer.Option("--all", help="All pairs; the first ten if not given.")] = False,
+    out: Annotated[Path | None, typer.Option("--json", help="Also write all pairs and gates as JSON.")] = None,
+) -> None:
+    """The ranked initial pairs, and how each fares at every gate: ours, COLMAP's as set, COLMAP's at its defaults."""
+    from stcal.sfm.gates import limits_text, pairs_json, pairs_table, run_gates
+    from stcal.sfm.saved import load_run
+
+    saved = load_run(run)
+    found = run_gates(saved, group)
+    for name, rows in found.items():
+        images = len({image for row in rows for image in (row.score.first, row.score.second)})
+        print(pairs_table(name, images, rows, len(rows) if everything else SHOWN_PAIRS), end="\n\n")
+    print(limits_text(saved.options.pairs))
+    if out:
+        out.write_text(json.dumps(pairs_json(found), indent=1) + "\n", encoding="utf-8")
+        print(f"as JSON: {out}")
+
+
+@app.command()
+def doctor(
+    run: Run,
+    images: Annotated[
+        Path | None,
+        typer.Option("--images", help="Folder of the photographs, if it is no longer where the run had it."),
+    ] = None,
+    everything: Annotated[bool, typer.Option("--all", help="All lines; the first forty if not given.")] = False,
+    out: Annotated[Path | None, typer.Option("--json", help="Also write all findings as JSON.")] = None,
+    workers: Annotated[
+        int | None, typer.Option("--workers", min=1, help="Processes; one per core if not given.")
+    ] = None,
+) -> None:
+    """Every image and circle left out: the threshold that stopped it, its value there, and what would let it in."""
+    from stcal.sfm import findings
+    from stcal.sfm.doctor import diagnose
+    from stcal.sfm.saved import load_run
+
+    saved = load_run(run)
+    with StageProgress() as progress:
+        diagnosis = diagnose(saved, images, workers, progress)
+    print(findings.table(diagnosis, None if everything else findings.MAX_LINES))
+    if out:
+        out.write_text(json.dumps(findings.to_json(diagnosis), indent=1) + "\n", encoding="utf-8")
+        print(f"as JSON: {out}")

@@ -7,6 +7,7 @@ import numpy as np
 
 from stcal.camera_file import CameraPrior
 from stcal.design import BoardDesign, TargetDesign
+from stcal.errors import MappingError
 from stcal.geometry.camera import Camera
 from stcal.geometry.rigid import Rigid, Similarity
 from stcal.sfm.adjust import adjust
@@ -67,7 +68,10 @@ def calibrate(
         found, missing = faces_of_group(model, scales[model.group].mm_per_unit, camera, target, options.frame)
         faces += found
         notes += missing
-    calibrated = chain_faces(faces, target, options.reference_face)
+    try:
+        calibrated = chain_faces(faces, target, options.reference_face)
+    except MappingError as error:  # a face without a frame may be why
+        raise MappingError("; ".join([str(error), *notes])) from error
     factor = image_sigma_factor(models, camera)
     metric = [_placed(m, scales[m.group], calibrated) for m in models if m.group in calibrated.target_from_group]
     joint = None

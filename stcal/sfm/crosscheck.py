@@ -19,17 +19,23 @@ from stcal.errors import InputError, MappingError
 from stcal.geometry.rigid import Rigid
 from stcal.sfm.calibration import Calibration, calibrate
 from stcal.sfm.chain import CalibratedTarget
-from stcal.sfm.colmap_model import find_models, open_model, read_model
-from stcal.sfm.database import image_ids
+from stcal.sfm.colmap_model import KEYPOINT_TOLERANCE_PX, ReadModel, find_models, open_model, read_model
+from stcal.sfm.database import from_colmap_px, image_ids
 from stcal.sfm.export import export_database
 from stcal.sfm.foreign import faces_from_models
 from stcal.sfm.mapping import labelled_model, pipeline_options, seeded_mapping
-from stcal.sfm.native import NativeColmap, find_colmap, map_natively
+from stcal.sfm.native import NativeColmap, find_colmap, map_natively, require_listable
 from stcal.sfm.refine import refine
 from stcal.sfm.saved import SavedRun
 from stcal.sfm.schema import schema_of_version
 
 MICRO = 1e3
+RENAMED = {
+    "ba_global_images_freq": "ba_global_frames_freq",
+    "ba_global_images_ratio": "ba_global_frames_ratio",
+    "local_ba_min_tri_angle": "ba_local_min_tri_angle",
+}
+"""Thresholds that older versions know by other names than pycolmap."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -41,6 +47,11 @@ class Tolerances:
     circle_um: float = 2.0
     camera_um: float = 20.0
     camera_mdeg: float = 2.0
+
+    def __post_init__(self):
+        for name, value in asdict(self).items():
+            if not 0 <= value < np.inf:
+                raise InputError(f"tolerance {name} {value:g}: a number of 0 or more needed; give another")
 
 
 def crosscheck(
@@ -55,13 +66,15 @@ def crosscheck(
     Raises
     ------
     InputError
-        No native program, or one of a version that no schema is known for.
+        No native program, or one of a version that no schema is known for; a name that it cannot list; a database that
+        is not the run's.
     MappingError
-        The native program fails, hangs, or makes no model of a group.
+        The native program fails, hangs, or makes no model of a group, or none of this database.
     """
     tell = progress or (lambda *_: None)
     native = find_colmap(colmap)
     schema = schema_of_version(native.version)
+    require_listable([image.name for image in run.observations])
     ids = image_ids(run.observations)
     theirs, ours, adjusted = [], [], []
     groups = run.groups()
@@ -69,6 +82,7 @@ def crosscheck(
         folder = Path(scratch)
         export_database(run.database, folder / "native.db", schema)
         export_database(run.database, folder / "ours.db", "4.2")
+        _require_keypoints(run, folder / "ours.db", ids)
         for done, (name, group) in enumerate(groups.items()):
             tell("crosscheck", done, len(groups))
             names = [image.name for image in group]
@@ -76,8 +90,8 @@ def crosscheck(
             place = folder / f"group{done}"
             options = mapper_options(native, names, pair)
             map_natively(native, folder / "native.db", place, names, options, timeout_s)
-            path = _largest(place / "models", name, native)
-            theirs.append(read_model(path, run.observations, ids, run.corrected_px))
+            path, read = _native_model(place / "models", name, native, run, ids)
+            theirs.append(read)
             adjusted.append(_adjusted(path, group, ids, run))
             ours.append(_own(folder, place, names, pair, name, run, ids))
         tell("crosscheck", len(groups), len(groups))
@@ -94,6 +108,7 @@ def mapper_options(native: NativeColmap, names: list[str], pair: tuple[int, int]
     for option in sorted(native.mapper_options):
         prefix, _, key = option.partition(".")
         if prefix == "Mapper":
+            key = RENAMED.get(key, key)
             places = ((own, key), (own.mapper, key), (own.triangulation, key.removeprefix("tri_")))
             value = next((getattr(place, k) for place, k in places if hasattr(place, k)), None)
             if isinstance(value, bool | int | float) and value >= 0:
@@ -107,13 +122,35 @@ def _initial_pair(run: SavedRun, group: str, ids: dict[str, int]) -> tuple[int, 
     return ids[chosen["first"]], ids[chosen["second"]]
 
 
-def _largest(folder: Path, group: str, native: NativeColmap) -> Path:
+def _require_keypoints(run: SavedRun, copy: Path, ids: dict[str, int]) -> None:
+    """The database must hold the keypoints that the labels are of; ``copy`` may be changed."""
+    with pycolmap.Database.open(str(copy)) as opened:
+        names = {image.name: image.image_id for image in opened.read_all_images()}
+        found = {name: opened.read_keypoints(i)[:, :2] for name, i in names.items()} if names == ids else {}
+    for image, expected in zip(run.observations, run.corrected_px, strict=True):
+        xy = found.get(image.name)
+        same = xy is not None and len(xy) == len(expected)
+        if not same or np.abs(from_colmap_px(xy) - expected).max(initial=0.0) > KEYPOINT_TOLERANCE_PX:
+            raise InputError(
+                f"{run.database}: its keypoints of {image.name} are not those of {run.folder / 'labels.csv'}; run again"
+            )
+
+
+def _native_model(folder: Path, group: str, native: NativeColmap, run: SavedRun, ids) -> tuple[Path, ReadModel]:
+    """The largest of the native models, and the same read with labels."""
     try:
-        return max(find_models(folder), key=lambda path: open_model(path).num_reg_images())
+        found = find_models(folder)
     except InputError as error:
         raise MappingError(
             f"group {group}: native COLMAP {native.version} makes no model from the run's initial pair; "
             "see `stcal-sfm pairs` for the gate that stops it"
+        ) from error
+    try:
+        path = max(found, key=lambda each: open_model(each).num_reg_images())
+        return path, read_model(path, run.observations, ids, run.corrected_px)
+    except InputError as error:
+        raise MappingError(
+            f"group {group}: what native COLMAP {native.version} made of the run's database is of no use: {error}"
         ) from error
 
 
@@ -142,7 +179,13 @@ def _comparison(run, native, schema, foreign: Calibration, own: Calibration, aga
         "pycolmap": pycolmap.__version__,
         "schema": schema,
         "tolerances": asdict(tolerances),
-        "images": {"native": _images(foreign), "pycolmap": _images(own), "run": len(run.observations)},
+        "images": {
+            "native": len(_images(foreign)),
+            "pycolmap": len(_images(own)),
+            "run": len(run.observations),
+            "only_native": sorted(_images(foreign) - _images(own)),
+            "only_pycolmap": sorted(_images(own) - _images(foreign)),
+        },
         "residual_rms_px": {"native": _rms_px(foreign, run), "pycolmap": _rms_px(own, run), "run": _run_rms(run)},
         "mapping": {
             "faces": _faces(foreign.target.target_from_face, own.target.target_from_face),
@@ -202,8 +245,8 @@ def _cameras(a: Calibration, b: Calibration) -> list[dict]:
     return sorted(rows, key=lambda row: row["image"])
 
 
-def _images(calibration: Calibration) -> int:
-    return sum(len(model.images) for model in calibration.models)
+def _images(calibration: Calibration) -> set[str]:
+    return {name for model in calibration.models for name in model.images}
 
 
 def _rms_px(calibration: Calibration, run: SavedRun) -> float:
@@ -251,9 +294,11 @@ def comparison_text(check: dict) -> str:
 def _differences(content: dict, tolerances: Tolerances) -> list[str]:
     """Where the two differ by more than is allowed, one clause each."""
     found = []
-    counts = content["images"]
-    if counts["native"] != counts["pycolmap"]:
-        found.append(f"native COLMAP registers {counts['native']} images, pycolmap {counts['pycolmap']}")
+    images = content["images"]
+    for key, who in (("only_native", "native COLMAP"), ("only_pycolmap", "pycolmap")):
+        if images[key]:
+            more = f" and {len(images[key]) - 1} more" if len(images[key]) > 1 else ""
+            found.append(f"image {images[key][0]}{more}: registered by {who} only")
     for key, what in (("mapping", "mapped by both"), ("result", "from the native model against faces.json")):
         for face, row in content[key]["faces"].items():
             if row is None:

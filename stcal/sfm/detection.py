@@ -173,11 +173,14 @@ def _detect_file(
             file.name,
             f"{width}×{height} px, but {size_from} says {camera.width}×{camera.height} px; "
             "use images as the camera took them, or the camera file that belongs to them",
+            "image_size",
+            f"{width}×{height} px",
+            f"{camera.width}×{camera.height} px",
         )
     try:
         detection = detect_image(image, camera, target, board, options)
     except ConvergenceError as error:
-        return Skipped(file.name, str(error))
+        return Skipped(file.name, str(error), "distortion")
     digest, key = _key(data, settings)
     _save(cache / f"{key}.npz", detection, digest, image)
     return key
@@ -245,7 +248,7 @@ def _without_copies(found: list[DetectedImage | Skipped]) -> tuple[list[Detected
         if isinstance(each, Skipped):
             skipped.append(each)
         elif each.digest in first:
-            skipped.append(Skipped(each.file.name, f"the same image as {first[each.digest]}"))
+            skipped.append(Skipped(each.file.name, f"the same image as {first[each.digest]}", "copy"))
         else:
             first[each.digest] = each.file.name
             images.append(each)

@@ -39,10 +39,13 @@ class ImageFile:
 
 @dataclass(frozen=True, slots=True)
 class Skipped:
-    """A file that is not used, and why."""
+    """A file that is not used, and why: its ``value`` is not what ``gate`` asks for, ``limit``."""
 
     name: str
     reason: str
+    gate: str = "readable"
+    value: str | None = None
+    limit: str | None = None
 
 
 def find_images(folder: str | Path) -> tuple[list[ImageFile], list[Skipped]]:
@@ -82,12 +85,14 @@ def _sort_in(path: Path, name: str, group: str, files: list, skipped: list) -> N
         return
     plain = name.encode("utf-8", "backslashreplace").decode()
     if path.is_dir():
-        skipped.append(Skipped(plain, "a folder inside a group; images lie in <group>/ directly"))
+        skipped.append(Skipped(plain, "a folder inside a group; images lie in <group>/ directly", "folder"))
     elif path.suffix.lower() not in SUFFIXES:
-        skipped.append(Skipped(plain, "not an image file"))
+        kinds = ", ".join(SUFFIXES)
+        skipped.append(Skipped(plain, "not an image file", "file_type", path.suffix or "no suffix", kinds))
     elif plain != name or any(ord(c) < 32 for c in name):
         # No file of results could hold such a name.
-        skipped.append(Skipped(repr(plain)[1:-1], "its name is not UTF-8, or holds a control character; rename it"))
+        reason = "its name is not UTF-8, or holds a control character; rename it"
+        skipped.append(Skipped(repr(plain)[1:-1], reason, "file_name"))
     elif not path.is_file():
         skipped.append(Skipped(name, "cannot be read: not a file, or a broken link"))
     else:

@@ -3,9 +3,11 @@
 import contextlib
 import os
 import re
+import selectors
 import shutil
 import signal
 import subprocess
+import time
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -15,6 +17,10 @@ INSTALL = "install it with `sudo apt-get install colmap` (Debian, Ubuntu) or `br
 ASK_SECONDS = 60.0
 """For an answer about itself; loading its libraries takes a second or two."""
 LAST_WORDS = 200
+MAX_OUTPUT = 1 << 20
+"""Bytes kept of what a program prints, the last ones: it may print without end."""
+LOOK_SECONDS = 0.1
+"""Between two looks whether a program that prints nothing has ended."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -32,21 +38,35 @@ def find_colmap(path: Path | None = None) -> NativeColmap:
     Raises
     ------
     InputError
-        There is none, or it is not COLMAP.
-    MappingError
-        It fails or hangs when asked for its version.
+        There is none, it is not COLMAP, or it fails or hangs when asked for its version.
     """
     found = shutil.which("colmap" if path is None else str(path))
     if found is None:
         where = "on the PATH" if path is None else f"at {path} that can be executed"
         raise InputError(f"native COLMAP: no program {where}; {INSTALL}, or give its path with --colmap")
     program = Path(found)
-    text = _run([str(program), "help"], ASK_SECONDS, program)
+    text = _answer(program, "help")
     version = re.search(r"COLMAP\s+v?(\d+\.\d+(?:\.\d+)?)", text)
     if version is None:
         raise InputError(f"native COLMAP: {program} does not say a COLMAP version; {INSTALL}, or give another --colmap")
-    options = re.findall(r"--([\w.]+)", _run([str(program), "mapper", "-h"], ASK_SECONDS, program))
+    options = re.findall(r"--([\w.]+)", _answer(program, "mapper", "-h"))
     return NativeColmap(program, version[1], frozenset(options))
+
+
+def require_listable(names: list[str]) -> None:
+    """Refuse names that do not survive COLMAP's list of images, whose lines are stripped.
+
+    Raises
+    ------
+    InputError
+        A name begins or ends with a space.
+    """
+    for name in names:
+        if name != name.strip(" "):
+            raise InputError(
+                f"image {name!r}: native COLMAP lists images without the spaces at their names' ends and would not "
+                "find it; rename the image or its folder, and run again"
+            )
 
 
 def map_natively(
@@ -73,37 +93,70 @@ def map_natively(
     command = [str(native.program), "mapper"]
     for name, value in (fixed | options).items():
         command += [f"--{name}", str(value)]
-    text = _run(command, timeout_s, native.program)
-    (folder / "mapper.log").write_text(text, encoding="utf-8")
+    code, output = _run(command, timeout_s, TMPDIR=str(folder))  # where it leaves its logs
+    (folder / "mapper.log").write_text(output, encoding="utf-8")
+    what = f"native COLMAP: `{native.program} mapper`"
+    if code is None:
+        raise MappingError(f"{what} still runs after {timeout_s:g} s; raise --timeout, or look at the program")
+    if code != 0:
+        raise MappingError(f"{what} {_end(code, output)}; check the program")
 
 
-def _run(command: list[str], timeout_s: float, program: Path) -> str:
-    """What a command prints; it needs no screen, and takes its children with it when it hangs."""
-    what = f"{program} {command[1]}"
-    environment = os.environ | {"QT_QPA_PLATFORM": "offscreen"}
+def _answer(program: Path, *words: str) -> str:
+    """What the program says of itself."""
+    code, output = _run([str(program), *words], ASK_SECONDS)
+    if code != 0:
+        how = f"does not end in {ASK_SECONDS:g} s" if code is None else _end(code, output)
+        raise InputError(f"native COLMAP: `{program} {' '.join(words)}` {how}; {INSTALL}, or give another --colmap")
+    return output
+
+
+def _end(code: int, output: str) -> str:
+    how = f"ended with code {code}" if code >= 0 else f"was ended by signal {-code}"
+    return f"{how}: {' '.join(output.split())[-LAST_WORDS:] or 'no message'}"
+
+
+def _run(command: list[str], timeout_s: float, **environment: str) -> tuple[int | None, str]:
+    """The exit code, None where the time was over, and the last that a command printed; ``environment`` is added.
+
+    It needs no screen, and nothing that it started outlives it.
+    """
     try:
         process = subprocess.Popen(
             command,
             stdin=subprocess.DEVNULL,
             stdout=subprocess.PIPE,
             stderr=subprocess.STDOUT,
-            env=environment,
+            env=os.environ | {"QT_QPA_PLATFORM": "offscreen"} | environment,
             start_new_session=True,
         )
     except OSError as error:
-        raise InputError(f"native COLMAP: {program} cannot be started ({error.strerror}); {INSTALL}") from error
+        raise InputError(f"native COLMAP: {command[0]} cannot be started ({error.strerror}); {INSTALL}") from error
     try:
-        output = process.communicate(timeout=timeout_s)[0].decode(errors="replace")
-    except subprocess.TimeoutExpired as error:
-        raise MappingError(
-            f"native COLMAP: `{what}` still runs after {timeout_s:g} s; raise --timeout, or look at the program"
-        ) from error
+        output = _listen(process, time.monotonic() + timeout_s)
+        code = process.poll()
     finally:
-        if process.poll() is None:
-            with contextlib.suppress(ProcessLookupError):
-                os.killpg(process.pid, signal.SIGKILL)
-            process.communicate()
-    if process.returncode != 0:
-        words = " ".join(output.split())[-LAST_WORDS:] or "no message"
-        raise MappingError(f"native COLMAP: `{what}` ended with code {process.returncode}: {words}; check the program")
-    return output
+        with contextlib.suppress(ProcessLookupError, PermissionError):  # macOS: not permitted on what has ended
+            os.killpg(process.pid, signal.SIGKILL)
+        process.wait()
+        process.stdout.close()
+    return code, output.decode(errors="replace")
+
+
+def _listen(process: subprocess.Popen, until: float) -> bytes:
+    """The last that a process prints, till it ends or the time is over; a child of it may keep the pipe open."""
+    kept = b""
+    with selectors.DefaultSelector() as selector:
+        selector.register(process.stdout, selectors.EVENT_READ)
+        while (left := until - time.monotonic()) > 0:
+            ended = process.poll() is not None
+            if selector.select(0 if ended else min(left, LOOK_SECONDS)):
+                chunk = os.read(process.stdout.fileno(), 1 << 16)
+                if not chunk:
+                    with contextlib.suppress(subprocess.TimeoutExpired):
+                        process.wait(left)
+                    break
+                kept = (kept + chunk)[-MAX_OUTPUT:]
+            elif ended:
+                break
+    return kept

@@ -10,9 +10,10 @@ from stcal.design import TargetDesign
 from stcal.geometry.plane import fit_plane
 from stcal.sfm.chain import CalibratedTarget
 from stcal.sfm.check import Check
-from stcal.sfm.model import GroupModel
-from stcal.sfm.observations import face_of, is_board
+from stcal.sfm.model import MIN_POINTS, GroupModel
+from stcal.sfm.observations import ImageObservations, face_of, is_board
 from stcal.sfm.options import RunOptions
+from stcal.sfm.resect import MIN_RAY_ANGLE_RAD
 from stcal.sfm.result import RunResult
 
 MICRO = 1e3
@@ -236,28 +237,64 @@ def _by_label(models: dict[str, GroupModel], residual: dict[str, np.ndarray]) ->
 
 def _left_out(result: RunResult) -> dict:
     observed = {(each.observations.name): each for each in result.labelled}
-    mapped = {s.model.group: set(s.model.labels) for s in result.solutions}
-    circles = []
+    images, circles = [], []
     for solution in result.solutions:
+        mapped = set(solution.model.labels)
+        for name, reason in solution.left_out.items():
+            known = len(mapped & set(observed[name].observations.labels))
+            few = known < MIN_POINTS
+            images.append(
+                {
+                    "name": name,
+                    "reason": reason,
+                    "gate": "known_circles" if few else "fitting_circles",
+                    "value": known if few else None,
+                    "limit": MIN_POINTS,
+                }
+            )
         circles += [
             {
                 "image": o.image,
                 "label": o.label,
                 "reason": f"residual {o.residual_px:.3f} px, {o.limit_px:.3f} px allowed: contradicts the other images",
+                "gate": "residual",
+                "value": o.residual_px,
+                "limit": o.limit_px,
+                "unit": "px",
             }
             for o in solution.outliers
         ]
-    for name, each in observed.items():
-        unmapped = [label for label in each.observations.labels if label not in mapped[each.observations.group]]
-        circles += [
-            {"image": name, "label": label, "reason": "seen in one mapped image only; 2 needed"} for label in unmapped
-        ]
+        own = [observed[name].observations for name in solution.model.images]
+        circles += _without_point(solution.model, own, {(o.image, o.label) for o in solution.outliers})
     return {
-        "files": [{"name": s.name, "reason": s.reason} for s in result.detection.skipped],
-        "images": [{"name": name, "reason": reason} for s in result.solutions for name, reason in s.left_out.items()],
+        "files": [asdict(skipped) for skipped in result.detection.skipped],
+        "images": images,
         "circles": circles,
         "notes": [{"image": name, "note": note} for name, each in observed.items() for note in each.notes],
     }
+
+
+def _without_point(model: GroupModel, images: list[ImageObservations], outliers: set[tuple[str, str]]) -> list[dict]:
+    """Circles labelled in mapped images that are no points of the model: seen once, or from one direction."""
+    rays: dict[str, list[tuple[str, np.ndarray]]] = {}
+    for image, pose in zip(images, model.camera_from_world, strict=True):
+        for k in range(len(image)):
+            if image.labels[k] not in model.labels and (image.name, image.labels[k]) not in outliers:
+                ray = pose.rotation.T @ np.append(image.centre[k], 1.0)
+                rays.setdefault(image.labels[k], []).append((image.name, ray / np.linalg.norm(ray)))
+    circles = []
+    for label, own in rays.items():
+        direction = np.array([ray for _, ray in own])
+        angle = float(np.degrees(np.arccos(np.clip(direction @ direction.T, -1, 1)).max()))
+        needed = float(np.degrees(MIN_RAY_ANGLE_RAD))
+        if len(own) == 1:
+            gate = {"gate": "views", "value": 1, "limit": 2, "unit": "images"}
+            reason = "seen in one mapped image only; 2 needed"
+        else:
+            gate = {"gate": "ray_angle", "value": angle, "limit": needed, "unit": "deg"}
+            reason = f"{len(own)} images see it within {angle:.2f}°, {needed:g}° needed; add views from further apart"
+        circles += [{"image": name, "label": label, "reason": reason} | gate for name, _ in own]
+    return circles
 
 
 def _scene(result: RunResult) -> dict:

@@ -1,6 +1,7 @@
 """The main job: from a folder of images to the calibrated target. Each call is a stage; its result is saved."""
 
 import json
+import os
 import shutil
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
@@ -164,6 +165,7 @@ def crosscheck_run(
     saved: SavedRun, colmap: Path | None, tolerances: Tolerances, timeout_s: float, progress: Progress | None = None
 ) -> dict:
     """Cross-check a finished run with the native COLMAP; the comparison is added to its report."""
+    _require_report(saved)  # before minutes of mapping
     check = crosscheck(saved, colmap, tolerances, timeout_s, progress)
     write_report(saved.folder, saved.report | {"crosscheck": check})
     return check
@@ -322,9 +324,29 @@ def _write(result: RunResult, tell: Progress) -> None:
 
 def write_report(out: Path, report: dict) -> None:
     """``report.json`` and ``report.html`` of a run's folder."""
+    page = _report_page(out, report)
     write_bytes(out / "report.json", _json(report))
+    write_bytes(out / "report.html", page)
+
+
+def _report_page(out: Path, report: dict) -> bytes:
     overlays = {name: overlay_path(out, name).read_bytes() for name in shown_overlays(report)}
-    write_bytes(out / "report.html", report_html(report, overlays).encode())
+    return report_html(report, overlays).encode()
+
+
+def _require_report(saved: SavedRun) -> None:
+    """Refuse a run whose report cannot be added to: of another version, without its overlays, or read-only."""
+    try:
+        _report_page(saved.folder, {key: value for key, value in saved.report.items() if key != "crosscheck"})
+    except OSError as error:
+        raise InputError(f"{error.filename}: {error.strerror or error}; the report needs it, run it again") from error
+    except (LookupError, TypeError, ValueError, AttributeError) as error:
+        reason = f"no {error}" if isinstance(error, KeyError) else error
+        raise InputError(
+            f"{saved.folder / 'report.json'}: damaged, or of another version ({reason}); run it again"
+        ) from error
+    if not os.access(saved.folder, os.W_OK):
+        raise InputError(f"run {saved.folder}: cannot be written to, and the comparison goes into its report; copy it")
 
 
 def _corrected_px(models: dict[str, GroupModel], observations: list[ImageObservations]) -> list[np.ndarray]:

@@ -6,9 +6,9 @@ from stcal.sfm.figures import Html, cells, fold, number, table
 from stcal.sfm.observations import face_of
 
 QUESTIONS = {
-    "mapping": "Native against pycolmap, both adjusted by COLMAP",
-    "result": "Native, then our adjustment, against this result",
-    "plain": "Native as it is against this result",
+    "mapping": "Native – pycolmap",
+    "result": "Native, adjusted – result",
+    "plain": "Native – result",
 }
 
 
@@ -25,9 +25,10 @@ def crosscheck_section(check: dict) -> str:
     return (
         f"<p>Native COLMAP {escape(check['native'])} and pycolmap {escape(check['pycolmap'])} on the same database "
         f"(schema {escape(check['schema'])} for the native one), initial pairs and thresholds. {verdict}</p>\n"
-        f"{_models(check)}<h3>Faces</h3>\n<p>Differences in the target frame. Allowed in the first two: "
-        f"{limits['face_um']:g} µm and {limits['face_mdeg']:g} mdeg. The third shows what weights and the "
-        "joint adjustment are worth; nothing is demanded of it.</p>\n"
+        f"{_models(check)}<h3>Faces</h3>\n<p>Differences in the target frame: the two programs' models as COLMAP "
+        "adjusts them; the native models after our own adjustment against this result; and without it. Allowed in the "
+        f"first two: {limits['face_um']:g} µm and {limits['face_mdeg']:g} mdeg; the third shows what weights "
+        "and the joint adjustment are worth.</p>\n"
         f"{_faces(check)}{_circles(check)}{_cameras(check)}{notes}"
     )
 

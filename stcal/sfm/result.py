@@ -20,7 +20,7 @@ from stcal.sfm.solve import GroupSolution
 
 @dataclass(frozen=True, slots=True, eq=False)
 class RunResult:
-    """Everything a run found; ``camera_covariance`` as the camera file states it; ``calibration.target`` is the answer."""
+    """Everything a run found; ``calibration.target`` is the answer, ``camera_covariance`` the camera file's."""
 
     out: Path
     camera: Camera

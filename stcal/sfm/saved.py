@@ -2,6 +2,8 @@
 
 import csv
 import json
+from collections.abc import Collection, Iterator
+from contextlib import contextmanager
 from dataclasses import asdict, dataclass
 from pathlib import Path
 
@@ -10,8 +12,10 @@ import numpy as np
 from stcal.camera_file import read_camera
 from stcal.design import BoardDesign, TargetDesign
 from stcal.design_file import load_board, load_target
-from stcal.errors import InputError
+from stcal.errors import InputError, StcalError
+from stcal.geometry.arrays import frozen
 from stcal.geometry.camera import Camera
+from stcal.geometry.rigid import Rigid
 from stcal.sfm.detect.ellipses import EllipseOptions
 from stcal.sfm.images import RUN_MARKER
 from stcal.sfm.observations import ImageObservations, by_group
@@ -79,13 +83,16 @@ def load_run(folder: str | Path) -> SavedRun:
     marker, faces, report = (_json(folder / name) for name in (RUN_MARKER, "faces.json", "report.json"))
     model = read_camera(folder / CAMERA)
     camera = model.sized(0, 0)
-    try:
-        options, images = _options(marker["options"]), Path(marker["images"])
-        names = [(each["name"], each["group"]) for each in report["images"]]
-    except (KeyError, TypeError) as error:
-        raise InputError(f"run {folder}: of another version ({error}); run it again") from error
-    observations, corrected = _labels(folder / "labels.csv", names, camera)
     target, board = load_target(folder / TARGET), load_board(folder / BOARD)
+    with _as_written(folder / RUN_MARKER):
+        options, images = _options(marker["options"]).settled(target), Path(marker["images"])
+    with _as_written(folder / "report.json"):
+        names = _require_report(report)
+    with _as_written(folder / "faces.json"):
+        _require_faces(faces)
+    with _as_written(folder / "labels.csv"):
+        known = {*target.radius_of(), *board.radius_of()}
+        observations, corrected = _labels(folder / "labels.csv", names, camera, known)
     return SavedRun(
         folder, images, options, camera, model.colmap_model, target, board, observations, corrected, faces, report
     )
@@ -96,46 +103,75 @@ def _options(stored: dict) -> RunOptions:
     return RunOptions(**(stored | {"pairs": pairs, "ellipses": ellipses}))
 
 
+@contextmanager
+def _as_written(path: Path) -> Iterator[None]:
+    """InputError that names the file for whatever is not as a run of this version writes it."""
+    try:
+        yield
+    except (OSError, LookupError, TypeError, ValueError, AttributeError, csv.Error, StcalError) as error:
+        reason = f"no {error}" if isinstance(error, KeyError) else error
+        raise InputError(f"{path}: damaged, or of another version ({reason}); run it again") from error
+
+
 def _json(path: Path) -> dict:
     try:
         content = json.loads(path.read_text(encoding="utf-8"))
-    except (OSError, ValueError) as error:
+    except (OSError, ValueError, RecursionError) as error:
         raise InputError(f"{path}: cannot be read ({error}); run it again") from error
     if not isinstance(content, dict):
         raise InputError(f"{path}: not a JSON object; run it again")
     return content
 
 
-def _labels(path: Path, names: list[tuple[str, str]], camera: Camera):
-    """Observations and corrected centres of ``labels.csv`` for the images (name, group) of the database."""
-    rows: dict[str, list[dict]] = {name: [] for name, _ in names}
-    try:
-        with open(path, encoding="utf-8", newline="") as stream:
-            for row in csv.DictReader(stream):
-                rows[row["image"]].append(row)
-        observations, corrected = [], []
-        for name, group in names:
-            own = rows[name]
-            if [int(row["keypoint"]) for row in own] != list(range(len(own))):
-                raise ValueError(f"image {name}: keypoints are not in the order of the database")
-            xy, xy_corrected = (
-                np.array([[row[f"{kind}x_px"], row[f"{kind}y_px"]] for row in own], float).reshape(-1, 2)
-                for kind in ("", "corrected_")
+def _require_report(report: dict) -> list[tuple[str, str, int]]:
+    """(name, group, circles) of the images in the database's order; what later commands read is there."""
+    names = [(each["name"], each["group"], each["circles"]) for each in report["images"]]
+    pairs = {each["name"]: each["pairs"][0] for each in report["groups"]}
+    for group in {group for _, group, _ in names}:
+        own = {name for name, of, _ in names if of == group}
+        if not {pairs[group]["first"], pairs[group]["second"]} <= own:
+            raise ValueError(f"group {group}: its initial pair is not of its images")
+    float(report["summary"]["residual_rms_px"])
+    return names
+
+
+def _require_faces(faces: dict) -> None:
+    for matrix in faces["target_from_face"].values():
+        Rigid.from_matrix(matrix)
+    for label, xyz in faces["circles"].items():
+        frozen(xyz, (3,), f"circle {label}")
+
+
+def _labels(path: Path, names: list[tuple[str, str, int]], camera: Camera, known: Collection[str]):
+    """Observations and corrected centres of ``labels.csv`` for the images (name, group, circles) of the database."""
+    rows: dict[str, list[dict]] = {name: [] for name, _, _ in names}
+    with open(path, encoding="utf-8", newline="") as stream:
+        for row in csv.DictReader(stream):
+            rows[row["image"]].append(row)
+    observations, corrected = [], []
+    for name, group, circles in names:
+        own = rows[name]
+        if [int(row["keypoint"]) for row in own] != list(range(circles)):
+            raise ValueError(f"image {name}: its keypoints are not 0 to {circles - 1} in the order of the database")
+        labels = tuple(row["label"] for row in own)
+        unknown = [label for label in labels if label not in known]
+        if unknown or len(set(labels)) < len(labels):
+            raise ValueError(f"image {name}: {f'no circle {unknown[0]}' if unknown else 'a label twice'}")
+        columns = ("x_px", "y_px", "corrected_x_px", "corrected_y_px", *COVARIANCE)
+        values = frozen([[row[column] for column in columns] for row in own] or np.zeros((0, 7)), (None, 7), name)
+        covariance = values[:, [4, 5, 5, 6]].reshape(-1, 2, 2)
+        if not ((values[:, 4] > 0) & (np.linalg.det(covariance) > 0)).all():
+            raise ValueError(f"image {name}: a σ that is not positive")
+        observations.append(
+            ImageObservations(
+                name,
+                group,
+                labels,
+                values[:, :2],
+                camera.normalised_from_pixel(values[:, :2]),
+                np.zeros((len(own), 2, 2)),
+                covariance,
             )
-            xx, xy_, yy = (np.array([row[key] for row in own], float) for key in COVARIANCE)
-            observations.append(
-                ImageObservations(
-                    name,
-                    group,
-                    tuple(row["label"] for row in own),
-                    xy,
-                    camera.normalised_from_pixel(xy),
-                    np.zeros((len(own), 2, 2)),
-                    np.stack([xx, xy_, xy_, yy], axis=1).reshape(-1, 2, 2),
-                )
-            )
-            corrected.append(xy_corrected)
-    except (OSError, KeyError, TypeError, ValueError) as error:
-        reason = f"no {error}" if isinstance(error, KeyError) else error
-        raise InputError(f"{path}: cannot be read ({reason}); run it again") from error
+        )
+        corrected.append(values[:, 2:4])
     return tuple(observations), tuple(corrected)

@@ -182,7 +182,7 @@ def _number(candidates: Candidates, cells, board: BoardDesign, image_corners) ->
     uv, index = grid[matched >= 0], matched[matched >= 0]
     if np.linalg.det(homography) < 0:
         uv, homography = uv[:, ::-1], homography[:, [1, 0, 2]]
-    if len(uv) < max(MIN_SHARE * board.rows * board.columns, MIN_SIDE**2):
+    if len(uv) < needed_dots(board):
         return None
     readings = [_place(candidates, uv, index, turn, board, homography, image_corners) for turn in range(4)]
     placements = sorted((p for reading in readings for p in reading), key=lambda p: (p[0], -len(p[1])))
@@ -191,6 +191,11 @@ def _number(candidates: Candidates, cells, board: BoardDesign, image_corners) ->
     fewest = placements[0][0]
     placements = [p for p in placements if p[0] <= fewest + MAX_UNEXPLAINED]
     return _reading(placements, candidates, board)
+
+
+def needed_dots(board: BoardDesign) -> float:
+    """Fewest dots that make a reading of the board."""
+    return max(MIN_SHARE * board.rows * board.columns, MIN_SIDE**2)
 
 
 def _robust_homography(uv, candidates: Candidates, index) -> np.ndarray | None:

@@ -55,6 +55,48 @@ def singular_values(m: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     return np.sqrt(half_trace + root), np.sqrt(np.maximum(half_trace - root, 0))
 
 
+@dataclass(frozen=True, slots=True, eq=False)
+class PatternFit:
+    """The candidate nearest to each of the m circles of a pattern, and how well it fits the prediction.
+
+    ``index`` : (m,); ``radius`` : (m,) predicted, of equal area; ``distance``, ``max_distance`` : (m,) from the
+    predicted place, and what is allowed; ``widest``, ``narrowest``, ``max_stretch`` : (m,) extremes over all
+    directions of the ratio between the predicted and the found ellipse, and how far from 1 they may be (by a factor).
+    """
+
+    index: np.ndarray
+    radius: np.ndarray
+    distance: np.ndarray
+    max_distance: np.ndarray
+    widest: np.ndarray
+    narrowest: np.ndarray
+    max_stretch: np.ndarray
+
+    def in_place(self) -> np.ndarray:
+        """Mask of the circles with a candidate at their place."""
+        return self.distance < self.max_distance
+
+    def fits(self) -> np.ndarray:
+        """Mask of the circles with a candidate of their size and shape at their place."""
+        return self.in_place() & (self.widest < self.max_stretch) & (self.narrowest > 1 / self.max_stretch)
+
+
+def fit_pattern(
+    candidates: Candidates, image_from_plane: np.ndarray, xy_plane: np.ndarray, radius: np.ndarray, slack: float = 1.0
+) -> PatternFit:
+    """Compare a pattern with the candidates nearest to it; arguments as of :func:`match_pattern`."""
+    predicted = apply_homography(image_from_plane, xy_plane)
+    local = homography_jacobian(image_from_plane, xy_plane) * radius[:, None, None]
+    size = np.sqrt(np.abs(np.linalg.det(local)))
+    distance, index = candidates.tree.query(predicted)
+    index = np.where(np.isfinite(distance), index, 0)
+    max_distance = slack * np.maximum(MAX_POSITION_ERROR * size, MAX_POSITION_ERROR_PX * candidates.px)
+    widest, narrowest = singular_values(np.linalg.solve(candidates.shape[index], local))
+    # Blur and pixels widen small ellipses: half a pixel at each end of the minor axis.
+    max_stretch = MAX_AXIS_RATIO * (1 + candidates.px / np.maximum(singular_values(local)[1], candidates.px))
+    return PatternFit(index, size, distance, max_distance, widest, narrowest, max_stretch)
+
+
 def match_pattern(
     candidates: Candidates, image_from_plane: np.ndarray, xy_plane: np.ndarray, radius: np.ndarray, slack: float = 1.0
 ) -> np.ndarray:
@@ -70,19 +112,10 @@ def match_pattern(
     -------
     index : (m,) int, −1 where there is none
     """
-    predicted = apply_homography(image_from_plane, xy_plane)
-    local = homography_jacobian(image_from_plane, xy_plane) * radius[:, None, None]
-    size = np.sqrt(np.abs(np.linalg.det(local)))
-    distance, index = candidates.tree.query(predicted)
-    ok = distance < slack * np.maximum(MAX_POSITION_ERROR * size, MAX_POSITION_ERROR_PX * candidates.px)
-    index = np.where(ok, index, 0)
-    largest, smallest = singular_values(np.linalg.solve(candidates.shape[index], local))
-    # Blur and pixels widen small ellipses: half a pixel at each end of the minor axis.
-    ratio = MAX_AXIS_RATIO * (1 + candidates.px / np.maximum(singular_values(local)[1], candidates.px))
-    ok &= (largest < ratio) & (smallest > 1 / ratio)
-    index = np.where(ok, index, -1)
+    fit = fit_pattern(candidates, image_from_plane, xy_plane, radius, slack)
+    index = np.where(fit.fits(), fit.index, -1)
     # A candidate that two circles claim goes to the nearer one.
-    order = np.lexsort((distance, index))
+    order = np.lexsort((fit.distance, index))
     again = np.flatnonzero((index[order][1:] == index[order][:-1]) & (index[order][1:] >= 0)) + 1
     index[order[again]] = -1
     return index

@@ -1,5 +1,6 @@
 """Candidates: blobs of either polarity whose outline is an ellipse, over a pyramid of scales."""
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 
 import cv2
@@ -31,6 +32,10 @@ MAX_OUTLINE_DEVIATION = 0.025
 """RMS deviation of the outline from the ellipse, in units of its radius (a square has 0.07) …"""
 MAX_OUTLINE_DEVIATION_PX = 0.45
 """… on top of what pixels and noise do to any outline."""
+MAX_AREA_ERROR = 0.15
+"""Largest difference between the areas of the outline and of its ellipse, as a fraction of the latter."""
+MIN_THRESHOLD = 4.0
+"""Grey values, of the 8-bit image."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -79,35 +84,111 @@ class Ellipses:
         return Ellipses(self.centre_px[keep], self.shape_px[keep], self.contrast[keep])
 
 
+@dataclass(frozen=True, slots=True, eq=False)
+class Level:
+    """One level of the pyramid: ``image``, ``scale`` of its pixels in px of the full image, ``lowest`` diameter
+    sought, px of the level."""
+
+    image: np.ndarray
+    scale: float
+    lowest: float
+
+    def in_full(self, rows: list[tuple[float, ...]]) -> np.ndarray:
+        """Ellipses of the level, rows (x, y, full axis 1, full axis 2, angle of axis 1 in degrees), in the image."""
+        table = np.array(rows).reshape(-1, 5)
+        table[:, :2] = table[:, :2] * self.scale + (self.scale - 1) / 2
+        table[:, 2:4] *= self.scale
+        return table
+
+
+@dataclass(frozen=True, slots=True)
+class OutlineGates:
+    """What an outline in one mask must keep to; px of the level, ``shortest`` and ``longest`` in points."""
+
+    width: int
+    height: int
+    lowest: float
+    highest: float
+    min_axis_ratio: float
+    shortest: float
+    longest: float
+
+    def check(self, contour: np.ndarray) -> tuple[str, float, float, tuple[float, ...]]:
+        """(gate, value, limit, ellipse): the first gate that the outline fails, none where it passes all; the ellipse
+        (x, y, full axis 1, full axis 2, angle of axis 1 in degrees) is fitted after the first three."""
+        if len(contour) < self.shortest:
+            return "short", len(contour), self.shortest, ()
+        if len(contour) > self.longest:
+            return "long", len(contour), self.longest, ()
+        x, y, w, h = cv2.boundingRect(contour)
+        if x == 0 or y == 0 or x + w == self.width or y + h == self.height:
+            return "border", 0.0, 1.0, ()
+        (cx, cy), (d1, d2), angle = cv2.fitEllipseDirect(contour)
+        if not np.isfinite(d1 + d2 + cx + cy):
+            return "ellipse", np.nan, np.nan, ()
+        # The outline runs through the centres of the outermost pixels, half a pixel inside the edge.
+        d1, d2 = d1 + 1, d2 + 1
+        row = (cx, cy, d1, d2, angle)
+        if min(d1, d2) < self.min_axis_ratio * max(d1, d2):
+            return "min_axis_ratio", min(d1, d2) / max(d1, d2), self.min_axis_ratio, row
+        diameter = np.sqrt(d1 * d2)
+        if not diameter >= self.lowest:
+            return "min_diameter", diameter, self.lowest, row
+        if not diameter <= self.highest:
+            return "max_diameter", diameter, self.highest, row
+        error = abs(outline_area(contour) / (np.pi / 4 * d1 * d2) - 1)
+        if error > MAX_AREA_ERROR:
+            return "outline_area", error, MAX_AREA_ERROR, row
+        deviation = _outline_deviation(contour[:, 0, :], cx, cy, d1 - 1, d2 - 1, angle)
+        if deviation > 1:
+            return "outline_deviation", deviation, 1.0, row
+        return "", 0.0, 0.0, row
+
+
 def find_ellipses(image: np.ndarray, polarity: Polarity, options: EllipseOptions) -> Ellipses:
     """Blobs of one polarity with an elliptic outline, in an 8-bit grey image; centres good to about 0.1 px."""
-    low, high = np.percentile(image[::8, ::8], [0.5, 99.9])
-    threshold = max(4.0, options.min_contrast * (max(high, 1.0) - low))
-    full, scale, minimum = image, 1.0, options.min_diameter_px
-    if image.size > HALF_SCALE_FROM_PX and (minimum is None or minimum >= MIN_DIAMETER_AT_HALF_SCALE_PX):
-        minimum = minimum or MIN_DIAMETER_AT_HALF_SCALE_PX
-        image, scale = cv2.resize(image, None, fx=0.5, fy=0.5, interpolation=cv2.INTER_AREA), 2.0
-    elif image.size < DOUBLE_SCALE_BELOW_PX:
-        image, scale = cv2.resize(image, None, fx=2, fy=2, interpolation=cv2.INTER_CUBIC), 0.5
-    minimum = minimum or MIN_DIAMETER_PX
-    found = []
-    while True:
-        # Both of the first two levels of a small image look for everything: the coarser one sees less noise.
-        fine = not found or scale <= 1
-        smallest = max(MIN_LEVEL_DIAMETER_PX, minimum / scale) if fine else MIN_COARSE_DIAMETER_PX
-        found.append(_level(image, scale, polarity, threshold, smallest, options))
-        if options.max_diameter_px / scale <= WINDOWS_PX[-1] / WINDOW_OVER_DIAMETER or min(image.shape) < 16:
-            break
-        scale *= 2
-        image = cv2.resize(image, None, fx=0.5, fy=0.5, interpolation=cv2.INTER_AREA)
-    centre, shape = _distinct(np.concatenate(found))
-    contrast = _contrast(full, centre, shape) * (1 if polarity == "bright" else -1)
+    threshold, _ = contrast_threshold(image, options)
+    found = [_rows(level, polarity, threshold, options) for level in levels(image, options)]
+    centre, shape = distinct(np.concatenate(found))
+    contrast = contrast_of(image, polarity, centre, shape)
     keep = contrast > threshold
     return Ellipses(centre[keep], shape[keep], contrast[keep])
 
 
-def _contrast(image: np.ndarray, centre: np.ndarray, shape: np.ndarray) -> np.ndarray:
-    """Median grey value in the middle less the median around, (n,)."""
+def contrast_threshold(image: np.ndarray, options: EllipseOptions) -> tuple[float, float]:
+    """Contrast that a circle must exceed, and the image's grey range that it is a fraction of; grey values."""
+    low, high = np.percentile(image[::8, ::8], [0.5, 99.9])
+    grey_range = max(high, 1.0) - low
+    return max(MIN_THRESHOLD, options.min_contrast * grey_range), grey_range
+
+
+def diameter_limits_px(pixels: int, options: EllipseOptions) -> tuple[float, float]:
+    """Smallest and largest diameter sought in an image of that many pixels."""
+    default = MIN_DIAMETER_AT_HALF_SCALE_PX if pixels > HALF_SCALE_FROM_PX else MIN_DIAMETER_PX
+    return options.min_diameter_px or default, options.max_diameter_px
+
+
+def levels(image: np.ndarray, options: EllipseOptions) -> Iterator[Level]:
+    """The pyramid, finest level first."""
+    scale, minimum = 1.0, diameter_limits_px(image.size, options)[0]
+    if image.size > HALF_SCALE_FROM_PX and minimum >= MIN_DIAMETER_AT_HALF_SCALE_PX:
+        image, scale = cv2.resize(image, None, fx=0.5, fy=0.5, interpolation=cv2.INTER_AREA), 2.0
+    elif image.size < DOUBLE_SCALE_BELOW_PX:
+        image, scale = cv2.resize(image, None, fx=2, fy=2, interpolation=cv2.INTER_CUBIC), 0.5
+    first = True
+    while True:
+        # Both of the first two levels of a small image look for everything: the coarser one sees less noise.
+        fine = first or scale <= 1
+        smallest = max(MIN_LEVEL_DIAMETER_PX, minimum / scale) if fine else MIN_COARSE_DIAMETER_PX
+        yield Level(image, scale, max((options.min_diameter_px or 0) / scale, smallest))
+        if options.max_diameter_px / scale <= WINDOWS_PX[-1] / WINDOW_OVER_DIAMETER or min(image.shape) < 16:
+            return
+        scale, first = 2 * scale, False
+        image = cv2.resize(image, None, fx=0.5, fy=0.5, interpolation=cv2.INTER_AREA)
+
+
+def contrast_of(image: np.ndarray, polarity: Polarity, centre: np.ndarray, shape: np.ndarray) -> np.ndarray:
+    """Median grey value in the middle less the median around, (n,); the other way round for dark circles."""
     angle = np.arange(16) * (np.pi / 8)
     unit = np.column_stack([np.cos(angle), np.sin(angle)])
 
@@ -117,18 +198,16 @@ def _contrast(image: np.ndarray, centre: np.ndarray, shape: np.ndarray) -> np.nd
         x, y = (np.clip(at[..., k], 0, image.shape[1 - k] - 1) for k in range(2))
         return np.median(image[y, x], axis=1) if len(at) else np.zeros(0)
 
-    return sample(0.4, 0.0) - sample(1.25, 2.0)
+    return (sample(0.4, 0.0) - sample(1.25, 2.0)) * (1 if polarity == "bright" else -1)
 
 
-def _level(
-    image, scale: float, polarity: Polarity, threshold: float, smallest: float, options: EllipseOptions
-) -> np.ndarray:
-    """Rows (x, y, full axis 1, full axis 2, angle of axis 1 in degrees) in px of the full image."""
-    smooth = cv2.GaussianBlur(image, (3, 3), 0)
-    lowest = max((options.min_diameter_px or 0) / scale, smallest)
-    rows = []
+def masks(
+    level: Level, polarity: Polarity, threshold: float, options: EllipseOptions
+) -> Iterator[tuple[np.ndarray, OutlineGates]]:
+    """Masks of what stands out in one level, one for each window, with the gates for outlines in them."""
+    smooth = cv2.GaussianBlur(level.image, (3, 3), 0)
     for window in WINDOWS_PX:
-        highest = min(options.max_diameter_px / scale, window / WINDOW_OVER_DIAMETER)
+        highest = min(options.max_diameter_px / level.scale, window / WINDOW_OVER_DIAMETER)
         mean = cv2.blur(smooth, (window, window), borderType=cv2.BORDER_REFLECT)
         difference = cv2.subtract(smooth, mean) if polarity == "bright" else cv2.subtract(mean, smooth)
         # An outline at half the blob's own height neither grows with blur nor runs into a neighbour.
@@ -137,40 +216,30 @@ def _level(
             cv2.compare(difference, threshold, cv2.CMP_GT),
             cv2.compare(difference, cv2.convertScaleAbs(height, alpha=OUTLINE_LEVEL), cv2.CMP_GT),
         )
-        rows += _outlines(mask, lowest, highest, options.min_axis_ratio)
-    table = np.array(rows).reshape(-1, 5)
-    table[:, :2] = table[:, :2] * scale + (scale - 1) / 2
-    table[:, 2:4] *= scale
-    return table
+        shortest, longest = max(6.0, 2 * level.lowest), 4 * highest / np.sqrt(options.min_axis_ratio)
+        yield mask, OutlineGates(*mask.shape[::-1], level.lowest, highest, options.min_axis_ratio, shortest, longest)
 
 
-def _outlines(mask, lowest: float, highest: float, min_axis_ratio: float) -> list[tuple[float, ...]]:
-    height, width = mask.shape
+def outlines(mask: np.ndarray) -> list[np.ndarray]:
+    """Outer outlines in a mask; the rims of holes are none."""
     contours, hierarchy = cv2.findContours(mask, cv2.RETR_CCOMP, cv2.CHAIN_APPROX_NONE)
-    shortest, longest = max(6.0, 2 * lowest), 4 * highest / np.sqrt(min_axis_ratio)
+    return [contours[i] for i in np.flatnonzero(hierarchy[0, :, 3] < 0)] if contours else []
+
+
+def outline_area(contour: np.ndarray) -> float:
+    """Area of the pixels that an outline goes around, the outline's own included."""
+    return cv2.contourArea(contour) + 0.5 * cv2.arcLength(contour, True) + 1
+
+
+def _rows(level: Level, polarity: Polarity, threshold: float, options: EllipseOptions) -> np.ndarray:
+    """Ellipses of one level, as of :meth:`Level.in_full`."""
     rows = []
-    for i, contour in enumerate(contours):
-        if hierarchy[0, i, 3] >= 0:  # the rim of a hole
-            continue
-        if not shortest <= len(contour) <= longest:
-            continue
-        x, y, w, h = cv2.boundingRect(contour)
-        if x == 0 or y == 0 or x + w == width or y + h == height:
-            continue
-        (cx, cy), (d1, d2), angle = cv2.fitEllipseDirect(contour)
-        if not np.isfinite(d1 + d2 + cx + cy):
-            continue
-        # The outline runs through the centres of the outermost pixels, half a pixel inside the edge.
-        d1, d2 = d1 + 1, d2 + 1
-        if min(d1, d2) < min_axis_ratio * max(d1, d2) or not lowest <= np.sqrt(d1 * d2) <= highest:
-            continue
-        area = cv2.contourArea(contour) + 0.5 * cv2.arcLength(contour, True) + 1
-        if abs(area / (np.pi / 4 * d1 * d2) - 1) > 0.15:
-            continue
-        if _outline_deviation(contour[:, 0, :], cx, cy, d1 - 1, d2 - 1, angle) > 1:
-            continue
-        rows.append((cx, cy, d1, d2, angle))
-    return rows
+    for mask, gates in masks(level, polarity, threshold, options):
+        for contour in outlines(mask):
+            gate, _, _, row = gates.check(contour)
+            if not gate:
+                rows.append(row)
+    return level.in_full(rows)
 
 
 def _outline_deviation(points, cx, cy, d1, d2, angle_deg) -> float:
@@ -183,7 +252,7 @@ def _outline_deviation(points, cx, cy, d1, d2, angle_deg) -> float:
     return float(np.sqrt(np.mean((rho - 1) ** 2)) * size / (MAX_OUTLINE_DEVIATION_PX + MAX_OUTLINE_DEVIATION * size))
 
 
-def _distinct(table: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def distinct(table: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Centres and shapes, one of each: rows come finest level first, and the first of those that coincide stays."""
     if not len(table):
         return np.zeros((0, 2)), np.zeros((0, 2, 2))

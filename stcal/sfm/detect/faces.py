@@ -49,13 +49,30 @@ class FaceReading:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
+class RefusedReading:
+    """A reading of the candidates ``used`` that was left out: its ``value`` did not pass the ``limit`` of ``gate``;
+    ``note`` : the same in words."""
+
+    used: np.ndarray
+    gate: str
+    value: float
+    limit: float
+    note: str
+
+
+@dataclass(frozen=True, slots=True, eq=False)
 class FaceFinding:
-    """``faces`` : named with certainty, at most one reading each; ``notes`` : what was seen and left out, and why;
+    """``faces`` : named with certainty, at most one reading each; ``refused`` : what was seen and left out, and why;
     ``repeated`` : ids of faces seen more than once."""
 
     faces: tuple[FaceReading, ...]
-    notes: tuple[str, ...]
+    refused: tuple[RefusedReading, ...]
     repeated: tuple[str, ...]
+
+    @property
+    def notes(self) -> tuple[str, ...]:
+        """What was seen and left out, and why, in words."""
+        return tuple(reading.note for reading in self.refused)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -173,27 +190,25 @@ def _seen_from_outside(homography: np.ndarray, face: FaceDesign) -> bool:
     return np.linalg.det(homography) * depth < 0
 
 
-def _needed(face: FaceDesign) -> int:
+def needed_circles(face: FaceDesign) -> int:
     """Fewest circles that make a reading of the face."""
     return max(len(face.ids) - MAX_HIDDEN, min(MIN_CIRCLES, len(face.ids)))
 
 
 def _decide(readings: list[FaceReading], candidates: Candidates, contrast: float, target: TargetDesign) -> FaceFinding:
     """Keep the readings that explain more than every other reading of the same candidates, and no reflections."""
-    readings = [r for r in readings if r.count() >= _needed(r.face)]
+    readings = [r for r in readings if r.count() >= needed_circles(r.face)]
     readings.sort(key=lambda r: -r.count())
     named: list[FaceReading] = []
-    notes: list[str] = []
+    refused: list[RefusedReading] = []
     own = [float(np.median(candidates.contrast[r.used()])) for r in readings]
     least = max([contrast, *own]) / MAX_CONTRAST_RATIO
     faint: set[int] = set()
     for reading, value in zip(readings, own, strict=True):
         if value < least and not faint & set(reading.used()):
             faint |= set(reading.used())
-            notes.append(
-                f"a pattern like face {reading.face.id}: contrast {value:.0f}, {least:.0f} needed; a reflection, "
-                "left out"
-            )
+            note = f"a pattern like face {reading.face.id}: contrast {value:.0f}, {least:.0f} needed; a reflection, "
+            refused.append(RefusedReading(reading.used(), "face_contrast", value, least, f"{note}left out"))
     readings = [r for r, value in zip(readings, own, strict=True) if value >= least]
     settled: set[int] = set()
     for reading in readings:
@@ -210,12 +225,14 @@ def _decide(readings: list[FaceReading], candidates: Candidates, contrast: float
         ]
         if rivals or not is_named(reading.face, reading.index >= 0, target):
             ids = ", ".join(sorted({r.face.id for r in (reading, *rivals)}))
-            notes.append(
+            note = (
                 f"a pattern of {reading.count()} circles that fits face {ids} but may be another; left out, "
                 "show the circles that tell the faces apart"
             )
+            others = max(len(rivals), 1)
+            refused.append(RefusedReading(reading.used(), "face_readings", others, 0, note))
         else:
             named.append(reading)
     ids = [r.face.id for r in named]
     repeated = tuple(sorted({i for i in ids if ids.count(i) > 1}))
-    return FaceFinding(tuple(r for r in named if r.face.id not in repeated), tuple(notes), repeated)
+    return FaceFinding(tuple(r for r in named if r.face.id not in repeated), tuple(refused), repeated)

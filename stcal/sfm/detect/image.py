@@ -5,13 +5,13 @@ from dataclasses import dataclass, field
 import cv2
 import numpy as np
 
-from stcal.design import BoardDesign, TargetDesign
+from stcal.design import BoardDesign, Polarity, TargetDesign
 from stcal.geometry.camera import Camera
-from stcal.sfm.detect.board import find_boards
+from stcal.sfm.detect.board import BoardReading, find_boards
 from stcal.sfm.detect.candidates import Candidates
 from stcal.sfm.detect.centres import Centres, measure_centres
-from stcal.sfm.detect.ellipses import EllipseOptions, find_ellipses
-from stcal.sfm.detect.faces import MAX_CONTRAST_RATIO, FaceFinder
+from stcal.sfm.detect.ellipses import EllipseOptions, Ellipses, find_ellipses
+from stcal.sfm.detect.faces import MAX_CONTRAST_RATIO, FaceFinder, FaceFinding
 
 SECOND_BOARD_SHARE = 0.8
 """A second board is one with at least this share of the dots of the first."""
@@ -47,19 +47,37 @@ def grey_8bit(image: np.ndarray) -> np.ndarray:
     return cv2.convertScaleAbs(image, alpha=255.0 / _bright_end(image))
 
 
+def grey_fine(image: np.ndarray) -> np.ndarray:
+    """The image in the grey values of :func:`grey_8bit`, not rounded to them."""
+    return image if image.dtype == np.uint8 else image * np.float32(255.0 / _bright_end(image))
+
+
 def _bright_end(image: np.ndarray) -> float:
     return max(float(np.percentile(image[::4, ::4], 99.95)), 255.0)
 
 
-def detect_image(
-    image: np.ndarray, camera: Camera, target: TargetDesign, board: BoardDesign | None, options: EllipseOptions
-) -> ImageDetection:
-    """Find and measure all circles of the target and the board in one grey image of the camera's size."""
-    grey = grey_8bit(image)
+@dataclass(frozen=True, slots=True, eq=False)
+class ImageReading:
+    """What the outlines in one image were read as, before their centres are measured.
+
+    ``found`` : all outlines by polarity; ``board`` : the one board, if any; ``free`` : the target's outlines that are
+    no board's; ``faces`` : what they were read as; ``repeated`` : what is in view more than once.
+    """
+
+    found: dict[Polarity, Ellipses]
+    board: BoardReading | None
+    free: Ellipses
+    faces: FaceFinding
+    repeated: tuple[str, ...]
+
+
+def read_image(
+    grey: np.ndarray, camera: Camera, target: TargetDesign, board: BoardDesign | None, options: EllipseOptions
+) -> ImageReading:
+    """Find the outlines of one polarity or both in an 8-bit image, and the board and the faces among them."""
     found = {
         p: find_ellipses(grey, p, options) for p in {target.polarity, board.polarity if board else target.polarity}
     }
-    notes: list[str] = []
     repeated: list[str] = []
     reading = None
     free = {p: np.ones(len(e), bool) for p, e in found.items()}
@@ -84,32 +102,39 @@ def detect_image(
     bright = 0.0
     if reading is not None and board.polarity == target.polarity:
         bright = float(np.median(found[board.polarity].contrast[reading.candidates]))
-    finding = FaceFinder(target).find(Candidates.of(ellipses, camera), bright)
-    repeated += [f"face {face_id}" for face_id in finding.repeated]
-    notes += finding.notes
+    faces = FaceFinder(target).find(Candidates.of(ellipses, camera), bright)
+    repeated += [f"face {face_id}" for face_id in faces.repeated]
+    return ImageReading(found, reading, ellipses, faces, tuple(repeated))
 
-    scaled = image if image.dtype == np.uint8 else image * np.float32(255.0 / _bright_end(image))
-    labels = [
-        label for face in finding.faces for label, i in zip(face.face.labels(), face.index, strict=True) if i >= 0
-    ]
-    used = np.concatenate([face.used() for face in finding.faces]) if finding.faces else np.zeros(0, int)
-    target_centres = measure_centres(scaled, camera, ellipses.select(used), found[target.polarity])
+
+def detect_image(
+    image: np.ndarray, camera: Camera, target: TargetDesign, board: BoardDesign | None, options: EllipseOptions
+) -> ImageDetection:
+    """Find and measure all circles of the target and the board in one grey image of the camera's size."""
+    reading = read_image(grey_8bit(image), camera, target, board, options)
+    scaled = grey_fine(image)
+    faces = reading.faces.faces
+    notes = list(reading.faces.notes)
+    labels = [label for face in faces for label, i in zip(face.face.labels(), face.index, strict=True) if i >= 0]
+    used = np.concatenate([face.used() for face in faces]) if faces else np.zeros(0, int)
+    target_centres = measure_centres(scaled, camera, reading.free.select(used), reading.found[target.polarity])
     notes += [_rim_note(label, c) for label, c, ok in _rows(labels, target_centres) if not ok]
     kept = np.flatnonzero(target_centres.ok)
     parts = [target_centres.select(kept)]
     numberings = np.zeros((0, 0, 2), int)
-    if reading is not None:
-        dots = measure_centres(scaled, camera, found[board.polarity].select(reading.candidates), found[board.polarity])
+    if reading.board is not None:
+        found = reading.found[board.polarity]
+        dots = measure_centres(scaled, camera, found.select(reading.board.candidates), found)
         notes += [_rim_note("a board dot", rim) for _, rim, ok in _rows(range(len(dots)), dots) if not ok]
         parts.append(dots.select(np.flatnonzero(dots.ok)))
-        numberings = reading.numberings[:, dots.ok]
+        numberings = reading.board.numberings[:, dots.ok]
     return ImageDetection(
         Centres.concatenate(parts),
         tuple(labels[i] for i in kept),
         numberings,
         tuple(notes),
-        tuple(repeated),
-        sum(len(e) for e in found.values()),
+        reading.repeated,
+        sum(len(e) for e in reading.found.values()),
     )
 
 
