@@ -30,12 +30,12 @@ class RunOptions:
     frame: FrameKind | None = None
     eccentricity: bool = True
     reference_face: str | None = None
-    flatness_mm: float | None = 0.02
-    refine_camera: bool = False
     graph: GraphKind | None = None
     pairs: PairOptions = field(default_factory=PairOptions)
     ellipses: EllipseOptions = field(default_factory=EllipseOptions)
     workers: int | None = None
+    flatness_mm: float | None = 0.02
+    refine_camera: bool = False
 
     def settled(self, target: TargetDesign) -> "RunOptions":
         """The same options with every default decided.
@@ -57,4 +57,6 @@ class RunOptions:
         ):
             if value not in choices:
                 raise InputError(f"{what} {value!r}: not a choice; use {' or '.join(choices)}")
+        if chosen.refine_camera and chosen.solve != "joint":
+            raise InputError("--refine-camera: part of the joint adjustment, the solve is chain; use --solve joint")
         return chosen

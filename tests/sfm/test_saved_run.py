@@ -29,6 +29,8 @@ OTHER = RunOptions(
     pairs=PairOptions(max_angle_rad=0.9),
     ellipses=EllipseOptions(min_diameter_px=7.5, max_diameter_px=321.0, min_axis_ratio=0.23, min_contrast=0.07),
     workers=3,
+    flatness_mm=0.3,
+    refine_camera=True,
 )
 """No value is a default."""
 
