@@ -9,7 +9,7 @@ from scipy.linalg import block_diag
 from scipy.spatial.transform import Rotation
 
 from stcal.design import BoardDesign, TargetDesign
-from stcal.errors import StcalError
+from stcal.errors import DegenerateError, StcalError
 from stcal.geometry.plane import fit_plane
 from stcal.geometry.rigid import Rigid, skew
 from stcal.sfm.calibration import Calibration
@@ -45,10 +45,13 @@ class Again:
         StcalError
             The part does not hold the faces.
         """
-        joint = adjust_jointly(models, self.board, self.calibration.camera, self.options.flatness_mm)
         whole = self.calibration.target
         start = replace(whole, reference_face=faces[0], target_from_face={f: whole.target_from_face[f] for f in faces})
-        return calibrated_target(joint, start, self.target, self.options.frame), joint
+        try:
+            joint = adjust_jointly(models, self.board, self.calibration.camera, self.options.flatness_mm)
+            return calibrated_target(joint, start, self.target, self.options.frame), joint
+        except np.linalg.LinAlgError as error:
+            raise DegenerateError(f"{len(models)} groups do not fix the target; add images") from error
 
 
 def _difference(a: Rigid, b: Rigid) -> np.ndarray:
@@ -98,7 +101,11 @@ def groups_check(again: Again) -> Check:
     reference = whole.reference_face
     faces = [reference, *(f for f in whole.target_from_face if f != reference)]
     members = {m.group: {f.face for f in calibration.faces if f.group == m.group} for m in models}
-    spare = [g for g in members if _linked([s for other, s in members.items() if other != g], reference) >= set(faces)]
+    spare = [
+        g
+        for g in members
+        if len(members) > 1 and _linked([s for other, s in members.items() if other != g], reference) >= set(faces)
+    ]
     trials = []
     for group in spare:
         try:

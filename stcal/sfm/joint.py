@@ -12,13 +12,14 @@ import numpy as np
 
 from stcal.camera_file import CameraPrior, intrinsic_basis
 from stcal.design import BoardDesign
-from stcal.errors import ConvergenceError
+from stcal.errors import ConvergenceError, ScaleError
 from stcal.geometry.align import align_rigid
 from stcal.geometry.arrays import frozen
 from stcal.geometry.camera import Camera
 from stcal.geometry.plane import fit_plane
 from stcal.geometry.rigid import Rigid, skew
 from stcal.sfm.blocks import Block, Shared, condense, moved, normalised, robust_weights
+from stcal.sfm.metric import MIN_DOTS
 from stcal.sfm.model import GroupModel
 from stcal.sfm.observations import face_of, is_board
 
@@ -184,6 +185,11 @@ def _block(model: GroupModel, board: BoardDesign, labels: tuple[str, ...]) -> Bl
     place = {label: i for i, label in enumerate(labels)}
     dots = np.array([i for i, label in enumerate(model.labels) if is_board(label)])
     circles = np.array([i for i, label in enumerate(model.labels) if not is_board(label)], int)
+    if len(dots) < MIN_DOTS:
+        raise ScaleError(
+            f"group {model.group}: {len(dots)} board dots in the joint adjustment, {MIN_DOTS} needed; "
+            "photograph the board with the faces"
+        )
     cells = np.array([[int(v) for v in model.labels[i].split(":")[1:]] for i in dots])
     design = np.column_stack([board.pitch_mm * cells[:, ::-1], np.zeros(len(cells))])
     return Block(

@@ -17,7 +17,7 @@ from stcal.camera_file import colmap_params, read_camera, write_cameras_txt
 from stcal.errors import InputError
 from stcal.sfm.export_model import export_model
 
-AGAIN_PX = 2e-5
+AGAIN_PX = 5e-5
 """The eccentricity, settled group by group in ``labels.csv``, is computed again in the joint adjustment: nanometres."""
 FORMATS = ("colmap-bin", "colmap-txt", "ply", "nvm", "bundler")
 
