@@ -87,7 +87,7 @@ def run_checks(evidence: Evidence) -> tuple[Check, ...]:
     return (
         camera_check(networks, evidence.camera, evidence.colmap_model, calibration, evidence.prior),
         field_check(networks, camera),
-        sigma_check(networks, image_sigma_factor([n.model for n in networks], camera)),
+        sigma_check(networks, calibration.sigma_factor),
         *_joint_checks(evidence, networks),
         moved_check(networks),
         image_check(networks),

@@ -127,7 +127,17 @@ def test_a_blurred_image_is_named(full_scene, lab, stated, caught):
         assert checks[key].names == (image.name,)
 
 
-def test_a_moved_target_is_named(full_scene, lab):
+@pytest.mark.parametrize(("over", "verdict"), [(1, "passed"), (3, "suspicious"), (6, "failed")])
+def test_noise_beyond_the_centres_own_sigma_is_said(full_scene, lab, over, verdict):
+    """σ stated too small for all centres alike: no image stands out, and the result's σ are scaled."""
+    images = [replace(i, covariance_px2=i.covariance_px2 / over**2) for i in lab.observe(full_scene, over * NOISE_PX)]
+    check = lab.check(full_scene, images)["centres"]
+    assert check.verdict == verdict
+    assert check.measured[0].value == pytest.approx(over, rel=0.05)  # 3000 degrees of freedom: 1.3 %
+
+
+@pytest.mark.parametrize("solve", ["chain", "joint"])
+def test_a_moved_target_is_named(full_scene, lab, solve):
     """0.2 mm and 0.05° against the board, in half of the images of a group; the others are innocent."""
     motion = Rigid.exp([np.radians(0.05), 0, 0, 0.2, 0, 0])
     group = full_scene.groups["14"]
@@ -140,7 +150,7 @@ def test_a_moved_target_is_named(full_scene, lab):
     moved = lab.observe(replace(full_scene, groups=full_scene.groups | {"14": elsewhere}))
     names = {"14/0", "14/1", "14/2"}
     images = [b if b.name in names else a for a, b in zip(lab.observe(full_scene), moved, strict=True)]
-    check = lab.check(full_scene, images)["moved"]
+    check = lab.check(full_scene, images, solve=solve)["moved"]
     assert check.verdict == "failed"
     assert {name[:3] for name in check.names} == {"14/"}
     assert check.measured[0].value > 80  # µm
