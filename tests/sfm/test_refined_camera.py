@@ -36,9 +36,8 @@ def test_wrong_intrinsics_are_refined():
         observations = observe(scene, NOISE_PX, np.random.default_rng(seed))
         true = scene.camera
         k1 = np.array([0.01 * true.distortion[0], *[0] * 7])
-        wrong = replace(
-            true, focal=1.0003 * true.focal, centre=true.centre + np.array([2, 2]), distortion=true.distortion + k1
-        )
+        centre = true.centre + np.array([2, 2])
+        wrong = replace(true, focal=1.0003 * true.focal, centre=centre, distortion=true.distortion + k1)
         cases = ((true, False), (wrong, True), (wrong, False))
         errors.append([position_error_um(scene, observations, camera, refined) for camera, refined in cases])
     known, refined, held = np.sqrt(np.mean(np.square(errors), axis=0))
