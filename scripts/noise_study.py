@@ -1,6 +1,6 @@
 """Error of the faces against noise, number of views, their spread and the circles' radius, with the Cramér–Rao bound.
 
-.venv/bin/python scripts/noise_study.py [--seeds 20] [--plot noise.png]
+.venv/bin/python scripts/noise_study.py [--seeds 20] [--plot FILE.svg]
 
 Labels are simulated, no pixels: 5184×3456 px, groups and designs as in Zhang & Wei (2017), from the true model. One
 quantity at a time departs from the base (0.01 px, 10 images a group, 40°, the reference radii). σ of a centre falls
@@ -21,6 +21,7 @@ from pathlib import Path
 
 import matplotlib as mpl
 import numpy as np
+from drawing import save
 
 from stcal.design import BoardDesign, TargetDesign, reference_board, reference_target
 from stcal.geometry.rigid import Rigid
@@ -135,7 +136,7 @@ def draw(found: dict[Point, np.ndarray], seeds: int, path: Path) -> None:
     handles, labels = grid[0, 0].get_legend_handles_labels()
     figure.legend(handles[::-1], labels[::-1], loc="outside lower center", ncols=3, frameon=False)
     figure.suptitle(f"Simulated labels, 5184×3456 px, RMS over {seeds} seeds and four faces", fontsize=11)
-    figure.savefig(path, dpi=150)
+    save(figure, path)
 
 
 def _tidy(axes) -> None:
@@ -149,7 +150,7 @@ def main() -> None:
     """Print the table; draw."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--seeds", type=int, default=20, help="runs at each point")
-    parser.add_argument("--plot", type=Path, metavar="FILE.png")
+    parser.add_argument("--plot", type=Path, metavar="FILE", help="draw into FILE.svg or .png")
     given = parser.parse_args()
     found = study(given.seeds)
     print(f"Simulated labels, 5184×3456 px, {given.seeds} runs at each point, RMS over faces 2–5\n")

@@ -1,6 +1,6 @@
 """The experiments of Zhang & Wei (2017) in simulation: five trials on the board (Table 1) and five faces (Table 2).
 
-.venv/bin/python scripts/reproduce_paper.py [--trials 5] [--width 5184] [--keep FOLDER] [--plot paper.png]
+.venv/bin/python scripts/reproduce_paper.py [--trials 5] [--width 5184] [--keep FOLDER] [--plot FILE.svg]
 
 Every trial renders a scene of its own (target, board, camera, noise): four groups of ten photographs. It is solved
 - by the paper's method: centres of the ellipses fitted to thresholded contours, all weighted alike, taken for the
@@ -22,6 +22,7 @@ from pathlib import Path
 import cv2
 import matplotlib as mpl
 import numpy as np
+from drawing import save
 
 from stcal.geometry.align import align_rigid
 from stcal.geometry.rigid import Rigid
@@ -225,7 +226,7 @@ def draw(trials: list[dict[str, Errors]], path: Path, width: int) -> None:
         axes.spines[["top", "right"]].set_visible(False)
         axes.yaxis.set_major_formatter("{x:g}")
     figure.suptitle(f"Simulated photographs, {width} px wide, 10 a group, {len(trials)} trials", fontsize=11)
-    figure.savefig(path, dpi=150)
+    save(figure, path)
 
 
 def main() -> None:
@@ -234,7 +235,7 @@ def main() -> None:
     parser.add_argument("--trials", type=int, default=5)
     parser.add_argument("--width", type=int, default=5184, help="of the images, px")
     parser.add_argument("--keep", type=Path, metavar="FOLDER", help="keep photographs and runs here, or use those")
-    parser.add_argument("--plot", type=Path, metavar="FILE.png")
+    parser.add_argument("--plot", type=Path, metavar="FILE", help="draw into FILE.svg or .png")
     arguments = parser.parse_args()
     trials = []
     with tempfile.TemporaryDirectory() as scratch:

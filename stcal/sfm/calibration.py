@@ -13,7 +13,7 @@ from stcal.geometry.rigid import Rigid, Similarity
 from stcal.sfm.adjust import adjust
 from stcal.sfm.chain import CalibratedTarget, chain_faces
 from stcal.sfm.faces import FaceInGroup, faces_of_group
-from stcal.sfm.joint import JointResult, adjust_jointly
+from stcal.sfm.joint import SETTLED_PX, JointResult, adjust_jointly
 from stcal.sfm.metric import Scale, find_scale
 from stcal.sfm.model import GroupModel
 from stcal.sfm.options import RunOptions
@@ -29,7 +29,7 @@ class Calibration:
     """``target`` is the answer; ``scales`` by group; ``faces`` of the single groups; ``joint`` where it was asked for;
     ``sigma_factor`` : by how much residuals of the single groups exceed the centres' own σ; ``models`` : those that
     the answer rests on, mm, target frame, groups that are not linked to it absent; ``camera`` : as refined where it
-    was, else as given; ``notes`` : faces without a frame, and why."""
+    was, else as given; ``notes`` : faces without a frame, and why; an adjustment that did not settle."""
 
     target: CalibratedTarget
     scales: dict[str, Scale]
@@ -80,12 +80,23 @@ def calibrate(
         calibrated = calibrated_target(joint, calibrated, target, options.frame)
         metric = [m.moved(Similarity(1.0, calibrated.target_from_group[m.group])) for m in joint.models]
         camera = joint.camera
+        notes += _unsettled(joint)
     return Calibration(calibrated, scales, tuple(faces), joint, factor, tuple(metric), camera, tuple(notes))
 
 
 def _placed(model: GroupModel, scale: Scale, start: CalibratedTarget) -> GroupModel:
     """The model in mm in the target frame, by its chain."""
     return model.moved(Similarity(1.0, start.target_from_group[model.group]) @ Similarity(scale.mm_per_unit, Rigid()))
+
+
+def _unsettled(joint: JointResult) -> list[str]:
+    """What is to be said of an adjustment that stopped on the way."""
+    if joint.settled:
+        return []
+    return [
+        f"joint adjustment: not settled, projections still moved by {joint.last_move_px:.1g} px in the last step, less "
+        f"than {SETTLED_PX:g} px needed; look at the checks for what contradicts the rest, take it out and run again"
+    ]
 
 
 def _adjust_all(

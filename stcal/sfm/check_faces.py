@@ -14,8 +14,8 @@ from stcal.geometry.plane import fit_plane
 from stcal.geometry.rigid import Rigid, skew
 from stcal.sfm.calibration import Calibration
 from stcal.sfm.chain import CalibratedTarget, Chain, measure_chains
-from stcal.sfm.check import Check, Trial, impossible, judge
-from stcal.sfm.joint import JointResult, adjust_jointly
+from stcal.sfm.check import Check, Measured, Trial, impossible, judge
+from stcal.sfm.joint import SETTLED_PX, JointResult, adjust_jointly
 from stcal.sfm.model import GroupModel
 from stcal.sfm.network import Network
 from stcal.sfm.options import RunOptions
@@ -190,7 +190,8 @@ def _along(again: Again, way: Chain, steps) -> tuple[Rigid, np.ndarray]:
 
 def agreement_check(calibration: Calibration, networks: Sequence[Network]) -> Check:
     """σ₀ of the joint adjustment: what one target, the board's σ and flat faces add to the residuals of the free
-    networks, against what they should (F test of nested models)."""
+    networks, against what they should (F test of nested models). Suspicious at least where that adjustment has not
+    settled, which is no matter of chance: contradictory observations make its last steps slow."""
     key, title = "agreement", "Groups, board and faces against one another (σ₀)"
     joint = calibration.joint
     free = float(sum(n.redundancy.sum() for n in networks))
@@ -200,7 +201,18 @@ def agreement_check(calibration: Calibration, networks: Sequence[Network]) -> Ch
     value = float(np.sqrt(extra / freedom))
     remedy = "look at the checks of board, groups and flatness: one of their σ is too small, or something moved"
     trial = Trial("all groups", value, "σ", extra, freedom, free)
-    return judge(key, title, [trial], "adjustments", remedy)
+    check = judge(key, title, [trial], "adjustments", remedy)
+    if joint.settled:
+        return check
+    last = Measured("last step", joint.last_move_px, SETTLED_PX, "px", None)
+    return replace(
+        check,
+        verdict="suspicious" if check.verdict == "passed" else check.verdict,
+        reason=f"{check.reason}; not settled, {last.name} at {last.words()}",
+        measured=(*check.measured, last),
+        names=(*check.names, last.name),
+        remedy=remedy,
+    )
 
 
 def flatness_check(networks: Sequence[Network], flatness_mm: float | None) -> Check:

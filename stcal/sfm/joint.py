@@ -28,6 +28,7 @@ MAX_MOVE_PX = 0.02
 """Contradictory observations make the last steps slow; what still moves less than this has an answer for the checks."""
 MAX_HALVINGS = 8
 SETTLED_PX = 1e-7
+"""What moves less has settled; what stops between the two limits is returned, and marked."""
 FREE_DIRECTIONS = 6
 """The world may be anywhere: a rigid motion of everything changes nothing."""
 HUBER = 3.0
@@ -47,7 +48,8 @@ class JointResult:
     ``sigma0``²; ``sigma0`` : residuals against the centres' own σ; ``board_residuals_mm`` by group: (n, 3), board
     frame; ``board_common`` : share of the board's variance that all groups have in common; ``camera`` : adjusted where
     asked, with ``camera_covariance`` (q, q) of the parameters of its COLMAP model, else empty; ``weights`` by group:
-    (n,) Huber's; ``redundancy`` : degrees of freedom.
+    (n,) Huber's; ``redundancy`` : degrees of freedom; ``last_move_px`` : by how much the last whole step moves a
+    projection at most.
     """
 
     models: tuple[GroupModel, ...]
@@ -62,11 +64,17 @@ class JointResult:
     camera_covariance: np.ndarray
     weights: dict[str, np.ndarray]
     redundancy: int
+    last_move_px: float
 
     def __post_init__(self):
         c = len(self.labels)
         object.__setattr__(self, "xyz_world", frozen(self.xyz_world, (c, 3), "circles"))
         object.__setattr__(self, "covariance_mm2", frozen(self.covariance_mm2, (3 * c, 3 * c), "covariance"))
+
+    @property
+    def settled(self) -> bool:
+        """Whether the adjustment ended at its minimum, not merely on the way to it."""
+        return self.last_move_px < SETTLED_PX
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -111,12 +119,12 @@ def adjust_jointly(
     """
     blocks, shared, setting = _start(models, board, camera, flatness_mm, prior, start or camera)
     setting = replace(setting, huber=HUBER * _spread(blocks, shared.camera))
-    blocks, shared = _minimise(blocks, shared, setting)
+    blocks, shared, move = _minimise(blocks, shared, setting)
     common = _common_share(blocks, board)
     if common > 0:
         blocks, setting = _with_common(blocks, setting, common)
-        blocks, shared = _minimise(blocks, shared, setting)
-    return _result(blocks, shared, setting)
+        blocks, shared, move = _minimise(blocks, shared, setting)
+    return _result(blocks, shared, setting, move)
 
 
 def covariance_of(
@@ -134,7 +142,7 @@ def covariance_of(
     blocks, shared, setting = _start(models, board, camera, flatness_mm, prior, camera)
     if common > 0:
         blocks, setting = _with_common(blocks, setting, common)
-    return _result(blocks, shared, setting, 1.0)
+    return _result(blocks, shared, setting, 0.0, 1.0)
 
 
 def _start(models, board: BoardDesign, camera: Camera, flatness_mm, prior: CameraPrior | None, start: Camera):
@@ -156,29 +164,35 @@ def _with_common(blocks: list[Block], setting: _Setting, common: float) -> tuple
     return [replace(b, sigma_mm=own, dot_place=_dot_place(b.model, b.dots, board)) for b in blocks], setting
 
 
-def _minimise(blocks: list[Block], shared: Shared, setting: _Setting) -> tuple[list[Block], Shared]:
-    """Gauss–Newton with step halving."""
+def _minimise(blocks: list[Block], shared: Shared, setting: _Setting) -> tuple[list[Block], Shared, float]:
+    """Gauss–Newton with step halving; and by how much the last whole step moves a projection at most, px."""
     cost = _cost(blocks, shared, setting)
     move = np.inf
     for _ in range(MAX_STEPS):
         normal, right, condensed = _normal_equations(blocks, shared, setting)
         step = _inverse(normal, shared, setting) @ right
-        for halving in range(MAX_HALVINGS):
-            trial, trial_shared = _step(blocks, shared, condensed, step, 0.5**halving, setting)
+        for factor in 0.5 ** np.arange(MAX_HALVINGS):
+            trial, trial_shared = _step(blocks, shared, condensed, step, factor, setting)
             trial_cost = _cost(trial, trial_shared, setting)
-            if trial_cost <= cost * (1 + 1e-9):
+            lower = trial_cost <= cost * (1 + 1e-9)
+            if lower:
                 break
+        # A shortened step moves little wherever it is: whether this is the minimum, only the whole step tells. That
+        # holds too where no length lowers the cost: at a minimum to rounding the whole step is rounding as well, and
+        # where it is not, the derivatives do not describe the cost, and nothing has settled.
         move = max(_largest_move(old, shared, new, trial_shared) for old, new in zip(blocks, trial, strict=True))
-        if trial_cost <= cost * (1 + 1e-9):
-            blocks, shared, cost = trial, trial_shared, trial_cost
-        if move < SETTLED_PX or halving == MAX_HALVINGS - 1:
+        move /= factor
+        if not lower:
             break
-    if move > MAX_MOVE_PX:
+        blocks, shared, cost = trial, trial_shared, trial_cost
+        if move < SETTLED_PX:
+            break
+    if not move <= MAX_MOVE_PX:  # not a number either
         raise ConvergenceError(
-            f"joint adjustment: projections still move by {move:.1g} px after {MAX_STEPS} steps; "
+            f"joint adjustment: projections still move by {move:.1g} px in the last of at most {MAX_STEPS} steps; "
             "compare with --solve chain and look at the outliers"
         )
-    return blocks, shared
+    return blocks, shared, float(move)
 
 
 def _block(model: GroupModel, board: BoardDesign, labels: tuple[str, ...]) -> Block:
@@ -354,8 +368,10 @@ def _largest_move(old: Block, shared: Shared, new: Block, new_shared: Shared) ->
     return float(np.abs(after - before).max(initial=0.0))
 
 
-def _result(blocks: list[Block], shared: Shared, setting: _Setting, sigma0: float | None = None) -> JointResult:
-    """``sigma0`` : estimated from the residuals where None."""
+def _result(
+    blocks: list[Block], shared: Shared, setting: _Setting, move_px: float, sigma0: float | None = None
+) -> JointResult:
+    """``move_px`` : of the last step; ``sigma0`` : estimated from the residuals where None."""
     normal, _, _ = _normal_equations(blocks, shared, setting)
     inverse = _inverse(normal, shared, setting)
     q, c = shared.basis.shape[1], 3 * len(setting.labels)
@@ -379,4 +395,5 @@ def _result(blocks: list[Block], shared: Shared, setting: _Setting, sigma0: floa
         covariance[len(inverse) - q :, len(inverse) - q :],
         {b.model.group: robust_weights(b.model, shared.camera, setting.huber) for b in blocks},
         redundancy,
+        move_px,
     )

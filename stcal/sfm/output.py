@@ -78,6 +78,7 @@ def report_json(result: RunResult) -> dict:
             "scale_sigma_ppm": None if result.target.scale_sigma is None else 1e6 * result.target.scale_sigma,
             "sigma0": result.calibration.joint.sigma0 if result.calibration.joint else None,
             "redundancy": result.calibration.joint.redundancy if result.calibration.joint else None,
+            "last_move_px": result.calibration.joint.last_move_px if result.calibration.joint else None,
         },
         "faces": {face: _face(result, face) for face in result.target.target_from_face},
         "between_faces": _between(result),

@@ -106,7 +106,7 @@ def _result(report: dict) -> str:
     cards = "".join(f"<div><b>{v}</b> {unit}<span>{escape(text)}</span></div>" for v, unit, text in tiles)
     solve = {"joint": "joint: one adjustment over all groups", "chain": "chain: group by group, then combined"}
     frame = {"plane": "plane: Z from the plane of all circles", "three-point": "three-point: from three circles"}
-    left = report["left_out"]
+    left, last = report["left_out"], summary["last_move_px"]
     rows = [
         ["Solve", solve.get(options["solve"], options["solve"])],
         ["Face frames", frame.get(options["frame"], options["frame"])],
@@ -114,6 +114,7 @@ def _result(report: dict) -> str:
         ["Reference face", report["reference_face"]],
         ["Faces not seen", join(summary["faces_not_seen"]) if summary["faces_not_seen"] else "none"],
         ["Centres observed", f"{summary['observations']}, redundancy {summary['redundancy'] or NONE}"],
+        ["Last step of the joint adjustment", NONE if last is None else f"{last:.1g} px"],
         ["Left out", f"{len(left['files'])} files, {len(left['images'])} images, {len(left['circles'])} circles"],
         ["Camera, as given", f"{camera['model']}, {sizes} px"],
         ["Focal lengths (px)", ", ".join(number(v, 4) for v in camera["focal_px"])],
@@ -375,7 +376,7 @@ def _left_out(report: dict) -> str:
         ("Images", ["<Image", "<Reason"], [cells(each, "name reason") for each in left["images"]]),
         ("Circles", ["<Image", "Number", "<Circles", "<Reason"], several),
         ("Notes on images", ["<Image", "<Note"], [cells(each, "image note") for each in left["notes"]]),
-        ("Notes on faces", ["<No.", "<Note"], [[i, note] for i, note in enumerate(report["notes"], 1)]),
+        ("Notes on the whole run", ["<No.", "<Note"], [[i, note] for i, note in enumerate(report["notes"], 1)]),
     ):
         if rows:
             parts.append(f"<h3>{title}</h3>\n{table(columns, rows, css='text')}")

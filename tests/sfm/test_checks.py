@@ -9,9 +9,11 @@ import pytest
 
 from stcal.geometry.conic import circle_conic, ellipse_of_conic
 from stcal.geometry.rigid import Rigid
+from stcal.sfm import joint
 from stcal.sfm.calibration import calibrate
 from stcal.sfm.check import FAILED, SUSPICIOUS, Trial, judge
 from stcal.sfm.checks import Evidence, run_checks
+from stcal.sfm.joint import SETTLED_PX
 from stcal.sfm.options import RunOptions
 from stcal.sfm.pipeline import run
 from stcal.sfm.refine import refine
@@ -52,15 +54,21 @@ class Lab:
     def check(self, scene, images, camera=None, board=None, solve="chain"):
         """All checks by key."""
         camera, board = camera or scene.camera, board or scene.board
-        refined = [refine(m, camera, scene.target, board) for m in self.labels_only.models(scene, images)]
-        options = RunOptions(solve=solve).settled(scene.target)
+        refined, calibration, options = self.calibrate(scene, images, camera, board, solve)
         models = tuple(each.model for each in refined)
-        calibration = calibrate(models, camera, scene.target, board, options)
         outliers = tuple(o for each in refined for o in each.outliers)
         evidence = Evidence(
             models, outliers, tuple(images), camera, "OPENCV", scene.target, board, options, calibration, None, {}
         )
         return {check.key: check for check in run_checks(evidence)}
+
+    def calibrate(self, scene, images, camera=None, board=None, solve="chain"):
+        """Refined groups, their calibration, and its options."""
+        camera, board = camera or scene.camera, board or scene.board
+        refined = [refine(m, camera, scene.target, board) for m in self.labels_only.models(scene, images)]
+        options = RunOptions(solve=solve).settled(scene.target)
+        models = [each.model for each in refined]
+        return refined, calibrate(models, camera, scene.target, board, options), options
 
 
 @pytest.fixture(scope="module")
@@ -154,6 +162,26 @@ def test_a_moved_target_is_named(full_scene, lab, solve):
     assert check.verdict == "failed"
     assert {name[:3] for name in check.names} == {"14/"}
     assert check.measured[0].value > 80  # µm
+
+
+def test_an_adjustment_that_has_not_settled_is_flagged(full_scene, lab, monkeypatch):
+    """One step comes within a hundredth of a pixel of the minimum, which is not at it."""
+    images = lab.observe(full_scene)
+    settled = lab.calibrate(full_scene, images, solve="joint")[1]
+    assert settled.joint.settled
+    assert 0 < settled.joint.last_move_px < SETTLED_PX
+    assert settled.notes == ()
+    monkeypatch.setattr(joint, "MAX_STEPS", 1)
+    monkeypatch.setattr(joint, "HUBER", 1.0)  # a third of the residuals is reweighted: one step is not enough
+    stopped = lab.calibrate(full_scene, images, solve="joint")[1]
+    assert not stopped.joint.settled
+    assert SETTLED_PX < stopped.joint.last_move_px < joint.MAX_MOVE_PX
+    (note,) = stopped.notes
+    assert note.startswith("joint adjustment: not settled")
+    checks = lab.check(full_scene, images, solve="joint")
+    assert checks["agreement"].verdict == "suspicious"
+    assert checks["agreement"].names == ("last step",)
+    assert checks["agreement"].remedy
 
 
 def test_a_circle_out_of_its_plane_is_named(full_scene, lab):

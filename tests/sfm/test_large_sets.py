@@ -202,6 +202,7 @@ def test_2000_images_cost_no_more_each_than_40():
     """Time per image within 3×, database and memory linear: what is quadratic would be 50× here."""
     small, large = measured(40), measured(2000)
     assert large["mapped"] == 2000
+    assert small["not_passed"] == large["not_passed"] == []
     assert large["ms_per_image"] < 3 * small["ms_per_image"]
     assert large["database_mib"] < 3 * 50 * small["database_mib"]
     assert large["memory_mib"] < 1000

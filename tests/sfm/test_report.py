@@ -119,6 +119,7 @@ def make(sigma: bool = True, eccentricity: bool = True) -> dict:
             "sigma_factor": 1.494,
             "sigma0": 0.9312 if sigma else None,
             "redundancy": 17 if sigma else None,
+            "last_move_px": 3.14e-8 if sigma else None,
         },
         "faces": {"1": face(IDENTITY, sigma), "2": face(TURNED, sigma)},
         "between_faces": [{"a": "1", "b": "2", "distance_mm": 161.59991, "distance_sigma_um": 3.2, "angle_deg": 90.0}],
