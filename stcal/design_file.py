@@ -1,27 +1,21 @@
 """``target.toml`` and ``board.toml``: read with every mistake named, and written with comments to edit."""
 
 import json
-import tomllib
 from pathlib import Path
 from typing import Annotated
 
 import numpy as np
-from pydantic import AfterValidator, BaseModel, BeforeValidator, ConfigDict, Field, ValidationError
+from pydantic import AfterValidator, BeforeValidator, Field
 
 from stcal.design import BOARD, BoardDesign, FaceDesign, Polarity, TargetDesign
 from stcal.errors import InputError
+from stcal.toml_file import Finite, Positive, Strict, load_toml
 
+REMEDY = "`stcal-sfm init DIR` writes one"
 MIN_SINE = 0.02
 """Smallest sine of the angle between the X and Y circles as seen from the origin circle."""
 
 
-class _Strict(BaseModel):
-    model_config = ConfigDict(extra="forbid", frozen=True)
-
-
-# strict: a quoted number or a true is a slip of the pen; 1e6 mm: a slip of the unit.
-Positive = Annotated[float, Field(gt=0, le=1e6, allow_inf_nan=False, strict=True)]
-Finite = Annotated[float, Field(ge=-1e6, le=1e6, allow_inf_nan=False, strict=True)]
 Count = Annotated[int, Field(ge=2, le=1000, strict=True)]
 Index = Annotated[int, Field(ge=0, strict=True)]
 Name = Annotated[
@@ -31,14 +25,14 @@ Name = Annotated[
 ]
 
 
-class _CircleFile(_Strict):
+class _CircleFile(Strict):
     id: Name
     x_mm: Finite
     y_mm: Finite
     radius_mm: Positive
 
 
-class _FaceFile(_Strict):
+class _FaceFile(Strict):
     id: Name
     origin: Name
     x: Name
@@ -46,19 +40,19 @@ class _FaceFile(_Strict):
     circles: list[_CircleFile] = Field(min_length=4)
 
 
-class _TargetFile(_Strict):
+class _TargetFile(Strict):
     name: Annotated[str, AfterValidator(lambda v: " ".join(v.split()))] = "target"
     polarity: Polarity
     face: list[_FaceFile] = Field(min_length=1)
 
 
-class _CornerFile(_Strict):
+class _CornerFile(Strict):
     row: Index
     column: Index
     radius_mm: Positive
 
 
-class _BoardFile(_Strict):
+class _BoardFile(Strict):
     rows: Count
     columns: Count
     pitch_mm: Positive
@@ -77,7 +71,7 @@ def load_target(path: str | Path) -> TargetDesign:
         Unknown or missing keys, duplicate ids, overlapping circles, frame circles that are missing, collinear,
         or left-handed; the message names the file and the place.
     """
-    data = _load(path, _TargetFile, "target file")
+    data = load_toml(path, _TargetFile, "target file", REMEDY)
     where = f"target file {path}"
     _no_duplicates([face.id for face in data.face], f"{where}: face id")
     for face in data.face:
@@ -88,7 +82,7 @@ def load_target(path: str | Path) -> TargetDesign:
 
 def load_board(path: str | Path) -> BoardDesign:
     """Read ``board.toml`` (form: ``data_layout.md``); errors as :func:`load_target`."""
-    data = _load(path, _BoardFile, "board file")
+    data = load_toml(path, _BoardFile, "board file", REMEDY)
     where = f"board file {path}"
     if 2 * data.radius_mm >= data.pitch_mm:
         raise InputError(f"{where}: radius {data.radius_mm:g} mm, under half the pitch {data.pitch_mm:g} mm needed")
@@ -112,32 +106,6 @@ def load_board(path: str | Path) -> BoardDesign:
         corner,
         data.corner.radius_mm if data.corner else None,
     )
-
-
-def _load(path: str | Path, model: type[BaseModel], what: str):
-    try:
-        text = Path(path).read_bytes().decode("utf-8-sig")  # Windows editors put a byte-order mark first
-        return model.model_validate(tomllib.loads(text))
-    except OSError as error:
-        raise InputError(f"{what} {path}: {error.strerror or error}; `stcal-sfm init DIR` writes one") from error
-    except ValidationError as error:
-        first = error.errors()[0]
-        place = ".".join(str(part + 1 if isinstance(part, int) else part) for part in first["loc"])
-        place = " ".join(place.split())  # a quoted TOML key may hold a line break
-        if first["type"] == "extra_forbidden":
-            reason = "unknown key; remove it or correct its spelling"
-        elif first["type"] == "missing":
-            reason = "key missing; add it"
-        elif first["type"] == "string_pattern_mismatch":
-            reason = f"{first['input'][:80]!r}: spaces, colons, commas, slashes and line breaks are not allowed"
-        else:
-            shown = repr(first["input"])
-            shown = shown if len(shown) <= 80 else shown[:79] + "…"
-            reason = f"{shown}: {first['msg'][0].lower()}{first['msg'][1:]}"
-        more = f" (and {error.error_count() - 1} more)" if error.error_count() > 1 else ""
-        raise InputError(f"{what} {path}: {place}: {reason}{more}") from error
-    except (ValueError, RecursionError) as error:  # TOMLDecodeError, UnicodeDecodeError, numbers of 5000 digits
-        raise InputError(f"{what} {path}: not valid TOML: {error}") from error
 
 
 def _no_duplicates(ids: list[str], what: str) -> None:

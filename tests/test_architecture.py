@@ -46,7 +46,7 @@ def layer(module: str) -> int:
             return 0
         case ["geometry", *_]:
             return 1
-        case ["design" | "design_file" | "camera_file", *_]:
+        case ["design" | "design_file" | "camera_file" | "toml_file" | "table_file", *_]:
             return 2
         case ["sfm", "pipeline", *_]:
             return 4

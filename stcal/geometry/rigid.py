@@ -1,5 +1,6 @@
 """Rigid and similarity transforms: ``a_from_b @ b_from_c == a_from_c`` and ``xyz_a = a_from_b @ xyz_b``."""
 
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -7,6 +8,9 @@ from scipy.spatial.transform import Rotation
 
 from stcal.errors import InputError
 from stcal.geometry.arrays import frozen
+
+UNIT_WITHIN = 1e-3
+"""A quaternion's length may differ so much from 1: what four printed digits make of it."""
 
 
 def skew(v: np.ndarray) -> np.ndarray:
@@ -80,7 +84,7 @@ class Rigid:
     def __matmul__(self, other):
         if isinstance(other, Rigid):
             return Rigid(self.rotation @ other.rotation, self.rotation @ other.translation + self.translation)
-        if isinstance(other, Similarity):
+        if isinstance(other, Similarity | Poses):
             return NotImplemented
         return np.asarray(other, float) @ self.rotation.T + self.translation
 
@@ -122,3 +126,79 @@ class Similarity:
         if isinstance(other, Rigid):
             return Similarity(1.0, other) @ self
         return NotImplemented
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Poses:
+    """m transforms a_from_b.
+
+    ``rotation`` : (m, 3, 3), proper to 1e-6; ``translation`` : (m, 3), origin of b in a, mm.
+    """
+
+    rotation: np.ndarray
+    translation: np.ndarray
+
+    def __post_init__(self):
+        object.__setattr__(self, "translation", frozen(self.translation, (None, 3), "translations"))
+        object.__setattr__(self, "rotation", frozen(self.rotation, (len(self.translation), 3, 3), "rotations"))
+        r = self.rotation
+        left_handed = np.einsum("mi,mi->m", np.cross(r[:, 0], r[:, 1]), r[:, 2]) < 0
+        if len(r) and (left_handed.any() or np.abs(r @ np.swapaxes(r, 1, 2) - np.eye(3)).max() > 1e-6):
+            raise InputError("rotations: not proper rotation matrices; orthogonal with determinant +1 needed")
+
+    @classmethod
+    def of(cls, transforms: Iterable[Rigid]) -> "Poses":
+        """From single transforms."""
+        transforms = list(transforms)
+        rotation = np.array([t.rotation for t in transforms]).reshape(-1, 3, 3)
+        return cls(rotation, np.array([t.translation for t in transforms]).reshape(-1, 3))
+
+    @classmethod
+    def from_quaternions(cls, wxyz: np.ndarray, translation: np.ndarray) -> "Poses":
+        """From quaternions (m, 4), w first, unit to 1e-3, and translations (m, 3), mm."""
+        wxyz = np.asarray(wxyz, float)
+        off = np.abs(np.linalg.norm(wxyz, axis=1) - 1)
+        if len(off) and off.max() > UNIT_WITHIN:
+            raise InputError(f"quaternion {off.argmax() + 1}: length off 1 by {off.max():.3g}, {UNIT_WITHIN:g} allowed")
+        return cls(Rotation.from_quat(wxyz[:, [1, 2, 3, 0]]).as_matrix(), translation)
+
+    def quaternions(self) -> np.ndarray:
+        """(m, 4), w first and not negative."""
+        return Rotation.from_matrix(np.array(self.rotation)).as_quat(canonical=True)[:, [3, 0, 1, 2]]
+
+    def __len__(self) -> int:
+        return len(self.translation)
+
+    def __getitem__(self, index):
+        """One :class:`Rigid` for an integer, :class:`Poses` for a slice, mask or list."""
+        if np.ndim(index) == 0 and not isinstance(index, slice):
+            return Rigid(self.rotation[index], self.translation[index])
+        return Poses(self.rotation[index], self.translation[index])
+
+    def __iter__(self) -> Iterator[Rigid]:
+        return (self[i] for i in range(len(self)))
+
+    def inverse(self) -> "Poses":
+        """b_from_a."""
+        back = np.swapaxes(self.rotation, 1, 2)
+        return Poses(back, -np.einsum("mij,mj->mi", back, self.translation))
+
+    def __matmul__(self, other):
+        """With :class:`Rigid` or as many :class:`Poses`: a_from_c; with one point (3,) or one for each, (m, 3): (m, 3)."""
+        if isinstance(other, Rigid | Poses):
+            translation = np.einsum(
+                "mij,...j->mi" if other.translation.ndim == 1 else "mij,mj->mi", self.rotation, other.translation
+            )
+            return Poses(self.rotation @ other.rotation, translation + self.translation)
+        points = np.broadcast_to(np.asarray(other, float), self.translation.shape)
+        return np.einsum("mij,mj->mi", self.rotation, points) + self.translation
+
+    def __rmatmul__(self, other):
+        if isinstance(other, Rigid):
+            return Poses(other.rotation @ self.rotation, self.translation @ other.rotation.T + other.translation)
+        return NotImplemented
+
+    def difference(self, other: "Poses") -> np.ndarray:
+        """What leads from ``other`` to these, (m, 6): rotation vector (rad) and translation (mm) in frame a."""
+        turn = self.rotation @ np.swapaxes(other.rotation, 1, 2)
+        return np.hstack([Rotation.from_matrix(turn).as_rotvec(), self.translation - other.translation])

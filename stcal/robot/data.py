@@ -1,0 +1,128 @@
+"""Measured data of robots: joint values with the positions, poses or distances that an instrument saw."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from stcal.errors import InputError
+from stcal.geometry.arrays import frozen
+from stcal.geometry.rigid import Poses
+from stcal.robot.model import Robot
+from stcal.table_file import ANGLES, LENGTHS, Table, read_table
+
+WHAT = "robot data"
+MAX_TURNS = 4
+"""Joint values beyond so many turns are degrees in a column of radians."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Measurements:
+    """What an instrument saw at m joint vectors.
+
+    ``where`` : the file; ``lines`` : (m,) its lines; ``q`` : (m, n) values of the controller, rad or mm; ``targets`` :
+    (m,) names of the reflector or target seen; ``positions`` : (m, 3) mm in the instrument's frame; ``rotations`` :
+    (m, 3, 3) where poses were measured; ``covariance`` : (m, 6, 6) of the poses where known; ``distances`` : (m,) mm,
+    where only these were measured, from the position at row ``from_row``, (m,), from 0. What was not measured is None.
+    """
+
+    where: str
+    lines: Sequence[int]
+    q: np.ndarray
+    targets: tuple[str, ...]
+    positions: np.ndarray | None = None
+    rotations: np.ndarray | None = None
+    covariance: np.ndarray | None = None
+    distances: np.ndarray | None = None
+    from_row: np.ndarray | None = None
+
+    def __post_init__(self):
+        m = len(self.q)
+        object.__setattr__(self, "q", frozen(self.q, (m, None), "joint values"))
+        for name, shape in (("positions", (m, 3)), ("rotations", (m, 3, 3)), ("covariance", (m, 6, 6))):
+            if getattr(self, name) is not None:
+                object.__setattr__(self, name, frozen(getattr(self, name), shape, name))
+        if self.distances is not None:
+            object.__setattr__(self, "distances", frozen(self.distances, (m,), "distances"))
+            object.__setattr__(self, "from_row", frozen(self.from_row, (m,), "rows", int))
+
+    def __len__(self) -> int:
+        return len(self.q)
+
+    def __getitem__(self, index) -> "Measurements":
+        """Rows by a mask, slice or list; not for distances, which refer to one another."""
+        if self.distances is not None:
+            raise InputError(f"{self.where}: distances refer to other rows, so that rows cannot be taken out")
+        rows = np.arange(len(self))[index]
+        return Measurements(
+            self.where,
+            [self.lines[i] for i in rows],
+            self.q[rows],
+            tuple(self.targets[i] for i in rows),
+            *(None if a is None else a[rows] for a in (self.positions, self.rotations, self.covariance)),
+        )
+
+    def poses(self) -> Poses:
+        """world_from_tool as measured."""
+        if self.rotations is None:
+            raise InputError(f"{self.where}: positions without orientation; columns qw, qx, qy, qz needed")
+        return Poses(self.rotations, self.positions)
+
+
+def read_measurements(path: str | Path, robot: Robot) -> Measurements:
+    """Read joint values with positions, poses or distances (form: ``data_layout.md``).
+
+    Raises
+    ------
+    InputError
+        Missing columns, bad rows, joint values of another unit or number than the robot's; the message names the line.
+    """
+    table = read_table(path, WHAT)
+    q = joint_values(table, robot)
+    targets = tuple(table.text("target")) if "target" in table else ("",) * len(table)
+    common = (table.where, table.lines, q, targets)
+    if table.has("x", LENGTHS):
+        positions = table.points()
+        if table.has_rotation():
+            return Measurements(*common, positions, table.poses().rotation, table.pose_covariances())
+        return Measurements(*common, positions)
+    if not table.has("distance", LENGTHS):
+        raise InputError(
+            f"{table.where}: neither x_mm, y_mm, z_mm nor distance_mm; what was measured is needed; "
+            f"the header is {table.header()}"
+        )
+    distances = table.quantity("distance", LENGTHS)
+    return Measurements(*common, distances=distances, from_row=_from_rows(table, distances))
+
+
+def joint_values(table: Table, robot: Robot) -> np.ndarray:
+    """(m, n) of columns ``q1_deg`` … (``_rad``; ``_mm``, ``_m`` for prismatic joints)."""
+    n = len(robot.rows)
+    if any(name.startswith(f"q{n + 1}_") for name in table.columns):
+        raise InputError(
+            f"{table.where}: a column q{n + 1}_…, but robot {robot.name} has {n} joints; give its own file"
+        )
+    columns = []
+    for i, joint in enumerate(robot.joints, 1):
+        units = ANGLES if joint.type == "revolute" else LENGTHS
+        values = table.quantity(f"q{i}", units)
+        far = np.flatnonzero(np.abs(values) > 2 * np.pi * MAX_TURNS)
+        if joint.type == "revolute" and len(far) and table.unit(f"q{i}", units) == "rad":
+            raise InputError(
+                f"{table.where}: line {table.lines[far[0]]}: q{i}_rad is {values[far[0]]:g}, {MAX_TURNS} turns at most; "
+                f"if these are degrees call the column q{i}_deg"
+            )
+        columns.append(values)
+    return np.column_stack(columns)
+
+
+def _from_rows(table: Table, distances: np.ndarray) -> np.ndarray:
+    """Row that each distance starts from: column ``from_row``, counted from 1 as the rows stand; else the first."""
+    if "from_row" not in table:
+        return np.zeros(len(table), int)
+    rows = table.numbers("from_row")
+    for i, row in enumerate(rows):
+        if row != int(row) or not 1 <= row <= len(rows):
+            raise InputError(f"{table.where}: line {table.lines[i]}: from_row is {row:g}, 1 … {len(rows)} needed")
+    return rows.astype(int) - 1

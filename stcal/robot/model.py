@@ -1,0 +1,150 @@
+"""What a robot is: Denavit–Hartenberg rows, joints with limits and coupling, base and tools.
+
+Both conventions and Hayati's extension are one chain: a fixed transform to the frame of each joint, in which the
+joint turns about z or moves along it, and a fixed transform from the last joint to the flange.
+"""
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import Literal
+
+import numpy as np
+
+from stcal.errors import InputError
+from stcal.geometry.arrays import frozen
+from stcal.geometry.rigid import Rigid
+
+Convention = Literal["standard", "modified"]
+JointType = Literal["revolute", "prismatic"]
+
+
+@dataclass(frozen=True, slots=True)
+class DHRow:
+    """One row: ``a``, ``d`` in mm, ``alpha``, ``theta``, Hayati's ``beta`` in rad.
+
+    Standard (Denavit & Hartenberg 1955, Hayati 1983): Rz(θ+q) Tz(d) Tx(a) Rx(α) Ry(β).
+    Modified (Craig 1986): Rx(α) Tx(a) Ry(β) Rz(θ+q) Tz(d), α and a being those before the joint.
+    A prismatic joint adds its value to d.
+    """
+
+    a: float
+    alpha: float
+    d: float
+    theta: float
+    beta: float = 0.0
+
+
+@dataclass(frozen=True, slots=True)
+class Joint:
+    """Type and range of the controller's value, rad or mm; unlimited where none is given."""
+
+    type: JointType = "revolute"
+    lower: float = -np.inf
+    upper: float = np.inf
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Robot:
+    """A serial arm.
+
+    ``rows``, ``joints`` : one for each joint; ``coupling`` : (n, n), kinematic joint values from the controller's;
+    ``world_from_base`` : base in the frame of the measuring instrument; ``tools`` : flange_from_tool by name, ``""``
+    being the one meant where none is named.
+    """
+
+    name: str
+    convention: Convention
+    rows: tuple[DHRow, ...]
+    joints: tuple[Joint, ...]
+    coupling: np.ndarray | None = None
+    world_from_base: Rigid = field(default_factory=Rigid)
+    tools: Mapping[str, Rigid] = field(default_factory=lambda: {"": Rigid()})
+
+    def __post_init__(self):
+        n = len(self.rows)
+        if len(self.joints) != n or n == 0:
+            raise InputError(
+                f"robot {self.name}: {n} rows and {len(self.joints)} joints, one row for each joint needed"
+            )
+        coupling = np.eye(n) if self.coupling is None else self.coupling
+        object.__setattr__(self, "coupling", frozen(coupling, (n, n), f"robot {self.name}: coupling"))
+        if np.linalg.cond(self.coupling) > 1e6:
+            raise InputError(f"robot {self.name}: the coupling matrix cannot be inverted; a regular matrix needed")
+
+    @property
+    def prismatic(self) -> np.ndarray:
+        """(n,) of bool."""
+        return np.array([joint.type == "prismatic" for joint in self.joints])
+
+    def limits(self) -> np.ndarray:
+        """(n, 2) lowest and highest value of the controller, rad or mm."""
+        return np.array([[joint.lower, joint.upper] for joint in self.joints])
+
+    def tool(self, name: str = "") -> Rigid:
+        """flange_from_tool by name."""
+        if name not in self.tools:
+            known = ", ".join(repr(t) for t in self.tools)
+            raise InputError(f"robot {self.name}: no tool {name!r}; there are {known}")
+        return self.tools[name]
+
+    def chain(self) -> "Chain":
+        """The fixed transforms in order."""
+        n = len(self.rows)
+        gaps = [self.world_from_base]
+        for i, row in enumerate(self.rows):
+            if self.convention == "modified":
+                gaps[i] = gaps[i] @ across(row)
+                gaps.append(along(row))
+            else:
+                gaps.append(along(row) @ across(row))
+        rotation, translation = np.array([g.rotation for g in gaps]), np.array([g.translation for g in gaps])
+        return Chain(rotation[:n], translation[:n], gaps[n], self.prismatic, self.coupling)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Chain:
+    """Fixed transforms of a serial arm: everything that calibration changes.
+
+    ``rotation``, ``translation`` : (n, 3, 3), (n, 3) of each joint's frame in the one before (the first: in the world);
+    ``last_from_flange`` : flange in the frame of the last joint; ``prismatic`` : (n,); ``coupling`` : (n, n).
+    Joint values turn about, or move along, z of the joint's frame.
+    """
+
+    rotation: np.ndarray
+    translation: np.ndarray
+    last_from_flange: Rigid
+    prismatic: np.ndarray
+    coupling: np.ndarray
+
+    def __post_init__(self):
+        n = len(self.prismatic)
+        object.__setattr__(self, "rotation", frozen(self.rotation, (n, 3, 3), "chain"))
+        object.__setattr__(self, "translation", frozen(self.translation, (n, 3), "chain"))
+        object.__setattr__(self, "prismatic", frozen(self.prismatic, (n,), "chain", bool))
+        object.__setattr__(self, "coupling", frozen(self.coupling, (n, n), "coupling"))
+
+    def __len__(self) -> int:
+        return len(self.prismatic)
+
+    def gap(self, i: int) -> Rigid:
+        """Frame of joint ``i`` in the one before."""
+        return Rigid(self.rotation[i], self.translation[i])
+
+
+def about_z(angle: float) -> np.ndarray:
+    """(3, 3) rotation about z."""
+    c, s = np.cos(angle), np.sin(angle)
+    return np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
+
+
+def along(row: DHRow) -> Rigid:
+    """Rz(θ) Tz(d)."""
+    return Rigid(about_z(row.theta), [0.0, 0.0, row.d])
+
+
+def across(row: DHRow) -> Rigid:
+    """Tx(a) Rx(α) Ry(β) (the two first commute)."""
+    ca, sa, cb, sb = np.cos(row.alpha), np.sin(row.alpha), np.cos(row.beta), np.sin(row.beta)
+    tilt = np.array([[1.0, 0.0, 0.0], [0.0, ca, -sa], [0.0, sa, ca]])
+    turn = np.array([[cb, 0.0, sb], [0.0, 1.0, 0.0], [-sb, 0.0, cb]])
+    return Rigid(tilt @ turn, [row.a, 0.0, 0.0])

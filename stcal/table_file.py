@@ -1,0 +1,203 @@
+"""CSV files with a header: numbers with their unit in the column's name, every bad row named by its line."""
+
+import csv
+import io
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from stcal.errors import InputError
+from stcal.geometry.rigid import UNIT_WITHIN, Poses, Rigid
+
+LENGTHS = {"mm": 1.0, "m": 1000.0, "um": 1e-3, "cm": 10.0, "in": 25.4}
+ANGLES = {"rad": 1.0, "deg": np.pi / 180}
+QUATERNION = ("qw", "qx", "qy", "qz")
+TWIST = ("rx", "ry", "rz", "x", "y", "z")
+COVARIANCE = tuple(f"cov_{a}_{b}" for i, a in enumerate(TWIST) for b in TWIST[i:])
+"""Upper triangle of a pose covariance, rows first: rotation vector (rad) and translation (mm), left perturbation."""
+POSE = ("x_mm", "y_mm", "z_mm", *QUATERNION)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Table:
+    """Rows of a CSV file. ``lines`` : (m,) line of the file that each row stands on, from 1."""
+
+    where: str
+    columns: dict[str, list[str] | np.ndarray]
+    lines: Sequence[int]
+
+    def __len__(self) -> int:
+        return len(self.lines)
+
+    def __contains__(self, column: str) -> bool:
+        return column in self.columns
+
+    def text(self, column: str) -> list[str]:
+        """A column as it stands, without white space around."""
+        self._need(column)
+        values = self.columns[column]
+        return values if isinstance(values, list) else [f"{v:g}" for v in values]
+
+    def numbers(self, column: str) -> np.ndarray:
+        """(m,) finite numbers."""
+        self._need(column)
+        values = self.columns[column]
+        if not isinstance(values, np.ndarray):
+            try:
+                values = np.array(values, dtype=float)
+            except ValueError:
+                values = np.array([_number(v) for v in values])
+        bad = np.flatnonzero(~np.isfinite(values))
+        if len(bad):
+            shown = self.columns[column][bad[0]]
+            more = f" (and {len(bad) - 1} more)" if len(bad) > 1 else ""
+            raise InputError(
+                f"{self.where}: line {self.lines[bad[0]]}: {column} is {str(shown)!r}, a finite number needed{more}"
+            )
+        return values
+
+    def quantity(self, name: str, units: dict[str, float]) -> np.ndarray:
+        """(m,) of the column ``name_unit``, in mm or rad."""
+        return self.numbers(f"{name}_{self.unit(name, units)}") * units[self.unit(name, units)]
+
+    def unit(self, name: str, units: dict[str, float]) -> str:
+        """In which of the units ``name`` is given."""
+        given = [unit for unit in units if f"{name}_{unit}" in self.columns]
+        if len(given) != 1:
+            wanted = " or ".join(f"{name}_{unit}" for unit in units)
+            found = "no such column" if not given else f"{len(given)} of them"
+            raise InputError(f"{self.where}: {found}, {wanted} needed; the header is {self.header()}")
+        return given[0]
+
+    def has(self, name: str, units: dict[str, float]) -> bool:
+        """Whether there is a column ``name_unit``."""
+        return any(f"{name}_{unit}" in self.columns for unit in units)
+
+    def points(self, prefix: str = "") -> np.ndarray:
+        """(m, 3) mm of ``prefix + x``, ``y``, ``z``."""
+        return np.column_stack([self.quantity(prefix + axis, LENGTHS) for axis in "xyz"])
+
+    def has_rotation(self, prefix: str = "") -> bool:
+        """Whether there are quaternions; an error when only some of their columns are there."""
+        there = [prefix + c for c in QUATERNION if prefix + c in self.columns]
+        if there and len(there) < 4:
+            missing = ", ".join(prefix + c for c in QUATERNION if prefix + c not in self.columns)
+            raise InputError(f"{self.where}: {', '.join(there)} without {missing}; all four or none needed")
+        return bool(there)
+
+    def poses(self, prefix: str = "") -> Poses:
+        """m transforms of ``prefix + x`` … and ``prefix + qw`` …."""
+        self.has_rotation(prefix)
+        wxyz = np.column_stack([self.numbers(prefix + c) for c in QUATERNION])
+        length = np.linalg.norm(wxyz, axis=1)
+        bad = np.flatnonzero(np.abs(length - 1) > UNIT_WITHIN)
+        if len(bad):
+            more = f" (and {len(bad) - 1} more)" if len(bad) > 1 else ""
+            raise InputError(
+                f"{self.where}: line {self.lines[bad[0]]}: quaternion of length {length[bad[0]]:.4g}, "
+                f"1 ± {UNIT_WITHIN:g} needed{more}; is the order qw, qx, qy, qz?"
+            )
+        return Poses.from_quaternions(wxyz, self.points(prefix))
+
+    def pose_covariances(self, prefix: str = "") -> np.ndarray | None:
+        """(m, 6, 6) of the columns :data:`COVARIANCE`; None where there are none.
+
+        Raises
+        ------
+        InputError
+            Some columns only, or a matrix that is not positive definite.
+        """
+        there = [name for name in COVARIANCE if prefix + name in self.columns]
+        if not there:
+            return None
+        if len(there) < len(COVARIANCE):
+            missing = next(prefix + name for name in COVARIANCE if prefix + name not in self.columns)
+            raise InputError(f"{self.where}: {missing} is missing; all {len(COVARIANCE)} columns cov_… or none needed")
+        full = np.zeros((len(self), 6, 6))
+        i, j = np.triu_indices(6)
+        full[:, i, j] = full[:, j, i] = np.column_stack([self.numbers(prefix + name) for name in COVARIANCE])
+        sigma = np.sqrt(np.maximum(np.diagonal(full, axis1=1, axis2=2), 1e-300))
+        lowest = np.linalg.eigvalsh(full / sigma[:, :, None] / sigma[:, None, :])[:, 0]
+        bad = np.flatnonzero(lowest <= 0)
+        if len(bad):
+            raise InputError(
+                f"{self.where}: line {self.lines[bad[0]]}: covariance is not positive definite; correct it"
+            )
+        return full
+
+    def header(self) -> str:
+        """The columns' names, shortened."""
+        text = ",".join(self.columns)
+        return repr(text if len(text) <= 100 else text[:99] + "…")
+
+    def _need(self, column: str) -> None:
+        if column not in self.columns:
+            raise InputError(f"{self.where}: column {column} is missing; the header is {self.header()}")
+
+
+def read_table(path: str | Path, what: str) -> Table:
+    """Read a CSV file with a header line; empty lines and lines that start with ``#`` are passed over.
+
+    Raises
+    ------
+    InputError
+        Unreadable, not UTF-8, no header or no rows, another separator, a name twice, or a row of another length.
+    """
+    where = f"{what} {path}"
+    try:
+        text = Path(path).read_bytes().decode("utf-8-sig")
+    except OSError as error:
+        raise InputError(f"{where}: {error.strerror or error}; check the path") from error
+    except UnicodeDecodeError as error:
+        raise InputError(f"{where}: not UTF-8 text; save it as CSV in UTF-8") from error
+    lines = text.splitlines()
+    used = [(i, line) for i, line in enumerate(lines, 1) if line.strip() and not line.lstrip().startswith("#")]
+    if not used:
+        raise InputError(f"{where}: empty; a header and rows needed")
+    names = [name.strip() for name in next(csv.reader([used[0][1]]))]
+    if len(names) == 1 and any(separator in names[0] for separator in ";\t"):
+        raise InputError(f"{where}: columns separated by ';' or tabs; commas needed, and '.' in numbers")
+    for name in names:
+        if names.count(name) > 1 or not name:
+            shown = name or "without a name"
+            raise InputError(f"{where}: column {shown} occurs {names.count(name)} times; every name once needed")
+    if all(_is_number(name) for name in names):
+        raise InputError(f"{where}: line {used[0][0]} is numbers, a header with names and units needed, like x_mm,y_mm")
+    if len(used) == 1:
+        raise InputError(f"{where}: a header but no rows; rows needed")
+    numbers = [i for i, _ in used[1:]]
+    rows = [line for _, line in used[1:]]
+    try:
+        fast = np.loadtxt(io.StringIO("\n".join(rows)), delimiter=",", ndmin=2, comments=None)
+        if fast.shape == (len(rows), len(names)):
+            return Table(where, {name: fast[:, k] for k, name in enumerate(names)}, numbers)
+    except ValueError:
+        pass  # text among the numbers: row by row
+    cells = list(csv.reader(rows))
+    if len(cells) != len(rows):
+        raise InputError(f"{where}: a quoted cell goes over several lines; one row on one line needed")
+    for line, row in zip(numbers, cells, strict=True):
+        if len(row) != len(names):
+            raise InputError(f"{where}: line {line}: {len(row)} cells, {len(names)} needed as in the header")
+    return Table(where, {n: [row[k].strip() for row in cells] for k, n in enumerate(names)}, numbers)
+
+
+def pose_cells(pose: Rigid, covariance: np.ndarray | None = None) -> list[str]:
+    """Cells of the columns :data:`POSE`, and of :data:`COVARIANCE` where it is given."""
+    values = [*pose.translation, *Poses.of([pose]).quaternions()[0]]
+    if covariance is not None:
+        values += list(covariance[np.triu_indices(6)])
+    return [repr(float(v)) for v in values]
+
+
+def _number(text: str) -> float:
+    try:
+        return float(text)
+    except ValueError:
+        return np.nan
+
+
+def _is_number(text: str) -> bool:
+    return np.isfinite(_number(text))

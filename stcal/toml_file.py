@@ -1,0 +1,55 @@
+"""TOML files against a pydantic model, with every mistake named by file and place."""
+
+import tomllib
+from pathlib import Path
+from typing import Annotated, TypeVar
+
+from pydantic import BaseModel, ConfigDict, Field, ValidationError
+
+from stcal.errors import InputError
+
+M = TypeVar("M", bound=BaseModel)
+
+
+class Strict(BaseModel):
+    """Unknown keys are errors."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True)
+
+
+# strict: a quoted number or a true is a slip of the pen; 1e6 mm: a slip of the unit.
+Positive = Annotated[float, Field(gt=0, le=1e6, allow_inf_nan=False, strict=True)]
+Finite = Annotated[float, Field(ge=-1e6, le=1e6, allow_inf_nan=False, strict=True)]
+
+
+def load_toml(path: str | Path, model: type[M], what: str, remedy: str) -> M:
+    """Read and validate; ``what`` names the kind of file, ``remedy`` what to do when it is not there.
+
+    Raises
+    ------
+    InputError
+        Unreadable, not TOML, or not as ``model`` wants it; the message names file, place and reason.
+    """
+    try:
+        text = Path(path).read_bytes().decode("utf-8-sig")  # Windows editors put a byte-order mark first
+        return model.model_validate(tomllib.loads(text))
+    except OSError as error:
+        raise InputError(f"{what} {path}: {error.strerror or error}; {remedy}") from error
+    except ValidationError as error:
+        first = error.errors()[0]
+        place = ".".join(str(part + 1 if isinstance(part, int) else part) for part in first["loc"])
+        place = " ".join(place.split())  # a quoted TOML key may hold a line break
+        if first["type"] == "extra_forbidden":
+            reason = "unknown key; remove it or correct its spelling"
+        elif first["type"] == "missing":
+            reason = "key missing; add it"
+        elif first["type"] == "string_pattern_mismatch":
+            reason = f"{first['input'][:80]!r}: spaces, colons, commas, slashes and line breaks are not allowed"
+        else:
+            shown = repr(first["input"])
+            shown = shown if len(shown) <= 80 else shown[:79] + "…"
+            reason = f"{shown}: {first['msg'][0].lower()}{first['msg'][1:]}"
+        more = f" (and {error.error_count() - 1} more)" if error.error_count() > 1 else ""
+        raise InputError(f"{what} {path}: {place}: {reason}{more}") from error
+    except (ValueError, RecursionError) as error:  # TOMLDecodeError, UnicodeDecodeError, numbers of 5000 digits
+        raise InputError(f"{what} {path}: not valid TOML: {error}") from error
