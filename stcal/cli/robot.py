@@ -32,9 +32,9 @@ def init(
         raise InputError(f"robot file {file}: exists already; give another name or move it away")
     file.parent.mkdir(parents=True, exist_ok=True)
     comments = (
-        "One [[joint]] for each joint, from the base. Optional: coupling (kinematic joint values from the controller's,",
-        "Fanuc: third row [0, 1, 1, 0, 0, 0]), min_deg, max_deg, beta_deg, base, tool, and [[target]] for more tools.",
-        'Joints with type = "prismatic" have min_mm and max_mm.',
+        "One [[joint]] for each joint, from the base; of type revolute or prismatic (then min_mm and max_mm).",
+        "Optional: min_deg, max_deg, beta_deg, base, tool, [[target]] for more tools, and coupling, which makes",
+        "kinematic joint values of the controller's (Fanuc: its third row is [0, 1, 1, 0, 0, 0]).",
     )
     file.write_text(robot_toml(mh80(), comments), encoding="utf-8")
     print(f"written: {file}")

@@ -184,7 +184,7 @@ class Poses:
         return Poses(back, -np.einsum("mij,mj->mi", back, self.translation))
 
     def __matmul__(self, other):
-        """With :class:`Rigid` or as many :class:`Poses`: a_from_c; with one point (3,) or one for each, (m, 3): (m, 3)."""
+        """With :class:`Rigid` or as many :class:`Poses`: a_from_c; with one point (3,) or m: (m, 3)."""
         if isinstance(other, Rigid | Poses):
             translation = np.einsum(
                 "mij,...j->mi" if other.translation.ndim == 1 else "mij,mj->mi", self.rotation, other.translation

@@ -110,7 +110,7 @@ def joint_values(table: Table, robot: Robot) -> np.ndarray:
         far = np.flatnonzero(np.abs(values) > 2 * np.pi * MAX_TURNS)
         if joint.type == "revolute" and len(far) and table.unit(f"q{i}", units) == "rad":
             raise InputError(
-                f"{table.where}: line {table.lines[far[0]]}: q{i}_rad is {values[far[0]]:g}, {MAX_TURNS} turns at most; "
+                f"{table.where}: line {table.lines[far[0]]}: q{i}_rad is {values[far[0]]:g}, over {MAX_TURNS} turns; "
                 f"if these are degrees call the column q{i}_deg"
             )
         columns.append(values)

@@ -17,7 +17,7 @@ SAME_AXIS_MM = 1e-10
 def robot_from_chain(chain: Chain, tools: Mapping[str, Rigid], nominal: Robot) -> Robot:
     """The robot whose rows, base and tools make the same poses as ``chain`` with ``tools`` (flange_from_tool).
 
-    What a chain does not determine is kept from ``nominal``: θ and d of the first row (the base may turn about and slide
+    What a chain does not determine is kept from ``nominal``: θ and d of the first row (the base may turn and slide
     along the first axis) and the whole part of the last row after its joint (the tools may do so along the last), a and
     d of a prismatic joint, d of a row with β.
     """
@@ -56,7 +56,7 @@ def robot_from_chain(chain: Chain, tools: Mapping[str, Rigid], nominal: Robot) -
 
 
 def _row_between(gap: Rigid, nominal: DHRow, to_prismatic: bool) -> DHRow:
-    """θ, d of the joint before and a, α, β up to the next axis, where ``gap`` ends up to what that joint lets through."""
+    """θ, d of the joint before and a, α, β up to the next axis, ``gap`` being known up to what that lets through."""
     z, place = gap.rotation[:, 2], gap.translation
     sine = float(np.hypot(z[0], z[1]))
     parallel = sine < np.sin(PARALLEL_RAD)

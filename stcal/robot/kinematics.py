@@ -70,7 +70,7 @@ def joint_frames(chain: Chain, q: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _walk(chain: Chain, q: np.ndarray, visit=None) -> tuple[np.ndarray, np.ndarray]:
-    """Axes (3 axes, 3 components, m) and origin (3, m) after the last joint; ``visit`` sees each frame before it moves."""
+    """Axes (3 axes, 3 components, m) and origin (3, m) after the last joint; ``visit`` sees each frame unmoved."""
     m = len(q)
     axes = np.repeat(np.eye(3)[:, :, None], m, axis=2)
     origin = np.zeros((3, m))

@@ -4,8 +4,9 @@ import base64
 import math
 from html import escape
 
+from stcal.page import NONE, Html, cells, fold, join, number, page, plot, swatch, table
 from stcal.sfm import figures
-from stcal.sfm.figures import NONE, PAGE, STYLE, Html, cells, fold, join, legend, number, plot, swatch, table
+from stcal.sfm.figures import legend
 from stcal.sfm.observations import face_of, is_board
 from stcal.sfm.report_checks import checks_section
 from stcal.sfm.report_crosscheck import crosscheck_section
@@ -37,10 +38,7 @@ def report_html(report: dict, overlays: dict[str, bytes]) -> str:
         *([("crosscheck", "Cross-check", crosscheck_section(report["crosscheck"]))] if "crosscheck" in report else []),
         ("overlays", "Overlays", _overlays(report, overlays)),
     ]
-    links = "".join(f'<li><a href="#{key}">{title}</a></li>' for key, title, _ in sections)
-    body = "".join(f'<section id="{key}"><h2>{title}</h2>\n{content}</section>\n' for key, title, content in sections)
-    name = escape(report["target"])
-    return PAGE.format(title=name, style=STYLE, banner=_banner(report), links=links, body=body)
+    return page(f"{report['target']}: calibration report", _banner(report), sections)
 
 
 def _size_mm(report: dict) -> float:

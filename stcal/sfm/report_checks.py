@@ -2,7 +2,7 @@
 
 from html import escape
 
-from stcal.sfm.figures import NONE, Html, fold, number, table
+from stcal.page import NONE, Html, fold, number, table
 
 COLOURS = {"passed": "#1b7837", "suspicious": "#b26a00", "failed": "#b3261e", "not possible": "#556270"}
 ORDER = ("failed", "suspicious", "passed", "not possible")

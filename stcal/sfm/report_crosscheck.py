@@ -2,7 +2,7 @@
 
 from html import escape
 
-from stcal.sfm.figures import Html, cells, fold, number, table
+from stcal.page import Html, cells, fold, number, table
 from stcal.sfm.observations import face_of
 
 QUESTIONS = {

@@ -8,7 +8,7 @@ from html.parser import HTMLParser
 
 import pytest
 
-from stcal.sfm import figures
+from stcal.page import Html, number, round_below, table
 from stcal.sfm.report import FIRST_IMAGES, report_html, shown_overlays
 
 NASTY = 'a/<script>alert("1")</script>&$_.jpg'
@@ -343,18 +343,18 @@ def test_odd_names_of_faces_and_groups_are_drawn():
     ],
 )
 def test_number(value, digits, text):
-    assert figures.number(value, digits) == text
+    assert number(value, digits) == text
 
 
 @pytest.mark.parametrize(
     ("value", "below"), [(7.3, 5), (5.0, 5), (0.0299, 0.02), (1.0, 1), (3000, 2000), (0.0, 1), (float("nan"), 1)]
 )
 def test_round_below(value, below):
-    assert figures.round_below(value) == pytest.approx(below)
+    assert round_below(value) == pytest.approx(below)
 
 
 def test_table_escapes_all_but_markup():
-    page = figures.table(["<Name", "x < y (mm)"], [["<b>", figures.Html("<i>1</i>")]])
+    page = table(["<Name", "x < y (mm)"], [["<b>", Html("<i>1</i>")]])
     assert '<th scope="row" class="l">&lt;b&gt;</th><td><i>1</i></td>' in page
     assert '<th scope="col">x &lt; y (mm)</th>' in page
 
