@@ -6,7 +6,7 @@ from typing import NoReturn
 import typer
 
 import stcal
-from stcal.cli import camera, capture, colmap, robot, sfm
+from stcal.cli import camera, capture, colmap, measure, robot, sfm
 from stcal.errors import StcalError
 
 INTERRUPTED = 130
@@ -23,6 +23,7 @@ app = typer.Typer(
 sfm.app.add_typer(colmap.app)
 sfm.app.add_typer(capture.app)
 sfm.app.add_typer(camera.app)
+sfm.app.add_typer(measure.app)
 app.add_typer(sfm.app, name="sfm")
 app.add_typer(robot.app, name="robot")
 

@@ -1,5 +1,9 @@
 """``stcal robot``: kinematics from measured data, and joint values that reach what was commanded."""
 
+import json
+import math
+import os
+from enum import StrEnum
 from pathlib import Path
 from typing import Annotated
 
@@ -38,3 +42,205 @@ def init(
     )
     file.write_text(robot_toml(mh80(), comments), encoding="utf-8")
     print(f"written: {file}")
+
+
+@app.command()
+def axes(
+    sweeps: Annotated[Path, typer.Argument(help="Joint values and positions of reflectors in sweeps (CSV).")],
+    robot_file: RobotFile,
+    out: Annotated[Path | None, typer.Option("--out", help="The robot that the axes make (TOML).")] = None,
+    still_deg: Annotated[
+        float, typer.Option(min=1e-9, max=1.0, help="Joints that change by less than this stand still.")
+    ] = 0.0015,
+    json_file: JsonFile = None,
+    report: ReportFile = None,
+) -> None:
+    """The axis method: each joint's axis from sweeps of that joint alone, and the robot that follows."""
+    from stcal.robot.axes_model import robot_from_sweeps
+    from stcal.robot.axes_report import axes_json, axes_page, axes_text
+    from stcal.robot.data import read_measurements
+    from stcal.robot.robot_file import load_robot, robot_toml
+
+    nominal = load_robot(robot_file)
+    data = read_measurements(sweeps, nominal)
+    result = robot_from_sweeps(data, nominal, math.radians(still_deg))
+    print(axes_text(result))
+    for note in result.notes:
+        print(f"warning: {data.where}: {note}")
+    if out:
+        _save(out, robot_toml(result.robot, [f"Identified by the axis method from {sweeps.name}."]))
+    _save_json(json_file, axes_json(result))
+    if report:
+        _save(report, axes_page(result, data.where))
+
+
+class Kind(StrEnum):
+    """What is taken of the measurements."""
+
+    pose = "pose"
+    position = "position"
+    distance = "distance"
+
+
+@app.command()
+def identify(
+    data_file: Annotated[Path, typer.Argument(metavar="DATA", help="Joint values with what was measured there (CSV).")],
+    robot_file: RobotFile,
+    out: Annotated[Path | None, typer.Option("--out", help="The identified robot (TOML).")] = None,
+    observe: Annotated[Kind | None, typer.Option(help="What to use; the most that was measured if not given.")] = None,
+    sigma_mm: Annotated[float | None, typer.Option("--sigma-mm", min=1e-9, help="σ of a position's coordinate.")] = None,
+    sigma_rad: Annotated[
+        float | None, typer.Option("--sigma-rad", min=1e-12, help="σ of an orientation's coordinate.")
+    ] = None,
+    folds: Annotated[int, typer.Option(min=0, help="Of the cross-validation; 0 for none.")] = 6,
+    seed: Annotated[int, typer.Option(min=0, help="Of its divisions.")] = 0,
+    robust: Annotated[bool, typer.Option("--robust/--least-squares", help="Whether outliers weigh less.")] = True,
+    partial: Annotated[
+        bool, typer.Option("--partial", help="Keep nominal what the data leave open, in place of refusing them.")
+    ] = False,
+    json_file: JsonFile = None,
+    report: ReportFile = None,
+) -> None:
+    """Identify the kinematics from poses, positions or distances; σ not given are estimated."""
+    from stcal.robot.data import read_measurements
+    from stcal.robot.identify import IdentifyOptions
+    from stcal.robot.identify import identify as identified_from
+    from stcal.robot.identify_report import identified_json, identified_page, identified_text
+    from stcal.robot.robot_file import load_robot, robot_toml
+
+    nominal = load_robot(robot_file)
+    data = read_measurements(data_file, nominal)
+    kind = observe.value if observe else None
+    options = IdentifyOptions(kind, sigma_mm, sigma_rad, robust, folds, seed=seed, partial=partial)
+    result = identified_from(nominal, data, options)
+    print(identified_text(result, nominal))
+    if out:
+        _save(out, robot_toml(result.robot, [f"Identified from {data_file.name}: {result.rank} parameters."]))
+    _save_json(json_file, identified_json(result, nominal))
+    if report:
+        _save(report, identified_page(result, nominal))
+
+
+@app.command()
+def compensate(
+    targets: Annotated[Path, typer.Argument(help="Commanded poses or joint values (CSV).")],
+    robot_file: Annotated[Path, typer.Option("--robot", help="The identified robot (TOML).")],
+    nominal: Annotated[
+        Path | None, typer.Option("--nominal", help="The robot as its controller believes it to be (TOML).")
+    ] = None,
+    out: Annotated[
+        Path | None, typer.Option("--out", help="Joint values to send, with status and errors (CSV).")
+    ] = None,
+    json_file: JsonFile = None,
+    report: ReportFile = None,
+) -> None:
+    """Joint values that really reach commanded poses, beside the nominal ones."""
+    from stcal.robot import compensate as stage
+    from stcal.robot.robot_file import load_robot
+
+    identified = load_robot(robot_file)
+    wanted = stage.read_targets(targets, identified)
+    result = stage.compensate(identified, wanted, load_robot(nominal) if nominal else None)
+    print(stage.compensated_text(result, identified))
+    for line in stage.compensated_summary(result):
+        print(line)
+    for note in result.notes():
+        print(f"warning: {wanted.where}: {note}")
+    if out:
+        _save(out, stage.compensated_csv(result, identified))
+    _save_json(json_file, stage.compensated_json(result, identified))
+    if report:
+        from stcal.robot.use_report import compensation_page
+
+        _save(report, compensation_page(result, identified))
+
+
+@app.command()
+def verify(
+    measured: Annotated[
+        Path, typer.Argument(help="commanded_x_mm … beside measured x_mm …; set: before, after (CSV).")
+    ],
+    plot: Annotated[Path | None, typer.Option("--plot", help="Error of each pose and set (.png or .svg).")] = None,
+    json_file: JsonFile = None,
+    report: ReportFile = None,
+) -> None:
+    """Distances of measured positions from the first, against the commanded ones; sets before and after compared."""
+    from stcal.robot import verify as stage
+
+    if plot and plot.suffix.lower() not in (".png", ".svg"):
+        raise InputError(f"--plot {plot}: a name ending in .png or .svg needed")
+    result = stage.verify(stage.read_measured(measured))
+    print(stage.verified_text(result))
+    for warning in result.warnings():
+        print(f"warning: {warning}")
+    if plot:
+        from stcal.robot.use_report import figure_bytes, verification_figure
+
+        _save(plot, figure_bytes(verification_figure(result), plot.suffix.lower()[1:]))
+    _save_json(json_file, stage.verified_json(result))
+    if report:
+        from stcal.robot.use_report import verification_page
+
+        _save(report, verification_page(result))
+
+
+class Observed(StrEnum):
+    """What the instrument measures."""
+
+    pose = "pose"
+    position = "position"
+
+
+@app.command()
+def design(
+    robot_file: RobotFile,
+    count: Annotated[int, typer.Option(min=1, max=2000, help="Poses.")] = 40,
+    seed: Annotated[int, typer.Option(min=0, help="Of the candidates.")] = 0,
+    out: Annotated[Path | None, typer.Option("--out", help="The poses (CSV).")] = None,
+    observe: Annotated[Observed, typer.Option(help="What the instrument measures.")] = Observed.position,
+    candidates: Annotated[int, typer.Option(min=2, max=100_000, help="Random poses to choose from.")] = 1000,
+    sigma_mm: Annotated[float, typer.Option("--sigma-mm", help="σ of measured positions, per axis.")] = 0.05,
+    sigma_rad: Annotated[float, typer.Option("--sigma-rad", help="σ of measured orientations, per axis.")] = 2e-4,
+    box: Annotated[
+        str | None, typer.Option(help="Where the tool may be, mm in the base: xmin,ymin,zmin,xmax,ymax,zmax.")
+    ] = None,
+    target: Annotated[str, typer.Option(help="Name of the target (tool) that is measured.")] = "",
+    json_file: JsonFile = None,
+) -> None:
+    """Choose measurement poses that show the robot's parameters best."""
+    from stcal.robot import plan_poses as stage
+    from stcal.robot.robot_file import load_robot
+
+    options = stage.DesignOptions(
+        count, seed, observe.value, candidates, sigma_mm, sigma_rad, _box(box) if box else None, target
+    )
+    robot = load_robot(robot_file)
+    result = stage.design(robot, options)
+    print(stage.design_text(result))
+    if out:
+        _save(out, stage.design_csv(result, robot))
+    _save_json(json_file, stage.design_json(result))
+
+
+def _box(text: str) -> tuple[float, ...]:
+    try:
+        return tuple(float(cell) for cell in text.split(","))
+    except ValueError as error:
+        raise InputError(f"--box {text}: six numbers with commas between needed, in mm") from error
+
+
+def _save_json(path: Path | None, content: dict) -> None:
+    if path:
+        _save(path, json.dumps(content, indent=1, ensure_ascii=False, allow_nan=False) + "\n")
+
+
+def _save(path: Path, content: str | bytes) -> None:
+    """Write a file at once, complete or not at all."""
+    partial = path.with_name(f"{path.name}.{os.getpid()}.partial")
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        partial.write_bytes(content.encode() if isinstance(content, str) else content)
+        os.replace(partial, path)
+    finally:
+        partial.unlink(missing_ok=True)
+    print(f"written: {path}")

@@ -125,7 +125,7 @@ def run(
         refine_camera=refine_camera,
         graph=pairs and pairs.value,
         pairs=PairOptions(None if max_angle is None else float(np.radians(max_angle))),
-        ellipses=_ellipses(min_diameter, max_diameter),
+        ellipses=ellipse_options(min_diameter, max_diameter),
         workers=workers,
     )
     with StageProgress() as progress:
@@ -152,7 +152,7 @@ def detect(
     model = read_camera(camera)
     target_design = pipeline.load_design(target, reference_target, load_target)
     board_design = pipeline.load_design(board, reference_board, load_board)
-    options = pipeline.RunOptions(ellipses=_ellipses(min_diameter, max_diameter), workers=workers)
+    options = pipeline.RunOptions(ellipses=ellipse_options(min_diameter, max_diameter), workers=workers)
     if (out / "faces.json").exists():
         raise InputError(f"output folder {out}: holds a finished calibration; give another folder with --out")
     find_images(images)
@@ -307,7 +307,8 @@ def _flatness(text: str) -> float | None:
     return value
 
 
-def _ellipses(min_diameter: float | None, max_diameter: float):
+def ellipse_options(min_diameter: float | None, max_diameter: float):
+    """Sizes of the circles that detection seeks."""
     from stcal.sfm.detect.ellipses import EllipseOptions
 
     if min_diameter is not None and max_diameter <= min_diameter:

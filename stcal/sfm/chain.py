@@ -33,8 +33,8 @@ class CalibratedTarget:
     ``target_from_face`` by face; ``circles`` : label → (3,) mm in the target frame; ``target_from_group`` : metric
     group frames; ``face_covariance`` : 6×6 by face (rotation rad, translation mm; perturbation in the target frame
     about the face's origin), ``circle_covariance`` : 3×3 mm² by label, ``distance_sigma_mm`` : of the distance between
-    the origins of two faces, and ``scale_sigma`` : relative, of all lengths together; empty and None where none was
-    computed.
+    the origins of two faces, ``scale_sigma`` : relative, of all lengths together, and ``covariance_mm2`` : (3c, 3c) of
+    all circles together, target frame, in their order; empty and None where none was computed.
     """
 
     reference_face: str
@@ -45,6 +45,7 @@ class CalibratedTarget:
     circle_covariance: dict[str, np.ndarray] = field(default_factory=dict)
     distance_sigma_mm: dict[tuple[str, str], float] = field(default_factory=dict)
     scale_sigma: float | None = None
+    covariance_mm2: np.ndarray | None = None
 
 
 def chain_faces(faces: list[FaceInGroup], target: TargetDesign, reference: str) -> CalibratedTarget:

@@ -19,7 +19,9 @@ from stcal.sfm.result import RunResult
 MICRO = 1e3
 
 
-def faces_json(target: CalibratedTarget, design: TargetDesign, options: RunOptions) -> dict:
+def faces_json(
+    target: CalibratedTarget, design: TargetDesign, options: RunOptions, centre_sigma_factor: float
+) -> dict:
     """The content of ``faces.json``: mm and rad, target frame, 4×4 row-major."""
     radius = design.radius_of()
     content = {
@@ -32,12 +34,17 @@ def faces_json(target: CalibratedTarget, design: TargetDesign, options: RunOptio
         "target_from_face": {face: pose.matrix().tolist() for face, pose in target.target_from_face.items()},
         "circles": {label: xyz.tolist() for label, xyz in target.circles.items()},
         "radius_mm": {label: radius[label] for label in target.circles},
+        "centre_sigma_factor": centre_sigma_factor,
     }
     if target.face_covariance:
         content["target_from_face_covariance"] = {f: c.tolist() for f, c in target.face_covariance.items()}
         content["distance_sigma_mm"] = {f"{a} {b}": sigma for (a, b), sigma in target.distance_sigma_mm.items()}
         content["scale_sigma_ppm"] = 1e6 * target.scale_sigma
         content["circle_covariance_mm2"] = {label: c.tolist() for label, c in target.circle_covariance.items()}
+        content["circles_joint_covariance_mm2"] = {
+            "labels": list(target.circles),
+            "upper_triangle": target.covariance_mm2[np.triu_indices(3 * len(target.circles))].tolist(),
+        }
     return content
 
 

@@ -181,7 +181,7 @@ def calibrate_models(model: Path, saved: SavedRun) -> Calibration:
 def write_faces(path: Path, calibration: Calibration, saved: SavedRun) -> None:
     """``faces.json`` of models that were chained."""
     options = replace(saved.options, solve="chain")
-    write_bytes(path, _json(faces_json(calibration.target, saved.target, options)))
+    write_bytes(path, _json(faces_json(calibration.target, saved.target, options, calibration.sigma_factor)))
 
 
 def load_design(given, default: Callable, load: Callable):
@@ -317,7 +317,8 @@ def _write(result: RunResult, tell: Progress) -> None:
     write_bytes(out / TARGET, target_toml(result.target_design).encode())
     write_bytes(out / BOARD, board_toml(result.board_design).encode())
     report = report_json(result)
-    write_bytes(out / "faces.json", _json(faces_json(result.target, result.target_design, result.options)))
+    faces = faces_json(result.target, result.target_design, result.options, result.calibration.sigma_factor)
+    write_bytes(out / "faces.json", _json(faces))
     write_report(out, report)
     tell("report", 1, 1)
 

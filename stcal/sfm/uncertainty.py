@@ -45,6 +45,11 @@ class Derivatives:
         """(c, 3, 3) mm², target frame, of the circles' (3c, 3c)."""
         return np.einsum("cip,pq,cjq->cij", self.circles, covariance_mm2, self.circles, optimize=True)
 
+    def all_circles_covariance(self, covariance_mm2: np.ndarray) -> np.ndarray:
+        """(3c, 3c) mm², target frame, of all circles together; singular, since they carry the frame."""
+        flat = self.circles.reshape(-1, self.circles.shape[-1])
+        return flat @ covariance_mm2 @ flat.T
+
 
 def calibrated_target(
     result: JointResult, start: CalibratedTarget, target: TargetDesign, kind: FrameKind
@@ -63,6 +68,7 @@ def calibrated_target(
         dict(zip(result.labels, own.circle_covariance(result.covariance_mm2), strict=True)),
         own.distance_sigma_mm(result.covariance_mm2),
         scale_sigma(result.xyz_world, result.covariance_mm2),
+        own.all_circles_covariance(result.covariance_mm2),
     )
 
 

@@ -1,0 +1,77 @@
+"""``stcal-sfm measure``: the calibrated target at work."""
+
+import json
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from stcal.camera_file import read_camera
+from stcal.cli.progress import StageProgress
+from stcal.cli.sfm import CameraFile, MaxDiameter, MinDiameter, TargetFile, Workers, ellipse_options
+from stcal.design import reference_target
+from stcal.design_file import load_board, load_target
+from stcal.errors import InputError
+
+app = typer.Typer()
+
+
+@app.command()
+def measure(
+    images: Annotated[Path, typer.Argument(help="Folder of images, in it or in its subfolders.")],
+    camera: CameraFile,
+    faces: Annotated[Path, typer.Option("--faces", help="faces.json of the target's calibration.")],
+    target: TargetFile = None,
+    out: Annotated[Path, typer.Option("--out", help="Table of the poses (CSV).")] = Path("poses.csv"),
+    json_file: Annotated[
+        Path | None, typer.Option("--json", help="Also write everything as JSON, both poses of an undecided image too.")
+    ] = None,
+    joints: Annotated[
+        Path | None,
+        typer.Option("--joints", help="CSV with a column image: its other columns, joint values say, join the table."),
+    ] = None,
+    board: Annotated[
+        Path | None, typer.Option("--board", help="board.toml of a dot board that is in view, to tell its dots apart.")
+    ] = None,
+    previous: Annotated[
+        bool, typer.Option("--previous", help="Motions are small: the image before decides between two poses.")
+    ] = False,
+    sigma_factor: Annotated[
+        float | None,
+        typer.Option("--sigma-factor", min=1e-3, max=1e3, help="On the centres' σ; that of faces.json if not given."),
+    ] = None,
+    min_diameter: MinDiameter = None,
+    max_diameter: MaxDiameter = 450.0,
+    workers: Workers = None,
+) -> None:
+    """Pose of a calibrated target in each image, from whatever faces it shows, with its 6×6 covariance."""
+    from stcal.sfm import measure as work
+    from stcal.sfm.detection import write_bytes
+    from stcal.sfm.pipeline import load_design
+    from stcal.sfm.single_pose import PoseOptions
+    from stcal.sfm.target_circles import read_target
+    from stcal.table_file import read_table
+
+    for path in (out, json_file):
+        if path is not None and not path.parent.is_dir():
+            raise InputError(f"{path}: no folder {path.parent}; make it, or give another place")
+    design = load_design(target, reference_target, load_target)
+    known = read_target(faces, design)
+    table = read_table(joints, "joints") if joints else None
+    options = work.MeasureOptions(
+        PoseOptions(sigma_factor=sigma_factor), previous, ellipse_options(min_diameter, max_diameter), workers
+    )
+    with StageProgress() as progress:
+        result = work.measure(
+            images, read_camera(camera), known, design, load_board(board) if board else None, options, progress
+        )
+    text, apart = work.poses_csv(result, table)
+    print(work.measure_text(result))
+    for each in apart:
+        print(f"not joined: {each}")
+    write_bytes(out, text.encode())
+    print(f"poses: {out}")
+    if json_file:
+        content = json.dumps(work.measure_json(result), indent=1, ensure_ascii=False, allow_nan=False) + "\n"
+        write_bytes(json_file, content.encode())
+        print(f"as JSON: {json_file}")

@@ -1,0 +1,158 @@
+"""Trust-region least squares over the minimal parameters of a robot, robust, with what the data determine told apart."""
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from scipy.stats import chi2
+
+from stcal.errors import ConvergenceError
+from stcal.robot.observe import WIDTH, Observed, State, jacobian, moved, residuals
+
+MAX_STEPS = 100
+SETTLED = 1e-10
+"""Relative fall of the cost below which nothing is gained."""
+HUBER_LEVEL = 0.999
+"""One honest observation in a thousand weighs less than one."""
+USELESS_MM = 50.0
+"""A direction (1 mm, or the turn that moves the tool by 1 mm) with a larger σ is not determined: the nominal is better.
+All parameters are held to where they start by this σ, which nothing feels that is determined."""
+LEAST_GAIN = 1e-9
+"""In units of σ²: what measurements without noise still gain by rounding."""
+
+
+@dataclass(frozen=True, slots=True)
+class Weighting:
+    """σ of one coordinate; the covariances that came with the measurements in place of both where ``given``."""
+
+    sigma_mm: float
+    sigma_rad: float
+    given: bool = False
+
+    def whiten(self, values: np.ndarray, seen: Observed) -> np.ndarray:
+        """Residuals (r, w) or derivatives (r, w, k) of ``seen`` in units of σ."""
+        flat = values.ndim == 2
+        values = values[..., None] if flat else values
+        width = values.shape[1]
+        if self.given and width > 1:
+            covariance = seen.data.covariance
+            values = np.linalg.solve(np.linalg.cholesky(covariance[:, -width:, -width:]), values)
+        else:
+            sigma = [self.sigma_rad] * 3 + [self.sigma_mm] * 3
+            values = values / np.array(sigma[-width:])[:, None]
+        return values[..., 0] if flat else values
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Held:
+    """Knowledge from elsewhere, linear about a state: ``value + slope @ step`` is 0 with ``sigma``; (p,), (p, k), (p,)."""
+
+    value: np.ndarray
+    slope: np.ndarray
+    sigma: np.ndarray
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Solution:
+    """``state`` : adjusted; ``residuals`` : (r, w) rad, mm; ``weights`` : (r,) Huber's; ``normal`` : (k, k) whitened and
+    weighted, of the observations alone; ``prior`` : (k, k) of what was held; ``units`` : (k,) that make each parameter a
+    movement of the tool of about 1 mm; ``cost`` : Huber's."""
+
+    state: State
+    residuals: np.ndarray
+    weights: np.ndarray
+    normal: np.ndarray
+    units: np.ndarray
+    cost: float
+    prior: np.ndarray
+
+    def spectrum(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Eigenvalues (k,), directions (k, k) in columns, and which are determined by the data (k,)."""
+        values, directions = np.linalg.eigh(self.normal * self.units[:, None] * self.units)
+        return values, directions, values > 1 / USELESS_MM**2
+
+    def rank(self) -> int:
+        """Directions that the data determine."""
+        return int(self.spectrum()[2].sum())
+
+    def inverse(self) -> np.ndarray:
+        """(k, k) covariance of the parameters at unit weight."""
+        scaled = (self.normal + self.prior) * self.units[:, None] * self.units
+        return np.linalg.inv(scaled) * self.units[:, None] * self.units
+
+
+def solve(
+    state: State, seen: Observed, weighting: Weighting, robust: bool = True, held: Held | None = None
+) -> Solution:
+    """Minimise the observations' whitened residuals from ``state``, where ``held`` is linear.
+
+    Levenberg's damping by the ratio of actual to predicted gain (Moré 1978); parameters are small motions about the
+    present state, so that no representation is ever singular.
+
+    Raises
+    ------
+    ConvergenceError
+        No minimum is reached.
+    """
+    limit = np.sqrt(chi2.ppf(HUBER_LEVEL, WIDTH[seen.kind])) if robust else np.inf
+    solution, gradient = _linearised(state, seen, weighting, limit)
+    hold, pull = np.diag((USELESS_MM * solution.units) ** -2.0), np.zeros(len(solution.units))
+    if held is not None:
+        weighted = held.slope.T / held.sigma**2
+        hold, pull = hold + weighted @ held.slope, weighted @ held.value
+    away, damping = np.zeros(len(hold)), 1e-3
+    for _ in range(MAX_STEPS):
+        normal, slope = solution.normal + hold, gradient - hold @ away - pull
+        cost = solution.cost + away @ (hold @ away + 2 * pull)
+        scale = np.diag(normal)
+        while True:
+            step = np.linalg.solve(normal + damping * np.diag(scale), slope)
+            trial = moved(solution.state, step, seen.kind)
+            there = away + step
+            trial_cost = _cost(residuals(trial, seen), seen, weighting, limit) + there @ (hold @ there + 2 * pull)
+            gain, predicted = cost - trial_cost, 2 * slope @ step - step @ normal @ step
+            if gain >= 0.1 * predicted or predicted <= SETTLED * abs(cost) + LEAST_GAIN or damping > 1e12:
+                break
+            damping *= 10
+        if gain <= SETTLED * abs(cost) + LEAST_GAIN:
+            last = _linearised(trial, seen, weighting, limit)[0] if gain > 0 else solution
+            return replace(last, prior=hold)
+        damping = max(damping / 10, 1e-12) if gain > 0.5 * predicted else damping
+        away = there
+        solution, gradient = _linearised(trial, seen, weighting, limit)
+    raise ConvergenceError(
+        f"{seen.data.where}: identification still gains after {MAX_STEPS} steps; check the robot file and the outliers"
+    )
+
+
+def normal_rank(state: State, seen: Observed, weighting: Weighting) -> int:
+    """How many parameters these observations determine, at the state where they would be exact."""
+    return _linearised(state, seen, weighting, np.inf)[0].rank()
+
+
+def _linearised(state: State, seen: Observed, weighting: Weighting, limit: float) -> tuple[Solution, np.ndarray]:
+    """State with its normal matrix, and the gradient (k,)."""
+    found, derivative = residuals(state, seen), jacobian(state, seen)
+    units = _units(derivative)
+    white, slope = weighting.whiten(found, seen), weighting.whiten(derivative, seen)
+    weights = np.minimum(1.0, limit / np.maximum(np.linalg.norm(white, axis=1), 1e-300))
+    flat = slope.reshape(-1, slope.shape[2])
+    weighted = flat * np.repeat(weights, white.shape[1])[:, None]
+    cost = _cost(found, seen, weighting, limit)
+    normal = weighted.T @ flat
+    return Solution(state, found, weights, normal, units, cost, np.zeros_like(normal)), weighted.T @ white.ravel()
+
+
+def _units(derivative: np.ndarray) -> np.ndarray:
+    """Of each parameter, what moves the tool by 1 mm RMS at most; 1 for what moves nothing."""
+    lengths = derivative[:, -3:] if derivative.shape[1] > 1 else derivative
+    moves = np.sqrt((lengths**2).sum(1).mean(0))
+    turns = np.sqrt((derivative[:, :3] ** 2).sum(1).mean(0)) if derivative.shape[1] == 6 else np.zeros(len(moves))
+    moves = np.where(moves > 1e-9, moves, turns)  # the tool's orientation moves no point
+    return np.where(moves > 1e-9, 1 / np.maximum(moves, 1e-9), 1.0)
+
+
+def _cost(found: np.ndarray, seen: Observed, weighting: Weighting, limit: float) -> float:
+    length = np.linalg.norm(weighting.whiten(found, seen), axis=1)
+    inside = np.minimum(length, limit)
+    beyond = length - inside
+    return float((inside**2).sum() + (2 * limit * beyond.sum() if beyond.any() else 0.0))

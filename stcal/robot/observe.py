@@ -1,0 +1,161 @@
+"""What measurements say about a robot: residuals, and their derivatives by the minimal parameters."""
+
+from dataclasses import dataclass, replace
+from typing import Literal
+
+import numpy as np
+
+from stcal.errors import InputError
+from stcal.geometry.rigid import Poses, Rigid
+from stcal.robot.data import Measurements
+from stcal.robot.kinematics import chain_jacobian, chain_parameters, flange_poses, moved_chain
+from stcal.robot.model import Chain
+
+Kind = Literal["pose", "position", "distance"]
+WIDTH = {"pose": 6, "position": 3, "distance": 1}
+ALL_PAIRS_UP_TO = 60
+ANCHORS = 8
+"""Of more positions not all pairs are taken, but the distances of all from a few that lie far apart."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class State:
+    """What is identified: the chain, and flange_from_tool by target."""
+
+    chain: Chain
+    tools: dict[str, Rigid]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Observed:
+    """Measurements as one kind of observation.
+
+    ``first``, ``second`` : (r,) rows of the measurements that each observation is about; equal but for distances.
+    ``values`` : (r,) distances, mm, else empty; ``derived`` : whether they were made of positions.
+    """
+
+    kind: Kind
+    data: Measurements
+    first: np.ndarray
+    second: np.ndarray
+    values: np.ndarray
+    derived: bool = False
+
+    def __len__(self) -> int:
+        return len(self.first)
+
+    @property
+    def tool_width(self) -> int:
+        """Parameters of each tool: orientation is seen in poses only."""
+        return 6 if self.kind == "pose" else 3
+
+
+def unknowns(robot_chain: Chain, targets: int, kind: Kind) -> int:
+    """Number of parameters."""
+    return len(chain_parameters(robot_chain)) + (6 if kind == "pose" else 3) * targets
+
+
+def observed(data: Measurements, kind: Kind | None = None) -> Observed:
+    """The measurements as ``kind``, or as the most that they hold.
+
+    Raises
+    ------
+    InputError
+        They do not hold it.
+    """
+    held = "distance" if data.distances is not None else "position" if data.rotations is None else "pose"
+    kind = kind or held
+    if WIDTH[kind] > WIDTH[held]:
+        raise InputError(f"{data.where}: {held}s were measured, {kind}s cannot be had from them")
+    rows, none = np.arange(len(data)), np.zeros(0)
+    if kind != "distance":
+        return Observed(kind, data, rows, rows, none)
+    if held == "distance":
+        real = rows[data.from_row != rows]
+        return Observed(kind, data, real, data.from_row[real], data.distances[real])
+    first, second = _pairs(data)
+    return Observed(kind, data, first, second, np.linalg.norm(data.positions[first] - data.positions[second], axis=1), True)
+
+
+def _pairs(data: Measurements) -> tuple[np.ndarray, np.ndarray]:
+    """Pairs of rows: all, or all with the anchors (each the farthest from those before)."""
+    m = len(data)
+    if m <= ALL_PAIRS_UP_TO:
+        return np.triu_indices(m, 1)
+    away = np.linalg.norm(data.positions - data.positions.mean(0), axis=1)
+    anchors = [int(away.argmax())]
+    for _ in range(ANCHORS - 1):
+        to_nearest = np.min([np.linalg.norm(data.positions - data.positions[a], axis=1) for a in anchors], axis=0)
+        anchors.append(int(to_nearest.argmax()))
+    pairs = sorted({(min(i, a), max(i, a)) for a in anchors for i in range(m) if i != a})
+    return tuple(np.array(pairs).T)
+
+
+def parameter_names(state: State, kind: Kind) -> list[str]:
+    """``J2 rx`` … of the axes and ``tool x`` … of the tools; r in rad, the others in mm."""
+    component = ("rx", "ry", "rz", "x", "y", "z")
+    tool = component if kind == "pose" else component[3:]
+    names = [f"J{i + 1} {component[c]}" for i, c in chain_parameters(state.chain)]
+    return names + [f"tool {name} {c}".replace("  ", " ") for name in state.tools for c in tool]
+
+
+def tips(state: State, data: Measurements) -> Poses:
+    """world_from_tool of every row."""
+    flange = flange_poses(state.chain, data.q)
+    names = list(state.tools)
+    tool = Poses.of(state.tools.values())
+    return flange @ tool[[names.index(t) for t in data.targets]]
+
+
+def residuals(state: State, seen: Observed) -> np.ndarray:
+    """Measured minus modelled, (r, 6), (r, 3) or (r, 1): rad and mm in the world's axes."""
+    tip = tips(state, seen.data)
+    if seen.kind == "pose":
+        return seen.data.poses().difference(tip)
+    if seen.kind == "position":
+        return seen.data.positions - tip.translation
+    apart = tip.translation[seen.first] - tip.translation[seen.second]
+    return (seen.values - np.linalg.norm(apart, axis=1))[:, None]
+
+
+def jacobian(state: State, seen: Observed) -> np.ndarray:
+    """Derivative of what the model says by :func:`parameter_names`, (r, 6 or 3 or 1, k)."""
+    tip = tips(state, seen.data)
+    width = seen.tool_width
+    by_axes = chain_jacobian(state.chain, seen.data.q, tip)
+    by_tools = np.zeros((len(tip), 6, width * len(state.tools)))
+    for t, name in enumerate(state.tools):
+        rows = np.array([target == name for target in seen.data.targets])
+        place = width * t
+        if width == 6:
+            by_tools[rows, :3, place : place + 3] = tip.rotation[rows]
+            place += 3
+        by_tools[rows, 3:, place : place + 3] = tip.rotation[rows]
+    full = np.concatenate([by_axes, by_tools], axis=2)
+    if seen.kind == "pose":
+        return full
+    if seen.kind == "position":
+        return full[:, 3:]
+    apart = tip.translation[seen.first] - tip.translation[seen.second]
+    unit = apart / np.maximum(np.linalg.norm(apart, axis=1), 1e-12)[:, None]
+    return np.einsum("ri,rik->rk", unit, full[seen.first, 3:] - full[seen.second, 3:])[:, None]
+
+
+def moved(state: State, step: np.ndarray, kind: Kind) -> State:
+    """The state after small motions along the parameters, (k,)."""
+    k = len(chain_parameters(state.chain))
+    width = 6 if kind == "pose" else 3
+    tools = {}
+    for t, (name, tool) in enumerate(state.tools.items()):
+        own = step[k + width * t : k + width * (t + 1)]
+        tools[name] = tool @ Rigid.exp(own if width == 6 else [0, 0, 0, *own])
+    return replace(state, chain=moved_chain(state.chain, step[:k]), tools=tools)
+
+
+def only_of(seen: Observed, keep: np.ndarray) -> Observed:
+    """The observations of a mask (r,)."""
+    if seen.kind == "distance":
+        return replace(seen, first=seen.first[keep], second=seen.second[keep], values=seen.values[keep])
+    data = seen.data[keep]
+    rows = np.arange(len(data))
+    return replace(seen, data=data, first=rows, second=rows)
