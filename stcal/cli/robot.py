@@ -88,7 +88,9 @@ def identify(
     robot_file: RobotFile,
     out: Annotated[Path | None, typer.Option("--out", help="The identified robot (TOML).")] = None,
     observe: Annotated[Kind | None, typer.Option(help="What to use; the most that was measured if not given.")] = None,
-    sigma_mm: Annotated[float | None, typer.Option("--sigma-mm", min=1e-9, help="σ of a position's coordinate.")] = None,
+    sigma_mm: Annotated[
+        float | None, typer.Option("--sigma-mm", min=1e-9, help="σ of a position's coordinate.")
+    ] = None,
     sigma_rad: Annotated[
         float | None, typer.Option("--sigma-rad", min=1e-12, help="σ of an orientation's coordinate.")
     ] = None,

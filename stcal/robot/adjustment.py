@@ -1,4 +1,4 @@
-"""Trust-region least squares over the minimal parameters of a robot, robust, with what the data determine told apart."""
+"""Trust-region least squares over the minimal parameters of a robot, robust; what the data determine told apart."""
 
 from dataclasses import dataclass, replace
 
@@ -44,7 +44,7 @@ class Weighting:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Held:
-    """Knowledge from elsewhere, linear about a state: ``value + slope @ step`` is 0 with ``sigma``; (p,), (p, k), (p,)."""
+    """Knowledge from elsewhere, linear about a state: ``value + slope @ step``, (p,), is 0 with σ ``sigma``, (p,)."""
 
     value: np.ndarray
     slope: np.ndarray
@@ -53,9 +53,9 @@ class Held:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Solution:
-    """``state`` : adjusted; ``residuals`` : (r, w) rad, mm; ``weights`` : (r,) Huber's; ``normal`` : (k, k) whitened and
-    weighted, of the observations alone; ``prior`` : (k, k) of what was held; ``units`` : (k,) that make each parameter a
-    movement of the tool of about 1 mm; ``cost`` : Huber's."""
+    """``state`` : adjusted; ``residuals`` : (r, w) rad, mm; ``weights`` : (r,) Huber's; ``normal`` : (k, k) whitened
+    and weighted, of the observations alone; ``prior`` : (k, k) of what was held; ``units`` : (k,) that make each
+    parameter a movement of the tool of about 1 mm; ``cost`` : Huber's."""
 
     state: State
     residuals: np.ndarray

@@ -26,6 +26,8 @@ WEAK_RAD = 0.02
 MOTION = np.radians(2.0)
 """Joints, gears and zero positions are true to hundredths of this; also the share of a sliding joint's way."""
 LONGER = "sweep further, or with reflectors farther apart"
+QUIET = 1e-3
+"""Share of the largest arc below which no residual can hide a gross error that bent the first axis."""
 ITERATIONS, HALVINGS, STARTS, REWEIGHTINGS = 100, 12, 60, 30
 SINGULAR, TINY = 1e-10, 1e-300
 FIRST_SIZE = 0.05
@@ -185,7 +187,8 @@ class _Fit:
             length = np.linalg.norm(self.residuals(), axis=1)
             if np.median(length) < least:
                 least, best = np.median(length), (self.frame, self.weights)
-            if out < 0 and length.max() <= GROSS * self.robust_sigma(length):
+            quiet = length.max() <= min(GROSS * self.robust_sigma(length), QUIET * self.size)
+            if out < 0 and quiet:
                 break
         self.frame, self.weights = best
 

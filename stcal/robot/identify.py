@@ -1,10 +1,10 @@
-"""Identification of a robot's kinematics from measured poses, positions or distances: parameters, σ and held-out error."""
+"""Identification of a robot's kinematics from poses, positions or distances: parameters, σ and held-out error."""
 
 from dataclasses import astuple, dataclass, replace
 
 import numpy as np
 
-from stcal.errors import DegenerateError, InputError
+from stcal.errors import DegenerateError
 from stcal.geometry.arrays import frozen
 from stcal.robot.adjustment import Solution, Weighting, normal_rank, solve
 from stcal.robot.data import Measurements
@@ -17,7 +17,6 @@ from stcal.robot.observe import (
     Observed,
     State,
     jacobian,
-    moved,
     observed,
     only_of,
     parameter_names,
@@ -34,7 +33,7 @@ VARIANCE_SETTLED = 1e-3
 STILL_RAD, STILL_MM = 1e-5, 1e-2
 """A joint that moves less than this did not move."""
 OUTLIER_WEIGHT = 0.5
-REPEATS, FEW_ROWS = 3, 300
+REPEATS, FEW_ROWS = 5, 300
 """Divisions of the cross-validation of few rows; one does for more."""
 
 
@@ -68,8 +67,8 @@ class Identified:
     """The identified robot, and how far to trust it.
 
     ``robot`` : base where the instrument stands, tools by target; ``names`` : (k,) of the parameters, small motions of
-    each joint's frame and of the tools (J2 ry: axis of joint 2 about its y, rad; tool x: mm); ``covariance`` : (k, k) of
-    them, zero for what was kept; ``rank`` of the data used, ``ranks`` by kind of observation of the same joint values;
+    each joint's frame and of the tools (J2 ry: axis of joint 2 about its y, rad; tool x: mm); ``covariance`` : (k, k);
+    ``rank`` of the data used, ``ranks`` by kind of observation of the same joint values;
     ``undetermined`` : names of parameters along directions that were kept nominal; ``weights`` : (r,) Huber's;
     ``nominal_mm``, ``fitted_mm`` : (r,) errors with nominal axes (base and tools fitted) and identified ones;
     ``dh_sigma`` : (n, 5) of a, alpha, d, theta, beta, mm and rad; ``spectrum`` : (rank,) singular values in 1/mm of the

@@ -102,14 +102,15 @@ def identified_json(result: Identified, nominal: Robot) -> dict:
 def identified_page(result: Identified, nominal: Robot) -> str:
     """The report page."""
     title = f"{nominal.name}: identified"
-    counts = f"{len(result.seen)} {result.seen.kind}s from {result.seen.data.where}, {result.rank} parameters determined"
+    seen = result.seen
+    counts = f"{len(seen)} {seen.kind}s from {seen.data.where}, {result.rank} parameters determined"
     banner = f'<h1>{escape(title)}</h1>\n<p class="counts">{escape(counts)}</p>\n'
     errors = [[name, *(number(v, 4) for v in _statistics(e))] for name, e in _errors(result).items()]
     facts = [[name, f"{value:.4g}"] for name, value in _indices(result).values().items()]
     accuracy = (
         table(["<Error", "Mean (mm)", "RMS (mm)", "Max (mm)"], errors)
         + f"<p>{escape(_noise(result))}. Held out: rows that took no part in the fit that they judge.</p>\n"
-        + plot(uri(_figure(result)), "Errors by row", "Error of each observation; held out: mean over the divisions", "wide")
+        + plot(uri(_figure(result)), "Errors by row", "Error by observation; held out: mean over the divisions", "wide")
     )
     sections = [
         ("accuracy", "Accuracy", accuracy),
@@ -126,12 +127,12 @@ def _rows(result: Identified, nominal: Robot) -> str:
     for i in range(len(values)):
         cells = []
         for k in range(5):
-            fixed = sigma[i, k] == 0
-            cells += [number(values[i, k], 4), NONE if fixed else number(values[i, k] - before[i, k], 4), _sigma(sigma[i, k])]
+            change = NONE if sigma[i, k] == 0 else number(values[i, k] - before[i, k], 4)
+            cells += [number(values[i, k], 4), change, _sigma(sigma[i, k])]
         lines.append([str(i + 1), *cells])
     heads = ["<Joint", *["value", "change", "σ"] * 5]
     over = [("", 1), *[(f"{n} ({u})", 3) for n, u in zip(DH, UNITS, strict=True)]]
-    text = f"<p>Convention {result.robot.convention}. β (Hayati) where two axes are nearly parallel; d is then kept.</p>\n"
+    text = f"<p>Convention {result.robot.convention}. β (Hayati) where axes are nearly parallel; d is then kept.</p>\n"
     return text + table(heads, lines, over)
 
 
@@ -159,7 +160,8 @@ def _figure(result: Identified):
     size = 4 if len(rows) <= 200 else 1.5
     axes.plot(rows, result.fitted_mm, "o", color=COLOURS[0], ms=size, mew=0, label="identified")
     if result.held_out is not None:
-        axes.plot(rows, _by_row(result.held_out.position_mm), "_", color=COLOURS[1], ms=size * 2, mew=1.6, label="held out")
+        errors = _by_row(result.held_out.position_mm)
+        axes.plot(rows, errors, "_", color=COLOURS[1], ms=size * 2, mew=1.6, label="held out")
     axes.set_xlabel("observation", fontsize=8)
     axes.set_ylabel("error, mm", fontsize=8)
     axes.set_ylim(bottom=0)

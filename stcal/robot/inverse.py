@@ -26,8 +26,8 @@ SINGULAR = 1e-5
 """Smallest singular value (no unit) below which joint values are not determined. At a fold the error is the square of
 what the joints are off, so that an error of 1e-12 leaves 1e-6: the joints cannot be found nearer to the fold."""
 POOL, STARTS = 4096, 96
-"""Joint vectors over the range from which starts are taken, and starts for each pose: those of nearest pose. All of 8
-branches of 2000 poses of six-axis arms were found with 32."""
+"""Joint vectors over the range from which starts are taken, and starts for each pose: those of nearest pose. Of 2738
+branches of 600 poses of five arms, found with 600 starts, 96 missed none, 48 three, 32 twenty-eight."""
 SAME_BRANCH = 1e-4
 """Joint vectors nearer than this (rad) are one solution."""
 SHORT = 0.1

@@ -1,4 +1,4 @@
-"""What the nominal D-H rows are worth: dimensions as made differ from the drawing by σ that the data themselves show."""
+"""What the nominal D-H rows are worth: dimensions as made differ from the drawing by σ that the data show."""
 
 from dataclasses import astuple, dataclass
 

@@ -74,7 +74,8 @@ def observed(data: Measurements, kind: Kind | None = None) -> Observed:
         real = rows[data.from_row != rows]
         return Observed(kind, data, real, data.from_row[real], data.distances[real])
     first, second = _pairs(data)
-    return Observed(kind, data, first, second, np.linalg.norm(data.positions[first] - data.positions[second], axis=1), True)
+    apart = np.linalg.norm(data.positions[first] - data.positions[second], axis=1)
+    return Observed(kind, data, first, second, apart, True)
 
 
 def _pairs(data: Measurements) -> tuple[np.ndarray, np.ndarray]:

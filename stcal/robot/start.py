@@ -1,4 +1,4 @@
-"""Where identification starts: base and tools by the nominal axes; and data that no robot of this file can have made."""
+"""Where identification starts: base and tools by the nominal axes; and data that this robot cannot have made."""
 
 from dataclasses import replace
 
@@ -15,7 +15,7 @@ from stcal.robot.observe import State
 ROUNDS = 50
 SETTLED_MM = 1e-6
 FITS = 0.05
-"""A nominal robot fits its data when its RMS error is below this share of their spread: factory errors are below 1 %."""
+"""A nominal robot fits its data when its RMS error is below this share of their spread; factories err by under 1 %."""
 EXPLAINS = 0.2
 """A mistake explains a misfit when mending it leaves less than this share of it."""
 STILL_MM = 0.01
@@ -78,7 +78,7 @@ def _placed(robot: Robot, data: Measurements, tools: dict[str, Rigid]) -> tuple[
 
 
 def _base_and_points(flange: Poses, positions: np.ndarray, rows: np.ndarray, points: np.ndarray):
-    """Gauss–Newton over the base and the tool points, from the alignment with the points as they are. RMS misfit, mm."""
+    """Gauss–Newton over the base and the tool points, from the alignment with the points given; and RMS misfit, mm."""
     base = align_rigid(positions, flange @ points[rows])
     misfit = np.inf
     for _ in range(ROUNDS):
@@ -102,12 +102,13 @@ def _explain(robot: Robot, data: Measurements, tools: dict[str, Rigid], misfit: 
     """Say what is wrong with the data."""
     turning = ~robot.prismatic
     mirrored = replace(data, positions=data.positions * [1, 1, -1], rotations=None, covariance=None)
+    degree = np.pi / 180
     guesses = {
-        "joint values are radians in columns of degrees; call the columns q1_rad …": _with_q(data, turning, 180 / np.pi),
-        "joint values are degrees in columns of radians; call the columns q1_deg …": _with_q(data, turning, np.pi / 180),
+        "joint values are radians in columns of degrees; call the columns q1_rad …": _with_q(data, turning, 1 / degree),
+        "joint values are degrees in columns of radians; call the columns q1_deg …": _with_q(data, turning, degree),
         "positions are mirrored (a left-handed frame); change the sign of one axis": mirrored,
         "positions are metres in columns of mm; call the columns x_m …": _scaled(data, 1e3),
-        "joint values have the opposite sign; check the D-H rows and the joint directions": _with_q(data, turning, -1.0),
+        "joint values have the opposite sign; check the rows and the joints' directions": _with_q(data, turning, -1.0),
     }
     if data.rotations is not None:
         inverse = data.poses().inverse()
@@ -120,8 +121,8 @@ def _explain(robot: Robot, data: Measurements, tools: dict[str, Rigid], misfit: 
             np.sqrt(((guess.positions - guess.positions.mean(0)) ** 2).sum(1).mean())
         )
     reason = min(found, key=found.get)
-    says = f"{data.where}: robot {robot.name} misses the measurements by {misfit:.3g} mm RMS, {FITS:.0%} of their spread "
-    says += f"of {spread:.3g} mm allowed; "
+    says = f"{data.where}: robot {robot.name} misses the measurements by {misfit:.3g} mm RMS, "
+    says += f"{FITS:.0%} of their spread of {spread:.3g} mm allowed; "
     if found[reason] < EXPLAINS * misfit / spread:
         raise InputError(f"{says}it would fit if {reason}")
     raise InputError(f"{says}check D-H rows and convention, the order and zero of joints, coupling, and units")

@@ -91,8 +91,8 @@ def _require_motion(data: Measurements) -> None:
         if len(points) > 1 and np.quantile(moved, 0.9) < NOT_MOVED_MM:
             raise InputError(
                 f"{data.where}: {called(target)} does not move: 90 % of its {len(points)} positions lie within "
-                f"{np.quantile(moved, 0.9):.3g} mm while the joints move; a reflector on the flange is needed, and each "
-                "row's own measurement"
+                f"{np.quantile(moved, 0.9):.3g} mm while the joints move; a reflector on the flange, and each "
+                "row's own measurement needed"
             )
 
 

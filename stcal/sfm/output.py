@@ -19,9 +19,7 @@ from stcal.sfm.result import RunResult
 MICRO = 1e3
 
 
-def faces_json(
-    target: CalibratedTarget, design: TargetDesign, options: RunOptions, centre_sigma_factor: float
-) -> dict:
+def faces_json(target: CalibratedTarget, design: TargetDesign, options: RunOptions, centre_sigma_factor: float) -> dict:
     """The content of ``faces.json``: mm and rad, target frame, 4×4 row-major."""
     radius = design.radius_of()
     content = {

@@ -28,12 +28,14 @@ WORST_SHARE = 0.5
 """Centres at least so much beyond the limit as the worst one go with it; the others may only have been pulled along."""
 MAX_OUTLIER_SHARE = 1 / 3
 RAYLEIGH_MEDIAN = float(np.sqrt(2 * np.log(2)))
+MIN_BREADTH = 0.05
+"""Of the circles seen, over their length: in a row they leave the rotation about it open."""
 SAME = 1.0
 """Minima nearer than this, in σ, are one: its covariance covers both."""
 
 
-def start_pose(names: list[str], problem: PoseProblem, target: TargetCircles, where: str) -> tuple[PoseStack, str]:
-    """Pose by the homography of the face with the most circles, and that face."""
+def start_pose(names: list[str], problem: PoseProblem, target: TargetCircles, where: str) -> tuple[PoseStack, Rigid]:
+    """Pose by the homography of the face with the most circles, and target_from_plane of that face."""
     faces: dict[str, list[int]] = {}
     for i, name in enumerate(names):
         faces.setdefault(face_of(name), []).append(i)
@@ -46,14 +48,22 @@ def start_pose(names: list[str], problem: PoseProblem, target: TargetCircles, wh
     for face_id in by_size:
         rows, plane = faces[face_id], target.target_from_plane[face_id]
         xy = (plane.inverse() @ problem.xyz[rows])[:, :2]
+        long, broad = np.linalg.svd(xy - xy.mean(0), compute_uv=False)
+        if broad < MIN_BREADTH * long:
+            reason = f"{len(rows)} circles, {MIN_CIRCLES} off one line needed"
+            continue
         try:
             homography = fit_homography(xy, problem.centre[rows])
         except DegenerateError as error:
             reason = error
             continue
         pose = camera_from_plane(homography) @ plane.inverse()
-        return PoseStack(pose.rotation[None], pose.translation[None]), face_id
-    raise DegenerateError(f"{where}: face {by_size[0]}: {reason}; show more of its circles")
+        start = PoseStack(pose.rotation[None], pose.translation[None])
+        if (problem.seen(start)[1].depth <= 0).any():
+            reason = "its circles would be behind the camera; check their labels"
+            continue
+        return start, plane
+    raise DegenerateError(f"{where}: face {by_size[0]}: {reason}; show all of its circles")
 
 
 def mirrored(poses: PoseStack, target_from_plane: Rigid) -> PoseStack:
@@ -97,7 +107,7 @@ def _two_minima(problem: PoseProblem, poses: PoseStack, plane: Rigid, alone: boo
     there is one face only."""
     if len(poses.rotation) == 1:
         poses = poses.plus(mirrored(poses, plane))
-    whiten = whitening_by_centre(problem, poses)
+    whiten = whitening_by_centre(problem, poses[[0]])  # of one pose, so that the costs of both compare
     spread = 1.0
     for _ in range(2):  # the second time with the residuals' own spread, if that is larger
         found = descend(problem, poses, whiten, HUBER * spread)
@@ -107,14 +117,17 @@ def _two_minima(problem: PoseProblem, poses: PoseStack, plane: Rigid, alone: boo
             break
         spread = wider
     if not np.isfinite(found.cost[best]) or not found.settled[best]:
-        raise ConvergenceError(f"{where}: no pose found; check that the camera file belongs to the images")
-    order = [best, 1 - best]
-    if alone and not distinct(found.poses[order], found.normal[best]):  # perhaps both starts were on one side
+        raise ConvergenceError(
+            f"{where}: no pose found; check the labels, and that the camera file belongs to the images"
+        )
+    order = np.array([best, 1 - best])
+    two = distinct(found.poses[order], found.normal[best])
+    if alone and not two:  # perhaps both starts were on one side
         again = mirrored(found.poses[[best]], plane)
-        other = descend(problem, again, whitening_by_centre(problem, again), HUBER * spread)
-        found = _joined(found, best, other)
+        found = _joined(found, best, descend(problem, again, whiten, HUBER * spread))
         order = np.argsort(found.cost)
-    if not np.isfinite(found.cost[order[1]]) or not distinct(found.poses[order], found.normal[order[0]]):
+        two = distinct(found.poses[order], found.normal[order[0]])
+    if not two or not np.isfinite(found.cost[order[1]]):
         order = order[:1]
     return Minima(*(getattr(found, f)[order] for f in Minima.__slots__)), OUTLIER * spread
 

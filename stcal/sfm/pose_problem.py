@@ -10,9 +10,9 @@ from stcal.geometry.rigid import Rigid
 from stcal.sfm.circle_projection import CircleImages, project_circles
 
 MAX_STEPS = 60
-SETTLED = 1e-8
-"""A step that lowers χ² by less moves the pose by less than 1e-4 of its σ; a rival with a large χ² need not be better
-known than that, relatively."""
+SETTLED = 1e-4
+"""A step that lowers χ² by less moves the pose by less than a hundredth of its σ, and the two steps that weigh the
+centres anew are still to come; a rival with a large χ² need not be better known than that, relatively."""
 ACCEPTED = 1e-2
 """What is still settled after all steps: a tenth of σ. In a flat valley steps are many, and short."""
 HOPELESS = 500.0
@@ -85,6 +85,7 @@ class Minima:
 
 
 def rigid_of(poses: PoseStack, row: int) -> Rigid:
+    """camera_from_target of one of them."""
     return Rigid(poses.rotation[row], poses.translation[row])
 
 
@@ -126,7 +127,7 @@ def whitening_by_centre(problem: PoseProblem, poses: PoseStack) -> np.ndarray:
 
 def descend(problem: PoseProblem, poses: PoseStack, whiten: np.ndarray, huber: float) -> Minima:
     """Levenberg–Marquardt from h poses at once, Huber's loss on the lengths of the whitened residuals."""
-    h = len(whiten)
+    h = len(poses.rotation)
     evaluate = partial(_evaluate, problem, whiten, huber)
     cost, normal, right, length = evaluate(poses)
     damping = np.full(h, 1e-6)
@@ -156,7 +157,7 @@ def descend(problem: PoseProblem, poses: PoseStack, whiten: np.ndarray, huber: f
 
 def _evaluate(problem: PoseProblem, whiten: np.ndarray, huber: float, poses: PoseStack):
     """Cost (h,), normal matrix (h, 6, 6), right-hand side (h, 6) and lengths (h, n) of the whitened residuals."""
-    h, n = len(whiten), len(problem.xyz)
+    h, n = len(poses.rotation), len(problem.xyz)
     residual, image = problem.seen(poses)
     r = (whiten @ residual.reshape(h, 2 * n, 1))[..., 0]
     a = whiten @ image.by_pose.reshape(h, 2 * n, 6)

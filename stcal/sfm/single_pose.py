@@ -22,6 +22,7 @@ from stcal.sfm.model import Outlier
 from stcal.sfm.observations import face_of, is_board
 from stcal.sfm.pose_minima import HUBER, MIN_CIRCLES, distinct, minima_without_outliers, start_pose
 from stcal.sfm.pose_problem import (
+    HOPELESS,
     Minima,
     PoseProblem,
     PoseStack,
@@ -29,16 +30,12 @@ from stcal.sfm.pose_problem import (
     covariance_of_centres,
     residuals_px,
     rigid_of,
-    step_between,
 )
+from stcal.sfm.pose_spread import spread
 from stcal.sfm.target_circles import TargetCircles
 
-CURVED = 0.2
-"""χ² two σ away that differs from its parabola by more than this share: the covariance is then taken from samples."""
-SAMPLES = 1000
-SAMPLED_WIDER = 1.5
-"""Samples are drawn with σ so much larger, or their tails would rest on a few of them."""
-SAMPLE_ROUNDS = 2
+MAX_SIGMA_RAD = 0.5
+"""A rotation whose σ is larger is none: linear propagation says nothing any more."""
 
 Status = Literal["certain", "resolved", "ambiguous"]
 
@@ -79,8 +76,9 @@ class TargetPose:
     by their likelihood differs from these, zero where that is Gaussian; ``status`` : see ``delta_chi2``; ``faces`` and
     ``labels`` used; ``residuals_px`` : (n, 2) measured minus projected ellipse centres; ``weights`` : (n,) Huber's;
     ``outliers`` left out; ``chi2``, ``dof`` : of all residuals against their covariance; ``delta_chi2`` : by which the
-    other minimum is worse (infinite without one); ``needed_chi2`` : the least of it for the pose to be certain;
-    ``alternative`` : the other pose where that is not reached.
+    other minimum is worse, or, where both are one wide valley, the other side of it (infinite where there is neither);
+    ``needed_chi2`` : the least of it for the pose to be certain; ``alternative`` : the other minimum where that is not
+    reached.
     """
 
     camera_from_target: Rigid
@@ -159,13 +157,18 @@ def pose_from_circles(
     options = options or PoseOptions()
     used, problem = _problem(labels, centre_px, covariance_px2, target, camera, options, prior, where)
     names = [labels[i] for i in used]
-    start, face_id = start_pose(names, problem, target, where)
-    found, keep, outliers = minima_without_outliers(problem, start, target.target_from_plane[face_id], names, where)
+    start, plane = start_pose(names, problem, target, where)
+    found, keep, outliers = minima_without_outliers(problem, start, plane, names, where)
     problem, names = problem.select(keep), [names[i] for i in keep]
     dof = 2 * len(names) - 6
     if dof <= 0:
         raise DegenerateError(f"{where}: {len(names)} circles left, {MIN_CIRCLES} needed; show more of a face")
-    return _answer(problem, found, names, outliers, dof, options)
+    pose = _answer(problem, found, names, plane, dof, options)
+    if np.sqrt(np.diag(pose.covariance)[:3].max()) > MAX_SIGMA_RAD:
+        raise DegenerateError(f"{where}: its circles leave the rotation open; show more of a face, off one line")
+    return replace(
+        pose, outliers=outliers, alternative=pose.alternative and replace(pose.alternative, outliers=outliers)
+    )
 
 
 def _problem(labels, centre_px, covariance_px2, target: TargetCircles, camera, options, prior, where):
@@ -231,26 +234,33 @@ def _parts(problem: PoseProblem, image: CircleImages, noise: np.ndarray, full: n
     }
 
 
-def _answer(problem: PoseProblem, found: Minima, names, outliers, dof: int, options: PoseOptions) -> TargetPose:
-    """Decide between the minima, and collect."""
-    delta, rival = _rivalry(problem, found)
-    pose = _weighed(problem, found, 0, rival, names, dof)
+def _answer(
+    problem: PoseProblem, found: Minima, names: list[str], plane: Rigid, dof: int, options: PoseOptions
+) -> TargetPose:
+    """Decide between the minima, or what there is of a second one, and collect."""
+    delta, rival = _rivalry(problem, found, dof)
+    alone = rival is None and len({face_of(name) for name in names}) == 1
+    pose = _weighed(problem, found, 0, rival, names, dof, plane if alone else None, options)
     needed = options.needed(pose.chi2_per_dof())
-    pose = replace(pose, outliers=outliers, delta_chi2=delta, needed_chi2=needed)
-    if delta > needed:
+    pose = replace(pose, delta_chi2=min(delta, pose.delta_chi2), needed_chi2=needed)
+    if pose.delta_chi2 > needed:
         return replace(pose, status="certain")
-    other = _weighed(problem, found, 1, found.poses[[0]], names, dof)
-    other = replace(other, outliers=outliers, delta_chi2=-delta, needed_chi2=needed)
-    return replace(pose, alternative=other)
+    if rival is None:
+        return pose
+    other = _weighed(problem, found, 1, found.poses[[0]], names, dof, None, options)
+    return replace(pose, alternative=replace(other, delta_chi2=-delta, needed_chi2=needed))
 
 
-def _rivalry(problem: PoseProblem, found: Minima) -> tuple[float, PoseStack | None]:
+def _rivalry(problem: PoseProblem, found: Minima, dof: int) -> tuple[float, PoseStack | None]:
     """By how much χ² the second minimum is worse than the first, and its pose; infinite where there is none.
 
     Both weigh the circles alike, as the stricter of the two does, or an outlier of one of them could decide.
     """
     if len(found.cost) == 1:
         return np.inf, None
+    behind = float(found.cost[1] - found.cost[0])
+    if behind > HOPELESS * max(1.0, found.cost[0] / dof):  # whatever the weights
+        return behind, found.poses[[1]]
     residual, image = problem.seen(found.poses)
     common = np.tile(problem.noise / _huber(found.length).min(0)[:, None, None], (2, 1, 1, 1))
     rivals = _weigh(residual, image.by_pose, covariance_of_centres(problem, image, common), found.poses)
@@ -263,8 +273,18 @@ def _huber(length: np.ndarray) -> np.ndarray:
     return np.minimum(1.0, HUBER / np.maximum(length, HUBER))
 
 
-def _weighed(problem: PoseProblem, found: Minima, row: int, other: PoseStack | None, names, dof: int) -> TargetPose:
-    """One minimum by the whole covariance of its centres: two steps, whatever the first leaves is of second order."""
+def _weighed(
+    problem: PoseProblem,
+    found: Minima,
+    row: int,
+    other: PoseStack | None,
+    names: list[str],
+    dof: int,
+    plane: Rigid | None,
+    options: PoseOptions,
+) -> TargetPose:
+    """One minimum by the whole covariance of its centres, undecided; ``other``, ``plane`` : see
+    :func:`stcal.sfm.pose_spread.spread`. Two steps: what the first leaves is of second order."""
     weights = _huber(found.length[row])
     noise = problem.noise / weights[:, None, None]
     start = found.poses[[row]]
@@ -275,7 +295,10 @@ def _weighed(problem: PoseProblem, found: Minima, row: int, other: PoseStack | N
     last = _weigh(residual, image.by_pose, full, poses)
     parts = _parts(problem, image, noise, full[0])
     gaussian = sum(parts.values())
-    covariance = _sampled(problem, last.poses, full[0], gaussian, other)
+    chi2 = float(last.chi2[0])
+    # The samples span a valley from side to side: the margin for wrong σ is for what they do not show.
+    plausible = options.needed(chi2 / dof) / options.sigma_margin**2
+    covariance, other_side = spread(problem, last.poses, full[0], chi2, gaussian, other, plane, plausible)
     parts["curvature"] = covariance - gaussian
     return TargetPose(
         rigid_of(last.poses, 0),
@@ -287,47 +310,8 @@ def _weighed(problem: PoseProblem, found: Minima, row: int, other: PoseStack | N
         residuals_px(problem, last.poses),
         weights,
         (),
-        float(last.chi2[0]),
+        chi2,
         dof,
-        np.inf,
+        other_side,
         0.0,
     )
-
-
-def _sampled(problem: PoseProblem, pose: PoseStack, full: np.ndarray, covariance: np.ndarray, other: PoseStack | None):
-    """Second moment about the pose of all poses by their likelihood, where that is no Gaussian; else ``covariance``.
-
-    A face seen frontally says little on how it is tilted to first order, and more to second order. Importance sampling
-    with fixed numbers (Bishop 2006, Pattern Recognition and Machine Learning, sec. 11.1.4); poses nearer to the
-    ``other`` minimum are that one's.
-    """
-    whiten = np.linalg.inv(np.linalg.cholesky(full))
-
-    def excess(step: np.ndarray) -> np.ndarray:
-        near = PoseStack(np.repeat(pose.rotation, len(step), 0), np.repeat(pose.translation, len(step), 0)).moved(step)
-        residual, image = problem.seen(near)
-        square = ((residual.reshape(len(step), -1) @ whiten.T) ** 2).sum(1)
-        return np.where((image.depth > 0).all(1), square, np.inf)
-
-    least = excess(np.zeros((1, 6)))[0]
-    axes = _principal(covariance)
-    if np.abs((excess(2 * np.vstack([axes, -axes])) - least) / 4 - 1).max() < CURVED:
-        return covariance
-    normal = np.random.default_rng(0).standard_normal((SAMPLES, 6))
-    precision = np.linalg.inv(covariance)
-    for _ in range(SAMPLE_ROUNDS):
-        step = SAMPLED_WIDER * normal @ _principal(covariance)
-        log = (normal**2).sum(1) / 2 - (excess(step) - least) / 2
-        if other is not None:
-            away = step_between(pose, other)
-            log[(step - away / 2) @ precision @ away > 0] = -np.inf
-        weight = np.exp(log - log.max())
-        covariance = np.einsum("k,ki,kj->ij", weight / weight.sum(), step, step)
-    return covariance
-
-
-def _principal(covariance: np.ndarray) -> np.ndarray:
-    """Rows whose summed outer products are the covariance: principal axes in units of σ."""
-    sigma = np.sqrt(np.diag(covariance))
-    value, vector = np.linalg.eigh(covariance / sigma / sigma[:, None])
-    return (vector * np.sqrt(np.maximum(value, 0))).T * sigma

@@ -149,15 +149,15 @@ def test_errors_of_pairs_are_as_large_as_their_sigma():
     fits, covariance, _ = fit_axes(measured(true, q), nominal, arcs)
     wanted = pairs_of([f.world_from_axis for f in fits], covariance, nominal)
     scores = []
-    for seed in range(100):
+    for seed in range(60):
         fits, covariance, _ = fit_axes(measured(true, q, SIGMA, seed), nominal, arcs)
         pairs = pairs_of([f.world_from_axis for f in fits], covariance, nominal)
         for one, two in zip(pairs[:3], wanted[:3], strict=True):  # the others cross: the sign of 0 is not kept
             scores.append(
                 [(one.distance - two.distance) / one.distance_sigma, (one.angle - two.angle) / one.angle_sigma]
             )
-    # 300 each, not all independent: the mean square scatters by √(2 / 300) = 8 % or somewhat more
-    assert np.mean(np.square(scores), axis=0) == pytest.approx([1, 1], abs=0.25)
+    # 180 each, not all independent: the mean square scatters by √(2 / 180) = 11 % or somewhat more
+    assert np.mean(np.square(scores), axis=0) == pytest.approx([1, 1], abs=0.33)
 
 
 def test_leaving_out_a_row_is_fitting_without_it():
@@ -175,7 +175,7 @@ def test_leaving_out_a_row_is_fitting_without_it():
         assert np.abs(found - [p.distance for p in whole.pairs]).max() > 1e-4
 
 
-@pytest.mark.parametrize("off_mm", [0.5, 20.0, 2000.0])
+@pytest.mark.parametrize("off_mm", [0.5, 20.0, 300.0, 2000.0])
 def test_a_gross_error_is_named_and_left_out(off_mm):
     nominal = mh80()
     data = measured(arm(nominal), sweep_values(nominal, 6), SIGMA, 7)

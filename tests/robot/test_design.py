@@ -106,6 +106,14 @@ def test_exchange_finds_the_best_of_all_sets_of_a_small_problem():
     assert hits >= 6  # single exchanges may end in a local best, mostly they do not
 
 
+def test_no_pose_is_taken_twice_however_good_it_is():
+    rows = np.full((6, 1, 1), 0.1) * np.eye(2)
+    rows[2] *= 100
+    chosen, _ = choose(rows, 3)
+    assert 2 in chosen
+    assert len(set(chosen.tolist())) == 3
+
+
 def test_predicted_sigma_is_that_of_simulated_identifications():
     """Linear least squares on noisy positions: spread of predicted positions against the stated σ."""
     options = DesignOptions(count=25, candidates=300, sigma_mm=0.05)
