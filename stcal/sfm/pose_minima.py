@@ -12,7 +12,6 @@ from stcal.sfm.pose_problem import (
     PoseProblem,
     PoseStack,
     descend,
-    residuals_px,
     step_between,
     whitening_by_centre,
 )
@@ -47,7 +46,8 @@ def start_pose(names: list[str], problem: PoseProblem, target: TargetCircles, wh
         )
     for face_id in by_size:
         rows, plane = faces[face_id], target.target_from_plane[face_id]
-        xy = (plane.inverse() @ problem.xyz[rows])[:, :2]
+        plane_from_target = plane.inverse()
+        xy = (plane_from_target @ problem.xyz[rows])[:, :2]
         long, broad = np.linalg.svd(xy - xy.mean(0), compute_uv=False)
         if broad < MIN_BREADTH * long:
             reason = f"{len(rows)} circles, {MIN_CIRCLES} off one line needed"
@@ -57,9 +57,9 @@ def start_pose(names: list[str], problem: PoseProblem, target: TargetCircles, wh
         except DegenerateError as error:
             reason = error
             continue
-        pose = camera_from_plane(homography) @ plane.inverse()
+        pose = camera_from_plane(homography) @ plane_from_target
         start = PoseStack(pose.rotation[None], pose.translation[None])
-        if (problem.seen(start)[1].depth <= 0).any():
+        if (problem.xyz @ pose.rotation[2] + pose.translation[2] <= 0).any():
             reason = "its circles would be behind the camera; check their labels"
             continue
         return start, plane
@@ -88,7 +88,7 @@ def minima_without_outliers(problem: PoseProblem, start: PoseStack, plane: Rigid
         bad = excess > max(1.0, WORST_SHARE * excess.max())
         if not bad.any():
             return found, keep, tuple(outliers)
-        residual = np.linalg.norm(residuals_px(part, found.poses[:1]), axis=1)
+        residual = np.linalg.norm(part.in_px(part.seen(found.poses[[0]])[0][0]), axis=1)
         sigma = residual / found.length[0]
         outliers += [
             Outlier(where, names[keep[i]], float(residual[i]), float(limit * sigma[i])) for i in np.flatnonzero(bad)

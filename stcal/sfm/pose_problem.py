@@ -29,6 +29,7 @@ class PoseStack:
     translation: np.ndarray
 
     def moved(self, step: np.ndarray) -> "PoseStack":
+        """After left perturbations (h, 6)."""
         turn = Rotation.from_rotvec(step[:, :3]).as_matrix()
         return PoseStack(turn @ self.rotation, self.translation + step[:, 3:])
 
@@ -66,6 +67,10 @@ class PoseProblem:
         image = project_circles(self.xyz, self.normal, self.radius, poses.rotation, poses.translation)
         return self.centre - image.centre, image
 
+    def in_px(self, residual: np.ndarray) -> np.ndarray:
+        """Residuals (n, 2) in the image as it is, px."""
+        return (self.slope @ residual[..., None])[..., 0]
+
     def select(self, keep: np.ndarray) -> "PoseProblem":
         """Those circles only."""
         rows = (3 * keep[:, None] + np.arange(3)).ravel()
@@ -93,11 +98,6 @@ def step_between(pose: PoseStack, other: PoseStack) -> np.ndarray:
     """(6,) left perturbation that leads from the one pose to the other, stacks of one each."""
     turn = Rotation.from_matrix(other.rotation[0] @ pose.rotation[0].T).as_rotvec()
     return np.concatenate([turn, other.translation[0] - pose.translation[0]])
-
-
-def residuals_px(problem: PoseProblem, pose: PoseStack) -> np.ndarray:
-    """Residuals of one pose in pixels, (n, 2)."""
-    return (problem.slope @ problem.seen(pose)[0][0][..., None])[..., 0]
 
 
 def block_diagonal(blocks: np.ndarray) -> np.ndarray:

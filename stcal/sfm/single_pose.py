@@ -28,7 +28,6 @@ from stcal.sfm.pose_problem import (
     PoseStack,
     block_diagonal,
     covariance_of_centres,
-    residuals_px,
     rigid_of,
 )
 from stcal.sfm.pose_spread import spread
@@ -201,9 +200,11 @@ def _problem(labels, centre_px, covariance_px2, target: TargetCircles, camera, o
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Weighed:
-    """One step of generalised least squares from h poses: the poses after it, ``normal`` (h, 6, 6), ``chi2`` (h,)."""
+    """One step of generalised least squares from h poses: the poses after it, ``residual`` (h, n, 2) that it leaves to
+    first order, ``normal`` (h, 6, 6), ``chi2`` (h,)."""
 
     poses: PoseStack
+    residual: np.ndarray
     normal: np.ndarray
     chi2: np.ndarray
 
@@ -217,7 +218,8 @@ def _weigh(residual: np.ndarray, by_pose: np.ndarray, full: np.ndarray, poses: P
     normal, right = back[..., :6], back[..., 6:]
     step = np.linalg.solve(normal, right)[..., 0]
     square = (np.swapaxes(r, 1, 2) @ solved[..., 6:])[:, 0, 0]
-    return _Weighed(poses.moved(step), normal, square - (step * right[..., 0]).sum(1))
+    left = residual - (a @ step[..., None]).reshape(residual.shape)
+    return _Weighed(poses.moved(step), left, normal, square - (step * right[..., 0]).sum(1))
 
 
 def _parts(problem: PoseProblem, image: CircleImages, noise: np.ndarray, full: np.ndarray) -> dict[str, np.ndarray]:
@@ -307,7 +309,7 @@ def _weighed(
         "ambiguous",
         tuple(dict.fromkeys(face_of(name) for name in names)),
         tuple(names),
-        residuals_px(problem, last.poses),
+        problem.in_px(last.residual[0]),
         weights,
         (),
         chi2,
