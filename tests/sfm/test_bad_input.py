@@ -22,27 +22,9 @@ from stcal.geometry.rigid import Rigid
 from stcal.sfm.images import decode
 from stcal.synthetic.observe import image_circles
 from stcal.synthetic.render import RenderOptions, encode, render
+from tests.outcome import COMPUTATION, INPUT, assert_error, lines_of
 
-INPUT, COMPUTATION = 2, 3
-PROGRESS = re.compile(r"\w+: \d+ of \d+")
 RESULTS = ("faces.json", "report.json", "report.html", "database.db")
-
-
-def lines_of(stderr: str) -> list[str]:
-    """Standard error without progress."""
-    return [line for line in stderr.splitlines() if not PROGRESS.fullmatch(line)]
-
-
-def assert_error(outcome, code: int, *parts: str) -> None:
-    """One line, this exit code, and every part in the line."""
-    found_code, out, err = outcome
-    lines = lines_of(err)
-    assert len(lines) == 1, err
-    assert lines[0].startswith("error: ")
-    assert "Traceback" not in out + err
-    for part in parts:
-        assert part in lines[0]
-    assert found_code == code, lines[0]
 
 
 def assert_success(outcome) -> str:

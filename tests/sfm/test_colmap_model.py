@@ -22,21 +22,11 @@ from stcal.sfm.foreign import faces_from_models
 from stcal.sfm.mapping import seeded_mapping
 from stcal.sfm.pipeline import calibrate_models
 from stcal.sfm.saved import load_run
+from tests.outcome import COMPUTATION, INPUT, assert_error
 
-INPUT, COMPUTATION = 2, 3
 FILES = ("cameras", "rigs", "frames", "images", "points3D")
 SAME_MM = 1e-9
 """Between results of the same numbers: they are summed in another order at most."""
-
-
-def assert_error(outcome, code: int, *parts: str) -> None:
-    """One line, this exit code, and every part in the line."""
-    found, out, err = outcome
-    (line,) = err.splitlines()
-    assert line.startswith("error: ")
-    for part in parts:
-        assert part in line
-    assert (found, out) == (code, "")
 
 
 @pytest.fixture(scope="module")
@@ -559,6 +549,7 @@ import json, resource, sys, time
 resource.setrlimit(resource.RLIMIT_AS, (2 << 30, 2 << 30))
 from stcal.errors import InputError
 from stcal.sfm.colmap_model import open_model
+from tests.outcome import COMPUTATION, INPUT, assert_error
 for folder in json.load(sys.stdin):
     start = time.monotonic()
     try:

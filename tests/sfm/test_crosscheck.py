@@ -26,21 +26,9 @@ from stcal.sfm.mapping import pipeline_options
 from stcal.sfm.native import NativeColmap, find_colmap, map_natively, require_listable
 from stcal.sfm.pipeline import write_report
 from stcal.sfm.saved import load_run
+from tests.outcome import COMPUTATION, INPUT, INTERRUPTED, assert_error, lines_of
 
-INPUT, COMPUTATION, INTERRUPTED = 2, 3, 130
-PROGRESS = re.compile(r"\w+: \d+ of \d+")
 INSTALL = "install it with `sudo apt-get install colmap`"
-
-
-def assert_error(outcome, code: int, *parts: str) -> str:
-    """One line besides progress, this exit code, and every part in the line."""
-    found, _, err = outcome
-    (line,) = [line for line in err.splitlines() if not PROGRESS.fullmatch(line)]
-    assert line.startswith("error: ")
-    for part in parts:
-        assert part in line
-    assert found == code
-    return line
 
 
 def state_of(folder) -> dict[str, str]:
@@ -96,7 +84,7 @@ def checked(small_run, colmap, tmp_path_factory):
 def test_the_two_programs_agree(checked):
     run, _, done = checked
     assert done.returncode == 0, done.stderr
-    assert [line for line in done.stderr.splitlines() if not PROGRESS.fullmatch(line)] == []
+    assert lines_of(done.stderr) == []
     assert "allowed: faces 2 µm and 1 mdeg, circles 2 µm, cameras 20 µm and 2 mdeg: they agree" in done.stdout
     assert done.stdout.splitlines()[-1] == f"report: {run / 'report.html'}"
     check = json.loads((run / "report.json").read_text(encoding="utf-8"))["crosscheck"]

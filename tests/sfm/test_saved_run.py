@@ -16,8 +16,8 @@ from stcal.sfm.options import RunOptions
 from stcal.sfm.pairs import PairOptions
 from stcal.sfm.pipeline import claim_folder
 from stcal.sfm.saved import load_run, marker_json
+from tests.outcome import INPUT, assert_error
 
-INPUT = 2
 FRAME = ("id", "ids", "origin", "x", "y")
 UNLABELLED = "12/IMG_1001.jpg"
 OTHER = RunOptions(
@@ -32,16 +32,6 @@ OTHER = RunOptions(
     flatness_mm=0.3,
 )
 """No value is a default but that of ``refine_camera``, which only the joint adjustment knows."""
-
-
-def assert_error(outcome, code: int, *parts: str) -> None:
-    """One line, this exit code, and every part in the line."""
-    found, out, err = outcome
-    (line,) = err.splitlines()
-    assert line.startswith("error: ")
-    for part in parts:
-        assert part in line
-    assert (found, out) == (code, "")
 
 
 @pytest.fixture(scope="module")
