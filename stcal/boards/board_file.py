@@ -82,10 +82,15 @@ class TagEntry(Strict):
         return square @ np.array([[cosine, sine], [-sine, cosine]]) + [self.x_mm, self.y_mm]
 
 
-class _Tags(Strict):
+class TagsFile(Strict):
+    """A layout of tags; what ``stcal locate`` adds, a board does without."""
+
     type: Literal["tags"]
     name: str = "tags"
     sigma_mm: Annotated[float, Field(ge=0, le=1e3)] = 0.0
+    origin: Annotated[int, Field(ge=0, strict=True)] | None = None
+    sigma_factor: Positive = 1.0
+    covariance_mm2: list[list[Finite]] | None = None
     tag: list[TagEntry] = Field(min_length=1)
 
 
@@ -112,7 +117,7 @@ def load_flat_board(path: str | Path) -> BoardDesign | FlatBoard:
             )
         return CharucoDesign(data.rows, data.columns, data.square_mm, data.marker_mm, data.dictionary, data.legacy)
     if kind == "tags":
-        data = load_toml(path, _Tags, "board file", REMEDY)
+        data = load_toml(path, TagsFile, "board file", REMEDY)
         corners = [tag.corners(where) for tag in data.tag]
         for tag, place in zip(data.tag, corners, strict=True):
             if place is None:

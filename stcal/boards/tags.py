@@ -14,6 +14,10 @@ from stcal.images import grey_8bit
 
 UNREFINED_PX = 0.5
 """σ of a corner whose edges cannot be measured."""
+SATURATED = 254
+"""Grey value (8 bit) from which on a pixel may have been brighter."""
+SATURATION_POINTS = 8
+"""Of each edge."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -21,18 +25,23 @@ class Tags:
     """Tags seen in one image.
 
     ``tags`` : (n,) dictionary and id; ``corners_px`` : (n, 4, 2) top left, top right, bottom right, bottom left as
-    printed, with ``covariance_px2`` : (n, 4, 2, 2); ``repeated`` : tags seen more than once, left out for that.
+    printed, with ``covariance_px2`` : (n, 4, 2, 2); ``repeated`` : tags seen more than once, left out for that;
+    ``saturated`` : (n,) share of the white around a tag that is at the sensor's limit: its edges then lie too far
+    inside, by up to half a pixel, which no residual shows.
     """
 
     tags: tuple[tuple[str, int], ...]
     corners_px: np.ndarray
     covariance_px2: np.ndarray
     repeated: tuple[tuple[str, int], ...] = ()
+    saturated: np.ndarray | None = None
 
     def __post_init__(self):
         object.__setattr__(self, "corners_px", frozen(self.corners_px, (len(self.tags), 4, 2), "tags' corners"))
         shape = (len(self.tags), 4, 2, 2)
         object.__setattr__(self, "covariance_px2", frozen(self.covariance_px2, shape, "corners' covariances"))
+        share = np.zeros(len(self.tags)) if self.saturated is None else self.saturated
+        object.__setattr__(self, "saturated", frozen(share, (len(self.tags),), "saturated shares"))
 
     def __len__(self) -> int:
         return len(self.tags)
@@ -49,12 +58,30 @@ def find_tags(image: np.ndarray, dictionaries: Sequence[str]) -> Tags:
             found.setdefault((name, int(tag)), []).append(place.reshape(4, 2))
     once = {tag: places[0] for tag, places in sorted(found.items()) if len(places) == 1}
     refined = [_refined(grey, name, place) for (name, _), place in once.items()]
+    corners = np.array([r.corners_px for r in refined]).reshape(-1, 4, 2)
     return Tags(
         tuple(once),
-        np.array([r.corners_px for r in refined]).reshape(-1, 4, 2),
+        corners,
         np.array([r.covariance_px2 for r in refined]).reshape(-1, 4, 2, 2),
         tuple(sorted(tag for tag, places in found.items() if len(places) > 1)),
+        _saturated(grey, corners, np.array([_dictionary(name).markerSize + 2 for name, _ in once])),
     )
+
+
+def other_dictionaries(image: np.ndarray, known: Sequence[str]) -> list[tuple[str, int]]:
+    """Dictionaries but the ``known`` ones of which the image shows tags, and how many; those with most tags first, and
+    of dictionaries that contain one another the smaller first."""
+    grey = grey_8bit(image)
+    names = sorted(name for name in dir(cv2.aruco) if name.startswith("DICT_") and name not in known)
+    # Two names for one dictionary; and one that finds tags everywhere.
+    names = [name for name in names if name.upper() == name or name.upper() not in names]
+    counts = []
+    for name in names:
+        dictionary = _dictionary(name)
+        _, ids, _ = cv2.aruco.ArucoDetector(dictionary, _parameters(name)).detectMarkers(grey)
+        if ids is not None:
+            counts.append((-len(ids), len(dictionary.bytesList), name))
+    return [(name, -count) for count, _, name in sorted(counts)]
 
 
 def view_of_tags(image: str, tags: Tags, layout: TagLayout) -> BoardView | None:
@@ -102,6 +129,19 @@ def _parameters(name: str):
     if "APRILTAG" in name.upper():
         how.cornerRefinementMethod = cv2.aruco.CORNER_REFINE_NONE
     return how
+
+
+def _saturated(grey: np.ndarray, corners: np.ndarray, cells: np.ndarray) -> np.ndarray:
+    """Share (n,) of the white, half a cell outside of the edges of tags (n, 4, 2) with so many cells a side."""
+    if not len(corners):
+        return np.zeros(0)
+    middle = corners.mean(1, keepdims=True)
+    outer = middle + (corners - middle) * (1 + 1 / cells)[:, None, None]
+    along = np.linspace(0, 1, SATURATION_POINTS, endpoint=False)[:, None]
+    points = outer[:, :, None] + along * (np.roll(outer, -1, axis=1) - outer)[:, :, None]
+    x, y = np.rint(points).astype(int).reshape(-1, 2).T
+    level = grey[y.clip(0, grey.shape[0] - 1), x.clip(0, grey.shape[1] - 1)]
+    return (level.reshape(len(corners), -1) >= SATURATED).mean(1)
 
 
 def _refined(grey: np.ndarray, name: str, corners: np.ndarray) -> EdgeCorners:
