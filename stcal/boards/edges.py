@@ -50,6 +50,20 @@ def corners_from_edges(grey: np.ndarray, corners: np.ndarray, cells: int) -> Edg
     return EdgeCorners(np.array(found), np.array(covariance))
 
 
+def corners_by_edges(corners: np.ndarray) -> np.ndarray:
+    """How far the corners (..., 4, 2) of tags, in order around, go when all four edges move outwards by one.
+
+    Edges move alike where an image is over-exposed, where ink has spread, and where a camera's response is not linear.
+    """
+    along = np.roll(corners, -1, axis=-2) - corners
+    along /= np.linalg.norm(along, axis=-1, keepdims=True)
+    normal = np.stack([along[..., 1], -along[..., 0]], axis=-1)
+    outwards = np.sign((normal * (corners - corners.mean(-2, keepdims=True))).sum((-1, -2)))
+    normal *= outwards[..., None, None]
+    pair = np.stack([np.roll(normal, 1, axis=-2), normal], axis=-2)
+    return np.linalg.solve(pair, np.ones((*pair.shape[:-1], 1)))[..., 0]
+
+
 @dataclass(frozen=True, slots=True, eq=False)
 class _Line:
     """Points p with ``normal @ (p − middle) = offset + slope · along @ (p − middle)``; ``covariance`` of the two."""

@@ -16,6 +16,11 @@ UNREFINED_PX = 0.5
 """σ of a corner whose edges cannot be measured."""
 SATURATED = 254
 """Grey value (8 bit) from which on a pixel may have been brighter."""
+EDGE_PX = 0.1
+"""σ of the shift that all edges share: a response that is not linear, stray light, ink."""
+SATURATED_EDGE_PX = 0.7
+"""What saturation adds: an edge blurred by 0.7 px whose bright side is clipped at ½, ¼ of its height seems to lie 0.6,
+0.9 px farther towards the dark (the mean of a normal density's tail)."""
 SATURATION_POINTS = 8
 """Of each edge."""
 
@@ -26,8 +31,7 @@ class Tags:
 
     ``tags`` : (n,) dictionary and id; ``corners_px`` : (n, 4, 2) top left, top right, bottom right, bottom left as
     printed, with ``covariance_px2`` : (n, 4, 2, 2); ``repeated`` : tags seen more than once, left out for that;
-    ``saturated`` : (n,) share of the white around a tag that is at the sensor's limit: its edges then lie too far
-    inside, by up to half a pixel, which no residual shows.
+    ``saturated`` : (n,) share of the white around a tag that is at the sensor's limit, see :meth:`edge_sigma_px`.
     """
 
     tags: tuple[tuple[str, int], ...]
@@ -45,6 +49,10 @@ class Tags:
 
     def __len__(self) -> int:
         return len(self.tags)
+
+    def edge_sigma_px(self) -> np.ndarray:
+        """σ (n,) of a shift that all edges of a tag share, outwards or inwards, which no residual of theirs shows."""
+        return np.hypot(EDGE_PX, SATURATED_EDGE_PX * self.saturated)
 
 
 def find_tags(image: np.ndarray, dictionaries: Sequence[str]) -> Tags:

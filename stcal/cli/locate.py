@@ -46,6 +46,48 @@ def schedule(
 
 
 @app.command()
+def calibrate(
+    images: Annotated[Path, typer.Argument(help="Photographs of the target with a board in the same plane.")],
+    camera: CameraFile,
+    board: Annotated[Path, typer.Option("--board", help="Dots, chessboard, ChArUco or tags (TOML).")],
+    layout: LayoutFile,
+    out: Annotated[Path, typer.Option("--out", help="The calibrated layout (TOML).")] = Path("calibrated.toml"),
+    workers: Annotated[int | None, typer.Option(min=1, help="Processes; as many as cores if not given.")] = None,
+    json_file: JsonFile = None,
+) -> None:
+    """Where the corners of the target's tags lie, with σ; the frame in the middle of the layout's origin tag."""
+    from stcal.boards.board_file import load_flat_board
+    from stcal.camera_file import read_camera
+    from stcal.cli import circle_views as circles
+    from stcal.cli.progress import StageProgress
+    from stcal.design import BoardDesign
+    from stcal.locate.calibrate import calibrate as calibrated
+    from stcal.locate.calibrate_report import calibrated_json, calibrated_text, warnings
+    from stcal.locate.layout import layout_toml, load_plan
+    from stcal.locate.views import read_images
+
+    plan, design, model = load_plan(layout), load_flat_board(board), read_camera(camera)
+    dots = isinstance(design, BoardDesign)
+    dictionaries = tuple(dict.fromkeys(dictionary for dictionary, _ in plan.tags))
+    with StageProgress() as progress:
+        found = read_images(images, model, None if dots else design, dictionaries, workers, progress)
+        views = found.views
+        if dots:
+            by_name = circles.circle_views(images, model, design, workers, progress)
+            views = [by_name.get(name) for name in found.names]
+    symmetries = circles.symmetries(design) if dots else design.symmetries()
+    result = calibrated(plan, views, found.tags, found.names, found.camera, symmetries)
+    print(calibrated_text(result))
+    for each in (*found.left_out, *result.left_out):
+        print(f"left out: {each}")
+    for warning in warnings(result, plan.tags):
+        print(f"warning: {warning}")
+    _save(out, layout_toml(result.layout, [f"Calibrated by stcal locate from {len(result.images)} images."]))
+    if json_file:
+        _save(json_file, json.dumps(calibrated_json(result), indent=1, ensure_ascii=False, allow_nan=False) + "\n")
+
+
+@app.command()
 def run(
     exposures: Annotated[
         Path, typer.Argument(help="One image; a folder of exposures of one scene; or a folder of such folders.")

@@ -41,7 +41,7 @@ class TargetLayout:
     corners_mm : (n, 4, 2) top left, top right, bottom right, bottom left as printed, in {obj}
     covariance_mm2 : (8n, 8n) of all their coordinates, tag by tag, corner by corner, x before y
     origin : row of the tag that holds the origin
-    sigma_factor : by which a corner's measured σ is too small, as the calibration's residuals say
+    sigma_px : what print, lens and flatness add to the measured σ of a corner, as the calibration's residuals say
     """
 
     name: str
@@ -49,7 +49,7 @@ class TargetLayout:
     corners_mm: np.ndarray
     covariance_mm2: np.ndarray
     origin: int
-    sigma_factor: float = 1.0
+    sigma_px: float = 0.0
 
     def __post_init__(self):
         n = len(self.tags)
@@ -104,14 +104,14 @@ def load_layout(path: str | Path) -> TargetLayout:
         covariance = _full(data.covariance_mm2, size, where)
     else:
         corners = _in_obj(corners, plan.origin)
-    return TargetLayout(plan.name, plan.tags, corners, covariance, plan.origin, data.sigma_factor)
+    return TargetLayout(plan.name, plan.tags, corners, covariance, plan.origin, data.sigma_px)
 
 
 def layout_toml(layout: TargetLayout, comments: Sequence[str] = ()) -> str:
     """The file :func:`load_layout` reads."""
     lines = [f"# {comment}" for comment in comments]
     lines += ['type = "tags"', f"name = {_quoted(layout.name)}", f"origin = {layout.tags[layout.origin][1]}"]
-    lines.append(f"sigma_factor = {layout.sigma_factor:.6g}")
+    lines.append(f"sigma_px = {layout.sigma_px:.6g}")
     lines.append("# Lower triangle; coordinates tag by tag, corner by corner, x before y.")
     rows = (", ".join(f"{v:.6g}" for v in row[: k + 1]) for k, row in enumerate(_finite(layout.covariance_mm2)))
     lines += ["covariance_mm2 = [", *(f"  [{row}]," for row in rows), "]"]
@@ -128,12 +128,12 @@ def square(size_mm: float) -> np.ndarray:
     return size_mm / 2 * np.array([[-1, -1], [1, -1], [1, 1], [-1, 1]], float)
 
 
-def obj_from_plane(corners: np.ndarray, size_mm: float | None = None) -> tuple[np.ndarray, np.ndarray]:
+def obj_from_plane(corners: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Turn (2, 2) and shift (2,) into the frame in the middle of a tag with these corners (4, 2).
 
-    Least squares between them and a square (of ``size_mm``, which does not matter for turn and shift).
+    Least squares between them and a square, whose size does not matter.
     """
-    nominal = square(size_mm or 1.0)
+    nominal = square(1.0)
     middle = corners.mean(0)
     along = np.sum((corners - middle) * nominal)
     across = np.sum((corners - middle) @ np.array([[0, -1], [1, 0]]) * nominal)

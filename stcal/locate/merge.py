@@ -5,13 +5,11 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from stcal.boards.edges import corners_by_edges
 from stcal.boards.tags import Tags
 from stcal.locate.layout import TargetLayout
 from stcal.locate.pose import SeenTags
 
-SATURATED_PX = 0.4
-"""σ that a corner gains where all the white around its tag is saturated: clipped at half their height, edges blurred by
-0.7 px lie 0.56 px inside."""
 PRIOR_SHARE, PRIOR_WEIGHT = 0.5, 20.0
 """Share of a corner's variance that other exposures do not repeat, and how many differences this guess is worth."""
 
@@ -49,14 +47,16 @@ def merge(exposures: Sequence[Tags], layout: TargetLayout, names: Sequence[str] 
 
     Exposures of one scene share much of a corner's error: print, lens, how pixels cut its edges. A part that they do
     share does not average out. It is estimated from how much they differ, against the σ they state; where they differ
-    by more than these, the σ grow.
+    by more than these, the σ grow. What print, lens and flatness add (the layout's ``sigma_px``) is the same in all.
     """
     rows = layout.rows()
     places = [{rows[tag]: k for k, tag in enumerate(tags.tags) if tag in rows} for tags in exposures]
     used = np.array(sorted({row for place in places for row in place}), int)
-    corners, covariance = _stacked(exposures, places, used, layout.sigma_factor)
+    corners, covariance, edge = _stacked(exposures, places, used)
     there = np.isfinite(corners[..., 0, 0])
-    weight = np.where(there[..., None], 1 / np.trace(covariance, axis1=-2, axis2=-1), 0.0)
+    # At a right angle a corner goes √2 as far as its edges.
+    variance = np.trace(covariance, axis1=-2, axis2=-1) + 2 * edge[..., None] ** 2
+    weight = np.where(there[..., None], 1 / variance, 0.0)
     share_of = weight / weight.sum(0)
     mean = (share_of[..., None] * np.where(there[..., None, None], corners, 0)).sum(0)
     share = _differing_share(corners, covariance, mean, there)
@@ -64,12 +64,12 @@ def merge(exposures: Sequence[Tags], layout: TargetLayout, names: Sequence[str] 
     root = share_of[..., None, None] * np.linalg.cholesky(covariance)
     alone = np.einsum("enkij,enklj->nkil", root, root)
     together = np.einsum("enkij,fnklj->nkil", root, root)
-    merged = growth * (own * alone + (1 - own) * together)
+    merged = growth * (own * alone + (1 - own) * together) + layout.sigma_px**2 * np.eye(2)
     names = names or [str(k + 1) for k in range(len(exposures))]
     repeated = {tag for tags in exposures for tag in tags.repeated if tag in rows}
     unknown = {tag for tags in exposures for tag in tags.tags if tag not in rows}
     return Merged(
-        SeenTags(used, mean, merged),
+        SeenTags(used, mean, merged, (share_of.mean(2) * edge).sum(0)),
         tuple(int(n) for n in there.sum(1)),
         share,
         _shifts(corners, covariance, there, names),
@@ -78,27 +78,32 @@ def merge(exposures: Sequence[Tags], layout: TargetLayout, names: Sequence[str] 
     )
 
 
-def _stacked(exposures, places, used: np.ndarray, factor: float) -> tuple[np.ndarray, np.ndarray]:
-    """Corners (e, n, 4, 2), NaN where a tag is not seen, and their covariances, there those of one pixel."""
+def _stacked(exposures, places, used: np.ndarray) -> tuple[np.ndarray, ...]:
+    """Corners (e, n, 4, 2), NaN where a tag is not seen, their covariances, there those of one pixel, and σ of their
+    edges' common shift (e, n), there 0."""
     corners = np.full((len(exposures), len(used), 4, 2), np.nan)
+    edge = np.zeros(corners.shape[:2])
     covariance = np.tile(np.eye(2), (len(exposures), len(used), 4, 1, 1))
     for e, (tags, place) in enumerate(zip(exposures, places, strict=True)):
         seen = [k for k, row in enumerate(used) if row in place]
         own = [place[used[k]] for k in seen]
         corners[e, seen] = tags.corners_px[own]
-        more = (SATURATED_PX * tags.saturated[own]) ** 2
-        covariance[e, seen] = factor**2 * tags.covariance_px2[own] + more[:, None, None, None] * np.eye(2)
-    return corners, covariance
+        covariance[e, seen] = tags.covariance_px2[own]
+        edge[e, seen] = tags.edge_sigma_px()[own]
+    return corners, covariance, edge
 
 
 def _differing_share(corners, covariance, mean, there) -> float:
-    """Of the corners' stated variance, how much their differences between exposures show."""
+    """Of the corners' stated variance, how much their differences between exposures show, without what is common to a
+    tag's edges."""
     off = np.where(there[..., None, None], corners - mean, 0)
+    way = corners_by_edges(mean)
+    off -= (off * way).sum((2, 3), keepdims=True) / (way * way).sum((1, 2))[:, None, None] * way
     square = np.einsum("enki,enkij,enkj->enk", off, np.linalg.inv(covariance), off)
     many = there.sum(0) > 1
     # A tag that one exposure gets wrong must not speak for all.
     square = np.minimum(square[:, many], 25.0)
-    free = 8 * float((there.sum(0)[many] - 1).sum())
+    free = 7 * float((there.sum(0)[many] - 1).sum())
     return float((square.sum() + PRIOR_SHARE * PRIOR_WEIGHT) / (free + PRIOR_WEIGHT))
 
 

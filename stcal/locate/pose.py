@@ -7,8 +7,10 @@ Pinz 2006): the reprojection error has two minima. Both are found and refined, a
 from dataclasses import dataclass, replace
 
 import numpy as np
+from scipy.linalg import block_diag
 from scipy.stats import chi2 as chi_square
 
+from stcal.boards.edges import corners_by_edges
 from stcal.camera_file import CameraPrior, intrinsic_basis
 from stcal.errors import ConvergenceError, DegenerateError
 from stcal.geometry.arrays import frozen
@@ -44,26 +46,28 @@ MAX_SIGMA_RAD = 0.5
 class SeenTags:
     """Tags of a layout in one scene.
 
-    ``rows`` : (k,) of the layout; ``corners_px`` : (k, 4, 2); ``covariance_px2`` : (k, 4, 2, 2), with the layout's
-    factor on their σ.
+    ``rows`` : (k,) of the layout; ``corners_px`` : (k, 4, 2); ``covariance_px2`` : (k, 4, 2, 2), what the
+    layout's print and the lens add included; ``edge_sigma_px`` : (k,) of a shift that all edges of a tag share.
     """
 
     rows: np.ndarray
     corners_px: np.ndarray
     covariance_px2: np.ndarray
+    edge_sigma_px: np.ndarray
 
     def __post_init__(self):
         k = len(self.rows)
         object.__setattr__(self, "rows", frozen(self.rows, (k,), "rows", int))
         object.__setattr__(self, "corners_px", frozen(self.corners_px, (k, 4, 2), "tags' corners"))
         object.__setattr__(self, "covariance_px2", frozen(self.covariance_px2, (k, 4, 2, 2), "corners' covariances"))
+        object.__setattr__(self, "edge_sigma_px", frozen(self.edge_sigma_px, (k,), "edges' σ"))
 
     def __len__(self) -> int:
         return len(self.rows)
 
     def select(self, keep) -> "SeenTags":
         """Those tags only."""
-        return SeenTags(self.rows[keep], self.corners_px[keep], self.covariance_px2[keep])
+        return SeenTags(self.rows[keep], self.corners_px[keep], self.covariance_px2[keep], self.edge_sigma_px[keep])
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -161,13 +165,21 @@ def problem_of(seen: SeenTags, layout: TargetLayout, camera: Camera, prior: Came
     ideal = camera.normalised_from_pixel(pixels)
     slope = camera.distort_jacobian(ideal)[1] * camera.focal[:, None]
     back = np.linalg.inv(slope)
-    by_camera, known = np.zeros((len(ideal), 2, 0)), np.zeros((0, 0))
+    common, known = _by_edges(seen, back), np.diag(seen.edge_sigma_px**2)
     if prior is not None:
         by_camera = back @ (camera.parameter_jacobian(ideal) @ intrinsic_basis(prior.colmap_model))
-        known = prior.covariance
+        common, known = np.concatenate([common, by_camera], axis=2), block_diag(known, prior.covariance)
     noise = back @ seen.covariance_px2.reshape(-1, 2, 2) @ np.swapaxes(back, 1, 2)
     xy = layout.corners_mm[seen.rows].reshape(-1, 2)
-    return PlanarProblem(xy, ideal, noise, slope, layout.covariance_mm2[np.ix_(rows, rows)], by_camera, known)
+    return PlanarProblem(xy, ideal, noise, slope, layout.covariance_mm2[np.ix_(rows, rows)], common, known)
+
+
+def _by_edges(seen: SeenTags, back: np.ndarray) -> np.ndarray:
+    """Derivative (4k, 2, k) of the corners by the shift of each tag's edges, px."""
+    k = len(seen)
+    by = np.zeros((k, 4, 2, k))
+    by[np.arange(k), :, :, np.arange(k)] = corners_by_edges(seen.corners_px)
+    return back @ by.reshape(4 * k, 2, k)
 
 
 def _start(problem: PlanarProblem, where: str) -> Rigid:

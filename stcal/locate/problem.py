@@ -19,8 +19,9 @@ class PlanarProblem:
     """n corners of a plane, what was measured of them, and what is known of everything else; the lens taken out.
 
     ``xy`` : (n, 2) mm in {obj}; ``seen`` : (n, 2) normalised coordinates; ``noise`` : (n, 2, 2) their covariance;
-    ``slope`` : (n, 2, 2) px by those; ``shape`` : (2n, 2n) mm² covariance of ``xy``; ``by_camera`` : (n, 2, q)
-    derivative of ``seen`` by the intrinsics, q = 0 where they are held, ``prior`` : (q, q) their covariance.
+    ``slope`` : (n, 2, 2) px by those; ``shape`` : (2n, 2n) mm² covariance of ``xy``; ``common`` : (n, 2, q)
+    derivative of ``seen`` by what several corners share, the edges of each tag and the intrinsics, where these are not
+    held, and ``prior`` : (q, q) its covariance.
     """
 
     xy: np.ndarray
@@ -28,14 +29,14 @@ class PlanarProblem:
     noise: np.ndarray
     slope: np.ndarray
     shape: np.ndarray
-    by_camera: np.ndarray
+    common: np.ndarray
     prior: np.ndarray
 
     def select(self, keep: np.ndarray) -> "PlanarProblem":
         """Those corners only."""
         rows = (2 * keep[:, None] + np.arange(2)).ravel()
         own = (self.xy[keep], self.seen[keep], self.noise[keep], self.slope[keep])
-        return PlanarProblem(*own, self.shape[np.ix_(rows, rows)], self.by_camera[keep], self.prior)
+        return PlanarProblem(*own, self.shape[np.ix_(rows, rows)], self.common[keep], self.prior)
 
     def in_px(self, residual: np.ndarray) -> np.ndarray:
         """Residuals (n, 2) in the image as it is, px."""
@@ -99,7 +100,8 @@ def own_whitening(problem: PlanarProblem, pose: Poses) -> np.ndarray:
     by_corner = project(problem, pose).by_corner[0]
     n = len(problem.xy)
     own = problem.shape.reshape(n, 2, n, 2)[np.arange(n), :, np.arange(n)]
-    return np.linalg.inv(np.linalg.cholesky(problem.noise + by_corner @ own @ np.swapaxes(by_corner, 1, 2)))
+    shared = problem.common @ problem.prior @ np.swapaxes(problem.common, 1, 2)
+    return np.linalg.inv(np.linalg.cholesky(problem.noise + shared + by_corner @ own @ np.swapaxes(by_corner, 1, 2)))
 
 
 def descend(problem: PlanarProblem, poses: Poses, whiten: np.ndarray, huber: float = HUBER) -> Minima:
@@ -156,11 +158,11 @@ class Weighed:
 
 
 def weigh(problem: PlanarProblem, pose: Poses, weights: np.ndarray, steps: int = 2) -> Weighed:
-    """Generalised least squares from one pose: the image's noise (over Huber's ``weights`` (n,)), the layout's and the
-    intrinsics' covariance add up. What the second step leaves is of second order."""
+    """Generalised least squares from one pose: the image's noise (over Huber's ``weights`` (n,)), what corners share
+    and the layout's covariance add up. What the second step leaves is of second order."""
     noise = block_diagonal(problem.noise / weights[:, None, None])
-    by_camera = problem.by_camera.reshape(2 * len(problem.xy), -1)
-    noise += by_camera @ problem.prior @ by_camera.T
+    common = problem.common.reshape(2 * len(problem.xy), -1)
+    noise += common @ problem.prior @ common.T
     by_corner = block_diagonal(project(problem, pose).by_corner[0])
     full = noise + by_corner @ problem.shape @ by_corner.T
     for _ in range(steps):

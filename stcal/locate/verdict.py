@@ -17,12 +17,12 @@ Decision = Literal["accept", "ambiguous", "reject"]
 class VerdictOptions:
     """The limits.
 
-    ``min_tags`` : tags used; ``min_spread_px`` : the corners' extent across their longer direction; ``min_foreshortening``
-    : cosine between the target's normal and the line of sight, which is det J of a target of any size and distance;
-    ``max_p`` : odds of residuals as large as a pose is rejected for; ``flip_odds`` : at most these odds of the other
-    pose, for Gaussian errors; ``sigma_margin`` : by which all σ may be too small without that becoming untrue;
-    ``equal_deg`` : two poses nearer than this are one, and its covariance covers both; ``max_sigma_deg``,
-    ``max_sigma_mm`` : of rotation and position in their worst direction.
+    ``min_tags`` : tags used; ``min_spread_px`` : the corners' extent across their longer direction;
+    ``min_foreshortening`` : cosine between the target's normal and the line of sight, which is det J of a target of any
+    size and distance; ``max_p`` : odds of residuals as large as a pose is rejected for; ``flip_odds`` : at most these
+    odds of the other pose, for Gaussian errors; ``sigma_margin`` : by which all σ may be too small without that
+    becoming untrue; ``equal_deg`` : two poses nearer than this are one, and its covariance covers both;
+    ``max_sigma_deg``, ``max_sigma_mm`` : of rotation and position in their worst direction.
     """
 
     min_tags: int = 1
