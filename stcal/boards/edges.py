@@ -10,44 +10,55 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 
-STEP_PX = 0.25
+SAMPLES = 33
+"""Of a profile across an edge."""
+POINTS = 40
+"""Profiles of an edge; where they are nearer than a pixel they count as many as there are pixels."""
 ALONG = (0.08, 0.92)
 """Part of an edge that is used: near its ends the other edge's blur is in the profile."""
 CELLS_ACROSS = 0.8
 """How far a profile reaches to either side, in cells; the border of a tag, and the white about it, is one cell wide."""
 REACH_PX = (1.5, 6.0)
+MIN_RISE = 0.15
+"""Noise rises too, everywhere alike: what is below this share of a profile's steepest step is not the edge."""
 MIN_CONTRAST = 0.3
-"""Of a profile, as a share of the tag's median; less is another tag's edge, a stain, a shadow's rim."""
-POINTS = 40
-MIN_POINTS = 5
+"""Of a profile, as a share of the tag's; less is another tag's edge, a stain, a shadow's rim."""
+MIN_SHARE = 0.25
+"""Of an edge's profiles; with fewer it is not seen."""
+MIN_CELL_PX = 2.0
 CUT = 2.5
 """Points farther off the line than so many robust σ are left out."""
+CUT_ROUNDS = 4
 MIN_SIGMA_PX = 0.01
 """Below this the noise of edge points is not what limits a corner: printing, flatness and the lens are."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class EdgeCorners:
-    """``corners_px`` : (4, 2); ``covariance_px2`` : (4, 2, 2)."""
+    """``corners_px`` : (n, 4, 2); ``covariance_px2`` : (n, 4, 2, 2); ``seen`` : (n,) whether all four edges are; of
+    the other tags the values mean nothing."""
 
     corners_px: np.ndarray
     covariance_px2: np.ndarray
+    seen: np.ndarray
 
 
-def corners_from_edges(grey: np.ndarray, corners: np.ndarray, cells: int) -> EdgeCorners | None:
-    """Refine four corners (4, 2), in order around a dark tag with ``cells`` cells a side, its border included.
+def corners_from_edges(grey: np.ndarray, corners: np.ndarray, cells: np.ndarray) -> EdgeCorners:
+    """Refine the corners (n, 4, 2), in order around, of dark tags with ``cells`` (n,) cells a side, border included.
 
-    None where an edge is not seen: too short, hidden, or without contrast.
+    An edge is not seen where it is too short, hidden, outside of the image, or without contrast.
     """
-    lines = []
-    contrast = _tag_contrast(grey, corners)
-    for k in range(4):
-        line = _edge(grey, corners[k], corners[(k + 1) % 4], cells, corners.mean(0), contrast)
-        if line is None:
-            return None
-        lines.append(line)
-    found, covariance = zip(*(_meet(lines[k - 1], lines[k]) for k in range(4)), strict=True)
-    return EdgeCorners(np.array(found), np.array(covariance))
+    n = len(corners)
+    if not n:
+        return EdgeCorners(np.zeros((0, 4, 2)), np.zeros((0, 4, 2, 2)), np.zeros(0, bool))
+    frame = _frame(np.asarray(corners, float), cells)
+    offset, good = _profiles(grey, frame)
+    with np.errstate(divide="ignore", invalid="ignore"):  # of edges that are not seen
+        lines = _fit(frame.place, offset, good)
+        found, covariance = _meet(frame, lines)
+    seen = good.mean(2) >= MIN_SHARE
+    seen &= np.isfinite(covariance).all((2, 3)) & (frame.length >= MIN_CELL_PX * np.reshape(cells, (-1, 1)))
+    return EdgeCorners(found, covariance, seen.all(1))
 
 
 def corners_by_edges(corners: np.ndarray) -> np.ndarray:
@@ -65,84 +76,103 @@ def corners_by_edges(corners: np.ndarray) -> np.ndarray:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class _Line:
-    """Points p with ``normal @ (p − middle) = offset + slope · along @ (p − middle)``; ``covariance`` of the two."""
+class _Frame:
+    """Of each edge: ``middle``, ``along``, ``normal`` outwards (n, 4, 2), ``length`` and ``reach`` of the profiles
+    (n, 4), and their ``place`` from the middle (n, 4, POINTS); px."""
 
     middle: np.ndarray
-    normal: np.ndarray
     along: np.ndarray
-    offset: float
-    slope: float
+    normal: np.ndarray
+    length: np.ndarray
+    reach: np.ndarray
+    place: np.ndarray
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Lines:
+    """Points p with ``normal @ (p − middle) = offset + slope · along @ (p − middle)``, (n, 4); ``covariance`` of the
+    two, (n, 4, 2, 2)."""
+
+    offset: np.ndarray
+    slope: np.ndarray
     covariance: np.ndarray
 
 
-def _tag_contrast(grey: np.ndarray, corners: np.ndarray) -> float:
-    """Bright minus dark end of what is in and around the tag."""
-    x0, y0 = np.floor(corners.min(0) - 3).astype(int).clip(0)
-    x1, y1 = np.ceil(corners.max(0) + 4).astype(int)
-    low, high = np.percentile(grey[y0:y1, x0:x1], [5, 95])
-    return float(high - low)
+def _frame(corners: np.ndarray, cells: np.ndarray) -> _Frame:
+    """Edges from each corner to the next."""
+    end = np.roll(corners, -1, axis=1)
+    length = np.linalg.norm(end - corners, axis=2)
+    along = (end - corners) / length[..., None]
+    middle = (corners + end) / 2
+    normal = np.stack([along[..., 1], -along[..., 0]], axis=-1)
+    depth = 2 * ((middle - corners.mean(1, keepdims=True)) * normal).sum(2)
+    normal = normal * np.where(depth < 0, -1.0, 1.0)[..., None]
+    reach = np.clip(CELLS_ACROSS * np.minimum(np.abs(depth), length) / np.reshape(cells, (-1, 1)), *REACH_PX)
+    place = (np.linspace(*ALONG, POINTS) - 0.5) * length[..., None]
+    return _Frame(middle, along, normal, length, reach, place)
 
 
-def _edge(grey: np.ndarray, start: np.ndarray, end: np.ndarray, cells: int, inside: np.ndarray, contrast: float):
-    """The line through the edge's points; None where there are too few."""
-    length = np.linalg.norm(end - start)
-    if length < 2 * cells:  # cells of under two pixels: nothing to measure
-        return None
-    along = (end - start) / length
-    normal = np.array([along[1], -along[0]])
-    if normal @ (inside - start) > 0:
-        normal = -normal  # outwards, from dark to bright
-    depth = abs(normal @ (inside - start)) * 2
-    reach = float(np.clip(CELLS_ACROSS * min(depth, length) / cells, *REACH_PX))
-    across = np.arange(-reach, reach + STEP_PX / 2, STEP_PX)
-    place = np.linspace(*ALONG, int(np.clip(length, MIN_POINTS, POINTS))) * length
-    base = start + place[:, None] * along
-    xy = base[:, None] + across[:, None] * normal
-    profile = cv2.remap(grey, xy[..., 0].astype(np.float32), xy[..., 1].astype(np.float32), cv2.INTER_LINEAR)
-    if (xy < 0).any() or (xy > [grey.shape[1] - 1, grey.shape[0] - 1]).any():
-        return None
-    rise = np.diff(profile.astype(float), axis=1).clip(0)
-    # Noise rises too, everywhere alike: what is below a share of the steepest is not the edge.
-    rise[rise < 0.15 * rise.max(1, keepdims=True)] = 0
-    total = rise.sum(1)
-    good = total > MIN_CONTRAST * contrast
-    if good.sum() < MIN_POINTS:
-        return None
-    middle_of_step = (across[1:] + across[:-1]) / 2
-    offset = (rise[good] @ middle_of_step) / total[good]
-    return _fit(base[good], place[good] - length / 2, offset, start + along * length / 2, normal, along)
+def _profiles(grey: np.ndarray, frame: _Frame) -> tuple[np.ndarray, np.ndarray]:
+    """Where each profile rises, px from the frame's line, and whether it is one of the edge, (n, 4, POINTS)."""
+    n = len(frame.length)
+    across = np.linspace(-1, 1, SAMPLES) * frame.reach[..., None]
+    base = frame.middle[:, :, None] + frame.place[..., None] * frame.along[:, :, None]
+    xy = base[:, :, :, None] + (across[..., None] * frame.normal[:, :, None])[:, :, None]
+    flat = xy.reshape(4 * n, POINTS * SAMPLES, 2).astype(np.float32)
+    level = cv2.remap(grey, flat[..., 0], flat[..., 1], cv2.INTER_LINEAR).reshape(n, 4, POINTS, SAMPLES).astype(float)
+    inside = ((xy >= 0) & (xy <= [grey.shape[1] - 1, grey.shape[0] - 1])).all((2, 3, 4))
+    rise = np.diff(level, axis=3).clip(0)
+    rise[rise < MIN_RISE * rise.max(3, keepdims=True)] = 0
+    total = rise.sum(3)
+    low, high = np.percentile(level.reshape(n, -1), [5, 95], axis=1)
+    good = (total > MIN_CONTRAST * (high - low)[:, None, None]) & (total > 0) & inside[..., None]
+    middle = (across[..., 1:] + across[..., :-1]) / 2
+    return np.einsum("nkps,nks->nkp", rise, middle) / np.where(good, total, 1.0), good
 
 
-def _fit(base, place, offset, middle, normal, along) -> _Line | None:
-    """Straight line by least squares without what is far off it."""
-    keep = np.ones(len(place), bool)
-    for _ in range(5):
-        slope = np.column_stack([np.ones(keep.sum()), place[keep]])
-        value = np.linalg.lstsq(slope, offset[keep], rcond=None)[0]
-        off = np.abs(offset - value[0] - value[1] * place)
-        spread = max(1.4826 * np.median(off[keep]), MIN_SIGMA_PX)
-        new = off < CUT * spread
-        if new.sum() < MIN_POINTS:
-            return None
+def _fit(place: np.ndarray, offset: np.ndarray, good: np.ndarray) -> _Lines:
+    """Straight lines by least squares without what is far off them."""
+    keep = good
+    for _ in range(CUT_ROUNDS):
+        value, spread = _line(place, offset, keep)
+        off = np.abs(offset - value[..., :1] - value[..., 1:] * place)
+        typical = 1.4826 * np.nanmedian(np.where(keep | ~good.any(2, keepdims=True), off, np.nan), axis=2)
+        new = good & (off < CUT * np.maximum(typical, MIN_SIGMA_PX)[..., None])
         if (new == keep).all():
             break
         keep = new
-    # Profiles nearer than a pixel share pixels: not more independent points than pixels along the edge.
-    points = min(keep.sum(), max(np.ptp(place[keep]), MIN_POINTS))
-    sigma2 = max(float((off[keep] ** 2).sum() / (keep.sum() - 2)), MIN_SIGMA_PX**2)
-    covariance = sigma2 * np.linalg.inv(slope.T @ slope) * keep.sum() / points
-    return _Line(middle, normal, along, float(value[0]), float(value[1]), covariance)
+    value, spread = _line(place, offset, keep)
+    off = offset - value[..., :1] - value[..., 1:] * place
+    count = keep.sum(2)
+    variance = np.maximum((off**2 * keep).sum(2) / (count - 2), MIN_SIGMA_PX**2)
+    extent = np.where(keep, place, -np.inf).max(2) - np.where(keep, place, np.inf).min(2)
+    points = np.minimum(count, np.maximum(extent, 1.0))
+    return _Lines(value[..., 0], value[..., 1], (variance * count / points)[..., None, None] * spread)
 
 
-def _meet(a: _Line, b: _Line) -> tuple[np.ndarray, np.ndarray]:
-    """Where two lines meet, and its covariance (2, 2)."""
-    rows = np.array([a.normal - a.slope * a.along, b.normal - b.slope * b.along])
-    right = np.array([a.offset + rows[0] @ a.middle, b.offset + rows[1] @ b.middle])
-    point = np.linalg.solve(rows, right)
-    variance = np.zeros((2, 2))
-    for i, line in enumerate((a, b)):
-        by = np.array([1.0, line.along @ (point - line.middle)])
-        variance[i, i] = by @ line.covariance @ by
-    inverse = np.linalg.inv(rows)
-    return point, inverse @ variance @ inverse.T
+def _line(place: np.ndarray, offset: np.ndarray, keep: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Offset and slope (n, 4, 2) of the points kept, and the inverse of their normal matrix (n, 4, 2, 2)."""
+    s0, s1, s2 = keep.sum(2), (place * keep).sum(2), (place**2 * keep).sum(2)
+    y0, y1 = (offset * keep).sum(2), (offset * place * keep).sum(2)
+    inverse = np.stack([np.stack([s2, -s1], -1), np.stack([-s1, s0.astype(float)], -1)], -2)
+    inverse = inverse / (s0 * s2 - s1**2)[..., None, None]
+    return (inverse @ np.stack([y0, y1], -1)[..., None])[..., 0], inverse
+
+
+def _meet(frame: _Frame, lines: _Lines) -> tuple[np.ndarray, np.ndarray]:
+    """Where each edge meets the one before, (n, 4, 2), and its covariance (n, 4, 2, 2)."""
+    row = frame.normal - lines.slope[..., None] * frame.along
+    right = lines.offset + (row * frame.middle).sum(2)
+    pair = np.stack([np.roll(row, 1, axis=1), row], axis=2)
+    bad = ~np.isfinite(pair).all((2, 3)) | (np.abs(np.linalg.det(np.nan_to_num(pair))) < 1e-6)
+    pair[bad] = np.eye(2)
+    inverse = np.linalg.inv(pair)
+    point = (inverse @ np.stack([np.roll(right, 1, axis=1), right], axis=2)[..., None])[..., 0]
+    variance = np.zeros_like(pair)
+    for side, turn in enumerate((1, 0)):
+        middle, along = np.roll(frame.middle, turn, axis=1), np.roll(frame.along, turn, axis=1)
+        by = np.stack([np.ones(point.shape[:2]), ((point - middle) * along).sum(2)], axis=-1)
+        variance[..., side, side] = np.einsum("nki,nkij,nkj->nk", by, np.roll(lines.covariance, turn, axis=1), by)
+    covariance = inverse @ variance @ np.swapaxes(inverse, 2, 3)
+    covariance[bad] = np.nan
+    return point, covariance

