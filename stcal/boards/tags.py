@@ -67,13 +67,11 @@ def find_tags(image: np.ndarray, dictionaries: Sequence[str]) -> Tags:
     once = {tag: places[0] for tag, places in sorted(found.items()) if len(places) == 1}
     cells = np.array([_dictionary(name).markerSize + 2 for name, _ in once])
     corners, covariance = _refined(grey, np.array(list(once.values()), float).reshape(-1, 4, 2), cells)
-    return Tags(
-        tuple(once),
-        corners,
-        covariance,
-        tuple(sorted(tag for tag, places in found.items() if len(places) > 1)),
-        _saturated(grey, corners, cells),
-    )
+    saturated = _saturated(grey, corners, cells)
+    # Where some of the white is saturated and some is not, edges shift, and each by something else.
+    uneven = SATURATED_EDGE_PX**2 * saturated * (1 - saturated)
+    repeated = tuple(sorted(tag for tag, places in found.items() if len(places) > 1))
+    return Tags(tuple(once), corners, covariance + uneven[:, None, None, None] * np.eye(2), repeated, saturated)
 
 
 def other_dictionaries(image: np.ndarray, known: Sequence[str]) -> list[tuple[str, int]]:

@@ -16,6 +16,8 @@ SETTLED = 1e-4
 """A step that moves nothing by more than this, in mm or milliradians, is the last."""
 HUBER_TAIL = 0.011
 """Share of honest points, or tags, whose residuals Huber's loss damps: 3 σ in the plane."""
+GROSS = 4.0
+"""Times that limit: another tag than it is read as, or a corner that is hidden. It has no weight at all."""
 VARIANCE_ROUNDS = 6
 NEAR_PX = 0.005
 RAYLEIGH_MEDIAN = float(np.sqrt(2 * np.log(2)))
@@ -176,11 +178,12 @@ def _group(image: ImageCorners, pose: Poses, xy: np.ndarray, seen: np.ndarray, n
     residual = (root @ raw[..., None])[..., 0]
     limit = float(np.sqrt(chi_square.isf(HUBER_TAIL, d)))
     length = np.linalg.norm(residual, axis=1)
+    weight = np.where(length > GROSS * limit, 0.0, np.minimum(1.0, limit / np.maximum(length, limit)))
     return _Group(
         residual,
         root @ view.by_pose[0].reshape(p, d, 6),
         root @ by_point.reshape(p, d, d),
-        np.minimum(1.0, limit / np.maximum(length, limit)),
+        weight,
         image.focal_px * raw,
     )
 
@@ -225,7 +228,7 @@ def _variances(images, blocks, covariance: np.ndarray, noise: _Noise) -> _Noise:
         by_board = np.einsum("p,pij,pik->jk", board.weight, board.by_pose, board.by_pose)
         taken += float(np.trace(of_pose @ by_board))
         square += float((board.weight * (board.residual**2).sum(1)).sum())
-        free += [group.residual.size for group in block]
+        free += [group.residual.shape[1] * np.count_nonzero(group.weight) for group in block]
     unknowns = 6 * len(blocks) + len(covariance)
     free = np.maximum(free - [taken, unknowns - taken], 1.0)
     own = np.concatenate([image.noise for image in images])

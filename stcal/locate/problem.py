@@ -12,6 +12,11 @@ HUBER = 3.0
 MAX_STEPS = 60
 SETTLED = 1e-5
 """A step that lowers χ² by less moves the pose by less than a hundredth of its σ."""
+WEIGH_STEPS, WEIGHED = 10, 1e-6
+"""A step of under a thousandth of σ is the last. What many corners share, the intrinsics say, can move a pose by many
+σ of its single corners."""
+ACCEPTED = 1e-2
+"""What is still settled after all steps: a tenth of σ. In a flat valley steps are many, and short."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -113,7 +118,8 @@ def descend(problem: PlanarProblem, poses: Poses, whiten: np.ndarray, huber: flo
         # Metres and radians: damped by the diagonal (Marquardt), not by its mean.
         scale = np.einsum("hii->hi", normal)
         step = np.linalg.solve(normal + (damping[:, None] * scale)[:, :, None] * np.eye(6), right[..., None])[..., 0]
-        settled |= (step * right).sum(1) < SETTLED * np.maximum(cost, 1)
+        gain = (step * right).sum(1)
+        settled |= gain < SETTLED * np.maximum(cost, 1)
         if settled.all():
             break
         step[settled] = 0
@@ -128,7 +134,7 @@ def descend(problem: PlanarProblem, poses: Poses, whiten: np.ndarray, huber: flo
         cost, length = np.where(better, new[0], cost), np.where(better[:, None], new[3], length)
         normal, right = np.where(take, new[1], normal), np.where(better[:, None], new[2], right)
         damping = np.where(better, damping / 10, np.minimum(np.maximum(10 * damping, 1e-3), 1e8))
-    return Minima(poses, cost, normal, length, settled)
+    return Minima(poses, cost, normal, length, settled | (gain < ACCEPTED))
 
 
 def _evaluate(problem: PlanarProblem, poses: Poses, whiten: np.ndarray, huber: float):
@@ -157,21 +163,23 @@ class Weighed:
     full: np.ndarray
 
 
-def weigh(problem: PlanarProblem, pose: Poses, weights: np.ndarray, steps: int = 2) -> Weighed:
+def weigh(problem: PlanarProblem, pose: Poses, weights: np.ndarray) -> Weighed:
     """Generalised least squares from one pose: the image's noise (over Huber's ``weights`` (n,)), what corners share
-    and the layout's covariance add up. What the second step leaves is of second order."""
+    and the layout's covariance add up."""
     noise = block_diagonal(problem.noise / weights[:, None, None])
     common = problem.common.reshape(2 * len(problem.xy), -1)
     noise += common @ problem.prior @ common.T
     by_corner = block_diagonal(project(problem, pose).by_corner[0])
     full = noise + by_corner @ problem.shape @ by_corner.T
-    for _ in range(steps):
+    for _ in range(WEIGH_STEPS):
         view = project(problem, pose)
         a, r = view.by_pose[0].reshape(-1, 6), view.residual[0].ravel()
         solved = np.linalg.solve(full, np.column_stack([a, r]))
         normal = a.T @ solved[:, :6]
         step = np.linalg.solve(normal, a.T @ solved[:, 6])
         pose = moved(pose, step[None])
+        if step @ normal @ step < WEIGHED:
+            break
     left = r - a @ step
     chi2 = float(left @ (solved[:, 6] - solved[:, :6] @ step))
     covariance = np.linalg.inv(normal)
