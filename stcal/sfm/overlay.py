@@ -13,19 +13,6 @@ QUALITY = 82
 MIN_WIDTH_PX = 1000
 MIN_LABEL_GAP = 70.0
 """Between numbered dots, px at text size 1."""
-THUMBNAIL_PX = 1400
-THUMBNAIL_QUALITY = 80
-
-
-def thumbnail(grey: np.ndarray) -> tuple[np.ndarray, float]:
-    """A small JPEG (bytes as a uint8 array) of an 8-bit grey image, and its size over the image's."""
-    width = grey.shape[1]
-    scale = min(1.0, THUMBNAIL_PX / grey.shape[1])
-    while scale < 0.5:  # halving is cheap, and takes most of the pixels away
-        grey, scale = cv2.resize(grey, None, fx=0.5, fy=0.5, interpolation=cv2.INTER_AREA), 2 * scale
-    small = cv2.resize(grey, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA)
-    _, jpeg = cv2.imencode(".jpg", small, [cv2.IMWRITE_JPEG_QUALITY, THUMBNAIL_QUALITY])
-    return jpeg.ravel(), small.shape[1] / width
 
 
 def draw_overlay(

@@ -20,6 +20,9 @@ TOP_GROUP = "."
 RUN_MARKER = "stcal-run.json"
 """A folder that holds this file is a run's output and never a group of images."""
 
+THUMBNAIL_PX = 1400
+THUMBNAIL_QUALITY = 80
+
 _JPEG_MARKER = re.compile(rb"\xff[\x01-\xcf\xd8-\xfe]")
 """A marker other than a restart, which stands inside a scan."""
 _DAMAGE = re.compile(
@@ -126,6 +129,33 @@ def decode(data: bytes, name: str) -> np.ndarray:
     if image.dtype not in (np.uint8, np.uint16):
         raise InputError(f"{name}: pixels of type {image.dtype}; 8 or 16 bit needed")
     return image
+
+
+def grey_8bit(image: np.ndarray) -> np.ndarray:
+    """The image in 8 bit; deeper images are scaled so that their bright end just fits."""
+    if image.dtype == np.uint8:
+        return image
+    return cv2.convertScaleAbs(image, alpha=255.0 / _bright_end(image))
+
+
+def grey_fine(image: np.ndarray) -> np.ndarray:
+    """The image in the grey values of :func:`grey_8bit`, not rounded to them."""
+    return image if image.dtype == np.uint8 else image * np.float32(255.0 / _bright_end(image))
+
+
+def thumbnail(grey: np.ndarray, width_px: int = THUMBNAIL_PX) -> tuple[np.ndarray, float]:
+    """A small JPEG (bytes as a uint8 array) of an 8-bit grey image, and its size over the image's."""
+    width = grey.shape[1]
+    scale = min(1.0, width_px / grey.shape[1])
+    while scale < 0.5:  # halving is cheap, and takes most of the pixels away
+        grey, scale = cv2.resize(grey, None, fx=0.5, fy=0.5, interpolation=cv2.INTER_AREA), 2 * scale
+    small = cv2.resize(grey, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA)
+    _, jpeg = cv2.imencode(".jpg", small, [cv2.IMWRITE_JPEG_QUALITY, THUMBNAIL_QUALITY])
+    return jpeg.ravel(), small.shape[1] / width
+
+
+def _bright_end(image: np.ndarray) -> float:
+    return max(float(np.percentile(image[::4, ::4], 99.95)), 255.0)
 
 
 @contextlib.contextmanager

@@ -1,0 +1,178 @@
+"""Corners of a tag from its four edges: lines through edge points, and where they meet.
+
+``cv2.cornerSubPix`` balances gradients about a point. That is right where two dark squares meet in a corner of a
+chessboard, but at the outer corner of a tag it lies inside, by 0.1 to 0.2 px with ordinary blur. The edges' middles do
+not move with a symmetrical blur, so that lines through them meet in the corner.
+"""
+
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+
+SAMPLES = 33
+"""Of a profile across an edge."""
+POINTS = 40
+"""Profiles of an edge; where they are nearer than a pixel they count as many as there are pixels."""
+ALONG = (0.08, 0.92)
+"""Part of an edge that is used: near its ends the other edge's blur is in the profile."""
+CELLS_ACROSS = 0.8
+"""How far a profile reaches to either side, in cells; the border of a tag, and the white about it, is one cell wide."""
+REACH_PX = (1.5, 6.0)
+MIN_RISE = 0.15
+"""Noise rises too, everywhere alike: what is below this share of a profile's steepest step is not the edge."""
+MIN_CONTRAST = 0.3
+"""Of a profile, as a share of the tag's; less is another tag's edge, a stain, a shadow's rim."""
+MIN_SHARE = 0.25
+"""Of an edge's profiles; with fewer it is not seen."""
+MIN_CELL_PX = 2.0
+CUT = 2.5
+"""Points farther off the line than so many robust σ are left out."""
+CUT_ROUNDS = 4
+MIN_SIGMA_PX = 0.01
+"""Below this the noise of edge points is not what limits a corner: printing, flatness and the lens are."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class EdgeCorners:
+    """``corners_px`` : (n, 4, 2); ``covariance_px2`` : (n, 4, 2, 2); ``seen`` : (n,) whether all four edges are; of
+    the other tags the values mean nothing."""
+
+    corners_px: np.ndarray
+    covariance_px2: np.ndarray
+    seen: np.ndarray
+
+
+def corners_from_edges(grey: np.ndarray, corners: np.ndarray, cells: np.ndarray) -> EdgeCorners:
+    """Refine the corners (n, 4, 2), in order around, of dark tags with ``cells`` (n,) cells a side, border included.
+
+    An edge is not seen where it is too short, hidden, outside of the image, or without contrast.
+    """
+    n = len(corners)
+    if not n:
+        return EdgeCorners(np.zeros((0, 4, 2)), np.zeros((0, 4, 2, 2)), np.zeros(0, bool))
+    frame = _frame(np.asarray(corners, float), cells)
+    offset, good = _profiles(grey, frame)
+    with np.errstate(divide="ignore", invalid="ignore"):  # of edges that are not seen
+        lines = _fit(frame.place, offset, good)
+        found, covariance = _meet(frame, lines)
+    seen = good.mean(2) >= MIN_SHARE
+    seen &= np.isfinite(covariance).all((2, 3)) & (frame.length >= MIN_CELL_PX * np.reshape(cells, (-1, 1)))
+    return EdgeCorners(found, covariance, seen.all(1))
+
+
+def corners_by_edges(corners: np.ndarray) -> np.ndarray:
+    """How far the corners (..., 4, 2) of tags, in order around, go when all four edges move outwards by one.
+
+    Edges move alike where an image is over-exposed, where ink has spread, and where a camera's response is not linear.
+    """
+    along = np.roll(corners, -1, axis=-2) - corners
+    along /= np.linalg.norm(along, axis=-1, keepdims=True)
+    normal = np.stack([along[..., 1], -along[..., 0]], axis=-1)
+    outwards = np.sign((normal * (corners - corners.mean(-2, keepdims=True))).sum((-1, -2)))
+    normal *= outwards[..., None, None]
+    pair = np.stack([np.roll(normal, 1, axis=-2), normal], axis=-2)
+    return np.linalg.solve(pair, np.ones((*pair.shape[:-1], 1)))[..., 0]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Frame:
+    """Of each edge: ``middle``, ``along``, ``normal`` outwards (n, 4, 2), ``length`` and ``reach`` of the profiles
+    (n, 4), and their ``place`` from the middle (n, 4, POINTS); px."""
+
+    middle: np.ndarray
+    along: np.ndarray
+    normal: np.ndarray
+    length: np.ndarray
+    reach: np.ndarray
+    place: np.ndarray
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Lines:
+    """Points p with ``normal @ (p − middle) = offset + slope · along @ (p − middle)``, (n, 4); ``covariance`` of the
+    two, (n, 4, 2, 2)."""
+
+    offset: np.ndarray
+    slope: np.ndarray
+    covariance: np.ndarray
+
+
+def _frame(corners: np.ndarray, cells: np.ndarray) -> _Frame:
+    """Edges from each corner to the next."""
+    end = np.roll(corners, -1, axis=1)
+    length = np.linalg.norm(end - corners, axis=2)
+    along = (end - corners) / length[..., None]
+    middle = (corners + end) / 2
+    normal = np.stack([along[..., 1], -along[..., 0]], axis=-1)
+    depth = 2 * ((middle - corners.mean(1, keepdims=True)) * normal).sum(2)
+    normal = normal * np.where(depth < 0, -1.0, 1.0)[..., None]
+    reach = np.clip(CELLS_ACROSS * np.minimum(np.abs(depth), length) / np.reshape(cells, (-1, 1)), *REACH_PX)
+    place = (np.linspace(*ALONG, POINTS) - 0.5) * length[..., None]
+    return _Frame(middle, along, normal, length, reach, place)
+
+
+def _profiles(grey: np.ndarray, frame: _Frame) -> tuple[np.ndarray, np.ndarray]:
+    """Where each profile rises, px from the frame's line, and whether it is one of the edge, (n, 4, POINTS)."""
+    n = len(frame.length)
+    across = np.linspace(-1, 1, SAMPLES) * frame.reach[..., None]
+    base = frame.middle[:, :, None] + frame.place[..., None] * frame.along[:, :, None]
+    xy = base[:, :, :, None] + (across[..., None] * frame.normal[:, :, None])[:, :, None]
+    flat = xy.reshape(4 * n, POINTS * SAMPLES, 2).astype(np.float32)
+    level = cv2.remap(grey, flat[..., 0], flat[..., 1], cv2.INTER_LINEAR).reshape(n, 4, POINTS, SAMPLES).astype(float)
+    inside = ((xy >= 0) & (xy <= [grey.shape[1] - 1, grey.shape[0] - 1])).all((2, 3, 4))
+    rise = np.diff(level, axis=3).clip(0)
+    rise[rise < MIN_RISE * rise.max(3, keepdims=True)] = 0
+    total = rise.sum(3)
+    low, high = np.percentile(level.reshape(n, -1), [5, 95], axis=1)
+    good = (total > MIN_CONTRAST * (high - low)[:, None, None]) & (total > 0) & inside[..., None]
+    middle = (across[..., 1:] + across[..., :-1]) / 2
+    return np.einsum("nkps,nks->nkp", rise, middle) / np.where(good, total, 1.0), good
+
+
+def _fit(place: np.ndarray, offset: np.ndarray, good: np.ndarray) -> _Lines:
+    """Straight lines by least squares without what is far off them."""
+    keep = good
+    for _ in range(CUT_ROUNDS):
+        value, spread = _line(place, offset, keep)
+        off = np.abs(offset - value[..., :1] - value[..., 1:] * place)
+        typical = 1.4826 * np.nanmedian(np.where(keep | ~good.any(2, keepdims=True), off, np.nan), axis=2)
+        new = good & (off < CUT * np.maximum(typical, MIN_SIGMA_PX)[..., None])
+        if (new == keep).all():
+            break
+        keep = new
+    value, spread = _line(place, offset, keep)
+    off = offset - value[..., :1] - value[..., 1:] * place
+    count = keep.sum(2)
+    variance = np.maximum((off**2 * keep).sum(2) / (count - 2), MIN_SIGMA_PX**2)
+    extent = np.where(keep, place, -np.inf).max(2) - np.where(keep, place, np.inf).min(2)
+    points = np.minimum(count, np.maximum(extent, 1.0))
+    return _Lines(value[..., 0], value[..., 1], (variance * count / points)[..., None, None] * spread)
+
+
+def _line(place: np.ndarray, offset: np.ndarray, keep: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Offset and slope (n, 4, 2) of the points kept, and the inverse of their normal matrix (n, 4, 2, 2)."""
+    s0, s1, s2 = keep.sum(2), (place * keep).sum(2), (place**2 * keep).sum(2)
+    y0, y1 = (offset * keep).sum(2), (offset * place * keep).sum(2)
+    inverse = np.stack([np.stack([s2, -s1], -1), np.stack([-s1, s0.astype(float)], -1)], -2)
+    inverse = inverse / (s0 * s2 - s1**2)[..., None, None]
+    return (inverse @ np.stack([y0, y1], -1)[..., None])[..., 0], inverse
+
+
+def _meet(frame: _Frame, lines: _Lines) -> tuple[np.ndarray, np.ndarray]:
+    """Where each edge meets the one before, (n, 4, 2), and its covariance (n, 4, 2, 2)."""
+    row = frame.normal - lines.slope[..., None] * frame.along
+    right = lines.offset + (row * frame.middle).sum(2)
+    pair = np.stack([np.roll(row, 1, axis=1), row], axis=2)
+    bad = ~np.isfinite(pair).all((2, 3)) | (np.abs(np.linalg.det(np.nan_to_num(pair))) < 1e-6)
+    pair[bad] = np.eye(2)
+    inverse = np.linalg.inv(pair)
+    point = (inverse @ np.stack([np.roll(right, 1, axis=1), right], axis=2)[..., None])[..., 0]
+    variance = np.zeros_like(pair)
+    for side, turn in enumerate((1, 0)):
+        middle, along = np.roll(frame.middle, turn, axis=1), np.roll(frame.along, turn, axis=1)
+        by = np.stack([np.ones(point.shape[:2]), ((point - middle) * along).sum(2)], axis=-1)
+        variance[..., side, side] = np.einsum("nki,nkij,nkj->nk", by, np.roll(lines.covariance, turn, axis=1), by)
+    covariance = inverse @ variance @ np.swapaxes(inverse, 2, 3)
+    covariance[bad] = np.nan
+    return point, covariance

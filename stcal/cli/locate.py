@@ -1,0 +1,196 @@
+"""``stcal locate``: a planar target of several tags, calibrated, found under any light, and judged."""
+
+import json
+import os
+from enum import StrEnum
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from stcal.errors import InputError
+
+app = typer.Typer(
+    name="stcal locate",
+    help="Find a planar target of several tags under any light, with a verdict whether its pose may be trusted.",
+    no_args_is_help=True,
+    add_completion=False,
+    pretty_exceptions_enable=False,
+)
+
+CameraFile = Annotated[Path, typer.Option("--camera", help="Intrinsics: COLMAP cameras.txt, OpenCV or ROS file.")]
+LayoutFile = Annotated[Path, typer.Option("--layout", help="The target's tags (TOML).")]
+JsonFile = Annotated[Path | None, typer.Option("--json", help="Also write everything as JSON.")]
+ReportFile = Annotated[Path | None, typer.Option("--report", help="Also write a page with tables and pictures (HTML).")]
+NOTHING_ACCEPTED = 3
+
+
+class MethodName(StrEnum):
+    """How the pose is found and judged."""
+
+    joint = "joint"
+    patent = "patent"
+
+
+@app.command()
+def schedule(
+    shortest: Annotated[float, typer.Argument(help="Shortest exposure time, in any unit.")],
+    longest: Annotated[float, typer.Argument(help="Longest.")],
+    count: Annotated[int, typer.Argument(min=1, max=1000, help="How many.")],
+) -> None:
+    """Exposure times in a geometric series."""
+    from stcal.locate.exposures import exposure_times
+
+    for time in exposure_times(shortest, longest, count):
+        print(f"{time:.6g}")
+
+
+@app.command()
+def calibrate(
+    images: Annotated[Path, typer.Argument(help="Photographs of the target with a board in the same plane.")],
+    camera: CameraFile,
+    board: Annotated[Path, typer.Option("--board", help="Dots, chessboard, ChArUco or tags (TOML).")],
+    layout: LayoutFile,
+    out: Annotated[Path, typer.Option("--out", help="The calibrated layout (TOML).")] = Path("calibrated.toml"),
+    workers: Annotated[int | None, typer.Option(min=1, help="Processes; as many as cores if not given.")] = None,
+    json_file: JsonFile = None,
+) -> None:
+    """Where the corners of the target's tags lie, with σ; the frame in the middle of the layout's origin tag."""
+    from stcal.boards.board_file import load_flat_board
+    from stcal.camera_file import read_camera
+    from stcal.cli import circle_views as circles
+    from stcal.cli.progress import StageProgress
+    from stcal.design import BoardDesign
+    from stcal.locate.calibrate import calibrate as calibrated
+    from stcal.locate.calibrate_report import calibrated_json, calibrated_text, warnings
+    from stcal.locate.layout import layout_toml, load_plan
+    from stcal.locate.views import read_images
+
+    plan, design, model = load_plan(layout), load_flat_board(board), read_camera(camera)
+    dots = isinstance(design, BoardDesign)
+    dictionaries = tuple(dict.fromkeys(dictionary for dictionary, _ in plan.tags))
+    with StageProgress() as progress:
+        found = read_images(images, model, None if dots else design, dictionaries, workers, progress)
+        views = found.views
+        if dots:
+            by_name = circles.circle_views(images, model, design, workers, progress)
+            views = [by_name.get(name) for name in found.names]
+    symmetries = circles.symmetries(design) if dots else design.symmetries()
+    result = calibrated(plan, views, found.tags, found.names, found.camera, symmetries)
+    print(calibrated_text(result))
+    for each in (*found.left_out, *result.left_out):
+        print(f"left out: {each}")
+    for warning in warnings(result, plan.tags):
+        print(f"warning: {warning}")
+    _save(out, layout_toml(result.layout, [f"Calibrated by stcal locate from {len(result.images)} images."]))
+    if json_file:
+        _save(json_file, json.dumps(calibrated_json(result), indent=1, ensure_ascii=False, allow_nan=False) + "\n")
+
+
+@app.command()
+def run(
+    exposures: Annotated[
+        Path, typer.Argument(help="One image; a folder of exposures of one scene; or a folder of such folders.")
+    ],
+    layout: LayoutFile,
+    camera: CameraFile,
+    out: Annotated[Path | None, typer.Option("--out", help="Accepted poses (CSV).")] = None,
+    method: Annotated[MethodName, typer.Option(help="joint: all exposures together; patent: as published.")] = (
+        MethodName.joint
+    ),
+    hand_eye: Annotated[
+        Path | None, typer.Option("--hand-eye", help="JSON of `stcal handeye`: poses in the robot's base too.")
+    ] = None,
+    robot_poses: Annotated[
+        Path | None, typer.Option("--robot-poses", help="base_from_flange of each scene (CSV with a column scene).")
+    ] = None,
+    offset: Annotated[
+        Path | None, typer.Option("--offset", help="JSON with obj_from_goal, 4×4: where to go, in the target's frame.")
+    ] = None,
+    min_tags: Annotated[int, typer.Option(min=1, help="Tags needed.")] = 1,
+    min_spread_px: Annotated[float, typer.Option("--min-spread-px", min=0, help="Extent of their corners.")] = 12.0,
+    min_foreshortening: Annotated[
+        float, typer.Option(min=0, max=1, help="Cosine between target's normal and line of sight: det J without scale.")
+    ] = 0.17,
+    max_p: Annotated[float, typer.Option(help="Odds of residuals as large, from which on a pose is rejected.")] = 1e-4,
+    flip_odds: Annotated[float, typer.Option(help="Odds of the other pose that are allowed.")] = 1e-6,
+    sigma_margin: Annotated[float, typer.Option(min=1, help="By which all σ may be too small.")] = 1.5,
+    equal_deg: Annotated[float, typer.Option("--equal-deg", min=0, help="Two poses nearer than this are one.")] = 1.0,
+    max_sigma_deg: Annotated[float, typer.Option("--max-sigma-deg", help="Largest σ of the rotation.")] = 2.0,
+    max_sigma_mm: Annotated[
+        float | None, typer.Option("--max-sigma-mm", help="Largest σ of the position; any if not given.")
+    ] = None,
+    moved_px: Annotated[
+        float, typer.Option("--moved-px", help="Tags that shift by more between exposures have moved.")
+    ] = 0.5,
+    s_dis: Annotated[float, typer.Option("--s-dis", help="The patent's share of the largest area.")] = 0.8,
+    j_lim: Annotated[float, typer.Option("--j-lim", help="The patent's limit of det J, 1/mm².")] = 1e-8,
+    e_lim_px: Annotated[float, typer.Option("--e-lim-px", help="The patent's limit of the error.")] = 1.0,
+    e_ratio: Annotated[float, typer.Option("--e-ratio", help="The patent's limit of the errors' ratio.")] = 2.0,
+    workers: Annotated[int | None, typer.Option(min=1, help="Threads; as many as cores if not given.")] = None,
+    json_file: JsonFile = None,
+    report: ReportFile = None,
+) -> None:
+    """Pose of the target in each scene, with its 6×6 covariance, and accept, ambiguous or reject.
+
+    Exit code 3 when no pose is accepted.
+    """
+    from stcal.camera_file import read_camera
+    from stcal.locate.chain import read_chain
+    from stcal.locate.exposures import find_scenes
+    from stcal.locate.layout import load_layout
+    from stcal.locate.patent import PatentOptions
+    from stcal.locate.run import LocateOptions
+    from stcal.locate.run import run as located
+    from stcal.locate.tables import accepted, poses_csv, run_json, run_text
+    from stcal.locate.verdict import VerdictOptions
+
+    if hand_eye is None and (robot_poses or offset):
+        raise InputError("--robot-poses, --offset: only with --hand-eye, which leads from the camera to the robot")
+    chain = read_chain(hand_eye, robot_poses, offset) if hand_eye else None
+    target, model = load_layout(layout), read_camera(camera)
+    limits = VerdictOptions(
+        min_tags,
+        min_spread_px,
+        min_foreshortening,
+        max_p,
+        flip_odds,
+        sigma_margin,
+        equal_deg,
+        max_sigma_deg,
+        max_sigma_mm,
+    )
+    patent = PatentOptions(s_dis, j_lim, e_lim_px, e_ratio)
+    scenes = find_scenes(exposures)
+    missing = chain.without_pose([scene.name for scene in scenes]) if chain else []
+    if missing:
+        raise InputError(f"robot poses {robot_poses}: none of scene {missing[0]}; add a row, or take the scene away")
+    results = list(located(scenes, target, model, LocateOptions(method.value, limits, patent, moved_px, workers)))
+    print(run_text(results))
+    for scene in scenes:
+        for each in scene.skipped:
+            print(f"not used: {each}")
+    if out:
+        _save(out, poses_csv(results, chain))
+    if json_file:
+        content = run_json(results, target, chain)
+        _save(json_file, json.dumps(content, indent=1, ensure_ascii=False, allow_nan=False) + "\n")
+    if report:
+        from stcal.locate.report import run_page
+
+        _save(report, run_page(results, scenes, target, model))
+    if not accepted(results):
+        print(f"no pose accepted in {len(results)} scene{'s' * (len(results) > 1)}")
+        raise typer.Exit(NOTHING_ACCEPTED)
+
+
+def _save(path: Path, content: str | bytes) -> None:
+    """Write a file at once, complete or not at all."""
+    partial = path.with_name(f"{path.name}.{os.getpid()}.partial")
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        partial.write_bytes(content.encode() if isinstance(content, str) else content)
+        os.replace(partial, path)
+    finally:
+        partial.unlink(missing_ok=True)
+    print(f"written: {path}")

@@ -1,0 +1,182 @@
+"""Scenes of drawn photographs: poses under changing light, and everything that must be named and rejected."""
+
+import cv2
+import numpy as np
+import pytest
+
+from stcal.camera_file import CameraModel
+from stcal.geometry.camera import Camera
+from stcal.geometry.rigid import Poses, Rigid
+from stcal.locate.exposures import find_scenes
+from stcal.locate.layout import TargetLayout
+from stcal.locate.run import LocateOptions, run
+from stcal.synthetic.exposure import Light, expose, moved
+from tests.locate.drawn_target import CAMERA, LAYOUT, PER_MM, SHEET_MM, photo, sheet, tilted
+
+MODEL = CameraModel(CAMERA.focal, CAMERA.centre, CAMERA.distortion, "PINHOLE", CAMERA.width, CAMERA.height, "test")
+TRUTH = tilted(30)
+
+
+@pytest.fixture(scope="module")
+def plain():
+    return photo(TRUTH)
+
+
+@pytest.fixture
+def located(tmp_path):
+    """Write the images of one scene, and locate it."""
+
+    def of(images, layout=LAYOUT, options=None):
+        for k, image in enumerate(images):
+            cv2.imwrite(str(tmp_path / f"{k}.png"), image)
+        return next(iter(run(find_scenes(tmp_path), layout, MODEL, options)))
+
+    return of
+
+
+def error_of(result, truth: Rigid = TRUTH) -> np.ndarray:
+    return Poses.of([result.pose.camera_from_obj]).difference(Poses.of([truth]))[0]
+
+
+def test_one_image(located, plain):
+    result = located([plain])
+    assert result.verdict.decision == "accept"
+    assert len(result.pose.rows) == 6
+    error = error_of(result)
+    assert error @ np.linalg.solve(result.pose.covariance, error) < 22.5  # one in a thousand (6 degrees of freedom)
+    assert np.linalg.norm(error[:3]) < np.radians(0.2)
+
+
+def test_exposures_together_find_what_none_finds_alone(located, plain):
+    at = (CAMERA.centre + [13, -8]) / CAMERA.width
+    images = expose(plain, np.geomspace(1 / 16, 16, 5), light=Light(25, 0.3, tuple(at)))
+    result = located(images)
+    assert result.verdict.decision == "accept"
+    assert len(result.merged.seen) == 6
+    assert max(result.merged.counts) < 6  # or one exposure would do
+    assert np.linalg.norm(error_of(result)[:3]) < np.radians(0.5)
+
+
+def test_an_over_exposed_target_keeps_its_place(located, plain):
+    """Saturation draws all edges inwards: what looks like a smaller tag is one σ of the depth, not ten."""
+    result = located(expose(plain, [4.0]))
+    assert result.verdict.decision == "accept"
+    error = error_of(result)
+    assert error @ np.linalg.solve(result.pose.covariance, error) < 22.5
+
+
+def test_no_tags(located):
+    result = located([np.full((900, 1200), 128, np.uint8)])
+    assert result.verdict.decision == "reject"
+    assert result.verdict.reasons[0].startswith("no tag of DICT_APRILTAG_36h11")
+    assert result.pose is None
+
+
+def test_a_wrong_dictionary_is_named(located, plain):
+    tags = tuple(("DICT_7X7_50", tag) for _, tag in LAYOUT.tags)
+    wrong = TargetLayout("wrong", tags, LAYOUT.corners_mm, LAYOUT.covariance_mm2, 0)
+    result = located([plain], wrong)
+    assert result.verdict.decision == "reject"
+    # Two tags each of 4×4 and 6×6 are the most of one kind.
+    assert "shows 2 of DICT_" in result.verdict.reasons[0]
+    assert "correct dictionary" in result.verdict.reasons[0]
+
+
+def test_tags_of_another_target_are_named(located, plain):
+    tags = tuple((dictionary, tag + 20) for dictionary, tag in LAYOUT.tags)
+    other = TargetLayout("other", tags, LAYOUT.corners_mm, LAYOUT.covariance_mm2, 0)
+    result = located([plain], other)
+    assert "no tag of the layout, but others of its dictionaries" in result.verdict.reasons[0]
+
+
+def test_one_tag_edge_on(located):
+    """From 82° on a tag is not read, or its pose not believed."""
+    decisions = []
+    for degrees in (60, 80, 83, 86):
+        printed = sheet()
+        printed[:, : int(PER_MM * SHEET_MM[0] / 2 - 21 * PER_MM)] = 255
+        printed[:, int(PER_MM * SHEET_MM[0] / 2 + 21 * PER_MM) :] = 255
+        printed[int(PER_MM * SHEET_MM[1] / 2 + 21 * PER_MM) :] = 255
+        result = located([photo(tilted(degrees, 250.0), printed)])
+        decisions.append(result.verdict.decision)
+        if degrees > 80:
+            assert result.verdict.reasons
+    assert decisions[2:] == ["reject", "reject"]
+    assert decisions[0] == "accept"
+
+
+def test_an_id_twice_in_view(located):
+    printed = sheet()
+    side = slice(int((SHEET_MM[1] / 2 - 50) * PER_MM) - 30, int((SHEET_MM[1] / 2 - 30) * PER_MM) + 30)
+    across = slice(int((SHEET_MM[0] / 2 + 50) * PER_MM) - 30, int((SHEET_MM[0] / 2 + 70) * PER_MM) + 30)
+    printed[800 : 800 + side.stop - side.start, 580 : 580 + across.stop - across.start] = printed[side, across]
+    result = located([photo(TRUTH, printed)])
+    assert result.verdict.decision == "reject"
+    assert result.verdict.reasons == ("tags seen twice: 11; every id once in view needed; cover the copy",)
+
+
+def test_exposures_of_different_sizes(located, plain):
+    result = located([plain, plain[:-10]])
+    assert result.verdict.decision == "reject"
+    assert "exposures of different sizes (" in result.verdict.reasons[0]
+    assert "1200×890" in result.verdict.reasons[0]
+
+
+def test_images_of_another_size_than_the_cameras(located, plain):
+    result = located([plain[:-10], plain[:-10]])
+    assert "images of 1200×890 px, the camera file is of 1200×900 px" in result.verdict.reasons[0]
+
+
+@pytest.mark.parametrize("shift", [1.0, 8.0])
+def test_a_scene_that_moved(located, plain, shift):
+    result = located([*expose(plain, [0.5, 1.0]), *expose(moved(plain, (shift, 0)), [0.7])])
+    assert result.verdict.decision == "reject"
+    assert result.verdict.reasons[0].startswith("the scene moved between")
+    assert result.pose is None
+
+
+def test_a_scene_that_did_not_move(located, plain):
+    result = located(expose(plain, [0.3, 0.6, 1.0, 2.0]))
+    assert result.verdict.decision == "accept"
+    assert max(shift.shift_px for shift in result.merged.shifts) < 0.25
+
+
+def test_a_damaged_exposure_is_left_out_and_named(tmp_path, plain):
+    good = cv2.imencode(".png", plain)[1].tobytes()
+    (tmp_path / "a.png").write_bytes(good)
+    (tmp_path / "b.png").write_bytes(good[: len(good) // 2])
+    result = next(iter(run(find_scenes(tmp_path), LAYOUT, MODEL)))
+    assert result.verdict.decision == "accept"
+    assert result.notes[0].startswith("left out: b.png: truncated")
+
+
+def test_scenes_of_a_folder(tmp_path, plain):
+    for name in ("near", "far"):
+        (tmp_path / name).mkdir()
+        cv2.imwrite(str(tmp_path / name / "1.png"), plain)
+        cv2.imwrite(str(tmp_path / name / "2.png"), plain)
+    scenes = find_scenes(tmp_path)
+    assert [(scene.name, len(scene.files)) for scene in scenes] == [("far", 2), ("near", 2)]
+    one = find_scenes(tmp_path / "far" / "1.png")
+    assert [(scene.name, len(scene.files)) for scene in one] == [("1", 1)]
+    both = [result.pose.camera_from_obj.matrix() for result in run(scenes, LAYOUT, MODEL)]
+    assert (both[0] == both[1]).all()
+
+
+def test_the_published_method_by_its_name(located, plain):
+    result = located([plain, plain], options=LocateOptions("patent"))
+    assert result.verdict.decision == "accept"
+    assert [check.name for check in result.verdict.checks] == ["det J", "error", "error ratio"]
+    off = result.patent.camera_from_obj @ TRUTH.inverse()
+    assert off.angle_rad() < np.radians(1)
+
+
+def test_a_camera_file_of_another_camera(located, plain):
+    """A focal length that is a tenth off cannot be seen in one plane's view from its residuals alone when it is small
+    and far; here it can."""
+    far_off = Camera(1200, 900, 1.5 * CAMERA.focal, CAMERA.centre, np.zeros(8))
+    model = CameraModel(far_off.focal, far_off.centre, far_off.distortion, "PINHOLE", 1200, 900, "test")
+    scene = located([plain]).tags
+    from stcal.locate.run import locate_scene
+
+    assert locate_scene(scene, LAYOUT, model).verdict.decision == "reject"
