@@ -23,7 +23,7 @@ from stcal.camera_file import read_camera
 from stcal.design_file import load_board, load_target
 from stcal.parallel import run_parallel
 
-FLAGS = cv2.IMREAD_GRAYSCALE | cv2.IMREAD_ANYDEPTH | cv2.IMREAD_IGNORE_ORIENTATION  # as stcal.sfm.images.decode
+FLAGS = cv2.IMREAD_GRAYSCALE | cv2.IMREAD_ANYDEPTH | cv2.IMREAD_IGNORE_ORIENTATION  # as stcal.images.decode
 GROUPS = 4
 RIGHT_PX = 3.0  # a board is right when every centre is this close to the image of a true dot
 THRESHOLDS = {
@@ -106,9 +106,9 @@ def resident(pid: int) -> int:
 
 def timed_detection(data: Path, cache: Path):
     """Seconds of detection alone, and the centres of the board's dots by image."""
+    from stcal.images import find_images
     from stcal.sfm.detect.ellipses import EllipseOptions
     from stcal.sfm.detection import detect_files
-    from stcal.sfm.images import find_images
 
     designs = load_target(data / "target.toml"), load_board(data / "board.toml")
     camera, (files, _) = read_camera(data / "cameras.txt"), find_images(data / "images")

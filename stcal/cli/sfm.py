@@ -145,8 +145,8 @@ def detect(
     workers: Workers = None,
 ) -> None:
     """Detection alone: detections.csv and an overlay picture of every image."""
+    from stcal.images import find_images
     from stcal.sfm import pipeline
-    from stcal.sfm.images import find_images
     from stcal.sfm.saved import marker_json
 
     model = read_camera(camera)

@@ -11,6 +11,7 @@ from stcal.camera_file import COLMAP_MODELS, CameraModel, parameter_names
 from stcal.design import BoardDesign, TargetDesign
 from stcal.errors import DegenerateError, DetectionError, InputError
 from stcal.geometry.camera import Camera
+from stcal.images import ImageFile, Skipped, decode, find_images
 from stcal.sfm.board_views import board_views, closed_form, start_camera
 from stcal.sfm.camera_check import (
     MIN_REACH,
@@ -23,7 +24,6 @@ from stcal.sfm.camera_check import (
 )
 from stcal.sfm.detect.ellipses import EllipseOptions
 from stcal.sfm.detection import DetectionResult, detect_files
-from stcal.sfm.images import ImageFile, Skipped, decode, find_images
 from stcal.sfm.intrinsics import Intrinsics, adjust_intrinsics, model_parameters
 from stcal.sfm.observations import ImageObservations
 

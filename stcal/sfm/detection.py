@@ -17,11 +17,11 @@ from stcal.camera_file import CameraModel
 from stcal.design import BoardDesign, TargetDesign
 from stcal.errors import ConvergenceError, DetectionError, InputError
 from stcal.geometry.camera import Camera
+from stcal.images import ImageFile, Skipped, decode, grey_8bit
 from stcal.parallel import run_parallel
 from stcal.sfm.detect.centres import Centres
 from stcal.sfm.detect.ellipses import EllipseOptions
-from stcal.sfm.detect.image import ImageDetection, detect_image, grey_8bit
-from stcal.sfm.images import ImageFile, Skipped, decode
+from stcal.sfm.detect.image import ImageDetection, detect_image
 from stcal.sfm.overlay import thumbnail
 
 CACHE_VERSION = 2

@@ -14,13 +14,13 @@ import numpy as np
 from stcal.design import BoardDesign, TargetDesign
 from stcal.errors import InputError
 from stcal.geometry.camera import Camera
+from stcal.images import decode
 from stcal.parallel import run_parallel
 from stcal.sfm.colmap_model import read_model
 from stcal.sfm.database import image_ids
 from stcal.sfm.detect.ellipses import EllipseOptions
 from stcal.sfm.detect.examine import Expected, Trial, Verdict, by_geometry, examine, labels_found, trials
 from stcal.sfm.findings import Diagnosis, Finding, advice, in_order
-from stcal.sfm.images import decode
 from stcal.sfm.in_view import missing_circles
 from stcal.sfm.model import MIN_POINTS, GroupModel
 from stcal.sfm.saved import SavedRun

@@ -14,9 +14,9 @@ from stcal.design import BoardDesign, TargetDesign
 from stcal.errors import DetectionError, InputError, StcalError
 from stcal.geometry.camera import Camera
 from stcal.geometry.rigid import Rigid
+from stcal.images import Skipped, find_images
 from stcal.sfm.detect.ellipses import EllipseOptions
 from stcal.sfm.detection import DetectedImage, detect_files
-from stcal.sfm.images import Skipped, find_images
 from stcal.sfm.labels import label_group
 from stcal.sfm.observations import ImageObservations, by_group
 from stcal.sfm.single_pose import PoseOptions, TargetPose, pose_from_circles

@@ -16,6 +16,7 @@ from stcal.design import BoardDesign, TargetDesign, reference_board, reference_t
 from stcal.design_file import board_toml, load_board, load_target, target_toml
 from stcal.errors import InputError
 from stcal.geometry.camera import Camera
+from stcal.images import RUN_MARKER, find_images
 from stcal.sfm.calibration import Calibration, calibrate
 from stcal.sfm.chain import measure_chains
 from stcal.sfm.checks import Evidence, run_checks
@@ -25,7 +26,6 @@ from stcal.sfm.database import image_ids, labels_csv, remove_database, write_dat
 from stcal.sfm.detection import DetectionResult, detect_files, require_single, write_bytes
 from stcal.sfm.foreign import faces_from_models
 from stcal.sfm.graph import ImageGraph, image_graph
-from stcal.sfm.images import RUN_MARKER, find_images
 from stcal.sfm.labels import LabelledImage, label_group
 from stcal.sfm.model import GroupModel
 from stcal.sfm.observations import ImageObservations, by_group, detections_csv

@@ -16,8 +16,8 @@ from stcal.errors import InputError, StcalError
 from stcal.geometry.arrays import frozen
 from stcal.geometry.camera import Camera
 from stcal.geometry.rigid import Rigid
+from stcal.images import RUN_MARKER
 from stcal.sfm.detect.ellipses import EllipseOptions
-from stcal.sfm.images import RUN_MARKER
 from stcal.sfm.observations import ImageObservations, by_group
 from stcal.sfm.options import RunOptions
 from stcal.sfm.pairs import PairOptions

@@ -15,8 +15,8 @@ from stcal.design import BoardDesign, TargetDesign
 from stcal.errors import MappingError
 from stcal.geometry.camera import Camera
 from stcal.geometry.rigid import Rigid
+from stcal.images import SUFFIXES, TOP_GROUP, Skipped
 from stcal.sfm.detection import write_bytes
-from stcal.sfm.images import SUFFIXES, TOP_GROUP, Skipped
 from stcal.sfm.mapping import left_out, map_group
 from stcal.sfm.model import GroupModel, Outlier
 from stcal.sfm.observations import ImageObservations, is_board

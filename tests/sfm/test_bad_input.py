@@ -19,7 +19,7 @@ import pytest
 from stcal.camera_file import read_camera
 from stcal.design_file import board_toml, target_toml
 from stcal.geometry.rigid import Rigid
-from stcal.sfm.images import decode
+from stcal.images import decode
 from stcal.synthetic.observe import image_circles
 from stcal.synthetic.render import RenderOptions, encode, render
 

@@ -13,6 +13,7 @@ from stcal.design import BOARD, BoardDesign, TargetDesign
 from stcal.geometry.arrays import frozen
 from stcal.geometry.camera import Camera
 from stcal.geometry.plane import apply_homography, homography_jacobian
+from stcal.images import grey_8bit, grey_fine
 from stcal.sfm.detect.board import needed_dots
 from stcal.sfm.detect.candidates import (
     MAX_POSITION_ERROR,
@@ -24,7 +25,7 @@ from stcal.sfm.detect.candidates import (
 from stcal.sfm.detect.centres import MIN_RIM, measure_centres
 from stcal.sfm.detect.ellipses import EllipseOptions, diameter_limits_px
 from stcal.sfm.detect.faces import needed_circles
-from stcal.sfm.detect.image import ImageReading, detect_image, grey_8bit, grey_fine, read_image
+from stcal.sfm.detect.image import ImageReading, detect_image, read_image
 from stcal.sfm.detect.trace import trace_outlines
 
 LEAST_MIN_DIAMETER_PX = 4.0

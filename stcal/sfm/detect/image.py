@@ -2,11 +2,11 @@
 
 from dataclasses import dataclass, field
 
-import cv2
 import numpy as np
 
 from stcal.design import BoardDesign, Polarity, TargetDesign
 from stcal.geometry.camera import Camera
+from stcal.images import grey_8bit, grey_fine
 from stcal.sfm.detect.board import BoardReading, find_boards
 from stcal.sfm.detect.candidates import Candidates
 from stcal.sfm.detect.centres import Centres, measure_centres
@@ -38,22 +38,6 @@ class ImageDetection:
     def face_ids(self) -> list[str]:
         """Faces seen, in order of their labels."""
         return list(dict.fromkeys(label.split(":")[0] for label in self.target_labels))
-
-
-def grey_8bit(image: np.ndarray) -> np.ndarray:
-    """The image in 8 bit; deeper images are scaled so that their bright end just fits."""
-    if image.dtype == np.uint8:
-        return image
-    return cv2.convertScaleAbs(image, alpha=255.0 / _bright_end(image))
-
-
-def grey_fine(image: np.ndarray) -> np.ndarray:
-    """The image in the grey values of :func:`grey_8bit`, not rounded to them."""
-    return image if image.dtype == np.uint8 else image * np.float32(255.0 / _bright_end(image))
-
-
-def _bright_end(image: np.ndarray) -> float:
-    return max(float(np.percentile(image[::4, ::4], 99.95)), 255.0)
 
 
 @dataclass(frozen=True, slots=True, eq=False)

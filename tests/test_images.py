@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 from stcal.errors import InputError
-from stcal.sfm.images import RUN_MARKER, TOP_GROUP, decode, find_images
+from stcal.images import RUN_MARKER, TOP_GROUP, decode, find_images
 
 
 def encoded(suffix, image=None, params=()):

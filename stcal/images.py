@@ -128,6 +128,22 @@ def decode(data: bytes, name: str) -> np.ndarray:
     return image
 
 
+def grey_8bit(image: np.ndarray) -> np.ndarray:
+    """The image in 8 bit; deeper images are scaled so that their bright end just fits."""
+    if image.dtype == np.uint8:
+        return image
+    return cv2.convertScaleAbs(image, alpha=255.0 / _bright_end(image))
+
+
+def grey_fine(image: np.ndarray) -> np.ndarray:
+    """The image in the grey values of :func:`grey_8bit`, not rounded to them."""
+    return image if image.dtype == np.uint8 else image * np.float32(255.0 / _bright_end(image))
+
+
+def _bright_end(image: np.ndarray) -> float:
+    return max(float(np.percentile(image[::4, ::4], 99.95)), 255.0)
+
+
 @contextlib.contextmanager
 def _decoder_messages() -> Iterator[bytearray]:
     """What libraries in C write to standard error meanwhile: the only sign that a decoder made something up."""
