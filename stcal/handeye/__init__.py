@@ -3,7 +3,24 @@
 from stcal.handeye.noise import Noise
 from stcal.handeye.pairs import HandEyePoses, read_poses
 from stcal.handeye.result import HandEye
-from stcal.handeye.solve import METHODS, handeye
+from stcal.handeye.solve import METHODS, HandEyeOptions, handeye
+from stcal.handeye.validate import Compared, HeldOut, compare, cross_validate, splits
 from stcal.handeye.views import View, Views, pairs_of_views
 
-__all__ = ["METHODS", "HandEye", "HandEyePoses", "Noise", "View", "Views", "handeye", "pairs_of_views", "read_poses"]
+__all__ = [
+    "METHODS",
+    "Compared",
+    "HandEye",
+    "HandEyeOptions",
+    "HandEyePoses",
+    "HeldOut",
+    "Noise",
+    "View",
+    "Views",
+    "compare",
+    "cross_validate",
+    "handeye",
+    "pairs_of_views",
+    "read_poses",
+    "splits",
+]

@@ -4,19 +4,21 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy.sparse import csr_matrix
+from scipy.spatial.transform import Rotation
 from scipy.stats import chi2
 
 from stcal.geometry.camera import Camera
 from stcal.geometry.rigid import Poses, Rigid, skew
-from stcal.handeye.leastsq import Linear, minimise, perturbed
+from stcal.handeye.leastsq import Linear, generalised_inverse, minimise, perturbed
 from stcal.handeye.views import project_jacobian
 
-HUBER_CORNER, HUBER_POSE = (float(np.sqrt(chi2.ppf(0.999, dof))) for dof in (2, 6))
-"""One good corner, and one good pose, in a thousand weighs less than one."""
-GROUPS = ("corner_px", "robot_rad", "robot_mm", "board_mm")
+CORNER, POSE = (float(np.sqrt(chi2.ppf(0.999, dof))) for dof in (2, 6))
+"""Huber's limits: one good corner, and one good pose, in a thousand weighs less than one."""
 LEAST = {"corner_px": 1e-6, "robot_rad": 1e-8, "robot_mm": 1e-5, "board_mm": 1e-5}
 """Estimated σ stay above: exact data have none."""
 ROUNDS = 100
+ROUGHLY = 1e-6
+"""Relative fall of the cost at which a round of σ has solved well enough."""
 SETTLED = 1e-3
 """Relative change of σ from round to round that moves nothing any more."""
 
@@ -44,7 +46,7 @@ class Corners:
 
     ``inverted`` : eye-to-hand; ``base_from_flange`` : m, as reported; ``xyz_board`` : (K, 3) as designed; ``view``,
     ``corner`` : (n,) of each measurement; ``xy_px`` : (n, 2); ``weight`` : (n, 2, 2) whitening at σ 1; ``robot`` :
-    (m, 6, 6) whitening in place of σ, or None; ``sigma`` : of each of GROUPS, 0 where exact; ``basis`` : (12, q) of the
+    (m, 6, 6) whitening in place of σ, or None; ``sigma`` : of each group, 0 where exact; ``basis`` : (12, q) of the
     intrinsics solved for, ``information`` : (q, q) about ``camera``; ``with_scale``.
     """
 
@@ -63,19 +65,20 @@ class Corners:
     with_scale: bool
 
     def places(self) -> dict[str, slice]:
-        """Where the unknowns stand in a step."""
-        at, found = 0, {}
+        """Where the unknowns stand in a step; empty for what is not solved for."""
         sizes = {"x": 6, "z": 6, "camera": self.basis.shape[1], "scale": int(self.with_scale)}
         sizes["board"] = self.xyz_board.size if self.sigma["board_mm"] else 0
         exact = self.robot is None and not self.sigma["robot_mm"]
         sizes["robot"] = 0 if exact else 6 * len(self.base_from_flange)
-        for name, size in sizes.items():
-            found[name] = slice(at, at + size)
-            at += size
-        return found
+        ends = np.cumsum([0, *sizes.values()])
+        return {name: slice(int(i), int(j)) for name, i, j in zip(sizes, ends[:-1], ends[1:], strict=True)}
+
+    def count(self) -> int:
+        """Number of unknowns."""
+        return max(place.stop for place in self.places().values())
 
     def robot_weight(self) -> np.ndarray:
-        """(m, 6, 6) whitening."""
+        """(m, 6, 6) whitening of errors of base_from_flange."""
         if self.robot is not None:
             return self.robot
         sigma = np.repeat([self.sigma["robot_rad"], self.sigma["robot_mm"]], 3)
@@ -83,27 +86,22 @@ class Corners:
 
     def moved(self, state: Bundle, step: np.ndarray) -> Bundle:
         """By a step of all unknowns."""
-        at = self.places()
-        camera, flange = state.camera, state.base_from_flange
-        if at["camera"].stop > at["camera"].start:
-            camera = camera.with_parameters(camera.parameters() + self.basis @ step[at["camera"]])
-        if at["robot"].stop > at["robot"].start:
-            each = step[at["robot"]].reshape(-1, 6)
-            flange = Poses.of(perturbed(p, s) for p, s in zip(flange, each, strict=True))
-        corners = state.corners
-        if at["board"].stop > at["board"].start:
-            corners = corners + step[at["board"]].reshape(-1, 3)
-        return Bundle(
-            perturbed(state.mount_from_camera, step[at["x"]]),
-            perturbed(state.stand_from_board, step[at["z"]]),
-            flange,
-            corners,
-            camera,
-            state.scale + float(step[at["scale"]].sum()),
-        )
+        part = {name: step[place] for name, place in self.places().items()}
+        camera, flange, corners = state.camera, state.base_from_flange, state.corners
+        if len(part["camera"]):
+            camera = camera.with_parameters(camera.parameters() + self.basis @ part["camera"])
+        if len(part["robot"]):
+            each = part["robot"].reshape(-1, 6)
+            turn = Rotation.from_rotvec(each[:, :3]).as_matrix()
+            flange = Poses(turn @ flange.rotation, flange.translation + each[:, 3:])
+        if len(part["board"]):
+            corners = corners + part["board"].reshape(-1, 3)
+        x, z = perturbed(state.mount_from_camera, part["x"]), perturbed(state.stand_from_board, part["z"])
+        return Bundle(x, z, flange, corners, camera, state.scale + float(part["scale"].sum()))
 
-    def residuals(self, state: Bundle) -> tuple[np.ndarray, dict[str, np.ndarray]]:
-        """White residuals (n, 2), and their derivatives (n, 2, ·) by each kind of unknown: of their view, their corner."""
+    def seen(self, state: Bundle) -> tuple[np.ndarray, dict[str, np.ndarray]]:
+        """White residuals of the corners (n, 2), and their derivatives (n, 2, ·) by each kind of unknown, of the own
+        view and corner."""
         x, z, hand = state.mount_from_camera, state.stand_from_board, state.base_from_flange
         turn, place = hand.rotation[self.view], hand.translation[self.view]
         board = state.corners[self.corner] @ z.rotation.T
@@ -132,129 +130,115 @@ class Corners:
         }
         return np.einsum("nab,nb->na", self.weight, px - self.xy_px) / self.sigma["corner_px"], by
 
-    def slope(self, by: dict[str, np.ndarray]) -> csr_matrix:
-        """Derivative (2 n, k) by all unknowns."""
-        at, n = self.places(), len(self.view)
-        columns, values = [], []
-        for name, place in at.items():
-            if place.stop == place.start:
-                continue
-            width = by[name].shape[2]
-            own = {"board": self.corner, "robot": self.view}.get(name)
-            first = place.start + (np.zeros(n, int) if own is None else width * own)
-            columns.append(np.repeat((first[:, None] + np.arange(width))[:, None], 2, axis=1))
-            values.append(by[name])
-        columns, values = np.concatenate(columns, axis=2), np.concatenate(values, axis=2)
-        pointers = np.arange(2 * n + 1) * columns.shape[2]
-        shape = (2 * n, max(place.stop for place in at.values()))
-        return csr_matrix((values.ravel(), columns.ravel(), pointers), shape=shape)
-
-    def parts(self, state: Bundle) -> dict[str, tuple[float, np.ndarray, np.ndarray]]:
-        """Of the corners and of each kind of knowledge beside them: cost, normal matrix and gradient in all unknowns;
-        quadratic with Huber's weights of ``state``."""
-        at = self.places()
-        size = max(place.stop for place in at.values())
-        white, by = self.residuals(state)
-        weight = _huber(np.linalg.norm(white, axis=1), HUBER_CORNER)
-        slope = self.slope(by)
-        pulled = slope.multiply(np.repeat(weight, 2)[:, None]).tocsr().T
-        found = {"corner_px": (float(weight @ (white**2).sum(1)), (pulled @ slope).toarray(), pulled @ white.ravel())}
-
-        def add(name, place, cost, information, pull):
-            normal, gradient = np.zeros((size, size)), np.zeros(size)
-            normal[place, place], gradient[place] = information, pull
-            found[name] = cost, normal, gradient
-
+    def groups(self, state: Bundle) -> list["Group"]:
+        """Everything that is known: the corners seen, and what was known before."""
+        at, count = self.places(), self.count()
+        white, by = self.seen(state)
+        found = [
+            Group(("corner_px",), white, _sparse(by, at, count, {"board": self.corner, "robot": self.view}), CORNER)
+        ]
         if self.basis.shape[1]:
+            root = np.linalg.cholesky(self.information).T
             off = np.linalg.pinv(self.basis) @ (state.camera.parameters() - self.camera.parameters())
-            add("camera", at["camera"], off @ self.information @ off, self.information, self.information @ off)
-        if self.sigma["board_mm"]:
-            off = (state.corners - self.xyz_board).ravel() / self.sigma["board_mm"]
-            add(
-                "board_mm",
-                at["board"],
-                off @ off,
-                np.eye(off.size) / self.sigma["board_mm"] ** 2,
-                off / self.sigma["board_mm"],
-            )
+            found.append(Group((), (root @ off)[None], _sparse({"camera": root[None]}, at, count, {}), np.inf))
+        if at["board"].stop > at["board"].start:
+            off = (state.corners - self.xyz_board) / self.sigma["board_mm"]
+            slope = np.tile(np.eye(3) / self.sigma["board_mm"], (len(off), 1, 1))
+            slope = _sparse({"board": slope}, at, count, {"board": np.arange(len(off))})
+            found.append(Group(("board_mm",), off, slope, np.inf))
         if at["robot"].stop > at["robot"].start:
-            self._add_robot(add, state, at["robot"])
+            weight = self.robot_weight()
+            off = np.einsum("mab,mb->ma", weight, state.base_from_flange.difference(self.base_from_flange))
+            slope = _sparse({"robot": weight}, at, count, {"robot": np.arange(len(off))})
+            names = ("robot_rad", "robot_mm") if self.robot is None else ()
+            found.append(Group(names, off, slope, POSE))
         return found
 
-    def _add_robot(self, add, state: Bundle, place: slice) -> None:
-        weight, m = self.robot_weight(), len(self.base_from_flange)
-        white = np.einsum("mab,mb->ma", weight, state.base_from_flange.difference(self.base_from_flange))
-        soft = np.sqrt(_huber(np.linalg.norm(white, axis=1), HUBER_POSE))[:, None]
-        white, weight = white * soft, weight * soft[:, :, None]
-        parts = (
-            {"robot": slice(0, 6)} if self.robot is not None else {"robot_rad": slice(0, 3), "robot_mm": slice(3, 6)}
-        )
-        for name, rows in parts.items():
-            information = np.zeros((6 * m, 6 * m))
-            for i, w in enumerate(weight[:, rows]):
-                information[6 * i : 6 * i + 6, 6 * i : 6 * i + 6] = w.T @ w
-            pull = np.einsum("mab,ma->mb", weight[:, rows], white[:, rows]).ravel()
-            add(name, place, float((white[:, rows] ** 2).sum()), information, pull)
-
     def linear(self, state: Bundle) -> Linear:
-        """Cost and normal equations."""
-        depth = state.camera_from_board(self.inverted)
-        reach = depth.rotation[self.view, 2] * (state.scale * state.corners[self.corner])
-        size = max(place.stop for place in self.places().values())
-        if (reach.sum(1) + depth.translation[self.view, 2] <= 0).any():
-            return Linear(np.inf, np.eye(size), np.zeros(size))
-        parts = self.parts(state).values()
-        return Linear(self.cost(state), sum(p[1] for p in parts), sum(p[2] for p in parts))
-
-    def cost(self, state: Bundle) -> float:
-        """Huber's, of corners and poses; squares of the rest."""
-        white, _ = self.residuals(state)
-        found = _huber_cost(np.linalg.norm(white, axis=1), HUBER_CORNER)
-        at = self.places()
-        if self.basis.shape[1]:
-            off = np.linalg.pinv(self.basis) @ (state.camera.parameters() - self.camera.parameters())
-            found += off @ self.information @ off
-        if self.sigma["board_mm"]:
-            found += float(((state.corners - self.xyz_board) ** 2).sum()) / self.sigma["board_mm"] ** 2
-        if at["robot"].stop > at["robot"].start:
-            off = np.einsum("mab,mb->ma", self.robot_weight(), state.base_from_flange.difference(self.base_from_flange))
-            found += _huber_cost(np.linalg.norm(off, axis=1), HUBER_POSE)
-        return float(found)
+        """Cost and normal equations; infinite cost where a corner lies behind the camera."""
+        poses = state.camera_from_board(self.inverted)
+        depth = (poses.rotation[self.view, 2] * (state.scale * state.corners[self.corner])).sum(1)
+        if (depth + poses.translation[self.view, 2] <= 0).any():
+            return Linear(np.inf, np.eye(self.count()), np.zeros(self.count()))
+        parts = [group.linear() for group in self.groups(state)]
+        return Linear(*(sum(values) for values in zip(*((p.cost, p.normal, p.gradient) for p in parts), strict=True)))
 
 
-def _huber(length: np.ndarray, limit: float) -> np.ndarray:
-    return np.minimum(1, limit / np.maximum(length, 1e-300))
+@dataclass(frozen=True, slots=True, eq=False)
+class Group:
+    """Knowledge of one kind.
 
+    ``names`` : of the σ that its columns have, each an equal share; ``white`` : (g, d) residuals in units of σ;
+    ``slope`` : (g d, k) their derivative; ``limit`` : Huber's, of the length of a row.
+    """
 
-def _huber_cost(length: np.ndarray, limit: float) -> float:
-    inside = np.minimum(length, limit)
-    return float((inside**2 + 2 * limit * (length - inside)).sum())
+    names: tuple[str, ...]
+    white: np.ndarray
+    slope: csr_matrix
+    limit: float
+
+    def weight(self) -> np.ndarray:
+        """(g,) Huber's weights."""
+        return np.minimum(1, self.limit / np.maximum(np.linalg.norm(self.white, axis=1), 1e-300))
+
+    def linear(self) -> Linear:
+        """Its part of the cost and of the normal equations."""
+        length = np.linalg.norm(self.white, axis=1)
+        inside = np.minimum(length, self.limit)
+        cost = float((inside**2).sum())
+        if (length > inside).any():
+            cost += float(2 * self.limit * (length - inside).sum())
+        pulled = self.slope.multiply(np.repeat(self.weight(), self.white.shape[1])[:, None]).tocsr().T
+        return Linear(cost, (pulled @ self.slope).toarray(), pulled @ self.white.ravel())
+
+    def variance_factors(self, inverse: np.ndarray) -> dict[str, float]:
+        """By name: squared residuals over their share of the redundancy, (g d − trace of their part) at a solution."""
+        spread = (self.slope @ inverse) * self.slope.toarray()
+        squared = self.weight()[:, None] * self.white**2
+        share = self.weight()[:, None] * spread.sum(1).reshape(self.white.shape)
+        found, width = {}, self.white.shape[1] // max(len(self.names), 1)
+        for i, name in enumerate(self.names):
+            columns = slice(i * width, (i + 1) * width)
+            redundancy = max(width * len(self.white) - share[:, columns].sum(), 1e-9)
+            found[name] = float(squared[:, columns].sum() / redundancy)
+        return found
 
 
 def adjust(corners: Corners, start: Bundle, free: tuple[str, ...]) -> tuple[Corners, Bundle, np.ndarray]:
     """Solve, and estimate the σ of the ``free`` groups: each is its squared residuals over its share of the redundancy
     (Helmert's variance components in their simplified form; Förstner 1979). Returns the corners with these σ, the
-    state, and the normal matrix."""
+    state, and the normal matrix.
+
+    Raises
+    ------
+    ConvergenceError
+        No minimum is reached.
+    """
     state = start
-    for _ in range(ROUNDS):
-        state, last = minimise(state, corners.linear, corners.moved, "hand-eye")
-        if not free:
-            break
-        parts = corners.parts(state)
-        inverse = np.linalg.inv(last.normal)
-        sizes = {
-            "corner_px": 2 * len(corners.view),
-            "board_mm": corners.xyz_board.size,
-            "robot_rad": 3 * len(corners.base_from_flange),
-            "robot_mm": 3 * len(corners.base_from_flange),
-        }
-        sigma = dict(corners.sigma)
-        for name in free:
-            cost, normal, _ = parts[name]
-            redundancy = sizes[name] - float((inverse * normal).sum())
-            sigma[name] = max(sigma[name] * np.sqrt(cost / max(redundancy, 1e-9)), LEAST[name])
+    for _ in range(ROUNDS if free else 0):
+        state, last = minimise(state, corners.linear, corners.moved, "hand-eye", ROUGHLY)
+        inverse, sigma = generalised_inverse(last.normal), dict(corners.sigma)
+        for group in corners.groups(state):
+            for name, factor in group.variance_factors(inverse).items():
+                if name in free:
+                    sigma[name] = max(sigma[name] * np.sqrt(factor), LEAST[name])
         change = max(abs(np.log(sigma[name] / corners.sigma[name])) for name in free)
         corners = replace(corners, sigma=sigma)
         if change < SETTLED:
             break
-    return corners, state, minimise(state, corners.linear, corners.moved, "hand-eye")[1].normal
+    state, last = minimise(state, corners.linear, corners.moved, "hand-eye")
+    return corners, state, last.normal
+
+
+def _sparse(by: dict, at: dict[str, slice], count: int, own: dict[str, np.ndarray]) -> csr_matrix:
+    """Derivatives by kind of unknown, (g, d, ·) each, as (g d, count); ``own`` : (g,) which block, of kinds of many."""
+    columns, values = [], []
+    for name, value in by.items():
+        if at[name].stop > at[name].start:
+            first = at[name].start + value.shape[2] * own.get(name, np.zeros(len(value), int))
+            place = first[:, None, None] + np.arange(value.shape[2])
+            columns.append(np.broadcast_to(place, value.shape))
+            values.append(value)
+    columns, values = np.concatenate(columns, axis=2), np.concatenate(values, axis=2)
+    rows, width = values.shape[0] * values.shape[1], values.shape[2]
+    return csr_matrix((values.ravel(), columns.ravel(), np.arange(rows + 1) * width), shape=(rows, count))

@@ -27,7 +27,7 @@ class Linear:
 
 
 def minimise(
-    state: S, linear: Callable[[S], Linear], moved: Callable[[S, np.ndarray], S], what: str
+    state: S, linear: Callable[[S], Linear], moved: Callable[[S, np.ndarray], S], what: str, settled: float = SETTLED
 ) -> tuple[S, Linear]:
     """State of least cost, and the problem about it; directions that nothing determines stay where they are.
 
@@ -46,13 +46,13 @@ def minimise(
             there = linear(trial)
             gain = here.cost - there.cost
             predicted = -(2 * slope @ step + step @ normal @ step)
-            small = predicted <= SETTLED * here.cost + LEAST_GAIN
+            small = predicted <= settled * here.cost + LEAST_GAIN
             if gain >= 0.1 * predicted or small or damping > 1e10:
                 break
             damping *= 10
         if gain > 0:
             state, here = trial, there
-        if gain <= SETTLED * here.cost + LEAST_GAIN:
+        if gain <= settled * here.cost + LEAST_GAIN:
             return state, here
         if gain > 0.5 * predicted:
             damping = max(damping / 10, 1e-10)

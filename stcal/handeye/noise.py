@@ -3,15 +3,13 @@
 from dataclasses import dataclass
 
 import numpy as np
+from scipy.optimize import minimize
 from scipy.stats import chi2
 
 from stcal.errors import InputError
 from stcal.geometry.rigid import Rigid
-from stcal.handeye.leastsq import generalised_inverse
 from stcal.handeye.loop import Loop
 
-ROUNDS = 500
-SETTLED = 1e-6
 LEAST_RAD, LEAST_MM = 1e-9, 1e-6
 """Estimates stay above: exact data have none."""
 
@@ -25,8 +23,8 @@ class Noise:
     robot_rad, robot_mm : float, optional
         Of base_from_flange, in the axes of the base, about the flange.
     camera_rad, camera_mm : float, optional
-        Of camera_from_board, about the board's origin. From poses alone the errors of two sides cannot be told apart
-        well: if nothing is known of either, the robot is taken to be exact, and what is estimated holds both.
+        Of camera_from_board, about the board's origin. If nothing is known of either side, ``robot_mm`` is taken to be
+        0: shifts of the two look alike, and the estimate of ``camera_mm`` holds both.
     corner_px : float, optional
         Of a corner in the image, or the factor of the stated covariances of corners. Never 0.
     board_mm : float, optional
@@ -57,22 +55,33 @@ class Noise:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Components:
-    """Covariances of a loop's residuals, (m, 6, 6): ``known``, and each of ``free``, (2, m, 6, 6), times a variance.
+    """Covariances of a loop's residuals, (m, 6, 6): ``known``, and each of ``free``, (f, m, 6, 6), times a variance.
 
-    ``side`` : ``camera`` or ``robot``, whose the free ones are; empty where all is known.
+    ``names`` : (f,) which σ of :class:`Noise` the free ones are.
     """
 
     known: np.ndarray
     free: np.ndarray
-    side: str
+    names: tuple[str, ...]
 
     def total(self, variances: np.ndarray) -> np.ndarray:
         """(m, 6, 6)."""
-        return self.known + np.tensordot(variances, self.free, 1) if self.side else self.known
+        return self.known + np.tensordot(variances, self.free, 1)
 
     def of(self, used: np.ndarray) -> "Components":
         """Of some poses."""
-        return Components(self.known[used], self.free[:, used], self.side)
+        return Components(self.known[used], self.free[:, used], self.names)
+
+    def first(self, residuals: np.ndarray) -> np.ndarray:
+        """Variances (f,) to start with, from the medians of residuals (m, 6): bad poses do not count."""
+        squared = np.median((residuals.reshape(-1, 2, 3) ** 2).sum(2), axis=0) / chi2.ppf(0.5, 3)
+        turns = [name.endswith("_rad") for name in self.names]
+        shares = np.where(turns, squared[0] / max(sum(turns), 1), squared[1])
+        return np.maximum(shares, self.least())
+
+    def least(self) -> np.ndarray:
+        """(f,)."""
+        return np.array([LEAST_RAD**2 if name.endswith("_rad") else LEAST_MM**2 for name in self.names])
 
 
 def components(loop: Loop, noise: Noise, mount_from_camera: Rigid, scale: float = 1.0) -> Components:
@@ -82,14 +91,16 @@ def components(loop: Loop, noise: Noise, mount_from_camera: Rigid, scale: float 
         "robot": _stated(len(loop), loop.robot_covariance, noise.robot_rad, noise.robot_mm),
         "camera": _stated(len(loop), loop.camera_covariance, noise.camera_rad, noise.camera_mm),
     }
-    known = sum(
-        (by[s] @ stated[s] @ np.swapaxes(by[s], 1, 2) for s in by if stated[s] is not None), np.zeros_like(by["camera"])
-    )
-    side = next((s for s in ("camera", "robot") if stated[s] is None), "")
-    if not side:
-        return Components(known, np.zeros((0, *known.shape)), "")
-    parts = [by[side][:, :, :3], by[side][:, :, 3:]]
-    return Components(known, np.array([p @ np.swapaxes(p, 1, 2) for p in parts]), side)
+    known, free = np.zeros((len(loop), 6, 6)), {}
+    for side, slope in by.items():
+        if stated[side] is not None:
+            known = known + slope @ stated[side] @ np.swapaxes(slope, 1, 2)
+            continue
+        for name, columns in ((f"{side}_rad", slice(0, 3)), (f"{side}_mm", slice(3, 6))):
+            free[name] = slope[:, :, columns] @ np.swapaxes(slope[:, :, columns], 1, 2)
+    if len(free) == 4:  # shifts of robot and camera move the board alike
+        del free["robot_mm"]
+    return Components(known, np.array(list(free.values())).reshape(-1, len(loop), 6, 6), tuple(free))
 
 
 def _stated(m: int, covariance: np.ndarray | None, rad: float | None, mm: float | None) -> np.ndarray | None:
@@ -101,30 +112,43 @@ def _stated(m: int, covariance: np.ndarray | None, rad: float | None, mm: float 
     return np.tile(np.diag([rad**2] * 3 + [mm**2] * 3), (m, 1, 1))
 
 
-def first_variances(residuals: np.ndarray) -> np.ndarray:
-    """Of rotation and translation, (2,), from the medians of residuals (m, 6): bad poses do not count."""
-    squared = np.median((residuals.reshape(-1, 2, 3) ** 2).sum(2), axis=0) / chi2.ppf(0.5, 3)
-    return np.maximum(squared, [LEAST_RAD**2, LEAST_MM**2])
-
-
 def variance_components(parts: Components, residuals: np.ndarray, slope: np.ndarray, first: np.ndarray) -> np.ndarray:
-    """Restricted maximum-likelihood variances (2,) of the free components, from residuals (m, 6) at a solution.
+    """Restricted maximum-likelihood variances (f,) of the free components, from residuals (m, 6) near a solution.
 
-    ``slope`` : (m, 6, k) derivative of the residuals by the parameters solved for. The fixed point of Zhou, Hu, Qiao &
-    Cho (2019), *MM algorithms for variance components models*, which never leaves the positive and always gains.
+    What the parameters take up of the residuals does not count (Patterson & Thompson 1971): no bias by few poses.
+
+    Parameters
+    ----------
+    slope : (m, 6, k) array
+        Derivative of the residuals by the parameters solved for; dependent columns do no harm.
+    first : (f,) array
+        Where to start.
     """
-    theta, least = first, np.array([LEAST_RAD**2, LEAST_MM**2])
-    for _ in range(ROUNDS):
-        inverse = np.linalg.inv(parts.total(theta))
+    slope = _independent(slope)
+
+    def cost(logs: np.ndarray) -> tuple[float, np.ndarray]:
+        theta = np.exp(logs)
+        spread = parts.total(theta)
+        inverse = np.linalg.inv(spread)
         weighted = inverse @ slope
-        covariance = generalised_inverse(np.einsum("mai,maj->ij", slope, weighted))
-        fitted = np.einsum("mab,mb->ma", inverse, residuals)
-        hit = np.einsum("ma,kmab,mb->k", fitted, parts.free, fitted)
-        spare = np.einsum("mab,kmab->k", inverse, parts.free)
-        spare -= np.einsum("mai,kmab,mbj,ij->k", weighted, parts.free, weighted, covariance, optimize=True)
-        new = np.maximum(theta * np.sqrt(np.maximum(hit, 0) / np.maximum(spare, 1e-300)), least)
-        done = np.abs(np.log(new / theta)).max() < SETTLED
-        theta = new
-        if done:
-            break
-    return theta
+        normal = np.einsum("mai,maj->ij", slope, weighted)
+        covariance = np.linalg.inv(normal)
+        left = residuals - slope @ (covariance @ np.einsum("mai,ma->i", weighted, residuals))
+        fitted = np.einsum("mab,mb->ma", inverse, left)
+        value = np.linalg.slogdet(spread)[1].sum() + np.linalg.slogdet(normal)[1] + (fitted * left).sum()
+        by = np.einsum("mab,kmba->k", inverse, parts.free)
+        taken = np.einsum("kmab,mbj->kmaj", parts.free, weighted)
+        by = by - np.einsum("mai,kmaj,ij->k", weighted, taken, covariance, optimize=True)
+        by = by - np.einsum("ma,kmab,mb->k", fitted, parts.free, fitted, optimize=True)
+        return float(value), by * theta
+
+    bounds = [(low, None) for low in np.log(parts.least())]
+    found = minimize(cost, np.log(first), jac=True, method="L-BFGS-B", bounds=bounds, options={"ftol": 1e-12})
+    return np.exp(found.x)
+
+
+def _independent(slope: np.ndarray) -> np.ndarray:
+    """Directions (m, 6, r) that span the same changes of the residuals as the columns of ``slope``."""
+    flat = slope.reshape(-1, slope.shape[2])
+    u, s, _ = np.linalg.svd(flat / np.maximum(np.linalg.norm(flat, axis=0), 1e-300), full_matrices=False)
+    return u[:, s > 1e-7 * s[0]].reshape(*slope.shape[:2], -1)

@@ -8,7 +8,7 @@ from scipy.stats import chi2, f
 from stcal.geometry.rigid import Rigid
 from stcal.handeye.leastsq import Linear, generalised_inverse, minimise, perturbed
 from stcal.handeye.loop import Loop
-from stcal.handeye.noise import Noise, components, first_variances, variance_components
+from stcal.handeye.noise import Noise, components, variance_components
 
 FALSE_ALARM = 0.01
 """Chance that a set of good poses has one called an outlier."""
@@ -38,17 +38,19 @@ class State:
 @dataclass(frozen=True, slots=True, eq=False)
 class PoseSolution:
     """``normal`` : (k, k) of X, Z (and the scale); ``residuals`` : (m, 6); ``spread`` : (m, 6, 6) their covariances;
-    ``outliers`` : (m,); ``sigma`` : (rad, mm) estimated, of ``side``; both empty where all was known;
-    ``variance_factor`` : mean squared residual in units of σ, per degree of freedom."""
+    ``outliers`` : (m,); ``sigma`` : what was estimated, by name; ``variance_factor`` : mean squared residual in
+    units of σ, per degree of freedom; ``spare`` : these; ``scale_hint`` : what the scale would become if it were solved
+    for, and its σ."""
 
     state: State
     normal: np.ndarray
     residuals: np.ndarray
     spread: np.ndarray
     outliers: np.ndarray
-    sigma: tuple[float, ...]
-    side: str
+    sigma: dict[str, float]
     variance_factor: float
+    spare: int
+    scale_hint: tuple[float, float]
 
 
 def adjust_poses(loop: Loop, start: State, noise: Noise, with_scale: bool = False, robust: bool = True) -> PoseSolution:
@@ -65,8 +67,8 @@ def adjust_poses(loop: Loop, start: State, noise: Noise, with_scale: bool = Fals
     count = 13 if with_scale else 12
     state = start
     residuals = _residuals(loop, state)
-    variances = first_variances(residuals)
     parts = components(loop, noise, state.mount_from_camera, state.scale)
+    variances = parts.first(residuals)
     used = _near(residuals, parts.total(variances)) if robust else np.ones(len(loop), bool)
     for round_ in range(ROUNDS):
         parts = components(loop, noise, state.mount_from_camera, state.scale)
@@ -74,21 +76,31 @@ def adjust_poses(loop: Loop, start: State, noise: Noise, with_scale: bool = Fals
         state, normal = _solved(loop[used], state, spread[used], count)
         residuals, slope = _residuals(loop, state), _slope(loop, state, count)
         before, settled = used, True
-        if parts.side:
+        if parts.names:
             old = variances
             variances = variance_components(parts.of(used), residuals[used], slope[used], variances)
             settled = np.abs(np.log(variances / old)).max() < SETTLED
         if robust and round_ < ROUNDS // 2:  # later they stay: a set that swings would never settle
-            used = _agreeing(residuals, slope, parts.total(variances), used, estimated=bool(parts.side))
+            used = _agreeing(residuals, slope, parts.total(variances), used, estimated=bool(parts.names))
         if settled and (used == before).all():
             break
     spread = parts.total(variances)
     state, normal = _solved(loop[used], state, spread[used], count)
     residuals = _residuals(loop, state)
-    sigma = tuple(float(v) for v in np.sqrt(variances)) if parts.side else ()
+    sigma = {name: float(v) for name, v in zip(parts.names, np.sqrt(variances), strict=True)}
     spare = max(6 * int(used.sum()) - count, 1)
     factor = float(_squared(residuals, spread)[used].sum() / spare)
-    return PoseSolution(state, normal, residuals, spread, ~used, sigma, parts.side, factor)
+    hint = _scale_hint(loop[used], state, residuals[used], spread[used])
+    return PoseSolution(state, normal, residuals, spread, ~used, sigma, factor, spare, hint)
+
+
+def _scale_hint(loop: Loop, state: State, residuals: np.ndarray, spread: np.ndarray) -> tuple[float, float]:
+    """What the scale would become, and its σ: one step from the solution with the scale among the unknowns."""
+    slope = _slope(loop, state, 13)
+    weighted = np.linalg.solve(spread, slope)
+    inverse = generalised_inverse(np.einsum("mai,maj->ij", slope, weighted))
+    step = -inverse[12] @ np.einsum("mai,ma->i", weighted, residuals)
+    return state.scale + float(step), float(np.sqrt(inverse[12, 12]))
 
 
 def _residuals(loop: Loop, state: State) -> np.ndarray:

@@ -8,6 +8,7 @@ from stcal.errors import InputError
 from stcal.geometry.arrays import frozen
 from stcal.geometry.rigid import Rigid
 from stcal.handeye.loop import FRAMES, Setup
+from stcal.handeye.observability import Observability
 from stcal.handeye.reprojection import Reprojection
 
 
@@ -44,6 +45,8 @@ class HandEye:
         Which of them were estimated from the residuals.
     reprojection : Reprojection, optional
         Camera, board and robot as adjusted, where corners were.
+    observability : Observability, optional
+        What the poses tell.
     notes : tuple of str
         What should be known about the result, one line each.
     """
@@ -62,6 +65,7 @@ class HandEye:
     sigma: dict[str, float] = field(default_factory=dict)
     estimated: tuple[str, ...] = ()
     reprojection: Reprojection | None = None
+    observability: Observability | None = None
     notes: tuple[str, ...] = ()
 
     def __post_init__(self):
