@@ -126,13 +126,13 @@ def read_poses(path: str | Path) -> HandEyePoses:
         Missing columns; a value that is not finite or a quaternion that is not of unit length, named by line; copies.
     """
     table = read_table(path, WHAT)
-    sides = [_side(table, *names) for names in SIDES]
+    sides = [read_side(table, *names) for names in SIDES]
     (flange, flange_covariance), (board, board_covariance) = sides
     names = tuple(f"line {line}" for line in table.lines)
     return HandEyePoses(flange, board, flange_covariance, board_covariance, names, table.where)
 
 
-def _side(table: Table, wanted: str, inverse: str) -> tuple[Poses, np.ndarray | None]:
+def read_side(table: Table, wanted: str, inverse: str) -> tuple[Poses, np.ndarray | None]:
     """Poses ``wanted`` and their covariances, whichever of the two the table has."""
     given = [name for name in (wanted, inverse) if any(column.startswith(name + "_") for column in table.columns)]
     if len(given) != 1:
