@@ -1,14 +1,13 @@
 """``stcal robot``: kinematics from measured data, and joint values that reach what was commanded."""
 
-import json
 import math
-import os
 from enum import StrEnum
 from pathlib import Path
 from typing import Annotated
 
 import typer
 
+from stcal.cli.saving import save, save_json
 from stcal.errors import InputError
 
 app = typer.Typer(
@@ -68,10 +67,10 @@ def axes(
     for note in result.notes:
         print(f"warning: {data.where}: {note}")
     if out:
-        _save(out, robot_toml(result.robot, [f"Identified by the axis method from {sweeps.name}."]))
-    _save_json(json_file, axes_json(result))
+        save(out, robot_toml(result.robot, [f"Identified by the axis method from {sweeps.name}."]))
+    save_json(json_file, axes_json(result))
     if report:
-        _save(report, axes_page(result, data.where))
+        save(report, axes_page(result, data.where))
 
 
 class Kind(StrEnum):
@@ -117,10 +116,10 @@ def identify(
     result = identified_from(nominal, data, options)
     print(identified_text(result, nominal))
     if out:
-        _save(out, robot_toml(result.robot, [f"Identified from {data_file.name}: {result.rank} parameters."]))
-    _save_json(json_file, identified_json(result, nominal))
+        save(out, robot_toml(result.robot, [f"Identified from {data_file.name}: {result.rank} parameters."]))
+    save_json(json_file, identified_json(result, nominal))
     if report:
-        _save(report, identified_page(result, nominal))
+        save(report, identified_page(result, nominal))
 
 
 @app.command()
@@ -149,12 +148,12 @@ def compensate(
     for note in result.notes():
         print(f"warning: {wanted.where}: {note}")
     if out:
-        _save(out, stage.compensated_csv(result, identified))
-    _save_json(json_file, stage.compensated_json(result, identified))
+        save(out, stage.compensated_csv(result, identified))
+    save_json(json_file, stage.compensated_json(result, identified))
     if report:
         from stcal.robot.use_report import compensation_page
 
-        _save(report, compensation_page(result, identified))
+        save(report, compensation_page(result, identified))
 
 
 @app.command()
@@ -178,12 +177,12 @@ def verify(
     if plot:
         from stcal.robot.use_report import figure_bytes, verification_figure
 
-        _save(plot, figure_bytes(verification_figure(result), plot.suffix.lower()[1:]))
-    _save_json(json_file, stage.verified_json(result))
+        save(plot, figure_bytes(verification_figure(result), plot.suffix.lower()[1:]))
+    save_json(json_file, stage.verified_json(result))
     if report:
         from stcal.robot.use_report import verification_page
 
-        _save(report, verification_page(result))
+        save(report, verification_page(result))
 
 
 class Observed(StrEnum):
@@ -220,8 +219,8 @@ def design(
     result = stage.design(robot, options)
     print(stage.design_text(result))
     if out:
-        _save(out, stage.design_csv(result, robot))
-    _save_json(json_file, stage.design_json(result))
+        save(out, stage.design_csv(result, robot))
+    save_json(json_file, stage.design_json(result))
 
 
 def _box(text: str) -> tuple[float, ...]:
@@ -229,20 +228,3 @@ def _box(text: str) -> tuple[float, ...]:
         return tuple(float(cell) for cell in text.split(","))
     except ValueError as error:
         raise InputError(f"--box {text}: six numbers with commas between needed, in mm") from error
-
-
-def _save_json(path: Path | None, content: dict) -> None:
-    if path:
-        _save(path, json.dumps(content, indent=1, ensure_ascii=False, allow_nan=False) + "\n")
-
-
-def _save(path: Path, content: str | bytes) -> None:
-    """Write a file at once, complete or not at all."""
-    partial = path.with_name(f"{path.name}.{os.getpid()}.partial")
-    try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        partial.write_bytes(content.encode() if isinstance(content, str) else content)
-        os.replace(partial, path)
-    finally:
-        partial.unlink(missing_ok=True)
-    print(f"written: {path}")

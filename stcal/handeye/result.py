@@ -1,0 +1,103 @@
+"""What every hand-eye method returns."""
+
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from stcal.errors import InputError
+from stcal.geometry.arrays import frozen
+from stcal.geometry.rigid import Rigid
+from stcal.handeye.loop import FRAMES, Setup
+from stcal.handeye.observability import Observability
+from stcal.handeye.reprojection import Reprojection
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class HandEye:
+    """A hand-eye calibration from m pose pairs.
+
+    Parameters
+    ----------
+    method : str
+        By which of :data:`~stcal.handeye.METHODS`.
+    setup : str
+        ``eye-in-hand`` or ``eye-to-hand``.
+    mount_from_camera, stand_from_board : Rigid
+        The two unknowns, mm; what mount and stand are tells :mod:`stcal.handeye.loop`. See :attr:`transforms`.
+    residuals : (m, 6) array
+        Of each pose: by how much its chain misses ``stand_from_board``, rotation vector (rad), and translation (mm)
+        at the board's origin, axes of the stand.
+    names : tuple of str
+        Of the poses.
+    outliers : (m,) bool array
+        Poses that were left out of the solution because they contradict the others.
+    covariance, stand_covariance : (6, 6) arrays, optional
+        Of ``mount_from_camera`` and ``stand_from_board``: rotation (rad), translation (mm), left perturbation. None
+        where the method gives none.
+    scale : float
+        The board's true size over its stated size, where it was solved for; else 1.
+    sigma_scale : float, optional
+        Its σ.
+    sigma : dict of str to float
+        σ by which poses or corners were weighted: ``robot_rad``, ``robot_mm``, ``camera_rad``, ``camera_mm``,
+        ``corner_px``, ``board_mm``, where the method weights.
+    estimated : tuple of str
+        Which of them were estimated from the residuals.
+    reprojection : Reprojection, optional
+        Camera, board and robot as adjusted, where corners were.
+    observability : Observability, optional
+        What the poses tell.
+    notes : tuple of str
+        What should be known about the result, one line each.
+    """
+
+    method: str
+    setup: Setup
+    mount_from_camera: Rigid
+    stand_from_board: Rigid
+    residuals: np.ndarray
+    names: tuple[str, ...]
+    outliers: np.ndarray
+    covariance: np.ndarray | None = None
+    stand_covariance: np.ndarray | None = None
+    scale: float = 1.0
+    sigma_scale: float | None = None
+    sigma: dict[str, float] = field(default_factory=dict)
+    estimated: tuple[str, ...] = ()
+    reprojection: Reprojection | None = None
+    observability: Observability | None = None
+    notes: tuple[str, ...] = ()
+
+    def __post_init__(self):
+        m = len(self.names)
+        object.__setattr__(self, "residuals", frozen(self.residuals, (m, 6), "residuals"))
+        object.__setattr__(self, "outliers", frozen(self.outliers, (m,), "outliers", bool))
+        for name in ("covariance", "stand_covariance"):
+            if getattr(self, name) is not None:
+                object.__setattr__(self, name, frozen(getattr(self, name), (6, 6), name))
+
+    @property
+    def transforms(self) -> dict[str, Rigid]:
+        """``flange_from_camera`` and ``base_from_board``, or ``base_from_camera`` and ``flange_from_board``."""
+        frames = FRAMES[self.setup]
+        return {frames.camera: self.mount_from_camera, frames.board: self.stand_from_board}
+
+    @property
+    def flange_from_camera(self) -> Rigid:
+        """Of the eye-in-hand setup."""
+        return self._named("flange_from_camera")
+
+    @property
+    def base_from_camera(self) -> Rigid:
+        """Of the eye-to-hand setup."""
+        return self._named("base_from_camera")
+
+    def _named(self, name: str) -> Rigid:
+        if name not in self.transforms:
+            raise InputError(f"hand-eye: {self.setup} has no {name}; it has {' and '.join(self.transforms)}")
+        return self.transforms[name]
+
+    def rms(self) -> tuple[float, float]:
+        """RMS lengths of the residuals of the poses used: rad, mm."""
+        squared = (self.residuals[~self.outliers].reshape(-1, 2, 3) ** 2).sum(2).mean(0)
+        return float(np.sqrt(squared[0])), float(np.sqrt(squared[1]))

@@ -1,0 +1,297 @@
+"""One call for every method."""
+
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+from scipy.stats import chi2
+
+from stcal.camera_file import CameraPrior
+from stcal.errors import DegenerateError, InputError
+from stcal.geometry.rigid import Rigid
+from stcal.handeye import start
+from stcal.handeye.closed_form import AX_XB, AX_ZB, closed_form
+from stcal.handeye.conventions import check_conventions
+from stcal.handeye.convex import convex
+from stcal.handeye.evolution import EvolutionOptions, Objective, evolve, polish
+from stcal.handeye.leastsq import generalised_inverse
+from stcal.handeye.loop import FRAMES, Loop, Setup
+from stcal.handeye.motions import Motions, poses_with_log
+from stcal.handeye.noise import Noise
+from stcal.handeye.observability import Observability, check, in_words
+from stcal.handeye.pairs import HandEyePoses
+from stcal.handeye.pose_adjustment import State, adjust_poses
+from stcal.handeye.reprojection import adjust_views, resected
+from stcal.handeye.result import HandEye
+from stcal.handeye.symmetry import repair
+from stcal.handeye.views import Views
+
+OTHERS = ("zhao", "de", "de-polished", "pose", "reprojection")
+METHODS = (*AX_XB, *AX_ZB, *OTHERS)
+"""Names of the methods."""
+UNIT_MM = 1000.0
+"""Length that weighs like one radian where no σ are stated: errors of 1 mm go with errors of 1 mrad."""
+SIZE_SIGMAS, SIZE_SHARE = 4.0, 1e-3
+"""A board's size is doubted beyond so many σ, and a share that matters: 0.5 mm at half a metre."""
+CAMERA_GAIN = 5.0
+"""Eight intrinsics that are right gain 8 ± 4 in cost, 1 ± 0.5 each; eight that gain 5 each are wrong."""
+HELD_MM = 1e-6
+"""σ by which X is held where it slides along the one axis of a robot of four axes."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class HandEyeOptions:
+    """What is known, and what is to be solved for.
+
+    Parameters
+    ----------
+    noise : Noise
+        What is known of the errors; the rest is estimated.
+    intrinsics : CameraPrior, optional
+        Solve for the camera's parameters too, held by this; ``reprojection`` only.
+    with_scale : bool
+        Solve for the board's true size too; ``pose`` and ``reprojection`` only.
+    symmetries : tuple of Rigid
+        All board_from_board after which the board looks the same, but for the identity: views that were numbered from
+        another end are put right.
+    four_dof : bool
+        The flange turns about one axis only: solve for all but X along it; ``pose`` and ``reprojection`` only.
+    evolution : EvolutionOptions
+        Of ``de`` and ``de-polished``.
+    """
+
+    noise: Noise = field(default_factory=Noise)
+    intrinsics: CameraPrior | None = None
+    with_scale: bool = False
+    symmetries: tuple[Rigid, ...] = ()
+    four_dof: bool = False
+    evolution: EvolutionOptions = field(default_factory=EvolutionOptions)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Task:
+    """One call's input: ``pairs`` and ``views`` repaired; ``seen`` : observability; ``notes`` : so far."""
+
+    pairs: HandEyePoses
+    loop: Loop
+    setup: Setup
+    views: Views | None
+    options: HandEyeOptions
+    seen: Observability
+    notes: tuple[str, ...]
+
+    def guess(self, loop: Loop) -> tuple[Rigid, Rigid, float]:
+        """First X, Z and scale."""
+        with_scale = self.options.with_scale
+        if self.options.four_dof:
+            return start.about_one_axis(loop, self.seen.mount_axis, with_scale)
+        return start.robust(loop, with_scale)
+
+
+def handeye(
+    pairs: HandEyePoses,
+    setup: Setup = "eye-in-hand",
+    method: str | None = None,
+    views: Views | None = None,
+    options: HandEyeOptions | None = None,
+) -> HandEye:
+    """Where the camera sits on the flange, or in the robot's base.
+
+    Parameters
+    ----------
+    pairs : HandEyePoses
+        At least three, rotated about two axes that are not parallel; see :func:`~stcal.handeye.read_poses`,
+        :func:`~stcal.handeye.pairs_of_views`.
+    setup : str
+        ``eye-in-hand``: the camera on the flange; ``eye-to-hand``: the board on the flange.
+    method : str, optional
+        One of :data:`METHODS`; ``reprojection`` with views, else ``pose`` where none is named.
+    views : Views, optional
+        The corners that ``pairs`` come from; only ``reprojection`` uses them.
+    options : HandEyeOptions, optional
+
+    Raises
+    ------
+    InputError
+        Unknown method or setup, ``reprojection`` without views, or poses in another convention.
+    DegenerateError
+        The poses do not determine the answer; the message says which motion is missing.
+    ConvergenceError
+        The method fails on these poses.
+
+    Examples
+    --------
+    >>> pairs = read_poses("poses.csv")  # doctest: +SKIP
+    >>> found = handeye(pairs, "eye-in-hand")  # doctest: +SKIP
+    >>> found.flange_from_camera @ [0, 0, 500]  # a point half a metre before the camera  # doctest: +SKIP
+    """
+    method = method or ("pose" if views is None else "reprojection")
+    if method not in METHODS:
+        raise InputError(f"hand-eye: method {method!r} is unknown; one of {', '.join(METHODS)} needed")
+    if method == "reprojection" and (views is None or len(views) != len(pairs)):
+        raise InputError("hand-eye: reprojection needs the corners of every pose; give views, or use method pose")
+    task = _task(pairs, setup, views, options or HandEyeOptions())
+    if method == "pose":
+        return _by_poses(task)
+    if method == "reprojection":
+        return _by_views(task)
+    return _by_equations(task, method)
+
+
+def _task(pairs: HandEyePoses, setup: Setup, views: Views | None, options: HandEyeOptions) -> _Task:
+    """Checks that all methods share."""
+    seen = check(Loop.of(pairs, setup), setup, pairs.where, options.four_dof)
+    notes: tuple[str, ...] = ()
+    if options.symmetries:
+        mended = repair(pairs, setup, options.symmetries, views)
+        pairs, views, notes = mended.pairs, mended.views, mended.notes()
+    task = _Task(pairs, Loop.of(pairs, setup), setup, views, options, seen, notes)
+    return replace(task, notes=notes + check_conventions(pairs, setup, task.guess))
+
+
+def _by_equations(task: _Task, method: str) -> HandEye:
+    """The methods that solve AX = XB or AX = ZB."""
+    if task.options.four_dof:
+        raise DegenerateError(f"hand-eye: {method} needs rotations about two axes; with four_dof use method pose")
+    loop, notes, noise = task.loop, task.notes, task.options.noise
+    unit_mm = noise.camera_mm / noise.camera_rad if noise.camera_mm and noise.camera_rad else UNIT_MM
+    if method in AX_XB and not (used := poses_with_log(loop)).all():
+        left_out = ", ".join(name for name, u in zip(task.pairs.names, used, strict=True) if not u)
+        notes = (*notes, f"left out, for they turn by more than 170° against others: {left_out}")
+        loop = loop[used]
+        if len(loop) < 3 or Observability.of(loop).useless:
+            raise DegenerateError(
+                f"hand-eye: without {left_out}, that turn by more than 170° against others, too few poses are left for "
+                f"{method}; use method pose or shah"
+            )
+    if method in (*AX_XB, *AX_ZB):
+        x, z = closed_form(loop, method, unit_mm)
+    else:
+        x = _by_motions(loop, method, unit_mm, task.options.evolution)
+        z = start.mean_pose(task.loop.chain(x))
+    none = np.zeros(len(task.loop), bool)
+    residuals = task.loop.residuals(x, z)
+    return HandEye(method, task.setup, x, z, residuals, task.pairs.names, none, observability=task.seen, notes=notes)
+
+
+def _by_motions(loop: Loop, method: str, unit_mm: float, options: EvolutionOptions) -> Rigid:
+    """X from the motions from each pose to the next."""
+    motions = Motions.consecutive(loop)
+    if method == "zhao":
+        return convex(motions, unit_mm)
+    objective = Objective(motions.with_log(method), unit_mm, options.weight)
+    farthest = max(np.linalg.norm(p.translation, axis=1).max() for p in (loop.camera_from_board, loop.stand_from_mount))
+    x = evolve(objective, farthest, options)
+    return polish(objective, x) if method == "de-polished" else x
+
+
+def _by_poses(task: _Task) -> HandEye:
+    options = task.options
+    solution = adjust_poses(task.loop, State(*task.guess(task.loop)), options.noise, options.with_scale)
+    state, normal = solution.state, solution.normal
+    x, z = state.mount_from_camera, state.stand_from_board
+    notes, covariance = task.notes, generalised_inverse(normal)
+    if options.four_dof:
+        x, z, covariance, notes = _without_slide(task, x, z, normal)
+    notes += _remarks(task, solution.outliers, solution.residuals, solution.scale_hint)
+    if not solution.sigma:
+        notes += _judged(solution.variance_factor, solution.spare)
+    stated = {name: getattr(options.noise, name) for name in ("robot_rad", "robot_mm", "camera_rad", "camera_mm")}
+    return HandEye(
+        "pose",
+        task.setup,
+        x,
+        z,
+        solution.residuals,
+        task.pairs.names,
+        solution.outliers,
+        covariance[:6, :6],
+        covariance[6:12, 6:12],
+        state.scale,
+        float(np.sqrt(covariance[12, 12])) if options.with_scale else None,
+        {name: value for name, value in stated.items() if value} | solution.sigma,
+        tuple(solution.sigma),
+        observability=task.seen,
+        notes=notes,
+    )
+
+
+def _by_views(task: _Task) -> HandEye:
+    options, names = task.options, task.pairs.names
+    solution = adjust_views(
+        task.loop,
+        task.pairs.base_from_flange,
+        task.views,
+        task.guess(task.loop),
+        options.noise,
+        options.intrinsics,
+        options.with_scale,
+    )
+    x, z = solution.state.mount_from_camera, solution.state.stand_from_board
+    notes, covariance = task.notes, solution.covariance
+    if options.four_dof:
+        x, z, covariance, notes = _without_slide(task, x, z, solution.normal)
+    seen = replace(task.loop, camera_from_board=resected(names, task.views, solution))
+    residuals = seen.residuals(x, z)
+    notes += _remarks(task, solution.outliers, residuals, solution.scale_hint)
+    if solution.camera_gain > CAMERA_GAIN:
+        notes += (
+            "the camera file does not fit the corners: solve for the intrinsics too, or calibrate the camera anew",
+        )
+    return HandEye(
+        "reprojection",
+        task.setup,
+        x,
+        z,
+        residuals,
+        names,
+        solution.outliers,
+        covariance[:6, :6],
+        covariance[6:12, 6:12],
+        solution.state.scale,
+        solution.sigma_scale,
+        solution.sigma,
+        solution.estimated,
+        solution.found,
+        task.seen,
+        notes,
+    )
+
+
+def _remarks(task: _Task, outliers: np.ndarray, residuals: np.ndarray, hint: tuple[float, float]) -> tuple[str, ...]:
+    """Outliers by name, and a board that is of another size than stated."""
+    found = []
+    for i in np.flatnonzero(outliers):
+        turn, shift = np.degrees(np.linalg.norm(residuals[i, :3])), np.linalg.norm(residuals[i, 3:])
+        found.append(
+            f"{task.pairs.names[i]} contradicts the others, by {turn:.2g}° and {shift:.2g} mm, and was left out"
+        )
+    scale, sigma = hint
+    if not task.options.with_scale and abs(scale - 1) > max(SIZE_SIGMAS * sigma, SIZE_SHARE):
+        found.append(
+            f"by the robot's motion the board is {scale:.4f} ± {sigma:.2g} times as large as stated: check its size "
+            "and the camera file, or solve with the scale"
+        )
+    return tuple(found)
+
+
+def _judged(factor: float, spare: int) -> tuple[str, ...]:
+    """A note where the residuals are not what the stated σ make expect."""
+    low, high = chi2.ppf([0.0005, 0.9995], spare) / spare
+    if low <= factor <= high:
+        return ()
+    return (
+        f"the residuals are {np.sqrt(factor):.2g} times what the stated σ make expect; correct σ, or look for errors",
+    )
+
+
+def _without_slide(task: _Task, x: Rigid, z: Rigid, normal: np.ndarray):
+    """X with nothing along the axis about which all poses turn; covariance given that; notes with what is unknown."""
+    axis, frames = task.seen.mount_axis, FRAMES[task.setup]
+    x, z = start.slid(x, z, axis, task.loop)
+    held = normal.copy()
+    held[3:6, 3:6] += np.outer(axis, axis) / HELD_MM**2
+    note = (
+        f"{frames.camera} is not known along {in_words(axis)} of the {frames.mount}, the one axis about which the "
+        f"flange turns: it is set to 0 there, and {frames.board} goes with it; measure one of them along that axis"
+    )
+    return x, z, generalised_inverse(held), (*task.notes, note)

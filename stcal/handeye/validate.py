@@ -1,0 +1,198 @@
+"""How good a hand-eye calibration is: on poses that it has not seen, by every method."""
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from stcal.errors import DegenerateError, InputError, StcalError
+from stcal.geometry.arrays import frozen
+from stcal.geometry.camera import Camera
+from stcal.geometry.rigid import Rigid
+from stcal.handeye.loop import Loop, Setup
+from stcal.handeye.pairs import HandEyePoses
+from stcal.handeye.result import HandEye
+from stcal.handeye.solve import METHODS, HandEyeOptions, handeye
+from stcal.handeye.symmetry import repair
+from stcal.handeye.views import View, Views, resect
+
+LEAST_LEFT = 3
+"""Poses that must be left to solve with."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class HeldOut:
+    """Errors on s times k poses that were held out. One row of an array is one split.
+
+    Parameters
+    ----------
+    rows : (s, k) int array
+        Which poses were held out.
+    rotation_rad, translation_mm : (s, k) arrays
+        By how much the chain through robot and camera misses the board's pose: angle, and distance of the origins.
+    board_mm : (s, k) array, or None without corners
+        3-D error at the board: how far from each corner the ray on which the camera saw it pierces the board where the
+        robot's chain has put it; mean over the corners of a view.
+    pose_mm : (s, k) array, or None without corners
+        Mean distance of the corners by the robot's chain from those by the pose that the view gives by itself; holds
+        the error of that pose, mostly along the line of sight.
+    """
+
+    rows: np.ndarray
+    rotation_rad: np.ndarray
+    translation_mm: np.ndarray
+    board_mm: np.ndarray | None
+    pose_mm: np.ndarray | None
+
+    def __post_init__(self):
+        object.__setattr__(self, "rows", frozen(self.rows, (None, None), "held-out poses", int))
+        for name in ("rotation_rad", "translation_mm", "board_mm", "pose_mm"):
+            if getattr(self, name) is not None:
+                object.__setattr__(self, name, frozen(getattr(self, name), self.rows.shape, name))
+
+    def means(self) -> dict[str, float]:
+        """Means over all splits of every error there is."""
+        names = ("rotation_rad", "translation_mm", "board_mm", "pose_mm")
+        return {name: float(getattr(self, name).mean()) for name in names if getattr(self, name) is not None}
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Compared:
+    """One method: its result and errors, or ``reason`` why there are none."""
+
+    method: str
+    result: HandEye | None
+    held_out: HeldOut | None
+    reason: str = ""
+
+
+def splits(count: int, held_out: int | None = None, repeats: int = 15, seed: int = 0) -> np.ndarray:
+    """Poses to hold out, (repeats, k) of ``count``: at random, in rounds in each of which every pose comes about once.
+
+    Without ``held_out`` a quarter of the poses, at least one.
+
+    Raises
+    ------
+    InputError
+        Fewer than three would be left.
+    """
+    k = held_out or max(1, count // 4)
+    if count - k < LEAST_LEFT:
+        raise InputError(
+            f"cross-validation: {k} of {count} poses held out leave {count - k}, {LEAST_LEFT} needed; take more poses"
+        )
+    rng = np.random.default_rng(seed)
+    chosen: list[np.ndarray] = []
+    while len(chosen) < repeats:
+        order = rng.permutation(count)
+        chosen += [np.sort(order[i : i + k]) for i in range(0, count - k + 1, k)]
+    return np.array(chosen[:repeats])
+
+
+def cross_validate(
+    pairs: HandEyePoses,
+    setup: Setup = "eye-in-hand",
+    method: str | None = None,
+    views: Views | None = None,
+    options: HandEyeOptions | None = None,
+    rows: np.ndarray | None = None,
+) -> HeldOut:
+    """Solve without some of the poses and predict these; arguments as of :func:`~stcal.handeye.handeye`.
+
+    ``rows`` : (s, k) from :func:`splits`.
+
+    Raises
+    ------
+    StcalError
+        As of :func:`~stcal.handeye.handeye`, where a split cannot be solved.
+    """
+    options = options or HandEyeOptions()
+    if options.symmetries:
+        mended = repair(pairs, setup, options.symmetries, views)
+        pairs, views, options = mended.pairs, mended.views, replace(options, symmetries=())
+    rows = splits(len(pairs)) if rows is None else rows
+    found = []
+    for out in rows:
+        kept = np.setdiff1d(np.arange(len(pairs)), out)
+        try:
+            result = handeye(pairs[kept], setup, method, None if views is None else views[kept], options)
+        except DegenerateError as error:
+            names = ", ".join(pairs.names[i] for i in out)
+            raise DegenerateError(f"without {names}: {error}") from error
+        found.append(predicted(result, pairs[out], None if views is None else views[out]))
+    parts = [None if part[0] is None else np.array(part) for part in zip(*found, strict=True)]
+    return HeldOut(rows, *parts)
+
+
+def predicted(result: HandEye, pairs: HandEyePoses, views: Views | None) -> tuple[np.ndarray | None, ...]:
+    """Errors of :class:`HeldOut`, (k,) each, on pairs and views that the result has not seen."""
+    scale, loop = result.scale, Loop.of(pairs, result.setup)
+    if views is None:
+        off = loop.residuals(result.mount_from_camera, result.stand_from_board, scale)
+        return np.linalg.norm(off[:, :3], axis=1), np.linalg.norm(off[:, 3:], axis=1), None, None
+    board = result.reprojection
+    camera = views.camera if board is None else board.camera
+    seen = [
+        View(scale * view.xyz_board if board is None else board.board(view.xyz_board), view.xy_px, view.covariance)
+        for view in views.views
+    ]
+    by_view = resect(Views(camera, tuple(seen)), pairs.names).camera_from_board
+    off = replace(loop, camera_from_board=by_view).residuals(result.mount_from_camera, result.stand_from_board)
+    by_robot = result.mount_from_camera.inverse() @ loop.stand_from_mount.inverse() @ result.stand_from_board
+    on_board = [_beside(view, camera, pose) for view, pose in zip(seen, by_robot, strict=True)]
+    apart = [_apart(view, *two) for view, *two in zip(seen, by_robot, by_view, strict=True)]
+    return (
+        np.linalg.norm(off[:, :3], axis=1),
+        np.linalg.norm(off[:, 3:], axis=1),
+        np.array(on_board),
+        np.array(apart),
+    )
+
+
+def compare(
+    pairs: HandEyePoses,
+    setup: Setup = "eye-in-hand",
+    views: Views | None = None,
+    options: HandEyeOptions | None = None,
+    methods: tuple[str, ...] = METHODS,
+    rows: np.ndarray | None = None,
+) -> tuple[Compared, ...]:
+    """Every method on the same poses and the same splits; ``reprojection`` only with views.
+
+    Raises
+    ------
+    InputError
+        Poses in another convention.
+    DegenerateError
+        Poses that no method can solve.
+    """
+    options = options or HandEyeOptions()
+    if options.symmetries:
+        mended = repair(pairs, setup, options.symmetries, views)
+        pairs, views, options = mended.pairs, mended.views, replace(options, symmetries=())
+    handeye(pairs, setup, "pose", None, options)  # what is wrong with the poses is wrong for all methods
+    rows = splits(len(pairs)) if rows is None else rows
+    found = []
+    for method in methods:
+        if method == "reprojection" and views is None:
+            continue
+        result, held_out, reason = None, None, ""
+        try:
+            result = handeye(pairs, setup, method, views, options)
+            held_out = cross_validate(pairs, setup, method, views, options, rows)
+        except StcalError as error:
+            reason = str(error)
+        found.append(Compared(method, result, held_out, reason))
+    return tuple(found)
+
+
+def _beside(view: View, camera: Camera, camera_from_board: Rigid) -> float:
+    """Mean distance of the corners from where their rays pierce the plane at their height on the board."""
+    ray = np.column_stack([camera.normalised_from_pixel(view.xy_px), np.ones(len(view))]) @ camera_from_board.rotation
+    eye = camera_from_board.inverse().translation
+    length = (view.xyz_board[:, 2] - eye[2]) / ray[:, 2]
+    return float(np.linalg.norm(eye + length[:, None] * ray - view.xyz_board, axis=1).mean())
+
+
+def _apart(view: View, first: Rigid, second: Rigid) -> float:
+    """Mean distance of the corners by two poses."""
+    return float(np.linalg.norm(first @ view.xyz_board - second @ view.xyz_board, axis=1).mean())

@@ -1,0 +1,87 @@
+"""Photographs of boards by a robot's camera, drawn, with the files that ``stcal handeye`` takes."""
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import cv2
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from stcal.camera_file import write_cameras_txt
+from stcal.geometry.camera import Camera
+from stcal.geometry.rigid import Poses, Rigid
+from stcal.handeye.simulated import BASE_FROM_BOARD, FLANGE_FROM_CAMERA
+from stcal.table_file import POSE, pose_cells
+from tests.boards.drawn import photograph
+
+CAMERA = Camera(1200, 900, [1500, 1500], [610, 440], np.zeros(8))
+PER_MM = 4
+MARGIN_MM = 30.0
+
+
+def sheet_of_chessboard(rows: int, columns: int, square_mm: int) -> tuple[np.ndarray, float]:
+    """The print with inner corners, and the place of inner corner (0, 0) on it, mm."""
+    cells = np.add.outer(np.arange(rows + 1), np.arange(columns + 1)) % 2 == 0
+    board = np.kron(np.where(cells, 0, 255), np.ones((square_mm * PER_MM,) * 2)).astype(np.uint8)
+    edge = int(MARGIN_MM * PER_MM)
+    return cv2.copyMakeBorder(board, *[edge] * 4, cv2.BORDER_CONSTANT, value=255), MARGIN_MM + square_mm
+
+
+def sheet_of_dots(xy_mm: np.ndarray, radius_mm: np.ndarray) -> tuple[np.ndarray, float]:
+    """The print with dark dots, and the place of the board's origin on it, mm."""
+    width, height = ((xy_mm.max(0) + 2 * MARGIN_MM) * PER_MM).astype(int)
+    sheet, shift = np.full((height, width), 255, np.uint8), 8
+    for place, radius in zip(xy_mm, radius_mm, strict=True):
+        # Pixel centres are integers: a place in mm is half a pixel more on the sheet.
+        at = np.rint(((place + MARGIN_MM) * PER_MM - 0.5) * 2**shift).astype(int)
+        cv2.circle(sheet, at.tolist(), round(radius * PER_MM * 2**shift), 0, -1, cv2.LINE_AA, shift)
+    return sheet, MARGIN_MM
+
+
+def take(sheet: np.ndarray, first_mm: float, camera_from_board: Rigid) -> np.ndarray:
+    """What :data:`CAMERA` sees of a sheet on which the board's origin is at (first_mm, first_mm)."""
+    turn, place = camera_from_board.rotation, camera_from_board.translation
+    matrix = np.array([[CAMERA.focal[0], 0, CAMERA.centre[0]], [0, CAMERA.focal[1], CAMERA.centre[1]], [0, 0, 1]])
+    off = np.array([[1, 0, -first_mm], [0, 1, -first_mm], [0, 0, 1]])
+    image = matrix @ np.column_stack([turn[:, :2], place]) @ off
+    return photograph(sheet, PER_MM, image / image[2, 2], (CAMERA.width, CAMERA.height))
+
+
+def looks(rng: np.random.Generator, count: int, middle_mm: np.ndarray, roll: float) -> Poses:
+    """camera_from_board about 550 mm before the middle of the board, tilted by up to 0.45 rad and rolled by ``roll``."""
+    tilt = rng.uniform(-0.45, 0.45, (count, 2))
+    turn = Rotation.from_rotvec(np.pad(tilt, ((0, 0), (0, 1)))) * Rotation.from_rotvec(
+        np.outer(rng.uniform(-roll, roll, count), [0, 0, 1])
+    )
+    at = rng.uniform(-1, 1, (count, 3)) * [30, 20, 60] + [0, 0, 550]
+    return Poses(turn.as_matrix(), at - turn.apply(np.append(middle_mm, 0)))
+
+
+@dataclass(frozen=True, slots=True)
+class Photographs:
+    """Files: ``images`` folder, ``poses`` CSV, ``camera``, ``board`` TOML."""
+
+    images: Path
+    poses: Path
+    camera: Path
+    board: Path
+
+    def arguments(self) -> list[str]:
+        """Of the command."""
+        options = [("--poses", self.poses), ("--camera", self.camera), ("--board", self.board)]
+        return [str(self.images), *(str(word) for pair in options for word in pair)]
+
+
+def photographs(folder: Path, sheet: np.ndarray, first_mm: float, seen: Poses, board_toml: str) -> Photographs:
+    """Eye-in-hand, without errors of the robot."""
+    found = Photographs(*(folder / name for name in ("images", "poses.csv", "cameras.txt", "board.toml")))
+    found.images.mkdir()
+    base_from_flange = BASE_FROM_BOARD @ seen.inverse() @ FLANGE_FROM_CAMERA.inverse()
+    rows = [",".join(["image", *(f"base_from_flange_{column}" for column in POSE)])]
+    for i, (pose, flange) in enumerate(zip(seen, base_from_flange, strict=True)):
+        cv2.imwrite(str(found.images / f"{i}.png"), take(sheet, first_mm, pose))
+        rows.append(",".join([f"{i}.png", *pose_cells(flange)]))
+    found.poses.write_text("\n".join(rows) + "\n")
+    write_cameras_txt(found.camera, CAMERA, "PINHOLE")
+    found.board.write_text(board_toml)
+    return found

@@ -1,0 +1,158 @@
+"""Boards of every kind in a folder of images."""
+
+import cv2
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from stcal.boards.design import CharucoDesign, ChessboardDesign, TagLayout
+from stcal.camera_file import CameraModel
+from stcal.cli.board_views import images_of_centres, look, symmetries
+from stcal.design import BoardDesign
+from stcal.errors import InputError
+from stcal.geometry.conic import circle_conic, ellipse_of_conic
+from stcal.geometry.rigid import Rigid
+from stcal.images import find_images
+from tests.handeye.photographed import (
+    CAMERA,
+    MARGIN_MM,
+    PER_MM,
+    sheet_of_chessboard,
+    sheet_of_dots,
+    take,
+)
+
+MODEL = CameraModel(CAMERA.focal, CAMERA.centre, CAMERA.distortion, "PINHOLE", None, None, "cameras.txt")
+SLANTED = Rigid(Rotation.from_rotvec([0.5, -0.3, 0.2]).as_matrix(), [-60, -50, 420])
+FAMILY = "DICT_APRILTAG_36h11"
+CORNER_PX = 0.12
+"""As in the tests of the detectors: what drawing in steps of 1/32 px, blur and noise leave."""
+
+
+def dots(rows=6, columns=8, corner=None) -> BoardDesign:
+    return BoardDesign(rows, columns, 20.0, 6.0, "dark", 0.0, corner, 9.0 if corner else None)
+
+
+def charuco() -> tuple[CharucoDesign, np.ndarray, float]:
+    design = CharucoDesign(6, 8, 20.0, 10.0, "DICT_5X5_50")
+    plain = cv2.aruco.CharucoBoard((8, 6), 20.0, 10.0, cv2.aruco.getPredefinedDictionary(cv2.aruco.DICT_5X5_50))
+    sheet = plain.generateImage((160 * PER_MM, 120 * PER_MM))
+    edge = int(MARGIN_MM * PER_MM)
+    return design, cv2.copyMakeBorder(sheet, *[edge] * 4, cv2.BORDER_CONSTANT, value=255), MARGIN_MM
+
+
+def tags() -> tuple[TagLayout, np.ndarray, float]:
+    sheet, places = np.full((150 * PER_MM, 190 * PER_MM), 255, np.uint8), []
+    square = np.array([[0, 0], [40, 0], [40, 40], [0, 40]], float)
+    for tag, (x, y) in enumerate([(20, 20), (120, 30), (40, 90)]):
+        side = 40 * PER_MM
+        dictionary = cv2.aruco.getPredefinedDictionary(getattr(cv2.aruco, FAMILY))
+        sheet[y * PER_MM :, x * PER_MM :][:side, :side] = cv2.aruco.generateImageMarker(dictionary, tag, side)
+        places.append(square + np.array([x, y]))
+    return TagLayout(tuple((FAMILY, tag) for tag in range(3)), np.array(places)), sheet, 0.0
+
+
+def boards():
+    plain = dots(corner=(0, 0))
+    return {
+        "dots": (plain, *sheet_of_dots(plain.xy_mm(), plain.radii_mm())),
+        "chessboard": (ChessboardDesign(5, 8, 20.0), *sheet_of_chessboard(5, 8, 20)),
+        "charuco": charuco(),
+        "tags": tags(),
+    }
+
+
+@pytest.mark.parametrize("kind", ["dots", "chessboard", "charuco", "tags"])
+def test_every_board_is_found_where_it_was_drawn(kind, tmp_path):
+    board, sheet, first = boards()[kind]
+    cv2.imwrite(str(tmp_path / "a.png"), take(sheet, first, SLANTED))
+    cv2.imwrite(str(tmp_path / "blank.png"), np.full((900, 1200), 200, np.uint8))
+    cv2.imwrite(str(tmp_path / "small.png"), np.full((90, 120), 200, np.uint8))
+    (tmp_path / "torn.png").write_bytes((tmp_path / "a.png").read_bytes()[:5000])
+    files, _ = find_images(tmp_path)
+    found = look(files, MODEL, board, (FAMILY,), workers=1)
+    assert (found.camera.width, found.camera.height) == (1200, 900)
+    view = found.views()["a.png"]
+    assert len(view) == len(board.xy_mm())
+    assert 1e-4 < np.abs(CAMERA.project(SLANTED @ view.xyz_board) - view.xy_px).max() < CORNER_PX
+    assert {each.name: each.gate for each in found.skipped} == {
+        "blank.png": "board",
+        "small.png": "image_size",
+        "torn.png": "readable",
+    }
+    assert [len(each.tags) for each in found.images if each.name == "a.png"] == [3 if kind == "tags" else 0]
+    assert found.symmetries == ()
+
+
+def test_dots_carry_a_covariance_like_their_errors(tmp_path):
+    """Mean squared error in units of σ²: 2 per dot for true σ; drawing in steps adds to the noise that σ knows."""
+    board, sheet, first = boards()["dots"]
+    cv2.imwrite(str(tmp_path / "a.png"), take(sheet, first, SLANTED))
+    view = look(find_images(tmp_path)[0], MODEL, board, workers=1).views()["a.png"]
+    off = CAMERA.project(SLANTED @ view.xyz_board) - view.xy_px
+    squared = np.einsum("na,nab,nb->n", off, np.linalg.inv(view.covariance_px2), off)
+    assert 0.5 < squared.mean() < 20
+
+
+def test_images_of_centres_are_exact():
+    """Against the conics of circles seen aslant from near: their centres are off by a tenth of a pixel."""
+    board = dots(corner=(0, 0))
+    xyz = np.column_stack([board.xy_mm(), np.zeros(len(board.xy_mm()))])
+    normal = SLANTED.rotation[:, 2]
+    conics = [
+        circle_conic(centre, normal, radius) for centre, radius in zip(SLANTED @ xyz, board.radii_mm(), strict=True)
+    ]
+    seen = CAMERA.pixel_from_normalised(np.array([ellipse_of_conic(conic)[0] for conic in conics]))
+    true = CAMERA.project(SLANTED @ xyz)
+    assert np.linalg.norm(seen - true, axis=1).max() > 0.1
+    found = images_of_centres(seen, xyz, board.radii_mm(), CAMERA)
+    assert np.linalg.norm(found - true, axis=1).max() < 1e-5
+
+
+@pytest.mark.parametrize(
+    ("board", "count"),
+    [(dots(), 1), (dots(6, 6), 3), (dots(6, 6, (0, 0)), 0), (ChessboardDesign(5, 7, 1.0), 1)],
+)
+def test_symmetries_bring_the_board_onto_itself(board, count):
+    xyz = np.column_stack([board.xy_mm(), np.zeros(len(board.xy_mm()))])
+    every = symmetries(board)
+    assert len(every) == count
+    for turn in every:
+        apart = np.linalg.norm((turn @ xyz)[:, None] - xyz, axis=2)
+        assert apart.min(1).max() < 1e-9
+        assert apart.argmin(1).tolist() != list(range(len(xyz)))
+
+
+def test_a_plain_board_is_numbered_up_to_its_symmetry(tmp_path):
+    board = dots()
+    sheet, first = sheet_of_dots(board.xy_mm(), board.radii_mm())
+    cv2.imwrite(str(tmp_path / "a.png"), take(sheet, first, SLANTED))
+    found = look(find_images(tmp_path)[0], MODEL, board, workers=1)
+    view = found.views()["a.png"]
+    errors = [
+        np.linalg.norm(CAMERA.project(SLANTED @ (turn @ view.xyz_board)) - view.xy_px, axis=1).max()
+        for turn in (Rigid(), *found.symmetries)
+    ]
+    assert min(errors) < CORNER_PX < 20 < max(errors)
+
+
+def test_a_strip_hidden_is_said(tmp_path):
+    """Seven of eight columns of a plain board: which one is hidden cannot be known."""
+    board = dots()
+    image = take(*sheet_of_dots(board.xy_mm()[board.xy_mm()[:, 0] < 139], board.radii_mm()[:42]), SLANTED)
+    cv2.imwrite(str(tmp_path / "a.png"), image)
+    found = look(find_images(tmp_path)[0], MODEL, board, workers=1)
+    assert found.views() == {}
+    assert "strip" in found.skipped[0].reason
+
+
+def test_a_camera_of_other_images_is_refused(tmp_path):
+    cv2.imwrite(str(tmp_path / "a.png"), np.full((300, 400), 200, np.uint8))
+    with pytest.raises(InputError, match=r"principal point \(610, 440\) px is outside of a.png"):
+        look(find_images(tmp_path)[0], MODEL, dots(), workers=1)
+
+
+def test_no_readable_image_is_said(tmp_path):
+    (tmp_path / "a.png").write_bytes(b"")
+    with pytest.raises(InputError, match=r"no usable image among 1: a\.png: empty"):
+        look(find_images(tmp_path)[0], MODEL, dots(), workers=1)
