@@ -116,8 +116,8 @@ def leverages(
     """
     p = None if precision is None else precision[used]
     origin, normal, _ = _normal_equations(model, transform, xyz_a[used], p)
-    jacobian = _jacobian(model, transform, xyz_a - origin)
-    spread = jacobian @ np.linalg.inv(normal) @ np.swapaxes(jacobian, 1, 2)
+    slope = jacobian(model, transform, xyz_a - origin)
+    spread = slope @ np.linalg.inv(normal) @ np.swapaxes(slope, 1, 2)
     if precision is None:
         return spread
     if precision.ndim == 1:
@@ -152,21 +152,24 @@ def hypotheses(model: Model, xyz_a: np.ndarray, xyz_b: np.ndarray) -> tuple[np.n
     return linear, mean_b - (linear @ mean_a[:, :, None])[:, :, 0]
 
 
-def _jacobian(model: Model, transform: Transform, from_origin: np.ndarray) -> np.ndarray:
-    """Derivative (n, 3, p) of b_from_a a by the parameters about the point that ``from_origin`` (n, 3) is taken from."""
+def jacobian(model: Model, transform: Transform, from_origin: np.ndarray) -> np.ndarray:
+    """Derivative (n, 3, p) of b_from_a a by the parameters (see :func:`unit_covariance`) about a point of a.
+
+    ``from_origin`` : (n, 3), a minus that point.
+    """
     n = len(from_origin)
-    jacobian = np.zeros((n, 3, model.parameters))
+    slope = np.zeros((n, 3, model.parameters))
     if model.name == "affine":
         for row in range(3):
-            jacobian[:, row, 4 * row : 4 * row + 3] = from_origin
-            jacobian[:, row, 4 * row + 3] = 1
-        return jacobian
+            slope[:, row, 4 * row : 4 * row + 3] = from_origin
+            slope[:, row, 4 * row + 3] = 1
+        return slope
     turned = from_origin @ parts(transform)[0].T
-    jacobian[:, :, :3] = -skew(turned)
-    jacobian[:, :, 3:6] = np.eye(3)
+    slope[:, :, :3] = -skew(turned)
+    slope[:, :, 3:6] = np.eye(3)
     if model.name == "similarity":
-        jacobian[:, :, 6] = turned
-    return jacobian
+        slope[:, :, 6] = turned
+    return slope
 
 
 def _normal_equations(
@@ -186,9 +189,9 @@ def _normal_equations(
         return origin, _isotropic_normal(model, transform, xyz_a - origin, weights), np.zeros(model.parameters)
     normal, right = np.zeros((model.parameters,) * 2), np.zeros(model.parameters)
     for rows in _chunks(len(xyz_a)):
-        jacobian = _jacobian(model, transform, xyz_a[rows] - origin)
-        weighted = np.swapaxes(jacobian, 1, 2) @ precision[rows]
-        normal += (weighted @ jacobian).sum(0)
+        slope = jacobian(model, transform, xyz_a[rows] - origin)
+        weighted = np.swapaxes(slope, 1, 2) @ precision[rows]
+        normal += (weighted @ slope).sum(0)
         if xyz_b is not None:
             residual = xyz_b[rows] - transform @ xyz_a[rows]
             right += (weighted @ residual[:, :, None]).sum((0, 2))

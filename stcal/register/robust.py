@@ -13,6 +13,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from scipy.special import gammaln
+from scipy.stats import chi2
 from scipy.stats import f as fisher
 
 from stcal.errors import DegenerateError
@@ -29,6 +30,8 @@ MAX_ROUNDS = 50
 NESTED = 6
 EXACT = 1e-11
 """σ below this share of the coordinates' size is rounding of numbers."""
+MOST_OF_REST = 0.5
+"""Of many outliers some always lie near some transform; half of them do for a reason."""
 AS_GOOD = 0.5
 """Another transform with this share of the points of the one found makes the answer ambiguous: with up to 60 % wrong
 points, all in one other motion, the true ones are 40 : 60 of the wrong."""
@@ -68,13 +71,12 @@ def robust_fit(
         inliers, samples = _consensus(model, a, b, own, rng)
     else:
         found = search(model, a, b, own, by_threshold(threshold), rng)
-        _enough(model, found.inliers if found is not None else np.zeros(0, bool), count, threshold)
+        _enough(model, found.inliers if found is not None else np.zeros(count, bool), threshold)
         inliers, samples = found.inliers, found.samples
-    transform = fit(model, a[inliers], b[inliers], own[inliers].precision)
-    start = _settled(model, a, b, own, inliers, transform, threshold)
+    start = settled(model, a, b, own, inliers, threshold)
     if count > SUBSET:
         near = squares(xyz_b - start.transform @ xyz_a, noise.precision) <= start.threshold**2
-        start = _settled(model, xyz_a, xyz_b, noise, near, start.transform, threshold)
+        start = settled(model, xyz_a, xyz_b, noise, near, threshold)
     return Fitted(start.transform, start.inliers, start.sigma, start.threshold, samples)
 
 
@@ -108,23 +110,25 @@ def _more_than_sample(model: Model, found: Consensus, rows: np.ndarray) -> None:
         )
 
 
-def _enough(model: Model, inliers: np.ndarray, count: int, threshold: float) -> None:
+def _enough(model: Model, inliers: np.ndarray, threshold: float | None) -> None:
     agree = int(inliers.sum())
-    if agree < model.sample or model.freedom(agree) <= 0:
-        raise DegenerateError(
-            f"registration: fewer than {max(model.sample, model.parameters // 3 + 1)} of {count} point pairs agree on "
-            f"one {model.name} transform within {threshold:.4g} mm; check the order of the rows and the units, or give "
-            "a larger threshold"
-        )
+    if agree >= model.sample and model.freedom(agree) > 0:
+        return
+    needed = max(model.sample, model.parameters // 3 + 1)
+    within = "" if threshold is None else f" within {threshold:.4g} mm"
+    larger = "" if threshold is None else ", or give a larger threshold"
+    raise DegenerateError(
+        f"registration: fewer than {needed} of {len(inliers)} point pairs agree on one {model.name} transform{within}; "
+        f"check the order of the rows and the units{larger}"
+    )
 
 
-def _settled(
+def settled(
     model: Model,
     xyz_a: np.ndarray,
     xyz_b: np.ndarray,
     noise: Noise,
     inliers: np.ndarray,
-    transform: Transform,
     threshold: float | None,
 ) -> Fitted:
     """Fit, σ and inliers in turn until the set stays, or comes again: then the larger of those in the cycle."""
@@ -132,7 +136,7 @@ def _settled(
     floor = rounding_mm(xyz_a, xyz_b)
     for _ in range(MAX_ROUNDS):
         count = int(inliers.sum())
-        _enough(model, inliers, len(inliers), threshold if threshold is not None else 0)
+        _enough(model, inliers, threshold)
         transform = fit(model, xyz_a[inliers], xyz_b[inliers], noise[inliers].precision)
         residuals = xyz_b - transform @ xyz_a
         square = squares(residuals, noise.precision)
@@ -171,21 +175,23 @@ def _chosen(model, transform, xyz_a, residuals, square, noise: Noise, used, sigm
     return float(np.sqrt(outside)), passed
 
 
-def chance(model: Model, fitted: Fitted, xyz_a: np.ndarray, xyz_b: np.ndarray) -> float:
+def chance(
+    model: Model, fitted: Fitted, xyz_a: np.ndarray, xyz_b: np.ndarray, extent: np.ndarray | None = None
+) -> float:
     """Logarithm of the number of sets that would agree so well were the points anywhere among the others.
 
-    Moisan & Stival's number of false alarms, (n − m) C(n, k) C(k, m) αᵏ⁻ᵐ, least over k; α(r) is the share of the
-    inliers' bounding box that a cube of half side r takes (at most 1 along each axis: coplanar points have thin boxes).
+    Moisan & Stival's number of false alarms, (n − m) C(n, k) C(k, m) αᵏ⁻ᵐ, least over k; α(r) is the share of a box
+    that a cube of half side r takes, at most 1 along each axis. ``extent`` : (3,) sides of that box, mm; else those of
+    the inliers along their principal axes (thin where they are coplanar).
     """
     rows = np.arange(len(xyz_a))[:: max(1, len(xyz_a) // LEVERAGE_UP_TO)]
-    inliers = fitted.inliers[rows]
-    residual = np.linalg.norm(xyz_b[rows] - fitted.transform @ xyz_a[rows], axis=1)
-    order = np.sort(residual)
     count, k = len(rows), np.arange(model.sample + 1, len(rows) + 1)
     if not len(k):
         return 0.0
-    extent = np.maximum(np.ptp(_along_axes(xyz_b[rows][inliers]), axis=0), 1e-300)
-    alpha = np.minimum(1, 2 * order[k - 1, None] / extent).prod(1)
+    order = np.sort(np.linalg.norm(xyz_b[rows] - fitted.transform @ xyz_a[rows], axis=1))
+    if extent is None:
+        extent = np.ptp(_along_axes(xyz_b[rows][fitted.inliers[rows]]), axis=0)
+    alpha = np.minimum(1, 2 * order[k - 1, None] / np.maximum(extent, 1e-300)).prod(1)
     choices = gammaln(count + 1) - gammaln(count - k + 1) - gammaln(model.sample + 1) - gammaln(k - model.sample + 1)
     value = np.log(count - model.sample) + choices + (k - model.sample) * np.log(np.maximum(alpha, 1e-300))
     return float(value.min())
@@ -206,20 +212,25 @@ def alternative_fit(
         return None
     rng = np.random.default_rng(seed + 1)
     tried = rest if len(rest) <= SUBSET else np.sort(rng.choice(rest, SUBSET, replace=False))
-    score: Score = by_threshold(fitted.threshold)
+    freedom = model.freedom(int(fitted.inliers.sum()))
+    threshold = fitted.threshold * float(np.sqrt(freedom / chi2.isf(1 - FALSE_ALARMS, freedom)))  # σ may be so large
+    score: Score = by_threshold(threshold)
     found = search(model, xyz_a[tried], xyz_b[tried], noise[tried], score, rng)
     if found is None or found.inliers.sum() <= model.sample:
         return None
     inside = tried[found.inliers]
     transform = fit(model, xyz_a[inside], xyz_b[inside], noise[inside].precision)
-    near = squares(xyz_b[rest] - transform @ xyz_a[rest], noise[rest].precision) <= fitted.threshold**2
-    if near.sum() <= model.sample:
+    near = squares(xyz_b[rest] - transform @ xyz_a[rest], noise[rest].precision) <= threshold**2
+    if near.sum() <= model.sample or near.sum() < min(MOST_OF_REST * len(rest), AS_GOOD * fitted.inliers.sum()):
         return None
     mask = np.zeros(len(xyz_a), bool)
     mask[rest[near]] = True
-    other = Fitted(transform, mask, fitted.sigma, fitted.threshold, found.samples)
-    alone = Fitted(transform, near, fitted.sigma, fitted.threshold)
-    return other if chance(model, alone, xyz_a[rest], xyz_b[rest]) < np.log(FALSE_ALARMS) else None
+    other = Fitted(transform, mask, fitted.sigma, threshold, found.samples)
+    alone = Fitted(transform, near, fitted.sigma, threshold)
+    # wrong points lie anywhere as far off the transform found as the farthest of them
+    off = np.linalg.norm(xyz_b[rest] - fitted.transform @ xyz_a[rest], axis=1).max()
+    is_chance = chance(model, alone, xyz_a[rest], xyz_b[rest], np.full(3, 2 * off)) > np.log(FALSE_ALARMS)
+    return None if is_chance else other
 
 
 def turn_between(one: Transform, two: Transform) -> float:

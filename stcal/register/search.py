@@ -54,21 +54,37 @@ class Consensus:
 
 
 def by_scale(model: Model, count: int, total: float) -> Score:
-    """Logarithm of the number of false alarms; ``total`` : square sum of the least-squares fit to all ``count`` points."""
+    """Logarithm of the number of false alarms; ``total`` : square sum of the least-squares fit to all points."""
     k = np.arange(model.sample, count)
     k = k[model.freedom(k) > 0]
     a, b = model.freedom(k) / 2, 3 * (count - k) / 2
     tests = np.log(len(k)) + gammaln(count + 1) - gammaln(k + 1) - gammaln(count - k + 1)
-    limit = a / (a + b)
 
     def score(square: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         ordered = np.sort(square, axis=1)
         share = np.cumsum(ordered, axis=1)[:, k - 1] / total
-        share = np.clip(share, TINY, limit)  # at its expectation or above, a set is no evidence: the bound is 1 there
-        value = tests + a * np.log(share / limit) + b * np.log((1 - share) / (1 - limit))
+        value = tests + chernoff(share, a, b)
         best = value.argmin(1)
         rows = np.arange(len(square))
         return value[rows, best], ordered[rows, k[best] - 1]
+
+    return score
+
+
+def chernoff(share: np.ndarray, a: np.ndarray, b: np.ndarray) -> np.ndarray:
+    """Chernoff's bound of log P(Beta(a, b) ≤ share): (x (a + b)/a)ᵃ ((1 − x)(a + b)/b)ᵇ below a/(a + b), else 1."""
+    limit = a / (a + b)
+    share = np.clip(share, TINY, limit)
+    return a * np.log(share / limit) + b * np.log((1 - share) / (1 - limit))
+
+
+def by_share(model: Model, count: int) -> Score:
+    """Least trimmed squares of the larger half, the one with the highest breakdown point (Rousseeuw 1984)."""
+    k = max((count + model.parameters // 3 + 1) // 2, model.sample + 1)
+
+    def score(square: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        ordered = np.partition(square, k - 1, axis=1)[:, :k]
+        return ordered.sum(1), ordered[:, k - 1]
 
     return score
 
