@@ -6,7 +6,7 @@ from typing import NoReturn
 import typer
 
 import stcal
-from stcal.cli import camera, capture, colmap, measure, robot, sfm
+from stcal.cli import camera, capture, colmap, measure, register, robot, sfm
 from stcal.errors import StcalError
 
 INTERRUPTED = 130
@@ -26,6 +26,7 @@ sfm.app.add_typer(camera.app)
 sfm.app.add_typer(measure.app)
 app.add_typer(sfm.app, name="sfm")
 app.add_typer(robot.app, name="robot")
+app.command("register")(register.register)
 
 
 @app.callback(invoke_without_command=True)
