@@ -1,5 +1,6 @@
-"""Base and kinematics solved together, beside the transform: what ``stcal register --robot`` composes of two systems."""
+"""Base and kinematics solved together, beside the transform: ``stcal register --robot`` composes two systems."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from html import escape
 from pathlib import Path
@@ -40,7 +41,7 @@ class Comparison:
     robot: Robot
     identified: Identified
     model: str
-    lines: list[int]
+    lines: Sequence[int]
     folds: int
     rows: np.ndarray
     transform_mm: np.ndarray
@@ -63,8 +64,12 @@ class Comparison:
         return bool(len(transform) and kinematics.mean() < transform.mean())
 
 
-def compared(pairs: Pairs, file: Path, robot_file: Path, found: Findings, options: dict, folds: int, ambiguous: bool):
+def compared(
+    pairs: Pairs, file: Path, robot_file: Path, found: Findings, options: dict, folds: int, allow_ambiguous: bool
+) -> Comparison:
     """Identify base and kinematics from the joint values of ``file``, and hold rows out of both ways.
+
+    ``options`` : of :func:`stcal.register.register`, as ``found`` was made with.
 
     Raises
     ------
@@ -75,46 +80,47 @@ def compared(pairs: Pairs, file: Path, robot_file: Path, found: Findings, option
     """
     robot = load_robot(robot_file)
     data = _measurements(pairs, file, robot)
-    count = len(pairs.lines)
     settings = IdentifyOptions("position", folds=0, seed=options["seed"], partial=True)
     good = found.registration.inliers.copy()
     if found.field is not None:
         good[found.field.taken_back] = True
     identified, used = _grown(robot, data, good, settings)
-    rows, transform, kinematics = [], [], []
-    fold = np.random.default_rng([options["seed"], 4]).permutation(np.arange(count) % max(folds, 1))
-    done = 0
+
+    def by_transform(train: np.ndarray, test: np.ndarray) -> np.ndarray:
+        own = {
+            name: None if values is None else values[train]
+            for name, values in (("weights", pairs.weights), ("covariances", pairs.covariances))
+        }
+        more = {"folds": 0, "allow_ambiguous": allow_ambiguous}
+        return register(pairs.xyz_a[train], pairs.xyz_b[train], **options, **own, **more).b_from_a @ pairs.xyz_a[test]
+
+    def by_kinematics(train: np.ndarray, test: np.ndarray) -> np.ndarray:
+        return _positions(_grown(robot, data[train], good[train], settings)[0].robot, data[test])
+
+    done, rows, errors = _held_out([by_transform, by_kinematics], pairs.xyz_b, folds, options["seed"])
+    wild = ~(found.registration.inliers | used)[rows]
+    nominal = _positions(robot, data)
+    off = float(np.sqrt(((pairs.xyz_a - align_rigid(pairs.xyz_a, nominal) @ nominal) ** 2).sum(1).mean()))
+    return Comparison(robot, identified, found.registration.model, pairs.lines, done, rows, *errors, wild, off)
+
+
+def _held_out(ways, xyz_b: np.ndarray, folds: int, seed: int) -> tuple[int, np.ndarray, np.ndarray]:
+    """Folds done, rows (m,) and the errors (ways, m) of each way, fitted to the other folds."""
+    fold = np.random.default_rng([seed, 4]).permutation(np.arange(len(xyz_b)) % max(folds, 1))
+    tried, errors = [], []
     for k in range(folds if folds > 1 else 0):
         train, test = np.flatnonzero(fold != k), np.flatnonzero(fold == k)
-        weights, covariances = (None if v is None else v[train] for v in (pairs.weights, pairs.covariances))
-        more = {"weights": weights, "covariances": covariances, "folds": 0, "allow_ambiguous": ambiguous}
         try:
-            b_from_a = register(pairs.xyz_a[train], pairs.xyz_b[train], **options, **more).b_from_a
-            from_rest = _grown(robot, data[train], good[train], settings)[0].robot
-            predicted = _positions(from_rest, data[test])
+            found = [np.linalg.norm(xyz_b[test] - way(train, test), axis=1) for way in ways]
         except StcalError:  # a fold that cannot be solved tells nothing of either way
             continue
-        done += 1
-        rows.append(test)
-        transform.append(np.linalg.norm(pairs.xyz_b[test] - b_from_a @ pairs.xyz_a[test], axis=1))
-        kinematics.append(np.linalg.norm(pairs.xyz_b[test] - predicted, axis=1))
-    tried = np.concatenate(rows) if rows else np.zeros(0, int)
-    order = np.argsort(tried)
-    errors = [np.concatenate(each)[order] if each else np.zeros(0) for each in (transform, kinematics)]
-    wild = ~(found.registration.inliers | used)[tried[order]]
-    nominal = _positions(robot, data)
-    off = pairs.xyz_a - align_rigid(pairs.xyz_a, nominal) @ nominal
-    return Comparison(
-        robot,
-        identified,
-        found.registration.model,
-        list(pairs.lines),
-        done,
-        tried[order],
-        *errors,
-        wild,
-        float(np.sqrt((off**2).sum(1).mean())),
-    )
+        tried.append(test)
+        errors.append(found)
+    if not tried:
+        return 0, np.zeros(0, int), np.zeros((len(ways), 0))
+    rows = np.concatenate(tried)
+    order = np.argsort(rows)
+    return len(tried), rows[order], np.hstack(errors)[:, order]
 
 
 def _measurements(pairs: Pairs, file: Path, robot: Robot) -> Measurements:
@@ -192,8 +198,8 @@ def comparison_section(beside: Comparison) -> tuple[str, str, str]:
     """For the page."""
     rows = [[name, *cells] for name, cells in _rows(beside)]
     text = (
-        f"<p>{escape(_title(beside))}. The robot's axes, its base and its tool are solved together from the joint values "
-        "and the positions in b; the same rows are held out of both ways.</p>\n"
+        f"<p>{escape(_title(beside))}. The robot's axes, its base and its tool are solved together from the joint "
+        "values and the positions in b; the same rows are held out of both ways.</p>\n"
         + table(["<Held out", "Points", "Mean (mm)", "RMS (mm)", "Max (mm)"], rows)
         + "<h3>b_from_base of the identified robot</h3>"
         + matrix_table(_b_from_base(beside), "base")
@@ -228,8 +234,8 @@ def _notes(beside: Comparison) -> list[str]:
         notes.append("base and kinematics together are no better here: trust the transform near its points")
     if beside.off_mm > SAME_MM:
         notes.append(
-            f"a is {beside.off_mm:.3g} mm RMS off the positions of the robot file, after a rigid fit: it comes from another "
-            "tool or other kinematics"
+            f"a is {beside.off_mm:.3g} mm RMS off the positions of the robot file, after a rigid fit: it comes from "
+            "another tool or other kinematics"
         )
     return notes
 

@@ -39,9 +39,9 @@ class Errors:
 class Cubes:
     """Errors by where the transform was fitted and where it is used.
 
-    ``middle`` : (3,) mm, frame a; cubes stand along its axes. ``sides_mm`` : (k,), growing. ``errors[i][j]`` : fitted to
-    the points in cube i, of the points in cube j that are not in cube j − 1; those that the fit used are held out in
-    turn. None where there are none.
+    ``middle`` : (3,) mm, frame a; cubes stand along its axes. ``sides_mm`` : (k,), growing. ``errors[i][j]`` : fitted
+    to the points in cube i, of the points in cube j that are not in cube j − 1; those that the fit used are held out
+    in turn. None where there are none.
     """
 
     middle: np.ndarray

@@ -1,9 +1,10 @@
-"""Where a registration holds: the systematic part of its residuals over the workspace, and cubes within cubes.
+"""Where a registration holds: the systematic part of its residuals over the workspace.
 
-A frame that is bent, as a robot's by its kinematics, leaves residuals that change smoothly from place to place. They are
-modelled as r(x) = f(x) + J(x) β + ε: f a Gaussian process (Matérn 5/2, each component alike), J β the small motions of the
-transform, which the fit has taken out (universal kriging: nothing is known beforehand of β), ε noise. Length, size and
-noise are those of the greatest restricted likelihood (Patterson & Thompson 1971; Rasmussen & Williams 2006, ch. 2.7, 5.4).
+A frame that is bent, as a robot's by its kinematics, leaves residuals that change smoothly from place to place. They
+are modelled as r(x) = f(x) + J(x) β + ε: f a Gaussian process (Matérn 5/2, each component alike), J β the small motions
+of the transform, which the fit has taken out (universal kriging: nothing is known beforehand of β), ε noise. Length,
+size and noise are those of the greatest restricted likelihood (Patterson & Thompson 1971; Rasmussen & Williams 2006,
+ch. 2.7 and 5.4).
 """
 
 from dataclasses import dataclass
@@ -14,11 +15,9 @@ from scipy.spatial import cKDTree
 from scipy.spatial.distance import cdist
 from scipy.stats import chi2
 
-from stcal.errors import DegenerateError
 from stcal.geometry.arrays import frozen
 from stcal.register.covariance import noise_of
-from stcal.register.models import MODELS, Model, Transform, fit, jacobian
-from stcal.register.models import jacobian
+from stcal.register.models import MODELS, Model, Transform, jacobian
 from stcal.register.result import Registration
 
 MOST_POINTS = 500

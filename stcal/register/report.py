@@ -1,6 +1,7 @@
 """What a registration found, as text and as a page."""
 
 from html import escape
+from itertools import pairwise
 
 import numpy as np
 
@@ -51,7 +52,8 @@ def _heading(found: Findings) -> str:
     result = found.registration
     count, agree = len(result), int(result.inliers.sum())
     cut = "" if result.threshold_mm is None else f", threshold {result.threshold_mm:.4g} mm"
-    return f"{found.where}: {count} point pairs, {result.model}, {result.method}{cut}: {agree} inliers, {count - agree} outliers"
+    way = f"{result.model}, {result.method}{cut}"
+    return f"{found.where}: {count} point pairs, {way}: {agree} inliers, {count - agree} outliers"
 
 
 def _parts_lines(found: Findings) -> list[str]:
@@ -114,8 +116,8 @@ def field_sentence(found: Findings) -> str:
     back = len(field.taken_back)
     taken = f"; {back} of the outliers follow{'s' * (back == 1)} it" if back else ""
     return (
-        f"residuals are systematic: {field.size_mm:.3g} mm RMS change smoothly over {field.length_mm:.0f} mm, beside noise "
-        f"of σ {field.noise_mm:.3g} mm; a point left out errs by {field.plain_mm.mean():.3g} mm on average, by "
+        f"residuals are systematic: {field.size_mm:.3g} mm RMS change smoothly over {field.length_mm:.0f} mm, beside "
+        f"noise of σ {field.noise_mm:.3g} mm; a point left out errs by {field.plain_mm.mean():.3g} mm on average, by "
         f"{field.corrected_mm.mean():.3g} mm with this field of the others taken off{taken}"
     )
 
@@ -127,7 +129,7 @@ def _field_lines(found: Findings) -> list[str]:
 def shells(found: Findings) -> list[str]:
     """``inner 200 mm``, ``200 … 300 mm`` …."""
     sides = [f"{side:g}" for side in found.cubes.sides_mm]
-    return [f"inner {sides[0]} mm"] + [f"{a} … {b} mm" for a, b in zip(sides, sides[1:], strict=False)]
+    return [f"inner {sides[0]} mm"] + [f"{a} … {b} mm" for a, b in pairwise(sides)]
 
 
 def _cube_lines(found: Findings) -> list[str]:
@@ -199,8 +201,8 @@ def _space(found: Findings) -> str:
     figure, scale = space_figure(found)
     legend = f'<p class="legend">{swatch("inlier", COLOURS[0])}{swatch("outlier", COLOURS[1])}</p>'
     caption = (
-        f"Points in frame b and their residuals b − b_from_a a, drawn {scale:,.0f} times larger; arrows of outliers that "
-        "would leave the picture end in a ring, their length in mm beside them"
+        f"Points in frame b and their residuals b − b_from_a a, drawn {scale:,.0f} times larger; arrows of outliers "
+        "that would leave the picture end in a ring, their length in mm beside them"
     )
     return legend + plot(uri(figure), "residuals in three views", caption, "wide")
 
@@ -223,9 +225,9 @@ def _holds(found: Findings) -> str:
     reach = found.cubes
     middle = " ".join(f"{v:.1f}" for v in reach.middle)
     text += (
-        f"<p>Cubes about ({middle}) mm, along the axes of a. The transform is fitted again to the points in one cube and "
-        "tried on those of all; the points that it is fitted to are held out in turn. Nothing is assumed about where "
-        f"errors come from. {escape(' '.join(s[0].upper() + s[1:] + '.' for s in holds(found)))}</p>\n"
+        f"<p>Cubes about ({middle}) mm, along the axes of a. The transform is fitted again to the points in one cube "
+        "and tried on those of all; the points that it is fitted to are held out in turn. Nothing is assumed about "
+        f"where errors come from. {escape(' '.join(s[0].upper() + s[1:] + '.' for s in holds(found)))}</p>\n"
     )
     names = shells(found)
     heads = ["<Fitted in the cube of", *(word for _ in names for word in ("points", "mean", "max"))]
