@@ -84,7 +84,7 @@ def compared(
     good = found.registration.inliers.copy()
     if found.field is not None:
         good[found.field.taken_back] = True
-    identified, used = _grown(robot, data, good, settings)
+    identified, used = grown(robot, data, good, settings)
 
     def by_transform(train: np.ndarray, test: np.ndarray) -> np.ndarray:
         own = {
@@ -95,11 +95,11 @@ def compared(
         return register(pairs.xyz_a[train], pairs.xyz_b[train], **options, **own, **more).b_from_a @ pairs.xyz_a[test]
 
     def by_kinematics(train: np.ndarray, test: np.ndarray) -> np.ndarray:
-        return _positions(_grown(robot, data[train], good[train], settings)[0].robot, data[test])
+        return positions(grown(robot, data[train], good[train], settings)[0].robot, data[test])
 
     done, rows, errors = _held_out([by_transform, by_kinematics], pairs.xyz_b, folds, options["seed"])
     wild = ~(found.registration.inliers | used)[rows]
-    nominal = _positions(robot, data)
+    nominal = positions(robot, data)
     off = float(np.sqrt(((pairs.xyz_a - align_rigid(pairs.xyz_a, nominal) @ nominal) ** 2).sum(1).mean()))
     return Comparison(robot, identified, found.registration.model, pairs.lines, done, rows, *errors, wild, off)
 
@@ -133,11 +133,11 @@ def _measurements(pairs: Pairs, file: Path, robot: Robot) -> Measurements:
     return Measurements(pairs.where, pairs.lines, q, targets, pairs.xyz_b)
 
 
-def _grown(robot: Robot, data: Measurements, good: np.ndarray, settings: IdentifyOptions):
+def grown(robot: Robot, data: Measurements, good: np.ndarray, settings: IdentifyOptions):
     """Identified from the rows that are good, and from those that it then explains: bent points are no outliers."""
     found = identify(robot, data[good], settings)
     for _ in range(ROUNDS):
-        error = np.linalg.norm(data.positions - _positions(found.robot, data), axis=1)
+        error = np.linalg.norm(data.positions - positions(found.robot, data), axis=1)
         explained = good | (error < found.weighting.sigma_mm * np.sqrt(chi2.isf(CLEAN_SETS / len(data), 3)))
         if (explained == good).all():
             break
@@ -148,7 +148,7 @@ def _grown(robot: Robot, data: Measurements, good: np.ndarray, settings: Identif
     return found, used
 
 
-def _positions(robot: Robot, data: Measurements) -> np.ndarray:
+def positions(robot: Robot, data: Measurements) -> np.ndarray:
     """(m, 3) of the targets, in the instrument's frame."""
     out = np.empty((len(data), 3))
     for name in set(data.targets):
