@@ -68,13 +68,20 @@ def _checked(xyz_a, xyz_b, weights, needed: int) -> tuple[np.ndarray, np.ndarray
     return a, b, w / w.sum()
 
 
+def _collinear(centred: np.ndarray) -> bool:
+    values = np.linalg.eigvalsh(centred.T @ centred)
+    if values[1] > 1e-12 * values[2]:  # plain without the singular values, which a million points take long for
+        return False
+    s = np.linalg.svd(centred, compute_uv=False)
+    return len(s) < 2 or s[1] <= 1e-9 * s[0]
+
+
 def _align(xyz_a, xyz_b, weights, with_scale: bool) -> Similarity:
     a, b, w = _checked(xyz_a, xyz_b, weights, 3)
     mean_a, mean_b = w @ a, w @ b
     da, db = a - mean_a, b - mean_b
     for points in (da, db):
-        s = np.linalg.svd(points[w > 0], compute_uv=False)
-        if len(s) < 2 or s[1] <= 1e-9 * s[0]:
+        if _collinear(points[w > 0]):
             raise DegenerateError("alignment: the points are collinear; points off the line are needed")
     rotation, product = best_rotations((w[:, None] * da).T @ db)
     scale = float(product / (w @ (db**2).sum(1))) if with_scale else 1.0

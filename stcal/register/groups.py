@@ -20,6 +20,8 @@ from stcal.register.search import FALSE_ALARMS, by_share, chernoff, search
 TRIED = 200
 """Points that are looked at: a shift of 4 σ of half of them is seen then."""
 MAX_ROUNDS = 30
+TOGETHER = 0.01
+"""Chance of scattered groups to seem to lie together."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -65,7 +67,7 @@ def lies_together(xyz_a: np.ndarray, group: np.ndarray) -> bool:
     nearest = cKDTree(xyz_a).query(xyz_a, k=2)[1][:, 1]
     same = int((group[nearest] == group).sum())
     share = group.mean()
-    return bool(binom.sf(same - 1, len(group), share**2 + (1 - share) ** 2) < FALSE_ALARMS)
+    return bool(binom.sf(same - 1, len(group), share**2 + (1 - share) ** 2) < TOGETHER)
 
 
 def _assigned(model: Model, a, b, noise: Noise, rng):

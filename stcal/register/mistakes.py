@@ -5,12 +5,13 @@ from collections.abc import Callable
 import numpy as np
 from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
+from scipy.stats import binom
 from scipy.stats import f as fisher
 
 from stcal.errors import InputError
 from stcal.geometry.align import best_rotations
 from stcal.register.models import Model, Transform, parts
-from stcal.register.robust import Fitted
+from stcal.register.robust import BY_CHANCE, Fitted
 
 Namer = Callable[[int], str]
 
@@ -109,7 +110,9 @@ def outlier_notes(transform: Transform, fitted: Fitted, xyz_a: np.ndarray, xyz_b
     mapped = transform @ xyz_a[rows]
     distance, nearest = cKDTree(mapped).query(xyz_b[rows])
     swapped = np.flatnonzero((distance <= reach) & (nearest != np.arange(len(rows))))
-    if len(swapped):
+    taken = np.minimum(1, 2 * reach / np.maximum(np.ptp(mapped, axis=0), 1e-300)).prod()
+    by_chance = binom.sf(len(swapped) - 1, len(rows), 1 - (1 - taken) ** (len(rows) - 1))
+    if len(swapped) and by_chance < BY_CHANCE:
         shown = ", ".join(f"{name(rows[i])} is the point of {name(rows[nearest[i]])}" for i in swapped[:SHOWN])
         notes.append(f"rows exchanged: b of {shown}{_more(len(swapped))}; correct the order")
     linear, translation = parts(transform)

@@ -86,8 +86,8 @@ def _no_pair_twice(table: Table, rows: np.ndarray) -> None:
         first, again = sorted((order[same[0]], order[same[0] + 1]))
         more = f" (and {len(same) - 1} more)" if len(same) > 1 else ""
         raise InputError(
-            f"{table.where}: line {table.lines[again]}: the same pair as on line {table.lines[first]}{more}; remove it, or "
-            "give one of them twice the weight"
+            f"{table.where}: line {table.lines[again]}: the same pair as on line {table.lines[first]}{more}; remove "
+            "it, or give one of them twice the weight"
         )
 
 

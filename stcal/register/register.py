@@ -13,8 +13,7 @@ from stcal.register.mistakes import check_mirrored, check_units, mirrored_error
 from stcal.register.models import MODELS, Model, fit, parts, squares
 from stcal.register.notes import Subject, notes_of
 from stcal.register.result import Alternative, Registration
-from stcal.register.robust import AS_GOOD, Fitted, alternative_fit, chance, robust_fit, settled, turn_between
-from stcal.register.search import FALSE_ALARMS
+from stcal.register.robust import AS_GOOD, BY_CHANCE, Fitted, alternative_fit, chance, robust_fit, settled, turn_between
 from stcal.register.validate import held_out
 
 METHODS = ("robust", "least-squares", "liu2017")
@@ -224,7 +223,7 @@ def _robust(
 
 
 def _beyond_chance(model: Model, fitted: Fitted, a: np.ndarray, b: np.ndarray) -> None:
-    if len(a) > model.sample and chance(model, fitted, a, b) > np.log(FALSE_ALARMS):
+    if len(a) > model.sample and chance(model, fitted, a, b) > np.log(BY_CHANCE):
         raise DegenerateError(
             f"registration: {fitted.inliers.sum()} of {len(a)} point pairs agree to {fitted.sigma:.4g} mm, no better "
             "than chance; check that row i of both is the same point"
@@ -241,7 +240,7 @@ def _check_mirrored_with_outliers(model: Model, fitted: Fitted | None, a, b, noi
     except DegenerateError:
         return
     usual = 0.0 if fitted is None else chance(model, fitted, a, b)
-    if chance(model, mirrored, a * flip, b) < 2 * usual + np.log(FALSE_ALARMS) and (
+    if chance(model, mirrored, a * flip, b) < 2 * usual + np.log(BY_CHANCE) and (
         fitted is None or mirrored.inliers.sum() > fitted.inliers.sum() or mirrored.sigma < fitted.sigma / 2
     ):
         scale = 1 if fitted is None else fitted.sigma / mirrored.sigma

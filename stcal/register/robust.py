@@ -19,7 +19,7 @@ from scipy.stats import f as fisher
 from stcal.errors import DegenerateError
 from stcal.register.covariance import Noise, sigma_within
 from stcal.register.models import Model, Transform, fit, leverages, parts, squares, whitened
-from stcal.register.search import FALSE_ALARMS, Consensus, Score, by_scale, by_threshold, search
+from stcal.register.search import FALSE_ALARMS, LEAST_FREEDOM, Consensus, Score, by_scale, by_threshold, search
 
 SUBSET = 500
 """Samples are scored on so many points: σ is then known to 2 %, shares to 2 %."""
@@ -30,6 +30,8 @@ MAX_ROUNDS = 50
 NESTED = 6
 EXACT = 1e-11
 """σ below this share of the coordinates' size is rounding of numbers."""
+BY_CHANCE = 0.01
+"""Sets that random points would give and that are taken for a transform: so many in one file."""
 MOST_OF_REST = 0.5
 """Of many outliers some always lie near some transform; half of them do for a reason."""
 AS_GOOD = 0.5
@@ -84,7 +86,7 @@ def _consensus(model: Model, a, b, noise: Noise, rng) -> tuple[np.ndarray, int]:
     """Mask of the points that agree, and samples drawn."""
     rows, samples = np.arange(len(a)), 0
     for _ in range(NESTED):
-        if len(rows) <= model.sample:
+        if len(rows) <= model.sample or model.freedom(len(rows) - 1) <= 0:
             break
         x, y, own = a[rows], b[rows], noise[rows]
         total = squares(y - fit(model, x, y, own.precision) @ x, own.precision).sum()
@@ -94,19 +96,19 @@ def _consensus(model: Model, a, b, noise: Noise, rng) -> tuple[np.ndarray, int]:
         samples += found.samples if found is not None else 0
         if found is None or found.value > np.log(FALSE_ALARMS):
             break
-        _more_than_sample(model, found, rows)
+        _can_be_trusted(model, found, rows)
         rows = rows[found.inliers]
     mask = np.zeros(len(a), bool)
     mask[rows] = True
     return mask, samples
 
 
-def _more_than_sample(model: Model, found: Consensus, rows: np.ndarray) -> None:
+def _can_be_trusted(model: Model, found: Consensus, rows: np.ndarray) -> None:
     agree = int(found.inliers.sum())
-    if agree <= model.sample:
+    if model.freedom(agree) < LEAST_FREEDOM:
         raise DegenerateError(
             f"registration: only {agree} of {len(rows)} point pairs agree on one {model.name} transform, at least "
-            f"{model.sample + 1} needed to tell which are wrong; measure more points"
+            f"{-(-(LEAST_FREEDOM + model.parameters) // 3)} needed to tell which are wrong; measure more points"
         )
 
 
@@ -149,7 +151,9 @@ def settled(
         if key in seen:
             break
         seen[key] = Fitted(transform, inliers, sigma, cut)
-        if (chosen == inliers).all():
+        # no test that leaves too few to judge by
+        too_few = threshold is None and model.freedom(int(chosen.sum())) < min(LEAST_FREEDOM, model.freedom(count))
+        if too_few or (chosen == inliers).all():
             return seen[key]
         inliers = chosen
     names = list(seen)
@@ -229,7 +233,7 @@ def alternative_fit(
     alone = Fitted(transform, near, fitted.sigma, threshold)
     # wrong points lie anywhere as far off the transform found as the farthest of them
     off = np.linalg.norm(xyz_b[rest] - fitted.transform @ xyz_a[rest], axis=1).max()
-    is_chance = chance(model, alone, xyz_a[rest], xyz_b[rest], np.full(3, 2 * off)) > np.log(FALSE_ALARMS)
+    is_chance = chance(model, alone, xyz_a[rest], xyz_b[rest], np.full(3, 2 * off)) > np.log(BY_CHANCE)
     return None if is_chance else other
 
 

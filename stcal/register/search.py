@@ -22,8 +22,11 @@ from stcal.errors import ConvergenceError, DegenerateError
 from stcal.register.covariance import Noise
 from stcal.register.models import Model, fit, hypotheses, squares
 
-FALSE_ALARMS = 0.01
-"""Sets declared in data without any outlier: so many in a hundred."""
+FALSE_ALARMS = 1e-4
+"""Expected number of sets that are declared in data without outliers. So few, because a chance set of few points claims a
+σ far too small. Real ones are far below: ten of 20 points that agree to 0.15 mm, the others off by 5 mm, have 1e-14."""
+LEAST_FREEDOM = 6
+"""Degrees of freedom of the smallest consensus: four points rigidly, five in similarity, six affinely."""
 MISSED = 1e-9
 """Chance that no sample is free of outliers."""
 LEAST_SHARE = 0.25
@@ -56,7 +59,7 @@ class Consensus:
 def by_scale(model: Model, count: int, total: float) -> Score:
     """Logarithm of the number of false alarms; ``total`` : square sum of the least-squares fit to all points."""
     k = np.arange(model.sample, count)
-    k = k[model.freedom(k) > 0]
+    k = k[model.freedom(k) > 0]  # smaller sets than can be trusted are looked for too: then nothing is
     a, b = model.freedom(k) / 2, 3 * (count - k) / 2
     tests = np.log(len(k)) + gammaln(count + 1) - gammaln(k + 1) - gammaln(count - k + 1)
 
