@@ -6,7 +6,7 @@ from typing import Annotated
 
 import typer
 
-from stcal.errors import InputError
+from stcal.errors import ConvergenceError, DegenerateError, InputError
 
 
 class Model(StrEnum):
@@ -60,6 +60,7 @@ def register(
     if identified and not robot_file:
         raise InputError(f"--identified {identified}: only with --robot FILE")
     pairs = read_pairs(pairs_file)
+    allow_ambiguous |= robot_file is not None  # a bent arm may look like two motions; the kinematics tell
     options = {"model": model.value, "method": method.value, "threshold_mm": threshold, "seed": seed}
     result = registered(
         pairs.xyz_a,
@@ -75,18 +76,23 @@ def register(
     print(registration_text(found))
     for note in result.notes:
         print(f"warning: {pairs.where}: {note}")
-    content, sections = registration_json(found), []
+    content, sections, failed = registration_json(found), [], None
     if robot_file:
         from stcal.cli.register_robot import compared, comparison_json, comparison_section, comparison_text
         from stcal.robot.robot_file import robot_toml
 
-        beside = compared(pairs, pairs_file, robot_file, found, options, folds, allow_ambiguous)
-        print("", comparison_text(beside), sep="\n")
-        content["robot"] = comparison_json(beside)
-        sections.append(comparison_section(beside))
-        if identified:
-            comments = [f"Identified from {pairs_file.name}: {beside.identified.rank} parameters."]
-            _save(identified, robot_toml(beside.identified.robot, comments))
+        try:
+            beside = compared(pairs, pairs_file, robot_file, found, options, folds)
+            print("", comparison_text(beside), sep="\n")
+            content["robot"] = comparison_json(beside)
+            sections.append(comparison_section(beside))
+            if identified:
+                comments = [f"Identified from {pairs_file.name}: {beside.identified.rank} parameters."]
+                _save(identified, robot_toml(beside.identified.robot, comments))
+        except (DegenerateError, ConvergenceError) as error:  # the transform stands all the same
+            failed = error
     _save_json(out, content)
     if report:
         _save(report, registration_page(found, sections))
+    if failed is not None:
+        raise failed

@@ -64,9 +64,7 @@ class Comparison:
         return bool(len(transform) and kinematics.mean() < transform.mean())
 
 
-def compared(
-    pairs: Pairs, file: Path, robot_file: Path, found: Findings, options: dict, folds: int, allow_ambiguous: bool
-) -> Comparison:
+def compared(pairs: Pairs, file: Path, robot_file: Path, found: Findings, options: dict, folds: int) -> Comparison:
     """Identify base and kinematics from the joint values of ``file``, and hold rows out of both ways.
 
     ``options`` : of :func:`stcal.register.register`, as ``found`` was made with.
@@ -91,7 +89,7 @@ def compared(
             name: None if values is None else values[train]
             for name, values in (("weights", pairs.weights), ("covariances", pairs.covariances))
         }
-        more = {"folds": 0, "allow_ambiguous": allow_ambiguous}
+        more = {"folds": 0, "allow_ambiguous": True}
         return register(pairs.xyz_a[train], pairs.xyz_b[train], **options, **own, **more).b_from_a @ pairs.xyz_a[test]
 
     def by_kinematics(train: np.ndarray, test: np.ndarray) -> np.ndarray:
@@ -229,7 +227,10 @@ def _notes(beside: Comparison) -> list[str]:
     notes, open_ones = [], beside.identified.undetermined
     if open_ones:
         shown = ", ".join(open_ones[:FIRST_NAMES]) + (", …" if len(open_ones) > FIRST_NAMES else "")
-        notes.append(f"kept nominal, as the points leave it open: {shown}; more varied orientations would show it")
+        notes.append(
+            f"the points leave open: {shown}; b_from_base and the tool may be off along these; vary the orientation "
+            "more"
+        )
     if len(beside.rows) and not beside.better:
         notes.append("base and kinematics together are no better here: trust the transform near its points")
     if beside.off_mm > SAME_MM:

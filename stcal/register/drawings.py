@@ -8,8 +8,8 @@ from stcal.register.findings import Findings
 VIEWS = ((0, 1), (0, 2), (1, 2))
 """Horizontal and vertical axis of each view."""
 MOST_ARROWS = 1500
-ARROW_SHARE = 0.12
-"""Of the picture's side that the RMS residual of the inliers takes up."""
+ARROW_SHARE, FEW = 0.12, 80
+"""Of the picture's side that the RMS residual of the inliers takes up, of so few points; less among more."""
 LONGEST_SHARE = 0.3
 """Of the picture's side; longer arrows of outliers are cut off there."""
 RASTER = 41
@@ -24,7 +24,8 @@ def space_figure(found: Findings):
     residual, inlier = result.residuals[rows], result.inliers[rows]
     side = float(np.ptp(place, axis=0).max()) or 1.0
     typical = max(result.rms_mm, 1e-12)
-    scale = round_below(ARROW_SHARE * side / typical)
+    crowded = min(1.0, FEW / len(rows)) ** (1 / 3)
+    scale = round_below(ARROW_SHARE * crowded * side / typical)
     length = np.linalg.norm(residual, axis=1)
     cut = np.minimum(1, LONGEST_SHARE * side / np.maximum(scale * length, 1e-300))
     arrow = scale * residual * np.where(inlier, 1, cut)[:, None]

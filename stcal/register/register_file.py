@@ -57,7 +57,7 @@ def registration_json(found: Findings) -> dict:
         "rms_mm": result.rms_mm,
         "max_mm": result.max_mm,
         "held_out": None if result.held_out is None else _held_out(found, result.held_out),
-        "ambiguous": result.ambiguous,
+        "ambiguous": bool(result.ambiguous),
         "alternative": None,
         "notes": list(result.notes),
         "seed": result.seed,

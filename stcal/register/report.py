@@ -118,7 +118,8 @@ def field_sentence(found: Findings) -> str:
     return (
         f"residuals are systematic: {field.size_mm:.3g} mm RMS change smoothly over {field.length_mm:.0f} mm, beside "
         f"noise of σ {field.noise_mm:.3g} mm; a point left out errs by {field.plain_mm.mean():.3g} mm on average, by "
-        f"{field.corrected_mm.mean():.3g} mm with this field of the others taken off{taken}"
+        f"{field.corrected_mm.mean():.3g} mm with this field of the others taken off{taken}; σ of the transform, which "
+        "takes residuals as independent, are too small"
     )
 
 
@@ -199,11 +200,12 @@ def _result(found: Findings) -> str:
 
 def _space(found: Findings) -> str:
     figure, scale = space_figure(found)
-    legend = f'<p class="legend">{swatch("inlier", COLOURS[0])}{swatch("outlier", COLOURS[1])}</p>'
-    caption = (
-        f"Points in frame b and their residuals b − b_from_a a, drawn {scale:,.0f} times larger; arrows of outliers "
-        "that would leave the picture end in a ring, their length in mm beside them"
-    )
+    outliers = bool(len(found.registration.outliers))
+    legend = swatch("inlier", COLOURS[0]) + (swatch("outlier", COLOURS[1]) if outliers else "")
+    legend = f'<p class="legend">{legend}</p>'
+    caption = f"Points in frame b and their residuals b − b_from_a a, drawn {scale:,g} times larger"
+    if outliers:
+        caption += "; arrows of outliers that would leave the picture end in a ring, their length in mm beside them"
     return legend + plot(uri(figure), "residuals in three views", caption, "wide")
 
 
