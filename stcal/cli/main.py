@@ -6,7 +6,7 @@ from typing import NoReturn
 import typer
 
 import stcal
-from stcal.cli import camera, capture, colmap, handeye, locate, measure, robot, sfm
+from stcal.cli import camera, capture, colmap, handeye, locate, measure, register, robot, sfm
 from stcal.errors import StcalError
 
 INTERRUPTED = 130
@@ -28,6 +28,7 @@ app.add_typer(sfm.app, name="sfm")
 app.add_typer(robot.app, name="robot")
 app.add_typer(locate.app, name="locate")
 app.command(name="handeye")(handeye.handeye)
+app.command("register")(register.register)
 
 
 @app.callback(invoke_without_command=True)

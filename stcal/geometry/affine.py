@@ -1,0 +1,51 @@
+"""Affine transforms: ``xyz_a = linear @ xyz_b + translation``, any 3×3 part."""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from stcal.errors import DegenerateError
+from stcal.geometry.arrays import frozen
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Affine:
+    """An affine transform a_from_b of twelve parameters.
+
+    Parameters
+    ----------
+    linear : (3, 3) array
+    translation : (3,) array
+        Image of b's origin in a, mm.
+    """
+
+    linear: np.ndarray
+    translation: np.ndarray
+
+    def __post_init__(self):
+        object.__setattr__(self, "linear", frozen(self.linear, (3, 3), "linear part"))
+        object.__setattr__(self, "translation", frozen(self.translation, (3,), "translation"))
+
+    def matrix(self) -> np.ndarray:
+        """Homogeneous 4×4 matrix."""
+        m = np.eye(4)
+        m[:3, :3], m[:3, 3] = self.linear, self.translation
+        return m
+
+    def inverse(self) -> "Affine":
+        """b_from_a.
+
+        Raises
+        ------
+        DegenerateError
+            The linear part flattens space.
+        """
+        if np.linalg.cond(self.linear) > 1e12:
+            raise DegenerateError("affine transform: its 3×3 part is singular; an invertible one needed")
+        back = np.linalg.inv(self.linear)
+        return Affine(back, -back @ self.translation)
+
+    def __matmul__(self, other):
+        if isinstance(other, Affine):
+            return Affine(self.linear @ other.linear, self.linear @ other.translation + self.translation)
+        return np.asarray(other, float) @ self.linear.T + self.translation

@@ -1,0 +1,102 @@
+"""Baseline: the method of Liu et al. (2017), "Research on coordinate transformation method between robot and laser
+tracker" (China Measurement & Test 43(11), 102–107), as written.
+
+Random samples of N point pairs; a 12-parameter affine transform by least squares (eqs. 5–6); solutions whose 3×3 part
+is not orthogonal are screened out (eq. 7); the points outside the sample that it brings within a limit are its inliers
+(eq. 8); it is acceptable when they are more than a given share; of the acceptable ones that of the smallest variance
+wins (eq. 9), and is the answer as it stands: from its sample, not from its inliers. The paper leaves open how
+orthogonal the 3×3 part must be and how many samples are drawn; both are options here.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from stcal.errors import DegenerateError, InputError
+from stcal.geometry.affine import Affine
+
+
+@dataclass(frozen=True, slots=True)
+class Liu2017Options:
+    """``sample`` : N, 4 … 40 in the paper, best 30–36; ``limit_mm`` : 0.18–0.23; ``share`` : of the points outside the
+    sample; ``orthogonal_within`` : largest entry of |RᵀR − 1|; ``tries`` : samples drawn."""
+
+    sample: int = 30
+    limit_mm: float = 0.2
+    share: float = 0.85
+    orthogonal_within: float = 0.01
+    tries: int = 1000
+
+    def __post_init__(self):
+        if self.sample < 4:
+            raise InputError(f"liu2017: samples of {self.sample} points, 4 or more needed for twelve parameters")
+        if not 0 < self.share <= 1:
+            raise InputError(f"liu2017: share {self.share:g} of inliers; more than 0 and at most 1 needed")
+        for name in ("limit_mm", "orthogonal_within", "tries"):
+            if not getattr(self, name) > 0:
+                raise InputError(f"liu2017: {name} is {getattr(self, name):g}; a positive number needed")
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Liu2017Result:
+    """``sample`` : (N,) rows of the winner; ``inliers`` : (n,) mask of points within the limit, of the sample too;
+    ``acceptable`` : how many samples were; ``shares`` : (tries,) of inliers outside each sample, NaN where screened
+    out.
+    """
+
+    b_from_a: Affine
+    sample: np.ndarray
+    inliers: np.ndarray
+    acceptable: int
+    shares: np.ndarray
+
+
+def affine_least_squares(xyz_a: np.ndarray, xyz_b: np.ndarray) -> Affine:
+    """b_from_a of twelve parameters as in the paper's eqs. 5–6; coplanar points are not refused.
+
+    Between them, coplanar points leave it free off their plane: there it may be wrong by metres.
+    """
+    design = np.column_stack([xyz_a, np.ones(len(xyz_a))])
+    solution = np.linalg.lstsq(design, np.asarray(xyz_b, float), rcond=None)[0]
+    return Affine(solution[:3].T, solution[3])
+
+
+def liu2017(xyz_a: np.ndarray, xyz_b: np.ndarray, options: Liu2017Options, seed: int = 0) -> Liu2017Result:
+    """b_from_a by the paper's method from points (n, 3), mm.
+
+    Raises
+    ------
+    DegenerateError
+        Too few points, or no sample acceptable.
+    """
+    count, size = len(xyz_a), options.sample
+    if count <= size:
+        raise DegenerateError(f"liu2017: {count} point pairs, more than the {size} of a sample needed; lower its size")
+    rng = np.random.default_rng(seed)
+    best, acceptable = None, 0
+    shares = np.full(options.tries, np.nan)
+    for i in range(options.tries):
+        sample = rng.choice(count, size, replace=False)
+        b_from_a = affine_least_squares(xyz_a[sample], xyz_b[sample])
+        if np.abs(b_from_a.linear.T @ b_from_a.linear - np.eye(3)).max() > options.orthogonal_within:
+            continue
+        error = np.linalg.norm(xyz_b - b_from_a @ xyz_a, axis=1)
+        outside = np.ones(count, bool)
+        outside[sample] = False
+        near = error < options.limit_mm
+        shares[i] = near[outside].mean()
+        if shares[i] <= options.share:
+            continue
+        acceptable += 1
+        variance = float(error[outside & near].var())
+        if best is None or variance < best[0]:
+            best = (variance, b_from_a, np.sort(sample), near)
+    if best is None:
+        tried = shares[np.isfinite(shares)]
+        most = f"at most {100 * tried.max():.0f} %" if len(tried) else "none had an orthogonal 3×3 part"
+        raise DegenerateError(
+            f"liu2017: no sample of {size} points leaves more than {100 * options.share:g} % of the others within "
+            f"{options.limit_mm:g} mm in {options.tries} tries ({most}); a larger limit, a smaller sample or share, or "
+            "the robust method needed"
+        )
+    return Liu2017Result(best[1], best[2], best[3], acceptable, shares)

@@ -1,0 +1,251 @@
+"""The three models of a registration – rigid, similarity, affine – and their weighted least-squares fits.
+
+Residuals are b − b_from_a a in frame b. What noise they have is given by ``precision``: None for equal and isotropic,
+(n,) for weights 1/σ², (n, 3, 3) for inverse covariances.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from stcal.errors import ConvergenceError, DegenerateError
+from stcal.geometry.affine import Affine
+from stcal.geometry.align import align_affine, align_rigid, align_similarity, best_rotations
+from stcal.geometry.rigid import Rigid, Similarity, skew
+
+Transform = Rigid | Similarity | Affine
+
+MAX_STEPS = 50
+SETTLED = 1e-8
+"""Gauss–Newton ends when a step moves no parameter by more than this share of its own σ at unit noise."""
+CHUNK = 100_000
+"""Points at once where a Jacobian of every point is held."""
+
+
+@dataclass(frozen=True, slots=True)
+class Model:
+    """``parameters`` : how many; ``sample`` : the fewest point pairs that determine them."""
+
+    name: str
+    parameters: int
+    sample: int
+
+    def freedom(self, n: int) -> int:
+        """Degrees of freedom of a fit to n point pairs."""
+        return 3 * n - self.parameters
+
+
+MODELS = {m.name: m for m in (Model("rigid", 6, 3), Model("similarity", 7, 3), Model("affine", 12, 4))}
+
+
+def parts(transform: Transform) -> tuple[np.ndarray, np.ndarray]:
+    """Linear part (3, 3) and translation (3,)."""
+    if isinstance(transform, Rigid):
+        return transform.rotation, transform.translation
+    if isinstance(transform, Similarity):
+        return transform.scale * transform.rigid.rotation, transform.rigid.translation
+    return transform.linear, transform.translation
+
+
+def fit(model: Model, xyz_a: np.ndarray, xyz_b: np.ndarray, precision: np.ndarray | None = None) -> Transform:
+    """b_from_a that minimises Σ rᵢᵀ Pᵢ rᵢ.
+
+    In closed form where noise is isotropic; with inverse covariances by Gauss–Newton from there.
+
+    Parameters
+    ----------
+    xyz_a, xyz_b : (n, 3) arrays, mm
+    precision : (n,) or (n, 3, 3) array, optional
+
+    Raises
+    ------
+    DegenerateError
+        Too few points, collinear ones, or coplanar ones for the affine model.
+    ConvergenceError
+        Gauss–Newton did not settle.
+    """
+    weights = precision
+    if precision is not None and precision.ndim == 3:
+        weights = np.trace(precision, axis1=1, axis2=2)
+    closed = {"rigid": align_rigid, "similarity": align_similarity, "affine": align_affine}[model.name]
+    start = closed(xyz_b, xyz_a, weights)
+    if precision is None or precision.ndim == 1:
+        return start
+    transform = start
+    for _ in range(MAX_STEPS):
+        origin, normal, right = _normal_equations(model, transform, xyz_a, precision, xyz_b)
+        step = np.linalg.solve(normal, right)
+        transform = _moved(model, transform, origin, step)
+        if (np.abs(step) * np.sqrt(np.diag(normal)) <= SETTLED * (1 + np.sqrt(len(xyz_a)))).all():
+            return transform
+    raise ConvergenceError(
+        f"registration: {MAX_STEPS} Gauss–Newton steps did not settle; are the covariances true, or some of them huge?"
+    )
+
+
+def squares(residuals: np.ndarray, precision: np.ndarray | None = None) -> np.ndarray:
+    """rᵀ P r, (n,), of residuals (n, 3)."""
+    if precision is not None and precision.ndim == 3:
+        return np.einsum("ni,nij,nj->n", residuals, precision, residuals)
+    plain = np.einsum("ni,ni->n", residuals, residuals)
+    return plain if precision is None else plain * precision
+
+
+def unit_covariance(
+    model: Model, transform: Transform, xyz_a: np.ndarray, precision: np.ndarray | None = None
+) -> np.ndarray:
+    """Covariance (p, p) of a fit's parameters at unit noise (1 mm, or the covariances that ``precision`` inverts).
+
+    Parameters of a left perturbation in frame b: rotation vector (rad) and translation (mm), R' = exp(w) R and
+    t' = t + dt; then for a similarity its relative scale, s' = s (1 + ds). Affine: rows of the 3×4 matrix.
+    """
+    origin, normal, _ = _normal_equations(model, transform, xyz_a, precision)
+    to_origin = _to_origin(model, transform, origin)
+    scale = 1 / np.sqrt(np.diag(normal))
+    covariance = np.linalg.inv(normal * scale[:, None] * scale) * scale[:, None] * scale
+    return to_origin @ covariance @ to_origin.T
+
+
+def leverages(
+    model: Model, transform: Transform, xyz_a: np.ndarray, used: np.ndarray, precision: np.ndarray | None = None
+) -> np.ndarray:
+    """What the uncertainty of the fit to the points ``used`` (mask) adds to every point's residual, (n, 3, 3).
+
+    H = Lᵀ J N⁻¹ Jᵀ L with P = L Lᵀ: whitened residuals Lᵀ r have covariance 1 − H for points that were used and 1 + H
+    for others. An eigenvalue of 1 is a direction in which no other point checks this one.
+    """
+    p = None if precision is None else precision[used]
+    origin, normal, _ = _normal_equations(model, transform, xyz_a[used], p)
+    slope = jacobian(model, transform, xyz_a - origin)
+    spread = slope @ np.linalg.inv(normal) @ np.swapaxes(slope, 1, 2)
+    if precision is None:
+        return spread
+    if precision.ndim == 1:
+        return spread * precision[:, None, None]
+    root = np.linalg.cholesky(precision)
+    return np.swapaxes(root, 1, 2) @ spread @ root
+
+
+def whitened(residuals: np.ndarray, precision: np.ndarray | None = None) -> np.ndarray:
+    """Lᵀ r, (n, 3), of residuals (n, 3), with P = L Lᵀ."""
+    if precision is None:
+        return residuals
+    if precision.ndim == 1:
+        return residuals * np.sqrt(precision)[:, None]
+    return np.einsum("nij,ni->nj", np.linalg.cholesky(precision), residuals)
+
+
+def hypotheses(model: Model, xyz_a: np.ndarray, xyz_b: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Fits to many minimal samples at once: linear parts (s, 3, 3) and translations (s, 3) of b_from_a.
+
+    ``xyz_a``, ``xyz_b`` : (s, m, 3). What degenerate samples give is finite and wrong.
+    """
+    mean_a, mean_b = xyz_a.mean(1), xyz_b.mean(1)
+    a, b = xyz_a - mean_a[:, None], xyz_b - mean_b[:, None]
+    cross = np.swapaxes(b, 1, 2) @ a
+    if model.name == "affine":
+        linear = cross @ np.linalg.pinv(np.swapaxes(a, 1, 2) @ a, hermitian=True)
+    else:
+        linear, product = best_rotations(cross)
+        if model.name == "similarity":
+            linear = linear * (product / np.maximum((a**2).sum((1, 2)), 1e-300))[:, None, None]
+    return linear, mean_b - (linear @ mean_a[:, :, None])[:, :, 0]
+
+
+def jacobian(model: Model, transform: Transform, from_origin: np.ndarray) -> np.ndarray:
+    """Derivative (n, 3, p) of b_from_a a by the parameters (see :func:`unit_covariance`) about a point of a.
+
+    ``from_origin`` : (n, 3), a minus that point.
+    """
+    n = len(from_origin)
+    slope = np.zeros((n, 3, model.parameters))
+    if model.name == "affine":
+        for row in range(3):
+            slope[:, row, 4 * row : 4 * row + 3] = from_origin
+            slope[:, row, 4 * row + 3] = 1
+        return slope
+    turned = from_origin @ parts(transform)[0].T
+    slope[:, :, :3] = -skew(turned)
+    slope[:, :, 3:6] = np.eye(3)
+    if model.name == "similarity":
+        slope[:, :, 6] = turned
+    return slope
+
+
+def _normal_equations(
+    model: Model,
+    transform: Transform,
+    xyz_a: np.ndarray,
+    precision: np.ndarray | None,
+    xyz_b: np.ndarray | None = None,
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Origin in a (the points' weighted mean), normal matrix (p, p) about it, and right side (p,) where b is given."""
+    if precision is None or precision.ndim == 1:
+        weights = np.ones(len(xyz_a)) if precision is None else precision
+    else:
+        weights = np.trace(precision, axis1=1, axis2=2)
+    origin = weights @ xyz_a / weights.sum()
+    if precision is None or precision.ndim == 1:
+        return origin, _isotropic_normal(model, transform, xyz_a - origin, weights), np.zeros(model.parameters)
+    normal, right = np.zeros((model.parameters,) * 2), np.zeros(model.parameters)
+    for rows in _chunks(len(xyz_a)):
+        slope = jacobian(model, transform, xyz_a[rows] - origin)
+        weighted = np.swapaxes(slope, 1, 2) @ precision[rows]
+        normal += (weighted @ slope).sum(0)
+        if xyz_b is not None:
+            residual = xyz_b[rows] - transform @ xyz_a[rows]
+            right += (weighted @ residual[:, :, None]).sum((0, 2))
+    return origin, normal, right
+
+
+def _isotropic_normal(model: Model, transform: Transform, from_origin: np.ndarray, weights: np.ndarray) -> np.ndarray:
+    """From the points' second moments, so that a million points need no Jacobian each."""
+    second, total = (from_origin * weights[:, None]).T @ from_origin, weights.sum()
+    normal = np.zeros((model.parameters,) * 2)
+    if model.name == "affine":
+        for row in range(3):
+            normal[4 * row : 4 * row + 3, 4 * row : 4 * row + 3] = second
+            normal[4 * row + 3, 4 * row + 3] = total
+        return normal
+    linear = parts(transform)[0]
+    second = linear @ second @ linear.T
+    normal[:3, :3] = np.trace(second) * np.eye(3) - second
+    normal[3:6, 3:6] = total * np.eye(3)
+    if model.name == "similarity":
+        normal[6, 6] = np.trace(second)
+    return normal
+
+
+def _to_origin(model: Model, transform: Transform, origin: np.ndarray) -> np.ndarray:
+    """(p, p): parameters about a's origin of those about the point ``origin`` of a."""
+    change = np.eye(model.parameters)
+    if model.name == "affine":
+        for row in range(3):
+            change[4 * row + 3, 4 * row : 4 * row + 3] = -origin
+        return change
+    turned = parts(transform)[0] @ origin
+    change[3:6, :3] = skew(turned)
+    if model.name == "similarity":
+        change[3:6, 6] = -turned
+    return change
+
+
+def _moved(model: Model, transform: Transform, origin: np.ndarray, step: np.ndarray) -> Transform:
+    """The transform after a step of the parameters about ``origin``."""
+    if model.name == "affine":
+        rows = step.reshape(3, 4)
+        linear = transform.linear + rows[:, :3]
+        return Affine(linear, transform @ origin + rows[:, 3] - linear @ origin)
+    turn = Rigid.exp([*step[:3], 0, 0, 0]).rotation
+    there = transform @ origin + step[3:6]
+    if model.name == "rigid":
+        rotation = turn @ transform.rotation
+        return Rigid(rotation, there - rotation @ origin)
+    scale, rotation = transform.scale * (1 + step[6]), turn @ transform.rigid.rotation
+    if scale <= 0:
+        raise DegenerateError("registration: the scale is not determined; are the covariances true?")
+    return Similarity(scale, Rigid(rotation, there - scale * rotation @ origin))
+
+
+def _chunks(n: int):
+    return (slice(i, i + CHUNK) for i in range(0, n, CHUNK))

@@ -1,0 +1,80 @@
+"""A real robot and a total station: the acceptance figures."""
+
+import importlib.util
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from stcal.geometry.rigid import Rigid
+from stcal.robot.kinematics import forward
+from stcal.robot.robot_file import load_robot
+
+SCRIPT = Path(__file__).resolve().parents[2] / "scripts" / "register_shared.py"
+
+
+@pytest.fixture(scope="module")
+def script():
+    spec = importlib.util.spec_from_file_location("register_shared", SCRIPT)
+    module = importlib.util.module_from_spec(spec)
+    sys.modules[spec.name] = module
+    spec.loader.exec_module(module)
+    return module
+
+
+@pytest.fixture(scope="module")
+def data(script, shared_data):
+    """Stations by name, and the robot of the URDF."""
+    root = shared_data / "hilti_stationing"
+    if not root.is_dir():
+        pytest.skip("hilti_stationing is not among the shared data sets")
+    return root, script.stations(root), script.robot_of(root / "data" / "trailblazer.urdf")
+
+
+def test_rows_make_the_poses_of_the_urdf(script, data):
+    """The URDF's transforms multiplied one by one, with both stages of the column as it says."""
+    root, stations, robot = data
+    q = script.everything(stations["flat"]).q[::40]
+    for values, found in zip(q, (robot.world_from_base @ forward(robot, q).translation), strict=True):
+        pose, rest = Rigid(), list(values[1:])
+        for name, kind, origin in script.urdf_joints(root / "data" / "trailblazer.urdf"):
+            pose = pose @ origin
+            if kind == "prismatic":
+                offset = {"column_middle_joint": -706.0, "column_top_joint": -736.0}[name]
+                pose = pose @ Rigid(np.eye(3), [0, 0, values[0] / 2 + offset])
+            elif kind == "revolute":
+                pose = pose @ Rigid.exp([0, 0, rest.pop(0), 0, 0, 0])
+        np.testing.assert_allclose(pose.translation, found, atol=1e-8)
+
+
+def test_rigid_registration_holds_to_a_centimetre_and_affine_to_metres(script, data):
+    """The figures of SOURCE.txt: 6.9–9.9 mm, and 3.2–5.4 m of the affine fit to coplanar places."""
+    _, stations, robot = data
+    rigid = {name: script.errors_by_part(s, robot).mean() for name, s in stations.items()}
+    affine = {name: script.errors_by_part(s, robot, affine=True).mean() for name, s in stations.items()}
+    assert len(rigid) == 7
+    assert min(rigid.values()) > 6.0
+    assert max(rigid.values()) < 9.95
+    assert min(affine.values()) > 2000
+
+
+def test_kinematics_of_one_station_serve_another(script, data):
+    """Identified where the floor is flat, used where it is not: the error falls to below 70 %."""
+    _, stations, robot = data
+    real = script.identified(robot, script.everything(stations["flat"]))
+    for name in ("outdoor", "pallet", "diagonal_wood"):
+        nominal, better = (script.errors_by_part(stations[name], each).mean() for each in (robot, real))
+        assert better < 0.7 * nominal
+
+
+def test_files_for_the_command(script, data, tmp_path):
+    _, stations, robot = data
+    script.write(tmp_path, {"flat": stations["flat"]}, robot)
+    read = load_robot(tmp_path / "robot.toml")
+    head, *rows = (tmp_path / "flat.csv").read_text().splitlines()
+    assert head == script.HEADER
+    values = np.array([[float(v) for v in row.split(",")] for row in rows])
+    assert len(values) == len(script.everything(stations["flat"]).q)
+    q = np.column_stack([values[:, 6], np.radians(values[:, 7:])])
+    np.testing.assert_allclose(forward(read, q).translation, values[:, :3], atol=1e-3)
