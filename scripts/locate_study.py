@@ -77,7 +77,7 @@ def poses(images: CalibrationImages) -> None:
 
 def subsets(images: CalibrationImages, most: int | None) -> None:
     print("real images, subsets of tags (all, or so many of each size and image: --most)")
-    gates = {"verdict": VerdictOptions(), "sigma of rotation to 5°": VerdictOptions(max_sigma_deg=5.0)}
+    gates = {"verdict": VerdictOptions(), "odds of the other 1:100": VerdictOptions(flip_odds=1e-2)}
     gates["the patent's gate"] = PatentOptions()
     for name, options in gates.items():
         for size in (1, 2, 3, 4):

@@ -90,6 +90,7 @@ class TagsFile(Strict):
     sigma_mm: Annotated[float, Field(ge=0, le=1e3)] = 0.0
     origin: Annotated[int, Field(ge=0, strict=True)] | None = None
     sigma_px: Annotated[float, Field(ge=0, le=1e3)] = 0.0
+    tag_sigma_px: Annotated[float, Field(ge=0, le=1e3)] = 0.0
     covariance_mm2: list[list[Finite]] | None = None
     tag: list[TagEntry] = Field(min_length=1)
 

@@ -64,6 +64,7 @@ def find_tags(image: np.ndarray, dictionaries: Sequence[str]) -> Tags:
         corners, ids, _ = detector.detectMarkers(grey)
         for place, tag in zip(corners, [] if ids is None else ids.ravel(), strict=True):
             found.setdefault((name, int(tag)), []).append(place.reshape(4, 2))
+    found = _outermost(found)
     once = {tag: places[0] for tag, places in sorted(found.items()) if len(places) == 1}
     cells = np.array([_dictionary(name).markerSize + 2 for name, _ in once])
     corners, covariance = _refined(grey, np.array(list(once.values()), float).reshape(-1, 4, 2), cells)
@@ -141,6 +142,17 @@ def _parameters(name: str):
     if "APRILTAG" in name.upper():
         how.cornerRefinementMethod = cv2.aruco.CORNER_REFINE_NONE
     return how
+
+
+def _outermost(found: dict[tuple[str, int], list[np.ndarray]]) -> dict[tuple[str, int], list[np.ndarray]]:
+    """Without what is read inside of a larger tag, its cells as a tag of another dictionary, or its border twice."""
+    flat = [(tag, place, cv2.contourArea(place)) for tag, places in found.items() for place in places]
+    kept: dict[tuple[str, int], list[np.ndarray]] = {}
+    for tag, place, area in flat:
+        x, y = place.mean(0).tolist()
+        if not any(larger > area and cv2.pointPolygonTest(other, (x, y), False) > 0 for _, other, larger in flat):
+            kept.setdefault(tag, []).append(place)
+    return kept
 
 
 def _saturated(grey: np.ndarray, corners: np.ndarray, cells: np.ndarray) -> np.ndarray:

@@ -1,13 +1,12 @@
 """``stcal locate``: a planar target of several tags, calibrated, found under any light, and judged."""
 
-import json
-import os
 from enum import StrEnum
 from pathlib import Path
 from typing import Annotated
 
 import typer
 
+from stcal.cli.saving import save, save_json
 from stcal.errors import InputError
 
 app = typer.Typer(
@@ -82,9 +81,9 @@ def calibrate(
         print(f"left out: {each}")
     for warning in warnings(result, plan.tags):
         print(f"warning: {warning}")
-    _save(out, layout_toml(result.layout, [f"Calibrated by stcal locate from {len(result.images)} images."]))
+    save(out, layout_toml(result.layout, [f"Calibrated by stcal locate from {len(result.images)} images."]))
     if json_file:
-        _save(json_file, json.dumps(calibrated_json(result), indent=1, ensure_ascii=False, allow_nan=False) + "\n")
+        save_json(json_file, calibrated_json(result))
 
 
 @app.command()
@@ -171,26 +170,13 @@ def run(
         for each in scene.skipped:
             print(f"not used: {each}")
     if out:
-        _save(out, poses_csv(results, chain))
+        save(out, poses_csv(results, chain))
     if json_file:
-        content = run_json(results, target, chain)
-        _save(json_file, json.dumps(content, indent=1, ensure_ascii=False, allow_nan=False) + "\n")
+        save_json(json_file, run_json(results, target, chain))
     if report:
         from stcal.locate.report import run_page
 
-        _save(report, run_page(results, scenes, target, model))
+        save(report, run_page(results, scenes, target, model))
     if not accepted(results):
         print(f"no pose accepted in {len(results)} scene{'s' * (len(results) > 1)}")
         raise typer.Exit(NOTHING_ACCEPTED)
-
-
-def _save(path: Path, content: str | bytes) -> None:
-    """Write a file at once, complete or not at all."""
-    partial = path.with_name(f"{path.name}.{os.getpid()}.partial")
-    try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        partial.write_bytes(content.encode() if isinstance(content, str) else content)
-        os.replace(partial, path)
-    finally:
-        partial.unlink(missing_ok=True)
-    print(f"written: {path}")

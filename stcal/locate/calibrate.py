@@ -15,7 +15,7 @@ from stcal.boards.tags import Tags
 from stcal.errors import DegenerateError
 from stcal.geometry.camera import Camera
 from stcal.geometry.plane import apply_homography, camera_from_plane, fit_homography, refine_planar_pose
-from stcal.geometry.rigid import Poses, Rigid
+from stcal.geometry.rigid import Rigid
 from stcal.locate.layout import LayoutPlan, TargetLayout, obj_from_plane
 from stcal.locate.layout_adjust import Adjusted, ImageCorners, adjust
 
@@ -187,6 +187,7 @@ def _collected(plan, images, seen, start, adjusted: Adjusted, left_out) -> Calib
         (covariance + covariance.T) / 2,
         origin,
         adjusted.sigma_px,
+        adjusted.tag_sigma_px,
     )
     obj_from_board = Rigid(np.block([[turn, np.zeros((2, 1))], [np.zeros((1, 2)), 1.0]]), np.append(shift, 0.0))
     first_turn, first_shift = obj_from_plane(start[origin])
@@ -237,8 +238,3 @@ def _deviation(nominal: np.ndarray, corners: np.ndarray) -> np.ndarray:
         off = np.linalg.norm((b - b.mean(0)) @ turn.T + a.mean(0) - a, axis=1)
         deviation[known] = off.reshape(-1, 4).max(1)
     return deviation
-
-
-def as_poses(images: Sequence[ImageCorners]) -> Poses:
-    """Of the board in each image."""
-    return Poses.of([image.pose for image in images])

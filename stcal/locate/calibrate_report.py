@@ -12,7 +12,8 @@ def calibrated_text(result: CalibratedLayout) -> str:
     layout, adjusted = result.layout, result.adjusted
     lines = [
         f"{len(result.images)} images, {len(layout.tags)} tags; residuals {adjusted.board_rms_px:.3f} px of the board, "
-        f"{adjusted.tag_rms_px:.3f} px of the tags, {adjusted.sigma_px:.3f} px more than their corners' own σ",
+        f"{adjusted.tag_rms_px:.3f} px of the tags",
+        f"beside the corners' own σ: {adjusted.sigma_px:.3f} px each, {adjusted.tag_sigma_px:.3f} px a tag as a whole",
         f"{'id':>5}  {'dictionary':<24} images   side_mm  sigma_um  adjusted by_um  from nominal_mm",
     ]
     moved = np.linalg.norm(layout.corners_mm - result.published, axis=2).max(1)
@@ -64,6 +65,7 @@ def calibrated_json(result: CalibratedLayout) -> dict:
         "board_rms_px": adjusted.board_rms_px,
         "tag_rms_px": adjusted.tag_rms_px,
         "sigma_px": adjusted.sigma_px,
+        "tag_sigma_px": adjusted.tag_sigma_px,
         "tags": [
             {
                 "dictionary": dictionary,

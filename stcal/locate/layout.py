@@ -41,7 +41,8 @@ class TargetLayout:
     corners_mm : (n, 4, 2) top left, top right, bottom right, bottom left as printed, in {obj}
     covariance_mm2 : (8n, 8n) of all their coordinates, tag by tag, corner by corner, x before y
     origin : row of the tag that holds the origin
-    sigma_px : what print, lens and flatness add to the measured σ of a corner, as the calibration's residuals say
+    sigma_px, tag_sigma_px : what print, lens and flatness add to the measured σ of a corner, for each by itself and for
+        the four of a tag together, as the calibration's residuals say
     """
 
     name: str
@@ -50,6 +51,7 @@ class TargetLayout:
     covariance_mm2: np.ndarray
     origin: int
     sigma_px: float = 0.0
+    tag_sigma_px: float = 0.0
 
     def __post_init__(self):
         n = len(self.tags)
@@ -104,14 +106,14 @@ def load_layout(path: str | Path) -> TargetLayout:
         covariance = _full(data.covariance_mm2, size, where)
     else:
         corners = _in_obj(corners, plan.origin)
-    return TargetLayout(plan.name, plan.tags, corners, covariance, plan.origin, data.sigma_px)
+    return TargetLayout(plan.name, plan.tags, corners, covariance, plan.origin, data.sigma_px, data.tag_sigma_px)
 
 
 def layout_toml(layout: TargetLayout, comments: Sequence[str] = ()) -> str:
     """The file :func:`load_layout` reads."""
     lines = [f"# {comment}" for comment in comments]
     lines += ['type = "tags"', f"name = {_quoted(layout.name)}", f"origin = {layout.tags[layout.origin][1]}"]
-    lines.append(f"sigma_px = {layout.sigma_px:.6g}")
+    lines += [f"sigma_px = {layout.sigma_px:.6g}", f"tag_sigma_px = {layout.tag_sigma_px:.6g}"]
     lines.append("# Lower triangle; coordinates tag by tag, corner by corner, x before y.")
     rows = (", ".join(f"{v:.6g}" for v in row[: k + 1]) for k, row in enumerate(_finite(layout.covariance_mm2)))
     lines += ["covariance_mm2 = [", *(f"  [{row}]," for row in rows), "]"]

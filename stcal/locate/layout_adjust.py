@@ -4,6 +4,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
+from scipy.linalg import null_space
 from scipy.optimize import brentq
 from scipy.stats import chi2 as chi_square
 
@@ -19,6 +20,10 @@ HUBER_TAIL = 0.011
 GROSS = 4.0
 """Times that limit: another tag than it is read as, or a corner that is hidden. It has no weight at all."""
 VARIANCE_ROUNDS = 6
+TOGETHER = np.tile(np.eye(2), (4, 1))
+"""(8, 2): the corners of a tag that moves as a whole."""
+APART = null_space(TOGETHER.T)
+"""(8, 6): what its corners do beside that."""
 NEAR_PX = 0.005
 RAYLEIGH_MEDIAN = float(np.sqrt(2 * np.log(2)))
 
@@ -55,16 +60,17 @@ class ImageCorners:
 @dataclass(frozen=True, slots=True, eq=False)
 class Adjusted:
     """``corners_mm`` : (n, 4, 2) on the board, ``covariance_mm2`` : (8n, 8n); ``poses`` camera_from_board;
-    ``board_factor`` : by which the stated σ of the board's points are too small, as the residuals say; ``sigma_px`` :
-    what print, lens and flatness add to the σ of a tag's corner, as they say; ``board_rms_px``, ``tag_rms_px`` : per
-    coordinate; ``image_rms_px`` : (m,) of the tags in each image; ``downweighted`` : share of the
-    tags that are damped as outliers."""
+    ``board_factor`` : by which the stated σ of the board's points are too small, as the residuals say; ``sigma_px``,
+    ``tag_sigma_px`` : what print, lens and flatness add to the σ of a corner, and to the four of a tag together;
+    ``board_rms_px``, ``tag_rms_px`` : per coordinate; ``image_rms_px`` : (m,) of the tags in each image;
+    ``downweighted`` : share of the tags that are damped as outliers."""
 
     corners_mm: np.ndarray
     covariance_mm2: np.ndarray
     poses: Poses
     board_factor: float
     sigma_px: float
+    tag_sigma_px: float
     board_rms_px: float
     tag_rms_px: float
     image_rms_px: np.ndarray
@@ -73,9 +79,11 @@ class Adjusted:
 
 @dataclass(frozen=True, slots=True)
 class _Noise:
-    """``board`` : factor on the σ of the board's points; ``tag_px`` : added to those of the tags' corners."""
+    """``board`` : factor on the σ of the board's points; ``corner_px``, ``tag_px`` : added to those of the tags'
+    corners, one by one and the four of a tag together."""
 
     board: float
+    corner_px: float
     tag_px: float
 
 
@@ -110,7 +118,8 @@ def adjust(images: Sequence[ImageCorners], start: np.ndarray) -> Adjusted:
         blocks = [_blocks(image, poses[[i]], corners, noise) for i, image in enumerate(images)]
         covariance = np.linalg.inv(_reduced(images, blocks, len(corners))[0])
         before, noise = noise, _variances(images, blocks, covariance, noise)
-        if round_ and abs(noise.board / before.board - 1) < 0.01 and abs(noise.tag_px - before.tag_px) < NEAR_PX:
+        change = max(abs(noise.corner_px - before.corner_px), abs(noise.tag_px - before.tag_px))
+        if round_ and abs(noise.board / before.board - 1) < 0.01 and change < NEAR_PX:
             break
     board, tags = ([block[side] for block in blocks] for side in (0, 1))
     return Adjusted(
@@ -118,6 +127,7 @@ def adjust(images: Sequence[ImageCorners], start: np.ndarray) -> Adjusted:
         covariance,
         poses,
         noise.board,
+        noise.corner_px,
         noise.tag_px,
         _rms(np.concatenate([g.px.ravel() for g in board])),
         _rms(np.concatenate([g.px.ravel() for g in tags])),
@@ -128,10 +138,10 @@ def adjust(images: Sequence[ImageCorners], start: np.ndarray) -> Adjusted:
 
 def _first_noise(images, poses: Poses, corners: np.ndarray) -> "_Noise":
     """By the medians of the residuals."""
-    blocks = [_blocks(image, poses[[i]], corners, _Noise(1.0, 0.0)) for i, image in enumerate(images)]
+    blocks = [_blocks(image, poses[[i]], corners, _Noise(1.0, 0.0, 0.0)) for i, image in enumerate(images)]
     board = np.median(np.concatenate([np.linalg.norm(b[0].residual, axis=1) for b in blocks]))
     tags = np.median(np.concatenate([np.linalg.norm(b[1].px.reshape(-1, 2), axis=1) for b in blocks]))
-    return _Noise(max(float(board) / RAYLEIGH_MEDIAN, 1e-3), float(tags) / RAYLEIGH_MEDIAN)
+    return _Noise(max(float(board) / RAYLEIGH_MEDIAN, 1e-3), float(tags) / RAYLEIGH_MEDIAN, 0.0)
 
 
 def _rms(values: np.ndarray) -> float:
@@ -162,8 +172,8 @@ def _blocks(image: ImageCorners, pose: Poses, corners: np.ndarray, noise: _Noise
     """Board and tags of one image."""
     own = (4 * image.rows[:, None] + np.arange(4)).ravel()
     board = _group(image, pose, image.board_xyz[:, :2], image.board_seen, noise.board**2 * image.board_noise)
-    spread = (image.noise + noise.tag_px**2 * np.eye(8)) / image.focal_px**2
-    return board, _group(image, pose, corners[own], image.seen, spread)
+    spread = image.noise + noise.corner_px**2 * np.eye(8) + noise.tag_px**2 * TOGETHER @ TOGETHER.T
+    return board, _group(image, pose, corners[own], image.seen, spread / image.focal_px**2)
 
 
 def _group(image: ImageCorners, pose: Poses, xy: np.ndarray, seen: np.ndarray, noise: np.ndarray) -> _Group:
@@ -235,10 +245,21 @@ def _variances(images, blocks, covariance: np.ndarray, noise: _Noise) -> _Noise:
     px = np.concatenate([block[1].px for block in blocks])
     weight = np.concatenate([block[1].weight for block in blocks])
 
-    def excess(added_px: float) -> float:
-        solved = np.linalg.solve(own + added_px**2 * np.eye(8), px[..., None])[..., 0]
-        return float((weight * (px * solved).sum(1)).sum()) - free[1]
+    corner = _added(own, px, weight, APART, 6 / 8 * free[1])
+    both = _added(own, px, weight, TOGETHER / 2, 2 / 8 * free[1])
+    # The mean of four corners, times two: a tag's shift counts four times, the corners' own once.
+    tag = np.sqrt(max(both**2 - corner**2, 0.0) / 4)
+    return _Noise(noise.board * float(np.sqrt(square / free[0])), corner, float(tag))
 
-    highest = float(np.sqrt((px**2).sum() / free[1])) + 1e-9
-    added = brentq(excess, 0.0, highest) if excess(0.0) > 0 else 0.0
-    return _Noise(noise.board * float(np.sqrt(square / free[0])), float(added))
+
+def _added(own: np.ndarray, px: np.ndarray, weight: np.ndarray, part: np.ndarray, free: float) -> float:
+    """σ that the residuals px (p, 8) have beside their own covariance (p, 8, 8), in the directions ``part`` (8, q)."""
+    seen, known, unit = px @ part, part.T @ own @ part, np.eye(part.shape[1])
+
+    def excess(added_px: float) -> float:
+        solved = np.linalg.solve(known + added_px**2 * unit, seen[..., None])[..., 0]
+        return float((weight * (seen * solved).sum(1)).sum()) - free
+
+    if excess(0.0) <= 0:
+        return 0.0
+    return float(brentq(excess, 0.0, float(np.sqrt((seen**2).sum() / free)) + 1e-9))

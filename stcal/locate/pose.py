@@ -47,7 +47,7 @@ class SeenTags:
     """Tags of a layout in one scene.
 
     ``rows`` : (k,) of the layout; ``corners_px`` : (k, 4, 2); ``covariance_px2`` : (k, 4, 2, 2), what the
-    layout's print and the lens add included; ``edge_sigma_px`` : (k,) of a shift that all edges of a tag share.
+    layout adds to single corners included; ``edge_sigma_px`` : (k,) of a shift that all edges of a tag share.
     """
 
     rows: np.ndarray
@@ -165,7 +165,8 @@ def problem_of(seen: SeenTags, layout: TargetLayout, camera: Camera, prior: Came
     ideal = camera.normalised_from_pixel(pixels)
     slope = camera.distort_jacobian(ideal)[1] * camera.focal[:, None]
     back = np.linalg.inv(slope)
-    common, known = _by_edges(seen, back), np.diag(seen.edge_sigma_px**2)
+    common = np.concatenate([_by_edges(seen, back), _by_tag(len(seen), back)], axis=2)
+    known = np.diag(np.append(seen.edge_sigma_px**2, np.full(2 * len(seen), layout.tag_sigma_px**2)))
     if prior is not None:
         by_camera = back @ (camera.parameter_jacobian(ideal) @ intrinsic_basis(prior.colmap_model))
         common, known = np.concatenate([common, by_camera], axis=2), block_diag(known, prior.covariance)
@@ -180,6 +181,13 @@ def _by_edges(seen: SeenTags, back: np.ndarray) -> np.ndarray:
     by = np.zeros((k, 4, 2, k))
     by[np.arange(k), :, :, np.arange(k)] = corners_by_edges(seen.corners_px)
     return back @ by.reshape(4 * k, 2, k)
+
+
+def _by_tag(k: int, back: np.ndarray) -> np.ndarray:
+    """Derivative (4k, 2, 2k) of the corners by the shift of each tag as a whole, px."""
+    by = np.zeros((k, 4, 2, k, 2))
+    by[np.arange(k), :, :, np.arange(k)] = np.eye(2)
+    return back @ by.reshape(4 * k, 2, 2 * k)
 
 
 def _start(problem: PlanarProblem, where: str) -> Rigid:

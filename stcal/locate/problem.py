@@ -154,13 +154,12 @@ def _evaluate(problem: PlanarProblem, poses: Poses, whiten: np.ndarray, huber: f
 @dataclass(frozen=True, slots=True, eq=False)
 class Weighed:
     """A pose by the whole covariance of its corners: ``residual`` (n, 2) that it leaves; ``chi2``; ``covariance``
-    (6, 6); ``full`` (2n, 2n) of the corners."""
+    (6, 6)."""
 
     pose: Poses
     residual: np.ndarray
     chi2: float
     covariance: np.ndarray
-    full: np.ndarray
 
 
 def weigh(problem: PlanarProblem, pose: Poses, weights: np.ndarray) -> Weighed:
@@ -183,7 +182,7 @@ def weigh(problem: PlanarProblem, pose: Poses, weights: np.ndarray) -> Weighed:
     left = r - a @ step
     chi2 = float(left @ (solved[:, 6] - solved[:, :6] @ step))
     covariance = np.linalg.inv(normal)
-    return Weighed(pose, left.reshape(-1, 2), chi2, (covariance + covariance.T) / 2, full)
+    return Weighed(pose, left.reshape(-1, 2), chi2, (covariance + covariance.T) / 2)
 
 
 def mirrored(pose: Rigid, middle_obj: np.ndarray) -> Rigid:

@@ -67,6 +67,7 @@ def simulated_exposures(
     ideal = camera.project(camera_from_obj @ flat).reshape(n, 4, 2)
     common = noise.sigma_px * np.sqrt(noise.shared) * rng.standard_normal(ideal.shape)
     common += layout.sigma_px * rng.standard_normal(ideal.shape)
+    common += layout.tag_sigma_px * rng.standard_normal((n, 1, 2))
     edge_sigma = Tags(layout.tags, ideal, np.zeros((n, 4, 2, 2))).edge_sigma_px()
     common += (edge_sigma * rng.standard_normal(n))[:, None, None] * corners_by_edges(ideal)
     found = []

@@ -71,7 +71,7 @@ def test_subsets_are_right_or_not_accepted(images, held_out, size, accepted):
 
 
 def test_exposures_together_see_more(folder, images):
-    """Light that falls off by eight stops over the target, as between sun and shade, and a spot of glare (simulated)."""
+    """Light (simulated) that falls off by eight stops over the target, as from sun to shade, and a spot of glare."""
     layout = half_calibrated(images, PLAN, range(16)).layout
     best = together = 0
     for i in range(0, 16, 2):

@@ -1,0 +1,186 @@
+"""``stcal locate`` from files to files."""
+
+import csv
+import json
+import sys
+
+import cv2
+import numpy as np
+import pytest
+
+from stcal.camera_file import write_cameras_txt
+from stcal.cli.main import main
+from stcal.geometry.rigid import Rigid
+from stcal.locate.layout import layout_toml, load_layout
+from stcal.locate.simulated import random_pose
+from stcal.table_file import POSE, pose_cells, read_table
+from tests.boards.drawn import photograph
+from tests.locate.drawn_target import CAMERA, LAYOUT, PER_MM, SHEET_MM, photo, sheet, tilted
+
+
+@pytest.fixture
+def stcal(monkeypatch, capsys):
+    """Run the command line; exit code, standard output and error."""
+
+    def call(*arguments):
+        monkeypatch.setattr(sys, "argv", ["stcal", *map(str, arguments)])
+        with pytest.raises(SystemExit) as ended:
+            main()
+        shown = capsys.readouterr()
+        return ended.value.code, shown.out, shown.err
+
+    return call
+
+
+@pytest.fixture(scope="module")
+def files(tmp_path_factory):
+    """Two scenes, one without tags; layout, camera, hand-eye and robot poses."""
+    root = tmp_path_factory.mktemp("locate")
+    for name, image in (("good", photo(tilted(30))), ("empty", np.full((900, 1200), 99, np.uint8))):
+        (root / "scenes" / name).mkdir(parents=True)
+        cv2.imwrite(str(root / "scenes" / name / "1.png"), image)
+    (root / "layout.toml").write_text(layout_toml(LAYOUT), encoding="utf-8")
+    write_cameras_txt(root / "cameras.txt", CAMERA, "PINHOLE")
+    (root / "he.json").write_text(json.dumps({"flange_from_camera": Rigid.exp([0, 0, 1, 0, 0, 50]).matrix().tolist()}))
+    rows = [",".join([name, *pose_cells(Rigid.exp([1, 0, 0, 400, 0, 300]))]) for name in ("good", "empty")]
+    (root / "robot.csv").write_text("\n".join([",".join(["scene", *POSE]), *rows]) + "\n")
+    return root
+
+
+def test_run_writes_accepted_poses(stcal, files, tmp_path):
+    out, record, report = tmp_path / "poses.csv", tmp_path / "all.json", tmp_path / "page.html"
+    robot = ["--hand-eye", files / "he.json", "--robot-poses", files / "robot.csv"]
+    save = ["--out", out, "--json", record, "--report", report]
+    target = ["--layout", files / "layout.toml", "--camera", files / "cameras.txt"]
+    code, shown, _ = stcal("locate", "run", files / "scenes", *target, *robot, *save)
+    assert code == 0
+    assert "good   accept        6          1" in shown
+    assert "no tag of" in shown
+    table = read_table(out, "poses")
+    assert table.text("scene") == ["good"]
+    seen, goal = table.poses()[0], table.poses("base_from_goal_")[0]
+    assert np.linalg.norm((seen @ tilted(30).inverse()).log()[:3]) < np.radians(0.2)
+    chain = Rigid.exp([1, 0, 0, 400, 0, 300]) @ Rigid.exp([0, 0, 1, 0, 0, 50]) @ seen
+    assert np.abs(goal.matrix() - chain.matrix()).max() < 1e-6
+    assert (np.linalg.eigvalsh(table.pose_covariances("base_from_goal_")[0]) > 0).all()
+    assert "# empty: reject: no tag of" in out.read_text()
+    scenes = {scene["scene"]: scene for scene in json.loads(record.read_text())["scenes"]}
+    assert scenes["empty"]["verdict"] == "reject"
+    assert scenes["empty"]["camera_from_obj"] is None
+    assert all(check["passed"] for check in scenes["good"]["checks"])
+    assert len(scenes["good"]["corners"]) == 24
+    page = report.read_text()
+    assert page.count("<svg") == 2
+    assert "http://" not in page.replace("http://www.w3.org", "")
+
+
+def test_nothing_accepted_is_exit_code_3(stcal, files):
+    target = ["--layout", files / "layout.toml", "--camera", files / "cameras.txt"]
+    code, shown, _ = stcal("locate", "run", files / "scenes" / "empty", *target)
+    assert code == 3
+    assert "no pose accepted in 1 scene" in shown
+
+
+def test_limits_are_options(stcal, files):
+    target = ["--layout", files / "layout.toml", "--camera", files / "cameras.txt"]
+    image = files / "scenes" / "good" / "1.png"
+    assert stcal("locate", "run", image, *target)[0] == 0
+    for option, value, reason in [
+        ("--min-tags", 7, "tags 6, at least 7 needed"),
+        ("--min-foreshortening", 0.9, "foreshortening 0.87"),
+        ("--max-sigma-deg", 0.001, "sigma of rotation"),
+        ("--max-sigma-mm", 0.001, "sigma of position"),
+        ("--min-spread-px", 1000, "spread"),
+    ]:
+        code, shown, _ = stcal("locate", "run", image, *target, option, value)
+        assert code == 3
+        assert reason in shown
+    code, shown, _ = stcal("locate", "run", image, *target, "--method", "patent", "--e-lim-px", 0.001)
+    assert code == 3
+    assert "error 0." in shown
+
+
+@pytest.mark.parametrize(
+    ("arguments", "reason"),
+    [
+        (["--robot-poses", "x.csv"], "only with --hand-eye"),
+        (["--flip-odds", "2"], "odds between 0 and 1"),
+        (["--s-dis", "3"], "S_dis 3"),
+        (["--moved-px", "-1"], "moved_px -1"),
+    ],
+)
+def test_options_that_make_no_sense(stcal, files, arguments, reason):
+    target = ["--layout", files / "layout.toml", "--camera", files / "cameras.txt"]
+    code, _, error = stcal("locate", "run", files / "scenes", *target, *arguments)
+    assert code == 2
+    assert reason in error
+    assert error.count("\n") == 1
+
+
+def test_schedule(stcal):
+    assert stcal("locate", "schedule", "1", "100", "3")[1] == "1\n10\n100\n"
+    assert stcal("locate", "schedule", "3", "1", "3")[0] == 2
+
+
+BOARDS = {
+    "dots": 'rows = 4\ncolumns = 9\npitch_mm = 20.0\nradius_mm = 6.0\npolarity = "dark"\n',
+    "chessboard": 'type = "chessboard"\nrows = 4\ncolumns = 9\nsquare_mm = 20.0\n',
+}
+
+
+def with_board(kind: str) -> np.ndarray:
+    """The target above a board, on one sheet 220 × 320 mm; the board's origin at (30, 230) mm."""
+    printed = np.full((320 * PER_MM, int(SHEET_MM[0]) * PER_MM), 255, np.uint8)
+    printed[: sheet().shape[0]] = sheet()
+    for row in range(-1, 4):
+        for column in range(-1, 9):
+            x, y = (30 + 20 * column) * PER_MM, (230 + 20 * row) * PER_MM
+            if kind == "chessboard" and (row + column) % 2 == 0:
+                printed[y : y + 20 * PER_MM, x : x + 20 * PER_MM] = 0
+            elif kind == "dots" and row >= 0 and column >= 0:
+                # the middle of a pixel stands for a place half a pixel on
+                middle = (int(16 * (x - 0.5)), int(16 * (y - 0.5)))
+                cv2.circle(printed, middle, 16 * 6 * PER_MM, 0, -1, cv2.LINE_AA, shift=4)
+    return printed
+
+
+@pytest.mark.parametrize("kind", ["dots", "chessboard"])
+def test_calibrate_with_boards_of_other_kinds(stcal, tmp_path, kind):
+    printed, rng = with_board(kind), np.random.default_rng(1)
+    (tmp_path / "images").mkdir()
+    matrix = np.array([[1300.0, 0, 599.5], [0, 1300.0, 449.5], [0, 0, 1]])
+    for k in range(5):
+        turn = random_pose(rng, tilt_deg=(15, 40)).rotation
+        # Looked at in its middle, upright enough for the image's shape.
+        spin = np.arctan2(turn[1, 0], turn[0, 0]) - np.pi / 2
+        c, s = np.cos(-spin), np.sin(-spin)
+        turn = np.array([[c, -s, 0], [s, c, 0], [0, 0, 1]]) @ turn
+        shift = np.array([0, 0, 620.0]) - turn @ np.array([SHEET_MM[0] / 2, 160.0, 0])
+        image = photograph(printed, PER_MM, matrix @ np.column_stack([turn[:, :2], shift]), (1200, 900))
+        cv2.imwrite(str(tmp_path / "images" / f"{k}.png"), image)
+    (tmp_path / "board.toml").write_text(BOARDS[kind])
+    entries = [f'[[tag]]\ndictionary = "{dictionary}"\nid = {tag}\n' for dictionary, tag in LAYOUT.tags]
+    (tmp_path / "plan.toml").write_text('type = "tags"\norigin = 0\n' + "".join(entries))
+    write_cameras_txt(tmp_path / "cameras.txt", CAMERA, "PINHOLE")
+    out, record = tmp_path / "calibrated.toml", tmp_path / "calibrated.json"
+    code, shown, _ = stcal(
+        *("locate", "calibrate", tmp_path / "images", "--camera", tmp_path / "cameras.txt", "--board"),
+        *(tmp_path / "board.toml", "--layout", tmp_path / "plan.toml", "--out", out, "--json", record, "--workers", 1),
+    )
+    assert code == 0
+    assert "5 images, 6 tags" in shown
+    layout = load_layout(out)
+    # Drawn to a sixth of a millimetre and seen with 2 pixels a millimetre.
+    assert np.abs(layout.corners_mm - LAYOUT.corners_mm).max() < 0.15
+    middle = np.array(json.loads(record.read_text())["board_from_obj"])[:3, 3]
+    there = SHEET_MM / 2 - [30, 230]
+    half_turn = np.array([160, 60]) - there
+    assert min(np.abs(middle[:2] - there).max(), np.abs(middle[:2] - half_turn).max()) < 0.15
+
+
+def test_a_table_of_poses_is_plain_csv(stcal, files, tmp_path):
+    target = ["--layout", files / "layout.toml", "--camera", files / "cameras.txt"]
+    stcal("locate", "run", files / "scenes" / "good", *target, "--out", tmp_path / "p.csv")
+    rows = list(csv.DictReader((tmp_path / "p.csv").read_text().splitlines()))
+    assert rows[0]["scene"] == "good"
+    assert float(rows[0]["z_mm"]) == pytest.approx(500, abs=1)
