@@ -100,18 +100,20 @@ def handeye(
     report: Annotated[Path | None, typer.Option("--report", help="Also write a page with tables and plots.")] = None,
 ) -> None:
     """Hand-eye calibration: where a camera sits on a robot's flange, or in its base, and how well that is known."""
-    from stcal.handeye import HandEyeOptions, Noise
+    from stcal.handeye import METHODS, HandEyeOptions, Noise
     from stcal.handeye.export import opencv_yaml, ros_yaml, urdf_joint
     from stcal.handeye.report import outcome_page, outcome_text
     from stcal.handeye.result_file import calibration_json, outcome_json
 
     robot, seen = (_radians(sigma_robot_deg), sigma_robot_mm), (_radians(sigma_camera_deg), sigma_camera_mm)
     noise = Noise(*robot, *seen, sigma_px, sigma_board_mm)
-    given = _given(source, poses, camera, board, workers)
-    if given.views is None and refine_camera:
-        raise InputError("--refine-camera: only with images; poses tell nothing of the camera")
     if camera_out and not refine_camera:
         raise InputError("--camera-out: only with --refine-camera; the camera is as given else")
+    if refine_camera and source.is_file():
+        raise InputError("--refine-camera: only with images; poses tell nothing of the camera")
+    if method not in (None, ALL, *METHODS):
+        raise InputError(f"--method {method}: unknown; {ALL} or one of {', '.join(METHODS)} needed")
+    given = _given(source, poses, camera, board, workers)
     prior = given.prior if refine_camera else None
     options = HandEyeOptions(noise, prior, with_scale, given.symmetries, four_dof)
     outcome = _solved(given, setup.value, method, options, (splits, held_out, seed), workers)

@@ -3,24 +3,28 @@
 from dataclasses import dataclass, replace
 
 import numpy as np
+from scipy.linalg import cho_factor, cho_solve
+from scipy.optimize import minimize
 from scipy.sparse import csr_matrix
 from scipy.spatial.transform import Rotation
 from scipy.stats import chi2
 
 from stcal.geometry.camera import Camera
 from stcal.geometry.rigid import Poses, Rigid, skew
-from stcal.handeye.leastsq import Linear, generalised_inverse, minimise, perturbed
+from stcal.handeye.leastsq import Linear, minimise, perturbed
 from stcal.handeye.views import project_jacobian
 
 CORNER, POSE = (float(np.sqrt(chi2.ppf(0.999, dof))) for dof in (2, 6))
 """Huber's limits: one good corner, and one good pose, in a thousand weighs less than one."""
 LEAST = {"corner_px": 1e-6, "robot_rad": 1e-8, "robot_mm": 1e-5, "board_mm": 1e-5}
 """Estimated σ stay above: exact data have none."""
-ROUNDS = 100
+ROUNDS = 20
 ROUGHLY = 1e-6
 """Relative fall of the cost at which a round of σ has solved well enough."""
 SETTLED = 1e-3
 """Relative change of σ from round to round that moves nothing any more."""
+HELD = 1e-10
+"""Share of each unknown's information that is added: what nothing determines must not be singular."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -191,23 +195,24 @@ class Group:
         pulled = self.slope.multiply(np.repeat(self.weight(), self.white.shape[1])[:, None]).tocsr().T
         return Linear(cost, (pulled @ self.slope).toarray(), pulled @ self.white.ravel())
 
-    def variance_factors(self, inverse: np.ndarray) -> dict[str, float]:
-        """By name: squared residuals over their share of the redundancy, (g d − trace of their part) at a solution."""
-        spread = (self.slope @ inverse) * self.slope.toarray()
-        squared = self.weight()[:, None] * self.white**2
-        share = self.weight()[:, None] * spread.sum(1).reshape(self.white.shape)
-        found, width = {}, self.white.shape[1] // max(len(self.names), 1)
-        for i, name in enumerate(self.names):
-            columns = slice(i * width, (i + 1) * width)
-            redundancy = max(width * len(self.white) - share[:, columns].sum(), 1e-9)
-            found[name] = float(squared[:, columns].sum() / redundancy)
+    def by_name(self) -> dict[str, tuple[int, Linear]]:
+        """By each of ``names``, or by none: number of residuals, and its quadratic part of the cost."""
+        g, d = self.white.shape
+        width = d // max(len(self.names), 1)
+        weight = np.repeat(self.weight(), d)
+        found = {}
+        for i, name in enumerate(self.names or ("",)):
+            rows = np.flatnonzero(np.arange(g * d) % d // width == i)
+            slope, white = self.slope[rows], self.white.ravel()[rows]
+            pulled = slope.multiply(weight[rows, None]).tocsr().T
+            linear = Linear(float(weight[rows] @ white**2), (pulled @ slope).toarray(), pulled @ white)
+            found[name] = len(rows), linear
         return found
 
 
 def adjust(corners: Corners, start: Bundle, free: tuple[str, ...]) -> tuple[Corners, Bundle, np.ndarray]:
-    """Solve, and estimate the σ of the ``free`` groups: each is its squared residuals over its share of the redundancy
-    (Helmert's variance components in their simplified form; Förstner 1979). Returns the corners with these σ, the
-    state, and the normal matrix.
+    """Solve, and estimate the σ of the ``free`` groups in rounds. Returns the corners with these σ, the state, and the
+    normal matrix.
 
     Raises
     ------
@@ -216,18 +221,49 @@ def adjust(corners: Corners, start: Bundle, free: tuple[str, ...]) -> tuple[Corn
     """
     state = start
     for _ in range(ROUNDS if free else 0):
-        state, last = minimise(state, corners.linear, corners.moved, "hand-eye", ROUGHLY)
-        inverse, sigma = generalised_inverse(last.normal), dict(corners.sigma)
-        for group in corners.groups(state):
-            for name, factor in group.variance_factors(inverse).items():
-                if name in free:
-                    sigma[name] = max(sigma[name] * np.sqrt(factor), LEAST[name])
+        state, _ = minimise(state, corners.linear, corners.moved, "hand-eye", ROUGHLY)
+        sigma = corners.sigma | estimated(corners, state, free)
         change = max(abs(np.log(sigma[name] / corners.sigma[name])) for name in free)
         corners = replace(corners, sigma=sigma)
         if change < SETTLED:
             break
     state, last = minimise(state, corners.linear, corners.moved, "hand-eye")
     return corners, state, last.normal
+
+
+def estimated(corners: Corners, state: Bundle, free: tuple[str, ...]) -> dict[str, float]:
+    """Restricted maximum-likelihood σ of the ``free`` groups, all else linear about a state (Patterson & Thompson 1971;
+    what the unknowns take up of the residuals does not count)."""
+    parts: dict[str, tuple[int, Linear]] = {}
+    for group in corners.groups(state):
+        for name, (count, linear) in group.by_name().items():
+            key = name if name in free else ""
+            old_count, old = parts.get(key, (0, Linear(0.0, 0.0, 0.0)))
+            sums = old.cost + linear.cost, old.normal + linear.normal, old.gradient + linear.gradient
+            parts[key] = old_count + count, Linear(*sums)
+    fixed = parts.pop("", (0, Linear(0.0, 0.0, 0.0)))[1]
+    names = tuple(parts)
+    total = fixed.normal + sum(linear.normal for _, linear in parts.values())
+    held = fixed.normal + HELD * np.diag(np.diag(total))
+
+    def cost(logs: np.ndarray) -> tuple[float, np.ndarray]:
+        """Minus twice the log-likelihood of (old σ / new σ)²."""
+        share = np.exp(logs)
+        linears = [linear for _, linear in parts.values()]
+        counts = np.array([count for count, _ in parts.values()])
+        normal = held + sum(s * linear.normal for s, linear in zip(share, linears, strict=True))
+        pull = fixed.gradient + sum(s * linear.gradient for s, linear in zip(share, linears, strict=True))
+        root = cho_factor(normal, lower=True)
+        step, inverse = -cho_solve(root, pull), cho_solve(root, np.eye(len(pull)))
+        value = fixed.cost + share @ [linear.cost for linear in linears] + pull @ step - counts @ logs
+        value += 2 * np.log(np.diag(root[0])).sum()
+        squares = [p.cost + 2 * p.gradient @ step + step @ p.normal @ step for p in linears]
+        taken = [(inverse * p.normal).sum() for p in linears]
+        return float(value), share * (np.array(squares) + taken) - counts
+
+    bounds = [(None, 2 * np.log(corners.sigma[name] / LEAST[name])) for name in names]
+    found = minimize(cost, np.zeros(len(names)), jac=True, method="L-BFGS-B", bounds=bounds)
+    return {name: float(corners.sigma[name] * np.exp(-x / 2)) for name, x in zip(names, found.x, strict=True)}
 
 
 def _sparse(by: dict, at: dict[str, slice], count: int, own: dict[str, np.ndarray]) -> csr_matrix:

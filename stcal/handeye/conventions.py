@@ -10,8 +10,8 @@ from stcal.geometry.rigid import Poses, Rigid
 from stcal.handeye.loop import Loop, Setup
 from stcal.handeye.pairs import HandEyePoses
 
-FAR_BETTER = 10.0
-"""By so many times the typical residuals must shrink, geometric mean of rotation and translation."""
+FAR_BETTER = 30.0
+"""By so many times the product of the typical residuals in rotation and translation must shrink."""
 WELL = np.radians(0.5), 5.0
 """Poses whose median residuals (rad, mm) are below are not suspected."""
 Guess = Callable[[Loop], tuple[Rigid, Rigid, float]]
@@ -34,7 +34,7 @@ def check_conventions(pairs: HandEyePoses, setup: Setup, guess: Guess) -> tuple[
     if given[0] > WELL[0] or given[1] > WELL[1]:
         for what, variant in _variants(loop, setup).items():
             found = _typical(variant, guess)
-            better = np.sqrt(given[0] / max(found[0], 1e-12) * given[1] / max(found[1], 1e-12))
+            better = given[0] / max(found[0], 1e-12) * given[1] / max(found[1], 1e-12)
             if better > FAR_BETTER:
                 raise InputError(
                     f"{pairs.where}: the poses contradict each other by {np.degrees(given[0]):.3g}° and {given[1]:.3g} "

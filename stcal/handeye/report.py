@@ -153,8 +153,9 @@ def outcome_page(outcome: Outcome) -> str:
     result = outcome.result
     banner = f'<h1>{FRAMES[result.setup].camera}</h1><p class="counts">{escape(outcome.where)}: '
     banner += f"{escape(_headline(outcome))}</p>\n"
-    banner += "".join(f'<p class="alarm">{escape(note)}</p>\n' for note in outcome.all_notes())
-    sections = [("result", "Result", _tiles(outcome) + _transform_tables(result) + _sigma_table(outcome))]
+    notes = "".join(f"<li>{escape(note)}</li>\n" for note in outcome.all_notes())
+    notes = f"<h3>To know</h3>\n<ul>\n{notes}</ul>\n" if notes else ""
+    sections = [("result", "Result", _tiles(outcome) + notes + _transform_tables(result) + _sigma_table(outcome))]
     if outcome.compared:
         sections.append(("methods", "Methods", _methods(outcome)))
     sections.append(("poses", "Poses", _poses(outcome)))

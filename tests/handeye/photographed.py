@@ -14,7 +14,7 @@ from stcal.handeye.simulated import BASE_FROM_BOARD, FLANGE_FROM_CAMERA
 from stcal.table_file import POSE, pose_cells
 from tests.boards.drawn import photograph
 
-CAMERA = Camera(1200, 900, [1500, 1500], [610, 440], np.zeros(8))
+CAMERA = Camera(800, 600, [1000, 1000], [406, 293], np.zeros(8))
 PER_MM = 4
 MARGIN_MM = 30.0
 
@@ -48,12 +48,12 @@ def take(sheet: np.ndarray, first_mm: float, camera_from_board: Rigid) -> np.nda
 
 
 def looks(rng: np.random.Generator, count: int, middle_mm: np.ndarray, roll: float) -> Poses:
-    """camera_from_board about 550 mm before the middle of the board, tilted by up to 0.45 rad and rolled by ``roll``."""
+    """camera_from_board about 450 mm before the middle of the board, tilted by up to 0.45, rolled by up to ``roll``."""
     tilt = rng.uniform(-0.45, 0.45, (count, 2))
     turn = Rotation.from_rotvec(np.pad(tilt, ((0, 0), (0, 1)))) * Rotation.from_rotvec(
         np.outer(rng.uniform(-roll, roll, count), [0, 0, 1])
     )
-    at = rng.uniform(-1, 1, (count, 3)) * [30, 20, 60] + [0, 0, 550]
+    at = rng.uniform(-1, 1, (count, 3)) * [30, 20, 40] + [0, 0, 450]
     return Poses(turn.as_matrix(), at - turn.apply(np.append(middle_mm, 0)))
 
 

@@ -1,0 +1,219 @@
+"""Poses that cannot be solved are refused with the motion that is missing; mixed-up conventions are said."""
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from stcal.errors import DegenerateError, InputError
+from stcal.geometry.rigid import Poses, Rigid
+from stcal.handeye import HandEyeOptions, HandEyePoses, handeye
+from stcal.handeye.loop import Loop
+from stcal.handeye.observability import Observability
+from stcal.handeye.simulated import (
+    BASE_FROM_BOARD,
+    BASE_FROM_CAMERA,
+    FLANGE_FROM_BOARD,
+    FLANGE_FROM_CAMERA,
+    board_corners,
+    disturbed,
+    simulated,
+    simulated_views,
+)
+from stcal.handeye.symmetry import repair
+from stcal.handeye.views import View, Views, pairs_of_views
+
+SETUPS = ("eye-in-hand", "eye-to-hand")
+NOISE = {"robot": (3e-4, 0.1), "camera": (1e-3, 0.3)}
+
+
+def seen_from(flange, setup, rng=None, sigma=(5e-4, 0.1)):
+    """Pairs of these flange poses."""
+    if setup == "eye-in-hand":
+        board = FLANGE_FROM_CAMERA.inverse() @ (flange.inverse() @ BASE_FROM_BOARD)
+    else:
+        board = BASE_FROM_CAMERA.inverse() @ (flange @ FLANGE_FROM_BOARD)
+    return HandEyePoses(flange, board if rng is None else disturbed(rng, board, *sigma))
+
+
+def flange_turned(rng, rotvec):
+    """Flange poses at random places with rotations of a fixed one by ``rotvec`` (m, 3) in its own frame."""
+    rest = Rotation.from_euler("zyx", [40, 160, 10], degrees=True)
+    place = rng.uniform([400, -200, 300], [700, 200, 500], (len(rotvec), 3))
+    return Poses((rest * Rotation.from_rotvec(rotvec)).as_matrix(), place)
+
+
+@pytest.mark.parametrize("setup", SETUPS)
+@pytest.mark.parametrize("axis", [(0, 0, 1.0), (0, 1.0, 0), (0.6, 0, 0.8)])
+@pytest.mark.parametrize("exact", [True, False])
+def test_parallel_axes_are_refused_with_the_missing_rotation(setup, axis, exact):
+    """The axis is named in the flange's frame, whichever carries the camera, and the one to add is across."""
+    rng = np.random.default_rng(1)
+    flange = flange_turned(rng, np.outer(rng.uniform(-1, 1, 10), axis))
+    if not exact:  # a tracker saw the flange, to 0.1 mrad
+        flange = disturbed(rng, flange, 1e-4, 0.01)
+    pairs = seen_from(flange, setup, rng)
+    found = Observability.of(Loop.of(pairs, setup))
+    assert found.axes[0] == pytest.approx(axis, abs=1e-3)
+    assert found.axes[1] @ axis == pytest.approx(0, abs=1e-3)
+    assert found.turns_rad[1] < 1e-3 < 0.3 < found.turns_rad[0]
+    words = ", ".join(f"{v:.2g}" for v in axis)
+    for method in ("pose", "park-martin", "shah"):
+        with pytest.raises(DegenerateError, match="are about its axis") as caught:
+            handeye(pairs, setup, method)
+        assert f"({words})" in str(caught.value) or not exact
+        assert "by 30° or more" in str(caught.value)
+
+
+@pytest.mark.parametrize("setup", SETUPS)
+def test_the_missing_rotation_helps(setup):
+    """Two poses turned by 30° about the axis that the message names, and the same poses are solved."""
+    rng = np.random.default_rng(2)
+    turns = np.outer(rng.uniform(-1, 1, 8), [0, 0, 1.0])
+    alone = seen_from(flange_turned(rng, turns), setup, rng)
+    other = Observability.of(Loop.of(alone, setup)).axes[1]
+    more = seen_from(flange_turned(rng, np.vstack([turns, np.outer([0.52, -0.52], other)])), setup, rng)
+    true = FLANGE_FROM_CAMERA if setup == "eye-in-hand" else BASE_FROM_CAMERA
+    found = handeye(more, setup)
+    assert (true.inverse() @ found.mount_from_camera).angle_rad() < 3e-3
+    sigma = np.sqrt(np.diag(found.covariance))
+    assert 0.01 < sigma[3:].max() < 3
+
+
+@pytest.mark.parametrize("setup", SETUPS)
+def test_motions_that_are_too_small_are_refused(setup):
+    pairs = simulated(np.random.default_rng(3), 12, setup, tilt=2e-4).pairs
+    with pytest.raises(DegenerateError, match=r"the flange turns by 0.0\d+° \(RMS\) .*rotate the flange about"):
+        handeye(pairs, setup)
+    pairs = simulated(np.random.default_rng(3), 12, setup, tilt=0.05).pairs  # ±3° do, with a larger σ
+    assert handeye(pairs, setup).outliers.sum() == 0
+
+
+def test_translations_only_are_refused():
+    rng = np.random.default_rng(4)
+    pairs = seen_from(flange_turned(rng, np.zeros((6, 3))), "eye-in-hand", rng)
+    with pytest.raises(DegenerateError, match="the flange turns by 0° "):
+        handeye(pairs)
+
+
+@pytest.mark.parametrize("count", [0, 1, 2])
+def test_too_few_poses(count):
+    pairs = simulated(np.random.default_rng(5), 4).pairs[:count]
+    with pytest.raises(DegenerateError, match=f"{count} poses, 3 needed and 10 wanted; rotate"):
+        handeye(pairs)
+
+
+def test_three_poses_are_enough():
+    truth = simulated(np.random.default_rng(6), 3)
+    found = handeye(truth.pairs)
+    assert found.flange_from_camera.translation == pytest.approx(truth.mount_from_camera.translation, abs=1e-5)
+
+
+def test_four_dof_where_it_does_not_belong():
+    rng = np.random.default_rng(7)
+    options = HandEyeOptions(four_dof=True)
+    with pytest.raises(DegenerateError, match="about one only; leave four_dof out"):
+        handeye(simulated(rng, 10).pairs, options=options)
+    with pytest.raises(DegenerateError, match=r"turns by .* about its principal axes; rotate it"):
+        handeye(seen_from(flange_turned(rng, np.zeros((6, 3))), "eye-in-hand", rng), options=options)
+
+
+@pytest.mark.parametrize("setup", SETUPS)
+@pytest.mark.parametrize("side", ["robot", "camera"])
+@pytest.mark.parametrize("method", ["pose", "daniilidis"])
+def test_one_side_inverted_is_said(setup, side, method):
+    truth = simulated(np.random.default_rng(8), 10, setup, **NOISE)
+    flange, board = truth.pairs.base_from_flange, truth.pairs.camera_from_board
+    flange, board = (flange.inverse(), board) if side == "robot" else (flange, board.inverse())
+    with pytest.raises(InputError, match=r"with one side inverted: .*the setup is eye-") as caught:
+        handeye(HandEyePoses(flange, board), setup, method)
+    assert setup not in str(caught.value)
+
+
+def test_both_sides_inverted_put_the_board_behind_the_camera():
+    """It fits, with X and Z exchanged; only the place of the board can tell."""
+    truth = simulated(np.random.default_rng(9), 10, **NOISE)
+    pairs = HandEyePoses(truth.pairs.base_from_flange.inverse(), truth.pairs.camera_from_board.inverse())
+    found = handeye(pairs)
+    assert found.flange_from_camera.translation == pytest.approx(truth.stand_from_board.translation, abs=2)
+    assert found.notes[0].startswith("the board lies behind the camera in all poses")
+
+
+def test_one_board_behind_the_camera_is_named():
+    truth = simulated(np.random.default_rng(9), 10, **NOISE)
+    board = list(truth.pairs.camera_from_board)
+    board[6] = Rigid(board[6].rotation, -board[6].translation)
+    found = handeye(HandEyePoses(truth.pairs.base_from_flange, Poses.of(board)))
+    assert found.notes[0] == "pose 7: the board lies behind the camera; check its pose"
+    assert found.outliers[6]
+
+
+@pytest.mark.parametrize("side", ["robot", "board"])
+def test_metres_that_are_called_millimetres_are_said(side):
+    truth = simulated(np.random.default_rng(10), 10, **NOISE)
+    flange, board = truth.pairs.base_from_flange, truth.pairs.camera_from_board
+    if side == "robot":
+        flange = Poses(flange.rotation, flange.translation / 1000)
+    else:
+        board = Poses(board.rotation, board.translation / 1000)
+    with pytest.raises(InputError, match=f"with the {side}'s lengths times 1000: if they are metres"):
+        handeye(HandEyePoses(flange, board))
+
+
+def test_rough_poses_in_the_right_convention_pass():
+    """Errors of 2° and 20 mm: bad, but no other convention is better."""
+    for seed in range(10):
+        truth = simulated(np.random.default_rng(seed), 12, camera=(0.035, 20.0))
+        assert len(handeye(truth.pairs).residuals) == 12
+
+
+HALF = Rigid(np.diag([-1.0, -1, 1]), [200, 175, 0])
+"""A chessboard of 8×7 squares of 25 mm seen from its other end."""
+
+
+@pytest.mark.parametrize("setup", SETUPS)
+@pytest.mark.parametrize("turned", [[], [2, 5, 9], [0, 1, 3, 4, 6, 7, 8]])
+def test_turned_views_are_put_right(setup, turned):
+    """Up to a turn of all: the numbering of most is kept."""
+    truth = simulated(np.random.default_rng(11), 12, setup, **NOISE)
+    board = [p @ HALF if i in turned else p for i, p in enumerate(truth.pairs.camera_from_board)]
+    pairs = HandEyePoses(truth.pairs.base_from_flange, Poses.of(board))
+    mended = repair(pairs, setup, (HALF,))
+    kept = turned if len(turned) < 6 else [i for i in range(12) if i not in turned]
+    assert np.flatnonzero(mended.turned).tolist() == kept
+    found = handeye(pairs, setup, options=HandEyeOptions(symmetries=(HALF,)))
+    assert not found.outliers.any()
+    assert (truth.mount_from_camera.inverse() @ found.mount_from_camera).angle_rad() < 3e-3
+    assert bool(found.notes) == bool(kept)
+    if kept:
+        assert found.notes[0].endswith(", ".join(f"pose {i + 1}" for i in kept))
+
+
+def test_a_square_board_has_four_numberings():
+    truth = simulated(np.random.default_rng(12), 14, **NOISE)
+    middle = np.array([87.5, 87.5, 0])
+    turns = []
+    for k in (1, 2, 3):
+        turn = Rotation.from_euler("z", 90 * k, degrees=True).as_matrix()
+        turns.append(Rigid(turn, middle - turn @ middle))
+    labels = np.random.default_rng(0).integers(0, 4, 14)
+    every = [Rigid(), *turns]
+    board = Poses.of(p @ every[k] for p, k in zip(truth.pairs.camera_from_board, labels, strict=True))
+    found = handeye(HandEyePoses(truth.pairs.base_from_flange, board), options=HandEyeOptions(symmetries=tuple(turns)))
+    assert not found.outliers.any()
+    assert (truth.mount_from_camera.inverse() @ found.mount_from_camera).angle_rad() < 3e-3
+
+
+def test_corners_of_turned_views_are_put_right():
+    """Numbered from the other end in two views: the adjustment comes out as without, to rounding."""
+    truth = simulated_views(np.random.default_rng(13), 8, corner_px=0.1)
+    xyz = board_corners(8, 7, 25.0)
+    other = np.argsort(((HALF @ xyz)[:, None] - xyz[None]).__pow__(2).sum(2), axis=1)[:, 0]
+    views = list(truth.views.views)
+    for i in (1, 6):
+        views[i] = View(xyz, views[i].xy_px[other])
+    views = Views(truth.views.camera, tuple(views))
+    pairs = pairs_of_views(truth.pairs.base_from_flange, views)
+    found = handeye(pairs, views=views, options=HandEyeOptions(symmetries=(HALF,)))
+    assert found.notes == ("numbered from another end of the board, and put right: pose 2, pose 7",)
+    plain = handeye(truth.pairs, views=truth.views)
+    assert found.mount_from_camera.translation == pytest.approx(plain.mount_from_camera.translation, abs=1e-5)

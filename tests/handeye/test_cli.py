@@ -1,0 +1,325 @@
+"""``stcal handeye`` as a user types it."""
+
+import json
+import sys
+
+import numpy as np
+import pytest
+import yaml
+
+from stcal.camera_file import read_camera
+from stcal.cli.main import main
+from stcal.design import BoardDesign
+from stcal.geometry.rigid import Poses, Rigid
+from stcal.handeye import METHODS
+from stcal.handeye.simulated import BASE_FROM_BOARD, FLANGE_FROM_CAMERA, simulated
+from stcal.table_file import POSE, pose_cells
+from tests.handeye.photographed import CAMERA, looks, photographs, sheet_of_chessboard, sheet_of_dots
+
+NOISE = {"robot": (2e-4, 0.1), "camera": (5e-4, 0.2)}
+INPUT, COMPUTATION = 2, 3
+
+
+@pytest.fixture
+def command(monkeypatch, capsys):
+    """Exit code, standard output and error."""
+
+    def call(*arguments):
+        monkeypatch.setattr(sys, "argv", ["stcal", "handeye", *map(str, arguments)])
+        with pytest.raises(SystemExit) as end:
+            main()
+        output = capsys.readouterr()
+        return end.value.code or 0, output.out, output.err
+
+    return call
+
+
+def write(path, sides: dict[str, Poses], edit=None):
+    """A file of poses by name; ``edit`` changes the rows of cells."""
+    header = [f"{name}_{column}" for name in sides for column in POSE]
+    rows = [[cell for pose in row for cell in pose_cells(pose)] for row in zip(*sides.values(), strict=True)]
+    if edit:
+        edit(rows)
+    path.write_text("\n".join(",".join(line) for line in [header, *rows]) + "\n")
+    return path
+
+
+def poses_file(path, truth, edit=None):
+    pairs = truth.pairs
+    return write(path, {"base_from_flange": pairs.base_from_flange, "camera_from_board": pairs.camera_from_board}, edit)
+
+
+def in_sigmas(data: dict, name: str, true: Rigid) -> float:
+    """How far a transform is off, in units of its covariance: chi of six degrees of freedom."""
+    off = Poses.of([Rigid.from_matrix(data[name])]).difference(Poses.of([true]))[0]
+    return float(np.sqrt(off @ np.linalg.solve(np.array(data["covariance"]), off)))
+
+
+EXACT = ("--sigma-robot-deg", 0, "--sigma-robot-mm", 0, "--sigma-board-mm", 0)
+"""Of drawn boards, and poses that they are drawn from."""
+CHANCE = 5.8
+"""Squared, over 6: F with 6 and 70 degrees of freedom (σ come from a dozen poses) exceeds it once in 10 000 times."""
+
+
+@pytest.mark.parametrize("setup", ["eye-in-hand", "eye-to-hand"])
+def test_a_file_of_poses(command, tmp_path, setup):
+    truth = simulated(np.random.default_rng(5), 20, setup, **NOISE)
+    source, out = poses_file(tmp_path / "poses.csv", truth), tmp_path / "deep" / "handeye.json"
+    code, shown, _ = command(source, "--setup", setup, "--out", out)
+    assert code == 0
+    data = json.loads(out.read_text())
+    camera, board = {
+        "eye-in-hand": ("flange_from_camera", "base_from_board"),
+        "eye-to-hand": ("base_from_camera", "flange_from_board"),
+    }[setup]
+    assert {camera, board} < data.keys()
+    assert not {"flange_from_camera", "base_from_camera"} <= data.keys()
+    assert 0.01 < in_sigmas(data, camera, truth.mount_from_camera) < CHANCE
+    assert np.array(data[f"{board}_covariance"]).shape == (6, 6)
+    assert [row["name"] for row in data["poses"]][:2] == ["line 2", "line 3"]
+    assert data["outliers"] == []
+    # A board's pose by robot and X is off by about the noise of both, and the error of X.
+    assert 0.05 < data["held_out"]["translation_mm"] < 2
+    for text in (camera, board, "held out (15 × 5 of 20 poses)", f"written: {out}"):
+        assert text in shown
+
+
+def test_outliers_are_named_by_line(command, tmp_path):
+    truth = simulated(np.random.default_rng(5), 15, **NOISE)
+
+    def edit(rows):
+        rows[6][0] = repr(float(rows[6][0]) + 15)
+
+    out = tmp_path / "h.json"
+    code, shown, _ = command(poses_file(tmp_path / "poses.csv", truth, edit), "--out", out, "--splits", 0)
+    data = json.loads(out.read_text())
+    assert (code, data["outliers"], data["held_out"]) == (0, ["line 8"], None)
+    assert [row["name"] for row in data["poses"] if not row["used"]] == ["line 8"]
+    assert "without 1 that contradicts them: line 8" in shown
+    assert in_sigmas(data, "flange_from_camera", FLANGE_FROM_CAMERA) < CHANCE
+
+
+def test_all_methods_are_compared(command, tmp_path):
+    truth = simulated(np.random.default_rng(6), 12, **NOISE)
+    everything, page = tmp_path / "all.json", tmp_path / "page.html"
+    code, shown, _ = command(
+        poses_file(tmp_path / "poses.csv", truth),
+        *("--method", "all", "--splits", 3, "--json", everything, "--report", page),
+    )
+    assert code == 0
+    data = json.loads(everything.read_text())
+    assert [row["method"] for row in data["methods"]] == [name for name in METHODS if name != "reprojection"]
+    rows = {line.split()[0]: line.split()[1:] for line in shown.splitlines() if line.split()[:1] and line[0] != " "}
+    for row in data["methods"]:
+        assert len(row["splits"]) == 3
+        mean = row["held_out"]["translation_mm"]
+        assert rows[row["method"]][1] == f"{mean:.3f}"
+        assert row["method"] in page.read_text()
+    assert data["method"] == "pose"
+    assert len(data["splits"]) == 3
+
+
+def test_one_method_by_name(command, tmp_path):
+    truth = simulated(np.random.default_rng(6), 12, **NOISE)
+    source = poses_file(tmp_path / "poses.csv", truth)
+    code, shown, _ = command(source, "--method", "park-martin", "--out", tmp_path / "h.json")
+    assert code == 0
+    assert "eye-in-hand, park-martin: 12 poses" in shown
+    assert json.loads((tmp_path / "h.json").read_text())["covariance"] is None
+    code, _, err = command(source, "--method", "kalman")
+    assert code == INPUT
+    assert "--method kalman: unknown; all or one of tsai-lenz, park-martin" in err
+
+
+def test_stated_sigmas_weight(command, tmp_path):
+    truth = simulated(np.random.default_rng(7), 15, **NOISE)
+    source, out = poses_file(tmp_path / "poses.csv", truth), tmp_path / "h.json"
+    robot = ("--sigma-robot-deg", np.degrees(2e-4), "--sigma-robot-mm", 0.1)
+    assert command(source, *robot, "--sigma-camera-deg", 0.03, "--sigma-camera-mm", 0.2, "--out", out)[0] == 0
+    data = json.loads(out.read_text())
+    assert data["estimated"] == []
+    assert data["sigma"]["camera_rad"] == pytest.approx(np.radians(0.03))
+    code, _, err = command(source, "--sigma-robot-mm", 0.1)
+    assert code == INPUT
+    assert "both or none needed" in err
+
+
+def test_the_boards_size_is_found(command, tmp_path):
+    """The file states a board of 0.96 times its true size."""
+    truth = simulated(np.random.default_rng(8), 20, **NOISE)
+    seen = truth.pairs.camera_from_board
+    small = Poses(seen.rotation, 0.96 * seen.translation)
+    source = write(tmp_path / "p.csv", {"base_from_flange": truth.pairs.base_from_flange, "camera_from_board": small})
+    out = tmp_path / "h.json"
+    code, shown, _ = command(source, "--with-scale", "--out", out)
+    board = json.loads(out.read_text())["board"]
+    assert code == 0
+    assert abs(board["scale"] - 1 / 0.96) < 4 * board["scale_sigma"] < 0.02
+    assert "times its stated size" in shown
+    _, shown, _ = command(source, "--splits", 0)
+    assert "note: by the robot's motion the board is" in shown
+
+
+def test_four_axes(command, tmp_path):
+    """Rotations about the vertical only: all is found but the height."""
+    rng = np.random.default_rng(9)
+    turn = np.column_stack([np.zeros((15, 2)), rng.uniform(-2, 2, 15)])
+    place = np.array([500, 0, 300]) + rng.uniform(-200, 200, (15, 3))
+    flange = Poses.of(Rigid.exp([*w, *t]) for w, t in zip(turn, place, strict=True))
+    seen = FLANGE_FROM_CAMERA.inverse() @ flange.inverse() @ BASE_FROM_BOARD
+    source = write(tmp_path / "p.csv", {"base_from_flange": flange, "camera_from_board": seen})
+    code, _, err = command(source)
+    assert code == COMPUTATION
+    assert "rotate the flange about" in err
+    out = tmp_path / "h.json"
+    code, shown, _ = command(source, "--four-dof", "--out", out)
+    assert code == 0
+    data = json.loads(out.read_text())
+    found = np.array(data["flange_from_camera"])
+    assert found[:2, 3] == pytest.approx(FLANGE_FROM_CAMERA.translation[:2], abs=1e-3)
+    assert found[2, 3] == pytest.approx(0, abs=1e-6)
+    assert "is not known along" in shown
+
+
+def change(column: int, value: str):
+    def edit(rows):
+        rows[3][column] = value
+
+    return edit
+
+
+def inverted(sides):
+    return {name: poses.inverse() if name == "camera_from_board" else poses for name, poses in sides.items()}
+
+
+def in_metres(sides):
+    board = sides["camera_from_board"]
+    return sides | {"camera_from_board": Poses(board.rotation, board.translation / 1000)}
+
+
+def first(count: int):
+    return lambda sides: {name: poses[:count] for name, poses in sides.items()}
+
+
+def again(sides):
+    order = [0, 1, 2, 3, 1, 4]
+    return {name: poses[order] for name, poses in sides.items()}
+
+
+@pytest.mark.parametrize(
+    ("alter", "edit", "code", "parts"),
+    [
+        (first(2), None, COMPUTATION, ["2 poses, 3 needed"]),
+        (again, None, INPUT, ["line 3 and line 6 are identical poses"]),
+        (None, change(3, "0.2"), INPUT, ["line 5: quaternion of length", "is the order qw, qx, qy, qz?"]),
+        (None, change(0, "nan"), INPUT, ["line 5: base_from_flange_x_mm is 'nan'"]),
+        (None, change(1, ""), INPUT, ["line 5: base_from_flange_y_mm is ''"]),
+        (inverted, None, INPUT, ["contradict each other", "board_from_camera or flange_from_base"]),
+        (in_metres, None, INPUT, ["if they are metres, name the columns _m"]),
+    ],
+)
+def test_bad_poses_are_named(command, tmp_path, alter, edit, code, parts):
+    truth = simulated(np.random.default_rng(10), 12, **NOISE).pairs
+    sides = {"base_from_flange": truth.base_from_flange, "camera_from_board": truth.camera_from_board}
+    source = write(tmp_path / "poses.csv", alter(sides) if alter else sides, edit)
+    found, out, err = command(source, "--out", tmp_path / "h.json")
+    (line,) = err.splitlines()
+    assert (found, out) == (code, "")
+    for part in parts:
+        assert part in line
+    assert not (tmp_path / "h.json").exists()
+
+
+@pytest.fixture(scope="module")
+def chessboard(tmp_path_factory):
+    """Eight photographs of a board that looks the same after half a turn, by a camera rolled all the way round."""
+    seen = looks(np.random.default_rng(11), 8, np.array([70, 50]), np.pi)
+    toml = 'type = "chessboard"\nrows = 6\ncolumns = 8\nsquare_mm = 20\n'
+    return photographs(tmp_path_factory.mktemp("chess"), *sheet_of_chessboard(6, 8, 20), seen, toml)
+
+
+def test_images_of_a_symmetric_chessboard(command, chessboard, tmp_path):
+    names = ("h.json", "ros.yaml", "h.urdf", "cv.yaml", "page.html", "cameras.txt")
+    out, ros, urdf, opencv, page, camera = (tmp_path / name for name in names)
+    code, shown, _ = command(
+        *chessboard.arguments(),
+        *("--workers", 1, "--splits", 3, "--refine-camera", "--out", out, "--ros", ros, "--urdf", urdf, *EXACT),
+        *("--opencv", opencv, "--parent", "tool0", "--report", page, "--camera-out", camera),
+    )
+    assert code == 0
+    data = json.loads(out.read_text())
+    # Half a turn of the board is not told by the images: Z may be of either numbering, X is the same.
+    assert in_sigmas(data, "flange_from_camera", FLANGE_FROM_CAMERA) < CHANCE
+    off = Rigid.from_matrix(data["flange_from_camera"]).translation - FLANGE_FROM_CAMERA.translation
+    assert 1e-4 < np.linalg.norm(off) < 0.5
+    assert any("numbered from another end" in note for note in data["notes"])
+    assert data["held_out"]["board_mm"] < 0.1
+    assert data["camera"]["model"] == "PINHOLE"
+    assert read_camera(camera).focal == pytest.approx(CAMERA.focal, rel=2e-3)
+    assert yaml.safe_load(ros.read_text())["header"]["frame_id"] == "tool0"
+    assert 'link="tool0"' in urdf.read_text()
+    assert "flange_from_camera: !!opencv-matrix" in opencv.read_text()
+    assert "Camera, as adjusted" in page.read_text()
+    for path in (out, ros, urdf, opencv, page, camera):
+        assert f"written: {path}" in shown
+
+
+def test_images_of_dots_whose_size_is_wrong(command, tmp_path):
+    """Dots drawn with a pitch of 20 mm; the file says 25, and radii as much too large."""
+    true = BoardDesign(6, 8, 20.0, 6.0, "dark", 0.0, (0, 0), 9.0)
+    sheet, first_mm = sheet_of_dots(true.xy_mm(), true.radii_mm())
+    toml = 'rows = 6\ncolumns = 8\npitch_mm = 25\nradius_mm = 7.5\npolarity = "dark"\nsigma_mm = 0.1\n'
+    toml += "[corner]\nrow = 0\ncolumn = 0\nradius_mm = 11.25\n"
+    seen = looks(np.random.default_rng(12), 8, np.array([70, 50]), 1.0)
+    files = photographs(tmp_path, sheet, first_mm, seen, toml)
+    (files.images / "extra.png").write_bytes((files.images / "0.png").read_bytes())
+    with files.poses.open("a") as more:
+        more.write(",".join(["gone.png", *pose_cells(Rigid())]) + "\n")
+    out = tmp_path / "h.json"
+    code, shown, _ = command(*files.arguments(), "--workers", 1, "--splits", 0, "--with-scale", "--out", out, *EXACT)
+    assert code == 0
+    data = json.loads(out.read_text())
+    sigma = data["board"]["scale_sigma"]
+    assert abs(data["board"]["scale"] - 0.8) < 5 * sigma < 0.01
+    assert data["board"]["pitch_mm"] == pytest.approx(20, abs=0.1)
+    assert "stated 25 mm" in shown
+    assert data["corner_px_is_factor"]
+    assert {each["name"]: each["reason"] for each in data["left_out"]} == {
+        "extra.png": "no row in poses.csv",
+        "gone.png": "no such image, in a row of poses.csv",
+    }
+    assert in_sigmas(data, "flange_from_camera", FLANGE_FROM_CAMERA) < CHANCE
+
+
+def test_what_images_need_is_said(command, chessboard, tmp_path):
+    code, _, err = command(chessboard.images, "--poses", chessboard.poses)
+    assert (code, "--camera, --board needed with images" in err) == (INPUT, True)
+    code, _, err = command(tmp_path / "none.csv")
+    assert (code, "does not exist" in err) == (INPUT, True)
+    truth = simulated(np.random.default_rng(10), 12, **NOISE)
+    source = poses_file(tmp_path / "poses.csv", truth)
+    code, _, err = command(source, "--board", chessboard.board)
+    assert (code, "--board: only with a folder of images" in err) == (INPUT, True)
+    code, _, err = command(source, "--refine-camera")
+    assert (code, "--refine-camera: only with images" in err) == (INPUT, True)
+    code, _, err = command(*chessboard.arguments(), "--camera-out", tmp_path / "c.txt")
+    assert (code, "only with --refine-camera" in err) == (INPUT, True)
+
+
+@pytest.mark.parametrize(
+    ("rows", "part"),
+    [
+        (["0.png", "0.png"], "lines 2 and 3: both are of image '0.png'"),
+        (["a.png", "b.png"], "no row is of an image in"),
+        (["0.png", "1.png"], "2 poses, 3 needed"),
+    ],
+)
+def test_bad_rows_of_images_are_named(command, chessboard, tmp_path, rows, part):
+    header, *cells = chessboard.poses.read_text().splitlines()
+    lines = [",".join([name, *line.split(",")[1:]]) for name, line in zip(rows, cells, strict=False)]
+    poses = tmp_path / "poses.csv"
+    poses.write_text("\n".join([header, *lines]) + "\n")
+    images, _, _, *rest = chessboard.arguments()
+    code, _, err = command(images, "--poses", poses, *rest, "--workers", 1)
+    assert code == (COMPUTATION if "needed" in part else INPUT)
+    assert part in err.splitlines()[-1]

@@ -1,0 +1,86 @@
+"""Held-out errors and the comparison of methods."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from stcal.errors import DegenerateError, InputError
+from stcal.geometry.rigid import Poses, Rigid
+from stcal.handeye import METHODS, HandEyeOptions, HandEyePoses, Noise, compare, cross_validate, handeye, splits
+from stcal.handeye.simulated import simulated, simulated_views
+from stcal.handeye.validate import predicted
+
+
+def test_every_pose_has_its_turn():
+    rows = splits(12, 3, 8)
+    assert rows.shape == (8, 3)
+    assert sorted(rows[:4].ravel()) == sorted(rows[4:].ravel()) == list(range(12))
+    assert (splits(12, 3, 8) == rows).all()
+    assert splits(16, 5, 15).shape == (15, 5)
+    assert all(len(set(row)) == 5 for row in splits(16, 5, 15))
+    assert splits(4).shape == (15, 1)
+    with pytest.raises(InputError, match="5 of 7 poses held out leave 2, 3 needed"):
+        splits(7, 5)
+
+
+@pytest.mark.parametrize("setup", ["eye-in-hand", "eye-to-hand"])
+def test_held_out_errors_are_those_of_the_poses(setup):
+    """Of many poses X is well known, and what is left is the noise of a pose: a length of 3 coordinates, √(8/π) σ in
+    the mean. 180 values scatter by 0.42/√180 = 3 %; X adds 12/60 of the variance at most."""
+    truth = simulated(np.random.default_rng(1), 60, setup, camera=(1e-3, 0.3))
+    found = cross_validate(truth.pairs, setup, "pose", rows=splits(60, 12, 15))
+    means = found.means()
+    assert means["rotation_rad"] == pytest.approx(np.sqrt(8 / np.pi) * 1e-3, rel=0.15)
+    assert means["translation_mm"] == pytest.approx(np.sqrt(8 / np.pi) * 0.3, rel=0.15)
+    assert set(means) == {"rotation_rad", "translation_mm"}
+
+
+def test_errors_at_the_board():
+    """A chain 1 mm off across the line of sight is 1 mm off at the board by both measures; along it, by one only."""
+    truth = simulated_views(np.random.default_rng(2), 6, "eye-to-hand")
+    exact = handeye(truth.pairs, "eye-to-hand", views=truth.views, options=HandEyeOptions(noise=Noise(board_mm=0)))
+    seen = truth.pairs[:1], truth.views[:1]
+    assert [v.item() < 1e-3 for v in predicted(exact, *seen)] == [True] * 4
+    for shift, on_board in (([1.0, 0, 0], 1.0), ([0, 0, 1.0], 0.0)):
+        moved = exact.mount_from_camera @ Rigid(np.eye(3), shift)
+        _, distance, board, pose = (v.item() for v in predicted(replace(exact, mount_from_camera=moved), *seen))
+        assert distance == pytest.approx(1, abs=1e-2)
+        assert pose == pytest.approx(1, abs=1e-2)
+        # The board is tilted by up to 29° and seen up to 20° off the axis.
+        assert board == pytest.approx(on_board, abs=0.6)
+
+
+def test_compare_lists_every_method():
+    truth = simulated_views(np.random.default_rng(3), 10, robot=(3e-4, 0.1), corner_px=0.1)
+    found = compare(truth.pairs, views=truth.views, rows=splits(10, 3, 4))
+    assert tuple(c.method for c in found) == METHODS
+    errors = {c.method: c.held_out.means()["board_mm"] for c in found}
+    assert all(np.isfinite(list(errors.values())))
+    assert errors["reprojection"] < 1.3 * min(errors.values())
+    assert all(c.result.method == c.method for c in found)
+    poses_only = compare(truth.pairs, rows=splits(10, 3, 2), methods=("pose", "reprojection", "shah"))
+    assert [c.method for c in poses_only] == ["pose", "shah"]
+    assert poses_only[0].held_out.board_mm is None
+
+
+def test_a_method_that_fails_says_why():
+    truth = simulated(np.random.default_rng(4), 12, camera=(1e-3, 0.3))
+    scale = compare(truth.pairs, rows=splits(12, 3, 2), methods=("pose", "li"), options=HandEyeOptions(with_scale=True))
+    assert [c.reason for c in scale] == ["", ""]
+    upright = simulated(np.random.default_rng(4), 12, tilt=0.0)
+    turned = Rotation.from_rotvec(np.linspace(-1, 1, 12)[:, None] * [0, 0, 1.0]).as_matrix()
+    flange = Poses(turned, upright.pairs.base_from_flange.translation)
+    board = upright.mount_from_camera.inverse() @ (flange.inverse() @ upright.stand_from_board)
+    found = compare(HandEyePoses(flange, board), options=HandEyeOptions(four_dof=True), rows=splits(12, 3, 4))
+    by = {c.method: c for c in found}
+    assert by["pose"].held_out.means()["translation_mm"] < 1e-3
+    assert by["shah"].result is None
+    assert "needs rotations about two axes" in by["shah"].reason
+
+
+def test_a_split_that_cannot_be_solved_is_named():
+    truth = simulated(np.random.default_rng(5), 12)
+    with pytest.raises(DegenerateError, match=r"without pose 3, pose 4, .*: .*3 needed"):
+        cross_validate(truth.pairs, rows=np.arange(2, 12)[None])
