@@ -22,7 +22,6 @@ million
 
 import argparse
 import time
-from dataclasses import dataclass
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -35,85 +34,16 @@ from stcal.geometry.rigid import Rigid, Similarity, skew
 from stcal.register import Liu2017Options, Registration, register
 from stcal.register.liu2017 import affine_least_squares
 from stcal.register.models import parts
+from stcal.register.simulated import CENTRE_MM, SIGMA_MM, cube, make_scene, parameter_error
 
-SIGMA_MM = 0.15
-HALF_MM = 100.0
-CENTRE = np.array([800.0, 200.0, 700.0])
 SHARES = (0.0, 0.1, 0.2, 0.3, 0.4, 0.5, 0.6)
 WITHIN = 1.01
 ONE_IN = 1e-6
 
 
-@dataclass(frozen=True)
-class Scene:
-    """Points of a in b with noise; ``clean`` : (n,) mask."""
-
-    xyz_a: np.ndarray
-    xyz_b: np.ndarray
-    b_from_a: Rigid
-    clean: np.ndarray
-
-
-def directions(rng: np.random.Generator, n: int) -> np.ndarray:
-    """(n, 3) unit vectors, even over the sphere."""
-    v = rng.normal(size=(n, 3))
-    return v / np.linalg.norm(v, axis=1)[:, None]
-
-
-def cube(rng: np.random.Generator, n: int) -> np.ndarray:
-    """(n, 3) points in the cube."""
-    return CENTRE + rng.uniform(-HALF_MM, HALF_MM, (n, 3))
-
-
-def scene(rng: np.random.Generator, n: int, share: float, kind: str = "random", off_mm=(2.0, 50.0)) -> Scene:
-    """n points of which ``share`` are wrong."""
-    turn = Rotation.random(random_state=rng.integers(2**31)).as_matrix()
-    b_from_a = Rigid(turn, rng.uniform(-3000, 3000, 3))
-    xyz_a = cube(rng, n)
-    xyz_b = b_from_a @ xyz_a + rng.normal(0, SIGMA_MM, (n, 3))
-    wrong = rng.permutation(n)[: round(share * n)]
-    k = len(wrong)
-    if kind == "random":
-        xyz_b[wrong] += directions(rng, k) * rng.uniform(*off_mm, (k, 1))
-    elif kind == "one shift":
-        xyz_b[wrong] += directions(rng, 1) * rng.uniform(*off_mm)
-    elif kind == "shift of 2 mm":
-        xyz_b[wrong] += directions(rng, 1) * 2
-    elif kind == "two shifts":
-        xyz_b[wrong[: k // 2]] += directions(rng, 1) * rng.uniform(*off_mm)
-        xyz_b[wrong[k // 2 :]] += directions(rng, 1) * rng.uniform(*off_mm)
-    elif kind == "other motion":
-        middle = xyz_b.mean(0)
-        turn_and_shift = [
-            *directions(rng, 1)[0] * rng.uniform(0.03, 0.5),
-            *directions(rng, 1)[0] * rng.uniform(*off_mm),
-        ]
-        xyz_b[wrong] = Rigid.exp(turn_and_shift) @ (xyz_b[wrong] - middle) + middle
-    elif kind == "one place":
-        xyz_b[wrong] = xyz_b[wrong[0]] + rng.normal(0, SIGMA_MM, (k, 3))
-    elif kind == "drift":
-        xyz_b[wrong] += directions(rng, 1) * np.linspace(*off_mm, k)[:, None]
-    elif kind == "rows shifted":
-        xyz_b[wrong] = xyz_b[np.roll(wrong, 1)]
-    clean = np.ones(n, bool)
-    clean[wrong] = False
-    return Scene(xyz_a, xyz_b, b_from_a, clean)
-
-
-def parameter_error(found: Registration, truth) -> np.ndarray:
-    """What the covariance is of: the perturbation (p,) that leads from the truth to what was found."""
-    if found.model == "affine":
-        return (found.b_from_a.matrix() - truth.matrix())[:3].ravel()
-    (linear, translation), (true_linear, true_translation) = parts(found.b_from_a), parts(truth)
-    scale = np.cbrt(np.linalg.det(linear) / np.linalg.det(true_linear))
-    turn = Rotation.from_matrix(linear @ np.linalg.inv(true_linear) / scale).as_rotvec()
-    error = [*turn, *(translation - true_translation)]
-    return np.array([*error, scale - 1] if found.model == "similarity" else error)
-
-
 def is_silently_wrong(found: Registration, truth: Rigid) -> bool:
     """Whether the truth is outside what the covariance admits, and nothing was said."""
-    error = parameter_error(found, truth)
+    error = parameter_error(found.b_from_a, truth)
     size = error @ np.linalg.solve(found.covariance, error) / len(error)
     told = found.ambiguous or found.alternative is not None or any("bent" in note for note in found.notes)
     return bool(size > fisher.isf(ONE_IN, len(error), found.dof)) and not told
@@ -124,7 +54,7 @@ def trials_of(count: int, n: int, share: float, kind: str) -> str:
     ratios, errors, best_errors, refused, told, wrong = [], [], [], 0, 0, 0
     for trial in range(count):
         rng = np.random.default_rng([trial, n, round(100 * share), len(kind)])
-        s = scene(rng, n, share, kind)
+        s = make_scene(rng, n, share, *STRUCTURED.get(kind, (kind,)))
         try:
             found = register(s.xyz_a, s.xyz_b, folds=0, seed=trial)
         except DegenerateError:
@@ -151,6 +81,17 @@ HEAD = (
 )
 
 
+STRUCTURED = {
+    "one shift": ("one shift",),
+    "shift of 2 mm": ("one shift", (2.0, 2.0)),
+    "two shifts": ("two shifts",),
+    "other motion": ("other motion",),
+    "drift": ("drift",),
+    "one place": ("one place",),
+    "rows shifted": ("rows shifted",),
+}
+
+
 def outliers(count: int) -> None:
     """Clean data, and points displaced at random."""
     print(HEAD)
@@ -162,7 +103,7 @@ def outliers(count: int) -> None:
 def structured(count: int) -> None:
     """Wrong points that agree with one another."""
     print(HEAD)
-    for kind in ("one shift", "shift of 2 mm", "two shifts", "other motion", "drift", "one place", "rows shifted"):
+    for kind in STRUCTURED:
         for share in (0.2, 0.4, 0.5, 0.6):
             for n in (100, 12):
                 print(trials_of(count, n, share, kind), flush=True)
@@ -176,7 +117,7 @@ def affine(count: int) -> None:
         refused = 0
         for trial in range(count):
             rng = np.random.default_rng([trial, 5, round(100 * share)])
-            s = scene(rng, 100, share, off_mm=(5.0, 5.0))
+            s = make_scene(rng, 100, share, off_mm=(5.0, 5.0))
             at = cube(rng, 50)
             found = {
                 "robust": register(s.xyz_a, s.xyz_b, folds=0).b_from_a,
@@ -218,7 +159,7 @@ def _calibrated(title, count, model, n, share, threshold=None, given=False, unde
     sizes, errors, covariances = [], [], []
     for trial in range(count):
         rng = np.random.default_rng([trial, n, len(title)])
-        s = scene(rng, n, share)
+        s = make_scene(rng, n, share)
         truth = _distorted(rng, s.b_from_a, model)
         xyz_b = truth @ s.xyz_a + (s.xyz_b - s.b_from_a @ s.xyz_a)
         stated = None
@@ -230,11 +171,11 @@ def _calibrated(title, count, model, n, share, threshold=None, given=False, unde
             xyz_b = np.where(s.clean[:, None], truth @ s.xyz_a + noise, xyz_b)
             stated = root @ np.swapaxes(root, 1, 2) / understated
         found = register(s.xyz_a, xyz_b, model=model, covariances=stated, threshold_mm=threshold, folds=0, seed=trial)
-        error = parameter_error(found, truth)
+        error = parameter_error(found.b_from_a, truth)
         spread = (found.dof - 2) / found.dof if np.isfinite(found.dof) else 1.0
         sizes.append(error @ np.linalg.solve(found.covariance, error) / len(error) * spread)
         # about the points' middle, where rotation and translation are independent
-        shift = _about(found, CENTRE)
+        shift = _about(found, np.array(CENTRE_MM))
         errors.append(shift @ error)
         covariances.append(np.diag(shift @ found.covariance @ shift.T))
     ratio = np.var(errors, axis=0) / np.mean(covariances, axis=0)
@@ -266,7 +207,7 @@ def _about(found: Registration, point: np.ndarray) -> np.ndarray:
 
 def million(_: int) -> None:
     """Time of a million pairs."""
-    s = scene(np.random.default_rng(0), 1_000_000, 0.3)
+    s = make_scene(np.random.default_rng(0), 1_000_000, 0.3)
     for folds in (0, 6):
         start, used = time.perf_counter(), time.process_time()
         found = register(s.xyz_a, s.xyz_b, folds=folds)

@@ -234,12 +234,13 @@ def draw(shares: dict, first: dict, path: Path) -> None:
     for name in (PAPER, RIGID, AFFINE, TOGETHER):
         if name in first:
             for k, (side, style) in enumerate(((SMALL, "-"), (LARGE, (0, (4, 2))))):
-                label = f"{name}, in {side:.0f} mm"
+                label = f"{name}, {side:.0f} mm"
                 points = np.arange(1, TESTS + 1)
                 right.plot(points, np.sort(first[name][k]), color=COLOURS[name], lw=1.6, ls=style, label=label)
     right.set(xlabel="points, the smallest errors first", ylabel="error, mm", ylim=(0, None), xlim=(1, TESTS))
     right.set_title("The same fits in cubes of 200 and 400 mm (fig. 8)", fontsize=10)
-    right.legend(frameon=False, fontsize=8, loc="upper left")
+    right.set_ylim(top=1.25 * right.get_ylim()[1])
+    right.legend(frameon=False, fontsize=8, loc="upper left", ncols=2, columnspacing=0.8)
     for axes in (left, middle, right):
         axes.grid(axis="y", color="#d5d9de", lw=0.6)
         axes.spines[["top", "right"]].set_visible(False)

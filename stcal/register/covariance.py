@@ -10,7 +10,7 @@ import numpy as np
 from scipy.optimize import brentq
 from scipy.stats import chi2
 
-from stcal.errors import DegenerateError, InputError
+from stcal.errors import InputError
 from stcal.register.models import Model, Transform, unit_covariance
 
 CONTRADICTED_AT = 0.01
@@ -72,14 +72,10 @@ def kept_variance(cut: float) -> float:
 
 
 def sigma_within(square_sum: float, model: Model, count: int, threshold: float | None) -> float:
-    """σ per axis, mm, of points whose residuals were cut off at ``threshold``.
+    """σ per axis, mm, of points whose residuals were cut off at ``threshold``; at most the threshold.
 
-    Those within c σ hold only the share χ²₅(c²)/χ²₃(c²) of their variance: σ solves s² = σ² χ²₅/χ²₃ at c = t/σ.
-
-    Raises
-    ------
-    DegenerateError
-        The points fill the sphere of radius ``threshold`` evenly, so that it says nothing about their σ.
+    Those within c σ hold only the share χ²₅(c²)/χ²₃(c²) of their variance: σ solves s² = σ² χ²₅/χ²₃ at c = t/σ. Below
+    c = 1 they fill the sphere all but evenly and say nothing about σ.
     """
     sigma = float(np.sqrt(square_sum / model.freedom(count)))
     if threshold is None or sigma == 0 or threshold > WIDE * sigma:
@@ -89,12 +85,8 @@ def sigma_within(square_sum: float, model: Model, count: int, threshold: float |
         cut = threshold / candidate
         return candidate**2 * kept_variance(cut) / kept_share(cut) - sigma**2
 
-    # At 1 σ the inliers are a fifth of the points and σ is four times as uncertain as they make it look.
     if excess(threshold) < 0:
-        raise DegenerateError(
-            f"registration: residuals of {sigma:.4g} mm per axis fill the threshold of {threshold:.4g} mm evenly; "
-            "a larger threshold needed, or none: it is then estimated"
-        )
+        return threshold
     return float(brentq(excess, sigma, threshold, xtol=1e-9 * sigma, rtol=1e-9))
 
 

@@ -62,6 +62,29 @@ def single_supports(model: Model, xyz_a: np.ndarray, sigma_mm: float) -> np.ndar
     return np.flatnonzero(np.sqrt(off) < WIDER_THAN * sigma_mm)
 
 
+def check_supports(model: Model, xyz_a: np.ndarray, inliers: np.ndarray, sigma_mm: float, name: Namer) -> None:
+    """Refuse a set with outliers in which one point alone tells a turn: any wrong point would have fitted there.
+
+    Raises
+    ------
+    DegenerateError
+        Without that point the others would be refused by :func:`check_extent`.
+    """
+    rows = np.flatnonzero(inliers)
+    alone = single_supports(model, xyz_a[rows], sigma_mm)
+    if len(alone):
+        kind = "plane" if model.name == "affine" else "line"
+        raise DegenerateError(
+            f"registration: only {name(rows[alone[0]])} keeps the {len(rows)} points that agree off a {kind}, and any "
+            f"wrong point would fit there as well; measure more points off the {kind}"
+        )
+
+
+def row_name(row: int, lines: Sequence[int] | None) -> str:
+    """A point's name for messages: its line in the file, else its row from 1."""
+    return f"row {row + 1}" if lines is None else f"line {lines[row]}"
+
+
 def symmetry(xyz: np.ndarray, tolerance_mm: float) -> tuple[float, np.ndarray] | None:
     """A turn that maps the points onto themselves but not each onto itself: its angle (rad) and the permutation (n,).
 

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.stats import f as fisher
 
-from stcal.register.degeneracy import WIDER_THAN, single_supports, spreads, symmetry, symmetry_note
+from stcal.register.degeneracy import WIDER_THAN, row_name, single_supports, spreads, symmetry, symmetry_note
 from stcal.register.mistakes import SHOWN, UNIT_WITHIN, UNITS, outlier_notes
 from stcal.register.models import Model, squares
 from stcal.register.result import Alternative
@@ -15,8 +15,8 @@ from stcal.register.robust import CLEAN_SETS_WITH_OUTLIER, LEVERAGE_UP_TO, Fitte
 FEW_FREEDOMS = 6
 """Below so many degrees of freedom σ is uncertain by more than 30 %."""
 MAJORITY = 0.5
-TIGHT = 2.0
-"""A threshold of 2 σ cuts off a quarter of the good points."""
+TIGHT = 2.5
+"""A threshold of 2.5 σ cuts off a tenth of the good points; below it the covariance of few points is too small."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -37,7 +37,7 @@ class Subject:
 
     def name(self, row: int) -> str:
         """A point's name for messages."""
-        return f"row {row + 1}" if self.lines is None else f"line {self.lines[row]}"
+        return row_name(row, self.lines)
 
 
 def notes_of(subject: Subject) -> list[str]:

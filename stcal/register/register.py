@@ -6,7 +6,7 @@ import numpy as np
 
 from stcal.errors import DegenerateError, InputError
 from stcal.register.covariance import Noise, covariance_of, noise_of, sigma_within
-from stcal.register.degeneracy import check_extent
+from stcal.register.degeneracy import check_extent, check_supports, row_name
 from stcal.register.groups import two_groups
 from stcal.register.liu2017 import Liu2017Options, liu2017
 from stcal.register.mistakes import check_mirrored, check_units, mirrored_error
@@ -14,6 +14,7 @@ from stcal.register.models import MODELS, Model, fit, parts, squares
 from stcal.register.notes import Subject, notes_of
 from stcal.register.result import Alternative, Registration
 from stcal.register.robust import AS_GOOD, BY_CHANCE, Fitted, alternative_fit, chance, robust_fit, settled, turn_between
+from stcal.register.search import LEAST_SHARE
 from stcal.register.validate import held_out
 
 METHODS = ("robust", "least-squares", "liu2017")
@@ -110,8 +111,10 @@ def register(
         fitted = of_rows(np.arange(len(a)))
     inliers = fitted.inliers
     if method != "liu2017":
-        check_extent(chosen, a[inliers], fitted.sigma)
         check_mirrored(chosen, a[inliers], b[inliers])
+        check_extent(chosen, a[inliers], fitted.sigma)
+        if method == "robust" and not inliers.all():
+            check_supports(chosen, a, inliers, fitted.sigma, lambda row: row_name(row, lines))
     alternative = None if other is None else _alternative(fitted, other, a)
     ambiguous = alternative is not None and len(alternative.rows) >= AS_GOOD * inliers.sum()
     if ambiguous and not allow_ambiguous:
@@ -238,6 +241,8 @@ def _check_mirrored_with_outliers(model: Model, fitted: Fitted | None, a, b, noi
     try:
         mirrored = robust_fit(model, a * flip, b, noise, threshold, seed)
     except DegenerateError:
+        return
+    if mirrored.inliers.mean() < LEAST_SHARE:  # points near any one plane fit
         return
     usual = 0.0 if fitted is None else chance(model, fitted, a, b)
     if chance(model, mirrored, a * flip, b) < 2 * usual + np.log(BY_CHANCE) and (

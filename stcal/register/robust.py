@@ -3,7 +3,7 @@
 1. Consensus (``search.py``), again within its own set until nothing contradicts one σ there any more.
 2. Fit, σ, inliers in turn until the set stays: a point is an outlier when its residual, with what the fit's own
    uncertainty adds (deletion residual), exceeds the F(3, ν) bound that a set of clean points exceeds anywhere in one
-   case of a hundred; or when it exceeds the threshold given.
+   case of a thousand (5 σ for a hundred points); or when it exceeds the threshold given.
 3. Whether that consensus can be chance: a-contrario again, now against points that lie anywhere among the others
    (Moisan & Stival 2004).
 4. Whether other points agree as well on another transform.
@@ -23,7 +23,7 @@ from stcal.register.search import FALSE_ALARMS, LEAST_FREEDOM, Consensus, Score,
 
 SUBSET = 500
 """Samples are scored on so many points: σ is then known to 2 %, shares to 2 %."""
-CLEAN_SETS_WITH_OUTLIER = 0.01
+CLEAN_SETS_WITH_OUTLIER = 0.001
 LEVERAGE_UP_TO = 10_000
 """With more points the fit's own uncertainty adds under 0.02 % to a residual."""
 MAX_ROUNDS = 50
@@ -32,6 +32,8 @@ EXACT = 1e-11
 """σ below this share of the coordinates' size is rounding of numbers."""
 BY_CHANCE = 0.01
 """Sets that random points would give and that are taken for a transform: so many in one file."""
+DISTINCT = 5.0
+"""σ between two transforms; nearer ones are one."""
 MOST_OF_REST = 0.5
 """Of many outliers some always lie near some transform; half of them do for a reason."""
 AS_GOOD = 0.5
@@ -227,6 +229,9 @@ def alternative_fit(
     near = squares(xyz_b[rest] - transform @ xyz_a[rest], noise[rest].precision) <= threshold**2
     if near.sum() <= model.sample or near.sum() < min(MOST_OF_REST * len(rest), AS_GOOD * fitted.inliers.sum()):
         return None
+    own = xyz_a[rest[near]]
+    if np.sqrt(((transform @ own - fitted.transform @ own) ** 2).sum(1).mean()) < DISTINCT * fitted.sigma:
+        return None  # good points that a tight threshold cut off
     mask = np.zeros(len(xyz_a), bool)
     mask[rest[near]] = True
     other = Fitted(transform, mask, fitted.sigma, threshold, found.samples)

@@ -23,7 +23,7 @@ from stcal.register.covariance import Noise
 from stcal.register.models import Model, fit, hypotheses, squares
 
 FALSE_ALARMS = 1e-4
-"""Expected number of sets that are declared in data without outliers. So few, because a chance set of few points claims a
+"""Expected number of sets declared in data without outliers. So few, because a chance set of few points claims a
 σ far too small. Real ones are far below: ten of 20 points that agree to 0.15 mm, the others off by 5 mm, have 1e-14."""
 LEAST_FREEDOM = 6
 """Degrees of freedom of the smallest consensus: four points rigidly, five in similarity, six affinely."""
@@ -37,8 +37,8 @@ EXHAUSTIVE = 2000
 """Up to so many samples are all tried (23 points rigidly)."""
 BATCH = 500
 MOST_SAMPLES = 20_000
-REFINED = 12
-"""So many of the best samples are refined."""
+REFINED = 6
+"""So many of the best samples of a batch are refined."""
 MAX_STEPS = 30
 TINY = 1e-24
 """Square sums below this share of the points' own are rounding."""

@@ -7,6 +7,8 @@ import numpy as np
 import pytest
 
 from stcal.cli.main import main
+from stcal.cli.register_robot import held_out
+from stcal.errors import DegenerateError
 from stcal.geometry.rigid import Rigid
 from stcal.robot.kinematics import forward
 from stcal.robot.robot_file import load_robot, robot_toml
@@ -317,3 +319,23 @@ def test_a_transform_stands_where_the_kinematics_do_not(run, tmp_path, robot_pai
     assert code == 3
     assert "27 parameters" in err
     assert "robot" not in json.loads(out.read_text())
+
+
+def test_rows_are_held_out_of_both_ways():
+    seen = []
+
+    def way(train, test):
+        seen.append((train, test))
+        if 5 in test:
+            raise DegenerateError("this fold cannot be solved")
+        return np.zeros((len(test), 3))
+
+    xyz = np.arange(33.0).reshape(11, 3)
+    done, rows, errors = held_out([way, way], xyz, folds=4, seed=0)
+    assert done == 3
+    assert not any(set(train) & set(test) for train, test in seen)
+    assert all(len(train) + len(test) == 11 for train, test in seen)
+    tried = np.sort(np.concatenate([test for _, test in seen if 5 not in test]))
+    np.testing.assert_array_equal(rows, np.unique(tried))
+    np.testing.assert_allclose(errors, np.tile(np.linalg.norm(xyz[rows], axis=1), (2, 1)))
+    assert held_out([way], xyz, folds=0, seed=0)[0] == 0
