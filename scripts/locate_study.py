@@ -11,6 +11,7 @@ import argparse
 import tempfile
 import time
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 
 import cv2
@@ -20,6 +21,7 @@ import yaml
 from stcal.boards.design import CharucoDesign
 from stcal.boards.tags import Tags, find_tags
 from stcal.camera_file import CameraModel
+from stcal.cli.locate import calibration_images
 from stcal.geometry.rigid import Poses
 from stcal.images import decode, find_images
 from stcal.locate.exposures import find_scenes
@@ -31,7 +33,7 @@ from stcal.locate.pose import locate
 from stcal.locate.run import LocateOptions, run
 from stcal.locate.simulated import CAMERA, CornerNoise, example_layout, random_pose, simulated_exposures
 from stcal.locate.verdict import VerdictOptions, judge
-from stcal.locate.views import CalibrationImages, read_images
+from stcal.locate.views import CalibrationImages
 from stcal.synthetic.exposure import Light, expose
 
 BOARD = CharucoDesign(7, 5, 36.195, 18.256, "DICT_6X6_250")
@@ -55,10 +57,12 @@ def charuco_camera(folder: Path) -> CameraModel:
 
 def charuco_images(folder: Path) -> CalibrationImages:
     """All images of the set in the order of their numbers."""
-    found = read_images(folder / "images", charuco_camera(folder), BOARD, (BOARD.dictionary,), workers=1)
+    found = calibration_images(
+        folder / "images", charuco_camera(folder), BOARD, (BOARD.dictionary,), 1, lambda *_: None
+    )
     order = sorted(range(len(found.names)), key=lambda i: int(Path(found.names[i]).stem))
     names, views, tags = (tuple(values[i] for i in order) for values in (found.names, found.views, found.tags))
-    return CalibrationImages(names, views, tags, found.camera, found.left_out)
+    return replace(found, names=names, views=views, tags=tags)
 
 
 def halves(images: CalibrationImages) -> list[tuple[list[int], list[int]]]:

@@ -2,12 +2,17 @@
 
 from enum import StrEnum
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
 from stcal.cli.saving import save, save_json
 from stcal.errors import InputError
+
+if TYPE_CHECKING:
+    from stcal.camera_file import CameraModel
+    from stcal.cli.board_views import Board
+    from stcal.locate.views import CalibrationImages
 
 app = typer.Typer(
     name="stcal locate",
@@ -57,25 +62,16 @@ def calibrate(
     """Where the corners of the target's tags lie, with σ; the frame in the middle of the layout's origin tag."""
     from stcal.boards.board_file import load_flat_board
     from stcal.camera_file import read_camera
-    from stcal.cli import circle_views as circles
     from stcal.cli.progress import StageProgress
-    from stcal.design import BoardDesign
     from stcal.locate.calibrate import calibrate as calibrated
     from stcal.locate.calibrate_report import calibrated_json, calibrated_text, warnings
     from stcal.locate.layout import layout_toml, load_plan
-    from stcal.locate.views import read_images
 
     plan, design, model = load_plan(layout), load_flat_board(board), read_camera(camera)
-    dots = isinstance(design, BoardDesign)
     dictionaries = tuple(dict.fromkeys(dictionary for dictionary, _ in plan.tags))
     with StageProgress() as progress:
-        found = read_images(images, model, None if dots else design, dictionaries, workers, progress)
-        views = found.views
-        if dots:
-            by_name = circles.circle_views(images, model, design, workers, progress)
-            views = [by_name.get(name) for name in found.names]
-    symmetries = circles.symmetries(design) if dots else design.symmetries()
-    result = calibrated(plan, views, found.tags, found.names, found.camera, symmetries)
+        found = calibration_images(images, model, design, dictionaries, workers, progress)
+    result = calibrated(plan, found.views, found.tags, found.names, found.camera, found.symmetries)
     print(calibrated_text(result))
     for each in (*found.left_out, *result.left_out):
         print(f"left out: {each}")
@@ -180,3 +176,18 @@ def run(
     if not accepted(results):
         print(f"no pose accepted in {len(results)} scene{'s' * (len(results) > 1)}")
         raise typer.Exit(NOTHING_ACCEPTED)
+
+
+def calibration_images(
+    folder: Path, model: "CameraModel", board: "Board", dictionaries: tuple[str, ...], workers: int | None, progress
+) -> "CalibrationImages":
+    """Board and tags in all images of a folder; ``progress`` is told (stage, done, total)."""
+    from stcal.cli.board_views import look
+    from stcal.images import find_images
+    from stcal.locate.views import CalibrationImages
+
+    files, skipped = find_images(folder)
+    sights = look(files, model, board, dictionaries, workers, lambda done, total: progress("images", done, total))
+    names, views, tags = zip(*((sight.name, sight.view, sight.tags) for sight in sights.images), strict=True)
+    left_out = tuple(f"{each.name}: {each.reason}" for each in (*skipped, *sights.skipped) if each.name not in names)
+    return CalibrationImages(names, views, tags, sights.camera, sights.symmetries, left_out)

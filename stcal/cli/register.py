@@ -6,6 +6,7 @@ from typing import Annotated
 
 import typer
 
+from stcal.cli.saving import save, save_json
 from stcal.errors import ConvergenceError, DegenerateError, InputError
 
 
@@ -50,7 +51,6 @@ def register(
     report: Annotated[Path | None, typer.Option("--report", help="A page with tables and pictures (HTML).")] = None,
 ) -> None:
     """b_from_a from points measured in two frames, some of which may be wrong; with σ, outliers and where it holds."""
-    from stcal.cli.robot import _save, _save_json
     from stcal.register import register as registered
     from stcal.register.findings import findings
     from stcal.register.pairs import read_pairs
@@ -88,11 +88,11 @@ def register(
             sections.append(comparison_section(beside))
             if identified:
                 comments = [f"Identified from {pairs_file.name}: {beside.identified.rank} parameters."]
-                _save(identified, robot_toml(beside.identified.robot, comments))
+                save(identified, robot_toml(beside.identified.robot, comments))
         except (DegenerateError, ConvergenceError) as error:  # the transform stands all the same
             failed = error
-    _save_json(out, content)
+    save_json(out, content)
     if report:
-        _save(report, registration_page(found, sections))
+        save(report, registration_page(found, sections))
     if failed is not None:
         raise failed

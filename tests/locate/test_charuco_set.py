@@ -10,10 +10,11 @@ import yaml
 from stcal.boards.design import CharucoDesign
 from stcal.boards.tags import find_tags
 from stcal.camera_file import CameraModel
+from stcal.cli.locate import calibration_images
 from stcal.locate.holdout import half_calibrated, subset_trials
 from stcal.locate.layout import LayoutPlan
 from stcal.locate.merge import merge
-from stcal.locate.views import CalibrationImages, read_images
+from stcal.locate.views import CalibrationImages
 from stcal.synthetic.exposure import Light, expose
 
 BOARD = CharucoDesign(7, 5, 36.195, 18.256, "DICT_6X6_250")
@@ -36,7 +37,7 @@ def images(folder) -> CalibrationImages:
     camera = CameraModel(
         np.array([k["fx"], k["fy"]]), np.array([k["cx"], k["cy"]]), np.zeros(8), "PINHOLE", None, None, "cal_data.yaml"
     )
-    return read_images(folder / "images", camera, BOARD, (BOARD.dictionary,), workers=1)
+    return calibration_images(folder / "images", camera, BOARD, (BOARD.dictionary,), 1, lambda *_: None)
 
 
 @pytest.fixture(scope="module", params=[0, 1])
