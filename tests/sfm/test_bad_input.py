@@ -15,7 +15,6 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
-from tests.outcome import COMPUTATION, INPUT, assert_error, lines_of
 
 from stcal.camera_file import read_camera
 from stcal.design_file import board_toml, target_toml
@@ -23,6 +22,7 @@ from stcal.geometry.rigid import Rigid
 from stcal.images import decode
 from stcal.synthetic.observe import image_circles
 from stcal.synthetic.render import RenderOptions, encode, render
+from tests.outcome import COMPUTATION, INPUT, assert_error, lines_of
 
 RESULTS = ("faces.json", "report.json", "report.html", "database.db")
 

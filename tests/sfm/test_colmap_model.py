@@ -13,7 +13,6 @@ from dataclasses import replace
 import numpy as np
 import pycolmap
 import pytest
-from tests.outcome import COMPUTATION, INPUT, assert_error
 
 from stcal.errors import InputError, MappingError, ScaleError
 from stcal.sfm.colmap_model import find_models, open_model, read_model, write_model
@@ -23,6 +22,7 @@ from stcal.sfm.foreign import faces_from_models
 from stcal.sfm.mapping import seeded_mapping
 from stcal.sfm.pipeline import calibrate_models
 from stcal.sfm.saved import load_run
+from tests.outcome import COMPUTATION, INPUT, assert_error
 
 FILES = ("cameras", "rigs", "frames", "images", "points3D")
 SAME_MM = 1e-9

@@ -17,7 +17,6 @@ from hashlib import sha256
 from pathlib import Path
 
 import pytest
-from tests.outcome import COMPUTATION, INPUT, INTERRUPTED, assert_error, lines_of
 
 from stcal.errors import InputError, MappingError
 from stcal.sfm import native
@@ -27,6 +26,7 @@ from stcal.sfm.mapping import pipeline_options
 from stcal.sfm.native import NativeColmap, find_colmap, map_natively, require_listable
 from stcal.sfm.pipeline import write_report
 from stcal.sfm.saved import load_run
+from tests.outcome import COMPUTATION, INPUT, INTERRUPTED, assert_error, lines_of
 
 INSTALL = "install it with `sudo apt-get install colmap`"
 

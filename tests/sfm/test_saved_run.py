@@ -8,7 +8,6 @@ from dataclasses import asdict
 import cv2
 import numpy as np
 import pytest
-from tests.outcome import INPUT, assert_error
 
 from stcal.errors import InputError
 from stcal.sfm import run
@@ -17,6 +16,7 @@ from stcal.sfm.options import RunOptions
 from stcal.sfm.pairs import PairOptions
 from stcal.sfm.pipeline import claim_folder
 from stcal.sfm.saved import load_run, marker_json
+from tests.outcome import INPUT, assert_error
 
 FRAME = ("id", "ids", "origin", "x", "y")
 UNLABELLED = "12/IMG_1001.jpg"
