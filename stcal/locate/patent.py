@@ -17,6 +17,8 @@ from stcal.locate.verdict import Check, Verdict
 
 SAME_RAD, SAME_SHARE = 1e-3, 1e-3
 """T_a and T_b are the same pose when they differ by less: turned, and shifted in shares of the distance."""
+TINY_PX = 1e-9
+"""Error of a pose that fits exactly, for the ratio."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -132,7 +134,7 @@ def locate_as_patent(
     i, found, errors = best
     first, second = found.poses if errors[0] <= errors[1] else found.poses[::-1]
     errors = sorted(errors)
-    verdict = gate(found.determinant, errors[0], errors[1] / errors[0], same_pose(first, second), options)
+    verdict = gate(found.determinant, errors[0], errors[1] / max(errors[0], TINY_PX), same_pose(first, second), options)
     return PatentPose(
         i, tuple(chosen), first, second, (errors[0], errors[1]), found.determinant, len(known[i]), verdict
     )

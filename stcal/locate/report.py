@@ -15,7 +15,7 @@ from stcal.locate.run import Located
 from stcal.locate.tables import accepted, camera_from_obj
 from stcal.page import AXIS_COLOURS, COLOURS, Html, number, page, table
 
-WIDE_PX, SMALL_PX = 900, 260
+WIDE_PX, SMALL_PX = 900, 215
 COLOUR = {"accept": "#1b7f3b", "ambiguous": "#a15c00", "reject": "#b3261e"}
 
 

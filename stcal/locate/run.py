@@ -127,7 +127,8 @@ def _scene_troubles(merged: Merged, options: LocateOptions) -> list[str]:
         return [f"tags seen twice: {names}; every id once in view needed; cover the copy"]
     if not len(merged.seen):
         return ["no tag of the layout; 1 needed"]
-    return [_moved_text(shift) for shift in merged.shifts if moved(shift, options)]
+    away = [shift for shift in merged.shifts if moved(shift, options)]
+    return [_moved_text(max(away, key=lambda shift: shift.shift_px), len(away) - 1)] if away else []
 
 
 def moved(shift: Shift, options: LocateOptions) -> bool:
@@ -135,10 +136,11 @@ def moved(shift: Shift, options: LocateOptions) -> bool:
     return shift.shift_px > max(options.moved_px, MOVED_SIGMAS * shift.sigma_px)
 
 
-def _moved_text(shift: Shift) -> str:
+def _moved_text(shift: Shift, others: int) -> str:
     first, second = shift.exposures
+    more = f" (and between {others} more pairs)" if others else ""
     return (
-        f"the scene moved between {first} and {second}: {shift.tags} tags by {shift.shift_px:.2f} px; "
+        f"the scene moved between {first} and {second}: {shift.tags} tags by {shift.shift_px:.2f} px{more}; "
         "take the exposures with camera and target at rest"
     )
 

@@ -118,7 +118,10 @@ def _scene_json(each: Located, layout: TargetLayout, chain: Chain | None) -> dic
     pose = camera_from_obj(each)
     content["camera_from_obj"] = None if pose is None else pose.matrix().tolist()
     if each.patent is not None:
-        content |= {"twin": each.patent.twin.matrix().tolist(), "errors_px": list(each.patent.errors_px)}
+        content |= {
+            "twin": each.patent.twin.matrix().tolist(),
+            "errors_px": [_finite(error) for error in each.patent.errors_px],
+        }
     if each.pose is not None:
         content |= _pose_json(each, layout)
     if chain and pose is not None and not chain.without_pose([each.name]):

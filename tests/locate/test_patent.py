@@ -86,3 +86,14 @@ def test_without_tags_there_is_no_pose():
     empty = Tags((), np.zeros((0, 4, 2)), np.zeros((0, 4, 2, 2)))
     with pytest.raises(DegenerateError, match="no tag"):
         locate_as_patent([empty], LAYOUT, CAMERA)
+
+
+def test_a_pose_that_fits_exactly_has_a_ratio():
+    found = locate_as_patent(exact_tags(), LAYOUT, CAMERA)
+    assert found.verdict.decision == "accept"
+
+
+def exact_tags() -> list[Tags]:
+    flat = np.pad(LAYOUT.corners_mm.reshape(-1, 2), ((0, 0), (0, 1)))
+    corners = CAMERA.project(TRUTH @ flat).reshape(-1, 4, 2)
+    return [Tags(LAYOUT.tags, corners, np.tile(np.eye(2), (len(corners), 4, 1, 1)))]
