@@ -85,16 +85,17 @@ def test_a_scene_takes_little_longer_than_its_decoding(folder, images, tmp_path)
         images.camera.focal, images.camera.centre, images.camera.distortion, "PINHOLE", None, None, "cal_data.yaml"
     )
     ratios = []
-    for _ in range(6):  # the first warms up; of the others the best, for machines with other work to do
-        start = time.perf_counter()
+    for _ in range(4):  # the first warms up
+        start = time.process_time()
         for file in scenes[0].files:
             decode(file.path.read_bytes(), file.name)
-        middle = time.perf_counter()
+        middle = time.process_time()
         result = next(iter(run(scenes, layout, model)))
-        ratios.append((time.perf_counter() - middle) / (middle - start))
-    print(f"scene over decoding: {min(ratios[1:]):.2f}")
+        ratios.append((time.process_time() - middle) / (middle - start))
     assert result.verdict.decision == "accept"
-    assert min(ratios[1:]) < 3
+    # Three times the decoding on two cores, all of which work; time on the clock is the script's to measure, since
+    # other work on the machine takes cores away.
+    assert min(ratios[1:]) < 2 * 3
 
 
 def test_exposures_together_see_more(folder, images):
