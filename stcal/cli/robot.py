@@ -1,14 +1,13 @@
 """``stcal robot``: kinematics from measured data, and joint values that reach what was commanded."""
 
-import json
 import math
-import os
 from enum import StrEnum
 from pathlib import Path
 from typing import Annotated
 
 import typer
 
+from stcal.cli.saving import save, save_json
 from stcal.errors import InputError
 
 app = typer.Typer(
@@ -34,14 +33,12 @@ def init(
 
     if file.exists():
         raise InputError(f"robot file {file}: exists already; give another name or move it away")
-    file.parent.mkdir(parents=True, exist_ok=True)
     comments = (
         "One [[joint]] for each joint, from the base; of type revolute or prismatic (then min_mm and max_mm).",
         "Optional: min_deg, max_deg, beta_deg, base, tool, [[target]] for more tools, and coupling, which makes",
         "kinematic joint values of the controller's (Fanuc: its third row is [0, 1, 1, 0, 0, 0]).",
     )
-    file.write_text(robot_toml(mh80(), comments), encoding="utf-8")
-    print(f"written: {file}")
+    save(file, robot_toml(mh80(), comments))
 
 
 @app.command()
@@ -63,15 +60,16 @@ def axes(
 
     nominal = load_robot(robot_file)
     data = read_measurements(sweeps, nominal)
+    _print_notes(data)
     result = robot_from_sweeps(data, nominal, math.radians(still_deg))
     print(axes_text(result))
     for note in result.notes:
         print(f"warning: {data.where}: {note}")
     if out:
-        _save(out, robot_toml(result.robot, [f"Identified by the axis method from {sweeps.name}."]))
-    _save_json(json_file, axes_json(result))
+        save(out, robot_toml(result.robot, [f"Identified by the axis method from {sweeps.name}."]))
+    save_json(json_file, axes_json(result))
     if report:
-        _save(report, axes_page(result, data.where))
+        save(report, axes_page(result, data.where))
 
 
 class Kind(StrEnum):
@@ -105,22 +103,23 @@ def identify(
 ) -> None:
     """Identify the kinematics from poses, positions or distances; σ not given are estimated."""
     from stcal.robot.data import read_measurements
-    from stcal.robot.identify import IdentifyOptions
-    from stcal.robot.identify import identify as identified_from
-    from stcal.robot.identify_report import identified_json, identified_page, identified_text
+    from stcal.robot.identification import IdentifyOptions
+    from stcal.robot.identification import identify as identified_from
+    from stcal.robot.identification_report import identified_json, identified_page, identified_text
     from stcal.robot.robot_file import load_robot, robot_toml
 
     nominal = load_robot(robot_file)
     data = read_measurements(data_file, nominal)
     kind = observe.value if observe else None
     options = IdentifyOptions(kind, sigma_mm, sigma_rad, robust, folds, seed=seed, partial=partial)
+    _print_notes(data)
     result = identified_from(nominal, data, options)
     print(identified_text(result, nominal))
     if out:
-        _save(out, robot_toml(result.robot, [f"Identified from {data_file.name}: {result.rank} parameters."]))
-    _save_json(json_file, identified_json(result, nominal))
+        save(out, robot_toml(result.robot, [f"Identified from {data_file.name}: {result.rank} parameters."]))
+    save_json(json_file, identified_json(result, nominal))
     if report:
-        _save(report, identified_page(result, nominal))
+        save(report, identified_page(result, nominal))
 
 
 @app.command()
@@ -137,7 +136,7 @@ def compensate(
     report: ReportFile = None,
 ) -> None:
     """Joint values that really reach commanded poses, beside the nominal ones."""
-    from stcal.robot import compensate as stage
+    from stcal.robot import compensation as stage
     from stcal.robot.robot_file import load_robot
 
     identified = load_robot(robot_file)
@@ -149,12 +148,12 @@ def compensate(
     for note in result.notes():
         print(f"warning: {wanted.where}: {note}")
     if out:
-        _save(out, stage.compensated_csv(result, identified))
-    _save_json(json_file, stage.compensated_json(result, identified))
+        save(out, stage.compensated_csv(result, identified))
+    save_json(json_file, stage.compensated_json(result, identified))
     if report:
         from stcal.robot.use_report import compensation_page
 
-        _save(report, compensation_page(result, identified))
+        save(report, compensation_page(result, identified))
 
 
 @app.command()
@@ -167,7 +166,7 @@ def verify(
     report: ReportFile = None,
 ) -> None:
     """Distances of measured positions from the first, against the commanded ones; sets before and after compared."""
-    from stcal.robot import verify as stage
+    from stcal.robot import verification as stage
 
     if plot and plot.suffix.lower() not in (".png", ".svg"):
         raise InputError(f"--plot {plot}: a name ending in .png or .svg needed")
@@ -178,12 +177,12 @@ def verify(
     if plot:
         from stcal.robot.use_report import figure_bytes, verification_figure
 
-        _save(plot, figure_bytes(verification_figure(result), plot.suffix.lower()[1:]))
-    _save_json(json_file, stage.verified_json(result))
+        save(plot, figure_bytes(verification_figure(result), plot.suffix.lower()[1:]))
+    save_json(json_file, stage.verified_json(result))
     if report:
         from stcal.robot.use_report import verification_page
 
-        _save(report, verification_page(result))
+        save(report, verification_page(result))
 
 
 class Observed(StrEnum):
@@ -208,6 +207,7 @@ def design(
     ] = None,
     target: Annotated[str, typer.Option(help="Name of the target (tool) that is measured.")] = "",
     json_file: JsonFile = None,
+    report: ReportFile = None,
 ) -> None:
     """Choose measurement poses that show the robot's parameters best."""
     from stcal.robot import plan_poses as stage
@@ -220,8 +220,12 @@ def design(
     result = stage.design(robot, options)
     print(stage.design_text(result))
     if out:
-        _save(out, stage.design_csv(result, robot))
-    _save_json(json_file, stage.design_json(result))
+        save(out, stage.design_csv(result, robot))
+    save_json(json_file, stage.design_json(result))
+    if report:
+        from stcal.robot.design_report import design_page
+
+        save(report, design_page(result, robot))
 
 
 def _box(text: str) -> tuple[float, ...]:
@@ -231,18 +235,6 @@ def _box(text: str) -> tuple[float, ...]:
         raise InputError(f"--box {text}: six numbers with commas between needed, in mm") from error
 
 
-def _save_json(path: Path | None, content: dict) -> None:
-    if path:
-        _save(path, json.dumps(content, indent=1, ensure_ascii=False, allow_nan=False) + "\n")
-
-
-def _save(path: Path, content: str | bytes) -> None:
-    """Write a file at once, complete or not at all."""
-    partial = path.with_name(f"{path.name}.{os.getpid()}.partial")
-    try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        partial.write_bytes(content.encode() if isinstance(content, str) else content)
-        os.replace(partial, path)
-    finally:
-        partial.unlink(missing_ok=True)
-    print(f"written: {path}")
+def _print_notes(data) -> None:
+    for note in data.notes:
+        print(f"note: {data.where}: {note}")
