@@ -10,6 +10,7 @@ import yaml
 
 from stcal.errors import InputError
 from stcal.geometry.camera import Camera
+from stcal.saving import save
 
 COLMAP_PIXEL_ORIGIN = 0.5
 """COLMAP's coordinate of the centre of the top-left pixel; OpenCV's, and ours, is 0."""
@@ -155,7 +156,7 @@ def write_cameras_txt(
         lines.append(f"{SIGMA} {' '.join(repr(float(s)) for s in sigma)}")
         lines += [f"{CORRELATION} {' '.join(repr(float(c)) for c in row)}" for row in correlation]
     lines.append(f"1 {colmap_model} {camera.width} {camera.height} {params}")
-    Path(path).write_text("\n".join(lines) + "\n", encoding="utf-8")
+    save(Path(path), "\n".join(lines) + "\n")
 
 
 def _stated_covariance(text: str, count: int, path: Path) -> np.ndarray | None:

@@ -43,7 +43,7 @@ def layer(module: str) -> int:
     """Rank in errors ← geometry ← design ← stages ← pipeline ← cli; a module imports its own rank and below."""
     parts = module.split(".")[1:]
     match parts:
-        case [] | ["errors" | "parallel" | "page", *_]:  # parallel.py, page.py: helpers below everything
+        case [] | ["errors" | "parallel" | "page" | "saving", *_]:  # helpers below everything
             return 0
         case ["geometry", *_]:
             return 1

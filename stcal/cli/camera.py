@@ -1,6 +1,5 @@
 """``stcal-sfm calibrate-camera``: intrinsics from photographs of the board."""
 
-import json
 from pathlib import Path
 from typing import Annotated
 
@@ -13,6 +12,7 @@ from stcal.cli.sfm import BoardFile, TargetFile, Workers
 from stcal.design import reference_board, reference_target
 from stcal.design_file import load_board, load_target
 from stcal.errors import InputError
+from stcal.saving import json_text, save
 
 app = typer.Typer()
 
@@ -48,7 +48,7 @@ def calibrate_camera(
     write_cameras_txt(out, result.intrinsics.camera, model, result.intrinsics.covariance)
     summary = calibration_json(result)
     json_file = json_file or out.with_suffix(".json")
-    json_file.write_text(json.dumps(summary, indent=1, ensure_ascii=False, allow_nan=False) + "\n", encoding="utf-8")
+    save(json_file, json_text(summary))
     _print(result, summary)
     print(f"camera file: {out}\nfigures and checks: {json_file}")
 

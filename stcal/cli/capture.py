@@ -1,6 +1,5 @@
 """``stcal-sfm plan`` and ``stcal-sfm advise``: what to photograph, before and after."""
 
-import json
 from itertools import permutations
 from pathlib import Path
 from typing import Annotated
@@ -13,6 +12,7 @@ from stcal.cli.progress import StageProgress
 from stcal.design import TargetDesign, reference_board, reference_target
 from stcal.design_file import load_board, load_target
 from stcal.errors import InputError
+from stcal.saving import json_text, save
 
 app = typer.Typer()
 
@@ -120,5 +120,5 @@ def _pairs(text: str, target: TargetDesign) -> tuple[tuple[str, str], ...]:
 
 def _write(out: Path | None, content: dict) -> None:
     if out is not None:
-        out.write_text(json.dumps(content, indent=1, ensure_ascii=False) + "\n", encoding="utf-8")
+        save(out, json_text(content))
         print(f"as JSON: {out}")

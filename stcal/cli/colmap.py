@@ -1,6 +1,5 @@
 """``stcal-sfm``: what goes to and comes from COLMAP, and why something was left out."""
 
-import json
 import os
 from pathlib import Path
 from typing import Annotated
@@ -9,6 +8,7 @@ import typer
 
 from stcal.cli.progress import StageProgress
 from stcal.errors import InputError, MappingError
+from stcal.saving import json_text, save
 
 app = typer.Typer()
 
@@ -154,7 +154,7 @@ def pairs(
         print(pairs_table(name, images, rows, len(rows) if everything else SHOWN_PAIRS), end="\n\n")
     print(limits_text(saved.options.pairs))
     if out:
-        out.write_text(json.dumps(pairs_json(found), indent=1) + "\n", encoding="utf-8")
+        save(out, json_text(pairs_json(found)))
         print(f"as JSON: {out}")
 
 
@@ -181,5 +181,5 @@ def doctor(
         diagnosis = diagnose(saved, images, workers, progress)
     print(findings.table(diagnosis, None if everything else findings.MAX_LINES))
     if out:
-        out.write_text(json.dumps(findings.to_json(diagnosis), indent=1) + "\n", encoding="utf-8")
+        save(out, json_text(findings.to_json(diagnosis)))
         print(f"as JSON: {out}")

@@ -1,6 +1,5 @@
 """``stcal-sfm measure``: the calibrated target at work."""
 
-import json
 from pathlib import Path
 from typing import Annotated
 
@@ -12,6 +11,7 @@ from stcal.cli.sfm import CameraFile, MaxDiameter, MinDiameter, TargetFile, Work
 from stcal.design import reference_target
 from stcal.design_file import load_board, load_target
 from stcal.errors import InputError
+from stcal.saving import json_text, save
 
 app = typer.Typer()
 
@@ -25,6 +25,9 @@ def measure(
     out: Annotated[Path, typer.Option("--out", help="Table of the poses (CSV).")] = Path("poses.csv"),
     json_file: Annotated[
         Path | None, typer.Option("--json", help="Also write everything as JSON, both poses of an undecided image too.")
+    ] = None,
+    report: Annotated[
+        Path | None, typer.Option("--report", help="Also write a page with the poses, their σ and plots (HTML).")
     ] = None,
     joints: Annotated[
         Path | None,
@@ -46,13 +49,12 @@ def measure(
 ) -> None:
     """Pose of a calibrated target in each image, from whatever faces it shows, with its 6×6 covariance."""
     from stcal.sfm import measure as work
-    from stcal.sfm.detection import write_bytes
     from stcal.sfm.pipeline import load_design
     from stcal.sfm.single_pose import PoseOptions
     from stcal.sfm.target_circles import read_target
     from stcal.table_file import read_table
 
-    for path in (out, json_file):
+    for path in (out, json_file, report):
         if path is not None and not path.parent.is_dir():
             raise InputError(f"{path}: no folder {path.parent}; make it, or give another place")
     design = load_design(target, reference_target, load_target)
@@ -69,9 +71,13 @@ def measure(
     print(work.measure_text(result))
     for each in apart:
         print(f"not joined: {each}")
-    write_bytes(out, text.encode())
+    save(out, text)
     print(f"poses: {out}")
     if json_file:
-        content = json.dumps(work.measure_json(result), indent=1, ensure_ascii=False, allow_nan=False) + "\n"
-        write_bytes(json_file, content.encode())
+        save(json_file, json_text(work.measure_json(result)))
         print(f"as JSON: {json_file}")
+    if report:
+        from stcal.sfm.report_measure import measure_page
+
+        save(report, measure_page(result, str(images)))
+        print(f"report: {report}")

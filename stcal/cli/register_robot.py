@@ -16,7 +16,7 @@ from stcal.register.findings import Findings
 from stcal.register.pairs import WHAT, Pairs
 from stcal.register.report import matrix_lines, matrix_table
 from stcal.robot.data import Measurements, joint_values
-from stcal.robot.identify import Identified, IdentifyOptions, identify
+from stcal.robot.identification import Identified, IdentifyOptions, identify
 from stcal.robot.kinematics import forward
 from stcal.robot.model import Robot
 from stcal.robot.robot_file import load_robot

@@ -33,14 +33,12 @@ def init(
 
     if file.exists():
         raise InputError(f"robot file {file}: exists already; give another name or move it away")
-    file.parent.mkdir(parents=True, exist_ok=True)
     comments = (
         "One [[joint]] for each joint, from the base; of type revolute or prismatic (then min_mm and max_mm).",
         "Optional: min_deg, max_deg, beta_deg, base, tool, [[target]] for more tools, and coupling, which makes",
         "kinematic joint values of the controller's (Fanuc: its third row is [0, 1, 1, 0, 0, 0]).",
     )
-    file.write_text(robot_toml(mh80(), comments), encoding="utf-8")
-    print(f"written: {file}")
+    save(file, robot_toml(mh80(), comments))
 
 
 @app.command()
@@ -62,6 +60,7 @@ def axes(
 
     nominal = load_robot(robot_file)
     data = read_measurements(sweeps, nominal)
+    _print_notes(data)
     result = robot_from_sweeps(data, nominal, math.radians(still_deg))
     print(axes_text(result))
     for note in result.notes:
@@ -104,15 +103,16 @@ def identify(
 ) -> None:
     """Identify the kinematics from poses, positions or distances; σ not given are estimated."""
     from stcal.robot.data import read_measurements
-    from stcal.robot.identify import IdentifyOptions
-    from stcal.robot.identify import identify as identified_from
-    from stcal.robot.identify_report import identified_json, identified_page, identified_text
+    from stcal.robot.identification import IdentifyOptions
+    from stcal.robot.identification import identify as identified_from
+    from stcal.robot.identification_report import identified_json, identified_page, identified_text
     from stcal.robot.robot_file import load_robot, robot_toml
 
     nominal = load_robot(robot_file)
     data = read_measurements(data_file, nominal)
     kind = observe.value if observe else None
     options = IdentifyOptions(kind, sigma_mm, sigma_rad, robust, folds, seed=seed, partial=partial)
+    _print_notes(data)
     result = identified_from(nominal, data, options)
     print(identified_text(result, nominal))
     if out:
@@ -136,7 +136,7 @@ def compensate(
     report: ReportFile = None,
 ) -> None:
     """Joint values that really reach commanded poses, beside the nominal ones."""
-    from stcal.robot import compensate as stage
+    from stcal.robot import compensation as stage
     from stcal.robot.robot_file import load_robot
 
     identified = load_robot(robot_file)
@@ -166,7 +166,7 @@ def verify(
     report: ReportFile = None,
 ) -> None:
     """Distances of measured positions from the first, against the commanded ones; sets before and after compared."""
-    from stcal.robot import verify as stage
+    from stcal.robot import verification as stage
 
     if plot and plot.suffix.lower() not in (".png", ".svg"):
         raise InputError(f"--plot {plot}: a name ending in .png or .svg needed")
@@ -207,6 +207,7 @@ def design(
     ] = None,
     target: Annotated[str, typer.Option(help="Name of the target (tool) that is measured.")] = "",
     json_file: JsonFile = None,
+    report: ReportFile = None,
 ) -> None:
     """Choose measurement poses that show the robot's parameters best."""
     from stcal.robot import plan_poses as stage
@@ -221,6 +222,10 @@ def design(
     if out:
         save(out, stage.design_csv(result, robot))
     save_json(json_file, stage.design_json(result))
+    if report:
+        from stcal.robot.design_report import design_page
+
+        save(report, design_page(result, robot))
 
 
 def _box(text: str) -> tuple[float, ...]:
@@ -228,3 +233,8 @@ def _box(text: str) -> tuple[float, ...]:
         return tuple(float(cell) for cell in text.split(","))
     except ValueError as error:
         raise InputError(f"--box {text}: six numbers with commas between needed, in mm") from error
+
+
+def _print_notes(data) -> None:
+    for note in data.notes:
+        print(f"note: {data.where}: {note}")

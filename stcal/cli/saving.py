@@ -1,23 +1,17 @@
-"""Files that commands write: complete or not at all."""
+"""Files that commands write, and say so."""
 
-import json
-import os
 from pathlib import Path
+
+from stcal import saving
 
 
 def save(path: Path, content: str | bytes) -> None:
-    """Write a file at once, its folder too, and say so."""
-    partial = path.with_name(f"{path.name}.{os.getpid()}.partial")
-    try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        partial.write_bytes(content.encode() if isinstance(content, str) else content)
-        os.replace(partial, path)
-    finally:
-        partial.unlink(missing_ok=True)
+    """Write a file at once, complete or not at all."""
+    saving.save(path, content)
     print(f"written: {path}")
 
 
 def save_json(path: Path | None, content: dict) -> None:
     """Where a path is given."""
     if path:
-        save(path, json.dumps(content, indent=1, ensure_ascii=False, allow_nan=False) + "\n")
+        save(path, saving.json_text(content))

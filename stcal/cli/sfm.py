@@ -1,6 +1,5 @@
 """``stcal-sfm``: from images to the calibrated target."""
 
-import json
 import tempfile
 from enum import StrEnum
 from pathlib import Path
@@ -14,6 +13,7 @@ from stcal.cli.progress import StageProgress
 from stcal.design import reference_board, reference_target
 from stcal.design_file import board_toml, load_board, load_target, target_toml
 from stcal.errors import InputError
+from stcal.saving import json_text, save
 
 app = typer.Typer(
     name="stcal-sfm",
@@ -182,7 +182,7 @@ def init(folder: Annotated[Path, typer.Argument(help="Where to write the two fil
         if (folder / name).exists():
             raise InputError(f"{folder / name}: exists; move it away, or give another folder")
     for name, text in texts.items():
-        (folder / name).write_text(text, encoding="utf-8")
+        save(folder / name, text)
         print(folder / name)
 
 
@@ -246,10 +246,9 @@ def compare(
 
     comparison = against(run_folder, truth)
     print(comparison_table(comparison))
-    text = json.dumps(comparison, indent=1) + "\n"
     target = out or (run_folder / "compare.json" if run_folder.is_dir() else None)
     if target:
-        target.write_text(text, encoding="utf-8")
+        save(target, json_text(comparison))
         print(f"as JSON: {target}")
 
 

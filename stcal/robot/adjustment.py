@@ -1,12 +1,13 @@
 """Trust-region least squares over the minimal parameters of a robot, robust; what the data determine told apart."""
 
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 
 import numpy as np
-from scipy.stats import chi2
+from scipy.special import chdtri
 
 from stcal.errors import ConvergenceError
-from stcal.robot.observe import WIDTH, Observed, State, jacobian, moved, residuals
+from stcal.robot.observe import WIDTH, Kind, Observed, State, jacobian, moved, residuals
 
 MAX_STEPS = 100
 SETTLED = 1e-10
@@ -16,17 +17,22 @@ HUBER_LEVEL = 0.999
 USELESS_MM = 50.0
 """A direction (1 mm, or the turn that moves the tool by 1 mm) with a larger σ is not determined: the nominal is better.
 All parameters are held to where they start by this σ, which nothing feels that is determined."""
+STAYS_MM = 1e-3
+"""σ of a movement that the observations never show."""
 LEAST_GAIN = 1e-9
 """In units of σ²: what measurements without noise still gain by rounding."""
 
 
 @dataclass(frozen=True, slots=True)
 class Weighting:
-    """σ of one coordinate; the covariances that came with the measurements in place of both where ``given``."""
+    """σ of one coordinate; the covariances that came with the measurements in place of both where ``given``; times
+    ``factor``. ``estimated`` : which of ``"mm"``, ``"rad"``, ``"factor"`` the residuals tell."""
 
     sigma_mm: float
     sigma_rad: float
     given: bool = False
+    factor: float = 1.0
+    estimated: tuple[str, ...] = ()
 
     def whiten(self, values: np.ndarray, seen: Observed) -> np.ndarray:
         """Residuals (r, w) or derivatives (r, w, k) of ``seen`` in units of σ."""
@@ -34,12 +40,27 @@ class Weighting:
         values = values[..., None] if flat else values
         width = values.shape[1]
         if self.given and width > 1:
-            covariance = seen.data.covariance
+            covariance = self.factor**2 * seen.data.covariance
             values = np.linalg.solve(np.linalg.cholesky(covariance[:, -width:, -width:]), values)
         else:
-            sigma = [self.sigma_rad] * 3 + [self.sigma_mm] * 3
-            values = values / np.array(sigma[-width:])[:, None]
+            sigma = self.factor * np.array([self.sigma_rad] * 3 + [self.sigma_mm] * 3)
+            values = values / sigma[-width:, None]
         return values[..., 0] if flat else values
+
+    def columns(self, width: int) -> dict[str, slice]:
+        """Which of the ``width`` coordinates each σ is of."""
+        if "factor" in self.estimated:
+            return {"factor": slice(None)}
+        return {"rad": slice(0, 3), "mm": slice(3, 6)} if width == 6 else {"mm": slice(None)}
+
+    def value(self, name: str) -> float:
+        """Of σ ``name``."""
+        return {"mm": self.sigma_mm, "rad": self.sigma_rad, "factor": self.factor}[name]
+
+    def with_values(self, found: Mapping[str, float]) -> "Weighting":
+        """With other σ."""
+        new = {name: found.get(name, self.value(name)) for name in ("mm", "rad", "factor")}
+        return replace(self, sigma_mm=new["mm"], sigma_rad=new["rad"], factor=new["factor"])
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -49,6 +70,14 @@ class Held:
     value: np.ndarray
     slope: np.ndarray
     sigma: np.ndarray
+
+    def normal(self) -> np.ndarray:
+        """(k, k)"""
+        return (self.slope.T / self.sigma**2) @ self.slope
+
+    def pull(self) -> np.ndarray:
+        """(k,) half the gradient of the squares."""
+        return (self.slope.T / self.sigma**2) @ self.value
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -93,12 +122,11 @@ def solve(
     ConvergenceError
         No minimum is reached.
     """
-    limit = np.sqrt(chi2.ppf(HUBER_LEVEL, WIDTH[seen.kind])) if robust else np.inf
+    limit = huber_limit(seen.kind) if robust else np.inf
     solution, gradient = _linearised(state, seen, weighting, limit)
-    hold, pull = np.diag((USELESS_MM * solution.units) ** -2.0), np.zeros(len(solution.units))
+    hold, pull = _fixed(solution, seen.kind), np.zeros(len(solution.units))
     if held is not None:
-        weighted = held.slope.T / held.sigma**2
-        hold, pull = hold + weighted @ held.slope, weighted @ held.value
+        hold, pull = hold + held.normal(), held.pull()
     away, damping = np.zeros(len(hold)), 1e-3
     for _ in range(MAX_STEPS):
         normal, slope = solution.normal + hold, gradient - hold @ away - pull
@@ -124,6 +152,23 @@ def solve(
     )
 
 
+def unseen(kind: Kind) -> int:
+    """Directions that this kind of observation never shows: where the instrument stands."""
+    return 6 if kind == "distance" else 0
+
+
+def _fixed(solution: Solution, kind: Kind) -> np.ndarray:
+    """(k, k) what keeps parameters where they start: hardly at all, but what is never seen does not drift."""
+    blind = solution.spectrum()[1][:, : unseen(kind)]
+    fixed = np.eye(len(blind)) / USELESS_MM**2 + blind @ blind.T / STAYS_MM**2
+    return fixed / solution.units[:, None] / solution.units
+
+
+def huber_limit(kind: Kind) -> float:
+    """Length of an observation's whitened residual beyond which it weighs less."""
+    return float(np.sqrt(chdtri(WIDTH[kind], 1 - HUBER_LEVEL)))
+
+
 def normal_rank(state: State, seen: Observed, weighting: Weighting) -> int:
     """How many parameters these observations determine, at the state where they would be exact."""
     return _linearised(state, seen, weighting, np.inf)[0].rank()
@@ -132,7 +177,7 @@ def normal_rank(state: State, seen: Observed, weighting: Weighting) -> int:
 def _linearised(state: State, seen: Observed, weighting: Weighting, limit: float) -> tuple[Solution, np.ndarray]:
     """State with its normal matrix, and the gradient (k,)."""
     found, derivative = residuals(state, seen), jacobian(state, seen)
-    units = _units(derivative)
+    units = parameter_units(derivative)
     white, slope = weighting.whiten(found, seen), weighting.whiten(derivative, seen)
     weights = np.minimum(1.0, limit / np.maximum(np.linalg.norm(white, axis=1), 1e-300))
     flat = slope.reshape(-1, slope.shape[2])
@@ -142,7 +187,7 @@ def _linearised(state: State, seen: Observed, weighting: Weighting, limit: float
     return Solution(state, found, weights, normal, units, cost, np.zeros_like(normal)), weighted.T @ white.ravel()
 
 
-def _units(derivative: np.ndarray) -> np.ndarray:
+def parameter_units(derivative: np.ndarray) -> np.ndarray:
     """Of each parameter, what moves the tool by 1 mm RMS at most; 1 for what moves nothing."""
     lengths = derivative[:, -3:] if derivative.shape[1] > 1 else derivative
     moves = np.sqrt((lengths**2).sum(1).mean(0))

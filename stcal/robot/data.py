@@ -1,7 +1,7 @@
 """Measured data of robots: joint values with the positions, poses or distances that an instrument saw."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -13,8 +13,12 @@ from stcal.robot.model import Robot
 from stcal.table_file import ANGLES, LENGTHS, Table, read_table
 
 WHAT = "robot data"
+STATUS, AMBIGUOUS = "status", "ambiguous"
+"""Column and word of ``stcal-sfm measure``."""
 MAX_TURNS = 4
 """Joint values beyond so many turns are degrees in a column of radians."""
+FARTHEST = {"mm": 1e7, "rad": 100 * 2 * np.pi}
+"""10 km and a hundred turns: what is beyond is no length and no joint value."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -25,6 +29,7 @@ class Measurements:
     (m,) names of the reflector or target seen; ``positions`` : (m, 3) mm in the instrument's frame; ``rotations`` :
     (m, 3, 3) where poses were measured; ``covariance`` : (m, 6, 6) of the poses where known; ``distances`` : (m,) mm,
     where only these were measured, from the position at row ``from_row``, (m,), from 0. What was not measured is None.
+    ``notes`` : on rows of the file that are not here.
     """
 
     where: str
@@ -36,6 +41,7 @@ class Measurements:
     covariance: np.ndarray | None = None
     distances: np.ndarray | None = None
     from_row: np.ndarray | None = None
+    notes: tuple[str, ...] = ()
 
     def __post_init__(self):
         m = len(self.q)
@@ -61,6 +67,7 @@ class Measurements:
             self.q[rows],
             tuple(self.targets[i] for i in rows),
             *(None if a is None else a[rows] for a in (self.positions, self.rotations, self.covariance)),
+            notes=self.notes,
         )
 
     def poses(self) -> Poses:
@@ -73,6 +80,9 @@ class Measurements:
 def read_measurements(path: str | Path, robot: Robot) -> Measurements:
     """Read joint values with positions, poses or distances (form: ``data_layout.md``).
 
+    Poses of which their ``status`` says that another one fits the image as well, and copies of a row, are left out with
+    a note.
+
     Raises
     ------
     InputError
@@ -83,17 +93,57 @@ def read_measurements(path: str | Path, robot: Robot) -> Measurements:
     targets = tuple(table.text("target")) if "target" in table else ("",) * len(table)
     common = (table.where, table.lines, q, targets)
     if table.has("x", LENGTHS):
-        positions = table.points()
         if table.has_rotation():
-            return Measurements(*common, positions, table.poses().rotation, table.pose_covariances())
-        return Measurements(*common, positions)
+            poses = table.poses()
+            data = Measurements(*common, poses.translation, poses.rotation, table.pose_covariances())
+        else:
+            data = Measurements(*common, table.points())
+        _within(table, "position", data.positions, "mm")
+        return _usable(data, table)
     if not table.has("distance", LENGTHS):
         raise InputError(
             f"{table.where}: neither x_mm, y_mm, z_mm nor distance_mm; what was measured is needed; "
             f"the header is {table.header()}"
         )
     distances = table.quantity("distance", LENGTHS)
+    _within(table, "distance", distances, "mm")
     return Measurements(*common, distances=distances, from_row=_from_rows(table, distances))
+
+
+def _within(table: Table, name: str, values: np.ndarray, unit: str) -> None:
+    """No value (m,) or (m, k) beyond what can be."""
+    bad = np.flatnonzero((np.abs(values).reshape(len(values), -1) > FARTHEST[unit]).any(axis=1))
+    if len(bad):
+        raise InputError(
+            f"{table.where}: line {table.lines[bad[0]]}: {name} is beyond {FARTHEST[unit]:.4g} {unit}; correct it, or "
+            "remove the line"
+        )
+
+
+def _usable(data: Measurements, table: Table) -> Measurements:
+    """Without the poses that are as likely wrong, and without copies of rows, which would count as measurements."""
+    undecided = np.zeros(len(data), bool)
+    if STATUS in table:
+        undecided = np.array([status == AMBIGUOUS for status in table.text(STATUS)])
+    rotations = np.zeros((len(data), 0)) if data.rotations is None else data.rotations.reshape(len(data), -1)
+    names = np.unique(data.targets, return_inverse=True)[1]
+    every = np.column_stack([data.q, names, data.positions, rotations])
+    copies = np.ones(len(data), bool)
+    copies[np.unique(every, axis=0, return_index=True)[1]] = False
+    reasons = {
+        f"their {STATUS} is {AMBIGUOUS} (two poses fit the image); show a second face, come nearer, or measure with "
+        "--previous": undecided,
+        "copies of other rows": copies & ~undecided,
+    }
+    notes = [
+        f"{gone.sum()} of {len(data)} rows left out, first line {data.lines[int(gone.argmax())]}: {reason}"
+        for reason, gone in reasons.items()
+        if gone.any()
+    ]
+    keep = ~(undecided | copies)
+    if not keep.any():
+        raise InputError(f"{data.where}: {notes[0]}")
+    return replace(data[keep], notes=tuple(notes)) if notes else data
 
 
 def joint_values(table: Table, robot: Robot) -> np.ndarray:
@@ -113,6 +163,7 @@ def joint_values(table: Table, robot: Robot) -> np.ndarray:
                 f"{table.where}: line {table.lines[far[0]]}: q{i}_rad is {values[far[0]]:g}, over {MAX_TURNS} turns; "
                 f"if these are degrees call the column q{i}_deg"
             )
+        _within(table, f"q{i}", values, "mm" if units is LENGTHS else "rad")
         columns.append(values)
     return np.column_stack(columns)
 

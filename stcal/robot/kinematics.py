@@ -3,6 +3,7 @@
 from dataclasses import replace
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from stcal.errors import InputError
 from stcal.geometry.rigid import Poses, Rigid
@@ -118,9 +119,14 @@ def moved_chain(chain: Chain, step: np.ndarray) -> Chain:
     twist = np.zeros((len(chain), 6))
     for value, (i, c) in zip(step, chain_parameters(chain), strict=True):
         twist[i, c] = value
-    gaps = [chain.gap(i) @ Rigid.exp(twist[i]) for i in range(len(chain))]
-    rotation, translation = np.array([g.rotation for g in gaps]), np.array([g.translation for g in gaps])
-    return Chain(rotation, translation, chain.last_from_flange, chain.prismatic, chain.coupling)
+    turn = Rotation.from_rotvec(twist[:, :3]).as_matrix()
+    translation = chain.translation + np.einsum("nij,nj->ni", chain.rotation, twist[:, 3:])
+    return replace(chain, rotation=_orthogonal(chain.rotation @ turn), translation=translation)
+
+
+def _orthogonal(rotation: np.ndarray) -> np.ndarray:
+    """(n, 3, 3) with the rounding of products taken away (one step of Newton's iteration for the polar factor)."""
+    return 1.5 * rotation - 0.5 * rotation @ np.swapaxes(rotation, 1, 2) @ rotation
 
 
 def _from_base_to_tool(robot: Robot, tool: str) -> Chain:

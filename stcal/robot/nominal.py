@@ -4,32 +4,30 @@ from dataclasses import astuple, dataclass
 
 import numpy as np
 
-from stcal.robot.adjustment import Held, Solution
-from stcal.robot.dh import robot_from_chain
+from stcal.robot.adjustment import Held
+from stcal.robot.dh import PARALLEL_RAD, robot_from_chain
+from stcal.robot.kinematics import chain_parameters
 from stcal.robot.model import Robot
 from stcal.robot.observe import Kind, State, moved
 
 DIFFERENCE_MM = 1e-4
-"""Step of the derivatives by differences, in movement of the tool; the way back to rows has cases."""
-LEAST = np.array([1e-3, 1e-6, 1e-6])
-FEW = 0.3
-"""Least redundancy of a group of dimensions: where the data say nothing, its σ is not moved far."""
+"""Step of the derivatives by differences, in movement of the tool: linear to a millionth, and far above rounding."""
+DOUBT = 1.0
+"""Of the logarithm of the deviations' σ: what makes of robots are known for is known within a factor of e or so."""
+COAXIAL_MM = 100.0
+"""Of parallel axes closer than this an error of length across them turns θ by more than zero positions err (0.5 mm over
+5 mrad)."""
+LENGTH, TWIST, ZERO = 0, 1, 2
 
 
 @dataclass(frozen=True, slots=True)
 class Deviations:
-    """σ of a robot's dimensions about nominal: lengths (mm), twists, and zero positions of joints (rad, mm)."""
+    """σ of a robot's dimensions about nominal: lengths (mm), twists, and zero positions of joints (rad, mm). The values
+    here are what is expected before the data are seen: some tenths of a millimetre and of a degree."""
 
     length_mm: float = 0.5
     twist_rad: float = 1e-3
     zero_rad: float = 5e-3
-
-    def by_column(self, prismatic: np.ndarray) -> np.ndarray:
-        """(n, 5) of a, alpha, d, theta, beta."""
-        row = [self.length_mm, self.twist_rad, self.length_mm, self.zero_rad, self.twist_rad]
-        sigma = np.tile(row, (len(prismatic), 1))
-        sigma[prismatic, 3] = self.twist_rad  # the zero of these is d
-        return sigma
 
 
 def dh_values(robot: Robot) -> np.ndarray:
@@ -37,55 +35,75 @@ def dh_values(robot: Robot) -> np.ndarray:
     return np.array([[row.a, row.alpha, row.d, row.theta, row.beta] for row in robot.rows], float)
 
 
-def dh_slope(state: State, units: np.ndarray, kind: Kind, nominal: Robot) -> np.ndarray:
-    """Derivative of :func:`dh_values` by the parameters, (n, 5, k)."""
-
-    def values(step: np.ndarray) -> np.ndarray:
-        there = moved(state, step, kind)
-        return dh_values(robot_from_chain(there.chain, there.tools, nominal))
-
-    columns = []
-    for k, unit in enumerate(units):
-        step = np.zeros(len(units))
-        step[k] = DIFFERENCE_MM * unit
-        columns.append((values(step) - values(-step)) / (2 * step[k]))
-    return np.stack(columns, axis=-1)
-
-
 @dataclass(frozen=True, slots=True, eq=False)
 class NominalRows:
-    """The nominal dimensions as observations of the parameters. ``slope`` : (n, 5, k), ``free`` : (n, 5) the dimensions
-    that parameters move at all; both taken once, as they hardly change over what a factory does."""
+    """The nominal dimensions as observations of the parameters.
+
+    Dimensions are the rows' a, alpha, d, theta, beta, but of coaxial joints the offset along and across the nominal x
+    in place of a and theta (its polar form). ``coaxial`` : rows of theta, and of the a that follows it; ``slope`` :
+    (n, 5, k) by the parameters; ``free`` : (n, 5) dimensions that parameters move at all; ``group`` : (n, 5) whose σ.
+    The slope is taken once, as it hardly changes over what a factory does.
+    """
 
     nominal: Robot
+    coaxial: tuple[tuple[int, int], ...]
     slope: np.ndarray
     free: np.ndarray
+    group: np.ndarray
 
     @classmethod
-    def about(cls, solution: Solution, kind: Kind, nominal: Robot) -> "NominalRows":
-        slope = dh_slope(solution.state, solution.units, kind, nominal)
-        return cls(nominal, slope, np.abs(slope * solution.units).max(axis=2) > 1e-9)
+    def about(cls, state: State, units: np.ndarray, kind: Kind, nominal: Robot) -> "NominalRows":
+        """With the derivatives at ``state``, where ``units`` (k,) of the parameters move the tool by 1 mm."""
+        coaxial = _coaxial(nominal)
 
-    def away(self, state: State) -> np.ndarray:
-        """(n, 5) dimensions beyond nominal."""
-        return dh_values(robot_from_chain(state.chain, state.tools, self.nominal)) - dh_values(self.nominal)
+        def values(step: np.ndarray) -> np.ndarray:
+            there = moved(state, step, kind)
+            return _dimensions(robot_from_chain(there.chain, there.tools, nominal), nominal, coaxial)
+
+        slope, here = np.zeros((len(nominal.rows), 5, len(units))), values(np.zeros(len(units)))
+        for k in range(len(chain_parameters(state.chain))):  # tools move no row
+            step = np.zeros(len(units))
+            step[k] = DIFFERENCE_MM * units[k]
+            slope[:, :, k] = (values(step) - here) / step[k]
+        group = np.tile([LENGTH, TWIST, LENGTH, ZERO, TWIST], (len(slope), 1))
+        group[nominal.prismatic, 3] = TWIST  # the zero of these is d
+        group[[turn for turn, _ in coaxial], 3] = LENGTH
+        return cls(nominal, coaxial, slope, np.abs(slope * units).max(axis=2) > 1e-9, group)
 
     def held(self, state: State, deviations: Deviations) -> Held:
-        """Linear about ``state``."""
-        sigma = deviations.by_column(self.nominal.prismatic)
-        return Held(self.away(state)[self.free], self.slope[self.free], sigma[self.free])
+        """Linear about ``state``, with the σ of ``deviations``."""
+        robot = robot_from_chain(state.chain, state.tools, self.nominal)
+        away = _dimensions(robot, self.nominal, self.coaxial) - _dimensions(self.nominal, self.nominal, self.coaxial)
+        return Held(away[self.free], self.slope[self.free], np.array(astuple(deviations))[self.group[self.free]])
 
-    def estimated(self, solution: Solution, before: Deviations) -> Deviations:
-        """σ from how far the solution is from nominal, and from how much of that is its own (variance components)."""
-        away = self.away(solution.state)
-        sigma = before.by_column(self.nominal.prismatic)
-        own = np.einsum("njk,kl,njl->nj", self.slope, solution.inverse(), self.slope) / sigma**2
-        group = np.tile([0, 1, 0, 2, 1], (len(away), 1))
-        group[self.nominal.prismatic, 3] = 1
-        found = []
-        for g, (least, sigma_before) in enumerate(zip(LEAST, astuple(before), strict=True)):
-            mine = self.free & (group == g)
-            redundancy = float((1 - own[mine]).clip(0).sum())
-            square = float((away[mine] ** 2).sum())
-            found.append(sigma_before if redundancy < FEW else max(float(np.sqrt(square / redundancy)), least))
-        return Deviations(*found)
+    def sigma(self, robot: Robot, covariance: np.ndarray) -> np.ndarray:
+        """(n, 5) σ of the rows of ``robot`` (a, alpha, d, theta, beta) from the parameters' covariance (k, k)."""
+        slope = self.slope.copy()
+        for turn, reach in self.coaxial:
+            angle = robot.rows[turn].theta - self.nominal.rows[turn].theta
+            along, across = self.slope[reach, 0], self.slope[turn, 3]
+            slope[reach, 0] = np.cos(angle) * along + np.sin(angle) * across
+            offset = max(abs(robot.rows[reach].a), 1e-9)
+            slope[turn, 3] = (np.cos(angle) * across - np.sin(angle) * along) / offset
+        return np.sqrt(np.einsum("njk,kl,njl->nj", slope, covariance, slope).clip(0))
+
+
+def _dimensions(robot: Robot, nominal: Robot, coaxial: tuple[tuple[int, int], ...]) -> np.ndarray:
+    """(n, 5) of a, alpha, d, theta, beta, or what stands in their place."""
+    values = dh_values(robot)
+    for turn, reach in coaxial:
+        angle, offset = values[turn, 3] - nominal.rows[turn].theta, values[reach, 0]
+        values[turn, 3], values[reach, 0] = offset * np.sin(angle), offset * np.cos(angle)
+    return values
+
+
+def _coaxial(nominal: Robot) -> tuple[tuple[int, int], ...]:
+    """(row of theta, row of a) of consecutive joints on nearly one line."""
+    found = []
+    for i in range(1, len(nominal.rows)):
+        reach = i - 1 if nominal.convention == "standard" else i
+        row = nominal.rows[reach]
+        parallel = abs(np.cos(row.alpha) * np.cos(row.beta)) > np.cos(PARALLEL_RAD)
+        if parallel and abs(row.a) < COAXIAL_MM and not nominal.prismatic[i]:
+            found.append((i - 1, reach))
+    return tuple(found)

@@ -1,23 +1,28 @@
 """How well a set of poses shows a robot's parameters: the observability indices O1 … O5."""
 
+from collections.abc import Iterable
 from dataclasses import dataclass
-from typing import Literal
 
 import numpy as np
 
 from stcal.errors import InputError
-from stcal.robot.kinematics import chain_jacobian, chain_parameters, flange_poses
+from stcal.robot.kinematics import chain_parameters
 from stcal.robot.model import Robot
+from stcal.robot.observe import WIDTH, Kind, State, tip_jacobian, tool_width
 from stcal.robot.solve import reach_mm
 
-Observe = Literal["pose", "position"]
+SEEN = 1e-9
+"""Singular values below this share of the largest are rounding: the parameter is not seen by any pose."""
 
 
 @dataclass(frozen=True, slots=True)
 class Observability:
     """Indices of an identification Jacobian with singular values σ₁ ≥ … ≥ σ_L from ``count`` poses; larger is better.
 
-    All depend on the unit of the parameters but for the order that O1 gives to sets of poses.
+    They depend on the unit of the parameters but for the order that O1 gives to sets of poses. Everywhere here all
+    parameters are lengths in mm, an angle being the arc that it makes at the arm's whole reach
+    (:func:`parameter_scale`), and what is measured is counted in its σ. So singular values, O1, O3, O4 and O5 are in
+    1/mm; O2 has no unit; and 1 / O3 is the σ in mm of the combination of parameters that is seen worst.
 
     Parameters
     ----------
@@ -61,6 +66,12 @@ class Observability:
             float(volume / np.sqrt(count)), last / first, last, last * last / first, float(1 / (1 / sigma).sum())
         )
 
+    @classmethod
+    def of_jacobian(cls, rows: np.ndarray, seen: int | None = None) -> "Observability":
+        """From the Jacobian (m, r, k) of m poses over σ, parameters in mm; of its ``seen`` largest singular values."""
+        sigma = np.linalg.svd(rows.reshape(-1, rows.shape[2]), compute_uv=False)[:seen]
+        return cls.of(np.where(sigma > SEEN * sigma[0], sigma, 0.0), len(rows))
+
     def values(self) -> dict[str, float]:
         """By name, O1 … O5."""
         return {"O1": self.o1, "O2": self.o2, "O3": self.o3, "O4": self.o4, "O5": self.o5}
@@ -69,36 +80,31 @@ class Observability:
 def identification_jacobian(
     robot: Robot,
     q: np.ndarray,
-    observe: Observe = "position",
+    observe: Kind = "position",
     sigma_mm: float = 1.0,
     sigma_rad: float = 1.0,
     tool: str = "",
 ) -> np.ndarray:
-    """Whitened derivative of what is measured at joint vectors by all that is identified, (m, r, k).
+    """Derivative of what is measured at joint vectors by all that is identified, over σ, (m, r, k).
 
-    r is 6 (rotation over σ_rad, translation over σ_mm) or 3 (position over σ_mm), in the world's axes. The k parameters
-    are 4 R + 2 P of the joints' axes (:func:`~stcal.robot.kinematics.chain_parameters`) and 6 or 3 of the tool, in its
-    own axes; rad and mm.
+    r is 6 (rotation over σ_rad, translation over σ_mm) or 3 (position over σ_mm), in the world's axes; the k parameters
+    are those of :func:`~stcal.robot.observe.parameter_names`, rad and mm.
 
     Parameters
     ----------
     q : (m, n) array
         Values of the controller, rad or mm.
     """
-    chain = robot.chain()
-    tip = flange_poses(chain, q) @ robot.tool(tool)
-    axes = chain_jacobian(chain, q, tip)
-    by_tool = np.zeros((len(q), 6, 6))
-    by_tool[:, :3, :3] = by_tool[:, 3:, 3:] = tip.rotation
-    if observe == "position":
-        return np.concatenate([axes[:, 3:], by_tool[:, 3:, 3:]], axis=2) / sigma_mm
-    weight = 1 / np.repeat([sigma_rad, sigma_mm], 3)
-    return np.concatenate([axes, by_tool], axis=2) * weight[:, None]
+    state = State(robot.chain(), {tool: robot.tool(tool)})
+    slope = tip_jacobian(state, q, (tool,) * len(q), observe)[1]
+    sigma = np.repeat([sigma_rad, sigma_mm], 3)
+    return (slope / sigma[:, None])[:, -WIDTH[observe] :]
 
 
-def parameter_scale(robot: Robot, observe: Observe = "position", tool: str = "") -> np.ndarray:
-    """(k,) factors of the columns of :func:`identification_jacobian` after which all parameters are in mm: an angle
-    counts by the arc that it makes at the arm's whole reach."""
+def parameter_scale(robot: Robot, observe: Kind = "position", tools: Iterable[str] = ("",)) -> np.ndarray:
+    """(k,) factors of the columns of an identification Jacobian after which all parameters are in mm: an angle counts
+    by the arc that it makes at the arm's whole reach (:func:`~stcal.robot.solve.reach_mm`, of the longest tool)."""
+    tools = list(tools)
     turning = [c < 3 for _, c in chain_parameters(robot.chain())]
-    turning += [True] * 3 * (observe == "pose") + [False] * 3
-    return np.where(turning, 1 / reach_mm(robot, tool), 1.0)
+    turning += ([True] * (tool_width(observe) - 3) + [False] * 3) * len(tools)
+    return np.where(turning, 1 / max(reach_mm(robot, tool) for tool in tools), 1.0)

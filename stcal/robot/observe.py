@@ -1,5 +1,6 @@
 """What measurements say about a robot: residuals, and their derivatives by the minimal parameters."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Literal
 
@@ -13,9 +14,6 @@ from stcal.robot.model import Chain
 
 Kind = Literal["pose", "position", "distance"]
 WIDTH = {"pose": 6, "position": 3, "distance": 1}
-ALL_PAIRS_UP_TO = 60
-ANCHORS = 8
-"""Of more positions not all pairs are taken, but the distances of all from a few that lie far apart."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -31,7 +29,9 @@ class Observed:
     """Measurements as one kind of observation.
 
     ``first``, ``second`` : (r,) rows of the measurements that each observation is about; equal but for distances.
-    ``values`` : (r,) distances, mm, else empty; ``derived`` : whether they were made of positions.
+    ``values`` : (r,) distances, mm, else empty. ``frameless`` : positions of which only the distances are used. All
+    distances of m points hold what the points hold but a motion of all of them; so these are positions in a frame of
+    their own, whose place is identified with the rest, and not counted.
     """
 
     kind: Kind
@@ -39,20 +39,25 @@ class Observed:
     first: np.ndarray
     second: np.ndarray
     values: np.ndarray
-    derived: bool = False
+    frameless: bool = False
 
     def __len__(self) -> int:
         return len(self.first)
 
     @property
-    def tool_width(self) -> int:
-        """Parameters of each tool: orientation is seen in poses only."""
-        return 6 if self.kind == "pose" else 3
+    def used(self) -> Kind:
+        """What of the measurements is used."""
+        return "distance" if self.frameless else self.kind
+
+
+def tool_width(kind: Kind) -> int:
+    """Parameters of each tool: orientation is seen in poses only."""
+    return 6 if kind == "pose" else 3
 
 
 def unknowns(robot_chain: Chain, targets: int, kind: Kind) -> int:
     """Number of parameters."""
-    return len(chain_parameters(robot_chain)) + (6 if kind == "pose" else 3) * targets
+    return len(chain_parameters(robot_chain)) + tool_width(kind) * targets
 
 
 def observed(data: Measurements, kind: Kind | None = None) -> Observed:
@@ -73,23 +78,7 @@ def observed(data: Measurements, kind: Kind | None = None) -> Observed:
     if held == "distance":
         real = rows[data.from_row != rows]
         return Observed(kind, data, real, data.from_row[real], data.distances[real])
-    first, second = _pairs(data)
-    apart = np.linalg.norm(data.positions[first] - data.positions[second], axis=1)
-    return Observed(kind, data, first, second, apart, True)
-
-
-def _pairs(data: Measurements) -> tuple[np.ndarray, np.ndarray]:
-    """Pairs of rows: all, or all with the anchors (each the farthest from those before)."""
-    m = len(data)
-    if m <= ALL_PAIRS_UP_TO:
-        return np.triu_indices(m, 1)
-    away = np.linalg.norm(data.positions - data.positions.mean(0), axis=1)
-    anchors = [int(away.argmax())]
-    for _ in range(ANCHORS - 1):
-        to_nearest = np.min([np.linalg.norm(data.positions - data.positions[a], axis=1) for a in anchors], axis=0)
-        anchors.append(int(to_nearest.argmax()))
-    pairs = sorted({(min(i, a), max(i, a)) for a in anchors for i in range(m) if i != a})
-    return tuple(np.array(pairs).T)
+    return Observed("position", data, rows, rows, none, frameless=True)
 
 
 def parameter_names(state: State, kind: Kind) -> list[str]:
@@ -100,17 +89,16 @@ def parameter_names(state: State, kind: Kind) -> list[str]:
     return names + [f"tool {name} {c}".replace("  ", " ") for name in state.tools for c in tool]
 
 
-def tips(state: State, data: Measurements) -> Poses:
-    """world_from_tool of every row."""
-    flange = flange_poses(state.chain, data.q)
-    names = list(state.tools)
+def tips(state: State, q: np.ndarray, targets: Sequence[str]) -> Poses:
+    """world_from_tool at joint vectors (m, n), with the tool of each."""
+    place = {name: i for i, name in enumerate(state.tools)}
     tool = Poses.of(state.tools.values())
-    return flange @ tool[[names.index(t) for t in data.targets]]
+    return flange_poses(state.chain, q) @ tool[[place[t] for t in targets]]
 
 
 def residuals(state: State, seen: Observed) -> np.ndarray:
     """Measured minus modelled, (r, 6), (r, 3) or (r, 1): rad and mm in the world's axes."""
-    tip = tips(state, seen.data)
+    tip = tips(state, seen.data.q, seen.data.targets)
     if seen.kind == "pose":
         return seen.data.poses().difference(tip)
     if seen.kind == "position":
@@ -121,18 +109,7 @@ def residuals(state: State, seen: Observed) -> np.ndarray:
 
 def jacobian(state: State, seen: Observed) -> np.ndarray:
     """Derivative of what the model says by :func:`parameter_names`, (r, 6 or 3 or 1, k)."""
-    tip = tips(state, seen.data)
-    width = seen.tool_width
-    by_axes = chain_jacobian(state.chain, seen.data.q, tip)
-    by_tools = np.zeros((len(tip), 6, width * len(state.tools)))
-    for t, name in enumerate(state.tools):
-        rows = np.array([target == name for target in seen.data.targets])
-        place = width * t
-        if width == 6:
-            by_tools[rows, :3, place : place + 3] = tip.rotation[rows]
-            place += 3
-        by_tools[rows, 3:, place : place + 3] = tip.rotation[rows]
-    full = np.concatenate([by_axes, by_tools], axis=2)
+    tip, full = tip_jacobian(state, seen.data.q, seen.data.targets, seen.kind)
     if seen.kind == "pose":
         return full
     if seen.kind == "position":
@@ -142,10 +119,27 @@ def jacobian(state: State, seen: Observed) -> np.ndarray:
     return np.einsum("ri,rik->rk", unit, full[seen.first, 3:] - full[seen.second, 3:])[:, None]
 
 
+def tip_jacobian(state: State, q: np.ndarray, targets: Sequence[str], kind: Kind) -> tuple[Poses, np.ndarray]:
+    """world_from_tool at joint vectors (m, n), and its derivative (m, 6, k) by :func:`parameter_names`: rotation (rad)
+    over translation (mm), in the world's axes."""
+    tip = tips(state, q, targets)
+    width = tool_width(kind)
+    by_axes = chain_jacobian(state.chain, q, tip)
+    by_tools = np.zeros((len(tip), 6, width * len(state.tools)))
+    targets = np.array(targets)
+    for t, name in enumerate(state.tools):
+        rows, place = targets == name, width * t
+        if width == 6:
+            by_tools[rows, :3, place : place + 3] = tip.rotation[rows]
+            place += 3
+        by_tools[rows, 3:, place : place + 3] = tip.rotation[rows]
+    return tip, np.concatenate([by_axes, by_tools], axis=2)
+
+
 def moved(state: State, step: np.ndarray, kind: Kind) -> State:
     """The state after small motions along the parameters, (k,)."""
     k = len(chain_parameters(state.chain))
-    width = 6 if kind == "pose" else 3
+    width = tool_width(kind)
     tools = {}
     for t, (name, tool) in enumerate(state.tools.items()):
         own = step[k + width * t : k + width * (t + 1)]

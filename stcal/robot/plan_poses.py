@@ -7,23 +7,22 @@ inverse information matrix by the few rows of a pose (Sherman, Morrison & Woodbu
 import csv
 import io
 from dataclasses import dataclass
+from typing import Literal
 
 import numpy as np
 
 from stcal.errors import DegenerateError, InputError
 from stcal.geometry.arrays import frozen
 from stcal.geometry.rigid import Poses
-from stcal.robot.compensate import joint_cells, joint_columns
+from stcal.robot.compensation import joint_cells, joint_columns
 from stcal.robot.kinematics import forward
 from stcal.robot.model import Robot
-from stcal.robot.observability import Observability, Observe, identification_jacobian, parameter_scale
+from stcal.robot.observability import SEEN, Observability, identification_jacobian, parameter_scale
 from stcal.table_file import POSE, pose_cells
 
 RANDOM_SETS = 20
 DRAWS = 200
 """So many joint vectors are drawn for each candidate that is wanted in the box before it counts as out of reach."""
-SEEN = 1e-9
-"""Singular values below this share of the largest are rounding: the parameter is not seen by any pose."""
 SWEEPS = 20
 """Passes over the whole set; after 2 to 6 nothing helps any more."""
 GAIN = 1e-9
@@ -78,7 +77,7 @@ class DesignOptions:
 
     count: int = 40
     seed: int = 0
-    observe: Observe = "position"
+    observe: Literal["pose", "position"] = "position"
     candidates: int = 1000
     sigma_mm: float = 0.05
     sigma_rad: float = 2e-4
@@ -114,7 +113,7 @@ def design(robot: Robot, options: DesignOptions | None = None) -> PoseDesign:
     options = options or DesignOptions()
     rng = np.random.default_rng(options.seed)
     q = _candidates(robot, options, rng)
-    scale = parameter_scale(robot, options.observe, options.tool)
+    scale = parameter_scale(robot, options.observe, [options.tool])
     rows = identification_jacobian(robot, q, options.observe, options.sigma_mm, options.sigma_rad, options.tool) * scale
     seen, basis = _seen_part(rows)
     rows = rows @ basis
@@ -132,8 +131,8 @@ def design(robot: Robot, options: DesignOptions | None = None) -> PoseDesign:
         forward(robot, q[chosen], options.tool),
         len(scale),
         seen,
-        _indices(rows[chosen]),
-        tuple(_indices(rows[s]) for s in sets),
+        Observability.of_jacobian(rows[chosen]),
+        tuple(Observability.of_jacobian(rows[s]) for s in sets),
         _predicted_mm(rows[chosen], predict),
         float(np.median([_predicted_mm(rows[s], predict) for s in sets])),
         exchanges,
@@ -232,11 +231,6 @@ def _updated(inverse: np.ndarray, rows: np.ndarray, sign: float) -> np.ndarray:
     """Inverse information after rows (r, k) are added (+1) or taken away (−1)."""
     half = inverse @ rows.T
     return inverse - half @ np.linalg.solve(sign * np.eye(len(rows)) + rows @ half, half.T)
-
-
-def _indices(rows: np.ndarray) -> Observability:
-    sigma = np.linalg.svd(rows.reshape(-1, rows.shape[2]), compute_uv=False)
-    return Observability.of(np.where(sigma > SEEN * sigma[0], sigma, 0.0), len(rows))
 
 
 def _predicted_mm(rows: np.ndarray, predict: np.ndarray) -> float:

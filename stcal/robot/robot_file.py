@@ -9,6 +9,7 @@ from pydantic import Field
 from stcal.errors import InputError
 from stcal.geometry.rigid import UNIT_WITHIN, Poses, Rigid
 from stcal.robot.model import Convention, DHRow, Joint, JointType, Robot
+from stcal.saving import save
 from stcal.toml_file import Finite, Strict, load_toml
 
 WHAT = "robot file"
@@ -130,6 +131,17 @@ def robot_toml(robot: Robot, comments: Sequence[str] = ()) -> str:
         if name:
             lines += ["", "[[target]]", f"name = {_text(name)}", *_pose_lines(tool)]
     return "\n".join(lines) + "\n"
+
+
+def save_robot(path: str | Path, robot: Robot, comments: Sequence[str] = ()) -> None:
+    """Write a robot file, complete or not at all.
+
+    Raises
+    ------
+    InputError
+        It cannot be written.
+    """
+    save(Path(path), robot_toml(robot, comments))
 
 
 _FORM = {

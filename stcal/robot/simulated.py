@@ -1,13 +1,17 @@
 """Simulated arms: a nominal one of a known size, and others as they leave the factory."""
 
+from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from stcal.geometry.rigid import Rigid
+from stcal.robot.data import Measurements
 from stcal.robot.dh import robot_from_chain
 from stcal.robot.kinematics import chain_parameters, moved_chain
 from stcal.robot.model import DHRow, Joint, Robot
+from stcal.robot.observe import State, tips
 
 
 def mh80() -> Robot:
@@ -47,3 +51,26 @@ def joint_vectors(robot: Robot, count: int, rng: np.random.Generator, share: flo
 def placed(robot: Robot, world_from_base: Rigid, tools: dict[str, Rigid]) -> Robot:
     """The robot where an instrument sees it, with these tools."""
     return replace(robot, world_from_base=world_from_base, tools=tools)
+
+
+def measured(
+    robot: Robot,
+    q: np.ndarray,
+    rng: np.random.Generator,
+    sigma_mm: float = 0.05,
+    sigma_rad: float = 2e-4,
+    targets: Sequence[str] = (),
+    covariance: np.ndarray | None = None,
+) -> Measurements:
+    """What an instrument sees of the robot at joint vectors (m, n): poses with normal noise of these σ per axis, or of
+    ``covariance`` (m, 6, 6) which then comes with them; of tool ``""``, or of each row's."""
+    targets = tuple(targets) or ("",) * len(q)
+    tip = tips(State(robot.chain(), dict(robot.tools)), q, targets)
+    noise = rng.normal(0, 1, (len(q), 6))
+    if covariance is None:
+        noise = noise * np.repeat([sigma_rad, sigma_mm], 3)
+    else:
+        noise = np.einsum("mij,mj->mi", np.linalg.cholesky(covariance), noise)
+    turn = Rotation.from_rotvec(noise[:, :3]).as_matrix()
+    place = tip.translation + noise[:, 3:]
+    return Measurements("simulated", range(2, len(q) + 2), q, targets, place, turn @ tip.rotation, covariance)

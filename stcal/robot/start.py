@@ -1,8 +1,10 @@
 """Where identification starts: base and tools by the nominal axes; and data that this robot cannot have made."""
 
+from collections.abc import Iterator
 from dataclasses import replace
 
 import numpy as np
+from scipy.optimize import least_squares
 
 from stcal.errors import DegenerateError, InputError
 from stcal.geometry.align import align_rigid
@@ -10,7 +12,8 @@ from stcal.geometry.rigid import Poses, Rigid, skew
 from stcal.robot.data import Measurements
 from stcal.robot.kinematics import flange_poses
 from stcal.robot.model import Robot
-from stcal.robot.observe import State
+from stcal.robot.observe import State, observed, residuals
+from stcal.robot.solve import reach_mm
 
 ROUNDS = 50
 SETTLED_MM = 1e-6
@@ -19,6 +22,8 @@ FITS = 0.05
 EXPLAINS = 0.2
 """A mistake explains a misfit when mending it leaves less than this share of it."""
 STILL_MM = 0.01
+AROUND = 0.1
+"""Of the arm's reach: how far from the given point of the tool distances are tried too."""
 
 
 def start(robot: Robot, data: Measurements) -> State:
@@ -33,13 +38,18 @@ def start(robot: Robot, data: Measurements) -> State:
     """
     _moves(data)
     tools = {name: robot.tools.get(name, robot.tools.get("", Rigid())) for name in sorted(set(data.targets))}
-    if data.positions is None:  # distances see neither base nor where the instrument stands
-        return State(replace(robot, world_from_base=Rigid()).chain(), tools)
     state, misfit = _placed(robot, data, tools)
-    spread = float(np.sqrt(((data.positions - data.positions.mean(0)) ** 2).sum(1).mean()))
+    spread = _spread(data)
     if misfit > FITS * spread:
         _explain(robot, data, tools, misfit, spread)
     return state
+
+
+def _spread(data: Measurements) -> float:
+    """RMS about the mean of what was measured, mm."""
+    if data.positions is None:
+        return float(np.sqrt((data.distances**2).mean()))
+    return float(np.sqrt(((data.positions - data.positions.mean(0)) ** 2).sum(1).mean()))
 
 
 def _moves(data: Measurements) -> None:
@@ -64,6 +74,10 @@ def _placed(robot: Robot, data: Measurements, tools: dict[str, Rigid]) -> tuple[
     names = list(tools)
     rows = np.array([names.index(t) for t in data.targets])
     points = np.array([tools[name].translation for name in names])
+    if data.positions is None:  # distances see neither base nor where the instrument stands
+        points, misfit = _points_of_distances(robot, flange, data, rows, points)
+        return State(chain, {name: Rigid(tools[name].rotation, points[k]) for k, name in enumerate(names)}), misfit
+    _off_a_line(data)
     base, points, misfit = _base_and_points(flange, data.positions, rows, points)
     if data.rotations is not None:
         seen = base.inverse() @ data.poses()
@@ -77,9 +91,23 @@ def _placed(robot: Robot, data: Measurements, tools: dict[str, Rigid]) -> tuple[
     return State(placed.chain(), tools), misfit
 
 
+def _off_a_line(data: Measurements) -> None:
+    extent = np.linalg.svd(data.positions - data.positions.mean(0), compute_uv=False)
+    if len(extent) < 2 or extent[1] <= STILL_MM:
+        raise DegenerateError(
+            f"{data.where}: all positions lie on one line (within {STILL_MM} mm), so that it is not seen where the "
+            "instrument stands; move joints that take the target off it"
+        )
+
+
 def _base_and_points(flange: Poses, positions: np.ndarray, rows: np.ndarray, points: np.ndarray):
     """Gauss–Newton over the base and the tool points, from the alignment with the points given; and RMS misfit, mm."""
-    base = align_rigid(positions, flange @ points[rows])
+    try:
+        base = align_rigid(positions, flange @ points[rows])
+    except DegenerateError as error:
+        raise DegenerateError(
+            "by the robot file all joint values put the target on one line; give the tool, roughly, in the robot file"
+        ) from error
     misfit = np.inf
     for _ in range(ROUNDS):
         seen = flange @ points[rows]
@@ -98,39 +126,66 @@ def _base_and_points(flange: Poses, positions: np.ndarray, rows: np.ndarray, poi
     return base, points, misfit
 
 
+def _points_of_distances(robot: Robot, flange: Poses, data: Measurements, rows: np.ndarray, points: np.ndarray):
+    """Tool points by least squares, from those given and from others around the flange; and RMS misfit, mm."""
+
+    def errors(moved: np.ndarray) -> np.ndarray:
+        tip = flange @ moved.reshape(-1, 3)[rows]
+        return data.distances - np.linalg.norm(tip - tip[data.from_row], axis=1)
+
+    around = AROUND * reach_mm(robot) * np.vstack([np.zeros((1, 3)), np.eye(3), -np.eye(3)])
+    fits = [least_squares(errors, (points + shift).ravel(), max_nfev=ROUNDS) for shift in around]
+    best = min(fits, key=lambda fit: fit.cost)
+    return best.x.reshape(-1, 3), float(np.sqrt(2 * best.cost / len(data)))
+
+
 def _explain(robot: Robot, data: Measurements, tools: dict[str, Rigid], misfit: float, spread: float) -> None:
-    """Say what is wrong with the data."""
-    turning = ~robot.prismatic
-    mirrored = replace(data, positions=data.positions * [1, 1, -1], rotations=None, covariance=None)
-    degree = np.pi / 180
-    guesses = {
-        "joint values are radians in columns of degrees; call the columns q1_rad …": _with_q(data, turning, 1 / degree),
-        "joint values are degrees in columns of radians; call the columns q1_deg …": _with_q(data, turning, degree),
-        "positions are mirrored (a left-handed frame); change the sign of one axis": mirrored,
-        "positions are metres in columns of mm; call the columns x_m …": _scaled(data, 1e3),
-        "joint values have the opposite sign; check the rows and the joints' directions": _with_q(data, turning, -1.0),
-    }
-    if data.rotations is not None:
-        inverse = data.poses().inverse()
-        guesses["poses are inverse (instrument seen from the tool); give the tool in the instrument's frame"] = replace(
-            data, positions=inverse.translation, rotations=inverse.rotation, covariance=None
-        )
+    """Say what is wrong with the data, or with the robot file."""
     found = {}
-    for reason, guess in guesses.items():
-        found[reason] = _placed(robot, guess, tools)[1] / float(
-            np.sqrt(((guess.positions - guess.positions.mean(0)) ** 2).sum(1).mean())
-        )
-    reason = min(found, key=found.get)
+    for reason, other, guess in _guesses(robot, data, tools):
+        try:
+            found[reason] = _placed(other, guess, tools)[1] / _spread(guess)
+        except DegenerateError:  # a guess that leaves too little
+            continue
     says = f"{data.where}: robot {robot.name} misses the measurements by {misfit:.3g} mm RMS, "
     says += f"{FITS:.0%} of their spread of {spread:.3g} mm allowed; "
-    if found[reason] < EXPLAINS * misfit / spread:
+    reason = min(found, key=found.get)
+    if found[reason] < min(EXPLAINS * misfit / spread, FITS):
         raise InputError(f"{says}it would fit if {reason}")
     raise InputError(f"{says}check D-H rows and convention, the order and zero of joints, coupling, and units")
 
 
-def _with_q(data: Measurements, turning: np.ndarray, factor: float) -> Measurements:
-    return replace(data, q=np.where(turning, data.q * factor, data.q))
-
-
-def _scaled(data: Measurements, factor: float) -> Measurements:
-    return replace(data, positions=data.positions * factor)
+def _guesses(robot: Robot, data: Measurements, tools: dict[str, Rigid]) -> Iterator[tuple[str, Robot, Measurements]]:
+    """Frequent mistakes: what would be right, with robot and data as if it were."""
+    turning, n = ~robot.prismatic, len(robot.rows)
+    q, angle = data.q, np.where(turning, 180 / np.pi, 1.0)
+    scaled = {"distances": data.distances, "positions": data.positions}
+    scaled = {name: 1e3 * values for name, values in scaled.items() if values is not None}
+    yield "joint values are radians in columns of degrees; call the columns q1_rad …", robot, replace(data, q=q * angle)
+    yield "joint values are degrees in columns of radians; call the columns q1_deg …", robot, replace(data, q=q / angle)
+    yield "lengths are metres in columns of mm; call the columns x_m … or distance_m", robot, replace(data, **scaled)
+    reason = "all joint values had the opposite sign; check the rows and the joints' directions"
+    yield reason, robot, replace(data, q=np.where(turning, -q, q))
+    for i in range(n):
+        reason = f"joint {i + 1} had the opposite sign; check its direction in the rows, or the sign of q{i + 1}"
+        yield reason, robot, replace(data, q=q * np.where(np.arange(n) == i, -1, 1))
+    if (robot.coupling != np.eye(n)).any():
+        yield "the joints were not coupled; take coupling out of the robot file", replace(robot, coupling=None), data
+    elif n >= 3:
+        coupling = np.eye(n)
+        coupling[2, 1] = 1.0
+        reason = "joint 3 were coupled to joint 2, as Fanuc's are; give coupling in the robot file"
+        yield reason, replace(robot, coupling=coupling), data
+    if data.positions is None:
+        return
+    mirrored = replace(data, positions=data.positions * [1, 1, -1], rotations=None, covariance=None)
+    yield "positions are mirrored (a left-handed frame); change the sign of one axis", robot, mirrored
+    error = np.linalg.norm(residuals(_placed(robot, data, tools)[0], observed(data, "position")), axis=1)
+    worst = int(error.argmax())
+    reason = f"line {data.lines[worst]} were not there, by far the worst; correct or remove it"
+    yield reason, robot, data[np.arange(len(data)) != worst]
+    if data.rotations is not None:
+        inverse = data.poses().inverse()
+        reason = "poses are inverse (instrument seen from the tool); give the tool in the instrument's frame"
+        there = {"positions": inverse.translation, "rotations": inverse.rotation, "covariance": None}
+        yield reason, robot, replace(data, **there)

@@ -6,10 +6,10 @@ from html import escape
 import numpy as np
 
 from stcal.page import COLOURS, FAINT, INK, NONE, SMALL, calm, new_figure, number, page, plot, table, uri
-from stcal.robot.compensate import Compensated, compensated_summary, joint_columns
-from stcal.robot.inverse import Inverse
+from stcal.robot.compensation import Compensated, compensated_summary, joint_columns
+from stcal.robot.inverse_kinematics import Inverse
 from stcal.robot.model import Robot
-from stcal.robot.verify import Verification
+from stcal.robot.verification import Verification
 
 MOST_ROWS = 500
 """Rows of a table on a page; more are in the CSV file."""

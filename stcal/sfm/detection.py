@@ -3,7 +3,6 @@
 import hashlib
 import io
 import json
-import os
 import zipfile
 import zlib
 from collections.abc import Callable
@@ -19,6 +18,7 @@ from stcal.errors import ConvergenceError, DetectionError, InputError
 from stcal.geometry.camera import Camera
 from stcal.images import ImageFile, Skipped, decode, grey_8bit, thumbnail
 from stcal.parallel import run_parallel
+from stcal.saving import save
 from stcal.sfm.detect.centres import Centres
 from stcal.sfm.detect.ellipses import EllipseOptions
 from stcal.sfm.detect.image import ImageDetection, detect_image
@@ -204,18 +204,7 @@ def _save(path: Path, detection: ImageDetection, digest: str, image: np.ndarray)
         meta=np.frombuffer(json.dumps(meta).encode(), np.uint8),
         **arrays,
     )
-    write_bytes(path, stream.getvalue())
-
-
-def write_bytes(path: Path, data: bytes) -> None:
-    """Write a file at once: it appears complete or not at all."""
-    partial = path.with_name(f"{path.name}.{os.getpid()}.partial")
-    try:
-        partial.write_bytes(data)
-        os.replace(partial, path)
-    except OSError as error:
-        partial.unlink(missing_ok=True)
-        raise InputError(f"{path}: cannot be written: {error.strerror or error}; free space or choose --out") from error
+    save(path, stream.getvalue())
 
 
 def _load(file: ImageFile, path: Path, reused: bool) -> DetectedImage | None:

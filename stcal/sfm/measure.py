@@ -305,11 +305,12 @@ def measure_text(result: MeasureResult) -> str:
             f"  outlier {each.name} {o.label}: residual {o.residual_px:.3f} px, limit {o.limit_px:.3f} px"
             for o in pose.outliers
         ]
-    return "\n".join([*lines, *_summary(result)])
+    left_out = [f"left out {each.name}: {each.reason}" for each in result.left_out]
+    return "\n".join([*lines, *summary(result), *left_out])
 
 
-def _summary(result: MeasureResult) -> list[str]:
-    """What is to be known besides the table."""
+def summary(result: MeasureResult) -> list[str]:
+    """Counts, then what is to be known besides."""
     poses = [each.pose for each in result.images]
     count = {s: sum(pose.status == s for pose in poses) for s in ("certain", "resolved", "ambiguous")}
     told = ", ".join(f"{n} {s}" for s, n in count.items() if n)
@@ -327,4 +328,4 @@ def _summary(result: MeasureResult) -> list[str]:
             f"χ² failed in {len(failed)} images, first {failed[0]}: residuals beyond their σ by chance in one image of "
             "100 000; check that camera file, faces.json and images belong together"
         )
-    return [*lines, *result.notes, *(f"left out {each.name}: {each.reason}" for each in result.left_out)]
+    return [*lines, *result.notes]

@@ -1,6 +1,5 @@
 """The main job: from a folder of images to the calibrated target. Each call is a stage; its result is saved."""
 
-import json
 import os
 import shutil
 from collections.abc import Callable, Sequence
@@ -17,13 +16,14 @@ from stcal.design_file import board_toml, load_board, load_target, target_toml
 from stcal.errors import InputError
 from stcal.geometry.camera import Camera
 from stcal.images import RUN_MARKER, find_images
+from stcal.saving import json_text, save
 from stcal.sfm.calibration import Calibration, calibrate
 from stcal.sfm.chain import measure_chains
 from stcal.sfm.checks import Evidence, run_checks
 from stcal.sfm.colmap_model import find_models, read_model, write_model
 from stcal.sfm.crosscheck import Tolerances, crosscheck
 from stcal.sfm.database import image_ids, labels_csv, remove_database, write_database
-from stcal.sfm.detection import DetectionResult, detect_files, require_single, write_bytes
+from stcal.sfm.detection import DetectionResult, detect_files, require_single
 from stcal.sfm.foreign import faces_from_models
 from stcal.sfm.graph import ImageGraph, image_graph
 from stcal.sfm.labels import LabelledImage, label_group
@@ -156,7 +156,7 @@ def detect(
     for image in detection.images:
         groups.setdefault(image.file.group, []).append((image.file.name, image.file.group, image.detection))
     labelled = [each for group in groups.values() for each in label_group(group, target, board)]
-    write_bytes(out / "detections.csv", detections_csv([each.observations for each in labelled]).encode())
+    save(out / "detections.csv", detections_csv([each.observations for each in labelled]))
     _write_overlays(detection, labelled, target, out, tell)
     return detection, labelled
 
@@ -181,7 +181,7 @@ def calibrate_models(model: Path, saved: SavedRun) -> Calibration:
 def write_faces(path: Path, calibration: Calibration, saved: SavedRun) -> None:
     """``faces.json`` of models that were chained."""
     options = replace(saved.options, solve="chain")
-    write_bytes(path, _json(faces_json(calibration.target, saved.target, options, calibration.sigma_factor)))
+    save(path, json_text(faces_json(calibration.target, saved.target, options, calibration.sigma_factor)))
 
 
 def load_design(given, default: Callable, load: Callable):
@@ -207,7 +207,7 @@ def claim_folder(out: str | Path, contents: dict) -> Path:
         if out.is_dir() and not marker.exists() and any(not p.name.startswith(RUN_MARKER) for p in out.iterdir()):
             raise InputError(f"output folder {out}: not empty and not of an earlier run; give a new folder with --out")
         out.mkdir(parents=True, exist_ok=True)
-        write_bytes(marker, _json({"program": "stcal-sfm", "version": stcal.__version__} | contents))
+        save(marker, json_text({"program": "stcal-sfm", "version": stcal.__version__} | contents))
         for name in RESULTS:
             (out / name).unlink(missing_ok=True)
         for name in RESULT_FOLDERS:
@@ -232,7 +232,7 @@ def _write_overlays(detection: DetectionResult, labelled: list[LabelledImage], t
             detection.camera.focal,
             len(each.notes),
         )
-        write_bytes(path, picture)
+        save(path, picture)
 
     with ThreadPoolExecutor() as pool:  # drawing and JPEG release the interpreter
         for i, _ in enumerate(pool.map(draw, _in_order(detection, labelled), labelled)):
@@ -300,7 +300,7 @@ def _write(result: RunResult, tell: Progress) -> None:
     models = {s.model.group: s.model for s in result.solutions}
     corrected = _corrected_px(models, observations)
     write_database(out / "database.db", result.camera, result.colmap_model, observations, result.graph.pairs, corrected)
-    write_bytes(out / "labels.csv", labels_csv(observations, corrected).encode())
+    save(out / "labels.csv", labels_csv(observations, corrected))
     shutil.rmtree(out / "models", ignore_errors=True)
     for name, model in models.items():
         folder = out / "models" / name  # "models/." where the images lie directly in their folder
@@ -314,11 +314,11 @@ def _write(result: RunResult, tell: Progress) -> None:
         result.colmap_model,
     )
     write_cameras_txt(out / CAMERA, result.camera, result.colmap_model, result.camera_covariance)
-    write_bytes(out / TARGET, target_toml(result.target_design).encode())
-    write_bytes(out / BOARD, board_toml(result.board_design).encode())
+    save(out / TARGET, target_toml(result.target_design))
+    save(out / BOARD, board_toml(result.board_design))
     report = report_json(result)
     faces = faces_json(result.target, result.target_design, result.options, result.calibration.sigma_factor)
-    write_bytes(out / "faces.json", _json(faces))
+    save(out / "faces.json", json_text(faces))
     write_report(out, report)
     tell("report", 1, 1)
 
@@ -326,8 +326,8 @@ def _write(result: RunResult, tell: Progress) -> None:
 def write_report(out: Path, report: dict) -> None:
     """``report.json`` and ``report.html`` of a run's folder."""
     page = _report_page(out, report)
-    write_bytes(out / "report.json", _json(report))
-    write_bytes(out / "report.html", page)
+    save(out / "report.json", json_text(report))
+    save(out / "report.html", page)
 
 
 def _report_page(out: Path, report: dict) -> bytes:
@@ -355,7 +355,3 @@ def _corrected_px(models: dict[str, GroupModel], observations: list[ImageObserva
     rows = {name: rows for m in models.values() for name, rows in zip(m.images, m.rows_by_image(), strict=True)}
     none = np.zeros(0, int)
     return [models[image.group].keypoints_px(image, rows.get(image.name, none)) for image in observations]
-
-
-def _json(value: dict) -> bytes:
-    return (json.dumps(value, indent=1, ensure_ascii=False, allow_nan=False) + "\n").encode()

@@ -16,7 +16,7 @@ from stcal.errors import MappingError
 from stcal.geometry.camera import Camera
 from stcal.geometry.rigid import Rigid
 from stcal.images import SUFFIXES, TOP_GROUP, Skipped
-from stcal.sfm.detection import write_bytes
+from stcal.saving import save
 from stcal.sfm.mapping import left_out, map_group
 from stcal.sfm.model import GroupModel, Outlier
 from stcal.sfm.observations import ImageObservations, is_board
@@ -172,7 +172,7 @@ def _save(path: Path, solution: GroupSolution) -> None:
     poses = np.stack([pose.matrix() for pose in model.camera_from_world])
     arrays = {name: getattr(model, name) for name in _ARRAYS}
     np.savez(stream, poses=poses, meta=np.frombuffer(json.dumps(meta).encode(), np.uint8), **arrays)
-    write_bytes(path, stream.getvalue())
+    save(path, stream.getvalue())
 
 
 def _load(path: Path) -> GroupSolution | None:

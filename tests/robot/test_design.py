@@ -1,5 +1,6 @@
 """Observability indices by hand; chosen measurement poses against random ones."""
 
+import json
 from dataclasses import replace
 
 import numpy as np
@@ -8,12 +9,13 @@ import pytest
 from stcal.cli.main import main
 from stcal.errors import DegenerateError, InputError
 from stcal.geometry.rigid import Poses, Rigid
+from stcal.robot.identification import IdentifyOptions, identify
 from stcal.robot.kinematics import chain_parameters, flange_poses, forward, moved_chain
 from stcal.robot.model import Joint
 from stcal.robot.observability import Observability, identification_jacobian, parameter_scale
 from stcal.robot.plan_poses import DesignOptions, choose, design
 from stcal.robot.robot_file import robot_toml
-from stcal.robot.simulated import joint_vectors, made, mh80
+from stcal.robot.simulated import joint_vectors, made, measured, mh80
 from stcal.table_file import read_table
 
 TOOL = Rigid.exp([0.1, 0.2, -0.3, 40.0, -25.0, 110.0])
@@ -85,6 +87,19 @@ def test_chosen_poses_beat_every_random_set(observe, parameters):
     assert result.chosen.o1 > 1.02 * max(each.o1 for each in result.random)
     assert result.sigma_mm < 0.97 * result.random_sigma_mm
     assert result.exchanges > 0
+
+
+@pytest.mark.parametrize("observe", ["position", "pose"])
+def test_identification_states_the_indices_that_the_design_promised(observe):
+    """With σ₀ out of the σ that the residuals tell; the arm as made differs from its drawing by a thousandth."""
+    options = DesignOptions(count=40, observe=observe, candidates=300, sigma_mm=0.05, sigma_rad=2e-4)
+    planned = design(ARM, options)
+    true, rng = made(ARM, np.random.default_rng(2)), np.random.default_rng(3)
+    data = measured(true, planned.q, rng, 0.05, 2e-4)
+    found = identify(ARM, data, IdentifyOptions(observe, 0.05, 2e-4, folds=0))
+    for name, value in planned.chosen.values().items():
+        scale = 1.0 if name == "O2" else found.sigma0
+        assert found.observability.values()[name] * scale == pytest.approx(value, rel=0.02)
 
 
 def test_exchange_finds_the_best_of_all_sets_of_a_small_problem():
@@ -172,6 +187,7 @@ def test_command_line(tmp_path, monkeypatch, capsys):
     (tmp_path / "robot.toml").write_text(robot_toml(ARM))
     out = tmp_path / "poses.csv"
     arguments = ["--robot", str(tmp_path / "robot.toml"), "--count", "15", "--candidates", "150", "--out", str(out)]
+    arguments += ["--report", str(tmp_path / "poses.html"), "--json", str(tmp_path / "poses.json")]
     monkeypatch.setattr(
         "sys.argv", ["stcal", "robot", "design", *arguments, "--box", "-2500,-2500,-500,2500,2500,3000"]
     )
@@ -179,6 +195,10 @@ def test_command_line(tmp_path, monkeypatch, capsys):
         main()
     assert caught.value.code == 0
     assert "15 poses for 27 parameters" in capsys.readouterr().out
+    html, content = (tmp_path / "poses.html").read_text(), json.loads((tmp_path / "poses.json").read_text())
+    for name, value in content["chosen"].items():
+        assert f'<th scope="row" class="l">{name}</th><td>{value:.4g}</td>' in html
+    assert html.count("<img") == 3
     table = read_table(out, "poses")
     q = np.column_stack([table.numbers(f"q{i}_deg") for i in range(1, 7)])
     reached = forward(ARM, np.radians(q))

@@ -19,8 +19,10 @@ from stcal.geometry.rigid import Rigid
 from stcal.sfm import RunOptions, run
 from stcal.sfm.circle_projection import project_circles
 from stcal.sfm.faces import face_frame
+from stcal.sfm.images import Skipped
 from stcal.sfm.measure import MeasureOptions, measure, measure_json, measure_labelled, resolved
 from stcal.sfm.observations import ImageObservations
+from stcal.sfm.report_measure import measure_page
 from stcal.sfm.simulated_poses import face_view, faces_view, is_flipped, known_target, pose_error, see, view
 from stcal.sfm.single_pose import PoseOptions, pose_from_circles
 from stcal.sfm.target_circles import TargetCircles, read_target
@@ -180,6 +182,28 @@ def test_images_are_resolved_in_order_of_their_names(scene, known):
     assert content["images"][0]["alternative"] is None
     assert np.shape(content["images"][1]["alternative"]["camera_from_target"]) == (4, 4)
     json.dumps(content, allow_nan=False)
+
+
+def test_the_page_shows_every_pose_and_what_was_left_out(scene, known):
+    rng = np.random.default_rng(4)
+    truth = view(face_view(scene, "1"), np.radians(25), 4500, rng)
+    images = [
+        replace(see(scene, truth, ("1", "2", "4") if i == 0 else ("1",), 0.5, rng), name=f"<a>/{i}", group="a")
+        for i in range(4)
+    ]
+    result = measure_labelled(images, scene.camera, known.truth)
+    result = replace(result, left_out=(Skipped("b.jpg", "no face of the target recognised", "pose"),))
+    html = measure_page(result, "some folder")
+    rows = re.findall(r'<tr><th scope="row" class="l">(.*?)</th>(.*?)</tr>', html)
+    assert [name for name, _ in rows] == ["&lt;a&gt;/0", "&lt;a&gt;/1", "&lt;a&gt;/2", "&lt;a&gt;/3", "b.jpg"]
+    for (_, cells), each in zip(rows, result.images, strict=False):
+        sigma = 1e3 * np.sqrt(np.diag(each.pose.covariance)[3:])
+        assert each.pose.status in cells
+        assert all(f"<td>{value:.1f}</td>" in cells for value in sigma)
+    assert "no face of the target recognised" in rows[-1][1]
+    assert html.count("<img") == 3
+    assert "ambiguous: two poses fit" in html
+    assert measure_page(result, "some folder") == html
 
 
 def test_derivatives_of_the_ellipse_centres(scene, known):
@@ -378,7 +402,7 @@ def test_command_writes_poses_with_joints(stcal_sfm, small_dataset, small_run, t
     import cv2
 
     cv2.imwrite(str(tmp_path / "images" / "empty.png"), grey)
-    more = ("--joints", joints, "--json", tmp_path / "poses.json")
+    more = ("--joints", joints, "--json", tmp_path / "poses.json", "--report", tmp_path / "poses.html")
     code, out, err = stcal_sfm(*command(small_dataset, small_run, tmp_path, *more))
     assert (code, err.count("error")) == (0, 0)
     assert "left out empty.png: no face of the target recognised" in out
@@ -397,6 +421,7 @@ def test_command_writes_poses_with_joints(stcal_sfm, small_dataset, small_run, t
     assert set(parts) == {"image", "target", "intrinsics", "curvature"}
     assert np.allclose(sum(np.array(p) for p in parts.values()), content["images"][0]["covariance"], rtol=1e-9)
     assert len(list(tmp_path.glob("*.partial"))) == 0
+    assert "empty.png" in (tmp_path / "poses.html").read_text()
 
 
 def spoilt(small_run, tmp_path, change):

@@ -12,7 +12,7 @@ from stcal.errors import InputError
 from stcal.geometry.arrays import frozen
 from stcal.geometry.rigid import Poses
 from stcal.robot.data import joint_values
-from stcal.robot.inverse import LIMIT, ORIENTATION, SINGULAR_POSE, UNREACHABLE, Inverse, inverse
+from stcal.robot.inverse_kinematics import LIMIT, ORIENTATION, SINGULAR_POSE, UNREACHABLE, Inverse, inverse
 from stcal.robot.kinematics import forward
 from stcal.robot.model import Robot
 from stcal.table_file import LENGTHS, read_table

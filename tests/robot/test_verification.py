@@ -9,7 +9,7 @@ import pytest
 from stcal.cli.main import main
 from stcal.errors import InputError
 from stcal.geometry.rigid import Rigid
-from stcal.robot.verify import read_measured, verified_json, verified_text, verify
+from stcal.robot.verification import read_measured, verified_json, verified_text, verify
 
 HEAD = "set,commanded_x_mm,commanded_y_mm,commanded_z_mm,x_mm,y_mm,z_mm"
 COMMANDED = np.array([[0, 0, 0], [30, 0, 0], [0, 40, 0], [0, 0, 50], [60, 80, 0]], float)

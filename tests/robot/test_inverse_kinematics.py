@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 
 from stcal.errors import InputError
 from stcal.geometry.rigid import Poses, Rigid
-from stcal.robot.inverse import branches, inverse
+from stcal.robot.inverse_kinematics import branches, inverse
 from stcal.robot.kinematics import forward
 from stcal.robot.model import DHRow, Joint, Robot
 from stcal.robot.simulated import joint_vectors, made, mh80

@@ -5,10 +5,9 @@ from html import escape
 import numpy as np
 
 from stcal.page import COLOURS, NONE, calm, fold, new_figure, number, page, plot, table, uri
-from stcal.robot.identify import Identified
+from stcal.robot.identification import Identified
 from stcal.robot.model import Robot
 from stcal.robot.nominal import dh_values
-from stcal.robot.observability import Observability
 
 DH = ("a", "alpha", "d", "theta", "beta")
 UNITS = ("mm", "deg", "mm", "deg", "deg")
@@ -18,9 +17,9 @@ FIRST_OUTLIERS = 10
 
 def identified_text(result: Identified, nominal: Robot) -> str:
     """Tables for the terminal."""
-    seen, kinds = result.seen, ", ".join(f"{k}s {v}" for k, v in result.ranks.items())
+    kinds = ", ".join(f"{k}s {v}" for k, v in result.ranks.items())
     lines = [
-        f"robot {nominal.name}: {len(seen)} {seen.kind}s, {result.rank} parameters determined "
+        f"robot {nominal.name}: {_observations(result)}, {result.rank} parameters determined "
         f"(what these joint values determine: {kinds})",
         _noise(result),
         "",
@@ -34,7 +33,7 @@ def identified_text(result: Identified, nominal: Robot) -> str:
     for i, (row, s) in enumerate(zip(values, sigma, strict=True), 1):
         cells = "".join(f"{v:13.4f}{_sigma(e):>9}" for v, e in zip(row, s, strict=True))
         lines.append(f"{i:>6}{cells}")
-    indices = _indices(result).values()
+    indices = result.observability.values()
     lines += ["", "observability  " + "   ".join(f"{name} {value:.3g}" for name, value in indices.items())]
     outliers = result.outliers()
     if outliers:
@@ -52,12 +51,13 @@ def identified_json(result: Identified, nominal: Robot) -> dict:
     content = {
         "format": "stcal identified 1",
         "robot": nominal.name,
-        "observed": result.seen.kind,
+        "observed": result.seen.used,
         "observations": len(result.seen),
         "rank": result.rank,
         "parameters": len(result.names),
         "ranks": result.ranks,
         "undetermined": list(result.undetermined),
+        "notes": list(result.seen.data.notes),
         "sigma_mm": result.weighting.sigma_mm,
         "sigma_rad": result.weighting.sigma_rad if result.seen.kind == "pose" else None,
         "sigma0": result.sigma0,
@@ -71,7 +71,7 @@ def identified_json(result: Identified, nominal: Robot) -> dict:
             for key, errors in zip(("nominal", "identified"), list(_errors(result).values())[:2], strict=True)
         },
         "held_out": None,
-        "observability": _indices(result).values(),
+        "observability": result.observability.values(),
         "rows": [
             {name: {"nominal": b, "identified": v, "sigma": s} for name, b, v, s in zip(DH, *each, strict=True)}
             for each in zip(before.tolist(), values.tolist(), result.dh_sigma.tolist(), strict=True)
@@ -103,10 +103,11 @@ def identified_page(result: Identified, nominal: Robot) -> str:
     """The report page."""
     title = f"{nominal.name}: identified"
     seen = result.seen
-    counts = f"{len(seen)} {seen.kind}s from {seen.data.where}, {result.rank} parameters determined"
+    counts = f"{_observations(result)} from {seen.data.where}, {result.rank} parameters determined"
     banner = f'<h1>{escape(title)}</h1>\n<p class="counts">{escape(counts)}</p>\n'
+    banner += "".join(f"<p>{escape(note)}</p>\n" for note in seen.data.notes)
     errors = [[name, *(number(v, 4) for v in _statistics(e))] for name, e in _errors(result).items()]
-    facts = [[name, f"{value:.4g}"] for name, value in _indices(result).values().items()]
+    facts = [[name, f"{value:.4g}"] for name, value in result.observability.values().items()]
     accuracy = (
         table(["<Error", "Mean (mm)", "RMS (mm)", "Max (mm)"], errors)
         + f"<p>{escape(_noise(result))}. Held out: rows that took no part in the fit that they judge.</p>\n"
@@ -200,12 +201,14 @@ def _noise(result: Identified) -> str:
     )
 
 
-def _indices(result: Identified) -> Observability:
-    return Observability.of(result.spectrum * result.weighting.sigma_mm, len(result.seen))
-
-
 def _sigma(value: float) -> str:
     return "" if value == 0 else f"{value:.4f}"
+
+
+def _observations(result: Identified) -> str:
+    """How many of what."""
+    seen = result.seen
+    return f"{len(seen)} {seen.kind}s" + (" by their distances" if seen.frameless else "")
 
 
 def _line(result: Identified, row: int) -> int:

@@ -1,16 +1,18 @@
 """Identification of a robot's kinematics from poses, positions or distances: parameters, σ and held-out error."""
 
-from dataclasses import astuple, dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 
-from stcal.errors import DegenerateError
+from stcal.errors import DegenerateError, InputError
 from stcal.geometry.arrays import frozen
-from stcal.robot.adjustment import Solution, Weighting, normal_rank, solve
+from stcal.geometry.rigid import skew
+from stcal.robot.adjustment import Solution, Weighting, normal_rank, parameter_units, solve, unseen
 from stcal.robot.data import Measurements
 from stcal.robot.dh import robot_from_chain
 from stcal.robot.model import Robot
-from stcal.robot.nominal import Deviations, NominalRows, dh_slope
+from stcal.robot.nominal import Deviations, NominalRows
+from stcal.robot.observability import Observability, parameter_scale
 from stcal.robot.observe import (
     WIDTH,
     Kind,
@@ -25,11 +27,16 @@ from stcal.robot.observe import (
     unknowns,
 )
 from stcal.robot.start import start
+from stcal.robot.variances import Components, components, estimated
 
-GUESS_MM, GUESS_RAD = 0.1, 5e-4
-"""σ to begin with where none is given; then they are estimated."""
+LEAST_MM, LEAST_RAD = 1e-3, 1e-6
+"""σ where none is given begin at the misfit of the nominal robot, but not below this."""
+TYPICAL_MM, TYPICAL_RAD = 0.1, 5e-4
+"""Of instruments: what joint values determine is told for these."""
 VARIANCE_ROUNDS = 10
 VARIANCE_SETTLED = 1e-3
+FALLS = 0.5
+"""Medians of residuals that fall by less are near enough for the estimates proper."""
 STILL_RAD, STILL_MM = 1e-5, 1e-2
 """A joint that moves less than this did not move."""
 OUTLIER_WEIGHT = 0.5
@@ -52,6 +59,11 @@ class IdentifyOptions:
     seed: int = 0
     partial: bool = False
 
+    def __post_init__(self):
+        for name, value, most in (("sigma_mm", self.sigma_mm, 1e3), ("sigma_rad", self.sigma_rad, 1.0)):
+            if value is not None and not 1e-12 <= value <= most:
+                raise InputError(f"{name} is {value:g}; a number above 0, up to {most:g}, needed")
+
 
 @dataclass(frozen=True, slots=True, eq=False)
 class HeldOut:
@@ -71,8 +83,8 @@ class Identified:
     ``rank`` of the data used, ``ranks`` by kind of observation of the same joint values;
     ``undetermined`` : names of parameters along directions that were kept nominal; ``weights`` : (r,) Huber's;
     ``nominal_mm``, ``fitted_mm`` : (r,) errors with nominal axes (base and tools fitted) and identified ones;
-    ``dh_sigma`` : (n, 5) of a, alpha, d, theta, beta, mm and rad; ``spectrum`` : (rank,) singular values in 1/mm of the
-    tool's movement, whitened; ``deviations`` : σ of this robot's dimensions about nominal, as the data show them.
+    ``dh_sigma`` : (n, 5) of a, alpha, d, theta, beta, mm and rad; ``observability`` : of the parameters
+    that are determined; ``deviations`` : σ of this robot's dimensions about nominal, as the data show them.
     """
 
     robot: Robot
@@ -91,7 +103,7 @@ class Identified:
     fitted_mm: np.ndarray
     held_out: HeldOut | None
     dh_sigma: np.ndarray
-    spectrum: np.ndarray
+    observability: Observability
     deviations: Deviations
 
     def __post_init__(self):
@@ -122,31 +134,31 @@ def identify(robot: Robot, data: Measurements, options: IdentifyOptions | None =
     _still_joints(robot, data, options.partial)
     first = start(robot, data)
     _enough(robot, seen, first)
-    solution, weighting, sigma0, deviations = _weighted(robot, first, seen, options)
+    adjusted = _adjusted(robot, first, seen, options)
+    solution, weighting = adjusted.solution, adjusted.weighting
     names = parameter_names(solution.state, seen.kind)
     undetermined = _undetermined(solution, names, seen, options.partial)
-    covariance = sigma0**2 * (_of_distances(solution, seen, weighting) if seen.derived else solution.inverse())
-    values, _, good = solution.spectrum()
+    covariance, rank = _covariance(adjusted, seen), solution.rank() - _place(seen)
     identified = robot_from_chain(solution.state.chain, solution.state.tools, robot)
     return Identified(
         identified,
         solution.state,
         seen,
         weighting,
-        sigma0,
+        weighting.factor,
         tuple(names),
         covariance,
-        solution.rank(),
-        _ranks(solution.state, data, weighting),
+        rank,
+        _ranks(solution.state, data),
         undetermined,
         solution.weights,
         solution.residuals,
         _lengths(residuals(first, seen)),
         _lengths(solution.residuals),
-        _cross_validated(robot, seen, weighting, options),
-        _dh_sigma(solution, covariance, seen.kind, robot),
-        np.sqrt(values[good])[::-1],
-        deviations,
+        _cross_validated(robot, seen, adjusted, options),
+        adjusted.rows.sigma(identified, covariance),
+        _observability(identified, adjusted, seen, rank),
+        adjusted.deviations,
     )
 
 
@@ -162,80 +174,66 @@ def _still_joints(robot: Robot, data: Measurements, partial: bool) -> None:
 
 
 def _enough(robot: Robot, seen: Observed, state: State) -> None:
-    unknowns = len(parameter_names(state, seen.kind))
+    seeks = len(parameter_names(state, seen.kind)) - unseen(seen.kind)
     numbers = WIDTH[seen.kind] * len(seen)
-    if numbers <= unknowns:
-        needed = unknowns // WIDTH[seen.kind] + 1
+    if numbers <= seeks:
+        needed = seeks // WIDTH[seen.kind] + 1
         raise DegenerateError(
-            f"{seen.data.where}: {len(seen)} {seen.kind}s give {numbers} numbers for {unknowns} parameters; "
+            f"{seen.data.where}: {len(seen)} {seen.kind}s give {numbers} numbers for {seeks} parameters; "
             f"{needed} or more needed, better twice that"
         )
 
 
-def _weighted(nominal: Robot, state: State, seen: Observed, options: IdentifyOptions):
-    """Solve; with σ from the residuals where none is given (Förstner's variance components); σ₀ after that."""
-    given = seen.data.covariance is not None and options.sigma_mm is None and options.sigma_rad is None
-    given = given and seen.kind != "distance"
-    weighting = Weighting(options.sigma_mm or GUESS_MM, options.sigma_rad or GUESS_RAD, given)
-    free = not given and (options.sigma_mm is None or (options.sigma_rad is None and seen.kind == "pose"))
-    solution = solve(state, seen, weighting, options.robust)
-    deviations, rows = Deviations(), NominalRows.about(solution, seen.kind, nominal)
+def _weighting(state: State, seen: Observed, options: IdentifyOptions) -> Weighting:
+    """Where σ begin, and which the residuals tell. What is given for all coordinates are weights, times σ₀; one σ given
+    of two is taken as it is. The others begin at the misfit, so that no observation is an outlier of the start."""
+    sigma = {"mm": options.sigma_mm, "rad": options.sigma_rad}
+    needed = ("rad", "mm") if seen.kind == "pose" else ("mm",)
+    missing = tuple(name for name in needed if sigma[name] is None)
+    own = seen.data.covariance is not None and seen.kind != "distance" and missing == needed
+    estimated = ("factor",) if own or not missing else missing
+    weighting = Weighting(options.sigma_mm or LEAST_MM, options.sigma_rad or LEAST_RAD, own, estimated=estimated)
+    white = weighting.whiten(residuals(state, seen), seen)
+    misfit = {name: float(np.median(np.abs(white[:, c]))) for name, c in weighting.columns(white.shape[1]).items()}
+    return weighting.with_values({n: weighting.value(n) * max(misfit[n], 1.0) for n in estimated})
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Adjusted:
+    """A solution with the σ that go with it."""
+
+    solution: Solution
+    weighting: Weighting
+    deviations: Deviations
+    rows: NominalRows
+    parts: Components
+
+
+def _adjusted(
+    nominal: Robot, state: State, seen: Observed, options: IdentifyOptions, rows: NominalRows | None = None
+) -> _Adjusted:
+    """Solve, and estimate σ, in turns."""
+    weighting, deviations = _weighting(state, seen, options), Deviations()
+    rows = rows or NominalRows.about(state, parameter_units(jacobian(state, seen)), seen.kind, nominal)
+    for _ in range(VARIANCE_ROUNDS):  # by medians, which outliers do not move, until they stay
+        state = solve(state, seen, weighting, options.robust, rows.held(state, deviations)).state
+        before, weighting = weighting, _weighting(state, seen, options)
+        if all(weighting.value(n) > FALLS * before.value(n) for n in weighting.estimated):
+            break
     for _ in range(VARIANCE_ROUNDS):
-        held = rows.held(solution.state, deviations)
-        solution = solve(solution.state, seen, weighting, options.robust, held)
-        new_deviations = rows.estimated(solution, deviations)
-        new = _variances(solution, seen, weighting, options) if free else weighting
-        change = _change(astuple(new)[:2] + astuple(new_deviations), astuple(weighting)[:2] + astuple(deviations))
-        weighting, deviations = new, new_deviations
+        solution = solve(state, seen, weighting, options.robust, rows.held(state, deviations))
+        parts = components(solution, seen, weighting, options.robust, rows, deviations)
+        new_weighting, new_deviations, change = estimated(parts, rows, weighting, deviations)
         if change < VARIANCE_SETTLED:
             break
-    held = rows.held(solution.state, deviations)
-    solution = solve(solution.state, seen, weighting, options.robust, held)
-    white = weighting.whiten(solution.residuals, seen)
-    redundancy = solution.weights.sum() * white.shape[1] - solution.rank()
-    sigma0 = float(np.sqrt((solution.weights[:, None] * white**2).sum() / max(redundancy, 1.0)))
-    return solution, weighting, 1.0 if free else sigma0, deviations
-
-
-def _variances(solution: Solution, seen: Observed, weighting: Weighting, options: IdentifyOptions) -> Weighting:
-    """σ of each kind of coordinate from its residuals and its share of the redundancy."""
-    slope = weighting.whiten(jacobian(solution.state, seen), seen)
-    white = weighting.whiten(solution.residuals, seen)
-    inverse = solution.inverse()
-    part = np.einsum("rwk,kl,rwl->rw", slope, inverse, slope) * solution.weights[:, None]
-    left = solution.weights[:, None] * (1 - part)
-    square = solution.weights[:, None] * white**2
-    mm = slice(-3, None) if white.shape[1] > 1 else slice(None)
-    sigma_mm = weighting.sigma_mm * np.sqrt(square[:, mm].sum() / max(left[:, mm].sum(), 1e-3))
-    sigma_rad = weighting.sigma_rad
-    if white.shape[1] == 6:
-        sigma_rad = sigma_rad * np.sqrt(square[:, :3].sum() / max(left[:, :3].sum(), 1e-3))
-    least = 1e-9  # data without noise
-    return Weighting(options.sigma_mm or max(float(sigma_mm), least), options.sigma_rad or max(float(sigma_rad), least))
-
-
-def _of_distances(solution: Solution, seen: Observed, weighting: Weighting) -> np.ndarray:
-    """Covariance where distances were made of positions, whose noise they share (the sandwich of least squares)."""
-    tip = tips(solution.state, seen.data).translation
-    apart = tip[seen.first] - tip[seen.second]
-    unit = apart / np.linalg.norm(apart, axis=1)[:, None]
-    slope = jacobian(solution.state, seen)[:, 0] * solution.weights[:, None] / weighting.sigma_mm**2
-    by_position = np.zeros((len(tip), 3, slope.shape[1]))
-    pulled = unit[:, :, None] * slope[:, None, :]
-    np.add.at(by_position, seen.first, pulled)
-    np.add.at(by_position, seen.second, -pulled)
-    inverse = solution.inverse()
-    middle = np.einsum("mak,mal->kl", by_position, by_position)
-    # of the squared residuals' expectation, tr(W D Dᵀ) less what the parameters take up
-    left = 2 * solution.weights.sum() - weighting.sigma_mm**2 * np.trace(inverse @ middle)
-    square = float((solution.weights * solution.residuals[:, 0] ** 2).sum())
-    return square / max(left, 1e-3) * inverse @ middle @ inverse
+        state, weighting, deviations = solution.state, new_weighting, new_deviations
+    return _Adjusted(solution, weighting, deviations, rows, parts)
 
 
 def _undetermined(solution: Solution, names: list[str], seen: Observed, partial: bool) -> tuple[str, ...]:
     """Parameters along the directions that the data leave open, beyond those that distances never see."""
     _, directions, good = solution.spectrum()
-    expected = 6 if seen.kind == "distance" else 0
+    expected = unseen(seen.kind)
     open_ones = directions[:, ~good]
     if open_ones.shape[1] <= expected:
         return ()
@@ -250,16 +248,51 @@ def _undetermined(solution: Solution, names: list[str], seen: Observed, partial:
     return found
 
 
-def _ranks(state: State, data: Measurements, weighting: Weighting) -> dict[str, int]:
+def _ranks(state: State, data: Measurements) -> dict[str, int]:
     """Parameters that poses, positions and distances at these joint values determine, whichever were measured."""
-    tip = tips(state, data)
+    tip = tips(state, data.q, data.targets)
     exact = Measurements(data.where, data.lines, data.q, data.targets, tip.translation, tip.rotation)
-    weighting = replace(weighting, given=False)
-    return {kind: normal_rank(state, observed(exact, kind), weighting) for kind in WIDTH}
+    ranks, weighting = {}, Weighting(TYPICAL_MM, TYPICAL_RAD)
+    for kind in WIDTH:
+        seen = observed(exact, kind)
+        ranks[kind] = normal_rank(state, seen, weighting) - _place(seen)
+    return ranks
 
 
-def _cross_validated(robot: Robot, seen: Observed, weighting: Weighting, options: IdentifyOptions) -> HeldOut | None:
-    """Errors of rows that took no part, each fit begun from the nominal robot."""
+def _observability(robot: Robot, adjusted: _Adjusted, seen: Observed, rank: int) -> Observability:
+    state, weighting = adjusted.solution.state, adjusted.weighting
+    rows = weighting.whiten(jacobian(state, seen), seen) * parameter_scale(robot, seen.kind, state.tools)
+    if seen.frameless:  # without what a motion of all points makes
+        at = seen.data.positions - seen.data.positions.mean(0)
+        motions = np.concatenate([-skew(at) / np.linalg.norm(at), np.tile(np.eye(3), (len(at), 1, 1))], axis=2)
+        u, s, _ = np.linalg.svd(weighting.whiten(motions, seen).reshape(-1, 6), full_matrices=False)
+        u, flat = u[:, s > 1e-9 * s[0]], rows.reshape(-1, rows.shape[2])
+        rows = (flat - u @ (u.T @ flat)).reshape(rows.shape)
+    return Observability.of_jacobian(rows, rank)
+
+
+def _place(seen: Observed) -> int:
+    """Directions in which positions that count by their distances can be moved together: 6 (5 of points on a line)."""
+    if not seen.frameless:
+        return 0
+    at = seen.data.positions - seen.data.positions.mean(0)
+    turns = np.linalg.matrix_rank(skew(at).reshape(-1, 3), tol=STILL_MM)
+    return 3 + int(turns)
+
+
+def _covariance(adjusted: _Adjusted, seen: Observed) -> np.ndarray:
+    """(k, k) of the parameters; none along the directions that distances never see, which stay where they were."""
+    covariance = adjusted.parts.covariance(np.zeros(len(adjusted.parts.count)))
+    if seen.kind != "distance":
+        return covariance
+    units = adjusted.solution.units
+    blind = adjusted.solution.spectrum()[1][:, : unseen(seen.kind)]
+    kept = (np.eye(len(units)) - blind @ blind.T) * units[:, None] / units
+    return kept @ covariance @ kept.T
+
+
+def _cross_validated(robot: Robot, seen: Observed, whole: _Adjusted, options: IdentifyOptions) -> HeldOut | None:
+    """Errors of rows that took no part: of neither the parameters nor (where rows are few) the σ."""
     rows = len(seen)
     folds = min(options.folds, rows)
     if folds < 2:
@@ -271,13 +304,17 @@ def _cross_validated(robot: Robot, seen: Observed, weighting: Weighting, options
         fold = rng.permutation(np.arange(rows) % folds)
         for k in range(folds):
             train, test = only_of(seen, fold != k), only_of(seen, fold == k)
-            if WIDTH[seen.kind] * len(train) <= unknowns(robot.chain(), len(set(train.data.targets)), seen.kind):
+            seeks = unknowns(robot.chain(), len(set(train.data.targets)), seen.kind) - unseen(seen.kind)
+            if WIDTH[seen.kind] * len(train) <= seeks:
                 return None
             begin = start(robot, train.data)
-            if rows <= FEW_ROWS:  # σ too from these rows alone
-                state = _weighted(robot, begin, train, options)[0].state
+            if rows <= FEW_ROWS:
+                state = _adjusted(robot, begin, train, options, whole.rows).solution.state
             else:
-                state = solve(begin, train, weighting, options.robust).state
+                state = begin
+                for weighting in (_weighting(begin, train, options), whole.weighting):
+                    held = whole.rows.held(state, whole.deviations)
+                    state = solve(state, train, weighting, options.robust, held).state
             known = np.array([t in state.tools for t in test.data.targets])
             if seen.kind != "distance":
                 test = only_of(test, known)
@@ -288,17 +325,6 @@ def _cross_validated(robot: Robot, seen: Observed, weighting: Weighting, options
             if seen.kind == "pose":
                 rotation[repeat, place] = np.linalg.norm(found[:, :3], axis=1)
     return HeldOut(folds, position, rotation)
-
-
-def _dh_sigma(solution: Solution, covariance: np.ndarray, kind: Kind, nominal: Robot) -> np.ndarray:
-    """(n, 5) σ of a, alpha, d, theta, beta."""
-    slope = dh_slope(solution.state, solution.units, kind, nominal)
-    return np.sqrt(np.einsum("njk,kl,njl->nj", slope, covariance, slope).clip(0))
-
-
-def _change(new: tuple[float, ...], old: tuple[float, ...]) -> float:
-    """Largest relative change."""
-    return float(np.abs(np.log(np.array(new) / np.array(old))).max())
 
 
 def _lengths(found: np.ndarray) -> np.ndarray:

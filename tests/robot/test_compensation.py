@@ -11,7 +11,7 @@ import pytest
 from stcal.cli.main import main
 from stcal.errors import InputError
 from stcal.geometry.rigid import Rigid
-from stcal.robot.compensate import compensate, compensated_csv, compensated_json, read_targets
+from stcal.robot.compensation import compensate, compensated_csv, compensated_json, read_targets
 from stcal.robot.kinematics import forward
 from stcal.robot.model import Joint
 from stcal.robot.robot_file import load_robot, robot_toml

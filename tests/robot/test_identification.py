@@ -2,6 +2,7 @@
 
 import json
 import re
+import time
 from dataclasses import replace
 from pathlib import Path
 
@@ -12,35 +13,30 @@ from scipy.spatial.transform import Rotation
 from stcal.errors import DegenerateError, InputError
 from stcal.geometry.rigid import Rigid
 from stcal.robot.data import Measurements, read_measurements
-from stcal.robot.identify import IdentifyOptions, identify
-from stcal.robot.identify_report import identified_json, identified_page, identified_text
+from stcal.robot.identification import IdentifyOptions, identify
+from stcal.robot.identification_report import identified_json, identified_page, identified_text
 from stcal.robot.kinematics import flange_poses
 from stcal.robot.model import DHRow, Joint, Robot
+from stcal.robot.nominal import dh_values
 from stcal.robot.observe import jacobian, moved, observed, residuals, tips
 from stcal.robot.robot_file import load_robot, robot_toml
-from stcal.robot.simulated import joint_vectors, made, mh80, placed
+from stcal.robot.simulated import joint_vectors, made, measured, mh80, placed
 
 ROKAE = Path(__file__).resolve().parents[2].parent / "shared" / "data" / "rokae_tracker" / "data"
 QUICK = IdentifyOptions(folds=0)
 
 
-def measured(seed: int, count: int, sigma_mm: float = 0.05, sigma_rad: float = 2e-4, targets=("",)):
+def simulated(seed: int, count: int, sigma_mm: float = 0.05, sigma_rad: float = 2e-4, targets=("",)):
     """A made arm somewhere in the instrument's frame, and what the instrument sees of it."""
     rng = np.random.default_rng(seed)
     tools = {name: Rigid.exp(rng.normal(0, 0.5, 6) * [1, 1, 1, 200, 200, 200]) for name in targets}
     true = placed(made(mh80(), rng), Rigid.exp(rng.normal(0, 1, 6) * [1, 1, 1, 1000, 1000, 1000]), tools)
-    q = joint_vectors(true, count, rng)
-    names = tuple(targets[i % len(targets)] for i in range(count))
-    flange = flange_poses(true.chain(), q)
-    poses = [flange[i] @ tools[name] for i, name in enumerate(names)]
-    turn = Rotation.from_rotvec(rng.normal(0, 1, (count, 3)) * sigma_rad).as_matrix()
-    positions = np.array([p.translation for p in poses]) + rng.normal(0, 1, (count, 3)) * sigma_mm
-    rotations = turn @ np.array([p.rotation for p in poses])
-    return true, Measurements("simulated", range(2, count + 2), q, names, positions, rotations)
+    names = [targets[i % len(targets)] for i in range(count)]
+    return true, measured(true, joint_vectors(true, count, rng), rng, sigma_mm, sigma_rad, names)
 
 
 def test_without_noise_the_arm_is_found_exactly():
-    true, data = measured(1, 40, 0, 0)
+    true, data = simulated(1, 40, 0, 0)
     found = identify(mh80(), data, QUICK)
     q = joint_vectors(true, 50, np.random.default_rng(9))
     error = (flange_poses(true.chain(), q) @ true.tools[""]).difference(
@@ -52,14 +48,14 @@ def test_without_noise_the_arm_is_found_exactly():
 
 @pytest.mark.parametrize(("kind", "rank"), [("pose", 30), ("position", 27), ("distance", 21)])
 def test_ranks_are_those_of_a_six_axis_arm(kind, rank):
-    _, data = measured(2, 45)
+    _, data = simulated(2, 45)
     found = identify(mh80(), data, replace(QUICK, observe=kind))
     assert found.rank == rank
     assert found.ranks == {"pose": 30, "position": 27, "distance": 21}
 
 
 def test_rows_base_and_tools_make_the_poses_of_the_minimal_parameters():
-    _, data = measured(3, 40, targets=("N1", "N2"))
+    _, data = simulated(3, 40, targets=("N1", "N2"))
     found = identify(mh80(), data, QUICK)
     again = load_robot_text(robot_toml(found.robot))
     for name in ("N1", "N2"):
@@ -80,8 +76,8 @@ def load_robot_text(text: str) -> Robot:
 @pytest.mark.parametrize("kind", ["pose", "position", "distance"])
 def test_derivatives_are_those_of_differences(kind):
     # without noise: with residuals w the logarithm of a rotation turns by w / 2 more
-    _, data = measured(4, 12, 0, 0, targets=("a", "b"))
-    state = identify(mh80(), measured(4, 40, 0, 0, targets=("a", "b"))[1], QUICK).state
+    _, data = simulated(4, 12, 0, 0, targets=("a", "b"))
+    state = identify(mh80(), simulated(4, 40, 0, 0, targets=("a", "b"))[1], QUICK).state
     seen = observed(data, kind)
     analytic = jacobian(state, seen)
     for k in range(analytic.shape[2]):
@@ -92,12 +88,14 @@ def test_derivatives_are_those_of_differences(kind):
 
 
 def test_held_out_error_is_that_of_new_poses():
-    true, data = measured(5, 60)
+    true, data = simulated(5, 60)
     found = identify(mh80(), data)
     q = joint_vectors(true, 500, np.random.default_rng(7))
     new = Measurements("", range(500), q, ("",) * 500, np.zeros((500, 3)), np.tile(np.eye(3), (500, 1, 1)))
     model = np.linalg.norm(
-        (flange_poses(true.chain(), q) @ true.tools[""]).translation - tips(found.state, new).translation, axis=1
+        (flange_poses(true.chain(), q) @ true.tools[""]).translation
+        - tips(found.state, new.q, new.targets).translation,
+        axis=1,
     )
     # mean length of the noise alone is 1.6 σ; the model's own error comes on top, in squares
     expected = np.hypot(0.05 * np.sqrt(8 / np.pi), model.mean())
@@ -105,8 +103,47 @@ def test_held_out_error_is_that_of_new_poses():
     assert found.held_out.position_mm.mean() > found.fitted_mm.mean()
 
 
+def test_the_covariance_is_true():
+    """30 positions: σ of the noise and of the arm's dimensions are estimated from little."""
+    draws, errors, rows = 40, [], []
+    for seed in range(draws):
+        true, data = simulated(1000 + seed, 30)
+        found = identify(mh80(), replace(data, rotations=None), QUICK)
+        q = joint_vectors(true, 100, np.random.default_rng(seed))
+        exact = observed(replace(measured(true, q, np.random.default_rng(0), 0, 0), rotations=None))
+        slope = jacobian(found.state, exact).reshape(300, 27)
+        away = np.linalg.lstsq(slope, residuals(found.state, exact).ravel(), rcond=None)[0]
+        errors.append(away @ np.linalg.solve(found.covariance, away) / 27)
+        seen = found.dh_sigma > 0
+        rows.append((((dh_values(found.robot) - dh_values(true)) / found.dh_sigma.clip(1e-12)) ** 2)[seen].mean())
+        assert seen.sum() == 18
+    # Squares of 27 normal numbers have a relative σ of √(2 / 27); three times what is left of it after so many draws.
+    # Those of the rows are correlated: √(2 / 9) at the most or so.
+    assert np.mean(errors) == pytest.approx(1, abs=3 * np.sqrt(2 / 27 / draws))
+    assert np.mean(rows) == pytest.approx(1, abs=3 * np.sqrt(2 / 9 / draws))
+
+
+def test_three_thousand_poses_are_no_trouble():
+    """Ratio within one run, to one least-squares solution of that size: 40 to 60 measured (`scripts/bench_robot.py`),
+    which are 0.3 s; linear in the number of poses."""
+    _, data = simulated(9, 3000)
+    matrix, right = np.random.default_rng(0).normal(size=(18000, 30)), np.ones(18000)
+    plain, own = [], []
+    for _ in range(3):
+        start = time.perf_counter()
+        np.linalg.lstsq(matrix, right, rcond=None)
+        plain.append(time.perf_counter() - start)
+    for _ in range(2):
+        start = time.perf_counter()
+        found = identify(mh80(), data, QUICK)
+        own.append(time.perf_counter() - start)
+    assert found.rank == 30
+    assert found.weighting.sigma_mm == pytest.approx(0.05, rel=4 / np.sqrt(2 * 9000))
+    assert min(own) < 400 * min(plain)
+
+
 def test_an_outlier_is_named_and_does_no_harm():
-    _, data = measured(6, 50)
+    _, data = simulated(6, 50)
     positions = data.positions.copy()
     positions[17] += [0, 5, 0]
     clean, spoilt = (identify(mh80(), d, QUICK) for d in (data, replace(data, positions=positions)))
@@ -117,7 +154,7 @@ def test_an_outlier_is_named_and_does_no_harm():
 
 
 def test_report_and_json_hold_the_result():
-    _, data = measured(7, 40)
+    _, data = simulated(7, 40)
     found = identify(mh80(), data, IdentifyOptions(folds=3, repeats=1))
     content = json.loads(json.dumps(identified_json(found, mh80()), allow_nan=False))
     assert content["rank"] == 30
@@ -140,7 +177,7 @@ def test_report_and_json_hold_the_result():
     ],
 )
 def test_data_that_cannot_be_right_are_named(spoil, kind, words):
-    _, data = measured(8, 40)
+    _, data = simulated(8, 40)
     with pytest.raises(kind, match=words):
         identify(mh80(), spoil(data), QUICK)
 
@@ -158,7 +195,7 @@ def test_an_arm_whose_rows_are_singular_is_identified():
     # mean length of the noise is 1.6 σ = 0.08 mm, less what 30 parameters take up of 360 numbers
     assert 0.06 < found.fitted_mm.mean() < 0.09
     again = flange_poses(found.robot.chain(), q) @ found.robot.tools[""]
-    assert again.difference(tips(found.state, data)) == pytest.approx(np.zeros((60, 6)), abs=1e-9)
+    assert again.difference(tips(found.state, data.q, data.targets)) == pytest.approx(np.zeros((60, 6)), abs=1e-9)
 
 
 def rokae() -> tuple[Robot, str]:

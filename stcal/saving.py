@@ -1,0 +1,36 @@
+"""Files that appear complete or not at all."""
+
+import json
+import os
+from contextlib import suppress
+from pathlib import Path
+
+from stcal.errors import InputError
+
+
+def save(path: Path, content: str | bytes) -> None:
+    """Write a file at once, its folder too where there is none.
+
+    Raises
+    ------
+    InputError
+        It cannot be written.
+    """
+    partial = path.with_name(f"{path.name}.{os.getpid()}.partial")
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        partial.write_bytes(content.encode() if isinstance(content, str) else content)
+        os.replace(partial, path)
+    except OSError as error:
+        raise InputError(
+            f"{path}: cannot be written: {error.strerror or error}; check the folder's space and rights, or give "
+            "another place"
+        ) from error
+    finally:
+        with suppress(OSError):  # where a file stands in the folder's place there is none to remove
+            partial.unlink(missing_ok=True)
+
+
+def json_text(content: dict) -> str:
+    """As all JSON files of the package are written."""
+    return json.dumps(content, indent=1, ensure_ascii=False, allow_nan=False) + "\n"

@@ -1,0 +1,47 @@
+"""Files appear complete or not at all."""
+
+import json
+
+import pytest
+
+from stcal.errors import InputError
+from stcal.saving import json_text, save
+
+
+def test_text_bytes_and_folders(tmp_path):
+    save(tmp_path / "a" / "b" / "text.txt", "µ\n")
+    assert (tmp_path / "a" / "b" / "text.txt").read_bytes() == "µ\n".encode()
+    save(tmp_path / "bytes", b"\x00\xff")
+    assert (tmp_path / "bytes").read_bytes() == b"\x00\xff"
+    assert sorted(p.name for p in tmp_path.iterdir()) == ["a", "bytes"]
+
+
+def test_a_failed_write_leaves_the_old_file_and_nothing_else(tmp_path, monkeypatch):
+    path = tmp_path / "result.csv"
+    save(path, "old")
+
+    def full(self, data):
+        with self.open("wb") as file:
+            file.write(data[:2])
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr("pathlib.Path.write_bytes", full)
+    with pytest.raises(InputError, match=r"result\.csv: cannot be written: No space left on device; check"):
+        save(path, "new content")
+    assert path.read_text() == "old"
+    assert [p.name for p in tmp_path.iterdir()] == ["result.csv"]
+
+
+@pytest.mark.parametrize("place", ["file/below.txt", "folder"])
+def test_a_place_that_is_none_is_named(tmp_path, place):
+    (tmp_path / "file").write_text("")
+    (tmp_path / "folder").mkdir()
+    with pytest.raises(InputError, match=f"{place}: cannot be written"):
+        save(tmp_path / place, "x")
+
+
+def test_json_keeps_letters_and_refuses_what_is_no_json():
+    assert json.loads(json_text({"σ": [1.0]})) == {"σ": [1.0]}
+    assert "σ" in json_text({"σ": 1})
+    with pytest.raises(ValueError, match="JSON"):
+        json_text({"a": float("nan")})
