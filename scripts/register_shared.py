@@ -30,7 +30,7 @@ from stcal.register import register
 from stcal.register.liu2017 import affine_least_squares
 from stcal.robot.data import Measurements
 from stcal.robot.dh import robot_from_chain
-from stcal.robot.identify import IdentifyOptions, identify
+from stcal.robot.identification import IdentifyOptions, identify
 from stcal.robot.kinematics import forward
 from stcal.robot.model import Chain, DHRow, Joint, Robot
 from stcal.robot.robot_file import robot_toml

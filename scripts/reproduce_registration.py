@@ -31,7 +31,7 @@ from stcal.register import register
 from stcal.register.field import residual_field
 from stcal.register.liu2017 import Liu2017Options, affine_least_squares, liu2017
 from stcal.robot.data import Measurements
-from stcal.robot.identify import IdentifyOptions
+from stcal.robot.identification import IdentifyOptions
 from stcal.robot.kinematics import forward
 from stcal.robot.model import Robot
 from stcal.robot.simulated import made, mh80
