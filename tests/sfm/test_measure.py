@@ -16,10 +16,10 @@ from stcal.design import reference_target
 from stcal.errors import ConvergenceError, DegenerateError, InputError
 from stcal.geometry.plane import fit_plane
 from stcal.geometry.rigid import Rigid
+from stcal.images import Skipped
 from stcal.sfm import RunOptions, run
 from stcal.sfm.circle_projection import project_circles
 from stcal.sfm.faces import face_frame
-from stcal.sfm.images import Skipped
 from stcal.sfm.measure import MeasureOptions, measure, measure_json, measure_labelled, resolved
 from stcal.sfm.observations import ImageObservations
 from stcal.sfm.report_measure import measure_page
