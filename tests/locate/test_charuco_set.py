@@ -83,17 +83,20 @@ def test_a_scene_takes_little_longer_than_its_decoding(folder, images, tmp_path)
     model = CameraModel(
         images.camera.focal, images.camera.centre, images.camera.distortion, "PINHOLE", None, None, "cal_data.yaml"
     )
-    ratios = []
-    for _ in range(6):  # the first warms up; of the others the best, for machines with other work to do
-        start = time.perf_counter()
-        for file in scenes[0].files:
-            decode(file.path.read_bytes(), file.name)
-        middle = time.perf_counter()
-        result = next(iter(run(scenes, layout, model)))
-        ratios.append((time.perf_counter() - middle) / (middle - start))
-    print(f"scene over decoding: {min(ratios[1:]):.2f}")
+    ratios = {time.perf_counter: [], time.process_time: []}
+    for _ in range(5):
+        for clock, found in ratios.items():
+            start = clock()
+            for file in scenes[0].files:
+                decode(file.path.read_bytes(), file.name)
+            middle = clock()
+            result = next(iter(run(scenes, layout, model)))
+            found.append((clock() - middle) / (middle - start))
+    by_clock, of_cores = (float(np.median(found)) for found in ratios.values())
+    print(f"scene over decoding: {by_clock:.2f} by the clock, {of_cores:.2f} in time of all cores")
+    # Other work on the machine changes the first, a single core the second.
+    assert min(by_clock, of_cores) < 3
     assert result.verdict.decision == "accept"
-    assert min(ratios[1:]) < 3
 
 
 def test_exposures_together_see_more(folder, images):
