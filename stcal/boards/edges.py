@@ -138,8 +138,10 @@ def _fit(place: np.ndarray, offset: np.ndarray, good: np.ndarray) -> _Lines:
     for _ in range(CUT_ROUNDS):
         value, spread = _line(place, offset, keep)
         off = np.abs(offset - value[..., :1] - value[..., 1:] * place)
-        typical = 1.4826 * np.nanmedian(np.where(keep | ~good.any(2, keepdims=True), off, np.nan), axis=2)
-        new = good & (off < CUT * np.maximum(typical, MIN_SIGMA_PX)[..., None])
+        sorted_off = np.sort(np.where(keep, off, np.inf), axis=2)
+        middle = np.maximum(keep.sum(2, keepdims=True) - 1, 0) // 2
+        typical = 1.4826 * np.take_along_axis(sorted_off, middle, axis=2)
+        new = good & (off < CUT * np.maximum(typical, MIN_SIGMA_PX))
         if (new == keep).all():
             break
         keep = new
