@@ -10,9 +10,9 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 
-SAMPLES = 33
+SAMPLES = 25
 """Of a profile across an edge."""
-POINTS = 40
+POINTS = 32
 """Profiles of an edge; where they are nearer than a pixel they count as many as there are pixels."""
 ALONG = (0.08, 0.92)
 """Part of an edge that is used: near its ends the other edge's blur is in the profile."""
@@ -119,7 +119,9 @@ def _profiles(grey: np.ndarray, frame: _Frame) -> tuple[np.ndarray, np.ndarray]:
     base = frame.middle[:, :, None] + frame.place[..., None] * frame.along[:, :, None]
     xy = base[:, :, :, None] + (across[..., None] * frame.normal[:, :, None])[:, :, None]
     flat = xy.reshape(4 * n, POINTS * SAMPLES, 2).astype(np.float32)
-    level = cv2.remap(grey, flat[..., 0], flat[..., 1], cv2.INTER_LINEAR).reshape(n, 4, POINTS, SAMPLES).astype(float)
+    level = (
+        cv2.remap(grey, flat[..., 0], flat[..., 1], cv2.INTER_LINEAR).reshape(n, 4, POINTS, SAMPLES).astype(np.float32)
+    )
     inside = ((xy >= 0) & (xy <= [grey.shape[1] - 1, grey.shape[0] - 1])).all((2, 3, 4))
     rise = np.diff(level, axis=3).clip(0)
     rise[rise < MIN_RISE * rise.max(3, keepdims=True)] = 0
@@ -136,8 +138,10 @@ def _fit(place: np.ndarray, offset: np.ndarray, good: np.ndarray) -> _Lines:
     for _ in range(CUT_ROUNDS):
         value, spread = _line(place, offset, keep)
         off = np.abs(offset - value[..., :1] - value[..., 1:] * place)
-        typical = 1.4826 * np.nanmedian(np.where(keep | ~good.any(2, keepdims=True), off, np.nan), axis=2)
-        new = good & (off < CUT * np.maximum(typical, MIN_SIGMA_PX)[..., None])
+        sorted_off = np.sort(np.where(keep, off, np.inf), axis=2)
+        middle = np.maximum(keep.sum(2, keepdims=True) - 1, 0) // 2
+        typical = 1.4826 * np.take_along_axis(sorted_off, middle, axis=2)
+        new = good & (off < CUT * np.maximum(typical, MIN_SIGMA_PX))
         if (new == keep).all():
             break
         keep = new

@@ -58,7 +58,7 @@ def test_poses_from_the_other_half(images, held_out):
     trials = list(subset_trials(images, held_out[1], held_out[0], None))
     assert all(trial.decision == "accept" for trial in trials)
     assert not any(trial.flipped for trial in trials)
-    # The bounds are of four tags and more; with all of them the board's own bend is what remains.
+    # With all tags the board's own bend is what remains.
     assert np.degrees(np.mean([trial.error_rad for trial in trials])) < 0.4
     assert np.mean([trial.error_mm for trial in trials]) < 1.0
 

@@ -31,7 +31,7 @@ def error_of(pose, truth: Rigid) -> np.ndarray:
     ],
 )
 def test_the_covariance_is_true(shown, layout, shared):
-    """Mean of eᵀC⁻¹e/6 over 500 poses: 1, with σ 0.026; the issue's band is four of them."""
+    """Mean of eᵀC⁻¹e/6 over 500 poses: 1, with σ 0.026; the band is four of them."""
     rng = np.random.default_rng(5)
     squares, fits = [], []
     for _ in range(500):
