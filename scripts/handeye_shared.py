@@ -104,11 +104,10 @@ def by_split(data: dict) -> np.ndarray:
 
 def _compare(found: dict) -> None:
     park, ours = by_split(next(row for row in found["methods"] if row["method"] == "park-martin")), by_split(found)
-    print(
-        f"3-D error at the board by split, {found['method']}: mean {ours.mean():.3f}, {ours.min():.3f} to {ours.max():.3f} "
-        f"mm; park-martin: {park.mean():.3f}, {park.min():.3f} to {park.max():.3f} mm; worse than park-martin on "
-        f"{(ours >= park).sum()} of {len(ours)} splits"
-    )
+    print("3-D error at the board by split:")
+    for name, errors in ((found["method"], ours), ("park-martin", park)):
+        print(f"  {name}: mean {errors.mean():.3f}, {errors.min():.3f} to {errors.max():.3f} mm")
+    print(f"  {found['method']} worse than park-martin on {(ours >= park).sum()} of {len(ours)} splits")
 
 
 def main() -> None:
