@@ -85,9 +85,9 @@ def _transform_rows(pose: Rigid, covariance: np.ndarray | None) -> list[list[str
 
 
 def _splits_text(outcome: Outcome) -> str:
-    found = outcome.held_out or next(each.held_out for each in outcome.compared if each.held_out is not None)
-    splits, count = found.rows.shape
-    return f"{splits} × {count} of {len(outcome.result.names)} poses"
+    every = (outcome.held_out, *(each.held_out for each in outcome.compared))
+    known = [found.rows.shape for found in every if found is not None]
+    return f"{known[0][0]} × {known[0][1]} of {len(outcome.result.names)} poses" if known else "no poses"
 
 
 def _means_text(outcome: Outcome) -> str:

@@ -304,6 +304,9 @@ def test_what_images_need_is_said(command, chessboard, tmp_path):
     assert (code, "--refine-camera: only with images" in err) == (INPUT, True)
     code, _, err = command(*chessboard.arguments(), "--camera-out", tmp_path / "c.txt")
     assert (code, "only with --refine-camera" in err) == (INPUT, True)
+    wanted = ("--refine-camera", "--camera-out", tmp_path / "c.txt", "--method", "shah")
+    code, _, err = command(*chessboard.arguments(), *wanted)
+    assert (code, "shah does not adjust the camera" in err) == (INPUT, True)
 
 
 @pytest.mark.parametrize(
