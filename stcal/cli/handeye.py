@@ -111,12 +111,14 @@ def handeye(
         raise InputError("--camera-out: only with --refine-camera; the camera is as given else")
     if refine_camera and source.is_file():
         raise InputError("--refine-camera: only with images; poses tell nothing of the camera")
+    if camera_out and method not in (None, ALL, "reprojection"):
+        raise InputError(f"--camera-out: {method} does not adjust the camera; leave --method out")
     if method not in (None, ALL, *METHODS):
         raise InputError(f"--method {method}: unknown; {ALL} or one of {', '.join(METHODS)} needed")
     given = _given(source, poses, camera, board, workers)
     prior = given.prior if refine_camera else None
     options = HandEyeOptions(noise, prior, with_scale, given.symmetries, four_dof)
-    outcome = _solved(given, setup.value, method, options, (splits, held_out, seed), workers)
+    outcome = _solved(given, setup.value, method, options, _Splits(splits, held_out, seed))
     print(outcome_text(outcome))
     for name, reason in outcome.left_out:
         print(f"left out {name}: {reason}")
@@ -206,33 +208,35 @@ def _first(sights) -> str:
     return f"{sights.skipped[0].name}: {sights.skipped[0].reason}"
 
 
-def _solved(given: _Given, setup: str, method: str | None, options: "HandEyeOptions", how, workers) -> "Outcome":
+@dataclass(frozen=True, slots=True)
+class _Splits:
+    """Of the cross-validation: how many, poses in each (a quarter if None), and which."""
+
+    repeats: int
+    held_out: int | None
+    seed: int
+
+
+def _solved(given: _Given, setup: str, method: str | None, options: "HandEyeOptions", validation: _Splits) -> "Outcome":
     """The result, its errors on poses held out, and the comparison of methods where it is asked for."""
     from stcal.handeye import handeye as solve
     from stcal.handeye.result_file import Outcome
-    from stcal.handeye.symmetry import repair
-    from stcal.handeye.validate import LEAST_LEFT, compare, cross_validate
-    from stcal.handeye.validate import splits as split_rows
+    from stcal.handeye.validate import LEAST_LEFT, compare, cross_validate, splits
 
-    pairs, views, notes = given.pairs, given.views, ()
-    if options.symmetries:
-        mended = repair(pairs, setup, options.symmetries, views)
-        pairs, views, notes = mended.pairs, mended.views, mended.notes()
-        options = replace(options, symmetries=())
+    pairs, views = given.pairs, given.views
     chosen = None if method == ALL else method
     result = solve(pairs, setup, chosen, views, options)
-    compared, held_out = (), None
-    repeats, count, seed = how
+    compared, held_out, notes = (), None, ()
     if method == ALL:
-        compared = compare(pairs, setup, views, options, rows=split_rows(len(pairs), count, max(repeats, 1), seed))
+        rows = splits(len(pairs), validation.held_out, max(validation.repeats, 1), validation.seed)
+        compared = compare(pairs, setup, views, options, rows=rows)
         held_out = next(each.held_out for each in compared if each.method == result.method)
-    elif repeats and (count or len(pairs) > LEAST_LEFT):
+    elif validation.repeats and (validation.held_out or len(pairs) > LEAST_LEFT):
+        rows = splits(len(pairs), validation.held_out, validation.repeats, validation.seed)
         try:
-            held_out = cross_validate(
-                pairs, setup, chosen, views, options, split_rows(len(pairs), count, repeats, seed)
-            )
+            held_out = cross_validate(pairs, setup, chosen, views, options, rows)
         except DegenerateError as error:
-            notes += (f"no errors on poses held out: {error}",)
+            notes = (f"no errors on poses held out: {error}",)
     model = options.intrinsics.colmap_model if options.intrinsics else ""
     own = views is not None and all(view.covariance is not None for view in views.views)
     return Outcome(given.where, result, held_out, compared, given.pitch_mm, model, own, given.left_out, notes)

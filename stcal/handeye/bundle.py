@@ -16,8 +16,8 @@ from stcal.handeye.views import project_jacobian
 
 CORNER, POSE = (float(np.sqrt(chi2.ppf(0.999, dof))) for dof in (2, 6))
 """Huber's limits: one good corner, and one good pose, in a thousand weighs less than one."""
-LEAST = {"corner_px": 1e-6, "robot_rad": 1e-8, "robot_mm": 1e-5, "board_mm": 1e-5}
-"""Estimated σ stay above: exact data have none."""
+LEAST = {"corner_px": 1e-6, "robot_rad": 1e-8, "robot_mm": 1e-5, "board_mm": 1e-5, "camera_prior": 1.0}
+"""Estimated σ stay above: exact data have none. What is stated of a camera is not made better than it says."""
 ROUNDS = 20
 ROUGHLY = 1e-6
 """Relative fall of the cost at which a round of σ has solved well enough."""
@@ -25,6 +25,8 @@ SETTLED = 1e-3
 """Relative change of σ from round to round that moves nothing any more."""
 HELD = 1e-10
 """Share of each unknown's information that is added: what nothing determines must not be singular."""
+FARTHEST = 14.0
+"""A round changes a σ by e⁷, a thousand times, at most."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -51,7 +53,8 @@ class Corners:
     ``inverted`` : eye-to-hand; ``base_from_flange`` : m, as reported; ``xyz_board`` : (K, 3) as designed; ``view``,
     ``corner`` : (n,) of each measurement; ``xy_px`` : (n, 2); ``weight`` : (n, 2, 2) whitening at σ 1; ``robot`` :
     (m, 6, 6) whitening in place of σ, or None; ``sigma`` : of each group, 0 where exact; ``basis`` : (12, q) of the
-    intrinsics solved for, ``information`` : (q, q) about ``camera``; ``with_scale``.
+    intrinsics solved for, ``information`` : (q, q) about ``camera``, over the square of the factor ``camera_prior``;
+    ``with_scale``.
     """
 
     inverted: bool
@@ -142,9 +145,10 @@ class Corners:
             Group(("corner_px",), white, _sparse(by, at, count, {"board": self.corner, "robot": self.view}), CORNER)
         ]
         if self.basis.shape[1]:
-            root = np.linalg.cholesky(self.information).T
+            root = np.linalg.cholesky(self.information).T / self.sigma["camera_prior"]
             off = np.linalg.pinv(self.basis) @ (state.camera.parameters() - self.camera.parameters())
-            found.append(Group((), (root @ off)[None], _sparse({"camera": root[None]}, at, count, {}), np.inf))
+            slope = _sparse({"camera": root[None]}, at, count, {})
+            found.append(Group(("camera_prior",), (root @ off)[None], slope, np.inf))
         if at["board"].stop > at["board"].start:
             off = (state.corners - self.xyz_board) / self.sigma["board_mm"]
             slope = np.tile(np.eye(3) / self.sigma["board_mm"], (len(off), 1, 1))
@@ -243,25 +247,26 @@ def estimated(corners: Corners, state: Bundle, free: tuple[str, ...]) -> dict[st
             parts[key] = old_count + count, Linear(*sums)
     fixed = parts.pop("", (0, Linear(0.0, 0.0, 0.0)))[1]
     names = tuple(parts)
-    total = fixed.normal + sum(linear.normal for _, linear in parts.values())
-    held = fixed.normal + HELD * np.diag(np.diag(total))
 
     def cost(logs: np.ndarray) -> tuple[float, np.ndarray]:
         """Minus twice the log-likelihood of (old σ / new σ)²."""
         share = np.exp(logs)
         linears = [linear for _, linear in parts.values()]
         counts = np.array([count for count, _ in parts.values()])
-        normal = held + sum(s * linear.normal for s, linear in zip(share, linears, strict=True))
+        normal = fixed.normal + sum(s * linear.normal for s, linear in zip(share, linears, strict=True))
+        scale = 1 / np.sqrt(np.maximum(np.diag(normal), 1e-300))
         pull = fixed.gradient + sum(s * linear.gradient for s, linear in zip(share, linears, strict=True))
-        root = cho_factor(normal, lower=True)
-        step, inverse = -cho_solve(root, pull), cho_solve(root, np.eye(len(pull)))
+        root = cho_factor(normal * scale[:, None] * scale + HELD * np.eye(len(scale)), lower=True)
+        inverse = cho_solve(root, np.eye(len(scale))) * scale[:, None] * scale
+        step = -inverse @ pull
         value = fixed.cost + share @ [linear.cost for linear in linears] + pull @ step - counts @ logs
-        value += 2 * np.log(np.diag(root[0])).sum()
+        value += 2 * np.log(np.diag(root[0]) / scale).sum()
         squares = [p.cost + 2 * p.gradient @ step + step @ p.normal @ step for p in linears]
         taken = [(inverse * p.normal).sum() for p in linears]
         return float(value), share * (np.array(squares) + taken) - counts
 
-    bounds = [(None, 2 * np.log(corners.sigma[name] / LEAST[name])) for name in names]
+    least = [2 * np.log(corners.sigma[name] / LEAST[name]) for name in names]
+    bounds = [(-FARTHEST, min(FARTHEST, highest)) for highest in least]
     found = minimize(cost, np.zeros(len(names)), jac=True, method="L-BFGS-B", bounds=bounds)
     return {name: float(corners.sigma[name] * np.exp(-x / 2)) for name, x in zip(names, found.x, strict=True)}
 

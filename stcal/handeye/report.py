@@ -85,9 +85,9 @@ def _transform_rows(pose: Rigid, covariance: np.ndarray | None) -> list[list[str
 
 
 def _splits_text(outcome: Outcome) -> str:
-    found = outcome.held_out or next(each.held_out for each in outcome.compared if each.held_out is not None)
-    splits, count = found.rows.shape
-    return f"{splits} × {count} of {len(outcome.result.names)} poses"
+    every = (outcome.held_out, *(each.held_out for each in outcome.compared))
+    known = [found.rows.shape for found in every if found is not None]
+    return f"{known[0][0]} × {known[0][1]} of {len(outcome.result.names)} poses" if known else "no poses"
 
 
 def _means_text(outcome: Outcome) -> str:
@@ -218,11 +218,14 @@ def _sigma_table(outcome: Outcome) -> str:
 def _methods(outcome: Outcome) -> str:
     heads, rows = _compared_cells(outcome)
     heads = [f"<{heads[0]}", *heads[1:-1], f"<{heads[-1]}" if heads[-1] == "" else heads[-1]]
+    seen = (
+        " 3-D at the board: how far from each corner the ray on which the camera saw it meets the board where the "
+        "robot has put it; by pose: distance from the corners by the pose that the image gives alone."
+    )
     text = (
         f"<p>Means over the same {_splits_text(outcome)} held out: each time all methods solve with the others and "
-        "predict where the board is. 3-D at the board: how far from each corner the ray on which the camera saw it "
-        "meets the board where the robot has put it; by pose: distance from the corners by the pose that the image "
-        "gives alone. Off: how far a method's result from all poses is from the one above.</p>\n"
+        f"predict where the board is.{seen if ERRORS['board_mm'][0] in heads else ''} Off: how far a method's result "
+        "from all poses is from the one above.</p>\n"
     )
     return table(heads, rows, css="text") + text
 

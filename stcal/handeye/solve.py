@@ -32,6 +32,8 @@ UNIT_MM = 1000.0
 """Length that weighs like one radian where no σ are stated: errors of 1 mm go with errors of 1 mrad."""
 SIZE_SIGMAS, SIZE_SHARE = 4.0, 1e-3
 """A board's size is doubted beyond so many σ, and a share that matters: 0.5 mm at half a metre."""
+WIDENED = 2.0
+"""Factor of the σ of a camera file from which on the file is doubted."""
 CAMERA_GAIN = 5.0
 """Eight intrinsics that are right gain 8 ± 4 in cost, 1 ± 0.5 each; eight that gain 5 each are wrong."""
 HELD_MM = 1e-6
@@ -236,6 +238,10 @@ def _by_views(task: _Task) -> HandEye:
     if solution.camera_gain > CAMERA_GAIN:
         notes += (
             "the camera file does not fit the corners: solve for the intrinsics too, or calibrate the camera anew",
+        )
+    if (factor := solution.sigma.get("camera_prior", 1.0)) > WIDENED:
+        notes += (
+            f"the corners contradict the camera file: its σ were widened {factor:.2g} times; calibrate the camera",
         )
     return HandEye(
         "reprojection",

@@ -9,6 +9,16 @@ SHARPER = 3
 """The view is drawn larger by this and averaged down, which makes the edges what pixels see."""
 
 
+def chessboard_mm(rows: int, columns: int, square: float, per_mm: int = 4) -> tuple[np.ndarray, float]:
+    """The printed sheet, and the place of inner corner (0, 0) on it, mm."""
+    margin = 2 * square
+    side = int(square * per_mm)
+    cells = np.add.outer(np.arange(rows + 1), np.arange(columns + 1)) % 2 == 0
+    board = np.kron(np.where(cells, 0, 255), np.ones((side, side))).astype(np.uint8)
+    edge = int(margin * per_mm)
+    return cv2.copyMakeBorder(board, edge, edge, edge, edge, cv2.BORDER_CONSTANT, value=255), margin + square
+
+
 def photograph(sheet: np.ndarray, per_mm: int, image_from_mm: np.ndarray, size=(1200, 900)) -> np.ndarray:
     """The sheet (pixels, ``per_mm`` of them a millimetre, white around) seen through a homography; a little noise."""
     # Centres of pixels are integers: half a pixel of the sheet, and of the image, lies before each.

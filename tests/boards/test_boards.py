@@ -13,7 +13,7 @@ from stcal.boards.tags import find_charuco, find_tags, view_of_tags
 from stcal.design import BoardDesign
 from stcal.errors import InputError
 from stcal.geometry.plane import apply_homography
-from tests.boards.drawn import IMAGE_FROM_MM, photograph
+from tests.boards.drawn import IMAGE_FROM_MM, chessboard_mm, photograph
 
 CHARUCO_IMAGES = Path(__file__).parents[3] / "shared/data/charuco_handeye/test_set_charuco/images"
 CORNER_PX = 0.12
@@ -25,16 +25,6 @@ def turn(degrees: float) -> np.ndarray:
     c, s = np.cos(np.radians(degrees)), np.sin(np.radians(degrees))
     about = np.array([[1, 0, 600], [0, 1, 450], [0, 0, 1.0]])
     return about @ np.array([[c, -s, 0], [s, c, 0], [0, 0, 1]]) @ np.linalg.inv(about) @ IMAGE_FROM_MM
-
-
-def chessboard_mm(rows: int, columns: int, square: float, per_mm: int = 4) -> tuple[np.ndarray, float]:
-    """The printed sheet, and the place of inner corner (0, 0) on it, mm."""
-    margin = 2 * square
-    side = int(square * per_mm)
-    cells = np.add.outer(np.arange(rows + 1), np.arange(columns + 1)) % 2 == 0
-    board = np.kron(np.where(cells, 0, 255), np.ones((side, side))).astype(np.uint8)
-    edge = int(margin * per_mm)
-    return cv2.copyMakeBorder(board, edge, edge, edge, edge, cv2.BORDER_CONSTANT, value=255), margin + square
 
 
 @pytest.mark.parametrize(("rows", "columns"), [(5, 8), (6, 7), (7, 7), (6, 6), (6, 8)])

@@ -19,14 +19,6 @@ PER_MM = 4
 MARGIN_MM = 30.0
 
 
-def sheet_of_chessboard(rows: int, columns: int, square_mm: int) -> tuple[np.ndarray, float]:
-    """The print with inner corners, and the place of inner corner (0, 0) on it, mm."""
-    cells = np.add.outer(np.arange(rows + 1), np.arange(columns + 1)) % 2 == 0
-    board = np.kron(np.where(cells, 0, 255), np.ones((square_mm * PER_MM,) * 2)).astype(np.uint8)
-    edge = int(MARGIN_MM * PER_MM)
-    return cv2.copyMakeBorder(board, *[edge] * 4, cv2.BORDER_CONSTANT, value=255), MARGIN_MM + square_mm
-
-
 def sheet_of_dots(xy_mm: np.ndarray, radius_mm: np.ndarray) -> tuple[np.ndarray, float]:
     """The print with dark dots, and the place of the board's origin on it, mm."""
     width, height = ((xy_mm.max(0) + 2 * MARGIN_MM) * PER_MM).astype(int)

@@ -14,7 +14,8 @@ from stcal.geometry.rigid import Poses, Rigid
 from stcal.handeye import METHODS
 from stcal.handeye.simulated import BASE_FROM_BOARD, FLANGE_FROM_CAMERA, simulated
 from stcal.table_file import POSE, pose_cells
-from tests.handeye.photographed import CAMERA, looks, photographs, sheet_of_chessboard, sheet_of_dots
+from tests.boards.drawn import chessboard_mm
+from tests.handeye.photographed import CAMERA, looks, photographs, sheet_of_dots
 
 NOISE = {"robot": (2e-4, 0.1), "camera": (5e-4, 0.2)}
 INPUT, COMPUTATION = 2, 3
@@ -235,7 +236,7 @@ def chessboard(tmp_path_factory):
     """Eight photographs of a board that looks the same after half a turn, by a camera rolled all the way round."""
     seen = looks(np.random.default_rng(11), 8, np.array([70, 50]), np.pi)
     toml = 'type = "chessboard"\nrows = 6\ncolumns = 8\nsquare_mm = 20\n'
-    return photographs(tmp_path_factory.mktemp("chess"), *sheet_of_chessboard(6, 8, 20), seen, toml)
+    return photographs(tmp_path_factory.mktemp("chess"), *chessboard_mm(6, 8, 20.0), seen, toml)
 
 
 def test_images_of_a_symmetric_chessboard(command, chessboard, tmp_path):
@@ -304,6 +305,9 @@ def test_what_images_need_is_said(command, chessboard, tmp_path):
     assert (code, "--refine-camera: only with images" in err) == (INPUT, True)
     code, _, err = command(*chessboard.arguments(), "--camera-out", tmp_path / "c.txt")
     assert (code, "only with --refine-camera" in err) == (INPUT, True)
+    wanted = ("--refine-camera", "--camera-out", tmp_path / "c.txt", "--method", "shah")
+    code, _, err = command(*chessboard.arguments(), *wanted)
+    assert (code, "shah does not adjust the camera" in err) == (INPUT, True)
 
 
 @pytest.mark.parametrize(

@@ -13,11 +13,11 @@ from stcal.errors import InputError
 from stcal.geometry.conic import circle_conic, ellipse_of_conic
 from stcal.geometry.rigid import Rigid
 from stcal.images import find_images
+from tests.boards.drawn import chessboard_mm
 from tests.handeye.photographed import (
     CAMERA,
     MARGIN_MM,
     PER_MM,
-    sheet_of_chessboard,
     sheet_of_dots,
     take,
 )
@@ -56,7 +56,7 @@ def boards():
     plain = dots(corner=(0, 0))
     return {
         "dots": (plain, *sheet_of_dots(plain.xy_mm(), plain.radii_mm())),
-        "chessboard": (ChessboardDesign(5, 8, 20.0), *sheet_of_chessboard(5, 8, 20)),
+        "chessboard": (ChessboardDesign(5, 8, 20.0), *chessboard_mm(5, 8, 20.0)),
         "charuco": charuco(),
         "tags": tags(),
     }

@@ -117,3 +117,10 @@ def test_the_file_is_plain_json_and_gives_the_transform_back(of_views, of_method
     data = json.loads(json.dumps(outcome_json(of_methods), allow_nan=False))
     assert [row["reason"] for row in data["methods"]] == [None, None, "hand-eye: zhao finds no rotation"]
     assert "methods" not in calibration_json(of_methods)
+
+
+def test_methods_of_which_none_could_be_validated_are_listed(of_methods):
+    each = replace(of_methods.compared[0], held_out=None, reason="without pose 1: too few")
+    outcome = replace(of_methods, held_out=None, compared=(each,))
+    assert "tsai-lenz" in outcome_text(outcome)
+    assert "without pose 1: too few" in " ".join(read(outcome_page(outcome)).text)

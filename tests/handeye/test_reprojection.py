@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from stcal.camera_file import CameraModel, camera_prior
+from stcal.camera_file import CameraModel, camera_prior, intrinsic_basis
 from stcal.errors import DegenerateError, InputError
 from stcal.geometry.camera import Camera
 from stcal.geometry.rigid import Poses
@@ -54,7 +54,7 @@ def test_derivatives_of_the_corners(setup):
     corners, _ = problem(loop, flange, truth.views, noise, prior(truth.views.camera, "FULL_OPENCV"), True)
     state = Bundle(truth.mount_from_camera, truth.stand_from_board, flange, corners.xyz_board, truth.views.camera, 1.1)
     groups, shared = corners.groups(state), corners.places()["board"].start
-    assert [g.names for g in groups] == [("corner_px",), (), ("board_mm",), ("robot_rad", "robot_mm")]
+    assert [g.names for g in groups] == [("corner_px",), ("camera_prior",), ("board_mm",), ("robot_rad", "robot_mm")]
     for k in (*range(shared), *range(shared, corners.count(), 9)):
         step = np.zeros(corners.count())
         step[k] = 1e-5
@@ -100,7 +100,9 @@ def test_a_camera_file_that_is_wrong_is_said_and_mended():
     assert doubtful.notes[-1].startswith("the camera file does not fit the corners")
     options = HandEyeOptions(intrinsics=prior(plain, "OPENCV"))
     found = handeye(pairs, "eye-to-hand", views=views, options=options)
-    assert found.notes == ()
+    # k1 is eight σ off what a calibration of some age may be.
+    assert 2 < found.sigma["camera_prior"] < 16
+    assert found.notes[-1].startswith("the corners contradict the camera file: its σ were widened ")
     off, off_doubtful = (np.linalg.norm(error(f, truth)[3:]) for f in (found, doubtful))
     assert off < 0.7 < 2 * off_doubtful
     assert found.reprojection.camera.distortion[0] == pytest.approx(-0.08, abs=0.02)
@@ -146,3 +148,18 @@ def test_views_that_show_too_little_are_named():
             )
     with pytest.raises(InputError, match="5 poses of the flange and 4 views"):
         pairs_of_views(truth.pairs.base_from_flange, truth.views[:4])
+
+
+def test_a_camera_file_that_is_right_keeps_its_sigma():
+    """Intrinsics drawn with the σ of the file: the factor is 1 or next to it, and the truth is within 4 σ."""
+    rng = np.random.default_rng(10)
+    truth = simulated_views(rng, 12, "eye-in-hand", (2e-4, 0.05), 0.1)
+    held = prior(good := truth.views.camera, "OPENCV")
+    drawn = good.parameters() + intrinsic_basis("OPENCV") @ rng.multivariate_normal(np.zeros(8), held.covariance)
+    views = Views(good.with_parameters(drawn), truth.views.views)
+    pairs = pairs_of_views(truth.pairs.base_from_flange, views)
+    found = handeye(pairs, views=views, options=HandEyeOptions(intrinsics=held))
+    assert 1 <= found.sigma["camera_prior"] < 2
+    assert found.notes == ()
+    off = intrinsic_basis("OPENCV").T @ (found.reprojection.camera.parameters() - good.parameters())
+    assert off @ np.linalg.solve(found.reprojection.camera_covariance, off) < 4 * 8

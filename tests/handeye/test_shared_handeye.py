@@ -64,3 +64,4 @@ def test_what_is_wrong_with_the_data_is_said(charuco):
     assert found.sigma["corner_px"] < 0.1
     assert 0.1 < found.sigma["board_mm"] < 0.3
     assert not found.outliers.any()
+    assert any("σ were widened" in note for note in found.notes)

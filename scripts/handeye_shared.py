@@ -1,0 +1,133 @@
+"""Hand-eye calibration of two real data sets, through the command line: the figures of the README.
+
+.venv/bin/python scripts/handeye_shared.py [../shared/data]
+
+charuco_handeye: 16 photographs of a ChArUco board on a robot, static camera; each method on the same 15 splits with 5
+of the 16 held out, with the camera and the board as their files have them, and as adjusted to all photographs.
+dotgrid_handeye: 15 photographs of a dot board by a camera on a robot; the pitch of the dots from the robot's motion.
+"""
+
+import contextlib
+import io
+import json
+import sys
+import tempfile
+from pathlib import Path
+
+import numpy as np
+import yaml
+
+from stcal.camera_file import write_cameras_txt
+from stcal.cli.main import app
+from stcal.geometry.camera import Camera
+from stcal.geometry.rigid import Poses
+from stcal.table_file import POSE, pose_cells
+
+CHARUCO = """type = "charuco"
+rows = 7
+columns = 5
+square_mm = 36.195
+marker_mm = 18.256
+dictionary = "DICT_6X6_250"
+"""
+DOTS = """# As the label on the sheet has it; target.yaml says 25.4 mm.
+rows = 10
+columns = 10
+pitch_mm = 20.0
+radius_mm = 5.0
+polarity = "dark"
+sigma_mm = 0.1
+
+[corner]
+row = 9
+column = 0
+radius_mm = 10.0
+"""
+# The two camera files of the data set differ by 8 and 14 px, and have no distortion.
+DOTS_CAMERA_SIGMA = (10.0, 10.0, 15.0, 15.0, 0.1, 0.1, 0.01, 0.01)
+SPLITS = ("--held-out", "5", "--splits", "15")
+
+
+def charuco(data: Path, scratch: Path, *options: str, adjusted: dict | None = None) -> tuple[dict, str]:
+    """Output of ``stcal handeye`` on charuco_handeye, and what it prints.
+
+    The camera file of the data set has no distortion, which the lens has: it is given as OPENCV, and adjusted; or
+    camera and board are those of an output, ``adjusted``.
+    """
+    folder = data / "charuco_handeye" / "test_set_charuco"
+    values = yaml.safe_load((folder / "cal_data.yaml").read_text())["intrinsics"]
+    camera = Camera(1600, 1200, [values["fx"], values["fy"]], [values["cx"], values["cy"]], np.zeros(8))
+    setup, board = ("--setup", "eye-to-hand"), CHARUCO
+    if adjusted is None:
+        setup = (*setup, "--refine-camera", "--with-scale")
+    else:
+        camera = camera.with_parameters(np.array(list(adjusted["camera"]["parameters"].values())))
+        board = board.replace("36.195", repr(adjusted["board"]["pitch_mm"]))
+    return _handeye(folder, scratch, camera, None, board, *setup, *options)
+
+
+def dots(data: Path, scratch: Path, *options: str) -> tuple[dict, str]:
+    """The same on dotgrid_handeye."""
+    folder = data / "dotgrid_handeye"
+    values = yaml.safe_load((folder / "camera_intr_calibrated.yaml").read_text())["intrinsics"]
+    camera = Camera(640, 480, [values["fx"], values["fy"]], [values["cx"], values["cy"]], np.zeros(8))
+    covariance = np.diag(np.square(DOTS_CAMERA_SIGMA))
+    return _handeye(folder, scratch, camera, covariance, DOTS, "--refine-camera", "--with-scale", *options)
+
+
+def _handeye(folder: Path, scratch: Path, camera: Camera, covariance, board: str, *options: str) -> tuple[dict, str]:
+    """Files of one data set in the command's forms, and the command."""
+    scratch.mkdir(parents=True, exist_ok=True)
+    (scratch / "board.toml").write_text(board)
+    write_cameras_txt(scratch / "cameras.txt", camera, "OPENCV", covariance)
+    rows = [",".join(["image", *(f"base_from_flange_{column}" for column in POSE)])]
+    for file in sorted((folder / "poses").glob("*.yaml")):
+        pose = yaml.safe_load(file.read_text())
+        wxyz, metres = ([[pose[key] for key in keys]] for keys in (("qw", "qx", "qy", "qz"), "xyz"))
+        flange = Poses.from_quaternions(np.array(wxyz), 1000 * np.array(metres))[0]
+        rows.append(",".join([f"{file.stem}.png", *pose_cells(flange)]))
+    (scratch / "poses.csv").write_text("\n".join(rows) + "\n")
+    files = {"--poses": "poses.csv", "--camera": "cameras.txt", "--board": "board.toml"}
+    given = [word for option, name in files.items() for word in (option, str(scratch / name))]
+    out = scratch / "all.json"
+    printed = io.StringIO()
+    with contextlib.redirect_stdout(printed):
+        arguments = ["handeye", str(folder / "images"), *given, *options, "--json", str(out)]
+        app(arguments, standalone_mode=False)
+    return json.loads(out.read_text()), printed.getvalue()
+
+
+def by_split(data: dict) -> np.ndarray:
+    """3-D error at the board of each split, mean over the poses held out, mm."""
+    return np.array([np.mean(split["board_mm"]) for split in data["splits"]])
+
+
+def _compare(found: dict) -> None:
+    park, ours = by_split(next(row for row in found["methods"] if row["method"] == "park-martin")), by_split(found)
+    print("3-D error at the board by split:")
+    for name, errors in ((found["method"], ours), ("park-martin", park)):
+        print(f"  {name}: mean {errors.mean():.3f}, {errors.min():.3f} to {errors.max():.3f} mm")
+    print(f"  {found['method']} worse than park-martin on {(ours >= park).sum()} of {len(ours)} splits")
+
+
+def main() -> None:
+    data = Path(sys.argv[1]) if len(sys.argv) > 1 else Path(__file__).resolve().parents[2] / "shared" / "data"
+    for name in ("charuco_handeye", "dotgrid_handeye"):
+        if not (data / name).is_dir():
+            sys.exit(f"error: {data / name} is missing; give the folder that holds it")
+    with tempfile.TemporaryDirectory() as scratch:
+        found, text = charuco(data, Path(scratch) / "charuco", "--method", "all", *SPLITS)
+        print(f"charuco_handeye\n\n{text}")
+        _compare(found)
+        found, text = charuco(data, Path(scratch) / "adjusted", "--method", "all", *SPLITS, adjusted=found)
+        print(f"\ncharuco_handeye, camera and board as adjusted\n\n{text[text.index('Methods') :]}")
+        _compare(found)
+        found, text = dots(data, Path(scratch) / "dots")
+        print(f"\ndotgrid_handeye\n\n{text}")
+        board = found["board"]
+        sigma = board["scale_sigma"] * board["pitch_mm"] / board["scale"]
+        print(f"pitch found: {board['pitch_mm']:.2f} ± {sigma:.2f} mm; 20 mm on the label, 25.4 mm in target.yaml")
+
+
+if __name__ == "__main__":
+    main()

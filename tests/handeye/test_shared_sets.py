@@ -1,0 +1,57 @@
+"""Two real data sets through the command line, from photographs: the acceptance figures."""
+
+import importlib.util
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+SCRIPT = Path(__file__).resolve().parents[2] / "scripts" / "handeye_shared.py"
+MEAN_MM = 0.75
+"""3-D error at the board that poses held out may have in the mean; published for these data, in sample: 0.96 mm."""
+SHEET_PITCH_MM = 24.8
+"""In all images the dots' sheet is 17.4 by 11.3 pitches: the sides of an 11 × 17 in sheet (431.8 × 279.4 mm) ask for
+24.8 and 24.7 mm. The label says 20, the data set's own file 25.4."""
+
+
+@pytest.fixture(scope="module")
+def script():
+    spec = importlib.util.spec_from_file_location("handeye_shared", SCRIPT)
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module
+
+
+def present(shared_data: Path, name: str) -> Path:
+    if not (shared_data / name).is_dir():
+        pytest.skip(f"{name} is not among the shared data sets")
+    return shared_data
+
+
+def test_charuco_photographs(script, shared_data, tmp_path):
+    data = present(shared_data, "charuco_handeye")
+    ours, text = script.charuco(data, tmp_path / "a", "--workers", "1", *script.SPLITS)
+    park, _ = script.charuco(data, tmp_path / "b", "--workers", "1", *script.SPLITS, "--method", "park-martin")
+    errors, others = script.by_split(ours), script.by_split(park)
+    assert (len(ours["poses"]), ours["outliers"], ours["left_out"]) == (16, [], [])
+    assert len(errors) == 15
+    assert 0.3 < errors.mean() <= MEAN_MM
+    assert (errors < others).all()
+    assert ours["method"] == "reprojection"
+    assert "3-D at the board" in text
+    assert ours["sigma"]["corner_px"] < 0.1
+
+
+def test_the_pitch_of_the_dots_is_found(script, shared_data, tmp_path):
+    found, text = script.dots(present(shared_data, "dotgrid_handeye"), tmp_path, "--workers", "1", "--splits", "0")
+    board = found["board"]
+    sigma_mm = 20 * board["scale_sigma"]
+    assert len(found["poses"]) == 15
+    assert len(found["outliers"]) <= 1
+    assert abs(board["pitch_mm"] - SHEET_PITCH_MM) < 3 * sigma_mm < 0.5
+    assert abs(board["pitch_mm"] - 20) > 10 * sigma_mm
+    assert f"pitch {board['pitch_mm']:.4f} ± {sigma_mm:.4f} mm, stated 20 mm" in text
+    # Turned by about a quarter about the optical axis, as the data set's first guess has it.
+    rotation = np.array(found["flange_from_camera"])[:3, :3]
+    guess = np.array([[0, 1, 0], [-1, 0, 0], [0, 0, 1.0]])
+    assert np.degrees(np.arccos((np.trace(guess.T @ rotation) - 1) / 2)) < 10
