@@ -122,6 +122,8 @@ def main() -> None:
         found, text = charuco(data, Path(scratch) / "adjusted", "--method", "all", *SPLITS, adjusted=found)
         print(f"\ncharuco_handeye, camera and board as adjusted\n\n{text[text.index('Methods') :]}")
         _compare(found)
+        many, _ = charuco(data, Path(scratch) / "many", *SPLITS[:2], "--splits", "60")
+        print(f"reprojection over 60 splits, all adjusted: mean {by_split(many).mean():.3f} mm")
         found, text = dots(data, Path(scratch) / "dots")
         print(f"\ndotgrid_handeye\n\n{text}")
         board = found["board"]

@@ -86,10 +86,7 @@ def evolve(objective: Objective, reach_mm: float, options: EvolutionOptions) -> 
     x = rng.uniform(-bounds, bounds, (size, 6))
     value = objective.values(x)
     for _ in range(options.iterations):
-        # Three others, all different: the first of a random order of all but oneself.
-        order = rng.random((size, size))
-        np.fill_diagonal(order, 2)
-        a, b, c = np.argsort(order, axis=1)[:, :3].T
+        a, b, c = three_others(rng, size)
         mutant = x[a] + options.factor * (x[b] - x[c])
         trial = np.where(rng.random((size, 6)) <= options.crossover, mutant, x)
         trial_value = objective.values(trial)
@@ -97,6 +94,13 @@ def evolve(objective: Objective, reach_mm: float, options: EvolutionOptions) -> 
         x, value = np.where(better[:, None], trial, x), np.where(better, trial_value, value)
     best = x[np.argmin(value)]
     return Rigid.exp(np.concatenate([best[:3], objective.unit_mm * best[3:]]))
+
+
+def three_others(rng: np.random.Generator, size: int) -> np.ndarray:
+    """(3, size): for each of ``size`` candidates three others, all different."""
+    order = rng.random((size, size))
+    np.fill_diagonal(order, 2)  # oneself comes last
+    return np.argsort(order, axis=1)[:, :3].T
 
 
 def polish(objective: Objective, x: Rigid) -> Rigid:

@@ -138,18 +138,26 @@ def _near(residuals: np.ndarray, spread: np.ndarray) -> np.ndarray:
 def _agreeing(
     residuals: np.ndarray, slope: np.ndarray, spread: np.ndarray, used: np.ndarray, estimated: bool
 ) -> np.ndarray:
-    """Which poses, (m,), agree with the solution of all others: a test of each pose's residual by its own variance."""
+    """Which poses, (m,), agree with the solution of all others."""
     m, count = len(used), slope.shape[2]
-    weight = np.linalg.inv(np.linalg.cholesky(spread))
-    white, by = np.einsum("mab,mb->ma", weight, residuals), weight @ slope
-    solved = by @ generalised_inverse(np.einsum("mai,maj->ij", by[used], by[used])) @ np.swapaxes(by, 1, 2)
-    # A pose that took part has drawn the solution towards itself; one that did not has the solution's error besides.
-    value, vector = np.linalg.eigh(np.eye(6) + np.where(used, -1, 1)[:, None, None] * solved)
-    turned = np.einsum("mab,ma->mb", vector, white)
-    squared = np.where(value > SEEN, turned**2 / np.maximum(value, SEEN), 0).sum(1)
     spare = 6 * int(used.sum()) - count - 6
     if spare < 6:
         return used
     level = 1 - FALSE_ALARM / m
-    agrees = squared <= (6 * f.ppf(level, 6, spare) if estimated else chi2.ppf(level, 6))
+    limit = 6 * f.ppf(level, 6, spare) if estimated else chi2.ppf(level, 6)
+    agrees = against_others(residuals, slope, spread, used) <= limit
     return agrees if agrees.sum() >= LEAST_POSES else used
+
+
+def against_others(residuals: np.ndarray, slope: np.ndarray, spread: np.ndarray, used: np.ndarray) -> np.ndarray:
+    """Squared residuals (m,), each in units of its own σ: χ² of 6 degrees of freedom for good poses.
+
+    A pose that took part has drawn the solution towards itself, so that its residual scatters less than the pose; one
+    that did not has the solution's error besides.
+    """
+    weight = np.linalg.inv(np.linalg.cholesky(spread))
+    white, by = np.einsum("mab,mb->ma", weight, residuals), weight @ slope
+    solved = by @ generalised_inverse(np.einsum("mai,maj->ij", by[used], by[used])) @ np.swapaxes(by, 1, 2)
+    value, vector = np.linalg.eigh(np.eye(6) + np.where(used, -1, 1)[:, None, None] * solved)
+    turned = np.einsum("mab,ma->mb", vector, white)
+    return np.where(value > SEEN, turned**2 / np.maximum(value, SEEN), 0).sum(1)

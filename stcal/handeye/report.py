@@ -29,6 +29,7 @@ SIGMA_NAMES = {
     "camera_rad": ("board's pose, rotation", "°", np.degrees(1.0)),
     "camera_mm": ("board's pose, position", "mm", 1.0),
     "board_mm": ("corner on the board", "mm", 1.0),
+    "camera_prior": ("intrinsics of the camera file", "times their σ", 1.0),
 }
 GOOD, BAD = COLOURS[0], COLOURS[1]
 

@@ -7,6 +7,7 @@ from scipy.spatial.transform import Rotation
 from stcal.errors import DegenerateError, InputError
 from stcal.geometry.rigid import Poses, Rigid
 from stcal.handeye import HandEyeOptions, HandEyePoses, handeye
+from stcal.handeye.leastsq import perturbed
 from stcal.handeye.loop import Loop
 from stcal.handeye.observability import Observability
 from stcal.handeye.simulated import (
@@ -217,3 +218,55 @@ def test_corners_of_turned_views_are_put_right():
     assert found.notes == ("numbered from another end of the board, and put right: pose 2, pose 7",)
     plain = handeye(truth.pairs, views=truth.views)
     assert found.mount_from_camera.translation == pytest.approx(plain.mount_from_camera.translation, abs=1e-5)
+
+
+def test_corners_of_a_square_board_are_put_right():
+    """Numbered from another corner, a quarter turn on: the corners fit where they then belong."""
+    truth = simulated_views(np.random.default_rng(15), 9)
+    xyz = board_corners(8, 8, 25.0)
+    middle, quarter = xyz.mean(0), Rotation.from_euler("z", 90, degrees=True).as_matrix()
+    turn = Rigid(quarter, middle - quarter @ middle)
+    turns = (turn, turn @ turn, turn @ turn @ turn)
+    truly = truth.pairs.camera_from_board
+    camera = truth.views.camera
+    # A corner that is called p is really at turn @ p.
+    views = [View(xyz, camera.project(p @ (turn @ xyz if i in (2, 5) else xyz))) for i, p in enumerate(truly)]
+    views = Views(camera, tuple(views))
+    pairs = pairs_of_views(truth.pairs.base_from_flange, views)
+    found = handeye(pairs, views=views, options=HandEyeOptions(symmetries=turns))
+    assert found.notes[0].endswith("pose 3, pose 6")
+    assert not found.outliers.any()
+    assert np.abs(found.reprojection.residuals_px).max() < 1e-3
+
+
+def test_covariances_of_turned_views_are_carried_along():
+    """The other origin moves by the rotation's error too: against the turned poses of many disturbed ones."""
+    truth = simulated(np.random.default_rng(14), 6)
+    seen = truth.pairs.camera_from_board[3] @ HALF
+    steps = np.eye(6) * np.repeat([1e-5, 1e-2], 3)
+    moved = Poses.of(perturbed(seen, step) @ HALF for step in steps)
+    by = moved.difference(Poses.of([seen @ HALF] * 6)).T / np.repeat([1e-5, 1e-2], 3)
+    board = [*truth.pairs.camera_from_board]
+    board[3] = seen
+    sigma = np.diag(np.square([1e-3, 2e-3, 5e-4, 0.1, 0.2, 0.4]))
+    pairs = HandEyePoses(truth.pairs.base_from_flange, Poses.of(board), None, np.array([sigma] * 6))
+    mended = repair(pairs, "eye-in-hand", (HALF,))
+    assert mended.turned.tolist() == [0, 0, 0, 1, 0, 0]
+    got = mended.pairs.camera_from_board_covariance
+    scale = np.sqrt(np.diag(by @ sigma @ by.T))
+    assert got[3] / np.outer(scale, scale) == pytest.approx(by @ sigma @ by.T / np.outer(scale, scale), abs=1e-3)
+    assert (got[2] == sigma).all()
+
+
+def test_rough_poses_of_a_square_board_are_put_right():
+    """Errors of 2° and 8 mm: no pose agrees with all others at once; the solution of most tells the rest."""
+    middle = np.array([87.5, 87.5, 0])
+    turns = [Rotation.from_euler("z", 90 * k, degrees=True).as_matrix() for k in (1, 2, 3)]
+    every = [Rigid(), *(Rigid(turn, middle - turn @ middle) for turn in turns)]
+    for seed in range(10):
+        truth = simulated(np.random.default_rng(seed), 14, camera=(0.035, 8.0))
+        labels = np.random.default_rng(seed).integers(0, 4, 14)
+        board = Poses.of(p @ every[k] for p, k in zip(truth.pairs.camera_from_board, labels, strict=True))
+        mended = repair(HandEyePoses(truth.pairs.base_from_flange, board), "eye-in-hand", tuple(every[1:]))
+        left = np.array([every[k].rotation @ every[t].rotation for k, t in zip(labels, mended.turned, strict=True)])
+        assert np.abs(left - left[0]).max() < 1e-9

@@ -8,6 +8,7 @@ from html.parser import HTMLParser
 import numpy as np
 import pytest
 
+from stcal.camera_file import CameraModel, camera_prior
 from stcal.handeye import HandEyeOptions, handeye
 from stcal.handeye.report import outcome_page, outcome_text
 from stcal.handeye.result_file import Outcome, calibration_json, outcome_json
@@ -76,6 +77,20 @@ def test_the_text_has_the_transform_with_its_sigma(of_views):
     assert "held out (2 × 2 of 10 poses): rotation" in text
     assert "σ of corner in the image: " in text
     assert " px (estimated)" in text
+
+
+def test_every_sigma_that_there_is_has_a_name():
+    """A camera file that is off: its σ are widened, and the factor is among the σ."""
+    truth = simulated_views(np.random.default_rng(2), 10, "eye-in-hand", (2e-4, 0.1), 0.1)
+    camera = truth.views.camera
+    wrong = replace(camera, focal=1.02 * camera.focal)
+    views = replace(truth.views, camera=wrong)
+    prior = camera_prior(CameraModel(wrong.focal, wrong.centre, wrong.distortion, "PINHOLE", None, None, ""), wrong)
+    result = handeye(truth.pairs, truth.setup, None, views, HandEyeOptions(intrinsics=prior))
+    outcome = Outcome("images", result, colmap_model="PINHOLE")
+    assert "σ of intrinsics of the camera file: " in outcome_text(outcome)
+    assert "Camera, as adjusted" in outcome_page(outcome)
+    assert calibration_json(outcome)["sigma"]["camera_prior"] > 1.5
 
 
 def test_corners_with_sigmas_of_their_own_have_a_factor(of_views):

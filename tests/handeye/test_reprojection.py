@@ -6,7 +6,7 @@ import pytest
 from stcal.camera_file import CameraModel, camera_prior, intrinsic_basis
 from stcal.errors import DegenerateError, InputError
 from stcal.geometry.camera import Camera
-from stcal.geometry.rigid import Poses
+from stcal.geometry.rigid import Poses, Rigid
 from stcal.handeye import HandEyeOptions, Noise, View, Views, handeye, pairs_of_views
 from stcal.handeye.bundle import Bundle
 from stcal.handeye.loop import Loop
@@ -163,3 +163,15 @@ def test_a_camera_file_that_is_right_keeps_its_sigma():
     assert found.notes == ()
     off = intrinsic_basis("OPENCV").T @ (found.reprojection.camera.parameters() - good.parameters())
     assert off @ np.linalg.solve(found.reprojection.camera_covariance, off) < 4 * 8
+
+
+def test_a_pose_of_the_robot_that_is_wrong_is_left_out():
+    """By 1° and 5 mm, 100 σ: not gross, but told by the other poses."""
+    truth = simulated_views(np.random.default_rng(11), 12, robot=(2e-4, 0.05), corner_px=0.1)
+    flange = list(truth.pairs.base_from_flange)
+    flange[7] = Rigid.exp([0.01, -0.012, 0.008, 3, -2, 3.5]) @ flange[7]
+    pairs = pairs_of_views(Poses.of(flange), truth.views)
+    found = handeye(pairs, views=truth.views)
+    assert np.flatnonzero(found.outliers).tolist() == [7]
+    assert "pose 8 contradicts the others" in found.notes[0]
+    assert found.sigma["robot_mm"] == pytest.approx(0.05, rel=0.5)
