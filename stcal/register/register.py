@@ -87,7 +87,7 @@ def register(
     a, b, chosen, noise = _checked(xyz_a, xyz_b, model, method, threshold_mm, weights, covariances)
     if chosen.name == "rigid":
         check_units(a, b, seed)
-    other, bent = None, False
+    other = None
     if method == "liu2017":
         limit = {} if threshold_mm is None else {"limit_mm": threshold_mm}
         options = liu2017_options or Liu2017Options(**limit)
@@ -106,7 +106,7 @@ def register(
             return robust_fit(chosen, a[rows], b[rows], noise[rows], threshold_mm, seed)
 
     if method == "robust":
-        fitted, other, bent = _robust(chosen, a, b, noise, threshold_mm, seed)
+        fitted, other = _robust(chosen, a, b, noise, threshold_mm, seed)
     else:
         fitted = of_rows(np.arange(len(a)))
     inliers = fitted.inliers
@@ -129,9 +129,7 @@ def register(
     residuals = b - fitted.transform @ a
     length = np.linalg.norm(residuals[inliers], axis=1)
     factor = None if noise.sigma_mm is None else fitted.sigma / noise.sigma_mm
-    subject = Subject(
-        chosen, method, a, b, fitted, alternative, ambiguous, bent, factor if scaled else None, dof, lines
-    )
+    subject = Subject(chosen, method, a, b, fitted, alternative, ambiguous, factor if scaled else None, dof, lines)
     return Registration(
         model=chosen.name,
         method=method,
@@ -198,8 +196,8 @@ def _liu2017(model: Model, a: np.ndarray, b: np.ndarray, options: Liu2017Options
 
 def _robust(
     model: Model, a: np.ndarray, b: np.ndarray, noise: Noise, threshold: float | None, seed: int
-) -> tuple[Fitted, Fitted | None, bool]:
-    """The fit, another one that other points agree on, and whether residuals speak for a bent frame."""
+) -> tuple[Fitted, Fitted | None]:
+    """The fit, and another one that other points agree on."""
     try:
         fitted = robust_fit(model, a, b, noise, threshold, seed)
         _beyond_chance(model, fitted, a, b)
@@ -212,17 +210,23 @@ def _robust(
     inside = np.flatnonzero(fitted.inliers)
     groups = two_groups(model, a[inside], b[inside], noise[inside], np.random.default_rng([seed, 4]))
     if groups is None or groups.in_space:
-        return fitted, alternative_fit(model, fitted, a, b, noise, seed), groups is not None
+        return fitted, alternative_fit(model, fitted, a, b, noise, seed)
     apart = [squares(b[inside] - t @ a[inside], noise[inside].precision) for t in groups.transforms]
     first = np.zeros(len(a), bool)
     first[inside[apart[0] <= apart[1]]] = True
     second = fitted.inliers & ~first
     one = settled(model, a, b, noise, first, threshold)
     if (one.inliers & second).sum() < second.sum() / 2:
-        return one, alternative_fit(model, one, a, b, noise, seed), False
-    # too near each other for a threshold between them: as assigned
-    pair = [Fitted(fit(model, a[m], b[m], noise[m].precision), m, one.sigma, one.threshold) for m in (first, second)]
-    return pair[0], pair[1], False
+        return one, alternative_fit(model, one, a, b, noise, seed)
+    return _as_assigned(model, a, b, noise, first, threshold), _as_assigned(model, a, b, noise, second, threshold)
+
+
+def _as_assigned(model: Model, a, b, noise: Noise, group: np.ndarray, threshold: float | None) -> Fitted:
+    """The fit to a group too near the other one for a threshold between them: that of its own σ reaches into it."""
+    transform = fit(model, a[group], b[group], noise[group].precision)
+    square = squares(b[group] - transform @ a[group], noise[group].precision)
+    sigma = sigma_within(float(square.sum()), model, int(group.sum()), threshold)
+    return Fitted(transform, group, sigma, threshold or float(np.sqrt(square.max())))
 
 
 def _beyond_chance(model: Model, fitted: Fitted, a: np.ndarray, b: np.ndarray) -> None:
