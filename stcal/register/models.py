@@ -18,6 +18,8 @@ Transform = Rigid | Similarity | Affine
 MAX_STEPS = 50
 SETTLED = 1e-8
 """Gauss–Newton ends when a step moves no parameter by more than this share of its own σ at unit noise."""
+EXACT = 1e-11
+"""σ below this share of the coordinates' size is rounding of numbers."""
 CHUNK = 100_000
 """Points at once where a Jacobian of every point is held."""
 
@@ -89,6 +91,11 @@ def squares(residuals: np.ndarray, precision: np.ndarray | None = None) -> np.nd
         return np.einsum("ni,nij,nj->n", residuals, precision, residuals)
     plain = np.einsum("ni,ni->n", residuals, residuals)
     return plain if precision is None else plain * precision
+
+
+def rounding_mm(xyz_a: np.ndarray, xyz_b: np.ndarray) -> float:
+    """What of residuals rounding of numbers may make."""
+    return EXACT * float(max(np.abs(xyz_a).max(), np.abs(xyz_b).max()))
 
 
 def unit_covariance(

@@ -4,7 +4,9 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
+from scipy.spatial import cKDTree
 from scipy.stats import f as fisher
+from scipy.stats import norm
 
 from stcal.register.degeneracy import WIDER_THAN, row_name, single_supports, spreads, symmetry, symmetry_note
 from stcal.register.mistakes import SHOWN, UNIT_WITHIN, UNITS, outlier_notes
@@ -15,6 +17,10 @@ from stcal.register.robust import CLEAN_SETS_WITH_OUTLIER, LEVERAGE_UP_TO, Fitte
 FEW_FREEDOMS = 6
 """Below so many degrees of freedom σ is uncertain by more than 30 %."""
 MAJORITY = 0.5
+NEIGHBOURS = 2000
+FEWEST_NEIGHBOURS = 20
+BY_NEIGHBOURS = 1e-4
+"""Of so many points; clean data called bent: so many."""
 TIGHT = 2.5
 """A threshold of 2.5 σ cuts off a tenth of the good points; below it the covariance of few points is too small."""
 
@@ -30,7 +36,6 @@ class Subject:
     fitted: Fitted
     alternative: Alternative | None
     ambiguous: bool
-    bent: bool
     factor: float | None
     dof: float
     lines: Sequence[int] | None
@@ -61,11 +66,6 @@ def _agreement(subject: Subject) -> list[str]:
             f"{start}{len(other.rows)} of the other points agree on another transform, {other.apart_mm:.4g} mm and "
             f"{np.degrees(other.turn_rad):.3g}° from this one ({shown}{more}); did an instrument move between them?"
         )
-    if subject.bent:
-        notes.append(
-            "the residuals are not noise: two regions fit far better each on its own, so that the frames are bent "
-            "against each other; a transform holds only where its points are"
-        )
     if subject.method == "least-squares":
         notes += _far_rows(subject)
     return notes
@@ -89,6 +89,13 @@ def _far_rows(subject: Subject) -> list[str]:
 
 def _noise(subject: Subject) -> list[str]:
     fitted, notes = subject.fitted, []
+    inside = fitted.inliers
+    residuals = subject.xyz_b[inside] - fitted.transform @ subject.xyz_a[inside]
+    if neighbours_alike(subject.xyz_a[inside], residuals):
+        notes.append(
+            "the residuals are not noise: neighbours are off alike, so that the frames are bent against each other and "
+            "a transform holds only where its points are; see the residual field"
+        )
     if subject.factor is not None:
         notes.append(
             f"residuals exceed the σ given {subject.factor:.3g} times, which chance does not explain; the covariance "
@@ -103,6 +110,22 @@ def _noise(subject: Subject) -> list[str]:
             "good points; leave it out to have it estimated"
         )
     return notes
+
+
+def neighbours_alike(xyz_a: np.ndarray, residuals: np.ndarray) -> bool:
+    """Whether points (n, 3) have residuals (n, 3) in common with their nearest neighbours, more than chance has it.
+
+    Of independent ones the products r · r' of neighbours have mean zero (a little less after a fit), and their sum is
+    normal with the variance Σ (r · r')².
+    """
+    rows = slice(None, None, max(1, len(xyz_a) // NEIGHBOURS))
+    xyz, r = xyz_a[rows], residuals[rows]
+    if len(xyz) < FEWEST_NEIGHBOURS:
+        return False
+    pairs = np.column_stack([np.arange(len(xyz)), cKDTree(xyz).query(xyz, k=2)[1][:, 1]])
+    one, two = np.unique(np.sort(pairs, axis=1), axis=0).T
+    product = np.einsum("ni,ni->n", r[one], r[two])
+    return bool(norm.sf(product.sum() / max(np.sqrt((product**2).sum()), 1e-300)) < BY_NEIGHBOURS)
 
 
 def _layout(subject: Subject) -> list[str]:

@@ -1,6 +1,8 @@
 """Registration of two instruments from corresponding points: the calls in order; read this first."""
 
 from collections.abc import Sequence
+from dataclasses import replace
+from functools import partial
 
 import numpy as np
 
@@ -87,34 +89,17 @@ def register(
     a, b, chosen, noise = _checked(xyz_a, xyz_b, model, method, threshold_mm, weights, covariances)
     if chosen.name == "rigid":
         check_units(a, b, seed)
-    other, bent = None, False
-    if method == "liu2017":
-        limit = {} if threshold_mm is None else {"limit_mm": threshold_mm}
-        options = liu2017_options or Liu2017Options(**limit)
-
-        def of_rows(rows: np.ndarray) -> Fitted:
-            return _liu2017(chosen, a[rows], b[rows], options, seed)
-
-    elif method == "least-squares":
-
-        def of_rows(rows: np.ndarray) -> Fitted:
-            return _least_squares(chosen, a[rows], b[rows], noise[rows])
-
-    else:
-
-        def of_rows(rows: np.ndarray) -> Fitted:
-            return robust_fit(chosen, a[rows], b[rows], noise[rows], threshold_mm, seed)
-
     if method == "robust":
-        fitted, other, bent = _robust(chosen, a, b, noise, threshold_mm, seed)
+        fit_rows = partial(_robust_rows, chosen, a, b, noise, threshold_mm, seed)
+        fitted, other = _robust(chosen, a, b, noise, threshold_mm, seed)
     else:
-        fitted = of_rows(np.arange(len(a)))
+        if method == "least-squares":
+            fit_rows = partial(_least_squares, chosen, a, b, noise)
+        else:
+            fit_rows = partial(_liu2017, a, b, _liu2017_options(liu2017_options, threshold_mm), seed)
+        fitted, other = fit_rows(np.arange(len(a))), None
+    _check_geometry(chosen, method, a, b, fitted, lines)
     inliers = fitted.inliers
-    if method != "liu2017":
-        check_mirrored(chosen, a[inliers], b[inliers])
-        check_extent(chosen, a[inliers], fitted.sigma)
-        if method == "robust" and not inliers.all():
-            check_supports(chosen, a, inliers, fitted.sigma, lambda row: row_name(row, lines))
     alternative = None if other is None else _alternative(fitted, other, a)
     ambiguous = alternative is not None and len(alternative.rows) >= AS_GOOD * inliers.sum()
     if ambiguous and not allow_ambiguous:
@@ -129,9 +114,7 @@ def register(
     residuals = b - fitted.transform @ a
     length = np.linalg.norm(residuals[inliers], axis=1)
     factor = None if noise.sigma_mm is None else fitted.sigma / noise.sigma_mm
-    subject = Subject(
-        chosen, method, a, b, fitted, alternative, ambiguous, bent, factor if scaled else None, dof, lines
-    )
+    subject = Subject(chosen, method, a, b, fitted, alternative, ambiguous, factor if scaled else None, dof, lines)
     return Registration(
         model=chosen.name,
         method=method,
@@ -147,7 +130,7 @@ def register(
         max_mm=float(length.max()),
         sigma_factor=factor,
         scaled=scaled,
-        held_out=held_out(lambda rows: of_rows(rows).transform, a, b, inliers, folds, chosen.sample + 1, seed),
+        held_out=held_out(lambda rows: fit_rows(rows).transform, a, b, inliers, folds, chosen.sample + 1, seed),
         ambiguous=ambiguous,
         alternative=alternative,
         notes=tuple(notes_of(subject)),
@@ -181,14 +164,32 @@ def _checked(
     return a, b, chosen, noise_of(len(a), weights, covariances)
 
 
-def _least_squares(model: Model, a: np.ndarray, b: np.ndarray, noise: Noise) -> Fitted:
+def _check_geometry(model: Model, method: str, a, b, fitted: Fitted, lines: Sequence[int] | None) -> None:
+    """Refuse mirrored frames, and points that do not determine the model; the baseline runs as it was published."""
+    if method == "liu2017":
+        return
+    inliers = fitted.inliers
+    check_mirrored(model, a[inliers], b[inliers])
+    check_extent(model, a[inliers], fitted.sigma)
+    if method == "robust" and not inliers.all():
+        check_supports(model, a, inliers, fitted.sigma, lambda row: row_name(row, lines))
+
+
+def _least_squares(model: Model, a: np.ndarray, b: np.ndarray, noise: Noise, rows: np.ndarray) -> Fitted:
+    a, b, noise = a[rows], b[rows], noise[rows]
     transform = fit(model, a, b, noise.precision)
     total = squares(b - transform @ a, noise.precision).sum()
     sigma = sigma_within(float(total), model, len(a), None)
     return Fitted(transform, np.ones(len(a), bool), sigma, None)
 
 
-def _liu2017(model: Model, a: np.ndarray, b: np.ndarray, options: Liu2017Options, seed: int) -> Fitted:
+def _liu2017_options(options: Liu2017Options | None, threshold_mm: float | None) -> Liu2017Options:
+    options = options or Liu2017Options()
+    return options if threshold_mm is None else replace(options, limit_mm=threshold_mm)
+
+
+def _liu2017(a: np.ndarray, b: np.ndarray, options: Liu2017Options, seed: int, rows: np.ndarray) -> Fitted:
+    a, b = a[rows], b[rows]
     found = liu2017(a, b, options, seed)
     near = found.inliers
     total = squares((b - found.b_from_a @ a)[near]).sum()
@@ -196,10 +197,14 @@ def _liu2017(model: Model, a: np.ndarray, b: np.ndarray, options: Liu2017Options
     return Fitted(found.b_from_a, near, sigma, options.limit_mm, options.tries)
 
 
+def _robust_rows(model: Model, a, b, noise: Noise, threshold: float | None, seed: int, rows: np.ndarray) -> Fitted:
+    return robust_fit(model, a[rows], b[rows], noise[rows], threshold, seed)
+
+
 def _robust(
     model: Model, a: np.ndarray, b: np.ndarray, noise: Noise, threshold: float | None, seed: int
-) -> tuple[Fitted, Fitted | None, bool]:
-    """The fit, another one that other points agree on, and whether residuals speak for a bent frame."""
+) -> tuple[Fitted, Fitted | None]:
+    """The fit, and another one that other points agree on."""
     try:
         fitted = robust_fit(model, a, b, noise, threshold, seed)
         _beyond_chance(model, fitted, a, b)
@@ -212,17 +217,23 @@ def _robust(
     inside = np.flatnonzero(fitted.inliers)
     groups = two_groups(model, a[inside], b[inside], noise[inside], np.random.default_rng([seed, 4]))
     if groups is None or groups.in_space:
-        return fitted, alternative_fit(model, fitted, a, b, noise, seed), groups is not None
+        return fitted, alternative_fit(model, fitted, a, b, noise, seed)
     apart = [squares(b[inside] - t @ a[inside], noise[inside].precision) for t in groups.transforms]
     first = np.zeros(len(a), bool)
     first[inside[apart[0] <= apart[1]]] = True
     second = fitted.inliers & ~first
     one = settled(model, a, b, noise, first, threshold)
     if (one.inliers & second).sum() < second.sum() / 2:
-        return one, alternative_fit(model, one, a, b, noise, seed), False
-    # too near each other for a threshold between them: as assigned
-    pair = [Fitted(fit(model, a[m], b[m], noise[m].precision), m, one.sigma, one.threshold) for m in (first, second)]
-    return pair[0], pair[1], False
+        return one, alternative_fit(model, one, a, b, noise, seed)
+    return _as_assigned(model, a, b, noise, first, threshold), _as_assigned(model, a, b, noise, second, threshold)
+
+
+def _as_assigned(model: Model, a, b, noise: Noise, group: np.ndarray, threshold: float | None) -> Fitted:
+    """The fit to a group too near the other one for a threshold between them: that of its own σ reaches into it."""
+    transform = fit(model, a[group], b[group], noise[group].precision)
+    square = squares(b[group] - transform @ a[group], noise[group].precision)
+    sigma = sigma_within(float(square.sum()), model, int(group.sum()), threshold)
+    return Fitted(transform, group, sigma, threshold or float(np.sqrt(square.max())))
 
 
 def _beyond_chance(model: Model, fitted: Fitted, a: np.ndarray, b: np.ndarray) -> None:

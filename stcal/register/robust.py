@@ -18,7 +18,7 @@ from scipy.stats import f as fisher
 
 from stcal.errors import DegenerateError
 from stcal.register.covariance import Noise, sigma_within
-from stcal.register.models import Model, Transform, fit, leverages, parts, squares, whitened
+from stcal.register.models import Model, Transform, fit, leverages, parts, rounding_mm, squares, whitened
 from stcal.register.search import FALSE_ALARMS, LEAST_FREEDOM, Consensus, Score, by_scale, by_threshold, search
 
 SUBSET = 500
@@ -28,8 +28,6 @@ LEVERAGE_UP_TO = 10_000
 """With more points the fit's own uncertainty adds under 0.02 % to a residual."""
 MAX_ROUNDS = 50
 NESTED = 6
-EXACT = 1e-11
-"""σ below this share of the coordinates' size is rounding of numbers."""
 BY_CHANCE = 0.01
 """Sets that random points would give and that are taken for a transform: so many in one file."""
 DISTINCT = 5.0
@@ -50,11 +48,6 @@ class Fitted:
     sigma: float
     threshold: float
     samples: int = 0
-
-
-def rounding_mm(xyz_a: np.ndarray, xyz_b: np.ndarray) -> float:
-    """What of residuals rounding of numbers may make."""
-    return EXACT * float(max(np.abs(xyz_a).max(), np.abs(xyz_b).max()))
 
 
 def robust_fit(
@@ -169,16 +162,31 @@ def _chosen(model, transform, xyz_a, residuals, square, noise: Noise, used, sigm
     outside = 3 * sigma**2 * fisher.isf(beyond, 3, freedom)
     if total > LEVERAGE_UP_TO:
         return float(np.sqrt(outside)), square <= outside
-    spread = leverages(model, transform, xyz_a, used, noise.precision)
-    own = np.where(used, -1.0, 1.0)[:, None, None]
-    value, vector = np.linalg.eigh(np.eye(3) + own * spread)
-    turned = np.einsum("nij,ni->nj", vector, whitened(residuals, noise.precision))
-    deletion = (turned**2 / np.maximum(value, 1e-9)).sum(1)
+    deletion = deletion_squares(model, transform, xyz_a, residuals, noise, used)
     passed = deletion <= outside
     if freedom > 3:  # a point that was used is tested against the σ of the others
         rest = np.maximum(freedom * sigma**2 - deletion[used], 0) / (freedom - 3)
         passed[used] = deletion[used] <= 3 * fisher.isf(beyond, 3, freedom - 3) * np.maximum(rest, 1e-300)
     return float(np.sqrt(outside)), passed
+
+
+def deletion_squares(
+    model: Model,
+    transform: Transform,
+    xyz_a: np.ndarray,
+    residuals: np.ndarray,
+    noise: Noise,
+    used: np.ndarray,
+) -> np.ndarray:
+    """(n,) rᵀ C⁻¹ r of each point's residual from a fit without it, C its covariance at unit noise.
+
+    ``residuals`` : (n, 3) of the fit to the points ``used``; for these r (1 − H)⁻¹ r, for others r (1 + H)⁻¹ r.
+    """
+    spread = leverages(model, transform, xyz_a, used, noise.precision)
+    own = np.where(used, -1.0, 1.0)[:, None, None]
+    value, vector = np.linalg.eigh(np.eye(3) + own * spread)
+    turned = np.einsum("nij,ni->nj", vector, whitened(residuals, noise.precision))
+    return (turned**2 / np.maximum(value, 1e-9)).sum(1)
 
 
 def chance(

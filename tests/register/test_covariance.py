@@ -6,7 +6,7 @@ from scipy.spatial.transform import Rotation
 
 from stcal.errors import InputError
 from stcal.register import register
-from stcal.register.covariance import kept_share, kept_variance, noise_of, sigma_within
+from stcal.register.covariance import covariance_of, kept_share, kept_variance, noise_of, sigma_within
 from stcal.register.models import MODELS
 from stcal.register.simulated import SIGMA_MM, make_scene, parameter_error
 
@@ -46,6 +46,14 @@ def calibration(trials: int, n: int, share=0.0, given=False, **options) -> float
 )
 def test_the_covariance_is_calibrated(share, options):
     assert calibration(60, 40, share, **options) == pytest.approx(1, abs=0.28)
+
+
+def test_a_cut_costs_what_an_estimator_with_hard_rejection_loses():
+    """At 2 σ: χ²₃(4)/χ²₅(4) = 0.7385/0.4506 of the variance that as many whole points have."""
+    s = make_scene(np.random.default_rng(7), 50)
+    arguments = RIGID, s.b_from_a, s.xyz_a, noise_of(50, None, None), 0.1
+    whole, cut = covariance_of(*arguments, None)[0], covariance_of(*arguments, 0.2)[0]
+    np.testing.assert_allclose(cut, whole * 0.7385 / 0.4506, rtol=2e-4)
 
 
 def test_sigma_of_cut_off_residuals():

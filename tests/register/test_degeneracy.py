@@ -83,6 +83,15 @@ def test_spreads_and_supports():
     assert single_supports(MODELS["rigid"], np.vstack([a[:2], [[1, 0, 0], [0, 5, 0]]]), 0.01).tolist() == [3]
 
 
+def test_one_point_off_a_plane_is_named_for_the_affine_model():
+    flat = np.random.default_rng(3).uniform(-100, 100, (12, 3)) * [1, 1, 0]
+    a = np.vstack([flat, [[0, 0, 90]]])
+    assert single_supports(MODELS["affine"], a, 0.1).tolist() == [12]
+    assert single_supports(MODELS["rigid"], a, 0.1).tolist() == []
+    found = register(a, seen(a), model="affine", method="least-squares", folds=0)
+    assert any("only row 13 keeps the points off a plane" in note for note in found.notes)
+
+
 SQUARE = np.array([[100.0, 0, 0], [0, 100, 0], [-100, 0, 0], [0, -100, 0]])
 
 

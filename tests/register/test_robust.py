@@ -8,9 +8,9 @@ from stcal.errors import DegenerateError
 from stcal.geometry.align import align_rigid
 from stcal.register import register
 from stcal.register.covariance import Noise
-from stcal.register.groups import lies_together, two_groups
-from stcal.register.models import MODELS
-from stcal.register.robust import CLEAN_SETS_WITH_OUTLIER
+from stcal.register.groups import lies_together, sphericity, two_groups, wilks_bound
+from stcal.register.models import MODELS, fit
+from stcal.register.robust import CLEAN_SETS_WITH_OUTLIER, deletion_squares
 from stcal.register.search import by_scale, chernoff, search
 from stcal.register.simulated import SIGMA_MM, make_scene
 
@@ -100,6 +100,70 @@ def test_half_of_the_points_shifted_by_little():
     assert refused == 10
 
 
+def test_groups_that_no_consensus_tells_apart():
+    """At 1 mm, 7 σ, between them: trimming sees one set of larger σ, two transforms are seen."""
+    for trial in range(4):
+        s = scene([trial, 9], 80, 0.5, "one shift", (1, 1))
+        found = register(s.xyz_a, s.xyz_b, folds=0, allow_ambiguous=True)
+        assert found.ambiguous
+        assert abs((found.inliers == s.clean).mean() - 0.5) > 0.45
+        assert found.sigma_mm == pytest.approx(SIGMA_MM, rel=0.3)
+
+
+def test_noise_along_one_axis_is_not_two_groups():
+    """Half of it is on either side, but what two transforms take off it, one covariance explains as well."""
+    for trial, n, along in ((0, 12, 3), (1, 30, 5), (2, 100, 3), (3, 200, 10), (4, 100, 30)):
+        rng = np.random.default_rng([trial, 6])
+        s = scene([trial, 6], n, sigma_mm=0.02)
+        b = s.xyz_b + rng.normal(0, along * 0.02, (n, 1)) * [0.6, 0, 0.8]
+        assert register(s.xyz_a, b, folds=0).inliers.mean() > 0.9
+
+
+def test_wilks_bound_is_above_the_distribution():
+    """Λ as drawn from the scatter of Gaussian residuals of two linear fits, one within the other."""
+    rng = np.random.default_rng(3)
+    design = rng.normal(size=(20, 6))
+    ratios = []
+    for _ in range(2000):
+        y = rng.normal(size=(20, 3)) * [1, 5, 0.2]
+        less, more = (y - design[:, :k] @ np.linalg.lstsq(design[:, :k], y, rcond=None)[0] for k in (4, 6))
+        ratios.append(np.linalg.slogdet(more.T @ more)[1] - np.linalg.slogdet(less.T @ less)[1])
+    for level in (0.5, 0.1, 0.01):
+        at = np.quantile(ratios, level)
+        assert np.log(level) - 0.3 < wilks_bound(at, 14, 2) < np.log(level) + 3
+
+
+def test_sphericity_is_a_p_value():
+    rng = np.random.default_rng(4)
+    p = [sphericity(y.T @ y, 15) for y in rng.normal(size=(1000, 15, 3))]
+    assert np.mean(np.array(p) < 0.1) == pytest.approx(0.1, abs=0.035)  # 3.5 of its standard deviations
+    y = rng.normal(size=(15, 3)) * [1, 1, 6]
+    assert sphericity(y.T @ y, 15) < 1e-4
+
+
+def test_deletion_residuals_are_those_of_the_fit_without_the_point():
+    """Exactly so of the affine model, which is linear, with σ of every point its own."""
+    s, model = scene(24, 12), MODELS["affine"]
+    noise = Noise(np.random.default_rng(0).uniform(0.5, 2, 12))
+    whole = np.ones(12, bool)
+    found = fit(model, s.xyz_a, s.xyz_b, noise.precision)
+    with_it = deletion_squares(model, found, s.xyz_a, s.xyz_b - found @ s.xyz_a, noise, whole)
+    for i in range(12):
+        rest = np.arange(12) != i
+        less = fit(model, s.xyz_a[rest], s.xyz_b[rest], noise[rest].precision)
+        without = deletion_squares(model, less, s.xyz_a, s.xyz_b - less @ s.xyz_a, noise, rest)
+        assert with_it[i] == pytest.approx(without[i], rel=1e-6)
+
+
+def test_a_far_point_may_be_off_by_what_the_fit_cannot_know():
+    """Points of 20 mm tell the place of one 3 m away to 150 times their noise: none of that is an outlier."""
+    rng = np.random.default_rng(25)
+    a = np.vstack([rng.uniform(-10, 10, (20, 3)), [[3000, 0, 0]]])
+    for trial in range(10):
+        b = a + np.random.default_rng(trial).normal(0, SIGMA_MM, a.shape)
+        assert register(a, b, folds=0).inliers.all()
+
+
 def test_a_minority_that_moved_is_left_out_and_told():
     s = scene(6, 60, 0.25, "one shift", (3, 3))
     found = register(s.xyz_a, s.xyz_b, folds=0)
@@ -122,6 +186,13 @@ def test_a_bent_frame_is_not_two_motions():
     assert any("bent" in note for note in found.notes)
     away = np.sqrt((((found.b_from_a @ a) - plain.b_from_a @ a) ** 2).sum(1).mean())
     assert away < 0.1 * plain.rms_mm
+
+
+def test_noise_is_not_called_bent():
+    """One case in ten thousand is."""
+    for trial in range(15):
+        s = scene([trial, 8], 100)
+        assert register(s.xyz_a, s.xyz_b, folds=0).notes == ()
 
 
 def test_rows_in_any_order_give_the_same_points():
@@ -270,7 +341,7 @@ def test_false_alarms_of_the_search_are_rare():
 
 
 def test_groups():
-    s = scene(22, 60, 0.4, "one shift", (1.2, 1.2))
+    s = scene(22, 60, 0.4, "one shift", (1.5, 1.5))
     groups = two_groups(RIGID, s.xyz_a, s.xyz_b, Noise(), np.random.default_rng(0))
     near = [((s.xyz_b - t @ s.xyz_a) ** 2).sum(1) for t in groups.transforms]
     assert ((near[0] < near[1]) == s.clean).mean() > 0.97
