@@ -5,7 +5,7 @@
 A camera of 1280×1024 px on the flange of an arm of a UR10's reach sees a chessboard of 8×7 squares of 25 mm from 25
 poses: 24 motions A_N, B_N from each pose to the next, 18 to solve with and 6 held out. Corners err by 0.1 px, the arm
 by 0.1 mm and 0.3 mrad (σ of a coordinate); nothing is real. DE runs as the paper has it: M = 30, F = 0.5, CR = 0.9, 100
-generations, λ = 1 (lengths in metres), x = (log R_X, b_X), DE/rand/1/bin. Its bounds are not legible; by default
+generations, λ = 1 (lengths in metres), x = (log R_X, b_X), DE/rand/1/bin. The paper's bounds are not legible: here
 the population starts within ±π and ± the farthest pose of the flange, and once more within ±200 mm.
 
 Prints, as Markdown, over all seeds: the objective that evolution reaches over its minimum, without and with polishing;

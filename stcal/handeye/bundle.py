@@ -12,12 +12,13 @@ from scipy.stats import chi2
 from stcal.geometry.camera import Camera
 from stcal.geometry.rigid import Poses, Rigid, skew
 from stcal.handeye.leastsq import Linear, minimise, perturbed
+from stcal.handeye.noise import CAUTION
 from stcal.handeye.views import project_jacobian
 
 CORNER, POSE = (float(np.sqrt(chi2.ppf(0.999, dof))) for dof in (2, 6))
 """Huber's limits: one good corner, and one good pose, in a thousand weighs less than one."""
-LEAST = {"corner_px": 1e-6, "robot_rad": 1e-8, "robot_mm": 1e-5, "board_mm": 1e-5, "camera_prior": 1.0}
-"""Estimated σ stay above: exact data have none. What is stated of a camera is not made better than it says."""
+LEAST = {"corner_px": 1e-6, "robot_rad": 1e-8, "robot_mm": 1e-5, "board_mm": 1e-5}
+"""Estimated σ stay above: exact data have none. Factors of what is stated of a camera stay above 1."""
 ROUNDS = 20
 ROUGHLY = 1e-6
 """Relative fall of the cost at which a round of σ has solved well enough."""
@@ -53,7 +54,7 @@ class Corners:
     ``inverted`` : eye-to-hand; ``base_from_flange`` : m, as reported; ``xyz_board`` : (K, 3) as designed; ``view``,
     ``corner`` : (n,) of each measurement; ``xy_px`` : (n, 2); ``weight`` : (n, 2, 2) whitening at σ 1; ``robot`` :
     (m, 6, 6) whitening in place of σ, or None; ``sigma`` : of each group, 0 where exact; ``basis`` : (12, q) of the
-    intrinsics solved for, ``information`` : (q, q) about ``camera``, over the square of the factor ``camera_prior``;
+    intrinsics solved for, ``information`` : (q, q) about ``camera``, over the square of factors;
     ``with_scale``.
     """
 
@@ -79,6 +80,15 @@ class Corners:
         sizes["robot"] = 0 if exact else 6 * len(self.base_from_flange)
         ends = np.cumsum([0, *sizes.values()])
         return {name: slice(int(i), int(j)) for name, i, j in zip(sizes, ends[:-1], ends[1:], strict=True)}
+
+    def camera_parts(self) -> list[tuple[str, np.ndarray]]:
+        """Intrinsics whose knowledge may be wrong by a factor of its own: kinds, or all where they are correlated."""
+        first = self.basis.argmax(0)
+        if np.count_nonzero(self.information - np.diag(np.diag(self.information))):
+            return [("camera_all", np.arange(len(first)))]
+        kinds = {"focal": (0, 1), "centre": (2, 3), "radial": (4, 5, 8, 9, 10, 11), "tangential": (6, 7)}
+        parts = [(f"camera_{kind}", np.flatnonzero(np.isin(first, numbers))) for kind, numbers in kinds.items()]
+        return [(name, rows) for name, rows in parts if len(rows)]
 
     def count(self) -> int:
         """Number of unknowns."""
@@ -145,10 +155,13 @@ class Corners:
             Group(("corner_px",), white, _sparse(by, at, count, {"board": self.corner, "robot": self.view}), CORNER)
         ]
         if self.basis.shape[1]:
-            root = np.linalg.cholesky(self.information).T / self.sigma["camera_prior"]
             off = np.linalg.pinv(self.basis) @ (state.camera.parameters() - self.camera.parameters())
-            slope = _sparse({"camera": root[None]}, at, count, {})
-            found.append(Group(("camera_prior",), (root @ off)[None], slope, np.inf))
+            for name, rows in self.camera_parts():
+                root = np.linalg.cholesky(self.information[rows][:, rows]).T / self.sigma[name]
+                whole = np.zeros((len(rows), len(off)))
+                whole[:, rows] = root
+                slope = _sparse({"camera": whole[None]}, at, count, {})
+                found.append(Group((name,), (whole @ off)[None], slope, np.inf))
         if at["board"].stop > at["board"].start:
             off = (state.corners - self.xyz_board) / self.sigma["board_mm"]
             slope = np.tile(np.eye(3) / self.sigma["board_mm"], (len(off), 1, 1))
@@ -236,8 +249,8 @@ def adjust(corners: Corners, start: Bundle, free: tuple[str, ...]) -> tuple[Corn
 
 
 def estimated(corners: Corners, state: Bundle, free: tuple[str, ...]) -> dict[str, float]:
-    """Restricted maximum-likelihood σ of the ``free`` groups, all else linear about a state (Patterson & Thompson 1971;
-    what the unknowns take up of the residuals does not count)."""
+    """Restricted maximum-likelihood σ of the ``free`` groups, all else linear about a state (as
+    :func:`~stcal.handeye.noise.variance_components`)."""
     parts: dict[str, tuple[int, Linear]] = {}
     for group in corners.groups(state):
         for name, (count, linear) in group.by_name().items():
@@ -263,9 +276,10 @@ def estimated(corners: Corners, state: Bundle, free: tuple[str, ...]) -> dict[st
         value += 2 * np.log(np.diag(root[0]) / scale).sum()
         squares = [p.cost + 2 * p.gradient @ step + step @ p.normal @ step for p in linears]
         taken = [(inverse * p.normal).sum() for p in linears]
-        return float(value), share * (np.array(squares) + taken) - counts
+        return float(value + caution @ logs), share * (np.array(squares) + taken) - counts + caution
 
-    least = [2 * np.log(corners.sigma[name] / LEAST[name]) for name in names]
+    least = [2 * np.log(corners.sigma[name] / LEAST.get(name, 1.0)) for name in names]
+    caution = np.array([CAUTION if name in LEAST else 0.0 for name in names])
     bounds = [(-FARTHEST, min(FARTHEST, highest)) for highest in least]
     found = minimize(cost, np.zeros(len(names)), jac=True, method="L-BFGS-B", bounds=bounds)
     return {name: float(corners.sigma[name] * np.exp(-x / 2)) for name, x in zip(names, found.x, strict=True)}

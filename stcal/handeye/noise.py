@@ -11,7 +11,14 @@ from stcal.geometry.rigid import Rigid
 from stcal.handeye.loop import Loop
 
 LEAST_RAD, LEAST_MM = 1e-9, 1e-6
-"""Estimates stay above: exact data have none."""
+"""Estimates stay above: exact data have none …"""
+CAUTION = 2.0
+"""Redundancies that are not counted: a variance of ν of them is the sum of squares over ν − 2, so that errors in units
+of its root have mean square 1 (the mean of F is ν / (ν − 2)). It also keeps a component of few poses off 0, as the
+penalty of Chung, Rabe-Hesketh, Dorie, Gelman & Liu (2013) does."""
+LEAST_SHARE = 1e-3
+"""… and above this share of what the first guess of the variance was: less does not weigh, but few poses that fit by
+chance would have all others follow them."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -115,14 +122,14 @@ def _stated(m: int, covariance: np.ndarray | None, rad: float | None, mm: float 
 def variance_components(parts: Components, residuals: np.ndarray, slope: np.ndarray, first: np.ndarray) -> np.ndarray:
     """Restricted maximum-likelihood variances (f,) of the free components, from residuals (m, 6) near a solution.
 
-    What the parameters take up of the residuals does not count (Patterson & Thompson 1971): no bias by few poses.
+    What the parameters take up of the residuals does not count (Patterson & Thompson 1971); :data:`CAUTION` besides.
 
     Parameters
     ----------
     slope : (m, 6, k) array
         Derivative of the residuals by the parameters solved for; dependent columns do no harm.
     first : (f,) array
-        Where to start.
+        The first guess, of :meth:`Components.first`.
     """
     slope = _independent(slope)
 
@@ -140,9 +147,9 @@ def variance_components(parts: Components, residuals: np.ndarray, slope: np.ndar
         taken = np.einsum("kmab,mbj->kmaj", parts.free, weighted)
         by = by - np.einsum("mai,kmaj,ij->k", weighted, taken, covariance, optimize=True)
         by = by - np.einsum("ma,kmab,mb->k", fitted, parts.free, fitted, optimize=True)
-        return float(value), by * theta
+        return float(value - CAUTION * logs.sum()), by * theta - CAUTION
 
-    bounds = [(low, None) for low in np.log(parts.least())]
+    bounds = [(low, None) for low in np.log(np.maximum(parts.least(), LEAST_SHARE * first))]
     found = minimize(cost, np.log(first), jac=True, method="L-BFGS-B", bounds=bounds, options={"ftol": 1e-12})
     return np.exp(found.x)
 

@@ -12,6 +12,8 @@ from stcal.handeye.noise import Noise, components, variance_components
 
 FALSE_ALARM = 0.01
 """Chance that a set of good poses has one called an outlier."""
+MOSTLY_GOOD = 2 / 3
+"""Share of the poses that is taken to be good."""
 LEAST_POSES = 4
 """So many must be left to contradict an outlier: three poses fit three free ones."""
 ROUNDS = 30
@@ -68,7 +70,7 @@ def adjust_poses(loop: Loop, start: State, noise: Noise, with_scale: bool = Fals
     state = start
     residuals = _residuals(loop, state)
     parts = components(loop, noise, state.mount_from_camera, state.scale)
-    variances = parts.first(residuals)
+    variances = first = parts.first(residuals)
     used = _near(residuals, parts.total(variances)) if robust else np.ones(len(loop), bool)
     for round_ in range(ROUNDS):
         parts = components(loop, noise, state.mount_from_camera, state.scale)
@@ -78,7 +80,7 @@ def adjust_poses(loop: Loop, start: State, noise: Noise, with_scale: bool = Fals
         before, settled = used, True
         if parts.names:
             old = variances
-            variances = variance_components(parts.of(used), residuals[used], slope[used], variances)
+            variances = variance_components(parts.of(used), residuals[used], slope[used], first)
             settled = np.abs(np.log(variances / old)).max() < SETTLED
         if robust and round_ < ROUNDS // 2:  # later they stay: a set that swings would never settle
             used = _agreeing(residuals, slope, parts.total(variances), used, estimated=bool(parts.names))
@@ -130,9 +132,10 @@ def _squared(residuals: np.ndarray, spread: np.ndarray) -> np.ndarray:
 
 
 def _near(residuals: np.ndarray, spread: np.ndarray) -> np.ndarray:
-    """Poses to start with, by σ of their medians; all, where these would be too few."""
-    used = _squared(residuals, spread) <= chi2.ppf(1 - FALSE_ALARM, 6)
-    return used if used.sum() >= LEAST_POSES else np.ones(len(used), bool)
+    """Poses to start with, by σ of their medians: at least the better two thirds, or chance would choose among them."""
+    squared = _squared(residuals, spread)
+    enough = np.quantile(squared, MOSTLY_GOOD, method="higher")
+    return squared <= max(chi2.ppf(1 - FALSE_ALARM, 6), enough)
 
 
 def _agreeing(

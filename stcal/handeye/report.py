@@ -11,6 +11,7 @@ from stcal.handeye.loop import FRAMES
 from stcal.handeye.observability import Observability
 from stcal.handeye.result import HandEye
 from stcal.handeye.result_file import Outcome
+from stcal.handeye.solve import FACTORS
 from stcal.handeye.validate import Compared
 from stcal.page import COLOURS, FAINT, INK, NONE, SMALL, calm, fold, new_figure, number, page, plot, swatch, table, uri
 
@@ -29,7 +30,7 @@ SIGMA_NAMES = {
     "camera_rad": ("board's pose, rotation", "°", np.degrees(1.0)),
     "camera_mm": ("board's pose, position", "mm", 1.0),
     "board_mm": ("corner on the board", "mm", 1.0),
-    "camera_prior": ("intrinsics of the camera file", "times their σ", 1.0),
+    **{key: (f"camera file, {name}", "times its σ", 1.0) for key, name in FACTORS.items()},
 }
 GOOD, BAD = COLOURS[0], COLOURS[1]
 

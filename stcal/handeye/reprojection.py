@@ -112,7 +112,7 @@ def adjust_views(
     """Least squares of all corners from ``first`` X, Z, scale; ``loop`` holds the same poses, the board's by them.
 
     Unknowns: X, Z, and by their σ where the robot really was and where the board's corners really are; intrinsics about
-    ``intrinsics`` (whose σ are widened by one factor where the corners contradict them) and the board's scale on
+    ``intrinsics`` (whose σ are widened where the corners contradict them) and the board's scale on
     demand. Corners and poses have Huber's weights; then poses that contradict the others are left out.
 
     Raises
@@ -144,8 +144,6 @@ def adjust_views(
     at = corners.places()
     sigma_scale = float(np.sqrt(inverse[at["scale"], at["scale"]].item())) if with_scale else None
     sigma = {name: float(value) for name, value in corners.sigma.items() if value}
-    if intrinsics is None:
-        del sigma["camera_prior"]
     found = _found(corners, state, inverse, base_from_flange, rows, intrinsics is not None)
     rest = generalised_inverse(normal[12:, 12:])
     own = normal[:12, :12] - normal[:12, 12:] @ rest @ normal[12:, :12]
@@ -191,9 +189,6 @@ def problem(
     if loop.robot_covariance is not None:
         robot = np.linalg.inv(np.linalg.cholesky(loop.robot_covariance))
         free = [name for name in free if not name.startswith("robot")]
-    sigma["camera_prior"] = 1.0
-    if intrinsics is not None:
-        free.append("camera_prior")
     basis = np.zeros((12, 0)) if intrinsics is None else intrinsic_basis(intrinsics.colmap_model)
     information = np.zeros((0, 0)) if intrinsics is None else np.linalg.inv(intrinsics.covariance)
     corners = Corners(
@@ -211,7 +206,8 @@ def problem(
         information,
         with_scale,
     )
-    return corners, tuple(free)
+    factors = dict.fromkeys((name for name, _ in corners.camera_parts()), 1.0)
+    return replace(corners, sigma=sigma | factors), (*free, *factors)
 
 
 def _contradicting(corners: Corners, state: Bundle, inverse: np.ndarray) -> np.ndarray:
@@ -247,6 +243,7 @@ def _camera_gain(corners: Corners, state: Bundle) -> float:
     basis = intrinsic_basis(CAMERA_MODEL)
     q = basis.shape[1]
     wider = replace(corners, basis=basis, information=np.eye(q) * NO_PRIOR)
+    wider = replace(wider, sigma=wider.sigma | {name: 1.0 for name, _ in wider.camera_parts()})
     linear = wider.linear(state)
     return float(linear.gradient @ generalised_inverse(linear.normal) @ linear.gradient) / q
 

@@ -32,6 +32,13 @@ UNIT_MM = 1000.0
 """Length that weighs like one radian where no σ are stated: errors of 1 mm go with errors of 1 mrad."""
 SIZE_SIGMAS, SIZE_SHARE = 4.0, 1e-3
 """A board's size is doubted beyond so many σ, and a share that matters: 0.5 mm at half a metre."""
+FACTORS = {
+    "camera_focal": "focal length",
+    "camera_centre": "principal point",
+    "camera_radial": "radial distortion",
+    "camera_tangential": "tangential distortion",
+    "camera_all": "all",
+}
 WIDENED = 2.0
 """Factor of the σ of a camera file from which on the file is doubted."""
 CAMERA_GAIN = 5.0
@@ -239,10 +246,10 @@ def _by_views(task: _Task) -> HandEye:
         notes += (
             "the camera file does not fit the corners: solve for the intrinsics too, or calibrate the camera anew",
         )
-    if (factor := solution.sigma.get("camera_prior", 1.0)) > WIDENED:
-        notes += (
-            f"the corners contradict the camera file: its σ were widened {factor:.2g} times; calibrate the camera",
-        )
+    doubted = {name: factor for name, factor in solution.sigma.items() if name in FACTORS and factor > WIDENED}
+    if doubted:
+        which = ", ".join(f"{FACTORS[name]} {factor:.2g} times" for name, factor in doubted.items())
+        notes += (f"the corners contradict the camera file: its σ were widened ({which}); calibrate the camera",)
     return HandEye(
         "reprojection",
         task.setup,
