@@ -36,11 +36,12 @@ def test_as_written():
     np.testing.assert_array_equal(found.inliers, error < 0.2)
     # of the acceptable samples that of the smallest variance, told by the points outside it
     rng, best = np.random.default_rng(2), np.inf
-    for _ in range(300):
+    for share in found.shares:
         sample = rng.choice(100, 12, replace=False)
         one = affine_least_squares(s.xyz_a[sample], s.xyz_b[sample])
         off = np.delete(np.linalg.norm(s.xyz_b - one @ s.xyz_a, axis=1), sample)
         is_rotation = np.abs(one.linear.T @ one.linear - np.eye(3)).max() <= options.orthogonal_within
+        assert share == pytest.approx((off < 0.2).mean()) if is_rotation else np.isnan(share)
         if is_rotation and (off < 0.2).mean() > 0.8 and off[off < 0.2].var() < best:
             best, winner = off[off < 0.2].var(), np.sort(sample)
     np.testing.assert_array_equal(found.sample, winner)

@@ -87,6 +87,8 @@ def test_exchanged_rows_are_named():
     assert "row 3 is the point of row 10, row 10 is the point of row 3" in note
     random = scene(8, 100, 0.4)
     assert not any("exchanged" in n for n in register(random.xyz_a, random.xyz_b, folds=0).notes)
+    many = scene(14, 8000, 0.5)  # of 4000 wrong points some lie by chance where another one should
+    assert not any("exchanged" in n for n in register(many.xyz_a, many.xyz_b, folds=0).notes)
 
 
 @pytest.mark.parametrize(("side", "factor"), [("a", 1000), ("b", 25.4)])
