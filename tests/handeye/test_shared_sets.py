@@ -8,9 +8,8 @@ import pytest
 
 SCRIPT = Path(__file__).resolve().parents[2] / "scripts" / "handeye_shared.py"
 MEAN_MM = 0.85
-"""0.756 mm; another width of the window in which corners are refined gives 0.73 to 0.77, another draw of 15 splits of 16
-images differs by 0.05 (standard error of their mean)."""
-"""3-D error at the board that poses held out may have in the mean; published for these data, in sample: 0.96 mm."""
+"""3-D error at the board that poses held out may have in the mean. It is 0.756 mm (0.73 to 0.77 with corners refined in
+other windows), with a standard error of 0.05 over the 15 splits; published for these data, in sample: 0.96 mm."""
 SHEET_PITCH_MM = 24.8
 """In all images the dots' sheet is 17.4 by 11.3 pitches: the sides of an 11 × 17 in sheet (431.8 × 279.4 mm) ask for
 24.8 and 24.7 mm. The label says 20, the data set's own file 25.4."""
