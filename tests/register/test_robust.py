@@ -12,7 +12,7 @@ from stcal.register.groups import lies_together, sphericity, two_groups, wilks_b
 from stcal.register.models import MODELS, fit
 from stcal.register.robust import CLEAN_SETS_WITH_OUTLIER, deletion_squares
 from stcal.register.search import by_scale, chernoff, search
-from stcal.register.simulated import SIGMA_MM, make_scene
+from stcal.register.simulated import SIGMA_MM, directions, make_scene
 
 RIGID = MODELS["rigid"]
 
@@ -60,8 +60,7 @@ def test_outliers_of_two_sizes(size):
     s = scene(4, 80)
     b = s.xyz_b.copy()
     b[:20] += np.random.default_rng(1).uniform(-size, size, (20, 3))
-    b[20:35] += [0, 2.5, 0]
-    b[35:40] += np.random.default_rng(0).normal(0, 5, (5, 3))
+    b[20:40] += 3 * directions(np.random.default_rng(0), 20)
     found = register(s.xyz_a, b, folds=0)
     np.testing.assert_array_equal(np.flatnonzero(~found.inliers), np.arange(40))
 
