@@ -16,6 +16,8 @@ def save(path: Path, content: str | bytes) -> None:
     InputError
         It cannot be written.
     """
+    if not path.name or path.is_dir():
+        raise InputError(f"{path}: is a folder; the name of a file needed")
     partial = path.with_name(f"{path.name}.{os.getpid()}.partial")
     try:
         path.parent.mkdir(parents=True, exist_ok=True)

@@ -1,6 +1,7 @@
 """Files appear complete or not at all."""
 
 import json
+from pathlib import Path
 
 import pytest
 
@@ -32,12 +33,17 @@ def test_a_failed_write_leaves_the_old_file_and_nothing_else(tmp_path, monkeypat
     assert [p.name for p in tmp_path.iterdir()] == ["result.csv"]
 
 
-@pytest.mark.parametrize("place", ["file/below.txt", "folder"])
-def test_a_place_that_is_none_is_named(tmp_path, place):
+@pytest.mark.parametrize(
+    ("place", "words"),
+    [("file/below.txt", "below.txt: cannot be written: "), ("folder", "folder: is a folder"), ("..", "is a folder")],
+)
+def test_a_place_that_is_none_is_named(tmp_path, place, words):
     (tmp_path / "file").write_text("")
     (tmp_path / "folder").mkdir()
-    with pytest.raises(InputError, match=f"{place}: cannot be written"):
+    with pytest.raises(InputError, match=words):
         save(tmp_path / place, "x")
+    with pytest.raises(InputError, match="is a folder"):
+        save(Path(), "x")
 
 
 def test_json_keeps_letters_and_refuses_what_is_no_json():

@@ -60,7 +60,6 @@ def axes(
 
     nominal = load_robot(robot_file)
     data = read_measurements(sweeps, nominal)
-    _print_notes(data)
     result = robot_from_sweeps(data, nominal, math.radians(still_deg))
     print(axes_text(result))
     for note in result.notes:
@@ -112,7 +111,6 @@ def identify(
     data = read_measurements(data_file, nominal)
     kind = observe.value if observe else None
     options = IdentifyOptions(kind, sigma_mm, sigma_rad, robust, folds, seed=seed, partial=partial)
-    _print_notes(data)
     result = identified_from(nominal, data, options)
     print(identified_text(result, nominal))
     if out:
@@ -233,8 +231,3 @@ def _box(text: str) -> tuple[float, ...]:
         return tuple(float(cell) for cell in text.split(","))
     except ValueError as error:
         raise InputError(f"--box {text}: six numbers with commas between needed, in mm") from error
-
-
-def _print_notes(data) -> None:
-    for note in data.notes:
-        print(f"note: {data.where}: {note}")

@@ -11,6 +11,8 @@ from stcal.robot.model import Robot
 
 LIKELY, MANY = 2.0, 4
 """A mirror explains all joints at once, and arms are symmetric: it is preferred to 1–3 reversed joints up to this."""
+LIKE_SIZE = 2.0
+"""Times that the axes may be farther apart than nominal ones, or nearer: units differ by more."""
 AGREES_RAD = np.radians(10.0)
 """Axes, joint zeros: a nominal robot that is off by more is another one, or counts otherwise."""
 
@@ -31,6 +33,17 @@ def _shape(z: np.ndarray, origin: np.ndarray, sliding: np.ndarray) -> tuple[np.n
         values.append(np.linalg.det(z[list(three)]))
         mirrored.append(-1 if sliding[list(three)].sum() % 2 else 1)
     return np.array(values), np.array(mirrored)
+
+
+def _distances(z: np.ndarray, origin: np.ndarray, sliding: np.ndarray) -> np.ndarray:
+    """Of every two revolute axes (of two nearly parallel ones, across)."""
+    found = []
+    for i, k in combinations(np.flatnonzero(~sliding), 2):
+        between, normal = origin[k] - origin[i], np.cross(z[i], z[k])
+        sine = np.linalg.norm(normal)
+        parallel = sine < np.sin(AGREES_RAD)
+        found.append(np.linalg.norm(np.cross(between, z[i])) if parallel else abs(between @ normal) / sine)
+    return np.array(found)
 
 
 def require_like_nominal(where: str, frames: list[Rigid], nominal: Robot) -> None:
@@ -56,6 +69,12 @@ def require_like_nominal(where: str, frames: list[Rigid], nominal: Robot) -> Non
         raise InputError(
             f"{where}: joint {named} counts against robot {nominal.name}'s; correct alpha in the robot file or "
             "the sign of its values"
+        )
+    apart, right = (_distances(z, o, nominal.prismatic).sum() for z, o in ((found, places), (wanted, origin[:, 0])))
+    if right > 0 and not 1 / LIKE_SIZE < apart / right < LIKE_SIZE:
+        raise InputError(
+            f"{where}: the axes lie {apart / right:.3g} times as far apart as robot {nominal.name}'s; check the unit "
+            "of x, y, z, and the lengths in the robot file"
         )
     for i in range(len(frames) - 1):
         angle, right = (np.degrees(np.arccos(np.clip(z[i] @ z[i + 1], -1, 1))) for z in (found, wanted))

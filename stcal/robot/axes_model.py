@@ -127,6 +127,7 @@ def robot_from_sweeps(data: Measurements, nominal: Robot, still_rad: float = STI
         Axes that their arcs do not determine.
     """
     arcs, notes = find_arcs(data, nominal, still_rad)
+    notes = [*data.notes, *notes]
     fits, covariance, unwound = fit_axes(data, nominal, arcs)
     frames = [fit.world_from_axis for fit in fits]
     require_like_nominal(data.where, frames, nominal)
@@ -278,6 +279,8 @@ def _pair_values(frames: list[Rigid], nominal: Robot) -> np.ndarray:
 
 def pairs_of(frames: list[Rigid], covariance: np.ndarray, robot: Robot) -> tuple[Pair, ...]:
     """Consecutive axes with their covariance; ``robot`` gives what axes leave open (planes of near-parallel pairs)."""
+    if len(frames) < 2:
+        return ()
     values = _pair_values(frames, robot).reshape(-1, 6)
     slopes = _slopes(lambda f: _pair_values(f, robot), frames, robot).reshape(len(values), 6, -1)
     size = sum(abs(row.a) + abs(row.d) for row in robot.rows)

@@ -11,7 +11,7 @@ import numpy as np
 from stcal.errors import InputError
 from stcal.geometry.arrays import frozen
 from stcal.geometry.rigid import Poses
-from stcal.robot.data import joint_values
+from stcal.robot.data import joint_values, within
 from stcal.robot.inverse_kinematics import LIMIT, ORIENTATION, SINGULAR_POSE, UNREACHABLE, Inverse, inverse
 from stcal.robot.kinematics import forward
 from stcal.robot.model import Robot
@@ -126,11 +126,20 @@ def read_targets(path: str | Path, robot: Robot) -> Targets:
     if has_poses and not table.has_rotation():
         raise InputError(f"{table.where}: positions without orientation; columns qw, qx, qy, qz needed")
     tools = tuple(table.text("target")) if "target" in table else ("",) * len(table)
+    for line, tool in zip(table.lines, tools, strict=True):
+        if tool not in robot.tools:
+            known = ", ".join(repr(name) for name in robot.tools)
+            raise InputError(
+                f"{table.where}: line {line}: target {tool!r} is not in robot {robot.name}; there are {known}"
+            )
+    poses = table.poses() if has_poses else None
+    if poses is not None:
+        within(table, "position", poses.translation, "mm")
     return Targets(
         table.where,
         table.lines,
         tools,
-        table.poses() if has_poses else None,
+        poses,
         joint_values(table, robot) if has_joints else None,
     )
 

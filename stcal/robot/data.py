@@ -10,6 +10,7 @@ from stcal.errors import InputError
 from stcal.geometry.arrays import frozen
 from stcal.geometry.rigid import Poses
 from stcal.robot.model import Robot
+from stcal.robot.solve import reach_mm
 from stcal.table_file import ANGLES, LENGTHS, Table, read_table
 
 WHAT = "robot data"
@@ -17,6 +18,7 @@ STATUS, AMBIGUOUS = "status", "ambiguous"
 """Column and word of ``stcal-sfm measure``."""
 MAX_TURNS = 4
 """Joint values beyond so many turns are degrees in a column of radians."""
+LONGEST_TOOL_MM = 10_000.0
 FARTHEST = {"mm": 1e7, "rad": 100 * 2 * np.pi}
 """10 km and a hundred turns: what is beyond is no length and no joint value."""
 
@@ -98,7 +100,8 @@ def read_measurements(path: str | Path, robot: Robot) -> Measurements:
             data = Measurements(*common, poses.translation, poses.rotation, table.pose_covariances())
         else:
             data = Measurements(*common, table.points())
-        _within(table, "position", data.positions, "mm")
+        within(table, "position", data.positions, "mm")
+        _in_reach(data, robot)
         return _usable(data, table)
     if not table.has("distance", LENGTHS):
         raise InputError(
@@ -106,17 +109,29 @@ def read_measurements(path: str | Path, robot: Robot) -> Measurements:
             f"the header is {table.header()}"
         )
     distances = table.quantity("distance", LENGTHS)
-    _within(table, "distance", distances, "mm")
+    within(table, "distance", distances, "mm")
     return Measurements(*common, distances=distances, from_row=_from_rows(table, distances))
 
 
-def _within(table: Table, name: str, values: np.ndarray, unit: str) -> None:
+def within(table: Table, name: str, values: np.ndarray, unit: str) -> None:
     """No value (m,) or (m, k) beyond what can be."""
     bad = np.flatnonzero((np.abs(values).reshape(len(values), -1) > FARTHEST[unit]).any(axis=1))
     if len(bad):
         raise InputError(
             f"{table.where}: line {table.lines[bad[0]]}: {name} is beyond {FARTHEST[unit]:.4g} {unit}; correct it, or "
             "remove the line"
+        )
+
+
+def _in_reach(data: Measurements, robot: Robot) -> None:
+    """No position farther from the middle one than the arm can put it."""
+    away = np.linalg.norm(data.positions - np.median(data.positions, axis=0), axis=1)
+    reach = max(reach_mm(robot, tool) for tool in robot.tools)
+    worst = int(away.argmax())
+    if away[worst] > 2 * reach + LONGEST_TOOL_MM:
+        raise InputError(
+            f"{data.where}: line {data.lines[worst]}: position is {away[worst]:.4g} mm from the middle of the others, "
+            f"robot {robot.name} reaches {reach:.4g} mm; correct it, or the unit of x, y, z"
         )
 
 
@@ -163,7 +178,7 @@ def joint_values(table: Table, robot: Robot) -> np.ndarray:
                 f"{table.where}: line {table.lines[far[0]]}: q{i}_rad is {values[far[0]]:g}, over {MAX_TURNS} turns; "
                 f"if these are degrees call the column q{i}_deg"
             )
-        _within(table, f"q{i}", values, "mm" if units is LENGTHS else "rad")
+        within(table, f"q{i}", values, "mm" if units is LENGTHS else "rad")
         columns.append(values)
     return np.column_stack(columns)
 

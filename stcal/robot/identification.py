@@ -83,8 +83,9 @@ class Identified:
     ``rank`` of the data used, ``ranks`` by kind of observation of the same joint values;
     ``undetermined`` : names of parameters along directions that were kept nominal; ``weights`` : (r,) Huber's;
     ``nominal_mm``, ``fitted_mm`` : (r,) errors with nominal axes (base and tools fitted) and identified ones;
-    ``dh_sigma`` : (n, 5) of a, alpha, d, theta, beta, mm and rad; ``observability`` : of the parameters
-    that are determined; ``deviations`` : σ of this robot's dimensions about nominal, as the data show them.
+    ``dh_sigma`` : (n, 5) of a, alpha, d, theta, beta, mm and rad; ``observability`` : of the parameters that are
+    determined; ``deviations`` : σ of this robot's dimensions about nominal, as the data show them, by name; ``notes`` :
+    rows left out, and what is to be known of the result.
     """
 
     robot: Robot
@@ -104,7 +105,8 @@ class Identified:
     held_out: HeldOut | None
     dh_sigma: np.ndarray
     observability: Observability
-    deviations: Deviations
+    deviations: dict[str, float | None]
+    notes: tuple[str, ...]
 
     def __post_init__(self):
         k = len(self.names)
@@ -158,7 +160,8 @@ def identify(robot: Robot, data: Measurements, options: IdentifyOptions | None =
         _cross_validated(robot, seen, adjusted, options),
         adjusted.rows.sigma(identified, covariance),
         _observability(identified, adjusted, seen, rank),
-        adjusted.deviations,
+        adjusted.deviations.of(adjusted.rows.group[adjusted.rows.free]),
+        data.notes + adjusted.rows.notes(identified),
     )
 
 
@@ -214,14 +217,14 @@ def _adjusted(
 ) -> _Adjusted:
     """Solve, and estimate σ, in turns."""
     weighting, deviations = _weighting(state, seen, options), Deviations()
-    rows = rows or NominalRows.about(state, parameter_units(jacobian(state, seen)), seen.kind, nominal)
+    rows = rows or NominalRows.about(state, parameter_units(jacobian(state, seen)), nominal)
     for _ in range(VARIANCE_ROUNDS):  # by medians, which outliers do not move, until they stay
-        state = solve(state, seen, weighting, options.robust, rows.held(state, deviations)).state
+        state = solve(state, seen, weighting, options.robust, rows.held(state, deviations, seen.kind)).state
         before, weighting = weighting, _weighting(state, seen, options)
         if all(weighting.value(n) > FALLS * before.value(n) for n in weighting.estimated):
             break
     for _ in range(VARIANCE_ROUNDS):
-        solution = solve(state, seen, weighting, options.robust, rows.held(state, deviations))
+        solution = solve(state, seen, weighting, options.robust, rows.held(state, deviations, seen.kind))
         parts = components(solution, seen, weighting, options.robust, rows, deviations)
         new_weighting, new_deviations, change = estimated(parts, rows, weighting, deviations)
         if change < VARIANCE_SETTLED:
@@ -313,7 +316,7 @@ def _cross_validated(robot: Robot, seen: Observed, whole: _Adjusted, options: Id
             else:
                 state = begin
                 for weighting in (_weighting(begin, train, options), whole.weighting):
-                    held = whole.rows.held(state, whole.deviations)
+                    held = whole.rows.held(state, whole.deviations, seen.kind)
                     state = solve(state, train, weighting, options.robust, held).state
             known = np.array([t in state.tools for t in test.data.targets])
             if seen.kind != "distance":

@@ -41,6 +41,7 @@ def identified_text(result: Identified, nominal: Robot) -> str:
         lines += [f"  {_place(result, row)}: {error:.3f} mm" for row, error in outliers[:FIRST_OUTLIERS]]
     if result.undetermined:
         lines.append(f"kept nominal, as the data leave it open: {', '.join(result.undetermined)}")
+    lines += [f"note: {note}" for note in result.notes]
     return "\n".join(lines)
 
 
@@ -57,15 +58,11 @@ def identified_json(result: Identified, nominal: Robot) -> dict:
         "parameters": len(result.names),
         "ranks": result.ranks,
         "undetermined": list(result.undetermined),
-        "notes": list(result.seen.data.notes),
+        "notes": list(result.notes),
         "sigma_mm": result.weighting.sigma_mm,
         "sigma_rad": result.weighting.sigma_rad if result.seen.kind == "pose" else None,
         "sigma0": result.sigma0,
-        "deviations": {
-            "length_mm": result.deviations.length_mm,
-            "twist_rad": result.deviations.twist_rad,
-            "zero_rad": result.deviations.zero_rad,
-        },
+        "deviations": result.deviations,
         "errors": {
             key: dict(zip(("mean_mm", "rms_mm", "max_mm"), _statistics(errors), strict=True))
             for key, errors in zip(("nominal", "identified"), list(_errors(result).values())[:2], strict=True)
@@ -105,7 +102,7 @@ def identified_page(result: Identified, nominal: Robot) -> str:
     seen = result.seen
     counts = f"{_observations(result)} from {seen.data.where}, {result.rank} parameters determined"
     banner = f'<h1>{escape(title)}</h1>\n<p class="counts">{escape(counts)}</p>\n'
-    banner += "".join(f"<p>{escape(note)}</p>\n" for note in seen.data.notes)
+    banner += "".join(f"<p>{escape(note)}</p>\n" for note in result.notes)
     errors = [[name, *(number(v, 4) for v in _statistics(e))] for name, e in _errors(result).items()]
     facts = [[name, f"{value:.4g}"] for name, value in result.observability.values().items()]
     accuracy = (
@@ -189,16 +186,15 @@ def _statistics(errors: np.ndarray) -> tuple[float, float, float]:
 
 
 def _noise(result: Identified) -> str:
-    weighting, deviations = result.weighting, result.deviations
+    weighting = result.weighting
     if weighting.given:
         noise = f"weights from the covariances given, σ₀ {result.sigma0:.2f}"
     else:
         rotation = f", {weighting.sigma_rad:.2g} rad" if result.seen.kind == "pose" else ""
         noise = f"σ of a coordinate {weighting.sigma_mm:.3g} mm{rotation}, σ₀ {result.sigma0:.2f}"
-    return (
-        f"{noise}; the robot differs from nominal by σ of {deviations.length_mm:.2g} mm in lengths, "
-        f"{deviations.twist_rad:.2g} rad in twists, {deviations.zero_rad:.2g} rad in zero positions"
-    )
+    found = zip(("mm in lengths", "rad in twists", "rad in zero positions"), result.deviations.values(), strict=True)
+    shown = ", ".join(f"{value:.2g} {what}" for what, value in found if value is not None)
+    return f"{noise}; the robot differs from nominal by σ of {shown}" if shown else noise
 
 
 def _sigma(value: float) -> str:

@@ -1,14 +1,14 @@
 """What the nominal D-H rows are worth: dimensions as made differ from the drawing by σ that the data show."""
 
-from dataclasses import astuple, dataclass
+from dataclasses import asdict, astuple, dataclass
 
 import numpy as np
 
 from stcal.robot.adjustment import Held
 from stcal.robot.dh import PARALLEL_RAD, robot_from_chain
-from stcal.robot.kinematics import chain_parameters
+from stcal.robot.kinematics import chain_parameters, moved_chain
 from stcal.robot.model import Robot
-from stcal.robot.observe import Kind, State, moved
+from stcal.robot.observe import Kind, State, unknowns
 
 DIFFERENCE_MM = 1e-4
 """Step of the derivatives by differences, in movement of the tool: linear to a millionth, and far above rounding."""
@@ -29,6 +29,11 @@ class Deviations:
     twist_rad: float = 1e-3
     zero_rad: float = 5e-3
 
+    def of(self, groups: np.ndarray) -> dict[str, float | None]:
+        """By name; None of groups that the robot has no dimensions of."""
+        present = np.isin((LENGTH, TWIST, ZERO), groups)
+        return {k: v if there else None for (k, v), there in zip(asdict(self).items(), present, strict=True)}
+
 
 def dh_values(robot: Robot) -> np.ndarray:
     """(n, 5) of a, alpha, d, theta, beta."""
@@ -41,8 +46,8 @@ class NominalRows:
 
     Dimensions are the rows' a, alpha, d, theta, beta, but of coaxial joints the offset along and across the nominal x
     in place of a and theta (its polar form). ``coaxial`` : rows of theta, and of the a that follows it; ``slope`` :
-    (n, 5, k) by the parameters; ``free`` : (n, 5) dimensions that parameters move at all; ``group`` : (n, 5) whose σ.
-    The slope is taken once, as it hardly changes over what a factory does.
+    (n, 5, k) by the parameters of the axes (tools move no row), taken once, as it hardly changes over what a factory
+    does; ``free`` : (n, 5) dimensions that parameters move at all; ``group`` : (n, 5) whose σ.
     """
 
     nominal: Robot
@@ -52,16 +57,17 @@ class NominalRows:
     group: np.ndarray
 
     @classmethod
-    def about(cls, state: State, units: np.ndarray, kind: Kind, nominal: Robot) -> "NominalRows":
+    def about(cls, state: State, units: np.ndarray, nominal: Robot) -> "NominalRows":
         """With the derivatives at ``state``, where ``units`` (k,) of the parameters move the tool by 1 mm."""
         coaxial = _coaxial(nominal)
 
         def values(step: np.ndarray) -> np.ndarray:
-            there = moved(state, step, kind)
-            return _dimensions(robot_from_chain(there.chain, there.tools, nominal), nominal, coaxial)
+            found = robot_from_chain(moved_chain(state.chain, step), state.tools, nominal)
+            return _dimensions(found, nominal, coaxial)
 
+        units = units[: len(chain_parameters(state.chain))]
         slope, here = np.zeros((len(nominal.rows), 5, len(units))), values(np.zeros(len(units)))
-        for k in range(len(chain_parameters(state.chain))):  # tools move no row
+        for k in range(len(units)):
             step = np.zeros(len(units))
             step[k] = DIFFERENCE_MM * units[k]
             slope[:, :, k] = (values(step) - here) / step[k]
@@ -70,15 +76,27 @@ class NominalRows:
         group[[turn for turn, _ in coaxial], 3] = LENGTH
         return cls(nominal, coaxial, slope, np.abs(slope * units).max(axis=2) > 1e-9, group)
 
-    def held(self, state: State, deviations: Deviations) -> Held:
-        """Linear about ``state``, with the σ of ``deviations``."""
+    def held(self, state: State, deviations: Deviations, kind: Kind) -> Held:
+        """Linear about ``state``, with the σ of ``deviations``, by all parameters of this kind of observation."""
         robot = robot_from_chain(state.chain, state.tools, self.nominal)
         away = _dimensions(robot, self.nominal, self.coaxial) - _dimensions(self.nominal, self.nominal, self.coaxial)
-        return Held(away[self.free], self.slope[self.free], np.array(astuple(deviations))[self.group[self.free]])
+        slope = self.slope[self.free]
+        tools = unknowns(state.chain, len(state.tools), kind) - slope.shape[1]
+        slope = np.pad(slope, ((0, 0), (0, tools)))
+        return Held(away[self.free], slope, np.array(astuple(deviations))[self.group[self.free]])
+
+    def notes(self, robot: Robot) -> tuple[str, ...]:
+        """What is to be known of the rows of ``robot``."""
+        return tuple(
+            f"joints {turn + 1} and {turn + 2} lie nearly on one line: theta of row {turn + 1} is the direction of the "
+            f"{robot.rows[reach].a:.3g} mm between them, not a zero position"
+            for turn, reach in self.coaxial
+        )
 
     def sigma(self, robot: Robot, covariance: np.ndarray) -> np.ndarray:
         """(n, 5) σ of the rows of ``robot`` (a, alpha, d, theta, beta) from the parameters' covariance (k, k)."""
-        slope = self.slope.copy()
+        slope, k = self.slope.copy(), self.slope.shape[2]
+        covariance = covariance[:k, :k]
         for turn, reach in self.coaxial:
             angle = robot.rows[turn].theta - self.nominal.rows[turn].theta
             along, across = self.slope[reach, 0], self.slope[turn, 3]

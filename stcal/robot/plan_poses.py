@@ -89,10 +89,10 @@ class DesignOptions:
             raise InputError(
                 f"design: {self.count} poses of {self.candidates} candidates; more candidates than poses needed"
             )
-        if self.sigma_mm <= 0 or self.sigma_rad <= 0:
+        if not (0 < self.sigma_mm < np.inf and 0 < self.sigma_rad < np.inf):
             raise InputError(f"design: σ of {self.sigma_mm:g} mm and {self.sigma_rad:g} rad; positive numbers needed")
         if self.box is not None and (
-            len(self.box) != 6 or any(a >= b for a, b in zip(self.box[:3], self.box[3:], strict=True))
+            len(self.box) != 6 or any(not a < b for a, b in zip(self.box[:3], self.box[3:], strict=True))
         ):
             shown = ",".join(f"{v:g}" for v in self.box)
             raise InputError(

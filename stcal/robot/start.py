@@ -78,7 +78,7 @@ def _placed(robot: Robot, data: Measurements, tools: dict[str, Rigid]) -> tuple[
         points, misfit = _points_of_distances(robot, flange, data, rows, points)
         return State(chain, {name: Rigid(tools[name].rotation, points[k]) for k, name in enumerate(names)}), misfit
     _off_a_line(data)
-    base, points, misfit = _base_and_points(flange, data.positions, rows, points)
+    base, points, misfit = _base_and_points(data.where, flange, data.positions, rows, points)
     if data.rotations is not None:
         seen = base.inverse() @ data.poses()
         turns = np.swapaxes(flange.rotation, 1, 2) @ seen.rotation
@@ -100,13 +100,14 @@ def _off_a_line(data: Measurements) -> None:
         )
 
 
-def _base_and_points(flange: Poses, positions: np.ndarray, rows: np.ndarray, points: np.ndarray):
+def _base_and_points(where: str, flange: Poses, positions: np.ndarray, rows: np.ndarray, points: np.ndarray):
     """Gauss–Newton over the base and the tool points, from the alignment with the points given; and RMS misfit, mm."""
     try:
         base = align_rigid(positions, flange @ points[rows])
     except DegenerateError as error:
         raise DegenerateError(
-            "by the robot file all joint values put the target on one line; give the tool, roughly, in the robot file"
+            f"{where}: by the robot file all joint values put the target on one line, so that it is not seen how the "
+            "instrument stands about it; move other joints, or give the tool in the robot file if it is off the axis"
         ) from error
     misfit = np.inf
     for _ in range(ROUNDS):
@@ -133,7 +134,8 @@ def _points_of_distances(robot: Robot, flange: Poses, data: Measurements, rows: 
         tip = flange @ moved.reshape(-1, 3)[rows]
         return data.distances - np.linalg.norm(tip - tip[data.from_row], axis=1)
 
-    around = AROUND * reach_mm(robot) * np.vstack([np.zeros((1, 3)), np.eye(3), -np.eye(3)])
+    reach = max(reach_mm(robot, tool) for tool in robot.tools)
+    around = AROUND * reach * np.vstack([np.zeros((1, 3)), np.eye(3), -np.eye(3)])
     fits = [least_squares(errors, (points + shift).ravel(), max_nfev=ROUNDS) for shift in around]
     best = min(fits, key=lambda fit: fit.cost)
     return best.x.reshape(-1, 3), float(np.sqrt(2 * best.cost / len(data)))

@@ -19,8 +19,8 @@ from stcal.robot.observe import WIDTH, Kind, Observed, jacobian
 
 LEAST = 1e-9
 """mm, rad: σ of data without noise."""
-FARTHEST = 12.0
-"""log σ is looked for within this of where it was: a factor of 160 000."""
+FARTHEST = 3.0
+"""log σ is looked for within this of where it was, a factor of 20, each round: beyond, rounding spoils the squares."""
 QUIETER = -2.5
 """log σ of the data is looked for from here too: few data may be explained by noise alone, or by dimensions."""
 GROSS = 0.5
@@ -116,27 +116,36 @@ def components(
     units = solution.units
     white = weighting.whiten(solution.residuals, seen)
     slope = weighting.whiten(jacobian(solution.state, seen), seen) * units
-    weight, kept = solution.weights[:, None], _kept(seen.kind) if robust else 1.0
+    kept = _kept(seen.kind) if robust else 1.0
     honest = solution.weights >= GROSS
     honest |= honest.mean() < 0.5
+    # What σ scales is the square of the residual cut off at Huber's limit, (w e)²; the rest of w e² stays as it is.
+    weight = solution.weights[:, None, None]
+    scaled = weight**2 * honest[:, None, None]
     parts, fixed, fixed_pull = [], np.eye(len(units)) / USELESS_MM**2, np.zeros(len(units))
     for name, columns in weighting.columns(white.shape[1]).items():
-        e, j = white[:, columns], slope[:, columns]
-        weighted = (weight[..., None] * j).reshape(-1, len(units)).T
-        normal, pull = weighted @ j.reshape(-1, len(units)), weighted @ e.ravel()
         if name in weighting.estimated:
-            least = np.log(LEAST / weighting.value(name))
-            square, count = ((weight * e)[honest] ** 2).sum(), kept * e[honest].size
-            parts.append((normal, pull, square, count, 0.0, np.inf, least))
+            square, count = _normal(white, slope, columns, scaled), kept * white[honest, columns].size
+            parts.append((*square, count, 0.0, np.inf, np.log(LEAST / weighting.value(name))))
+            normal, pull, _ = _normal(white, slope, columns, weight - scaled)
         else:
-            fixed, fixed_pull = fixed + normal, fixed_pull + pull
-    held, group = rows.held(solution.state, deviations), rows.group[rows.free]
+            normal, pull, _ = _normal(white, slope, columns, weight)
+        fixed, fixed_pull = fixed + normal, fixed_pull + pull
+    held, group = rows.held(solution.state, deviations, seen.kind), rows.group[rows.free]
     for g, (sigma, expected) in enumerate(zip(astuple(deviations), astuple(Deviations()), strict=True)):
         mine = group == g
         e, j = held.value[mine] / sigma, held.slope[mine] * units / sigma
         if mine.any():
             parts.append((j.T @ j, -j.T @ e, e @ e, mine.sum(), np.log(expected / sigma), DOUBT, -np.inf))
     return Components(*(np.array(each, float) for each in zip(*parts, strict=True)), fixed, fixed_pull, units)
+
+
+def _normal(white: np.ndarray, slope: np.ndarray, columns: slice, weight: np.ndarray):
+    """JᵀWJ, JᵀWe and eᵀWe of some coordinates, with weights (r, 1, 1)."""
+    k = slope.shape[2]
+    e, j = white[:, columns].ravel(), slope[:, columns]
+    weighted = (weight * j).reshape(-1, k).T
+    return weighted @ j.reshape(-1, k), weighted @ e, float((weight[:, :, 0] * white[:, columns] ** 2).sum())
 
 
 def estimated(parts: Components, rows: NominalRows, weighting: Weighting, deviations: Deviations):

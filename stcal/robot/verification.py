@@ -12,6 +12,7 @@ import numpy as np
 
 from stcal.errors import InputError
 from stcal.geometry.arrays import frozen
+from stcal.robot.data import within
 from stcal.table_file import Table, read_table
 
 WHAT = "measured positions"
@@ -105,6 +106,8 @@ def read_measured(path: str | Path) -> Measured:
     """
     table = read_table(path, WHAT)
     commanded, measured = table.points("commanded_"), table.points()
+    within(table, "commanded position", commanded, "mm")
+    within(table, "position", measured, "mm")
     sets = tuple(table.text("set")) if "set" in table else ("measured",) * len(table)
     return Measured(table.where, table.lines, sets, _names(table, sets, commanded), commanded, measured)
 
@@ -161,12 +164,13 @@ def verify(data: Measured) -> Verification:
                 f"{data.where}: pose {common[k]} is commanded {off[k]:.4g} mm apart in sets {next(iter(index))} and "
                 f"{group} (line {data.lines[own[k]]}); the same commands needed"
             )
-    sets = tuple(_set_result(group, data.commanded[own], data.measured[own]) for group, own in index.items())
+    sets = tuple(_set_result(data, group, own) for group, own in index.items())
     at = data.commanded[first]
     return Verification(data.where, tuple(common), np.linalg.norm(at[1:] - at[0], axis=1), sets, missing)
 
 
-def _set_result(name: str, commanded: np.ndarray, measured: np.ndarray) -> SetResult:
+def _set_result(data: Measured, name: str, rows: np.ndarray) -> SetResult:
+    commanded, measured = data.commanded[rows], data.measured[rows]
     error = np.linalg.norm(measured[1:] - measured[0], axis=1) - np.linalg.norm(commanded[1:] - commanded[0], axis=1)
     size = np.abs(error)
     squares = pairs = product = wanted_squares = 0.0
@@ -178,7 +182,7 @@ def _set_result(name: str, commanded: np.ndarray, measured: np.ndarray) -> SetRe
         wanted_squares += float(wanted @ wanted)
         pairs += i
     if wanted_squares == 0:
-        raise InputError(f"set {name}: all commanded positions are the same; different ones needed")
+        raise InputError(f"{data.where}: set {name}: all commanded positions are the same; different ones needed")
     return SetResult(
         name,
         error,

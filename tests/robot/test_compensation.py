@@ -97,7 +97,7 @@ def test_every_tool_by_its_name(case):
         wanted, reached = forward(case.nominal, case.q[own], name), forward(case.real, result.found.q[own], name)
         np.testing.assert_allclose(reached.translation, wanted.translation, atol=1e-8)
     rows[3][0] = "cube"
-    with pytest.raises(InputError, match=r"no tool 'cube'; there are '', 'ball'"):
+    with pytest.raises(InputError, match=r"line 5: target 'cube' is not in robot MH80; there are '', 'ball'"):
         compensate(case.real, read_targets(case.write(["target", *JOINTS], rows), case.real), case.nominal)
 
 

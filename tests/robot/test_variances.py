@@ -49,10 +49,10 @@ def test_of_several_parts_the_covariance_is_true_on_average():
 def test_parts_without_noise_do_not_break_it():
     design = np.random.default_rng(3).normal(size=(20, 3))
     exact = design @ [1.0, 2.0, 3.0]
-    parts = [(design.T @ design, design.T @ exact, exact @ exact, 20, 0.0, np.inf, -9.0)]
+    parts = [(design.T @ design, design.T @ exact, exact @ exact, 20, 0.0, np.inf, -2.0)]
     parts = Components(
         *(np.array(each, float) for each in zip(*parts, strict=True)), np.zeros((3, 3)), np.zeros(3), np.ones(3)
     )
     best = parts.best()
-    assert best == pytest.approx([-9.0])
+    assert best == pytest.approx([-2.0])
     assert np.isfinite(parts.covariance(best)).all()
