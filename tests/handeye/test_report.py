@@ -89,7 +89,7 @@ def test_every_sigma_that_there_is_has_a_name():
     prior = camera_prior(CameraModel(wrong.focal, wrong.centre, wrong.distortion, "PINHOLE", None, None, ""), wrong)
     result = handeye(truth.pairs, truth.setup, None, views, HandEyeOptions(intrinsics=prior))
     outcome = Outcome("images", result, colmap_model="PINHOLE")
-    assert "σ of intrinsics of the camera file: " in outcome_text(outcome)
+    assert "σ of camera file, focal length: " in outcome_text(outcome)
     assert "Camera, as adjusted" in outcome_page(outcome)
     assert max(v for k, v in calibration_json(outcome)["sigma"].items() if k in FACTORS) > 1.5
 
