@@ -1,6 +1,6 @@
 """Whether hand-eye results are as good as they can be, and know how good they are.
 
-.venv/bin/python scripts/handeye_study.py [--trials 500]
+.venv/bin/python scripts/handeye_study.py [--trials 500] [--only METHOD]
 
 Poses are simulated, and corners of a chessboard of 8×7 squares of 25 mm from about 450 mm; nothing is real. "Bound":
 RMS over trials and the six numbers of X of the error in units of the inverse information at the truth, with the σ that
@@ -98,14 +98,17 @@ def main() -> None:
     """Run all cases; print."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--trials", type=int, default=500)
-    trials = parser.parse_args().trials
+    parser.add_argument("--only", default="", metavar="TEXT", help="cases of methods that begin so")
+    arguments = parser.parse_args()
+    trials = arguments.trials
     low, high = np.sqrt(chi2.ppf([0.025, 0.975], 6 * trials) / (6 * trials))
     print(f"{trials} trials each, simulated; a ratio that is 1 lies within {low:.3f} … {high:.3f}\n")
     print(
         "| method | setup | noise | poses | bound | calibration | good poses left out |\n|---|---|---|---|---|---|---|"
     )
     with ProcessPoolExecutor() as pool:
-        cases = (Case(*v, count) for v in product(COUNTS, SETUPS, NOISES) for count in COUNTS[v[0]])
+        methods = [method for method in COUNTS if method.startswith(arguments.only)]
+        cases = (Case(*v, count) for v in product(methods, SETUPS, NOISES) for count in COUNTS[v[0]])
         for case in cases:
             found = np.array(list(pool.map(partial(trial, case), range(trials), chunksize=10)))
             bound, calibration = np.sqrt(found[:, :2].mean(0) / 6)

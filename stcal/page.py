@@ -204,6 +204,19 @@ def calm(axes) -> None:
         axes.spines[side].set_color("#9aa0a8")
 
 
+def plane(axes, x: str, y: str, margin: float) -> None:
+    """Axes of a map: one scale for both, a faint grid, ``margin`` around in shares of the extent."""
+    axes.set_aspect("equal", "datalim")
+    axes.margins(margin)
+    axes.set_xlabel(x, fontsize=SMALL + 1, color=INK)
+    axes.set_ylabel(y, fontsize=SMALL + 1, color=INK)
+    axes.xaxis.set_major_locator(locator())
+    axes.yaxis.set_major_locator(locator())
+    calm(axes)
+    axes.grid(color=FAINT, lw=0.6)
+    axes.set_axisbelow(True)
+
+
 def uri(figure) -> str:
     """The figure as an SVG data URI, the same bytes for the same figure."""
     import matplotlib

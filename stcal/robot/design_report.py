@@ -4,7 +4,22 @@ from html import escape
 
 import numpy as np
 
-from stcal.page import COLOURS, FAINT, INK, NONE, SMALL, calm, locator, new_figure, number, page, plot, table, uri
+from stcal.page import (
+    COLOURS,
+    FAINT,
+    INK,
+    NONE,
+    SMALL,
+    calm,
+    locator,
+    new_figure,
+    number,
+    page,
+    plane,
+    plot,
+    table,
+    uri,
+)
 from stcal.robot.compensation import joint_cells, joint_columns
 from stcal.robot.model import Robot
 from stcal.robot.plan_poses import PoseDesign
@@ -107,15 +122,7 @@ def _places(result: PoseDesign) -> str:
         )  # fmt: skip
         axes.plot(at[:, i], at[:, j], "o", ms=4, color=COLOURS[0], mew=0)
         axes.plot(0, 0, "s", ms=6, color=INK, mew=0)
-        axes.set_aspect("equal", "datalim")
-        axes.margins(0.16)
-        axes.set_xlabel("x, mm", fontsize=SMALL + 1, color=INK)
-        axes.set_ylabel(f"{'xyz'[j]}, mm", fontsize=SMALL + 1, color=INK)
-        axes.xaxis.set_major_locator(locator())
-        axes.yaxis.set_major_locator(locator())
-        calm(axes)
-        axes.grid(color=FAINT, lw=0.6)
-        axes.set_axisbelow(True)
+        plane(axes, "x, mm", f"{'xyz'[j]}, mm", 0.16)
         figures.append(plot(uri(figure), f"tool positions {title}", title.capitalize()))
     text = "<p>Tool in the robot's base (square: its origin); the arrow is the tool's z axis.</p>\n"
     return text + f'<div class="plots">{"".join(figures)}</div>\n'

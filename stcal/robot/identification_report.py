@@ -59,8 +59,8 @@ def identified_json(result: Identified, nominal: Robot) -> dict:
         "ranks": result.ranks,
         "undetermined": list(result.undetermined),
         "notes": list(result.notes),
-        "sigma_mm": result.weighting.sigma_mm,
-        "sigma_rad": result.weighting.sigma_rad if result.seen.kind == "pose" else None,
+        "sigma_mm": None if result.weighting.given else result.weighting.sigma_mm,
+        "sigma_rad": result.weighting.sigma_rad if result.seen.kind == "pose" and not result.weighting.given else None,
         "sigma0": result.sigma0,
         "deviations": result.deviations,
         "errors": {
@@ -113,7 +113,11 @@ def identified_page(result: Identified, nominal: Robot) -> str:
     sections = [
         ("accuracy", "Accuracy", accuracy),
         ("rows", "Denavit–Hartenberg rows", _rows(result, nominal)),
-        ("determined", "What the data determine", _determined(result) + table(["<Index", "Value"], facts)),
+        (
+            "determined",
+            "What the data determine",
+            _determined(result) + table(["<Index", "Value (1/mm, O2: none)"], facts),
+        ),
         ("outliers", "Outliers", _outliers(result)),
     ]
     return page(title, banner, sections)

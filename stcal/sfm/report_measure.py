@@ -15,6 +15,7 @@ from stcal.page import (
     new_figure,
     number,
     page,
+    plane,
     plot,
     round_below,
     swatch,
@@ -81,17 +82,9 @@ def _view(result: MeasureResult, at: np.ndarray, i: int, j: int, title: str, tim
         colour = COLOUR_OF[each.pose.status]
         axes.add_patch(Ellipse(place[[i, j]], width, height, angle=angle, fc=colour, ec=colour, alpha=0.3, lw=0.6))
         axes.plot(place[i], place[j], "o", ms=3.2, color=colour, mew=0)
-    axes.set_aspect("equal", "datalim")
-    axes.margins(0.12)
+    plane(axes, f"{'xyz'[i]}, mm", f"{'xyz'[j]}, mm", 0.12)
     if j == 1:
         axes.invert_yaxis()  # y of a camera points down
-    axes.set_xlabel(f"{'xyz'[i]}, mm", fontsize=SMALL + 1, color=INK)
-    axes.set_ylabel(f"{'xyz'[j]}, mm", fontsize=SMALL + 1, color=INK)
-    axes.xaxis.set_major_locator(locator())
-    axes.yaxis.set_major_locator(locator())
-    calm(axes)
-    axes.grid(color=FAINT, lw=0.6)
-    axes.set_axisbelow(True)
     return plot(uri(figure), f"path of the target {title}", title[0].upper() + title[1:])
 
 

@@ -151,6 +151,18 @@ def test_an_outlier_is_named_and_does_no_harm():
     change = [abs(a.a - b.a) for a, b in zip(clean.robot.rows, spoilt.robot.rows, strict=True)]
     assert max(change) < 0.05  # of σ about 0.03 mm; 5 mm in one of 50 rows would make tenths of a mm
     assert "line 19" in identified_text(spoilt, mh80())
+    assert spoilt.weighting.sigma_mm == pytest.approx(clean.weighting.sigma_mm, rel=0.05)
+
+
+def test_many_outliers_do_not_pass_for_noise():
+    _, data = simulated(11, 60)
+    positions = data.positions.copy()
+    positions[::6] += np.random.default_rng(0).normal(0, 60, (10, 3))
+    found = identify(mh80(), replace(data, positions=positions), QUICK)
+    assert [row for row, _ in found.outliers()] == list(range(0, 60, 6))
+    # 50 honest poses: σ to 1 / √(2 · 150), 6 %; what the 10 still pull adds to it
+    assert found.weighting.sigma_mm == pytest.approx(0.05, rel=0.35)
+    assert found.weighting.sigma_mm > 0.04
 
 
 def test_report_and_json_hold_the_result():
