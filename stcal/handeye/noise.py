@@ -10,8 +10,8 @@ from stcal.errors import InputError
 from stcal.geometry.rigid import Rigid
 from stcal.handeye.loop import Loop
 
-LEAST_RAD, LEAST_MM = 1e-9, 1e-6
-"""Estimates stay above: exact data have none …"""
+LEAST = {"rad": 1e-9, "mm": 1e-6, "factor": 1e-2}
+"""Estimates stay above, by kind: exact data have none …"""
 CAUTION = 2.0
 """Redundancies that are not counted: a variance of ν of them is the sum of squares over ν − 2, so that errors in units
 of its root have mean square 1 (the mean of F is ν / (ν − 2)). It also keeps a component of few poses off 0, as the
@@ -82,17 +82,26 @@ class Components:
     def first(self, residuals: np.ndarray) -> np.ndarray:
         """Variances (f,) to start with, from the medians of residuals (m, 6): bad poses do not count."""
         squared = np.median((residuals.reshape(-1, 2, 3) ** 2).sum(2), axis=0) / chi2.ppf(0.5, 3)
-        turns = [name.endswith("_rad") for name in self.names]
-        shares = np.where(turns, squared[0] / max(sum(turns), 1), squared[1])
-        return np.maximum(shares, self.least())
+        turns = max(sum(name.endswith("_rad") for name in self.names), 1)
+        by_kind = {"rad": squared[0] / turns, "mm": squared[1], "factor": 1.0}
+        return np.maximum([by_kind[_kind(name)] for name in self.names], self.least())
 
     def least(self) -> np.ndarray:
         """(f,)."""
-        return np.array([LEAST_RAD**2 if name.endswith("_rad") else LEAST_MM**2 for name in self.names])
+        return np.square([LEAST[_kind(name)] for name in self.names])
+
+
+def _kind(name: str) -> str:
+    """``rad``, ``mm`` or ``factor``."""
+    return name.rpartition("_")[2]
 
 
 def components(loop: Loop, noise: Noise, mount_from_camera: Rigid, scale: float = 1.0) -> Components:
-    """At an estimate of X, on which arms of levers depend."""
+    """At an estimate of X, on which arms of levers depend.
+
+    Covariances that come with the camera's poses tell the noise of the images; what intrinsics err has the same weak
+    directions. So they hold up to a factor that is estimated, where σ of the robot are too.
+    """
     by = {"robot": loop.by_robot(mount_from_camera, scale), "camera": loop.by_camera(mount_from_camera, scale)}
     stated = {
         "robot": _stated(len(loop), loop.robot_covariance, noise.robot_rad, noise.robot_mm),
@@ -101,7 +110,11 @@ def components(loop: Loop, noise: Noise, mount_from_camera: Rigid, scale: float 
     known, free = np.zeros((len(loop), 6, 6)), {}
     for side, slope in by.items():
         if stated[side] is not None:
-            known = known + slope @ stated[side] @ np.swapaxes(slope, 1, 2)
+            spread = slope @ stated[side] @ np.swapaxes(slope, 1, 2)
+            if side == "camera" and loop.camera_covariance is not None and stated["robot"] is None:
+                free["camera_factor"] = spread
+            else:
+                known = known + spread
             continue
         for name, columns in ((f"{side}_rad", slice(0, 3)), (f"{side}_mm", slice(3, 6))):
             free[name] = slope[:, :, columns] @ np.swapaxes(slope[:, :, columns], 1, 2)

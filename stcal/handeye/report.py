@@ -29,6 +29,7 @@ SIGMA_NAMES = {
     "robot_mm": ("robot, position", "mm", 1.0),
     "camera_rad": ("board's pose, rotation", "°", np.degrees(1.0)),
     "camera_mm": ("board's pose, position", "mm", 1.0),
+    "camera_factor": ("board's pose", "times its own σ", 1.0),
     "board_mm": ("corner on the board", "mm", 1.0),
     **{key: (f"camera file, {name}", "times its σ", 1.0) for key, name in FACTORS.items()},
 }

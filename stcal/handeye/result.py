@@ -40,9 +40,10 @@ class HandEye:
         Its σ.
     sigma : dict of str to float
         σ by which poses or corners were weighted: ``robot_rad``, ``robot_mm``, ``camera_rad``, ``camera_mm``,
-        ``corner_px``, ``board_mm``, where the method weights; ``camera_focal``,
-        ``camera_centre``, ``camera_radial``, ``camera_tangential`` (``camera_all`` where their covariance is stated)
-        are the factors, 1 or more, by which the σ of the stated intrinsics were widened.
+        ``corner_px``, ``board_mm``, where the method weights; ``camera_factor``, by which the σ that came with
+        camera_from_board were multiplied; ``camera_focal``, ``camera_centre``, ``camera_radial``, ``camera_tangential``
+        (``camera_all`` where their covariance is stated): factors, 1 or more, by which the σ of the stated intrinsics
+        were widened.
     estimated : tuple of str
         Which of them were estimated from the residuals.
     reprojection : Reprojection, optional

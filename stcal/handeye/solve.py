@@ -40,7 +40,7 @@ FACTORS = {
     "camera_all": "all",
 }
 WIDENED = 2.0
-"""Factor of the σ of a camera file from which on the file is doubted."""
+"""Factor of the σ of a camera file, or of the poses by it, from which on the file is doubted."""
 CAMERA_GAIN = 5.0
 """Eight intrinsics that are right gain 8 ± 4 in cost, 1 ± 0.5 each; eight that gain 5 each are wrong."""
 HELD_MM = 1e-6
@@ -202,6 +202,8 @@ def _by_poses(task: _Task) -> HandEye:
     if options.four_dof:
         x, z, covariance, notes = _without_slide(task, x, z, normal)
     notes += _remarks(task, solution.outliers, solution.residuals, solution.scale_hint)
+    if (factor := solution.sigma.get("camera_factor", 1.0)) > WIDENED:
+        notes += (f"the board's poses err {factor:.2g} times what their σ say: check the intrinsics",)
     if not solution.sigma:
         notes += _judged(solution.variance_factor, solution.spare)
     stated = {name: getattr(options.noise, name) for name in ("robot_rad", "robot_mm", "camera_rad", "camera_mm")}

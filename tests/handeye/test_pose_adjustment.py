@@ -1,5 +1,7 @@
 """Pose-error least squares: it reaches the bound, its covariance is true, bad poses are named."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -8,7 +10,7 @@ from stcal.handeye import HandEyeOptions, HandEyePoses, Noise, handeye
 from stcal.handeye.loop import Loop
 from stcal.handeye.noise import components
 from stcal.handeye.pose_adjustment import State, adjust_poses, against_others
-from stcal.handeye.simulated import simulated
+from stcal.handeye.simulated import simulated, simulated_views
 
 SETUPS = ("eye-in-hand", "eye-to-hand")
 TRUE = Noise(3e-4, 0.1, 1e-3, 0.3)
@@ -69,6 +71,18 @@ def test_the_robot_is_estimated_where_the_camera_is_known():
     assert found.estimated == ("robot_rad", "robot_mm")
     assert (found.sigma["robot_rad"], found.sigma["robot_mm"]) == pytest.approx((5e-4, 0.2), rel=0.4)
     assert found.sigma["camera_mm"] == 0.3
+
+
+@pytest.mark.parametrize("factor", [1, 4])
+def test_covariances_of_the_board_s_poses_hold_up_to_a_factor(factor):
+    """40 poses, 240 − 12 redundancies, most of them for the camera: 1/√(2·228) = 5 % of the factor, and what robot and
+    camera take from each other."""
+    truth = simulated_views(np.random.default_rng(5), 40, "eye-to-hand", (1e-4, 0.03), 0.3)
+    stated = replace(truth.pairs, camera_from_board_covariance=truth.pairs.camera_from_board_covariance / factor**2)
+    found, right = handeye(stated, "eye-to-hand"), handeye(truth.pairs, "eye-to-hand")
+    assert found.sigma["camera_factor"] == pytest.approx(factor, rel=0.15)
+    assert any("check the intrinsics" in note for note in found.notes) == (factor > 2)
+    assert found.covariance == pytest.approx(right.covariance, rel=1e-3)
 
 
 @pytest.mark.parametrize("bad", [1, 4])
