@@ -36,8 +36,8 @@ NOISES = {
     "robot ≫ camera": Noise(1e-3, 0.3, 1e-4, 0.03, **CORNERS),
 }
 COUNTS = {
-    "pose, σ stated": (8, 20),
-    "pose, σ estimated": (8, 20),
+    "pose, σ stated": (4, 8, 20),
+    "pose, σ estimated": (4, 8, 20),
     "reprojection, σ stated": (12,),
     "reprojection, σ estimated": (12,),
 }
@@ -109,11 +109,19 @@ def main() -> None:
     with ProcessPoolExecutor() as pool:
         methods = [method for method in COUNTS if method.startswith(arguments.only)]
         cases = (Case(*v, count) for v in product(methods, SETUPS, NOISES) for count in COUNTS[v[0]])
+        ratios: dict[tuple[str, int], list[np.ndarray]] = {}
         for case in cases:
             found = np.array(list(pool.map(partial(trial, case), range(trials), chunksize=10)))
-            bound, calibration = np.sqrt(found[:, :2].mean(0) / 6)
-            row = f"{case.method} | {case.setup} | {case.noise} | {case.count} | {bound:.3f} | {calibration:.3f}"
+            both = np.sqrt(found[:, :2].mean(0) / 6)
+            ratios.setdefault((case.method, case.count), []).append(both)
+            row = f"{case.method} | {case.setup} | {case.noise} | {case.count} | {both[0]:.3f} | {both[1]:.3f}"
             print(f"| {row} | {int(found[:, 2].sum())} of {trials * case.count} |", flush=True)
+    print("\nover setups and noises:\n\n| method | poses | bound | calibration |\n|---|---|---|---|")
+    for (method, count), values in ratios.items():
+        spans = " | ".join(
+            f"{low:.2f}–{high:.2f}" for low, high in zip(np.min(values, 0), np.max(values, 0), strict=True)
+        )
+        print(f"| {method} | {count} | {spans} |")
 
 
 if __name__ == "__main__":

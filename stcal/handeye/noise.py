@@ -16,6 +16,8 @@ CAUTION = 2.0
 """Redundancies that are not counted: a variance of ν of them is the sum of squares over ν − 2, so that errors in units
 of its root have mean square 1 (the mean of F is ν / (ν − 2)). It also keeps a component of few poses off 0, as the
 penalty of Chung, Rabe-Hesketh, Dorie, Gelman & Liu (2013) does."""
+UNKNOWNS = 12
+"""Of X and Z."""
 LEAST_SHARE = 1e-3
 """… and above this share of what the first guess of the variance was: less does not weigh, but few poses that fit by
 chance would have all others follow them."""
@@ -120,6 +122,11 @@ def components(loop: Loop, noise: Noise, mount_from_camera: Rigid, scale: float 
             free[name] = slope[:, :, columns] @ np.swapaxes(slope[:, :, columns], 1, 2)
     if len(free) == 4:  # shifts of robot and camera move the board alike
         del free["robot_mm"]
+    if 6 * len(loop) - UNKNOWNS <= CAUTION * len(free):  # three poses: one less is told
+        if "camera_factor" in free:
+            known = known + free.pop("camera_factor")
+        else:
+            del free["robot_rad"]
     return Components(known, np.array(list(free.values())).reshape(-1, len(loop), 6, 6), tuple(free))
 
 

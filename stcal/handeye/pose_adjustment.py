@@ -133,9 +133,9 @@ def _squared(residuals: np.ndarray, spread: np.ndarray) -> np.ndarray:
 
 def _near(residuals: np.ndarray, spread: np.ndarray) -> np.ndarray:
     """Poses to start with, by σ of their medians: at least the better two thirds, or chance would choose among them."""
-    squared = _squared(residuals, spread)
-    enough = np.quantile(squared, MOSTLY_GOOD, method="higher")
-    return squared <= max(chi2.ppf(1 - FALSE_ALARM, 6), enough)
+    squared = np.sort(_squared(residuals, spread))
+    enough = max(int(np.ceil(MOSTLY_GOOD * len(squared))), LEAST_POSES)
+    return _squared(residuals, spread) <= max(chi2.ppf(1 - FALSE_ALARM, 6), squared[min(enough, len(squared)) - 1])
 
 
 def _agreeing(

@@ -88,9 +88,8 @@ class _Task:
     seen: Observability
     notes: tuple[str, ...]
 
-    def guess(self, loop: Loop) -> tuple[Rigid, Rigid, float]:
+    def guess(self, loop: Loop, with_scale: bool) -> tuple[Rigid, Rigid, float]:
         """First X, Z and scale."""
-        with_scale = self.options.with_scale
         if self.options.four_dof:
             return start.about_one_axis(loop, self.seen.mount_axis, with_scale)
         return start.robust(loop, with_scale)
@@ -154,7 +153,7 @@ def _task(pairs: HandEyePoses, setup: Setup, views: Views | None, options: HandE
         mended = repair(pairs, setup, options.symmetries, views)
         pairs, views, notes = mended.pairs, mended.views, mended.notes()
     task = _Task(pairs, Loop.of(pairs, setup), setup, views, options, seen, notes)
-    return replace(task, notes=notes + check_conventions(pairs, setup, task.guess))
+    return replace(task, notes=notes + check_conventions(pairs, setup, task.guess, task.options.with_scale))
 
 
 def _by_equations(task: _Task, method: str) -> HandEye:
@@ -195,7 +194,9 @@ def _by_motions(loop: Loop, method: str, unit_mm: float, options: EvolutionOptio
 
 def _by_poses(task: _Task) -> HandEye:
     options = task.options
-    solution = adjust_poses(task.loop, State(*task.guess(task.loop)), options.noise, options.with_scale)
+    solution = adjust_poses(
+        task.loop, State(*task.guess(task.loop, options.with_scale)), options.noise, options.with_scale
+    )
     state, normal = solution.state, solution.normal
     x, z = state.mount_from_camera, state.stand_from_board
     notes, covariance = task.notes, generalised_inverse(normal)
@@ -232,7 +233,7 @@ def _by_views(task: _Task) -> HandEye:
         task.loop,
         task.pairs.base_from_flange,
         task.views,
-        task.guess(task.loop),
+        task.guess(task.loop, options.with_scale),
         options.noise,
         options.intrinsics,
         options.with_scale,

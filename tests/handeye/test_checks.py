@@ -1,5 +1,7 @@
 """Poses that cannot be solved are refused with the motion that is missing; mixed-up conventions are said."""
 
+import re
+
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
@@ -158,6 +160,63 @@ def test_metres_that_are_called_millimetres_are_said(side):
         board = Poses(board.rotation, board.translation / 1000)
     with pytest.raises(InputError, match=f"with the {side}'s lengths times 1000: if they are metres"):
         handeye(HandEyePoses(flange, board))
+
+
+def misread(poses):
+    """x, y, z, w read as w, x, y, z."""
+    return Poses.from_quaternions(poses.quaternions()[:, [1, 2, 3, 0]], poses.translation)
+
+
+@pytest.mark.parametrize("setup", SETUPS)
+@pytest.mark.parametrize("sides", ["the robot's", "the board's", "all"])
+def test_quaternions_in_another_order_are_said(setup, sides):
+    pairs = simulated(np.random.default_rng(14), 10, setup, **NOISE).pairs
+    flange, board = pairs.base_from_flange, pairs.camera_from_board
+    flange = flange if sides == "the board's" else misread(flange)
+    board = board if sides == "the robot's" else misread(board)
+    with pytest.raises(InputError, match=f"with {sides} quaternions in another order: .* hold x, y, z, w, name them"):
+        handeye(HandEyePoses(flange, board), setup)
+
+
+@pytest.mark.parametrize("setup", SETUPS)
+@pytest.mark.parametrize("axis", [0, 1, 2])
+@pytest.mark.parametrize("side", ["robot", "camera"])
+def test_left_handed_poses_are_said(setup, axis, side):
+    pairs = simulated(np.random.default_rng(15), 10, setup, **NOISE).pairs
+    mirror = np.eye(3)
+    mirror[axis, axis] = -1
+
+    def mirrored(poses):
+        return Poses(mirror @ poses.rotation @ mirror, poses.translation @ mirror)
+
+    flange, board = pairs.base_from_flange, pairs.camera_from_board
+    flange, board = (mirrored(flange), board) if side == "robot" else (flange, mirrored(board))
+    with pytest.raises(InputError, match="with one side mirrored: if robot or camera states left-handed poses"):
+        handeye(HandEyePoses(flange, board), setup)
+
+
+def test_poses_that_have_nothing_in_common_are_refused():
+    pairs = simulated(np.random.default_rng(16), 12, **NOISE).pairs
+    with pytest.raises(InputError, match=r"contradict each other by .* of what they differ by; pair each pose"):
+        handeye(HandEyePoses(pairs.base_from_flange, pairs.camera_from_board[np.roll(np.arange(12), 1)]))
+
+
+def test_a_board_of_another_size_is_no_contradiction():
+    """Half as large as stated: said, with its size, and solved for on demand."""
+    pairs = simulated(np.random.default_rng(17), 12, **NOISE).pairs
+    board = Poses(pairs.camera_from_board.rotation, 2 * pairs.camera_from_board.translation)
+    found = handeye(HandEyePoses(pairs.base_from_flange, board))
+    said = re.search(r"the board is ([\d.]+) ± ([\d.]+) times as large as stated", found.notes[0])
+    size, sigma = map(float, said.groups())
+    assert abs(size - 0.5) < 4 * sigma < 0.5
+    solved = handeye(HandEyePoses(pairs.base_from_flange, board), options=HandEyeOptions(with_scale=True))
+    assert solved.scale == pytest.approx(0.5, abs=5 * solved.sigma_scale)
+
+
+def test_few_poses_are_not_thinned_out():
+    """Without known σ four good poses are too few to contradict one another."""
+    for seed in range(10):
+        assert not handeye(simulated(np.random.default_rng(seed), 4, **NOISE).pairs).outliers.any()
 
 
 def test_rough_poses_in_the_right_convention_pass():

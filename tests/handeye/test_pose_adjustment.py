@@ -5,6 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from stcal.errors import DegenerateError
 from stcal.geometry.rigid import Poses, Rigid
 from stcal.handeye import HandEyeOptions, HandEyePoses, Noise, handeye
 from stcal.handeye.loop import Loop
@@ -71,6 +72,23 @@ def test_the_robot_is_estimated_where_the_camera_is_known():
     assert found.estimated == ("robot_rad", "robot_mm")
     assert (found.sigma["robot_rad"], found.sigma["robot_mm"]) == pytest.approx((5e-4, 0.2), rel=0.4)
     assert found.sigma["camera_mm"] == 0.3
+
+
+@pytest.mark.parametrize(("count", "low", "high"), [(3, 0.7, 1.3), (4, 0.7, 1.15)])
+def test_few_poses_state_what_they_can_know(count, low, high):
+    """All σ estimated from 6 or 12 redundancies: heavy tails, so 200 draws tell their RMS to some 10 %; caution may
+    state too much by a third, as the four are left 12 − 3·2 redundancies."""
+    errors, covariances = [], []
+    for seed in range(200):
+        truth = simulated(np.random.default_rng(seed), count, "eye-in-hand", (5e-4, 0.2), (5e-4, 0.2))
+        try:
+            found = handeye(truth.pairs)
+        except DegenerateError:  # three that hardly turned
+            continue
+        errors.append(error(found, truth))
+        covariances.append(found.covariance)
+    assert len(errors) > 190
+    assert low < normalised(errors, covariances) < high
 
 
 @pytest.mark.parametrize("factor", [1, 4])
