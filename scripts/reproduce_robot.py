@@ -30,12 +30,15 @@ from stcal.geometry.rigid import Poses, Rigid
 from stcal.robot.axes_model import robot_from_sweeps
 from stcal.robot.compensation import Targets, compensate
 from stcal.robot.data import Measurements
-from stcal.robot.identification import IdentifyOptions, identify
+from stcal.robot.identification import Identified, IdentifyOptions, identify
 from stcal.robot.inverse_kinematics import inverse
 from stcal.robot.kinematics import forward, jacobian
 from stcal.robot.model import Joint, Robot
+from stcal.robot.observe import jacobian as jacobian_of
+from stcal.robot.observe import observed, residuals
 from stcal.robot.simulated import joint_vectors, made, mh80, placed
 from stcal.robot.verification import Measured, SetResult, verify
+from stcal.sfm.common_errors import common_errors
 from stcal.sfm.observations import face_of
 from stcal.sfm.simulated_poses import KnownTarget, known_target, pose_error, see
 from stcal.sfm.single_pose import pose_from_circles
@@ -88,10 +91,13 @@ class Rig:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Draw:
-    """``sets`` : by kind of distance, the result of each model; ``pose_error`` : (m, 6) rad, mm, of the photographs."""
+    """``sets`` : by kind of distance, the result of each model; ``pose_error`` : (m, 6) rad, mm, of the photographs;
+    ``squared`` : (2,) squared error of the minimal model in units of its covariance, with the poses' common errors and
+    as if they had none."""
 
     sets: dict[str, dict[str, SetResult]]
     pose_error: np.ndarray
+    squared: np.ndarray
 
 
 @cache
@@ -215,12 +221,17 @@ def made_arm(gears_rad: float, rng: np.random.Generator) -> Arm:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Photographs:
-    """``data`` : the poses measured, with covariance; ``error`` : (m, 6) rad, mm of them; ``rows`` : (m,) of q, where
-    the target shows enough."""
+    """``data`` : the poses measured, with covariance and their common errors; ``error`` : (m, 6) rad, mm of them;
+    ``rows`` : (m,) of q, where the target shows enough."""
 
     data: Measurements
     error: np.ndarray
     rows: np.ndarray
+
+    def of(self, rows: np.ndarray) -> "Photographs":
+        """Those of rows of q by a mask."""
+        keep = rows[self.rows]
+        return Photographs(self.data[keep], self.error[keep], self.rows[keep])
 
 
 def photograph(arm: Arm, target: TargetCircles, q: np.ndarray, rng: np.random.Generator) -> Photographs:
@@ -238,14 +249,10 @@ def photograph(arm: Arm, target: TargetCircles, q: np.ndarray, rng: np.random.Ge
             rows.append(i)
     poses = Poses.of(pose.camera_from_target for pose in found)
     error = np.array([pose_error(pose, truth[i]) for pose, i in zip(poses, rows, strict=True)])
-    covariance = np.array([pose.covariance for pose in found])
-    return Photographs(measurements(q[rows], poses, covariance), error, np.array(rows))
-
-
-def measurements(q: np.ndarray, poses: Poses, covariance: np.ndarray) -> Measurements:
-    """As from a file."""
-    m = len(q)
-    return Measurements("photographs", range(2, m + 2), q, ("",) * m, poses.translation, poses.rotation, covariance)
+    covariance, common = np.array([pose.covariance for pose in found]), common_errors(found, target, None)
+    seen = poses.translation, poses.rotation, covariance, common
+    m = len(rows)
+    return Photographs(Measurements("photographs", range(2, m + 2), q[rows], ("",) * m, *seen), error, np.array(rows))
 
 
 def by_axes(data: Measurements, target: TargetCircles) -> Robot:
@@ -260,33 +267,35 @@ def by_axes(data: Measurements, target: TargetCircles) -> Robot:
     return replace(found, tools={"": align_rigid(places, np.array(list(middles.values())))})
 
 
-def by_cmmk(start: Robot, swept: Photographs, posed: Photographs) -> Robot:
-    """The minimal model from all photographs."""
-    both = [
-        np.concatenate([getattr(p.data, key) for p in (swept, posed)])
-        for key in ("q", "rotations", "positions", "covariance")
-    ]
-    return identify(start, measurements(both[0], Poses(*both[1:3]), both[3]), IdentifyOptions(folds=0)).robot
+def squared_error(found: Identified, arm: Arm, q: np.ndarray) -> float:
+    """eᵀC⁻¹e over its degrees of freedom, of all parameters that such poses tell of the arm."""
+    poses, m = arm.poses(q), len(q)
+    exact = observed(Measurements("truth", range(m), q, ("",) * m, poses.translation, poses.rotation))
+    slope = jacobian_of(found.state, exact).reshape(6 * m, -1)
+    error = np.linalg.lstsq(slope, residuals(found.state, exact).ravel())[0]
+    return float(error @ np.linalg.solve(found.covariance, error)) / len(error)
 
 
 def one_draw(seed: int, index: int, gears_rad: float) -> Draw:
     """An arm made, photographed, identified, compensated and verified."""
     rng = np.random.default_rng([seed, index])
     arm, target = made_arm(gears_rad, rng), rig().known.measured(rng)
-    swept = photograph(arm, target, sweeps(), rng)
-    posed = photograph(arm, target, random_poses(POSES, rng), rng)
-    axes = by_axes(swept.data, target)
-    robots = {AXES: axes, CMMK: by_cmmk(axes, swept, posed)}
+    q = np.concatenate([sweeps(), random_poses(POSES, rng)])
+    every = photograph(arm, target, q, rng)
+    axes = by_axes(every.of(np.arange(len(q)) < len(sweeps())).data, target)
+    found = [identify(axes, data, IdentifyOptions(folds=0)) for data in (every.data, replace(every.data, common=None))]
+    robots = {AXES: axes, CMMK: found[0].robot}
+    squared = [squared_error(each, arm, q) for each in found]
     far, near = commanded(FAR, rng), commanded(NEAR, rng)
     q = joint_values(robots, near)
     seen = {name: photograph(arm, target, values, rng) for name, values in q.items()}
-    every = np.arange(VERIFIED)
+    rows = np.arange(VERIFIED)
     sets = {
-        REACH: verified(far, {n: (every, arm.poses(v).translation) for n, v in joint_values(robots, far).items()}),
-        TRUE: verified(near, {n: (every, arm.poses(v).translation) for n, v in q.items()}),
+        REACH: verified(far, {n: (rows, arm.poses(v).translation) for n, v in joint_values(robots, far).items()}),
+        TRUE: verified(near, {n: (rows, arm.poses(v).translation) for n, v in q.items()}),
         CAMERA: verified(near, {n: (p.rows, p.data.positions) for n, p in seen.items()}),
     }
-    return Draw(sets, np.concatenate([swept.error, posed.error]))
+    return Draw(sets, every.error, np.array(squared))
 
 
 def joint_values(robots: dict[str, Robot], targets: Targets) -> dict[str, np.ndarray]:
@@ -384,6 +393,12 @@ def main() -> None:
         f"{NOISE_PX:g} px: origin off by {shift:.4f} mm, rotation by {1e3 * turn:.3f} mrad (RMS lengths).\n"
     )
     print_table(draws)
+    told, untold = np.mean([draw.squared for draw in draws], axis=0)
+    spread = np.std([draw.squared[0] for draw in draws]) / np.sqrt(count)
+    print(
+        f"\nParameters of the minimal model, eᵀC⁻¹e over their number, expected 1: {told:.2f} ± {spread:.2f}; "
+        f"with the poses taken as independent {untold:.1f}."
+    )
     if given.plot:
         draw_figure(draws, given.plot)
     print(f"\n{time.perf_counter() - start:.0f} s")

@@ -2,6 +2,7 @@
 
 import csv
 import io
+import re
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -17,6 +18,8 @@ QUATERNION = ("qw", "qx", "qy", "qz")
 TWIST = ("rx", "ry", "rz", "x", "y", "z")
 COVARIANCE = tuple(f"cov_{a}_{b}" for i, a in enumerate(TWIST) for b in TWIST[i:])
 """Upper triangle of a pose covariance, rows first: rotation vector (rad) and translation (mm), left perturbation."""
+COMMON = re.compile(r"common\d+_.+")
+"""Columns of errors that all poses have in common."""
 POSE = ("x_mm", "y_mm", "z_mm", *QUATERNION)
 
 
@@ -127,6 +130,33 @@ class Table:
             )
         return full
 
+    def common_errors(self, covariance: np.ndarray | None) -> np.ndarray | None:
+        """(m, 6, r) of the columns ``common1_rx`` … ``common1_z``, ``common2_rx`` …; None where there are none.
+
+        Raises
+        ------
+        InputError
+            Some columns only, or more than the covariance (m, 6, 6) that holds them.
+        """
+        count = len({name.split("_")[0] for name in self.columns if COMMON.fullmatch(name)})
+        if not count:
+            return None
+        if covariance is None:
+            raise InputError(f"{self.where}: columns common1_… without columns cov_…, which must hold them; give both")
+        for name in common_columns(count):
+            if name not in self.columns:
+                raise InputError(f"{self.where}: {name} is missing; all columns common1_rx … or none needed")
+        values = np.column_stack([self.numbers(name) for name in common_columns(count)])
+        full = np.swapaxes(values.reshape(len(self), count, 6), 1, 2)
+        sigma = np.sqrt(np.diagonal(covariance, axis1=1, axis2=2))
+        own = (covariance - full @ np.swapaxes(full, 1, 2)) / sigma[:, :, None] / sigma[:, None, :]
+        bad = np.flatnonzero(np.linalg.eigvalsh(own)[:, 0] <= 0)
+        if len(bad):
+            raise InputError(
+                f"{self.where}: line {self.lines[bad[0]]}: common errors are larger than the covariance; correct them"
+            )
+        return full
+
     def header(self) -> str:
         """The columns' names, shortened."""
         text = ",".join(self.columns)
@@ -182,6 +212,11 @@ def read_table(path: str | Path, what: str) -> Table:
         if len(row) != len(names):
             raise InputError(f"{where}: line {line}: {len(row)} cells, {len(names)} needed as in the header")
     return Table(where, {n: [row[k].strip() for row in cells] for k, n in enumerate(names)}, numbers)
+
+
+def common_columns(count: int) -> list[str]:
+    """Names of the columns of so many common errors."""
+    return [f"common{k}_{axis}" for k in range(1, count + 1) for axis in TWIST]
 
 
 def pose_cells(pose: Rigid, covariance: np.ndarray | None = None) -> list[str]:

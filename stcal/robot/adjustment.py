@@ -40,8 +40,10 @@ class Weighting:
         values = values[..., None] if flat else values
         width = values.shape[1]
         if self.given and width > 1:
-            covariance = self.factor**2 * seen.data.covariance
-            values = np.linalg.solve(np.linalg.cholesky(covariance[:, -width:, -width:]), values)
+            root = self.factor * np.linalg.cholesky(seen.data.own_covariance()[:, -width:, -width:])
+            values = np.linalg.solve(root, values)
+            if seen.data.common is not None:
+                values = _decorrelated(values, np.linalg.solve(root, seen.data.common[:, -width:]))
         else:
             sigma = self.factor * np.array([self.sigma_rad] * 3 + [self.sigma_mm] * 3)
             values = values / sigma[-width:, None]
@@ -61,6 +63,17 @@ class Weighting:
         """With other σ."""
         new = {name: found.get(name, self.value(name)) for name in ("mm", "rad", "factor")}
         return replace(self, sigma_mm=new["mm"], sigma_rad=new["rad"], factor=new["factor"])
+
+
+def _decorrelated(values: np.ndarray, common: np.ndarray) -> np.ndarray:
+    """Values (r, w, k), all of σ 1 but for common errors (r, w, c), times the inverse root of their covariance
+    1 + F Fᵀ, F being ``common`` with its rows stacked: what all observations may have in common counts less."""
+    f = common.reshape(-1, common.shape[2])
+    size, directions = np.linalg.eigh(f.T @ f)
+    size, directions = size[size > 0], directions[:, size > 0]
+    u = f @ directions / np.sqrt(size)
+    flat = values.reshape(len(f), -1)
+    return (flat - u * (1 - 1 / np.sqrt(1 + size)) @ (u.T @ flat)).reshape(values.shape)
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -29,9 +29,10 @@ class Measurements:
 
     ``where`` : the file; ``lines`` : (m,) its lines; ``q`` : (m, n) values of the controller, rad or mm; ``targets`` :
     (m,) names of the reflector or target seen; ``positions`` : (m, 3) mm in the instrument's frame; ``rotations`` :
-    (m, 3, 3) where poses were measured; ``covariance`` : (m, 6, 6) of the poses where known; ``distances`` : (m,) mm,
-    where only these were measured, from the position at row ``from_row``, (m,), from 0. What was not measured is None.
-    ``notes`` : on rows of the file that are not here.
+    (m, 3, 3) where poses were measured; ``covariance`` : (m, 6, 6) of the poses where known; ``common`` : (m, 6, r)
+    their common errors, in it: pose i errs by ``common[i] @ z`` with the same r normal numbers z of σ 1 for all, and by
+    itself; ``distances`` : (m,) mm, where only these were measured, from the position at row
+    ``from_row``, (m,), from 0. What was not measured is None. ``notes`` : on rows of the file that are not here.
     """
 
     where: str
@@ -41,6 +42,7 @@ class Measurements:
     positions: np.ndarray | None = None
     rotations: np.ndarray | None = None
     covariance: np.ndarray | None = None
+    common: np.ndarray | None = None
     distances: np.ndarray | None = None
     from_row: np.ndarray | None = None
     notes: tuple[str, ...] = ()
@@ -48,9 +50,10 @@ class Measurements:
     def __post_init__(self):
         m = len(self.q)
         object.__setattr__(self, "q", frozen(self.q, (m, None), "joint values"))
-        for name, shape in (("positions", (m, 3)), ("rotations", (m, 3, 3)), ("covariance", (m, 6, 6))):
+        shapes = {"positions": (3,), "rotations": (3, 3), "covariance": (6, 6), "common": (6, None)}
+        for name, shape in shapes.items():
             if getattr(self, name) is not None:
-                object.__setattr__(self, name, frozen(getattr(self, name), shape, name))
+                object.__setattr__(self, name, frozen(getattr(self, name), (m, *shape), name))
         if self.distances is not None:
             object.__setattr__(self, "distances", frozen(self.distances, (m,), "distances"))
             object.__setattr__(self, "from_row", frozen(self.from_row, (m,), "rows", int))
@@ -68,9 +71,15 @@ class Measurements:
             [self.lines[i] for i in rows],
             self.q[rows],
             tuple(self.targets[i] for i in rows),
-            *(None if a is None else a[rows] for a in (self.positions, self.rotations, self.covariance)),
+            *(None if a is None else a[rows] for a in (self.positions, self.rotations, self.covariance, self.common)),
             notes=self.notes,
         )
+
+    def own_covariance(self) -> np.ndarray:
+        """(m, 6, 6) of what each pose errs by itself."""
+        if self.common is None:
+            return self.covariance
+        return self.covariance - self.common @ np.swapaxes(self.common, 1, 2)
 
     def poses(self) -> Poses:
         """world_from_tool as measured."""
@@ -93,13 +102,14 @@ def read_measurements(path: str | Path, robot: Robot) -> Measurements:
     table = read_table(path, WHAT)
     q = joint_values(table, robot)
     targets = tuple(table.text("target")) if "target" in table else ("",) * len(table)
-    common = (table.where, table.lines, q, targets)
+    rows = (table.where, table.lines, q, targets)
     if table.has("x", LENGTHS):
         if table.has_rotation():
             poses = table.poses()
-            data = Measurements(*common, poses.translation, poses.rotation, table.pose_covariances())
+            covariance = table.pose_covariances()
+            data = Measurements(*rows, poses.translation, poses.rotation, covariance, table.common_errors(covariance))
         else:
-            data = Measurements(*common, table.points())
+            data = Measurements(*rows, table.points())
         within(table, "position", data.positions, "mm")
         _in_reach(data, robot)
         return _usable(data, table)
@@ -110,7 +120,7 @@ def read_measurements(path: str | Path, robot: Robot) -> Measurements:
         )
     distances = table.quantity("distance", LENGTHS)
     within(table, "distance", distances, "mm")
-    return Measurements(*common, distances=distances, from_row=_from_rows(table, distances))
+    return Measurements(*rows, distances=distances, from_row=_from_rows(table, distances))
 
 
 def within(table: Table, name: str, values: np.ndarray, unit: str) -> None:

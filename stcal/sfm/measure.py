@@ -12,16 +12,18 @@ import numpy as np
 from stcal.camera_file import CameraModel, CameraPrior
 from stcal.design import BoardDesign, TargetDesign
 from stcal.errors import DetectionError, InputError, StcalError
+from stcal.geometry.arrays import frozen
 from stcal.geometry.camera import Camera
 from stcal.geometry.rigid import Rigid
 from stcal.images import Skipped, find_images
+from stcal.sfm.common_errors import common_errors
 from stcal.sfm.detect.ellipses import EllipseOptions
 from stcal.sfm.detection import DetectedImage, detect_files
 from stcal.sfm.labels import label_group
 from stcal.sfm.observations import ImageObservations, by_group
 from stcal.sfm.single_pose import PoseOptions, TargetPose, pose_from_circles
 from stcal.sfm.target_circles import TargetCircles
-from stcal.table_file import COVARIANCE, POSE, Table, pose_cells
+from stcal.table_file import COVARIANCE, POSE, Table, common_columns, pose_cells
 
 NEAR_PREVIOUS = 1 / 3
 """The pose nearer to the previous image's is taken where its turn from there is at most this share of the other's."""
@@ -55,7 +57,8 @@ class MeasuredImage:
 @dataclass(frozen=True, slots=True, eq=False)
 class MeasureResult:
     """``images`` that have a pose, in order of name; ``left_out`` : the others, with reasons; ``notes`` : what the
-    covariances lack; ``sigma_factor`` : on the centres' own σ; ``intrinsics_held`` : whether they were taken as exact.
+    covariances lack; ``sigma_factor`` : on the centres' own σ; ``intrinsics_held`` : whether they were taken as exact;
+    ``common`` : (m, 6, r) what the poses' errors have in common, see :func:`stcal.sfm.common_errors.common_errors`.
     """
 
     images: tuple[MeasuredImage, ...]
@@ -63,6 +66,10 @@ class MeasureResult:
     notes: tuple[str, ...]
     sigma_factor: float
     intrinsics_held: bool
+    common: np.ndarray
+
+    def __post_init__(self):
+        object.__setattr__(self, "common", frozen(self.common, (len(self.images), 6, None), "common errors"))
 
 
 def measure(
@@ -150,7 +157,8 @@ def measure_labelled(
                 measured.append(MeasuredImage(image.name, pose))
             before = pose if pose is not None and pose.status != "ambiguous" else None
     factor = target.sigma_factor if options.pose.sigma_factor is None else options.pose.sigma_factor
-    return MeasureResult(tuple(measured), tuple(left_out), target.notes, factor, prior is None)
+    common = common_errors([each.pose for each in measured], target, prior)
+    return MeasureResult(tuple(measured), tuple(left_out), target.notes, factor, prior is None, common)
 
 
 def _measured(image: ImageObservations, camera, target: TargetCircles, options, prior):
@@ -192,12 +200,13 @@ def poses_csv(result: MeasureResult, joints: Table | None = None) -> tuple[str, 
         The table has no column ``image``, an image twice, or a column that is here already.
     """
     header = [IMAGE, FACES, CIRCLES, STATUS, *POSE, *COVARIANCE, *QUALITY]
-    more, rows = ([], None) if joints is None else _joint_cells(joints, header)
+    common = common_columns(result.common.shape[2])
+    more, rows = ([], None) if joints is None else _joint_cells(joints, header + common)
     stream = io.StringIO()
     writer = csv.writer(stream, lineterminator="\n")
-    writer.writerow(header + more)
+    writer.writerow(header + more + common)
     missing = []
-    for each in result.images:
+    for each, felt in zip(result.images, result.common, strict=True):
         if rows is not None and each.name not in rows:
             missing.append(f"{each.name}: measured, but not in {joints.where}")
             continue
@@ -207,6 +216,7 @@ def poses_csv(result: MeasureResult, joints: Table | None = None) -> tuple[str, 
             + pose_cells(pose.camera_from_target, pose.covariance)
             + [f"{pose.rms_px():.5f}", f"{pose.chi2_per_dof():.4f}"]
             + (rows[each.name] if rows is not None else [])
+            + [f"{v:.7g}" for v in felt.T.ravel()]
         )
     if rows is not None:
         names = {each.name for each in result.images}

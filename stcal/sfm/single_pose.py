@@ -72,8 +72,10 @@ class TargetPose:
     ``camera_from_target`` ; ``covariance`` : (6, 6), rad and mm, left perturbation in the camera frame, R' = exp(w) R,
     t' = t + dt; ``parts`` : what it is the sum of, (6, 6) each: ``image``, ``target`` and ``intrinsics``, of which the
     last two are common to all images of the same target and camera, and ``curvature``, by which the spread of all poses
-    by their likelihood differs from these, zero where that is Gaussian; ``status`` : see ``delta_chi2``; ``faces`` and
-    ``labels`` used; ``residuals_px`` : (n, 2) measured minus projected ellipse centres; ``weights`` : (n,) Huber's;
+    by their likelihood differs from these, zero where that is Gaussian; ``by_circles`` : (6, 3n), and ``by_intrinsics``
+    : (6, q) derivatives, but for the sign, by errors of the circles (target frame, mm) and intrinsics; ``status`` : see
+    ``delta_chi2``; ``faces`` and ``labels`` used; ``residuals_px`` : (n, 2) measured minus projected ellipse centres;
+    ``weights`` : (n,) Huber's;
     ``outliers`` left out; ``chi2``, ``dof`` : of all residuals against their covariance; ``delta_chi2`` : by which the
     other minimum is worse, or, where both are one wide valley, the other side of it (infinite where there is neither);
     ``needed_chi2`` : the least of it for the pose to be certain; ``alternative`` : the other minimum where that is not
@@ -83,6 +85,8 @@ class TargetPose:
     camera_from_target: Rigid
     covariance: np.ndarray
     parts: dict[str, np.ndarray]
+    by_circles: np.ndarray
+    by_intrinsics: np.ndarray
     status: Status
     faces: tuple[str, ...]
     labels: tuple[str, ...]
@@ -98,6 +102,8 @@ class TargetPose:
     def __post_init__(self):
         n = len(self.labels)
         object.__setattr__(self, "covariance", frozen(self.covariance, (6, 6), "pose covariance"))
+        object.__setattr__(self, "by_circles", frozen(self.by_circles, (6, 3 * n), "pose by circles"))
+        object.__setattr__(self, "by_intrinsics", frozen(self.by_intrinsics, (6, None), "pose by intrinsics"))
         object.__setattr__(self, "residuals_px", frozen(self.residuals_px, (n, 2), "residuals"))
         object.__setattr__(self, "weights", frozen(self.weights, (n,), "weights"))
 
@@ -222,18 +228,11 @@ def _weigh(residual: np.ndarray, by_pose: np.ndarray, full: np.ndarray, poses: P
     return _Weighed(poses.moved(step), left, normal, square - (step * right[..., 0]).sum(1))
 
 
-def _parts(problem: PoseProblem, image: CircleImages, noise: np.ndarray, full: np.ndarray) -> dict[str, np.ndarray]:
-    """The covariance of one pose by its sources, (6, 6) each."""
+def _gain(image: CircleImages, full: np.ndarray) -> np.ndarray:
+    """(6, 2n) derivative of the weighted pose by the centres."""
     a = image.by_pose.reshape(-1, 6)
     gain = np.linalg.solve(full, a)
-    gain = np.linalg.solve(a.T @ gain, gain.T)  # pose by centres
-    by_circle = gain @ block_diagonal(image.by_circle)[0]
-    by_camera = gain @ problem.by_camera.reshape(len(a), -1)
-    return {
-        "image": gain @ block_diagonal(noise[None])[0] @ gain.T,
-        "target": by_circle @ problem.shape @ by_circle.T,
-        "intrinsics": by_camera @ problem.prior @ by_camera.T,
-    }
+    return np.linalg.solve(a.T @ gain, gain.T)
 
 
 def _answer(
@@ -295,7 +294,14 @@ def _weighed(
     poses = _weigh(residual, image.by_pose, full, start).poses
     residual, image = problem.seen(poses)
     last = _weigh(residual, image.by_pose, full, poses)
-    parts = _parts(problem, image, noise, full[0])
+    gain = _gain(image, full[0])
+    by_circles = gain @ block_diagonal(image.by_circle)[0]
+    by_intrinsics = gain @ problem.by_camera.reshape(len(full[0]), -1)
+    parts = {
+        "image": gain @ block_diagonal(noise[None])[0] @ gain.T,
+        "target": by_circles @ problem.shape @ by_circles.T,
+        "intrinsics": by_intrinsics @ problem.prior @ by_intrinsics.T,
+    }
     gaussian = sum(parts.values())
     chi2 = float(last.chi2[0])
     # The samples span a valley from side to side: the margin for wrong σ is for what they do not show.
@@ -306,6 +312,8 @@ def _weighed(
         rigid_of(last.poses, 0),
         (covariance + covariance.T) / 2,
         parts,
+        by_circles,
+        by_intrinsics,
         "ambiguous",
         tuple(dict.fromkeys(face_of(name) for name in names)),
         tuple(names),

@@ -13,7 +13,7 @@ from stcal.robot.data import Measurements, read_measurements
 from stcal.robot.model import DHRow, Joint, Robot
 from stcal.robot.robot_file import save_robot
 from stcal.robot.simulated import joint_vectors, made, measured, mh80, placed
-from stcal.table_file import COVARIANCE, POSE, pose_cells
+from stcal.table_file import COVARIANCE, POSE, common_columns, pose_cells
 
 GANTRY = Robot("gantry", "standard", (DHRow(0, 0.3, 0, 0), DHRow(100, 0, 50, 0)), (Joint("prismatic"), Joint()))
 POSES = Poses.of([Rigid.exp([0.1, 0.2, 0.3, 4, 5, 6]), Rigid.exp([-0.4, 0, 0.3, 40, 50, 60])])
@@ -42,6 +42,30 @@ def test_poses_with_covariance(tmp_path):
     assert np.abs(data.poses().difference(POSES)).max() < 1e-12
     assert data.covariance == pytest.approx(np.array([covariance] * 2))
     assert data[1:].covariance.shape == (1, 6, 6)
+
+
+def common_text(common, names=None, covariance=None):
+    """Two poses with the covariance 1e-8 rad², 1e-4 mm² and common errors (2, 6, r)."""
+    covariance = np.diag([1e-8] * 3 + [1e-4] * 3) if covariance is None else covariance
+    columns = common_columns(common.shape[2]) if names is None else names
+    cells = [[f"{v:g}" for v in each.T.ravel()] for each in common]
+    rows = [["1", "2", *pose_cells(p, covariance), *c] for p, c in zip(POSES, cells, strict=True)]
+    return "\n".join(",".join(row) for row in [["q1_mm", "q2_deg", *POSE, *COVARIANCE, *columns], *rows])
+
+
+def test_common_errors_of_poses(tmp_path):
+    common = np.random.default_rng(0).normal(size=(2, 6, 3)) * 0.3 * np.repeat([1e-4, 1e-2], 3)[:, None]
+    data = read(tmp_path, common_text(common))
+    assert data.common == pytest.approx(common, rel=1e-5)
+    assert data[1:].common == pytest.approx(common[1:], rel=1e-5)
+    assert data.own_covariance() == pytest.approx(data.covariance - common @ np.swapaxes(common, 1, 2), rel=1e-5)
+    with pytest.raises(InputError, match=r"line 2: common errors are larger than the covariance"):
+        read(tmp_path, common_text(4 * common))
+    with pytest.raises(InputError, match=r"common1_rx is missing; all columns common1_rx … or none"):
+        read(tmp_path, common_text(common, ["common1_r", *common_columns(3)[1:]]))
+    without = ",".join(["q1_mm,q2_deg", *POSE, *common_columns(1)]) + "\n1,2,0,0,0,1,0,0,0,0,0,0,0,0,0\n"
+    with pytest.raises(InputError, match=r"columns common1_… without columns cov_…"):
+        read(tmp_path, without)
 
 
 def test_distances_from_rows(tmp_path):

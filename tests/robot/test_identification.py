@@ -123,6 +123,41 @@ def test_the_covariance_is_true():
     assert np.mean(rows) == pytest.approx(1, abs=3 * np.sqrt(2 / 9 / draws))
 
 
+def in_common(data, rng, count=5):
+    """The data with errors that all poses have in common, three times their own."""
+    sigma = np.repeat([2e-4, 0.05], 3)
+    common = rng.normal(0, 3 / np.sqrt(count), (len(data), 6, count)) * sigma[:, None]
+    error = common @ rng.standard_normal(count)
+    turn = Rotation.from_rotvec(error[:, :3]).as_matrix()
+    covariance = np.tile(np.diag(sigma**2), (len(data), 1, 1)) + common @ np.swapaxes(common, 1, 2)
+    return replace(
+        data,
+        positions=data.positions + error[:, 3:],
+        rotations=turn @ data.rotations,
+        covariance=covariance,
+        common=common,
+    )
+
+
+@pytest.mark.parametrize("kind", ["pose", "position"])
+def test_common_errors_of_poses_are_in_the_covariance(kind):
+    """Known to be common they are found and taken out; taken for noise they make it too large."""
+    draws, errors, independent = 15, [], []
+    for seed in range(draws):
+        true, data = simulated(2000 + seed, 45)
+        data = in_common(data, np.random.default_rng(seed))
+        q = joint_vectors(true, 100, np.random.default_rng(seed))
+        exact = observed(measured(true, q, np.random.default_rng(0), 0, 0), kind)
+        for given, found_errors in ((data, errors), (replace(data, common=None), independent)):
+            found = identify(mh80(), given, replace(QUICK, observe=kind))
+            slope = jacobian(found.state, exact).reshape(-1, len(found.names))
+            away = np.linalg.lstsq(slope, residuals(found.state, exact).ravel(), rcond=None)[0]
+            found_errors.append((away @ np.linalg.solve(found.covariance, away) / len(away), (slope @ away).std()))
+    count = len(found.names)
+    assert np.mean(errors, axis=0)[0] == pytest.approx(1, abs=3 * np.sqrt(2 / count / draws))
+    assert np.mean(errors, axis=0)[1] < 0.6 * np.mean(independent, axis=0)[1]
+
+
 def test_three_thousand_poses_are_no_trouble():
     """Ratio within one run, to one least-squares solution of that size: 40 to 60 measured (`scripts/bench_robot.py`),
     which are 0.3 s; linear in the number of poses."""

@@ -420,6 +420,11 @@ def test_command_writes_poses_with_joints(stcal_sfm, small_dataset, small_run, t
     parts = content["images"][0]["covariance_parts"]
     assert set(parts) == {"image", "target", "intrinsics", "curvature"}
     assert np.allclose(sum(np.array(p) for p in parts.values()), content["images"][0]["covariance"], rtol=1e-9)
+    common = table.common_errors(table.pose_covariances())
+    shared = common[0] @ common[0].T
+    part = sum(np.array(parts[source]) for source in ("target", "intrinsics"))
+    assert np.linalg.eigvalsh(part - shared)[0] > -1e-6 * np.linalg.eigvalsh(part)[-1]
+    assert np.trace(np.linalg.solve(table.pose_covariances()[0], part - shared)) < 1  # of 6, with FELT per direction
     assert len(list(tmp_path.glob("*.partial"))) == 0
     assert "empty.png" in (tmp_path / "poses.html").read_text()
 
