@@ -15,13 +15,10 @@ import tempfile
 from pathlib import Path
 
 import numpy as np
-import yaml
 
-from stcal.camera_file import write_cameras_txt
+from stcal.camera_file import read_camera, write_cameras_txt
 from stcal.cli.main import app
 from stcal.geometry.camera import Camera
-from stcal.geometry.rigid import Poses
-from stcal.table_file import POSE, pose_cells
 
 CHARUCO = """type = "charuco"
 rows = 7
@@ -51,44 +48,41 @@ SPLITS = ("--held-out", "5", "--splits", "15")
 def charuco(data: Path, scratch: Path, *options: str, adjusted: dict | None = None) -> tuple[dict, str]:
     """Output of ``stcal handeye`` on charuco_handeye, and what it prints.
 
-    The camera file of the data set has no distortion, which the lens has: it is given as OPENCV, and adjusted; or
-    camera and board are those of an output, ``adjusted``.
+    The camera file of the data set has no distortion, which the lens has: it is adjusted; or camera and board are those
+    of an output, ``adjusted``.
     """
     folder = data / "charuco_handeye" / "test_set_charuco"
-    values = yaml.safe_load((folder / "cal_data.yaml").read_text())["intrinsics"]
-    camera = Camera(1600, 1200, [values["fx"], values["fy"]], [values["cx"], values["cy"]], np.zeros(8))
-    setup, board = ("--setup", "eye-to-hand"), CHARUCO
+    file, board = folder / "cal_data.yaml", CHARUCO
     if adjusted is None:
-        setup = (*setup, "--refine-camera", "--with-scale")
+        options = ("--refine-camera", "--with-scale", *options)
     else:
+        camera = Camera(1600, 1200, np.ones(2), np.zeros(2), np.zeros(8))
         camera = camera.with_parameters(np.array(list(adjusted["camera"]["parameters"].values())))
+        file = _camera_file(scratch, camera)
         board = board.replace("36.195", repr(adjusted["board"]["pitch_mm"]))
-    return _handeye(folder, scratch, camera, None, board, *setup, *options)
+    return _handeye(folder, scratch, file, board, "--setup", "eye-to-hand", *options)
 
 
 def dots(data: Path, scratch: Path, *options: str) -> tuple[dict, str]:
     """The same on dotgrid_handeye."""
     folder = data / "dotgrid_handeye"
-    values = yaml.safe_load((folder / "camera_intr_calibrated.yaml").read_text())["intrinsics"]
-    camera = Camera(640, 480, [values["fx"], values["fy"]], [values["cx"], values["cy"]], np.zeros(8))
-    covariance = np.diag(np.square(DOTS_CAMERA_SIGMA))
-    return _handeye(folder, scratch, camera, covariance, DOTS, "--refine-camera", "--with-scale", *options)
+    camera = read_camera(folder / "camera_intr_calibrated.yaml").sized(640, 480)
+    file = _camera_file(scratch, camera, np.diag(np.square(DOTS_CAMERA_SIGMA)))
+    return _handeye(folder, scratch, file, DOTS, "--refine-camera", "--with-scale", *options)
 
 
-def _handeye(folder: Path, scratch: Path, camera: Camera, covariance, board: str, *options: str) -> tuple[dict, str]:
-    """Files of one data set in the command's forms, and the command."""
+def _camera_file(scratch: Path, camera: Camera, covariance: np.ndarray | None = None) -> Path:
+    scratch.mkdir(parents=True, exist_ok=True)
+    write_cameras_txt(scratch / "cameras.txt", camera, "OPENCV", covariance)
+    return scratch / "cameras.txt"
+
+
+def _handeye(folder: Path, scratch: Path, camera: Path, board: str, *options: str) -> tuple[dict, str]:
+    """The command on one data set, as it is."""
     scratch.mkdir(parents=True, exist_ok=True)
     (scratch / "board.toml").write_text(board)
-    write_cameras_txt(scratch / "cameras.txt", camera, "OPENCV", covariance)
-    rows = [",".join(["image", *(f"base_from_flange_{column}" for column in POSE)])]
-    for file in sorted((folder / "poses").glob("*.yaml")):
-        pose = yaml.safe_load(file.read_text())
-        wxyz, metres = ([[pose[key] for key in keys]] for keys in (("qw", "qx", "qy", "qz"), "xyz"))
-        flange = Poses.from_quaternions(np.array(wxyz), 1000 * np.array(metres))[0]
-        rows.append(",".join([f"{file.stem}.png", *pose_cells(flange)]))
-    (scratch / "poses.csv").write_text("\n".join(rows) + "\n")
-    files = {"--poses": "poses.csv", "--camera": "cameras.txt", "--board": "board.toml"}
-    given = [word for option, name in files.items() for word in (option, str(scratch / name))]
+    files = {"--poses": folder / "poses", "--camera": camera, "--board": scratch / "board.toml"}
+    given = [str(word) for pair in files.items() for word in pair]
     out = scratch / "all.json"
     printed = io.StringIO()
     with contextlib.redirect_stdout(printed):

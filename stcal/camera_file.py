@@ -228,6 +228,8 @@ def _from_opencv(values: dict, path: Path) -> CameraModel:
     names |= {"distCoeffs": "distortion_coefficients", "dist_coeffs": "distortion_coefficients"}
     values = {names.get(key, key): value for key, value in values.items()}
     if "camera_matrix" not in values:
+        if isinstance(values.get("intrinsics"), dict):
+            return _from_industrial(values["intrinsics"], path)
         raise InputError(f"camera file {path}: no camera_matrix; write it with cv2.FileStorage or as ROS camera_info")
     matrix = np.asarray(values["camera_matrix"], float)
     if matrix.size != 9:
@@ -255,6 +257,15 @@ def _from_opencv(values: dict, path: Path) -> CameraModel:
     size = [float(values.get(f"image_{side}") or 0) or None for side in ("width", "height")]
     flat = np.concatenate([[matrix[0, 0], matrix[1, 1], matrix[0, 2], matrix[1, 2]], distortion])
     return _model(flat, kind, *size, path)
+
+
+def _from_industrial(values: dict, path: Path) -> CameraModel:
+    """ROS-Industrial's: the form has no place for the distortion, which may be there all the same."""
+    missing = [key for key in PARAMETER_NAMES[:4] if key not in values]
+    if missing:
+        raise InputError(f"camera file {path}: intrinsics without {', '.join(missing)}; fx, fy, cx, cy needed")
+    flat = np.concatenate([np.array([values[key] for key in PARAMETER_NAMES[:4]], float), np.zeros(8)])
+    return _model(flat, "OPENCV", None, None, path)
 
 
 class _OpencvLoader(yaml.SafeLoader):

@@ -313,7 +313,7 @@ def test_what_images_need_is_said(command, chessboard, tmp_path):
 @pytest.mark.parametrize(
     ("rows", "part"),
     [
-        (["0.png", "0.png"], "lines 2 and 3: both are of image '0.png'"),
+        (["0.png", "0.png"], "line 2 and line 3: both are of image '0.png'"),
         (["a.png", "b.png"], "no row is of an image in"),
         (["0.png", "1.png"], "2 poses, 3 needed"),
     ],
