@@ -16,11 +16,10 @@ from pathlib import Path
 
 import cv2
 import numpy as np
-import yaml
 
 from stcal.boards.design import CharucoDesign
 from stcal.boards.tags import Tags, find_tags
-from stcal.camera_file import CameraModel
+from stcal.camera_file import CameraModel, read_camera
 from stcal.cli.locate import calibration_images
 from stcal.geometry.rigid import Poses
 from stcal.images import decode, find_images
@@ -50,9 +49,7 @@ def charuco_plan() -> LayoutPlan:
 
 def charuco_camera(folder: Path) -> CameraModel:
     """Intrinsics of the set, which states no distortion."""
-    k = yaml.safe_load((folder / "cal_data.yaml").read_text(encoding="utf-8"))["intrinsics"]
-    own = np.array([k["fx"], k["fy"]]), np.array([k["cx"], k["cy"]]), np.zeros(8)
-    return CameraModel(*own, "PINHOLE", None, None, "cal_data.yaml")
+    return read_camera(folder / "cal_data.yaml")
 
 
 def charuco_images(folder: Path) -> CalibrationImages:

@@ -178,6 +178,11 @@ class Poses:
     def __iter__(self) -> Iterator[Rigid]:
         return (self[i] for i in range(len(self)))
 
+    def moved(self, step: np.ndarray) -> "Poses":
+        """After left perturbations (m, 6), rad and mm: exp(w) R, t + dt."""
+        turn = Rotation.from_rotvec(step[:, :3]).as_matrix()
+        return Poses(turn @ self.rotation, self.translation + step[:, 3:])
+
     def inverse(self) -> "Poses":
         """b_from_a."""
         back = np.swapaxes(self.rotation, 1, 2)

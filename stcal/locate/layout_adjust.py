@@ -10,7 +10,7 @@ from scipy.stats import chi2 as chi_square
 
 from stcal.errors import ConvergenceError
 from stcal.geometry.rigid import Poses, Rigid
-from stcal.locate.problem import PlanarProblem, moved, project
+from stcal.locate.problem import PlanarProblem, project
 
 MAX_STEPS = 60
 SETTLED = 1e-4
@@ -159,7 +159,7 @@ def _settled(images, poses: Poses, corners: np.ndarray, noise: _Noise) -> tuple[
                 for own, g, cross, where in (_normal(image, block) for image, block in zip(images, blocks, strict=True))
             ]
         )
-        poses, corners = moved(poses, steps), corners + by_corner.reshape(-1, 2)
+        poses, corners = poses.moved(steps), corners + by_corner.reshape(-1, 2)
         if max(np.abs(by_corner).max(), np.abs(steps * [1e3, 1e3, 1e3, 1, 1, 1]).max()) < SETTLED:
             return poses, corners
     raise ConvergenceError(

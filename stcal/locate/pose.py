@@ -16,11 +16,11 @@ from stcal.errors import ConvergenceError, DegenerateError
 from stcal.geometry.arrays import frozen
 from stcal.geometry.camera import Camera
 from stcal.geometry.ippe import poses_of_plane
+from stcal.geometry.pose_descent import Minima
 from stcal.geometry.rigid import Poses, Rigid
 from stcal.locate.layout import TargetLayout
 from stcal.locate.problem import (
     HUBER,
-    Minima,
     PlanarProblem,
     Weighed,
     descend,

@@ -3,20 +3,18 @@
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.spatial.transform import Rotation
 
+from stcal.geometry import pose_descent
+from stcal.geometry.pose_descent import Minima, Normal, block_diagonal
 from stcal.geometry.rigid import Poses, Rigid, skew
 
 HUBER = 3.0
 """In σ of a corner: one honest corner in ninety is beyond."""
-MAX_STEPS = 60
 SETTLED = 1e-5
 """A step that lowers χ² by less moves the pose by less than a hundredth of its σ."""
 WEIGH_STEPS, WEIGHED = 10, 1e-6
 """A step of under a thousandth of σ is the last. What many corners share, the intrinsics say, can move a pose by many
 σ of its single corners."""
-ACCEPTED = 1e-2
-"""What is still settled after all steps: a tenth of σ. In a flat valley steps are many, and short."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -60,23 +58,6 @@ class Views:
     before: np.ndarray
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class Minima:
-    """h poses at their minima: ``cost`` (h,), ``normal`` (h, 6, 6), ``length`` (h, n) residuals in σ, ``settled``."""
-
-    poses: Poses
-    cost: np.ndarray
-    normal: np.ndarray
-    length: np.ndarray
-    settled: np.ndarray
-
-
-def moved(poses: Poses, step: np.ndarray) -> Poses:
-    """After left perturbations (h, 6)."""
-    turn = Rotation.from_rotvec(step[:, :3]).as_matrix()
-    return Poses(turn @ poses.rotation, poses.translation + step[:, 3:])
-
-
 def project(problem: PlanarProblem, poses: Poses) -> Views:
     """Residuals of h poses, and their derivatives."""
     turned = np.einsum("hij,nj->hni", poses.rotation[:, :, :2], problem.xy)
@@ -92,14 +73,6 @@ def project(problem: PlanarProblem, poses: Poses) -> Views:
     return Views(poses, problem.seen - uv, by_pose, by_point @ poses.rotation[:, None, :, :2], before)
 
 
-def block_diagonal(blocks: np.ndarray) -> np.ndarray:
-    """(an, bn) of (n, a, b)."""
-    n, a, b = blocks.shape
-    full = np.zeros((n, a, n, b))
-    full[np.arange(n), :, np.arange(n)] = blocks
-    return full.reshape(n * a, n * b)
-
-
 def own_whitening(problem: PlanarProblem, pose: Poses) -> np.ndarray:
     """(n, 2, 2) that make each corner's residual one of σ 1, the others apart; near ``pose``, one of them."""
     by_corner = project(problem, pose).by_corner[0]
@@ -110,45 +83,13 @@ def own_whitening(problem: PlanarProblem, pose: Poses) -> np.ndarray:
 
 
 def descend(problem: PlanarProblem, poses: Poses, whiten: np.ndarray, huber: float = HUBER) -> Minima:
-    """Levenberg–Marquardt from h poses at once, Huber's loss on the lengths of the whitened residuals."""
-    h = len(poses)
-    cost, normal, right, length = _evaluate(problem, poses, whiten, huber)
-    damping, settled = np.full(h, 1e-6), np.zeros(h, bool)
-    for _ in range(MAX_STEPS):
-        # Metres and radians: damped by the diagonal (Marquardt), not by its mean.
-        scale = np.einsum("hii->hi", normal)
-        step = np.linalg.solve(normal + (damping[:, None] * scale)[:, :, None] * np.eye(6), right[..., None])[..., 0]
-        gain = (step * right).sum(1)
-        settled |= gain < SETTLED * np.maximum(cost, 1)
-        if settled.all():
-            break
-        step[settled] = 0
-        trial = moved(poses, step)
-        new = _evaluate(problem, trial, whiten, huber)
-        better = (new[0] <= cost) & ~settled
-        take = better[:, None, None]
-        poses = Poses(
-            np.where(take, trial.rotation, poses.rotation),
-            np.where(better[:, None], trial.translation, poses.translation),
-        )
-        cost, length = np.where(better, new[0], cost), np.where(better[:, None], new[3], length)
-        normal, right = np.where(take, new[1], normal), np.where(better[:, None], new[2], right)
-        damping = np.where(better, damping / 10, np.minimum(np.maximum(10 * damping, 1e-3), 1e8))
-    return Minima(poses, cost, normal, length, settled | (gain < ACCEPTED))
+    """The minima next to h poses, Huber's loss on the residuals whitened by (n, 2, 2)."""
 
+    def evaluate(poses: Poses) -> Normal:
+        view = project(problem, poses)
+        return Normal.of((whiten @ view.residual[..., None])[..., 0], whiten @ view.by_pose, view.before, huber)
 
-def _evaluate(problem: PlanarProblem, poses: Poses, whiten: np.ndarray, huber: float):
-    """Cost (h,), normal matrix (h, 6, 6), right-hand side (h, 6) and lengths (h, n) of the whitened residuals."""
-    view = project(problem, poses)
-    r = (whiten @ view.residual[..., None])[..., 0]
-    a = whiten @ view.by_pose
-    length = np.linalg.norm(r, axis=2)
-    short = np.minimum(length, huber)
-    cost = np.where(view.before, (short * (2 * length - short)).sum(1), np.inf)
-    weight = short / np.maximum(length, 1e-12)
-    flat = a.reshape(len(r), -1, 6)
-    back = np.swapaxes((weight[..., None, None] * a).reshape(flat.shape), 1, 2)
-    return cost, back @ flat, (back @ r.reshape(len(r), -1, 1))[..., 0], length
+    return pose_descent.descend(evaluate, poses, SETTLED)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -176,7 +117,7 @@ def weigh(problem: PlanarProblem, pose: Poses, weights: np.ndarray) -> Weighed:
         solved = np.linalg.solve(full, np.column_stack([a, r]))
         normal = a.T @ solved[:, :6]
         step = np.linalg.solve(normal, a.T @ solved[:, 6])
-        pose = moved(pose, step[None])
+        pose = pose.moved(step[None])
         if step @ normal @ step < WEIGHED:
             break
     left = r - a @ step

@@ -4,17 +4,11 @@ import numpy as np
 
 from stcal.errors import ConvergenceError, DegenerateError
 from stcal.geometry.plane import camera_from_plane, fit_homography
+from stcal.geometry.pose_descent import Minima, PoseStack
 from stcal.geometry.rigid import Rigid
 from stcal.sfm.model import Outlier
 from stcal.sfm.observations import face_of
-from stcal.sfm.pose_problem import (
-    Minima,
-    PoseProblem,
-    PoseStack,
-    descend,
-    step_between,
-    whitening_by_centre,
-)
+from stcal.sfm.pose_problem import PoseProblem, descend, step_between, whitening_by_centre
 from stcal.sfm.target_circles import TargetCircles
 
 HUBER = 3.0

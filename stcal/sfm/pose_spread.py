@@ -5,9 +5,10 @@ Such a face says little on how it is tilted to first order, and more to second o
 
 import numpy as np
 
+from stcal.geometry.pose_descent import PoseStack
 from stcal.geometry.rigid import Rigid
 from stcal.sfm.pose_minima import mirrored
-from stcal.sfm.pose_problem import PoseProblem, PoseStack, step_between
+from stcal.sfm.pose_problem import PoseProblem, step_between
 
 CURVED = 0.2
 """χ² two σ away that differs from its parabola by more than this share: the covariance is then taken from samples."""

@@ -7,12 +7,12 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 from scipy.stats import chi2
 
+from stcal.geometry.pose_descent import PoseStack
 from stcal.geometry.rigid import Rigid
 from stcal.sfm.chain import CalibratedTarget
 from stcal.sfm.joint import covariance_of
 from stcal.sfm.observations import ImageObservations, is_board
 from stcal.sfm.pose_minima import mirrored
-from stcal.sfm.pose_problem import PoseStack
 from stcal.sfm.simulated import observe, true_models
 from stcal.sfm.single_pose import TargetPose
 from stcal.sfm.target_circles import TargetCircles

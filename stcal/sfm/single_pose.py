@@ -16,20 +16,13 @@ from stcal.camera_file import CameraPrior, intrinsic_basis
 from stcal.errors import DegenerateError, InputError
 from stcal.geometry.arrays import frozen
 from stcal.geometry.camera import Camera
+from stcal.geometry.pose_descent import Minima, PoseStack, block_diagonal
 from stcal.geometry.rigid import Rigid
 from stcal.sfm.circle_projection import CircleImages
 from stcal.sfm.model import Outlier
 from stcal.sfm.observations import face_of, is_board
 from stcal.sfm.pose_minima import HUBER, MIN_CIRCLES, distinct, minima_without_outliers, start_pose
-from stcal.sfm.pose_problem import (
-    HOPELESS,
-    Minima,
-    PoseProblem,
-    PoseStack,
-    block_diagonal,
-    covariance_of_centres,
-    rigid_of,
-)
+from stcal.sfm.pose_problem import HOPELESS, PoseProblem, covariance_of_centres, rigid_of
 from stcal.sfm.pose_spread import spread
 from stcal.sfm.target_circles import TargetCircles
 

@@ -6,11 +6,10 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
-import yaml
 
 from stcal.boards.design import CharucoDesign
 from stcal.boards.tags import find_tags
-from stcal.camera_file import CameraModel
+from stcal.camera_file import CameraModel, read_camera
 from stcal.cli.locate import calibration_images
 from stcal.images import decode
 from stcal.locate.exposures import find_scenes
@@ -37,10 +36,7 @@ def folder(shared_data) -> Path:
 
 @pytest.fixture(scope="module")
 def images(folder) -> CalibrationImages:
-    k = yaml.safe_load((folder / "cal_data.yaml").read_text())["intrinsics"]
-    camera = CameraModel(
-        np.array([k["fx"], k["fy"]]), np.array([k["cx"], k["cy"]]), np.zeros(8), "PINHOLE", None, None, "cal_data.yaml"
-    )
+    camera = read_camera(folder / "cal_data.yaml")
     return calibration_images(folder / "images", camera, BOARD, (BOARD.dictionary,), 1, lambda *_: None)
 
 
