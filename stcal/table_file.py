@@ -14,6 +14,8 @@ from stcal.geometry.rigid import UNIT_WITHIN, Poses, Rigid
 
 LENGTHS = {"mm": 1.0, "m": 1000.0, "um": 1e-3, "cm": 10.0, "in": 25.4}
 ANGLES = {"rad": 1.0, "deg": np.pi / 180}
+FARTHEST = 1e12
+"""In any unit: farther than all that is measured, and its square is still a number."""
 QUATERNION = ("qw", "qx", "qy", "qz")
 TWIST = ("rx", "ry", "rz", "x", "y", "z")
 COVARIANCE = tuple(f"cov_{a}_{b}" for i, a in enumerate(TWIST) for b in TWIST[i:])
@@ -63,7 +65,14 @@ class Table:
 
     def quantity(self, name: str, units: dict[str, float]) -> np.ndarray:
         """(m,) of the column ``name_unit``, in mm or rad."""
-        return self.numbers(f"{name}_{self.unit(name, units)}") * units[self.unit(name, units)]
+        column = f"{name}_{self.unit(name, units)}"
+        values = self.numbers(column)
+        far = np.flatnonzero(np.abs(values) > FARTHEST)
+        if len(far):
+            raise InputError(
+                f"{self.where}: line {self.lines[far[0]]}: {column} is {values[far[0]]:g}, up to {FARTHEST:g} possible"
+            )
+        return values * units[self.unit(name, units)]
 
     def unit(self, name: str, units: dict[str, float]) -> str:
         """In which of the units ``name`` is given."""
@@ -205,9 +214,13 @@ def read_table(path: str | Path, what: str) -> Table:
             return Table(where, {name: fast[:, k] for k, name in enumerate(names)}, numbers)
     except ValueError:
         pass  # text among the numbers: row by row
-    cells = list(csv.reader(rows))
+    try:
+        cells = list(csv.reader(rows))
+    except csv.Error:  # a cell without end, longer than any may be
+        cells = []
     if len(cells) != len(rows):
-        raise InputError(f"{where}: a quoted cell goes over several lines; one row on one line needed")
+        open_one = next((i for i, line in used[1:] if line.count('"') % 2), numbers[0])
+        raise InputError(f"{where}: line {open_one}: a quoted cell goes over several lines; one row on one line needed")
     for line, row in zip(numbers, cells, strict=True):
         if len(row) != len(names):
             raise InputError(f"{where}: line {line}: {len(row)} cells, {len(names)} needed as in the header")

@@ -9,8 +9,8 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from stcal.cli.progress import StageProgress
-from stcal.cli.saving import save, save_json
-from stcal.errors import DegenerateError, InputError
+from stcal.cli.saving import keep_apart, save, save_json
+from stcal.errors import DegenerateError, InputError, StcalError
 
 if TYPE_CHECKING:
     from stcal.camera_file import CameraPrior
@@ -18,6 +18,8 @@ if TYPE_CHECKING:
     from stcal.handeye.result_file import Outcome
 
 ALL = "all"
+SCALED = ("pose", "reprojection")
+"""Methods that can find the board's size."""
 
 
 class SetupName(StrEnum):
@@ -107,6 +109,8 @@ def handeye(
 
     robot, seen = (_radians(sigma_robot_deg), sigma_robot_mm), (_radians(sigma_camera_deg), sigma_camera_mm)
     noise = Noise(*robot, *seen, sigma_px, sigma_board_mm)
+    outputs = {"--out": out, "--ros": ros, "--urdf": urdf, "--opencv": opencv, "--camera-out": camera_out}
+    keep_apart(outputs | {"--json": json_file, "--report": report}, (source, poses, camera, board))
     if camera_out and not refine_camera:
         raise InputError("--camera-out: only with --refine-camera; the camera is as given else")
     if refine_camera and source.is_file():
@@ -115,11 +119,28 @@ def handeye(
         raise InputError(f"--camera-out: {method} does not adjust the camera; leave --method out")
     if method not in (None, ALL, *METHODS):
         raise InputError(f"--method {method}: unknown; {ALL} or one of {', '.join(METHODS)} needed")
+    if (parent or child) and not (ros or urdf):
+        raise InputError("--parent, --child: only with --ros or --urdf, whose frames they name")
+    if source.is_file() and (sigma_px is not None or sigma_board_mm is not None):
+        raise InputError(
+            "--sigma-px, --sigma-board-mm: only with images; give --sigma-camera-mm and --sigma-camera-deg"
+        )
+    if source.is_dir() and sigma_camera_mm is not None:
+        raise InputError("--sigma-camera-mm, --sigma-camera-deg: only with poses; with images give --sigma-px")
     given = _given(source, poses, camera, board, workers)
     prior = given.prior if refine_camera else None
     options = HandEyeOptions(noise, prior, with_scale, given.symmetries, four_dof)
-    outcome = _solved(given, setup.value, method, options, _Splits(splits, held_out, seed))
+    try:
+        outcome = _solved(given, setup.value, method, options, _Splits(splits, held_out, seed))
+    except StcalError as error:
+        if not given.left_out:
+            raise
+        name, reason = given.left_out[0]
+        raise type(error)(f"{error}; {len(given.left_out)} left out before, first {name}: {reason}") from error
     print(outcome_text(outcome))
+    for option, given_, able in (("--with-scale", with_scale, SCALED), ("--refine-camera", refine_camera, SCALED[1:])):
+        if given_ and outcome.result.method not in able:
+            print(f"note: {option} does nothing for {outcome.result.method}, only for {' and '.join(able)}")
     for name, reason in outcome.left_out:
         print(f"left out {name}: {reason}")
     for note in outcome.all_notes():
@@ -226,13 +247,13 @@ def _solved(given: _Given, setup: str, method: str | None, options: "HandEyeOpti
     pairs, views = given.pairs, given.views
     chosen = None if method == ALL else method
     result = solve(pairs, setup, chosen, views, options)
-    compared, held_out, notes = (), None, ()
+    compared, held_out, notes, rows = (), None, (), ()
+    if validation.repeats and (validation.held_out or len(pairs) > LEAST_LEFT):
+        rows = splits(len(pairs), validation.held_out, validation.repeats, validation.seed)
     if method == ALL:
-        rows = splits(len(pairs), validation.held_out, max(validation.repeats, 1), validation.seed)
         compared = compare(pairs, setup, views, options, rows=rows)
         held_out = next(each.held_out for each in compared if each.method == result.method)
-    elif validation.repeats and (validation.held_out or len(pairs) > LEAST_LEFT):
-        rows = splits(len(pairs), validation.held_out, validation.repeats, validation.seed)
+    elif len(rows):
         try:
             held_out = cross_validate(pairs, setup, chosen, views, options, rows)
         except DegenerateError as error:

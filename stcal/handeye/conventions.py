@@ -16,6 +16,9 @@ from stcal.handeye.start import mean_pose
 
 FAR_BETTER, BETTER = 30.0, 3.0
 """By so many times the product of the typical residuals in rotation and translation must shrink, and the latter."""
+DOUBTFUL = 1.5
+"""The same for a note that the other setup fits better."""
+INVERTED = "with one side inverted"
 WELL = np.radians(0.5), 5.0
 """Poses whose median residuals (rad, mm) are below are not suspected."""
 LOST = 0.25
@@ -42,7 +45,7 @@ def check_conventions(pairs: HandEyePoses, setup: Setup, guess: Guess, with_scal
         What is mixed up, and the remedy.
     """
     loop = Loop.of(pairs, setup)
-    given = _typical(loop, guess, with_scale)
+    given, notes = _typical(loop, guess, with_scale), ()
     if given[0] > WELL[0] or given[1] > WELL[1]:
         by = f"{np.degrees(given[0]):.3g}° and {given[1]:.3g} mm (median)"
         contradict = f"{pairs.where}: the poses contradict each other by {by}"
@@ -54,6 +57,12 @@ def check_conventions(pairs: HandEyePoses, setup: Setup, guess: Guess, with_scal
         if gain[what] > FAR_BETTER and given[1] > BETTER * found[what][1]:
             turn, shift = found[what]
             raise InputError(f"{contradict}, but by {np.degrees(turn):.2g}° and {shift:.2g} mm {what}")
+        other = next(what for what in found if what.startswith(INVERTED))
+        if gain[other] > DOUBTFUL and given[1] > found[other][1]:
+            turn, shift = found[other]
+            notes = (
+                f"the poses contradict each other by {by}, but by {np.degrees(turn):.2g}° and {shift:.2g} mm {other}",
+            )
         turn, shift = np.divide(_typical(loop, guess, True), _differ(loop))
         if max(turn, shift) > LOST:
             raise InputError(
@@ -62,10 +71,13 @@ def check_conventions(pairs: HandEyePoses, setup: Setup, guess: Guess, with_scal
             )
     behind = loop.camera_from_board.translation[:, 2] <= 0
     if behind.all():
-        return ("the board lies behind the camera in all poses: if these are board_from_camera, name the columns so",)
+        return (
+            *notes,
+            "the board lies behind the camera in all poses: if these are board_from_camera, name the columns so",
+        )
     if behind.any():
-        return (f"{pairs.names[int(behind.argmax())]}: the board lies behind the camera; check its pose",)
-    return ()
+        return (*notes, f"{pairs.names[int(behind.argmax())]}: the board lies behind the camera; check its pose")
+    return notes
 
 
 def _variants(loop: Loop, setup: Setup) -> dict[str, Loop]:
@@ -75,7 +87,7 @@ def _variants(loop: Loop, setup: Setup) -> dict[str, Loop]:
     # A turn of the mirror is a turn of X and Z, and a mirrored robot is to the camera what a mirrored camera is to it.
     mirrored = Poses(MIRROR @ eye.rotation @ MIRROR, eye.translation @ MIRROR)
     found = {
-        "with one side inverted: if these are board_from_camera or flange_from_base, name the columns so; "
+        f"{INVERTED}: if these are board_from_camera or flange_from_base, name the columns so; "
         f"if all are named rightly, the setup is {other}": replace(loop, camera_from_board=eye.inverse()),
         "with the board's lengths times 1000: if they are metres, name the columns _m": replace(
             loop, camera_from_board=Poses(eye.rotation, 1000 * eye.translation)

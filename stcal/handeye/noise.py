@@ -16,6 +16,10 @@ CAUTION = 2.0
 """Redundancies that are not counted: a variance of ν of them is the sum of squares over ν − 2, so that errors in units
 of its root have mean square 1 (the mean of F is ν / (ν − 2)). It also keeps a component of few poses off 0, as the
 penalty of Chung, Rabe-Hesketh, Dorie, Gelman & Liu (2013) does."""
+MOST_RAD, MOST_MM = np.radians(10), 100.0
+"""σ of poses beyond which they tell nothing."""
+FARTHEST = 7.0
+"""An estimate is looked for within a factor of a thousand of the first guess, in its logarithm."""
 UNKNOWNS = 12
 """Of X and Z."""
 LEAST_SHARE = 1e-3
@@ -52,14 +56,19 @@ class Noise:
             pair = getattr(self, f"{side}_rad"), getattr(self, f"{side}_mm")
             if (pair[0] is None) != (pair[1] is None):
                 raise InputError(f"noise: one of σ_rot and σ_trans of the {side} is given; both or none needed")
-            if pair[0] is not None and not (np.isfinite(pair).all() and min(pair) >= 0):
-                raise InputError(f"noise: σ of the {side} is {pair[0]:g} rad, {pair[1]:g} mm; not negative needed")
+            if pair[0] is not None and not (0 <= pair[0] <= MOST_RAD and 0 <= pair[1] <= MOST_MM):
+                raise InputError(
+                    f"noise: σ of the {side} is {np.degrees(pair[0]):g}° and {pair[1]:g} mm; 0 to "
+                    f"{np.degrees(MOST_RAD):g}° and {MOST_MM:g} mm possible"
+                )
         for name, least in (("corner_px", 1e-9), ("board_mm", 0.0)):
             value = getattr(self, name)
-            if value is not None and not (np.isfinite(value) and value >= least):
-                raise InputError(f"noise: {name} is {value:g}, {'more than 0' if least else 'not negative'} needed")
-        if self.robot_rad is not None and not self.robot_rad + (self.camera_rad if self.camera_rad is not None else 1):
-            raise InputError("noise: σ_rot of robot and camera are both 0; one of them must err")
+            if value is not None and not (least <= value <= MOST_MM):
+                more = "more than 0, up to" if least else "0 to"
+                raise InputError(f"noise: {name} is {value:g}, {more} {MOST_MM:g} needed")
+        for unit, word in (("rad", "σ_rot"), ("mm", "σ_trans")):
+            if getattr(self, f"robot_{unit}") == getattr(self, f"camera_{unit}") == 0:
+                raise InputError(f"noise: {word} of robot and camera are both 0; one of them must err")
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -169,8 +178,9 @@ def variance_components(parts: Components, residuals: np.ndarray, slope: np.ndar
         by = by - np.einsum("ma,kmab,mb->k", fitted, parts.free, fitted, optimize=True)
         return float(value - CAUTION * logs.sum()), by * theta - CAUTION
 
-    bounds = [(low, None) for low in np.log(np.maximum(parts.least(), LEAST_SHARE * first))]
-    found = minimize(cost, np.log(first), jac=True, method="L-BFGS-B", bounds=bounds, options={"ftol": 1e-12})
+    low, start = np.log(np.maximum(parts.least(), LEAST_SHARE * first)), np.log(first)
+    bounds = list(zip(low, np.maximum(start, low) + 2 * FARTHEST, strict=True))
+    found = minimize(cost, start, jac=True, method="L-BFGS-B", bounds=bounds, options={"ftol": 1e-12})
     return np.exp(found.x)
 
 

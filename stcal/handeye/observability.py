@@ -9,6 +9,14 @@ from stcal.errors import DegenerateError
 from stcal.geometry.arrays import frozen
 from stcal.handeye.loop import FRAMES, Loop, Setup
 
+UNITS = {"m": 1000.0, "in": 25.4, "cm": 10.0}
+SAME_UNIT = 0.05
+"""Logarithm by which a size may be off the ratio of two units."""
+LARGEST_SCALE = 5.0
+"""Nobody misses a board's size by more, but by a unit."""
+SCALE_SEEN = 36.0
+"""Times the number of poses: the information on a scale that counts. Errors of the camera's translations alone look
+like three to a pose, and by that share, a twelfth, a scale would be too small at this limit."""
 COMMON_RAD, COMMON_MM = 1e-3, 0.5
 """Errors of a common camera's poses at half a metre, with which is judged whether poses are of any use."""
 USELESS_RAD, USELESS_MM = np.radians(5), 50.0
@@ -18,6 +26,8 @@ WANTED_DEG = 30
 LEAST_TURN = np.radians(5)
 """Of a robot of four axes, RMS."""
 LEAST_POSES = 3
+MOST_PAIRS = 100_000
+"""Of poses, by which the principal axes are judged; of more poses than 450 some pairs, drawn at random."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -114,13 +124,56 @@ def check(loop: Loop, setup: Setup, where: str, four_dof: bool) -> Observability
     return found
 
 
+def scale_is_seen(scale: float, sigma: float, poses: int) -> bool:
+    """Whether a scale, solved for with this σ, is more than what noise makes of it."""
+    return scale > 0 and (scale / sigma) ** 2 > SCALE_SEEN * poses
+
+
+def require_scale(scale: float, sigma: float, loop: Loop, where: str) -> None:
+    """Refuse one that is not seen.
+
+    Raises
+    ------
+    DegenerateError
+        How far the flange moves, and that it should move farther.
+    """
+    if scale_is_seen(scale, sigma, len(loop)):
+        if not 1 / LARGEST_SCALE < scale < LARGEST_SCALE:
+            raise DegenerateError(
+                f"{where}: the board would be {scale:.4g} times as large as stated{unit_of(scale)}; correct the unit "
+                "of its size, or of the poses"
+            )
+        return
+    place = (loop.stand_from_mount.inverse() if loop.inverted else loop.stand_from_mount).translation
+    moved = float(np.sqrt(((place - place.mean(0)) ** 2).sum(1).mean()))
+    raise DegenerateError(
+        f"{where}: the board's size is {scale:.2g} ± {sigma:.2g} times as stated by the motions of the flange, which "
+        f"moves by {moved:.3g} mm (RMS): too little to tell; move it by a tenth of the board's distance or more, or "
+        "solve without the scale"
+    )
+
+
+def unit_of(scale: float) -> str:
+    """What a scale looks like that is the ratio of two units."""
+    for unit, factor in UNITS.items():
+        if abs(np.log(scale / factor)) < SAME_UNIT:
+            return f", as if its lengths were in {unit}"
+        if abs(np.log(scale * factor)) < SAME_UNIT:
+            return f", as if the robot's were in {unit}"
+    return ""
+
+
 def _principal(rotations: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """RMS angles (3,) about principal axes (3, 3), in rows, of R_j R_iᵀ between all pairs of rotations (m, 3, 3)."""
     i, j = np.triu_indices(len(rotations), 1)
+    if len(i) > MOST_PAIRS:
+        some = np.random.default_rng(0).choice(len(i), MOST_PAIRS, replace=False)
+        i, j = i[some], j[some]
     logs = Rotation.from_matrix(rotations[j] @ np.swapaxes(rotations[i], 1, 2)).as_rotvec()
-    _, s, vt = np.linalg.svd(logs / np.sqrt(len(logs)), full_matrices=True)
-    largest = np.abs(vt).argmax(1)
-    return np.pad(s, (0, 3 - len(s))), vt * np.sign(vt[np.arange(3), largest])[:, None]
+    square, axes = np.linalg.eigh(logs.T @ logs / len(logs))
+    turns, axes = np.sqrt(np.maximum(square[::-1], 0)), axes.T[::-1]
+    largest = np.abs(axes).argmax(1)
+    return turns, axes * np.sign(axes[np.arange(3), largest])[:, None]
 
 
 def _worst(loop: Loop) -> tuple[float, float]:

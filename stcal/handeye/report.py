@@ -15,7 +15,7 @@ from stcal.handeye.solve import FACTORS
 from stcal.handeye.validate import Compared
 from stcal.page import COLOURS, FAINT, INK, NONE, SMALL, calm, fold, new_figure, number, page, plot, swatch, table, uri
 
-HEADS = ("", "mm", "± σ", "rotation °", "± σ")
+HEADS = ("", "mm", "± σ", "rotation vector °", "± σ")
 ERRORS = {
     "rotation_rad": ("rotation °", np.degrees(1.0), 4),
     "translation_mm": ("board's origin mm", 1.0, 3),
@@ -45,7 +45,8 @@ def outcome_text(outcome: Outcome) -> str:
     turn, shift = result.rms()
     lines += ["", f"residuals (RMS): {np.degrees(turn):.4f}°, {shift:.3f} mm at the board's origin"]
     if outcome.held_out is not None:
-        lines.append(f"held out ({_splits_text(outcome)}): {_means_text(outcome)}")
+        lines.append(f"held out ({_splits_text(outcome)}): {_means_text(outcome.held_out.means())}")
+        lines += [f"held out, {text}" for text in _agreeing_text(outcome)]
     lines += [f"σ of {text}: {value} ({how})" for text, value, how in _sigma_rows(outcome)]
     if result.sigma_scale is not None:
         lines.append(scale_text(outcome))
@@ -93,9 +94,17 @@ def _splits_text(outcome: Outcome) -> str:
     return f"{known[0][0]} × {known[0][1]} of {len(outcome.result.names)} poses" if known else "no poses"
 
 
-def _means_text(outcome: Outcome) -> str:
+def _agreeing_text(outcome: Outcome) -> list[str]:
+    """Errors of the poses alone that agree with one another, where some do not."""
+    bad = outcome.result.outliers
+    if not bad.any() or outcome.held_out is None:
+        return []
+    return [f"without the {bad.sum()} left out above: {_means_text(outcome.held_out.means(~bad))}"]
+
+
+def _means_text(means: dict[str, float]) -> str:
     parts = []
-    for name, mean in outcome.held_out.means().items():
+    for name, mean in means.items():
         head, unit, digits = ERRORS[name]
         what, _, ending = head.rpartition(" ")
         parts.append(f"{what} {number(mean * unit, digits)}{ending if ending == '°' else f' {ending}'}")
@@ -187,7 +196,8 @@ def _tiles(outcome: Outcome) -> str:
         found = "" if outcome.pitch_mm is None else f": pitch {outcome.pitch_mm * result.scale:.3f} mm"
         tiles.append((f"{result.scale:.4f}", f"times its stated size is the board, ± {result.sigma_scale:.4f}{found}"))
     shown = "".join(f"<div><b>{value}</b><span>{escape(text)}</span></div>" for value, text in tiles)
-    return f'<div class="tiles">{shown}</div>\n'
+    more = "".join(f"<p>Held out, {escape(text)}.</p>\n" for text in _agreeing_text(outcome))
+    return f'<div class="tiles">{shown}</div>\n{more}'
 
 
 def _transform_tables(result: HandEye) -> str:
@@ -200,7 +210,10 @@ def _transform_tables(result: HandEye) -> str:
             + fold("4×4 matrix, mm", f'<div class="scroll"><pre>{matrix}</pre></div>')
             + "</div>"
         )
-    text = "<p>σ are of turns about the axes, and of shifts along the axes, of the frame named first.</p>\n"
+    text = (
+        "<p>The rotation vector is axis times angle, no roll, pitch and yaw. σ are of turns about the axes, and of "
+        "shifts along the axes, of the frame named first.</p>\n"
+    )
     return '<div class="columns">' + "\n".join(parts) + "</div>\n" + text
 
 

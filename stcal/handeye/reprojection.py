@@ -11,7 +11,7 @@ from stcal.errors import DegenerateError
 from stcal.geometry.arrays import frozen
 from stcal.geometry.camera import Camera
 from stcal.geometry.rigid import Poses, Rigid
-from stcal.handeye.bundle import Bundle, Corners, adjust
+from stcal.handeye.bundle import LEAST, Bundle, Corners, adjust
 from stcal.handeye.leastsq import generalised_inverse
 from stcal.handeye.loop import Loop
 from stcal.handeye.noise import Noise
@@ -185,6 +185,8 @@ def problem(
         if value is None:
             free.append(name)
         sigma[name] = getattr(FIRST, name) if value is None else value
+    if sigma["robot_rad"] or sigma["robot_mm"]:  # exact in one of the two only: nearly
+        sigma |= {name: max(sigma[name], LEAST[name]) for name in ("robot_rad", "robot_mm")}
     robot = None
     if loop.robot_covariance is not None:
         robot = np.linalg.inv(np.linalg.cholesky(loop.robot_covariance))

@@ -89,7 +89,7 @@ def calibration_json(outcome: Outcome) -> dict:
         "poses": _poses(result),
         "outliers": list(outcome.outliers()),
         "left_out": [{"name": name, "reason": reason} for name, reason in outcome.left_out],
-        "held_out": _held_out(outcome.held_out),
+        "held_out": _held_out(outcome.held_out, outcome.result.outliers),
         "observability": _observability(result.observability),
         "notes": list(outcome.all_notes()),
     }
@@ -130,10 +130,11 @@ def _poses(result: HandEye) -> list[dict]:
     return rows
 
 
-def _held_out(found: HeldOut | None) -> dict | None:
+def _held_out(found: HeldOut | None, outliers: np.ndarray) -> dict | None:
     if found is None:
         return None
-    return {"splits": found.rows.shape[0], "poses": found.rows.shape[1], **found.means()}
+    whole = {"splits": found.rows.shape[0], "poses": found.rows.shape[1], **found.means()}
+    return whole | {"agreeing": found.means(~outliers) if outliers.any() else None}
 
 
 def _splits(found: HeldOut | None, names: tuple[str, ...]) -> list[dict]:
@@ -148,7 +149,8 @@ def _splits(found: HeldOut | None, names: tuple[str, ...]) -> list[dict]:
 
 
 def _method(each: Compared, names: tuple[str, ...]) -> dict:
-    row = {"method": each.method, "reason": each.reason or None, "held_out": _held_out(each.held_out)}
+    bad = np.zeros(len(names), bool) if each.result is None else each.result.outliers
+    row = {"method": each.method, "reason": each.reason or None, "held_out": _held_out(each.held_out, bad)}
     if each.result is not None:
         row |= {name: pose.matrix().tolist() for name, pose in each.result.transforms.items()}
     return row | {"splits": _splits(each.held_out, names)}

@@ -39,6 +39,9 @@ class RobotPoses:
             of = [image] if image in names else short.get(image, [])
             if len(of) > 1:
                 raise InputError(f"{self.where}: {self.places[row]}: {image} may be {of[0]} or {of[1]}; give its path")
+            if of and of[0] in found:
+                both = f"{self.places[found[of[0]]]} and {self.places[row]}"
+                raise InputError(f"{self.where}: {both}: both are of image {of[0]!r}; one row needed")
             if of:
                 found[of[0]] = row
             else:

@@ -3,12 +3,11 @@
 from dataclasses import dataclass, field, replace
 
 import numpy as np
-from scipy.stats import chi2
 
 from stcal.camera_file import CameraPrior
 from stcal.errors import DegenerateError, InputError
 from stcal.geometry.rigid import Rigid
-from stcal.handeye import start
+from stcal.handeye import remarks, start
 from stcal.handeye.closed_form import AX_XB, AX_ZB, closed_form
 from stcal.handeye.conventions import check_conventions
 from stcal.handeye.convex import convex
@@ -17,7 +16,7 @@ from stcal.handeye.leastsq import generalised_inverse
 from stcal.handeye.loop import FRAMES, Loop, Setup
 from stcal.handeye.motions import Motions, poses_with_log
 from stcal.handeye.noise import Noise
-from stcal.handeye.observability import Observability, check, in_words
+from stcal.handeye.observability import Observability, check, in_words, require_scale
 from stcal.handeye.pairs import HandEyePoses
 from stcal.handeye.pose_adjustment import State, adjust_poses
 from stcal.handeye.reprojection import adjust_views, resected
@@ -30,8 +29,6 @@ METHODS = (*AX_XB, *AX_ZB, *OTHERS)
 """Names of the methods."""
 UNIT_MM = 1000.0
 """Length that weighs like one radian where no σ are stated: errors of 1 mm go with errors of 1 mrad."""
-SIZE_SIGMAS, SIZE_SHARE = 4.0, 1e-3
-"""A board's size is doubted beyond so many σ, and a share that matters: 0.5 mm at half a metre."""
 FACTORS = {
     "camera_focal": "focal length",
     "camera_centre": "principal point",
@@ -39,6 +36,8 @@ FACTORS = {
     "camera_tangential": "tangential distortion",
     "camera_all": "all",
 }
+LEAST_WITH_SCALE = 4
+"""Three poses leave five redundancies, with which no σ can be told."""
 WIDENED = 2.0
 """Factor of the σ of a camera file, or of the poses by it, from which on the file is doubted."""
 CAMERA_GAIN = 5.0
@@ -148,6 +147,10 @@ def handeye(
 def _task(pairs: HandEyePoses, setup: Setup, views: Views | None, options: HandEyeOptions) -> _Task:
     """Checks that all methods share."""
     seen = check(Loop.of(pairs, setup), setup, pairs.where, options.four_dof)
+    if options.with_scale and len(pairs) < LEAST_WITH_SCALE:
+        raise DegenerateError(
+            f"{pairs.where}: {len(pairs)} poses, {LEAST_WITH_SCALE} needed to find the board's size too; take more"
+        )
     notes: tuple[str, ...] = ()
     if options.symmetries:
         mended = repair(pairs, setup, options.symmetries, views)
@@ -200,13 +203,16 @@ def _by_poses(task: _Task) -> HandEye:
     state, normal = solution.state, solution.normal
     x, z = state.mount_from_camera, state.stand_from_board
     notes, covariance = task.notes, generalised_inverse(normal)
+    sigma_scale = float(np.sqrt(covariance[12, 12])) if options.with_scale else None
+    if sigma_scale is not None:
+        require_scale(state.scale, sigma_scale, task.loop, task.pairs.where)
     if options.four_dof:
         x, z, covariance, notes = _without_slide(task, x, z, normal)
     notes += _remarks(task, solution.outliers, solution.residuals, solution.scale_hint)
     if (factor := solution.sigma.get("camera_factor", 1.0)) > WIDENED:
         notes += (f"the board's poses err {factor:.2g} times what their σ say: check the intrinsics",)
-    if not solution.sigma:
-        notes += _judged(solution.variance_factor, solution.spare)
+    if not solution.sigma or options.noise.robot_rad is not None or options.noise.camera_rad is not None:
+        notes += remarks.of_variance(solution.variance_factor, solution.spare)
     stated = {name: getattr(options.noise, name) for name in ("robot_rad", "robot_mm", "camera_rad", "camera_mm")}
     return HandEye(
         "pose",
@@ -219,7 +225,7 @@ def _by_poses(task: _Task) -> HandEye:
         covariance[:6, :6],
         covariance[6:12, 6:12],
         state.scale,
-        float(np.sqrt(covariance[12, 12])) if options.with_scale else None,
+        sigma_scale,
         {name: value for name, value in stated.items() if value} | solution.sigma,
         tuple(solution.sigma),
         observability=task.seen,
@@ -238,6 +244,8 @@ def _by_views(task: _Task) -> HandEye:
         options.intrinsics,
         options.with_scale,
     )
+    if solution.sigma_scale is not None:
+        require_scale(solution.state.scale, solution.sigma_scale, task.loop, task.pairs.where)
     x, z = solution.state.mount_from_camera, solution.state.stand_from_board
     notes, covariance = task.notes, solution.covariance
     if options.four_dof:
@@ -274,30 +282,11 @@ def _by_views(task: _Task) -> HandEye:
 
 
 def _remarks(task: _Task, outliers: np.ndarray, residuals: np.ndarray, hint: tuple[float, float]) -> tuple[str, ...]:
-    """Outliers by name, and a board that is of another size than stated."""
-    found = []
-    for i in np.flatnonzero(outliers):
-        turn, shift = np.degrees(np.linalg.norm(residuals[i, :3])), np.linalg.norm(residuals[i, 3:])
-        found.append(
-            f"{task.pairs.names[i]} contradicts the others, by {turn:.2g}° and {shift:.2g} mm, and was left out"
-        )
-    scale, sigma = hint
-    if not task.options.with_scale and abs(scale - 1) > max(SIZE_SIGMAS * sigma, SIZE_SHARE):
-        found.append(
-            f"by the robot's motion the board is {scale:.4f} ± {sigma:.2g} times as large as stated: check its size "
-            "and the camera file, or solve with the scale"
-        )
-    return tuple(found)
-
-
-def _judged(factor: float, spare: int) -> tuple[str, ...]:
-    """A note where the residuals are not what the stated σ make expect."""
-    low, high = chi2.ppf([0.0005, 0.9995], spare) / spare
-    if low <= factor <= high:
-        return ()
-    return (
-        f"the residuals are {np.sqrt(factor):.2g} times what the stated σ make expect; correct σ, or look for errors",
-    )
+    """On poses and board."""
+    found = remarks.of_outliers(task.pairs.names, outliers, residuals)
+    if not (task.options.with_scale or task.options.four_dof):
+        found += remarks.of_size(task.loop[~outliers], hint, task.options.noise)
+    return found + remarks.of_distance(task.loop)
 
 
 def _without_slide(task: _Task, x: Rigid, z: Rigid, normal: np.ndarray):

@@ -49,10 +49,11 @@ class HeldOut:
             if getattr(self, name) is not None:
                 object.__setattr__(self, name, frozen(getattr(self, name), self.rows.shape, name))
 
-    def means(self) -> dict[str, float]:
-        """Means over all splits of every error there is."""
+    def means(self, of: np.ndarray | None = None) -> dict[str, float]:
+        """Means over all splits of every error there is; ``of`` : which poses (m,) count, all where None."""
         names = ("rotation_rad", "translation_mm", "board_mm", "pose_mm")
-        return {name: float(getattr(self, name).mean()) for name in names if getattr(self, name) is not None}
+        rows = slice(None) if of is None else of[self.rows]
+        return {name: float(getattr(self, name)[rows].mean()) for name in names if getattr(self, name) is not None}
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -156,7 +157,8 @@ def compare(
     methods: tuple[str, ...] = METHODS,
     rows: np.ndarray | None = None,
 ) -> tuple[Compared, ...]:
-    """Every method on the same poses and the same splits; ``reprojection`` only with views.
+    """Every method on the same poses and the same splits (none where ``rows`` is empty); ``reprojection`` only with
+    views.
 
     Raises
     ------
@@ -178,7 +180,7 @@ def compare(
         result, held_out, reason = None, None, ""
         try:
             result = handeye(pairs, setup, method, views, options)
-            held_out = cross_validate(pairs, setup, method, views, options, rows)
+            held_out = cross_validate(pairs, setup, method, views, options, rows) if len(rows) else None
         except StcalError as error:
             reason = str(error)
         found.append(Compared(method, result, held_out, reason))

@@ -182,7 +182,7 @@ def test_wrong_options():
         EvolutionOptions(population=3)
     with pytest.raises(InputError, match="one of σ_rot and σ_trans of the robot"):
         Noise(robot_rad=1e-3)
-    with pytest.raises(InputError, match="not negative needed"):
+    with pytest.raises(InputError, match="0 to 10° and 100 mm possible"):
         Noise(camera_rad=1e-3, camera_mm=-1.0)
     with pytest.raises(InputError, match="corner_px is 0, more than 0"):
         Noise(corner_px=0.0)

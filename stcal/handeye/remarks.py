@@ -1,0 +1,73 @@
+"""What should be known about a solution: poses that do not fit, wrong σ, a board or units that are not as stated."""
+
+import numpy as np
+from scipy.stats import chi2
+
+from stcal.errors import StcalError
+from stcal.handeye.leastsq import generalised_inverse
+from stcal.handeye.loop import Loop
+from stcal.handeye.noise import Noise
+from stcal.handeye.observability import scale_is_seen, unit_of
+from stcal.handeye.pose_adjustment import State, adjust_poses
+from stcal.handeye.start import robust
+
+SIZE_SIGMAS, SIZE_SHARE = 4.0, 1e-3
+"""A board's size is doubted beyond so many σ, and a share that matters: 0.5 mm at half a metre."""
+MANY = 0.25
+"""Share of the poses that may be bad before something else is suspected."""
+NEAR_MM = 20.0
+"""No camera sees a board from so near."""
+
+
+def of_outliers(names: tuple[str, ...], outliers: np.ndarray, residuals: np.ndarray) -> tuple[str, ...]:
+    """Poses left out (m,), with their residuals (m, 6)."""
+    found = []
+    for i in np.flatnonzero(outliers):
+        turn, shift = np.degrees(np.linalg.norm(residuals[i, :3])), np.linalg.norm(residuals[i, 3:])
+        found.append(f"{names[i]} contradicts the others, by {turn:.2g}° and {shift:.2g} mm, and was left out")
+    if outliers.mean() > MANY:
+        found.append(
+            f"{outliers.sum()} of {len(outliers)} poses contradict the others: with so many look first for a wrong "
+            "setup, for poses of the robot beside those of other images, and for a camera file that does not fit"
+        )
+    return tuple(found)
+
+
+def of_size(loop: Loop, hint: tuple[float, float], noise: Noise) -> tuple[str, ...]:
+    """Where the board is of another size than stated: ``hint`` is what one step makes of its scale, with σ."""
+    if not _is_other(*hint):
+        return ()
+    try:  # the step is a large one, and its σ are those of residuals that a wrong size makes
+        found = adjust_poses(loop, State(*robust(loop, with_scale=True)), noise, with_scale=True)
+    except StcalError:
+        return ()
+    scale, sigma = found.state.scale, float(np.sqrt(generalised_inverse(found.normal)[12, 12]))
+    if not (_is_other(scale, sigma) and scale_is_seen(scale, sigma, len(loop))):
+        return ()
+    return (
+        f"by the robot's motion the board is {scale:.4f} ± {sigma:.2g} times as large as stated{unit_of(scale)}: check "
+        "its size and the camera file, or solve with the scale",
+    )
+
+
+def _is_other(scale: float, sigma: float) -> bool:
+    return abs(scale - 1) > max(SIZE_SIGMAS * sigma, SIZE_SHARE)
+
+
+def of_distance(loop: Loop) -> tuple[str, ...]:
+    """Where all lengths are of another unit, which no equation shows."""
+    away = float(np.median(np.linalg.norm(loop.camera_from_board.translation, axis=1)))
+    if away >= NEAR_MM:
+        return ()
+    return (f"the board is {away:.2g} mm from the camera (median): if lengths are in metres, name the columns _m",)
+
+
+def of_variance(factor: float, spare: int) -> tuple[str, ...]:
+    """Where the residuals are not what stated σ make expect: ``factor`` is the mean square in units of σ of ``spare``
+    degrees of freedom."""
+    low, high = chi2.ppf([0.0005, 0.9995], spare) / spare
+    if low <= factor <= high:
+        return ()
+    return (
+        f"the residuals are {np.sqrt(factor):.2g} times what the stated σ make expect; correct σ, or look for errors",
+    )
