@@ -3,6 +3,7 @@
 import math
 from dataclasses import dataclass, replace
 from enum import StrEnum
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -131,7 +132,7 @@ def handeye(
     prior = given.prior if refine_camera else None
     options = HandEyeOptions(noise, prior, with_scale, given.symmetries, four_dof)
     try:
-        outcome = _solved(given, setup.value, method, options, _Splits(splits, held_out, seed))
+        outcome = _solved(given, setup.value, method, options, _Splits(splits, held_out, seed, workers))
     except StcalError as error:
         if not given.left_out:
             raise
@@ -231,11 +232,12 @@ def _first(sights) -> str:
 
 @dataclass(frozen=True, slots=True)
 class _Splits:
-    """Of the cross-validation: how many, poses in each (a quarter if None), and which."""
+    """Of the cross-validation: how many, poses in each (a quarter if None), which, and processes for it."""
 
     repeats: int
     held_out: int | None
     seed: int
+    workers: int | None
 
 
 def _solved(given: _Given, setup: str, method: str | None, options: "HandEyeOptions", validation: _Splits) -> "Outcome":
@@ -251,11 +253,15 @@ def _solved(given: _Given, setup: str, method: str | None, options: "HandEyeOpti
     if validation.repeats and (validation.held_out or len(pairs) > LEAST_LEFT):
         rows = splits(len(pairs), validation.held_out, validation.repeats, validation.seed)
     if method == ALL:
-        compared = compare(pairs, setup, views, options, rows=rows)
+        with StageProgress() as progress:
+            tell = partial(progress, "methods")
+            compared = compare(pairs, setup, views, options, rows=rows, workers=validation.workers, progress=tell)
         held_out = next(each.held_out for each in compared if each.method == result.method)
     elif len(rows):
         try:
-            held_out = cross_validate(pairs, setup, chosen, views, options, rows)
+            with StageProgress() as progress:
+                tell = partial(progress, "held out")
+                held_out = cross_validate(pairs, setup, chosen, views, options, rows, validation.workers, tell)
         except DegenerateError as error:
             notes = (f"no errors on poses held out: {error}",)
     model = options.intrinsics.colmap_model if options.intrinsics else ""

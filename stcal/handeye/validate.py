@@ -1,5 +1,6 @@
 """How good a hand-eye calibration is: on poses that it has not seen, by every method."""
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -14,6 +15,7 @@ from stcal.handeye.result import HandEye
 from stcal.handeye.solve import METHODS, HandEyeOptions, handeye
 from stcal.handeye.symmetry import repair
 from stcal.handeye.views import View, Views, resect
+from stcal.parallel import run_parallel
 
 LEAST_LEFT = 3
 """Poses that must be left to solve with."""
@@ -96,10 +98,16 @@ def cross_validate(
     views: Views | None = None,
     options: HandEyeOptions | None = None,
     rows: np.ndarray | None = None,
+    workers: int | None = 1,
+    progress: Callable[[int, int], None] | None = None,
 ) -> HeldOut:
     """Solve without some of the poses and predict these; arguments as of :func:`~stcal.handeye.handeye`.
 
-    ``rows`` : (s, k) from :func:`splits`.
+    Parameters
+    ----------
+    rows : (s, k) from :func:`splits`
+    workers : processes for adjustments of corners, as many as cores where None
+    progress : called with the number of splits done, and that of all
 
     Raises
     ------
@@ -111,17 +119,26 @@ def cross_validate(
         mended = repair(pairs, setup, options.symmetries, views)
         pairs, views, options = mended.pairs, mended.views, replace(options, symmetries=())
     rows = splits(len(pairs)) if rows is None else rows
-    found = []
-    for out in rows:
-        kept = np.setdiff1d(np.arange(len(pairs)), out)
-        try:
-            result = handeye(pairs[kept], setup, method, None if views is None else views[kept], options)
-        except DegenerateError as error:
-            names = ", ".join(pairs.names[i] for i in out)
-            raise DegenerateError(f"without {names}: {error}") from error
-        found.append(predicted(result, pairs[out], None if views is None else views[out]))
+    jobs = [(pairs, setup, method, views, options, out) for out in rows]
+    found: list = [None] * len(jobs)
+    slow = views is not None and method in (None, "reprojection")
+    for done, (i, errors) in enumerate(run_parallel(_without, jobs, workers if slow else 1), 1):
+        found[i] = errors
+        if progress:
+            progress(done, len(jobs))
     parts = [None if part[0] is None else np.array(part) for part in zip(*found, strict=True)]
     return HeldOut(rows, *parts)
+
+
+def _without(pairs: HandEyePoses, setup: Setup, method, views: Views | None, options: HandEyeOptions, out: np.ndarray):
+    """Errors on the poses ``out``, (k,), of the solution of the others."""
+    kept = np.setdiff1d(np.arange(len(pairs)), out)
+    try:
+        result = handeye(pairs[kept], setup, method, None if views is None else views[kept], options)
+    except DegenerateError as error:
+        names = ", ".join(pairs.names[i] for i in out)
+        raise DegenerateError(f"without {names}: {error}") from error
+    return predicted(result, pairs[out], None if views is None else views[out])
 
 
 def predicted(result: HandEye, pairs: HandEyePoses, views: Views | None) -> tuple[np.ndarray | None, ...]:
@@ -156,6 +173,8 @@ def compare(
     options: HandEyeOptions | None = None,
     methods: tuple[str, ...] = METHODS,
     rows: np.ndarray | None = None,
+    workers: int | None = 1,
+    progress: Callable[[int, int], None] | None = None,
 ) -> tuple[Compared, ...]:
     """Every method on the same poses and the same splits (none where ``rows`` is empty); ``reprojection`` only with
     views.
@@ -174,16 +193,21 @@ def compare(
     handeye(pairs, setup, "pose", None, options)  # what is wrong with the poses is wrong for all methods
     rows = splits(len(pairs)) if rows is None else rows
     found = []
-    for method in methods:
+    for done, method in enumerate(methods):
+        if progress:
+            progress(done, len(methods))
         if method == "reprojection" and views is None:
             continue
         result, held_out, reason = None, None, ""
         try:
             result = handeye(pairs, setup, method, views, options)
-            held_out = cross_validate(pairs, setup, method, views, options, rows) if len(rows) else None
+            if len(rows):
+                held_out = cross_validate(pairs, setup, method, views, options, rows, workers)
         except StcalError as error:
             reason = str(error)
         found.append(Compared(method, result, held_out, reason))
+    if progress:
+        progress(len(methods), len(methods))
     return tuple(found)
 
 
