@@ -15,6 +15,8 @@ from stcal.errors import InputError
 from stcal.toml_file import Finite, Positive, Strict, load_toml
 
 REMEDY = 'a file with type = "chessboard", "charuco" or "tags" needed, or one of dots, see data_layout.md'
+OF_OTHERS = {"square_mm", "marker_mm", "dictionary", "tag"}
+"""Keys that no board of dots has."""
 KINDS = ("circles", "chessboard", "charuco", "tags")
 
 
@@ -128,8 +130,13 @@ def load_flat_board(path: str | Path) -> BoardDesign | FlatBoard:
 
 
 def _kind(path: str | Path) -> str:
-    """The file's ``type``; dots where it says nothing, or cannot be read: its own loader then says why."""
+    """The file's ``type``; dots where it says nothing, or is no TOML: its own loader then says why."""
     try:
-        return str(tomllib.loads(Path(path).read_bytes().decode("utf-8-sig")).get("type", "circles"))
-    except (OSError, ValueError, RecursionError):
+        content = tomllib.loads(Path(path).read_bytes().decode("utf-8-sig"))
+    except OSError as error:
+        raise InputError(f"board file {path}: {error.strerror or error}; {REMEDY}") from error
+    except (ValueError, RecursionError):
         return "circles"
+    if "type" not in content and not OF_OTHERS.isdisjoint(content):
+        raise InputError(f"board file {path}: no type; {REMEDY}")
+    return str(content.get("type", "circles"))

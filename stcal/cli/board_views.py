@@ -127,11 +127,27 @@ def _find(image: np.ndarray, name: str, camera: Camera, board: Board) -> tuple[B
     if isinstance(board, BoardDesign):
         return _find_dots(image, name, camera, board)
     if isinstance(board, ChessboardDesign):
-        return find_chessboard(image, name, board), f"not all {board.rows}×{board.columns} corners of the chessboard"
+        inner = f"not all {board.rows}×{board.columns} inner corners of the chessboard"
+        return find_chessboard(image, name, board), f"{inner}, which rows and columns of its file count"
     if isinstance(board, CharucoDesign):
-        return find_charuco(image, name, board, camera), "fewer than 4 corners of the ChArUco board"
+        view = find_charuco(image, name, board, camera)
+        return view, "" if view else _without_charuco(image, board)
     tags = find_tags(image, tuple(dict.fromkeys(dictionary for dictionary, _ in board.tags)))
     return view_of_tags(name, tags, board), "no tag of the layout"
+
+
+def _without_charuco(image: np.ndarray, board: CharucoDesign) -> str:
+    """Why there are no corners, as far as the tags tell."""
+    ids = [tag for _, tag in find_tags(image, (board.dictionary,)).tags]
+    few, count = "fewer than 4 corners of the ChArUco board", board.rows * board.columns // 2
+    if not ids:
+        return f"{few}: no tag of {board.dictionary}"
+    if max(ids) >= count:
+        return f"{few}: tag {max(ids)} of {board.dictionary}, of {count} on a board of {board.rows}×{board.columns}"
+    return (
+        f"{few}, but {len(ids)} of its tags: are rows and columns exchanged, or is it one that OpenCV drew before 4.6 "
+        "(legacy = true)?"
+    )
 
 
 def _find_dots(image: np.ndarray, name: str, camera: Camera, board: BoardDesign) -> tuple[BoardView | None, str]:

@@ -19,6 +19,7 @@ if TYPE_CHECKING:
     from stcal.handeye.result_file import Outcome
 
 ALL = "all"
+WITHOUT_DISTORTION = ("PINHOLE", "SIMPLE_PINHOLE")
 SCALED = ("pose", "reprojection")
 """Methods that can find the board's size."""
 
@@ -205,7 +206,10 @@ def _from_images(source: Path, poses: Path, camera: Path, board: Path, workers: 
     files, skipped = find_images(source)
     rows, missing = robot.rows([file.name for file in files])
     if not rows:
-        raise InputError(f"{robot.where}: no row is of an image in {source}, which has {files[0].name}; correct them")
+        raise InputError(
+            f"{robot.where}: no row is of an image in {source}: {robot.images[0]} … there, {files[0].name} … here; "
+            "correct them"
+        )
     with StageProgress() as progress:
         with_pose = [file for file in files if file.name in rows]
         sights = look(with_pose, model, design, (), workers, lambda done, total: progress("board", done, total))
@@ -221,6 +225,8 @@ def _from_images(source: Path, poses: Path, camera: Path, board: Path, workers: 
     if robot.covariance is not None:
         pairs = replace(pairs, base_from_flange_covariance=robot.covariance[at])
     pitch = getattr(design, "pitch_mm", getattr(design, "square_mm", None))
+    if model.covariance is None and model.colmap_model in WITHOUT_DISTORTION:
+        model = replace(model, colmap_model="OPENCV")  # what such a file leaves out is to be found, too
     prior = camera_prior(model, sights.camera)
     where = f"{source.name}, {poses.name}"
     return _Given(where, pairs, seen, sights.symmetries, prior, pitch, tuple(left_out))

@@ -10,6 +10,8 @@ from stcal.cli import camera, capture, colmap, handeye, locate, measure, registe
 from stcal.errors import StcalError
 
 INTERRUPTED = 130
+RESUMED = {"run", "detect"}
+"""Commands that keep what they have done when they are interrupted."""
 # Of Click, which newer versions of Typer carry inside.
 UsageError = next(c for c in typer.BadParameter.__mro__ if c.__name__ == "ClickException")
 
@@ -73,7 +75,8 @@ def _guarded(application: typer.Typer) -> None:
         where = error.ctx.command_path if error.ctx else application.info.name
         _fail(f"{error.format_message().rstrip('.')}; `{where} --help` lists what there is", error.exit_code)
     except (KeyboardInterrupt, typer.Abort):
-        print("interrupted; finished detections are kept, run the same command again to go on", file=sys.stderr)
+        kept = "; finished detections are kept, run the same command again to go on"
+        print("interrupted" + kept * bool(RESUMED & set(arguments[:2])), file=sys.stderr)
         sys.exit(INTERRUPTED)
     except OSError as error:
         if debug:

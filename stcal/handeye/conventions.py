@@ -29,7 +29,9 @@ MIRROR = np.diag([1.0, -1.0, 1.0])
 Guess = Callable[[Loop, bool], tuple[Rigid, Rigid, float]]
 
 
-def check_conventions(pairs: HandEyePoses, setup: Setup, guess: Guess, with_scale: bool) -> tuple[str, ...]:
+def check_conventions(
+    pairs: HandEyePoses, setup: Setup, guess: Guess, with_scale: bool, by_images: bool
+) -> tuple[str, ...]:
     """Refuse poses that fit far better in another convention, or in none; notes on what the fit cannot decide.
 
     With both sides inverted X and Z change places and all fits as before: only a board behind the camera shows it.
@@ -38,6 +40,7 @@ def check_conventions(pairs: HandEyePoses, setup: Setup, guess: Guess, with_scal
     ----------
     guess : called with a loop and whether the board's scale is free; X, Z and scale
     with_scale : whether it is
+    by_images : whether the board's poses come from images, so that nothing but the robot's can be named wrongly
 
     Raises
     ------
@@ -49,7 +52,9 @@ def check_conventions(pairs: HandEyePoses, setup: Setup, guess: Guess, with_scal
     if given[0] > WELL[0] or given[1] > WELL[1]:
         by = f"{np.degrees(given[0]):.3g}° and {given[1]:.3g} mm (median)"
         contradict = f"{pairs.where}: the poses contradict each other by {by}"
-        found = {what: _typical(variant, guess, with_scale) for what, variant in _variants(loop, setup).items()}
+        found = {
+            what: _typical(variant, guess, with_scale) for what, variant in _variants(loop, setup, by_images).items()
+        }
         gain = {
             what: given[0] / max(turn, 1e-12) * given[1] / max(shift, 1e-12) for what, (turn, shift) in found.items()
         }
@@ -65,10 +70,9 @@ def check_conventions(pairs: HandEyePoses, setup: Setup, guess: Guess, with_scal
             )
         turn, shift = np.divide(_typical(loop, guess, True), _differ(loop))
         if max(turn, shift) > LOST:
-            raise InputError(
-                f"{contradict}, {max(turn, shift):.0%} of what they differ by; pair each pose of the board with that "
-                "of the flange at the same moment, and look for another convention of rotations"
-            )
+            pair = "pair each pose of the board with that of the flange at the same moment"
+            other = "check the camera file" if by_images else "look for another convention of rotations"
+            raise InputError(f"{contradict}, {max(turn, shift):.0%} of what they differ by; {pair}, and {other}")
     behind = loop.camera_from_board.translation[:, 2] <= 0
     if behind.all():
         return (
@@ -80,31 +84,36 @@ def check_conventions(pairs: HandEyePoses, setup: Setup, guess: Guess, with_scal
     return notes
 
 
-def _variants(loop: Loop, setup: Setup) -> dict[str, Loop]:
-    """By what they mean, and what to do."""
+def _variants(loop: Loop, setup: Setup, by_images: bool) -> dict[str, Loop]:
+    """By what they mean, and what to do; ``by_images`` : the board's poses are ours."""
     other = "eye-to-hand" if setup == "eye-in-hand" else "eye-in-hand"
     hand, eye = loop.stand_from_mount, loop.camera_from_board
     # A turn of the mirror is a turn of X and Z, and a mirrored robot is to the camera what a mirrored camera is to it.
     mirrored = Poses(MIRROR @ eye.rotation @ MIRROR, eye.translation @ MIRROR)
+    named = "flange_from_base" if by_images else "board_from_camera or flange_from_base"
+    metres = "if they are metres, name the columns _m"
+    size = "if the size in its file is in metres, correct that" if by_images else metres
+    states = "the robot states" if by_images else "robot or camera states"
+    left = "change the signs of its y, qx and qz" + ("; or images are mirrored: use them as taken" if by_images else "")
     found = {
-        f"{INVERTED}: if these are board_from_camera or flange_from_base, name the columns so; "
-        f"if all are named rightly, the setup is {other}": replace(loop, camera_from_board=eye.inverse()),
-        "with the board's lengths times 1000: if they are metres, name the columns _m": replace(
-            loop, camera_from_board=Poses(eye.rotation, 1000 * eye.translation)
+        f"{INVERTED}: if these are {named}, name the columns so; if all are named rightly, the setup is {other}": (
+            replace(loop, camera_from_board=eye.inverse())
         ),
-        "with the robot's lengths times 1000: if they are metres, name the columns _m": replace(
-            loop, stand_from_mount=Poses(hand.rotation, 1000 * hand.translation)
+        f"with the board's lengths times 1000: {size}": (
+            replace(loop, camera_from_board=Poses(eye.rotation, 1000 * eye.translation))
         ),
-        "with one side mirrored: if robot or camera states left-handed poses, change the signs of its y, qx and qz": (
-            replace(loop, camera_from_board=mirrored)
+        f"with the robot's lengths times 1000: {metres}": (
+            replace(loop, stand_from_mount=Poses(hand.rotation, 1000 * hand.translation))
         ),
+        f"with one side mirrored: if {states} left-handed poses, {left}": replace(loop, camera_from_board=mirrored),
     }
     for columns, order in ORDERS.items():
         robot, board = _reordered(hand, order, loop.inverted), _reordered(eye, order)
         remedy = f"quaternions in another order: if columns qw, qx, qy, qz hold {columns}, name them so"
         found[f"with the robot's {remedy}"] = replace(loop, stand_from_mount=robot)
-        found[f"with the board's {remedy}"] = replace(loop, camera_from_board=board)
-        found[f"with all {remedy}"] = replace(loop, stand_from_mount=robot, camera_from_board=board)
+        if not by_images:
+            found[f"with the board's {remedy}"] = replace(loop, camera_from_board=board)
+            found[f"with all {remedy}"] = replace(loop, stand_from_mount=robot, camera_from_board=board)
     return found
 
 

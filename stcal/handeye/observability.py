@@ -9,7 +9,7 @@ from stcal.errors import DegenerateError
 from stcal.geometry.arrays import frozen
 from stcal.handeye.loop import FRAMES, Loop, Setup
 
-UNITS = {"m": 1000.0, "in": 25.4, "cm": 10.0}
+UNITS = {"metres": 1000.0, "inches": 25.4, "centimetres": 10.0}
 SAME_UNIT = 0.05
 """Logarithm by which a size may be off the ratio of two units."""
 LARGEST_SCALE = 5.0

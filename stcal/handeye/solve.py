@@ -156,7 +156,9 @@ def _task(pairs: HandEyePoses, setup: Setup, views: Views | None, options: HandE
         mended = repair(pairs, setup, options.symmetries, views)
         pairs, views, notes = mended.pairs, mended.views, mended.notes()
     task = _Task(pairs, Loop.of(pairs, setup), setup, views, options, seen, notes)
-    return replace(task, notes=notes + check_conventions(pairs, setup, task.guess, task.options.with_scale))
+    return replace(
+        task, notes=notes + check_conventions(pairs, setup, task.guess, options.with_scale, views is not None)
+    )
 
 
 def _by_equations(task: _Task, method: str) -> HandEye:

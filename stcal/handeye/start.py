@@ -12,6 +12,8 @@ from stcal.handeye.motions import Motions
 
 SUBSETS = 200
 """Of three or four poses: with a third of all poses bad, hundreds of clean ones are among them on average …"""
+LEAST_LENGTH = 0.1
+"""Of the camera's paths over those of the flange, as they fit: 1 but for the board's size, 0 where neither moves."""
 SEED = 0
 """… and the same ones every time."""
 
@@ -69,7 +71,13 @@ def about_one_axis(loop: Loop, mount_axis: np.ndarray, with_scale: bool = False)
     ).reshape(-1, 8)
     right = -hand.translation - np.einsum("mab,mb->ma", hand.rotation, along)
     cosine, sine = np.linalg.lstsq(rows, right.ravel(), rcond=1e-9)[0][:2]
-    scale = float(np.hypot(cosine, sine)) if with_scale else 1.0
+    length = float(np.hypot(cosine, sine))
+    if length < LEAST_LENGTH:
+        raise DegenerateError(
+            "hand-eye: the flange turns about one axis at one place, so that the angle about it is open; move it "
+            "across the axis too, by a tenth of the board's distance or more"
+        )
+    scale = length if with_scale else 1.0
     about = Rotation.from_rotvec(np.arctan2(sine, cosine) * mount_axis)
     x = (about * turn).as_matrix()
     z = mean_pose(loop.chain(Rigid(x, np.zeros(3)))).rotation

@@ -1,12 +1,13 @@
 """Poses that cannot be solved are refused with the motion that is missing; mixed-up conventions are said."""
 
 import re
+import tracemalloc
 
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from stcal.errors import DegenerateError, InputError
+from stcal.errors import DegenerateError, InputError, StcalError
 from stcal.geometry.rigid import Poses, Rigid
 from stcal.handeye import HandEyeOptions, HandEyePoses, handeye
 from stcal.handeye.leastsq import perturbed
@@ -211,6 +212,90 @@ def test_a_board_of_another_size_is_no_contradiction():
     assert abs(size - 0.5) < 4 * sigma < 0.5
     solved = handeye(HandEyePoses(pairs.base_from_flange, board), options=HandEyeOptions(with_scale=True))
     assert solved.scale == pytest.approx(0.5, abs=5 * solved.sigma_scale)
+
+
+def turning(flange: Poses, seed: int) -> HandEyePoses:
+    """Of eye-in-hand with noise."""
+    rng = np.random.default_rng(seed)
+    board = FLANGE_FROM_CAMERA.inverse() @ flange.inverse() @ BASE_FROM_BOARD
+    return HandEyePoses(disturbed(rng, flange, 2e-4, 0.1), disturbed(rng, board, 5e-4, 0.2))
+
+
+@pytest.mark.parametrize("seed", range(8))
+def test_a_flange_that_only_turns_tells_no_size(seed):
+    """Z, the lever of X and the size are open together: refused where it is asked for, and no note says otherwise."""
+    rng = np.random.default_rng(seed)
+    turns = Rotation.from_euler("x", np.pi) * Rotation.from_rotvec(rng.normal(0, 0.3, (15, 3)))
+    pairs = turning(Poses(turns.as_matrix(), np.tile([600.0, 0, 500], (15, 1))), seed)
+    with pytest.raises(DegenerateError, match=r"which moves by 0\.\d+ mm \(RMS\): too little to tell; move it"):
+        handeye(pairs, options=HandEyeOptions(with_scale=True))
+    found = handeye(pairs)
+    assert not any("times as large" in note for note in found.notes)
+    assert found.flange_from_camera.translation == pytest.approx(FLANGE_FROM_CAMERA.translation, abs=1)
+
+
+def test_three_poses_tell_no_size():
+    with pytest.raises(DegenerateError, match="3 poses, 4 needed to find the board's size too"):
+        handeye(simulated(np.random.default_rng(5), 3).pairs, options=HandEyeOptions(with_scale=True))
+
+
+@pytest.mark.parametrize(
+    ("factor", "unit"), [(25.4, "the robot's were in inches"), (0.1, "its lengths were in centimetres")]
+)
+def test_units_of_one_side_are_named(factor, unit):
+    pairs = simulated(np.random.default_rng(18), 12, **NOISE).pairs
+    board = Poses(pairs.camera_from_board.rotation, factor * pairs.camera_from_board.translation)
+    pairs = HandEyePoses(pairs.base_from_flange, board)
+    assert any(f"as if {unit}: check" in note for note in handeye(pairs).notes)
+    with pytest.raises(DegenerateError, match=f"times as large as stated, as if {unit}; correct the unit"):
+        handeye(pairs, options=HandEyeOptions(with_scale=True))
+
+
+def test_metres_on_both_sides_are_said():
+    pairs = simulated(np.random.default_rng(19), 12, **NOISE).pairs
+    both = (Poses(p.rotation, p.translation / 1000) for p in (pairs.base_from_flange, pairs.camera_from_board))
+    assert handeye(HandEyePoses(*both)).notes[0].endswith("if lengths are in metres, name the columns _m")
+
+
+def test_four_dof_at_one_place():
+    rng = np.random.default_rng(20)
+    turns = Rotation.from_euler("x", np.pi) * Rotation.from_euler("z", rng.uniform(-1, 1, (12, 1)))
+    pairs = turning(Poses(turns.as_matrix(), np.tile([600.0, 0, 500], (12, 1))), 20)
+    with pytest.raises(DegenerateError, match="at one place, so that the angle about it is open; move it across"):
+        handeye(pairs, options=HandEyeOptions(four_dof=True))
+
+
+def test_many_outliers_make_the_setup_suspect():
+    pairs = simulated(np.random.default_rng(21), 15, **NOISE).pairs
+    places = pairs.camera_from_board.translation.copy()
+    places[:5] += np.random.default_rng(0).normal(0, 40, (5, 3))
+    found = handeye(HandEyePoses(pairs.base_from_flange, Poses(pairs.camera_from_board.rotation, places)))
+    assert any(note.startswith("5 of 15 poses contradict the others: with so many look first") for note in found.notes)
+
+
+def test_rough_poses_that_fit_another_setup_better_are_said():
+    """Errors of 0.5° and 5 mm, and turns of few degrees: no setup fits well, but the right one is named."""
+    said = 0
+    for seed in range(10):
+        truth = simulated(np.random.default_rng(seed), 15, "eye-in-hand", (8e-3, 5.0), (1e-3, 0.3), tilt=0.2)
+        try:
+            notes = handeye(truth.pairs, "eye-to-hand").notes
+        except StcalError as error:
+            notes = (str(error),)
+        said += any("the setup is eye-in-hand" in note for note in notes)
+        right = handeye(truth.pairs, "eye-in-hand").notes
+        assert not any("the setup is eye-to-hand" in note for note in right)
+    assert said >= 8
+
+
+def test_three_hundred_poses_need_little_memory():
+    """All pairs of motions are 45 000; a full singular basis of them would be 15 GB."""
+    tracemalloc.start()
+    found = handeye(simulated(np.random.default_rng(22), 300, **NOISE).pairs)
+    peak = tracemalloc.get_traced_memory()[1]
+    tracemalloc.stop()
+    assert found.covariance is not None
+    assert peak < 300e6
 
 
 def test_few_poses_are_not_thinned_out():

@@ -255,7 +255,7 @@ def test_images_of_a_symmetric_chessboard(command, chessboard, tmp_path):
     assert 1e-4 < np.linalg.norm(off) < 0.5
     assert any("numbered from another end" in note for note in data["notes"])
     assert data["held_out"]["board_mm"] < 0.1
-    assert data["camera"]["model"] == "PINHOLE"
+    assert data["camera"]["model"] == "OPENCV"  # the file states no distortion: it is found to be none
     assert read_camera(camera).focal == pytest.approx(CAMERA.focal, rel=2e-3)
     assert yaml.safe_load(ros.read_text())["header"]["frame_id"] == "tool0"
     assert 'link="tool0"' in urdf.read_text()
@@ -327,3 +327,80 @@ def test_bad_rows_of_images_are_named(command, chessboard, tmp_path, rows, part)
     code, _, err = command(images, "--poses", poses, *rest, "--workers", 1)
     assert code == (COMPUTATION if "needed" in part else INPUT)
     assert part in err.splitlines()[-1]
+
+
+def test_no_output_replaces_an_input_or_another(command, tmp_path):
+    source = poses_file(tmp_path / "poses.csv", simulated(np.random.default_rng(5), 8, **NOISE))
+    before = source.read_text()
+    for options, message in (
+        (("--out", source), "poses.csv: is an input of this command; give another name"),
+        (("--out", tmp_path / "a", "--ros", tmp_path / "b/../a"), "is also what --out writes; give each its own name"),
+        (("--report", tmp_path), "is a folder; the name of a file needed"),
+    ):
+        code, shown, err = command(source, *options, "--splits", 0)
+        assert (code, shown) == (INPUT, "")
+        assert message in err
+    assert source.read_text() == before
+    assert list(tmp_path.iterdir()) == [source]
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        (("--sigma-px", 0.1), "--sigma-px, --sigma-board-mm: only with images"),
+        (("--parent", "tool0"), "--parent, --child: only with --ros or --urdf"),
+        (("--sigma-robot-mm", 1000, "--sigma-robot-deg", 1), "0 to 10° and 100 mm possible"),
+        (("--sigma-robot-mm", "inf", "--sigma-robot-deg", 1), "0 to 10° and 100 mm possible"),
+        (
+            ("--sigma-robot-mm", 0, "--sigma-robot-deg", 0.1, "--sigma-camera-mm", 0, "--sigma-camera-deg", 0.1),
+            "σ_trans of robot and camera are both 0; one of them must err",
+        ),
+    ],
+)
+def test_options_that_cannot_be_are_refused(command, tmp_path, options, message):
+    source = poses_file(tmp_path / "poses.csv", simulated(np.random.default_rng(5), 8, **NOISE))
+    code, _, err = command(source, *options)
+    assert code == INPUT
+    assert message in err
+
+
+def test_methods_without_splits_are_compared_without_errors(command, tmp_path):
+    source = poses_file(tmp_path / "poses.csv", simulated(np.random.default_rng(7), 6, **NOISE))
+    out = tmp_path / "all.json"
+    code, shown, _ = command(source, "--method", "all", "--splits", 0, "--json", out)
+    rows = json.loads(out.read_text())["methods"]
+    assert code == 0
+    assert [row["held_out"] for row in rows] == [None] * len(rows)
+    assert "held out" not in shown.split("Methods")[0]
+
+
+def test_errors_of_the_poses_that_agree_are_told_apart(command, tmp_path):
+    def edit(rows):
+        rows[6][0] = repr(float(rows[6][0]) + 15)
+
+    source = poses_file(tmp_path / "poses.csv", simulated(np.random.default_rng(5), 15, **NOISE), edit)
+    out = tmp_path / "h.json"
+    code, shown, _ = command(source, "--out", out)
+    errors = json.loads(out.read_text())["held_out"]
+    assert code == 0
+    assert "held out, without the 1 left out above: rotation" in shown
+    assert errors["agreeing"]["translation_mm"] < 0.7 * errors["translation_mm"]
+
+
+def test_what_was_left_out_is_said_with_the_failure(command, chessboard, tmp_path):
+    header, *cells = chessboard.poses.read_text().splitlines()
+    poses = tmp_path / "poses.csv"
+    poses.write_text("\n".join([header, *cells[:2]]) + "\n")
+    images, _, _, *rest = chessboard.arguments()
+    code, _, err = command(images, "--poses", poses, *rest, "--workers", 1)
+    assert code == COMPUTATION
+    assert "2 poses, 3 needed" in err
+    assert " left out before, first 2.png: no row in poses.csv" in err
+
+
+def test_a_board_file_without_a_type_is_said(command, chessboard, tmp_path):
+    board = tmp_path / "board.toml"
+    board.write_text("rows = 5\ncolumns = 8\nsquare_mm = 20.0\n")
+    code, _, err = command(*chessboard.arguments()[:-1], board)
+    assert code == INPUT
+    assert 'board.toml: no type; a file with type = "chessboard", "charuco" or "tags" needed' in err

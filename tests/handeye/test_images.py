@@ -1,5 +1,7 @@
 """Boards of every kind in a folder of images."""
 
+from dataclasses import replace
+
 import cv2
 import numpy as np
 import pytest
@@ -156,3 +158,20 @@ def test_no_readable_image_is_said(tmp_path):
     (tmp_path / "a.png").write_bytes(b"")
     with pytest.raises(InputError, match=r"no usable image among 1: a\.png: empty"):
         look(find_images(tmp_path)[0], MODEL, dots(), workers=1)
+
+
+@pytest.mark.parametrize(
+    ("changed", "reason"),
+    [
+        ({"dictionary": "DICT_4X4_50"}, "no tag of DICT_4X4_50"),
+        ({"rows": 4, "columns": 5}, "of 10 on a board of 4×5"),
+        ({"legacy": True}, "of its tags: are rows and columns exchanged, or is it one that OpenCV drew before 4.6"),
+    ],
+)
+def test_why_a_charuco_board_is_not_found(tmp_path, changed, reason):
+    design, sheet, first = charuco()
+    (tmp_path / "images").mkdir()
+    cv2.imwrite(str(tmp_path / "images" / "0.png"), take(sheet, first, SLANTED))
+    files, _ = find_images(tmp_path / "images")
+    found = look(files, MODEL, replace(design, **changed), workers=1)
+    assert reason in found.skipped[0].reason

@@ -78,3 +78,12 @@ def test_a_bad_list_is_said(folder, text, message):
 def test_an_empty_folder_is_said(tmp_path):
     with pytest.raises(InputError, match=r"a folder without \*\.yaml; a CSV file, or"):
         read_robot_poses(tmp_path)
+
+
+def test_two_rows_of_one_image_are_said(tmp_path):
+    row = "0.1,0.2,0.3,1,0,0,0"
+    header = "image," + ",".join(f"base_from_flange_{c}" for c in ("x_m", "y_m", "z_m", "qw", "qx", "qy", "qz"))
+    (tmp_path / "poses.csv").write_text(f"{header}\n0.png,{row}\ng/0.png,{row}\n")
+    found = read_robot_poses(tmp_path / "poses.csv")
+    with pytest.raises(InputError, match=r"line 2 and line 3: both are of image 'g/0\.png'"):
+        found.rows(["g/0.png"])

@@ -137,3 +137,16 @@ def test_ambiguous_poses_alone_are_no_data(undecided):
     (undecided / "poses.csv").write_text(text)
     with pytest.raises(InputError, match="40 of 40 rows left out"):
         read_measurements(undecided / "poses.csv", mh80())
+
+
+def test_a_value_beyond_all_lengths_is_named(tmp_path):
+    with pytest.raises(InputError, match=r"line 3: x_mm is 1e\+200, up to 1e\+12 possible"):
+        read(tmp_path, "q1_mm,q2_deg,x_mm,y_mm,z_mm\n1,2,3,4,5\n1,2,1e200,4,5\n")
+
+
+def test_a_quote_without_end_is_named_by_its_line(tmp_path):
+    """However long the rest is: the csv module gives up at 131 072 characters."""
+    rows = ["1,2,3,4,5,ok"] * 20_000
+    rows[6] = '1,2,3,4,5,"moved'
+    with pytest.raises(InputError, match=r"line 8: a quoted cell goes over several lines"):
+        read(tmp_path, "\n".join(["q1_mm,q2_deg,x_mm,y_mm,z_mm,note", *rows]))
