@@ -161,7 +161,7 @@ def run(
     if missing:
         raise InputError(f"robot poses {robot_poses}: none of scene {missing[0]}; add a row, or take the scene away")
     results = list(located(scenes, target, model, LocateOptions(method.value, limits, patent, moved_px, workers)))
-    print(run_text(results))
+    print(run_text(results, chain))
     for scene in scenes:
         for each in scene.skipped:
             print(f"not used: {each}")
@@ -172,7 +172,7 @@ def run(
     if report:
         from stcal.locate.report import run_page
 
-        save(report, run_page(results, scenes, target, model))
+        save(report, run_page(results, scenes, target, model, chain))
     if not accepted(results):
         print(f"no pose accepted in {len(results)} scene{'s' * (len(results) > 1)}")
         raise typer.Exit(NOTHING_ACCEPTED)

@@ -8,7 +8,7 @@ from typing import Annotated
 import typer
 
 from stcal.cli.saving import save, save_json
-from stcal.errors import InputError
+from stcal.errors import DegenerateError, InputError
 
 app = typer.Typer(
     name="stcal robot",
@@ -152,6 +152,8 @@ def compensate(
         from stcal.robot.use_report import compensation_page
 
         save(report, compensation_page(result, identified))
+    if not result.found.usable.any():
+        raise DegenerateError(f"{wanted.where}: none of {len(result)} poses is reached; see the warnings above")
 
 
 @app.command()
@@ -217,6 +219,8 @@ def design(
     robot = load_robot(robot_file)
     result = stage.design(robot, options)
     print(stage.design_text(result))
+    also = f" and {sigma_rad:g} rad" if observe is Observed.pose else ""
+    print(f"for an instrument whose {observe.value}s have σ {sigma_mm:g} mm{also} per axis (--sigma-mm, --sigma-rad)")
     if out:
         save(out, stage.design_csv(result, robot))
     save_json(json_file, stage.design_json(result))

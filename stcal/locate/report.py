@@ -9,24 +9,31 @@ import numpy as np
 from stcal.camera_file import CameraModel
 from stcal.geometry.camera import Camera
 from stcal.images import ImageFile, decode, grey_8bit, thumbnail
+from stcal.locate.chain import Chain
 from stcal.locate.exposures import Exposure, SceneFiles
 from stcal.locate.layout import TargetLayout
 from stcal.locate.run import Located
-from stcal.locate.tables import accepted, camera_from_obj
+from stcal.locate.tables import accepted, camera_from_obj, uncertain
 from stcal.page import AXIS_COLOURS, COLOURS, Html, number, page, table
 
 WIDE_PX, SMALL_PX = 900, 215
 COLOUR = {"accept": "#1b7f3b", "ambiguous": "#a15c00", "reject": "#b3261e"}
 
 
-def run_page(results: Sequence[Located], scenes: Sequence[SceneFiles], layout: TargetLayout, model: CameraModel) -> str:
+def run_page(
+    results: Sequence[Located],
+    scenes: Sequence[SceneFiles],
+    layout: TargetLayout,
+    model: CameraModel,
+    chain: Chain | None = None,
+) -> str:
     """The whole page, which opens off line."""
     count = len(accepted(results))
     banner = (
         f"<h1>Target {escape(layout.name)}</h1>\n"
         f'<p class="counts">{len(results)} scenes, {count} accepted; {len(layout.tags)} tags in the layout</p>\n'
     )
-    sections = [("scenes", "Scenes", _overview(results))]
+    sections = [("scenes", "Scenes", _overview(results) + _in_base(results, chain))]
     for number_, (each, files) in enumerate(zip(results, scenes, strict=True), 1):
         sections.append((f"scene-{number_}", escape(each.name), _scene(each, files, layout, model)))
     return page(f"stcal locate: {layout.name}", banner, sections)
@@ -51,6 +58,19 @@ def _overview(results: Sequence[Located]) -> str:
             ]
         )
     return table(heads, rows, css="text")
+
+
+def _in_base(results: Sequence[Located], chain: Chain | None) -> str:
+    """base_from_goal of the accepted scenes."""
+    if chain is None or not accepted(results):
+        return ""
+    rows = []
+    for each in accepted(results):
+        goal = chain.base_from_goal(each.name, uncertain(each)).rigid
+        place, turn = goal.translation, np.degrees(goal.log()[:3])
+        rows.append([each.name, *(number(v, 2) for v in place), *(number(v, 3) for v in turn)])
+    heads = ["<scene", "x mm", "y mm", "z mm", "rotation vector x °", "y °", "z °"]
+    return "<h3>base_from_goal: where the robot has to go</h3>\n" + table(heads, rows)
 
 
 def _decision(each: Located) -> Html:

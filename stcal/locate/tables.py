@@ -16,8 +16,9 @@ from stcal.table_file import COVARIANCE, POSE, pose_cells
 BASE = "base_from_goal_"
 
 
-def run_text(results: Sequence[Located]) -> str:
-    """A line for each scene, reasons below those that are not accepted."""
+def run_text(results: Sequence[Located], chain: Chain | None = None) -> str:
+    """A line for each scene, reasons below those that are not accepted; the target in the robot's base where a chain
+    leads there."""
     width = max([5, *(len(each.name) for each in results)])
     head = f"{'scene':<{width}}  verdict    tags  exposures      x_mm      y_mm      z_mm  sigma_mm  sigma_deg   rms_px"
     lines = [head]
@@ -32,6 +33,13 @@ def run_text(results: Sequence[Located]) -> str:
             sigma = each.pose.sigma_mm(), np.degrees(each.pose.sigma_rad()), each.pose.rms_px()
             start += "{:10.3f}{:11.4f}{:9.3f}".format(*sigma)
         lines += [start, *(f"{'':<{width}}    {reason}" for reason in (*each.verdict.reasons, *each.notes))]
+    if chain and accepted(results):
+        lines += ["", f"{'base_from_goal':<{width + 22}}      x_mm      y_mm      z_mm  rotation vector, deg"]
+        for each in accepted(results):
+            goal = chain.base_from_goal(each.name, uncertain(each)).rigid
+            turn = np.degrees(goal.log()[:3])
+            place = "".join(f"{v:10.2f}" for v in goal.translation)
+            lines.append(f"{each.name:<{width + 22}}{place}" + "".join(f"{v:10.3f}" for v in turn))
     return "\n".join(lines)
 
 

@@ -96,7 +96,7 @@ def liu2017(xyz_a: np.ndarray, xyz_b: np.ndarray, options: Liu2017Options, seed:
         most = f"at most {100 * tried.max():.0f} %" if len(tried) else "none had an orthogonal 3×3 part"
         raise DegenerateError(
             f"liu2017: no sample of {size} points leaves more than {100 * options.share:g} % of the others within "
-            f"{options.limit_mm:g} mm in {options.tries} tries ({most}); a larger limit, a smaller sample or share, or "
-            "the robust method needed"
+            f"{options.limit_mm:g} mm in {options.tries} tries ({most}); a larger limit (--threshold), or the robust "
+            "method needed"
         )
     return Liu2017Result(best[1], best[2], best[3], acceptable, shares)

@@ -138,11 +138,11 @@ def _cube_lines(found: Findings) -> list[str]:
     if reach is None:
         return []
     middle = " ".join(f"{v:.0f}" for v in reach.middle)
-    width = max(16, max(map(len, shells(found))) + 2)
+    rows = [[f"{e.mean_mm:.3f} / {e.max_mm:.3f}" if e else "–" for e in row] for row in reach.errors]
+    width = max(16, 2 + max(len(cell) for row in [shells(found), *rows] for cell in row))
     title = f"errors in cubes about {middle} of a, mean / max, mm"
     lines = [f"{title:<52}" + "".join(f"{s:>{width}}" for s in shells(found))]
-    for side, row in zip(reach.sides_mm, reach.errors, strict=True):
-        cells = [f"{e.mean_mm:.3f} / {e.max_mm:.3f}" if e else "–" for e in row]
+    for side, cells in zip(reach.sides_mm, rows, strict=True):
         lines.append(f"{f'  fitted in the cube of {side:g} mm':<52}" + "".join(f"{c:>{width}}" for c in cells))
     return [*lines, *holds(found)]
 

@@ -17,6 +17,9 @@ HUBER_LEVEL = 0.999
 USELESS_MM = 50.0
 """A direction (1 mm, or the turn that moves the tool by 1 mm) with a larger σ is not determined: the nominal is better.
 All parameters are held to where they start by this σ, which nothing feels that is determined."""
+ACCEPTED = 1e-4
+"""In units of σ²: what a step may still gain when there have been enough. Along a flat direction, where Huber's weights
+make every step half as long as it should be, they are many and short."""
 STAYS_MM = 1e-3
 """σ of a movement that the observations never show."""
 LEAST_GAIN = 1e-9
@@ -160,6 +163,8 @@ def solve(
         damping = max(damping / 10, 1e-12) if gain > 0.5 * predicted else damping
         away = there
         solution, gradient = _linearised(trial, seen, weighting, limit)
+    if gain < ACCEPTED:
+        return replace(solution, prior=hold)
     raise ConvergenceError(
         f"{seen.data.where}: identification still gains after {MAX_STEPS} steps; check the robot file and the outliers"
     )

@@ -20,6 +20,8 @@ from stcal.table_file import LENGTHS, read_table
 WHAT = "targets"
 FAR_RAD = np.radians(1.0)
 """Arms are made to milliradians; a joint that has to move by more than this does so because others cannot."""
+SAME_TOOL_MM, SAME_TOOL_RAD = 20.0, np.radians(5)
+"""By more no tool is off what its drawing says."""
 MEANING = {
     LIMIT: "only joint values beyond the limits reach it",
     UNREACHABLE: "no joint values reach it",
@@ -67,6 +69,8 @@ class Compensated:
         Error, by the identified robot, of the nominal joint values: what compensation takes away.
     sliding : (n,) array
         Which joints are prismatic.
+    other_tools : tuple of str
+        Notes on tools that are others in the nominal robot.
     """
 
     targets: Targets
@@ -76,6 +80,7 @@ class Compensated:
     before_mm: np.ndarray | None
     before_rad: np.ndarray | None
     sliding: np.ndarray
+    other_tools: tuple[str, ...] = ()
 
     def __len__(self) -> int:
         return len(self.found)
@@ -85,8 +90,9 @@ class Compensated:
         return self.found.usable & self.nominal.usable if self.nominal else np.zeros(len(self), bool)
 
     def notes(self) -> list[str]:
-        """Every row that is not simply reached, or only a long way from the nominal joint values, by its line."""
-        return self._not_simply_reached() + self._far_moved()
+        """Every row that is not simply reached, or only a long way from the nominal joint values, by its line; tools
+        that the two robots do not share."""
+        return [*self.other_tools, *self._not_simply_reached(), *self._far_moved()]
 
     def _far_moved(self) -> list[str]:
         if self.nominal is None:
@@ -105,6 +111,21 @@ class Compensated:
             )
             if status in MEANING
         ]
+
+
+def _other_tools(identified: Robot, nominal: Robot | None, used: Sequence[str]) -> tuple[str, ...]:
+    """Where a tool is not nearly the same in both files: commanded poses are of one of them only."""
+    notes = []
+    for name in dict.fromkeys(used) if nominal else ():
+        own, other = identified.tool(name), nominal.tool(name)
+        mm, rad = np.linalg.norm(own.translation - other.translation), (own.inverse() @ other).angle_rad()
+        if mm > SAME_TOOL_MM or rad > SAME_TOOL_RAD:
+            notes.append(
+                f"tool {name or 'of the robot files'} differs by {mm:.4g} mm and {np.degrees(rad):.3g}° between "
+                f"{identified.name}'s two files: the commanded poses can be of one of them only; give both files the "
+                "[tool] that they are of"
+            )
+    return tuple(notes)
 
 
 def read_targets(path: str | Path, robot: Robot) -> Targets:
@@ -179,7 +200,8 @@ def compensate(identified: Robot, targets: Targets, nominal: Robot | None = None
         return Compensated(targets, poses, found, None, None, None, identified.prismatic)
     off = poses.difference(_by_tool(identified, targets, before.q))
     error_mm, error_rad = np.linalg.norm(off[:, 3:], axis=1), np.linalg.norm(off[:, :3], axis=1)
-    return Compensated(targets, poses, found, before, error_mm, error_rad, identified.prismatic)
+    tools = _other_tools(identified, nominal, targets.tools)
+    return Compensated(targets, poses, found, before, error_mm, error_rad, identified.prismatic, tools)
 
 
 def _rows_by_tool(targets: Targets) -> list[tuple[str, np.ndarray]]:

@@ -33,6 +33,12 @@ def identified_text(result: Identified, nominal: Robot) -> str:
     for i, (row, s) in enumerate(zip(values, sigma, strict=True), 1):
         cells = "".join(f"{v:13.4f}{_sigma(e):>9}" for v, e in zip(row, s, strict=True))
         lines.append(f"{i:>6}{cells}")
+    lines += [
+        "",
+        f"{'mm and rotation vector, deg':<34}" + "".join(f"{c:>11}" for c in ("x", "y", "z", "rx", "ry", "rz")),
+    ]
+    for name, pose in _placed(result.robot).items():
+        lines.append(f"{name:<34}" + "".join(f"{v:11.4f}" for v in pose))
     indices = result.observability.values()
     lines += ["", "observability  " + "   ".join(f"{name} {value:.3g}" for name, value in indices.items())]
     outliers = result.outliers()
@@ -112,7 +118,7 @@ def identified_page(result: Identified, nominal: Robot) -> str:
     )
     sections = [
         ("accuracy", "Accuracy", accuracy),
-        ("rows", "Denavit–Hartenberg rows", _rows(result, nominal)),
+        ("rows", "Denavit–Hartenberg rows", _rows(result, nominal) + _places(result.robot)),
         (
             "determined",
             "What the data determine",
@@ -121,6 +127,19 @@ def identified_page(result: Identified, nominal: Robot) -> str:
         ("outliers", "Outliers", _outliers(result)),
     ]
     return page(title, banner, sections)
+
+
+def _placed(robot: Robot) -> dict[str, np.ndarray]:
+    """Base and tools: translation, mm, and rotation vector, deg, (6,)."""
+    poses = {"base in the instrument's frame": robot.world_from_base}
+    poses |= {f"tool {name} in the flange's frame".replace("  ", " "): tool for name, tool in robot.tools.items()}
+    return {name: np.append(pose.translation, np.degrees(pose.log()[:3])) for name, pose in poses.items()}
+
+
+def _places(robot: Robot) -> str:
+    rows = [[name, *(number(v, 4) for v in pose)] for name, pose in _placed(robot).items()]
+    heads = ["<", "x mm", "y mm", "z mm", "rotation vector x °", "y °", "z °"]
+    return "<h3>Base and tools</h3>\n" + table(heads, rows)
 
 
 def _rows(result: Identified, nominal: Robot) -> str:
@@ -145,7 +164,8 @@ def _determined(result: Identified) -> str:
         text += f"<p>Kept nominal, as the data leave it open: {escape(', '.join(result.undetermined))}.</p>\n"
     sigma = np.sqrt(np.diag(result.covariance))
     rows = [
-        [name, f"{s:.2e} rad" if " r" in name else f"{s:.4f} mm"] for name, s in zip(result.names, sigma, strict=True)
+        [name, f"{1000 * np.degrees(s):.3f} mdeg" if " r" in name else f"{1000 * s:.1f} µm"]
+        for name, s in zip(result.names, sigma, strict=True)
     ]
     return text + fold("σ of the minimal parameters", table(["<Parameter", "σ"], rows))
 

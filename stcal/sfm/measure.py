@@ -29,6 +29,7 @@ NEAR_PREVIOUS = 1 / 3
 """The pose nearer to the previous image's is taken where its turn from there is at most this share of the other's."""
 IMAGE, FACES, CIRCLES, STATUS = "image", "faces", "circles", "status"
 QUALITY = ("rms_px", "chi2_per_dof")
+NO_FACE = "no face of the target recognised; if a dot board is in view, give --board"
 SUSPICIOUS, FAILED = 1e-3, 1e-5
 """Probabilities of a fit's χ², as the checks of a run have them."""
 
@@ -166,7 +167,7 @@ def _measured(image: ImageObservations, camera, target: TargetCircles, options, 
     known = [i for i, label in enumerate(image.labels) if label in target.place]
     if not known:
         seen = ", ".join(dict.fromkeys(x for x in image.face_ids()))
-        return None, f"face {seen} is not calibrated" if seen else "no face of the target recognised"
+        return None, f"face {seen} is not calibrated" if seen else NO_FACE
     own = image.select(known)
     try:
         pose = pose_from_circles(

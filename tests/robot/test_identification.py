@@ -1,7 +1,9 @@
 """Identification against simulated arms of known kinematics, and real tracker data where they are at hand."""
 
+import importlib.util
 import json
 import re
+import sys
 import time
 from dataclasses import replace
 from pathlib import Path
@@ -23,6 +25,7 @@ from stcal.robot.robot_file import load_robot, robot_toml
 from stcal.robot.simulated import joint_vectors, made, measured, mh80, placed
 
 ROKAE = Path(__file__).resolve().parents[2].parent / "shared" / "data" / "rokae_tracker" / "data"
+SCRIPTS = Path(__file__).resolve().parents[2] / "scripts"
 QUICK = IdentifyOptions(folds=0)
 
 
@@ -156,6 +159,18 @@ def test_common_errors_of_poses_are_in_the_covariance(kind):
     count = len(found.names)
     assert np.mean(errors, axis=0)[0] == pytest.approx(1, abs=3 * np.sqrt(2 / count / draws))
     assert np.mean(errors, axis=0)[1] < 0.6 * np.mean(independent, axis=0)[1]
+
+
+def test_a_flat_direction_is_no_failure():
+    """Distances of 30 points; along one direction every step gains a millionth of σ², a hundred times."""
+    spec = importlib.util.spec_from_file_location("identify_study", SCRIPTS / "identify_study.py")
+    study = importlib.util.module_from_spec(spec)
+    sys.modules[spec.name] = study
+    spec.loader.exec_module(study)
+    case = next(case for case in study.CASES if (case.kind, case.rows) == ("distance", 30))
+    predicted, parameters = study.errors(case, 45)
+    assert 0.1 < predicted < 3  # mean of 49 squares, correlated
+    assert 0.3 < parameters < 2.2  # of 21 squares
 
 
 def test_three_thousand_poses_are_no_trouble():
