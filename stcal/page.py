@@ -177,11 +177,11 @@ def round_below(value: float) -> float:
     return float(max(step * power for step in (1, 2, 5) if step * power <= value * (1 + 1e-9)))
 
 
-def locator():
+def locator(integer: bool = False):
     """Round ticks, few."""
     from matplotlib.ticker import MaxNLocator
 
-    return MaxNLocator(5, steps=[1, 2, 5, 10])
+    return MaxNLocator(5, steps=[1, 2, 5, 10], integer=integer)
 
 
 def new_figure(width: float, height: float):

@@ -80,7 +80,14 @@ def advise(
     from stcal.sfm.capture import advice_json, advice_text
     from stcal.sfm.saved import load_run
 
-    known = known_of(load_run(run))
+    saved = load_run(run)
+    failed = [check["title"] for check in saved.report["checks"] if check["verdict"] == "failed"]
+    if not saved.options.eccentricity:
+        print(f"warning: {run} is an uncorrected control, whose faces are biased by tens of µm: these σ are not theirs")
+    elif failed:
+        what = f"{len(failed)} checks of {run} failed, first {failed[0]}"
+        print(f"warning: {what}: its faces may be off by far more than these σ")
+    known = known_of(saved)
     with StageProgress() as progress:
         advice = advice_for(known, count, progress)
     print(advice_text(advice))

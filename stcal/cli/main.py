@@ -33,6 +33,7 @@ app.command(name="handeye")(handeye.handeye)
 app.command("register")(register.register)
 
 
+@sfm.app.callback(invoke_without_command=True)
 @app.callback(invoke_without_command=True)
 def _version(
     version: bool = typer.Option(False, "--version", help="Print the version and exit."),

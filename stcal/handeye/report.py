@@ -5,7 +5,7 @@ from html import escape
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from stcal.camera_file import PARAMETER_NAMES
+from stcal.camera_file import PARAMETER_NAMES, parameter_names
 from stcal.geometry.rigid import Rigid
 from stcal.handeye.loop import FRAMES
 from stcal.handeye.observability import Observability
@@ -224,9 +224,15 @@ def _sigma_table(outcome: Outcome) -> str:
     found = result.reprojection
     extra = ""
     if found is not None and found.camera_covariance is not None:
-        values = zip(PARAMETER_NAMES, found.camera.parameters(), strict=True)
-        shown = [[n, number(v, 3 if n[0] in "fc" else 6)] for n, v in values if v]
-        extra = "<div><h3>Camera, as adjusted</h3>\n" + table(["", "value"], shown) + "</div>"
+        sigma = dict(zip(parameter_names(outcome.colmap_model), np.sqrt(np.diag(found.camera_covariance)), strict=True))
+        shown = []
+        for name, value in zip(PARAMETER_NAMES, found.camera.parameters(), strict=True):
+            known = sigma.get(name, sigma.get("f") if name in ("fx", "fy") else None)
+            if value or known:
+                digits, unit = (3, "px") if name[0] in "fc" else (6, "")
+                shown.append([name, number(value, digits), number(known, digits), unit])
+        head = "<div><h3>Camera, as adjusted (first pixel's centre at 0, 0)</h3>\n"
+        extra = head + table(["<", "value", "± σ", "<unit"], shown) + "</div>"
     weights = "<div><h3>What errs, and by how much</h3>\n" + table(["<", "σ", "<"], _sigma_rows(outcome)) + "</div>"
     return f'<div class="columns">{weights}{extra}</div>\n'
 

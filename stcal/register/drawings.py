@@ -85,7 +85,7 @@ def field_figure(found: Findings):
     figure = new_figure(10.2, 3.5)
     shown = None
     for k, ((i, j), (u, v, size)) in enumerate(zip(VIEWS, planes, strict=True)):
-        axes = figure.add_axes((0.055 + k * 0.305, 0.15, 0.245, 0.8))
+        axes = figure.add_axes((0.055 + k * 0.298, 0.15, 0.24, 0.8))
         shown = axes.contourf(u, v, size, levels=levels, cmap="YlOrRd")
         axes.contour(u, v, size, levels=levels[1:-1:2], colors=INK, linewidths=0.4, alpha=0.5)
         third = 3 - i - j
@@ -94,7 +94,7 @@ def field_figure(found: Findings):
         box = np.array([[low[i], low[j]], [high[i], low[j]], [high[i], high[j]], [low[i], high[j]], [low[i], low[j]]])
         axes.plot(*box.T, color=INK, lw=0.7, ls=(0, (4, 3)))
         _frame(axes, "a", i, j, middle, reach)
-    bar = figure.colorbar(shown, cax=figure.add_axes((0.95, 0.15, 0.012, 0.8)))
+    bar = figure.colorbar(shown, cax=figure.add_axes((0.918, 0.15, 0.012, 0.8)))
     bar.set_ticks(levels[:: -(-len(levels) // 8)])
     bar.ax.tick_params(labelsize=SMALL, length=2)
     bar.set_label("mm", fontsize=SMALL + 1)

@@ -17,6 +17,10 @@ REMEDY = "`stcal robot init FILE` writes one to edit"
 POSE_KEYS = ("x_mm", "y_mm", "z_mm", "qw", "qx", "qy", "qz")
 
 
+LIMIT_DIGITS = 9
+"""Decimals of joint limits, degrees or mm: 125°, not 125.00000000000001."""
+
+
 class _PoseFile(Strict):
     x_mm: Finite = 0.0
     y_mm: Finite = 0.0
@@ -121,7 +125,7 @@ def robot_toml(robot: Robot, comments: Sequence[str] = ()) -> str:
             lines.append(f"beta_deg = {_number(np.degrees(row.beta))}")
         unit, of_unit = ("deg", np.degrees) if joint.type == "revolute" else ("mm", float)
         lines += [
-            f"{end}_{unit} = {_number(of_unit(value))}"
+            f"{end}_{unit} = {_number(round(of_unit(value), LIMIT_DIGITS))}"
             for end, value in (("min", joint.lower), ("max", joint.upper))
             if np.isfinite(value)
         ]

@@ -5,7 +5,7 @@ from html import escape
 
 import numpy as np
 
-from stcal.page import COLOURS, FAINT, INK, NONE, SMALL, calm, new_figure, number, page, plot, table, uri
+from stcal.page import COLOURS, FAINT, INK, NONE, SMALL, calm, locator, new_figure, number, page, plot, table, uri
 from stcal.robot.compensation import Compensated, compensated_summary, joint_columns
 from stcal.robot.inverse_kinematics import Inverse
 from stcal.robot.model import Robot
@@ -31,6 +31,7 @@ def verification_figure(result: Verification):
     calm(axes)
     axes.grid(axis="y", color=FAINT, lw=0.6)
     axes.set_axisbelow(True)
+    axes.xaxis.set_major_locator(locator(integer=True))
     axes.set_xlabel("pose, in order of the file", fontsize=SMALL + 1, color=INK)
     axes.set_ylabel("|distance error|, mm", fontsize=SMALL + 1, color=INK)
     if len(result.sets) <= 4:
@@ -105,6 +106,7 @@ def _before_plot(result: Compensated) -> str:
     calm(axes)
     axes.grid(axis="y", color=FAINT, lw=0.6)
     axes.set_axisbelow(True)
+    axes.xaxis.set_major_locator(locator(integer=True))
     axes.set_xlabel("pose, in order of the file", fontsize=SMALL + 1, color=INK)
     axes.set_ylabel("position error, mm", fontsize=SMALL + 1, color=INK)
     caption = "Position error of the nominal joint values by the identified robot: what compensation takes away"

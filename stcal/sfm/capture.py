@@ -163,18 +163,19 @@ def advice_text(advice: Advice) -> str:
         )
     lines += ["", f"further views, one after the other, the best of {advice.tried}:"]
     lines.append(
-        f"{'group':>6}  {'from':<20} {'go':<26} {'mm':>5}  {'worst face µm':<18} seen at, and nearest photograph"
+        f"{'group':>6}  {'from':<20} {'go':<26} {'mm':>5}  {'worst face, µm':<18} seen at, and nearest photograph"
     )
-    before = sigma
+    before = f"{worst}: {MICRO * sigma:.2f}"
     for choice in advice.choices:
         view = choice.view
-        change = f"{choice.face}: {MICRO * before:.2f} → {MICRO * choice.sigma_mm:.2f}"
+        after = f"{choice.face}: {MICRO * choice.sigma_mm:.2f}"
+        change = f"{before} → {after}"
         tilts = ", ".join(f"{'' if key == 'board' else 'face '}{key} {t:.0f}°" for key, t in view.tilts_deg.items())
         lines.append(
             f"{view.group:>6}  {view.middle:<20} {where(view):<26} {view.distance_mm:5.0f}  {change:<18} "
             f"{tilts}; {view.nearest} {view.nearest_deg:.0f}° away"
         )
-        before = choice.sigma_mm
+        before = after
     if not advice.choices:
         lines.append("none: no other view within ±50° shows the whole board and a face")
     lines += [

@@ -277,7 +277,30 @@ def test_advise_command(stcal_sfm, small_run, tmp_path, coarse):
     (view,) = content["views"]
     assert view["worst_sigma_um"] < content["worst_sigma_um"]
     assert f"{view['from_image']}" in text
-    assert f"{content['worst_sigma_um']:.2f} → {view['worst_sigma_um']:.2f}" in text
+    now, then = (f"{c['worst_face']}: {c['worst_sigma_um']:.2f}" for c in (content, view))
+    assert f"{now} → {then}" in text
+    assert "warning" not in text
+
+
+@pytest.mark.parametrize(
+    ("file", "change", "warning"),
+    [
+        (
+            "options.json",
+            lambda c: c["options"].update(eccentricity=False),
+            "is an uncorrected control, whose faces are",
+        ),
+        ("report.json", lambda c: c["checks"][0].update(verdict="failed"), "1 checks of"),
+    ],
+)
+def test_advice_on_a_run_that_is_not_to_be_trusted_says_so(stcal_sfm, small_run, tmp_path, file, change, warning):
+    shutil.copytree(small_run, tmp_path / "run", ignore=shutil.ignore_patterns("overlays", "cache"))
+    content = json.loads((tmp_path / "run" / file).read_text())
+    change(content)
+    (tmp_path / "run" / file).write_text(json.dumps(content))
+    code, text, _ = stcal_sfm("advise", tmp_path / "run", "--count", 1)
+    assert code == 0
+    assert warning in text.splitlines()[0]
 
 
 def test_advise_without_the_final_model(stcal_sfm, small_run, tmp_path):
