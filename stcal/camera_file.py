@@ -76,6 +76,7 @@ class CameraPrior:
     covariance: np.ndarray
 
 
+WITHOUT_DISTORTION = ("SIMPLE_PINHOLE", "PINHOLE")
 PRIOR_FOCAL = 1e-3
 """σ of the focal lengths where the camera file states none, relative …"""
 PRIOR_CENTRE = 2e-3
@@ -95,6 +96,14 @@ def camera_prior(model: "CameraModel", camera: Camera) -> CameraPrior:
     flat = np.concatenate([PRIOR_FOCAL * camera.focal, [PRIOR_CENTRE * camera.width] * 2, radial])
     first = intrinsic_basis(model.colmap_model).argmax(0)
     return CameraPrior(model.colmap_model, np.diag(flat[first] ** 2))
+
+
+def refinable(model: "CameraModel") -> "CameraModel":
+    """The same for a refinement: a file without distortion, and without σ that say that there is none, leaves the
+    lens's distortion out; it is refined as OPENCV, from zero."""
+    if model.covariance is None and model.colmap_model in WITHOUT_DISTORTION:
+        return replace(model, colmap_model="OPENCV")
+    return model
 
 
 def intrinsic_basis(colmap_model: str) -> np.ndarray:

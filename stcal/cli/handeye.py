@@ -19,7 +19,6 @@ if TYPE_CHECKING:
     from stcal.handeye.result_file import Outcome
 
 ALL = "all"
-WITHOUT_DISTORTION = ("PINHOLE", "SIMPLE_PINHOLE")
 SCALED = ("pose", "reprojection")
 """Methods that can find the board's size."""
 
@@ -196,7 +195,7 @@ def _given(source: Path, poses: Path | None, camera: Path | None, board: Path | 
 def _from_images(source: Path, poses: Path, camera: Path, board: Path, workers: int | None) -> _Given:
     """Corners of the board in all images that have a pose."""
     from stcal.boards.board_file import load_flat_board
-    from stcal.camera_file import camera_prior, read_camera
+    from stcal.camera_file import camera_prior, read_camera, refinable
     from stcal.cli.board_views import look
     from stcal.handeye import View, Views, pairs_of_views
     from stcal.handeye.robot_poses import read_robot_poses
@@ -225,9 +224,7 @@ def _from_images(source: Path, poses: Path, camera: Path, board: Path, workers: 
     if robot.covariance is not None:
         pairs = replace(pairs, base_from_flange_covariance=robot.covariance[at])
     pitch = getattr(design, "pitch_mm", getattr(design, "square_mm", None))
-    if model.covariance is None and model.colmap_model in WITHOUT_DISTORTION:
-        model = replace(model, colmap_model="OPENCV")  # what such a file leaves out is to be found, too
-    prior = camera_prior(model, sights.camera)
+    prior = camera_prior(refinable(model), sights.camera)
     where = f"{source.name}, {poses.name}"
     return _Given(where, pairs, seen, sights.symmetries, prior, pitch, tuple(left_out))
 

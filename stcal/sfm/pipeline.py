@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 
 import stcal
-from stcal.camera_file import CameraModel, CameraPrior, camera_prior, read_camera, write_cameras_txt
+from stcal.camera_file import CameraModel, CameraPrior, camera_prior, read_camera, refinable, write_cameras_txt
 from stcal.design import BoardDesign, TargetDesign, reference_board, reference_target
 from stcal.design_file import board_toml, load_board, load_target, target_toml
 from stcal.errors import InputError
@@ -72,6 +72,7 @@ def run(
     target = load_design(target, reference_target, load_target)
     board = load_design(board, reference_board, load_board)
     options = (options or RunOptions()).settled(target)
+    model = refinable(model) if options.refine_camera else model
     find_images(images)  # before anything of an earlier run is removed
     out = claim_folder(out, marker_json(images, options))
 

@@ -4,7 +4,7 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from stcal.camera_file import CameraModel, camera_prior
+from stcal.camera_file import CameraModel, camera_prior, refinable
 from stcal.design import BoardDesign, TargetDesign
 from stcal.errors import DegenerateError, InputError
 from stcal.geometry.camera import Camera
@@ -154,7 +154,7 @@ def _setup(scene: Scene, options: PlanOptions, board: BoardDesign) -> Setup:
         start,
         run.frame,
         run.flatness_mm,
-        camera_prior(own, scene.camera) if run.refine_camera else None,
+        camera_prior(refinable(own), scene.camera) if run.refine_camera else None,
         ONE_PLATE if options.one_board else 0.0,
     )
 
