@@ -1,13 +1,13 @@
 """Identification of a robot's kinematics from poses, positions or distances: parameters, σ and held-out error."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from stcal.errors import DegenerateError, InputError
 from stcal.geometry.arrays import frozen
 from stcal.geometry.rigid import skew
-from stcal.robot.adjustment import Solution, Weighting, normal_rank, parameter_units, solve, unseen
+from stcal.robot.adjustment import Solution, Weighting, huber_limit, normal_rank, parameter_units, solve, unseen
 from stcal.robot.data import Measurements
 from stcal.robot.dh import robot_from_chain
 from stcal.robot.model import Robot
@@ -27,7 +27,7 @@ from stcal.robot.observe import (
     unknowns,
 )
 from stcal.robot.start import start
-from stcal.robot.variances import Components, components, estimated
+from stcal.robot.variances import GROSS, Components, components, estimated
 
 LEAST_MM, LEAST_RAD = 1e-3, 1e-6
 """σ where none is given begin at the misfit of the nominal robot, but not below this."""
@@ -40,6 +40,9 @@ FALLS = 0.5
 STILL_RAD, STILL_MM = 1e-5, 1e-2
 """A joint that moves less than this did not move."""
 OUTLIER_WEIGHT = 0.5
+OUTLIER_ROUNDS = 5
+MOSTLY_GOOD = 0.5
+"""Share of the observations below which nothing is called an error."""
 REPEATS, FEW_ROWS = 5, 300
 """Divisions of the cross-validation of few rows; one does for more."""
 
@@ -215,9 +218,26 @@ class _Adjusted:
 def _adjusted(
     nominal: Robot, state: State, seen: Observed, options: IdentifyOptions, rows: NominalRows | None = None
 ) -> _Adjusted:
+    """Solve, and estimate σ; once more without what are errors and no noise: Huber's weights bound their pull, but let
+    each pull as hard as the worst honest observation, which no covariance knows of."""
+    rows = rows or NominalRows.about(state, parameter_units(jacobian(state, seen)), nominal)
+    found, good = _settled(state, seen, options, rows), np.ones(len(seen), bool)
+    for _ in range(OUTLIER_ROUNDS):
+        weights = found.solution.weights
+        if (good == (weights >= GROSS)).all() or (weights >= GROSS).mean() < MOSTLY_GOOD:
+            break
+        good = weights >= GROSS
+        found = _settled(found.solution.state, only_of(seen, good), options, rows)
+        left = residuals(found.solution.state, seen)
+        length = np.linalg.norm(found.weighting.whiten(left, seen), axis=1)
+        weights = np.minimum(1.0, huber_limit(seen.kind) / np.maximum(length, 1e-300))
+        found = replace(found, solution=replace(found.solution, residuals=left, weights=weights))
+    return found
+
+
+def _settled(state: State, seen: Observed, options: IdentifyOptions, rows: NominalRows) -> _Adjusted:
     """Solve, and estimate σ, in turns."""
     weighting, deviations = _weighting(state, seen, options), Deviations()
-    rows = rows or NominalRows.about(state, parameter_units(jacobian(state, seen)), nominal)
     for _ in range(VARIANCE_ROUNDS):  # by medians, which outliers do not move, until they stay
         state = solve(state, seen, weighting, options.robust, rows.held(state, deviations, seen.kind)).state
         before, weighting = weighting, _weighting(state, seen, options)
