@@ -190,7 +190,7 @@ def compare(
     if options.symmetries:
         mended = repair(pairs, setup, options.symmetries, views)
         pairs, views, options = mended.pairs, mended.views, replace(options, symmetries=())
-    handeye(pairs, setup, "pose", None, options)  # what is wrong with the poses is wrong for all methods
+    handeye(pairs, setup, "pose", views, options)  # what is wrong with the poses is wrong for all methods
     rows = splits(len(pairs)) if rows is None else rows
     found = []
     for done, method in enumerate(methods):

@@ -25,7 +25,7 @@ from stcal.robot.model import Robot
 from stcal.robot.plan_poses import PoseDesign
 
 MEANING = {
-    "O1": "volume of the ellipsoid of uncertainty (D-optimality): what was chosen for",
+    "O1": "volume of the ellipsoid of uncertainty (D-optimality)",
     "O2": "inverse condition number",
     "O3": "the combination of parameters that is seen worst (E-optimality)",
     "O4": "noise amplification",

@@ -5,6 +5,7 @@ from html import escape
 import numpy as np
 
 from stcal.page import COLOURS, NONE, calm, fold, new_figure, number, page, plot, table, uri
+from stcal.robot.design_report import MEANING
 from stcal.robot.identification import Identified
 from stcal.robot.model import Robot
 from stcal.robot.nominal import dh_values
@@ -110,7 +111,7 @@ def identified_page(result: Identified, nominal: Robot) -> str:
     banner = f'<h1>{escape(title)}</h1>\n<p class="counts">{escape(counts)}</p>\n'
     banner += "".join(f"<p>{escape(note)}</p>\n" for note in result.notes)
     errors = [[name, *(number(v, 4) for v in _statistics(e))] for name, e in _errors(result).items()]
-    facts = [[name, f"{value:.4g}"] for name, value in result.observability.values().items()]
+    facts = [[name, f"{value:.4g}", MEANING[name]] for name, value in result.observability.values().items()]
     accuracy = (
         table(["<Error", "Mean (mm)", "RMS (mm)", "Max (mm)"], errors)
         + f"<p>{escape(_noise(result))}. Held out: rows that took no part in the fit that they judge.</p>\n"
@@ -122,7 +123,7 @@ def identified_page(result: Identified, nominal: Robot) -> str:
         (
             "determined",
             "What the data determine",
-            _determined(result) + table(["<Index", "Value (1/mm, O2: none)"], facts),
+            _determined(result) + table(["<Index", "Value (1/mm, O2: none)", "<"], facts),
         ),
         ("outliers", "Outliers", _outliers(result)),
     ]
@@ -144,17 +145,19 @@ def _places(robot: Robot) -> str:
 
 def _rows(result: Identified, nominal: Robot) -> str:
     values, before, sigma = dh_values(result.robot) * SHOWN, dh_values(nominal) * SHOWN, result.dh_sigma * SHOWN
-    lines = []
-    for i in range(len(values)):
-        cells = []
-        for k in range(5):
-            change = NONE if sigma[i, k] == 0 else number(values[i, k] - before[i, k], 4)
-            cells += [number(values[i, k], 4), change, _sigma(sigma[i, k])]
-        lines.append([str(i + 1), *cells])
-    heads = ["<Joint", *["value", "change", "σ"] * 5]
-    over = [("", 1), *[(f"{n} ({u})", 3) for n, u in zip(DH, UNITS, strict=True)]]
     text = f"<p>Convention {result.robot.convention}. β (Hayati) where axes are nearly parallel; d is then kept.</p>\n"
-    return text + table(heads, lines, over)
+    for unit in dict.fromkeys(UNITS):
+        kinds = [k for k in range(5) if UNITS[k] == unit]
+        lines = []
+        for i in range(len(values)):
+            cells = []
+            for k in kinds:
+                change = NONE if sigma[i, k] == 0 else number(values[i, k] - before[i, k], 4)
+                cells += [number(values[i, k], 4), change, _sigma(sigma[i, k])]
+            lines.append([str(i + 1), *cells])
+        heads = ["<Joint", *["value", "change", "σ"] * len(kinds)]
+        text += table(heads, lines, [("", 1), *[(f"{DH[k]} ({unit})", 3) for k in kinds]])
+    return text
 
 
 def _determined(result: Identified) -> str:
@@ -214,10 +217,12 @@ def _noise(result: Identified) -> str:
     if weighting.given:
         noise = f"weights from the covariances given, σ₀ {result.sigma0:.2f}"
     else:
-        rotation = f", {weighting.sigma_rad:.2g} rad" if result.seen.kind == "pose" else ""
+        rotation = f", {np.degrees(weighting.sigma_rad):.2g}°" if result.seen.kind == "pose" else ""
         noise = f"σ of a coordinate {weighting.sigma_mm:.3g} mm{rotation}, σ₀ {result.sigma0:.2f}"
-    found = zip(("mm in lengths", "rad in twists", "rad in zero positions"), result.deviations.values(), strict=True)
-    shown = ", ".join(f"{value:.2g} {what}" for what, value in found if value is not None)
+    degrees = np.degrees(1.0)
+    kinds = ((" mm in lengths", 1.0), ("° in twists", degrees), ("° in zero positions", degrees))
+    found = [(s, *kind) for s, kind in zip(result.deviations.values(), kinds, strict=True) if s is not None]
+    shown = ", ".join(f"{sigma * unit:.2g}{what}" for sigma, what, unit in found)
     return f"{noise}; the robot differs from nominal by σ of {shown}" if shown else noise
 
 
