@@ -20,7 +20,7 @@ from stcal.images import Skipped
 from stcal.sfm import RunOptions, run
 from stcal.sfm.circle_projection import project_circles
 from stcal.sfm.faces import face_frame
-from stcal.sfm.measure import MeasureOptions, measure, measure_json, measure_labelled, resolved
+from stcal.sfm.measure import NO_FACE, MeasureOptions, measure, measure_json, measure_labelled, resolved
 from stcal.sfm.observations import ImageObservations
 from stcal.sfm.report_measure import measure_page
 from stcal.sfm.simulated_poses import face_view, faces_view, is_flipped, known_target, pose_error, see, view
@@ -536,4 +536,4 @@ def test_a_face_that_was_not_calibrated_is_left_out(scene, known):
     empty = ImageObservations(
         "a", ".", (), np.zeros((0, 2)), np.zeros((0, 2)), np.zeros((0, 2, 2)), np.zeros((0, 2, 2))
     )
-    assert measure_labelled([empty], scene.camera, truth).left_out[0].reason == "no face of the target recognised"
+    assert measure_labelled([empty], scene.camera, truth).left_out[0].reason == NO_FACE
