@@ -81,7 +81,7 @@ def advise(
     from stcal.sfm.saved import load_run
 
     saved = load_run(run)
-    failed = [check["title"] for check in saved.report["checks"] if check["verdict"] == "failed"]
+    failed = [check["title"] for check in saved.report.get("checks", ()) if check["verdict"] == "failed"]
     if not saved.options.eccentricity:
         print(f"warning: {run} is an uncorrected control, whose faces are biased by tens of µm: these σ are not theirs")
     elif failed:
