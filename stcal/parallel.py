@@ -28,13 +28,27 @@ def run_parallel(function: Callable, jobs: Sequence[tuple], workers: int | None 
         _plain_main(),
         ProcessPoolExecutor(workers, multiprocessing.get_context("spawn"), initializer=_follow_parent) as pool,
     ):
-        futures = {pool.submit(function, *job): i for i, job in enumerate(jobs)}
+        with _deaf_to_interrupts():
+            futures = {pool.submit(function, *job): i for i, job in enumerate(jobs)}
         try:
             for future in as_completed(futures):
                 yield futures[future], future.result()
         except BaseException:
             pool.shutdown(cancel_futures=True)
             raise
+
+
+@contextlib.contextmanager
+def _deaf_to_interrupts():
+    """Processes started meanwhile ignore Ctrl-C from their first moment, not only after their imports."""
+    if threading.current_thread() is not threading.main_thread():
+        yield
+        return
+    before = signal.signal(signal.SIGINT, signal.SIG_IGN)
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGINT, before)
 
 
 def _follow_parent() -> None:
