@@ -15,6 +15,9 @@ SIZE_SIGMAS, SIZE_SHARE = 4.0, 1e-3
 """A board's size is doubted beyond so many σ, and a share that matters: 0.5 mm at half a metre."""
 MANY = 0.25
 """Share of the poses that may be bad before something else is suspected."""
+LEAST_IN_GROUPS, APART = 10, 0.9
+"""Poses, and share of their scatter along its main direction that two groups explain: 0.64 of normal errors (2/π), and
+0.8 of a dozen of them at the most."""
 NEAR_MM = 20.0
 """No camera sees a board from so near."""
 
@@ -31,6 +34,29 @@ def of_outliers(names: tuple[str, ...], outliers: np.ndarray, residuals: np.ndar
             "setup, for poses of the robot beside those of other images, and for a camera file that does not fit"
         )
     return tuple(found)
+
+
+def of_groups(names: tuple[str, ...], residuals: np.ndarray) -> tuple[str, ...]:
+    """Whether poses with these residuals (m, 6) fall into two groups, as of a board that was moved in between."""
+    if len(names) < LEAST_IN_GROUPS:
+        return ()
+    for columns, unit, word in ((slice(0, 3), np.degrees(1.0), "°"), (slice(3, 6), 1.0, " mm")):
+        own = residuals[:, columns] - residuals[:, columns].mean(0)
+        along = own @ np.linalg.svd(own, full_matrices=False)[2][0]
+        order, m = np.argsort(along), len(along)
+        first = np.arange(max(3, m // 5), m - max(3, m // 5) + 1)
+        below = np.cumsum(along[order])[first - 1]
+        between = below**2 * (1 / first + 1 / (m - first))
+        if between.max() > APART * (along @ along):
+            k = int(first[between.argmax()])
+            groups = sorted((sorted(order[:k].tolist()), sorted(order[k:].tolist())))
+            gap = abs(along[groups[0]].mean() - along[groups[1]].mean()) * unit
+            first_ones = f"{len(groups[0])} with {names[0]} and {len(groups[1])} with {names[groups[1][0]]}"
+            return (
+                f"the poses fall into two groups that are {gap:.2g}{word} apart, {first_ones}: was board or camera moved "
+                "in between? solve each by itself",
+            )
+    return ()
 
 
 def of_size(loop: Loop, hint: tuple[float, float], noise: Noise) -> tuple[str, ...]:

@@ -285,7 +285,9 @@ def _by_views(task: _Task) -> HandEye:
 
 def _remarks(task: _Task, outliers: np.ndarray, residuals: np.ndarray, hint: tuple[float, float]) -> tuple[str, ...]:
     """On poses and board."""
+    names = tuple(name for name, bad in zip(task.pairs.names, outliers, strict=True) if not bad)
     found = remarks.of_outliers(task.pairs.names, outliers, residuals)
+    found += remarks.of_groups(names, residuals[~outliers])
     if not (task.options.with_scale or task.options.four_dof):
         found += remarks.of_size(task.loop[~outliers], hint, task.options.noise)
     return found + remarks.of_distance(task.loop)
