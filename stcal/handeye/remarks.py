@@ -53,8 +53,8 @@ def of_groups(names: tuple[str, ...], residuals: np.ndarray) -> tuple[str, ...]:
             gap = abs(along[groups[0]].mean() - along[groups[1]].mean()) * unit
             first_ones = f"{len(groups[0])} with {names[0]} and {len(groups[1])} with {names[groups[1][0]]}"
             return (
-                f"the poses fall into two groups that are {gap:.2g}{word} apart, {first_ones}: was board or camera moved "
-                "in between? solve each by itself",
+                f"the poses fall into two groups that are {gap:.2g}{word} apart, {first_ones}: was board or camera "
+                "moved in between? solve each by itself",
             )
     return ()
 
