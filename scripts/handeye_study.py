@@ -35,6 +35,7 @@ NOISES = {
     "camera ≈ robot": Noise(5e-4, 0.2, 5e-4, 0.2, **CORNERS),
     "robot ≫ camera": Noise(1e-3, 0.3, 1e-4, 0.03, **CORNERS),
 }
+EXACT = Noise(0, 0, 1e-12, 1e-12, 1e-9, 0)
 COUNTS = {
     "pose, σ stated": (4, 8, 20),
     "pose, σ estimated": (4, 8, 20),
@@ -70,7 +71,7 @@ def trial(case: Case, seed: int) -> tuple[float, float, int]:
     options = HandEyeOptions(noise=noise if case.method.endswith("stated") else Noise())
     found = handeye(truth.pairs, case.setup, "pose" if by_poses else "reprojection", truth.views, options)
     off = Poses.of([found.mount_from_camera]).difference(Poses.of([truth.mount_from_camera]))[0]
-    bound = (pose_bound if by_poses else corner_bound)(truth_of(case, seed, Noise(0, 0, 1, 0, 1e-9, 0)), noise)
+    bound = (pose_bound if by_poses else corner_bound)(truth_of(case, seed, EXACT), noise)
     return (
         float(off @ np.linalg.solve(bound, off)),
         float(off @ np.linalg.solve(found.covariance, off)),
