@@ -5,6 +5,7 @@ from pathlib import Path
 
 import pytest
 
+from stcal.cli.saving import keep_apart
 from stcal.errors import InputError
 from stcal.saving import json_text, save
 
@@ -51,3 +52,17 @@ def test_json_keeps_letters_and_refuses_what_is_no_json():
     assert "σ" in json_text({"σ": 1})
     with pytest.raises(ValueError, match="JSON"):
         json_text({"a": float("nan")})
+
+
+def test_outputs_are_kept_apart(tmp_path, monkeypatch):
+    """However a path is written, and before anything is done."""
+    monkeypatch.chdir(tmp_path)
+    given = tmp_path / "data.csv"
+    given.touch()
+    keep_apart({"--out": tmp_path / "a", "--json": None}, (given, None))
+    with pytest.raises(InputError, match=r"--out data\.csv: is an input of this command"):
+        keep_apart({"--out": Path("data.csv")}, (given,))
+    with pytest.raises(InputError, match="--json a: is also what --out writes"):
+        keep_apart({"--out": tmp_path / "a", "--json": Path("a")}, (given,))
+    with pytest.raises(InputError, match="is a folder; the name of a file needed"):
+        keep_apart({"--out": tmp_path}, (given,))

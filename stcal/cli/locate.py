@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from stcal.cli.saving import save, save_json
+from stcal.cli.saving import keep_apart, save, save_json
 from stcal.errors import InputError
 
 if TYPE_CHECKING:
@@ -67,6 +67,7 @@ def calibrate(
     from stcal.locate.calibrate_report import calibrated_json, calibrated_text, warnings
     from stcal.locate.layout import layout_toml, load_plan
 
+    keep_apart({"--out": out, "--json": json_file}, (layout, board, camera))
     plan, design, model = load_plan(layout), load_flat_board(board), read_camera(camera)
     dictionaries = tuple(dict.fromkeys(dictionary for dictionary, _ in plan.tags))
     with StageProgress() as progress:
@@ -140,6 +141,8 @@ def run(
     from stcal.locate.tables import accepted, poses_csv, run_json, run_text
     from stcal.locate.verdict import VerdictOptions
 
+    inputs = (layout, camera, hand_eye, robot_poses, offset)
+    keep_apart({"--out": out, "--json": json_file, "--report": report}, inputs)
     if hand_eye is None and (robot_poses or offset):
         raise InputError("--robot-poses, --offset: only with --hand-eye, which leads from the camera to the robot")
     chain = read_chain(hand_eye, robot_poses, offset) if hand_eye else None

@@ -7,6 +7,7 @@ import typer
 
 from stcal.camera_file import read_camera
 from stcal.cli.progress import StageProgress
+from stcal.cli.saving import keep_apart
 from stcal.cli.sfm import CameraFile, MaxDiameter, MinDiameter, TargetFile, Workers, ellipse_options
 from stcal.design import reference_target
 from stcal.design_file import load_board, load_target
@@ -54,6 +55,7 @@ def measure(
     from stcal.sfm.target_circles import read_target
     from stcal.table_file import read_table
 
+    keep_apart({"--out": out, "--json": json_file, "--report": report}, (camera, faces, target, board, joints))
     for path in (out, json_file, report):
         if path is not None and not path.parent.is_dir():
             raise InputError(f"{path}: no folder {path.parent}; make it, or give another place")

@@ -6,7 +6,7 @@ from typing import Annotated
 
 import typer
 
-from stcal.cli.saving import save, save_json
+from stcal.cli.saving import keep_apart, save, save_json
 from stcal.errors import ConvergenceError, DegenerateError, InputError
 
 
@@ -57,6 +57,7 @@ def register(
     from stcal.register.register_file import registration_json
     from stcal.register.report import registration_page, registration_text
 
+    keep_apart({"--out": out, "--report": report, "--identified": identified}, (pairs_file, robot_file))
     if identified and not robot_file:
         raise InputError(f"--identified {identified}: only with --robot FILE")
     pairs = read_pairs(pairs_file)

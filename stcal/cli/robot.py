@@ -7,7 +7,7 @@ from typing import Annotated
 
 import typer
 
-from stcal.cli.saving import save, save_json
+from stcal.cli.saving import keep_apart, save, save_json
 from stcal.errors import DegenerateError, InputError
 
 app = typer.Typer(
@@ -58,6 +58,7 @@ def axes(
     from stcal.robot.data import read_measurements
     from stcal.robot.robot_file import load_robot, robot_toml
 
+    keep_apart({"--out": out, "--json": json_file, "--report": report}, (sweeps, robot_file))
     nominal = load_robot(robot_file)
     data = read_measurements(sweeps, nominal)
     result = robot_from_sweeps(data, nominal, math.radians(still_deg))
@@ -107,6 +108,7 @@ def identify(
     from stcal.robot.identification_report import identified_json, identified_page, identified_text
     from stcal.robot.robot_file import load_robot, robot_toml
 
+    keep_apart({"--out": out, "--json": json_file, "--report": report}, (data_file, robot_file))
     nominal = load_robot(robot_file)
     data = read_measurements(data_file, nominal)
     kind = observe.value if observe else None
@@ -137,6 +139,7 @@ def compensate(
     from stcal.robot import compensation as stage
     from stcal.robot.robot_file import load_robot
 
+    keep_apart({"--out": out, "--json": json_file, "--report": report}, (targets, robot_file, nominal))
     identified = load_robot(robot_file)
     wanted = stage.read_targets(targets, identified)
     result = stage.compensate(identified, wanted, load_robot(nominal) if nominal else None)
@@ -170,6 +173,7 @@ def verify(
 
     if plot and plot.suffix.lower() not in (".png", ".svg"):
         raise InputError(f"--plot {plot}: a name ending in .png or .svg needed")
+    keep_apart({"--plot": plot, "--json": json_file, "--report": report}, (measured,))
     result = stage.verify(stage.read_measured(measured))
     print(stage.verified_text(result))
     for warning in result.warnings():
@@ -216,6 +220,7 @@ def design(
     options = stage.DesignOptions(
         count, seed, observe.value, candidates, sigma_mm, sigma_rad, _box(box) if box else None, target
     )
+    keep_apart({"--out": out, "--json": json_file, "--report": report}, (robot_file,))
     robot = load_robot(robot_file)
     result = stage.design(robot, options)
     print(stage.design_text(result))

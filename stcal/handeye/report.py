@@ -97,9 +97,8 @@ def _splits_text(outcome: Outcome) -> str:
 def _agreeing_text(outcome: Outcome) -> list[str]:
     """Errors of the poses alone that agree with one another, where some do not."""
     bad = outcome.result.outliers
-    if not bad.any() or outcome.held_out is None:
-        return []
-    return [f"without the {bad.sum()} left out above: {_means_text(outcome.held_out.means(~bad))}"]
+    means = outcome.held_out.means(~bad) if bad.any() and outcome.held_out is not None else {}
+    return [f"without the {bad.sum()} left out above: {_means_text(means)}"] if means else []
 
 
 def _means_text(means: dict[str, float]) -> str:

@@ -134,7 +134,7 @@ def _held_out(found: HeldOut | None, outliers: np.ndarray) -> dict | None:
     if found is None:
         return None
     whole = {"splits": found.rows.shape[0], "poses": found.rows.shape[1], **found.means()}
-    return whole | {"agreeing": found.means(~outliers) if outliers.any() else None}
+    return whole | {"agreeing": (found.means(~outliers) or None) if outliers.any() else None}
 
 
 def _splits(found: HeldOut | None, names: tuple[str, ...]) -> list[dict]:

@@ -52,9 +52,12 @@ class HeldOut:
                 object.__setattr__(self, name, frozen(getattr(self, name), self.rows.shape, name))
 
     def means(self, of: np.ndarray | None = None) -> dict[str, float]:
-        """Means over all splits of every error there is; ``of`` : which poses (m,) count, all where None."""
+        """Means over all splits of every error there is; ``of`` : which poses (m,) count, all where
+        None; empty where none of these was held out."""
         names = ("rotation_rad", "translation_mm", "board_mm", "pose_mm")
-        rows = slice(None) if of is None else of[self.rows]
+        rows = np.ones(self.rows.shape, bool) if of is None else of[self.rows]
+        if not rows.any():
+            return {}
         return {name: float(getattr(self, name)[rows].mean()) for name in names if getattr(self, name) is not None}
 
 

@@ -22,15 +22,8 @@ from stcal.page import (
 )
 from stcal.robot.compensation import joint_cells, joint_columns
 from stcal.robot.model import Robot
+from stcal.robot.observability import MEANING
 from stcal.robot.plan_poses import PoseDesign
-
-MEANING = {
-    "O1": "volume of the ellipsoid of uncertainty (D-optimality)",
-    "O2": "inverse condition number",
-    "O3": "the combination of parameters that is seen worst (E-optimality)",
-    "O4": "noise amplification",
-    "O5": "harmonic mean, near to A-optimality",
-}
 
 
 def design_page(result: PoseDesign, robot: Robot) -> str:

@@ -5,10 +5,10 @@ from html import escape
 import numpy as np
 
 from stcal.page import COLOURS, NONE, calm, fold, new_figure, number, page, plot, table, uri
-from stcal.robot.design_report import MEANING
 from stcal.robot.identification import Identified
 from stcal.robot.model import Robot
 from stcal.robot.nominal import dh_values
+from stcal.robot.observability import MEANING
 
 DH = ("a", "alpha", "d", "theta", "beta")
 UNITS = ("mm", "deg", "mm", "deg", "deg")

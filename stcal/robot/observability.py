@@ -15,6 +15,16 @@ SEEN = 1e-9
 """Singular values below this share of the largest are rounding: the parameter is not seen by any pose."""
 
 
+MEANING = {
+    "O1": "volume of the ellipsoid of uncertainty (D-optimality)",
+    "O2": "inverse condition number",
+    "O3": "the combination of parameters that is seen worst (E-optimality)",
+    "O4": "noise amplification",
+    "O5": "harmonic mean, near to A-optimality",
+}
+"""Of the indices, in words."""
+
+
 @dataclass(frozen=True, slots=True)
 class Observability:
     """Indices of an identification Jacobian with singular values σ₁ ≥ … ≥ σ_L from ``count`` poses; larger is better.

@@ -13,6 +13,9 @@ FELT = 0.5
 most, and still pass for independent: a result that feels nothing but this has a σ that is 20 % too small."""
 MOST = 24
 """Directions at the most."""
+LARGEST_SHARE = 0.999
+"""Of a pose's variance, in any direction: what is left must be one, also where the likelihood of a pose is narrower
+than its linearisation, and after rounding."""
 
 
 def common_errors(poses: Sequence[TargetPose], target: TargetCircles, prior: CameraPrior | None) -> np.ndarray:
@@ -31,8 +34,11 @@ def common_errors(poses: Sequence[TargetPose], target: TargetCircles, prior: Cam
         every.append(np.hstack([pose.by_circles @ circles[rows], pose.by_intrinsics @ intrinsics]))
     full = np.array(every)
     own = np.linalg.cholesky(np.array([pose.covariance for pose in poses]))
-    _, s, vt = np.linalg.svd(np.linalg.solve(own, full).reshape(-1, full.shape[2]), full_matrices=False)
-    return full @ vt[: min(int((s**2 > FELT).sum()), MOST)].T
+    white = np.linalg.solve(own, full)
+    _, s, vt = np.linalg.svd(white.reshape(-1, full.shape[2]), full_matrices=False)
+    white = white @ vt[: min(int((s**2 > FELT).sum()), MOST)].T
+    u, s, vt = np.linalg.svd(white, full_matrices=False)
+    return own @ (u * np.minimum(s, np.sqrt(LARGEST_SHARE))[:, None]) @ vt
 
 
 def _root(covariance: np.ndarray) -> np.ndarray:

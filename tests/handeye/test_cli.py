@@ -387,6 +387,27 @@ def test_errors_of_the_poses_that_agree_are_told_apart(command, tmp_path):
     assert errors["agreeing"]["translation_mm"] < 0.7 * errors["translation_mm"]
 
 
+def test_splits_that_hold_out_nothing_but_outliers(command, tmp_path):
+    """There is no error of agreeing poses then, and no empty mean."""
+
+    def edit(rows):
+        for row in rows[:2]:
+            row[0] = repr(float(row[0]) + 60)
+
+    source = poses_file(tmp_path / "poses.csv", simulated(np.random.default_rng(5), 12, **NOISE), edit)
+    found = set()
+    for seed in range(40):
+        out = tmp_path / f"{seed}.json"
+        code, shown, _ = command(source, "--splits", 1, "--held-out", 1, "--seed", seed, "--out", out)
+        assert code == 0
+        agreeing = json.loads(out.read_text())["held_out"]["agreeing"]
+        assert (agreeing is None) == ("left out above" not in shown)
+        found.add(agreeing is None)
+        if len(found) == 2:
+            return
+    raise AssertionError("no split held out an outlier")
+
+
 def test_what_was_left_out_is_said_with_the_failure(command, chessboard, tmp_path):
     header, *cells = chessboard.poses.read_text().splitlines()
     poses = tmp_path / "poses.csv"

@@ -1,12 +1,12 @@
 """Two real data sets through the command line, from photographs: the acceptance figures."""
 
-import importlib.util
 from pathlib import Path
 
 import numpy as np
 import pytest
 
-SCRIPT = Path(__file__).resolve().parents[2] / "scripts" / "handeye_shared.py"
+from tests.scripts import load_script
+
 MEAN_MM = 0.85
 """3-D error at the board that poses held out may have in the mean. It is 0.756 mm (0.73 to 0.77 with corners refined in
 other windows), with a standard error of 0.05 over the 15 splits; published for these data, in sample: 0.96 mm."""
@@ -17,10 +17,7 @@ SHEET_PITCH_MM = 24.8
 
 @pytest.fixture(scope="module")
 def script():
-    spec = importlib.util.spec_from_file_location("handeye_shared", SCRIPT)
-    module = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(module)
-    return module
+    return load_script("handeye_shared")
 
 
 def present(shared_data: Path, name: str) -> Path:

@@ -1,21 +1,13 @@
 """The study behind the README's figures: one trial of each of its methods."""
 
-import importlib.util
-import sys
-from pathlib import Path
-
 import pytest
 
-SCRIPT = Path(__file__).resolve().parents[2] / "scripts" / "handeye_study.py"
+from tests.scripts import load_script
 
 
 @pytest.fixture(scope="module")
 def study():
-    spec = importlib.util.spec_from_file_location("handeye_study", SCRIPT)
-    module = importlib.util.module_from_spec(spec)
-    sys.modules[spec.name] = module
-    spec.loader.exec_module(module)
-    return module
+    return load_script("handeye_study")
 
 
 @pytest.mark.parametrize("method", ["pose, σ stated", "pose, σ estimated", "reprojection, σ estimated"])

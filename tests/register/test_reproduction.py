@@ -1,28 +1,15 @@
 """The simulated experiment of Liu et al. (2017): what the README's table says, for one robot."""
 
-import importlib.util
-import sys
-from pathlib import Path
-
 import numpy as np
 import pytest
 
 from stcal.robot.kinematics import forward
-
-SCRIPT = Path(__file__).resolve().parents[2] / "scripts" / "reproduce_registration.py"
+from tests.scripts import load_script
 
 
 @pytest.fixture(scope="module")
 def script():
-    sys.path.insert(0, str(SCRIPT.parent))
-    try:
-        spec = importlib.util.spec_from_file_location("reproduce_registration", SCRIPT)
-        module = importlib.util.module_from_spec(spec)
-        sys.modules[spec.name] = module
-        spec.loader.exec_module(module)
-    finally:
-        sys.path.remove(str(SCRIPT.parent))
-    return module
+    return load_script("reproduce_registration")
 
 
 @pytest.fixture(scope="module")

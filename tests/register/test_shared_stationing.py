@@ -1,26 +1,17 @@
 """A real robot and a total station: the acceptance figures."""
 
-import importlib.util
-import sys
-from pathlib import Path
-
 import numpy as np
 import pytest
 
 from stcal.geometry.rigid import Rigid
 from stcal.robot.kinematics import forward
 from stcal.robot.robot_file import load_robot
-
-SCRIPT = Path(__file__).resolve().parents[2] / "scripts" / "register_shared.py"
+from tests.scripts import load_script
 
 
 @pytest.fixture(scope="module")
 def script():
-    spec = importlib.util.spec_from_file_location("register_shared", SCRIPT)
-    module = importlib.util.module_from_spec(spec)
-    sys.modules[spec.name] = module
-    spec.loader.exec_module(module)
-    return module
+    return load_script("register_shared")
 
 
 @pytest.fixture(scope="module")

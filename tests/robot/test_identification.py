@@ -1,9 +1,7 @@
 """Identification against simulated arms of known kinematics, and real tracker data where they are at hand."""
 
-import importlib.util
 import json
 import re
-import sys
 import time
 from dataclasses import replace
 from pathlib import Path
@@ -23,9 +21,9 @@ from stcal.robot.nominal import dh_values
 from stcal.robot.observe import jacobian, moved, observed, residuals, tips
 from stcal.robot.robot_file import load_robot, robot_toml
 from stcal.robot.simulated import joint_vectors, made, measured, mh80, placed
+from tests.scripts import load_script
 
 ROKAE = Path(__file__).resolve().parents[2].parent / "shared" / "data" / "rokae_tracker" / "data"
-SCRIPTS = Path(__file__).resolve().parents[2] / "scripts"
 QUICK = IdentifyOptions(folds=0)
 
 
@@ -183,10 +181,7 @@ def test_common_errors_of_poses_are_in_the_covariance(kind):
 
 def test_a_flat_direction_is_no_failure():
     """Distances of 30 points; along one direction every step gains a millionth of σ², a hundred times."""
-    spec = importlib.util.spec_from_file_location("identify_study", SCRIPTS / "identify_study.py")
-    study = importlib.util.module_from_spec(spec)
-    sys.modules[spec.name] = study
-    spec.loader.exec_module(study)
+    study = load_script("identify_study")
     case = next(case for case in study.CASES if (case.kind, case.rows) == ("distance", 30))
     predicted, parameters = study.errors(case, 45)
     assert 0.1 < predicted < 3  # mean of 49 squares, correlated

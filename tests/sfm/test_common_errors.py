@@ -30,6 +30,19 @@ def measured(image, target, camera, prior):
     return pose_from_circles(image.labels, image.centre_px, image.covariance_px2, target, camera, prior=prior)
 
 
+def test_what_is_common_is_less_than_the_whole(scene, known):
+    """Of a pose whose covariance is smaller than the target's part of it, as a curved likelihood may have it."""
+    rng = np.random.default_rng(1)
+    images = [see(scene, view(faces_view(scene, ("1", "2")), 0.2, 900, rng), ("1", "2"), NOISE_PX, rng) for _ in "abc"]
+    poses = [measured(image, known.truth, scene.camera, None) for image in images]
+    poses[1] = replace(poses[1], covariance=0.3 * poses[1].parts["target"] + 1e-3 * poses[1].parts["image"])
+    common = common_errors(poses, known.truth, None)
+    for pose, own in zip(poses, common, strict=True):
+        root = np.linalg.inv(np.linalg.cholesky(pose.covariance))
+        left = np.linalg.eigvalsh(np.eye(6) - root @ own @ own.T @ root.T)
+        assert left[0] > 5e-4
+
+
 @pytest.mark.parametrize("with_camera", [False, True])
 def test_poses_err_together_as_stated(scene, known, with_camera):
     """Without noise in the images all errors are common ones: z of each direction, from the errors of all poses, has
