@@ -19,11 +19,11 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from stcal.camera_file import read_camera
-from stcal.design_file import load_board, load_target
+from stcal.io.camera import read_camera
+from stcal.io.design import load_board, load_target
 from stcal.parallel import run_parallel
 
-FLAGS = cv2.IMREAD_GRAYSCALE | cv2.IMREAD_ANYDEPTH | cv2.IMREAD_IGNORE_ORIENTATION  # as stcal.images.decode
+FLAGS = cv2.IMREAD_GRAYSCALE | cv2.IMREAD_ANYDEPTH | cv2.IMREAD_IGNORE_ORIENTATION  # as stcal.io.images.decode
 GROUPS = 4
 RIGHT_PX = 3.0  # a board is right when every centre is this close to the image of a true dot
 THRESHOLDS = {
@@ -106,9 +106,9 @@ def resident(pid: int) -> int:
 
 def timed_detection(data: Path, cache: Path):
     """Seconds of detection alone, and the centres of the board's dots by image."""
-    from stcal.images import find_images
+    from stcal.io.images import find_images
     from stcal.sfm.detect.ellipses import EllipseOptions
-    from stcal.sfm.detection import detect_files
+    from stcal.sfm.detect.files import detect_files
 
     designs = load_target(data / "target.toml"), load_board(data / "board.toml")
     camera, (files, _) = read_camera(data / "cameras.txt"), find_images(data / "images")
@@ -121,18 +121,18 @@ def timed_detection(data: Path, cache: Path):
 
 def timed_calibration(out: Path) -> float:
     """Seconds from the models of a finished run's groups to the calibrated target, options as in the run."""
-    from stcal.camera_file import camera_prior
-    from stcal.sfm.calibration import calibrate
-    from stcal.sfm.colmap_model import read_model
-    from stcal.sfm.database import image_ids
-    from stcal.sfm.saved import load_run
+    from stcal.io.camera import camera_prior
+    from stcal.sfm.adjust.calibration import calibrate
+    from stcal.sfm.mapping.database import image_ids
+    from stcal.sfm.mapping.models import read_model
+    from stcal.sfm.run.saved import load_run
 
     run = load_run(out)
     ids, px = image_ids(run.observations), run.corrected_px
     models = [m for g in run.groups() for m in read_model(out / "models" / g, run.observations, ids, px).groups]
     prior = camera_prior(read_camera(out / "cameras.txt"), run.camera)
     start = time.perf_counter()
-    calibrate(models, run.camera, run.target, run.board, run.options, prior)
+    calibrate(models, run.camera, run.target, run.board, run.options.adjustment(run.target), prior)
     return time.perf_counter() - start
 
 

@@ -1,4 +1,4 @@
-"""What the hardware is: the target's faces and circles, and the dot board. Files: ``design_file.py``."""
+"""What the hardware is: the target's faces and circles, and the dot board. Files: ``io/design.py``."""
 
 from dataclasses import dataclass
 from typing import Literal

@@ -7,16 +7,16 @@ import numpy as np
 import pytest
 
 from stcal.geometry.rigid import Rigid, Similarity
-from stcal.sfm.adjust import adjust
-from stcal.sfm.chain import chain_faces
-from stcal.sfm.faces import faces_of_group
-from stcal.sfm.joint import adjust_jointly
-from stcal.sfm.metric import find_scale
-from stcal.sfm.model import GroupModel
-from stcal.sfm.observations import ImageObservations
-from stcal.sfm.refine import eccentricity_px
-from stcal.sfm.simulated import observe, true_models
-from stcal.sfm.uncertainty import calibrated_target
+from stcal.sfm.adjust.chain import chain_faces
+from stcal.sfm.adjust.faces import faces_of_group
+from stcal.sfm.adjust.group import adjust
+from stcal.sfm.adjust.joint import adjust_jointly
+from stcal.sfm.adjust.refine import eccentricity_px
+from stcal.sfm.adjust.scale import find_scale
+from stcal.sfm.adjust.uncertainty import calibrated_target
+from stcal.sfm.data.model import GroupModel
+from stcal.sfm.data.observations import ImageObservations
+from stcal.sfm.plan.simulated import observe, true_models
 from stcal.synthetic.scene import Scene, SceneOptions, make_scene
 
 SHARED = Path(__file__).resolve().parents[2] / "shared" / "data"

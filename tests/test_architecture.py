@@ -1,6 +1,7 @@
-"""Imports go one way, and heavy libraries stay where they belong: read from the source with ``ast``."""
+"""Who may import whom, folder by folder, and where heavy libraries belong: read from the source with ``ast``."""
 
 import ast
+from collections import Counter
 from pathlib import Path
 
 import pytest
@@ -8,11 +9,58 @@ import pytest
 import stcal
 
 ROOT = Path(stcal.__file__).parent
-SYSTEMS = ("sfm", "robot", "register", "handeye", "locate")
-COLMAP_FILES = {"database.py", "mapping.py", "colmap_model.py", "resect.py", "export.py", "crosscheck.py"}
-COLMAP_FILES |= {"export_model.py", "gates.py"}
-CV2_FILES = {"overlay.py", "pairs.py"}
-HANDEYE_CV2_FILES = {"closed_form.py"}
+MOST_FILES = 16
+"""In one folder: what can be seen at a glance."""
+MOST_ENTRIES = 15
+"""Of ``sfm/``, folders and files."""
+
+LAYERS = (
+    ("errors", "front", "parallel"),
+    ("geometry",),
+    ("design",),
+    ("io",),
+    ("boards", "report"),
+    ("synthetic",),
+    ("sfm", "robot", "register", "handeye", "locate"),
+    ("synthetic/measured",),
+    ("workflows",),
+    ("cli",),
+)
+"""From below; a folder imports its own layer and those below it. ``design`` lies below ``io``, whose readers make
+designs. ``synthetic`` knows no system, which must not be tested on its own view of the world; ``synthetic/measured``
+has the forms in which systems take their data, and only studies and tests use it."""
+INSIDE = {
+    "sfm": (
+        ("data",),
+        ("detect", "mapping"),
+        ("report",),
+        ("adjust",),
+        ("checks", "camera", "measure"),
+        ("run",),
+        ("interop", "diagnose", "plan"),
+        (".",),
+    ),
+    "robot": (("kinematics",), ("identify", "axes"), ("use",), (".",)),
+    "register": (("core",), ("judge", "workspace"), (".",), ("report",)),
+    "handeye": (("data",), ("methods",), ("judge",), (".",), ("report",)),
+    "locate": (("data",), ("pose", "calibrate"), (".",), ("report",)),
+}
+"""Folders of each system, from below; ``.`` stands for the files beside them. Folders of one layer know nothing of each
+other."""
+SIDEWAYS = {("locate/calibrate", "locate/pose")}
+"""(importer, imported) of one layer."""
+FRONTS = {f"{system}/__init__.py" for system in INSIDE}
+"""May hand on everything of their system."""
+LIBRARIES = {
+    "pycolmap": ("sfm/mapping", "sfm/interop"),
+    "sqlite3": ("sfm/mapping", "sfm/interop"),
+    "cv2": (
+        *("io/images.py", "boards", "sfm/detect", "sfm/diagnose", "synthetic"),
+        *("handeye/methods/closed_form.py", "sfm/mapping/pairs.py"),
+    ),
+}
+"""Library: folders or files that may use it. ``cv2`` where pixels are, and in two places for a method of its own."""
+GEOMETRY_USES = {"numpy", "scipy", "dataclasses", "typing", "collections", "math", "functools", "itertools"}
 
 
 def imports_in(source: str, module: str) -> set[str]:
@@ -26,67 +74,70 @@ def imports_in(source: str, module: str) -> set[str]:
             if node.level:
                 package = module.split(".")[: -node.level]
                 base = ".".join([*package, *([base] if base else [])])
-            found |= {base} | {f"{base}.{alias.name}" for alias in node.names}
+            found |= {f"{base}.{alias.name}" for alias in node.names} | ({base} if base.count(".") != 0 else set())
     return found
 
 
-def module_of(path: str) -> str:
-    """``stcal.geometry.rigid`` of ``geometry/rigid.py``; a package is ``stcal.geometry.__init__``."""
-    return "stcal." + path.removesuffix(".py").replace("/", ".")
+def place_of(path: str) -> str:
+    """``sfm/detect`` of ``sfm/detect/faces.py``; ``errors`` of ``errors.py``; ``sfm`` of ``sfm/pipeline.py``."""
+    parts = path.split("/")
+    return "/".join(parts[:-1]) or parts[0].removesuffix(".py")
 
 
-def tops(imports: set[str]) -> set[str]:
-    return {name.split(".")[0] for name in imports}
+def target_of(name: str) -> str | None:
+    """The place that an imported dotted name lies in; None outside the package, and for the package itself."""
+    parts = name.split(".")
+    if parts[0] != "stcal" or len(parts) < 2:
+        return None
+    for end in range(len(parts), 1, -1):
+        path = "/".join(parts[1:end])
+        if (ROOT / f"{path}.py").is_file():
+            return place_of(f"{path}.py")
+        if (ROOT / path).is_dir():
+            return path
+    return place_of("/".join(parts[1:]) + ".py")
 
 
-def layer(module: str) -> int:
-    """Rank in errors ← geometry ← design ← stages ← pipeline ← cli; a module imports its own rank and below."""
-    parts = module.split(".")[1:]
-    match parts:
-        case [] | ["errors" | "parallel" | "page" | "saving", *_]:  # helpers below everything
-            return 0
-        case ["geometry", *_]:
-            return 1
-        case ["design" | "design_file" | "camera_file" | "toml_file" | "table_file" | "images" | "boards", *_]:
-            return 2
-        case ["sfm", "pipeline", *_]:
-            return 4
-        case ["sfm" | "synthetic" | "robot" | "register" | "handeye" | "locate", *_]:
-            return 3
-        case _:
-            return 5
+def layer_of(place: str) -> int:
+    """Rank in ``LAYERS``; the longest name that fits counts."""
+    ranks = {name: rank for rank, layer in enumerate(LAYERS) for name in layer}
+    return ranks.get("/".join(place.split("/")[:2]), ranks.get(place.split("/")[0], len(LAYERS)))
+
+
+def inner_layer(place: str) -> int:
+    """Rank of a system's folder in ``INSIDE``."""
+    system, _, folder = place.partition("/")
+    return next(rank for rank, layer in enumerate(INSIDE[system]) if (folder.split("/")[0] or ".") in layer)
+
+
+def forbidden(path: str, target: str) -> str:
+    """Why the file at ``path`` may not import from the place ``target``; empty where it may."""
+    own = place_of(path)
+    if own == target or (path in FRONTS and target.split("/")[0] == own.split("/")[0]):
+        return ""
+    system, other = own.split("/")[0], target.split("/")[0]
+    if layer_of(target) > layer_of(own):
+        return f"{target} lies above {own}"
+    if system == other and system in INSIDE:
+        if inner_layer(target) > inner_layer(own):
+            return f"{target} lies above {own}"
+        if inner_layer(target) == inner_layer(own) and (own, target) not in SIDEWAYS:
+            return f"{target} stands beside {own}"
+    if system != other and system in INSIDE and other in INSIDE:
+        return f"{target} is another system"
+    return ""
 
 
 def violations(path: str, imports: set[str]) -> list[str]:
     """What in ``imports`` the file at ``path`` (below ``stcal/``) may not import, with the reason."""
-    module = module_of(path)
-    parts = path.split("/")
-    package, name = parts[0].removesuffix(".py"), parts[-1]
-    is_front = path == "sfm/__init__.py"  # a package's front may re-export its pipeline
-    bad = []
-    for target in sorted(imports):
-        if target.startswith("stcal.") and layer(target) > layer(module) and not (is_front and layer(target) == 4):
-            bad.append(f"{target}: above {module}")
-        other = target.split(".")[1] if target.startswith("stcal.") else ""
-        if package in SYSTEMS and other in SYSTEMS and other != package:
-            bad.append(f"{target}: another system")
-        if package == "synthetic" and other in SYSTEMS:
-            bad.append(f"{target}: a system, which must not be tested on its own view of the world")
-    if package == "geometry":
-        known = ("numpy", "scipy", "dataclasses", "typing", "collections", "math", "functools", "itertools")
-        allowed = ("stcal.errors", "stcal.geometry")
-        for target in sorted(imports):
-            if not target.startswith(allowed) and target.split(".")[0] not in known:
-                bad.append(f"{target}: geometry is numpy and scipy only")
-    used = tops(imports)
-    for library in sorted(used & {"pycolmap", "sqlite3"}):
-        if not (parts[0] == "sfm" and len(parts) == 2 and name in COLMAP_FILES):
-            bad.append(f"{library}: only in sfm/ {', '.join(sorted(COLMAP_FILES))}")
-    if "cv2" in used:
-        in_sfm = parts[0] == "sfm" and (parts[1] == "detect" or (len(parts) == 2 and name in CV2_FILES))
-        in_handeye = parts[0] == "handeye" and name in HANDEYE_CV2_FILES
-        if not (in_sfm or in_handeye or parts[0] in ("synthetic", "boards", "images.py")):
-            bad.append("cv2: only where pixels are")
+    targets = {target_of(name) for name in imports} - {None}
+    bad = [why for target in sorted(targets) if (why := forbidden(path, target))]
+    used = {name.split(".")[0] for name in imports}
+    for library, places in LIBRARIES.items():
+        if library in used and not any(path == place or path.startswith(f"{place}/") for place in places):
+            bad.append(f"{library} is for {', '.join(places)} alone")
+    if path.startswith("geometry/") and (others := used - {"stcal", *GEOMETRY_USES}):
+        bad.append(f"geometry is numpy and scipy only, not {', '.join(sorted(others))}")
     return bad
 
 
@@ -94,13 +145,34 @@ FILES = sorted(str(path.relative_to(ROOT).as_posix()) for path in ROOT.rglob("*.
 
 
 def test_the_source_is_found():
-    assert {"errors.py", "geometry/rigid.py", "design.py", "camera_file.py"} <= set(FILES)
+    assert {"errors.py", "geometry/rigid.py", "design.py", "io/camera.py", "sfm/pipeline.py"} <= set(FILES)
 
 
 @pytest.mark.parametrize("path", FILES)
 def test_imports_go_one_way(path):
     source = (ROOT / path).read_text(encoding="utf-8")
-    assert violations(path, imports_in(source, module_of(path))) == []
+    module = "stcal." + path.removesuffix(".py").replace("/", ".")
+    assert violations(path, imports_in(source, module)) == []
+
+
+def test_every_folder_has_its_place():
+    for path in FILES:
+        place = place_of(path)
+        assert layer_of(place) < len(LAYERS) or path == "__init__.py", place
+        if place.split("/")[0] in INSIDE:
+            inner_layer(place)
+
+
+def test_no_folder_holds_more_than_one_can_see():
+    counts = Counter(path.rpartition("/")[0] for path in FILES)
+    assert {folder: n for folder, n in counts.items() if n > MOST_FILES} == {}
+    entries = [p for p in (ROOT / "sfm").iterdir() if p.suffix == ".py" or (p / "__init__.py").is_file()]
+    assert len(entries) <= MOST_ENTRIES
+
+
+def test_no_file_repeats_its_folder():
+    repeated = [p for p in FILES if "/" in p and p.split("/")[-1].removesuffix(".py") == p.split("/")[-2]]
+    assert repeated == []
 
 
 @pytest.mark.parametrize(
@@ -110,54 +182,62 @@ def test_imports_go_one_way(path):
         ("geometry/plane.py", "from stcal.design import BOARD"),
         ("geometry/plane.py", "from stcal import design"),
         ("geometry/plane.py", "from .. import sfm"),
-        ("geometry/plane.py", "from ..design_file import load_target"),
+        ("geometry/plane.py", "from ..io.design import load_target"),
         ("geometry/plane.py", "import cv2"),
         ("geometry/plane.py", "import yaml"),
-        ("geometry/__init__.py", "from ..design import BOARD"),
-        ("design.py", "import stcal.sfm.faces"),
-        ("sfm/faces.py", "from stcal.sfm import pipeline"),
-        ("sfm/faces.py", "from stcal.sfm.pipeline import run"),
+        ("design.py", "from stcal.io.design import load_target"),
+        ("io/design.py", "import stcal.sfm.adjust.faces"),
+        ("sfm/adjust/faces.py", "from stcal.sfm import pipeline"),
+        ("sfm/adjust/faces.py", "from stcal.sfm.pipeline import run"),
+        ("sfm/adjust/faces.py", "from stcal.sfm.run.options import RunOptions"),
+        ("sfm/detect/faces.py", "from stcal.sfm.mapping import pairs"),
+        ("sfm/data/model.py", "from stcal.sfm.detect.faces import x"),
         ("sfm/pipeline.py", "from stcal.cli.main import main"),
         ("sfm/pipeline.py", "def f():\n    from stcal.cli import main"),  # hiding it in a function does not help
         ("sfm/__init__.py", "from stcal.cli import main"),
-        ("sfm/faces.py", "from stcal.robot import dh"),
-        ("robot/dh.py", "from stcal.sfm.faces import x"),
-        ("locate/pose.py", "from stcal import handeye"),
-        ("synthetic/scene.py", "from stcal.sfm.observations import x"),
+        ("sfm/adjust/faces.py", "from stcal.robot.kinematics import dh"),
+        ("robot/kinematics/dh.py", "from stcal.sfm.adjust.faces import x"),
+        ("robot/kinematics/dh.py", "from stcal.robot.use import design"),
+        ("locate/pose/estimate.py", "from stcal import handeye"),
+        ("synthetic/scene.py", "from stcal.sfm.data.observations import x"),
         ("synthetic/scene.py", "import stcal.robot"),
         ("synthetic/scene.py", "import pycolmap"),
-        ("sfm/metric.py", "import pycolmap"),
-        ("sfm/metric.py", "if True:\n    from sqlite3 import connect"),
+        ("sfm/adjust/scale.py", "import pycolmap"),
+        ("sfm/adjust/scale.py", "if True:\n    from sqlite3 import connect"),
         ("sfm/detect/database.py", "import sqlite3"),
         ("cli/sfm.py", "import pycolmap"),
-        ("sfm/refine.py", "import cv2"),
+        ("sfm/adjust/refine.py", "import cv2"),
         ("sfm/pipeline.py", "from cv2 import imread"),
-        ("design_file.py", "import cv2"),
-        ("handeye/pairs.py", "import cv2"),
-        ("handeye/report.py", "from stcal.sfm.detect.image import detect_image"),
-        ("handeye/export.py", "from stcal.cli.saving import save"),
-        ("cli/board_views.py", "import cv2"),
-        ("boards/tags.py", "from stcal.locate import pose"),
+        ("io/design.py", "import cv2"),
+        ("handeye/data/pairs.py", "import cv2"),
+        ("handeye/report/page.py", "from stcal.sfm.detect.image import detect_image"),
+        ("handeye/report/export.py", "from stcal.workflows.board_views import look"),
+        ("workflows/board_views.py", "import cv2"),
+        ("workflows/board_views.py", "from stcal.cli.main import main"),
+        ("boards/tags.py", "from stcal.locate.pose import estimate"),
+        ("sfm/plan/session.py", "from stcal.synthetic.measured import image_poses"),
     ],
 )
 def test_the_rules_catch_it(path, source):
-    assert violations(path, imports_in(source, module_of(path))) != []
+    assert violations(path, imports_in(source, "stcal." + path.removesuffix(".py").replace("/", "."))) != []
 
 
 @pytest.mark.parametrize(
     ("path", "source"),
     [
         ("geometry/plane.py", "from dataclasses import dataclass\nfrom .rigid import Rigid\nimport scipy.spatial"),
-        ("sfm/pipeline.py", "from stcal.sfm import mapping, faces\nfrom stcal.camera_file import read_camera"),
+        ("sfm/pipeline.py", "from stcal.sfm.adjust import faces\nfrom stcal.io.camera import read_camera"),
         ("sfm/__init__.py", "from stcal.sfm.pipeline import run"),
-        ("sfm/database.py", "import sqlite3, pycolmap"),
+        ("sfm/mapping/database.py", "import sqlite3, pycolmap"),
         ("sfm/detect/centres.py", "import cv2"),
-        ("handeye/closed_form.py", "import cv2"),
-        ("boards/tags.py", "import cv2\nfrom stcal.images import grey_8bit"),
-        ("synthetic/render.py", "import cv2\nfrom stcal.design_file import target_toml"),
-        ("cli/main.py", "from stcal.sfm import pipeline\nfrom stcal.robot import dh"),
-        ("cli/board_views.py", "from stcal.sfm.detect import image\nfrom stcal.boards.tags import find_tags"),
+        ("sfm/run/saved.py", "from stcal.sfm.checks.verdict import Check"),
+        ("handeye/methods/closed_form.py", "import cv2"),
+        ("boards/tags.py", "import cv2\nfrom stcal.io.images import grey_8bit"),
+        ("synthetic/render.py", "import cv2\nfrom stcal.io.design import target_toml"),
+        ("synthetic/measured/arms.py", "from stcal.robot.kinematics import dh"),
+        ("workflows/board_views.py", "from stcal.sfm.detect import image\nfrom stcal.boards.tags import find_tags"),
+        ("cli/main.py", "from stcal.sfm import pipeline\nfrom stcal.robot.kinematics import dh"),
     ],
 )
 def test_the_rules_let_it_pass(path, source):
-    assert violations(path, imports_in(source, module_of(path))) == []
+    assert violations(path, imports_in(source, "stcal." + path.removesuffix(".py").replace("/", "."))) == []

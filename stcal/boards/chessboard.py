@@ -5,7 +5,7 @@ import numpy as np
 
 from stcal.boards.design import BoardView, ChessboardDesign, view_of
 from stcal.geometry.plane import apply_homography, fit_homography
-from stcal.images import grey_8bit
+from stcal.io.images import grey_8bit
 
 WINDOW_SHARE = 0.4
 """Half the side of the window in which a corner is refined, as a share of the smallest square's side."""

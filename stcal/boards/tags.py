@@ -10,7 +10,7 @@ from stcal.boards.design import BoardView, CharucoDesign, TagLayout, view_of
 from stcal.boards.edges import corners_from_edges
 from stcal.geometry.arrays import frozen
 from stcal.geometry.camera import Camera
-from stcal.images import grey_8bit
+from stcal.io.images import grey_8bit
 
 REFINE_STEPS = (cv2.TERM_CRITERIA_EPS + cv2.TERM_CRITERIA_MAX_ITER, 100, 1e-5)
 UNREFINED_PX = 0.5

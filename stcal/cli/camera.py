@@ -6,13 +6,13 @@ from typing import Annotated
 import numpy as np
 import typer
 
-from stcal.camera_file import write_cameras_txt
 from stcal.cli.progress import StageProgress
 from stcal.cli.sfm import BoardFile, TargetFile, Workers
 from stcal.design import reference_board, reference_target
-from stcal.design_file import load_board, load_target
 from stcal.errors import InputError
-from stcal.saving import json_text, save
+from stcal.io.camera import write_cameras_txt
+from stcal.io.design import load_board, load_target
+from stcal.io.saving import json_text, save
 
 app = typer.Typer()
 
@@ -35,8 +35,8 @@ def calibrate_camera(
     workers: Workers = None,
 ) -> None:
     """Intrinsics from views of the board, without any start: cameras.txt with σ and correlations, for run."""
-    from stcal.sfm.camera_calibration import calibrate_camera as calibrate
-    from stcal.sfm.camera_calibration import calibration_json
+    from stcal.sfm.camera.calibrate import calibrate_camera as calibrate
+    from stcal.sfm.camera.calibrate import calibration_json
     from stcal.sfm.pipeline import load_design
 
     if out.exists():

@@ -6,13 +6,13 @@ from typing import Annotated
 
 import typer
 
-from stcal.camera_file import read_camera
 from stcal.cli.colmap import Run
 from stcal.cli.progress import StageProgress
 from stcal.design import TargetDesign, reference_board, reference_target
-from stcal.design_file import load_board, load_target
 from stcal.errors import InputError
-from stcal.saving import json_text, save
+from stcal.io.camera import read_camera
+from stcal.io.design import load_board, load_target
+from stcal.io.saving import json_text, save
 
 app = typer.Typer()
 
@@ -44,10 +44,11 @@ def plan(
     out: JsonFile = None,
 ) -> None:
     """The σ to expect before any photograph is taken, and what would help most; no Monte Carlo."""
-    from stcal.sfm.capture import plan_json, plan_text
-    from stcal.sfm.nominal import nominal_poses
-    from stcal.sfm.options import RunOptions
-    from stcal.sfm.plan import PlanOptions, make_plan
+    from stcal.sfm.plan.nominal import nominal_poses
+    from stcal.sfm.plan.session import PlanOptions
+    from stcal.sfm.plan.session import plan as planned
+    from stcal.sfm.plan.tables import plan_json, plan_text
+    from stcal.sfm.run.options import RunOptions
 
     design = load_target(target) if target else reference_target()
     centre_noise, told = _centre_noise(noise, run)
@@ -63,7 +64,7 @@ def plan(
         RunOptions(refine_camera=refine_camera),
         seed,
     )
-    result = make_plan(options, design, load_board(board) if board else reference_board(), nominal_poses(design, faces))
+    result = planned(options, design, load_board(board) if board else reference_board(), nominal_poses(design, faces))
     print(plan_text(result, told))
     _write(out, plan_json(result))
 
@@ -75,10 +76,10 @@ def advise(
     out: JsonFile = None,
 ) -> None:
     """Which further photographs would lower the σ of a run's worst face most, computed from its own geometry."""
-    from stcal.sfm.advise import advise as advice_for
-    from stcal.sfm.advise import known_of
-    from stcal.sfm.capture import advice_json, advice_text
-    from stcal.sfm.saved import load_run
+    from stcal.sfm.plan.advise import advise as advice_for
+    from stcal.sfm.plan.advise import known_of
+    from stcal.sfm.plan.tables import advice_json, advice_text
+    from stcal.sfm.run.saved import load_run
 
     saved = load_run(run)
     failed = [check["title"] for check in saved.report.get("checks", ()) if check["verdict"] == "failed"]
@@ -96,9 +97,9 @@ def advise(
 
 def _centre_noise(noise: float | None, run: Path | None):
     """The σ of centres, and in words where it comes from."""
-    from stcal.sfm import forecast
-    from stcal.sfm.advise import known_of
-    from stcal.sfm.saved import load_run
+    from stcal.sfm.plan.advise import known_of
+    from stcal.sfm.plan.session import forecast
+    from stcal.sfm.run.saved import load_run
 
     if noise is not None and run is not None:
         raise InputError(f"--noise {noise:g} and --run {run}: two sources of one σ; give one of them")

@@ -8,7 +8,7 @@ import typer
 
 from stcal.cli.progress import StageProgress
 from stcal.errors import InputError, MappingError
-from stcal.saving import json_text, save
+from stcal.io.saving import json_text, save
 
 app = typer.Typer()
 
@@ -25,8 +25,8 @@ def export_database(
     ],
 ) -> None:
     """A copy of the run's database that another version of COLMAP opens; ids, orders and values stay."""
-    from stcal.sfm.export import export_database as export
-    from stcal.sfm.saved import load_run
+    from stcal.sfm.interop.export_database import export_database as export
+    from stcal.sfm.run.saved import load_run
 
     written = export(load_run(run).database, out, schema)
     print(
@@ -46,7 +46,7 @@ def export_model(
     kind: Annotated[str, typer.Option("--format", help="colmap-bin, colmap-txt, ply, nvm or bundler.")],
 ) -> None:
     """The run's final model, mm, target frame, for other programs; labels beside it."""
-    from stcal.sfm.export_model import export_model as export
+    from stcal.sfm.interop.export_model import export_model as export
 
     written = export(run, out, kind)
     print(f"{written.images} images and {written.points} points, mm, target frame: {written.path}")
@@ -82,8 +82,8 @@ def crosscheck(
 ) -> None:
     """Map the same database with the native COLMAP and compare faces, circles and cameras; into the report."""
     from stcal.sfm import pipeline
-    from stcal.sfm.crosscheck import Tolerances, comparison_text
-    from stcal.sfm.saved import load_run
+    from stcal.sfm.interop.crosscheck import Tolerances, comparison_text
+    from stcal.sfm.run.saved import load_run
 
     tolerances = Tolerances(tolerance_um, tolerance_mdeg, tolerance_um, camera_tolerance_um, camera_tolerance_mdeg)
     saved = load_run(run)
@@ -107,8 +107,8 @@ def faces(
 ) -> None:
     """Scale and faces from a COLMAP model made or edited elsewhere; points get their labels by (image, keypoint)."""
     from stcal.sfm import pipeline
-    from stcal.sfm.crosscheck import face_differences
-    from stcal.sfm.saved import load_run
+    from stcal.sfm.interop.crosscheck import face_differences
+    from stcal.sfm.run.saved import load_run
 
     if out is not None and os.path.lexists(out):
         raise InputError(f"{out}: exists; give a new file with --out")
@@ -144,8 +144,8 @@ def pairs(
     out: Annotated[Path | None, typer.Option("--json", help="Also write all pairs and gates as JSON.")] = None,
 ) -> None:
     """The ranked initial pairs, and how each fares at every gate: ours, COLMAP's as set, COLMAP's at its defaults."""
-    from stcal.sfm.gates import limits_text, pairs_json, pairs_table, run_gates
-    from stcal.sfm.saved import load_run
+    from stcal.sfm.interop.gates import limits_text, pairs_json, pairs_table, run_gates
+    from stcal.sfm.run.saved import load_run
 
     saved = load_run(run)
     found = run_gates(saved, group)
@@ -172,9 +172,9 @@ def doctor(
     ] = None,
 ) -> None:
     """Every image and circle left out: the threshold that stopped it, its value there, and what would let it in."""
-    from stcal.sfm import findings
-    from stcal.sfm.doctor import diagnose
-    from stcal.sfm.saved import load_run
+    from stcal.sfm.diagnose import findings
+    from stcal.sfm.diagnose.doctor import diagnose
+    from stcal.sfm.run.saved import load_run
 
     saved = load_run(run)
     with StageProgress() as progress:

@@ -14,9 +14,9 @@ from stcal.cli.saving import keep_apart, save, save_json
 from stcal.errors import DegenerateError, InputError, StcalError
 
 if TYPE_CHECKING:
-    from stcal.camera_file import CameraPrior
     from stcal.handeye import HandEyeOptions, HandEyePoses, Views
-    from stcal.handeye.result_file import Outcome
+    from stcal.handeye.report.file import Outcome
+    from stcal.io.camera import CameraPrior
 
 ALL = "all"
 SCALED = ("pose", "reprojection")
@@ -104,9 +104,9 @@ def handeye(
 ) -> None:
     """Hand-eye calibration: where a camera sits on a robot's flange, or in its base, and how well that is known."""
     from stcal.handeye import METHODS, HandEyeOptions, Noise
-    from stcal.handeye.export import opencv_yaml, ros_yaml, urdf_joint
-    from stcal.handeye.report import outcome_page, outcome_text
-    from stcal.handeye.result_file import calibration_json, outcome_json
+    from stcal.handeye.report.export import opencv_yaml, ros_yaml, urdf_joint
+    from stcal.handeye.report.file import calibration_json, outcome_json
+    from stcal.handeye.report.page import outcome_page, outcome_text
 
     robot, seen = (_radians(sigma_robot_deg), sigma_robot_mm), (_radians(sigma_camera_deg), sigma_camera_mm)
     noise = Noise(*robot, *seen, sigma_px, sigma_board_mm)
@@ -194,12 +194,12 @@ def _given(source: Path, poses: Path | None, camera: Path | None, board: Path | 
 
 def _from_images(source: Path, poses: Path, camera: Path, board: Path, workers: int | None) -> _Given:
     """Corners of the board in all images that have a pose."""
-    from stcal.boards.board_file import load_flat_board
-    from stcal.camera_file import camera_prior, read_camera, refinable
-    from stcal.cli.board_views import look
+    from stcal.boards.file import load_flat_board
     from stcal.handeye import View, Views, pairs_of_views
-    from stcal.handeye.robot_poses import read_robot_poses
-    from stcal.images import find_images
+    from stcal.handeye.data.robot_poses import read_robot_poses
+    from stcal.io.camera import camera_prior, read_camera, refinable
+    from stcal.io.images import find_images
+    from stcal.workflows.board_views import look
 
     design, model, robot = load_flat_board(board), read_camera(camera), read_robot_poses(poses)
     files, skipped = find_images(source)
@@ -246,7 +246,7 @@ class _Splits:
 def _solved(given: _Given, setup: str, method: str | None, options: "HandEyeOptions", validation: _Splits) -> "Outcome":
     """The result, its errors on poses held out, and the comparison of methods where it is asked for."""
     from stcal.handeye import handeye as solve
-    from stcal.handeye.result_file import Outcome
+    from stcal.handeye.report.file import Outcome
     from stcal.handeye.validate import LEAST_LEFT, compare, cross_validate, splits
 
     pairs, views = given.pairs, given.views
@@ -273,7 +273,7 @@ def _solved(given: _Given, setup: str, method: str | None, options: "HandEyeOpti
 
 
 def _save_camera(path: Path, outcome: "Outcome") -> None:
-    from stcal.camera_file import write_cameras_txt
+    from stcal.io.camera import write_cameras_txt
 
     found = outcome.result.reprojection
     path.parent.mkdir(parents=True, exist_ok=True)

@@ -10,9 +10,9 @@ from stcal.cli.saving import keep_apart, save, save_json
 from stcal.errors import InputError
 
 if TYPE_CHECKING:
-    from stcal.camera_file import CameraModel
-    from stcal.cli.board_views import Board
-    from stcal.locate.views import CalibrationImages
+    from stcal.io.camera import CameraModel
+    from stcal.locate.data.views import CalibrationImages
+    from stcal.workflows.board_views import Board
 
 app = typer.Typer(
     name="stcal locate",
@@ -43,7 +43,7 @@ def schedule(
     count: Annotated[int, typer.Argument(min=1, max=1000, help="How many.")],
 ) -> None:
     """Exposure times in a geometric series."""
-    from stcal.locate.exposures import exposure_times
+    from stcal.locate.data.exposures import exposure_times
 
     for time in exposure_times(shortest, longest, count):
         print(f"{time:.6g}")
@@ -60,12 +60,12 @@ def calibrate(
     json_file: JsonFile = None,
 ) -> None:
     """Where the corners of the target's tags lie, with σ; the frame in the middle of the layout's origin tag."""
-    from stcal.boards.board_file import load_flat_board
-    from stcal.camera_file import read_camera
+    from stcal.boards.file import load_flat_board
     from stcal.cli.progress import StageProgress
-    from stcal.locate.calibrate import calibrate as calibrated
-    from stcal.locate.calibrate_report import calibrated_json, calibrated_text, warnings
-    from stcal.locate.layout import layout_toml, load_plan
+    from stcal.io.camera import read_camera
+    from stcal.locate.calibrate.solve import calibrate as calibrated
+    from stcal.locate.data.layout import layout_toml, load_plan
+    from stcal.locate.report.calibration import calibrated_json, calibrated_text, warnings
 
     keep_apart({"--out": out, "--json": json_file}, (layout, board, camera))
     plan, design, model = load_plan(layout), load_flat_board(board), read_camera(camera)
@@ -131,15 +131,15 @@ def run(
 
     Exit code 3 when no pose is accepted.
     """
-    from stcal.camera_file import read_camera
-    from stcal.locate.chain import read_chain
-    from stcal.locate.exposures import find_scenes
-    from stcal.locate.layout import load_layout
-    from stcal.locate.patent import PatentOptions
-    from stcal.locate.run import LocateOptions
-    from stcal.locate.run import run as located
-    from stcal.locate.tables import accepted, poses_csv, run_json, run_text
-    from stcal.locate.verdict import VerdictOptions
+    from stcal.io.camera import read_camera
+    from stcal.locate.data.exposures import find_scenes
+    from stcal.locate.data.layout import load_layout
+    from stcal.locate.pipeline import LocateOptions
+    from stcal.locate.pipeline import run as located
+    from stcal.locate.pose.patent import PatentOptions
+    from stcal.locate.pose.verdict import VerdictOptions
+    from stcal.locate.report.chain import read_chain
+    from stcal.locate.report.tables import accepted, poses_csv, run_json, run_text
 
     inputs = (layout, camera, hand_eye, robot_poses, offset)
     keep_apart({"--out": out, "--json": json_file, "--report": report}, inputs)
@@ -173,7 +173,7 @@ def run(
     if json_file:
         save_json(json_file, run_json(results, target, chain))
     if report:
-        from stcal.locate.report import run_page
+        from stcal.locate.report.page import run_page
 
         save(report, run_page(results, scenes, target, model, chain))
     if not accepted(results):
@@ -185,9 +185,9 @@ def calibration_images(
     folder: Path, model: "CameraModel", board: "Board", dictionaries: tuple[str, ...], workers: int | None, progress
 ) -> "CalibrationImages":
     """Board and tags in all images of a folder; ``progress`` is told (stage, done, total)."""
-    from stcal.cli.board_views import look
-    from stcal.images import find_images
-    from stcal.locate.views import CalibrationImages
+    from stcal.io.images import find_images
+    from stcal.locate.data.views import CalibrationImages
+    from stcal.workflows.board_views import look
 
     files, skipped = find_images(folder)
     sights = look(files, model, board, dictionaries, workers, lambda done, total: progress("images", done, total))

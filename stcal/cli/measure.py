@@ -5,14 +5,14 @@ from typing import Annotated
 
 import typer
 
-from stcal.camera_file import read_camera
 from stcal.cli.progress import StageProgress
 from stcal.cli.saving import keep_apart
 from stcal.cli.sfm import CameraFile, MaxDiameter, MinDiameter, TargetFile, Workers, ellipse_options
 from stcal.design import reference_target
-from stcal.design_file import load_board, load_target
 from stcal.errors import InputError
-from stcal.saving import json_text, save
+from stcal.io.camera import read_camera
+from stcal.io.design import load_board, load_target
+from stcal.io.saving import json_text, save
 
 app = typer.Typer()
 
@@ -49,11 +49,11 @@ def measure(
     workers: Workers = None,
 ) -> None:
     """Pose of a calibrated target in each image, from whatever faces it shows, with its 6×6 covariance."""
-    from stcal.sfm import measure as work
+    from stcal.io.table import read_table
+    from stcal.sfm.measure import images as work
+    from stcal.sfm.measure.pose import PoseOptions
+    from stcal.sfm.measure.target import read_target
     from stcal.sfm.pipeline import load_design
-    from stcal.sfm.single_pose import PoseOptions
-    from stcal.sfm.target_circles import read_target
-    from stcal.table_file import read_table
 
     keep_apart({"--out": out, "--json": json_file, "--report": report}, (camera, faces, target, board, joints))
     for path in (out, json_file, report):
@@ -79,7 +79,7 @@ def measure(
         save(json_file, json_text(work.measure_json(result)))
         print(f"as JSON: {json_file}")
     if report:
-        from stcal.sfm.report_measure import measure_page
+        from stcal.sfm.measure.report import measure_page
 
         save(report, measure_page(result, str(images)))
         print(f"report: {report}")

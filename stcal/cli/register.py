@@ -52,10 +52,10 @@ def register(
 ) -> None:
     """b_from_a from points measured in two frames, some of which may be wrong; with σ, outliers and where it holds."""
     from stcal.register import register as registered
-    from stcal.register.findings import findings
-    from stcal.register.pairs import read_pairs
-    from stcal.register.register_file import registration_json
-    from stcal.register.report import registration_page, registration_text
+    from stcal.register.core.pairs import read_pairs
+    from stcal.register.report.file import registration_json
+    from stcal.register.report.page import registration_page, registration_text
+    from stcal.register.workspace.findings import findings
 
     keep_apart({"--out": out, "--report": report, "--identified": identified}, (pairs_file, robot_file))
     if identified and not robot_file:
@@ -79,8 +79,8 @@ def register(
         print(f"warning: {pairs.where}: {note}")
     content, sections, failed = registration_json(found), [], None
     if robot_file:
-        from stcal.cli.register_robot import compared, comparison_json, comparison_section, comparison_text
-        from stcal.robot.robot_file import robot_toml
+        from stcal.robot.kinematics.file import robot_toml
+        from stcal.workflows.register_robot import compared, comparison_json, comparison_section, comparison_text
 
         try:
             beside = compared(pairs, pairs_file, robot_file, found, options, folds)

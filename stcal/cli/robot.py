@@ -28,8 +28,8 @@ def init(
     file: Annotated[Path, typer.Argument(help="Robot file to write; must not exist.")] = Path("robot.toml"),
 ) -> None:
     """Write an example of a robot file, to edit: a six-axis arm of 2 m reach."""
-    from stcal.robot.robot_file import robot_toml
-    from stcal.robot.simulated import mh80
+    from stcal.robot.kinematics.file import robot_toml
+    from stcal.synthetic.measured.arms import mh80
 
     if file.exists():
         raise InputError(f"robot file {file}: exists already; give another name or move it away")
@@ -53,10 +53,10 @@ def axes(
     report: ReportFile = None,
 ) -> None:
     """The axis method: each joint's axis from sweeps of that joint alone, and the robot that follows."""
-    from stcal.robot.axes_model import robot_from_sweeps
-    from stcal.robot.axes_report import axes_json, axes_page, axes_text
-    from stcal.robot.data import read_measurements
-    from stcal.robot.robot_file import load_robot, robot_toml
+    from stcal.robot.axes.model import robot_from_sweeps
+    from stcal.robot.axes.report import axes_json, axes_page, axes_text
+    from stcal.robot.kinematics.file import load_robot, robot_toml
+    from stcal.robot.kinematics.measurements import read_measurements
 
     keep_apart({"--out": out, "--json": json_file, "--report": report}, (sweeps, robot_file))
     nominal = load_robot(robot_file)
@@ -102,11 +102,11 @@ def identify(
     report: ReportFile = None,
 ) -> None:
     """Identify the kinematics from poses, positions or distances; σ not given are estimated."""
-    from stcal.robot.data import read_measurements
-    from stcal.robot.identification import IdentifyOptions
-    from stcal.robot.identification import identify as identified_from
-    from stcal.robot.identification_report import identified_json, identified_page, identified_text
-    from stcal.robot.robot_file import load_robot, robot_toml
+    from stcal.robot.identify.report import identified_json, identified_page, identified_text
+    from stcal.robot.identify.solve import IdentifyOptions
+    from stcal.robot.identify.solve import identify as identified_from
+    from stcal.robot.kinematics.file import load_robot, robot_toml
+    from stcal.robot.kinematics.measurements import read_measurements
 
     keep_apart({"--out": out, "--json": json_file, "--report": report}, (data_file, robot_file))
     nominal = load_robot(robot_file)
@@ -136,8 +136,8 @@ def compensate(
     report: ReportFile = None,
 ) -> None:
     """Joint values that really reach commanded poses, beside the nominal ones."""
-    from stcal.robot import compensation as stage
-    from stcal.robot.robot_file import load_robot
+    from stcal.robot.kinematics.file import load_robot
+    from stcal.robot.use import compensation as stage
 
     keep_apart({"--out": out, "--json": json_file, "--report": report}, (targets, robot_file, nominal))
     identified = load_robot(robot_file)
@@ -152,7 +152,7 @@ def compensate(
         save(out, stage.compensated_csv(result, identified))
     save_json(json_file, stage.compensated_json(result, identified))
     if report:
-        from stcal.robot.use_report import compensation_page
+        from stcal.robot.use.report import compensation_page
 
         save(report, compensation_page(result, identified))
     if not result.found.usable.any():
@@ -169,7 +169,7 @@ def verify(
     report: ReportFile = None,
 ) -> None:
     """Distances of measured positions from the first, against the commanded ones; sets before and after compared."""
-    from stcal.robot import verification as stage
+    from stcal.robot.use import verification as stage
 
     if plot and plot.suffix.lower() not in (".png", ".svg"):
         raise InputError(f"--plot {plot}: a name ending in .png or .svg needed")
@@ -179,12 +179,12 @@ def verify(
     for warning in result.warnings():
         print(f"warning: {warning}")
     if plot:
-        from stcal.robot.use_report import figure_bytes, verification_figure
+        from stcal.robot.use.report import figure_bytes, verification_figure
 
         save(plot, figure_bytes(verification_figure(result), plot.suffix.lower()[1:]))
     save_json(json_file, stage.verified_json(result))
     if report:
-        from stcal.robot.use_report import verification_page
+        from stcal.robot.use.report import verification_page
 
         save(report, verification_page(result))
 
@@ -214,8 +214,8 @@ def design(
     report: ReportFile = None,
 ) -> None:
     """Choose measurement poses that show the robot's parameters best."""
-    from stcal.robot import plan_poses as stage
-    from stcal.robot.robot_file import load_robot
+    from stcal.robot.kinematics.file import load_robot
+    from stcal.robot.use import design as stage
 
     options = stage.DesignOptions(
         count, seed, observe.value, candidates, sigma_mm, sigma_rad, _box(box) if box else None, target
@@ -230,7 +230,7 @@ def design(
         save(out, stage.design_csv(result, robot))
     save_json(json_file, stage.design_json(result))
     if report:
-        from stcal.robot.design_report import design_page
+        from stcal.robot.use.design_report import design_page
 
         save(report, design_page(result, robot))
 

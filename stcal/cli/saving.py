@@ -3,8 +3,8 @@
 from collections.abc import Sequence
 from pathlib import Path
 
-from stcal import saving
 from stcal.errors import InputError
+from stcal.io import saving
 
 
 def save(path: Path, content: str | bytes) -> None:

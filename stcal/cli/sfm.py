@@ -8,12 +8,12 @@ from typing import Annotated
 import numpy as np
 import typer
 
-from stcal.camera_file import read_camera
 from stcal.cli.progress import StageProgress
 from stcal.design import reference_board, reference_target
-from stcal.design_file import board_toml, load_board, load_target, target_toml
 from stcal.errors import InputError
-from stcal.saving import json_text, save
+from stcal.io.camera import read_camera
+from stcal.io.design import board_toml, load_board, load_target, target_toml
+from stcal.io.saving import json_text, save
 
 app = typer.Typer(
     name="stcal-sfm",
@@ -114,7 +114,7 @@ def run(
 ) -> None:
     """Calibrate: detect, map, scale, chain and adjust; writes faces.json and report.html."""
     from stcal.sfm import pipeline
-    from stcal.sfm.pairs import PairOptions
+    from stcal.sfm.mapping.pairs import PairOptions
 
     options = pipeline.RunOptions(
         solve=solve and solve.value,
@@ -145,9 +145,9 @@ def detect(
     workers: Workers = None,
 ) -> None:
     """Detection alone: detections.csv and an overlay picture of every image."""
-    from stcal.images import find_images
+    from stcal.io.images import find_images
     from stcal.sfm import pipeline
-    from stcal.sfm.saved import marker_json
+    from stcal.sfm.run.saved import marker_json
 
     model = read_camera(camera)
     target_design = pipeline.load_design(target, reference_target, load_target)
@@ -241,8 +241,8 @@ def compare(
     out: Annotated[Path | None, typer.Option("--json", help="Also write the comparison as JSON.")] = None,
 ) -> None:
     """Errors of a run against a known truth, as a table and as JSON."""
-    from stcal.sfm.compare import compare as against
-    from stcal.sfm.compare import comparison_table
+    from stcal.sfm.report.compare import compare as against
+    from stcal.sfm.report.compare import comparison_table
 
     comparison = against(run_folder, truth)
     print(comparison_table(comparison))
@@ -261,8 +261,8 @@ def demo(
 ) -> None:
     """Render a small data set with known truth, calibrate it, and print the faces against the truth."""
     from stcal.sfm import pipeline
-    from stcal.sfm.compare import compare as against
-    from stcal.sfm.compare import comparison_table
+    from stcal.sfm.report.compare import compare as against
+    from stcal.sfm.report.compare import comparison_table
     from stcal.synthetic.dataset import write_dataset
     from stcal.synthetic.scene import SceneOptions, make_scene
 
@@ -322,7 +322,7 @@ def _print_skipped(skipped) -> None:
 
 def _print_checks(checks) -> None:
     """How many checks came out how, and those that did not pass."""
-    from stcal.sfm.report_checks import count_verdicts
+    from stcal.sfm.report.checks import count_verdicts
 
     print(f"checks: {count_verdicts([check.verdict for check in checks])}")
     for check in checks:

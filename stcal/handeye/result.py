@@ -7,9 +7,9 @@ import numpy as np
 from stcal.errors import InputError
 from stcal.geometry.arrays import frozen
 from stcal.geometry.rigid import Rigid
-from stcal.handeye.loop import FRAMES, Setup
-from stcal.handeye.observability import Observability
-from stcal.handeye.reprojection import Reprojection
+from stcal.handeye.data.loop import FRAMES, Setup
+from stcal.handeye.judge.observability import Observability
+from stcal.handeye.methods.reprojection import Reprojection
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -23,7 +23,7 @@ class HandEye:
     setup : str
         ``eye-in-hand`` or ``eye-to-hand``.
     mount_from_camera, stand_from_board : Rigid
-        The two unknowns, mm; what mount and stand are tells :mod:`stcal.handeye.loop`. See :attr:`transforms`.
+        The two unknowns, mm; what mount and stand are tells :mod:`stcal.handeye.data.loop`. See :attr:`transforms`.
     residuals : (m, 6) array
         Of each pose: by how much its chain misses ``stand_from_board``, rotation vector (rad), and translation (mm)
         at the board's origin, axes of the stand.

@@ -4,25 +4,26 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from stcal.camera_file import CameraPrior
 from stcal.errors import DegenerateError, InputError
+from stcal.geometry.least_squares import generalised_inverse
 from stcal.geometry.rigid import Rigid
-from stcal.handeye import remarks, start
-from stcal.handeye.closed_form import AX_XB, AX_ZB, closed_form
-from stcal.handeye.conventions import check_conventions
-from stcal.handeye.convex import convex
-from stcal.handeye.evolution import EvolutionOptions, Objective, evolve, polish
-from stcal.handeye.leastsq import generalised_inverse
-from stcal.handeye.loop import FRAMES, Loop, Setup
-from stcal.handeye.motions import Motions, poses_with_log
-from stcal.handeye.noise import Noise
-from stcal.handeye.observability import Observability, check, in_words, require_scale
-from stcal.handeye.pairs import HandEyePoses
-from stcal.handeye.pose_adjustment import State, adjust_poses
-from stcal.handeye.reprojection import adjust_views, resected
+from stcal.handeye.data.loop import FRAMES, Loop, Setup
+from stcal.handeye.data.motions import Motions, poses_with_log
+from stcal.handeye.data.pairs import HandEyePoses
+from stcal.handeye.data.views import Views
+from stcal.handeye.judge import remarks
+from stcal.handeye.judge.conventions import check_conventions
+from stcal.handeye.judge.observability import Observability, check, in_words, require_scale
+from stcal.handeye.judge.symmetry import repair
+from stcal.handeye.methods import start
+from stcal.handeye.methods.closed_form import AX_XB, AX_ZB, closed_form
+from stcal.handeye.methods.convex import convex
+from stcal.handeye.methods.evolution import EvolutionOptions, Objective, evolve, polish
+from stcal.handeye.methods.noise import Noise
+from stcal.handeye.methods.pose_adjustment import State, adjust_poses
+from stcal.handeye.methods.reprojection import adjust_views, resected
 from stcal.handeye.result import HandEye
-from stcal.handeye.symmetry import repair
-from stcal.handeye.views import Views
+from stcal.io.camera import CameraPrior
 
 OTHERS = ("zhao", "de", "de-polished", "pose", "reprojection")
 METHODS = (*AX_XB, *AX_ZB, *OTHERS)

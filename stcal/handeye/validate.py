@@ -9,12 +9,12 @@ from stcal.errors import DegenerateError, InputError, StcalError
 from stcal.geometry.arrays import frozen
 from stcal.geometry.camera import Camera
 from stcal.geometry.rigid import Rigid
-from stcal.handeye.loop import Loop, Setup
-from stcal.handeye.pairs import HandEyePoses
+from stcal.handeye.data.loop import Loop, Setup
+from stcal.handeye.data.pairs import HandEyePoses
+from stcal.handeye.data.views import View, Views, resect
+from stcal.handeye.judge.symmetry import repair
 from stcal.handeye.result import HandEye
 from stcal.handeye.solve import METHODS, HandEyeOptions, handeye
-from stcal.handeye.symmetry import repair
-from stcal.handeye.views import View, Views, resect
 from stcal.parallel import run_parallel
 
 LEAST_LEFT = 3

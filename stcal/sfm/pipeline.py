@@ -10,32 +10,32 @@ from pathlib import Path
 import numpy as np
 
 import stcal
-from stcal.camera_file import CameraModel, CameraPrior, camera_prior, read_camera, refinable, write_cameras_txt
 from stcal.design import BoardDesign, TargetDesign, reference_board, reference_target
-from stcal.design_file import board_toml, load_board, load_target, target_toml
 from stcal.errors import InputError
 from stcal.geometry.camera import Camera
-from stcal.images import RUN_MARKER, find_images
-from stcal.saving import json_text, save
-from stcal.sfm.calibration import Calibration, calibrate
-from stcal.sfm.chain import measure_chains
-from stcal.sfm.checks import Evidence, run_checks
-from stcal.sfm.colmap_model import find_models, read_model, write_model
-from stcal.sfm.crosscheck import Tolerances, crosscheck
-from stcal.sfm.database import image_ids, labels_csv, remove_database, write_database
-from stcal.sfm.detection import DetectionResult, detect_files, require_single
-from stcal.sfm.foreign import faces_from_models
-from stcal.sfm.graph import ImageGraph, image_graph
-from stcal.sfm.labels import LabelledImage, label_group
-from stcal.sfm.model import GroupModel
-from stcal.sfm.observations import ImageObservations, by_group, detections_csv
-from stcal.sfm.options import RunOptions
-from stcal.sfm.output import faces_json, report_json
-from stcal.sfm.overlay import draw_overlay
-from stcal.sfm.report import report_html, shown_overlays
-from stcal.sfm.result import RunResult
-from stcal.sfm.saved import BOARD, CAMERA, TARGET, SavedRun, marker_json
-from stcal.sfm.solve import GroupSolution, require_groups, solve_group, unseen_board
+from stcal.io.camera import CameraModel, CameraPrior, camera_prior, read_camera, refinable, write_cameras_txt
+from stcal.io.design import board_toml, load_board, load_target, target_toml
+from stcal.io.images import RUN_MARKER, find_images
+from stcal.io.saving import json_text, save
+from stcal.sfm.adjust.calibration import Calibration, calibrate
+from stcal.sfm.adjust.chain import measure_chains
+from stcal.sfm.checks.suite import Evidence, run_checks
+from stcal.sfm.data.model import GroupModel
+from stcal.sfm.data.observations import ImageObservations, by_group, detections_csv
+from stcal.sfm.detect.files import DetectionResult, detect_files, require_single
+from stcal.sfm.detect.labels import LabelledImage, label_group
+from stcal.sfm.detect.overlay import draw_overlay
+from stcal.sfm.interop.crosscheck import Tolerances, crosscheck
+from stcal.sfm.interop.external import faces_from_models
+from stcal.sfm.mapping.database import image_ids, labels_csv, remove_database, write_database
+from stcal.sfm.mapping.graph import ImageGraph, image_graph
+from stcal.sfm.mapping.models import find_models, read_model, write_model
+from stcal.sfm.report.page import report_html, shown_overlays
+from stcal.sfm.run.options import RunOptions
+from stcal.sfm.run.output import faces_json, report_json
+from stcal.sfm.run.result import RunResult
+from stcal.sfm.run.saved import BOARD, CAMERA, TARGET, SavedRun, marker_json
+from stcal.sfm.run.solve import GroupSolution, require_groups, solve_group, unseen_board
 
 RESULTS = ("faces.json", "report.json", "report.html", "labels.csv", "detections.csv", "compare.json")
 RESULTS += (CAMERA, TARGET, BOARD)
@@ -58,7 +58,7 @@ def run(
     Parameters
     ----------
     images : folder with one folder of images for each group
-    camera : COLMAP's cameras.txt, OpenCV's YAML or XML, or what :func:`stcal.camera_file.read_camera` returned
+    camera : COLMAP's cameras.txt, OpenCV's YAML or XML, or what :func:`stcal.io.camera.read_camera` returned
     out : the run's folder, new, empty, or of an earlier run
     target, board : designs or their TOML files; the reference design where None
 
@@ -89,7 +89,9 @@ def run(
     )
     tell("faces", 0, 1)
     prior = camera_prior(model, detection.camera)
-    calibration = calibrate([s.model for s in solutions], detection.camera, target, board, options, prior)
+    calibration = calibrate(
+        [s.model for s in solutions], detection.camera, target, board, options.adjustment(target), prior
+    )
     tell("faces", 1, 1)
     result = RunResult(
         out,
@@ -125,7 +127,7 @@ def _evidence(result: RunResult, prior: CameraPrior) -> Evidence:
         result.colmap_model,
         result.target_design,
         result.board_design,
-        result.options,
+        result.options.adjustment(result.target_design),
         result.calibration,
         prior if result.options.refine_camera else None,
         {name: float(np.median(each)) for name, each in blur.items() if len(each)},
@@ -181,7 +183,7 @@ def calibrate_models(model: Path, saved: SavedRun) -> Calibration:
 
 def write_faces(path: Path, calibration: Calibration, saved: SavedRun) -> None:
     """``faces.json`` of models that were chained."""
-    options = replace(saved.options, solve="chain")
+    options = replace(saved.options, solve="chain").adjustment(saved.target)
     save(path, json_text(faces_json(calibration.target, saved.target, options, calibration.sigma_factor)))
 
 
@@ -318,7 +320,12 @@ def _write(result: RunResult, tell: Progress) -> None:
     save(out / TARGET, target_toml(result.target_design))
     save(out / BOARD, board_toml(result.board_design))
     report = report_json(result)
-    faces = faces_json(result.target, result.target_design, result.options, result.calibration.sigma_factor)
+    faces = faces_json(
+        result.target,
+        result.target_design,
+        result.options.adjustment(result.target_design),
+        result.calibration.sigma_factor,
+    )
     save(out / "faces.json", json_text(faces))
     write_report(out, report)
     tell("report", 1, 1)

@@ -6,10 +6,10 @@ from pathlib import Path
 
 import numpy as np
 
-from stcal.camera_file import write_cameras_txt
 from stcal.design import BOARD
-from stcal.design_file import board_toml, target_toml
 from stcal.errors import InputError
+from stcal.io.camera import write_cameras_txt
+from stcal.io.design import board_toml, target_toml
 from stcal.parallel import run_parallel
 from stcal.synthetic.observe import image_circles
 from stcal.synthetic.render import RenderOptions, encode, render

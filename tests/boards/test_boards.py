@@ -6,9 +6,9 @@ import cv2
 import numpy as np
 import pytest
 
-from stcal.boards.board_file import load_flat_board
 from stcal.boards.chessboard import find_chessboard
 from stcal.boards.design import CharucoDesign, ChessboardDesign, TagLayout
+from stcal.boards.file import load_flat_board
 from stcal.boards.tags import find_charuco, find_tags, view_of_tags
 from stcal.design import BoardDesign
 from stcal.errors import InputError

@@ -7,11 +7,11 @@ import cv2
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from stcal.camera_file import write_cameras_txt
 from stcal.geometry.camera import Camera
 from stcal.geometry.rigid import Poses, Rigid
-from stcal.handeye.simulated import BASE_FROM_BOARD, FLANGE_FROM_CAMERA
-from stcal.table_file import POSE, pose_cells
+from stcal.io.camera import write_cameras_txt
+from stcal.io.table import POSE, pose_cells
+from stcal.synthetic.measured.handeye import BASE_FROM_BOARD, FLANGE_FROM_CAMERA
 from tests.boards.drawn import photograph
 
 CAMERA = Camera(800, 600, [1000, 1000], [406, 293], np.zeros(8))

@@ -8,12 +8,14 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from stcal.errors import DegenerateError, InputError, StcalError
+from stcal.geometry.least_squares import perturbed
 from stcal.geometry.rigid import Poses, Rigid
 from stcal.handeye import HandEyeOptions, HandEyePoses, handeye
-from stcal.handeye.leastsq import perturbed
-from stcal.handeye.loop import Loop
-from stcal.handeye.observability import Observability
-from stcal.handeye.simulated import (
+from stcal.handeye.data.loop import Loop
+from stcal.handeye.data.views import View, Views, pairs_of_views
+from stcal.handeye.judge.observability import Observability
+from stcal.handeye.judge.symmetry import repair
+from stcal.synthetic.measured.handeye import (
     BASE_FROM_BOARD,
     BASE_FROM_CAMERA,
     FLANGE_FROM_BOARD,
@@ -23,8 +25,6 @@ from stcal.handeye.simulated import (
     simulated,
     simulated_views,
 )
-from stcal.handeye.symmetry import repair
-from stcal.handeye.views import View, Views, pairs_of_views
 
 SETUPS = ("eye-in-hand", "eye-to-hand")
 NOISE = {"robot": (3e-4, 0.1), "camera": (1e-3, 0.3)}

@@ -7,13 +7,13 @@ import numpy as np
 import pytest
 import yaml
 
-from stcal.camera_file import read_camera
 from stcal.cli.main import main
 from stcal.design import BoardDesign
 from stcal.geometry.rigid import Poses, Rigid
 from stcal.handeye import METHODS
-from stcal.handeye.simulated import BASE_FROM_BOARD, FLANGE_FROM_CAMERA, simulated
-from stcal.table_file import POSE, pose_cells
+from stcal.io.camera import read_camera
+from stcal.io.table import POSE, pose_cells
+from stcal.synthetic.measured.handeye import BASE_FROM_BOARD, FLANGE_FROM_CAMERA, simulated
 from tests.boards.drawn import chessboard_mm
 from tests.handeye.photographed import CAMERA, looks, photographs, sheet_of_dots
 

@@ -7,7 +7,7 @@ from scipy.spatial.transform import Rotation
 from stcal.errors import DegenerateError
 from stcal.geometry.rigid import Poses
 from stcal.handeye import HandEyeOptions, HandEyePoses, handeye
-from stcal.handeye.simulated import BASE_FROM_CAMERA, FLANGE_FROM_BOARD, disturbed
+from stcal.synthetic.measured.handeye import BASE_FROM_CAMERA, FLANGE_FROM_BOARD, disturbed
 
 
 def scara(rng, count=12, setup="eye-to-hand", sigma=(5e-4, 0.1)):

@@ -8,13 +8,13 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from stcal.boards.design import CharucoDesign, ChessboardDesign, TagLayout
-from stcal.camera_file import CameraModel
-from stcal.cli.board_views import images_of_centres, look, symmetries
 from stcal.design import BoardDesign
 from stcal.errors import InputError
 from stcal.geometry.conic import circle_conic, ellipse_of_conic
 from stcal.geometry.rigid import Rigid
-from stcal.images import find_images
+from stcal.io.camera import CameraModel
+from stcal.io.images import find_images
+from stcal.workflows.board_views import images_of_centres, look, symmetries
 from tests.boards.drawn import chessboard_mm
 from tests.handeye.photographed import (
     CAMERA,

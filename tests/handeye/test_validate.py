@@ -9,8 +9,8 @@ from scipy.spatial.transform import Rotation
 from stcal.errors import DegenerateError, InputError
 from stcal.geometry.rigid import Poses, Rigid
 from stcal.handeye import METHODS, HandEyeOptions, HandEyePoses, Noise, compare, cross_validate, handeye, splits
-from stcal.handeye.simulated import simulated, simulated_views
 from stcal.handeye.validate import predicted
+from stcal.synthetic.measured.handeye import simulated, simulated_views
 
 
 def test_every_pose_has_its_turn():

@@ -5,8 +5,8 @@ import numpy as np
 
 from stcal.geometry.camera import Camera
 from stcal.geometry.rigid import Rigid
-from stcal.locate.layout import TargetLayout
-from stcal.locate.simulated import example_layout
+from stcal.locate.data.layout import TargetLayout
+from stcal.synthetic.measured.tags import example_layout
 from tests.boards.drawn import photograph
 
 CAMERA = Camera(1200, 900, [1300.0, 1300.0], [599.5, 449.5], np.zeros(8))

@@ -9,15 +9,15 @@ import pytest
 
 from stcal.boards.design import CharucoDesign
 from stcal.boards.tags import find_tags
-from stcal.camera_file import CameraModel, read_camera
 from stcal.cli.locate import calibration_images
-from stcal.images import decode
-from stcal.locate.exposures import find_scenes
-from stcal.locate.holdout import half_calibrated, subset_trials
-from stcal.locate.layout import LayoutPlan
-from stcal.locate.merge import merge
-from stcal.locate.run import run
-from stcal.locate.views import CalibrationImages
+from stcal.io.camera import CameraModel, read_camera
+from stcal.io.images import decode
+from stcal.locate.calibrate.holdout import half_calibrated, subset_trials
+from stcal.locate.data.exposures import find_scenes
+from stcal.locate.data.layout import LayoutPlan
+from stcal.locate.data.views import CalibrationImages
+from stcal.locate.pipeline import run
+from stcal.locate.pose.merge import merge
 from stcal.synthetic.exposure import Light, expose
 
 BOARD = CharucoDesign(7, 5, 36.195, 18.256, "DICT_6X6_250")

@@ -8,12 +8,12 @@ import cv2
 import numpy as np
 import pytest
 
-from stcal.camera_file import write_cameras_txt
 from stcal.cli.main import main
 from stcal.geometry.rigid import Rigid
-from stcal.locate.layout import layout_toml, load_layout
-from stcal.locate.simulated import random_pose
-from stcal.table_file import POSE, pose_cells, read_table
+from stcal.io.camera import write_cameras_txt
+from stcal.io.table import POSE, pose_cells, read_table
+from stcal.locate.data.layout import layout_toml, load_layout
+from stcal.synthetic.measured.tags import random_pose
 from tests.boards.drawn import photograph
 from tests.locate.drawn_target import CAMERA, LAYOUT, PER_MM, SHEET_MM, photo, sheet, tilted
 

@@ -6,12 +6,12 @@ import cv2
 import numpy as np
 import pytest
 
-from stcal.camera_file import CameraModel
 from stcal.geometry.camera import Camera
 from stcal.geometry.rigid import Poses, Rigid
-from stcal.locate.exposures import find_scenes
-from stcal.locate.layout import TargetLayout
-from stcal.locate.run import LocateOptions, locate_scene, run
+from stcal.io.camera import CameraModel
+from stcal.locate.data.exposures import find_scenes
+from stcal.locate.data.layout import TargetLayout
+from stcal.locate.pipeline import LocateOptions, locate_scene, run
 from stcal.synthetic.exposure import Light, expose, moved
 from tests.locate.drawn_target import CAMERA, LAYOUT, PER_MM, SHEET_MM, photo, sheet, tilted
 

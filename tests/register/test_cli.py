@@ -7,12 +7,12 @@ import numpy as np
 import pytest
 
 from stcal.cli.main import main
-from stcal.cli.register_robot import held_out
 from stcal.errors import DegenerateError
 from stcal.geometry.rigid import Rigid
-from stcal.robot.kinematics import forward
-from stcal.robot.robot_file import load_robot, robot_toml
-from stcal.robot.simulated import joint_vectors, made, mh80, placed
+from stcal.robot.kinematics.file import load_robot, robot_toml
+from stcal.robot.kinematics.forward import forward
+from stcal.synthetic.measured.arms import joint_vectors, made, mh80, placed
+from stcal.workflows.register_robot import held_out
 
 HEAD = "ax_mm,ay_mm,az_mm,bx_mm,by_mm,bz_mm"
 B_FROM_A = Rigid.exp([0.3, -0.4, 1.1, 2500.0, -300.0, 800.0])

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from stcal.robot.kinematics import forward
+from stcal.robot.kinematics.forward import forward
 from tests.scripts import load_script
 
 

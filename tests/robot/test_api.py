@@ -10,9 +10,9 @@ import pytest
 
 from stcal import robot
 from stcal.geometry.rigid import Rigid
-from stcal.robot.compensation import joint_cells, joint_columns
-from stcal.robot.simulated import joint_vectors, made, measured, mh80, placed
-from stcal.table_file import POSE, pose_cells
+from stcal.io.table import POSE, pose_cells
+from stcal.robot.use.compensation import joint_cells, joint_columns
+from stcal.synthetic.measured.arms import joint_vectors, made, measured, mh80, placed
 
 
 def write(path, header, rows) -> None:
@@ -69,7 +69,7 @@ def test_the_example_of_the_docstring_runs(files, monkeypatch, capsys):
 def test_every_name_is_there_and_no_other():
     for name in robot.__all__:
         assert getattr(robot, name).__name__ == name
-    with pytest.raises(AttributeError, match="no attribute nothing"):
+    with pytest.raises(AttributeError, match="attribute nothing"):
         robot.nothing  # noqa: B018
 
 

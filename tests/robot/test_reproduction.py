@@ -1,20 +1,14 @@
 """The published chain end to end, as the study runs it: photographs of the target on an arm, axes, model, positions."""
 
-import importlib
-from pathlib import Path
-
 import numpy as np
 import pytest
 
-SCRIPTS = Path(__file__).resolve().parents[2] / "scripts"
+from tests.scripts import load_script
 
 
 @pytest.fixture
 def study(monkeypatch):
-    for name in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS"):
-        monkeypatch.setenv(name, "1")  # the study sets them: this brings them back
-    monkeypatch.syspath_prepend(SCRIPTS)
-    module = importlib.import_module("reproduce_robot")
+    module = load_script("reproduce_robot")
     monkeypatch.setattr(module, "VERIFIED", 15)
     monkeypatch.setattr(module, "POOL", 15)
     return module

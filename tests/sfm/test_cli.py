@@ -6,7 +6,7 @@ import sys
 import pytest
 
 from stcal.cli.main import main, main_sfm
-from stcal.design_file import load_board, load_target
+from stcal.io.design import load_board, load_target
 
 
 @pytest.fixture
@@ -77,7 +77,7 @@ def test_the_demo_ends_within_its_own_sigma(command, tmp_path):
     code, text, _ = command("demo", "--out", tmp_path / "demo")
     assert code == 0
     assert "simulated" in text
-    from stcal.sfm.compare import compare
+    from stcal.sfm.report.compare import compare
 
     comparison = compare(tmp_path / "demo" / "run", tmp_path / "demo" / "data" / "truth.json")
     for face_id in ("2", "3", "4", "5"):

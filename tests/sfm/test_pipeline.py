@@ -9,12 +9,12 @@ import pytest
 
 from stcal.errors import InputError
 from stcal.sfm import RunOptions, run
-from stcal.sfm.adjust import adjust
-from stcal.sfm.compare import compare
-from stcal.sfm.database import from_colmap_px, image_ids
-from stcal.sfm.mapping import map_group
-from stcal.sfm.metric import find_scale
-from stcal.sfm.pairs import PairOptions, rank_pairs
+from stcal.sfm.adjust.group import adjust
+from stcal.sfm.adjust.scale import find_scale
+from stcal.sfm.mapping.database import from_colmap_px, image_ids
+from stcal.sfm.mapping.incremental import map_group
+from stcal.sfm.mapping.pairs import PairOptions, rank_pairs
+from stcal.sfm.report.compare import compare
 from stcal.synthetic.dataset import write_dataset
 from stcal.synthetic.render import RenderOptions
 from stcal.synthetic.scene import SceneOptions, make_scene

@@ -3,9 +3,9 @@
 import numpy as np
 import pytest
 
-from stcal.design_file import load_board, load_target
+from stcal.io.design import load_board, load_target
 from stcal.sfm import run
-from stcal.sfm.compare import compare
+from stcal.sfm.report.compare import compare
 from stcal.synthetic.dataset import write_dataset
 from stcal.synthetic.scene import SceneOptions, make_scene, second_design
 

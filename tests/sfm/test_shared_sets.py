@@ -8,15 +8,15 @@ import cv2
 import numpy as np
 import pytest
 
-from stcal.camera_file import read_camera
 from stcal.design import BoardDesign, reference_target
 from stcal.geometry.camera import Camera
+from stcal.io.camera import read_camera
 from stcal.sfm import RunOptions, run
-from stcal.sfm.compare import compare
-from stcal.sfm.crosscheck import crosscheck
 from stcal.sfm.detect.ellipses import EllipseOptions
 from stcal.sfm.detect.image import detect_image
-from stcal.sfm.saved import load_run
+from stcal.sfm.interop.crosscheck import crosscheck
+from stcal.sfm.report.compare import compare
+from stcal.sfm.run.saved import load_run
 
 # Bounds of the issue: µm of faces 2, 4, 5 and of face 3, mdeg of the same, µm mean of circles after a rigid fit,
 # and the share of visible circles found.

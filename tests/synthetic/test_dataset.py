@@ -7,9 +7,9 @@ import cv2
 import numpy as np
 import pytest
 
-from stcal.camera_file import read_camera
-from stcal.design_file import load_board, load_target
 from stcal.errors import InputError
+from stcal.io.camera import read_camera
+from stcal.io.design import load_board, load_target
 from stcal.synthetic.dataset import truth, write_dataset
 from stcal.synthetic.render import RenderOptions, render
 from stcal.synthetic.scene import SceneOptions, make_scene, second_design

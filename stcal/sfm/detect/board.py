@@ -2,7 +2,7 @@
 
 A plain board looks the same after half a turn (a square one after a quarter), and a hidden strip may leave open
 which rows or columns are seen. A reading therefore carries every numbering that fits the image; the group decides
-(``stcal.sfm.labels``).
+(``stcal.sfm.detect.labels``).
 """
 
 from dataclasses import dataclass

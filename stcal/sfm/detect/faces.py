@@ -11,8 +11,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from stcal.design import FaceDesign, TargetDesign
+from stcal.sfm.detect.ambiguity import is_named
 from stcal.sfm.detect.candidates import MAX_AXIS_RATIO, Candidates, grow_match, singular_values
-from stcal.sfm.detect.likeness import is_named
 
 NEIGHBOURS_IN_DESIGN = 3
 NEIGHBOURS_IN_IMAGE = 12

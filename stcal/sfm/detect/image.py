@@ -6,7 +6,7 @@ import numpy as np
 
 from stcal.design import BoardDesign, Polarity, TargetDesign
 from stcal.geometry.camera import Camera
-from stcal.images import grey_8bit, grey_fine
+from stcal.io.images import grey_8bit, grey_fine
 from stcal.sfm.detect.board import BoardReading, find_boards
 from stcal.sfm.detect.candidates import Candidates
 from stcal.sfm.detect.centres import Centres, measure_centres

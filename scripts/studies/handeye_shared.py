@@ -1,0 +1,129 @@
+"""Hand-eye calibration of two real data sets, through the command line: the figures of the README.
+
+.venv/bin/python scripts/studies/handeye_shared.py [../shared/data]
+
+charuco_handeye: 16 photographs of a ChArUco board on a robot, static camera; each method on the same 15 splits with 5
+of the 16 held out, with the camera and the board as their files have them, and as adjusted to all photographs.
+dotgrid_handeye: 15 photographs of a dot board by a camera on a robot; the pitch of the dots from the robot's motion.
+"""
+
+import contextlib
+import io
+import json
+import sys
+import tempfile
+from pathlib import Path
+
+import numpy as np
+
+from stcal.cli.main import app
+from stcal.geometry.camera import Camera
+from stcal.io.camera import read_camera, write_cameras_txt
+
+CHARUCO = """type = "charuco"
+rows = 7
+columns = 5
+square_mm = 36.195
+marker_mm = 18.256
+dictionary = "DICT_6X6_250"
+"""
+DOTS = """# As the label on the sheet has it; target.yaml says 25.4 mm.
+rows = 10
+columns = 10
+pitch_mm = 20.0
+radius_mm = 5.0
+polarity = "dark"
+sigma_mm = 0.1
+
+[corner]
+row = 9
+column = 0
+radius_mm = 10.0
+"""
+# The two camera files of the data set differ by 8 and 14 px, and have no distortion.
+DOTS_CAMERA_SIGMA = (10.0, 10.0, 15.0, 15.0, 0.1, 0.1, 0.01, 0.01)
+SPLITS = ("--held-out", "5", "--splits", "15")
+
+
+def charuco(data: Path, scratch: Path, *options: str, adjusted: dict | None = None) -> tuple[dict, str]:
+    """Output of ``stcal handeye`` on charuco_handeye, and what it prints.
+
+    The camera file of the data set has no distortion, which the lens has: it is adjusted; or camera and board are those
+    of an output, ``adjusted``.
+    """
+    folder = data / "charuco_handeye" / "test_set_charuco"
+    file, board = folder / "cal_data.yaml", CHARUCO
+    if adjusted is None:
+        options = ("--refine-camera", "--with-scale", *options)
+    else:
+        camera = Camera(1600, 1200, np.ones(2), np.zeros(2), np.zeros(8))
+        camera = camera.with_parameters(np.array(list(adjusted["camera"]["parameters"].values())))
+        file = _camera_file(scratch, camera)
+        board = board.replace("36.195", repr(adjusted["board"]["pitch_mm"]))
+    return _handeye(folder, scratch, file, board, "--setup", "eye-to-hand", *options)
+
+
+def dots(data: Path, scratch: Path, *options: str) -> tuple[dict, str]:
+    """The same on dotgrid_handeye."""
+    folder = data / "dotgrid_handeye"
+    camera = read_camera(folder / "camera_intr_calibrated.yaml").sized(640, 480)
+    file = _camera_file(scratch, camera, np.diag(np.square(DOTS_CAMERA_SIGMA)))
+    return _handeye(folder, scratch, file, DOTS, "--refine-camera", "--with-scale", *options)
+
+
+def _camera_file(scratch: Path, camera: Camera, covariance: np.ndarray | None = None) -> Path:
+    scratch.mkdir(parents=True, exist_ok=True)
+    write_cameras_txt(scratch / "cameras.txt", camera, "OPENCV", covariance)
+    return scratch / "cameras.txt"
+
+
+def _handeye(folder: Path, scratch: Path, camera: Path, board: str, *options: str) -> tuple[dict, str]:
+    """The command on one data set, as it is."""
+    scratch.mkdir(parents=True, exist_ok=True)
+    (scratch / "board.toml").write_text(board)
+    files = {"--poses": folder / "poses", "--camera": camera, "--board": scratch / "board.toml"}
+    given = [str(word) for pair in files.items() for word in pair]
+    out = scratch / "all.json"
+    printed = io.StringIO()
+    with contextlib.redirect_stdout(printed):
+        arguments = ["handeye", str(folder / "images"), *given, *options, "--json", str(out)]
+        app(arguments, standalone_mode=False)
+    return json.loads(out.read_text()), printed.getvalue()
+
+
+def by_split(data: dict) -> np.ndarray:
+    """3-D error at the board of each split, mean over the poses held out, mm."""
+    return np.array([np.mean(split["board_mm"]) for split in data["splits"]])
+
+
+def _compare(found: dict) -> None:
+    park, ours = by_split(next(row for row in found["methods"] if row["method"] == "park-martin")), by_split(found)
+    print("3-D error at the board by split:")
+    for name, errors in ((found["method"], ours), ("park-martin", park)):
+        print(f"  {name}: mean {errors.mean():.3f}, {errors.min():.3f} to {errors.max():.3f} mm")
+    print(f"  {found['method']} worse than park-martin on {(ours >= park).sum()} of {len(ours)} splits")
+
+
+def main() -> None:
+    data = Path(sys.argv[1]) if len(sys.argv) > 1 else Path(__file__).resolve().parents[3] / "shared" / "data"
+    for name in ("charuco_handeye", "dotgrid_handeye"):
+        if not (data / name).is_dir():
+            sys.exit(f"error: {data / name} is missing; give the folder that holds it")
+    with tempfile.TemporaryDirectory() as scratch:
+        found, text = charuco(data, Path(scratch) / "charuco", "--method", "all", *SPLITS)
+        print(f"charuco_handeye\n\n{text}")
+        _compare(found)
+        found, text = charuco(data, Path(scratch) / "adjusted", "--method", "all", *SPLITS, adjusted=found)
+        print(f"\ncharuco_handeye, camera and board as adjusted\n\n{text[text.index('Methods') :]}")
+        _compare(found)
+        many, _ = charuco(data, Path(scratch) / "many", *SPLITS[:2], "--splits", "60")
+        print(f"reprojection over 60 splits, all adjusted: mean {by_split(many).mean():.3f} mm")
+        found, text = dots(data, Path(scratch) / "dots")
+        print(f"\ndotgrid_handeye\n\n{text}")
+        board = found["board"]
+        sigma = board["scale_sigma"] * board["pitch_mm"] / board["scale"]
+        print(f"pitch found: {board['pitch_mm']:.2f} ± {sigma:.2f} mm; 20 mm on the label, 25.4 mm in target.yaml")
+
+
+if __name__ == "__main__":
+    main()

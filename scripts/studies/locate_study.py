@@ -1,0 +1,228 @@
+"""How good ``stcal locate`` is: real photographs of a ChArUco board whose tags are the target and whose chessboard
+corners are the truth, the same exposed again in simulated light, simulated corners, and the time of it.
+
+.venv/bin/python scripts/studies/locate_study.py SET [--part poses|subsets|exposures|covariance|time] [--most 200]
+
+SET is a folder with ``images/`` of a 7×5 board of DICT_6X6_250 (squares of 36.195 mm, tags of 18.256 mm) and
+``cal_data.yaml`` with its intrinsics. Even images calibrate the layout, odd ones are located; then the other way round.
+"""
+
+import argparse
+import tempfile
+import time
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+
+import cv2
+import numpy as np
+
+from stcal.boards.design import CharucoDesign
+from stcal.boards.tags import Tags, find_tags
+from stcal.cli.locate import calibration_images
+from stcal.geometry.rigid import Poses
+from stcal.io.camera import CameraModel, read_camera
+from stcal.io.images import decode, find_images
+from stcal.locate.calibrate.holdout import Trial, half_calibrated, subset_trials
+from stcal.locate.data.exposures import find_scenes
+from stcal.locate.data.layout import LayoutPlan, TargetLayout
+from stcal.locate.data.views import CalibrationImages
+from stcal.locate.pipeline import LocateOptions, run
+from stcal.locate.pose.estimate import locate
+from stcal.locate.pose.merge import merge
+from stcal.locate.pose.patent import PatentOptions
+from stcal.locate.pose.verdict import VerdictOptions, judge
+from stcal.synthetic.exposure import Light, expose
+from stcal.synthetic.measured.tags import CAMERA, CornerNoise, example_layout, random_pose, simulated_exposures
+
+BOARD = CharucoDesign(7, 5, 36.195, 18.256, "DICT_6X6_250")
+TAGS = 17
+ORIGIN = 8
+TIMES = np.geomspace(1 / 16, 16, 5)
+
+
+def charuco_plan() -> LayoutPlan:
+    """The board's tags as a target of unknown places."""
+    tags = tuple((BOARD.dictionary, k) for k in range(TAGS))
+    return LayoutPlan("tags of a ChArUco", tags, np.full(TAGS, BOARD.marker_mm), ORIGIN, np.full((TAGS, 4, 2), np.nan))
+
+
+def charuco_camera(folder: Path) -> CameraModel:
+    """Intrinsics of the set, which states no distortion."""
+    return read_camera(folder / "cal_data.yaml")
+
+
+def charuco_images(folder: Path) -> CalibrationImages:
+    """All images of the set in the order of their numbers."""
+    found = calibration_images(
+        folder / "images", charuco_camera(folder), BOARD, (BOARD.dictionary,), 1, lambda *_: None
+    )
+    order = sorted(range(len(found.names)), key=lambda i: int(Path(found.names[i]).stem))
+    names, views, tags = (tuple(values[i] for i in order) for values in (found.names, found.views, found.tags))
+    return replace(found, names=names, views=views, tags=tags)
+
+
+def halves(images: CalibrationImages) -> list[tuple[list[int], list[int]]]:
+    """Images to calibrate with and to locate."""
+    even, odd = list(range(0, len(images.names), 2)), list(range(1, len(images.names), 2))
+    return [(even, odd), (odd, even)]
+
+
+def poses(images: CalibrationImages) -> None:
+    print("real images, all tags seen: layout from one half, poses in the other, against the chessboard corners")
+    for chosen, held_out in halves(images):
+        calibrated = half_calibrated(images, charuco_plan(), chosen)
+        trials = list(subset_trials(images, held_out, calibrated, None))
+        print(f"  {_line(trials)}")
+
+
+def subsets(images: CalibrationImages, most: int | None) -> None:
+    print("real images, subsets of tags (all, or so many of each size and image: --most)")
+    gates = {"verdict": VerdictOptions(), "odds of the other 1:100": VerdictOptions(flip_odds=1e-2)}
+    gates["the patent's gate"] = PatentOptions()
+    for name, options in gates.items():
+        for size in (1, 2, 3, 4):
+            trials: list[Trial] = []
+            for chosen, held_out in halves(images):
+                calibrated = half_calibrated(images, charuco_plan(), chosen)
+                trials += subset_trials(images, held_out, calibrated, size, options, most)
+            print(f"  {name:<24} {size} tags  {_line(trials)}")
+
+
+def _line(trials: Sequence[Trial]) -> str:
+    count = len(trials)
+    used = [t for t in trials if t.decision == "accept"]
+    ambiguous = sum(t.decision == "ambiguous" for t in trials)
+    flipped, far = sum(t.flipped for t in used), sum(t.error_rad > np.radians(5) for t in used)
+    text = f"{count:6d} poses, {len(used):6d} accepted, {ambiguous:5d} ambiguous; "
+    if not used:
+        return text + "none to judge"
+    rad, mm = np.array([(t.error_rad, t.error_mm) for t in used]).T
+    return (
+        text + f"accepted wrong branch {flipped}, off by over 5° {far} ({100 * max(flipped, far) / len(used):.2f} %); "
+        f"mean {np.degrees(rad.mean()):.3f}° {mm.mean():.2f} mm, worst {np.degrees(rad.max()):.2f}° {mm.max():.1f} mm"
+    )
+
+
+def relit(photograph: np.ndarray, tags: Tags, seed: int, stops: float = 8.0) -> list[np.ndarray]:
+    """Five exposures in light that falls off by so many powers of two over the target, with a spot of glare on it."""
+    rng = np.random.default_rng(seed)
+    width = photograph.shape[1]
+    corners = tags.corners_px.reshape(-1, 2) / width
+    at = tuple(corners.mean(0) + 0.05 * rng.standard_normal(2))
+    extent = float(np.ptp(corners, axis=0).max())
+    middle = tuple(corners.mean(0))
+    light = Light(stops / extent, rng.uniform(0, 2 * np.pi), middle, glare=2.0, glare_at=at, glare_radius=extent / 8)
+    return expose(photograph, TIMES, light=light, seed=seed)
+
+
+def exposures(folder: Path, images: CalibrationImages) -> None:
+    print("real images exposed again (simulated): 5 exposures over 8 stops; light falling off over the target, glare")
+    layout = half_calibrated(images, charuco_plan(), range(len(images.names))).layout
+    photographs = [cv2.imread(str(folder / "images" / name), cv2.IMREAD_GRAYSCALE) for name in images.names]
+    for stops in (2, 4, 6, 8):
+        counts, together, shifts = [], [], []
+        for i, photograph in enumerate(photographs):
+            found = [find_tags(each, layout.dictionaries()) for each in relit(photograph, images.tags[i], i, stops)]
+            merged = merge(found, layout)
+            counts.append(max(merged.counts))
+            together.append(len(merged.seen))
+            shifts += [shift.shift_px for shift in merged.shifts]
+        fewer = sum(all_ < best for all_, best in zip(together, counts, strict=True))
+        print(
+            f"  {stops} stops: best single exposure {sum(counts):3d} tags, together {sum(together):3d}: "
+            f"{sum(together) / sum(counts):.2f} times, fewer in {fewer} scenes; apparent shift of tags at most "
+            f"{max(shifts):.2f} px"
+        )
+
+
+def covariance(count: int = 500) -> None:
+    print(f"simulated corners, mean of e'C^-1 e / 6 over {count} poses (expected 1, σ of the mean 0.026)")
+    layout, printed = example_layout(), example_layout(0.03, 0.3)
+    six = tuple(range(6))
+    cases = {
+        "6 tags, 1 exposure": (layout, (six,), (10, 50), CornerNoise()),
+        "6 tags, 5 exposures, half of the variance shared": (layout, (six,) * 5, (10, 50), CornerNoise()),
+        "6 tags, 5 exposures, all of it shared": (layout, (six,) * 5, (10, 50), CornerNoise(shared=1.0)),
+        "6 tags, 5 exposures, none of it shared": (layout, (six,) * 5, (10, 50), CornerNoise(shared=0.0)),
+        "each exposure other tags": (layout, ((0, 1, 2), (2, 3, 4), (4, 5)), (10, 50), CornerNoise()),
+        "6 tags, 0.3 px of print and lens": (printed, (six,), (10, 50), CornerNoise()),
+        "6 tags, frontal": (layout, (six,), (0, 5), CornerNoise()),
+        "2 tags": (layout, ((0, 3),), (10, 50), CornerNoise()),
+        "1 tag": (layout, ((0,),), (10, 50), CornerNoise()),
+        "1 tag, frontal": (layout, ((0,),), (0, 10), CornerNoise()),
+    }
+    for name, case in cases.items():
+        value, accepted, wrong = calibration(*case, count)
+        print(f"  {name:<50} {value:.3f}  accepted {accepted}, wrong branch {wrong}")
+
+
+def calibration(
+    layout: TargetLayout, shown, tilt_deg, noise: CornerNoise, count: int, seed: int = 5
+) -> tuple[float, int, int]:
+    """Mean normalised squared error of the accepted poses, how many these are, and how many of them off by over 5°."""
+    rng = np.random.default_rng(seed)
+    squares, wrong = [], 0
+    for _ in range(count):
+        truth = random_pose(rng, tilt_deg=tilt_deg)
+        seen = merge(simulated_exposures(layout, truth, rng, noise, shown), layout).seen
+        pose, verdict = judge(locate(seen, layout, CAMERA))
+        error = Poses.of([pose.camera_from_obj]).difference(Poses.of([truth]))[0]
+        if verdict.decision == "accept":
+            squares.append(error @ np.linalg.solve(pose.covariance, error) / 6)
+            wrong += np.linalg.norm(error[:3]) > np.radians(5)
+    return float(np.mean(squares)), len(squares), int(wrong)
+
+
+def timing(folder: Path, images: CalibrationImages, rounds: int = 5) -> None:
+    print("time of a scene of 5 exposures of 2 MP, against decoding them")
+    layout = half_calibrated(images, charuco_plan(), range(len(images.names))).layout
+    model = charuco_camera(folder)
+    with tempfile.TemporaryDirectory() as place:
+        photograph = cv2.imread(str(folder / "images" / images.names[5]), cv2.IMREAD_GRAYSCALE)
+        for k, each in enumerate(relit(photograph, images.tags[5], 5)):
+            cv2.imwrite(f"{place}/{k}.png", each)
+        scenes = find_scenes(place)
+        files, _ = find_images(place)
+        list(run(scenes, layout, model))
+        for name, clock in (("by the clock", time.perf_counter), ("time of all cores", time.process_time)):
+            decoding, all_of_it = [], []
+            for _ in range(rounds):
+                start = clock()
+                for file in files:
+                    decode(file.path.read_bytes(), file.name)
+                middle = clock()
+                result = next(iter(run(scenes, layout, model, LocateOptions())))
+                decoding.append(middle - start)
+                all_of_it.append(clock() - middle)
+            ratio = np.median(np.array(all_of_it) / decoding)
+            print(
+                f"  {name}: decoding {1e3 * np.median(decoding):.0f} ms, scene {1e3 * np.median(all_of_it):.0f} ms: "
+                f"{ratio:.2f} times ({result.verdict.decision}, {len(result.merged.seen)} tags)"
+            )
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__.split("\n\n")[0])
+    parser.add_argument("folder", type=Path)
+    parser.add_argument("--part", choices=["poses", "subsets", "exposures", "covariance", "time"])
+    parser.add_argument("--most", type=int)
+    arguments = parser.parse_args()
+    chosen = [arguments.part] if arguments.part else ["poses", "subsets", "exposures", "covariance", "time"]
+    images = None if chosen == ["covariance"] else charuco_images(arguments.folder)
+    for part in chosen:
+        match part:
+            case "poses":
+                poses(images)
+            case "subsets":
+                subsets(images, arguments.most)
+            case "exposures":
+                exposures(arguments.folder, images)
+            case "covariance":
+                covariance()
+            case "time":
+                timing(arguments.folder, images)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,46 @@
+"""The figures of the README on the rendered data sets beside the repository: errors, labels found, the control, and
+the cross-check with the native COLMAP where that is installed.
+
+.venv/bin/python scripts/studies/measure_shared.py [../shared/data/stereo_target]
+"""
+
+import json
+import shutil
+import sys
+import tempfile
+from pathlib import Path
+
+from stcal.sfm import RunOptions, run
+from stcal.sfm.interop.crosscheck import comparison_text, crosscheck
+from stcal.sfm.report.compare import compare, comparison_table
+from stcal.sfm.run.saved import load_run
+
+
+def main() -> None:
+    default = Path(__file__).resolve().parents[3] / "shared" / "data" / "stereo_target"
+    root = Path(sys.argv[1]) if len(sys.argv) > 1 else default
+    for name in ("clean", "clutter"):
+        folder = root / name
+        if not folder.is_dir():
+            sys.exit(f"error: {folder} is missing; give the folder that holds clean/ and clutter/")
+        for title, options in (
+            ("corrected, joint adjustment", RunOptions()),
+            ("corrected, chained (--solve chain)", RunOptions(solve="chain")),
+            ("uncorrected control (--no-eccentricity)", RunOptions(eccentricity=False)),
+        ):
+            with tempfile.TemporaryDirectory() as scratch:
+                out = Path(scratch) / "run"
+                run(folder / "images", folder / "cameras.txt", out, options=options)
+                summary = json.loads((out / "report.json").read_text())["summary"]
+                print(
+                    f"\n{name}, {title}: {summary['images_mapped']} of {summary['images']} images registered, "
+                    f"residual RMS {summary['residual_rms_px']:.4f} px"
+                )
+                print(comparison_table(compare(out, folder / "truth.json")))
+                if options == RunOptions() and shutil.which("colmap"):
+                    print(f"\n{name}, cross-check with the native COLMAP:")
+                    print(comparison_text(crosscheck(load_run(out))))
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,159 @@
+#!/usr/bin/env python3
+"""Time, memory, database size and accuracy of mapping against the number of images; labels simulated, no pixels.
+
+Every size is run in a process of its own: graph, database, mapping, refinement, joint adjustment, checks and writing of
+the final database. Centres carry 0.02 px noise and one label in ten is missing. Prints a Markdown table.
+"""
+
+import argparse
+import json
+import resource
+import subprocess
+import sys
+import tempfile
+import time
+from pathlib import Path
+
+import numpy as np
+
+from stcal.sfm.adjust.calibration import Calibration, calibrate
+from stcal.sfm.adjust.options import AdjustOptions
+from stcal.sfm.checks.suite import Evidence, run_checks
+from stcal.sfm.data.observations import ImageObservations
+from stcal.sfm.mapping.database import write_database
+from stcal.sfm.mapping.graph import image_graph
+from stcal.sfm.pipeline import RunOptions, solve_groups
+from stcal.synthetic.observe import image_circles, simulate_centres
+from stcal.synthetic.scene import Scene, SceneOptions, make_scene
+
+NOISE_PX = 0.02
+MISSING = 0.1
+SIZES = (40, 80, 160, 300, 1000, 2000)
+ALL_UP_TO = 300
+
+
+def observe(scene: Scene) -> list[ImageObservations]:
+    """Labelled ellipse centres of every image of the scene."""
+    rng = np.random.default_rng(0)
+    images = []
+    for group in scene.groups:
+        for i in range(len(scene.groups[group].camera_from_target)):
+            centres = simulate_centres(scene, group, i, NOISE_PX, rng)
+            labels = tuple(label for label in centres if rng.random() > MISSING)
+            xy, n = np.array([centres[label] for label in labels]), len(labels)
+            covariance = np.tile(NOISE_PX**2 * np.eye(2), (n, 1, 1))
+            normalised = scene.camera.normalised_from_pixel(xy)
+            name = f"{group}/{i:04d}"
+            shape = ellipse_shapes(scene, group, i)
+            shapes = np.array([shape[label] for label in labels])
+            images.append(ImageObservations(name, group, labels, xy, normalised, shapes, covariance))
+    return images
+
+
+def ellipse_shapes(scene: Scene, group: str, image: int) -> dict[str, np.ndarray]:
+    """By label: a root of the ellipse's shape matrix, (2, 2), in normalised coordinates, for the check of the radii.
+
+    From the dual conic r²(I − n·nᵀ) − C·Cᵀ (Hartley & Zisserman, sec. 8.3).
+    """
+    seen = image_circles(scene, group, image)
+    n, c = seen.normal_camera, seen.xyz_camera
+    flat = np.eye(3) - n[:, :, None] * n[:, None]
+    dual = seen.radius_mm[:, None, None] ** 2 * flat - c[:, :, None] * c[:, None]
+    dual /= dual[:, 2:, 2:]
+    middle = dual[:, :2, 2:]
+    root = np.linalg.cholesky(middle * middle.swapaxes(1, 2) - dual[:, :2, :2])
+    return dict(zip(seen.labels, root, strict=True))
+
+
+def evidence(scene: Scene, observations, options: AdjustOptions, solutions, result: Calibration) -> Evidence:
+    """What a run gives to the checks, but for the blur of the edges, which needs pixels."""
+    return Evidence(
+        tuple(s.model for s in solutions),
+        tuple(o for s in solutions for o in s.outliers),
+        tuple(observations),
+        scene.camera,
+        scene.colmap_model,
+        scene.target,
+        scene.board,
+        options,
+        result,
+        None,
+        {},
+    )
+
+
+def measure(count: int, kind: str) -> dict:
+    """One run over ``count`` images in all."""
+    groups = 4
+    scene = make_scene(SceneOptions(seed=5, images_per_group=count // groups))
+    observations = observe(scene)
+    options = RunOptions(graph=kind).settled(scene.target)
+    base = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    marks = [("start", time.perf_counter())]
+    with tempfile.TemporaryDirectory() as folder:
+        out = Path(folder)
+        (out / "cache").mkdir()
+        graph = image_graph(observations, scene.board, kind)
+        marks.append(("graph", time.perf_counter()))
+        arguments = (scene.camera, scene.colmap_model, scene.target, scene.board, options)
+        solutions = solve_groups(observations, graph, out, *arguments, lambda *_: None)
+        marks.append(("map", time.perf_counter()))
+        adjustment = options.adjustment(scene.target)
+        result = calibrate([s.model for s in solutions], scene.camera, scene.target, scene.board, adjustment)
+        marks.append(("adjust", time.perf_counter()))
+        checks = run_checks(evidence(scene, observations, adjustment, solutions, result))
+        marks.append(("check", time.perf_counter()))
+        database = out / "database.db"
+        write_database(database, scene.camera, scene.colmap_model, observations, graph.pairs)
+        marks.append(("write", time.perf_counter()))
+        size = database.stat().st_size
+    error = [
+        np.linalg.norm(pose.translation - scene.target_from_face[face].translation)
+        for face, pose in result.target.target_from_face.items()
+    ]
+    seconds = {name: at - before for (name, at), (_, before) in zip(marks[1:], marks[:-1], strict=True)}
+    return {
+        "images": len(observations),
+        "kind": kind,
+        "mapped": sum(len(s.model.images) for s in solutions),
+        "pairs": len(graph.pairs),
+        "seconds": seconds,
+        "not_passed": [c.key for c in checks if c.verdict not in ("passed", "not possible")],
+        "ms_per_image": 1e3 * sum(seconds.values()) / len(observations),
+        "memory_mib": (resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - base) / 1024,
+        "database_mib": size / 2**20,
+        "worst_face_um": 1e3 * float(max(error)),
+    }
+
+
+def main() -> None:
+    """Print the table."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--sizes", type=int, nargs="*", default=SIZES, help="images in all, multiples of 4")
+    parser.add_argument("--one", nargs=2, metavar=("COUNT", "KIND"), help="measure one size in this process, as JSON")
+    arguments = parser.parse_args()
+    if arguments.one:
+        print(json.dumps(measure(int(arguments.one[0]), arguments.one[1])))
+        return
+    print(
+        "| images | pairs | mapped | pairs matched | ms an image | graph + map + adjust + check + write, s | "
+        "total, s | memory, MiB | database, MiB | worst face, µm |"
+    )
+    print("|---|---|---|---|---|---|---|---|---|---|")
+    for count in arguments.sizes:
+        for kind in ("all", "sparse"):
+            if kind == "all" and count > ALL_UP_TO:
+                continue
+            command = [sys.executable, __file__, "--one", str(count), kind]
+            answer = json.loads(subprocess.run(command, check=True, capture_output=True, text=True).stdout)
+            parts = " + ".join(f"{s:.2f}" for s in answer["seconds"].values())
+            print(
+                f"| {answer['images']} | {kind} | {answer['mapped']} | {answer['pairs']} | "
+                f"{answer['ms_per_image']:.1f} | {parts} | {sum(answer['seconds'].values()):.1f} | "
+                f"{answer['memory_mib']:.0f} | {answer['database_mib']:.1f} | {answer['worst_face_um']:.2f} |",
+                flush=True,
+            )
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,17 @@
+from .data.loop import SETUPS as SETUPS
+from .data.pairs import HandEyePoses as HandEyePoses
+from .data.pairs import read_poses as read_poses
+from .data.views import View as View
+from .data.views import Views as Views
+from .data.views import pairs_of_views as pairs_of_views
+from .methods.evolution import EvolutionOptions as EvolutionOptions
+from .methods.noise import Noise as Noise
+from .result import HandEye as HandEye
+from .solve import METHODS as METHODS
+from .solve import HandEyeOptions as HandEyeOptions
+from .solve import handeye as handeye
+from .validate import Compared as Compared
+from .validate import HeldOut as HeldOut
+from .validate import compare as compare
+from .validate import cross_validate as cross_validate
+from .validate import splits as splits

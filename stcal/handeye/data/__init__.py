@@ -1,0 +1,1 @@
+"""Poses, views and motions that the methods solve from."""

@@ -1,0 +1,87 @@
+"""Motions between poses: A of the mount, B of the camera, AX = XB."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from stcal.errors import DegenerateError
+from stcal.geometry.rigid import Poses
+from stcal.handeye.data.loop import Loop
+
+LARGEST_RAD = np.radians(170)
+"""Beyond it the logarithm is ill-conditioned: at a half turn the smallest error turns the axis round."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Motions:
+    """k motions between two poses each.
+
+    ``first``, ``second`` : (k,) poses i, j; ``mount`` : mount_j_from_mount_i, A; ``camera`` : camera_j_from_camera_i,
+    B; ``alpha``, ``beta`` : (k, 3) their rotation vectors, rad.
+    """
+
+    first: np.ndarray
+    second: np.ndarray
+    mount: Poses
+    camera: Poses
+    alpha: np.ndarray
+    beta: np.ndarray
+
+    @classmethod
+    def between(cls, loop: Loop, first: np.ndarray, second: np.ndarray) -> "Motions":
+        """Between poses ``first`` and ``second`` (k,) of a loop."""
+        hand, eye = loop.stand_from_mount, loop.camera_from_board
+        mount = hand[second].inverse() @ hand[first]
+        camera = eye[second] @ eye[first].inverse()
+        logs = (Rotation.from_matrix(np.array(p.rotation)).as_rotvec() for p in (mount, camera))
+        return cls(np.asarray(first), np.asarray(second), mount, camera, *logs)
+
+    @classmethod
+    def consecutive(cls, loop: Loop) -> "Motions":
+        """From each pose to the next."""
+        at = np.arange(len(loop) - 1)
+        return cls.between(loop, at, at + 1)
+
+    @classmethod
+    def all(cls, loop: Loop) -> "Motions":
+        """Of every pair of poses."""
+        return cls.between(loop, *np.triu_indices(len(loop), 1))
+
+    def __len__(self) -> int:
+        return len(self.first)
+
+    def __getitem__(self, index) -> "Motions":
+        """Motions by a mask, slice or list."""
+        return Motions(*(getattr(self, name)[index] for name in self.__slots__))
+
+    def has_log(self) -> np.ndarray:
+        """(k,) whether the logarithms of both rotations are well-conditioned."""
+        return (np.linalg.norm(self.alpha, axis=1) < LARGEST_RAD) & (np.linalg.norm(self.beta, axis=1) < LARGEST_RAD)
+
+    def with_log(self, method: str) -> "Motions":
+        """Those of :meth:`has_log`.
+
+        Raises
+        ------
+        DegenerateError
+            Fewer than two.
+        """
+        good = self.has_log()
+        if good.sum() < 2:
+            raise DegenerateError(
+                f"hand-eye: {len(good) - good.sum()} of {len(good)} motions turn by more than "
+                f"{np.degrees(LARGEST_RAD):.0f}°, {method} needs 2 that do not; use another method or order of poses"
+            )
+        return self[good]
+
+
+def poses_with_log(loop: Loop) -> np.ndarray:
+    """Poses (m,) between any two of which the logarithm is well-conditioned: those most in the way are left out."""
+    motions, used = Motions.all(loop), np.ones(len(loop), bool)
+    bad = ~motions.has_log()
+    while bad.any():
+        worst = np.bincount(np.concatenate([motions.first[bad], motions.second[bad]]), minlength=len(loop)).argmax()
+        used[worst] = False
+        bad &= (motions.first != worst) & (motions.second != worst)
+    return used

@@ -1,0 +1,161 @@
+"""Pose pairs: where the robot said its flange was, and where the camera saw the board."""
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from stcal.errors import InputError
+from stcal.geometry.arrays import frozen
+from stcal.geometry.rigid import Poses, Rigid, skew
+from stcal.io.table import Table, read_table
+
+WHAT = "pose file"
+SIDES = (("base_from_flange", "flange_from_base"), ("camera_from_board", "board_from_camera"))
+"""What each row must hold, and the inverse that is accepted in its place."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class HandEyePoses:
+    """m pairs of poses of one robot, one camera and one board.
+
+    Parameters
+    ----------
+    base_from_flange, camera_from_board : Poses
+        m each, mm.
+    base_from_flange_covariance, camera_from_board_covariance : (m, 6, 6) arrays, optional
+        Rotation (rad) and translation (mm), left perturbation in the first frame, where they are known.
+    names : tuple of str
+        What each pair is called in messages: ``line 7``, an image's name; ``pose 1`` … where none are given.
+    where : str
+        What they were read from.
+
+    Raises
+    ------
+    InputError
+        Unequal lengths; a pair that occurs twice; a board that stands still to the last digit while the flange moves.
+    """
+
+    base_from_flange: Poses
+    camera_from_board: Poses
+    base_from_flange_covariance: np.ndarray | None = None
+    camera_from_board_covariance: np.ndarray | None = None
+    names: tuple[str, ...] = ()
+    where: str = "poses"
+
+    def __post_init__(self):
+        m = len(self.base_from_flange)
+        if len(self.camera_from_board) != m:
+            raise InputError(
+                f"{self.where}: {m} poses of the flange and {len(self.camera_from_board)} of the board; pairs needed"
+            )
+        for name in ("base_from_flange_covariance", "camera_from_board_covariance"):
+            if getattr(self, name) is not None:
+                object.__setattr__(self, name, frozen(getattr(self, name), (m, 6, 6), name))
+        names = tuple(self.names) or tuple(f"pose {i}" for i in range(1, m + 1))
+        if len(names) != m:
+            raise InputError(f"{self.where}: {len(names)} names of {m} poses; one each needed")
+        object.__setattr__(self, "names", names)
+        self._check_copies()
+
+    @classmethod
+    def from_matrices(cls, base_from_flange, camera_from_board, names=(), where: str = "poses") -> "HandEyePoses":
+        """From homogeneous matrices (m, 4, 4), mm.
+
+        Raises
+        ------
+        InputError
+            A matrix that is not finite, left-handed, scaled or transposed; the message names it.
+        """
+        sides = []
+        for what, matrices in (("base_from_flange", base_from_flange), ("camera_from_board", camera_from_board)):
+            rigid = []
+            for i, matrix in enumerate(matrices):
+                name = names[i] if i < len(names) else f"pose {i + 1}"
+                try:
+                    rigid.append(Rigid.from_matrix(matrix))
+                except InputError as error:
+                    raise InputError(f"{where}: {name}: {what}: {error}") from error
+            sides.append(Poses.of(rigid))
+        return cls(*sides, names=tuple(names), where=where)
+
+    def __len__(self) -> int:
+        return len(self.base_from_flange)
+
+    def __getitem__(self, index) -> "HandEyePoses":
+        """Pairs by a mask, slice or list."""
+        rows = np.arange(len(self))[index]
+        covariances = (self.base_from_flange_covariance, self.camera_from_board_covariance)
+        return HandEyePoses(
+            self.base_from_flange[rows],
+            self.camera_from_board[rows],
+            *(None if c is None else c[rows] for c in covariances),
+            tuple(self.names[i] for i in rows),
+            self.where,
+        )
+
+    def _check_copies(self):
+        """Measured values are never equal to the last digit: equal ones were copied."""
+        flange, board = self.base_from_flange, self.camera_from_board
+        first: dict[bytes, int] = {}
+        for i in range(len(self)):
+            seen = board.rotation[i].tobytes() + board.translation[i].tobytes()
+            j = first.setdefault(seen, i)
+            if j == i:
+                continue
+            pair = f"{self.where}: {self.names[j]} and {self.names[i]}"
+            moved = np.linalg.norm(flange.translation[i] - flange.translation[j])
+            turned = Rigid(flange.rotation[j].T @ flange.rotation[i]).angle_rad()
+            if moved == 0 and turned < 1e-12:
+                raise InputError(f"{pair} are identical poses; take one of them out")
+            raise InputError(
+                f"{pair}: the board's pose is the same to the last digit, while the flange moved by {moved:.3g} mm and "
+                f"{np.degrees(turned):.3g}°; give each its own pose of the board"
+            )
+
+
+def read_poses(path: str | Path) -> HandEyePoses:
+    """Read a CSV file of pose pairs.
+
+    Columns ``base_from_flange_x_mm`` … ``_qw`` … and ``camera_from_board_…`` (or ``flange_from_base_…``,
+    ``board_from_camera_…``), lengths in any unit of :data:`~stcal.io.table.LENGTHS`, covariances as ``…_cov_rx_rx``.
+
+    Raises
+    ------
+    InputError
+        Missing columns; a value that is not finite or a quaternion that is not of unit length, named by line; copies.
+    """
+    table = read_table(path, WHAT)
+    sides = [read_side(table, *names) for names in SIDES]
+    (flange, flange_covariance), (board, board_covariance) = sides
+    names = tuple(f"line {line}" for line in table.lines)
+    return HandEyePoses(flange, board, flange_covariance, board_covariance, names, table.where)
+
+
+def read_side(table: Table, wanted: str, inverse: str) -> tuple[Poses, np.ndarray | None]:
+    """Poses ``wanted`` and their covariances, whichever of the two the table has."""
+    given = [name for name in (wanted, inverse) if any(column.startswith(name + "_") for column in table.columns)]
+    if len(given) != 1:
+        found = "no such columns" if not given else "both"
+        raise InputError(
+            f"{table.where}: {found}, {wanted}_x_mm … or {inverse}_x_mm … needed; the header is {table.header()}"
+        )
+    poses, covariance = table.poses(given[0] + "_"), table.pose_covariances(given[0] + "_")
+    if given[0] == wanted:
+        return poses, covariance
+    return poses.inverse(), None if covariance is None else inverse_covariance(poses, covariance)
+
+
+def inverse_jacobian(poses: Poses) -> np.ndarray:
+    """Derivative (m, 6, 6) of the left perturbation of the inverses by that of the poses."""
+    back = np.swapaxes(poses.rotation, 1, 2)
+    by = np.zeros((len(poses), 6, 6))
+    by[:, :3, :3] = by[:, 3:, 3:] = -back
+    by[:, 3:, :3] = -back @ skew(poses.translation)
+    return by
+
+
+def inverse_covariance(poses: Poses, covariance: np.ndarray) -> np.ndarray:
+    """Covariances (m, 6, 6) of the inverses of poses with these (m, 6, 6)."""
+    by = inverse_jacobian(poses)
+    return by @ covariance @ np.swapaxes(by, 1, 2)

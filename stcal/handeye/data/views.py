@@ -1,0 +1,153 @@
+"""What the camera saw of the board: corners in images, and the board's pose in each by itself."""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from stcal.errors import DegenerateError, InputError
+from stcal.geometry.arrays import frozen
+from stcal.geometry.camera import Camera
+from stcal.geometry.least_squares import Linear, minimise, perturbed
+from stcal.geometry.plane import camera_from_plane, fit_homography
+from stcal.geometry.rigid import Poses, Rigid, skew
+from stcal.handeye.data.pairs import HandEyePoses
+
+LEAST_CORNERS = 4
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class View:
+    """Corners of the board in one image.
+
+    Parameters
+    ----------
+    xyz_board : (k, 3) array
+        Their places on the board, mm; k ≥ 4, not all on a line.
+    xy_px : (k, 2) array
+        Where they were seen, px, lens distortion in them.
+    covariance : (k, 2, 2) array, optional
+        Of ``xy_px``, px², known up to a common factor. Without it all weigh alike.
+    """
+
+    xyz_board: np.ndarray
+    xy_px: np.ndarray
+    covariance: np.ndarray | None = None
+
+    def __post_init__(self):
+        object.__setattr__(self, "xyz_board", frozen(self.xyz_board, (None, 3), "corners on the board"))
+        k = len(self.xyz_board)
+        object.__setattr__(self, "xy_px", frozen(self.xy_px, (k, 2), "corners in the image"))
+        if self.covariance is not None:
+            object.__setattr__(self, "covariance", frozen(self.covariance, (k, 2, 2), "covariance of corners"))
+
+    def __len__(self) -> int:
+        return len(self.xyz_board)
+
+    def whitening(self) -> np.ndarray:
+        """(k, 2, 2): makes the covariance of errors 1."""
+        if self.covariance is None:
+            return np.tile(np.eye(2), (len(self), 1, 1))
+        return np.linalg.inv(np.linalg.cholesky(self.covariance))
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Views:
+    """One :class:`View` for each pose of the flange, all by one camera."""
+
+    camera: Camera
+    views: tuple[View, ...]
+
+    def __len__(self) -> int:
+        return len(self.views)
+
+    def __getitem__(self, index) -> "Views":
+        """Views by a mask, slice or list."""
+        return Views(self.camera, tuple(self.views[i] for i in np.arange(len(self))[index]))
+
+    def corners(self) -> int:
+        """Number in all views."""
+        return sum(len(view) for view in self.views)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Resection:
+    """``camera_from_board`` : m poses; ``covariance`` : (m, 6, 6); ``sigma_px`` : factor of the corners' σ (σ itself
+    where views state no covariance), from all residuals."""
+
+    camera_from_board: Poses
+    covariance: np.ndarray
+    sigma_px: float
+
+
+def resect(views: Views, names: tuple[str, ...], scale: float = 1.0) -> Resection:
+    """Pose of the board in each view by itself, of least reprojection error.
+
+    Raises
+    ------
+    DegenerateError
+        Fewer than four corners in a view, or all on a line; the message names the view.
+    """
+    poses, normals, cost = [], [], 0.0
+    for view, name in zip(views.views, names, strict=True):
+        pose, linear = _pose_of(view, views.camera, name)
+        poses.append(Rigid(pose.rotation, scale * pose.translation))
+        normals.append(linear.normal)
+        cost += linear.cost
+    spare = 2 * views.corners() - 6 * len(views)
+    variance = cost / spare if spare else 1.0
+    covariance = variance * np.linalg.inv(np.array(normals))
+    unit = np.repeat([1.0, scale], 3)
+    return Resection(Poses.of(poses), covariance * unit[:, None] * unit, float(np.sqrt(variance)))
+
+
+def pairs_of_views(
+    base_from_flange: Poses, views: Views, names: tuple[str, ...] = (), where: str = "views"
+) -> HandEyePoses:
+    """Pose pairs of which the board's poses, with their covariances, come from the corners of each view.
+
+    Raises
+    ------
+    InputError
+        Unequal lengths.
+    DegenerateError
+        A view in which no pose can be found; the message names it.
+    """
+    if len(views) != len(base_from_flange):
+        raise InputError(f"{where}: {len(base_from_flange)} poses of the flange and {len(views)} views; pairs needed")
+    names = names or tuple(f"pose {i}" for i in range(1, len(views) + 1))
+    found = resect(views, names)
+    return HandEyePoses(base_from_flange, found.camera_from_board, None, found.covariance, names, where)
+
+
+def project_jacobian(camera: Camera, xyz_camera: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Pixels (n, 2) of points (n, 3) in the camera's frame, and their derivative (n, 2, 3)."""
+    depth = xyz_camera[:, 2:]
+    xy = xyz_camera[:, :2] / depth
+    distorted, by_ideal = camera.distort_jacobian(xy)
+    by_point = np.zeros((len(xy), 2, 3))
+    by_point[:, [0, 1], [0, 1]] = 1 / depth
+    by_point[:, :, 2] = -xy / depth
+    return distorted * camera.focal + camera.centre, camera.focal[:, None] * (by_ideal @ by_point)
+
+
+def _pose_of(view: View, camera: Camera, name: str) -> tuple[Rigid, Linear]:
+    if len(view) < LEAST_CORNERS:
+        raise DegenerateError(f"{name}: {len(view)} corners of the board, {LEAST_CORNERS} needed; take the image out")
+    try:
+        homography = fit_homography(view.xyz_board[:, :2], camera.normalised_from_pixel(view.xy_px))
+    except DegenerateError as error:
+        raise DegenerateError(f"{name}: the corners seen lie on a line; take the image out") from error
+    weight = view.whitening()
+
+    def linear(pose: Rigid) -> Linear:
+        rotated = view.xyz_board @ pose.rotation.T
+        point = rotated + pose.translation
+        if (point[:, 2] <= 0).any():
+            return Linear(np.inf, np.eye(6), np.zeros(6))
+        px, by_point = project_jacobian(camera, point)
+        by = np.concatenate([-by_point @ skew(rotated), by_point], axis=2)
+        white = np.einsum("kab,kb->ka", weight, px - view.xy_px).ravel()
+        slope = (weight @ by).reshape(-1, 6)
+        return Linear(float(white @ white), slope.T @ slope, slope.T @ white)
+
+    return minimise(camera_from_plane(homography), linear, perturbed, name)

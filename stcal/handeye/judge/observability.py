@@ -1,0 +1,200 @@
+"""What a set of poses can tell about X: the axes about which the flange turned, and the motion that is missing."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from stcal.errors import DegenerateError
+from stcal.geometry.arrays import frozen
+from stcal.handeye.data.loop import FRAMES, Loop, Setup
+
+UNITS = {"metres": 1000.0, "inches": 25.4, "centimetres": 10.0}
+SAME_UNIT = 0.05
+"""Logarithm by which a size may be off the ratio of two units."""
+LARGEST_SCALE = 5.0
+"""Nobody misses a board's size by more, but by a unit."""
+SCALE_SEEN = 36.0
+"""Times the number of poses: the information on a scale that counts. Errors of the camera's translations alone look
+like three to a pose, and by that share, a twelfth, a scale would be too small at this limit."""
+COMMON_RAD, COMMON_MM = 1e-3, 0.5
+"""Errors of a common camera's poses at half a metre, with which is judged whether poses are of any use."""
+USELESS_RAD, USELESS_MM = np.radians(5), 50.0
+"""A hand-eye transform that is not known better than so (σ) from such poses is not worth having."""
+WANTED_DEG = 30
+"""Rotations of this size between poses make σ of the translation about that of a pose."""
+LEAST_TURN = np.radians(5)
+"""Of a robot of four axes, RMS."""
+LEAST_POSES = 3
+MOST_PAIRS = 100_000
+"""Of poses, by which the principal axes are judged; of more poses than 450 some pairs, drawn at random."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Observability:
+    """How well a loop of m poses determines X.
+
+    Parameters
+    ----------
+    turns_rad : (3,) array
+        RMS rotations between poses about ``axes``, falling: singular values of the stacked log R_A over √(number of
+        motions). The second one is 0 where all axes are parallel: X then slides along the axis.
+    axes : (3, 3) array
+        Rows: the principal axes of all rotations, in the flange's frame.
+    mount_axis : (3,) array
+        The first of them in the mount's frame.
+    sigma_rad, sigma_mm : float
+        σ of the worst direction of X from poses of a common camera (:data:`COMMON_RAD`, :data:`COMMON_MM`); infinite
+        where it is not determined.
+    """
+
+    turns_rad: np.ndarray
+    axes: np.ndarray
+    mount_axis: np.ndarray
+    sigma_rad: float
+    sigma_mm: float
+
+    def __post_init__(self):
+        for name, shape in (("turns_rad", (3,)), ("axes", (3, 3)), ("mount_axis", (3,))):
+            object.__setattr__(self, name, frozen(getattr(self, name), shape, name))
+
+    @classmethod
+    def of(cls, loop: Loop) -> "Observability":
+        """Of the poses of a loop, at least two; X itself is not needed."""
+        flange = loop.stand_from_mount.rotation
+        base_from_flange = np.swapaxes(flange, 1, 2) if loop.inverted else flange
+        turns, axes = _principal(np.swapaxes(base_from_flange, 1, 2))  # flange_j_from_flange_i
+        mount_axis = _principal(base_from_flange)[1][0] if loop.inverted else axes[0]
+        sigma_rad, sigma_mm = _worst(loop)
+        return cls(turns, axes, mount_axis, sigma_rad, sigma_mm)
+
+    @property
+    def useless(self) -> bool:
+        """Whether no answer is worth having."""
+        return self.sigma_rad > USELESS_RAD or self.sigma_mm > USELESS_MM
+
+    @property
+    def one_axis(self) -> bool:
+        """Whether what is missing are rotations about a second axis."""
+        return bool(self.turns_rad[1] < 0.1 * self.turns_rad[0])
+
+    def missing(self) -> str:
+        """The motion that would help, in words."""
+        turns, first = np.degrees(self.turns_rad), in_words(self.axes[0])
+        if self.one_axis and self.turns_rad[0] > LEAST_TURN:
+            return (
+                f"all rotations of the flange are about its axis {first}, only {turns[1]:.2g}° (RMS) about others; "
+                f"rotate the flange about {in_words(self.axes[1])} too, by {WANTED_DEG}° or more"
+            )
+        return (
+            f"the flange turns by {np.linalg.norm(turns):.2g}° (RMS) between poses; "
+            f"rotate the flange about {first} and about {in_words(self.axes[1])}, by {WANTED_DEG}° or more each"
+        )
+
+
+def check(loop: Loop, setup: Setup, where: str, four_dof: bool) -> Observability:
+    """Refuse what cannot be solved.
+
+    Raises
+    ------
+    DegenerateError
+        Fewer than three poses, rotations about one axis only (unless ``four_dof``), or none.
+    """
+    if len(loop) < LEAST_POSES:
+        raise DegenerateError(
+            f"{where}: {len(loop)} poses, {LEAST_POSES} needed and 10 wanted; rotate the flange about two axes of its "
+            f"own, by {WANTED_DEG}° or more, and take more"
+        )
+    found = Observability.of(loop)
+    if four_dof:
+        turns = _list(np.degrees(found.turns_rad))
+        if found.turns_rad[0] < LEAST_TURN:
+            raise DegenerateError(
+                f"{where}: the flange turns by {turns}° (RMS) about its principal axes; "
+                f"rotate it about {in_words(found.axes[0])} by {WANTED_DEG}° or more"
+            )
+        if not found.one_axis:
+            raise DegenerateError(
+                f"{where}: the flange turns by {turns}° (RMS) about its principal axes, "
+                "that of a robot of four axes about one only; leave four_dof out"
+            )
+    elif found.useless:
+        slides = f"; a robot of four axes cannot: with four_dof all but {FRAMES[setup].camera} along that axis is found"
+        raise DegenerateError(f"{where}: {found.missing()}{slides if found.one_axis else ''}")
+    return found
+
+
+def scale_is_seen(scale: float, sigma: float, poses: int) -> bool:
+    """Whether a scale, solved for with this σ, is more than what noise makes of it."""
+    return scale > 0 and (scale / sigma) ** 2 > SCALE_SEEN * poses
+
+
+def require_scale(scale: float, sigma: float, loop: Loop, where: str) -> None:
+    """Refuse one that is not seen.
+
+    Raises
+    ------
+    DegenerateError
+        How far the flange moves, and that it should move farther.
+    """
+    if scale_is_seen(scale, sigma, len(loop)):
+        if not 1 / LARGEST_SCALE < scale < LARGEST_SCALE:
+            raise DegenerateError(
+                f"{where}: the board would be {scale:.4g} times as large as stated{unit_of(scale)}; correct the unit "
+                "of its size, or of the poses"
+            )
+        return
+    place = (loop.stand_from_mount.inverse() if loop.inverted else loop.stand_from_mount).translation
+    moved = float(np.sqrt(((place - place.mean(0)) ** 2).sum(1).mean()))
+    raise DegenerateError(
+        f"{where}: the board's size is {scale:.2g} ± {sigma:.2g} times as stated by the motions of the flange, which "
+        f"moves by {moved:.3g} mm (RMS): too little to tell; move it by a tenth of the board's distance or more, or "
+        "solve without the scale"
+    )
+
+
+def unit_of(scale: float) -> str:
+    """What a scale looks like that is the ratio of two units."""
+    for unit, factor in UNITS.items():
+        if abs(np.log(scale / factor)) < SAME_UNIT:
+            return f", as if its lengths were in {unit}"
+        if abs(np.log(scale * factor)) < SAME_UNIT:
+            return f", as if the robot's were in {unit}"
+    return ""
+
+
+def _principal(rotations: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """RMS angles (3,) about principal axes (3, 3), in rows, of R_j R_iᵀ between all pairs of rotations (m, 3, 3)."""
+    i, j = np.triu_indices(len(rotations), 1)
+    if len(i) > MOST_PAIRS:
+        some = np.random.default_rng(0).choice(len(i), MOST_PAIRS, replace=False)
+        i, j = i[some], j[some]
+    logs = Rotation.from_matrix(rotations[j] @ np.swapaxes(rotations[i], 1, 2)).as_rotvec()
+    square, axes = np.linalg.eigh(logs.T @ logs / len(logs))
+    turns, axes = np.sqrt(np.maximum(square[::-1], 0)), axes.T[::-1]
+    largest = np.abs(axes).argmax(1)
+    return turns, axes * np.sign(axes[np.arange(3), largest])[:, None]
+
+
+def _worst(loop: Loop) -> tuple[float, float]:
+    """Largest σ of X's rotation (rad) and translation (mm) from poses of a common camera.
+
+    Two steps: the rotation from rotations alone, then the translation with the rotation known. Both depend on how the
+    robot turned, not on X.
+    """
+    turn = loop.stand_from_mount.rotation
+    m, mean = len(turn), turn.mean(0)
+    # Σ over poses of the information on w_X in R_G w_X − w_Z, with w_Z eliminated; the same for translations.
+    spare = np.maximum(np.linalg.eigvalsh(m * (np.eye(3) - mean.T @ mean))[0], 0)
+    if spare < 1e-12 * m:
+        return np.inf, np.inf
+    return float(COMMON_RAD / np.sqrt(spare)), float(COMMON_MM / np.sqrt(spare))
+
+
+def in_words(axis: np.ndarray) -> str:
+    """A direction, to two digits."""
+    return f"({_list(axis + 0.0)})"
+
+
+def _list(values: np.ndarray) -> str:
+    return ", ".join(f"{v:.2g}" if abs(v) >= 0.005 else "0" for v in values)

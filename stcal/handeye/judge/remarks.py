@@ -1,0 +1,99 @@
+"""What should be known about a solution: poses that do not fit, wrong σ, a board or units that are not as stated."""
+
+import numpy as np
+from scipy.stats import chi2
+
+from stcal.errors import StcalError
+from stcal.geometry.least_squares import generalised_inverse
+from stcal.handeye.data.loop import Loop
+from stcal.handeye.judge.observability import scale_is_seen, unit_of
+from stcal.handeye.methods.noise import Noise
+from stcal.handeye.methods.pose_adjustment import State, adjust_poses
+from stcal.handeye.methods.start import robust
+
+SIZE_SIGMAS, SIZE_SHARE = 4.0, 1e-3
+"""A board's size is doubted beyond so many σ, and a share that matters: 0.5 mm at half a metre."""
+MANY = 0.25
+"""Share of the poses that may be bad before something else is suspected."""
+LEAST_IN_GROUPS, APART = 10, 0.9
+"""Poses, and share of their scatter along its main direction that two groups explain: 0.64 of normal errors (2/π), and
+0.8 of a dozen of them at the most."""
+NEAR_MM = 20.0
+"""No camera sees a board from so near."""
+
+
+def of_outliers(names: tuple[str, ...], outliers: np.ndarray, residuals: np.ndarray) -> tuple[str, ...]:
+    """Poses left out (m,), with their residuals (m, 6)."""
+    found = []
+    for i in np.flatnonzero(outliers):
+        turn, shift = np.degrees(np.linalg.norm(residuals[i, :3])), np.linalg.norm(residuals[i, 3:])
+        found.append(f"{names[i]} contradicts the others, by {turn:.2g}° and {shift:.2g} mm, and was left out")
+    if outliers.mean() > MANY:
+        found.append(
+            f"{outliers.sum()} of {len(outliers)} poses contradict the others: with so many look first for a wrong "
+            "setup, for poses of the robot beside those of other images, and for a camera file that does not fit"
+        )
+    return tuple(found)
+
+
+def of_groups(names: tuple[str, ...], residuals: np.ndarray) -> tuple[str, ...]:
+    """Whether poses with these residuals (m, 6) fall into two groups, as of a board that was moved in between."""
+    if len(names) < LEAST_IN_GROUPS:
+        return ()
+    for columns, unit, word in ((slice(0, 3), np.degrees(1.0), "°"), (slice(3, 6), 1.0, " mm")):
+        own = residuals[:, columns] - residuals[:, columns].mean(0)
+        along = own @ np.linalg.svd(own, full_matrices=False)[2][0]
+        order, m = np.argsort(along), len(along)
+        first = np.arange(max(3, m // 5), m - max(3, m // 5) + 1)
+        below = np.cumsum(along[order])[first - 1]
+        between = below**2 * (1 / first + 1 / (m - first))
+        if between.max() > APART * (along @ along):
+            k = int(first[between.argmax()])
+            groups = sorted((sorted(order[:k].tolist()), sorted(order[k:].tolist())))
+            gap = abs(along[groups[0]].mean() - along[groups[1]].mean()) * unit
+            first_ones = f"{len(groups[0])} with {names[0]} and {len(groups[1])} with {names[groups[1][0]]}"
+            return (
+                f"the poses fall into two groups that are {gap:.2g}{word} apart, {first_ones}: was board or camera "
+                "moved in between? solve each by itself",
+            )
+    return ()
+
+
+def of_size(loop: Loop, hint: tuple[float, float], noise: Noise) -> tuple[str, ...]:
+    """Where the board is of another size than stated: ``hint`` is what one step makes of its scale, with σ."""
+    if not _is_other(*hint):
+        return ()
+    try:  # the step is a large one, and its σ are those of residuals that a wrong size makes
+        found = adjust_poses(loop, State(*robust(loop, with_scale=True)), noise, with_scale=True)
+    except StcalError:
+        return ()
+    scale, sigma = found.state.scale, float(np.sqrt(generalised_inverse(found.normal)[12, 12]))
+    if not (_is_other(scale, sigma) and scale_is_seen(scale, sigma, len(loop))):
+        return ()
+    return (
+        f"by the robot's motion the board is {scale:.4f} ± {sigma:.2g} times as large as stated{unit_of(scale)}: check "
+        "its size and the camera file, or solve with the scale",
+    )
+
+
+def _is_other(scale: float, sigma: float) -> bool:
+    return abs(scale - 1) > max(SIZE_SIGMAS * sigma, SIZE_SHARE)
+
+
+def of_distance(loop: Loop) -> tuple[str, ...]:
+    """Where all lengths are of another unit, which no equation shows."""
+    away = float(np.median(np.linalg.norm(loop.camera_from_board.translation, axis=1)))
+    if away >= NEAR_MM:
+        return ()
+    return (f"the board is {away:.2g} mm from the camera (median): if lengths are in metres, name the columns _m",)
+
+
+def of_variance(factor: float, spare: int) -> tuple[str, ...]:
+    """Where the residuals are not what stated σ make expect: ``factor`` is the mean square in units of σ of ``spare``
+    degrees of freedom."""
+    low, high = chi2.ppf([0.0005, 0.9995], spare) / spare
+    if low <= factor <= high:
+        return ()
+    return (
+        f"the residuals are {np.sqrt(factor):.2g} times what the stated σ make expect; correct σ, or look for errors",
+    )

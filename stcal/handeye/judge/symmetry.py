@@ -1,0 +1,135 @@
+"""Boards that look the same after a turn: views that were numbered from another end, found from the robot's motion."""
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from stcal.geometry.rigid import Poses, Rigid, skew
+from stcal.handeye.data.loop import Loop, Setup
+from stcal.handeye.data.pairs import HandEyePoses
+from stcal.handeye.data.views import View, Views
+from stcal.handeye.methods import start
+
+ROUNDS = 20
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Repair:
+    """``pairs`` : m, the board's poses as if all had been numbered alike; ``views`` : the same, where given;
+    ``turned`` : (m,) which of the symmetries each was turned by, counted from 1; 0 where it stayed."""
+
+    pairs: HandEyePoses
+    views: Views | None
+    turned: np.ndarray
+
+    def notes(self) -> tuple[str, ...]:
+        """Which views were turned."""
+        names = [name for name, turn in zip(self.pairs.names, self.turned, strict=True) if turn]
+        if not names:
+            return ()
+        return (f"numbered from another end of the board, and put right: {', '.join(names)}",)
+
+
+def repair(pairs: HandEyePoses, setup: Setup, symmetries: tuple[Rigid, ...], views: Views | None = None) -> Repair:
+    """Give all views the same numbering of a symmetric board.
+
+    Between two poses robot and camera turn by the same angle, and advance by the same length along the axis, whatever X
+    is: that tells which numberings belong together. The most common numbering is kept.
+
+    Parameters
+    ----------
+    symmetries : tuple of Rigid
+        All board_from_board that leave the look of the board as it is, but for the identity.
+
+    Raises
+    ------
+    DegenerateError
+        Fewer than three poses.
+    """
+    loop, every = Loop.of(pairs, setup), (Rigid(), *symmetries)
+    seen = loop.camera_from_board
+    variants = [seen @ turn for turn in every]
+    best, least = np.zeros(len(loop), int), np.inf
+    for labels in np.unique(_guesses(loop, variants), axis=0):
+        labels, cost = _settled(loop, variants, labels)
+        if cost < least:
+            best, least = labels, cost
+    best = _most_as_they_are(best, every)
+    poses = Poses.of(variants[k][i] for i, k in enumerate(best))
+    covariance = pairs.camera_from_board_covariance
+    if covariance is not None:
+        covariance = _carried(covariance, seen, poses)
+    repaired = replace(pairs, camera_from_board=poses, camera_from_board_covariance=covariance)
+    if views is not None:
+        turned = (_turned(view, every[k]) for view, k in zip(views.views, best, strict=True))
+        views = Views(views.camera, tuple(turned))
+    return Repair(repaired, views, best)
+
+
+def _guesses(loop: Loop, variants: list[Poses]) -> np.ndarray:
+    """Labels (m, m): seen from each pose as the reference, the numbering that agrees best with the robot's motion."""
+    hand, m = loop.stand_from_mount, len(loop)
+    labels = np.zeros((m, m), int)
+    for reference in range(m):
+        by_robot = _invariants(hand.inverse() @ hand[reference])
+        away = []
+        for variant in variants:
+            by_camera = _invariants(variant @ variants[0][reference].inverse())
+            # Angles weigh by the distance of the board: then both are millimetres.
+            reach = np.linalg.norm(variant.translation, axis=1)
+            away.append(np.hypot((by_robot - by_camera)[:, 0] * reach, (by_robot - by_camera)[:, 1]))
+        labels[reference] = np.argmin(away, axis=0)
+        labels[reference, reference] = 0
+    return labels
+
+
+def _invariants(motions: Poses) -> np.ndarray:
+    """Angle (rad) and advance along the axis (mm) of motions, (m, 2): the same for A and B where AX = XB."""
+    log = Rotation.from_matrix(np.array(motions.rotation)).as_rotvec()
+    angle = np.linalg.norm(log, axis=1)
+    axis = log / np.maximum(angle, 1e-12)[:, None]
+    advance = np.abs((axis * motions.translation).sum(1))
+    return np.column_stack([angle, np.where(angle > 1e-3, advance, np.linalg.norm(motions.translation, axis=1))])
+
+
+def _settled(loop: Loop, variants: list[Poses], labels: np.ndarray) -> tuple[np.ndarray, float]:
+    """Labels that fit the solution they lead to, and the sum of their residuals, mm."""
+    for _ in range(ROUNDS):
+        chosen = replace(loop, camera_from_board=Poses.of(variants[k][i] for i, k in enumerate(labels)))
+        x, z, _ = start.robust(chosen)
+        costs = []
+        for variant in variants:
+            misses = replace(loop, camera_from_board=variant).residuals(x, z).reshape(-1, 2, 3)
+            turn, shift = np.linalg.norm(misses, axis=2).T
+            costs.append(np.hypot(turn * np.linalg.norm(variant.translation, axis=1), shift))
+        better = np.argmin(costs, axis=0)
+        if (better == labels).all():
+            break
+        labels = better
+    return labels, float(np.min(costs, axis=0).sum())
+
+
+def _most_as_they_are(labels: np.ndarray, every: tuple[Rigid, ...]) -> np.ndarray:
+    """The same numbering up to one turn of all, by which most views stay as they are."""
+    common = int(np.bincount(labels).argmax())
+    back = every[common].inverse()
+    # label k of a view means C S_k; all turned by S_common⁻¹ from the right: S_k S_common⁻¹, again one of the group.
+    return np.array([_nearest(every[k] @ back, every) for k in labels])
+
+
+def _nearest(turn: Rigid, every: tuple[Rigid, ...]) -> int:
+    away = [Rigid(each.rotation.T @ turn.rotation).angle_rad() for each in every]
+    return int(np.argmin(away))
+
+
+def _carried(covariance: np.ndarray, seen: Poses, poses: Poses) -> np.ndarray:
+    """Covariances of camera_from_board when its origin moves on the board: the rotation's error moves it too."""
+    by = np.tile(np.eye(6), (len(poses), 1, 1))
+    by[:, 3:, :3] = -skew(poses.translation - seen.translation)
+    return by @ covariance @ np.swapaxes(by, 1, 2)
+
+
+def _turned(view: View, turn: Rigid) -> View:
+    """The same corners under the numbers that they have after the turn."""
+    return View(turn.inverse() @ view.xyz_board, view.xy_px, view.covariance)

@@ -1,0 +1,1 @@
+"""The methods, by their authors' names, and the two adjustments."""

@@ -1,0 +1,299 @@
+"""The adjustment of corners behind the reprojection method: unknowns, residuals, normal equations, σ of each group."""
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from scipy.linalg import cho_factor, cho_solve
+from scipy.optimize import minimize
+from scipy.sparse import csr_matrix
+from scipy.spatial.transform import Rotation
+from scipy.stats import chi2
+
+from stcal.geometry.camera import Camera
+from stcal.geometry.least_squares import Linear, minimise, perturbed
+from stcal.geometry.rigid import Poses, Rigid, skew
+from stcal.handeye.data.views import project_jacobian
+from stcal.handeye.methods.noise import CAUTION
+
+CORNER, POSE = (float(np.sqrt(chi2.ppf(0.999, dof))) for dof in (2, 6))
+"""Huber's limits: one good corner, and one good pose, in a thousand weighs less than one."""
+LEAST = {"corner_px": 1e-6, "robot_rad": 1e-8, "robot_mm": 1e-5, "board_mm": 1e-5}
+"""Estimated σ stay above: exact data have none. Factors of what is stated of a camera stay above 1."""
+ROUNDS = 20
+ROUGHLY = 1e-6
+"""Relative fall of the cost at which a round of σ has solved well enough."""
+SETTLED = 1e-3
+"""Relative change of σ from round to round that moves nothing any more."""
+HELD = 1e-10
+"""Share of each unknown's information that is added: what nothing determines must not be singular."""
+FARTHEST = 14.0
+"""A round changes a σ by e⁷, a thousand times, at most."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Bundle:
+    """The unknowns: X, Z, base_from_flange as it really was (m), the board's corners (K, 3), camera and scale."""
+
+    mount_from_camera: Rigid
+    stand_from_board: Rigid
+    base_from_flange: Poses
+    corners: np.ndarray
+    camera: Camera
+    scale: float = 1.0
+
+    def camera_from_board(self, inverted: bool) -> Poses:
+        """By the robot's poses, of the scaled board."""
+        hand = self.base_from_flange if inverted else self.base_from_flange.inverse()
+        return self.mount_from_camera.inverse() @ hand @ self.stand_from_board
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Corners:
+    """What was measured and how well, n corners in m views of a board of K.
+
+    ``inverted`` : eye-to-hand; ``base_from_flange`` : m, as reported; ``xyz_board`` : (K, 3) as designed; ``view``,
+    ``corner`` : (n,) of each measurement; ``xy_px`` : (n, 2); ``weight`` : (n, 2, 2) whitening at σ 1; ``robot`` :
+    (m, 6, 6) whitening in place of σ, or None; ``sigma`` : of each group, 0 where exact; ``basis`` : (12, q) of the
+    intrinsics solved for, ``information`` : (q, q) about ``camera``, over the square of factors;
+    ``with_scale``.
+    """
+
+    inverted: bool
+    base_from_flange: Poses
+    xyz_board: np.ndarray
+    view: np.ndarray
+    corner: np.ndarray
+    xy_px: np.ndarray
+    weight: np.ndarray
+    robot: np.ndarray | None
+    sigma: dict[str, float]
+    camera: Camera
+    basis: np.ndarray
+    information: np.ndarray
+    with_scale: bool
+
+    def places(self) -> dict[str, slice]:
+        """Where the unknowns stand in a step; empty for what is not solved for."""
+        sizes = {"x": 6, "z": 6, "camera": self.basis.shape[1], "scale": int(self.with_scale)}
+        sizes["board"] = self.xyz_board.size if self.sigma["board_mm"] else 0
+        exact = self.robot is None and not self.sigma["robot_mm"]
+        sizes["robot"] = 0 if exact else 6 * len(self.base_from_flange)
+        ends = np.cumsum([0, *sizes.values()])
+        return {name: slice(int(i), int(j)) for name, i, j in zip(sizes, ends[:-1], ends[1:], strict=True)}
+
+    def camera_parts(self) -> list[tuple[str, np.ndarray]]:
+        """Intrinsics whose knowledge may be wrong by a factor of its own: kinds, or all where they are correlated."""
+        first = self.basis.argmax(0)
+        if np.count_nonzero(self.information - np.diag(np.diag(self.information))):
+            return [("camera_all", np.arange(len(first)))]
+        kinds = {"focal": (0, 1), "centre": (2, 3), "radial": (4, 5, 8, 9, 10, 11), "tangential": (6, 7)}
+        parts = [(f"camera_{kind}", np.flatnonzero(np.isin(first, numbers))) for kind, numbers in kinds.items()]
+        return [(name, rows) for name, rows in parts if len(rows)]
+
+    def count(self) -> int:
+        """Number of unknowns."""
+        return max(place.stop for place in self.places().values())
+
+    def robot_weight(self) -> np.ndarray:
+        """(m, 6, 6) whitening of errors of base_from_flange."""
+        if self.robot is not None:
+            return self.robot
+        sigma = np.repeat([self.sigma["robot_rad"], self.sigma["robot_mm"]], 3)
+        return np.tile(np.diag(1 / sigma), (len(self.base_from_flange), 1, 1))
+
+    def moved(self, state: Bundle, step: np.ndarray) -> Bundle:
+        """By a step of all unknowns."""
+        part = {name: step[place] for name, place in self.places().items()}
+        camera, flange, corners = state.camera, state.base_from_flange, state.corners
+        if len(part["camera"]):
+            camera = camera.with_parameters(camera.parameters() + self.basis @ part["camera"])
+        if len(part["robot"]):
+            each = part["robot"].reshape(-1, 6)
+            turn = Rotation.from_rotvec(each[:, :3]).as_matrix()
+            flange = Poses(turn @ flange.rotation, flange.translation + each[:, 3:])
+        if len(part["board"]):
+            corners = corners + part["board"].reshape(-1, 3)
+        x, z = perturbed(state.mount_from_camera, part["x"]), perturbed(state.stand_from_board, part["z"])
+        return Bundle(x, z, flange, corners, camera, state.scale + float(part["scale"].sum()))
+
+    def seen(self, state: Bundle) -> tuple[np.ndarray, dict[str, np.ndarray]]:
+        """White residuals of the corners (n, 2), and their derivatives (n, 2, ·) by each kind of unknown, of the own
+        view and corner."""
+        x, z, hand = state.mount_from_camera, state.stand_from_board, state.base_from_flange
+        turn, place = hand.rotation[self.view], hand.translation[self.view]
+        board = state.corners[self.corner] @ z.rotation.T
+        stand = state.scale * board + z.translation
+        if self.inverted:  # the flange is the stand, the base the mount
+            mount_from_stand, arm = turn, np.einsum("nab,nb->na", turn, stand)
+            mount = arm + place
+            by_hand = np.concatenate([-skew(arm), np.broadcast_to(np.eye(3), turn.shape)], axis=2)
+        else:
+            mount_from_stand = np.swapaxes(turn, 1, 2)
+            mount = np.einsum("nab,nb->na", mount_from_stand, stand - place)
+            by_hand = mount_from_stand @ np.concatenate([skew(stand - place), -np.ones_like(turn) * np.eye(3)], axis=2)
+        reach = mount - x.translation
+        seen = reach @ x.rotation
+        px, by_point = project_jacobian(state.camera, seen)
+        by_mount = self.weight / self.sigma["corner_px"] @ by_point @ x.rotation.T
+        by_stand = by_mount @ mount_from_stand
+        by_camera = state.camera.parameter_jacobian(seen[:, :2] / seen[:, 2:]) @ self.basis
+        by = {
+            "x": np.concatenate([by_mount @ skew(reach), -by_mount], axis=2),
+            "z": np.concatenate([-by_stand @ skew(state.scale * board), by_stand], axis=2),
+            "camera": self.weight / self.sigma["corner_px"] @ by_camera,
+            "scale": np.einsum("nab,nb->na", by_stand, board)[:, :, None],
+            "board": state.scale * by_stand @ z.rotation,
+            "robot": by_mount @ by_hand,
+        }
+        return np.einsum("nab,nb->na", self.weight, px - self.xy_px) / self.sigma["corner_px"], by
+
+    def groups(self, state: Bundle) -> list["Group"]:
+        """Everything that is known: the corners seen, and what was known before."""
+        at, count = self.places(), self.count()
+        white, by = self.seen(state)
+        found = [
+            Group(("corner_px",), white, _sparse(by, at, count, {"board": self.corner, "robot": self.view}), CORNER)
+        ]
+        if self.basis.shape[1]:
+            off = np.linalg.pinv(self.basis) @ (state.camera.parameters() - self.camera.parameters())
+            for name, rows in self.camera_parts():
+                root = np.linalg.cholesky(self.information[rows][:, rows]).T / self.sigma[name]
+                whole = np.zeros((len(rows), len(off)))
+                whole[:, rows] = root
+                slope = _sparse({"camera": whole[None]}, at, count, {})
+                found.append(Group((name,), (whole @ off)[None], slope, np.inf))
+        if at["board"].stop > at["board"].start:
+            off = (state.corners - self.xyz_board) / self.sigma["board_mm"]
+            slope = np.tile(np.eye(3) / self.sigma["board_mm"], (len(off), 1, 1))
+            slope = _sparse({"board": slope}, at, count, {"board": np.arange(len(off))})
+            found.append(Group(("board_mm",), off, slope, np.inf))
+        if at["robot"].stop > at["robot"].start:
+            weight = self.robot_weight()
+            off = np.einsum("mab,mb->ma", weight, state.base_from_flange.difference(self.base_from_flange))
+            slope = _sparse({"robot": weight}, at, count, {"robot": np.arange(len(off))})
+            names = ("robot_rad", "robot_mm") if self.robot is None else ()
+            found.append(Group(names, off, slope, POSE))
+        return found
+
+    def linear(self, state: Bundle) -> Linear:
+        """Cost and normal equations; infinite cost where a corner lies behind the camera."""
+        poses = state.camera_from_board(self.inverted)
+        depth = (poses.rotation[self.view, 2] * (state.scale * state.corners[self.corner])).sum(1)
+        if (depth + poses.translation[self.view, 2] <= 0).any():
+            return Linear(np.inf, np.eye(self.count()), np.zeros(self.count()))
+        parts = [group.linear() for group in self.groups(state)]
+        return Linear(*(sum(values) for values in zip(*((p.cost, p.normal, p.gradient) for p in parts), strict=True)))
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Group:
+    """Knowledge of one kind.
+
+    ``names`` : of the σ that its columns have, each an equal share; ``white`` : (g, d) residuals in units of σ;
+    ``slope`` : (g d, k) their derivative; ``limit`` : Huber's, of the length of a row.
+    """
+
+    names: tuple[str, ...]
+    white: np.ndarray
+    slope: csr_matrix
+    limit: float
+
+    def weight(self) -> np.ndarray:
+        """(g,) Huber's weights."""
+        return np.minimum(1, self.limit / np.maximum(np.linalg.norm(self.white, axis=1), 1e-300))
+
+    def linear(self) -> Linear:
+        """Its part of the cost and of the normal equations."""
+        length = np.linalg.norm(self.white, axis=1)
+        inside = np.minimum(length, self.limit)
+        cost = float((inside**2).sum())
+        if (length > inside).any():
+            cost += float(2 * self.limit * (length - inside).sum())
+        pulled = self.slope.multiply(np.repeat(self.weight(), self.white.shape[1])[:, None]).tocsr().T
+        return Linear(cost, (pulled @ self.slope).toarray(), pulled @ self.white.ravel())
+
+    def by_name(self) -> dict[str, tuple[int, Linear]]:
+        """By each of ``names``, or by none: number of residuals, and its quadratic part of the cost."""
+        g, d = self.white.shape
+        width = d // max(len(self.names), 1)
+        weight = np.repeat(self.weight(), d)
+        found = {}
+        for i, name in enumerate(self.names or ("",)):
+            rows = np.flatnonzero(np.arange(g * d) % d // width == i)
+            slope, white = self.slope[rows], self.white.ravel()[rows]
+            pulled = slope.multiply(weight[rows, None]).tocsr().T
+            linear = Linear(float(weight[rows] @ white**2), (pulled @ slope).toarray(), pulled @ white)
+            found[name] = len(rows), linear
+        return found
+
+
+def adjust(corners: Corners, start: Bundle, free: tuple[str, ...]) -> tuple[Corners, Bundle, np.ndarray]:
+    """Solve, and estimate the σ of the ``free`` groups in rounds. Returns the corners with these σ, the state, and the
+    normal matrix.
+
+    Raises
+    ------
+    ConvergenceError
+        No minimum is reached.
+    """
+    state = start
+    for _ in range(ROUNDS if free else 0):
+        state, _ = minimise(state, corners.linear, corners.moved, "hand-eye", ROUGHLY)
+        sigma = corners.sigma | estimated(corners, state, free)
+        change = max(abs(np.log(sigma[name] / corners.sigma[name])) for name in free)
+        corners = replace(corners, sigma=sigma)
+        if change < SETTLED:
+            break
+    state, last = minimise(state, corners.linear, corners.moved, "hand-eye")
+    return corners, state, last.normal
+
+
+def estimated(corners: Corners, state: Bundle, free: tuple[str, ...]) -> dict[str, float]:
+    """Restricted maximum-likelihood σ of the ``free`` groups, all else linear about a state (as
+    :func:`~stcal.handeye.methods.noise.variance_components`)."""
+    parts: dict[str, tuple[int, Linear]] = {}
+    for group in corners.groups(state):
+        for name, (count, linear) in group.by_name().items():
+            key = name if name in free else ""
+            old_count, old = parts.get(key, (0, Linear(0.0, 0.0, 0.0)))
+            sums = old.cost + linear.cost, old.normal + linear.normal, old.gradient + linear.gradient
+            parts[key] = old_count + count, Linear(*sums)
+    fixed = parts.pop("", (0, Linear(0.0, 0.0, 0.0)))[1]
+    names = tuple(parts)
+
+    def cost(logs: np.ndarray) -> tuple[float, np.ndarray]:
+        """Minus twice the log-likelihood of (old σ / new σ)²."""
+        share = np.exp(logs)
+        linears = [linear for _, linear in parts.values()]
+        counts = np.array([count for count, _ in parts.values()])
+        normal = fixed.normal + sum(s * linear.normal for s, linear in zip(share, linears, strict=True))
+        scale = 1 / np.sqrt(np.maximum(np.diag(normal), 1e-300))
+        pull = fixed.gradient + sum(s * linear.gradient for s, linear in zip(share, linears, strict=True))
+        root = cho_factor(normal * scale[:, None] * scale + HELD * np.eye(len(scale)), lower=True)
+        inverse = cho_solve(root, np.eye(len(scale))) * scale[:, None] * scale
+        step = -inverse @ pull
+        value = fixed.cost + share @ [linear.cost for linear in linears] + pull @ step - counts @ logs
+        value += 2 * np.log(np.diag(root[0]) / scale).sum()
+        squares = [p.cost + 2 * p.gradient @ step + step @ p.normal @ step for p in linears]
+        taken = [(inverse * p.normal).sum() for p in linears]
+        return float(value + caution @ logs), share * (np.array(squares) + taken) - counts + caution
+
+    least = [2 * np.log(corners.sigma[name] / LEAST.get(name, 1.0)) for name in names]
+    caution = np.array([CAUTION if name in LEAST else 0.0 for name in names])
+    bounds = [(-FARTHEST, min(FARTHEST, highest)) for highest in least]
+    found = minimize(cost, np.zeros(len(names)), jac=True, method="L-BFGS-B", bounds=bounds)
+    return {name: float(corners.sigma[name] * np.exp(-x / 2)) for name, x in zip(names, found.x, strict=True)}
+
+
+def _sparse(by: dict, at: dict[str, slice], count: int, own: dict[str, np.ndarray]) -> csr_matrix:
+    """Derivatives by kind of unknown, (g, d, ·) each, as (g d, count); ``own`` : (g,) which block, of kinds of many."""
+    columns, values = [], []
+    for name, value in by.items():
+        if at[name].stop > at[name].start:
+            first = at[name].start + value.shape[2] * own.get(name, np.zeros(len(value), int))
+            place = first[:, None, None] + np.arange(value.shape[2])
+            columns.append(np.broadcast_to(place, value.shape))
+            values.append(value)
+    columns, values = np.concatenate(columns, axis=2), np.concatenate(values, axis=2)
+    rows, width = values.shape[0] * values.shape[1], values.shape[2]
+    return csr_matrix((values.ravel(), columns.ravel(), np.arange(rows + 1) * width), shape=(rows, count))

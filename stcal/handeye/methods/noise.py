@@ -1,0 +1,191 @@
+"""How much robot and camera err: stated, or estimated from the residuals as variance components."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.optimize import minimize
+from scipy.stats import chi2
+
+from stcal.errors import InputError
+from stcal.geometry.rigid import Rigid
+from stcal.handeye.data.loop import Loop
+
+LEAST = {"rad": 1e-9, "mm": 1e-6, "factor": 1e-2}
+"""Estimates stay above, by kind: exact data have none …"""
+CAUTION = 2.0
+"""Redundancies that are not counted: a variance of ν of them is the sum of squares over ν − 2, so that errors in units
+of its root have mean square 1 (the mean of F is ν / (ν − 2)). It also keeps a component of few poses off 0, as the
+penalty of Chung, Rabe-Hesketh, Dorie, Gelman & Liu (2013) does."""
+MOST_RAD, MOST_MM = np.radians(10), 100.0
+"""σ of poses beyond which they tell nothing."""
+FARTHEST = 7.0
+"""An estimate is looked for within a factor of a thousand of the first guess, in its logarithm."""
+UNKNOWNS = 12
+"""Of X and Z."""
+LEAST_SHARE = 1e-3
+"""… and above this share of what the first guess of the variance was: less does not weigh, but few poses that fit by
+chance would have all others follow them."""
+
+
+@dataclass(frozen=True, slots=True)
+class Noise:
+    """σ of one coordinate; None where it is not known and to be estimated from the residuals, 0 for what is exact.
+
+    Parameters
+    ----------
+    robot_rad, robot_mm : float, optional
+        Of base_from_flange, in the axes of the base, about the flange.
+    camera_rad, camera_mm : float, optional
+        Of camera_from_board, about the board's origin. If nothing is known of either side, ``robot_mm`` is taken to be
+        0: shifts of the two look alike, and the estimate of ``camera_mm`` holds both.
+    corner_px : float, optional
+        Of a corner in the image, or the factor of the stated covariances of corners. Never 0.
+    board_mm : float, optional
+        Of a corner's place on the board.
+    """
+
+    robot_rad: float | None = None
+    robot_mm: float | None = None
+    camera_rad: float | None = None
+    camera_mm: float | None = None
+    corner_px: float | None = None
+    board_mm: float | None = None
+
+    def __post_init__(self):
+        for side in ("robot", "camera"):
+            pair = getattr(self, f"{side}_rad"), getattr(self, f"{side}_mm")
+            if (pair[0] is None) != (pair[1] is None):
+                raise InputError(f"noise: one of σ_rot and σ_trans of the {side} is given; both or none needed")
+            if pair[0] is not None and not (0 <= pair[0] <= MOST_RAD and 0 <= pair[1] <= MOST_MM):
+                raise InputError(
+                    f"noise: σ of the {side} is {np.degrees(pair[0]):g}° and {pair[1]:g} mm; 0 to "
+                    f"{np.degrees(MOST_RAD):g}° and {MOST_MM:g} mm possible"
+                )
+        for name, least in (("corner_px", 1e-9), ("board_mm", 0.0)):
+            value = getattr(self, name)
+            if value is not None and not (least <= value <= MOST_MM):
+                more = "more than 0, up to" if least else "0 to"
+                raise InputError(f"noise: {name} is {value:g}, {more} {MOST_MM:g} needed")
+        for unit, word in (("rad", "σ_rot"), ("mm", "σ_trans")):
+            if getattr(self, f"robot_{unit}") == getattr(self, f"camera_{unit}") == 0:
+                raise InputError(f"noise: {word} of robot and camera are both 0; one of them must err")
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Components:
+    """Covariances of a loop's residuals, (m, 6, 6): ``known``, and each of ``free``, (f, m, 6, 6), times a variance.
+
+    ``names`` : (f,) which σ of :class:`Noise` the free ones are.
+    """
+
+    known: np.ndarray
+    free: np.ndarray
+    names: tuple[str, ...]
+
+    def total(self, variances: np.ndarray) -> np.ndarray:
+        """(m, 6, 6)."""
+        return self.known + np.tensordot(variances, self.free, 1)
+
+    def of(self, used: np.ndarray) -> "Components":
+        """Of some poses."""
+        return Components(self.known[used], self.free[:, used], self.names)
+
+    def first(self, residuals: np.ndarray) -> np.ndarray:
+        """Variances (f,) to start with, from the medians of residuals (m, 6): bad poses do not count."""
+        squared = np.median((residuals.reshape(-1, 2, 3) ** 2).sum(2), axis=0) / chi2.ppf(0.5, 3)
+        turns = max(sum(name.endswith("_rad") for name in self.names), 1)
+        by_kind = {"rad": squared[0] / turns, "mm": squared[1], "factor": 1.0}
+        return np.maximum([by_kind[_kind(name)] for name in self.names], self.least())
+
+    def least(self) -> np.ndarray:
+        """(f,)."""
+        return np.square([LEAST[_kind(name)] for name in self.names])
+
+
+def _kind(name: str) -> str:
+    """``rad``, ``mm`` or ``factor``."""
+    return name.rpartition("_")[2]
+
+
+def components(loop: Loop, noise: Noise, mount_from_camera: Rigid, scale: float = 1.0) -> Components:
+    """At an estimate of X, on which arms of levers depend.
+
+    Covariances that come with the camera's poses tell the noise of the images; what intrinsics err has the same weak
+    directions. So they hold up to a factor that is estimated, where σ of the robot are too.
+    """
+    by = {"robot": loop.by_robot(mount_from_camera, scale), "camera": loop.by_camera(mount_from_camera, scale)}
+    stated = {
+        "robot": _stated(len(loop), loop.robot_covariance, noise.robot_rad, noise.robot_mm),
+        "camera": _stated(len(loop), loop.camera_covariance, noise.camera_rad, noise.camera_mm),
+    }
+    known, free = np.zeros((len(loop), 6, 6)), {}
+    for side, slope in by.items():
+        if stated[side] is not None:
+            spread = slope @ stated[side] @ np.swapaxes(slope, 1, 2)
+            if side == "camera" and loop.camera_covariance is not None and stated["robot"] is None:
+                free["camera_factor"] = spread
+            else:
+                known = known + spread
+            continue
+        for name, columns in ((f"{side}_rad", slice(0, 3)), (f"{side}_mm", slice(3, 6))):
+            free[name] = slope[:, :, columns] @ np.swapaxes(slope[:, :, columns], 1, 2)
+    if len(free) == 4:  # shifts of robot and camera move the board alike
+        del free["robot_mm"]
+    if 6 * len(loop) - UNKNOWNS <= CAUTION * len(free):  # three poses: one less is told
+        if "camera_factor" in free:
+            known = known + free.pop("camera_factor")
+        else:
+            del free["robot_rad"]
+    return Components(known, np.array(list(free.values())).reshape(-1, len(loop), 6, 6), tuple(free))
+
+
+def _stated(m: int, covariance: np.ndarray | None, rad: float | None, mm: float | None) -> np.ndarray | None:
+    """The covariances of the poses where they have any, else of one σ for all."""
+    if covariance is not None:
+        return covariance
+    if rad is None:
+        return None
+    return np.tile(np.diag([rad**2] * 3 + [mm**2] * 3), (m, 1, 1))
+
+
+def variance_components(parts: Components, residuals: np.ndarray, slope: np.ndarray, first: np.ndarray) -> np.ndarray:
+    """Restricted maximum-likelihood variances (f,) of the free components, from residuals (m, 6) near a solution.
+
+    What the parameters take up of the residuals does not count (Patterson & Thompson 1971); :data:`CAUTION` besides.
+
+    Parameters
+    ----------
+    slope : (m, 6, k) array
+        Derivative of the residuals by the parameters solved for; dependent columns do no harm.
+    first : (f,) array
+        The first guess, of :meth:`Components.first`.
+    """
+    slope = _independent(slope)
+
+    def cost(logs: np.ndarray) -> tuple[float, np.ndarray]:
+        theta = np.exp(logs)
+        spread = parts.total(theta)
+        inverse = np.linalg.inv(spread)
+        weighted = inverse @ slope
+        normal = np.einsum("mai,maj->ij", slope, weighted)
+        covariance = np.linalg.inv(normal)
+        left = residuals - slope @ (covariance @ np.einsum("mai,ma->i", weighted, residuals))
+        fitted = np.einsum("mab,mb->ma", inverse, left)
+        value = np.linalg.slogdet(spread)[1].sum() + np.linalg.slogdet(normal)[1] + (fitted * left).sum()
+        by = np.einsum("mab,kmba->k", inverse, parts.free)
+        taken = np.einsum("kmab,mbj->kmaj", parts.free, weighted)
+        by = by - np.einsum("mai,kmaj,ij->k", weighted, taken, covariance, optimize=True)
+        by = by - np.einsum("ma,kmab,mb->k", fitted, parts.free, fitted, optimize=True)
+        return float(value - CAUTION * logs.sum()), by * theta - CAUTION
+
+    low, start = np.log(np.maximum(parts.least(), LEAST_SHARE * first)), np.log(first)
+    bounds = list(zip(low, np.maximum(start, low) + 2 * FARTHEST, strict=True))
+    found = minimize(cost, start, jac=True, method="L-BFGS-B", bounds=bounds, options={"ftol": 1e-12})
+    return np.exp(found.x)
+
+
+def _independent(slope: np.ndarray) -> np.ndarray:
+    """Directions (m, 6, r) that span the same changes of the residuals as the columns of ``slope``."""
+    flat = slope.reshape(-1, slope.shape[2])
+    u, s, _ = np.linalg.svd(flat / np.maximum(np.linalg.norm(flat, axis=0), 1e-300), full_matrices=False)
+    return u[:, s > 1e-7 * s[0]].reshape(*slope.shape[:2], -1)

@@ -1,0 +1,166 @@
+"""Pose-error least squares: both unknowns from all poses, weighted by what robot and camera err; bad poses named."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.stats import chi2, f
+
+from stcal.geometry.least_squares import Linear, generalised_inverse, minimise, perturbed
+from stcal.geometry.rigid import Rigid
+from stcal.handeye.data.loop import Loop
+from stcal.handeye.methods.noise import Noise, components, variance_components
+
+FALSE_ALARM = 0.01
+"""Chance that a set of good poses has one called an outlier."""
+MOSTLY_GOOD = 2 / 3
+"""Share of the poses that is taken to be good."""
+LEAST_POSES = 4
+"""So many must be left to contradict an outlier: three poses fit three free ones."""
+ROUNDS = 30
+SEEN = 1e-6
+"""A share of a pose's own variance below which the pose alone determined the solution, and cannot contradict it."""
+SETTLED = 1e-4
+"""Relative change of the estimated σ from round to round that moves nothing any more."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class State:
+    """Unknowns: X, Z and the board's scale."""
+
+    mount_from_camera: Rigid
+    stand_from_board: Rigid
+    scale: float = 1.0
+
+    def moved(self, step: np.ndarray) -> "State":
+        """By left perturbations (12,) or (13,) of X, Z and the scale."""
+        x, z = (perturbed(a, s) for a, s in ((self.mount_from_camera, step[:6]), (self.stand_from_board, step[6:12])))
+        return State(x, z, self.scale + (step[12] if len(step) > 12 else 0.0))
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class PoseSolution:
+    """``normal`` : (k, k) of X, Z (and the scale); ``residuals`` : (m, 6); ``spread`` : (m, 6, 6) their covariances;
+    ``outliers`` : (m,); ``sigma`` : what was estimated, by name; ``variance_factor`` : mean squared residual in
+    units of σ, per degree of freedom; ``spare`` : these; ``scale_hint`` : what the scale would become if it were solved
+    for, and its σ."""
+
+    state: State
+    normal: np.ndarray
+    residuals: np.ndarray
+    spread: np.ndarray
+    outliers: np.ndarray
+    sigma: dict[str, float]
+    variance_factor: float
+    spare: int
+    scale_hint: tuple[float, float]
+
+
+def adjust_poses(loop: Loop, start: State, noise: Noise, with_scale: bool = False, robust: bool = True) -> PoseSolution:
+    """Least squares of the loop's residuals, each in units of its σ, from a start.
+
+    This is the maximum-likelihood solution for Gaussian errors of robot and camera (Strobl & Hirzinger 2006 without
+    their metric's free parameter): errors of both are carried to the board's origin, to first order.
+
+    Raises
+    ------
+    ConvergenceError
+        No minimum is reached.
+    """
+    count = 13 if with_scale else 12
+    state = start
+    residuals = _residuals(loop, state)
+    parts = components(loop, noise, state.mount_from_camera, state.scale)
+    variances = first = parts.first(residuals)
+    used = _near(residuals, parts.total(variances)) if robust else np.ones(len(loop), bool)
+    for round_ in range(ROUNDS):
+        parts = components(loop, noise, state.mount_from_camera, state.scale)
+        spread = parts.total(variances)
+        state, normal = _solved(loop[used], state, spread[used], count)
+        residuals, slope = _residuals(loop, state), _slope(loop, state, count)
+        before, settled = used, True
+        if parts.names:
+            old = variances
+            variances = variance_components(parts.of(used), residuals[used], slope[used], first)
+            settled = np.abs(np.log(variances / old)).max() < SETTLED
+        if robust and round_ < ROUNDS // 2:  # later they stay: a set that swings would never settle
+            used = _agreeing(residuals, slope, parts.total(variances), used, estimated=bool(parts.names))
+        if settled and (used == before).all():
+            break
+    spread = parts.total(variances)
+    state, normal = _solved(loop[used], state, spread[used], count)
+    residuals = _residuals(loop, state)
+    sigma = {name: float(v) for name, v in zip(parts.names, np.sqrt(variances), strict=True)}
+    spare = max(6 * int(used.sum()) - count, 1)
+    factor = float(_squared(residuals, spread)[used].sum() / spare)
+    hint = _scale_hint(loop[used], state, residuals[used], spread[used])
+    return PoseSolution(state, normal, residuals, spread, ~used, sigma, factor, spare, hint)
+
+
+def _scale_hint(loop: Loop, state: State, residuals: np.ndarray, spread: np.ndarray) -> tuple[float, float]:
+    """What the scale would become, and its σ: one step from the solution with the scale among the unknowns."""
+    slope = _slope(loop, state, 13)
+    weighted = np.linalg.solve(spread, slope)
+    inverse = generalised_inverse(np.einsum("mai,maj->ij", slope, weighted))
+    step = -inverse[12] @ np.einsum("mai,ma->i", weighted, residuals)
+    return state.scale + float(step), float(np.sqrt(inverse[12, 12]))
+
+
+def _residuals(loop: Loop, state: State) -> np.ndarray:
+    return loop.residuals(state.mount_from_camera, state.stand_from_board, state.scale)
+
+
+def _slope(loop: Loop, state: State, count: int) -> np.ndarray:
+    return loop.jacobian(state.mount_from_camera, state.scale)[:, :, :count]
+
+
+def _solved(loop: Loop, start: State, spread: np.ndarray, count: int) -> tuple[State, np.ndarray]:
+    """State of least squares and its normal matrix."""
+    weight = np.linalg.inv(np.linalg.cholesky(spread))
+
+    def linear(state: State) -> Linear:
+        white = np.einsum("mab,mb->ma", weight, _residuals(loop, state)).ravel()
+        slope = (weight @ _slope(loop, state, count)).reshape(-1, count)
+        return Linear(float(white @ white), slope.T @ slope, slope.T @ white)
+
+    state, last = minimise(start, linear, State.moved, "hand-eye")
+    return state, last.normal
+
+
+def _squared(residuals: np.ndarray, spread: np.ndarray) -> np.ndarray:
+    """Squared residuals in units of σ, (m,)."""
+    return np.einsum("ma,ma->m", residuals, np.linalg.solve(spread, residuals[:, :, None])[:, :, 0])
+
+
+def _near(residuals: np.ndarray, spread: np.ndarray) -> np.ndarray:
+    """Poses to start with, by σ of their medians: at least the better two thirds, or chance would choose among them."""
+    squared = np.sort(_squared(residuals, spread))
+    enough = max(int(np.ceil(MOSTLY_GOOD * len(squared))), LEAST_POSES)
+    return _squared(residuals, spread) <= max(chi2.ppf(1 - FALSE_ALARM, 6), squared[min(enough, len(squared)) - 1])
+
+
+def _agreeing(
+    residuals: np.ndarray, slope: np.ndarray, spread: np.ndarray, used: np.ndarray, estimated: bool
+) -> np.ndarray:
+    """Which poses, (m,), agree with the solution of all others."""
+    m, count = len(used), slope.shape[2]
+    spare = 6 * int(used.sum()) - count - 6
+    if spare < 6:
+        return used
+    level = 1 - FALSE_ALARM / m
+    limit = 6 * f.ppf(level, 6, spare) if estimated else chi2.ppf(level, 6)
+    agrees = against_others(residuals, slope, spread, used) <= limit
+    return agrees if agrees.sum() >= LEAST_POSES else used
+
+
+def against_others(residuals: np.ndarray, slope: np.ndarray, spread: np.ndarray, used: np.ndarray) -> np.ndarray:
+    """Squared residuals (m,), each in units of its own σ: χ² of 6 degrees of freedom for good poses.
+
+    A pose that took part has drawn the solution towards itself, so that its residual scatters less than the pose; one
+    that did not has the solution's error besides.
+    """
+    weight = np.linalg.inv(np.linalg.cholesky(spread))
+    white, by = np.einsum("mab,mb->ma", weight, residuals), weight @ slope
+    solved = by @ generalised_inverse(np.einsum("mai,maj->ij", by[used], by[used])) @ np.swapaxes(by, 1, 2)
+    value, vector = np.linalg.eigh(np.eye(6) + np.where(used, -1, 1)[:, None, None] * solved)
+    turned = np.einsum("mab,ma->mb", vector, white)
+    return np.where(value > SEEN, turned**2 / np.maximum(value, SEEN), 0).sum(1)

@@ -1,0 +1,148 @@
+"""Linear solutions of the loop, many subsets of poses at once; and one that a third of bad poses does not disturb."""
+
+from dataclasses import replace
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from stcal.errors import DegenerateError
+from stcal.geometry.rigid import Poses, Rigid
+from stcal.handeye.data.loop import Loop
+from stcal.handeye.data.motions import Motions
+
+SUBSETS = 200
+"""Of three or four poses: with a third of all poses bad, hundreds of clean ones are among them on average …"""
+LEAST_LENGTH = 0.1
+"""Of the camera's paths over those of the flange, as they fit: 1 but for the board's size, 0 where neither moves."""
+SEED = 0
+"""… and the same ones every time."""
+
+
+def robust(loop: Loop, with_scale: bool = False) -> tuple[Rigid, Rigid, float]:
+    """The best X, Z and scale of many small subsets: with the least product of the median rotation and translation.
+
+    The product has no unit that would have to be weighed. Solved once more from all poses within three times the
+    medians. Rotations by Shah (2013), then translations, and the board's scale where wanted, by linear least squares:
+    no logarithms, so that half turns are motions like any other.
+
+    Raises
+    ------
+    DegenerateError
+        Fewer than three poses.
+    """
+    m = len(loop)
+    if m < 3:
+        raise DegenerateError(f"hand-eye: {m} poses, 3 needed; rotate the flange about two axes and take more")
+    candidates = [_linear(loop, np.arange(m)[None], with_scale)]
+    rng = np.random.default_rng(SEED)
+    if m > 3:
+        size = 3 if m < 6 else 4
+        order = rng.permuted(np.tile(np.arange(m), (SUBSETS, 1)), axis=1)
+        candidates.append(_linear(loop, order[:, :size], with_scale))
+    parts = [np.concatenate(part) for part in zip(*candidates, strict=True)]
+    turn, shift = _misses(loop, *parts)
+    best = np.argmin(np.log(np.median(turn, 1) + 1e-15) + np.log(np.median(shift, 1) + 1e-12))
+    inside = (turn[best] <= 3 * np.median(turn[best])) & (shift[best] <= 3 * np.median(shift[best]))
+    if inside.sum() >= 3:
+        again = _linear(loop, np.flatnonzero(inside)[None], with_scale)
+        new_turn, new_shift = _misses(loop, *again)
+        if np.median(new_turn) * np.median(new_shift) < np.median(turn[best]) * np.median(shift[best]):
+            parts, best = again, 0
+    x, t_x, z, t_z, scale = (part[best] for part in parts)
+    return Rigid(x, t_x), Rigid(z, t_z), float(scale)
+
+
+def about_one_axis(loop: Loop, mount_axis: np.ndarray, with_scale: bool = False) -> tuple[Rigid, Rigid, float]:
+    """X, Z and scale of poses that turn about one axis (3,) of the mount only; X does not move along it.
+
+    The rotations tell where the axis lies in the camera; the angle about it comes from the translations, linear in its
+    cosine and sine; their length is the scale.
+    """
+    hand, eye = loop.stand_from_mount, loop.camera_from_board
+    motions = Motions.all(loop)
+    motions = motions[motions.has_log()]
+    camera_axis = (motions.alpha @ mount_axis) @ motions.beta
+    turn, _ = Rotation.align_vectors(mount_axis[None], camera_axis[None])
+    board = eye.translation @ turn.as_matrix().T
+    along = (board @ mount_axis)[:, None] * mount_axis
+    across = np.stack([board - along, np.cross(mount_axis, board)], axis=2)
+    rows = np.concatenate(
+        [hand.rotation @ across, hand.rotation, np.tile(-np.eye(3), (len(loop), 1, 1))], axis=2
+    ).reshape(-1, 8)
+    right = -hand.translation - np.einsum("mab,mb->ma", hand.rotation, along)
+    cosine, sine = np.linalg.lstsq(rows, right.ravel(), rcond=1e-9)[0][:2]
+    length = float(np.hypot(cosine, sine))
+    if length < LEAST_LENGTH:
+        raise DegenerateError(
+            "hand-eye: the flange turns about one axis at one place, so that the angle about it is open; move it "
+            "across the axis too, by a tenth of the board's distance or more"
+        )
+    scale = length if with_scale else 1.0
+    about = Rotation.from_rotvec(np.arctan2(sine, cosine) * mount_axis)
+    x = (about * turn).as_matrix()
+    z = mean_pose(loop.chain(Rigid(x, np.zeros(3)))).rotation
+    t_x, t_z, _ = _translations(_scaled(loop, scale), np.arange(len(loop))[None], x[None], False)
+    return *slid(Rigid(x, t_x[0]), Rigid(z, t_z[0]), mount_axis, loop), scale
+
+
+def slid(x: Rigid, z: Rigid, mount_axis: np.ndarray, loop: Loop) -> tuple[Rigid, Rigid]:
+    """X without its part along the axis about which all poses turn, and Z that still closes the loop."""
+    along = (x.translation @ mount_axis) * mount_axis
+    stand = (loop.stand_from_mount.rotation @ along).mean(0)
+    return Rigid(x.rotation, x.translation - along), Rigid(z.rotation, z.translation - stand)
+
+
+def _linear(loop: Loop, subsets: np.ndarray, with_scale: bool) -> tuple[np.ndarray, ...]:
+    """X, Z and scale of subsets (s, k) of the poses: rotations (s, 3, 3), translations (s, 3), of each; scales (s,)."""
+    hand, eye = loop.stand_from_mount, loop.camera_from_board
+    # R_G R_X R_C = R_Z: Σ R_C ⊗ R_G maps vec R_X to k vec R_Z, both of the same length: its first singular vectors.
+    k = np.einsum("mab,mcd->madbc", hand.rotation, eye.rotation).reshape(len(loop), 9, 9)
+    u, _, vt = np.linalg.svd(k[subsets].sum(1))
+    z, x = u[:, :, 0].reshape(-1, 3, 3), vt[:, 0].reshape(-1, 3, 3)
+    sign = np.sign(np.linalg.det(x))[:, None, None]
+    x, z = _nearest_rotation(sign * x), _nearest_rotation(sign * z)
+    t_x, t_z, scale = _translations(loop, subsets, x, with_scale)
+    return x, t_x, z, t_z, scale
+
+
+def _translations(loop: Loop, subsets: np.ndarray, x: np.ndarray, with_scale: bool) -> tuple[np.ndarray, ...]:
+    """t_X and t_Z, (s, 3), and scales (s,) for rotations of X (s, 3, 3): R_G t_X + s R_G R_X t_C − t_Z = −t_G; the
+    shortest where they are not unique."""
+    hand, eye = loop.stand_from_mount, loop.camera_from_board
+    rows = np.concatenate([hand.rotation, np.tile(-np.eye(3), (len(loop), 1, 1))], axis=2)[subsets]
+    moved = np.einsum("skab,sbc,skc->ska", hand.rotation[subsets], x, eye.translation[subsets])
+    right = -hand.translation[subsets]
+    if with_scale:
+        rows = np.concatenate([rows, moved[..., None]], axis=3)
+    else:
+        right = right - moved
+    s = len(subsets)
+    solved = (np.linalg.pinv(rows.reshape(s, -1, rows.shape[3]), rcond=1e-9) @ right.reshape(s, -1, 1))[:, :, 0]
+    return solved[:, :3], solved[:, 3:6], solved[:, 6] if with_scale else np.ones(s)
+
+
+def _scaled(loop: Loop, scale: float) -> Loop:
+    eye = loop.camera_from_board
+    return replace(loop, camera_from_board=Poses(eye.rotation, scale * eye.translation))
+
+
+def _misses(loop: Loop, x, t_x, z, t_z, scale) -> tuple[np.ndarray, np.ndarray]:
+    """Angles (s, m) and distances (s, m) by which the chains miss Z."""
+    hand, eye = loop.stand_from_mount, loop.camera_from_board
+    chain = np.einsum("mab,sbc,mcd->smad", hand.rotation, x, eye.rotation)
+    cosine = (np.einsum("smab,sab->sm", chain, z) - 1) / 2
+    board = scale[:, None, None] * eye.translation @ np.swapaxes(x, 1, 2) + t_x[:, None]
+    at = np.einsum("mab,smb->sma", hand.rotation, board)
+    return np.arccos(np.clip(cosine, -1, 1)), np.linalg.norm(at + hand.translation - t_z[:, None], axis=2)
+
+
+def _nearest_rotation(m: np.ndarray) -> np.ndarray:
+    """Rotations nearest to matrices (s, 3, 3)."""
+    u, _, vt = np.linalg.svd(m)
+    u[:, :, 2] *= np.linalg.det(u @ vt)[:, None]
+    return u @ vt
+
+
+def mean_pose(chain: Poses) -> Rigid:
+    """Mean of poses: the chordal mean of their rotations."""
+    return Rigid(Rotation.from_matrix(np.array(chain.rotation)).mean().as_matrix(), chain.translation.mean(0))

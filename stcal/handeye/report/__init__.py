@@ -1,0 +1,1 @@
+"""A hand-eye calibration for people and for other programs."""

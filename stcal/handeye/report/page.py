@@ -1,0 +1,372 @@
+"""A hand-eye calibration for the terminal, and as a page."""
+
+from html import escape
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from stcal.geometry.rigid import Rigid
+from stcal.handeye.data.loop import FRAMES
+from stcal.handeye.judge.observability import Observability
+from stcal.handeye.report.file import Outcome
+from stcal.handeye.result import HandEye
+from stcal.handeye.solve import FACTORS
+from stcal.handeye.validate import Compared
+from stcal.io.camera import PARAMETER_NAMES, parameter_names
+from stcal.report.page import (
+    COLOURS,
+    FAINT,
+    INK,
+    NONE,
+    SMALL,
+    calm,
+    fold,
+    new_figure,
+    number,
+    page,
+    plot,
+    swatch,
+    table,
+    uri,
+)
+
+HEADS = ("", "mm", "± σ", "rotation vector °", "± σ")
+ERRORS = {
+    "rotation_rad": ("rotation °", np.degrees(1.0), 4),
+    "translation_mm": ("board's origin mm", 1.0, 3),
+    "board_mm": ("3-D at the board mm", 1.0, 3),
+    "pose_mm": ("3-D by pose mm", 1.0, 3),
+}
+"""Heads, units and digits of the errors of poses held out."""
+SIGMA_NAMES = {
+    "corner_px": ("corner in the image", "px", 1.0),
+    "robot_rad": ("robot, rotation", "°", np.degrees(1.0)),
+    "robot_mm": ("robot, position", "mm", 1.0),
+    "camera_rad": ("board's pose, rotation", "°", np.degrees(1.0)),
+    "camera_mm": ("board's pose, position", "mm", 1.0),
+    "camera_factor": ("board's pose", "times its own σ", 1.0),
+    "board_mm": ("corner on the board", "mm", 1.0),
+    **{key: (f"camera file, {name}", "times its σ", 1.0) for key, name in FACTORS.items()},
+}
+GOOD, BAD = COLOURS[0], COLOURS[1]
+
+
+def outcome_text(outcome: Outcome) -> str:
+    """Tables for the terminal."""
+    result, frames = outcome.result, FRAMES[outcome.result.setup]
+    lines = [_headline(outcome)]
+    for name, pose, covariance in _transforms(result):
+        lines += ["", *_aligned([name, *HEADS[1:]], _transform_rows(pose, covariance))]
+    turn, shift = result.rms()
+    lines += ["", f"residuals (RMS): {np.degrees(turn):.4f}°, {shift:.3f} mm at the board's origin"]
+    if outcome.held_out is not None:
+        lines.append(f"held out ({_splits_text(outcome)}): {_means_text(outcome.held_out.means())}")
+        lines += [f"held out, {text}" for text in _agreeing_text(outcome)]
+    lines += [f"σ of {text}: {value} ({how})" for text, value, how in _sigma_rows(outcome)]
+    if result.sigma_scale is not None:
+        lines.append(scale_text(outcome))
+    if result.observability is not None:
+        lines.append(_turns_text(result.observability))
+    if outcome.compared:
+        lines += ["", f"Methods, on the same {_splits_text(outcome)} held out; off: from {frames.camera} above"]
+        lines += _aligned(*_compared_cells(outcome), left=True)
+    return "\n".join(lines)
+
+
+def scale_text(outcome: Outcome) -> str:
+    """The board's true size, as found."""
+    result = outcome.result
+    text = f"board: {result.scale:.5f} ± {result.sigma_scale:.5f} times its stated size"
+    if outcome.pitch_mm is None:
+        return text
+    found, sigma = outcome.pitch_mm * result.scale, outcome.pitch_mm * result.sigma_scale
+    return f"{text}: pitch {found:.4f} ± {sigma:.4f} mm, stated {outcome.pitch_mm:g} mm"
+
+
+def _headline(outcome: Outcome) -> str:
+    result, bad = outcome.result, outcome.outliers()
+    without = f", without {len(bad)} that contradict{'s' * (len(bad) == 1)} them: {', '.join(bad)}" if bad else ""
+    return f"{result.setup}, {result.method}: {len(result.names) - len(bad)} poses{without}"
+
+
+def _transforms(result: HandEye) -> list[tuple[str, Rigid, np.ndarray | None]]:
+    covariances = (result.covariance, result.stand_covariance)
+    return [(*item, covariance) for item, covariance in zip(result.transforms.items(), covariances, strict=True)]
+
+
+def _transform_rows(pose: Rigid, covariance: np.ndarray | None) -> list[list[str]]:
+    """Of x, y, z: translation and rotation vector, each with σ."""
+    turn = np.degrees(Rotation.from_matrix(np.array(pose.rotation)).as_rotvec())
+    sigma = [None] * 6 if covariance is None else np.sqrt(np.maximum(np.diag(covariance), 0))
+    sigma = [*(None if s is None else np.degrees(s) for s in sigma[:3]), *sigma[3:]]
+    columns = zip("xyz", pose.translation, sigma[3:], turn, sigma[:3], strict=True)
+    return [[a, number(t, 4), number(s, 4), number(r, 4), number(d, 4)] for a, t, s, r, d in columns]
+
+
+def _splits_text(outcome: Outcome) -> str:
+    every = (outcome.held_out, *(each.held_out for each in outcome.compared))
+    known = [found.rows.shape for found in every if found is not None]
+    return f"{known[0][0]} × {known[0][1]} of {len(outcome.result.names)} poses" if known else "no poses"
+
+
+def _agreeing_text(outcome: Outcome) -> list[str]:
+    """Errors of the poses alone that agree with one another, where some do not."""
+    bad = outcome.result.outliers
+    means = outcome.held_out.means(~bad) if bad.any() and outcome.held_out is not None else {}
+    return [f"without the {bad.sum()} left out above: {_means_text(means)}"] if means else []
+
+
+def _means_text(means: dict[str, float]) -> str:
+    parts = []
+    for name, mean in means.items():
+        head, unit, digits = ERRORS[name]
+        what, _, ending = head.rpartition(" ")
+        parts.append(f"{what} {number(mean * unit, digits)}{ending if ending == '°' else f' {ending}'}")
+    return ", ".join(parts)
+
+
+def _sigma_rows(outcome: Outcome) -> list[list[str]]:
+    """What errs, by how much, and how that is known."""
+    rows = []
+    for name, value in outcome.result.sigma.items():
+        text, unit, factor = SIGMA_NAMES[name]
+        if name == "corner_px" and outcome.own_sigmas:
+            unit = "times its own σ"
+        how = "estimated" if name in outcome.result.estimated else "stated"
+        rows.append([text, f"{value * factor:.3g}{unit if unit == '°' else f' {unit}'}", how])
+    return rows
+
+
+def _turns_text(seen: Observability) -> str:
+    turns = ", ".join(f"{t:.1f}°" for t in np.degrees(seen.turns_rad))
+    return f"the flange turns between poses by {turns} (RMS) about its principal axes"
+
+
+def _compared_cells(outcome: Outcome) -> tuple[list[str], list[list[str]]]:
+    """Heads, and a row for each method: means on poses held out, and how far from the result."""
+    known = [name for name in ERRORS if any(c.held_out and name in c.held_out.means() for c in outcome.compared)]
+    rows = []
+    for each in outcome.compared:
+        means = each.held_out.means() if each.held_out else {}
+        cells = [number(means.get(n, np.nan) * ERRORS[n][1], ERRORS[n][2]) for n in known]
+        rows.append([each.method, *cells, *_off(each, outcome.result), each.reason])
+    heads = ["method", *(ERRORS[name][0] for name in known), "off mm", "off °", ""]
+    return (heads, rows) if any(row[-1] for row in rows) else (heads[:-1], [row[:-1] for row in rows])
+
+
+def _off(each: Compared, result: HandEye) -> list[str]:
+    if each.result is None:
+        return [NONE, NONE]
+    off = result.mount_from_camera.inverse() @ each.result.mount_from_camera
+    return [number(np.linalg.norm(off.translation), 3), number(np.degrees(off.angle_rad()), 4)]
+
+
+def _aligned(heads: list[str], rows: list[list[str]], left: bool = False) -> list[str]:
+    """Columns to the right, the first to the left, and the last with ``left`` as it is."""
+    every = [heads, *rows]
+    width = [max(len(row[k]) for row in every) for k in range(len(heads))]
+    lines = []
+    for row in every:
+        cells = [row[0].ljust(width[0]), *(cell.rjust(w) for cell, w in zip(row[1:], width[1:], strict=True))]
+        if left and heads[-1] == "":
+            cells[-1] = row[-1]
+        lines.append("  ".join(cells).rstrip())
+    return lines
+
+
+def outcome_page(outcome: Outcome) -> str:
+    """The report."""
+    result = outcome.result
+    banner = f'<h1>{FRAMES[result.setup].camera}</h1><p class="counts">{escape(outcome.where)}: '
+    banner += f"{escape(_headline(outcome))}</p>\n"
+    notes = "".join(f"<li>{escape(note)}</li>\n" for note in outcome.all_notes())
+    notes = f"<h3>To know</h3>\n<ul>\n{notes}</ul>\n" if notes else ""
+    sections = [("result", "Result", _tiles(outcome) + notes + _transform_tables(result) + _sigma_table(outcome))]
+    if outcome.compared:
+        sections.append(("methods", "Methods", _methods(outcome)))
+    sections.append(("poses", "Poses", _poses(outcome)))
+    if result.observability is not None:
+        sections.append(("motions", "What the motions tell", _motions(result)))
+    if outcome.left_out:
+        sections.append(("left-out", "Left out", table(["<image", "<reason"], [list(r) for r in outcome.left_out])))
+    return page(f"Hand-eye calibration: {FRAMES[result.setup].camera}", banner, sections)
+
+
+def _tiles(outcome: Outcome) -> str:
+    result, tiles = outcome.result, []
+    if outcome.held_out is not None:
+        means = outcome.held_out.means()
+        name = "board_mm" if "board_mm" in means else "translation_mm"
+        where = "3-D error at the board" if name == "board_mm" else "error of the board's origin"
+        tiles.append((f"{means[name]:.3f} mm", f"{where}, on poses held out ({_splits_text(outcome)})"))
+        turn = np.degrees(means["rotation_rad"])
+        tiles.append((f"{turn:.3f}°", "error of rotation, on poses held out"))
+    if result.covariance is not None:
+        sigma = np.sqrt(np.linalg.eigvalsh(result.covariance[3:, 3:])[-1])
+        tiles.append((f"{sigma:.3f} mm", "σ of the camera's place, in its worst direction"))
+    turn, shift = result.rms()
+    tiles.append((f"{shift:.3f} mm", f"RMS residual at the board's origin, and {np.degrees(turn):.3f}°"))
+    if result.sigma_scale is not None:
+        found = "" if outcome.pitch_mm is None else f": pitch {outcome.pitch_mm * result.scale:.3f} mm"
+        tiles.append((f"{result.scale:.4f}", f"times its stated size is the board, ± {result.sigma_scale:.4f}{found}"))
+    shown = "".join(f"<div><b>{value}</b><span>{escape(text)}</span></div>" for value, text in tiles)
+    more = "".join(f"<p>Held out, {escape(text)}.</p>\n" for text in _agreeing_text(outcome))
+    return f'<div class="tiles">{shown}</div>\n{more}'
+
+
+def _transform_tables(result: HandEye) -> str:
+    parts = []
+    for name, pose, covariance in _transforms(result):
+        matrix = "\n".join(" ".join(f"{v:14.9f}" for v in row) for row in pose.matrix())
+        parts.append(
+            f"<div><h3>{name}</h3>\n"
+            + table(list(HEADS), _transform_rows(pose, covariance))
+            + fold("4×4 matrix, mm", f'<div class="scroll"><pre>{matrix}</pre></div>')
+            + "</div>"
+        )
+    text = (
+        "<p>The rotation vector is axis times angle, no roll, pitch and yaw. σ are of turns about the axes, and of "
+        "shifts along the axes, of the frame named first.</p>\n"
+    )
+    return '<div class="columns">' + "\n".join(parts) + "</div>\n" + text
+
+
+def _sigma_table(outcome: Outcome) -> str:
+    result = outcome.result
+    if not result.sigma:
+        return ""
+    found = result.reprojection
+    extra = ""
+    if found is not None and found.camera_covariance is not None:
+        sigma = dict(zip(parameter_names(outcome.colmap_model), np.sqrt(np.diag(found.camera_covariance)), strict=True))
+        shown = []
+        for name, value in zip(PARAMETER_NAMES, found.camera.parameters(), strict=True):
+            known = sigma.get(name, sigma.get("f") if name in ("fx", "fy") else None)
+            if value or known:
+                digits, unit = (3, "px") if name[0] in "fc" else (6, "")
+                shown.append([name, number(value, digits), number(known, digits), unit])
+        head = "<div><h3>Camera, as adjusted (first pixel's centre at 0, 0)</h3>\n"
+        extra = head + table(["<", "value", "± σ", "<unit"], shown) + "</div>"
+    weights = "<div><h3>What errs, and by how much</h3>\n" + table(["<", "σ", "<"], _sigma_rows(outcome)) + "</div>"
+    return f'<div class="columns">{weights}{extra}</div>\n'
+
+
+def _methods(outcome: Outcome) -> str:
+    heads, rows = _compared_cells(outcome)
+    heads = [f"<{heads[0]}", *heads[1:-1], f"<{heads[-1]}" if heads[-1] == "" else heads[-1]]
+    seen = (
+        " 3-D at the board: how far from each corner the ray on which the camera saw it meets the board where the "
+        "robot has put it; by pose: distance from the corners by the pose that the image gives alone."
+    )
+    text = (
+        f"<p>Means over the same {_splits_text(outcome)} held out: each time all methods solve with the others and "
+        f"predict where the board is.{seen if ERRORS['board_mm'][0] in heads else ''} Off: how far a method's result "
+        "from all poses is from the one above.</p>\n"
+    )
+    return table(heads, rows, css="text") + text
+
+
+def _poses(outcome: Outcome) -> str:
+    result = outcome.result
+    bad = ", ".join(outcome.outliers())
+    text = f"{swatch('used', GOOD)} {swatch('left out, contradicting the others', BAD)}" if bad else ""
+    caption = "By how much the chain through each pose misses the board"
+    figures = plot(uri(_residual_figure(result)), "residual of each pose", caption, "wide")
+    if result.reprojection is not None:
+        cloud = plot(uri(_corner_figure(result)), "residuals of corners", "Corners: projected minus seen; circle: 95 %")
+        bars = plot(uri(_corner_rms_figure(result)), "corners of each pose", "Corners of each pose: RMS length")
+        figures += f'<div class="plots">{cloud}{bars}</div>\n'
+    turn, shift = (np.linalg.norm(part, axis=1) for part in (result.residuals[:, :3], result.residuals[:, 3:]))
+    rows = []
+    for i, name in enumerate(result.names):
+        row = [
+            name,
+            number(np.degrees(turn[i]), 4),
+            number(shift[i], 3),
+            *(number(v, 3) for v in result.residuals[i, 3:]),
+        ]
+        if result.reprojection is not None:
+            row.append(number(result.reprojection.rms_px(i), 3))
+        rows.append([*row, "left out" if result.outliers[i] else ""])
+    heads = ["<pose", "rotation °", "mm", "x mm", "y mm", "z mm"]
+    heads += ["corners px"] if result.reprojection is not None else []
+    legend = f'<p class="legend">{text}</p>\n' if text else ""
+    return legend + figures + fold(f"{len(rows)} poses", table([*heads, "<"], rows))
+
+
+def _residual_figure(result: HandEye):
+    """Bars of each pose: rotation above, translation below."""
+    figure = new_figure(9.0, 3.6)
+    at = np.arange(1, len(result.names) + 1)
+    parts = ((np.degrees(result.residuals[:, :3]), "rotation, °"), (result.residuals[:, 3:], "board's origin, mm"))
+    for k, (part, label) in enumerate(parts):
+        axes = figure.add_axes((0.08, 0.57 - 0.43 * k, 0.91, 0.37))
+        colours = [BAD if bad else GOOD for bad in result.outliers]
+        axes.vlines(at, 0, np.linalg.norm(part, axis=1), color=colours, lw=_width(300, len(at)))
+        axes.set_xlim(0.3, len(at) + 0.7)
+        axes.set_ylim(0, None)
+        _finish(axes, "", label)
+        few = len(at) <= 30
+        short = [name if len(name) <= 12 else f"…{name[-11:]}" for name in result.names]
+        if few:
+            axes.set_xticks(
+                at, short if k else [""] * len(at), rotation=40 if max(map(len, short)) > 3 else 0, ha="right"
+            )
+        elif not k:
+            axes.tick_params(labelbottom=False)
+    return figure
+
+
+def _corner_figure(result: HandEye):
+    found = result.reprojection
+    figure = new_figure(4.4, 4.0)
+    axes = figure.add_axes((0.15, 0.12, 0.8, 0.86))
+    off = found.residuals_px
+    axes.plot(*off.T, ".", color=GOOD, ms=2.2, alpha=0.6)
+    radius = float(np.quantile(np.linalg.norm(off, axis=1), 0.95))
+    turn = np.linspace(0, 2 * np.pi, 100)
+    axes.plot(radius * np.cos(turn), radius * np.sin(turn), color=INK, lw=0.8)
+    axes.set_aspect("equal", adjustable="datalim")
+    _finish(axes, "x, px", "y, px (down)")
+    axes.invert_yaxis()
+    return figure
+
+
+def _corner_rms_figure(result: HandEye):
+    figure = new_figure(4.4, 4.0)
+    axes = figure.add_axes((0.15, 0.12, 0.8, 0.86))
+    rms = np.array([result.reprojection.rms_px(i) for i in range(len(result.names))])
+    axes.vlines(
+        np.arange(1, len(rms) + 1), 0, np.nan_to_num(rms), color=GOOD, lw=float(np.clip(150 / len(rms), 0.8, 6))
+    )
+    axes.set_xlim(0.3, len(rms) + 0.7)
+    axes.set_ylim(0, None)
+    _finish(axes, "pose, in order of the table", "px")
+    return figure
+
+
+def _width(room: float, bars: int) -> float:
+    return float(np.clip(room / bars, 0.8, 8))
+
+
+def _finish(axes, x: str, y: str) -> None:
+    calm(axes)
+    axes.grid(axis="y", color=FAINT, lw=0.6)
+    axes.set_axisbelow(True)
+    axes.set_xlabel(x, fontsize=SMALL + 1, color=INK)
+    axes.set_ylabel(y, fontsize=SMALL + 1, color=INK)
+
+
+def _motions(result: HandEye) -> str:
+    seen = result.observability
+    rows = [
+        [str(i + 1), *(number(v, 3) for v in axis), number(np.degrees(turn), 2)]
+        for i, (axis, turn) in enumerate(zip(seen.axes, seen.turns_rad, strict=True))
+    ]
+    text = (
+        "<p>The principal axes of all rotations between poses, in the flange's frame, and the RMS turn about each. "
+        "The transform is known well where the second turn is large; where it is 0, the camera's place slides along "
+        f"the first axis. From poses of a common camera (1 mrad, 0.5 mm) these motions give σ of "
+        f"{number(np.degrees(seen.sigma_rad), 3)}° and {number(seen.sigma_mm, 2)} mm in the worst direction.</p>\n"
+    )
+    return table(["axis", "x", "y", "z", "turn ° (RMS)"], rows) + text

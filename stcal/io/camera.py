@@ -1,0 +1,305 @@
+"""Camera files: COLMAP's ``cameras.txt``, OpenCV's YAML and XML, ROS ``camera_info``; each with its pixel origin."""
+
+import re
+import xml.etree.ElementTree as ElementTree
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+import yaml
+
+from stcal.errors import InputError
+from stcal.geometry.camera import Camera
+from stcal.io.saving import save
+
+COLMAP_PIXEL_ORIGIN = 0.5
+"""COLMAP's coordinate of the centre of the top-left pixel; OpenCV's, and ours, is 0."""
+
+SIGMA, CORRELATION = "# SIGMA[]", "# CORRELATION[]"
+"""Comments of ``cameras.txt`` that state the uncertainty of its parameters."""
+
+MAX_SIDE_PX = 1_000_000
+"""Longest image side that a camera file may state, px."""
+
+DISTORTION_COUNTS = (0, 4, 5, 8, 12, 14)
+"""Numbers of distortion coefficients that OpenCV knows."""
+
+# Places of COLMAP's parameters in fx, fy, cx, cy, k1, k2, p1, p2, k3, k4, k5, k6.
+_COLMAP_LAYOUT = {
+    "SIMPLE_PINHOLE": [(0, 1), 2, 3],
+    "PINHOLE": [0, 1, 2, 3],
+    "SIMPLE_RADIAL": [(0, 1), 2, 3, 4],
+    "RADIAL": [(0, 1), 2, 3, 4, 5],
+    "OPENCV": list(range(8)),
+    "FULL_OPENCV": list(range(12)),
+}
+COLMAP_MODELS = tuple(_COLMAP_LAYOUT)
+"""Camera models that stcal supports."""
+PARAMETER_NAMES = ("fx", "fy", "cx", "cy", "k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6")
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class CameraModel:
+    """A camera as its file states it.
+
+    ``focal``, ``centre``, ``distortion`` : as in :class:`Camera`, pixel origin already OpenCV's;
+    ``colmap_model`` : the COLMAP model that holds it exactly;
+    ``width``, ``height`` : px, or None where the file states none (see :meth:`sized`);
+    ``covariance`` : (q, q) of the parameters of ``colmap_model``, in its order, or None where the file states none.
+    """
+
+    focal: np.ndarray
+    centre: np.ndarray
+    distortion: np.ndarray
+    colmap_model: str
+    width: int | None
+    height: int | None
+    source: str
+    covariance: np.ndarray | None = None
+
+    def sized(self, width: int, height: int) -> Camera:
+        """The camera; a size that the file does not state is taken from the arguments."""
+        return Camera(self.width or width, self.height or height, self.focal, self.centre, self.distortion)
+
+
+def colmap_params(camera: Camera, colmap_model: str) -> list[float]:
+    """Parameters of ``camera`` in COLMAP's order and pixel origin for ``colmap_model``."""
+    flat = np.concatenate([camera.focal, camera.centre + COLMAP_PIXEL_ORIGIN, camera.distortion])
+    return [float(flat[place[0] if isinstance(place, tuple) else place]) for place in _COLMAP_LAYOUT[colmap_model]]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class CameraPrior:
+    """Intrinsics as observations: ``covariance`` (q, q) of the parameters of ``colmap_model``, in its order."""
+
+    colmap_model: str
+    covariance: np.ndarray
+
+
+WITHOUT_DISTORTION = ("SIMPLE_PINHOLE", "PINHOLE")
+PRIOR_FOCAL = 1e-3
+"""σ of the focal lengths where the camera file states none, relative …"""
+PRIOR_CENTRE = 2e-3
+"""… of the principal point, in image widths …"""
+PRIOR_RADIAL = 0.01
+"""… of k1 … k6 (and a tenth of each) …"""
+PRIOR_TANGENTIAL = 1e-3
+"""… and of p1, p2: what a calibration of some weeks ago, or of another copy of the lens, is worth."""
+
+
+def camera_prior(model: "CameraModel", camera: Camera) -> CameraPrior:
+    """The intrinsics as observations with the covariance of their file, or with that of a calibration of some age."""
+    if model.covariance is not None:
+        return CameraPrior(model.colmap_model, model.covariance)
+    radial = np.maximum(PRIOR_RADIAL, 0.1 * np.abs(camera.distortion))
+    radial[2:4] = PRIOR_TANGENTIAL
+    flat = np.concatenate([PRIOR_FOCAL * camera.focal, [PRIOR_CENTRE * camera.width] * 2, radial])
+    first = intrinsic_basis(model.colmap_model).argmax(0)
+    return CameraPrior(model.colmap_model, np.diag(flat[first] ** 2))
+
+
+def refinable(model: "CameraModel") -> "CameraModel":
+    """The same for a refinement: a file without distortion, and without σ that say that there is none, leaves the
+    lens's distortion out; it is refined as OPENCV, from zero."""
+    if model.covariance is None and model.colmap_model in WITHOUT_DISTORTION:
+        return replace(model, colmap_model="OPENCV")
+    return model
+
+
+def intrinsic_basis(colmap_model: str) -> np.ndarray:
+    """Derivative (12, q) of fx, fy, cx, cy, k1, k2, p1, p2, k3 … k6 by the q parameters of a COLMAP model."""
+    layout = _COLMAP_LAYOUT[colmap_model]
+    basis = np.zeros((len(PARAMETER_NAMES), len(layout)))
+    for column, place in enumerate(layout):
+        basis[list(place) if isinstance(place, tuple) else place, column] = 1
+    return basis
+
+
+def parameter_names(colmap_model: str) -> list[str]:
+    """Names of the parameters of a COLMAP model, in its order."""
+    layout = _COLMAP_LAYOUT[colmap_model]
+    return ["f" if isinstance(place, tuple) else PARAMETER_NAMES[place] for place in layout]
+
+
+def read_camera(path: str | Path) -> CameraModel:
+    """Read a camera file of any supported kind, told apart by content.
+
+    Raises
+    ------
+    InputError
+        Missing or malformed file, more than one camera, or a camera model that stcal does not support.
+    """
+    path = Path(path)
+    try:
+        text = path.read_text(encoding="utf-8-sig")
+    except OSError as error:
+        raise InputError(f"camera file {path}: {error.strerror or error}; give a readable file") from error
+    except ValueError as error:  # not UTF-8, or a NUL in the name
+        raise InputError(f"camera file {path}: not a text file; give cameras.txt, or OpenCV's YAML or XML") from error
+    try:
+        if text.lstrip().startswith("<"):
+            return _from_opencv(_xml_values(text), path)
+        rows = [line.split() for line in text.splitlines() if line.strip() and not line.lstrip().startswith("#")]
+        if rows and len(rows[0]) >= 5 and re.fullmatch(r"[A-Z][A-Z0-9_]+", rows[0][1]):
+            model = _from_colmap(rows, path)
+            return replace(model, covariance=_stated_covariance(text, len(rows[0]) - 4, path))
+        return _from_opencv(_yaml_values(text), path)
+    except InputError:
+        raise
+    except (ElementTree.ParseError, yaml.YAMLError, ValueError, TypeError, RecursionError) as error:
+        reason = " ".join(str(error).split())[:150]
+        raise InputError(
+            f"camera file {path}: neither COLMAP's cameras.txt nor OpenCV's YAML or XML ({reason}); check its form"
+        ) from error
+
+
+def write_cameras_txt(
+    path: str | Path, camera: Camera, colmap_model: str = "FULL_OPENCV", covariance: np.ndarray | None = None
+) -> None:
+    """Write ``cameras.txt`` with one camera of id 1; σ and correlations of its parameters as comments."""
+    params = " ".join(repr(p) for p in colmap_params(camera, colmap_model))
+    lines = ["# CAMERA_ID, MODEL, WIDTH, HEIGHT, PARAMS[] (centre of the first pixel at 0.5, 0.5)"]
+    if covariance is not None:
+        sigma = np.sqrt(np.diag(covariance))
+        correlation = covariance / np.outer(sigma, sigma)
+        lines.append(f"{SIGMA} {' '.join(repr(float(s)) for s in sigma)}")
+        lines += [f"{CORRELATION} {' '.join(repr(float(c)) for c in row)}" for row in correlation]
+    lines.append(f"1 {colmap_model} {camera.width} {camera.height} {params}")
+    save(Path(path), "\n".join(lines) + "\n")
+
+
+def _stated_covariance(text: str, count: int, path: Path) -> np.ndarray | None:
+    """Covariance (count, count) of the comments that :func:`write_cameras_txt` makes; None without them."""
+    rows = {
+        key: [line.split()[2:] for line in text.splitlines() if line.startswith(key)] for key in (SIGMA, CORRELATION)
+    }
+    if not rows[SIGMA]:
+        return None
+    try:
+        sigma = np.array(rows[SIGMA][0], float)
+        correlation = np.array(rows[CORRELATION], float).reshape(count, count)
+        covariance = correlation * np.outer(sigma, sigma)
+        np.linalg.cholesky(covariance)
+    except (ValueError, np.linalg.LinAlgError) as error:
+        raise InputError(
+            f"camera file {path}: SIGMA and CORRELATION do not state a covariance of {count} parameters; "
+            "write it again, or remove these comments"
+        ) from error
+    return covariance
+
+
+def _model(flat: np.ndarray, colmap_model: str, width, height, path: Path) -> CameraModel:
+    if not np.isfinite(flat).all():
+        raise InputError(f"camera file {path}: a camera parameter is not a finite number; correct it")
+    if (flat[:2] <= 0).any():
+        raise InputError(f"camera file {path}: focal length {flat[0]:g}, {flat[1]:g} px; positive numbers needed")
+    for side in (width, height):
+        if side is not None and not (0 < side <= MAX_SIDE_PX and float(side).is_integer()):
+            raise InputError(f"camera file {path}: image side {side:g} px; a whole number in 1…{MAX_SIDE_PX} needed")
+    width, height = (None if side is None else int(side) for side in (width, height))
+    return CameraModel(flat[:2], flat[2:4], flat[4:], colmap_model, width, height, str(path))
+
+
+def _from_colmap(rows: list[list[str]], path: Path) -> CameraModel:
+    if len(rows) != 1:
+        raise InputError(f"camera file {path}: {len(rows)} cameras, 1 needed; leave the one that took the images")
+    _, name, width, height, *params = rows[0]
+    try:
+        numbers = [float(value) for value in (width, height, *params)]
+    except ValueError as error:
+        raise InputError(f"camera file {path}: {' '.join(str(error).split())[:150]}; numbers needed") from error
+    return camera_from_colmap(name, *numbers[:2], numbers[2:], path)
+
+
+def camera_from_colmap(colmap_model: str, width: float, height: float, params, source: str | Path) -> CameraModel:
+    """The camera of COLMAP's ``params`` (its order, its pixel origin); ``source`` : where they come from.
+
+    Raises
+    ------
+    InputError
+        A camera model that stcal does not support, a wrong number of parameters, or impossible values.
+    """
+    if colmap_model not in _COLMAP_LAYOUT:
+        known = ", ".join(_COLMAP_LAYOUT)
+        raise InputError(f"camera file {source}: model {colmap_model} is not supported; use one of {known}")
+    layout = _COLMAP_LAYOUT[colmap_model]
+    if len(params) != len(layout):
+        raise InputError(f"camera file {source}: {len(params)} parameters for {colmap_model}, {len(layout)} needed")
+    flat = np.zeros(12)
+    for place, value in zip(layout, params, strict=True):
+        flat[list(place) if isinstance(place, tuple) else place] = value
+    flat[2:4] -= COLMAP_PIXEL_ORIGIN
+    return _model(flat, colmap_model, width, height, Path(source))
+
+
+def _from_opencv(values: dict, path: Path) -> CameraModel:
+    names = {"K": "camera_matrix", "cameraMatrix": "camera_matrix", "D": "distortion_coefficients"}
+    names |= {"distCoeffs": "distortion_coefficients", "dist_coeffs": "distortion_coefficients"}
+    values = {names.get(key, key): value for key, value in values.items()}
+    if "camera_matrix" not in values:
+        if isinstance(values.get("intrinsics"), dict):
+            return _from_industrial(values["intrinsics"], path)
+        raise InputError(f"camera file {path}: no camera_matrix; write it with cv2.FileStorage or as ROS camera_info")
+    matrix = np.asarray(values["camera_matrix"], float)
+    if matrix.size != 9:
+        raise InputError(f"camera file {path}: camera_matrix of {matrix.size} numbers; 3×3 needed")
+    matrix = matrix.reshape(3, 3)
+    if (matrix[[1, 2, 2, 2], [0, 0, 1, 2]] != [0, 0, 0, 1]).any():
+        raise InputError(f"camera file {path}: camera_matrix is not [fx 0 cx; 0 fy cy; 0 0 1]; is it transposed?")
+    if not abs(matrix[0, 1]) <= 1e-9 * abs(matrix[0, 0]) and np.isfinite(matrix[0, 0]):
+        raise InputError(f"camera file {path}: skew {matrix[0, 1]:g} is not supported; calibrate without skew")
+    model = values.get("distortion_model", "plumb_bob")
+    if model not in ("plumb_bob", "rational_polynomial"):
+        raise InputError(f"camera file {path}: distortion model {model!r} is not supported; use plumb_bob")
+    given = np.asarray(values.get("distortion_coefficients", []), float).ravel()
+    if given[8:].any():
+        raise InputError(f"camera file {path}: {len(given)} distortion coefficients, at most 8 are supported")
+    if len(given) not in DISTORTION_COUNTS:
+        raise InputError(
+            f"camera file {path}: {len(given)} distortion coefficients; {', '.join(map(str, DISTORTION_COUNTS))} "
+            "are possible (k1, k2, p1, p2, k3 …)"
+        )
+    distortion = np.zeros(8)
+    distortion[: min(len(given), 8)] = given[:8]
+    kind = "FULL_OPENCV" if distortion[4:].any() else "OPENCV" if distortion.any() else "PINHOLE"
+    # A missing size, or 0, is one the file does not state.
+    size = [float(values.get(f"image_{side}") or 0) or None for side in ("width", "height")]
+    flat = np.concatenate([[matrix[0, 0], matrix[1, 1], matrix[0, 2], matrix[1, 2]], distortion])
+    return _model(flat, kind, *size, path)
+
+
+def _from_industrial(values: dict, path: Path) -> CameraModel:
+    """ROS-Industrial's: the form has no place for the distortion, which may be there all the same."""
+    missing = [key for key in PARAMETER_NAMES[:4] if key not in values]
+    if missing:
+        raise InputError(f"camera file {path}: intrinsics without {', '.join(missing)}; fx, fy, cx, cy needed")
+    flat = np.concatenate([np.array([values[key] for key in PARAMETER_NAMES[:4]], float), np.zeros(8)])
+    return _model(flat, "OPENCV", None, None, path)
+
+
+class _OpencvLoader(yaml.SafeLoader):
+    """YAML with OpenCV's matrix tag."""
+
+
+_OpencvLoader.add_constructor(
+    "tag:yaml.org,2002:opencv-matrix", lambda loader, node: loader.construct_mapping(node, deep=True)
+)
+
+
+def _yaml_values(text: str) -> dict:
+    # cv2.FileStorage heads its files with "%YAML:1.0", which is not a YAML directive.
+    values = yaml.load(re.sub(r"\A\s*%YAML:?\s*[\d.]+\s*\n", "", text), _OpencvLoader)
+    if not isinstance(values, dict):
+        raise ValueError("no keys")
+    return {k: v["data"] if isinstance(v, dict) and "data" in v else v for k, v in values.items()}
+
+
+def _xml_values(text: str) -> dict:
+    values = {}
+    for node in ElementTree.fromstring(text):
+        data = node.find("data")
+        if data is not None:
+            values[node.tag] = [float(word) for word in (data.text or "").split()]
+        elif node.text and not len(node):
+            values[node.tag] = node.text.strip().strip('"')
+    return values

@@ -1,0 +1,210 @@
+"""``target.toml`` and ``board.toml``: read with every mistake named, and written with comments to edit."""
+
+import json
+from pathlib import Path
+from typing import Annotated
+
+import numpy as np
+from pydantic import AfterValidator, BeforeValidator, Field
+
+from stcal.design import BOARD, BoardDesign, FaceDesign, Polarity, TargetDesign
+from stcal.errors import InputError
+from stcal.io.toml import Finite, Positive, Strict, load_toml
+
+REMEDY = "`stcal-sfm init DIR` writes one"
+MIN_SINE = 0.02
+"""Smallest sine of the angle between the X and Y circles as seen from the origin circle."""
+
+
+Count = Annotated[int, Field(ge=2, le=1000, strict=True)]
+Index = Annotated[int, Field(ge=0, strict=True)]
+Name = Annotated[
+    str,
+    BeforeValidator(lambda v: str(v) if isinstance(v, int) and not isinstance(v, bool) else v),
+    Field(min_length=1, pattern=r"^[^:,\s/\\\p{C}]+$"),
+]
+
+
+class _CircleFile(Strict):
+    id: Name
+    x_mm: Finite
+    y_mm: Finite
+    radius_mm: Positive
+
+
+class _FaceFile(Strict):
+    id: Name
+    origin: Name
+    x: Name
+    y: Name
+    circles: list[_CircleFile] = Field(min_length=4)
+
+
+class _TargetFile(Strict):
+    name: Annotated[str, AfterValidator(lambda v: " ".join(v.split()))] = "target"
+    polarity: Polarity
+    face: list[_FaceFile] = Field(min_length=1)
+
+
+class _CornerFile(Strict):
+    row: Index
+    column: Index
+    radius_mm: Positive
+
+
+class _BoardFile(Strict):
+    rows: Count
+    columns: Count
+    pitch_mm: Positive
+    radius_mm: Positive
+    polarity: Polarity
+    sigma_mm: Positive = 0.005
+    corner: _CornerFile | None = None
+
+
+def load_target(path: str | Path) -> TargetDesign:
+    """Read ``target.toml`` (form: ``data_layout.md``).
+
+    Raises
+    ------
+    InputError
+        Unknown or missing keys, duplicate ids, overlapping circles, frame circles that are missing, collinear,
+        or left-handed; the message names the file and the place.
+    """
+    data = load_toml(path, _TargetFile, "target file", REMEDY)
+    where = f"target file {path}"
+    _no_duplicates([face.id for face in data.face], f"{where}: face id")
+    for face in data.face:
+        if face.id == BOARD:
+            raise InputError(f"{where}: face id {BOARD} is taken by the board; choose another")
+    return TargetDesign(data.name, data.polarity, tuple(_face(face, f"{where}: face {face.id}") for face in data.face))
+
+
+def load_board(path: str | Path) -> BoardDesign:
+    """Read ``board.toml`` (form: ``data_layout.md``); errors as :func:`load_target`."""
+    data = load_toml(path, _BoardFile, "board file", REMEDY)
+    where = f"board file {path}"
+    if 2 * data.radius_mm >= data.pitch_mm:
+        raise InputError(f"{where}: radius {data.radius_mm:g} mm, under half the pitch {data.pitch_mm:g} mm needed")
+    corner = None
+    if data.corner is not None:
+        corner = (data.corner.row, data.corner.column)
+        if corner[0] not in (0, data.rows - 1) or corner[1] not in (0, data.columns - 1):
+            raise InputError(f"{where}: corner dot at row {corner[0]}, column {corner[1]}; a corner of the grid needed")
+        if not 1.15 * data.radius_mm <= data.corner.radius_mm < data.pitch_mm - data.radius_mm:
+            raise InputError(
+                f"{where}: corner radius {data.corner.radius_mm:g} mm; at least {1.15 * data.radius_mm:g} mm "
+                f"and under {data.pitch_mm - data.radius_mm:g} mm needed"
+            )
+    return BoardDesign(
+        data.rows,
+        data.columns,
+        data.pitch_mm,
+        data.radius_mm,
+        data.polarity,
+        data.sigma_mm,
+        corner,
+        data.corner.radius_mm if data.corner else None,
+    )
+
+
+def _no_duplicates(ids: list[str], what: str) -> None:
+    for i, value in enumerate(ids):
+        if value in ids[:i]:
+            raise InputError(f"{what} {value} occurs twice; ids must differ")
+
+
+def _face(face: _FaceFile, where: str) -> FaceDesign:
+    ids = [circle.id for circle in face.circles]
+    _no_duplicates(ids, f"{where}: circle id")
+    for key in ("origin", "x", "y"):
+        if getattr(face, key) not in ids:
+            raise InputError(f"{where}: {key} circle {getattr(face, key)} is not among the circles {', '.join(ids)}")
+    xy = np.array([[circle.x_mm, circle.y_mm] for circle in face.circles])
+    radius = np.array([circle.radius_mm for circle in face.circles])
+    gap = np.linalg.norm(xy[:, None] - xy, axis=2) - radius[:, None] - radius
+    np.fill_diagonal(gap, np.inf)
+    if gap.min() <= 0:
+        i, j = np.unravel_index(gap.argmin(), gap.shape)
+        raise InputError(f"{where}: circles {ids[i]} and {ids[j]} overlap; move them apart")
+    origin, x, y = (xy[ids.index(getattr(face, key))] for key in ("origin", "x", "y"))
+    length_x, length_y = np.linalg.norm(x - origin), np.linalg.norm(y - origin)
+    if min(length_x, length_y) == 0:
+        raise InputError(f"{where}: frame circles {face.origin}, {face.x}, {face.y}; three different ones needed")
+    axis = (x - origin) / length_x
+    sine = float(axis[0] * (y - origin)[1] - axis[1] * (y - origin)[0]) / length_y
+    if abs(sine) < MIN_SINE:
+        raise InputError(
+            f"{where}: frame circles {face.origin}, {face.x}, {face.y} are collinear; choose three off one line"
+        )
+    if sine < 0:
+        raise InputError(
+            f"{where}: X to Y through {face.x} and {face.y} turns clockwise seen from outside; swap x and y, or "
+            "give positions as seen from outside with y up"
+        )
+    face_from_drawing = np.array([axis, [-axis[1], axis[0]]])
+    return FaceDesign(face.id, tuple(ids), (xy - origin) @ face_from_drawing.T, radius, face.origin, face.x, face.y)
+
+
+def target_toml(target: TargetDesign) -> str:
+    """Text of a ``target.toml`` for ``target``, with comments."""
+    lines = [
+        "# A stereo target: faces with circles. Positions in mm, in any right-handed drawing frame of the face,",
+        "# seen from outside with y up. Circle ids are free (no spaces, colons or commas), unique within a face.",
+        f"name = {_string(target.name)}",
+        f'polarity = "{target.polarity}"  # circles are "bright" or "dark" against what surrounds them',
+    ]
+    for face in target.faces:
+        lines += [
+            "",
+            "[[face]]",
+            f"id = {_string(face.id)}",
+            "# The face frame: origin at one circle, X through a second one, Y on the side of a third, Z outwards.",
+            f"origin = {_string(face.origin)}",
+            f"x = {_string(face.x)}",
+            f"y = {_string(face.y)}",
+            "circles = [",
+        ]
+        lines += [
+            f"  {{ id = {_string(circle)}, x_mm = {_number(x)}, y_mm = {_number(y)}, radius_mm = {_number(r)} }},"
+            for circle, (x, y), r in zip(face.ids, face.xy_mm, face.radius_mm, strict=True)
+        ]
+        lines += ["]"]
+    return "\n".join(lines) + "\n"
+
+
+def board_toml(board: BoardDesign) -> str:
+    """Text of a ``board.toml`` for ``board``, with comments."""
+    corner = board.corner or (0, 0)
+    corner_radius = board.corner_radius_mm or 1.5 * board.radius_mm
+    off = "" if board.corner else "# "
+    return (
+        "\n".join(
+            [
+                "# A rectangular grid of dots. Dot (row 0, column 0) is the origin, columns run along X, rows along Y.",
+                f"rows = {board.rows}",
+                f"columns = {board.columns}",
+                f"pitch_mm = {_number(board.pitch_mm)}",
+                f"radius_mm = {_number(board.radius_mm)}",
+                f'polarity = "{board.polarity}"  # dots are "bright" or "dark" against the board',
+                f"sigma_mm = {_number(board.sigma_mm)}  # standard deviation of the dots' positions, per axis",
+                "",
+                "# One larger dot in a corner of the grid tells the orientation; without it the board looks the",
+                "# same after half a turn, which a run settles by comparing the images of a group.",
+                f"{off}[corner]",
+                f"{off}row = {corner[0]}",
+                f"{off}column = {corner[1]}",
+                f"{off}radius_mm = {_number(corner_radius)}",
+            ]
+        )
+        + "\n"
+    )
+
+
+def _string(value: str) -> str:
+    # JSON's escapes are TOML's, but JSON leaves DEL as it is.
+    return json.dumps(value, ensure_ascii=False).replace("\x7f", "\\u007f")
+
+
+def _number(value: float) -> str:
+    return repr(round(float(value), 9) + 0.0)

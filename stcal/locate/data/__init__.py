@@ -1,0 +1,1 @@
+"""The target's layout, its scenes and the photographs of its calibration."""

@@ -1,0 +1,107 @@
+"""Scenes: one target in one place, photographed at several exposures; and the tags that each of these shows."""
+
+from collections.abc import Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from stcal.boards.tags import Tags, find_tags
+from stcal.errors import InputError
+from stcal.io.images import SUFFIXES, TOP_GROUP, ImageFile, decode, find_images, grey_8bit
+from stcal.locate.data.layout import TargetLayout
+
+
+@dataclass(frozen=True, slots=True)
+class SceneFiles:
+    """The exposures of one scene; ``skipped`` : what lies beside them and is none."""
+
+    name: str
+    files: tuple[ImageFile, ...]
+    skipped: tuple[str, ...] = ()
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Exposure:
+    """What one image shows: ``tags``, None where it cannot be read and ``trouble`` says why; ``size`` : width and
+    height, px."""
+
+    name: str
+    tags: Tags | None
+    size: tuple[int, int] | None = None
+    trouble: str | None = None
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class SceneTags:
+    """The exposures of one scene."""
+
+    name: str
+    exposures: tuple[Exposure, ...]
+
+    def readable(self) -> list[Exposure]:
+        """Those with an image."""
+        return [exposure for exposure in self.exposures if exposure.tags is not None]
+
+
+def exposure_times(shortest: float, longest: float, count: int) -> np.ndarray:
+    """``count`` exposure times from ``shortest`` to ``longest`` in a geometric series, in their unit.
+
+    Raises
+    ------
+    InputError
+        Times that are not positive or not in order, or fewer than one of them.
+    """
+    if not (0 < shortest <= longest < np.inf) or count < 1 or (count == 1 and shortest < longest):
+        raise InputError(
+            f"exposures: {count} from {shortest:g} to {longest:g}; two or more, from a positive shortest time to a "
+            "longest that is not shorter, needed"
+        )
+    return np.geomspace(shortest, longest, count)
+
+
+def find_scenes(path: str | Path) -> list[SceneFiles]:
+    """Scenes in ``path``: one image; a folder of exposures; or a folder of such folders, each a scene.
+
+    Raises
+    ------
+    InputError
+        Nothing there, or no image.
+    """
+    path = Path(path)
+    if path.is_file():
+        if path.suffix.lower() not in SUFFIXES:
+            raise InputError(f"exposures {path}: not an image; a folder or one of {', '.join(SUFFIXES)} needed")
+        return [SceneFiles(path.stem, (ImageFile(path, path.name, TOP_GROUP),))]
+    files, skipped = find_images(path)
+    scenes = []
+    for group in dict.fromkeys(file.group for file in files):
+        left_out = tuple(f"{s.name}: {s.reason}" for s in skipped if (Path(s.name).parent.name or TOP_GROUP) == group)
+        name = path.resolve().name if group == TOP_GROUP else group
+        scenes.append(SceneFiles(name, tuple(f for f in files if f.group == group), left_out))
+    return scenes
+
+
+def read_scenes(scenes: Sequence[SceneFiles], layout: TargetLayout, workers: int | None = None) -> Iterator[SceneTags]:
+    """The tags of each scene. Every image is decoded once, while others are searched for tags beside it."""
+    dictionaries = layout.dictionaries()
+    with ThreadPoolExecutor(workers) as pool:
+        for scene in scenes:
+            # Decoding stays in this thread: it listens to what the decoders write to standard error.
+            found = [_begin(file, dictionaries, pool) for file in scene.files]
+            yield SceneTags(scene.name, tuple(finish() for finish in found))
+
+
+def detect(image: np.ndarray, name: str, dictionaries: Sequence[str]) -> Exposure:
+    """The tags of a decoded image."""
+    return Exposure(name, find_tags(image, dictionaries), (image.shape[1], image.shape[0]))
+
+
+def _begin(file: ImageFile, dictionaries: Sequence[str], pool: ThreadPoolExecutor):
+    try:
+        image = grey_8bit(decode(file.path.read_bytes(), file.name))
+    except (InputError, OSError) as error:
+        trouble = Exposure(file.name, None, trouble=" ".join(str(error).split()))
+        return lambda: trouble
+    return pool.submit(detect, image, file.name, dictionaries).result

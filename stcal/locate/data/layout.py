@@ -1,0 +1,191 @@
+"""The target: which tags it has, where their corners lie in {obj}, and how well that is known."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from stcal.boards.file import REMEDY, TagsFile
+from stcal.errors import InputError
+from stcal.geometry.arrays import frozen
+from stcal.io.toml import load_toml
+
+WHAT = "layout file"
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class LayoutPlan:
+    """A target as it is meant to be, for its calibration.
+
+    ``tags`` : (n,) dictionary and id; ``size_mm`` : (n,) sides, NaN where not given; ``origin`` : row of the tag in
+    whose middle {obj} lies; ``corners_mm`` : (n, 4, 2), NaN where a place is not given.
+    """
+
+    name: str
+    tags: tuple[tuple[str, int], ...]
+    size_mm: np.ndarray
+    origin: int
+    corners_mm: np.ndarray
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class TargetLayout:
+    """A target whose corners are known.
+
+    {obj} : origin in the middle of the tag in row ``origin``, X along its upper edge, Y down, Z into the target.
+
+    Parameters
+    ----------
+    tags : (n,) dictionary and id; the ids differ
+    corners_mm : (n, 4, 2) top left, top right, bottom right, bottom left as printed, in {obj}
+    covariance_mm2 : (8n, 8n) of all their coordinates, tag by tag, corner by corner, x before y
+    origin : row of the tag that holds the origin
+    sigma_px, tag_sigma_px : what print, lens and flatness add to the measured σ of a corner, for each by itself and for
+        the four of a tag together, as the calibration's residuals say
+    """
+
+    name: str
+    tags: tuple[tuple[str, int], ...]
+    corners_mm: np.ndarray
+    covariance_mm2: np.ndarray
+    origin: int
+    sigma_px: float = 0.0
+    tag_sigma_px: float = 0.0
+
+    def __post_init__(self):
+        n = len(self.tags)
+        object.__setattr__(self, "corners_mm", frozen(self.corners_mm, (n, 4, 2), "tags' corners"))
+        object.__setattr__(self, "covariance_mm2", frozen(self.covariance_mm2, (8 * n, 8 * n), "corners' covariance"))
+
+    def dictionaries(self) -> tuple[str, ...]:
+        """Each once."""
+        return tuple(dict.fromkeys(dictionary for dictionary, _ in self.tags))
+
+    def rows(self) -> dict[tuple[str, int], int]:
+        """Row of each tag."""
+        return {tag: row for row, tag in enumerate(self.tags)}
+
+    def sigma_mm(self) -> np.ndarray:
+        """(n, 4, 2) of each coordinate."""
+        return np.sqrt(np.maximum(np.diag(self.covariance_mm2), 0)).reshape(-1, 4, 2)
+
+
+def load_plan(path: str | Path) -> LayoutPlan:
+    """Read a layout file whose tags may be without a place.
+
+    Raises
+    ------
+    InputError
+        Unreadable, not as ``data_layout.md`` has it, or an id twice.
+    """
+    return _plan(load_toml(path, TagsFile, WHAT, REMEDY), f"{WHAT} {path}")
+
+
+def load_layout(path: str | Path) -> TargetLayout:
+    """Read a layout file: a calibrated one, or one whose tags have nominal places.
+
+    Raises
+    ------
+    InputError
+        As :func:`load_plan`, or a tag without a place.
+    """
+    where = f"{WHAT} {path}"
+    data = load_toml(path, TagsFile, WHAT, REMEDY)
+    plan = _plan(data, where)
+    open_places = [tag for tag, corners in zip(plan.tags, plan.corners_mm, strict=True) if np.isnan(corners).any()]
+    if open_places:
+        raise InputError(
+            f"{where}: tag {open_places[0][1]}: no place; x_mm, y_mm and size_mm or corners_mm needed, "
+            "or the file that `stcal locate calibrate` writes"
+        )
+    size = plan.corners_mm.size
+    covariance = data.sigma_mm**2 * np.eye(size)
+    corners = plan.corners_mm
+    if data.covariance_mm2 is not None:
+        covariance = _full(data.covariance_mm2, size, where)
+    else:
+        corners = _in_obj(corners, plan.origin)
+    return TargetLayout(plan.name, plan.tags, corners, covariance, plan.origin, data.sigma_px, data.tag_sigma_px)
+
+
+def layout_toml(layout: TargetLayout, comments: Sequence[str] = ()) -> str:
+    """The file :func:`load_layout` reads."""
+    lines = [f"# {comment}" for comment in comments]
+    lines += ['type = "tags"', f"name = {_quoted(layout.name)}", f"origin = {layout.tags[layout.origin][1]}"]
+    lines += [f"sigma_px = {layout.sigma_px:.6g}", f"tag_sigma_px = {layout.tag_sigma_px:.6g}"]
+    lines.append("# Lower triangle; coordinates tag by tag, corner by corner, x before y.")
+    rows = (", ".join(f"{v:.6g}" for v in row[: k + 1]) for k, row in enumerate(_finite(layout.covariance_mm2)))
+    lines += ["covariance_mm2 = [", *(f"  [{row}]," for row in rows), "]"]
+    for (dictionary, tag), corners, sigma in zip(layout.tags, layout.corners_mm, layout.sigma_mm(), strict=True):
+        places = ", ".join(f"[{x:.6f}, {y:.6f}]" for x, y in corners.tolist())
+        errors = ", ".join(f"{1000 * np.hypot(*s):.1f}" for s in sigma)
+        lines += ["", "[[tag]]", f'dictionary = "{dictionary}"', f"id = {tag}", f"corners_mm = [{places}]"]
+        lines.append(f"# sigma of the corners in the plane: {errors} um")
+    return "\n".join(lines) + "\n"
+
+
+def square(size_mm: float) -> np.ndarray:
+    """Corners (4, 2) of a tag about its middle."""
+    return size_mm / 2 * np.array([[-1, -1], [1, -1], [1, 1], [-1, 1]], float)
+
+
+def obj_from_plane(corners: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Turn (2, 2) and shift (2,) into the frame in the middle of a tag with these corners (4, 2).
+
+    Least squares between them and a square, whose size does not matter.
+    """
+    nominal = square(1.0)
+    middle = corners.mean(0)
+    along = np.sum((corners - middle) * nominal)
+    across = np.sum((corners - middle) @ np.array([[0, -1], [1, 0]]) * nominal)
+    cosine, sine = np.array([along, across]) / np.hypot(along, across)
+    turn = np.array([[cosine, sine], [-sine, cosine]])
+    return turn, -turn @ middle
+
+
+def _plan(data: TagsFile, where: str) -> LayoutPlan:
+    ids = [tag.id for tag in data.tag]
+    twice = [i for i in ids if ids.count(i) > 1]
+    if twice:
+        raise InputError(f"{where}: id {twice[0]} occurs {ids.count(twice[0])} times; ids must differ, in all families")
+    origin = ids[0] if data.origin is None else data.origin
+    if origin not in ids:
+        raise InputError(f"{where}: origin {origin}: no tag has this id; one of {', '.join(map(str, ids))} needed")
+    corners = np.full((len(ids), 4, 2), np.nan)
+    for row, tag in enumerate(data.tag):
+        place = tag.corners(where)
+        if place is not None:
+            if np.linalg.det(np.diff(place[:3], axis=0)) <= 0:
+                raise InputError(
+                    f"{where}: tag {tag.id}: corners go round the wrong way; top left, top right, … needed"
+                )
+            corners[row] = place
+    size = np.array([np.nan if tag.size_mm is None else tag.size_mm for tag in data.tag])
+    return LayoutPlan(data.name, tuple((tag.dictionary, tag.id) for tag in data.tag), size, ids.index(origin), corners)
+
+
+def _in_obj(corners: np.ndarray, origin: int) -> np.ndarray:
+    turn, shift = obj_from_plane(corners[origin])
+    return corners @ turn.T + shift
+
+
+def _full(lower: list[list[float]], size: int, where: str) -> np.ndarray:
+    """A symmetric matrix without the negative eigenvalues that rounding makes of zeros."""
+    if [len(row) for row in lower] != list(range(1, size + 1)):
+        raise InputError(f"{where}: covariance_mm2 is not the lower triangle of {size} rows; calibrate again")
+    full = np.zeros((size, size))
+    for k, row in enumerate(lower):
+        full[k, : k + 1] = full[: k + 1, k] = row
+    value, vector = np.linalg.eigh(full)
+    if value[0] < -1e-4 * max(value[-1], 0):
+        raise InputError(f"{where}: covariance_mm2 is not positive; calibrate again")
+    return (vector * np.maximum(value, 0)) @ vector.T
+
+
+def _finite(matrix: np.ndarray) -> np.ndarray:
+    return matrix + 0.0  # no minus before zero
+
+
+def _quoted(text: str) -> str:
+    return '"' + text.replace("\\", "\\\\").replace('"', '\\"') + '"'

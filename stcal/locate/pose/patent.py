@@ -1,0 +1,152 @@
+"""The published way, step by step as written, to compare with: CN patent "monocular visual target positioning",
+Anhui Yuanguji, steps S5 to S9. Every step is a function that can be replaced."""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.spatial import Delaunay, QhullError
+
+from stcal.boards.tags import Tags
+from stcal.errors import DegenerateError, InputError
+from stcal.geometry.camera import Camera
+from stcal.geometry.ippe import PlanePoses, poses_of_plane
+from stcal.geometry.rigid import Rigid
+from stcal.locate.data.layout import TargetLayout
+from stcal.locate.pose.verdict import Check, Verdict
+
+SAME_RAD, SAME_SHARE = 1e-3, 1e-3
+"""T_a and T_b are the same pose when they differ by less: turned, and shifted in shares of the distance."""
+TINY_PX = 1e-9
+"""Error of a pose that fits exactly, for the ratio."""
+
+
+@dataclass(frozen=True, slots=True)
+class PatentOptions:
+    """The patent's thresholds, which it names and gives no values for.
+
+    ``area_share`` : S_dis; ``min_det_j`` : J_lim, 1/mm² (a target of any size seen straight from 10 m has 10⁻⁸);
+    ``max_error_px`` : E_lim; ``min_error_ratio`` : E_ratio.
+    """
+
+    area_share: float = 0.8
+    min_det_j: float = 1e-8
+    max_error_px: float = 1.0
+    min_error_ratio: float = 2.0
+
+    def __post_init__(self):
+        if not (0 <= self.area_share <= 1 and self.max_error_px > 0 and self.min_error_ratio >= 1):
+            raise InputError(
+                f"patent: S_dis {self.area_share:g}, E_lim {self.max_error_px:g}, E_ratio {self.min_error_ratio:g}: "
+                "0 … 1, a positive number and 1 or more needed"
+            )
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class PatentPose:
+    """``exposure`` : index of the one that was kept, of ``candidates``; ``errors_px`` : RMS of both poses there, the
+    smaller first; ``camera_from_obj`` : the better pose, ``twin`` the other; ``det_j`` : of the homography's derivative
+    at the normalised centre, 1/mm²; ``tags`` used."""
+
+    exposure: int
+    candidates: tuple[int, ...]
+    camera_from_obj: Rigid
+    twin: Rigid
+    errors_px: tuple[float, float]
+    det_j: float
+    tags: int
+    verdict: Verdict
+
+
+def most_tags(corners: Sequence[np.ndarray]) -> list[int]:
+    """S5: indices of the exposures with the most tags; ``corners`` : (k, 4, 2) px of each."""
+    most = max(len(each) for each in corners)
+    return [i for i, each in enumerate(corners) if len(each) == most]
+
+
+def largest_area(corners: Sequence[np.ndarray], chosen: Sequence[int], share: float) -> list[int]:
+    """S5: of the chosen exposures those whose tags span more than ``share`` of the largest area."""
+    area = {i: triangulated_area(corners[i].reshape(-1, 2)) for i in chosen}
+    return [i for i in chosen if area[i] >= share * max(area.values())]
+
+
+def triangulated_area(points: np.ndarray) -> float:
+    """Sum of the Delaunay triangles' areas by Heron's formula, px²; 0 for points on a line."""
+    try:
+        triangles = points[Delaunay(points).simplices]
+    except QhullError:
+        return 0.0
+    a, b, c = np.linalg.norm(triangles - np.roll(triangles, 1, axis=1), axis=2).T
+    s = (a + b + c) / 2
+    return float(np.sqrt(np.maximum(s * (s - a) * (s - b) * (s - c), 0)).sum())
+
+
+def reprojection_rms(pose: Rigid, xy_obj: np.ndarray, pixels: np.ndarray, camera: Camera) -> float:
+    """S7: RMS distance of the projected corners from the measured ones, px."""
+    at = pose @ np.column_stack([xy_obj, np.zeros(len(xy_obj))])
+    if (at[:, 2] <= 0).any():
+        return np.inf
+    return float(np.sqrt(((camera.project(at) - pixels) ** 2).sum(1).mean()))
+
+
+def same_pose(a: Rigid, b: Rigid) -> bool:
+    """S8: whether T_a and T_b are equivalent."""
+    away = a @ b.inverse()
+    shift = np.linalg.norm(a.translation - b.translation)
+    return away.angle_rad() < SAME_RAD and bool(shift < SAME_SHARE * np.linalg.norm(a.translation))
+
+
+def locate_as_patent(
+    exposures: Sequence[Tags],
+    layout: TargetLayout,
+    camera: Camera,
+    options: PatentOptions | None = None,
+    where: str = "scene",
+    solve: Callable[[np.ndarray, np.ndarray], PlanePoses] = poses_of_plane,
+) -> PatentPose:
+    """S5 to S9: the exposure whose IPPE pose has the smallest reprojection error, and the gate.
+
+    Raises
+    ------
+    DegenerateError
+        No exposure shows a tag, or none a pose.
+    """
+    options = options or PatentOptions()
+    rows = layout.rows()
+    known = [[k for k, tag in enumerate(tags.tags) if tag in rows] for tags in exposures]
+    corners = [tags.corners_px[own] for tags, own in zip(exposures, known, strict=True)]
+    if not any(known):
+        raise DegenerateError(f"{where}: no tag of the layout; 1 needed")
+    chosen = largest_area(corners, most_tags(corners), options.area_share)
+    best = None
+    for i in chosen:
+        xy = layout.corners_mm[[rows[exposures[i].tags[k]] for k in known[i]]].reshape(-1, 2)
+        pixels = corners[i].reshape(-1, 2)
+        try:
+            found = solve(xy, camera.normalised_from_pixel(pixels))
+        except DegenerateError:
+            continue
+        errors = [reprojection_rms(pose, xy, pixels, camera) for pose in found.poses]
+        if best is None or min(errors) < min(best[2]):
+            best = (i, found, errors)
+    if best is None:
+        raise DegenerateError(f"{where}: no exposure shows the tags' corners so; check layout and camera file")
+    i, found, errors = best
+    first, second = found.poses if errors[0] <= errors[1] else found.poses[::-1]
+    errors = sorted(errors)
+    verdict = gate(found.determinant, errors[0], errors[1] / max(errors[0], TINY_PX), same_pose(first, second), options)
+    return PatentPose(
+        i, tuple(chosen), first, second, (errors[0], errors[1]), found.determinant, len(known[i]), verdict
+    )
+
+
+def gate(det_j: float, error_px: float, error_ratio: float, same: bool, options: PatentOptions) -> Verdict:
+    """S9: reject unless det J, the error, and (for two different poses) the ratio of the errors keep their limits."""
+    checks = [
+        Check("det J", det_j, at_least=options.min_det_j, unit="/mm²"),
+        Check("error", error_px, at_most=options.max_error_px, unit=" px"),
+    ]
+    if not same:
+        checks.append(Check("error ratio", error_ratio, at_least=options.min_error_ratio))
+    failed = tuple(check.text() for check in checks if not check.passed)
+    return Verdict("reject" if failed else "accept", tuple(checks), failed)

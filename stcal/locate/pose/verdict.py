@@ -1,0 +1,120 @@
+"""Whether a pose may be trusted: each value beside its limit, and accept, ambiguous or reject."""
+
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+from scipy.stats import chi2 as chi_square
+
+from stcal.errors import InputError
+from stcal.geometry.rigid import Poses
+from stcal.locate.pose.estimate import ObjPose, covering_both
+
+Decision = Literal["accept", "ambiguous", "reject"]
+
+
+@dataclass(frozen=True, slots=True)
+class VerdictOptions:
+    """The limits.
+
+    ``min_tags`` : tags used; ``min_spread_px`` : the corners' extent across their longer direction;
+    ``min_foreshortening`` : cosine between the target's normal and the line of sight, which is det J of a target of any
+    size and distance; ``max_p`` : odds of residuals as large as a pose is rejected for; ``flip_odds`` : at most these
+    odds of the other pose, for Gaussian errors; ``sigma_margin`` : by which all σ may be too small without that
+    becoming untrue; ``equal_deg`` : two poses nearer than this are one, and its covariance covers both;
+    ``max_sigma_deg``, ``max_sigma_mm`` : of rotation and position in their worst direction.
+    """
+
+    min_tags: int = 1
+    min_spread_px: float = 12.0
+    min_foreshortening: float = 0.17
+    max_p: float = 1e-4
+    flip_odds: float = 1e-6
+    sigma_margin: float = 1.5
+    equal_deg: float = 1.0
+    max_sigma_deg: float = 2.0
+    max_sigma_mm: float | None = None
+
+    def __post_init__(self):
+        odds = all(0 < value < 1 for value in (self.max_p, self.flip_odds))
+        if not (odds and self.sigma_margin >= 1 and self.min_tags >= 1):
+            raise InputError(
+                f"verdict: odds {self.max_p:g} and {self.flip_odds:g}, margin {self.sigma_margin:g}, {self.min_tags} "
+                "tags: odds between 0 and 1, a margin and a number of at least 1 needed"
+            )
+
+
+@dataclass(frozen=True, slots=True)
+class Check:
+    """One value beside its limit: ``value`` must be ``at_least`` or ``at_most`` what stands there."""
+
+    name: str
+    value: float
+    at_least: float | None = None
+    at_most: float | None = None
+    unit: str = ""
+
+    @property
+    def passed(self) -> bool:
+        """Whether it is; a value that is no number is not."""
+        low = self.at_least is None or self.value >= self.at_least
+        return low and (self.at_most is None or self.value <= self.at_most)
+
+    def text(self) -> str:
+        """``foreshortening 0.11, at least 0.17 needed``."""
+        limit = f"at least {self.at_least:.3g}" if self.at_least is not None else f"at most {self.at_most:.3g}"
+        return f"{self.name} {self.value:.3g}{self.unit}, {limit}{self.unit} needed"
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Verdict:
+    """``decision``, with ``checks``; ``reasons`` : those that are not passed, in words."""
+
+    decision: Decision
+    checks: tuple[Check, ...]
+    reasons: tuple[str, ...]
+
+
+def judge(pose: ObjPose, options: VerdictOptions | None = None) -> tuple[ObjPose, Verdict]:
+    """The verdict on a pose, and the pose with a covariance that covers both where two are called one."""
+    options = options or VerdictOptions()
+    apart_deg = _apart_deg(pose)
+    if pose.twin is not None and apart_deg <= options.equal_deg:
+        pose = covering_both(pose)
+    margin2 = options.sigma_margin**2
+    checks = [
+        Check("tags", len(pose.rows), at_least=options.min_tags),
+        Check("spread", pose.spread_px, at_least=options.min_spread_px, unit=" px"),
+        Check("foreshortening", pose.foreshortening, at_least=options.min_foreshortening),
+        Check("chi2 per dof", pose.chi2_per_dof(), at_most=margin2 * _chi2_limit(pose.dof, options.max_p)),
+        Check("sigma of rotation", float(np.degrees(pose.sigma_rad())), at_most=options.max_sigma_deg, unit="°"),
+    ]
+    if options.max_sigma_mm is not None:
+        checks.append(Check("sigma of position", pose.sigma_mm(), at_most=options.max_sigma_mm, unit=" mm"))
+    failed = [check.text() for check in checks if not check.passed]
+    ambiguity = Check("delta chi2 of the other pose", pose.delta_chi2, at_least=needed_delta(pose, options))
+    clear = ambiguity.passed or apart_deg <= options.equal_deg
+    checks.append(ambiguity)
+    if failed:
+        return pose, Verdict("reject", tuple(checks), tuple(failed))
+    if clear:
+        return pose, Verdict("accept", tuple(checks), ())
+    reason = f"two poses {apart_deg:.1f}° apart: {ambiguity.text()}"
+    return pose, Verdict("ambiguous", tuple(checks), (reason,))
+
+
+def needed_delta(pose: ObjPose, options: VerdictOptions) -> float:
+    """Δχ² that decides between two poses: −2 ln of the odds, times the variance factor that is to be allowed for."""
+    return -2 * float(np.log(options.flip_odds)) * max(options.sigma_margin**2, pose.chi2_per_dof())
+
+
+def _chi2_limit(dof: int, p: float) -> float:
+    return float(chi_square.isf(p, dof) / dof)
+
+
+def _apart_deg(pose: ObjPose) -> float:
+    """Angle between the pose and its twin; 0 where there is none."""
+    if pose.twin is None:
+        return 0.0
+    away = Poses.of([pose.twin]).difference(Poses.of([pose.camera_from_obj]))[0]
+    return float(np.degrees(np.linalg.norm(away[:3])))

@@ -1,0 +1,89 @@
+"""What the calibration of a layout found, as text and JSON."""
+
+import numpy as np
+
+from stcal.locate.calibrate.solve import CalibratedLayout
+
+FEW_IMAGES = 3
+
+
+def calibrated_text(result: CalibratedLayout) -> str:
+    """Totals, and a line for each tag."""
+    layout, adjusted = result.layout, result.adjusted
+    lines = [
+        f"{len(result.images)} images, {len(layout.tags)} tags; residuals {adjusted.board_rms_px:.3f} px of the board, "
+        f"{adjusted.tag_rms_px:.3f} px of the tags",
+        f"beside the corners' own σ: {adjusted.sigma_px:.3f} px each, {adjusted.tag_sigma_px:.3f} px a tag as a whole",
+        f"{'id':>5}  {'dictionary':<24} images   side_mm  sigma_um  adjusted by_um  from nominal_mm",
+    ]
+    moved = np.linalg.norm(layout.corners_mm - result.published, axis=2).max(1)
+    for row, ((dictionary, tag), count) in enumerate(zip(layout.tags, result.counts, strict=True)):
+        sigma = 1000 * np.sqrt((layout.sigma_mm()[row] ** 2).sum(1).mean())
+        nominal = result.deviation_mm[row]
+        far = f"{nominal:15.3f}" if np.isfinite(nominal) else f"{'–':>15}"
+        side = sides_mm(layout.corners_mm[row]).mean()
+        mark = "  origin" if row == layout.origin else ""
+        lines.append(
+            f"{tag:>5}  {dictionary:<24} {count:>6}  {side:8.3f}  {sigma:8.1f}  {1000 * moved[row]:14.1f}  {far}{mark}"
+        )
+    return "\n".join(lines)
+
+
+def sides_mm(corners: np.ndarray) -> np.ndarray:
+    """(4,) of a tag."""
+    return np.linalg.norm(np.roll(corners, -1, axis=0) - corners, axis=1)
+
+
+def warnings(result: CalibratedLayout, names: tuple[tuple[str, int], ...]) -> list[str]:
+    """What makes the result worse than its σ may say; ``names`` : tags of the plan."""
+    found = []
+    if result.unseen:
+        tags = ", ".join(str(names[row][1]) for row in result.unseen)
+        found.append(f"tags that no image shows, left out of the layout: {tags}")
+    few = [tag[1] for tag, count in zip(result.layout.tags, result.counts, strict=True) if count < FEW_IMAGES]
+    if few:
+        found.append(f"tags in fewer than {FEW_IMAGES} images, a misread one would not be noticed: {few}")
+    if result.adjusted.downweighted > 0.1:
+        found.append(
+            f"{result.adjusted.downweighted:.0%} of the tags seen are outliers; is target and board one plane?"
+        )
+    return found
+
+
+def calibrated_json(result: CalibratedLayout) -> dict:
+    """Everything but the covariance, which the layout file holds."""
+    layout, adjusted = result.layout, result.adjusted
+    return {
+        "format": "stcal layout calibration 1",
+        "unit": "mm",
+        "images": [
+            {"image": name, "camera_from_board": pose.matrix().tolist(), "tags_rms_px": float(rms)}
+            for name, pose, rms in zip(result.images, adjusted.poses, adjusted.image_rms_px, strict=True)
+        ],
+        "left_out": list(result.left_out),
+        "board_from_obj": result.board_from_obj.matrix().tolist(),
+        "board_rms_px": adjusted.board_rms_px,
+        "tag_rms_px": adjusted.tag_rms_px,
+        "sigma_px": adjusted.sigma_px,
+        "tag_sigma_px": adjusted.tag_sigma_px,
+        "tags": [
+            {
+                "dictionary": dictionary,
+                "id": tag,
+                "images": int(count),
+                "corners_mm": corners.tolist(),
+                "sigma_mm": sigma.tolist(),
+                "published_mm": published.tolist(),
+                "from_nominal_mm": float(nominal) if np.isfinite(nominal) else None,
+            }
+            for (dictionary, tag), count, corners, sigma, published, nominal in zip(
+                layout.tags,
+                result.counts,
+                layout.corners_mm,
+                layout.sigma_mm(),
+                result.published,
+                result.deviation_mm,
+                strict=True,
+            )
+        ],
+    }

@@ -1,0 +1,162 @@
+"""What ``locate run`` found, as text, CSV and JSON."""
+
+import csv
+import io
+from collections.abc import Sequence
+
+import numpy as np
+
+from stcal.geometry.rigid import Rigid
+from stcal.geometry.uncertain import UncertainRigid
+from stcal.io.table import COVARIANCE, POSE, pose_cells
+from stcal.locate.data.layout import TargetLayout
+from stcal.locate.pipeline import Located
+from stcal.locate.report.chain import Chain
+
+BASE = "base_from_goal_"
+
+
+def run_text(results: Sequence[Located], chain: Chain | None = None) -> str:
+    """A line for each scene, reasons below those that are not accepted; the target in the robot's base where a chain
+    leads there."""
+    width = max([5, *(len(each.name) for each in results)])
+    head = f"{'scene':<{width}}  verdict    tags  exposures      x_mm      y_mm      z_mm  sigma_mm  sigma_deg   rms_px"
+    lines = [head]
+    for each in results:
+        exposures = len(each.tags.readable())
+        tags = len(each.merged.seen) if each.merged else 0
+        start = f"{each.name:<{width}}  {each.verdict.decision:<9}  {tags:4d}  {exposures:9d}"
+        pose = camera_from_obj(each)
+        if pose is not None:
+            start += "".join(f"{v:10.2f}" for v in pose.translation)
+        if each.pose is not None:
+            sigma = each.pose.sigma_mm(), np.degrees(each.pose.sigma_rad()), each.pose.rms_px()
+            start += "{:10.3f}{:11.4f}{:9.3f}".format(*sigma)
+        lines += [start, *(f"{'':<{width}}    {reason}" for reason in (*each.verdict.reasons, *each.notes))]
+    if chain and accepted(results):
+        lines += ["", f"{'base_from_goal':<{width + 22}}      x_mm      y_mm      z_mm  rotation vector, deg"]
+        for each in accepted(results):
+            goal = chain.base_from_goal(each.name, uncertain(each)).rigid
+            turn = np.degrees(goal.log()[:3])
+            place = "".join(f"{v:10.2f}" for v in goal.translation)
+            lines.append(f"{each.name:<{width + 22}}{place}" + "".join(f"{v:10.3f}" for v in turn))
+    return "\n".join(lines)
+
+
+def camera_from_obj(each: Located) -> Rigid | None:
+    """Of whatever method was asked for."""
+    if each.patent is not None:
+        return each.patent.camera_from_obj
+    return None if each.pose is None else each.pose.camera_from_obj
+
+
+def uncertain(each: Located) -> UncertainRigid:
+    """camera_from_obj with its covariance; the patent's method states none."""
+    if each.pose is None:
+        return UncertainRigid.exact(camera_from_obj(each))
+    return UncertainRigid(each.pose.camera_from_obj, each.pose.covariance)
+
+
+def accepted(results: Sequence[Located]) -> list[Located]:
+    """Those whose pose may be used."""
+    return [each for each in results if each.verdict.decision == "accept"]
+
+
+def poses_csv(results: Sequence[Located], chain: Chain | None = None) -> str:
+    """Accepted poses only, so that nobody moves a robot to a rejected one; the others as comments."""
+    out = io.StringIO()
+    for each in results:
+        if each.verdict.decision != "accept":
+            out.write(f"# {each.name}: {each.verdict.decision}: {'; '.join(each.verdict.reasons)}\n")
+    write = csv.writer(out, lineterminator="\n")
+    full = all(each.pose is not None for each in accepted(results))
+    columns = [*POSE, *(COVARIANCE if full else ())]
+    base = [BASE + column for column in columns] if chain else []
+    write.writerow(["scene", "tags", "exposures", *columns, "rms_px", "chi2_per_dof", *base])
+    for each in accepted(results):
+        own = uncertain(each)
+        cells = pose_cells(own.rigid, own.covariance if full else None)
+        fit = [f"{each.pose.rms_px():.4f}", f"{each.pose.chi2_per_dof():.4f}"] if full else ["", ""]
+        row = [each.name, len(each.merged.seen), len(each.tags.readable()), *cells, *fit]
+        if chain:
+            goal = chain.base_from_goal(each.name, own)
+            row += pose_cells(goal.rigid, goal.covariance if full else None)
+        write.writerow(row)
+    return out.getvalue()
+
+
+def run_json(results: Sequence[Located], layout: TargetLayout, chain: Chain | None = None) -> dict:
+    """Everything, rejected and ambiguous poses too."""
+    return {
+        "format": "stcal located 1",
+        "unit": "mm",
+        "layout": layout.name,
+        "scenes": [_scene_json(each, layout, chain) for each in results],
+    }
+
+
+def _scene_json(each: Located, layout: TargetLayout, chain: Chain | None) -> dict:
+    verdict, merged = each.verdict, each.merged
+    content = {
+        "scene": each.name,
+        "verdict": verdict.decision,
+        "reasons": list(verdict.reasons),
+        "notes": list(each.notes),
+        "checks": [
+            {
+                "name": check.name,
+                "value": _finite(check.value),
+                "at_least": check.at_least,
+                "at_most": check.at_most,
+                "unit": check.unit.strip(),
+                "passed": check.passed,
+            }
+            for check in verdict.checks
+        ],
+        "exposures": [
+            {"image": e.name, "tags": None if e.tags is None else len(e.tags), "trouble": e.trouble}
+            for e in each.tags.exposures
+        ],
+        "tags": [] if merged is None else [layout.tags[row][1] for row in merged.seen.rows],
+        "differing_share": None if merged is None else merged.share,
+        "shifts": []
+        if merged is None
+        else [{"between": list(s.exposures), "tags": s.tags, "shift_px": s.shift_px} for s in merged.shifts],
+    }
+    pose = camera_from_obj(each)
+    content["camera_from_obj"] = None if pose is None else pose.matrix().tolist()
+    if each.patent is not None:
+        content |= {
+            "twin": each.patent.twin.matrix().tolist(),
+            "errors_px": [_finite(error) for error in each.patent.errors_px],
+        }
+    if each.pose is not None:
+        content |= _pose_json(each, layout)
+    if chain and pose is not None and not chain.without_pose([each.name]):
+        goal = chain.base_from_goal(each.name, uncertain(each))
+        content |= {"base_from_goal": goal.rigid.matrix().tolist(), "base_covariance": goal.covariance.tolist()}
+    return content
+
+
+def _pose_json(each: Located, layout: TargetLayout) -> dict:
+    pose = each.pose
+    names = [f"{layout.tags[row][1]}:{corner}" for row in pose.rows for corner in range(4)]
+    return {
+        "covariance": pose.covariance.tolist(),
+        "twin": None if pose.twin is None else pose.twin.matrix().tolist(),
+        "delta_chi2": _finite(pose.delta_chi2),
+        "rms_px": pose.rms_px(),
+        "chi2": pose.chi2,
+        "dof": pose.dof,
+        "p_value": pose.p_value(),
+        "outliers": [layout.tags[row][1] for row in pose.outliers],
+        "corners": [
+            {"corner": name, "residual_px": residual.tolist(), "weight": float(weight)}
+            for name, residual, weight in zip(names, pose.residuals_px, pose.weights, strict=True)
+        ],
+    }
+
+
+def _finite(value: float) -> float | None:
+    """JSON knows no infinity: null, where there is no other pose."""
+    return float(value) if np.isfinite(value) else None

@@ -1,0 +1,173 @@
+"""Which point pairs agree on one transform: random minimal samples, scored, the best refined by concentration.
+
+The score needs no threshold. For a transform and the k points nearest to it, x = RSS_k / RSS_n compares their square
+sum with that of the least-squares fit to all n. Were all residuals Gaussian of one σ, x would follow
+Beta((3k − p)/2, 3(n − k)/2) for a set chosen beforehand; for the best of all C(n, k) sets of all sizes the chance is at
+most Σ C(n, k) P(x): a number of false alarms in the sense of Moisan & Stival (2004, a-contrario RANSAC), but with
+Gaussian least squares as the background, so that neither a threshold nor a volume enters. The set that minimises it
+is the consensus; a minimum above ``FALSE_ALARMS`` means that nothing contradicts one σ for all points. Chernoff's bound
+stands for the Beta distribution (it is never below it, and has no underflow). Refinement is the concentration step of
+least trimmed squares (Rousseeuw & Van Driessen 2006): fit to the set, choose the set anew.
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from itertools import combinations
+from math import comb
+
+import numpy as np
+from scipy.special import gammaln
+
+from stcal.errors import ConvergenceError, DegenerateError
+from stcal.register.core.covariance import Noise
+from stcal.register.core.models import Model, fit, hypotheses, squares
+
+FALSE_ALARMS = 1e-4
+"""Expected number of sets declared in data without outliers. So few, because a chance set of few points claims a
+σ far too small. Real ones are far below: ten of 20 points that agree to 0.15 mm, the others off by 5 mm, have 1e-14."""
+LEAST_FREEDOM = 6
+"""Degrees of freedom of the smallest consensus: four points rigidly, five in similarity, six affinely."""
+MISSED = 1e-9
+"""Chance that no sample is free of outliers."""
+LEAST_SHARE = 0.25
+"""Samples are drawn until a consensus of this share cannot have been missed; below it may be."""
+SPARE = 3
+"""Of clean samples one in so many is wide enough to lead to the optimum; measured: every second one does."""
+EXHAUSTIVE = 2000
+"""Up to so many samples are all tried (23 points rigidly)."""
+BATCH = 500
+MOST_SAMPLES = 20_000
+REFINED = 6
+"""So many of the best samples of a batch are refined."""
+MAX_STEPS = 30
+TINY = 1e-24
+"""Square sums below this share of the points' own are rounding."""
+
+Score = Callable[[np.ndarray], tuple[np.ndarray, np.ndarray]]
+"""Of squared distances (s, n): value of each row, less is better, and the square up to which its set reaches."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Consensus:
+    """``inliers`` : (n,) mask; ``value`` : its score; ``samples`` : drawn, 0 when all there are were tried."""
+
+    inliers: np.ndarray
+    value: float
+    samples: int
+
+
+def by_scale(model: Model, count: int, total: float) -> Score:
+    """Logarithm of the number of false alarms; ``total`` : square sum of the least-squares fit to all points."""
+    k = np.arange(model.sample, count)
+    k = k[model.freedom(k) > 0]  # smaller sets than can be trusted are looked for too: then nothing is
+    a, b = model.freedom(k) / 2, 3 * (count - k) / 2
+    tests = np.log(len(k)) + gammaln(count + 1) - gammaln(k + 1) - gammaln(count - k + 1)
+
+    def score(square: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        ordered = np.sort(square, axis=1)
+        share = np.cumsum(ordered, axis=1)[:, k - 1] / total
+        value = tests + chernoff(share, a, b)
+        best = value.argmin(1)
+        rows = np.arange(len(square))
+        return value[rows, best], ordered[rows, k[best] - 1]
+
+    return score
+
+
+def chernoff(share: np.ndarray, a: np.ndarray, b: np.ndarray) -> np.ndarray:
+    """Chernoff's bound of log P(Beta(a, b) ≤ share): (x (a + b)/a)ᵃ ((1 − x)(a + b)/b)ᵇ below a/(a + b), else 1."""
+    limit = a / (a + b)
+    share = np.clip(share, TINY, limit)
+    return a * np.log(share / limit) + b * np.log((1 - share) / (1 - limit))
+
+
+def by_share(model: Model, count: int) -> Score:
+    """Least trimmed squares of the larger half, the one with the highest breakdown point (Rousseeuw 1984)."""
+    k = max((count + model.parameters // 3 + 1) // 2, model.sample + 1)
+
+    def score(square: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        ordered = np.partition(square, k - 1, axis=1)[:, :k]
+        return ordered.sum(1), ordered[:, k - 1]
+
+    return score
+
+
+def by_threshold(threshold: float) -> Score:
+    """Square sum cut off at the threshold (MSAC, Torr & Zisserman 2000)."""
+
+    def score(square: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        return np.minimum(square, threshold**2).sum(1), np.full(len(square), threshold**2)
+
+    return score
+
+
+def search(
+    model: Model, xyz_a: np.ndarray, xyz_b: np.ndarray, noise: Noise, score: Score, rng: np.random.Generator
+) -> Consensus | None:
+    """The best set that random samples lead to; None where no sample gives one of enough points."""
+    count = len(xyz_a)
+    drawn, needed, best = 0, 1, None
+    batches = _all_samples(count, model.sample) if comb(count, model.sample) <= EXHAUSTIVE else None
+    while drawn < needed:
+        samples = batches if batches is not None else _random_samples(count, model.sample, rng)
+        drawn += len(samples)
+        found = _best_of(model, xyz_a, xyz_b, noise, score, samples)
+        if found is not None and (best is None or found.value < best.value):
+            best = found
+        if batches is not None:
+            break
+        share = max(best.inliers.mean() if best is not None else 0, LEAST_SHARE)
+        clean = min(share, 1 - 1e-9) ** model.sample
+        needed = min(SPARE * np.log(MISSED) / np.log1p(-clean), MOST_SAMPLES)
+    return None if best is None else Consensus(best.inliers, best.value, 0 if batches is not None else drawn)
+
+
+def _best_of(model, xyz_a, xyz_b, noise, score, samples) -> Consensus | None:
+    linear, translation = hypotheses(model, xyz_a[samples], xyz_b[samples])
+    square = _squares_of_many(linear, translation, xyz_a, xyz_b, noise.precision)
+    value, cut = score(square)
+    best = None
+    for i in np.argsort(value, kind="stable")[:REFINED]:
+        found = _concentrated(model, xyz_a, xyz_b, noise, score, square[i] <= cut[i])
+        if found is not None and (best is None or found.value < best.value):
+            best = found
+    return best
+
+
+def _concentrated(model, xyz_a, xyz_b, noise, score, inliers: np.ndarray) -> Consensus | None:
+    """Fit and choose anew until the score falls no more."""
+    best = None
+    for _ in range(MAX_STEPS):
+        if inliers.sum() < model.sample:
+            break
+        try:
+            transform = fit(model, xyz_a[inliers], xyz_b[inliers], noise[inliers].precision)
+        except (DegenerateError, ConvergenceError):
+            break
+        square = squares(xyz_b - transform @ xyz_a, noise.precision)
+        value, cut = score(square[None])
+        if best is not None and value[0] >= best.value:
+            break
+        inliers = square <= cut[0]
+        best = Consensus(inliers, float(value[0]), 0)
+    return best
+
+
+def _squares_of_many(linear, translation, xyz_a, xyz_b, precision) -> np.ndarray:
+    """Squared distances (s, n) under s transforms."""
+    residual = xyz_b.T - translation[:, :, None] - (linear.reshape(-1, 3) @ xyz_a.T).reshape(len(linear), 3, -1)
+    if precision is not None and precision.ndim == 3:
+        weighted = np.einsum("nij,sjn->sin", precision, residual, optimize=True)
+        return np.maximum(np.einsum("sin,sin->sn", residual, weighted), 0)
+    plain = np.einsum("sin,sin->sn", residual, residual)
+    return plain if precision is None else plain * precision
+
+
+def _all_samples(count: int, size: int) -> np.ndarray:
+    return np.array(list(combinations(range(count), size)))
+
+
+def _random_samples(count: int, size: int, rng: np.random.Generator) -> np.ndarray:
+    """(s, size) indices, different in each sample."""
+    drawn = np.sort(rng.integers(count, size=(BATCH, size)), axis=1)
+    return drawn[(np.diff(drawn, axis=1) > 0).all(1)]

@@ -1,0 +1,139 @@
+"""Whether the points can tell what is asked of them: lines, planes, symmetric layouts."""
+
+from collections.abc import Callable, Sequence
+from itertools import pairwise
+
+import numpy as np
+from scipy.spatial import cKDTree
+from scipy.spatial.distance import pdist
+from scipy.spatial.transform import Rotation
+
+from stcal.errors import DegenerateError
+from stcal.geometry.align import best_rotations
+from stcal.register.core.models import Model
+
+WIDER_THAN = 10.0
+"""Points must spread √Σd² ≥ 10 σ off a line (affine: off a plane): the turn about it then has σ ≤ 0.1 rad."""
+SYMMETRY_UP_TO = 200
+"""Points; larger sets are clouds, not layouts with labels."""
+SHOWN = 6
+
+Namer = Callable[[int], str]
+
+
+def spreads(xyz: np.ndarray) -> np.ndarray:
+    """(3,) root square sums of centred points along their principal axes, the longest first, mm."""
+    centred = xyz - xyz.mean(0)
+    return np.sqrt(np.maximum(np.linalg.eigvalsh(centred.T @ centred)[::-1], 0))
+
+
+def check_extent(model: Model, xyz_a: np.ndarray, sigma_mm: float) -> None:
+    """Refuse points that do not determine the model at their σ.
+
+    Raises
+    ------
+    DegenerateError
+        Along a line; for the affine model also in a plane.
+    """
+    n, spread = len(xyz_a), spreads(xyz_a)
+    needed = WIDER_THAN * sigma_mm
+    off_line = float(np.hypot(spread[1], spread[2]))
+    length = spread[0] / np.sqrt(n)
+    if off_line < needed:
+        raise DegenerateError(
+            f"registration: the {n} points lie along a line, {off_line / np.sqrt(n):.4g} mm RMS off it ({length:.4g} "
+            f"mm along it); {needed / np.sqrt(n):.4g} mm needed at σ {sigma_mm:.4g} mm; measure points off the line"
+        )
+    if model.name == "affine" and spread[2] < needed:
+        raise DegenerateError(
+            f"registration: the {n} points lie in a plane, {spread[2] / np.sqrt(n):.4g} mm RMS off it ({length:.4g} mm "
+            f"along it); {needed / np.sqrt(n):.4g} mm needed for the affine model at σ {sigma_mm:.4g} mm; measure "
+            "points off the plane, or use the rigid model"
+        )
+
+
+def single_supports(model: Model, xyz_a: np.ndarray, sigma_mm: float) -> np.ndarray:
+    """Indices of points without any one of which the others would be refused by :func:`check_extent`."""
+    n = len(xyz_a)
+    centred = xyz_a - xyz_a.mean(0)
+    without = centred.T @ centred - n / (n - 1) * centred[:, :, None] * centred[:, None, :]
+    values = np.maximum(np.linalg.eigvalsh(without), 0)
+    off = values[:, 0] if model.name == "affine" else values[:, 0] + values[:, 1]
+    return np.flatnonzero(np.sqrt(off) < WIDER_THAN * sigma_mm)
+
+
+def check_supports(model: Model, xyz_a: np.ndarray, inliers: np.ndarray, sigma_mm: float, name: Namer) -> None:
+    """Refuse a set with outliers in which one point alone tells a turn: any wrong point would have fitted there.
+
+    Raises
+    ------
+    DegenerateError
+        Without that point the others would be refused by :func:`check_extent`.
+    """
+    rows = np.flatnonzero(inliers)
+    alone = single_supports(model, xyz_a[rows], sigma_mm)
+    if len(alone):
+        kind = "plane" if model.name == "affine" else "line"
+        raise DegenerateError(
+            f"registration: only {name(rows[alone[0]])} keeps the {len(rows)} points that agree off a {kind}, and any "
+            f"wrong point would fit there as well; measure more points off the {kind}"
+        )
+
+
+def row_name(row: int, lines: Sequence[int] | None) -> str:
+    """A point's name for messages: its line in the file, else its row from 1."""
+    return f"row {row + 1}" if lines is None else f"line {lines[row]}"
+
+
+def symmetry(xyz: np.ndarray, tolerance_mm: float) -> tuple[float, np.ndarray] | None:
+    """A turn that maps the points onto themselves but not each onto itself: its angle (rad) and the permutation (n,).
+
+    Candidates map the point farthest from the centroid and one off that line to others at the same distances. Of
+    several turns the one of the smallest misfit is given; None where there is none, or points are too near for the
+    tolerance.
+    """
+    n = len(xyz)
+    if not 3 <= n <= SYMMETRY_UP_TO:
+        return None
+    centred = xyz - xyz.mean(0)
+    if pdist(centred).min() < 4 * tolerance_mm:
+        return None
+    radius = np.linalg.norm(centred, axis=1)
+    first = int(radius.argmax())
+    second = int(np.linalg.norm(np.cross(centred, centred[first]), axis=1).argmax())
+    apart = np.linalg.norm(centred[:, None] - centred, axis=2)
+    fits = (
+        (np.abs(radius - radius[first]) < 2 * tolerance_mm)[:, None]
+        & (np.abs(radius - radius[second]) < 2 * tolerance_mm)
+        & (np.abs(apart - apart[first, second]) < 2 * tolerance_mm)
+    )
+    tree = cKDTree(centred)
+    best = None
+    for i, j in np.argwhere(fits):
+        if (i, j) == (first, second):
+            continue
+        turn = best_rotations(centred[[i, j]].T @ centred[[first, second]])[0]
+        for _ in range(2):  # from two points, then from all: the first two carry their own noise
+            _, to = tree.query(centred @ turn.T)
+            turn = best_rotations(centred[to].T @ centred)[0]
+        misfit = np.linalg.norm(centred @ turn.T - centred[to], axis=1).max()
+        is_one = len(np.unique(to)) == n and (to != np.arange(n)).any()
+        if is_one and misfit <= 2 * tolerance_mm and (best is None or misfit < best[0]):
+            best = (misfit, float(Rotation.from_matrix(turn).magnitude()), to)
+    return None if best is None else best[1:]
+
+
+def symmetry_note(found: tuple[float, np.ndarray], rows: Sequence[int], name: Namer) -> str:
+    """One line: the turn and what it exchanges."""
+    angle, to = found
+    start = int(np.flatnonzero(to != np.arange(len(to)))[0])
+    cycle, at = [start], int(to[start])
+    while at != start:
+        cycle.append(at)
+        at = int(to[at])
+    steps = ", ".join(f"{name(rows[i])} → {name(rows[j])}" for i, j in pairwise([*cycle, start][: SHOWN + 1]))
+    return (
+        f"the layout is symmetric: a turn by {np.degrees(angle):.1f}° maps it onto itself ({steps}"
+        f"{', …' if len(cycle) > SHOWN or (to != np.arange(len(to))).sum() > len(cycle) else ''}); labels exchanged "
+        "like that would fit as well, so check that rows are the same points"
+    )

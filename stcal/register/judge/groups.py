@@ -1,0 +1,140 @@
+"""Whether points that seem to agree on one transform are two groups, each with a transform of its own.
+
+When half of the points are shifted together by a few σ, one transform between the two leaves residuals that look like
+more noise. Two transforms are found by least trimmed squares for half of the points and for the rest, and then by
+assigning points and fitting in turn. Of groups chosen beforehand Wilks' Λ = det S₂ / det S₁ of the residuals' scatter
+with two transforms and with one has a known distribution, whatever the noise's covariance; there are 2ⁿ⁻¹ ways to
+choose, and so a number of false alarms as in ``search.py``. Square sums instead of determinants, x = RSS₂ / RSS₁ ~
+Beta((3n − 2p)/2, p/2), tell more about few points, but take noise that is greater along one axis for two groups: they
+are used up to 16 points, where noise of equal strength along all axes is left within the groups. (Noise twice as large
+along one axis would be parted so, but is no false alarm below 50 points; of larger ratios more is left along it.)
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.spatial import cKDTree
+from scipy.special import gammaln
+from scipy.stats import binom, chi2
+
+from stcal.errors import ConvergenceError, DegenerateError
+from stcal.register.core.covariance import Noise
+from stcal.register.core.models import Model, Transform, fit, rounding_mm, squares, whitened
+from stcal.register.core.search import FALSE_ALARMS, by_share, chernoff, search
+
+TRIED = 200
+"""Points that are looked at: a shift of 4 σ of half of them is seen then."""
+MAX_ROUNDS = 30
+FEW = 16
+SPHERICAL = 0.1
+"""Of 16 points with noise three times as large along one axis half are told so; the others are too few to mislead."""
+TOGETHER = 0.01
+"""Chance of scattered groups to seem to lie together."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Groups:
+    """``transforms`` : of the larger group and of the other; ``in_space`` : whether place tells the group, which speaks
+    for a bent frame and not for two motions."""
+
+    transforms: tuple[Transform, Transform]
+    in_space: bool
+
+
+def two_groups(
+    model: Model, xyz_a: np.ndarray, xyz_b: np.ndarray, noise: Noise, rng: np.random.Generator
+) -> Groups | None:
+    """The two transforms; None where one explains the points as well."""
+    rows = np.arange(len(xyz_a))
+    if len(rows) > TRIED:
+        rows = np.sort(rng.choice(rows, TRIED, replace=False))
+    a, b, own = xyz_a[rows], xyz_b[rows], noise[rows]
+    n = len(rows)
+    least = model.sample + 1
+    if n < 2 * least:
+        return None
+    try:
+        whole = whitened(b - fit(model, a, b, own.precision) @ a, own.precision)
+        found = _assigned(model, a, b, own, rng)
+    except (DegenerateError, ConvergenceError):
+        return None
+    if found is None or np.abs(whole).max() <= rounding_mm(a, b):
+        return None
+    first, transforms = found
+    parted = np.where(first[:, None], *(whitened(b - t @ a, own.precision) for t in transforms))
+    if (n - 1) * np.log(2) + _log_chance(model, whole, parted) > np.log(FALSE_ALARMS):
+        return None
+    if first.sum() < n / 2:
+        first, transforms = ~first, transforms[::-1]
+    return Groups(transforms, lies_together(a, first))
+
+
+def _log_chance(model: Model, whole: np.ndarray, parted: np.ndarray) -> float:
+    """Bound of the logarithm of the chance of residuals (n, 3) to shrink so when groups chosen beforehand are parted.
+
+    0 where noise along the loudest axis enters the fit, and with it the quiet ones, by more than these have: the ratio
+    of their variances is then above n / 2, and determinants tell nothing.
+    """
+    n, per_axis = len(whole), model.parameters / 3
+    one, two = whole.T @ whole, parted.T @ parted
+    of_error = n - 2 * per_axis
+    if np.linalg.cond(two) > n / 2:
+        return 0.0
+    bound = wilks_bound(np.linalg.slogdet(two)[1] - np.linalg.slogdet(one)[1], of_error, per_axis)
+    if n <= FEW and sphericity(two, of_error) > SPHERICAL:
+        share = np.trace(two) / np.trace(one)
+        bound = min(bound, float(chernoff(share, 1.5 * of_error, model.parameters / 2)))
+    return bound
+
+
+def sphericity(scatter: np.ndarray, freedom: float) -> float:
+    """p-value of equal noise along all axes (Mauchly 1940, with Bartlett's factor)."""
+    w = np.linalg.slogdet(scatter)[1] - 3 * np.log(np.trace(scatter) / 3)
+    return float(chi2.sf(-(freedom - 23 / 18) * w, 5))
+
+
+def wilks_bound(log_ratio: float, of_error: float, of_hypothesis: float) -> float:
+    """Chernoff's bound of log P(Λ ≤ exp(log_ratio)) of Wilks' Λ(3, of_error, of_hypothesis).
+
+    Λ is a product of independent Beta((νₑ − i)/2, νₕ/2), i = 0, 1, 2 (Anderson 2003, th. 8.4.1); the bound is the least
+    of λᵗ E[Λ⁻ᵗ] over t.
+    """
+    a, b = (of_error - np.arange(3)) / 2, of_hypothesis / 2
+    t = np.linspace(0, a[2], 400, endpoint=False)[:, None]
+    moments = gammaln(a - t) + gammaln(a + b) - gammaln(a) - gammaln(a + b - t)
+    return float((t[:, 0] * log_ratio + moments.sum(1)).min())
+
+
+def lies_together(xyz_a: np.ndarray, group: np.ndarray) -> bool:
+    """Whether neighbours are in the same group more often than chance would have it."""
+    nearest = cKDTree(xyz_a).query(xyz_a, k=2)[1][:, 1]
+    same = int((group[nearest] == group).sum())
+    share = group.mean()
+    return bool(binom.sf(same - 1, len(group), share**2 + (1 - share) ** 2) < TOGETHER)
+
+
+def _assigned(model: Model, a, b, noise: Noise, rng):
+    """Mask of the first group, and both transforms; None where a group becomes too small."""
+    core = search(model, a, b, noise, by_share(model, len(a)), rng)
+    if core is None:
+        return None
+    rest = np.flatnonzero(~core.inliers)
+    if len(rest) <= model.sample:
+        return None
+    inner = search(model, a[rest], b[rest], noise[rest], by_share(model, len(rest)), rng)
+    if inner is None:
+        return None
+    first, second = core.inliers, np.isin(np.arange(len(a)), rest[inner.inliers])
+    best = None
+    for _ in range(MAX_ROUNDS):
+        if min(first.sum(), second.sum()) <= model.sample:
+            break
+        pair = tuple(fit(model, a[g], b[g], noise[g].precision) for g in (first, second))
+        apart = np.array([squares(b - t @ a, noise.precision) for t in pair])
+        total = apart.min(0).sum()
+        if best is not None and total >= best[2]:
+            break
+        first = apart[0] <= apart[1]
+        second = ~first
+        best = (first, pair, total)
+    return None if best is None else best[:2]

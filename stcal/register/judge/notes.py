@@ -1,0 +1,153 @@
+"""What a user should look at, one line each."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.spatial import cKDTree
+from scipy.stats import f as fisher
+from scipy.stats import norm
+
+from stcal.register.core.models import Model, squares
+from stcal.register.core.result import Alternative
+from stcal.register.core.robust import CLEAN_SETS_WITH_OUTLIER, LEVERAGE_UP_TO, Fitted
+from stcal.register.judge.degeneracy import WIDER_THAN, row_name, single_supports, spreads, symmetry, symmetry_note
+from stcal.register.judge.mistakes import SHOWN, UNIT_WITHIN, UNITS, outlier_notes
+
+FEW_FREEDOMS = 6
+"""Below so many degrees of freedom σ is uncertain by more than 30 %."""
+MAJORITY = 0.5
+NEIGHBOURS = 2000
+FEWEST_NEIGHBOURS = 20
+BY_NEIGHBOURS = 1e-4
+"""Of so many points; clean data called bent: so many."""
+TIGHT = 2.5
+"""A threshold of 2.5 σ cuts off a tenth of the good points; below it the covariance of few points is too small."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Subject:
+    """What there is to judge. ``factor`` : by which residuals exceed the σ given, where the data contradict it."""
+
+    model: Model
+    method: str
+    xyz_a: np.ndarray
+    xyz_b: np.ndarray
+    fitted: Fitted
+    alternative: Alternative | None
+    ambiguous: bool
+    factor: float | None
+    dof: float
+    lines: Sequence[int] | None
+
+    def name(self, row: int) -> str:
+        """A point's name for messages."""
+        return row_name(row, self.lines)
+
+
+def notes_of(subject: Subject) -> list[str]:
+    """The lines."""
+    notes = [*_agreement(subject), *_noise(subject), *_layout(subject)]
+    fitted = subject.fitted
+    return notes + outlier_notes(fitted.transform, fitted, subject.xyz_a, subject.xyz_b, subject.name)
+
+
+def _agreement(subject: Subject) -> list[str]:
+    fitted, other = subject.fitted, subject.alternative
+    agree, count = int(fitted.inliers.sum()), len(fitted.inliers)
+    notes = []
+    if agree < MAJORITY * count:
+        notes.append(f"only {agree} of {count} point pairs agree; check the others before you trust the transform")
+    if other is not None:
+        shown = ", ".join(subject.name(i) for i in other.rows[:SHOWN])
+        more = ", …" if len(other.rows) > SHOWN else ""
+        start = "AMBIGUOUS: " if subject.ambiguous else ""
+        notes.append(
+            f"{start}{len(other.rows)} of the other points agree on another transform, {other.apart_mm:.4g} mm and "
+            f"{np.degrees(other.turn_rad):.3g}° from this one ({shown}{more}); did an instrument move between them?"
+        )
+    if subject.method == "least-squares":
+        notes += _far_rows(subject)
+    return notes
+
+
+def _far_rows(subject: Subject) -> list[str]:
+    """Rows that the robust method would look at."""
+    fitted, n = subject.fitted, len(subject.xyz_a)
+    freedom = subject.model.freedom(n)
+    square = squares(subject.xyz_b - fitted.transform @ subject.xyz_a)
+    bound = square.sum() / freedom * 3 * fisher.isf(CLEAN_SETS_WITH_OUTLIER / n, 3, freedom)
+    far = np.flatnonzero(square > bound)
+    if not len(far):
+        return []
+    worst = far[square[far].argmax()]
+    return [
+        f"{len(far)} points lie farther off than noise would put them, the farthest {subject.name(worst)} at "
+        f"{np.sqrt(square[worst]):.4g} mm; use the robust method"
+    ]
+
+
+def _noise(subject: Subject) -> list[str]:
+    fitted, notes = subject.fitted, []
+    inside = fitted.inliers
+    residuals = subject.xyz_b[inside] - fitted.transform @ subject.xyz_a[inside]
+    if neighbours_alike(subject.xyz_a[inside], residuals):
+        notes.append(
+            "the residuals are not noise: neighbours are off alike, so that the frames are bent against each other and "
+            "a transform holds only where its points are; see the residual field"
+        )
+    if subject.factor is not None:
+        notes.append(
+            f"residuals exceed the σ given {subject.factor:.3g} times, which chance does not explain; the covariance "
+            "is scaled by it"
+        )
+    if subject.dof < FEW_FREEDOMS:
+        notes.append(f"σ rests on {subject.dof:.0f} degrees of freedom and is a rough guess; measure more points")
+    is_tight = fitted.threshold is not None and fitted.threshold < TIGHT * fitted.sigma
+    if is_tight and subject.method == "robust":
+        notes.append(
+            f"the threshold of {fitted.threshold:.4g} mm is only {fitted.threshold / fitted.sigma:.2g} σ and cuts off "
+            "good points; leave it out to have it estimated"
+        )
+    return notes
+
+
+def neighbours_alike(xyz_a: np.ndarray, residuals: np.ndarray) -> bool:
+    """Whether points (n, 3) have residuals (n, 3) in common with their nearest neighbours, more than chance has it.
+
+    Of independent ones the products r · r' of neighbours have mean zero (a little less after a fit), and their sum is
+    normal with the variance Σ (r · r')².
+    """
+    rows = slice(None, None, max(1, len(xyz_a) // NEIGHBOURS))
+    xyz, r = xyz_a[rows], residuals[rows]
+    if len(xyz) < FEWEST_NEIGHBOURS:
+        return False
+    pairs = np.column_stack([np.arange(len(xyz)), cKDTree(xyz).query(xyz, k=2)[1][:, 1]])
+    one, two = np.unique(np.sort(pairs, axis=1), axis=0).T
+    product = np.einsum("ni,ni->n", r[one], r[two])
+    return bool(norm.sf(product.sum() / max(np.sqrt((product**2).sum()), 1e-300)) < BY_NEIGHBOURS)
+
+
+def _layout(subject: Subject) -> list[str]:
+    model, fitted, notes = subject.model, subject.fitted, []
+    rows = np.flatnonzero(fitted.inliers)
+    inside, sigma = subject.xyz_a[rows], fitted.sigma
+    if len(rows) <= LEVERAGE_UP_TO and subject.method != "liu2017":
+        alone = single_supports(model, inside, sigma)
+        kind = "plane" if model.name == "affine" else "line"
+        notes += [
+            f"only {subject.name(rows[i])} keeps the points off a {kind}, and no other checks it; measure more off it"
+            for i in alone[:SHOWN]
+        ]
+    if model.name != "affine" and spreads(inside)[2] < WIDER_THAN * sigma:
+        notes.append("the points lie in a plane: a mirrored frame would not be noticed")
+    if model.name == "affine" and np.linalg.det(fitted.transform.linear) < 0:
+        notes.append("the transform mirrors: one of the frames is left-handed")
+    if model.name == "similarity":
+        scale = fitted.transform.scale
+        for factor, (name, _) in UNITS.items():
+            if abs(max(scale, 1 / scale) / factor - 1) < UNIT_WITHIN:
+                notes.append(f"the scale is {scale:.6g}: is {'a' if scale > 1 else 'b'} in {name}?")
+    reach = fitted.threshold if fitted.threshold is not None else 4 * sigma
+    found = symmetry(inside, reach)
+    return notes if found is None else [*notes, symmetry_note(found, rows, subject.name)]

@@ -1,0 +1,1 @@
+"""A registration for people and for programs."""

@@ -1,0 +1,154 @@
+"""Pictures of a registration: residuals in space, the field over the workspace, errors by place."""
+
+import numpy as np
+
+from stcal.register.workspace.findings import Findings
+from stcal.report.page import COLOURS, FAINT, INK, SMALL, calm, locator, new_figure, round_below
+
+VIEWS = ((0, 1), (0, 2), (1, 2))
+"""Horizontal and vertical axis of each view."""
+MOST_ARROWS = 1500
+ARROW_SHARE, FEW = 0.12, 80
+"""Of the picture's side that the RMS residual of the inliers takes up, of so few points; less among more."""
+LONGEST_SHARE = 0.3
+"""Of the picture's side; longer arrows of outliers are cut off there."""
+RASTER = 41
+MARGIN = 0.25
+
+
+def space_figure(found: Findings):
+    """Three views of the points in frame b with their residuals; and by how much these are enlarged."""
+    result = found.registration
+    rows = _shown(found)
+    place = result.b_from_a @ found.xyz_a[rows]
+    residual, inlier = result.residuals[rows], result.inliers[rows]
+    side = float(np.ptp(place, axis=0).max()) or 1.0
+    typical = max(result.rms_mm, 1e-12)
+    crowded = min(1.0, FEW / len(rows)) ** (1 / 3)
+    scale = round_below(ARROW_SHARE * crowded * side / typical)
+    length = np.linalg.norm(residual, axis=1)
+    cut = np.minimum(1, LONGEST_SHARE * side / np.maximum(scale * length, 1e-300))
+    arrow = scale * residual * np.where(inlier, 1, cut)[:, None]
+    middle = (place.min(0) + place.max(0)) / 2
+    reach = np.abs(np.concatenate([place, place + arrow]) - middle).max(0) * 1.06 + 0.01 * side
+    figure = new_figure(10.2, 3.7)
+    width = 0.27
+    for k, (i, j) in enumerate(VIEWS):
+        axes = figure.add_axes((0.055 + k * 0.33, 0.14, width, 0.82))
+        for kind, colour in ((True, COLOURS[0]), (False, COLOURS[1])):
+            own = inlier == kind
+            if own.any():
+                axes.quiver(
+                    *place[own][:, [i, j]].T,
+                    *arrow[own][:, [i, j]].T,
+                    color=colour,
+                    angles="xy",
+                    scale_units="xy",
+                    scale=1,
+                    width=0.006,
+                    headwidth=3.2,
+                    headlength=4,
+                    headaxislength=3.6,
+                    zorder=2 if kind else 3,
+                )
+                axes.plot(*place[own][:, [i, j]].T, ".", color=colour, ms=2.5, zorder=2)
+        for row in np.flatnonzero(~inlier & (cut < 1)):
+            end = (place[row] + arrow[row])[[i, j]]
+            axes.plot(*end, "o", mfc="white", mec=COLOURS[1], ms=4, mew=0.8, zorder=4)
+            axes.annotate(
+                f"{length[row]:.2g}", end, (3, 3), textcoords="offset points", fontsize=SMALL - 1, color=INK, zorder=5
+            )
+        _frame(axes, "b", i, j, middle, reach)
+    return figure, scale
+
+
+def field_figure(found: Findings):
+    """Planes through the middle of the points with the error to expect; None where the points have no width."""
+    field = found.field
+    own = found.xyz_a[field.rows]
+    low, high = own.min(0), own.max(0)
+    if (high - low).min() < 1e-3 * (high - low).max():
+        return None
+    middle, reach = (low + high) / 2, (high - low) / 2 * (1 + 2 * MARGIN)
+    planes = []
+    for i, j in VIEWS:
+        u = middle[i] + reach[i] * np.linspace(-1, 1, RASTER)
+        v = middle[j] + reach[j] * np.linspace(-1, 1, RASTER)
+        grid = np.tile(middle, (RASTER * RASTER, 1))
+        grid[:, i], grid[:, j] = (each.ravel() for each in np.meshgrid(u, v))
+        error, covariance = field.at(grid)
+        size = np.sqrt((error**2).sum(1) + np.trace(covariance, axis1=1, axis2=2))
+        planes.append((u, v, size.reshape(RASTER, RASTER)))
+    most = max(float(size.max()) for _, _, size in planes)
+    step = round_below(most / 10)
+    levels = np.arange(np.ceil(most / step * (1 - 1e-9)) + 1) * step
+    figure = new_figure(10.2, 3.5)
+    shown = None
+    for k, ((i, j), (u, v, size)) in enumerate(zip(VIEWS, planes, strict=True)):
+        axes = figure.add_axes((0.055 + k * 0.298, 0.15, 0.24, 0.8))
+        shown = axes.contourf(u, v, size, levels=levels, cmap="YlOrRd")
+        axes.contour(u, v, size, levels=levels[1:-1:2], colors=INK, linewidths=0.4, alpha=0.5)
+        third = 3 - i - j
+        near = np.abs(own[:, third] - middle[third]) < (high - low)[third] / 8
+        axes.plot(*own[near][:, [i, j]].T, ".", color=INK, ms=3)
+        box = np.array([[low[i], low[j]], [high[i], low[j]], [high[i], high[j]], [low[i], high[j]], [low[i], low[j]]])
+        axes.plot(*box.T, color=INK, lw=0.7, ls=(0, (4, 3)))
+        _frame(axes, "a", i, j, middle, reach)
+    bar = figure.colorbar(shown, cax=figure.add_axes((0.918, 0.15, 0.012, 0.8)))
+    bar.set_ticks(levels[:: -(-len(levels) // 8)])
+    bar.ax.tick_params(labelsize=SMALL, length=2)
+    bar.set_label("mm", fontsize=SMALL + 1)
+    return figure
+
+
+def errors_figure(found: Findings):
+    """Lengths of residuals against the side of the cube about the middle that a point lies on."""
+    result = found.registration
+    rows = _shown(found)
+    side = 2 * np.abs(found.xyz_a[rows] - found.cubes.middle).max(1)
+    length, inlier = found.length_mm[rows], result.inliers[rows]
+    figure = new_figure(9, 2.6)
+    axes = figure.add_axes((0.07, 0.2, 0.92, 0.66))
+    top = 1.25 * result.max_mm
+    for edge in found.cubes.sides_mm:
+        axes.axvline(edge, color=FAINT, lw=0.8)
+    for kind, colour, name in ((True, COLOURS[0], "inlier"), (False, COLOURS[1], "outlier")):
+        own = inlier == kind
+        inside = own & (length <= top)
+        axes.plot(side[inside], length[inside], "o", color=colour, ms=3.2, mew=0, label=name if own.any() else None)
+        axes.plot(side[own & ~inside], np.full((own & ~inside).sum(), top), "^", color=colour, ms=4.5, mew=0)
+    held = result.held_out
+    if held is not None and len(held.rows) == len(result):
+        tried = np.full(len(result), np.nan)
+        tried[held.rows] = held.error_mm
+        tried = tried[rows]
+        axes.plot(side[tried <= top], tried[tried <= top], "_", color=COLOURS[2], ms=6, mew=1, label="held out")
+    axes.set_ylim(0, 1.04 * top)
+    axes.set_xlim(0, None)
+    calm(axes)
+    axes.set_xlabel("cube about the middle, side in mm (triangles: farther off than shown)", fontsize=SMALL + 0.5)
+    axes.set_ylabel("error, mm", fontsize=SMALL + 0.5)
+    axes.legend(fontsize=SMALL, frameon=False, loc="lower left", bbox_to_anchor=(0, 1), ncols=3)
+    return figure
+
+
+def _shown(found: Findings) -> np.ndarray:
+    """All rows, or the outliers (of very many, some) and as many others as can be told apart."""
+    result = found.registration
+    if len(result) <= MOST_ARROWS:
+        return np.arange(len(result))
+    bad, good = result.outliers[: MOST_ARROWS // 3], np.flatnonzero(result.inliers)
+    return np.concatenate([good[np.linspace(0, len(good) - 1, MOST_ARROWS - len(bad)).astype(int)], bad])
+
+
+def _frame(axes, frame: str, i: int, j: int, middle: np.ndarray, reach: np.ndarray) -> None:
+    """Limits of equal scale that hold ``middle`` ± ``reach``."""
+    width, height = axes.get_position().size * axes.figure.get_size_inches()
+    per_inch = max(reach[i] / width, reach[j] / height)
+    axes.set_xlim(middle[i] - per_inch * width, middle[i] + per_inch * width)
+    axes.set_ylim(middle[j] - per_inch * height, middle[j] + per_inch * height)
+    axes.xaxis.set_major_locator(locator())
+    axes.yaxis.set_major_locator(locator())
+    axes.set_xlabel(f"{'xyz'[i]} of {frame}, mm", fontsize=SMALL + 0.5, color=INK)
+    axes.set_ylabel(f"{'xyz'[j]} of {frame}, mm", fontsize=SMALL + 0.5, color=INK, labelpad=1)
+    calm(axes)

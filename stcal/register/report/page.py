@@ -1,0 +1,257 @@
+"""What a registration found, as text and as a page."""
+
+from html import escape
+from itertools import pairwise
+
+import numpy as np
+
+from stcal.geometry.affine import Affine
+from stcal.geometry.rigid import Similarity
+from stcal.register.report.drawings import errors_figure, field_figure, space_figure
+from stcal.register.report.file import matrix_of
+from stcal.register.workspace.findings import Findings
+from stcal.report.page import COLOURS, fold, number, page, plot, swatch, table, uri
+
+FEW_ROWS = 24
+"""Up to so many every row is listed, else the outliers and …"""
+WORST = 5
+"""… so many of the inliers, those with the largest residuals."""
+MOST_OUTLIERS = 30
+ROWS_ON_PAGE = 2000
+
+Sections = list[tuple[str, str, str]]
+"""(anchor, title, markup)."""
+
+
+def registration_text(found: Findings) -> str:
+    """Tables for the terminal."""
+    result = found.registration
+    lines = [_heading(found), "", "b_from_a, mm", *matrix_lines(matrix_of(result.b_from_a)), *_parts_lines(found), ""]
+    lines += [f"{'mm':<28}{'points':>8}{'mean':>10}{'RMS':>10}{'max':>10}"]
+    for name, count, *figures in _errors(found):
+        lines.append(f"{name:<28}{count:>8}" + "".join(f"{number(v, 4):>10}" for v in figures))
+    lines += ["", *_row_lines(found)]
+    reach = _field_lines(found) + _cube_lines(found)
+    return "\n".join(lines + (["", *reach] if reach else []))
+
+
+def matrix_lines(matrix: np.ndarray) -> list[str]:
+    """A 4×4 matrix, row by row."""
+    return ["  " + "".join(f"{v:14.9f}" for v in row[:3]) + f"{row[3]:16.4f}" for row in matrix]
+
+
+def matrix_table(matrix: np.ndarray, frame: str) -> str:
+    """The same as markup: what becomes of the axes and the origin of ``frame``."""
+    rows = [
+        [axis] + [f"{v:.9f}" for v in row[:3]] + [f"{row[3]:.4f}"] for axis, row in zip("xyz ", matrix, strict=True)
+    ]
+    return table(["", f"x of {frame}", "y", "z", "origin (mm)"], rows)
+
+
+def _heading(found: Findings) -> str:
+    result = found.registration
+    count, agree = len(result), int(result.inliers.sum())
+    cut = "" if result.threshold_mm is None else f", threshold {result.threshold_mm:.4g} mm"
+    way = f"{result.model}, {result.method}{cut}"
+    return f"{found.where}: {count} point pairs, {way}: {agree} inliers, {count - agree} outliers"
+
+
+def _parts_lines(found: Findings) -> list[str]:
+    """σ of the transform, and what else it holds."""
+    result, lines = found.registration, []
+    sigma = np.sqrt(np.diag(result.covariance))
+    if isinstance(result.b_from_a, Affine):
+        scales = np.linalg.svd(result.b_from_a.linear, compute_uv=False)
+        lines.append(f"scales {' '.join(f'{s:.6f}' for s in scales)}: a frame of the same unit has 1 1 1")
+    else:
+        lines.append(f"σ of its rotation {' '.join(f'{v:.3g}' for v in 1e3 * np.degrees(sigma[:3]))} mdeg")
+    if isinstance(result.b_from_a, Similarity):
+        lines.append(f"scale {result.b_from_a.scale:.8f} ± {sigma[6] * result.b_from_a.scale:.2g}")
+    for place, xyz in (("the middle of the inliers", found.middle()), ("a's origin", np.zeros(3))):
+        lines.append(f"σ it makes at {place}: {' '.join(f'{v:.3g}' for v in found.sigma_mm_at(xyz))} mm")
+    freedom = f", {result.dof:.0f} degrees of freedom" if np.isfinite(result.dof) else ""
+    factor = "" if result.sigma_factor is None else f", {result.sigma_factor:.2f} of the σ given"
+    return [*lines, f"σ of a coordinate {result.sigma_mm:.4g} mm{factor}{freedom}"]
+
+
+def _errors(found: Findings) -> list[tuple]:
+    """(name, points, mean, RMS, maximum)."""
+    result, held = found.registration, found.registration.held_out
+    rows = [("residuals of the inliers", int(result.inliers.sum()), result.mean_mm, result.rms_mm, result.max_mm)]
+    if held is not None:
+        own = int(result.inliers[held.rows].sum())
+        rows.append((f"held out ({held.folds} folds), inliers", own, *held.of_inliers))
+        if own < len(held.rows):
+            rows.append((f"held out ({held.folds} folds), all", len(held.rows), *held.of_all))
+    return rows
+
+
+def _row_lines(found: Findings) -> list[str]:
+    result, length = found.registration, found.length_mm
+    if len(result) <= FEW_ROWS:
+        rows, title = np.arange(len(result)), "residuals b − b_from_a a, mm"
+    else:
+        inliers = np.flatnonzero(result.inliers)
+        worst = inliers[np.argsort(-length[inliers], kind="stable")][:WORST]
+        rows = np.concatenate([result.outliers[:MOST_OUTLIERS], worst])
+        title = f"residuals b − b_from_a a of the outliers and of the {len(worst)} largest inliers, mm"
+    lines = [f"{title:<60}{'x':>10}{'y':>10}{'z':>10}{'length':>10}"] if len(rows) else []
+    for row in rows:
+        kind = "inlier" if result.inliers[row] else "OUTLIER"
+        values = [*result.residuals[row], length[row]]
+        lines.append(f"  {f'line {found.lines[row]}':<16}{kind:<42}" + "".join(f"{v:10.3f}" for v in values))
+    if len(result) > FEW_ROWS and len(result.outliers) > MOST_OUTLIERS:
+        lines.append(f"  … and {len(result.outliers) - MOST_OUTLIERS} more outliers; all are in --out and --report")
+    return lines
+
+
+def field_sentence(found: Findings) -> str:
+    """Whether residuals are more than noise, in a sentence."""
+    field = found.field
+    if not field.seen:
+        return (
+            f"no systematic residuals seen: they look like noise of σ {field.noise_mm:.3g} mm "
+            f"(chance of as much structure: {field.p_value:.2g})"
+        )
+    back = len(field.taken_back)
+    taken = f"; {back} of the outliers follow{'s' * (back == 1)} it" if back else ""
+    return (
+        f"residuals are systematic: {field.size_mm:.3g} mm RMS change smoothly over {field.length_mm:.0f} mm, beside "
+        f"noise of σ {field.noise_mm:.3g} mm; a point left out errs by {field.plain_mm.mean():.3g} mm on average, by "
+        f"{field.corrected_mm.mean():.3g} mm with this field of the others taken off{taken}; σ of the transform, which "
+        "takes residuals as independent, are too small"
+    )
+
+
+def _field_lines(found: Findings) -> list[str]:
+    return [] if found.field is None else [field_sentence(found)]
+
+
+def shells(found: Findings) -> list[str]:
+    """``inner 200 mm``, ``200 … 300 mm`` …."""
+    sides = [f"{side:g}" for side in found.cubes.sides_mm]
+    return [f"inner {sides[0]} mm"] + [f"{a} … {b} mm" for a, b in pairwise(sides)]
+
+
+def _cube_lines(found: Findings) -> list[str]:
+    reach = found.cubes
+    if reach is None:
+        return []
+    middle = " ".join(f"{v:.0f}" for v in reach.middle)
+    rows = [[f"{e.mean_mm:.3f} / {e.max_mm:.3f}" if e else "–" for e in row] for row in reach.errors]
+    width = max(16, 2 + max(len(cell) for row in [shells(found), *rows] for cell in row))
+    title = f"errors in cubes about {middle} of a, mean / max, mm"
+    lines = [f"{title:<52}" + "".join(f"{s:>{width}}" for s in shells(found))]
+    for side, cells in zip(reach.sides_mm, rows, strict=True):
+        lines.append(f"{f'  fitted in the cube of {side:g} mm':<52}" + "".join(f"{c:>{width}}" for c in cells))
+    return [*lines, *holds(found)]
+
+
+def holds(found: Findings) -> list[str]:
+    """Of a fit to the inner cube: how far it errs there, and farther out."""
+    reach = found.cubes
+    first = reach.errors[0]
+    outside = [(side, e) for side, e in zip(reach.sides_mm[1:], first[1:], strict=True) if e]
+    if first[0] is None or not outside:
+        return []
+    text, most = f"fitted in the cube of {reach.sides_mm[0]:g} mm it holds within {first[0].max_mm:.3g} mm there", 0.0
+    for side, each in outside:
+        most = max(most, each.max_mm, first[0].max_mm)
+        text += f", {most:.3g} mm to {side:g} mm"
+    return [text]
+
+
+def registration_page(found: Findings, more: Sections | None = None) -> str:
+    """The report page; ``more`` sections stand before the rows."""
+    result = found.registration
+    alarms = "".join(f'<p class="alarm">{escape(note)}</p>\n' for note in result.notes)
+    banner = f'<h1>Registration</h1>\n<p class="counts">{escape(_heading(found))}</p>\n{alarms}'
+    sections = [
+        ("result", "Result", _result(found)),
+        ("space", "Residuals in space", _space(found)),
+        ("holds", "Where it holds", _holds(found)),
+        *(more or []),
+        ("rows", "Rows", _rows(found)),
+    ]
+    return page("Registration", banner, sections)
+
+
+def _result(found: Findings) -> str:
+    result = found.registration
+    tiles = [(f"{result.inliers.sum()} / {len(result)}", "inliers of the point pairs")]
+    tiles.append((f"{result.rms_mm:.3g} mm", f"RMS residual of the inliers, at most {result.max_mm:.3g} mm"))
+    if result.held_out is not None:
+        mean, _, largest = result.held_out.of_inliers
+        tiles.append((f"{mean:.3g} mm", f"mean error of inliers held out, at most {largest:.3g} mm"))
+    sigma = float(np.linalg.norm(found.sigma_mm_at(found.middle())))
+    tiles.append((f"{sigma:.2g} mm", "σ of the transform at the middle of the inliers, all axes together"))
+    boxes = "".join(f"<div><b>{value}</b><span>{escape(name)}</span></div>" for value, name in tiles)
+    matrix = matrix_table(matrix_of(result.b_from_a), "a")
+    errors = table(
+        ["<Lengths of errors", "Points", "Mean (mm)", "RMS (mm)", "Max (mm)"],
+        [[name, str(count), *(number(v, 4) for v in figures)] for name, count, *figures in _errors(found)],
+    )
+    facts = "".join(f"<p>{escape(line)}.</p>\n" for line in _parts_lines(found))
+    return (
+        f'<div class="tiles">{boxes}</div>\n<div class="columns"><div><h3>b_from_a</h3>{matrix}{facts}</div>'
+        f"<div><h3>Errors</h3>{errors}</div></div>\n"
+    )
+
+
+def _space(found: Findings) -> str:
+    figure, scale = space_figure(found)
+    outliers = bool(len(found.registration.outliers))
+    legend = swatch("inlier", COLOURS[0]) + (swatch("outlier", COLOURS[1]) if outliers else "")
+    legend = f'<p class="legend">{legend}</p>'
+    caption = f"Points in frame b and their residuals b − b_from_a a, drawn {scale:,g} times larger"
+    if outliers:
+        caption += "; arrows of outliers that would leave the picture end in a ring, their length in mm beside them"
+    return legend + plot(uri(figure), "residuals in three views", caption, "wide")
+
+
+def _holds(found: Findings) -> str:
+    text = ""
+    if found.field is not None:
+        sentence = field_sentence(found)
+        text += f"<p>{escape(sentence[0].upper() + sentence[1:])}.</p>\n"
+        figure = field_figure(found)
+        if figure is not None:
+            caption = (
+                "Systematic error to expect of the transform (RMS: of what the residuals show and of what they leave "
+                "open), in planes through the middle of the points, frame a. Dots: the points within an eighth of the "
+                "plane; dashed: the box of all. Beyond it the model knows less and says more"
+            )
+            text += plot(uri(figure), "systematic error over the workspace", caption, "wide")
+    if found.cubes is None:
+        return text + ("" if text else "<p>Too few points to tell.</p>\n")
+    reach = found.cubes
+    middle = " ".join(f"{v:.1f}" for v in reach.middle)
+    text += (
+        f"<p>Cubes about ({middle}) mm, along the axes of a. The transform is fitted again to the points in one cube "
+        "and tried on those of all; the points that it is fitted to are held out in turn. Nothing is assumed about "
+        f"where errors come from. {escape(' '.join(s[0].upper() + s[1:] + '.' for s in holds(found)))}</p>\n"
+    )
+    names = shells(found)
+    heads = ["<Fitted in the cube of", *(word for _ in names for word in ("points", "mean", "max"))]
+    rows = []
+    for side, row in zip(reach.sides_mm, reach.errors, strict=True):
+        cells = [[str(e.points), number(e.mean_mm, 4), number(e.max_mm, 4)] if e else ["0", "–", "–"] for e in row]
+        rows.append([f"{side:g} mm", *(c for cell in cells for c in cell)])
+    text += table(heads, rows, [("errors (mm)", 1), *((name, 3) for name in names)])
+    return text + plot(uri(errors_figure(found)), "errors by place", "Lengths of the residuals by place", "wide")
+
+
+def _rows(found: Findings) -> str:
+    result, length = found.registration, found.length_mm
+    heads = ["line", "<", "x (mm)", "y (mm)", "z (mm)", "length (mm)"]
+
+    def cells(row: int) -> list[str]:
+        kind = "inlier" if result.inliers[row] else "outlier"
+        values = [number(v, 4) for v in (*result.residuals[row], length[row])]
+        return [str(found.lines[row]), kind, *values]
+
+    outliers = [cells(row) for row in result.outliers[:ROWS_ON_PAGE]]
+    text = f"<h3>Outliers</h3>{table(heads, outliers)}" if outliers else "<p>No outliers.</p>\n"
+    shown = range(min(len(result), ROWS_ON_PAGE))
+    name = "All rows" if len(result) <= ROWS_ON_PAGE else f"The first {ROWS_ON_PAGE} of {len(result)} rows"
+    return text + fold(name, table(heads, [cells(row) for row in shown]))

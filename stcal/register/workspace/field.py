@@ -1,0 +1,277 @@
+"""Where a registration holds: the systematic part of its residuals over the workspace.
+
+A frame that is bent, as a robot's by its kinematics, leaves residuals that change smoothly from place to place. They
+are modelled as r(x) = f(x) + J(x) β + ε: f a Gaussian process (Matérn 5/2, each component alike), J β the small motions
+of the transform, which the fit has taken out (universal kriging: nothing is known beforehand of β), ε noise. Length,
+size and noise are those of the greatest restricted likelihood (Patterson & Thompson 1971; Rasmussen & Williams 2006,
+ch. 2.7 and 5.4).
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.optimize import minimize_scalar
+from scipy.spatial import cKDTree
+from scipy.spatial.distance import cdist
+from scipy.stats import chi2
+
+from stcal.geometry.arrays import frozen
+from stcal.register.core.covariance import noise_of
+from stcal.register.core.models import MODELS, Model, Transform, jacobian
+from stcal.register.core.result import Registration
+
+MOST_POINTS = 500
+"""The model of more points is of so many of them, evenly chosen: its cost grows with the third power."""
+SEEN_AT = 0.01
+"""A systematic part is declared in so many of registrations whose residuals are noise."""
+LENGTHS, RATIOS = 12, np.geomspace(1e-3, 1e7, 41)
+"""Lengths tried before refinement, and variances of f over that of the noise."""
+WILD = 0.01
+"""Clean sets in which one point or more is taken for wild."""
+ROUNDS = 5
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Field:
+    """Systematic residuals b − b_from_a a over the workspace, frame b's axes, at places in frame a.
+
+    ``length_mm`` : over which they change; ``size_mm`` : RMS length of them at the points; ``noise_mm`` : σ per axis of
+    what is left; ``p_value`` : of so much of it by chance; ``rows`` : (m,) of the points used;
+    ``taken_back`` : outliers of the registration that follow the field of the others; ``plain_mm``, ``corrected_mm`` :
+    (m,) errors of points by the transform, and by transform and field, fitted to the others; ``sigma_ratio`` : RMS of
+    the latter over their σ, about 1 when the field's σ are true.
+    """
+
+    length_mm: float
+    size_mm: float
+    noise_mm: float
+    p_value: float
+    rows: np.ndarray
+    taken_back: np.ndarray
+    plain_mm: np.ndarray
+    corrected_mm: np.ndarray
+    sigma_ratio: float
+    _solved: "_Solved"
+
+    def __post_init__(self):
+        for name, kind in (("rows", int), ("taken_back", int), ("plain_mm", float), ("corrected_mm", float)):
+            object.__setattr__(self, name, frozen(getattr(self, name), (None,), name, kind))
+
+    @property
+    def seen(self) -> bool:
+        """Whether residuals are more than noise."""
+        return self.p_value < SEEN_AT
+
+    def at(self, xyz_a: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Systematic error (g, 3) to expect of the transform at places (g, 3), mm, and its covariance (g, 3, 3)."""
+        return self._solved.at(np.asarray(xyz_a, float))
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Solved:
+    """What predictions need: places (m, 3), C⁻¹ (m, m) of unit noise, and what follows from it."""
+
+    model: Model
+    transform: Transform
+    xyz_a: np.ndarray
+    length: float
+    ratio: float
+    inverse: np.ndarray
+    kriged: "_Kriged"
+
+    def at(self, xyz_a: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        near = self.ratio * _matern(cdist(xyz_a, self.xyz_a) / self.length)
+        motions = _motions(self.model, self.transform, xyz_a, self.xyz_a)
+        left = motions - np.einsum("gm,mcp->gcp", near, self.kriged.of_motions)
+        value = near @ self.kriged.of_y + left @ self.kriged.beta
+        own = self.ratio - np.einsum("gm,mk,gk->g", near, self.inverse, near, optimize=True)
+        covariance = np.maximum(own, 0)[:, None, None] * np.eye(3) + left @ self.kriged.spread @ np.swapaxes(left, 1, 2)
+        return value, self.kriged.variance * covariance
+
+
+def residual_field(
+    registration: Registration,
+    xyz_a: np.ndarray,
+    xyz_b: np.ndarray,
+    weights: np.ndarray | None = None,
+    covariances: np.ndarray | None = None,
+) -> Field | None:
+    """The systematic part of the residuals of the inliers and of outliers that follow it; None with too few points.
+
+    Arguments as of :func:`stcal.register.pipeline`; of covariances the mean variance of each point counts.
+    """
+    a, b = np.asarray(xyz_a, float), np.asarray(xyz_b, float)
+    model = MODELS[registration.model]
+    variance = _relative_variances(len(a), weights, covariances)
+    used = registration.inliers.copy()
+    taken = np.zeros(0, int)
+    for _ in range(ROUNDS):
+        rows = _few(np.flatnonzero(used))
+        if model.freedom(len(rows)) < 2 * model.parameters:
+            return None
+        found = _Likelihood.of(model, registration.b_from_a, a[rows], b[rows], variance[rows])
+        field = _field(found, rows, taken)
+        more = _followers(field, a, b - registration.b_from_a @ a, variance, used)
+        if not len(more):
+            return field
+        used[more] = True
+        taken = np.sort(np.concatenate([taken, more]))
+    return field
+
+
+def _relative_variances(n: int, weights, covariances) -> np.ndarray:
+    """(n,) of the noise, over that of a point of mean σ."""
+    precision = noise_of(n, weights, covariances).precision
+    if precision is None:
+        return np.ones(n)
+    return 1 / precision if precision.ndim == 1 else np.trace(np.linalg.inv(precision), axis1=1, axis2=2) / 3
+
+
+def _few(rows: np.ndarray) -> np.ndarray:
+    return rows if len(rows) <= MOST_POINTS else rows[np.linspace(0, len(rows) - 1, MOST_POINTS).astype(int)]
+
+
+def _followers(field: Field, a, residuals, variance, used) -> np.ndarray:
+    """Points not used that lie where the field says, and not where the transform says."""
+    rows = _few(np.flatnonzero(~used))
+    if not field.seen or not len(rows):
+        return np.zeros(0, int)
+    value, covariance = field.at(a[rows])
+    off = residuals[rows] - value
+    whole = covariance + (field.noise_mm**2 * variance[rows])[:, None, None] * np.eye(3)
+    square = np.einsum("ni,ni->n", off, np.linalg.solve(whole, off[:, :, None])[:, :, 0])
+    follows = (square < chi2.isf(WILD / len(rows), 3)) & (
+        np.linalg.norm(off, axis=1) < np.linalg.norm(residuals[rows], axis=1) / 2
+    )
+    return rows[follows]
+
+
+def _matern(distance: np.ndarray) -> np.ndarray:
+    """Matérn 5/2 of distances over the length."""
+    scaled = np.sqrt(5) * distance
+    return (1 + scaled + scaled**2 / 3) * np.exp(-scaled)
+
+
+def _motions(model: Model, transform: Transform, xyz_a: np.ndarray, about: np.ndarray) -> np.ndarray:
+    """What small motions of the transform add to residuals, (m, 3, p), in numbers about 1."""
+    origin = about.mean(0)
+    extent = float(np.abs(about - origin).max())
+    return jacobian(model, transform, xyz_a - origin) / np.where(_in_mm(model), extent, 1.0)
+
+
+def _in_mm(model: Model) -> np.ndarray:
+    """Parameters whose motions grow with the distance from the origin."""
+    if model.name == "affine":
+        return np.tile([True, True, True, False], 3)
+    return np.array([True] * 3 + [False] * 3 + [True])[: model.parameters]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Likelihood:
+    """Restricted likelihood of length and variance ratio. ``y`` : (m, 3) residuals, ``motions`` : (m, 3, p), both over
+    the root of the points' relative variance ``variance`` : (m,)."""
+
+    model: Model
+    transform: Transform
+    xyz_a: np.ndarray
+    variance: np.ndarray
+    y: np.ndarray
+    motions: np.ndarray
+    distance: np.ndarray
+
+    @classmethod
+    def of(cls, model: Model, transform: Transform, xyz_a, xyz_b, variance) -> "_Likelihood":
+        root = np.sqrt(variance)
+        y = (xyz_b - transform @ xyz_a) / root[:, None]
+        motions = _motions(model, transform, xyz_a, xyz_a) / root[:, None, None]
+        return cls(model, transform, xyz_a, variance, y, motions, cdist(xyz_a, xyz_a))
+
+    def best(self) -> tuple[float, float, float, float]:
+        """Length, ratio, −2 log L there, and without f."""
+        nearest = cKDTree(self.xyz_a).query(self.xyz_a, k=2)[0][:, 1]
+        low, high = max(np.median(nearest), 1e-6 * self.distance.max()), 2 * self.distance.max()
+        lengths = np.geomspace(low, high, LENGTHS)
+        values = [self._at_length(length)[0] for length in lengths]
+        i = int(np.argmin(values))
+        around = np.log(lengths[[max(i - 1, 0), min(i + 1, LENGTHS - 1)]])
+        refined = minimize_scalar(
+            lambda x: self._at_length(np.exp(x))[0], bounds=around, method="bounded", options={"xatol": 0.02}
+        )
+        length = float(np.exp(refined.x)) if refined.fun < values[i] else float(lengths[i])
+        value, ratio, without = self._at_length(length)
+        return length, ratio, value, without
+
+    def _at_length(self, length: float) -> tuple[float, float, float]:
+        """−2 log L at the best ratio, that ratio, and −2 log L without f."""
+        root = np.sqrt(self.variance)
+        values, vectors = np.linalg.eigh(_matern(self.distance / length) / root[:, None] / root)
+        values = np.maximum(values, 0)
+        m, _, p = self.motions.shape
+        y = vectors.T @ self.y
+        h = (vectors.T @ self.motions.reshape(m, -1)).reshape(m, 3, p)
+        square, mixed, normal = (y**2).sum(1), np.einsum("mcp,mc->mp", h, y), np.einsum("mcp,mcq->mpq", h, h)
+
+        def twice(ratio: float) -> float:
+            spread = 1 + ratio * values
+            a = np.tensordot(1 / spread, normal, 1)
+            g = (mixed / spread[:, None]).sum(0)
+            rest = (square / spread).sum() - g @ np.linalg.solve(a, g)
+            return (3 * m - p) * np.log(max(rest, 1e-300)) + 3 * np.log(spread).sum() + np.linalg.slogdet(a)[1]
+
+        tried = [twice(r) for r in RATIOS]
+        i = int(np.argmin(tried))
+        around = np.log(RATIOS[[max(i - 1, 0), min(i + 1, len(RATIOS) - 1)]])
+        refined = minimize_scalar(lambda x: twice(np.exp(x)), bounds=around, method="bounded", options={"xatol": 0.01})
+        best = float(np.exp(refined.x)) if refined.fun < tried[i] else float(RATIOS[i])
+        return min(float(refined.fun), tried[i]), best, twice(0.0)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Kriged:
+    """Generalised least squares with unit covariance C of each component: C⁻¹ y, C⁻¹ J, (JᵀC⁻¹J)⁻¹, β, C⁻¹ (y − J β),
+    and the variance factor."""
+
+    own: np.ndarray
+    of_y: np.ndarray
+    of_motions: np.ndarray
+    spread: np.ndarray
+    beta: np.ndarray
+    left: np.ndarray
+    variance: float
+
+    @classmethod
+    def of(cls, inverse: np.ndarray, y: np.ndarray, motions: np.ndarray) -> "_Kriged":
+        m, _, p = motions.shape
+        of_y = inverse @ y
+        of_motions = (inverse @ motions.reshape(m, -1)).reshape(m, 3, p)
+        spread = np.linalg.inv(np.einsum("mcp,mcq->pq", motions, of_motions))
+        beta = spread @ np.einsum("mcp,mc->p", motions, of_y)
+        left = of_y - of_motions @ beta
+        variance = float((y * left).sum() / (3 * m - p))
+        return cls(np.diag(inverse), of_y, of_motions, spread, beta, left, variance)
+
+    def left_out(self) -> tuple[np.ndarray, float]:
+        """Errors (m,) of each point by the model of the others, and their RMS over their σ.
+
+        (Q⁻¹)ᵢᵢ⁻¹ … of Q = C⁻¹ − C⁻¹J(JᵀC⁻¹J)⁻¹JᵀC⁻¹, in blocks of a point's three components (Dubrule 1983).
+        """
+        block = self.own[:, None, None] * np.eye(3)
+        block = block - self.of_motions @ self.spread @ np.swapaxes(self.of_motions, 1, 2)
+        error = np.linalg.solve(block, self.left[:, :, None])[:, :, 0]
+        ratio = np.sqrt((error * self.left).sum() / (3 * len(error) * self.variance))
+        return np.linalg.norm(error, axis=1), float(ratio)
+
+
+def _field(found: _Likelihood, rows: np.ndarray, taken: np.ndarray) -> Field:
+    length, ratio, value, without = found.best()
+    root = np.sqrt(found.variance)[:, None]
+    y, motions = found.y * root, found.motions * root[:, :, None]
+    inverse = np.linalg.inv(ratio * _matern(found.distance / length) + np.diag(found.variance))
+    kriged = _Kriged.of(inverse, y, motions)
+    corrected, sigma_ratio = kriged.left_out()
+    plain, _ = _Kriged.of(np.diag(1 / found.variance), y, motions).left_out()
+    noise = float(np.sqrt(kriged.variance))
+    p_value = float(chi2.sf(max(without - value, 0.0), 2))
+    solved = _Solved(found.model, found.transform, found.xyz_a, length, ratio, inverse, kriged)
+    size = float(np.sqrt((solved.at(found.xyz_a)[0] ** 2).sum(1).mean()))
+    return Field(length, size, noise, p_value, rows, taken, plain, corrected, sigma_ratio, solved)

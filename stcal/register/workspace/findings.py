@@ -1,0 +1,59 @@
+"""A registration with all that is told of it: the points' lines, the residual field, the cubes."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from stcal.geometry.arrays import frozen
+from stcal.register.core.models import MODELS, jacobian
+from stcal.register.core.result import Registration
+from stcal.register.workspace.cubes import Cubes, cubes
+from stcal.register.workspace.field import Field, residual_field
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Findings:
+    """``where`` : the file; ``lines`` : (n,) its lines; ``xyz_a`` : (n, 3) mm; ``field``, ``cubes`` : None where the
+    points are too few."""
+
+    where: str
+    lines: Sequence[int]
+    xyz_a: np.ndarray
+    registration: Registration
+    field: Field | None
+    cubes: Cubes | None
+
+    def __post_init__(self):
+        object.__setattr__(self, "xyz_a", frozen(self.xyz_a, (len(self.registration), 3), "points"))
+
+    @property
+    def length_mm(self) -> np.ndarray:
+        """(n,) of the residuals."""
+        return np.linalg.norm(self.registration.residuals, axis=1)
+
+    def middle(self) -> np.ndarray:
+        """(3,) of the inliers, frame a, mm."""
+        return self.xyz_a[self.registration.inliers].mean(0)
+
+    def sigma_mm_at(self, xyz_a: np.ndarray) -> np.ndarray:
+        """(3,) σ that the transform's covariance makes at a point of frame a, along b's axes."""
+        found = self.registration
+        slope = jacobian(MODELS[found.model], found.b_from_a, xyz_a[None])[0]
+        return np.sqrt(np.diag(slope @ found.covariance @ slope.T).clip(0))
+
+
+def findings(
+    where: str,
+    lines: Sequence[int],
+    xyz_a: np.ndarray,
+    xyz_b: np.ndarray,
+    registration: Registration,
+    weights: np.ndarray | None = None,
+    covariances: np.ndarray | None = None,
+) -> Findings:
+    """The residual field and the cubes of a registration; arguments as of :func:`stcal.register.pipeline`."""
+    field = residual_field(registration, xyz_a, xyz_b, weights, covariances)
+    back = None if field is None else field.taken_back
+    reach = cubes(registration, xyz_a, xyz_b, back, weights, covariances)
+    return Findings(where, lines, xyz_a, registration, field, reach)

@@ -1,0 +1,1 @@
+"""Report pages that open off line, for every system."""

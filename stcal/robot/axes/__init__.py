@@ -1,0 +1,1 @@
+"""The axis method: a robot from sweeps of its joints."""

@@ -1,0 +1,382 @@
+"""The axis method: the axis of each joint, fitted to all arcs of its sweeps at once.
+
+A reflector on the flange draws an arc about the axis of the one joint that turns, and a straight line along a
+prismatic one (Stone 1987, "circle point analysis"; Santolaria & Ginés 2013 for its uncertainty). All arcs of a joint
+share one axis, so that each only adds its own radius and height.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from stcal.errors import ConvergenceError, DegenerateError, InputError
+from stcal.geometry.rigid import Rigid
+from stcal.robot.axes.sweeps import Arc
+
+HUBER = 3.0
+"""σ of a point's residual from which it counts less: 1 in 90 of normal ones, so that the rest loses nothing."""
+GROSS = 6.0
+"""σ from which a point is left out and named: 1 in 10⁷ of normal ones."""
+NEAR_AXIS = 10.0
+"""Radii below so many σ of a point are of no use: noise bends them by σ²/2r, a twentieth of σ here."""
+ROUNDING = 1e-12
+"""Relative size of what rounding leaves of coordinates."""
+WEAK_RAD = 0.02
+"""σ of a direction beyond which an axis is not known: its covariance rests on small angles."""
+MOTION = np.radians(2.0)
+"""Joints, gears and zero positions are true to hundredths of this; also the share of a sliding joint's way."""
+LONGER = "sweep further, or with reflectors farther apart"
+QUIET = 1e-3
+"""Share of the largest arc below which no residual can hide a gross error that bent the first axis."""
+ITERATIONS, HALVINGS, STARTS, REWEIGHTINGS = 100, 12, 60, 30
+SINGULAR, TINY = 1e-10, 1e-300
+FIRST_SIZE = 0.05
+"""Arcs of this share of the largest one give the first axis and σ, by which the smaller are judged."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class AxisFit:
+    """The axis of one joint.
+
+    ``world_from_axis`` : z of this frame is the joint's positive direction, the origin lies on the axis, at the foot of
+    the centroid of what was measured; ``arcs``, ``radii``, ``heights`` : of the arcs used, (a,) mm, heights above the
+    origin (nan along a prismatic joint); ``near`` : arcs too close to the axis to be used; ``rows`` : (k,) rows used,
+    one for each point of each arc; ``residuals`` : (k, 2) mm, radial and axial (across the line, for a prismatic
+    joint); ``weights`` : (k,), 0 for what is grossly wrong; ``gain`` : (p, k, 3) derivative of the axis by the points,
+    p being 4 (rx, ry rad, tx, ty mm in the axis's own frame) or 2 (rx, ry); ``sigma_mm`` : of one coordinate;
+    ``dof`` : redundancy; ``span`` : what the joint moved, rad or mm.
+    """
+
+    joint: int
+    world_from_axis: Rigid
+    arcs: tuple[Arc, ...]
+    radii: np.ndarray
+    heights: np.ndarray
+    near: tuple[Arc, ...]
+    rows: np.ndarray
+    residuals: np.ndarray
+    weights: np.ndarray
+    gain: np.ndarray
+    sigma_mm: float
+    dof: int
+    span: float
+
+    @property
+    def covariance(self) -> np.ndarray:
+        """(p, p) of the axis by the noise of its own points, in its own frame."""
+        return self.sigma_mm**2 * np.einsum("pkc,qkc->pq", self.gain, self.gain)
+
+    @property
+    def outliers(self) -> np.ndarray:
+        """Rows that are left out as grossly wrong."""
+        return np.unique(self.rows[self.weights == 0])
+
+    def lengths(self) -> np.ndarray:
+        """(k',) lengths of the residuals of the points used, mm."""
+        return np.linalg.norm(self.residuals[self.weights > 0], axis=1)
+
+
+def fit_axis(points: np.ndarray, moved: np.ndarray, arcs: list[Arc], prismatic: bool, where: str) -> AxisFit:
+    """The axis of a joint from all its arcs, by least squares of the points' distances to their circles or lines.
+
+    Robust: Huber weights (Huber 1964) on the points' residuals with a median σ; what is off by :data:`GROSS` σ is left
+    out. The first axis is the one with the least median residual among those that leave one point out.
+
+    Parameters
+    ----------
+    points : (m, 3) array
+        Positions of all rows, mm, with the joints before this one unwound.
+    moved : (m,) array
+        Kinematic values of this joint, rad or mm.
+    arcs : list of Arc
+        Of this joint.
+    prismatic : bool
+        Whether the joint slides.
+    where : str
+        The joint, for messages.
+
+    Raises
+    ------
+    DegenerateError
+        No redundancy, reflectors on the axis, or arcs too short to give a direction.
+    InputError
+        Motion seen about the axis that is not the joint's.
+    """
+    size = np.array([_spread(points[arc.rows]) for arc in arcs])
+    if size.max() <= ROUNDING * max(np.abs(points).max(), 1.0) * 1e3:
+        raise DegenerateError(_on_axis(where, size.max()))
+    use = list(np.flatnonzero(size >= FIRST_SIZE * size.max()))
+    fit = _Fit(points, [arcs[i] for i in use], prismatic, where)
+    fit.solve()
+    if not prismatic:
+        small = [i for i in range(len(arcs)) if i not in use]
+        more = [i for i in small if fit.radius_of(points[arcs[i].rows]) > NEAR_AXIS * fit.sigma()]
+        if more:
+            use = sorted(use + more)
+            fit = _Fit(points, [arcs[i] for i in use], prismatic, where, fit.frame)
+            fit.solve()
+    fit.orient(moved)
+    return fit.result(moved, tuple(arc for i, arc in enumerate(arcs) if i not in use))
+
+
+def refit_axis(fit: AxisFit, points: np.ndarray, left_out: np.ndarray) -> Rigid:
+    """world_from_axis without some rows, from moved points; the weights of the fit are kept."""
+    again = _Fit(points, list(fit.arcs), fit.gain.shape[0] == 2, f"joint {fit.joint + 1}", fit.world_from_axis)
+    again.weights = np.where(np.isin(fit.rows, left_out), 0.0, fit.weights)
+    again.descend()
+    return again.frame
+
+
+def _spread(points: np.ndarray) -> float:
+    return float(np.linalg.norm(points - points.mean(axis=0), axis=1).max())
+
+
+def _on_axis(where: str, spread: float) -> str:
+    return (
+        f"{where}: all reflectors stay within {spread:.3g} mm of one place while it moves, so close to its axis that "
+        "they say nothing about it; put a reflector off the axis"
+    )
+
+
+class _Fit:
+    """A fit under way: frame of the axis and weights change, the points stay."""
+
+    def __init__(self, points, arcs: list[Arc], prismatic: bool, where: str, frame: Rigid | None = None):
+        self.arcs, self.prismatic, self.where, self.frame = arcs, prismatic, where, frame
+        self.rows = np.concatenate([arc.rows for arc in arcs])
+        self.points = points[self.rows]
+        self.member = np.zeros((len(self.rows), len(arcs)))  # (k, a) one-hot
+        self.member[np.arange(len(self.rows)), np.repeat(np.arange(len(arcs)), [len(a.rows) for a in arcs])] = 1
+        self.weights = np.ones(len(self.rows))
+        self.size = max(_spread(points[arc.rows]) for arc in arcs)
+        self.floor = ROUNDING * max(np.abs(self.points).max(), self.size)
+
+    def solve(self) -> None:
+        """Start, Huber's iteration, gross points out, until nothing changes."""
+        if self.dof() < 1:
+            raise DegenerateError(
+                f"{self.where}: {len(self.rows)} positions on {len(self.arcs)} arcs leave no redundancy; another "
+                "position or a second reflector needed"
+            )
+        if self.frame is None:
+            self.start()
+            self.weights = self.huber()  # before the first step, which a gross error would lead astray
+        for gross in (np.inf, GROSS):
+            for _ in range(REWEIGHTINGS):
+                self.descend()
+                length = np.linalg.norm(self.residuals(), axis=1)
+                new = np.where(length > gross * self.robust_sigma(length), 0.0, self.huber())
+                new = new if self.dof(new) > 0 else self.huber()
+                changed = np.abs(new - self.weights).max()
+                self.weights = new
+                if changed < 1e-3:
+                    break
+        self.descend()
+        self.require_known()
+
+    def start(self) -> None:
+        """The axis from all points; where some stand out, from all but one (of many points: but a few), such that the
+        median residual is least. The weights say which were used."""
+        groups = min(len(self.rows), STARTS)
+        least = np.inf
+        for out in range(-1, groups):
+            self.weights = np.ones(len(self.rows))
+            if out >= 0:
+                self.weights[out::groups] = 0
+            self.frame = self.linear_start()
+            length = np.linalg.norm(self.residuals(), axis=1)
+            if np.median(length) < least:
+                least, best = np.median(length), (self.frame, self.weights)
+            quiet = length.max() <= min(GROSS * self.robust_sigma(length), QUIET * self.size)
+            if out < 0 and quiet:
+                break
+        self.frame, self.weights = best
+
+    def linear_start(self) -> Rigid:
+        """Direction from the arcs' common scatter, place from the circles' common centre (Kåsa 1976)."""
+        centred = self.demean(self.points)
+        _, axes = np.linalg.eigh((self.weights[:, None] * centred).T @ centred)
+        middle = self.points.mean(axis=0)
+        if self.prismatic:
+            return Rigid(_frame(axes[:, 0], axes[:, 2]), middle)
+        frame = _frame(axes[:, 2], axes[:, 0])
+        flat = (self.points - middle) @ frame[:, :2]
+        # |x|² − 2 c·x is the same all along a circle about c
+        root = np.sqrt(self.weights)
+        square = self.demean((flat**2).sum(axis=1, keepdims=True))[:, 0]
+        centre = np.linalg.lstsq(2 * root[:, None] * self.demean(flat), root * square, rcond=None)[0]
+        return Rigid(frame, middle + frame[:, :2] @ centre)
+
+    def local(self) -> np.ndarray:
+        """(k, 3) points in the axis's frame."""
+        return (self.points - self.frame.translation) @ self.frame.rotation
+
+    def values(self) -> np.ndarray:
+        """(k, 2) of which each arc has but one: radius and height, or the place across a line."""
+        local = self.local()
+        if self.prismatic:
+            return local[:, :2]
+        return np.column_stack([np.hypot(local[:, 0], local[:, 1]), local[:, 2]])
+
+    def means(self) -> np.ndarray:
+        """(2, a) weighted means of the values by arc."""
+        weighted = self.member * self.weights[:, None]
+        return (self.values().T @ weighted) / np.maximum(weighted.sum(axis=0), TINY)
+
+    def demean(self, values: np.ndarray) -> np.ndarray:
+        """(k, c) less each arc's weighted mean: its radius and height are eliminated (variable projection)."""
+        weighted = self.member * self.weights[:, None]
+        means = (weighted.T @ values) / np.maximum(weighted.sum(axis=0), TINY)[:, None]
+        return values - self.member @ means
+
+    def residuals(self) -> np.ndarray:
+        return self.demean(self.values())
+
+    def radius_of(self, points: np.ndarray) -> float:
+        """Mean distance from the axis."""
+        local = (points - self.frame.translation) @ self.frame.rotation
+        return float(np.hypot(local[:, 0], local[:, 1]).mean())
+
+    def dof(self, weights: np.ndarray | None = None) -> int:
+        kept = (self.weights if weights is None else weights) > 0
+        return int(2 * kept.sum() - (2 if self.prismatic else 4) - 2 * (self.member[kept].any(axis=0)).sum())
+
+    def sigma(self) -> float:
+        """Of one coordinate, mm."""
+        return float(np.sqrt((self.weights[:, None] * self.residuals() ** 2).sum() / max(self.dof(), 1)))
+
+    def huber(self) -> np.ndarray:
+        """(k,) weights by the lengths of the residuals."""
+        length = np.linalg.norm(self.residuals(), axis=1)
+        limit = HUBER * self.robust_sigma(length)
+        return limit / np.maximum(length, limit)
+
+    def robust_sigma(self, length: np.ndarray) -> float:
+        """From the median length of two normal coordinates, σ √(2 ln 2)."""
+        redundancy = self.dof(np.ones(len(length))) / (2 * len(length))
+        return max(float(np.median(length)) / np.sqrt(2 * np.log(2) * redundancy), self.floor)
+
+    def by_points(self) -> np.ndarray:
+        """(k, 2, 3) derivative of the values by the points."""
+        local, axes = self.local(), self.frame.rotation
+        if self.prismatic:
+            return np.broadcast_to(axes[:, :2].T, (len(local), 2, 3))
+        outward = local[:, :2] / np.maximum(np.hypot(local[:, 0], local[:, 1]), TINY)[:, None]
+        return np.stack([outward @ axes[:, :2].T, np.broadcast_to(axes[:, 2], (len(local), 3))], axis=1)
+
+    def by_axis(self) -> np.ndarray:
+        """(k, 2, p) derivative of the residuals by rx, ry, tx, ty of the axis in its own frame."""
+        u, v, w = self.local().T
+        zero = np.zeros_like(u)
+        if self.prismatic:
+            values = np.array([[zero, -w], [w, zero]])
+        else:
+            u1, v1 = np.array([u, v]) / np.maximum(np.hypot(u, v), TINY)
+            values = np.array([[v1 * w, -u1 * w, -u1, -v1], [-v, u, zero, zero]])
+        k = len(u)
+        return self.demean(np.moveaxis(values, 2, 0).reshape(k, -1)).reshape(k, 2, -1)
+
+    def inverse(self) -> np.ndarray:
+        """(p, k, 2) : the step of Gauss and Newton from the residuals."""
+        slope = self.by_axis()
+        k, _, p = slope.shape
+        root = np.repeat(np.sqrt(self.weights), 2)
+        unit = np.array([1 / self.size, 1 / self.size, 1.0, 1.0])[:p]
+        u, s, vt = np.linalg.svd(root[:, None] * slope.reshape(2 * k, p) * unit, full_matrices=False)
+        if s[-1] <= SINGULAR * s[0]:
+            raise DegenerateError(f"{self.where}: its arcs do not determine an axis; {LONGER}")
+        return -(unit[:, None] * (vt.T / s) @ u.T * root).reshape(p, k, 2)
+
+    def descend(self) -> None:
+        """Gauss–Newton with halved steps, the weights being fixed."""
+        for _ in range(ITERATIONS):
+            residuals = self.residuals()
+            before, frame = (self.weights[:, None] * residuals**2).sum(), self.frame
+            step = np.einsum("pkc,kc->p", self.inverse(), residuals)
+            for _ in range(HALVINGS):
+                twist = np.zeros(6)
+                twist[[0, 1]] = step[:2]
+                twist[3 : 1 + len(step)] = step[2:]
+                self.frame = frame @ Rigid.exp(twist)
+                if (self.weights[:, None] * self.residuals() ** 2).sum() <= before + self.floor**2:
+                    break
+                step = step / 2
+            self.centre()
+            if np.linalg.norm(step[:2]) * self.size + np.linalg.norm(step[2:]) <= 10 * self.floor:
+                return
+        raise ConvergenceError(
+            f"{self.where}: the fit of its axis still moves after {ITERATIONS} steps; are these single-joint sweeps?"
+        )
+
+    def centre(self) -> None:
+        """Origin to the foot of the points' centroid."""
+        shift = self.local().mean(axis=0)
+        if not self.prismatic:
+            shift[:2] = 0
+        self.frame = Rigid(self.frame.rotation, self.frame.translation + self.frame.rotation @ shift)
+
+    def gain(self) -> np.ndarray:
+        return np.einsum("pkv,kvc->pkc", self.inverse(), self.by_points())
+
+    def require_known(self) -> None:
+        """Refuse an axis whose σ is beyond what its linear covariance can say."""
+        if not self.prismatic and (self.means()[0] <= NEAR_AXIS * self.sigma()).all():
+            raise DegenerateError(_on_axis(self.where, self.size))
+        sigma = self.sigma() * np.linalg.norm(self.gain(), axis=2)
+        direction, place = np.linalg.norm(sigma[:2]), np.linalg.norm(sigma[2:])
+        if direction > WEAK_RAD or place > WEAK_RAD * self.size * 10:
+            raise DegenerateError(
+                f"{self.where}: σ of the direction of its axis is {np.degrees(direction):.2g}° and of its place "
+                f"{place:.2g} mm, {np.degrees(WEAK_RAD):.1f}° and {WEAK_RAD * self.size * 10:.2g} mm needed; {LONGER}"
+            )
+
+    def orient(self, moved: np.ndarray) -> None:
+        """z along positive motion, and the motion seen against the joint's."""
+        moved, local = moved[self.rows], self.local()
+        if self.prismatic:
+            way = self.demean(np.column_stack([local[:, 2], moved]))
+            turned = (self.weights * way[:, 0]) @ way[:, 1] < 0
+            off = np.abs((-1 if turned else 1) * way[:, 0] - way[:, 1])
+            allowed, unit, shown = MOTION * np.ptp(moved) + GROSS * self.sigma(), "mm", 1.0
+        else:
+            place = local[:, 0] + 1j * local[:, 1]
+            weighted = self.member * self.weights[:, None]
+            with_it, against = ((place * np.exp(-1j * sign * moved)) @ weighted for sign in (1, -1))
+            turned = np.abs(against).sum() > np.abs(with_it).sum()
+            arm = self.member @ (against if turned else with_it)
+            off = np.abs(np.angle(place * np.exp(-1j * (-1 if turned else 1) * moved) * arm.conj()))
+            near = GROSS * self.sigma() / np.maximum(np.abs(place), TINY)
+            allowed, unit, shown = MOTION + near, "°", np.degrees(1.0)
+        wrong = np.flatnonzero((off > allowed) & (self.weights > 0))
+        if len(wrong):
+            raise InputError(
+                f"{self.where}: the motion seen is off its values by up to {off[wrong].max() * shown:.3g} "
+                f"{unit}; check the column's unit, the coupling in the robot file, and that positions and rows match"
+            )
+        if turned:
+            self.frame = Rigid(self.frame.rotation * [1, -1, -1], self.frame.translation)
+
+    def result(self, moved: np.ndarray, near: tuple[Arc, ...]) -> AxisFit:
+        radii, heights = self.means()
+        if self.prismatic:
+            radii, heights = np.full((2, len(self.arcs)), np.nan)
+        return AxisFit(
+            self.arcs[0].joint,
+            self.frame,
+            tuple(self.arcs),
+            radii,
+            heights,
+            near,
+            self.rows,
+            self.residuals(),
+            self.weights,
+            self.gain(),
+            self.sigma(),
+            self.dof(),
+            float(np.ptp(moved[self.rows])),
+        )
+
+
+def _frame(x: np.ndarray, z: np.ndarray) -> np.ndarray:
+    """(3, 3) right-handed axes from two perpendicular ones."""
+    return np.column_stack([x, np.cross(z, x), z])

@@ -1,0 +1,248 @@
+"""The axis method's result for the terminal, for programs, and as a page."""
+
+from html import escape
+
+import numpy as np
+
+import stcal
+from stcal.report.page import AXIS_COLOURS, FAINT, INK, SMALL, calm, new_figure, number, page, plot, swatch, table, uri
+from stcal.robot.axes.fit import AxisFit
+from stcal.robot.axes.model import ROW_VALUES, AxesResult, Pair
+from stcal.robot.axes.sweeps import called
+from stcal.robot.kinematics.file import robot_toml
+
+AXIS_HEADS = ("joint", "arcs", "points", "span", "RMS mm", "mean mm", "length RMS mm", "σ direction µrad", "σ place mm")
+PAIR_HEADS = ("joints", "angle °", "σ °", "distance mm", "σ mm", "D-H a mm", "σ mm", "foot m", "σ m", "row")
+ROW_HEADS = ("joint", "a mm", "alpha °", "d mm", "theta °", "beta °")
+SPREAD_HEADS = ("joints", "distance mm", "D-H a mm")
+
+
+def axes_text(result: AxesResult) -> str:
+    """Tables for the terminal."""
+    lines = ["Axes: residuals as RMS of a coordinate, and as mean and RMS length of the points' vectors"]
+    lines += _aligned(AXIS_HEADS, [_axis_cells(fit) for fit in result.fits])
+    lines += ["", "Pairs of axes: robust distance, and the common normal of Denavit and Hartenberg"]
+    lines += _aligned(PAIR_HEADS, [_pair_cells(pair) for pair in result.pairs])
+    lines += [f"refused D-H value of joints {_names(p)}: {p.refused}" for p in result.pairs if p.refused]
+    lines += ["", f"Leave-one-out: largest less smallest over {len(result.without_one.lines)} rows"]
+    lines += _aligned(SPREAD_HEADS, _spread_cells(result))
+    lines += ["", f"Rows ({result.robot.convention}), ± σ where the axes determine them"]
+    lines += _aligned(ROW_HEADS, _row_cells(result))
+    for name, tool in result.robot.tools.items():
+        x, y, z = tool.translation
+        lines.append(
+            f"{called(name)} on the flange: {x:.4f} {y:.4f} {z:.4f} mm, RMS {result.tool_spread_mm[name]:.3f} mm over "
+            "all rows"
+        )
+    return "\n".join(lines)
+
+
+def _aligned(heads: tuple[str, ...], rows: list[list[str]]) -> list[str]:
+    width = [max(len(row[k]) for row in [heads, *rows]) for k in range(len(heads))]
+    return ["  ".join(cell.rjust(w) for cell, w in zip(row, width, strict=True)) for row in [heads, *rows]]
+
+
+def _axis_cells(fit: AxisFit) -> list[str]:
+    length = fit.lengths()
+    sliding = len(fit.gain) == 2
+    deviation = np.sqrt(np.diag(fit.covariance))
+    return [
+        str(fit.joint + 1),
+        str(len(fit.arcs)),
+        str(len(length)),
+        f"{fit.span:.1f} mm" if sliding else f"{np.degrees(fit.span):.1f}°",
+        f"{_rms(length) / np.sqrt(2):.4f}",
+        f"{length.mean():.4f}",
+        f"{_rms(length):.4f}",
+        f"{1e6 * np.linalg.norm(deviation[:2]):.1f}",
+        "–" if sliding else f"{np.linalg.norm(deviation[2:]):.4f}",
+    ]
+
+
+def _rms(values: np.ndarray) -> float:
+    return float(np.sqrt(np.mean(values**2)))
+
+
+def _names(pair: Pair) -> str:
+    return f"{pair.joint + 1}–{pair.joint + 2}"
+
+
+def _pair_cells(pair: Pair) -> list[str]:
+    metres = [None if v is None else v / 1e3 for v in (pair.foot, pair.foot_sigma)]
+    return [
+        _names(pair),
+        f"{np.degrees(pair.angle):.4f}",
+        f"{np.degrees(pair.angle_sigma):.4f}",
+        number(pair.distance, 4),
+        number(pair.distance_sigma, 4),
+        number(pair.normal, 4),
+        number(pair.normal_sigma, 4),
+        number(metres[0], 4),
+        number(metres[1], 5),
+        ("Hayati β" if pair.parallel else "D-H") + (", D-H refused" if pair.parallel and pair.refused else ""),
+    ]
+
+
+def _spread_cells(result: AxesResult) -> list[list[str]]:
+    distance, normal = (result.without_one.spread(name) for name in ("distance", "normal"))
+    return [[_names(p), number(distance[p.joint], 4), number(normal[p.joint], 4)] for p in result.pairs]
+
+
+def _row_cells(result: AxesResult) -> list[list[str]]:
+    rows = []
+    for i, (row, sigma) in enumerate(zip(result.robot.rows, result.row_sigma, strict=True)):
+        cells = [str(i + 1)]
+        for key, deviation in zip(ROW_VALUES, sigma, strict=True):
+            value = getattr(row, key)
+            if key not in ("a", "d"):
+                value, deviation = np.degrees(value), np.degrees(deviation)
+            cells.append(f"{value:.4f}" + (f" ± {deviation:.4f}" if deviation > 0 else ""))
+        rows.append(cells)
+    return rows
+
+
+def axes_json(result: AxesResult) -> dict:
+    """Everything as plain values: mm, rad; None where there is no value."""
+    distance, normal = (result.without_one.spread(name) for name in ("distance", "normal"))
+    return {
+        "format": "stcal axes 1",
+        "version": stcal.__version__,
+        "robot": robot_toml(result.robot),
+        "axes": [_axis_json(fit) for fit in result.fits],
+        "covariance": result.covariance.tolist(),
+        "rows": [
+            {f"{key}{_unit(key)}": getattr(row, key) for key in ROW_VALUES}
+            | {f"{key}_sigma{_unit(key)}": float(s) for key, s in zip(ROW_VALUES, sigma, strict=True)}
+            for row, sigma in zip(result.robot.rows, result.row_sigma, strict=True)
+        ],
+        "targets": {
+            name: {"xyz_flange_mm": tool.translation.tolist(), "rms_mm": result.tool_spread_mm[name]}
+            for name, tool in result.robot.tools.items()
+        },
+        "pairs": [
+            _pair_json(pair)
+            | {
+                "leave_one_out_distance_spread_mm": _known(distance[pair.joint]),
+                "leave_one_out_normal_spread_mm": _known(normal[pair.joint]),
+            }
+            for pair in result.pairs
+        ],
+        "leave_one_out": {
+            "lines": list(result.without_one.lines),
+            "distance_mm": [[_known(v) for v in row] for row in result.without_one.distance],
+            "normal_mm": [[_known(v) for v in row] for row in result.without_one.normal],
+        },
+        "notes": list(result.notes),
+    }
+
+
+def _unit(key: str) -> str:
+    return "_mm" if key in ("a", "d") else "_rad"
+
+
+def _known(value: float) -> float | None:
+    return float(value) if np.isfinite(value) else None
+
+
+def _axis_json(fit: AxisFit) -> dict:
+    length = fit.lengths()
+    return {
+        "joint": fit.joint + 1,
+        "direction": fit.world_from_axis.rotation[:, 2].tolist(),
+        "point_mm": fit.world_from_axis.translation.tolist(),
+        "world_from_axis": fit.world_from_axis.matrix().tolist(),
+        "covariance": fit.covariance.tolist(),
+        "residual_rms_mm": _rms(length) / np.sqrt(2),
+        "residual_length_mean_mm": float(length.mean()),
+        "residual_length_rms_mm": _rms(length),
+        "sigma_mm": fit.sigma_mm,
+        "dof": fit.dof,
+        "span_mm" if len(fit.gain) == 2 else "span_rad": fit.span,
+        "arcs": [
+            {"target": arc.target, "points": len(arc.rows), "radius_mm": _known(r), "height_mm": _known(h)}
+            for arc, r, h in zip(fit.arcs, fit.radii, fit.heights, strict=True)
+        ],
+    }
+
+
+def _pair_json(pair: Pair) -> dict:
+    return {
+        "joints": [pair.joint + 1, pair.joint + 2],
+        "angle_rad": pair.angle,
+        "angle_sigma_rad": pair.angle_sigma,
+        "hayati": pair.parallel,
+        "distance_mm": pair.distance,
+        "distance_sigma_mm": pair.distance_sigma,
+        "normal_mm": pair.normal,
+        "normal_sigma_mm": pair.normal_sigma,
+        "foot_mm": pair.foot,
+        "foot_sigma_mm": pair.foot_sigma,
+        "refused": pair.refused,
+    }
+
+
+def axes_page(result: AxesResult, where: str) -> str:
+    """The report of ``axes``."""
+    banner = f'<h1>Axes of {escape(result.robot.name)}</h1><p class="counts">{escape(where)}</p>\n'
+    refused = "".join(
+        f'<p class="alarm">D-H value of joints {_names(p)} refused: {escape(p.refused)}.</p>\n'
+        for p in result.pairs
+        if p.refused
+    )
+    tools = [
+        [called(name), *(number(v, 4) for v in tool.translation), number(result.tool_spread_mm[name], 3)]
+        for name, tool in result.robot.tools.items()
+    ]
+    heads = list(AXIS_HEADS)
+    axes = table(heads, [_axis_cells(f) for f in result.fits], [("", 4), ("residuals", 3), ("uncertainty", 2)])
+    over = [("", 3), ("robust", 2), ("common normal", 4), ("", 1)]
+    pairs = table(list(PAIR_HEADS), [_pair_cells(p) for p in result.pairs], over)
+    without = (
+        f"<p>Largest less smallest value when each of {len(result.without_one.lines)} rows (with its reflectors) is "
+        "left out.</p>\n" + table(list(SPREAD_HEADS), _spread_cells(result))
+    )
+    robot = (
+        table(list(ROW_HEADS), _row_cells(result))
+        + "<p>σ where the axes determine the value; the others are kept from the robot file.</p>\n"
+        + table(["<on the flange", "x mm", "y mm", "z mm", "RMS over all rows mm"], tools)
+    )
+    sections = [
+        ("axes", "Axes", AXIS_TEXT + axes + _residuals(result)),
+        ("pairs", "Pairs of axes", refused + pairs + PAIR_TEXT),
+        ("leave-one-out", "Leave-one-out", without),
+        ("robot", "Robot", robot),
+    ]
+    notes = "".join(f"<li>{escape(note)}</li>" for note in result.notes)
+    if notes:
+        sections.append(("notes", "Left out", f"<ul>{notes}</ul>\n"))
+    return page(f"Axes of {result.robot.name}", banner, sections)
+
+
+AXIS_TEXT = (
+    "<p>One fit for each joint over all arcs of all reflectors. Residuals: RMS of a coordinate (radial, axial), mean "
+    "and RMS length of the points' vectors.</p>\n"
+)
+PAIR_TEXT = (
+    "<p>Distance: of nearly parallel axes in the plane across the first that its row in the robot has (Hayati), of "
+    "others along their common normal. Foot: of the common normal, along the first axis from where that was measured."
+    "</p>\n"
+)
+
+
+def _residuals(result: AxesResult) -> str:
+    figure = new_figure(7.5, 2.9)
+    axes = figure.add_axes((0.09, 0.17, 0.89, 0.78))
+    for fit in result.fits:
+        used = fit.residuals[fit.weights > 0]
+        beside = np.linspace(-0.3, 0.3, len(used)) if len(used) > 1 else np.zeros(1)
+        for k in range(2):
+            axes.plot(fit.joint + 1 + beside, used[:, k], "o", ms=2.4, color=AXIS_COLOURS[2 * k], mew=0)
+    axes.set_xticks(range(1, len(result.fits) + 1))
+    axes.axhline(0, color=INK, lw=0.6)
+    calm(axes)
+    axes.grid(axis="y", color=FAINT, lw=0.6)
+    axes.set_axisbelow(True)
+    axes.set_xlabel("joint", fontsize=SMALL + 1, color=INK)
+    axes.set_ylabel("residual, mm", fontsize=SMALL + 1, color=INK)
+    caption = f"{swatch('radial', AXIS_COLOURS[0])} {swatch('axial', AXIS_COLOURS[2])} (both across, if prismatic)"
+    return plot(uri(figure), "residuals of each joint's points", caption + ", reflector by reflector", "wide")

@@ -1,0 +1,1 @@
+"""Kinematic parameters from poses, positions or distances."""

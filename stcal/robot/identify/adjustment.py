@@ -1,0 +1,221 @@
+"""Trust-region least squares over the minimal parameters of a robot, robust; what the data determine told apart."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+
+import numpy as np
+from scipy.special import chdtri
+
+from stcal.errors import ConvergenceError
+from stcal.robot.identify.residuals import WIDTH, Kind, Observed, State, jacobian, moved, residuals
+
+MAX_STEPS = 100
+SETTLED = 1e-10
+"""Relative fall of the cost below which nothing is gained."""
+HUBER_LEVEL = 0.999
+"""One honest observation in a thousand weighs less than one."""
+USELESS_MM = 50.0
+"""A direction (1 mm, or the turn that moves the tool by 1 mm) with a larger σ is not determined: the nominal is better.
+All parameters are held to where they start by this σ, which nothing feels that is determined."""
+ACCEPTED = 1e-4
+"""In units of σ²: what a step may still gain when there have been enough. Along a flat direction, where Huber's weights
+make every step half as long as it should be, they are many and short."""
+STAYS_MM = 1e-3
+"""σ of a movement that the observations never show."""
+LEAST_GAIN = 1e-9
+"""In units of σ²: what measurements without noise still gain by rounding."""
+
+
+@dataclass(frozen=True, slots=True)
+class Weighting:
+    """σ of one coordinate; the covariances that came with the measurements in place of both where ``given``; times
+    ``factor``. ``estimated`` : which of ``"mm"``, ``"rad"``, ``"factor"`` the residuals tell."""
+
+    sigma_mm: float
+    sigma_rad: float
+    given: bool = False
+    factor: float = 1.0
+    estimated: tuple[str, ...] = ()
+
+    def whiten(self, values: np.ndarray, seen: Observed) -> np.ndarray:
+        """Residuals (r, w) or derivatives (r, w, k) of ``seen`` in units of σ."""
+        flat = values.ndim == 2
+        values = values[..., None] if flat else values
+        width = values.shape[1]
+        if self.given and width > 1:
+            root = self.factor * np.linalg.cholesky(seen.data.own_covariance()[:, -width:, -width:])
+            values = np.linalg.solve(root, values)
+            if seen.data.common is not None:
+                values = _decorrelated(values, np.linalg.solve(root, seen.data.common[:, -width:]))
+        else:
+            sigma = self.factor * np.array([self.sigma_rad] * 3 + [self.sigma_mm] * 3)
+            values = values / sigma[-width:, None]
+        return values[..., 0] if flat else values
+
+    def columns(self, width: int) -> dict[str, slice]:
+        """Which of the ``width`` coordinates each σ is of."""
+        if "factor" in self.estimated:
+            return {"factor": slice(None)}
+        return {"rad": slice(0, 3), "mm": slice(3, 6)} if width == 6 else {"mm": slice(None)}
+
+    def value(self, name: str) -> float:
+        """Of σ ``name``."""
+        return {"mm": self.sigma_mm, "rad": self.sigma_rad, "factor": self.factor}[name]
+
+    def with_values(self, found: Mapping[str, float]) -> "Weighting":
+        """With other σ."""
+        new = {name: found.get(name, self.value(name)) for name in ("mm", "rad", "factor")}
+        return replace(self, sigma_mm=new["mm"], sigma_rad=new["rad"], factor=new["factor"])
+
+
+def _decorrelated(values: np.ndarray, common: np.ndarray) -> np.ndarray:
+    """Values (r, w, k), all of σ 1 but for common errors (r, w, c), times the inverse root of their covariance
+    1 + F Fᵀ, F being ``common`` with its rows stacked: what all observations may have in common counts less."""
+    f = common.reshape(-1, common.shape[2])
+    size, directions = np.linalg.eigh(f.T @ f)
+    size, directions = size[size > 0], directions[:, size > 0]
+    u = f @ directions / np.sqrt(size)
+    flat = values.reshape(len(f), -1)
+    return (flat - u * (1 - 1 / np.sqrt(1 + size)) @ (u.T @ flat)).reshape(values.shape)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Held:
+    """Knowledge from elsewhere, linear about a state: ``value + slope @ step``, (p,), is 0 with σ ``sigma``, (p,)."""
+
+    value: np.ndarray
+    slope: np.ndarray
+    sigma: np.ndarray
+
+    def normal(self) -> np.ndarray:
+        """(k, k)"""
+        return (self.slope.T / self.sigma**2) @ self.slope
+
+    def pull(self) -> np.ndarray:
+        """(k,) half the gradient of the squares."""
+        return (self.slope.T / self.sigma**2) @ self.value
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Solution:
+    """``state`` : adjusted; ``residuals`` : (r, w) rad, mm; ``weights`` : (r,) Huber's; ``normal`` : (k, k) whitened
+    and weighted, of the observations alone; ``prior`` : (k, k) of what was held; ``units`` : (k,) that make each
+    parameter a movement of the tool of about 1 mm; ``cost`` : Huber's."""
+
+    state: State
+    residuals: np.ndarray
+    weights: np.ndarray
+    normal: np.ndarray
+    units: np.ndarray
+    cost: float
+    prior: np.ndarray
+
+    def spectrum(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Eigenvalues (k,), directions (k, k) in columns, and which are determined by the data (k,)."""
+        values, directions = np.linalg.eigh(self.normal * self.units[:, None] * self.units)
+        return values, directions, values > 1 / USELESS_MM**2
+
+    def rank(self) -> int:
+        """Directions that the data determine."""
+        return int(self.spectrum()[2].sum())
+
+    def inverse(self) -> np.ndarray:
+        """(k, k) covariance of the parameters at unit weight."""
+        scaled = (self.normal + self.prior) * self.units[:, None] * self.units
+        return np.linalg.inv(scaled) * self.units[:, None] * self.units
+
+
+def solve(
+    state: State, seen: Observed, weighting: Weighting, robust: bool = True, held: Held | None = None
+) -> Solution:
+    """Minimise the observations' whitened residuals from ``state``, where ``held`` is linear.
+
+    Levenberg's damping by the ratio of actual to predicted gain (Moré 1978); parameters are small motions about the
+    present state, so that no representation is ever singular.
+
+    Raises
+    ------
+    ConvergenceError
+        No minimum is reached.
+    """
+    limit = huber_limit(seen.kind) if robust else np.inf
+    solution, gradient = _linearised(state, seen, weighting, limit)
+    hold, pull = _fixed(solution, seen.kind), np.zeros(len(solution.units))
+    if held is not None:
+        hold, pull = hold + held.normal(), held.pull()
+    away, damping = np.zeros(len(hold)), 1e-3
+    for _ in range(MAX_STEPS):
+        normal, slope = solution.normal + hold, gradient - hold @ away - pull
+        cost = solution.cost + away @ (hold @ away + 2 * pull)
+        scale = np.diag(normal)
+        while True:
+            step = np.linalg.solve(normal + damping * np.diag(scale), slope)
+            trial = moved(solution.state, step, seen.kind)
+            there = away + step
+            trial_cost = _cost(residuals(trial, seen), seen, weighting, limit) + there @ (hold @ there + 2 * pull)
+            gain, predicted = cost - trial_cost, 2 * slope @ step - step @ normal @ step
+            if gain >= 0.1 * predicted or predicted <= SETTLED * abs(cost) + LEAST_GAIN or damping > 1e12:
+                break
+            damping *= 10
+        if gain <= SETTLED * abs(cost) + LEAST_GAIN:
+            last = _linearised(trial, seen, weighting, limit)[0] if gain > 0 else solution
+            return replace(last, prior=hold)
+        damping = max(damping / 10, 1e-12) if gain > 0.5 * predicted else damping
+        away = there
+        solution, gradient = _linearised(trial, seen, weighting, limit)
+    if gain < ACCEPTED:
+        return replace(solution, prior=hold)
+    raise ConvergenceError(
+        f"{seen.data.where}: identification still gains after {MAX_STEPS} steps; check the robot file and the outliers"
+    )
+
+
+def unseen(kind: Kind) -> int:
+    """Directions that this kind of observation never shows: where the instrument stands."""
+    return 6 if kind == "distance" else 0
+
+
+def _fixed(solution: Solution, kind: Kind) -> np.ndarray:
+    """(k, k) what keeps parameters where they start: hardly at all, but what is never seen does not drift."""
+    blind = solution.spectrum()[1][:, : unseen(kind)]
+    fixed = np.eye(len(blind)) / USELESS_MM**2 + blind @ blind.T / STAYS_MM**2
+    return fixed / solution.units[:, None] / solution.units
+
+
+def huber_limit(kind: Kind) -> float:
+    """Length of an observation's whitened residual beyond which it weighs less."""
+    return float(np.sqrt(chdtri(WIDTH[kind], 1 - HUBER_LEVEL)))
+
+
+def normal_rank(state: State, seen: Observed, weighting: Weighting) -> int:
+    """How many parameters these observations determine, at the state where they would be exact."""
+    return _linearised(state, seen, weighting, np.inf)[0].rank()
+
+
+def _linearised(state: State, seen: Observed, weighting: Weighting, limit: float) -> tuple[Solution, np.ndarray]:
+    """State with its normal matrix, and the gradient (k,)."""
+    found, derivative = residuals(state, seen), jacobian(state, seen)
+    units = parameter_units(derivative)
+    white, slope = weighting.whiten(found, seen), weighting.whiten(derivative, seen)
+    weights = np.minimum(1.0, limit / np.maximum(np.linalg.norm(white, axis=1), 1e-300))
+    flat = slope.reshape(-1, slope.shape[2])
+    weighted = flat * np.repeat(weights, white.shape[1])[:, None]
+    cost = _cost(found, seen, weighting, limit)
+    normal = weighted.T @ flat
+    return Solution(state, found, weights, normal, units, cost, np.zeros_like(normal)), weighted.T @ white.ravel()
+
+
+def parameter_units(derivative: np.ndarray) -> np.ndarray:
+    """Of each parameter, what moves the tool by 1 mm RMS at most; 1 for what moves nothing."""
+    lengths = derivative[:, -3:] if derivative.shape[1] > 1 else derivative
+    moves = np.sqrt((lengths**2).sum(1).mean(0))
+    turns = np.sqrt((derivative[:, :3] ** 2).sum(1).mean(0)) if derivative.shape[1] == 6 else np.zeros(len(moves))
+    moves = np.where(moves > 1e-9, moves, turns)  # the tool's orientation moves no point
+    return np.where(moves > 1e-9, 1 / np.maximum(moves, 1e-9), 1.0)
+
+
+def _cost(found: np.ndarray, seen: Observed, weighting: Weighting, limit: float) -> float:
+    length = np.linalg.norm(weighting.whiten(found, seen), axis=1)
+    inside = np.minimum(length, limit)
+    beyond = length - inside
+    return float((inside**2).sum() + (2 * limit * beyond.sum() if beyond.any() else 0.0))

@@ -1,0 +1,248 @@
+"""What an identification found, as text, JSON and page."""
+
+from html import escape
+
+import numpy as np
+
+from stcal.report.page import COLOURS, NONE, calm, fold, new_figure, number, page, plot, table, uri
+from stcal.robot.identify.nominal import dh_values
+from stcal.robot.identify.observability import MEANING
+from stcal.robot.identify.solve import Identified
+from stcal.robot.kinematics.model import Robot
+
+DH = ("a", "alpha", "d", "theta", "beta")
+UNITS = ("mm", "deg", "mm", "deg", "deg")
+SHOWN = np.array([1.0, 180 / np.pi, 1.0, 180 / np.pi, 180 / np.pi])
+FIRST_OUTLIERS = 10
+
+
+def identified_text(result: Identified, nominal: Robot) -> str:
+    """Tables for the terminal."""
+    kinds = ", ".join(f"{k}s {v}" for k, v in result.ranks.items())
+    lines = [
+        f"robot {nominal.name}: {_observations(result)}, {result.rank} parameters determined "
+        f"(what these joint values determine: {kinds})",
+        _noise(result),
+        "",
+        f"{'error, mm':<34}{'mean':>9}{'RMS':>9}{'max':>9}",
+    ]
+    for name, errors in _errors(result).items():
+        mean, rms, largest = _statistics(errors)
+        lines.append(f"{name:<34}{mean:9.4f}{rms:9.4f}{largest:9.4f}")
+    lines += ["", " joint" + "".join(f"{f'{n} {u}':>13}{'±':>9}" for n, u in zip(DH, UNITS, strict=True))]
+    values, sigma = dh_values(result.robot) * SHOWN, result.dh_sigma * SHOWN
+    for i, (row, s) in enumerate(zip(values, sigma, strict=True), 1):
+        cells = "".join(f"{v:13.4f}{_sigma(e):>9}" for v, e in zip(row, s, strict=True))
+        lines.append(f"{i:>6}{cells}")
+    lines += [
+        "",
+        f"{'mm and rotation vector, deg':<34}" + "".join(f"{c:>11}" for c in ("x", "y", "z", "rx", "ry", "rz")),
+    ]
+    for name, pose in _placed(result.robot).items():
+        lines.append(f"{name:<34}" + "".join(f"{v:11.4f}" for v in pose))
+    indices = result.observability.values()
+    lines += ["", "observability  " + "   ".join(f"{name} {value:.3g}" for name, value in indices.items())]
+    outliers = result.outliers()
+    if outliers:
+        lines.append(f"outliers, of less than half weight: {len(outliers)}")
+        lines += [f"  {_place(result, row)}: {error:.3f} mm" for row, error in outliers[:FIRST_OUTLIERS]]
+    if result.undetermined:
+        lines.append(f"kept nominal, as the data leave it open: {', '.join(result.undetermined)}")
+    lines += [f"note: {note}" for note in result.notes]
+    return "\n".join(lines)
+
+
+def identified_json(result: Identified, nominal: Robot) -> dict:
+    """Everything, for programs (keys: ``data_layout.md``)."""
+    values, before = dh_values(result.robot), dh_values(nominal)
+    held = result.held_out
+    content = {
+        "format": "stcal identified 1",
+        "robot": nominal.name,
+        "observed": result.seen.used,
+        "observations": len(result.seen),
+        "rank": result.rank,
+        "parameters": len(result.names),
+        "ranks": result.ranks,
+        "undetermined": list(result.undetermined),
+        "notes": list(result.notes),
+        "sigma_mm": None if result.weighting.given else result.weighting.sigma_mm,
+        "sigma_rad": result.weighting.sigma_rad if result.seen.kind == "pose" and not result.weighting.given else None,
+        "sigma0": result.sigma0,
+        "deviations": result.deviations,
+        "errors": {
+            key: dict(zip(("mean_mm", "rms_mm", "max_mm"), _statistics(errors), strict=True))
+            for key, errors in zip(("nominal", "identified"), list(_errors(result).values())[:2], strict=True)
+        },
+        "held_out": None,
+        "observability": result.observability.values(),
+        "rows": [
+            {name: {"nominal": b, "identified": v, "sigma": s} for name, b, v, s in zip(DH, *each, strict=True)}
+            for each in zip(before.tolist(), values.tolist(), result.dh_sigma.tolist(), strict=True)
+        ],
+        "parameter_names": list(result.names),
+        "covariance": result.covariance.tolist(),
+        "residuals": [
+            {"line": _line(result, i), "error_mm": float(e), "weight": float(w)}
+            for i, (e, w) in enumerate(zip(result.fitted_mm, result.weights, strict=True))
+        ],
+        "outliers": [
+            {"line": _line(result, i), "place": _place(result, i), "error_mm": error} for i, error in result.outliers()
+        ],
+    }
+    if held is not None:
+        mean, rms, largest = _statistics(held.position_mm)
+        content["held_out"] = {
+            "folds": held.folds,
+            "repeats": len(held.position_mm),
+            "mean_mm": mean,
+            "rms_mm": rms,
+            "max_mm": largest,
+            "mean_deg": float(np.degrees(np.nanmean(held.rotation_rad))) if result.seen.kind == "pose" else None,
+        }
+    return content
+
+
+def identified_page(result: Identified, nominal: Robot) -> str:
+    """The report page."""
+    title = f"{nominal.name}: identified"
+    seen = result.seen
+    counts = f"{_observations(result)} from {seen.data.where}, {result.rank} parameters determined"
+    banner = f'<h1>{escape(title)}</h1>\n<p class="counts">{escape(counts)}</p>\n'
+    banner += "".join(f"<p>{escape(note)}</p>\n" for note in result.notes)
+    errors = [[name, *(number(v, 4) for v in _statistics(e))] for name, e in _errors(result).items()]
+    facts = [[name, f"{value:.4g}", MEANING[name]] for name, value in result.observability.values().items()]
+    accuracy = (
+        table(["<Error", "Mean (mm)", "RMS (mm)", "Max (mm)"], errors)
+        + f"<p>{escape(_noise(result))}. Held out: rows that took no part in the fit that they judge.</p>\n"
+        + plot(uri(_figure(result)), "Errors by row", "Error by observation; held out: mean over the divisions", "wide")
+    )
+    sections = [
+        ("accuracy", "Accuracy", accuracy),
+        ("rows", "Denavit–Hartenberg rows", _rows(result, nominal) + _places(result.robot)),
+        (
+            "determined",
+            "What the data determine",
+            _determined(result) + table(["<Index", "Value (1/mm, O2: none)", "<"], facts),
+        ),
+        ("outliers", "Outliers", _outliers(result)),
+    ]
+    return page(title, banner, sections)
+
+
+def _placed(robot: Robot) -> dict[str, np.ndarray]:
+    """Base and tools: translation, mm, and rotation vector, deg, (6,)."""
+    poses = {"base in the instrument's frame": robot.world_from_base}
+    poses |= {f"tool {name} in the flange's frame".replace("  ", " "): tool for name, tool in robot.tools.items()}
+    return {name: np.append(pose.translation, np.degrees(pose.log()[:3])) for name, pose in poses.items()}
+
+
+def _places(robot: Robot) -> str:
+    rows = [[name, *(number(v, 4) for v in pose)] for name, pose in _placed(robot).items()]
+    heads = ["<", "x mm", "y mm", "z mm", "rotation vector x °", "y °", "z °"]
+    return "<h3>Base and tools</h3>\n" + table(heads, rows)
+
+
+def _rows(result: Identified, nominal: Robot) -> str:
+    values, before, sigma = dh_values(result.robot) * SHOWN, dh_values(nominal) * SHOWN, result.dh_sigma * SHOWN
+    text = f"<p>Convention {result.robot.convention}. β (Hayati) where axes are nearly parallel; d is then kept.</p>\n"
+    for unit in dict.fromkeys(UNITS):
+        kinds = [k for k in range(5) if UNITS[k] == unit]
+        lines = []
+        for i in range(len(values)):
+            cells = []
+            for k in kinds:
+                change = NONE if sigma[i, k] == 0 else number(values[i, k] - before[i, k], 4)
+                cells += [number(values[i, k], 4), change, _sigma(sigma[i, k])]
+            lines.append([str(i + 1), *cells])
+        heads = ["<Joint", *["value", "change", "σ"] * len(kinds)]
+        text += table(heads, lines, [("", 1), *[(f"{DH[k]} ({unit})", 3) for k in kinds]])
+    return text
+
+
+def _determined(result: Identified) -> str:
+    kinds = ", ".join(f"{kind}s {rank}" for kind, rank in result.ranks.items())
+    text = f"<p>{result.rank} of {len(result.names)} parameters. These joint values determine: {escape(kinds)}.</p>\n"
+    if result.undetermined:
+        text += f"<p>Kept nominal, as the data leave it open: {escape(', '.join(result.undetermined))}.</p>\n"
+    sigma = np.sqrt(np.diag(result.covariance))
+    rows = [
+        [name, f"{1000 * np.degrees(s):.3f} mdeg" if " r" in name else f"{1000 * s:.1f} µm"]
+        for name, s in zip(result.names, sigma, strict=True)
+    ]
+    return text + fold("σ of the minimal parameters", table(["<Parameter", "σ"], rows))
+
+
+def _outliers(result: Identified) -> str:
+    rows = [[_place(result, i), number(error, 3), number(result.weights[i], 2)] for i, error in result.outliers()]
+    return table(["<Where", "Error (mm)", "Weight"], rows) if rows else "<p>None.</p>\n"
+
+
+def _figure(result: Identified):
+    figure = new_figure(9, 2.6)
+    axes = figure.add_subplot()
+    rows = np.arange(1, len(result.seen) + 1)
+    size = 4 if len(rows) <= 200 else 1.5
+    axes.plot(rows, result.fitted_mm, "o", color=COLOURS[0], ms=size, mew=0, label="identified")
+    if result.held_out is not None:
+        errors = _by_row(result.held_out.position_mm)
+        axes.plot(rows, errors, "_", color=COLOURS[1], ms=size * 2, mew=1.6, label="held out")
+    axes.set_xlabel("observation", fontsize=8)
+    axes.set_ylabel("error, mm", fontsize=8)
+    axes.set_ylim(bottom=0)
+    axes.legend(fontsize=7.5, frameon=False, ncols=2, loc="upper right", bbox_to_anchor=(1, 1.15))
+    calm(axes)
+    figure.subplots_adjust(left=0.07, right=0.99, bottom=0.18, top=0.92)
+    return figure
+
+
+def _by_row(values: np.ndarray) -> np.ndarray:
+    seen = np.isfinite(values)
+    return np.where(seen, values, 0).sum(0) / np.where(seen.any(0), seen.sum(0), np.nan)
+
+
+def _errors(result: Identified) -> dict[str, np.ndarray]:
+    found = {"nominal axes, base and tool fitted": result.nominal_mm, "identified, the same rows": result.fitted_mm}
+    if result.held_out is not None:
+        found[f"held out, {result.held_out.folds} folds"] = result.held_out.position_mm
+    return found
+
+
+def _statistics(errors: np.ndarray) -> tuple[float, float, float]:
+    return float(np.nanmean(errors)), float(np.sqrt(np.nanmean(errors**2))), float(np.nanmax(errors))
+
+
+def _noise(result: Identified) -> str:
+    weighting = result.weighting
+    if weighting.given:
+        noise = f"weights from the covariances given, σ₀ {result.sigma0:.2f}"
+    else:
+        rotation = f", {np.degrees(weighting.sigma_rad):.2g}°" if result.seen.kind == "pose" else ""
+        noise = f"σ of a coordinate {weighting.sigma_mm:.3g} mm{rotation}, σ₀ {result.sigma0:.2f}"
+    degrees = np.degrees(1.0)
+    kinds = ((" mm in lengths", 1.0), ("° in twists", degrees), ("° in zero positions", degrees))
+    found = [(s, *kind) for s, kind in zip(result.deviations.values(), kinds, strict=True) if s is not None]
+    shown = ", ".join(f"{sigma * unit:.2g}{what}" for sigma, what, unit in found)
+    return f"{noise}; the robot differs from nominal by σ of {shown}" if shown else noise
+
+
+def _sigma(value: float) -> str:
+    return "" if value == 0 else f"{value:.4f}"
+
+
+def _observations(result: Identified) -> str:
+    """How many of what."""
+    seen = result.seen
+    return f"{len(seen)} {seen.kind}s" + (" by their distances" if seen.frameless else "")
+
+
+def _line(result: Identified, row: int) -> int:
+    return int(result.seen.data.lines[result.seen.first[row]])
+
+
+def _place(result: Identified, row: int) -> str:
+    seen = result.seen
+    if seen.kind == "distance":
+        return f"lines {seen.data.lines[seen.second[row]]} – {seen.data.lines[seen.first[row]]}"
+    target = seen.data.targets[row]
+    return f"line {seen.data.lines[row]}" + (f", target {target}" if target else "")

@@ -1,0 +1,156 @@
+"""What measurements say about a robot: residuals, and their derivatives by the minimal parameters."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import Literal
+
+import numpy as np
+
+from stcal.errors import InputError
+from stcal.geometry.rigid import Poses, Rigid
+from stcal.robot.kinematics.forward import chain_jacobian, chain_parameters, flange_poses, moved_chain
+from stcal.robot.kinematics.measurements import Measurements
+from stcal.robot.kinematics.model import Chain
+
+Kind = Literal["pose", "position", "distance"]
+WIDTH = {"pose": 6, "position": 3, "distance": 1}
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class State:
+    """What is identified: the chain, and flange_from_tool by target."""
+
+    chain: Chain
+    tools: dict[str, Rigid]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Observed:
+    """Measurements as one kind of observation.
+
+    ``first``, ``second`` : (r,) rows of the measurements that each observation is about; equal but for distances.
+    ``values`` : (r,) distances, mm, else empty. ``frameless`` : positions of which only the distances are used. All
+    distances of m points hold what the points hold but a motion of all of them; so these are positions in a frame of
+    their own, whose place is identified with the rest, and not counted.
+    """
+
+    kind: Kind
+    data: Measurements
+    first: np.ndarray
+    second: np.ndarray
+    values: np.ndarray
+    frameless: bool = False
+
+    def __len__(self) -> int:
+        return len(self.first)
+
+    @property
+    def used(self) -> Kind:
+        """What of the measurements is used."""
+        return "distance" if self.frameless else self.kind
+
+
+def tool_width(kind: Kind) -> int:
+    """Parameters of each tool: orientation is seen in poses only."""
+    return 6 if kind == "pose" else 3
+
+
+def unknowns(robot_chain: Chain, targets: int, kind: Kind) -> int:
+    """Number of parameters."""
+    return len(chain_parameters(robot_chain)) + tool_width(kind) * targets
+
+
+def observed(data: Measurements, kind: Kind | None = None) -> Observed:
+    """The measurements as ``kind``, or as the most that they hold.
+
+    Raises
+    ------
+    InputError
+        They do not hold it.
+    """
+    held = "distance" if data.distances is not None else "position" if data.rotations is None else "pose"
+    kind = kind or held
+    if WIDTH[kind] > WIDTH[held]:
+        raise InputError(f"{data.where}: {held}s were measured, {kind}s cannot be had from them")
+    rows, none = np.arange(len(data)), np.zeros(0)
+    if kind != "distance":
+        return Observed(kind, data, rows, rows, none)
+    if held == "distance":
+        real = rows[data.from_row != rows]
+        return Observed(kind, data, real, data.from_row[real], data.distances[real])
+    return Observed("position", data, rows, rows, none, frameless=True)
+
+
+def parameter_names(state: State, kind: Kind) -> list[str]:
+    """``J2 rx`` … of the axes and ``tool x`` … of the tools; r in rad, the others in mm."""
+    component = ("rx", "ry", "rz", "x", "y", "z")
+    tool = component if kind == "pose" else component[3:]
+    names = [f"J{i + 1} {component[c]}" for i, c in chain_parameters(state.chain)]
+    return names + [f"tool {name} {c}".replace("  ", " ") for name in state.tools for c in tool]
+
+
+def tips(state: State, q: np.ndarray, targets: Sequence[str]) -> Poses:
+    """world_from_tool at joint vectors (m, n), with the tool of each."""
+    place = {name: i for i, name in enumerate(state.tools)}
+    tool = Poses.of(state.tools.values())
+    return flange_poses(state.chain, q) @ tool[[place[t] for t in targets]]
+
+
+def residuals(state: State, seen: Observed) -> np.ndarray:
+    """Measured minus modelled, (r, 6), (r, 3) or (r, 1): rad and mm in the world's axes."""
+    tip = tips(state, seen.data.q, seen.data.targets)
+    if seen.kind == "pose":
+        return seen.data.poses().difference(tip)
+    if seen.kind == "position":
+        return seen.data.positions - tip.translation
+    apart = tip.translation[seen.first] - tip.translation[seen.second]
+    return (seen.values - np.linalg.norm(apart, axis=1))[:, None]
+
+
+def jacobian(state: State, seen: Observed) -> np.ndarray:
+    """Derivative of what the model says by :func:`parameter_names`, (r, 6 or 3 or 1, k)."""
+    tip, full = tip_jacobian(state, seen.data.q, seen.data.targets, seen.kind)
+    if seen.kind == "pose":
+        return full
+    if seen.kind == "position":
+        return full[:, 3:]
+    apart = tip.translation[seen.first] - tip.translation[seen.second]
+    unit = apart / np.maximum(np.linalg.norm(apart, axis=1), 1e-12)[:, None]
+    return np.einsum("ri,rik->rk", unit, full[seen.first, 3:] - full[seen.second, 3:])[:, None]
+
+
+def tip_jacobian(state: State, q: np.ndarray, targets: Sequence[str], kind: Kind) -> tuple[Poses, np.ndarray]:
+    """world_from_tool at joint vectors (m, n), and its derivative (m, 6, k) by :func:`parameter_names`: rotation (rad)
+    over translation (mm), in the world's axes."""
+    tip = tips(state, q, targets)
+    width = tool_width(kind)
+    by_axes = chain_jacobian(state.chain, q, tip)
+    by_tools = np.zeros((len(tip), 6, width * len(state.tools)))
+    targets = np.array(targets)
+    for t, name in enumerate(state.tools):
+        rows, place = targets == name, width * t
+        if width == 6:
+            by_tools[rows, :3, place : place + 3] = tip.rotation[rows]
+            place += 3
+        by_tools[rows, 3:, place : place + 3] = tip.rotation[rows]
+    return tip, np.concatenate([by_axes, by_tools], axis=2)
+
+
+def moved(state: State, step: np.ndarray, kind: Kind) -> State:
+    """The state after small motions along the parameters, (k,)."""
+    k = len(chain_parameters(state.chain))
+    width = tool_width(kind)
+    tools = {}
+    for t, (name, tool) in enumerate(state.tools.items()):
+        own = step[k + width * t : k + width * (t + 1)]
+        tools[name] = tool @ Rigid.exp(own if width == 6 else [0, 0, 0, *own])
+    return replace(state, chain=moved_chain(state.chain, step[:k]), tools=tools)
+
+
+def only_of(seen: Observed, keep: np.ndarray) -> Observed:
+    """The observations of a mask (r,)."""
+    if seen.kind == "distance":
+        return replace(seen, first=seen.first[keep], second=seen.second[keep], values=seen.values[keep])
+    data = seen.data[keep]
+    rows = np.arange(len(data))
+    return replace(seen, data=data, first=rows, second=rows)

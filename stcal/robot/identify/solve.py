@@ -1,0 +1,363 @@
+"""Identification of a robot's kinematics from poses, positions or distances: parameters, σ and held-out error."""
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from stcal.errors import DegenerateError, InputError
+from stcal.geometry.arrays import frozen
+from stcal.geometry.rigid import skew
+from stcal.robot.identify.adjustment import (
+    Solution,
+    Weighting,
+    huber_limit,
+    normal_rank,
+    parameter_units,
+    solve,
+    unseen,
+)
+from stcal.robot.identify.nominal import Deviations, NominalRows
+from stcal.robot.identify.observability import Observability, parameter_scale
+from stcal.robot.identify.residuals import (
+    WIDTH,
+    Kind,
+    Observed,
+    State,
+    jacobian,
+    observed,
+    only_of,
+    parameter_names,
+    residuals,
+    tips,
+    unknowns,
+)
+from stcal.robot.identify.start import start
+from stcal.robot.identify.variances import GROSS, Components, components, estimated
+from stcal.robot.kinematics.dh import robot_from_chain
+from stcal.robot.kinematics.measurements import Measurements
+from stcal.robot.kinematics.model import Robot
+
+LEAST_MM, LEAST_RAD = 1e-3, 1e-6
+"""σ where none is given begin at the misfit of the nominal robot, but not below this."""
+TYPICAL_MM, TYPICAL_RAD = 0.1, 5e-4
+"""Of instruments: what joint values determine is told for these."""
+VARIANCE_ROUNDS = 10
+VARIANCE_SETTLED = 1e-3
+FALLS = 0.5
+"""Medians of residuals that fall by less are near enough for the estimates proper."""
+STILL_RAD, STILL_MM = 1e-5, 1e-2
+"""A joint that moves less than this did not move."""
+OUTLIER_WEIGHT = 0.5
+OUTLIER_ROUNDS = 5
+MOSTLY_GOOD = 0.5
+"""Share of the observations below which nothing is called an error."""
+REPEATS, FEW_ROWS = 5, 300
+"""Divisions of the cross-validation of few rows; one does for more."""
+
+
+@dataclass(frozen=True, slots=True)
+class IdentifyOptions:
+    """``observe`` : kind of observation, None for the most that was measured; ``sigma_mm``, ``sigma_rad`` : of one
+    coordinate, estimated where None; ``folds`` of the cross-validation, 0 for none, each row held out once in each of
+    ``repeats`` divisions drawn with ``seed``; ``partial`` : keep nominal what the data do not determine."""
+
+    observe: Kind | None = None
+    sigma_mm: float | None = None
+    sigma_rad: float | None = None
+    robust: bool = True
+    folds: int = 6
+    repeats: int | None = None
+    seed: int = 0
+    partial: bool = False
+
+    def __post_init__(self):
+        for name, value, most in (("sigma_mm", self.sigma_mm, 1e3), ("sigma_rad", self.sigma_rad, 1.0)):
+            if value is not None and not 1e-12 <= value <= most:
+                raise InputError(f"{name} is {value:g}; a number above 0, up to {most:g}, needed")
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class HeldOut:
+    """Errors of rows that a fit had not seen: ``position_mm`` : (repeats, r); ``rotation_rad`` : the same, or empty."""
+
+    folds: int
+    position_mm: np.ndarray
+    rotation_rad: np.ndarray
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Identified:
+    """The identified robot, and how far to trust it.
+
+    ``robot`` : base where the instrument stands, tools by target; ``names`` : (k,) of the parameters, small motions of
+    each joint's frame and of the tools (J2 ry: axis of joint 2 about its y, rad; tool x: mm); ``covariance`` : (k, k);
+    ``rank`` of the data used, ``ranks`` by kind of observation of the same joint values;
+    ``undetermined`` : names of parameters along directions that were kept nominal; ``weights`` : (r,) Huber's;
+    ``nominal_mm``, ``fitted_mm`` : (r,) errors with nominal axes (base and tools fitted) and identified ones;
+    ``dh_sigma`` : (n, 5) of a, alpha, d, theta, beta, mm and rad; ``observability`` : of the parameters that are
+    determined; ``deviations`` : σ of this robot's dimensions about nominal, as the data show them, by name; ``notes`` :
+    rows left out, and what is to be known of the result.
+    """
+
+    robot: Robot
+    state: State
+    seen: Observed
+    weighting: Weighting
+    sigma0: float
+    names: tuple[str, ...]
+    covariance: np.ndarray
+    rank: int
+    ranks: dict[str, int]
+    undetermined: tuple[str, ...]
+    weights: np.ndarray
+    residuals: np.ndarray
+    nominal_mm: np.ndarray
+    fitted_mm: np.ndarray
+    held_out: HeldOut | None
+    dh_sigma: np.ndarray
+    observability: Observability
+    deviations: dict[str, float | None]
+    notes: tuple[str, ...]
+
+    def __post_init__(self):
+        k = len(self.names)
+        object.__setattr__(self, "covariance", frozen(self.covariance, (k, k), "covariance"))
+
+    def outliers(self) -> list[tuple[int, float]]:
+        """(row of the observations, error in mm) of those that weigh less than half."""
+        return [(int(i), float(self.fitted_mm[i])) for i in np.flatnonzero(self.weights < OUTLIER_WEIGHT)]
+
+
+def identify(robot: Robot, data: Measurements, options: IdentifyOptions | None = None) -> Identified:
+    """Identify the axes, base and tools of ``robot`` from ``data``.
+
+    Complete, minimal and continuous parameters (:func:`stcal.robot.kinematics.forward.chain_parameters`), trust region,
+    Huber weights, covariance, and the way back to D-H rows with Hayati's β (Hayati 1983) for nearly parallel axes.
+
+    Raises
+    ------
+    DegenerateError
+        A joint or a target never moved, too few observations, or directions that the data do not determine (kept
+        nominal with ``partial``).
+    InputError
+        The nominal robot does not fit the data.
+    """
+    options = options or IdentifyOptions()
+    seen = observed(data, options.observe)
+    _still_joints(robot, data, options.partial)
+    first = start(robot, data)
+    _enough(robot, seen, first)
+    adjusted = _adjusted(robot, first, seen, options)
+    solution, weighting = adjusted.solution, adjusted.weighting
+    names = parameter_names(solution.state, seen.kind)
+    undetermined = _undetermined(solution, names, seen, options.partial)
+    covariance, rank = _covariance(adjusted, seen), solution.rank() - _place(seen)
+    identified = robot_from_chain(solution.state.chain, solution.state.tools, robot)
+    return Identified(
+        identified,
+        solution.state,
+        seen,
+        weighting,
+        weighting.factor,
+        tuple(names),
+        covariance,
+        rank,
+        _ranks(solution.state, data),
+        undetermined,
+        solution.weights,
+        solution.residuals,
+        _lengths(residuals(first, seen)),
+        _lengths(solution.residuals),
+        _cross_validated(robot, seen, adjusted, options),
+        adjusted.rows.sigma(identified, covariance),
+        _observability(identified, adjusted, seen, rank),
+        adjusted.deviations.of(adjusted.rows.group[adjusted.rows.free]),
+        data.notes + adjusted.rows.notes(identified),
+    )
+
+
+def _still_joints(robot: Robot, data: Measurements, partial: bool) -> None:
+    moves = np.ptp(data.q @ robot.coupling.T, axis=0)
+    for i, move in enumerate(moves, 1):
+        prismatic = robot.joints[i - 1].type == "prismatic"
+        if move < (STILL_MM if prismatic else STILL_RAD) and not partial:
+            raise DegenerateError(
+                f"{data.where}: joint {i} never moved, so that its axis is not seen; measure with other values of "
+                f"q{i}, or keep its nominal values with --partial"
+            )
+
+
+def _enough(robot: Robot, seen: Observed, state: State) -> None:
+    seeks = len(parameter_names(state, seen.kind)) - unseen(seen.kind)
+    numbers = WIDTH[seen.kind] * len(seen)
+    if numbers <= seeks:
+        needed = seeks // WIDTH[seen.kind] + 1
+        raise DegenerateError(
+            f"{seen.data.where}: {len(seen)} {seen.kind}s give {numbers} numbers for {seeks} parameters; "
+            f"{needed} or more needed, better twice that"
+        )
+
+
+def _weighting(state: State, seen: Observed, options: IdentifyOptions) -> Weighting:
+    """Where σ begin, and which the residuals tell. What is given for all coordinates are weights, times σ₀; one σ given
+    of two is taken as it is. The others begin at the misfit, so that no observation is an outlier of the start."""
+    sigma = {"mm": options.sigma_mm, "rad": options.sigma_rad}
+    needed = ("rad", "mm") if seen.kind == "pose" else ("mm",)
+    missing = tuple(name for name in needed if sigma[name] is None)
+    own = seen.data.covariance is not None and seen.kind != "distance" and missing == needed
+    estimated = ("factor",) if own or not missing else missing
+    weighting = Weighting(options.sigma_mm or LEAST_MM, options.sigma_rad or LEAST_RAD, own, estimated=estimated)
+    white = weighting.whiten(residuals(state, seen), seen)
+    misfit = {name: float(np.median(np.abs(white[:, c]))) for name, c in weighting.columns(white.shape[1]).items()}
+    return weighting.with_values({n: weighting.value(n) * max(misfit[n], 1.0) for n in estimated})
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Adjusted:
+    """A solution with the σ that go with it."""
+
+    solution: Solution
+    weighting: Weighting
+    deviations: Deviations
+    rows: NominalRows
+    parts: Components
+
+
+def _adjusted(
+    nominal: Robot, state: State, seen: Observed, options: IdentifyOptions, rows: NominalRows | None = None
+) -> _Adjusted:
+    """Solve, and estimate σ; once more without what are errors and no noise: Huber's weights bound their pull, but let
+    each pull as hard as the worst honest observation, which no covariance knows of."""
+    rows = rows or NominalRows.about(state, parameter_units(jacobian(state, seen)), nominal)
+    found, good = _settled(state, seen, options, rows), np.ones(len(seen), bool)
+    for _ in range(OUTLIER_ROUNDS):
+        weights = found.solution.weights
+        if (good == (weights >= GROSS)).all() or (weights >= GROSS).mean() < MOSTLY_GOOD:
+            break
+        good = weights >= GROSS
+        found = _settled(found.solution.state, only_of(seen, good), options, rows)
+        left = residuals(found.solution.state, seen)
+        length = np.linalg.norm(found.weighting.whiten(left, seen), axis=1)
+        weights = np.minimum(1.0, huber_limit(seen.kind) / np.maximum(length, 1e-300))
+        found = replace(found, solution=replace(found.solution, residuals=left, weights=weights))
+    return found
+
+
+def _settled(state: State, seen: Observed, options: IdentifyOptions, rows: NominalRows) -> _Adjusted:
+    """Solve, and estimate σ, in turns."""
+    weighting, deviations = _weighting(state, seen, options), Deviations()
+    for _ in range(VARIANCE_ROUNDS):  # by medians, which outliers do not move, until they stay
+        state = solve(state, seen, weighting, options.robust, rows.held(state, deviations, seen.kind)).state
+        before, weighting = weighting, _weighting(state, seen, options)
+        if all(weighting.value(n) > FALLS * before.value(n) for n in weighting.estimated):
+            break
+    for _ in range(VARIANCE_ROUNDS):
+        solution = solve(state, seen, weighting, options.robust, rows.held(state, deviations, seen.kind))
+        parts = components(solution, seen, weighting, options.robust, rows, deviations)
+        new_weighting, new_deviations, change = estimated(parts, rows, weighting, deviations)
+        if change < VARIANCE_SETTLED:
+            break
+        state, weighting, deviations = solution.state, new_weighting, new_deviations
+    return _Adjusted(solution, weighting, deviations, rows, parts)
+
+
+def _undetermined(solution: Solution, names: list[str], seen: Observed, partial: bool) -> tuple[str, ...]:
+    """Parameters along the directions that the data leave open, beyond those that distances never see."""
+    _, directions, good = solution.spectrum()
+    expected = unseen(seen.kind)
+    open_ones = directions[:, ~good]
+    if open_ones.shape[1] <= expected:
+        return ()
+    strength = (open_ones**2).sum(1)
+    found = tuple(names[i] for i in np.argsort(-strength) if strength[i] > 0.1)
+    if not partial:
+        raise DegenerateError(
+            f"{seen.data.where}: the data determine {solution.rank()} of {len(names) - expected} parameters, open are "
+            f"{', '.join(found[:6])}; measure more varied poses (`stcal robot design`), or keep the nominal values of "
+            "these with --partial"
+        )
+    return found
+
+
+def _ranks(state: State, data: Measurements) -> dict[str, int]:
+    """Parameters that poses, positions and distances at these joint values determine, whichever were measured."""
+    tip = tips(state, data.q, data.targets)
+    exact = Measurements(data.where, data.lines, data.q, data.targets, tip.translation, tip.rotation)
+    ranks, weighting = {}, Weighting(TYPICAL_MM, TYPICAL_RAD)
+    for kind in WIDTH:
+        seen = observed(exact, kind)
+        ranks[kind] = normal_rank(state, seen, weighting) - _place(seen)
+    return ranks
+
+
+def _observability(robot: Robot, adjusted: _Adjusted, seen: Observed, rank: int) -> Observability:
+    state, weighting = adjusted.solution.state, adjusted.weighting
+    rows = weighting.whiten(jacobian(state, seen), seen) * parameter_scale(robot, seen.kind, state.tools)
+    if seen.frameless:  # without what a motion of all points makes
+        at = seen.data.positions - seen.data.positions.mean(0)
+        motions = np.concatenate([-skew(at) / np.linalg.norm(at), np.tile(np.eye(3), (len(at), 1, 1))], axis=2)
+        u, s, _ = np.linalg.svd(weighting.whiten(motions, seen).reshape(-1, 6), full_matrices=False)
+        u, flat = u[:, s > 1e-9 * s[0]], rows.reshape(-1, rows.shape[2])
+        rows = (flat - u @ (u.T @ flat)).reshape(rows.shape)
+    return Observability.of_jacobian(rows, rank)
+
+
+def _place(seen: Observed) -> int:
+    """Directions in which positions that count by their distances can be moved together: 6 (5 of points on a line)."""
+    if not seen.frameless:
+        return 0
+    at = seen.data.positions - seen.data.positions.mean(0)
+    turns = np.linalg.matrix_rank(skew(at).reshape(-1, 3), tol=STILL_MM)
+    return 3 + int(turns)
+
+
+def _covariance(adjusted: _Adjusted, seen: Observed) -> np.ndarray:
+    """(k, k) of the parameters; none along the directions that distances never see, which stay where they were."""
+    covariance = adjusted.parts.covariance(np.zeros(len(adjusted.parts.count)))
+    if seen.kind != "distance":
+        return covariance
+    units = adjusted.solution.units
+    blind = adjusted.solution.spectrum()[1][:, : unseen(seen.kind)]
+    kept = (np.eye(len(units)) - blind @ blind.T) * units[:, None] / units
+    return kept @ covariance @ kept.T
+
+
+def _cross_validated(robot: Robot, seen: Observed, whole: _Adjusted, options: IdentifyOptions) -> HeldOut | None:
+    """Errors of rows that took no part: of neither the parameters nor (where rows are few) the σ."""
+    rows = len(seen)
+    folds = min(options.folds, rows)
+    if folds < 2:
+        return None
+    repeats = options.repeats or (REPEATS if rows <= FEW_ROWS else 1)
+    rng = np.random.default_rng(options.seed)
+    position, rotation = np.full((repeats, rows), np.nan), np.full((repeats, rows), np.nan)
+    for repeat in range(repeats):
+        fold = rng.permutation(np.arange(rows) % folds)
+        for k in range(folds):
+            train, test = only_of(seen, fold != k), only_of(seen, fold == k)
+            seeks = unknowns(robot.chain(), len(set(train.data.targets)), seen.kind) - unseen(seen.kind)
+            if WIDTH[seen.kind] * len(train) <= seeks:
+                return None
+            begin = start(robot, train.data)
+            if rows <= FEW_ROWS:
+                state = _adjusted(robot, begin, train, options, whole.rows).solution.state
+            else:
+                state = begin
+                for weighting in (_weighting(begin, train, options), whole.weighting):
+                    held = whole.rows.held(state, whole.deviations, seen.kind)
+                    state = solve(state, train, weighting, options.robust, held).state
+            known = np.array([t in state.tools for t in test.data.targets])
+            if seen.kind != "distance":
+                test = only_of(test, known)
+            found = residuals(state, test)
+            place = np.flatnonzero(fold == k)
+            place = place[known] if seen.kind != "distance" else place
+            position[repeat, place] = _lengths(found)
+            if seen.kind == "pose":
+                rotation[repeat, place] = np.linalg.norm(found[:, :3], axis=1)
+    return HeldOut(folds, position, rotation)
+
+
+def _lengths(found: np.ndarray) -> np.ndarray:
+    """(r,) position error, mm."""
+    return np.linalg.norm(found[:, -3:], axis=1) if found.shape[1] > 1 else np.abs(found[:, 0])

@@ -1,0 +1,193 @@
+"""Where identification starts: base and tools by the nominal axes; and data that this robot cannot have made."""
+
+from collections.abc import Iterator
+from dataclasses import replace
+
+import numpy as np
+from scipy.optimize import least_squares
+
+from stcal.errors import DegenerateError, InputError
+from stcal.geometry.align import align_rigid
+from stcal.geometry.rigid import Poses, Rigid, skew
+from stcal.robot.identify.residuals import State, observed, residuals
+from stcal.robot.kinematics.damped import reach_mm
+from stcal.robot.kinematics.forward import flange_poses
+from stcal.robot.kinematics.measurements import Measurements
+from stcal.robot.kinematics.model import Robot
+
+ROUNDS = 50
+SETTLED_MM = 1e-6
+FITS = 0.05
+"""A nominal robot fits its data when its RMS error is below this share of their spread; factories err by under 1 %."""
+EXPLAINS = 0.2
+"""A mistake explains a misfit when mending it leaves less than this share of it."""
+STILL_MM = 0.01
+AROUND = 0.1
+"""Of the arm's reach: how far from the given point of the tool distances are tried too."""
+
+
+def start(robot: Robot, data: Measurements) -> State:
+    """The nominal chain where the instrument stands, with tools that fit the measurements best.
+
+    Raises
+    ------
+    InputError
+        The nominal robot does not fit the data; the reason is named where one mends it.
+    DegenerateError
+        A target never moved, or only along a line.
+    """
+    _moves(data)
+    tools = {name: robot.tools.get(name, robot.tools.get("", Rigid())) for name in sorted(set(data.targets))}
+    state, misfit = _placed(robot, data, tools)
+    spread = _spread(data)
+    if misfit > FITS * spread:
+        _explain(robot, data, tools, misfit, spread)
+    return state
+
+
+def _spread(data: Measurements) -> float:
+    """RMS about the mean of what was measured, mm."""
+    if data.positions is None:
+        return float(np.sqrt((data.distances**2).mean()))
+    return float(np.sqrt(((data.positions - data.positions.mean(0)) ** 2).sum(1).mean()))
+
+
+def _moves(data: Measurements) -> None:
+    if data.positions is None:
+        if np.ptp(data.distances) < STILL_MM:
+            raise DegenerateError(f"{data.where}: all distances are equal; positions apart from one another needed")
+        return
+    for name in sorted(set(data.targets)):
+        own = data.positions[[t == name for t in data.targets]]
+        moved = float(np.linalg.norm(np.ptp(own, axis=0)))
+        if moved < STILL_MM and len(own) > 1:
+            raise DegenerateError(
+                f"{data.where}: target {name or 'of all rows'} never moved ({moved:.2g} mm over {len(own)} rows, more "
+                f"than {STILL_MM} mm needed); was it on the robot, were positions read anew?"
+            )
+
+
+def _placed(robot: Robot, data: Measurements, tools: dict[str, Rigid]) -> tuple[State, float]:
+    """Base and tool points by least squares, tool orientations after them; and the RMS misfit, mm."""
+    chain = replace(robot, world_from_base=Rigid()).chain()
+    flange = flange_poses(chain, data.q)
+    names = list(tools)
+    rows = np.array([names.index(t) for t in data.targets])
+    points = np.array([tools[name].translation for name in names])
+    if data.positions is None:  # distances see neither base nor where the instrument stands
+        points, misfit = _points_of_distances(robot, flange, data, rows, points)
+        return State(chain, {name: Rigid(tools[name].rotation, points[k]) for k, name in enumerate(names)}), misfit
+    _off_a_line(data)
+    base, points, misfit = _base_and_points(data.where, flange, data.positions, rows, points)
+    if data.rotations is not None:
+        seen = base.inverse() @ data.poses()
+        turns = np.swapaxes(flange.rotation, 1, 2) @ seen.rotation
+        for k, name in enumerate(names):
+            u, _, vt = np.linalg.svd(turns[rows == k].sum(0))
+            rotation = u @ np.diag([1, 1, np.linalg.det(u @ vt)]) @ vt
+            tools = tools | {name: Rigid(rotation, tools[name].translation)}
+    tools = {name: Rigid(tools[name].rotation, points[k]) for k, name in enumerate(names)}
+    placed = replace(robot, world_from_base=base)
+    return State(placed.chain(), tools), misfit
+
+
+def _off_a_line(data: Measurements) -> None:
+    extent = np.linalg.svd(data.positions - data.positions.mean(0), compute_uv=False)
+    if len(extent) < 2 or extent[1] <= STILL_MM:
+        raise DegenerateError(
+            f"{data.where}: all positions lie on one line (within {STILL_MM} mm), so that it is not seen where the "
+            "instrument stands; move joints that take the target off it"
+        )
+
+
+def _base_and_points(where: str, flange: Poses, positions: np.ndarray, rows: np.ndarray, points: np.ndarray):
+    """Gauss–Newton over the base and the tool points, from the alignment with the points given; and RMS misfit, mm."""
+    try:
+        base = align_rigid(positions, flange @ points[rows])
+    except DegenerateError as error:
+        raise DegenerateError(
+            f"{where}: by the robot file all joint values put the target on one line, so that it is not seen how the "
+            "instrument stands about it; move other joints, or give the tool in the robot file if it is off the axis"
+        ) from error
+    misfit = np.inf
+    for _ in range(ROUNDS):
+        seen = flange @ points[rows]
+        error = positions - base @ seen
+        before, misfit = misfit, float(np.sqrt((error**2).sum(1).mean()))
+        if before - misfit < SETTLED_MM:
+            break
+        slope = np.zeros((len(rows), 3, 6 + 3 * len(points)))
+        slope[:, :, :3] = -skew(seen @ base.rotation.T)
+        slope[:, :, 3:6] = np.eye(3)
+        for k in range(len(points)):
+            slope[rows == k, :, 6 + 3 * k : 9 + 3 * k] = base.rotation @ flange.rotation[rows == k]
+        step = np.linalg.lstsq(slope.reshape(-1, slope.shape[2]), error.ravel(), rcond=1e-9)[0]
+        base = Rigid(Rigid.exp(step[:6]).rotation @ base.rotation, base.translation + step[3:6])
+        points = points + step[6:].reshape(-1, 3)
+    return base, points, misfit
+
+
+def _points_of_distances(robot: Robot, flange: Poses, data: Measurements, rows: np.ndarray, points: np.ndarray):
+    """Tool points by least squares, from those given and from others around the flange; and RMS misfit, mm."""
+
+    def errors(moved: np.ndarray) -> np.ndarray:
+        tip = flange @ moved.reshape(-1, 3)[rows]
+        return data.distances - np.linalg.norm(tip - tip[data.from_row], axis=1)
+
+    reach = max(reach_mm(robot, tool) for tool in robot.tools)
+    around = AROUND * reach * np.vstack([np.zeros((1, 3)), np.eye(3), -np.eye(3)])
+    fits = [least_squares(errors, (points + shift).ravel(), max_nfev=ROUNDS) for shift in around]
+    best = min(fits, key=lambda fit: fit.cost)
+    return best.x.reshape(-1, 3), float(np.sqrt(2 * best.cost / len(data)))
+
+
+def _explain(robot: Robot, data: Measurements, tools: dict[str, Rigid], misfit: float, spread: float) -> None:
+    """Say what is wrong with the data, or with the robot file."""
+    found = {}
+    for reason, other, guess in _guesses(robot, data, tools):
+        try:
+            found[reason] = _placed(other, guess, tools)[1] / _spread(guess)
+        except DegenerateError:  # a guess that leaves too little
+            continue
+    says = f"{data.where}: robot {robot.name} misses the measurements by {misfit:.3g} mm RMS, "
+    says += f"{FITS:.0%} of their spread of {spread:.3g} mm allowed; "
+    reason = min(found, key=found.get)
+    if found[reason] < min(EXPLAINS * misfit / spread, FITS):
+        raise InputError(f"{says}it would fit if {reason}")
+    raise InputError(f"{says}check D-H rows and convention, the order and zero of joints, coupling, and units")
+
+
+def _guesses(robot: Robot, data: Measurements, tools: dict[str, Rigid]) -> Iterator[tuple[str, Robot, Measurements]]:
+    """Frequent mistakes: what would be right, with robot and data as if it were."""
+    turning, n = ~robot.prismatic, len(robot.rows)
+    q, angle = data.q, np.where(turning, 180 / np.pi, 1.0)
+    scaled = {"distances": data.distances, "positions": data.positions}
+    scaled = {name: 1e3 * values for name, values in scaled.items() if values is not None}
+    yield "joint values are radians in columns of degrees; call the columns q1_rad …", robot, replace(data, q=q * angle)
+    yield "joint values are degrees in columns of radians; call the columns q1_deg …", robot, replace(data, q=q / angle)
+    yield "lengths are metres in columns of mm; call the columns x_m … or distance_m", robot, replace(data, **scaled)
+    reason = "all joint values had the opposite sign; check the rows and the joints' directions"
+    yield reason, robot, replace(data, q=np.where(turning, -q, q))
+    for i in range(n):
+        reason = f"joint {i + 1} had the opposite sign; check its direction in the rows, or the sign of q{i + 1}"
+        yield reason, robot, replace(data, q=q * np.where(np.arange(n) == i, -1, 1))
+    if (robot.coupling != np.eye(n)).any():
+        yield "the joints were not coupled; take coupling out of the robot file", replace(robot, coupling=None), data
+    elif n >= 3:
+        coupling = np.eye(n)
+        coupling[2, 1] = 1.0
+        reason = "joint 3 were coupled to joint 2, as Fanuc's are; give coupling in the robot file"
+        yield reason, replace(robot, coupling=coupling), data
+    if data.positions is None:
+        return
+    mirrored = replace(data, positions=data.positions * [1, 1, -1], rotations=None, covariance=None)
+    yield "positions are mirrored (a left-handed frame); change the sign of one axis", robot, mirrored
+    error = np.linalg.norm(residuals(_placed(robot, data, tools)[0], observed(data, "position")), axis=1)
+    worst = int(error.argmax())
+    reason = f"line {data.lines[worst]} were not there, by far the worst; correct or remove it"
+    yield reason, robot, data[np.arange(len(data)) != worst]
+    if data.rotations is not None:
+        inverse = data.poses().inverse()
+        reason = "poses are inverse (instrument seen from the tool); give the tool in the instrument's frame"
+        there = {"positions": inverse.translation, "rotations": inverse.rotation, "covariance": None}
+        yield reason, robot, replace(data, **there)

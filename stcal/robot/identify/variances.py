@@ -1,0 +1,165 @@
+"""Variance components of an identification, and a covariance that knows that they are estimates themselves.
+
+Estimated are the σ of the measurements and of the robot's dimensions about nominal. About the solution everything is
+linear, so that for any σ the parameters and the likelihood of the σ (restricted maximum likelihood, Patterson &
+Thompson 1971) are closed forms of a few k × k matrices. The covariance of the parameters is the mean over the posterior
+of the σ of their covariance there and of the square of their shift (Kass & Steffey 1989), by Gauss-Hermite quadrature
+about the maximum: in place of σ taken as known it is wider by what a t distribution is wider than a normal one.
+"""
+
+from dataclasses import astuple, dataclass
+
+import numpy as np
+from scipy.optimize import minimize
+from scipy.special import chdtr, chdtrc
+
+from stcal.robot.identify.adjustment import USELESS_MM, Solution, Weighting, huber_limit
+from stcal.robot.identify.nominal import DOUBT, Deviations, NominalRows
+from stcal.robot.identify.residuals import WIDTH, Kind, Observed, jacobian
+
+LEAST = 1e-9
+"""mm, rad: σ of data without noise."""
+FARTHEST = 3.0
+"""log σ is looked for within this of where it was, a factor of 20, each round: beyond, rounding spoils the squares."""
+QUIETER = -2.5
+"""log σ of the data is looked for from here too: few data may be explained by noise alone, or by dimensions."""
+GROSS = 0.5
+"""Observations of less weight are errors, not noise (normal ones never are so far out), and say nothing of σ."""
+NODES, NODE_WEIGHTS = np.sqrt(3.0) * np.array([0.0, -1.0, 1.0]), np.array([4.0, 1.0, 1.0]) / 6
+"""Gauss-Hermite of three points for a standard normal distribution."""
+STEP = 1e-4
+"""Of the second derivatives, in log σ."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Components:
+    """An adjustment, linear about its solution, in p parts of which each has a σ.
+
+    ``normal`` : (p, k, k), ``pull`` : (p, k), ``square`` : (p,) of each part's residuals e - J δ over its present σ:
+    JᵀJ, Jᵀe and eᵀe. ``count`` : (p,) of numbers. ``expected``, ``doubt`` : (p,) mean and σ of what is known of
+    log (σ / present σ) beforehand, ``doubt`` infinite where nothing is. ``least`` : (p,) of that logarithm.
+    ``fixed``, ``fixed_pull`` : (k, k), (k,) of what has no σ to be estimated; ``units`` : (k,) of the parameters.
+    """
+
+    normal: np.ndarray
+    pull: np.ndarray
+    square: np.ndarray
+    count: np.ndarray
+    expected: np.ndarray
+    doubt: np.ndarray
+    least: np.ndarray
+    fixed: np.ndarray
+    fixed_pull: np.ndarray
+    units: np.ndarray
+
+    def at(self, x: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+        """At log (σ / present σ) x (m, p): log posterior density (m,), its gradient (m, p), parameters (m, k) beyond
+        the solution and their covariance (m, k, k), both in ``units``."""
+        share = np.exp(-2 * x)
+        normal = np.einsum("mp,pkl->mkl", share, self.normal) + self.fixed
+        pull = share @ self.pull + self.fixed_pull
+        inverse = np.linalg.inv(normal)
+        step = np.einsum("mkl,ml->mk", inverse, pull)
+        away = (x - self.expected) / self.doubt
+        square = self.square - 2 * step @ self.pull.T + np.einsum("mk,pkl,ml->mp", step, self.normal, step)
+        taken = np.einsum("mkl,plk->mp", inverse, self.normal)
+        fixed = np.einsum("mk,kl,ml->m", step, self.fixed, step) - 2 * step @ self.fixed_pull
+        value = -(x @ self.count) - 0.5 * ((share * square).sum(1) + fixed + np.linalg.slogdet(normal)[1])
+        return value - 0.5 * (away**2).sum(1), share * (square + taken) - self.count - away / self.doubt, step, inverse
+
+    def best(self) -> np.ndarray:
+        """(p,) log (σ / present σ) of highest density."""
+        bounds = np.column_stack([np.maximum(self.least, -FARTHEST), np.full(len(self.least), FARTHEST)])
+
+        def downhill(x: np.ndarray) -> tuple[float, np.ndarray]:
+            value, gradient, _, _ = self.at(x[None])
+            return -float(value[0]), -gradient[0]
+
+        data = np.isinf(self.doubt)
+        starts = (np.zeros(len(data)), np.where(data, QUIETER, self.expected))
+        fits = [minimize(downhill, np.clip(x, *bounds.T), jac=True, method="L-BFGS-B", bounds=bounds) for x in starts]
+        return min(fits, key=lambda fit: fit.fun).x
+
+    def covariance(self, best: np.ndarray) -> np.ndarray:
+        """(k, k) covariance of the parameters about the estimate at ``best`` (p,)."""
+        spread = self._spread(best)
+        index = np.indices((len(NODES),) * spread.shape[1]).reshape(spread.shape[1], len(NODES) ** spread.shape[1]).T
+        z = NODES[index]
+        log_density, _, step, inverse = self.at(best + z @ spread.T)
+        middle = self.at(best[None])
+        log_weight = np.log(NODE_WEIGHTS[index]).sum(1) + log_density - middle[0] + 0.5 * (z**2).sum(1)
+        weight = np.exp(log_weight - log_weight.max())
+        weight /= weight.sum()
+        shift = step - middle[2]
+        mean = np.einsum("m,mkl->kl", weight, inverse) + (shift.T * weight) @ shift
+        return mean * self.units[:, None] * self.units
+
+    def _spread(self, best: np.ndarray) -> np.ndarray:
+        """(p, f) square root of the covariance of log σ, of the f that are not at their least value."""
+        free = np.flatnonzero(best > np.maximum(self.least, -FARTHEST) + STEP)
+        moves = STEP * np.eye(len(best))[free]
+        gradient = self.at(np.concatenate([best + moves, best - moves]))[1]
+        slope = (gradient[: len(free)] - gradient[len(free) :])[:, free] / (2 * STEP)
+        values, directions = np.linalg.eigh(-(slope + slope.T) / 2)
+        # a flat or rising direction: as wide as what is known beforehand, at the most
+        least = np.full(len(free), np.min(self.doubt, initial=1.0) ** -2.0)
+        values = np.maximum(values, least)
+        spread = np.zeros((len(best), len(free)))
+        spread[free] = directions / np.sqrt(values)
+        return spread
+
+
+def components(
+    solution: Solution, seen: Observed, weighting: Weighting, robust: bool, rows: NominalRows, deviations: Deviations
+) -> Components:
+    """The parts of an adjustment: of the data those whose σ is estimated, then the groups of the robot's dimensions."""
+    units = solution.units
+    white = weighting.whiten(solution.residuals, seen)
+    slope = weighting.whiten(jacobian(solution.state, seen), seen) * units
+    kept = _kept(seen.kind) if robust else 1.0
+    honest = solution.weights >= GROSS
+    honest |= honest.mean() < 0.5
+    # What σ scales is the square of the residual cut off at Huber's limit, (w e)²; the rest of w e² stays as it is.
+    weight = solution.weights[:, None, None]
+    scaled = weight**2 * honest[:, None, None]
+    parts, fixed, fixed_pull = [], np.eye(len(units)) / USELESS_MM**2, np.zeros(len(units))
+    for name, columns in weighting.columns(white.shape[1]).items():
+        if name in weighting.estimated:
+            square, count = _normal(white, slope, columns, scaled), kept * white[honest, columns].size
+            parts.append((*square, count, 0.0, np.inf, np.log(LEAST / weighting.value(name))))
+            normal, pull, _ = _normal(white, slope, columns, weight - scaled)
+        else:
+            normal, pull, _ = _normal(white, slope, columns, weight)
+        fixed, fixed_pull = fixed + normal, fixed_pull + pull
+    held, group = rows.held(solution.state, deviations, seen.kind), rows.group[rows.free]
+    for g, (sigma, expected) in enumerate(zip(astuple(deviations), astuple(Deviations()), strict=True)):
+        mine = group == g
+        e, j = held.value[mine] / sigma, held.slope[mine] * units / sigma
+        if mine.any():
+            parts.append((j.T @ j, -j.T @ e, e @ e, mine.sum(), np.log(expected / sigma), DOUBT, -np.inf))
+    return Components(*(np.array(each, float) for each in zip(*parts, strict=True)), fixed, fixed_pull, units)
+
+
+def _normal(white: np.ndarray, slope: np.ndarray, columns: slice, weight: np.ndarray):
+    """JᵀWJ, JᵀWe and eᵀWe of some coordinates, with weights (r, 1, 1)."""
+    k = slope.shape[2]
+    e, j = white[:, columns].ravel(), slope[:, columns]
+    weighted = (weight * j).reshape(-1, k).T
+    return weighted @ j.reshape(-1, k), weighted @ e, float((weight[:, :, 0] * white[:, columns] ** 2).sum())
+
+
+def estimated(parts: Components, rows: NominalRows, weighting: Weighting, deviations: Deviations):
+    """σ of the measurements and of the dimensions that are best, and by how much a logarithm of one changed."""
+    best = parts.best()
+    names = [name for name in ("factor", "rad", "mm") if name in weighting.estimated]
+    new = {name: weighting.value(name) * np.exp(x) for name, x in zip(names, best, strict=False)}
+    sigma = np.array(astuple(deviations))
+    sigma[np.unique(rows.group[rows.free])] *= np.exp(best[len(names) :])
+    return weighting.with_values(new), Deviations(*sigma.tolist()), float(np.abs(best).max())
+
+
+def _kept(kind: Kind) -> float:
+    """Of the square of normal residuals, the share that is left when they are cut off at Huber's limit (Huber's
+    Proposal 2), so that outliers hardly move σ, and σ of honest ones comes out as it is."""
+    width, limit = WIDTH[kind], huber_limit(kind) ** 2
+    return float(chdtr(width + 2, limit) + limit / width * chdtrc(width, limit))

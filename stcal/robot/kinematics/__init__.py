@@ -1,0 +1,1 @@
+"""Robots: what they are, their file, forward and inverse kinematics, and what was measured on them."""

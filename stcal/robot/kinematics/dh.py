@@ -1,0 +1,89 @@
+"""From a chain of axes back to Denavit–Hartenberg rows, with Hayati's β where two axes are nearly parallel."""
+
+from collections.abc import Mapping
+from dataclasses import replace
+
+import numpy as np
+
+from stcal.geometry.rigid import Rigid
+from stcal.robot.kinematics.model import Chain, DHRow, Robot, about_z, across, along
+
+PARALLEL_RAD = np.radians(1.0)
+"""Below this the foot of the common normal is far away and moves by metres with micro-radians: Hayati's β instead."""
+SAME_AXIS_MM = 1e-10
+"""Parallel axes closer than this are one line, as of a SCARA's spindle: any θ does, the nominal one is kept."""
+
+
+def robot_from_chain(chain: Chain, tools: Mapping[str, Rigid], nominal: Robot) -> Robot:
+    """The robot whose rows, base and tools make the same poses as ``chain`` with ``tools`` (flange_from_tool).
+
+    What a chain does not determine is kept from ``nominal``: θ and d of the first row (the base may turn and slide
+    along the first axis) and the whole part of the last row after its joint (the tools may do so along the last), a and
+    d of a prismatic joint, d of a row with β.
+    """
+    n = len(chain)
+    rows = list(nominal.rows)
+    standard = nominal.convention == "standard"
+    first = Rigid()
+    passed = Rigid()
+    """What a joint lets through to the next: turn about and slide along its axis (any shift, if prismatic)."""
+    for i in range(1, n):
+        gap = passed @ chain.gap(i)
+        before = rows[i - 1]
+        after = before if standard else rows[i]
+        wanted = DHRow(after.a, after.alpha, before.d, before.theta, after.beta)
+        found = _row_between(gap, wanted, bool(chain.prismatic[i]))
+        passed = (along(found) @ across(found)).inverse() @ gap
+        if i == 1:  # the base takes what differs from the nominal first row
+            first = Rigid(about_z(found.theta - before.theta), [0.0, 0.0, found.d - before.d])
+            found = replace(found, theta=before.theta, d=before.d)
+        if standard:
+            rows[i - 1] = found
+        else:
+            rows[i - 1] = replace(before, theta=found.theta, d=found.d)
+            rows[i] = replace(after, a=found.a, alpha=found.alpha, beta=found.beta)
+    base = chain.gap(0) @ first
+    if not standard:
+        base = base @ across(rows[0]).inverse()
+    nominal_end = along(rows[-1]) if not standard else along(rows[-1]) @ across(rows[-1])
+    flange = nominal_end.inverse() @ passed @ chain.last_from_flange
+    return replace(
+        nominal,
+        rows=tuple(rows),
+        world_from_base=base,
+        tools={name: flange @ tool for name, tool in tools.items()},
+    )
+
+
+def _row_between(gap: Rigid, nominal: DHRow, to_prismatic: bool) -> DHRow:
+    """θ, d of the joint before and a, α, β up to the next axis, ``gap`` being known up to what that lets through."""
+    z, place = gap.rotation[:, 2], gap.translation
+    sine = float(np.hypot(z[0], z[1]))
+    parallel = sine < np.sin(PARALLEL_RAD)
+    if parallel:
+        theta = nominal.theta
+        if not to_prismatic:
+            x, y = place[:2] + (nominal.d - place[2]) / z[2] * z[:2]
+            offset = float(np.hypot(x, y))
+            sign = -1.0 if nominal.a < 0 else 1.0
+            a = sign * offset
+            if offset > SAME_AXIS_MM:
+                theta = _near(float(np.arctan2(sign * y, sign * x)), nominal.theta)
+        else:
+            a = nominal.a
+        seen = about_z(-theta) @ z  # (sin β, −sin α cos β, cos α cos β)
+        alpha = _near(float(np.arctan2(-seen[1], seen[2])), nominal.alpha)
+        return DHRow(a, alpha, nominal.d, theta, float(np.arcsin(seen[0])))
+    sign = -1.0 if np.sin(nominal.alpha) < 0 else 1.0
+    alpha = _near(float(np.arctan2(sign * sine, z[2])), nominal.alpha)
+    theta = _near(float(np.arctan2(sign * z[0], -sign * z[1])), nominal.theta)
+    if to_prismatic:
+        return DHRow(nominal.a, alpha, nominal.d, theta)
+    seen = about_z(-theta) @ place  # (a, −ψ sin α, d + ψ cos α), ψ along the next axis
+    slide = -seen[1] / np.sin(alpha)
+    return DHRow(float(seen[0]), alpha, float(seen[2] - slide * np.cos(alpha)), theta)
+
+
+def _near(angle: float, nominal: float) -> float:
+    """The same angle in the turn around the nominal one."""
+    return angle + 2 * np.pi * round((nominal - angle) / (2 * np.pi))

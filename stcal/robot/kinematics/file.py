@@ -1,0 +1,172 @@
+"""``robot.toml``: read with every mistake named, and written so that it reads back the same."""
+
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+from pydantic import Field
+
+from stcal.errors import InputError
+from stcal.geometry.rigid import UNIT_WITHIN, Poses, Rigid
+from stcal.io.saving import save
+from stcal.io.toml import Finite, Strict, load_toml
+from stcal.robot.kinematics.model import Convention, DHRow, Joint, JointType, Robot
+
+WHAT = "robot file"
+REMEDY = "`stcal robot init FILE` writes one to edit"
+POSE_KEYS = ("x_mm", "y_mm", "z_mm", "qw", "qx", "qy", "qz")
+
+
+LIMIT_DIGITS = 9
+"""Decimals of joint limits, degrees or mm: 125°, not 125.00000000000001."""
+
+
+class _PoseFile(Strict):
+    x_mm: Finite = 0.0
+    y_mm: Finite = 0.0
+    z_mm: Finite = 0.0
+    qw: Finite = 1.0
+    qx: Finite = 0.0
+    qy: Finite = 0.0
+    qz: Finite = 0.0
+
+    def rigid(self, where: str) -> Rigid:
+        wxyz = np.array([self.qw, self.qx, self.qy, self.qz])
+        length = float(np.linalg.norm(wxyz))
+        if abs(length - 1) > UNIT_WITHIN:
+            raise InputError(f"{where}: quaternion of length {length:.4g}, 1 needed; normalise qw, qx, qy, qz")
+        return Poses.from_quaternions(wxyz[None], [[self.x_mm, self.y_mm, self.z_mm]])[0]
+
+
+class _ToolFile(_PoseFile):
+    name: str = Field(min_length=1)
+
+
+class _JointFile(Strict):
+    type: JointType = "revolute"
+    a_mm: Finite = 0.0
+    alpha_deg: Finite = 0.0
+    d_mm: Finite = 0.0
+    theta_deg: Finite = 0.0
+    beta_deg: Finite = 0.0
+    min_deg: Finite | None = None
+    max_deg: Finite | None = None
+    min_mm: Finite | None = None
+    max_mm: Finite | None = None
+
+
+class _RobotFile(Strict):
+    name: str = "robot"
+    convention: Convention
+    joint: list[_JointFile] = Field(min_length=1, max_length=20)
+    coupling: list[list[Finite]] | None = None
+    base: _PoseFile = _PoseFile()
+    tool: _PoseFile = _PoseFile()
+    target: tuple[_ToolFile, ...] = ()
+
+
+def load_robot(path: str | Path) -> Robot:
+    """Read ``robot.toml`` (form: ``data_layout.md``).
+
+    Raises
+    ------
+    InputError
+        Unreadable, unknown or missing keys, limits that are swapped or of the wrong unit, a coupling matrix that does
+        not fit, quaternions that are not unit; the message names the file and the place.
+    """
+    data = load_toml(path, _RobotFile, WHAT, REMEDY)
+    where = f"{WHAT} {path}"
+    rows, joints = [], []
+    for i, j in enumerate(data.joint, 1):
+        rows.append(DHRow(j.a_mm, *_radians(j.alpha_deg), j.d_mm, *_radians(j.theta_deg, j.beta_deg)))
+        joints.append(_joint(j, f"{where}: joint {i}"))
+    n = len(rows)
+    if data.coupling is not None and (len(data.coupling) != n or any(len(row) != n for row in data.coupling)):
+        raise InputError(f"{where}: coupling: {n} rows of {n} numbers needed for {n} joints")
+    names = [t.name for t in data.target]
+    for name in names:
+        if names.count(name) > 1:
+            raise InputError(f"{where}: target {name} occurs twice; names must differ")
+    tools = {"": data.tool.rigid(f"{where}: tool")}
+    tools |= {t.name: t.rigid(f"{where}: target {t.name}") for t in data.target}
+    base = data.base.rigid(f"{where}: base")
+    return Robot(data.name, data.convention, tuple(rows), tuple(joints), data.coupling, base, tools)
+
+
+def _joint(j: _JointFile, where: str) -> Joint:
+    mine, other = ("deg", "mm") if j.type == "revolute" else ("mm", "deg")
+    for end in ("min", "max"):
+        if getattr(j, f"{end}_{other}") is not None:
+            raise InputError(f"{where}: {end}_{other} at a {j.type} joint; {end}_{mine} needed")
+    lower, upper = getattr(j, f"min_{mine}"), getattr(j, f"max_{mine}")
+    if lower is not None and upper is not None and lower >= upper:
+        raise InputError(f"{where}: min_{mine} {lower:g} is not below max_{mine} {upper:g}; swap or correct them")
+    unit = np.pi / 180 if mine == "deg" else 1.0
+    return Joint(
+        j.type, -np.inf if lower is None else float(lower * unit), np.inf if upper is None else float(upper * unit)
+    )
+
+
+def robot_toml(robot: Robot, comments: Sequence[str] = ()) -> str:
+    """The text of a robot file; every number reads back to the same double but for the last bit of the angles."""
+    lines = [f"# {comment}" for comment in comments]
+    lines += [
+        f"name = {_text(robot.name)}",
+        f'convention = "{robot.convention}"  # {_FORM[robot.convention]}; angles in degrees, lengths in mm',
+    ]
+    if (robot.coupling != np.eye(len(robot.rows))).any():
+        rows = ", ".join(f"[{', '.join(_number(v) for v in row)}]" for row in robot.coupling)
+        lines += ["# kinematic joint values from the controller's", f"coupling = [{rows}]"]
+    for row, joint in zip(robot.rows, robot.joints, strict=True):
+        lines += ["", "[[joint]]", f'type = "{joint.type}"']
+        lines += [f"a_mm = {_number(row.a)}", f"alpha_deg = {_number(np.degrees(row.alpha))}"]
+        lines += [f"d_mm = {_number(row.d)}", f"theta_deg = {_number(np.degrees(row.theta))}"]
+        if row.beta:
+            lines.append(f"beta_deg = {_number(np.degrees(row.beta))}")
+        unit, of_unit = ("deg", np.degrees) if joint.type == "revolute" else ("mm", float)
+        lines += [
+            f"{end}_{unit} = {_number(round(of_unit(value), LIMIT_DIGITS))}"
+            for end, value in (("min", joint.lower), ("max", joint.upper))
+            if np.isfinite(value)
+        ]
+    lines += ["", "[base]  # of the robot, in the frame of the instrument", *_pose_lines(robot.world_from_base)]
+    lines += ["", "[tool]  # in the frame of the flange", *_pose_lines(robot.tools.get("", Rigid()))]
+    for name, tool in robot.tools.items():
+        if name:
+            lines += ["", "[[target]]", f"name = {_text(name)}", *_pose_lines(tool)]
+    return "\n".join(lines) + "\n"
+
+
+def save_robot(path: str | Path, robot: Robot, comments: Sequence[str] = ()) -> None:
+    """Write a robot file, complete or not at all.
+
+    Raises
+    ------
+    InputError
+        It cannot be written.
+    """
+    save(Path(path), robot_toml(robot, comments))
+
+
+_FORM = {
+    "standard": "Rz(theta + q) Tz(d) Tx(a) Rx(alpha) Ry(beta)",
+    "modified": "Rx(alpha) Tx(a) Ry(beta) Rz(theta + q) Tz(d)",
+}
+
+
+def _pose_lines(pose: Rigid) -> list[str]:
+    values = (*pose.translation, *Poses.of([pose]).quaternions()[0])
+    return [f"{key} = {_number(value)}" for key, value in zip(POSE_KEYS, values, strict=True)]
+
+
+def _number(value: float) -> str:
+    return repr(float(value))
+
+
+def _text(value: str) -> str:
+    escaped = value.replace("\\", "\\\\").replace('"', '\\"').replace("\n", " ")
+    return f'"{escaped}"'
+
+
+def _radians(*degrees: float) -> list[float]:
+    return np.radians(degrees).tolist()

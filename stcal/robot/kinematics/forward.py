@@ -1,0 +1,144 @@
+"""Forward kinematics of many joint vectors at once, and its derivatives by joint values and by the chain."""
+
+from dataclasses import replace
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from stcal.errors import InputError
+from stcal.geometry.rigid import Poses, Rigid
+from stcal.robot.kinematics.model import Chain, Robot
+
+CHUNK = 8192
+"""Joint vectors at a time: their frames stay in the cache."""
+
+
+def forward(robot: Robot, q: np.ndarray, tool: str = "") -> Poses:
+    """base_from_tool of each joint vector.
+
+    Parameters
+    ----------
+    q : (m, n) or (n,) array
+        Values of the controller, rad or mm.
+    tool : str
+        Name of the tool.
+
+    Returns
+    -------
+    Poses
+        m transforms, mm.
+    """
+    return flange_poses(_from_base_to_tool(robot, tool), _joint_vectors(q, len(robot.rows)))
+
+
+def jacobian(robot: Robot, q: np.ndarray, tool: str = "") -> np.ndarray:
+    """Derivative of base_from_tool by the controller's values, (m, 6, n).
+
+    Rotation vector (rad) over translation (mm) of the tool's origin, both in the axes of the base (left perturbation).
+    """
+    q = _joint_vectors(q, len(robot.rows))
+    chain = _from_base_to_tool(robot, tool)
+    axes, origins = joint_frames(chain, q)
+    z = axes[..., 2]  # (n, m, 3)
+    swept = np.cross(z, flange_poses(chain, q).translation - origins)
+    sliding = chain.prismatic[:, None, None]
+    by_joint = np.concatenate([np.where(sliding, 0.0, z), np.where(sliding, z, swept)], axis=2)
+    return np.moveaxis(by_joint, 0, 2) @ chain.coupling
+
+
+def flange_poses(chain: Chain, q: np.ndarray) -> Poses:
+    """world_from_flange of joint vectors (m, n)."""
+    rotation, translation = np.empty((len(q), 3, 3)), np.empty((len(q), 3))
+    for start in range(0, len(q), CHUNK):
+        part = slice(start, start + CHUNK)
+        axes, origin = _walk(chain, q[part] @ chain.coupling.T)
+        end = chain.last_from_flange
+        rotation[part] = np.einsum("cjm,ck->mjk", axes, end.rotation)
+        translation[part] = (origin + np.einsum("cjm,c->jm", axes, end.translation)).T
+    return Poses(rotation, translation)
+
+
+def joint_frames(chain: Chain, q: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """world_from_joint of each joint before it moves: rotations (n, m, 3, 3) and origins (n, m, 3)."""
+    n, m = len(chain), len(q)
+    rotation, origin = np.empty((n, m, 3, 3)), np.empty((n, m, 3))
+
+    def keep(i: int, axes: np.ndarray, place: np.ndarray) -> None:
+        rotation[i], origin[i] = np.moveaxis(axes, 2, 0).swapaxes(1, 2), place.T
+
+    _walk(chain, q @ chain.coupling.T, keep)
+    return rotation, origin
+
+
+def _walk(chain: Chain, q: np.ndarray, visit=None) -> tuple[np.ndarray, np.ndarray]:
+    """Axes (3 axes, 3 components, m) and origin (3, m) after the last joint; ``visit`` sees each frame unmoved."""
+    m = len(q)
+    axes = np.repeat(np.eye(3)[:, :, None], m, axis=2)
+    origin = np.zeros((3, m))
+    for i in range(len(chain)):
+        origin = origin + np.tensordot(chain.translation[i], axes, 1)
+        axes = (chain.rotation[i].T @ axes.reshape(3, -1)).reshape(3, 3, m)
+        if visit is not None:
+            visit(i, axes, origin)
+        if chain.prismatic[i]:
+            origin = origin + q[:, i] * axes[2]
+        else:
+            c, s = np.cos(q[:, i]), np.sin(q[:, i])
+            x, y = axes[0] * c + axes[1] * s, axes[1] * c - axes[0] * s
+            axes = np.stack([x, y, axes[2]])
+    return axes, origin
+
+
+def chain_parameters(chain: Chain) -> list[tuple[int, int]]:
+    """(joint, component) of the minimal parameters of the chain's axes; component 0–5 is rx, ry, rz, tx, ty, tz.
+
+    An axis is a line: of the six small motions of a joint's frame, turning about it and sliding along it are passed on
+    to what follows, and of a prismatic joint only its direction counts. With the six of one tool this makes the
+    complete, minimal and continuous set of 4 R + 2 P + 6 parameters (Zhuang, Roth & Hamano 1992 for the count;
+    Okamura & Park 1996 for parameters local to each joint).
+    """
+    return [(i, c) for i in range(len(chain)) for c in ((0, 1) if chain.prismatic[i] else (0, 1, 3, 4))]
+
+
+def chain_jacobian(chain: Chain, q: np.ndarray, tip: Poses) -> np.ndarray:
+    """Derivative of poses ``tip`` (world_from_tool) by :func:`chain_parameters`, (m, 6, k), in the world's axes."""
+    rotation, origin = joint_frames(chain, q)
+    out = np.zeros((len(q), 6, 0))
+    columns = []
+    for i, c in chain_parameters(chain):
+        direction = rotation[i][:, :, c % 3]
+        if c < 3:
+            columns.append(np.hstack([direction, np.cross(direction, tip.translation - origin[i])]))
+        else:
+            columns.append(np.hstack([np.zeros_like(direction), direction]))
+    return np.stack(columns, axis=2) if columns else out
+
+
+def moved_chain(chain: Chain, step: np.ndarray) -> Chain:
+    """The chain after small motions along :func:`chain_parameters`, (k,)."""
+    twist = np.zeros((len(chain), 6))
+    for value, (i, c) in zip(step, chain_parameters(chain), strict=True):
+        twist[i, c] = value
+    turn = Rotation.from_rotvec(twist[:, :3]).as_matrix()
+    translation = chain.translation + np.einsum("nij,nj->ni", chain.rotation, twist[:, 3:])
+    return replace(chain, rotation=_orthogonal(chain.rotation @ turn), translation=translation)
+
+
+def _orthogonal(rotation: np.ndarray) -> np.ndarray:
+    """(n, 3, 3) with the rounding of products taken away (one step of Newton's iteration for the polar factor)."""
+    return 1.5 * rotation - 0.5 * rotation @ np.swapaxes(rotation, 1, 2) @ rotation
+
+
+def _from_base_to_tool(robot: Robot, tool: str) -> Chain:
+    """The chain without the world, with the tool in the flange's place."""
+    chain = replace(robot, world_from_base=Rigid()).chain()
+    return replace(chain, last_from_flange=chain.last_from_flange @ robot.tool(tool))
+
+
+def _joint_vectors(q: np.ndarray, n: int) -> np.ndarray:
+    q = np.atleast_2d(np.asarray(q, float))
+    if q.ndim != 2 or q.shape[1] != n:
+        raise InputError(f"joint values: shape {q.shape}, (m, {n}) needed for {n} joints")
+    if not np.isfinite(q).all():
+        raise InputError("joint values: hold values that are not finite")
+    return q

@@ -1,0 +1,204 @@
+"""Measured data of robots: joint values with the positions, poses or distances that an instrument saw."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+
+from stcal.errors import InputError
+from stcal.geometry.arrays import frozen
+from stcal.geometry.rigid import Poses
+from stcal.io.table import ANGLES, LENGTHS, Table, read_table
+from stcal.robot.kinematics.damped import reach_mm
+from stcal.robot.kinematics.model import Robot
+
+WHAT = "robot data"
+STATUS, AMBIGUOUS = "status", "ambiguous"
+"""Column and word of ``stcal-sfm measure``."""
+MAX_TURNS = 4
+"""Joint values beyond so many turns are degrees in a column of radians."""
+LONGEST_TOOL_MM = 10_000.0
+FARTHEST = {"mm": 1e7, "rad": 100 * 2 * np.pi}
+"""10 km and a hundred turns: what is beyond is no length and no joint value."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Measurements:
+    """What an instrument saw at m joint vectors.
+
+    ``where`` : the file; ``lines`` : (m,) its lines; ``q`` : (m, n) values of the controller, rad or mm; ``targets`` :
+    (m,) names of the reflector or target seen; ``positions`` : (m, 3) mm in the instrument's frame; ``rotations`` :
+    (m, 3, 3) where poses were measured; ``covariance`` : (m, 6, 6) of the poses where known; ``common`` : (m, 6, r)
+    their common errors, in it: pose i errs by ``common[i] @ z`` with the same r normal numbers z of σ 1 for all, and by
+    itself; ``distances`` : (m,) mm, where only these were measured, from the position at row
+    ``from_row``, (m,), from 0. What was not measured is None. ``notes`` : on rows of the file that are not here.
+    """
+
+    where: str
+    lines: Sequence[int]
+    q: np.ndarray
+    targets: tuple[str, ...]
+    positions: np.ndarray | None = None
+    rotations: np.ndarray | None = None
+    covariance: np.ndarray | None = None
+    common: np.ndarray | None = None
+    distances: np.ndarray | None = None
+    from_row: np.ndarray | None = None
+    notes: tuple[str, ...] = ()
+
+    def __post_init__(self):
+        m = len(self.q)
+        object.__setattr__(self, "q", frozen(self.q, (m, None), "joint values"))
+        shapes = {"positions": (3,), "rotations": (3, 3), "covariance": (6, 6), "common": (6, None)}
+        for name, shape in shapes.items():
+            if getattr(self, name) is not None:
+                object.__setattr__(self, name, frozen(getattr(self, name), (m, *shape), name))
+        if self.distances is not None:
+            object.__setattr__(self, "distances", frozen(self.distances, (m,), "distances"))
+            object.__setattr__(self, "from_row", frozen(self.from_row, (m,), "rows", int))
+
+    def __len__(self) -> int:
+        return len(self.q)
+
+    def __getitem__(self, index) -> "Measurements":
+        """Rows by a mask, slice or list; not for distances, which refer to one another."""
+        if self.distances is not None:
+            raise InputError(f"{self.where}: distances refer to other rows, so that rows cannot be taken out")
+        rows = np.arange(len(self))[index]
+        return Measurements(
+            self.where,
+            [self.lines[i] for i in rows],
+            self.q[rows],
+            tuple(self.targets[i] for i in rows),
+            *(None if a is None else a[rows] for a in (self.positions, self.rotations, self.covariance, self.common)),
+            notes=self.notes,
+        )
+
+    def own_covariance(self) -> np.ndarray:
+        """(m, 6, 6) of what each pose errs by itself."""
+        if self.common is None:
+            return self.covariance
+        return self.covariance - self.common @ np.swapaxes(self.common, 1, 2)
+
+    def poses(self) -> Poses:
+        """world_from_tool as measured."""
+        if self.rotations is None:
+            raise InputError(f"{self.where}: positions without orientation; columns qw, qx, qy, qz needed")
+        return Poses(self.rotations, self.positions)
+
+
+def read_measurements(path: str | Path, robot: Robot) -> Measurements:
+    """Read joint values with positions, poses or distances (form: ``data_layout.md``).
+
+    Poses of which their ``status`` says that another one fits the image as well, and copies of a row, are left out with
+    a note.
+
+    Raises
+    ------
+    InputError
+        Missing columns, bad rows, joint values of another unit or number than the robot's; the message names the line.
+    """
+    table = read_table(path, WHAT)
+    q = joint_values(table, robot)
+    targets = tuple(table.text("target")) if "target" in table else ("",) * len(table)
+    rows = (table.where, table.lines, q, targets)
+    if table.has("x", LENGTHS):
+        if table.has_rotation():
+            poses = table.poses()
+            covariance = table.pose_covariances()
+            data = Measurements(*rows, poses.translation, poses.rotation, covariance, table.common_errors(covariance))
+        else:
+            data = Measurements(*rows, table.points())
+        within(table, "position", data.positions, "mm")
+        _in_reach(data, robot)
+        return _usable(data, table)
+    if not table.has("distance", LENGTHS):
+        raise InputError(
+            f"{table.where}: neither x_mm, y_mm, z_mm nor distance_mm; what was measured is needed; "
+            f"the header is {table.header()}"
+        )
+    distances = table.quantity("distance", LENGTHS)
+    within(table, "distance", distances, "mm")
+    return Measurements(*rows, distances=distances, from_row=_from_rows(table, distances))
+
+
+def within(table: Table, name: str, values: np.ndarray, unit: str) -> None:
+    """No value (m,) or (m, k) beyond what can be."""
+    bad = np.flatnonzero((np.abs(values).reshape(len(values), -1) > FARTHEST[unit]).any(axis=1))
+    if len(bad):
+        raise InputError(
+            f"{table.where}: line {table.lines[bad[0]]}: {name} is beyond {FARTHEST[unit]:.4g} {unit}; correct it, or "
+            "remove the line"
+        )
+
+
+def _in_reach(data: Measurements, robot: Robot) -> None:
+    """No position farther from the middle one than the arm can put it."""
+    away = np.linalg.norm(data.positions - np.median(data.positions, axis=0), axis=1)
+    reach = max(reach_mm(robot, tool) for tool in robot.tools)
+    worst = int(away.argmax())
+    if away[worst] > 2 * reach + LONGEST_TOOL_MM:
+        raise InputError(
+            f"{data.where}: line {data.lines[worst]}: position is {away[worst]:.4g} mm from the middle of the others, "
+            f"robot {robot.name} reaches {reach:.4g} mm; correct it, or the unit of x, y, z"
+        )
+
+
+def _usable(data: Measurements, table: Table) -> Measurements:
+    """Without the poses that are as likely wrong, and without copies of rows, which would count as measurements."""
+    undecided = np.zeros(len(data), bool)
+    if STATUS in table:
+        undecided = np.array([status == AMBIGUOUS for status in table.text(STATUS)])
+    rotations = np.zeros((len(data), 0)) if data.rotations is None else data.rotations.reshape(len(data), -1)
+    names = np.unique(data.targets, return_inverse=True)[1]
+    every = np.column_stack([data.q, names, data.positions, rotations])
+    copies = np.ones(len(data), bool)
+    copies[np.unique(every, axis=0, return_index=True)[1]] = False
+    reasons = {
+        f"their {STATUS} is {AMBIGUOUS} (two poses fit the image); show a second face, come nearer, or measure with "
+        "--previous": undecided,
+        "copies of other rows": copies & ~undecided,
+    }
+    notes = [
+        f"{gone.sum()} of {len(data)} rows left out, first line {data.lines[int(gone.argmax())]}: {reason}"
+        for reason, gone in reasons.items()
+        if gone.any()
+    ]
+    keep = ~(undecided | copies)
+    if not keep.any():
+        raise InputError(f"{data.where}: {notes[0]}")
+    return replace(data[keep], notes=tuple(notes)) if notes else data
+
+
+def joint_values(table: Table, robot: Robot) -> np.ndarray:
+    """(m, n) of columns ``q1_deg`` … (``_rad``; ``_mm``, ``_m`` for prismatic joints)."""
+    n = len(robot.rows)
+    if any(name.startswith(f"q{n + 1}_") for name in table.columns):
+        raise InputError(
+            f"{table.where}: a column q{n + 1}_…, but robot {robot.name} has {n} joints; give its own file"
+        )
+    columns = []
+    for i, joint in enumerate(robot.joints, 1):
+        units = ANGLES if joint.type == "revolute" else LENGTHS
+        values = table.quantity(f"q{i}", units)
+        far = np.flatnonzero(np.abs(values) > 2 * np.pi * MAX_TURNS)
+        if joint.type == "revolute" and len(far) and table.unit(f"q{i}", units) == "rad":
+            raise InputError(
+                f"{table.where}: line {table.lines[far[0]]}: q{i}_rad is {values[far[0]]:g}, over {MAX_TURNS} turns; "
+                f"if these are degrees call the column q{i}_deg"
+            )
+        within(table, f"q{i}", values, "mm" if units is LENGTHS else "rad")
+        columns.append(values)
+    return np.column_stack(columns)
+
+
+def _from_rows(table: Table, distances: np.ndarray) -> np.ndarray:
+    """Row that each distance starts from: column ``from_row``, counted from 1 as the rows stand; else the first."""
+    if "from_row" not in table:
+        return np.zeros(len(table), int)
+    rows = table.numbers("from_row")
+    for i, row in enumerate(rows):
+        if row != int(row) or not 1 <= row <= len(rows):
+            raise InputError(f"{table.where}: line {table.lines[i]}: from_row is {row:g}, 1 … {len(rows)} needed")
+    return rows.astype(int) - 1

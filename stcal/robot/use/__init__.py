@@ -1,0 +1,1 @@
+"""An identified robot at work: compensation, verification, poses to measure at."""

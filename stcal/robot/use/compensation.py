@@ -1,0 +1,337 @@
+"""Compensation off line: joint values with which the identified robot really reaches what was commanded."""
+
+import csv
+import io
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from stcal.errors import InputError
+from stcal.geometry.arrays import frozen
+from stcal.geometry.rigid import Poses
+from stcal.io.table import LENGTHS, read_table
+from stcal.robot.kinematics.forward import forward
+from stcal.robot.kinematics.inverse import LIMIT, ORIENTATION, SINGULAR_POSE, UNREACHABLE, Inverse, inverse
+from stcal.robot.kinematics.measurements import joint_values, within
+from stcal.robot.kinematics.model import Robot
+
+WHAT = "targets"
+FAR_RAD = np.radians(1.0)
+"""Arms are made to milliradians; a joint that has to move by more than this does so because others cannot."""
+SAME_TOOL_MM, SAME_TOOL_RAD = 20.0, np.radians(5)
+"""By more no tool is off what its drawing says."""
+MEANING = {
+    LIMIT: "only joint values beyond the limits reach it",
+    UNREACHABLE: "no joint values reach it",
+    SINGULAR_POSE: "singular: the joint values are not the only ones",
+    ORIENTATION: "position reached, orientation as near as the joints allow",
+}
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Targets:
+    """Commanded poses base_from_tool, one for each row of a file.
+
+    ``lines`` : (m,) of the file; ``tools`` : (m,) names; ``poses`` : None where joint values command; ``q`` : (m, n)
+    commanded joint values, or those whose branch is wanted, rad or mm; None where there are none.
+    """
+
+    where: str
+    lines: Sequence[int]
+    tools: tuple[str, ...]
+    poses: Poses | None
+    q: np.ndarray | None
+
+    def __post_init__(self):
+        if self.q is not None:
+            object.__setattr__(self, "q", frozen(self.q, (len(self), None), "joint values"))
+
+    def __len__(self) -> int:
+        return len(self.lines)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Compensated:
+    """Commanded poses with what the controller must be told.
+
+    Parameters
+    ----------
+    targets : Targets
+    poses : Poses
+        Commanded base_from_tool.
+    found : Inverse
+        By the identified robot.
+    nominal : Inverse or None
+        By the nominal robot: what would be told without calibration.
+    before_mm, before_rad : (m,) arrays or None
+        Error, by the identified robot, of the nominal joint values: what compensation takes away.
+    sliding : (n,) array
+        Which joints are prismatic.
+    other_tools : tuple of str
+        Notes on tools that are others in the nominal robot.
+    """
+
+    targets: Targets
+    poses: Poses
+    found: Inverse
+    nominal: Inverse | None
+    before_mm: np.ndarray | None
+    before_rad: np.ndarray | None
+    sliding: np.ndarray
+    other_tools: tuple[str, ...] = ()
+
+    def __len__(self) -> int:
+        return len(self.found)
+
+    def compared(self) -> np.ndarray:
+        """(m,) rows that both robots reach."""
+        return self.found.usable & self.nominal.usable if self.nominal else np.zeros(len(self), bool)
+
+    def notes(self) -> list[str]:
+        """Every row that is not simply reached, or only a long way from the nominal joint values, by its line; tools
+        that the two robots do not share."""
+        return [*self.other_tools, *self._not_simply_reached(), *self._far_moved()]
+
+    def _far_moved(self) -> list[str]:
+        if self.nominal is None:
+            return []
+        moved = np.abs(self.found.q - self.nominal.q)[:, ~self.sliding].max(axis=1, initial=0.0)
+        return [
+            f"line {self.targets.lines[i]}: a joint moves by {np.degrees(moved[i]):.1f}°: near a singular pose"
+            for i in np.flatnonzero(self.compared() & (moved > FAR_RAD))
+        ]
+
+    def _not_simply_reached(self) -> list[str]:
+        return [
+            f"line {line}: {MEANING[status]}; {mm:.4g} mm and {np.degrees(rad):.4g}° remain"
+            for line, status, mm, rad in zip(
+                self.targets.lines, self.found.status, self.found.error_mm, self.found.error_rad, strict=True
+            )
+            if status in MEANING
+        ]
+
+
+def _other_tools(identified: Robot, nominal: Robot | None, used: Sequence[str]) -> tuple[str, ...]:
+    """Where a tool is not nearly the same in both files: commanded poses are of one of them only."""
+    notes = []
+    for name in dict.fromkeys(used) if nominal else ():
+        own, other = identified.tool(name), nominal.tool(name)
+        mm, rad = np.linalg.norm(own.translation - other.translation), (own.inverse() @ other).angle_rad()
+        if mm > SAME_TOOL_MM or rad > SAME_TOOL_RAD:
+            notes.append(
+                f"tool {name or 'of the robot files'} differs by {mm:.4g} mm and {np.degrees(rad):.3g}° between "
+                f"{identified.name}'s two files: the commanded poses can be of one of them only; give both files the "
+                "[tool] that they are of"
+            )
+    return tuple(notes)
+
+
+def read_targets(path: str | Path, robot: Robot) -> Targets:
+    """Read commanded poses (form: ``data_layout.md``).
+
+    Raises
+    ------
+    InputError
+        Neither poses nor joint values, positions without orientation, bad rows; the message names the line.
+    """
+    table = read_table(path, WHAT)
+    has_joints = any(name.startswith("q1_") for name in table.columns)
+    has_poses = table.has("x", LENGTHS)
+    if not has_poses and not has_joints:
+        raise InputError(
+            f"{table.where}: neither poses x_mm … qz nor joint values q1_deg …; commanded poses are needed; "
+            f"the header is {table.header()}"
+        )
+    if has_poses and not table.has_rotation():
+        raise InputError(f"{table.where}: positions without orientation; columns qw, qx, qy, qz needed")
+    tools = tuple(table.text("target")) if "target" in table else ("",) * len(table)
+    for line, tool in zip(table.lines, tools, strict=True):
+        if tool not in robot.tools:
+            known = ", ".join(repr(name) for name in robot.tools)
+            raise InputError(
+                f"{table.where}: line {line}: target {tool!r} is not in robot {robot.name}; there are {known}"
+            )
+    poses = table.poses() if has_poses else None
+    if poses is not None:
+        within(table, "position", poses.translation, "mm")
+    return Targets(
+        table.where,
+        table.lines,
+        tools,
+        poses,
+        joint_values(table, robot) if has_joints else None,
+    )
+
+
+def compensate(identified: Robot, targets: Targets, nominal: Robot | None = None) -> Compensated:
+    """Joint values for the commanded poses, by the identified robot and beside it by the nominal one.
+
+    Of several branches the one nearest to the nominal joint values, or without a nominal robot to the commanded ones.
+    Where neither is known the first pose gets the one nearest to the middle of the joint limits and every other the one
+    nearest to the pose before.
+
+    Raises
+    ------
+    InputError
+        Joint values without poses need the nominal robot; robots of different joints; an unknown tool.
+    """
+    if nominal is not None and (
+        len(nominal.rows) != len(identified.rows) or (nominal.prismatic != identified.prismatic).any()
+    ):
+        raise InputError(
+            f"nominal robot {nominal.name} and identified robot {identified.name}: joints of different number or type; "
+            "files of the same robot needed"
+        )
+    if targets.poses is None and nominal is None:
+        raise InputError(
+            f"{targets.where}: joint values without poses; only the nominal robot knows which poses they command, "
+            "give its file with --nominal"
+        )
+    poses = targets.poses if targets.poses is not None else _by_tool(nominal, targets)
+    before = None
+    near = targets.q
+    if nominal is not None:
+        before = _inverse_by_tool(nominal, targets, poses, targets.q)
+        near = before.q
+    found = _inverse_by_tool(identified, targets, poses, near)
+    if before is None:
+        return Compensated(targets, poses, found, None, None, None, identified.prismatic)
+    off = poses.difference(_by_tool(identified, targets, before.q))
+    error_mm, error_rad = np.linalg.norm(off[:, 3:], axis=1), np.linalg.norm(off[:, :3], axis=1)
+    tools = _other_tools(identified, nominal, targets.tools)
+    return Compensated(targets, poses, found, before, error_mm, error_rad, identified.prismatic, tools)
+
+
+def _rows_by_tool(targets: Targets) -> list[tuple[str, np.ndarray]]:
+    names = np.array(targets.tools, dtype=object)
+    return [(name, np.flatnonzero(names == name)) for name in dict.fromkeys(targets.tools)]
+
+
+def _by_tool(robot: Robot, targets: Targets, q: np.ndarray | None = None) -> Poses:
+    """base_from_tool of each row's joint values and tool."""
+    q = targets.q if q is None else q
+    rotation, translation = np.empty((len(q), 3, 3)), np.empty((len(q), 3))
+    for name, rows in _rows_by_tool(targets):
+        part = forward(robot, q[rows], name)
+        rotation[rows], translation[rows] = part.rotation, part.translation
+    return Poses(rotation, translation)
+
+
+def _inverse_by_tool(robot: Robot, targets: Targets, poses: Poses, near: np.ndarray | None) -> Inverse:
+    m = len(poses)
+    q, status = np.empty((m, len(robot.rows))), np.empty(m, object)
+    error_mm, error_rad = np.empty(m), np.empty(m)
+    for name, rows in _rows_by_tool(targets):
+        part = inverse(robot, poses[rows], None if near is None else near[rows], name)
+        q[rows], status[rows] = part.q, part.status
+        error_mm[rows], error_rad[rows] = part.error_mm, part.error_rad
+    return Inverse(q, tuple(status), error_mm, error_rad)
+
+
+def joint_columns(robot: Robot) -> list[str]:
+    """``q1_deg`` … and ``q3_mm`` of prismatic joints."""
+    return [f"q{i}_{'mm' if sliding else 'deg'}" for i, sliding in enumerate(robot.prismatic, 1)]
+
+
+def joint_cells(robot: Robot, q: np.ndarray) -> list[str]:
+    """One joint vector in the units of :func:`joint_columns`, to nine decimals (a millionth of a µm of arc)."""
+    return [f"{value:.9f}" for value in np.where(robot.prismatic, q, np.degrees(q))]
+
+
+def compensated_csv(result: Compensated, robot: Robot) -> str:
+    """The table of ``--out`` (form: ``data_layout.md``); joint values of poses that are not reached are left empty."""
+    stream = io.StringIO()
+    writer = csv.writer(stream, lineterminator="\n")
+    columns = joint_columns(robot)
+    head = ["line", "target", *columns, "status", "error_mm", "error_deg"]
+    if result.nominal:
+        head += [*(f"nominal_{c}" for c in columns), "nominal_status", "nominal_error_mm", "nominal_error_deg"]
+    writer.writerow(head)
+    none = [""] * len(columns)
+    for i, line in enumerate(result.targets.lines):
+        found = result.found
+        row = [line, result.targets.tools[i], *(joint_cells(robot, found.q[i]) if found.usable[i] else none)]
+        row += [found.status[i], f"{found.error_mm[i]:.6f}", f"{np.degrees(found.error_rad[i]):.6f}"]
+        if result.nominal:
+            usable = result.nominal.usable[i]
+            row += joint_cells(robot, result.nominal.q[i]) if usable else none
+            row.append(result.nominal.status[i])
+            row += [f"{result.before_mm[i]:.6f}", f"{np.degrees(result.before_rad[i]):.6f}"] if usable else ["", ""]
+        writer.writerow(row)
+    return stream.getvalue()
+
+
+def compensated_json(result: Compensated, robot: Robot) -> dict:
+    """Everything, for programs."""
+    columns = joint_columns(robot)
+    unit = np.where(robot.prismatic, 1.0, np.degrees(1.0))
+
+    def joints(found: Inverse, i: int) -> dict | None:
+        return dict(zip(columns, (found.q[i] * unit).tolist(), strict=True)) if found.usable[i] else None
+
+    rows = []
+    quaternions = result.poses.quaternions()
+    for i, line in enumerate(result.targets.lines):
+        row = {
+            "line": int(line),
+            "target": result.targets.tools[i],
+            "commanded_mm": result.poses.translation[i].tolist(),
+            "commanded_quaternion": quaternions[i].tolist(),
+            "status": result.found.status[i],
+            "joints": joints(result.found, i),
+            "error_mm": float(result.found.error_mm[i]),
+            "error_rad": float(result.found.error_rad[i]),
+        }
+        if result.nominal:
+            usable = bool(result.nominal.usable[i])
+            row |= {
+                "nominal_status": result.nominal.status[i],
+                "nominal_joints": joints(result.nominal, i),
+                "nominal_error_mm": float(result.before_mm[i]) if usable else None,
+                "nominal_error_rad": float(result.before_rad[i]) if usable else None,
+            }
+        rows.append(row)
+    counts = {status: result.found.status.count(status) for status in dict.fromkeys(result.found.status)}
+    return {"format": "stcal compensation 1", "robot": robot.name, "counts": counts, "poses": rows}
+
+
+def compensated_text(result: Compensated, robot: Robot, most: int = 60) -> str:
+    """Nominal and compensated side by side, for the terminal; of more than ``most`` rows the first."""
+    digits = np.where(robot.prismatic, 4, 5)
+    unit = np.where(robot.prismatic, 1.0, np.degrees(1.0))
+    width = 12
+    head = [f"{'line':>6} {'':<12}", *(f"{c:>{width}}" for c in joint_columns(robot)), f"{'error mm':>11}  status"]
+    lines = ["".join(head)]
+
+    def line_of(number: str, name: str, found: Inverse, i: int, error: float) -> str:
+        shown = [f"{v:>{width}.{d}f}" for v, d in zip(found.q[i] * unit, digits, strict=True)]
+        values = "".join(shown) if found.usable[i] else " " * (width - 1) + "–" + " " * width * (len(unit) - 1)
+        return f"{number:>6} {name:<12}{values}{error:>11.4f}  {found.status[i]}"
+
+    for i in range(min(most, len(result))):
+        number = str(result.targets.lines[i])
+        if result.nominal:
+            error = result.before_mm[i] if result.nominal.usable[i] else result.nominal.error_mm[i]
+            lines.append(line_of(number, "nominal", result.nominal, i, error))
+            number = ""
+        lines.append(line_of(number, "compensated", result.found, i, result.found.error_mm[i]))
+    if len(result) > most:
+        lines.append(f"… and {len(result) - most} more (--out, --json)")
+    return "\n".join(lines)
+
+
+def compensated_summary(result: Compensated) -> list[str]:
+    """Sentences on all poses together."""
+    m = len(result)
+    good = int(result.found.usable.sum())
+    lines = [f"{good} of {m} poses reached by the identified robot"]
+    both = result.compared()
+    if both.any():
+        before = result.before_mm[both]
+        lines.append(
+            f"Position error of the nominal joint values, by the identified robot: mean {before.mean():.4f}, "
+            f"max {before.max():.4f} mm; taken away by compensation, down to {result.found.error_mm[both].max():.1g} mm"
+        )
+    return lines

@@ -1,0 +1,292 @@
+"""Measurement poses that show a robot's parameters well: D-optimal choice among random candidates.
+
+Greedy choice, then exchange of single poses while that helps (Fedorov 1972; Mitchell 1974, DETMAX), with updates of the
+inverse information matrix by the few rows of a pose (Sherman, Morrison & Woodbury).
+"""
+
+import csv
+import io
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+
+from stcal.errors import DegenerateError, InputError
+from stcal.geometry.arrays import frozen
+from stcal.geometry.rigid import Poses
+from stcal.io.table import POSE, pose_cells
+from stcal.robot.identify.observability import SEEN, Observability, identification_jacobian, parameter_scale
+from stcal.robot.kinematics.forward import forward
+from stcal.robot.kinematics.model import Robot
+from stcal.robot.use.compensation import joint_cells, joint_columns
+
+RANDOM_SETS = 20
+DRAWS = 200
+"""So many joint vectors are drawn for each candidate that is wanted in the box before it counts as out of reach."""
+SWEEPS = 20
+"""Passes over the whole set; after 2 to 6 nothing helps any more."""
+GAIN = 1e-9
+"""Least growth of log det that counts."""
+TEST_POSES = 200
+"""Random poses at which the identified robot's position is predicted."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class PoseDesign:
+    """Chosen poses beside random ones.
+
+    Parameters
+    ----------
+    q : (count, n) array
+        Joint vectors, in order of choice: the first ones alone are a good set too.
+    poses : Poses
+        base_from_tool there.
+    parameters, seen : int
+        Parameters, and how many of them (in combination) the candidates show; the indices are of these.
+    chosen : Observability
+    random : tuple of Observability
+        Of random sets of the same size.
+    sigma_mm, random_sigma_mm : float
+        σ of the position that the identified robot will predict, RMS per axis over random poses; of the chosen set, and
+        median of the random ones.
+    exchanges : int
+    """
+
+    q: np.ndarray
+    poses: Poses
+    parameters: int
+    seen: int
+    chosen: Observability
+    random: tuple[Observability, ...]
+    sigma_mm: float
+    random_sigma_mm: float
+    exchanges: int
+
+    def __post_init__(self):
+        object.__setattr__(self, "q", frozen(self.q, (len(self.poses), None), "joint values"))
+
+    def median(self) -> dict[str, float]:
+        """Of the random sets' indices."""
+        names = self.chosen.values()
+        return {name: float(np.median([each.values()[name] for each in self.random])) for name in names}
+
+
+@dataclass(frozen=True, slots=True)
+class DesignOptions:
+    """``box`` : lowest x, y, z and highest x, y, z of the tool in the base, mm; σ are those of the instrument."""
+
+    count: int = 40
+    seed: int = 0
+    observe: Literal["pose", "position"] = "position"
+    candidates: int = 1000
+    sigma_mm: float = 0.05
+    sigma_rad: float = 2e-4
+    box: tuple[float, ...] | None = None
+    tool: str = ""
+
+    def __post_init__(self):
+        if self.count < 1 or self.candidates <= self.count:
+            raise InputError(
+                f"design: {self.count} poses of {self.candidates} candidates; more candidates than poses needed"
+            )
+        if not (0 < self.sigma_mm < np.inf and 0 < self.sigma_rad < np.inf):
+            raise InputError(f"design: σ of {self.sigma_mm:g} mm and {self.sigma_rad:g} rad; positive numbers needed")
+        if self.box is not None and (
+            len(self.box) != 6 or any(not a < b for a, b in zip(self.box[:3], self.box[3:], strict=True))
+        ):
+            shown = ",".join(f"{v:g}" for v in self.box)
+            raise InputError(
+                f"design: box {shown}; xmin,ymin,zmin,xmax,ymax,zmax needed, each minimum below its maximum"
+            )
+
+
+def design(robot: Robot, options: DesignOptions | None = None) -> PoseDesign:
+    """Choose poses for the identification of ``robot``, the same for the same seed.
+
+    Raises
+    ------
+    InputError
+        A prismatic joint without limits, or no poses in the box.
+    DegenerateError
+        So few poses that the parameters cannot be determined.
+    """
+    options = options or DesignOptions()
+    rng = np.random.default_rng(options.seed)
+    q = _candidates(robot, options, rng)
+    scale = parameter_scale(robot, options.observe, [options.tool])
+    rows = identification_jacobian(robot, q, options.observe, options.sigma_mm, options.sigma_rad, options.tool) * scale
+    seen, basis = _seen_part(rows)
+    rows = rows @ basis
+    needed = -(-seen // rows.shape[1])
+    if options.count < needed:
+        raise DegenerateError(
+            f"design: {options.count} poses with {rows.shape[1]} values each for {seen} parameters; "
+            f"at least {needed} needed, some tens advisable"
+        )
+    chosen, exchanges = choose(rows, options.count)
+    sets = [rng.choice(len(q), options.count, replace=False) for _ in range(RANDOM_SETS)]
+    predict = _prediction(robot, q[:TEST_POSES], options) * scale @ basis
+    return PoseDesign(
+        q[chosen],
+        forward(robot, q[chosen], options.tool),
+        len(scale),
+        seen,
+        Observability.of_jacobian(rows[chosen]),
+        tuple(Observability.of_jacobian(rows[s]) for s in sets),
+        _predicted_mm(rows[chosen], predict),
+        float(np.median([_predicted_mm(rows[s], predict) for s in sets])),
+        exchanges,
+    )
+
+
+def _prediction(robot: Robot, q: np.ndarray, options: DesignOptions) -> np.ndarray:
+    """Derivative (m, 3, k) of the tool's position by all parameters; its orientation, if any, does not move it."""
+    by_position = identification_jacobian(robot, q, "position", tool=options.tool)
+    if options.observe == "position":
+        return by_position
+    return np.insert(by_position, [by_position.shape[2] - 3] * 3, 0.0, axis=2)
+
+
+def _candidates(robot: Robot, options: DesignOptions, rng: np.random.Generator) -> np.ndarray:
+    """(candidates, n) uniform over the joint limits (one turn where unlimited), with the tool in the box."""
+    low, high = robot.limits().T
+    open_ended = robot.prismatic & ~np.isfinite(high - low)
+    if open_ended.any():
+        raise InputError(
+            f"robot {robot.name}: joint {np.flatnonzero(open_ended)[0] + 1} is prismatic without limits; "
+            "min_mm and max_mm needed"
+        )
+    low = np.where(np.isfinite(low), low, np.where(np.isfinite(high), high - 2 * np.pi, -np.pi))
+    high = np.where(np.isfinite(high), high, low + 2 * np.pi)
+    found: list[np.ndarray] = []
+    count, drawn = 0, 0
+    while count < options.candidates:
+        if drawn >= DRAWS * options.candidates:
+            shown = ",".join(f"{v:g}" for v in options.box)
+            raise InputError(
+                f"design: of {drawn} random joint vectors {count} bring the tool into the box {shown} mm, "
+                f"{options.candidates} needed; widen it (it is in the robot's base) or ask for fewer candidates"
+            )
+        q = rng.uniform(low, high, (options.candidates, len(low)))
+        drawn += len(q)
+        if options.box is not None:
+            at = forward(robot, q, options.tool).translation
+            q = q[((at >= options.box[:3]) & (at <= options.box[3:])).all(axis=1)]
+        found.append(q)
+        count += len(q)
+    return np.concatenate(found)[: options.candidates]
+
+
+def _seen_part(rows: np.ndarray) -> tuple[int, np.ndarray]:
+    """How many combinations of parameters the candidates show, and these: (k, seen) orthonormal columns."""
+    _, sigma, vt = np.linalg.svd(np.linalg.qr(rows.reshape(-1, rows.shape[2]), mode="r"))
+    seen = int((sigma > SEEN * sigma[0]).sum())
+    return seen, vt[:seen].T
+
+
+def choose(rows: np.ndarray, count: int) -> tuple[np.ndarray, int]:
+    """``count`` of m candidates with rows (m, r, k) for which det Σ JᵀJ is large; and the number of exchanges.
+
+    Greedy from next to no information (a millionth of the candidates' mean), then exchange of each pose for the best
+    other one until nothing helps. No pose is taken twice.
+    """
+    k = rows.shape[2]
+    mean = np.einsum("mri,mrj->ij", rows, rows) / len(rows)
+    start = 1e-6 * np.trace(mean) / k * np.eye(k)
+    inverse = np.linalg.inv(start)
+    chosen: list[int] = []
+    for _ in range(count):
+        gain = _gains(rows, inverse)
+        gain[chosen] = -np.inf
+        chosen.append(int(gain.argmax()))
+        inverse = _updated(inverse, rows[chosen[-1]], 1.0)
+    exchanges = 0
+    for _ in range(SWEEPS):
+        before = exchanges
+        inverse = np.linalg.inv(start + np.einsum("mri,mrj->ij", rows[chosen], rows[chosen]))  # no rounding gathers
+        for place in range(count):
+            without = _updated(inverse, rows[chosen[place]], -1.0)
+            gain = _gains(rows, without)
+            own = gain[chosen[place]]
+            gain[chosen] = -np.inf
+            best = int(gain.argmax())
+            if gain[best] > own + GAIN:
+                chosen[place] = best
+                inverse = _updated(without, rows[best], 1.0)
+                exchanges += 1
+        if exchanges == before:
+            break
+    return np.array(chosen), exchanges
+
+
+def _gains(rows: np.ndarray, inverse: np.ndarray) -> np.ndarray:
+    """(m,) growth of log det of the information with each candidate."""
+    inner = np.einsum("mri,mji->mrj", rows @ inverse, rows)
+    r = np.arange(inner.shape[1])
+    inner[:, r, r] += 1
+    return np.linalg.slogdet(inner)[1]
+
+
+def _updated(inverse: np.ndarray, rows: np.ndarray, sign: float) -> np.ndarray:
+    """Inverse information after rows (r, k) are added (+1) or taken away (−1)."""
+    half = inverse @ rows.T
+    return inverse - half @ np.linalg.solve(sign * np.eye(len(rows)) + rows @ half, half.T)
+
+
+def _predicted_mm(rows: np.ndarray, predict: np.ndarray) -> float:
+    """σ of predicted positions, RMS per axis, mm; infinite where the set leaves something open."""
+    _, sigma, vt = np.linalg.svd(rows.reshape(-1, rows.shape[2]), full_matrices=False)
+    if len(sigma) < rows.shape[2] or sigma[-1] <= SEEN * sigma[0]:
+        return float("inf")
+    return float(np.sqrt(np.mean(((predict @ vt.T / sigma) ** 2).sum(axis=2))))
+
+
+def design_csv(result: PoseDesign, robot: Robot) -> str:
+    """The table of ``--out`` (form: ``data_layout.md``)."""
+    stream = io.StringIO()
+    writer = csv.writer(stream, lineterminator="\n")
+    writer.writerow(["pose", *joint_columns(robot), *(f"nominal_{c}" for c in POSE)])
+    for i, (q, pose) in enumerate(zip(result.q, result.poses, strict=True), 1):
+        writer.writerow([i, *joint_cells(robot, q), *pose_cells(pose)])
+    return stream.getvalue()
+
+
+def design_json(result: PoseDesign) -> dict:
+    """Everything but the poses themselves, for programs."""
+    return {
+        "format": "stcal pose design 1",
+        "count": len(result.q),
+        "parameters": result.parameters,
+        "seen": result.seen,
+        "exchanges": result.exchanges,
+        "chosen": result.chosen.values(),
+        "random_median": result.median(),
+        "random": [each.values() for each in result.random],
+        "predicted_sigma_mm": result.sigma_mm,
+        "random_predicted_sigma_mm": result.random_sigma_mm if np.isfinite(result.random_sigma_mm) else None,
+    }
+
+
+def design_text(result: PoseDesign) -> str:
+    """The comparison for the terminal."""
+    lines = [
+        f"{len(result.q)} poses for {result.seen} parameters, {result.exchanges} exchanges after the greedy choice"
+    ]
+    if result.seen < result.parameters:
+        lines.append(
+            f"{result.parameters - result.seen} of {result.parameters} combinations of parameters move nothing that is "
+            "measured, in any pose (as with a tool on the last axis), and are left out"
+        )
+    median = result.median()
+    lines.append(f"{'':<3}{'chosen':>12}{'random':>12}{'ratio':>8}   (random: median of {len(result.random)} sets)")
+    for name, value in result.chosen.values().items():
+        ratio = f"{value / median[name]:.2f}" if median[name] > 0 else "–"
+        lines.append(f"{name:<3}{value:12.4g}{median[name]:12.4g}{ratio:>8}")
+    text = f"σ of predicted positions: {1000 * result.sigma_mm:.1f} µm per axis"
+    if np.isfinite(result.random_sigma_mm):
+        ratio = result.random_sigma_mm / result.sigma_mm
+        text += (
+            f", of random poses {1000 * result.random_sigma_mm:.1f} µm; to be as good these would have to be "
+            f"{ratio**2:.2f} times as many"
+        )
+    return "\n".join([*lines, text, "collisions are not looked at: only joint limits and the box of the tool"])

@@ -1,0 +1,241 @@
+"""Whether a calibration helped: distances between measured positions against those between the commanded ones.
+
+The test of the stereo-target paper: distances from the first position, which need no common frame of robot and
+instrument. They all carry the error of the first position; the distances of all pairs depend less on any one.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from stcal.errors import InputError
+from stcal.geometry.arrays import frozen
+from stcal.io.table import Table, read_table
+from stcal.robot.kinematics.measurements import within
+
+WHAT = "measured positions"
+SAME_MM = 1e-6
+"""Commanded positions nearer than this are the same command: what printing makes of a number."""
+SCALE_WITHIN = 0.01
+"""Arms are off by parts of a thousand; measured distances off by more in common are of another unit or other poses."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Measured:
+    """Rows of a file. ``sets``, ``names`` : (m,) set and pose of each; ``commanded``, ``measured`` : (m, 3) mm, each in
+    a frame of its own."""
+
+    where: str
+    lines: Sequence[int]
+    sets: tuple[str, ...]
+    names: tuple[str, ...]
+    commanded: np.ndarray
+    measured: np.ndarray
+
+    def __post_init__(self):
+        m = len(self.lines)
+        object.__setattr__(self, "commanded", frozen(self.commanded, (m, 3), "commanded positions"))
+        object.__setattr__(self, "measured", frozen(self.measured, (m, 3), "measured positions"))
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class SetResult:
+    """Distance errors of one set, mm.
+
+    ``error_mm`` : (m − 1,) measured minus commanded distance from the first position; ``mean_mm``, ``std_mm``,
+    ``max_mm`` : of their absolute values, the standard deviation with m − 2 degrees of freedom; ``pairs_rms_mm`` : of
+    the errors of all pairs; ``scale`` : measured over commanded distances of all pairs, by least squares.
+    """
+
+    name: str
+    error_mm: np.ndarray
+    mean_mm: float
+    std_mm: float
+    max_mm: float
+    pairs_rms_mm: float
+    scale: float
+
+    def figures(self) -> dict[str, float]:
+        """What is compared between sets, mm."""
+        return {"mean": self.mean_mm, "std": self.std_mm, "max": self.max_mm, "all pairs RMS": self.pairs_rms_mm}
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Verification:
+    """Sets over the poses that all of them have.
+
+    ``poses`` : names, the first being the one that distances start from; ``sets`` : in order of the file; ``missing`` :
+    by set the poses that it lacks, which are left out of all.
+    """
+
+    where: str
+    poses: tuple[str, ...]
+    distance_mm: np.ndarray
+    sets: tuple[SetResult, ...]
+    missing: dict[str, tuple[str, ...]]
+
+    def reduction(self, index: int) -> dict[str, float]:
+        """By how many per cent each figure of set ``index`` is below the first set's."""
+        first, own = self.sets[0].figures(), self.sets[index].figures()
+        return {key: 100 * (1 - own[key] / first[key]) if first[key] > 0 else float("nan") for key in first}
+
+    def warnings(self) -> list[str]:
+        """What to look at."""
+        found = [
+            f"set {name}: missing poses, left out of all sets ({len(poses)}): {_few(poses)}"
+            for name, poses in self.missing.items()
+            if poses
+        ]
+        return found + [
+            f"set {s.name}: measured distances are {s.scale:.4f} times the commanded ones; "
+            "check units and the order of the poses"
+            for s in self.sets
+            if abs(s.scale - 1) > SCALE_WITHIN
+        ]
+
+
+def read_measured(path: str | Path) -> Measured:
+    """Read commanded and measured positions (form: ``data_layout.md``).
+
+    Raises
+    ------
+    InputError
+        Missing columns, bad rows, or a pose twice in one set; the message names the line.
+    """
+    table = read_table(path, WHAT)
+    commanded, measured = table.points("commanded_"), table.points()
+    within(table, "commanded position", commanded, "mm")
+    within(table, "position", measured, "mm")
+    sets = tuple(table.text("set")) if "set" in table else ("measured",) * len(table)
+    return Measured(table.where, table.lines, sets, _names(table, sets, commanded), commanded, measured)
+
+
+def _names(table: Table, sets: tuple[str, ...], commanded: np.ndarray) -> tuple[str, ...]:
+    """Names of poses: column ``pose``; else equal commanded positions are one pose, a second time in a set another."""
+    if "pose" in table:
+        names = tuple(table.text("pose"))
+        seen: dict[tuple[str, str], int] = {}
+        for line, key in zip(table.lines, zip(sets, names, strict=True), strict=True):
+            if key in seen:
+                raise InputError(
+                    f"{table.where}: line {line}: pose {key[1]} of set {key[0]} stands on line {seen[key]} already; "
+                    "give the sets different names"
+                )
+            seen[key] = line
+        return names
+    places: dict[tuple, list[int]] = {}
+    names, times = [], {}
+    for name, xyz in zip(sets, np.round(commanded / SAME_MM).astype(np.int64).tolist(), strict=True):
+        place = tuple(xyz)
+        times[name, place] = times.get((name, place), 0) + 1
+        key = (place, times[name, place])
+        names.append(places.setdefault(key, len(places) + 1))
+    return tuple(str(name) for name in names)
+
+
+def verify(data: Measured) -> Verification:
+    """Distance errors of each set, over the poses that all sets have.
+
+    Raises
+    ------
+    InputError
+        Fewer than three poses in common, or one pose commanded to different places.
+    """
+    rows: dict[str, dict[str, int]] = {}
+    for i, (group, name) in enumerate(zip(data.sets, data.names, strict=True)):
+        rows.setdefault(group, {})[name] = i
+    every = list(dict.fromkeys(data.names))
+    common = [name for name in every if all(name in own for own in rows.values())]
+    missing = {group: tuple(name for name in every if name not in own) for group, own in rows.items()}
+    if len(common) < 3:
+        raise InputError(
+            f"{data.where}: {len(common)} poses in {'all of the sets ' if len(rows) > 1 else ''}{', '.join(rows)}; "
+            "at least 3 needed; are the commanded positions of the sets the same?"
+        )
+    index = {group: np.array([own[name] for name in common]) for group, own in rows.items()}
+    first = next(iter(index.values()))
+    for group, own in index.items():
+        off = np.abs(data.commanded[own] - data.commanded[first]).max(axis=1)
+        if off.max() > SAME_MM:
+            k = int(off.argmax())
+            raise InputError(
+                f"{data.where}: pose {common[k]} is commanded {off[k]:.4g} mm apart in sets {next(iter(index))} and "
+                f"{group} (line {data.lines[own[k]]}); the same commands needed"
+            )
+    sets = tuple(_set_result(data, group, own) for group, own in index.items())
+    at = data.commanded[first]
+    return Verification(data.where, tuple(common), np.linalg.norm(at[1:] - at[0], axis=1), sets, missing)
+
+
+def _set_result(data: Measured, name: str, rows: np.ndarray) -> SetResult:
+    commanded, measured = data.commanded[rows], data.measured[rows]
+    error = np.linalg.norm(measured[1:] - measured[0], axis=1) - np.linalg.norm(commanded[1:] - commanded[0], axis=1)
+    size = np.abs(error)
+    squares = pairs = product = wanted_squares = 0.0
+    for i in range(1, len(measured)):  # row by row: all pairs of thousands at once are gigabytes
+        found = np.linalg.norm(measured[:i] - measured[i], axis=1)
+        wanted = np.linalg.norm(commanded[:i] - commanded[i], axis=1)
+        squares += float(((found - wanted) ** 2).sum())
+        product += float(found @ wanted)
+        wanted_squares += float(wanted @ wanted)
+        pairs += i
+    if wanted_squares == 0:
+        raise InputError(f"{data.where}: set {name}: all commanded positions are the same; different ones needed")
+    return SetResult(
+        name,
+        error,
+        float(size.mean()),
+        float(size.std(ddof=1)),
+        float(size.max()),
+        float(np.sqrt(squares / pairs)),
+        product / wanted_squares,
+    )
+
+
+def verified_text(result: Verification) -> str:
+    """The table for the terminal."""
+    width = max(9, *(len(s.name) for s in result.sets))
+    lines = [
+        f"distances of {len(result.poses) - 1} positions from the first (pose {result.poses[0]}), measured against "
+        "commanded",
+        f"{'':<{width}} {'mean mm':>10} {'std mm':>10} {'max mm':>10} {'all pairs RMS mm':>17}",
+    ]
+    for k, each in enumerate(result.sets):
+        mean, std, most, pairs = each.figures().values()
+        lines.append(f"{each.name:<{width}} {mean:10.4f} {std:10.4f} {most:10.4f} {pairs:17.4f}")
+        if k:
+            mean, std, most, pairs = (f"{v:.1f} %" for v in result.reduction(k).values())
+            lines.append(f"{'  reduced':<{width}} {mean:>10} {std:>10} {most:>10} {pairs:>17}")
+    lines.append(
+        "mean, std, max all carry the error of the first position; the RMS over all pairs depends less on any one"
+    )
+    return "\n".join(lines)
+
+
+def verified_json(result: Verification) -> dict:
+    """Everything, for programs."""
+    sets = []
+    for k, each in enumerate(result.sets):
+        figures = dict(zip(("mean_mm", "std_mm", "max_mm", "all_pairs_rms_mm"), each.figures().values(), strict=True))
+        reduced = dict(zip(figures, result.reduction(k).values(), strict=True)) if k else None
+        reduced = reduced and {
+            key.replace("_mm", "_percent"): v if np.isfinite(v) else None for key, v in reduced.items()
+        }
+        sets.append(
+            {"set": each.name, **figures, "scale": each.scale, "reduced": reduced, "error_mm": each.error_mm.tolist()}
+        )
+    return {
+        "format": "stcal verification 1",
+        "poses": list(result.poses),
+        "distance_mm": result.distance_mm.tolist(),
+        "sets": sets,
+        "missing": {name: list(poses) for name, poses in result.missing.items()},
+        "warnings": result.warnings(),
+    }
+
+
+def _few(names: Sequence[str], most: int = 12) -> str:
+    shown = ", ".join(names[:most])
+    return shown + (f" and {len(names) - most} more" if len(names) > most else "")

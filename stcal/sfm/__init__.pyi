@@ -1,0 +1,11 @@
+from .camera.calibrate import calibrate_camera as calibrate_camera
+from .measure.images import MeasureOptions as MeasureOptions
+from .measure.images import measure as measure
+from .measure.target import read_target as read_target
+from .pipeline import run as run
+from .plan.advise import advise as advise
+from .plan.session import PlanOptions as PlanOptions
+from .plan.session import plan as plan
+from .run.options import RunOptions as RunOptions
+from .run.result import RunResult as RunResult
+from .run.saved import load_run as load_run

@@ -1,0 +1,1 @@
+"""From models without unit to calibrated faces: adjustment, scale, frames, chaining, covariances."""

@@ -1,0 +1,132 @@
+"""From the models of the groups to the calibrated target: scale, faces, chaining, joint adjustment."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from stcal.design import BoardDesign, TargetDesign
+from stcal.errors import MappingError
+from stcal.geometry.camera import Camera
+from stcal.geometry.rigid import Rigid, Similarity
+from stcal.io.camera import CameraPrior
+from stcal.sfm.adjust.chain import CalibratedTarget, chain_faces
+from stcal.sfm.adjust.faces import FaceInGroup, faces_of_group
+from stcal.sfm.adjust.group import adjust
+from stcal.sfm.adjust.joint import SETTLED_PX, JointResult, adjust_jointly
+from stcal.sfm.adjust.options import AdjustOptions
+from stcal.sfm.adjust.refine import eccentricity_px
+from stcal.sfm.adjust.scale import Scale, find_scale
+from stcal.sfm.adjust.uncertainty import calibrated_target
+from stcal.sfm.data.model import GroupModel
+
+JOINT_ROUNDS = 2
+"""Eccentricity moves by nanometres between the first and the second joint adjustment."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Calibration:
+    """``target`` is the answer; ``scales`` by group; ``faces`` of the single groups; ``joint`` where it was asked for;
+    ``sigma_factor`` : by how much residuals of the single groups exceed the centres' own σ; ``models`` : those that
+    the answer rests on, mm, target frame, groups that are not linked to it absent; ``camera`` : as refined where it
+    was, else as given; ``notes`` : faces without a frame, and why; an adjustment that did not settle."""
+
+    target: CalibratedTarget
+    scales: dict[str, Scale]
+    faces: tuple[FaceInGroup, ...]
+    joint: JointResult | None
+    sigma_factor: float
+    models: tuple[GroupModel, ...]
+    camera: Camera
+    notes: tuple[str, ...]
+
+
+def calibrate(
+    models: Sequence[GroupModel],
+    camera: Camera,
+    target: TargetDesign,
+    board: BoardDesign,
+    options: AdjustOptions,
+    prior: CameraPrior | None = None,
+) -> Calibration:
+    """Calibrate the target from the groups' models (worlds without unit, corrections settled).
+
+    ``prior`` : the camera's intrinsics as observations, for options that refine them.
+
+    Raises
+    ------
+    ScaleError
+        A group's board is not mapped.
+    MappingError
+        No face is, or the reference face is not, or a face is not linked to it.
+    ConvergenceError
+        The adjustment finds no minimum.
+    """
+    scales = {model.group: find_scale(model, board) for model in models}
+    faces, notes = [], []
+    for model in models:
+        found, missing = faces_of_group(model, scales[model.group].mm_per_unit, camera, target, options.frame)
+        faces += found
+        notes += missing
+    try:
+        calibrated = chain_faces(faces, target, options.reference_face)
+    except MappingError as error:  # a face without a frame may be why
+        raise MappingError("; ".join([str(error), *notes])) from error
+    factor = image_sigma_factor(models, camera)
+    metric = [_placed(m, scales[m.group], calibrated) for m in models if m.group in calibrated.target_from_group]
+    joint = None
+    if options.solve == "joint":
+        joint, factor = _adjust_all(metric, factor, camera, target, board, options, prior)
+        calibrated = calibrated_target(joint, calibrated, target, options.frame)
+        metric = [m.moved(Similarity(1.0, calibrated.target_from_group[m.group])) for m in joint.models]
+        camera = joint.camera
+        notes += _unsettled(joint)
+    return Calibration(calibrated, scales, tuple(faces), joint, factor, tuple(metric), camera, tuple(notes))
+
+
+def _placed(model: GroupModel, scale: Scale, start: CalibratedTarget) -> GroupModel:
+    """The model in mm in the target frame, by its chain."""
+    return model.moved(Similarity(1.0, start.target_from_group[model.group]) @ Similarity(scale.mm_per_unit, Rigid()))
+
+
+def _unsettled(joint: JointResult) -> list[str]:
+    """What is to be said of an adjustment that stopped on the way."""
+    if joint.settled:
+        return []
+    return [
+        f"joint adjustment: not settled, projections still moved by {joint.last_move_px:.1g} px in the last step, less "
+        f"than {SETTLED_PX:g} px needed; look at the checks for what contradicts the rest, take it out and run again"
+    ]
+
+
+def _adjust_all(
+    models: list[GroupModel], factor: float, camera: Camera, target, board, options: AdjustOptions, prior
+) -> tuple[JointResult, float]:
+    """The joint adjustment from the chained result, and the factor on the centres' σ; eccentricity follows, and with
+    refined intrinsics that factor too: a wrong camera makes residuals of its own."""
+    radius = target.radius_of() | board.radius_of()
+    own = [m.covariance_px2 for m in models]
+    prior = prior if options.refine_camera else None
+    current = camera
+    for _ in range(JOINT_ROUNDS + (prior is not None)):
+        if options.eccentricity:
+            models = [replace(m, shift_px=eccentricity_px(m, current, radius, 1.0)) for m in models]
+        models = [replace(m, covariance_px2=factor**2 * c) for m, c in zip(models, own, strict=True)]
+        result = adjust_jointly(models, board, camera, options.flatness_mm, prior, current)
+        models, current = list(result.models), result.camera
+        if prior is not None:
+            plain = [replace(m, covariance_px2=c) for m, c in zip(models, own, strict=True)]
+            factor = image_sigma_factor([adjust(m, current) for m in plain], current)
+    return result, factor
+
+
+def image_sigma_factor(models: Sequence[GroupModel], camera: Camera) -> float:
+    """How much larger the residuals of free networks are than the centres' own σ (one variance component)."""
+    square = sum(float((m.whiten(m.residuals_px(camera)) ** 2).sum()) for m in models)
+    redundancy = sum(2 * len(m.image_index) - 6 * len(m.images) - 3 * len(m.labels) + 7 for m in models)
+    return float(np.sqrt(square / redundancy)) if redundancy > 0 else 1.0
+
+
+def with_sigma(model: GroupModel, factor: float) -> GroupModel:
+    """The model with its observations' σ scaled."""
+    return replace(model, covariance_px2=factor**2 * model.covariance_px2)

@@ -1,0 +1,190 @@
+"""Chain the faces of all groups into the target frame, and say how far the ways to a face disagree."""
+
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from stcal.design import TargetDesign
+from stcal.errors import MappingError
+from stcal.geometry.rigid import Rigid, skew
+from stcal.sfm.adjust.faces import FaceInGroup
+
+MAX_CHAIN_STEPS = 4
+MAX_CHAINS = 12
+MAX_STEPS = 20
+SETTLED = 1e-9
+"""Of a step in rad and mm."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Chain:
+    """One way from the reference face to another: faces and groups in turn, and how far it is off the combination."""
+
+    faces: tuple[str, ...]
+    groups: tuple[str, ...]
+    translation_mm: float
+    rotation_rad: float
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class CalibratedTarget:
+    """The result.
+
+    ``target_from_face`` by face; ``circles`` : label → (3,) mm in the target frame; ``target_from_group`` : metric
+    group frames; ``face_covariance`` : 6×6 by face (rotation rad, translation mm; perturbation in the target frame
+    about the face's origin), ``circle_covariance`` : 3×3 mm² by label, ``distance_sigma_mm`` : of the distance between
+    the origins of two faces, ``scale_sigma`` : relative, of all lengths together, and ``covariance_mm2`` : (3c, 3c) of
+    all circles together, target frame, in their order; empty and None where none was computed.
+    """
+
+    reference_face: str
+    target_from_face: dict[str, Rigid]
+    circles: dict[str, np.ndarray]
+    target_from_group: dict[str, Rigid]
+    face_covariance: dict[str, np.ndarray] = field(default_factory=dict)
+    circle_covariance: dict[str, np.ndarray] = field(default_factory=dict)
+    distance_sigma_mm: dict[tuple[str, str], float] = field(default_factory=dict)
+    scale_sigma: float | None = None
+    covariance_mm2: np.ndarray | None = None
+
+
+def chain_faces(faces: list[FaceInGroup], target: TargetDesign, reference: str) -> CalibratedTarget:
+    """Combine the faces of all groups into the target frame, that of the reference face.
+
+    Every group states the pose of its faces against one another; a least-squares adjustment over all groups, weighted
+    by how well each face is fixed in each group, gives one pose for each face.
+
+    Raises
+    ------
+    InputError
+        The reference face is not of the design.
+    MappingError
+        The reference face is not mapped, or a face is not linked to it.
+    """
+    target.face(reference)
+    seen = {each.face for each in faces}
+    if reference not in seen:
+        raise MappingError(
+            f"reference face {reference}: not mapped in any group; add a group that shows it, or choose one of "
+            f"{', '.join(sorted(seen)) or 'none'} with --reference-face"
+        )
+    chains = {face_id: _chains(faces, reference, face_id) for face_id in sorted(seen)}
+    unlinked = [face_id for face_id, found in chains.items() if not found]
+    if unlinked:
+        raise MappingError(
+            f"face {', '.join(unlinked)}: never linked to reference face {reference}; "
+            f"add a group that shows it together with {reference} or a face that is linked"
+        )
+    target_from_face, target_from_group = _adjust(faces, chains, reference)
+    circles = _circles(faces, target_from_face, target)
+    return CalibratedTarget(reference, target_from_face, circles, target_from_group)
+
+
+def measure_chains(faces: list[FaceInGroup], calibrated: CalibratedTarget) -> dict[str, tuple[Chain, ...]]:
+    """All ways to every face but the reference, with their distance from the calibrated pose."""
+    return {
+        face_id: tuple(_measure(way, faces, pose) for way in _chains(faces, calibrated.reference_face, face_id))
+        for face_id, pose in calibrated.target_from_face.items()
+        if face_id != calibrated.reference_face
+    }
+
+
+def _chains(faces: list[FaceInGroup], start: str, goal: str) -> list[tuple[tuple[str, ...], tuple[str, ...]]]:
+    """Simple ways from one face to another, the shortest first: (faces, groups)."""
+    by_group: dict[str, list[str]] = {}
+    for each in faces:
+        by_group.setdefault(each.group, []).append(each.face)
+    queue, found = [((start,), ())], []
+    for way, groups in queue:
+        if way[-1] == goal:
+            found.append((way, groups))
+            if len(found) == MAX_CHAINS:
+                break
+            continue
+        if found and len(way) > len(found[0][0]):
+            break
+        if len(way) <= max(MAX_CHAIN_STEPS, len(by_group)):
+            queue += [
+                ((*way, face_id), (*groups, group))
+                for group, members in by_group.items()
+                if way[-1] in members and group not in groups
+                for face_id in members
+                if face_id not in way
+            ]
+    return found
+
+
+def _measure(chain, faces: list[FaceInGroup], combined: Rigid) -> Chain:
+    way, groups = chain
+    difference = _along(chain, faces) @ combined.inverse()
+    shift = _along(chain, faces).translation - combined.translation
+    return Chain(way, groups, float(np.linalg.norm(shift)), difference.angle_rad())
+
+
+def _along(chain, faces: list[FaceInGroup]) -> Rigid:
+    """reference_from_face along one chain."""
+    pose = {(each.group, each.face): each.group_from_face for each in faces}
+    way, groups = chain
+    result = Rigid()
+    for group, a, b in zip(groups, way[:-1], way[1:], strict=True):
+        result = result @ pose[group, a].inverse() @ pose[group, b]
+    return result
+
+
+def _pose_information(each: FaceInGroup) -> np.ndarray:
+    """6×6 information of (rotation rad, translation mm) of a face frame, perturbed in the face frame."""
+    jacobian = np.concatenate([-skew(each.xyz_face), np.broadcast_to(np.eye(3), (len(each.labels), 3, 3))], axis=2)
+    return np.einsum("nki,nkl,nlj->ij", jacobian, each.information, jacobian)
+
+
+def _adjust(faces: list[FaceInGroup], chains, reference: str) -> tuple[dict[str, Rigid], dict[str, Rigid]]:
+    """Poses of faces and groups in the target frame by weighted Gauss–Newton over all (group, face).
+
+    Poses are perturbed on the right, so that a face's own step is minus its residual.
+    """
+    start = {face_id: _along(found[0], faces) for face_id, found in chains.items()}
+    groups = list(dict.fromkeys(each.group for each in faces))
+    start_group = {}
+    for each in sorted(faces, key=lambda f: len(chains[f.face][0][0])):
+        start_group.setdefault(each.group, start[each.face] @ each.group_from_face.inverse())
+    free = [face_id for face_id in start if face_id != reference]
+    roots = [np.linalg.cholesky(_pose_information(each) + 1e-12 * np.eye(6)).T for each in faces]
+
+    face = {face_id: start[face_id] for face_id in (reference, *free)}
+    group = dict(start_group)
+    column = {("face", f): 6 * i for i, f in enumerate(free)}
+    column |= {("group", g): 6 * (len(free) + i) for i, g in enumerate(groups)}
+    for _ in range(MAX_STEPS):
+        jacobian, residual = np.zeros((6 * len(faces), 6 * len(column))), np.zeros(6 * len(faces))
+        for k, (each, root) in enumerate(zip(faces, roots, strict=True)):
+            rows = slice(6 * k, 6 * k + 6)
+            residual[rows] = root @ (face[each.face].inverse() @ group[each.group] @ each.group_from_face).log()
+            r, t = each.group_from_face.rotation.T, each.group_from_face.translation
+            at = column["group", each.group]
+            jacobian[rows, at : at + 6] = root @ np.block([[r, np.zeros((3, 3))], [-r @ skew(t), r]])
+            if each.face != reference:
+                at = column["face", each.face]
+                jacobian[rows, at : at + 6] = -root
+        step = -np.linalg.lstsq(jacobian, residual, rcond=1e-13)[0]
+        for (kind, name), at in column.items():
+            poses = face if kind == "face" else group
+            poses[name] = poses[name] @ Rigid.exp(step[at : at + 6])
+        if np.abs(step).max() < SETTLED:
+            break
+    return face, group
+
+
+def _circles(faces: list[FaceInGroup], target_from_face: dict[str, Rigid], target: TargetDesign) -> dict:
+    """Circle centres in the target frame: weighted means over the groups, in the face frame."""
+    weight: dict[str, np.ndarray] = {}
+    total: dict[str, np.ndarray] = {}
+    for each in faces:
+        for label, xyz, information in zip(each.labels, each.xyz_face, each.information, strict=True):
+            weight[label] = weight.get(label, 0) + information
+            total[label] = total.get(label, 0) + information @ xyz
+    return {
+        label: target_from_face[face.id] @ np.linalg.solve(weight[label], total[label])
+        for face in target.faces
+        for label in face.labels()
+        if label in weight
+    }

@@ -1,0 +1,116 @@
+"""Face frames from circle centres, and the faces of one group."""
+
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+
+from stcal.design import FaceDesign, TargetDesign
+from stcal.errors import DegenerateError
+from stcal.geometry.arrays import frozen
+from stcal.geometry.camera import Camera
+from stcal.geometry.plane import fit_plane
+from stcal.geometry.rigid import Rigid
+from stcal.sfm.adjust.group import projection_jacobians
+from stcal.sfm.data.model import GroupModel
+
+FrameKind = Literal["plane", "three-point"]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class FaceInGroup:
+    """One face in the metric frame of one group.
+
+    ``group_from_face`` ; ``labels`` : (n,) its mapped circles, ``xyz_face`` : (n, 3) mm, ``information`` : (n, 3, 3)
+    their inverse covariances in the face frame, given the cameras; ``images`` that show it.
+    """
+
+    group: str
+    face: str
+    group_from_face: Rigid
+    labels: tuple[str, ...]
+    xyz_face: np.ndarray
+    information: np.ndarray
+    images: int
+
+    def __post_init__(self):
+        n = len(self.labels)
+        object.__setattr__(self, "xyz_face", frozen(self.xyz_face, (n, 3), "circles"))
+        object.__setattr__(self, "information", frozen(self.information, (n, 3, 3), "information"))
+
+
+def face_frame(face: FaceDesign, xyz: dict[str, np.ndarray], kind: FrameKind, towards: np.ndarray) -> Rigid:
+    """world_from_face from circle centres, by Zhang & Wei's Gram–Schmidt (eqs. 8–10).
+
+    Parameters
+    ----------
+    xyz : centres (3,) by circle id, all that are mapped
+    kind : ``three-point`` as in the document; ``plane``: Z from the plane of all circles, and origin and X in it
+    towards : direction (3,) to the side the face is seen from
+
+    Raises
+    ------
+    DegenerateError
+        A frame circle is missing, or the circles are collinear.
+    """
+    missing = [circle for circle in (face.origin, face.x, face.y) if circle not in xyz]
+    if missing:
+        names = " and ".join(f"{face.id}:{circle}" for circle in missing)
+        raise DegenerateError(f"face {face.id}: frame circle {names} not mapped; add views that show it")
+    origin, x, y = (xyz[circle] for circle in (face.origin, face.x, face.y))
+    if kind == "plane":
+        plane = fit_plane(np.array(list(xyz.values())), towards)
+        origin, x, y = plane.project(origin), plane.project(x), plane.project(y)
+    axis_x = (x - origin) / np.linalg.norm(x - origin)
+    across = (y - origin) - (y - origin) @ axis_x * axis_x
+    if np.linalg.norm(across) < 1e-6 * np.linalg.norm(y - origin):
+        raise DegenerateError(f"face {face.id}: its frame circles are mapped in one line; check their labels")
+    axis_y = across / np.linalg.norm(across)
+    return Rigid(np.column_stack([axis_x, axis_y, np.cross(axis_x, axis_y)]), origin)
+
+
+def faces_of_group(
+    model: GroupModel, mm_per_unit: float, camera: Camera, target: TargetDesign, kind: FrameKind
+) -> tuple[list[FaceInGroup], list[str]]:
+    """Frames of all faces of one group, and why a face has none."""
+    xyz = mm_per_unit * model.xyz_world
+    information = _point_information(model, camera) / mm_per_unit**2
+    cameras = np.stack([pose.inverse().translation for pose in model.camera_from_world]) * mm_per_unit
+    faces, notes = [], []
+    for face in target.faces:
+        members = model.points_by_face().get(face.id, np.zeros(0, int))
+        if not len(members):
+            continue
+        place = {model.labels[i].split(":", 1)[1]: xyz[i] for i in members}
+        observed = np.isin(model.point_index, members)
+        seen_by = np.unique(model.image_index[observed])
+        try:
+            frame = face_frame(face, place, kind, cameras[seen_by].mean(0) - xyz[members].mean(0))
+        except DegenerateError as error:
+            notes.append(f"group {model.group}: {error}")
+            continue
+        r = frame.rotation
+        faces.append(
+            FaceInGroup(
+                model.group,
+                face.id,
+                frame,
+                tuple(model.labels[i] for i in members),
+                frame.inverse() @ xyz[members],
+                r.T @ information[members] @ r,
+                len(seen_by),
+            )
+        )
+    if not faces and not notes:
+        notes.append(
+            f"group {model.group}: no face mapped (two images must see it); add views that show faces and board"
+        )
+    return faces, notes
+
+
+def _point_information(model: GroupModel, camera: Camera) -> np.ndarray:
+    """Inverse covariance (p, 3, 3) of each point, given the cameras, world units."""
+    jacobian = model.whiten(projection_jacobians(model, camera)[1])
+    information = np.zeros((len(model.labels), 3, 3))
+    np.add.at(information, model.point_index, np.swapaxes(jacobian, 1, 2) @ jacobian)
+    return information

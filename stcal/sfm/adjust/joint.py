@@ -1,0 +1,399 @@
+"""One adjustment over all groups: one target, one board with a pose for each group, all cameras, intrinsics if asked.
+
+Board positions are observations with their stated σ, so scale is part of the estimate. The circles of a face are
+coplanar within a stated σ. Residuals far beyond their σ weigh less (Huber). The inverse of the condensed normal matrix
+is the marginal covariance of the circles, everything else accounted for.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from stcal.design import BoardDesign
+from stcal.errors import ConvergenceError, ScaleError
+from stcal.geometry.align import align_rigid
+from stcal.geometry.arrays import frozen
+from stcal.geometry.camera import Camera
+from stcal.geometry.plane import fit_plane
+from stcal.geometry.rigid import Rigid, skew
+from stcal.io.camera import CameraPrior, intrinsic_basis
+from stcal.sfm.adjust.blocks import Block, Shared, condense, moved, normalised, robust_weights
+from stcal.sfm.adjust.scale import MIN_DOTS
+from stcal.sfm.data.model import GroupModel
+from stcal.sfm.data.observations import face_of, is_board
+
+MAX_STEPS = 100
+MAX_MOVE_PX = 0.02
+"""Contradictory observations make the last steps slow; what still moves less than this has an answer for the checks."""
+MAX_HALVINGS = 8
+SETTLED_PX = 1e-7
+"""What moves less has settled; what stops between the two limits is returned, and marked."""
+FREE_DIRECTIONS = 6
+"""The world may be anywhere: a rigid motion of everything changes nothing."""
+HUBER = 3.0
+"""In units of the residuals' robust spread: one honest residual in ninety is longer, and loses hardly anything."""
+MIN_COMMON = 0.1
+MAX_COMMON = 0.99
+"""Share of the board's variance that is common to all groups: below the first it is taken as none, above the second
+what is left to a single group would be smaller than anything a board does."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class JointResult:
+    """The adjusted models, in one metric world.
+
+    ``models`` : one for each group, mm; ``world_from_board`` by group; ``labels`` : (c,) of the target's circles;
+    ``xyz_world`` : (c, 3) mm; ``covariance_mm2`` : (3c, 3c) marginal, in the datum of smallest trace, scaled by
+    ``sigma0``²; ``sigma0`` : residuals against the centres' own σ; ``board_residuals_mm`` by group: (n, 3), board
+    frame; ``board_common`` : share of the board's variance that all groups have in common; ``camera`` : adjusted where
+    asked, with ``camera_covariance`` (q, q) of the parameters of its COLMAP model, else empty; ``weights`` by group:
+    (n,) Huber's; ``redundancy`` : degrees of freedom; ``last_move_px`` : by how much the last whole step moves a
+    projection at most.
+    """
+
+    models: tuple[GroupModel, ...]
+    world_from_board: dict[str, Rigid]
+    labels: tuple[str, ...]
+    xyz_world: np.ndarray
+    covariance_mm2: np.ndarray
+    sigma0: float
+    board_residuals_mm: dict[str, np.ndarray]
+    board_common: float
+    camera: Camera
+    camera_covariance: np.ndarray
+    weights: dict[str, np.ndarray]
+    redundancy: int
+    last_move_px: float
+
+    def __post_init__(self):
+        c = len(self.labels)
+        object.__setattr__(self, "xyz_world", frozen(self.xyz_world, (c, 3), "circles"))
+        object.__setattr__(self, "covariance_mm2", frozen(self.covariance_mm2, (3 * c, 3 * c), "covariance"))
+
+    @property
+    def settled(self) -> bool:
+        """Whether the adjustment ended at its minimum, not merely on the way to it."""
+        return self.last_move_px < SETTLED_PX
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Setting:
+    """What stays the same in one minimisation."""
+
+    labels: tuple[str, ...]
+    board: BoardDesign
+    common: float
+    flatness_mm: float | None
+    given: Camera
+    prior: np.ndarray
+    huber: float
+
+    def own_sigma_mm(self) -> float:
+        return self.board.sigma_mm * float(np.sqrt(1 - self.common))
+
+    def shape_sigma_mm(self) -> float:
+        return self.board.sigma_mm * float(np.sqrt(self.common))
+
+
+def adjust_jointly(
+    models: Sequence[GroupModel],
+    board: BoardDesign,
+    camera: Camera,
+    flatness_mm: float | None = None,
+    prior: CameraPrior | None = None,
+    start: Camera | None = None,
+) -> JointResult:
+    """Adjust metric models that share one world (mm), all observations weighted by their σ.
+
+    ``flatness_mm`` : σ of a circle's distance from the plane of its face, None for no such knowledge; ``prior`` : the
+    intrinsics of ``camera`` are observations with this covariance and are adjusted, from ``start``; fixed where None.
+
+    Whether the board kept its shape between the groups (one plate) or not (a film, a screen) is estimated from its
+    dots: first every group has its own deviations from the design, and where these agree a common shape follows.
+
+    Raises
+    ------
+    ConvergenceError
+        No minimum is reached.
+    """
+    blocks, shared, setting = _start(models, board, camera, flatness_mm, prior, start or camera)
+    setting = replace(setting, huber=HUBER * _spread(blocks, shared.camera))
+    blocks, shared, move = _minimise(blocks, shared, setting)
+    common = _common_share(blocks, board)
+    if common > 0:
+        blocks, setting = _with_common(blocks, setting, common)
+        blocks, shared, move = _minimise(blocks, shared, setting)
+    return _result(blocks, shared, setting, move)
+
+
+def covariance_of(
+    models: Sequence[GroupModel],
+    board: BoardDesign,
+    camera: Camera,
+    flatness_mm: float | None = None,
+    prior: CameraPrior | None = None,
+    common: float = 0.0,
+) -> JointResult:
+    """What :func:`adjust_jointly` is to report of models that are where they should be: nothing is moved, σ₀ is 1.
+
+    Arguments as there; ``common`` : share of the board's variance that all groups have in common.
+    """
+    blocks, shared, setting = _start(models, board, camera, flatness_mm, prior, camera)
+    if common > 0:
+        blocks, setting = _with_common(blocks, setting, common)
+    return _result(blocks, shared, setting, 0.0, 1.0)
+
+
+def _start(models, board: BoardDesign, camera: Camera, flatness_mm, prior: CameraPrior | None, start: Camera):
+    """Groups, what they share, and the setting: each group with its own board, no residual too long."""
+    labels = tuple(sorted({label for model in models for label in model.labels if not is_board(label)}))
+    basis = intrinsic_basis(prior.colmap_model) if prior else np.zeros((12, 0))
+    weight = np.linalg.inv(prior.covariance) if prior else np.zeros((0, 0))
+    blocks = [_block(model, board, labels) for model in models]
+    xyz = _shared_circles(blocks, len(labels))
+    shared = Shared(xyz, np.zeros((board.rows * board.columns, 3)), start, basis)
+    blocks = [replace(b, model=_with_circles(b, xyz)) for b in blocks]
+    return blocks, shared, _Setting(labels, board, 0.0, flatness_mm, camera, weight, np.inf)
+
+
+def _with_common(blocks: list[Block], setting: _Setting, common: float) -> tuple[list[Block], _Setting]:
+    """The same with a shape of the board that the groups have in common."""
+    setting = replace(setting, common=common)
+    own, board = setting.own_sigma_mm(), setting.board
+    return [replace(b, sigma_mm=own, dot_place=_dot_place(b.model, b.dots, board)) for b in blocks], setting
+
+
+def _minimise(blocks: list[Block], shared: Shared, setting: _Setting) -> tuple[list[Block], Shared, float]:
+    """Gauss–Newton with step halving; and by how much the last whole step moves a projection at most, px."""
+    cost = _cost(blocks, shared, setting)
+    move = np.inf
+    for _ in range(MAX_STEPS):
+        normal, right, condensed = _normal_equations(blocks, shared, setting)
+        step = _inverse(normal, shared, setting) @ right
+        for factor in 0.5 ** np.arange(MAX_HALVINGS):
+            trial, trial_shared = _step(blocks, shared, condensed, step, factor, setting)
+            trial_cost = _cost(trial, trial_shared, setting)
+            lower = trial_cost <= cost * (1 + 1e-9)
+            if lower:
+                break
+        # A shortened step moves little wherever it is: whether this is the minimum, only the whole step tells. That
+        # holds too where no length lowers the cost: at a minimum to rounding the whole step is rounding as well, and
+        # where it is not, the derivatives do not describe the cost, and nothing has settled.
+        move = max(_largest_move(old, shared, new, trial_shared) for old, new in zip(blocks, trial, strict=True))
+        move /= factor
+        if not lower:
+            break
+        blocks, shared, cost = trial, trial_shared, trial_cost
+        if move < SETTLED_PX:
+            break
+    if not move <= MAX_MOVE_PX:  # not a number either
+        raise ConvergenceError(
+            f"joint adjustment: projections still move by {move:.1g} px in the last of at most {MAX_STEPS} steps; "
+            "compare with --solve chain and look at the outliers"
+        )
+    return blocks, shared, float(move)
+
+
+def _block(model: GroupModel, board: BoardDesign, labels: tuple[str, ...]) -> Block:
+    place = {label: i for i, label in enumerate(labels)}
+    dots = np.array([i for i, label in enumerate(model.labels) if is_board(label)])
+    circles = np.array([i for i, label in enumerate(model.labels) if not is_board(label)], int)
+    if len(dots) < MIN_DOTS:
+        raise ScaleError(
+            f"group {model.group}: {len(dots)} board dots in the joint adjustment, {MIN_DOTS} needed; "
+            "photograph the board with the faces"
+        )
+    cells = np.array([[int(v) for v in model.labels[i].split(":")[1:]] for i in dots])
+    design = np.column_stack([board.pitch_mm * cells[:, ::-1], np.zeros(len(cells))])
+    return Block(
+        model,
+        align_rigid(model.xyz_world[dots], design),
+        design,
+        board.sigma_mm,
+        dots,
+        circles,
+        np.zeros(0, int),
+        np.array([place[model.labels[i]] for i in circles], int),
+    )
+
+
+def _dot_place(model: GroupModel, dots: np.ndarray, board: BoardDesign) -> np.ndarray:
+    cells = np.array([[int(v) for v in model.labels[i].split(":")[1:]] for i in dots])
+    return cells[:, 0] * board.columns + cells[:, 1]
+
+
+def _spread(blocks: list[Block], camera: Camera) -> float:
+    """Robust σ of the normalised residuals per axis, from the median of their lengths (Rayleigh)."""
+    length = np.concatenate([np.linalg.norm(normalised(b.model, camera), axis=1) for b in blocks])
+    return max(float(np.median(length) / np.sqrt(2 * np.log(2))), 1e-6)
+
+
+def _common_share(blocks: list[Block], board: BoardDesign) -> float:
+    """Covariance between the groups' board residuals over their variance; 0 where it is no more than chance."""
+    by_dot = np.full((len(blocks), board.rows * board.columns, 3), np.nan)
+    for k, b in enumerate(blocks):
+        by_dot[k, _dot_place(b.model, b.dots, board)] = b.board_residual()
+    product, square, count = 0.0, 0.0, 0
+    for i in range(len(blocks)):
+        for j in range(i):
+            both = np.isfinite(by_dot[i]) & np.isfinite(by_dot[j])
+            product += float((by_dot[i][both] * by_dot[j][both]).sum())
+            square += float((by_dot[i][both] ** 2 + by_dot[j][both] ** 2).sum()) / 2
+            count += int(both.sum())
+    if not count or square == 0:
+        return 0.0
+    share = product / square
+    return 0.0 if share < max(MIN_COMMON, 3 / np.sqrt(count)) else min(share, MAX_COMMON)
+
+
+def _shared_circles(blocks: list[Block], count: int) -> np.ndarray:
+    """Start values: the mean over the groups."""
+    total, seen = np.zeros((count, 3)), np.zeros(count)
+    for b in blocks:
+        np.add.at(total, b.circle_place, b.model.xyz_world[b.circles])
+        np.add.at(seen, b.circle_place, 1)
+    return total / seen[:, None]
+
+
+def _with_circles(block: Block, xyz: np.ndarray) -> GroupModel:
+    points = block.model.xyz_world.copy()
+    points[block.circles] = xyz[block.circle_place]
+    return replace(block.model, xyz_world=points)
+
+
+def _outer(block: Block, setting: _Setting, q: int) -> np.ndarray:
+    """Places of a group's outer unknowns among all: circles, shape, intrinsics."""
+    c = 3 * len(setting.labels)
+    s = 3 * setting.board.rows * setting.board.columns if setting.common else 0
+    circles = (3 * block.circle_place[:, None] + np.arange(3)).ravel()
+    shape = c + (3 * block.dot_place[:, None] + np.arange(3)).ravel()
+    return np.concatenate([circles, shape, c + s + np.arange(q)]).astype(int)
+
+
+def _normal_equations(blocks: list[Block], shared: Shared, setting: _Setting):
+    """Over circles, common shape and intrinsics; everything else condensed."""
+    q = shared.basis.shape[1]
+    c = 3 * len(setting.labels)
+    s = 3 * len(shared.shape_mm) if setting.common else 0
+    normal, right = np.zeros((c + s + q, c + s + q)), np.zeros(c + s + q)
+    condensed = []
+    for b in blocks:
+        each = condense(b, shared, setting.huber)
+        place = _outer(b, setting, q)
+        normal[np.ix_(place, place)] += each.normal
+        right[place] += each.right
+        condensed.append(each)
+    if s:
+        shape = np.arange(c, c + s)
+        normal[shape, shape] += 1 / setting.shape_sigma_mm() ** 2
+        right[shape] -= shared.shape_mm.ravel() / setting.shape_sigma_mm() ** 2
+    if q:
+        normal[c + s :, c + s :] += setting.prior
+        right[c + s :] -= setting.prior @ _away(shared, setting)
+    for members, across, normal_world in _planes(shared, setting):
+        jacobian = across[:, :, None] * normal_world  # distances from the plane by the circles
+        flat = jacobian.reshape(len(members), -1)
+        place = (3 * members[:, None] + np.arange(3)).ravel()
+        distance = across @ (shared.xyz_world[members] @ normal_world)
+        normal[np.ix_(place, place)] += flat.T @ flat / setting.flatness_mm**2
+        right[place] -= flat.T @ distance / setting.flatness_mm**2
+    return normal, right, condensed
+
+
+def _planes(shared: Shared, setting: _Setting):
+    """For every face: its circles, the projector that takes heights to distances from the best plane, its normal."""
+    if setting.flatness_mm is None:
+        return
+    faces: dict[str, list[int]] = {}
+    for i, label in enumerate(setting.labels):
+        faces.setdefault(face_of(label), []).append(i)
+    for own in faces.values():
+        if len(own) > 3:
+            members = np.array(own)
+            xyz = shared.xyz_world[members]
+            normal = fit_plane(xyz).normal
+            base = np.linalg.svd(np.eye(3) - np.outer(normal, normal))[0][:, :2]
+            design = np.column_stack([np.ones(len(own)), (xyz - xyz.mean(0)) @ base])
+            yield members, np.eye(len(own)) - design @ np.linalg.pinv(design), normal
+
+
+def _away(shared: Shared, setting: _Setting) -> np.ndarray:
+    """Adjusted minus given intrinsics, (q,)."""
+    return np.linalg.pinv(shared.basis) @ (shared.camera.parameters() - setting.given.parameters())
+
+
+def _cost(blocks: list[Block], shared: Shared, setting: _Setting) -> float:
+    cost = sum(b.cost(shared, setting.huber) for b in blocks)
+    if setting.common:
+        cost += float(((shared.shape_mm / setting.shape_sigma_mm()) ** 2).sum())
+    if shared.basis.shape[1]:
+        away = _away(shared, setting)
+        cost += float(away @ setting.prior @ away)
+    for members, across, normal in _planes(shared, setting):
+        cost += float(((across @ (shared.xyz_world[members] @ normal)) ** 2).sum()) / setting.flatness_mm**2
+    return cost
+
+
+def _inverse(normal: np.ndarray, shared: Shared, setting: _Setting) -> np.ndarray:
+    """Inverse with inner constraints on the circles: of all datums that of smallest trace (S-transformation)."""
+    middle = shared.xyz_world - shared.xyz_world.mean(0)
+    free = np.zeros((len(normal), FREE_DIRECTIONS))
+    rows = 3 * len(middle)
+    free[:rows] = np.concatenate([-skew(middle), np.broadcast_to(np.eye(3), (len(middle), 3, 3))], axis=2).reshape(
+        rows, 6
+    )
+    free[:rows] = np.linalg.qr(free[:rows])[0]
+    scale = float(np.median(np.diag(normal)[:rows]))
+    return np.linalg.inv(normal + scale * free @ free.T) - free @ free.T / scale
+
+
+def _step(blocks, shared: Shared, condensed, step: np.ndarray, factor: float, setting: _Setting):
+    q, c = shared.basis.shape[1], 3 * len(setting.labels)
+    s = 3 * len(shared.shape_mm) if setting.common else 0
+    intrinsics = step[c + s :]
+    new = [
+        moved(b, each, step[_outer(b, setting, q)], intrinsics, factor)
+        for b, each in zip(blocks, condensed, strict=True)
+    ]
+    shape = shared.shape_mm + factor * step[c : c + s].reshape(-1, 3) if s else shared.shape_mm
+    camera = shared.camera
+    if q:
+        camera = camera.with_parameters(camera.parameters() + factor * shared.basis @ intrinsics)
+    return new, Shared(shared.xyz_world + factor * step[:c].reshape(-1, 3), shape, camera, shared.basis)
+
+
+def _largest_move(old: Block, shared: Shared, new: Block, new_shared: Shared) -> float:
+    before, after = old.model.residuals_px(shared.camera), new.model.residuals_px(new_shared.camera)
+    return float(np.abs(after - before).max(initial=0.0))
+
+
+def _result(
+    blocks: list[Block], shared: Shared, setting: _Setting, move_px: float, sigma0: float | None = None
+) -> JointResult:
+    """``move_px`` : of the last step; ``sigma0`` : estimated from the residuals where None."""
+    normal, _, _ = _normal_equations(blocks, shared, setting)
+    inverse = _inverse(normal, shared, setting)
+    q, c = shared.basis.shape[1], 3 * len(setting.labels)
+    flat = sum(len(members) - 3 for members, _, _ in _planes(shared, setting))
+    observations = sum(2 * len(b.model.image_index) + 3 * len(b.dots) for b in blocks) + flat
+    unknowns = c + sum(6 * len(b.model.images) + 3 * len(b.dots) + 6 for b in blocks)
+    redundancy = observations - unknowns + FREE_DIRECTIONS
+    if sigma0 is None:
+        sigma0 = float(np.sqrt(_cost(blocks, shared, setting) / max(redundancy, 1)))
+    covariance = sigma0**2 * inverse
+    return JointResult(
+        tuple(b.model for b in blocks),
+        {b.model.group: b.world_from_board for b in blocks},
+        setting.labels,
+        shared.xyz_world,
+        covariance[:c, :c],
+        sigma0,
+        {b.model.group: b.board_residual() for b in blocks},
+        setting.common,
+        shared.camera,
+        covariance[len(inverse) - q :, len(inverse) - q :],
+        {b.model.group: robust_weights(b.model, shared.camera, setting.huber) for b in blocks},
+        redundancy,
+        move_px,
+    )

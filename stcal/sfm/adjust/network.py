@@ -1,0 +1,153 @@
+"""The free network of one group with its cofactors: what residuals, circles and further parameters may do by chance.
+
+A fault is a set of further parameters that the adjustment lacks: another camera, a face that moved in one image.
+Whether they are needed is told by the residuals alone, to first order and without another adjustment (score test, Rao
+1948; for one observation Baarda's data snooping, 1968).
+"""
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from stcal.geometry.arrays import frozen
+from stcal.geometry.camera import Camera
+from stcal.geometry.rigid import skew
+from stcal.sfm.adjust.group import projection_jacobians
+from stcal.sfm.data.model import GroupModel
+
+MIN_SHARE = 1e-6
+"""Of a parameter's information that poses and points leave to it; below, it cannot be told from them."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Network:
+    """An adjusted group, mm, with n observations, m images, p points.
+
+    ``residual`` : (n, 2) over σ; ``by_pose`` (n, 2, 6), ``by_point`` (n, 2, 3) : derivatives of the projections over σ;
+    ``inverse`` : (m, 6, 6) of the poses' normal blocks; ``coupling`` : (m, 6, 3p) between poses and points;
+    ``pose_right`` : (m, 6), ``point_right`` : (3p,) what the adjustment left of its right-hand sides, all but zero;
+    ``covariance_mm2`` : (3p, 3p) of the points, in the datum of smallest trace (7 free directions);
+    ``redundancy`` : (n,) of each observation, between 0 and 2.
+    """
+
+    model: GroupModel
+    residual: np.ndarray
+    by_pose: np.ndarray
+    by_point: np.ndarray
+    inverse: np.ndarray
+    coupling: np.ndarray
+    pose_right: np.ndarray
+    point_right: np.ndarray
+    covariance_mm2: np.ndarray
+    redundancy: np.ndarray
+
+    def __post_init__(self):
+        p = 3 * len(self.model.labels)
+        object.__setattr__(self, "covariance_mm2", frozen(self.covariance_mm2, (p, p), "covariance"))
+
+    def square_by_image(self) -> tuple[np.ndarray, np.ndarray]:
+        """Squared residuals over σ² and redundancy of each image, (m,)."""
+        square, redundancy = np.zeros((2, len(self.model.images)))
+        np.add.at(square, self.model.image_index, (self.residual**2).sum(1))
+        np.add.at(redundancy, self.model.image_index, self.redundancy)
+        return square, redundancy
+
+    def covariance_of(self, points: np.ndarray) -> np.ndarray:
+        """Of some of the points, (3k, 3k)."""
+        place = (3 * np.asarray(points)[:, None] + np.arange(3)).ravel()
+        return self.covariance_mm2[np.ix_(place, place)]
+
+    def score(self, columns: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Normal matrix (q, q) and right-hand side (q,) of q further parameters of the whole group, all else
+        eliminated; ``columns`` : (n, 2, q) derivative of the projections by them, over σ."""
+        normal, right, to_points = self._by_image(columns)
+        coupled = to_points.sum(0)
+        weighted = coupled @ self.covariance_mm2
+        return normal.sum(0) - weighted @ coupled.T, right.sum(0) - weighted @ self.point_right
+
+    def score_by_image(self, columns: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """The same of parameters that every image has for itself: (m, q, q) and (m, q)."""
+        normal, right, to_points = self._by_image(columns)
+        weighted = to_points @ self.covariance_mm2
+        return normal - weighted @ np.swapaxes(to_points, 1, 2), right - weighted @ self.point_right
+
+    def _by_image(self, e: np.ndarray):
+        """By image: normal (m, q, q) with the pose eliminated, right (m, q), coupling to the points (m, q, 3p)."""
+        model = self.model
+        m, q, p = len(model.images), e.shape[2], len(model.labels)
+        et = np.swapaxes(e, 1, 2)
+        normal, by_pose, right = np.zeros((m, q, q)), np.zeros((m, q, 6)), np.zeros((m, q))
+        np.add.at(normal, model.image_index, et @ e)
+        np.add.at(by_pose, model.image_index, et @ self.by_pose)
+        np.add.at(right, model.image_index, np.einsum("nki,nk->ni", e, self.residual))
+        to_points = np.zeros((m, q, p, 3))
+        to_points[model.image_index, :, model.point_index] = et @ self.by_point
+        eliminated = by_pose @ self.inverse
+        return (
+            normal - eliminated @ np.swapaxes(by_pose, 1, 2),
+            right - np.einsum("mqi,mi->mq", eliminated, self.pose_right),
+            to_points.reshape(m, q, 3 * p) - eliminated @ self.coupling,
+        )
+
+
+def free_network(model: GroupModel, camera: Camera, factor: float) -> Network:
+    """Of an adjusted metric model; ``factor`` : on the centres' own σ."""
+    model = replace(model, covariance_px2=factor**2 * model.covariance_px2)
+    by_pose, by_point = projection_jacobians(model, camera)
+    a, b = model.whiten(by_pose), model.whiten(by_point)
+    m, p = len(model.images), len(model.labels)
+    at = np.swapaxes(a, 1, 2)
+    poses, points = np.zeros((m, 6, 6)), np.zeros((p, 3, 3))
+    np.add.at(poses, model.image_index, at @ a)
+    np.add.at(points, model.point_index, np.swapaxes(b, 1, 2) @ b)
+    coupling = np.zeros((m, p, 6, 3))
+    coupling[model.image_index, model.point_index] = at @ b
+    coupling = coupling.transpose(0, 2, 1, 3).reshape(m, 6, 3 * p)
+    inverse = np.linalg.inv(poses)
+    eliminated = inverse @ coupling
+    normal = -coupling.reshape(6 * m, -1).T @ eliminated.reshape(6 * m, -1)
+    place = 3 * np.arange(p)[:, None] + np.arange(3)
+    normal[place[:, :, None], place[:, None]] += points
+    covariance = _inverse(normal, model.xyz_world)
+    residual = model.whiten(model.residuals_px(camera))
+    redundancy = 2 - _leverage(model, a, b, inverse, eliminated, covariance)
+    pose_right, point_right = np.zeros((m, 6)), np.zeros((p, 3))
+    np.add.at(pose_right, model.image_index, np.einsum("nki,nk->ni", a, residual))
+    np.add.at(point_right, model.point_index, np.einsum("nki,nk->ni", b, residual))
+    left = point_right.ravel() - np.einsum("mip,mi->p", eliminated, pose_right)
+    return Network(model, residual, a, b, inverse, coupling, pose_right, left, covariance, redundancy)
+
+
+def _inverse(normal: np.ndarray, xyz: np.ndarray) -> np.ndarray:
+    """Inverse with inner constraints over the seven free directions of the world."""
+    middle = xyz - xyz.mean(0)
+    free = np.concatenate(
+        [-skew(middle), np.broadcast_to(np.eye(3), (len(xyz), 3, 3)), middle[:, :, None]], axis=2
+    ).reshape(-1, 7)
+    free = np.linalg.qr(free)[0]
+    scale = float(np.median(np.diag(normal)))
+    return np.linalg.inv(normal + scale * free @ free.T) - free @ free.T / scale
+
+
+def _leverage(model: GroupModel, a, b, inverse, eliminated, covariance) -> np.ndarray:
+    """Trace of the cofactors of the adjusted observations, (n,)."""
+    p = len(model.labels)
+    weighted = eliminated @ covariance
+    pose = inverse + weighted @ np.swapaxes(eliminated, 1, 2)
+    mixed = weighted.reshape(len(model.images), 6, p, 3)[model.image_index, :, model.point_index]
+    blocks = covariance.reshape(p, 3, p, 3)[np.arange(p), :, np.arange(p)]
+    own = np.einsum("nki,nij,nkj->n", a, pose[model.image_index], a, optimize=True)
+    own -= 2 * np.einsum("nki,nij,nkj->n", a, mixed, b, optimize=True)
+    return own + np.einsum("nki,nij,nkj->n", b, blocks[model.point_index], b, optimize=True)
+
+
+def solve_score(normal: np.ndarray, right: np.ndarray) -> tuple[np.ndarray, np.ndarray, float, int]:
+    """Estimate (q,), covariance (q, q), statistic (χ² distributed where no parameter is needed) and its degrees of
+    freedom: directions that the normal matrix does not hold count for nothing."""
+    scale = np.sqrt(np.maximum(np.diag(normal), 1e-300))
+    value, vector = np.linalg.eigh(normal / np.outer(scale, scale))
+    held = value > MIN_SHARE
+    half = vector[:, held] / np.sqrt(value[held])
+    half = half / scale[:, None]
+    along = half.T @ right
+    return half @ along, half @ half.T, float(along @ along), int(held.sum())

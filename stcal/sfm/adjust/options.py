@@ -1,0 +1,43 @@
+"""What the adjustment is asked for."""
+
+from dataclasses import dataclass
+from typing import Literal, get_args
+
+from stcal.errors import InputError
+from stcal.sfm.adjust.faces import FrameKind
+
+Solve = Literal["joint", "chain"]
+
+
+@dataclass(frozen=True, slots=True)
+class AdjustOptions:
+    """How models become a calibrated target; everything is decided.
+
+    ``reference_face`` : id of the face whose frame is the target frame; ``solve`` : ``joint`` (one adjustment over all
+    groups) or ``chain`` (as in Zhang & Wei (2017), group by group); ``frame`` : ``plane`` (Z from the plane of all
+    circles of a face) or ``three-point`` (as in Zhang & Wei (2017)); ``eccentricity`` : whether it is corrected;
+    ``flatness_mm`` : σ of a circle about the plane of its face, None for no such knowledge; ``refine_camera`` : adjust
+    the intrinsics, the given ones being observations.
+
+    Raises
+    ------
+    InputError
+        A choice that does not exist, or refined intrinsics without the joint adjustment.
+    """
+
+    reference_face: str
+    solve: Solve = "joint"
+    frame: FrameKind = "plane"
+    eccentricity: bool = True
+    flatness_mm: float | None = 0.02
+    refine_camera: bool = False
+
+    def __post_init__(self):
+        for what, value, choices in (
+            ("solve", self.solve, get_args(Solve)),
+            ("frame", self.frame, get_args(FrameKind)),
+        ):
+            if value not in choices:
+                raise InputError(f"{what} {value!r}: not a choice; use {' or '.join(choices)}")
+        if self.refine_camera and self.solve != "joint":
+            raise InputError("--refine-camera: part of the joint adjustment, the solve is chain; use --solve joint")

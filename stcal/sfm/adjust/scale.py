@@ -1,0 +1,93 @@
+"""Scale: λ in mm per unit of the model's world, from the board."""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from stcal.design import BoardDesign
+from stcal.errors import DegenerateError, ScaleError
+from stcal.geometry.align import align_similarity
+from stcal.geometry.arrays import frozen
+from stcal.geometry.rigid import Similarity
+from stcal.sfm.data.model import GroupModel
+
+MIN_DOTS = 4
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Scale:
+    """The scale of one group.
+
+    ``board_from_world`` : least-squares similarity over all dots; its scale is λ (mm per unit);
+    ``rows_mm_per_unit`` : λ as in Zhang & Wei (2017) (first and last row, all pairs), ``rows`` those two rows;
+    ``labels`` : (n,) the dots; ``residuals_mm`` : (n, 3) reconstructed minus design, board frame;
+    ``sigma_mm_per_unit`` : of λ, from the stated σ of the dots' positions.
+    """
+
+    board_from_world: Similarity
+    rows_mm_per_unit: float
+    rows: tuple[int, int]
+    labels: tuple[str, ...]
+    residuals_mm: np.ndarray
+    sigma_mm_per_unit: float
+
+    def __post_init__(self):
+        object.__setattr__(self, "residuals_mm", frozen(self.residuals_mm, (len(self.labels), 3), "residuals"))
+
+    @property
+    def mm_per_unit(self) -> float:
+        """λ by least squares."""
+        return self.board_from_world.scale
+
+    def rms_mm(self) -> float:
+        """RMS of the residuals' lengths."""
+        return float(np.sqrt((self.residuals_mm**2).sum(1).mean()))
+
+    def mean_mm(self) -> float:
+        """Mean of the residuals' lengths: the measure of Zhang & Wei's Table 1."""
+        return float(np.linalg.norm(self.residuals_mm, axis=1).mean())
+
+
+def find_scale(model: GroupModel, board: BoardDesign) -> Scale:
+    """Scale of a model from the dots of the board.
+
+    Raises
+    ------
+    ScaleError
+        Fewer than four dots are mapped, or all in one line.
+    """
+    members = model.points_by_face().get("board", np.zeros(0, int))
+    where = f"group {model.group}: scale"
+    if len(members) < MIN_DOTS:
+        raise ScaleError(
+            f"{where}: {len(members)} board dots mapped, {MIN_DOTS} needed; photograph the board with the faces; "
+            "check that the camera file belongs to the images and the board file to the board"
+        )
+    labels = [model.labels[i] for i in members]
+    cells = np.array([[int(v) for v in label.split(":")[1:]] for label in labels])
+    xyz_board = np.column_stack([board.pitch_mm * cells[:, ::-1], np.zeros(len(cells))])
+    xyz_world = model.xyz_world[members]
+    try:
+        board_from_world = align_similarity(xyz_board, xyz_world)
+    except DegenerateError as error:
+        raise ScaleError(f"{where}: the mapped board dots lie in one line; show more rows of the board") from error
+    spread = np.sqrt(((xyz_board - xyz_board.mean(0)) ** 2).sum())
+    by_rows, rows = _by_rows(xyz_board, xyz_world, cells[:, 0])
+    return Scale(
+        board_from_world,
+        by_rows,
+        rows,
+        tuple(labels),
+        board_from_world @ xyz_world - xyz_board,
+        float(board_from_world.scale * board.sigma_mm / spread),
+    )
+
+
+def _by_rows(xyz_board, xyz_world, row) -> tuple[float, tuple[int, int]]:
+    """Zhang & Wei (2017), eq. 7, with the mean over pairs as it must be: 2/(n(n−1)), not 1/(n−1)!."""
+    first, last = int(row.min()), int(row.max())
+    chosen = (row == first) | (row == last)
+    i, j = np.triu_indices(int(chosen.sum()), 1)
+    true = np.linalg.norm(xyz_board[chosen][i] - xyz_board[chosen][j], axis=1)
+    found = np.linalg.norm(xyz_world[chosen][i] - xyz_world[chosen][j], axis=1)
+    return float((true / found).mean()), (first, last)

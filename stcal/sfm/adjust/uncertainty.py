@@ -1,0 +1,132 @@
+"""The calibrated target of a joint adjustment with its marginal covariances."""
+
+from dataclasses import dataclass
+from itertools import combinations
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from stcal.design import TargetDesign
+from stcal.geometry.rigid import Rigid
+from stcal.sfm.adjust.chain import CalibratedTarget
+from stcal.sfm.adjust.faces import FrameKind, face_frame
+from stcal.sfm.adjust.joint import JointResult
+from stcal.sfm.data.observations import face_of
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Derivatives:
+    """The target in its own frame, and what moves it: derivatives by the circles in the world, mm.
+
+    ``target_from_face`` by face; ``xyz_target`` : (c, 3); ``target_from_world`` ; ``faces`` by face: (6, 3c) rotation
+    (rad) and translation (mm), perturbation in the target frame; ``circles`` : (c, 3, 3c).
+    """
+
+    target_from_face: dict[str, Rigid]
+    xyz_target: np.ndarray
+    target_from_world: Rigid
+    faces: dict[str, np.ndarray]
+    circles: np.ndarray
+
+    def face_covariance(self, covariance_mm2: np.ndarray) -> dict[str, np.ndarray]:
+        """6×6 by face, of the circles' (3c, 3c), whatever their datum."""
+        return {face_id: jacobian @ covariance_mm2 @ jacobian.T for face_id, jacobian in self.faces.items()}
+
+    def distance_sigma_mm(self, covariance_mm2: np.ndarray) -> dict[tuple[str, str], float]:
+        """σ of the distance between the origins of every two faces."""
+        sigma = {}
+        for a, b in combinations(self.target_from_face, 2):
+            way = self.target_from_face[b].translation - self.target_from_face[a].translation
+            gradient = way / np.linalg.norm(way) @ (self.faces[b][3:] - self.faces[a][3:])
+            sigma[a, b] = float(np.sqrt(max(gradient @ covariance_mm2 @ gradient, 0.0)))
+        return sigma
+
+    def circle_covariance(self, covariance_mm2: np.ndarray) -> np.ndarray:
+        """(c, 3, 3) mm², target frame, of the circles' (3c, 3c)."""
+        return np.einsum("cip,pq,cjq->cij", self.circles, covariance_mm2, self.circles, optimize=True)
+
+    def all_circles_covariance(self, covariance_mm2: np.ndarray) -> np.ndarray:
+        """(3c, 3c) mm², target frame, of all circles together; singular, since they carry the frame."""
+        flat = self.circles.reshape(-1, self.circles.shape[-1])
+        return flat @ covariance_mm2 @ flat.T
+
+
+def calibrated_target(
+    result: JointResult, start: CalibratedTarget, target: TargetDesign, kind: FrameKind
+) -> CalibratedTarget:
+    """Faces and circles of the adjusted target in the target frame, with their marginal covariances.
+
+    ``start`` tells the reference face and to which side each face looks.
+    """
+    own = derivatives(result, start, target, kind)
+    return CalibratedTarget(
+        start.reference_face,
+        own.target_from_face,
+        dict(zip(result.labels, own.xyz_target, strict=True)),
+        dict.fromkeys(start.target_from_group, own.target_from_world),
+        own.face_covariance(result.covariance_mm2),
+        dict(zip(result.labels, own.circle_covariance(result.covariance_mm2), strict=True)),
+        own.distance_sigma_mm(result.covariance_mm2),
+        scale_sigma(result.xyz_world, result.covariance_mm2),
+        own.all_circles_covariance(result.covariance_mm2),
+    )
+
+
+def scale_sigma(xyz_world: np.ndarray, covariance_mm2: np.ndarray) -> float:
+    """Relative σ of the scale of the circles: of the similarity's scale between them as adjusted and as they are."""
+    middle = xyz_world - xyz_world.mean(0)
+    gradient = (middle / (middle**2).sum()).ravel()
+    return float(np.sqrt(gradient @ covariance_mm2 @ gradient))
+
+
+def derivatives(result: JointResult, start: CalibratedTarget, target: TargetDesign, kind: FrameKind) -> Derivatives:
+    """Poses and circles in the target frame are functions of all circles; derivatives by central differences."""
+    step = 1e-3
+    own = _frames(result, result.xyz_world, start, target, kind)
+    origin = _in_target_frame(own, result.xyz_world, start)
+    twists, circles = [], []
+    for i, label in enumerate(result.labels):
+        for axis in range(3):
+            ends = []
+            for sign in (1, -1):
+                xyz = result.xyz_world.copy()
+                xyz[i, axis] += sign * step
+                moved = _frames(result, xyz, start, target, kind, only=face_of(label))
+                ends.append(_in_target_frame(own | moved, xyz, start))
+            ahead, behind = ends
+            twists.append({f: _perturbation(ahead[0][f], behind[0][f]) / (2 * step) for f in own})
+            circles.append((ahead[1] - behind[1]) / (2 * step))
+    by_face = {face_id: np.column_stack([twist[face_id] for twist in twists]) for face_id in own}
+    return Derivatives(*origin, by_face, np.stack(circles, axis=-1))
+
+
+def _perturbation(ahead: Rigid, behind: Rigid) -> np.ndarray:
+    """Rotation (rad) and translation (mm) between two close poses, in the frame they lead to, about the origin of b."""
+    rotation = Rotation.from_matrix(ahead.rotation @ behind.rotation.T).as_rotvec()
+    return np.concatenate([rotation, ahead.translation - behind.translation])
+
+
+def _frames(
+    result: JointResult, xyz_world, start: CalibratedTarget, target: TargetDesign, kind: FrameKind, only=None
+) -> dict[str, Rigid]:
+    """world_from_face of all faces, or of one."""
+    frames = {}
+    for face in target.faces:
+        if face.id in start.target_from_face and only in (None, face.id):
+            own = {
+                label.split(":", 1)[1]: xyz
+                for label, xyz in zip(result.labels, xyz_world, strict=True)
+                if face_of(label) == face.id
+            }
+            frames[face.id] = face_frame(face, own, kind, start.target_from_face[face.id].rotation[:, 2])
+    return frames
+
+
+def _in_target_frame(world_from_face: dict[str, Rigid], xyz_world: np.ndarray, start: CalibratedTarget):
+    """target_from_face, circles (c, 3) in the target frame, and target_from_world."""
+    target_from_world = world_from_face[start.reference_face].inverse()
+    return (
+        {face_id: target_from_world @ pose for face_id, pose in world_from_face.items()},
+        target_from_world @ xyz_world,
+        target_from_world,
+    )

@@ -1,0 +1,1 @@
+"""Intrinsics from photographs of the board."""

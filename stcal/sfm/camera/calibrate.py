@@ -1,0 +1,309 @@
+"""Calibrate a camera from photographs of the dot board, nothing known: the calls in order, and what they found."""
+
+import tempfile
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from stcal.design import BoardDesign, TargetDesign
+from stcal.errors import DegenerateError, DetectionError, InputError
+from stcal.geometry.camera import Camera
+from stcal.io.camera import COLMAP_MODELS, CameraModel, parameter_names
+from stcal.io.images import ImageFile, Skipped, decode, find_images
+from stcal.sfm.camera.intrinsics import Intrinsics, adjust_intrinsics, model_parameters
+from stcal.sfm.camera.trust import (
+    MIN_REACH,
+    ProjectionSigma,
+    SplitHalf,
+    image_grid,
+    projection_jacobian,
+    projection_sigma,
+    split_half,
+)
+from stcal.sfm.camera.views import board_views, closed_form, start_camera
+from stcal.sfm.data.observations import ImageObservations
+from stcal.sfm.detect.ellipses import EllipseOptions
+from stcal.sfm.detect.files import DetectionResult, detect_files
+
+MIN_VIEWS = 3
+MAX_ROUNDS = 5
+SETTLED_SIGMAS = 0.1
+"""Detection rounds end when the next one would move no parameter by more than this, in its σ."""
+MAX_FOCAL_SIGMA = 0.01
+"""Relative; beyond it the boards do not determine the focal length."""
+MAX_RESIDUAL_PX = 1.0
+"""RMS; beyond it the camera model, or the board file, is not that of the images."""
+SUSPICIOUS_FACTOR = 3.0
+OUTLIER_WEIGHT = 0.5
+CORNERS = ("top left", "top right", "bottom left", "bottom right")
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class CameraCalibration:
+    """``intrinsics`` with covariance; ``views`` that it rests on; ``skipped`` files and images without a board, and
+    why; ``rounds`` of detection; ``projection`` σ over the image; ``split`` None with fewer than six views;
+    ``warnings`` : what makes the result worse than its σ may say, and what to do."""
+
+    intrinsics: Intrinsics
+    views: tuple[ImageObservations, ...]
+    skipped: tuple[Skipped, ...]
+    rounds: int
+    projection: ProjectionSigma
+    split: SplitHalf | None
+    warnings: tuple[str, ...]
+
+
+def calibrate_camera(
+    images: str | Path,
+    target: TargetDesign,
+    board: BoardDesign,
+    colmap_model: str = "OPENCV",
+    ellipses: EllipseOptions | None = None,
+    workers: int | None = None,
+    progress: Callable[[str, int, int], None] | None = None,
+) -> CameraCalibration:
+    """Intrinsics from a folder of photographs that show the board.
+
+    The start needs no knowledge of the lens: labels do not depend on the focal length, and the closed form finds it.
+    Ellipses are fitted in undistorted coordinates, so detection is repeated with the camera found.
+
+    Raises
+    ------
+    StcalError
+        One of its kinds, with a one-line message that says what to do.
+    """
+    if colmap_model not in COLMAP_MODELS:
+        raise InputError(f"camera model {colmap_model}: not supported; use one of {', '.join(COLMAP_MODELS)}")
+    tell = progress or (lambda *_: None)
+    files, other = find_images(images)
+    camera = start_camera(*_first_size(files))
+    result = None
+    with tempfile.TemporaryDirectory(prefix="stcal-camera-") as cache:
+        for rounds in range(1, MAX_ROUNDS + 1):
+            detection = _detect(
+                files, camera, colmap_model, target, board, ellipses, Path(cache), workers, tell, rounds
+            )
+            views = board_views(detection.images, board, camera)
+            skipped = (*other, *detection.skipped, *_without_board(detection, views))
+            require_views(views, len(files), skipped)
+            before = result
+            start = camera if before else closed_form(views, board, camera)
+            result = adjust_intrinsics(views, board, start, colmap_model)
+            require_determined(result, views)
+            camera = result.camera
+            if before and _next_move(before, result) < SETTLED_SIGMAS:
+                break
+    projection = projection_sigma(result)
+    split = split_half(result, views, board)
+    warnings = _warnings(result, projection, split, board)
+    return CameraCalibration(result, tuple(views), skipped, rounds, projection, split, tuple(warnings))
+
+
+def _first_size(files: list[ImageFile]) -> tuple[int, int]:
+    """Width and height of the first readable image."""
+    for file in files:
+        try:
+            height, width = decode(file.path.read_bytes(), file.name).shape
+        except (InputError, OSError):
+            continue
+        return width, height
+    raise InputError(f"no readable image among {len(files)}, first {files[0].name}; check the files")
+
+
+def _detect(
+    files, camera: Camera, colmap_model: str, target, board, ellipses, cache: Path, workers, tell, rounds: int
+) -> DetectionResult:
+    # No size: the first readable image has it, and messages should say so.
+    model = CameraModel(camera.focal, camera.centre, camera.distortion, colmap_model, None, None, "the images")
+    stage, done = f"detect {rounds}", 0
+
+    def step(_name: str) -> None:
+        nonlocal done
+        done += 1
+        tell(stage, done, len(files))
+
+    tell(stage, 0, len(files))
+    return detect_files(files, model, target, board, ellipses or EllipseOptions(), cache, workers, step)
+
+
+def _without_board(detection: DetectionResult, views: Sequence[ImageObservations]) -> list[Skipped]:
+    seen = {view.name for view in views}
+    return [
+        Skipped(
+            image.file.name,
+            "the board is in view more than once" if "board" in image.detection.repeated else "no board recognised",
+        )
+        for image in detection.images
+        if image.file.name not in seen
+    ]
+
+
+def require_views(views: Sequence[ImageObservations], files: int, skipped: Sequence[Skipped]) -> None:
+    """Refuse too few views of the board.
+
+    Raises
+    ------
+    DetectionError
+        None at all.
+    DegenerateError
+        Fewer than three.
+    """
+    if len(views) >= MIN_VIEWS:
+        return
+    why = "".join(f"; {s.name}: {s.reason}" for s in skipped[:1])
+    if not views:
+        raise DetectionError(
+            f"camera: no board recognised in {files} images{why}; check the board file (rows, columns, polarity, "
+            "radius) and keep a third of the dots in view at least"
+        )
+    raise DegenerateError(
+        f"camera: {len(views)} of {files} images show the board, {MIN_VIEWS} needed, 10 and more advised{why}; "
+        "add views in which it is tilted by 20° to 40°"
+    )
+
+
+def require_determined(result: Intrinsics, views: Sequence[ImageObservations]) -> None:
+    """Refuse what the views do not determine, or the model does not describe.
+
+    Raises
+    ------
+    DegenerateError
+    """
+    relative = float((result.sigma()[0] / result.camera.focal[0]).max())
+    if relative > MAX_FOCAL_SIGMA:
+        raise DegenerateError(
+            f"camera: focal length determined to {100 * relative:.2g} % by {len(views)} views, "
+            f"{100 * MAX_FOCAL_SIGMA:.0f} % needed (largest angle between boards {_spread_deg(result):.0f}°); "
+            "add views in which the board is tilted by 20° to 40°, about different axes"
+        )
+    rms = residual_rms_px(result)
+    if rms > MAX_RESIDUAL_PX:
+        raise DegenerateError(
+            f"camera: dots are {rms:.1f} px RMS from where {result.colmap_model} puts them, {MAX_RESIDUAL_PX:g} px "
+            "allowed; choose a --model with more parameters, check the board file, use images of one focus and zoom"
+        )
+
+
+def residual_rms_px(result: Intrinsics) -> float:
+    """RMS per coordinate."""
+    return float(np.sqrt((result.residuals_px() ** 2).mean()))
+
+
+def _spread_deg(result: Intrinsics) -> float:
+    """Largest angle between the normals of two boards as the camera sees them."""
+    normals = np.array([pose.rotation[:, 2] for model in result.models for pose in model.camera_from_world])
+    return float(np.degrees(np.arccos(np.clip((normals @ normals.T).min(), -1, 1))))
+
+
+def _next_move(before: Intrinsics, after: Intrinsics) -> float:
+    """What another round of detection would move, in σ.
+
+    Less than the last round did, in the ratio in which that moved the camera less than the first round, which began
+    without distortion.
+    """
+    moved = model_parameters(after.camera, after.colmap_model) - model_parameters(before.camera, before.colmap_model)
+    ideal = before.camera.normalised_from_pixel(image_grid(before.camera))
+    bent_px = np.abs((before.camera.distort(ideal) - ideal) * before.camera.focal).max()
+    moved_px = np.abs(projection_jacobian(before.camera, before.colmap_model) @ moved).max()
+    return float(np.abs(moved / after.sigma()).max() * min(1.0, moved_px / max(bent_px, 1e-9)))
+
+
+def _warnings(
+    result: Intrinsics, projection: ProjectionSigma, split: SplitHalf | None, board: BoardDesign
+) -> list[str]:
+    """What a user should look at, and do."""
+    warnings = [
+        f"no dots near the corner {corner}: they reach {100 * reach:.0f} %, {100 * MIN_REACH:.0f} % advised, "
+        f"the distortion is extrapolated there, σ of a projection {sigma:.3f} px; add views with the board in it"
+        for corner, reach, sigma in zip(CORNERS, projection.reach, projection.corner_sigma_px, strict=True)
+        if reach < MIN_REACH
+    ]
+    if result.factors.centres > SUSPICIOUS_FACTOR:
+        warnings.append(
+            f"residuals exceed the σ of the centres {result.factors.centres:.1f} times: σ are scaled by it, but images "
+            "are blurred or moved, or a --model with more parameters is needed"
+        )
+    if result.factors.dots > SUSPICIOUS_FACTOR:
+        warnings.append(
+            f"dots deviate from the grid {result.factors.dots:.1f} times as much as the board file says: "
+            f"sigma_mm = {result.factors.dots * board.sigma_mm:.3g} fits, {board.sigma_mm:g} is stated"
+        )
+    if split is None:
+        warnings.append("fewer than six views: no split-half check; add views")
+    elif split.verdict != "passed":
+        warnings.append(
+            f"two halves of the views differ by more than chance (p = {split.p_value:.2g}): σ are too small; "
+            "keep focus and zoom fixed, look at the outliers, or choose a --model with more parameters"
+        )
+    return warnings
+
+
+def calibration_json(calibration: CameraCalibration) -> dict:
+    """Content of the file that ``--json`` names; pixels from the centre of the top-left pixel."""
+    result, projection, split = calibration.intrinsics, calibration.projection, calibration.split
+    camera, sigma = result.camera, result.sigma()
+    names = parameter_names(result.colmap_model)
+    values = model_parameters(camera, result.colmap_model)
+    return {
+        "format": "stcal camera 1",
+        "model": result.colmap_model,
+        "size_px": [camera.width, camera.height],
+        "parameters": {
+            name: {"value": float(v), "sigma": float(s)} for name, v, s in zip(names, values, sigma, strict=True)
+        },
+        "correlation": (result.covariance / np.outer(sigma, sigma)).tolist(),
+        "residual_rms_px": residual_rms_px(result),
+        "centre_sigma_factor": result.factors.centres,
+        "dot_sigma_factor": result.factors.dots,
+        "redundancy": result.redundancy,
+        "rounds": calibration.rounds,
+        "projection": {
+            "median_sigma_px": float(np.median(projection.sigma_px)),
+            "corners": {
+                corner: {"reach": float(reach), "sigma_px": float(s)}
+                for corner, reach, s in zip(CORNERS, projection.reach, projection.corner_sigma_px, strict=True)
+            },
+        },
+        "split_half": None
+        if split is None
+        else {
+            "verdict": split.verdict,
+            "p_value": split.p_value,
+            "difference": dict(zip(names, split.difference.tolist(), strict=True)),
+            "sigma": dict(zip(names, split.sigma.tolist(), strict=True)),
+            "largest_px": split.largest_px,
+            "largest_sigma_px": split.largest_sigma_px,
+        },
+        "images": _image_rows(result),
+        "outliers": _outlier_rows(result),
+        "left_out": [{"name": s.name, "reason": s.reason} for s in calibration.skipped],
+        "warnings": list(calibration.warnings),
+    }
+
+
+def _image_rows(result: Intrinsics) -> list[dict]:
+    rows = []
+    for model in result.models:
+        residual = model.residuals_px(result.camera)
+        for i, own in enumerate(model.rows_by_image()):
+            rows.append(
+                {
+                    "image": model.images[i],
+                    "dots": len(own),
+                    "tilt_deg": float(np.degrees(np.arccos(abs(model.camera_from_world[i].rotation[2, 2])))),
+                    "rms_px": float(np.sqrt((residual[own] ** 2).mean())),
+                }
+            )
+    return rows
+
+
+def _outlier_rows(result: Intrinsics) -> list[dict]:
+    rows = []
+    for model, weights in zip(result.models, result.weights(), strict=True):
+        length = np.linalg.norm(model.residuals_px(result.camera), axis=1)
+        for i in np.flatnonzero(weights < OUTLIER_WEIGHT):
+            image, label = model.images[model.image_index[i]], model.labels[model.point_index[i]]
+            rows.append({"image": image, "label": label, "residual_px": float(length[i]), "weight": float(weights[i])})
+    return rows

@@ -1,0 +1,1 @@
+"""Checks that residuals cannot fake; ``suite.py`` runs them all."""

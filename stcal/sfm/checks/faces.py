@@ -1,0 +1,263 @@
+"""Checks of the faces: parts of the images against one another, groups against groups, circles against their plane."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from itertools import combinations
+
+import numpy as np
+from scipy.linalg import block_diag
+from scipy.spatial.transform import Rotation
+
+from stcal.design import BoardDesign, TargetDesign
+from stcal.errors import DegenerateError, StcalError
+from stcal.geometry.plane import fit_plane
+from stcal.geometry.rigid import Rigid, skew
+from stcal.sfm.adjust.calibration import Calibration
+from stcal.sfm.adjust.chain import CalibratedTarget, Chain, measure_chains
+from stcal.sfm.adjust.joint import SETTLED_PX, JointResult, adjust_jointly
+from stcal.sfm.adjust.network import Network
+from stcal.sfm.adjust.options import AdjustOptions
+from stcal.sfm.adjust.uncertainty import calibrated_target
+from stcal.sfm.checks.verdict import Check, Measured, Trial, impossible, judge
+from stcal.sfm.data.model import GroupModel
+
+MIN_HALF = 2
+"""Images of a group in each half."""
+EXPLAINED = 0.05
+"""Directions in which a group adds less than this share of the variance are not tested: rounding would be."""
+MICRO = 1e3
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Again:
+    """What it takes to adjust parts of a run again, from the joint result, at its intrinsics."""
+
+    calibration: Calibration
+    target: TargetDesign
+    board: BoardDesign
+    options: AdjustOptions
+
+    def adjust(self, models: Sequence[GroupModel], faces: Sequence[str]) -> tuple[CalibratedTarget, JointResult]:
+        """The same adjustment of some models; poses of ``faces``, in the frame of the first.
+
+        Raises
+        ------
+        StcalError
+            The part does not hold the faces.
+        """
+        whole = self.calibration.target
+        start = replace(whole, reference_face=faces[0], target_from_face={f: whole.target_from_face[f] for f in faces})
+        try:
+            joint = adjust_jointly(models, self.board, self.calibration.camera, self.options.flatness_mm)
+            return calibrated_target(joint, start, self.target, self.options.frame), joint
+        except np.linalg.LinAlgError as error:
+            raise DegenerateError(f"{len(models)} groups do not fix the target; add images") from error
+
+
+def _difference(a: Rigid, b: Rigid) -> np.ndarray:
+    """Rotation (rad) and translation (mm) of a against b, in the frame of both: as covariances of faces are stated."""
+    return np.concatenate([Rotation.from_matrix(a.rotation @ b.rotation.T).as_rotvec(), a.translation - b.translation])
+
+
+def halves_check(again: Again) -> Check:
+    """Two results from two halves of the images of every group, taken in turn. Their difference against the sum of
+    their covariances; the board's own deviations are common to both, which makes the test a little milder."""
+    key, title = "halves", "Two halves of the images against each other"
+    models, reference = again.calibration.joint.models, again.calibration.target.reference_face
+    fewest = min(models, key=lambda model: len(model.images))
+    if len(fewest.images) < 2 * MIN_HALF:
+        reason = f"group {fewest.group} has {len(fewest.images)} images, {2 * MIN_HALF} needed"
+        return impossible(key, title, reason, "add images")
+    faces = [reference, *(f for f in again.calibration.target.target_from_face if f != reference)]
+    try:
+        parts = [again.adjust([m.without(m.image_index % 2 != k) for m in models], faces) for k in (0, 1)]
+    except StcalError as error:
+        return impossible(key, title, f"half of the images do not hold the result ({error})", "add images")
+    (first, joint), (second, other) = parts
+    redundancy = joint.redundancy + other.redundancy
+    trials = []
+    for face in faces[1:]:
+        apart = _difference(first.target_from_face[face], second.target_from_face[face])
+        covariance = first.face_covariance[face] + second.face_covariance[face]
+        trials.append(_face_trial(f"face {face}", apart, covariance, redundancy))
+    remedy = (
+        "images of one group contradict one another more than their residuals show: look for images in which something "
+        "moved, or that are blurred; trust no σ below this difference"
+    )
+    return judge(key, title, trials, "faces", remedy)
+
+
+def _face_trial(name: str, apart: np.ndarray, covariance: np.ndarray, redundancy: float) -> Trial:
+    statistic = float(apart @ np.linalg.solve(covariance, apart))
+    return Trial(name, MICRO * float(np.linalg.norm(apart[3:])), "µm", statistic, 6, redundancy)
+
+
+def groups_check(again: Again) -> Check:
+    """The result without one group against that with it, for groups that all faces can spare. The covariance of that
+    change is the difference of the two covariances, as that of a nested adjustment."""
+    key, title = "groups", "The result without each group"
+    calibration = again.calibration
+    models, whole = calibration.joint.models, calibration.target
+    reference = whole.reference_face
+    faces = [reference, *(f for f in whole.target_from_face if f != reference)]
+    members = {m.group: {f.face for f in calibration.faces if f.group == m.group} for m in models}
+    spare = [
+        g
+        for g in members
+        if len(members) > 1 and _linked([s for other, s in members.items() if other != g], reference) >= set(faces)
+    ]
+    trials = []
+    for group in spare:
+        try:
+            without, joint = again.adjust([m for m in models if m.group != group], faces)
+        except StcalError:
+            continue
+        scale = (calibration.joint.sigma0 / joint.sigma0) ** 2
+        for face in faces[1:]:
+            change = _difference(without.target_from_face[face], whole.target_from_face[face])
+            larger = scale * without.face_covariance[face]
+            name = f"face {face} without group {group}"
+            trials.append(_nested_trial(name, change, larger, whole.face_covariance[face], joint.redundancy))
+    if not trials:
+        reason = "every group holds a face that no other links"
+        return impossible(key, title, reason, "to be able to make it, add a group that closes a loop of faces")
+    remedy = "one group contradicts the others: was the target or the board moved in it, or the focus changed?"
+    return judge(key, title, [t for t in trials if t.freedom], "faces", remedy)
+
+
+def _nested_trial(name: str, change, larger: np.ndarray, smaller: np.ndarray, redundancy: float) -> Trial:
+    root = np.linalg.cholesky(larger)
+    half = np.linalg.solve(root, np.linalg.solve(root, larger - smaller).T)
+    value, vector = np.linalg.eigh((half + half.T) / 2)
+    held = value > EXPLAINED
+    along = vector[:, held].T @ np.linalg.solve(root, change)
+    statistic = float((along**2 / value[held]).sum())
+    return Trial(name, MICRO * float(np.linalg.norm(change[3:])), "µm", statistic, int(held.sum()), redundancy)
+
+
+def _linked(members: list[set[str]], start: str) -> set[str]:
+    """Faces that groups link to one."""
+    reached = {start}
+    while True:
+        more = set().union(*(faces for faces in members if faces & reached)) - reached
+        if not more:
+            return reached
+        reached |= more
+
+
+def loops_check(again: Again) -> Check:
+    """Two ways to one face by different groups, each group adjusted alone with its board: their difference against the
+    covariances of the single steps."""
+    key, title = "loops", "Ways to a face through different groups"
+    calibration = again.calibration
+    trials = []
+    steps: dict[tuple[str, str, str], tuple[Rigid, np.ndarray]] = {}
+    redundancy = sum(2 * len(m.image_index) for m in calibration.joint.models)
+    for face, found in measure_chains(list(calibration.faces), calibration.target).items():
+        for one, two in combinations(found, 2):
+            if set(one.groups) & set(two.groups):
+                continue
+            try:
+                ends = [_along(again, way, steps) for way in (one, two)]
+            except StcalError:
+                continue
+            apart = _difference(ends[0][0], ends[1][0])
+            name = f"face {face} by groups {' '.join(one.groups)} and {' '.join(two.groups)}"
+            trials.append(_face_trial(name, apart, ends[0][1] + ends[1][1], redundancy))
+    if not trials:
+        reason = "no face is reached in two ways that share no group"
+        return impossible(key, title, reason, "to be able to make it, add a group that closes a loop of faces")
+    remedy = "a group of these ways is wrong: compare with the result without each group, and look for what moved in it"
+    return judge(key, title, trials, "loops", remedy)
+
+
+def _along(again: Again, way: Chain, steps) -> tuple[Rigid, np.ndarray]:
+    """reference_from_face along a way, and its covariance (6, 6)."""
+    pose, covariance = Rigid(), np.zeros((6, 6))
+    for group, a, b in zip(way.groups, way.faces[:-1], way.faces[1:], strict=True):
+        if (group, a, b) not in steps:
+            models = [m for m in again.calibration.joint.models if m.group == group]
+            single, _ = again.adjust(models, (a, b))
+            steps[group, a, b] = single.target_from_face[b], single.face_covariance[b]
+        step, own = steps[group, a, b]
+        # reference_from_b: turned by the way so far; an error of its rotation moves b on the arm from a to b.
+        arm = np.block([[np.eye(3), np.zeros((3, 3))], [-skew(pose.rotation @ step.translation), np.eye(3)]])
+        turn = block_diag(pose.rotation, pose.rotation)
+        covariance = arm @ covariance @ arm.T + turn @ own @ turn.T
+        pose = pose @ step
+    return pose, covariance
+
+
+def agreement_check(calibration: Calibration, networks: Sequence[Network]) -> Check:
+    """σ₀ of the joint adjustment: what one target, the board's σ and flat faces add to the residuals of the free
+    networks, against what they should (F test of nested models). Suspicious at least where that adjustment has not
+    settled, which is no matter of chance: contradictory observations make its last steps slow."""
+    key, title = "agreement", "Groups, board and faces against one another (σ₀)"
+    joint = calibration.joint
+    free = float(sum(n.redundancy.sum() for n in networks))
+    square = float(sum((n.residual**2).sum() for n in networks))
+    extra = max(joint.sigma0**2 * joint.redundancy - square, 0.0)
+    freedom = round(joint.redundancy - free)
+    value = float(np.sqrt(extra / freedom))
+    remedy = "look at the checks of board, groups and flatness: one of their σ is too small, or something moved"
+    trial = Trial("all groups", value, "σ", extra, freedom, free)
+    check = judge(key, title, [trial], "adjustments", remedy)
+    if joint.settled:
+        return check
+    last = Measured("last step", joint.last_move_px, SETTLED_PX, "px", None)
+    return replace(
+        check,
+        verdict="suspicious" if check.verdict == "passed" else check.verdict,
+        reason=f"{check.reason}; not settled, {last.name} at {last.words()}",
+        measured=(*check.measured, last),
+        names=(*check.names, last.name),
+        remedy=remedy,
+    )
+
+
+def flatness_check(networks: Sequence[Network], flatness_mm: float | None) -> Check:
+    """Distance of each circle from the plane of the others of its face, from the free networks of all groups that see
+    it, against its σ and the stated flatness."""
+    key, title = "flatness", "Each circle against the plane of its face"
+    if flatness_mm is None:
+        return impossible(key, title, "the run was asked not to use flatness", "state it with --flatness")
+    heights: dict[str, list[tuple[tuple[str, ...], np.ndarray, np.ndarray]]] = {}
+    for network in networks:
+        for face, members in network.model.points_by_face().items():
+            if face != "board" and len(members) > 3:
+                heights.setdefault(face, []).append(_heights(network, members))
+    redundancy = float(sum(n.redundancy.sum() for n in networks))
+    trials = []
+    for parts in heights.values():
+        labels = sorted({label for names, _, _ in parts for label in names})
+        normal, right = np.zeros((len(labels), len(labels))), np.zeros(len(labels))
+        for names, height, weight in parts:
+            place = [labels.index(name) for name in names]
+            normal[np.ix_(place, place)] += weight
+            right[place] += weight @ height
+        covariance = np.linalg.pinv(normal, rcond=1e-9, hermitian=True)
+        away = covariance @ right
+        held = covariance @ normal
+        weight = np.linalg.pinv(covariance + flatness_mm**2 * held @ held.T, rcond=1e-9, hermitian=True)
+        for i, label in enumerate(labels):
+            if weight[i, i] > 0:
+                height = float(weight[i] @ away / weight[i, i])
+                trials.append(Trial(label, MICRO * height, "µm", height**2 * weight[i, i], 1, redundancy))
+    remedy = "a circle out of its plane, or a face less flat than stated: press or glue it flat, or state --flatness"
+    return judge(key, title, trials, "circles", remedy)
+
+
+def _heights(network: Network, members: np.ndarray) -> tuple[tuple[str, ...], np.ndarray, np.ndarray]:
+    """Labels, heights over any plane (k,), mm, seen from outside, and their weight matrix, that no plane touches."""
+    model = network.model
+    xyz = model.xyz_world[members]
+    towards = np.mean([pose.inverse().translation for pose in model.camera_from_world], axis=0) - xyz.mean(0)
+    plane = fit_plane(xyz, towards)
+    across = np.kron(np.eye(len(members)), plane.normal)
+    covariance = across @ network.covariance_of(members) @ across.T
+    basis = np.linalg.svd(np.eye(3) - np.outer(plane.normal, plane.normal))[0][:, :2]
+    free = np.column_stack([np.ones(len(members)), (xyz - xyz.mean(0)) @ basis])
+    inverse = np.linalg.inv(covariance)
+    along = inverse @ free
+    weight = inverse - along @ np.linalg.solve(free.T @ along, along.T)
+    return tuple(model.labels[i] for i in members), plane.distance(xyz), weight

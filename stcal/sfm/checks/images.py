@@ -1,0 +1,207 @@
+"""Checks of images, labels and camera, from the residuals of the free networks: no board, no design is believed."""
+
+from collections.abc import Sequence
+
+import numpy as np
+from scipy.stats import f as fisher
+
+from stcal.geometry.camera import Camera
+from stcal.geometry.rigid import skew
+from stcal.io.camera import CameraPrior, intrinsic_basis
+from stcal.sfm.adjust.calibration import Calibration
+from stcal.sfm.adjust.network import Network, solve_score
+from stcal.sfm.checks.verdict import SUSPICIOUS, Check, Measured, Trial, judge
+from stcal.sfm.data.observations import is_board
+
+MIN_CIRCLES = 3
+"""Of the faces, and of the board, in an image that can tell whether the one moved against the other."""
+SIGMA_LIMITS = (2.0, 4.0)
+"""Residuals over the centres' own σ: twice is what light and lens add to a good image, four times is another model."""
+DULL = 1.5
+"""An image whose centres are less certain than its group's by this has lost more than half of its weight."""
+MAD_EFFICIENCY = 0.37
+"""Of the median absolute deviation: what a spread from n values is worth in degrees of freedom."""
+FIELD_DEGREE = 3
+FIELD_FLOOR_PX = 0.002
+"""σ of a field that any centring leaves: the pixel raster, JPEG's blocks and light from one side do not average out."""
+CAMERA_PARAMETERS = ("fx", "fy", "cx", "cy", "k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6")
+
+
+def camera_check(
+    networks: Sequence[Network], camera: Camera, colmap_model: str, calibration: Calibration, prior: CameraPrior | None
+) -> Check:
+    """Are the intrinsics those of the images? Given ones: further intrinsics are tested, all at once, in the residuals
+    of all free networks (score test). Refined ones: their distance from the given ones against the stated σ.
+
+    ``prior`` : where the intrinsics were refined. A camera file's stated σ does not excuse intrinsics that were held
+    fixed: the σ of the faces do not know of it.
+    """
+    key, title = "camera", "Intrinsics against the images"
+    remedy = (
+        "the camera file does not belong to these images (other focus, zoom, lens or size), or is too coarse: run with "
+        "--refine-camera, or calibrate the camera anew"
+    )
+    if prior is not None:
+        away = np.linalg.pinv(intrinsic_basis(prior.colmap_model))
+        away = away @ (calibration.camera.parameters() - camera.parameters())
+        gained = prior.covariance - calibration.joint.camera_covariance
+        estimate, sigma = away, np.sqrt(np.diag(prior.covariance))
+        _, _, statistic, freedom = solve_score(np.linalg.pinv(gained, hermitian=True), np.linalg.pinv(gained) @ away)
+        names = _names(prior.colmap_model)
+    else:
+        tested = "FULL_OPENCV" if colmap_model == "FULL_OPENCV" else "OPENCV"
+        normal, right = _summed(networks, lambda n: _by_intrinsics(n, calibration.camera, tested))
+        estimate, covariance, statistic, freedom = solve_score(normal, right)
+        sigma, names = np.sqrt(np.diag(covariance)), _names(tested)
+    redundancy = sum(n.redundancy.sum() for n in networks)
+    rms = float(np.sqrt(max(statistic, 0) / max(freedom, 1)))
+    check = judge(key, title, [Trial("camera", rms, "σ", statistic, freedom, redundancy)], "cameras", remedy)
+    single = tuple(
+        Measured(name, float(value), float(3.29 * s), "px" if name[0] in "fc" else "", None)
+        for name, value, s in zip(names, estimate, sigma, strict=True)
+    )
+    values = ", ".join(f"{m.name} {m.value:+.2g}" for m in single if abs(m.value) > (m.limit or 0))
+    reason = f"{check.reason}; images ask for {values}" if check.names and values else check.reason
+    return Check(key, title, check.verdict, reason, check.measured + single, 1, check.names, check.remedy)
+
+
+def _names(colmap_model: str) -> list[str]:
+    basis = intrinsic_basis(colmap_model)
+    return [CAMERA_PARAMETERS[i] for i in basis.argmax(0)]
+
+
+def _by_intrinsics(network: Network, camera: Camera, colmap_model: str) -> np.ndarray:
+    xyz = network.model.xyz_camera()
+    by_intrinsics = camera.parameter_jacobian(xyz[:, :2] / xyz[:, 2:]) @ intrinsic_basis(colmap_model)
+    return network.model.whiten(by_intrinsics)
+
+
+def _summed(networks: Sequence[Network], columns) -> tuple[np.ndarray, np.ndarray]:
+    scores = [n.score(columns(n)) for n in networks]
+    return sum(s[0] for s in scores), sum(s[1] for s in scores)
+
+
+def field_check(networks: Sequence[Network], camera: Camera) -> Check:
+    """A residual field that stays the same over all images: x and y each a cubic of the place in the image. Wrong
+    intrinsics make such a field too; what they do not explain is a lens or sensor that the camera model does not
+    describe. A field of 0.002 px RMS is allowed: there is one in any images."""
+    key, title = "residual-field", "Residuals over the image"
+
+    def columns(network: Network) -> np.ndarray:
+        size = np.array([camera.width, camera.height])
+        x, y = (2 * network.model.measured_px / size - 1).T
+        terms = np.stack([x**i * y**j for i in range(FIELD_DEGREE + 1) for j in range(FIELD_DEGREE + 1 - i)], axis=1)
+        none = np.zeros_like(terms)
+        field = np.stack([np.hstack([terms, none]), np.hstack([none, terms])], axis=1)
+        return network.model.whiten(field)
+
+    _, _, statistic, freedom = solve_score(*_summed(networks, columns))
+    count = sum(n.residual.size for n in networks)
+    redundancy = sum(n.redundancy.sum() for n in networks)
+    sigma = np.sqrt(np.mean(np.concatenate([n.model.sigma_px() ** 2 for n in networks])))
+    value = float(sigma * np.sqrt(max(statistic, 0) / count))
+    allowed = 1 + count * (FIELD_FLOOR_PX / sigma) ** 2 / max(freedom, 1)
+    trial = Trial("camera", value, "px RMS", statistic / allowed, freedom, redundancy)
+    remedy = (
+        "a distortion that the camera model cannot follow, or wrong intrinsics: calibrate with a richer model "
+        "(FULL_OPENCV), and keep focus and aperture as they were then"
+    )
+    return judge(key, title, [trial], "residual fields", remedy)
+
+
+def sigma_check(networks: Sequence[Network], factor: float) -> Check:
+    """σ₀ of the images alone: residuals of the free networks over the centres' own σ. The σ of the result carry this
+    factor, so that only a large one is a fault: images that the model does not describe."""
+    key, title = "centres", "Residuals against the centres' own σ"
+    low, high = SIGMA_LIMITS
+    verdict = "passed" if factor < low else "suspicious" if factor < high else "failed"
+    redundancy = sum(n.redundancy.sum() for n in networks)
+    reason = f"residuals are {factor:.2f} times the centres' own σ, limit {low:g}; {redundancy:.0f} degrees of freedom"
+    remedy = "look at the other checks first: camera, moved target, images; then at exposure and sharpness"
+    measured = (Measured("all images", factor, low, "×", None),)
+    names = () if verdict == "passed" else ("all images",)
+    return Check(key, title, verdict, reason, measured, 1, names, remedy if names else "")
+
+
+def image_check(networks: Sequence[Network]) -> Check:
+    """Squared residuals of every image over their expectation, against those of its group's other images (F test with
+    exact redundancies)."""
+    trials = []
+    for network in networks:
+        square, redundancy = network.square_by_image()
+        for i, name in enumerate(network.model.images):
+            rest = redundancy.sum() - redundancy[i]
+            if redundancy[i] < 1 or rest < 1:
+                continue
+            ratio = square[i] / redundancy[i] / max((square.sum() - square[i]) / rest, 1e-12)
+            trials.append(
+                Trial(name, float(np.sqrt(ratio)), "×", ratio * round(redundancy[i]), round(redundancy[i]), rest)
+            )
+    remedy = (
+        "a blurred image, or one in which something stood elsewhere: look at its overlay, take it out and run again"
+    )
+    return judge("image-residuals", "Residuals of each image against its group", trials, "images", remedy)
+
+
+def sharpness_check(networks: Sequence[Network], blur_px: dict[str, float]) -> Check:
+    """σ of the centres of every image against the same circles in its group's other images, and its blur likewise.
+
+    Log ratios have no known spread: it is taken from the images themselves (robustly), with the size that would cost an
+    image half of its weight, 1.5, as the least that is called out. ``blur_px`` : by image, of the edges, may be empty.
+    """
+    sigma: dict[str, float] = {}
+    blur: dict[str, float] = {}
+    for network in networks:
+        model, log_sigma = network.model, np.log(network.model.sigma_px())
+        usual = np.array([np.median(log_sigma[model.point_index == p]) for p in range(len(model.labels))])
+        away = log_sigma - usual[model.point_index]
+        sigma |= {name: float(np.median(away[r])) for name, r in zip(model.images, model.rows_by_image(), strict=True)}
+        own = {name: np.log(blur_px[name]) for name in model.images if blur_px.get(name, 0) > 0}
+        blur |= {name: float(value - np.median(list(own.values()))) for name, value in own.items()}
+    remedy = "blurred, out of focus or dark: take the image again; its centres have little weight, no harm is done"
+    trials = [*_dull(sigma, "× σ"), *_dull(blur, "× blur")]
+    return judge("sharpness", "Sharpness of each image against its group", trials, "values", remedy, "suspicious")
+
+
+def _dull(values: dict[str, float], unit: str) -> list[Trial]:
+    if not values:
+        return []
+    own = np.array(list(values.values()))
+    freedom = max(MAD_EFFICIENCY * len(own) - 1, 2.0)
+    least = np.log(DULL) / np.sqrt(fisher.isf(SUSPICIOUS / len(own), 1, freedom))
+    spread = max(1.4826 * float(np.median(np.abs(own - np.median(own)))), least)
+    return [
+        Trial(name, float(np.exp(value)), unit, max(value / spread, 0.0) ** 2, 1, freedom, True)
+        for name, value in values.items()
+    ]
+
+
+def moved_check(networks: Sequence[Network]) -> Check:
+    """Did the target stand still against the board? In every image all faces together may be displaced and turned
+    against the board; whether that is needed is a test with six degrees of freedom. One image against all others."""
+    trials = []
+    for network in networks:
+        model = network.model
+        on_face = np.array([not is_board(label) for label in model.labels])
+        if on_face.all() or not on_face.any():
+            continue
+        middle = model.xyz_world[on_face].mean(0)
+        arm = model.xyz_world[model.point_index] - middle
+        motion = np.concatenate([-skew(arm), np.broadcast_to(np.eye(3), (len(arm), 3, 3))], axis=2)
+        motion = motion * on_face[model.point_index][:, None, None]
+        normal, right = network.score_by_image(network.by_point @ motion)
+        redundancy = network.redundancy.sum()
+        for i, (name, rows) in enumerate(zip(model.images, model.rows_by_image(), strict=True)):
+            faces = on_face[model.point_index[rows]].sum()
+            if min(faces, len(rows) - faces) < MIN_CIRCLES:
+                continue
+            shift, _, statistic, freedom = solve_score(normal[i], right[i])
+            if freedom:
+                trials.append(
+                    Trial(name, 1e3 * float(np.linalg.norm(shift[3:])), "µm", statistic, freedom, redundancy - freedom)
+                )
+    remedy = (
+        "in these images the target stood elsewhere against the board than in the others of the group: sort the images "
+        "into groups between which nothing moved, or take the group again"
+    )
+    return judge("moved", "Target against board, image by image", trials, "images", remedy)

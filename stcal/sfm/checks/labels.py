@@ -1,0 +1,94 @@
+"""Checks of single observations: labels that were exchanged, centres that contradict all others."""
+
+from collections import Counter
+from collections.abc import Sequence
+from dataclasses import replace
+from itertools import combinations
+
+import numpy as np
+
+from stcal.geometry.camera import Camera
+from stcal.sfm.adjust.network import Network
+from stcal.sfm.checks.verdict import SHOWN, Check, Measured, Trial, judge
+from stcal.sfm.data.model import Outlier
+from stcal.sfm.data.observations import ImageObservations
+
+EXCHANGED = 0.1
+"""Two labels are exchanged where each centre lies at the other's place within this share of their distance."""
+MANY = 5
+"""Centres left out of one image: no longer single circles that were hidden or dirty."""
+
+
+def labels_check(
+    networks: Sequence[Network], outliers: Sequence[Outlier], images: Sequence[ImageObservations], camera: Camera
+) -> Check:
+    """Every observation against all others. What was left out already does no harm and is named; so is what stayed and
+    is beyond chance (the squared residual over its own redundancy: Baarda's data snooping), whose weight is reduced.
+    Labels of one image that stand at each other's places are a fault: others may be wrong that stand there unseen."""
+    remedy = "look at these circles in the overlays: hidden in part, dirty, a reflection, or a wrong label"
+    check = judge("labels", "Each centre against all others", _trials(networks), "centres", remedy, "suspicious")
+    swapped = _exchanged(networks, outliers, images, camera)
+    lost = tuple(name for name, count in Counter(o.image for o in outliers).most_common() if count >= MANY)
+    if not outliers:
+        return check
+    named = tuple(f"{o.image} {o.label}" for o in outliers)
+    measured = tuple(
+        Measured(name, o.residual_px, o.limit_px, "px", None) for name, o in zip(named, outliers, strict=True)
+    )
+    reason = f"{len(outliers)} left out, first {named[0]}: {outliers[0].residual_px:.3g} px"
+    verdict = "suspicious"
+    if lost:
+        verdict = "failed"
+        reason = f"{len(outliers)} left out, {MANY} or more of image {', '.join(lost)}"
+        remedy = (
+            "in these images the target stood elsewhere against the board, or they are of another group: take them out"
+        )
+    if swapped:
+        verdict = "failed"
+        reason = f"labels exchanged: {swapped[0]}"
+        remedy = "these labels are wrong: check the circles' positions and radii in target.toml, look at the overlay"
+    shown = (*measured, *check.measured)[:SHOWN]
+    return replace(
+        check,
+        verdict=verdict,
+        reason=reason,
+        measured=shown,
+        names=(*swapped, *lost, *named, *check.names),
+        remedy=remedy,
+    )
+
+
+def _trials(networks: Sequence[Network]) -> list[Trial]:
+    trials = []
+    for network in networks:
+        model, total = network.model, network.redundancy.sum()
+        length = np.linalg.norm(network.residual, axis=1)
+        for k in np.flatnonzero(network.redundancy > 0.2):
+            statistic = 2 * length[k] ** 2 / network.redundancy[k]
+            name = f"{model.images[model.image_index[k]]} {model.labels[model.point_index[k]]}"
+            trials.append(Trial(name, float(length[k]), "σ", float(statistic), 2, float(total)))
+    return trials
+
+
+def _exchanged(
+    networks: Sequence[Network], outliers: Sequence[Outlier], images: Sequence[ImageObservations], camera: Camera
+) -> tuple[str, ...]:
+    """``image: label and label`` of every pair of outliers that stand at each other's places."""
+    by_image: dict[str, list[str]] = {}
+    for each in outliers:
+        by_image.setdefault(each.image, []).append(each.label)
+    observed = {image.name: image for image in images}
+    found = []
+    for network in networks:
+        model = network.model
+        for name in set(model.images) & set(by_image):
+            pose = model.camera_from_world[model.images.index(name)]
+            labels = [label for label in by_image[name] if label in model.labels]
+            place = {x: camera.project((pose @ model.xyz_world[model.labels.index(x)])[None])[0] for x in labels}
+            measured = dict(zip(observed[name].labels, observed[name].centre_px, strict=True))
+            for a, b in combinations(labels, 2):
+                apart = np.linalg.norm(place[a] - place[b])
+                off = max(np.linalg.norm(measured[a] - place[b]), np.linalg.norm(measured[b] - place[a]))
+                if off < EXCHANGED * apart:
+                    found.append(f"{name}: {a} and {b}")
+    return tuple(found)

@@ -1,0 +1,153 @@
+"""The radius of every circle as measured against its design: labels, radii and scale must agree with the ellipses."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from stcal.geometry.arrays import frozen
+from stcal.geometry.camera import Camera
+from stcal.geometry.plane import fit_plane
+from stcal.sfm.adjust.network import Network
+from stcal.sfm.checks.verdict import Check, Trial, judge
+from stcal.sfm.data.observations import ImageObservations, is_board
+
+EDGE_BIAS_PX = 0.05
+"""σ of what light, lens and threshold add to all radii alike; it moves no centre."""
+EDGE_DIFFERENCE_PX = 0.01
+"""σ of what they add more to large circles than to small ones."""
+RADIUS_TOLERANCE = 2e-3
+"""Relative σ of a single radius in making; it moves the centre by 4·10⁻³ of its eccentricity, a nanometre's worth."""
+MIN_PEERS = 5
+"""Circles of one design radius among which one can be odd."""
+MAD_EFFICIENCY = 0.37
+"""Of the median absolute deviation: what a spread from n values is worth in degrees of freedom."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Radii:
+    """Circles of the target and dots of the board, over all images and groups.
+
+    ``labels`` ; ``design_mm`` : (c,); ``ratio`` : (c,) measured over designed, median; ``size_px`` : (c,) designed
+    radius in the images, geometric mean of the ellipse's axes, median.
+    """
+
+    labels: tuple[str, ...]
+    design_mm: np.ndarray
+    ratio: np.ndarray
+    size_px: np.ndarray
+
+    def __post_init__(self):
+        for name in ("design_mm", "ratio", "size_px"):
+            object.__setattr__(self, name, frozen(getattr(self, name), (len(self.labels),), name))
+
+    def classes(self) -> dict[str, np.ndarray]:
+        """Places of circles that are made alike, by name."""
+        found: dict[str, list[int]] = {}
+        for i, (label, radius) in enumerate(zip(self.labels, self.design_mm, strict=True)):
+            found.setdefault(f"{'dots' if is_board(label) else 'circles'} of radius {radius:g} mm", []).append(i)
+        return {name: np.array(members) for name, members in found.items()}
+
+
+@dataclass(frozen=True, slots=True)
+class Size:
+    """The size of the target over that of its design, less 1, with its σ from so many degrees of freedom."""
+
+    name: str
+    size: float
+    sigma: float
+    freedom: int
+
+
+def measure_radii(
+    networks: Sequence[Network], images: Sequence[ImageObservations], design_mm: dict[str, float], camera: Camera
+) -> Radii:
+    """Radii from the ellipses' areas and the circles' places and planes."""
+    shapes = {image.name: image.shape for image in images}
+    ratio: dict[str, list[np.ndarray]] = {}
+    size: dict[str, list[np.ndarray]] = {}
+    focal = float(np.sqrt(camera.focal.prod()))
+    for network in networks:
+        model = network.model
+        designed = np.array([design_mm[label] for label in model.labels])
+        measured = np.concatenate([shapes[model.images[i]][model.keypoint[rows]]
+                                   for i, rows in enumerate(model.rows_by_image())])  # fmt: skip
+        order = np.concatenate(model.rows_by_image())
+        expected = _areas(network, designed)[order]
+        own = np.sqrt(np.maximum(np.linalg.det(measured), 0) / expected)
+        point = model.point_index[order]
+        for k, label in enumerate(model.labels):
+            ratio.setdefault(label, []).append(own[point == k])
+            size.setdefault(label, []).append(focal * np.sqrt(expected[point == k]))
+    return Radii(
+        tuple(ratio),
+        np.array([design_mm[label] for label in ratio]),
+        np.array([np.median(np.concatenate(each)) for each in ratio.values()]),
+        np.array([np.median(np.concatenate(each)) for each in size.values()]),
+    )
+
+
+def _areas(network: Network, radius_mm: np.ndarray) -> np.ndarray:
+    """Areas over π of the circles' images in normalised coordinates, (n,): from the dual conic
+    r²(I − n·nᵀ) − C·Cᵀ (Hartley & Zisserman, sec. 8.3), with the planes of the faces as found."""
+    model = network.model
+    normal = np.zeros((len(model.labels), 3))
+    for members in model.points_by_face().values():
+        normal[members] = fit_plane(model.xyz_world[members]).normal
+    rotation = np.stack([pose.rotation for pose in model.camera_from_world])[model.image_index]
+    n = np.einsum("nij,nj->ni", rotation, normal[model.point_index])
+    c = model.xyz_camera()
+    square = radius_mm[model.point_index, None, None] ** 2
+    dual = square * (np.eye(3) - n[:, :, None] * n[:, None, :]) - c[:, :, None] * c[:, None, :]
+    middle = dual[:, :2, 2] / dual[:, 2:, 2]
+    shape2 = middle[:, :, None] * middle[:, None, :] - dual[:, :2, :2] / dual[:, 2:, 2:]
+    return np.sqrt(np.maximum(np.linalg.det(shape2), 1e-300))
+
+
+def radius_checks(radii: Radii) -> list[Check]:
+    """Every circle against those made alike, and all that are made alike against their design."""
+    single, whole = [], []
+    for name, members in radii.classes().items():
+        ratio = radii.ratio[members]
+        usual = float(np.median(ratio))
+        bias_px = (usual - 1) * float(np.median(radii.size_px[members]))
+        whole.append(Trial(name, bias_px, "px", (bias_px / EDGE_BIAS_PX) ** 2, 1))
+        if len(members) < MIN_PEERS:
+            continue
+        spread = float(np.hypot(1.4826 * np.median(np.abs(ratio - usual)), RADIUS_TOLERANCE))
+        freedom = max(MAD_EFFICIENCY * len(members) - 1, 2.0)
+        for i in members:
+            away = radii.ratio[i] - usual
+            single.append(
+                Trial(radii.labels[i], 1e3 * away * radii.design_mm[i], "µm", (away / spread) ** 2, 1, freedom)
+            )
+    odd = (
+        "a damaged or dirty circle, a wrong label, or another radius than the design's: look at it in the overlays, "
+        "correct target.toml"
+    )
+    other = (
+        "all circles of a kind are larger or smaller than target.toml or board.toml says, or over-exposed: measure "
+        "one, correct the file; a wrong radius makes a wrong eccentricity"
+    )
+    return [
+        judge("radius", "Radius of each circle against those made alike", single, "circles", odd),
+        judge("radius-design", "Radii against the design", whole, "kinds of circle", other),
+    ]
+
+
+def size_by_radii(radii: Radii) -> Size | None:
+    """Slope of measured over designed radii of the target's circles, less 1; None where all are alike."""
+    own = np.array([not is_board(label) for label in radii.labels])
+    size = radii.size_px[own]
+    design = radii.design_mm[own]
+    if len(size) < MIN_PEERS or np.ptp(design) == 0:
+        return None
+    design_matrix = np.column_stack([np.ones(len(size)), size])
+    excess = (radii.ratio[own] - 1) * size
+    fit, *_ = np.linalg.lstsq(design_matrix, excess, rcond=None)
+    freedom = len(size) - 2
+    variance = float(((excess - design_matrix @ fit) ** 2).sum()) / freedom
+    slope_variance = variance * np.linalg.inv(design_matrix.T @ design_matrix)[1, 1]
+    reach = np.median(size[design == design.max()]) - np.median(size[design == design.min()])
+    sigma = np.hypot(np.sqrt(slope_variance), EDGE_DIFFERENCE_PX / reach)
+    return Size("by radii of circles", float(fit[1]), float(sigma), freedom)

@@ -1,0 +1,158 @@
+"""Checks that residuals cannot fake: each asks a question that a wrong result with small residuals answers wrongly."""
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from stcal.design import BoardDesign, TargetDesign
+from stcal.errors import StcalError
+from stcal.geometry.camera import Camera
+from stcal.geometry.rigid import Rigid, Similarity
+from stcal.io.camera import CameraPrior
+from stcal.sfm.adjust.calibration import Calibration, calibrate, image_sigma_factor
+from stcal.sfm.adjust.group import adjust
+from stcal.sfm.adjust.network import Network, free_network, solve_score
+from stcal.sfm.adjust.options import AdjustOptions
+from stcal.sfm.checks.board import board_checks, pitch_check
+from stcal.sfm.checks.faces import (
+    Again,
+    agreement_check,
+    flatness_check,
+    groups_check,
+    halves_check,
+    loops_check,
+)
+from stcal.sfm.checks.images import (
+    camera_check,
+    field_check,
+    image_check,
+    moved_check,
+    sharpness_check,
+    sigma_check,
+)
+from stcal.sfm.checks.labels import labels_check
+from stcal.sfm.checks.radii import measure_radii, radius_checks
+from stcal.sfm.checks.verdict import Check, Measured, Trial, impossible, judge
+from stcal.sfm.data.model import GroupModel, Outlier
+from stcal.sfm.data.observations import ImageObservations
+
+JOINT = (
+    ("agreement", "Groups, board and faces against one another (σ₀)"),
+    ("halves", "Two halves of the images against each other"),
+    ("groups", "The result without each group"),
+    ("loops", "Ways to a face through different groups"),
+)
+"""Checks that need the joint result and its covariances."""
+CONTROL = "Uncorrected control"
+MICRO = 1e3
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Evidence:
+    """What the checks look at.
+
+    ``models`` : of the single groups, adjusted, without unit; ``outliers`` left out of them; ``images`` : all
+    observations; ``camera`` : as given; ``prior`` : of the intrinsics where they were refined; ``blur_px`` : of the
+    edges, by image, may be empty.
+    """
+
+    models: tuple[GroupModel, ...]
+    outliers: tuple[Outlier, ...]
+    images: tuple[ImageObservations, ...]
+    camera: Camera
+    colmap_model: str
+    target: TargetDesign
+    board: BoardDesign
+    options: AdjustOptions
+    calibration: Calibration
+    prior: CameraPrior | None
+    blur_px: dict[str, float]
+
+    def networks(self) -> list[Network]:
+        """Free networks of all groups, mm, at the intrinsics of the result."""
+        camera = self.calibration.camera
+        models = self.models
+        if not camera.same_as(self.camera):
+            models = tuple(adjust(model, camera) for model in models)
+        factor = image_sigma_factor(models, camera)
+        scales = self.calibration.scales
+        return [free_network(m.moved(Similarity(scales[m.group].mm_per_unit, Rigid())), camera, factor) for m in models]
+
+
+def run_checks(evidence: Evidence) -> tuple[Check, ...]:
+    """All checks of a run, in the order of the report."""
+    networks, calibration = evidence.networks(), evidence.calibration
+    camera, board, target = calibration.camera, evidence.board, evidence.target
+    radii = measure_radii(networks, evidence.images, target.radius_of() | board.radius_of(), camera)
+    return (
+        camera_check(networks, evidence.camera, evidence.colmap_model, calibration, evidence.prior),
+        field_check(networks, camera),
+        sigma_check(networks, calibration.sigma_factor),
+        *_joint_checks(evidence, networks),
+        moved_check(networks),
+        image_check(networks),
+        sharpness_check(networks, evidence.blur_px),
+        labels_check(networks, evidence.outliers, evidence.images, camera),
+        *board_checks(networks, board),
+        pitch_check(calibration.target, target, radii),
+        *radius_checks(radii),
+        flatness_check(networks, evidence.options.flatness_mm),
+        control_check(evidence, networks),
+    )
+
+
+def _joint_checks(evidence: Evidence, networks: list[Network]) -> list[Check]:
+    if evidence.calibration.joint is None:
+        reason = "needs the covariances of the joint adjustment"
+        return [impossible(key, title, reason, "run with --solve joint") for key, title in JOINT]
+    again = Again(evidence.calibration, evidence.target, evidence.board, evidence.options)
+    linked = {model.group for model in evidence.calibration.joint.models}
+    own = [n for n in networks if n.model.group in linked]
+    return [
+        agreement_check(evidence.calibration, own),
+        halves_check(again),
+        groups_check(again),
+        loops_check(again),
+    ]
+
+
+def control_check(evidence: Evidence, networks: list[Network]) -> Check:
+    """The same run without eccentricity, chained with three-point frames: how far faces are off that a program without
+    it delivers, and how little its residuals show it. And the test of the correction itself: it may be scaled by a
+    factor, all else free; by chance that is 1, and 0 where the centres are not those of ellipses."""
+    key = "control"
+    if not evidence.options.eccentricity:
+        return impossible(key, CONTROL, "this run is the control", "run with eccentricity")
+    scores = [n.score(n.model.whiten(n.model.shift_px[:, :, None])) for n in networks]
+    more, covariance, statistic, freedom = solve_score(sum(s[0] for s in scores), sum(s[1] for s in scores))
+    redundancy = sum(n.redundancy.sum() for n in networks)
+    remedy = (
+        "the measured centres do not move as those of ellipses: check radii, polarity and exposure; centroids of grey "
+        "values or of contours need another correction"
+    )
+    trial = Trial("share of the eccentricity found, less 1", float(more[0]), "", statistic, freedom, redundancy)
+    check = judge(key, CONTROL, [trial], "corrections", remedy)
+    try:
+        told, measured = _control(evidence)
+    except StcalError as error:
+        told, measured = f"no uncorrected result ({error})", ()
+    reason = f"{1 + more[0]:.3f} ± {np.sqrt(covariance[0, 0]):.3f} of the eccentricity found; {told}"
+    return replace(check, reason=reason, measured=check.measured + measured)
+
+
+def _control(evidence: Evidence) -> tuple[str, tuple[Measured, ...]]:
+    camera, whole = evidence.calibration.camera, evidence.calibration.target
+    models = [adjust(replace(m, shift_px=np.zeros_like(m.shift_px)), camera) for m in evidence.models]
+    options = replace(evidence.options, solve="chain", frame="three-point", eccentricity=False)
+    control = calibrate(models, camera, evidence.target, evidence.board, options).target
+    apart = {
+        face: MICRO * float(np.linalg.norm(control.target_from_face[face].translation - pose.translation))
+        for face, pose in whole.target_from_face.items()
+        if face != whole.reference_face
+    }
+    rms = float(np.sqrt(np.concatenate([m.residuals_px(camera).ravel() ** 2 for m in models]).mean()))
+    rows = tuple(
+        Measured(f"face {face}, without eccentricity", value, None, "µm", None) for face, value in apart.items()
+    )
+    largest = max(apart.values(), default=0.0)
+    return f"without it faces are off by up to {largest:.0f} µm at residuals of {rms:.4f} px", rows

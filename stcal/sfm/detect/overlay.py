@@ -1,0 +1,94 @@
+"""Overlay pictures: what was found in an image, drawn on it."""
+
+import cv2
+import numpy as np
+
+from stcal.design import BOARD
+from stcal.sfm.data.observations import ImageObservations, face_of, is_board
+
+# OpenCV's order: blue, green, red. The palette of Okabe & Ito (2008), for all kinds of colour vision.
+PALETTE = [(0, 159, 230), (115, 158, 0), (66, 228, 240), (167, 121, 204), (0, 94, 213), (178, 114, 0)]
+BOARD_COLOUR = (233, 180, 86)
+QUALITY = 82
+MIN_WIDTH_PX = 1000
+MIN_LABEL_GAP = 70.0
+"""Between numbered dots, px at text size 1."""
+
+
+def draw_overlay(
+    thumbnail: bytes,
+    scale: float,
+    observations: ImageObservations,
+    faces: list[str],
+    focal_px: np.ndarray,
+    notes: int,
+) -> bytes:
+    """A JPEG with every measured ellipse and its label.
+
+    Parameters
+    ----------
+    thumbnail : JPEG of the image, ``scale`` its size over the image's
+    faces : all face ids, for colours that stay the same over the images
+    notes : number of things left out, for the caption
+    """
+    picture = cv2.imdecode(np.frombuffer(thumbnail, np.uint8), cv2.IMREAD_COLOR)
+    if picture.shape[1] < MIN_WIDTH_PX:  # room for the labels of small circles
+        picture, scale = cv2.resize(picture, None, fx=2, fy=2, interpolation=cv2.INTER_CUBIC), 2 * scale
+    size = max(0.4, picture.shape[1] / 2800)
+    colours = {face: PALETTE[i % len(PALETTE)] for i, face in enumerate(faces)} | {BOARD: BOARD_COLOUR}
+    numbered = _numbered_dots(observations, MIN_LABEL_GAP * size / scale)
+    for label, centre, shape in zip(observations.labels, observations.centre_px, observations.shape, strict=True):
+        key = BOARD if is_board(label) else face_of(label)
+        rim = _rim(centre, shape * focal_px[:, None], scale)
+        cv2.polylines(picture, [rim], True, colours[key], 1, cv2.LINE_AA, shift=4)
+        at = ((centre + 0.5) * scale - 0.5).round().astype(int)
+        cv2.drawMarker(picture, at.tolist(), colours[key], cv2.MARKER_CROSS, 5, 1, cv2.LINE_AA)
+        text = label.split(":", 1)[1].replace(":", ",")
+        if label in numbered or not is_board(label):
+            reach = np.abs(shape * focal_px[:, None]).sum(1).max() * scale
+            _text(picture, text, (at[0] + int(0.75 * reach) + 1, at[1] - int(0.75 * reach)), size, colours[key])
+    _name_faces(picture, observations, scale, colours, size)
+    counts = f"{observations.name}: {len(observations)} circles labelled"
+    _text(
+        picture,
+        counts + (f", {notes} note{'s' * (notes > 1)}" if notes else ""),
+        (8, picture.shape[0] - 10),
+        1.2 * size,
+        (255,) * 3,
+    )
+    _, jpeg = cv2.imencode(".jpg", picture, [cv2.IMWRITE_JPEG_QUALITY, QUALITY])
+    return jpeg.tobytes()
+
+
+def _numbered_dots(observations: ImageObservations, gap_px: float) -> set[str]:
+    """Dots of the first row and column that carry their number: the first and last, and all where there is room."""
+    place = {x: p for x, p in zip(observations.labels, observations.centre_px, strict=True) if is_board(x)}
+    chosen = set()
+    for axis in (1, 2):
+        line = [x for x in sorted(place, key=lambda x: int(x.split(":")[axis])) if x.split(":")[3 - axis] == "0"]
+        if line:
+            steps = np.linalg.norm(np.diff([place[x] for x in line], axis=0), axis=1)
+            roomy = len(line) > 1 and np.median(steps) > gap_px
+            chosen |= set(line if roomy else (line[0], line[-1]))
+    return chosen
+
+
+def _rim(centre_px: np.ndarray, shape_px: np.ndarray, scale: float) -> np.ndarray:
+    """Points of the rim in the thumbnail, in sixteenths of a pixel; lens distortion inside a circle is not visible."""
+    angle = np.linspace(0, 2 * np.pi, 40, endpoint=False)
+    rim = centre_px + np.column_stack([np.cos(angle), np.sin(angle)]) @ shape_px.T
+    return np.round(((rim + 0.5) * scale - 0.5) * 16).astype(np.int32)
+
+
+def _name_faces(picture, observations: ImageObservations, scale: float, colours: dict, size: float) -> None:
+    for face in observations.face_ids():
+        members = [i for i, label in enumerate(observations.labels) if face_of(label) == face and not is_board(label)]
+        low, high = observations.centre_px[members].min(0), observations.centre_px[members].max(0)
+        at = (np.array([(low[0] + high[0]) / 2, low[1]]) * scale).astype(int)
+        _text(picture, f"face {face}", (at[0] - int(45 * size), at[1] - int(45 * size)), 1.5 * size, colours[face])
+
+
+def _text(picture, text: str, at: tuple[int, int], size: float, colour) -> None:
+    text = text.encode("ascii", "replace").decode()
+    for thickness, ink in ((3, (0, 0, 0)), (1, colour)):
+        cv2.putText(picture, text, at, cv2.FONT_HERSHEY_SIMPLEX, size, ink, thickness, cv2.LINE_AA)

@@ -1,0 +1,1 @@
+"""Why something was left out of a finished run."""

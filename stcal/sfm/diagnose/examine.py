@@ -1,0 +1,244 @@
+"""Why a circle that should be in view was not found: the gates of detection at its place, in detection's order.
+
+Nothing is judged anew here: outlines, patterns, faces, board and rims go through the functions that detection itself
+uses, with the same options. Whether another option would find a circle is not guessed either: detection is run with it.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from stcal.design import BOARD, BoardDesign, TargetDesign
+from stcal.geometry.arrays import frozen
+from stcal.geometry.camera import Camera
+from stcal.geometry.plane import apply_homography, homography_jacobian
+from stcal.io.images import grey_8bit, grey_fine
+from stcal.sfm.detect.board import needed_dots
+from stcal.sfm.detect.candidates import (
+    MAX_POSITION_ERROR,
+    MAX_POSITION_ERROR_PX,
+    Candidates,
+    PatternFit,
+    fit_pattern,
+)
+from stcal.sfm.detect.centres import MIN_RIM, measure_centres
+from stcal.sfm.detect.ellipses import EllipseOptions, diameter_limits_px
+from stcal.sfm.detect.faces import needed_circles
+from stcal.sfm.detect.image import ImageReading, detect_image, read_image
+from stcal.sfm.diagnose.trace import trace_outlines
+
+LEAST_MIN_DIAMETER_PX = 4.0
+"""The least that ``--min-diameter`` takes."""
+LOOSER = (0.75, 0.5, 0.25)
+"""Of limits that are tried looser: outlines run at half a blob's height, and only a threshold below leaves it whole."""
+LARGER = (1.02, 1.2)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Expected:
+    """The n circles of one plane, a face or the board, and where one image should show them.
+
+    ``plane`` : face id or ``board``; ``image_from_plane`` : (3, 3) homography, mm to normalised coordinates;
+    ``xy_mm`` : (n, 2) and ``radius_mm`` : (n,) of the design; ``missing`` : (n,) in view and without a label.
+    """
+
+    plane: str
+    image_from_plane: np.ndarray
+    labels: tuple[str, ...]
+    xy_mm: np.ndarray
+    radius_mm: np.ndarray
+    missing: np.ndarray
+
+    def __post_init__(self):
+        n = len(self.labels)
+        for name, shape in (("image_from_plane", (3, 3)), ("xy_mm", (n, 2)), ("radius_mm", (n,))):
+            object.__setattr__(self, name, frozen(getattr(self, name), shape, name))
+        object.__setattr__(self, "missing", frozen(self.missing, (n,), "missing", dtype=bool))
+
+    def in_px(self, camera: Camera) -> tuple[np.ndarray, np.ndarray]:
+        """Centres (n, 2) and shapes (n, 2, 2) of the circles in the image as it is."""
+        distorted, by_ideal = camera.distort_jacobian(apply_homography(self.image_from_plane, self.xy_mm))
+        local = homography_jacobian(self.image_from_plane, self.xy_mm) * self.radius_mm[:, None, None]
+        return distorted * camera.focal + camera.centre, camera.focal[:, None] * (by_ideal @ local)
+
+
+@dataclass(frozen=True, slots=True)
+class Verdict:
+    """What stopped one circle: its ``value`` did not pass the ``limit`` of ``gate``.
+
+    ``cause`` : ``merged`` where its outline runs into something else, ``cut`` where it misses a part.
+    """
+
+    label: str
+    gate: str
+    value: float | None = None
+    limit: float | None = None
+    unit: str = ""
+    cause: str = ""
+
+
+@dataclass(frozen=True, slots=True)
+class Trial:
+    """An option to try: ``text`` names it, ``gate`` is the one that it loosens."""
+
+    gate: str
+    text: str
+    options: EllipseOptions
+
+
+def examine(
+    image: np.ndarray,
+    camera: Camera,
+    target: TargetDesign,
+    board: BoardDesign,
+    options: EllipseOptions,
+    planes: list[Expected],
+) -> list[Verdict]:
+    """The first gate that each missing circle of an image fails."""
+    reading = read_image(grey_8bit(image), camera, target, board, options)
+    verdicts = []
+    for plane in planes:
+        verdicts += _Examination(image, camera, target, board, options, reading, plane).verdicts()
+    return verdicts
+
+
+class _Examination:
+    """One plane in one image."""
+
+    def __init__(self, image, camera: Camera, target, board, options, reading: ImageReading, plane: Expected):
+        self.image, self.camera, self.options, self.reading, self.plane = image, camera, options, reading, plane
+        self.target, self.board, self.is_board = target, board, plane.plane == BOARD
+        self.polarity = board.polarity if self.is_board else target.polarity
+        self.ellipses = reading.found[self.polarity] if self.is_board else reading.free
+        self.fit: PatternFit | None = None
+        if len(self.ellipses):
+            candidates = Candidates.of(self.ellipses, camera)
+            self.fit = fit_pattern(candidates, self._homography(), plane.xy_mm, plane.radius_mm)
+
+    def _homography(self) -> np.ndarray:
+        """What detection itself predicted the circles with, or the model's where it did not come that far."""
+        if self.is_board:
+            own = [] if self.reading.board is None else list(self.reading.board.homographies)
+        else:
+            own = [r.homography for r in self.reading.faces.faces if r.face.id == self.plane.plane]
+        # Of several numberings of the board the group has chosen the one that the model agrees with.
+        expected = apply_homography(self.plane.image_from_plane, self.plane.xy_mm)
+        off = [np.abs(apply_homography(h, self.plane.xy_mm) - expected).max() for h in own]
+        return own[int(np.argmin(off))] if own else self.plane.image_from_plane
+
+    def verdicts(self) -> list[Verdict]:
+        """Of all missing circles."""
+        verdicts, lost = [], []
+        for i in np.flatnonzero(self.plane.missing):
+            if self.fit is not None and self.fit.fits()[i]:
+                verdicts.append(self._recognised(i) or self._rim(i))
+            elif self.fit is not None and self.fit.distance[i] < self.fit.radius[i]:
+                verdicts.append(self._pattern(i))
+            else:
+                lost.append(i)
+        if lost:
+            centre, shape = self.plane.in_px(self.camera)
+            grey = grey_8bit(self.image)
+            for i, end in zip(
+                lost, trace_outlines(grey, self.polarity, self.options, centre[lost], shape[lost]), strict=True
+            ):
+                verdicts.append(Verdict(self.plane.labels[i], end.gate, end.value, end.limit, end.unit, end.cause))
+        return verdicts
+
+    def _recognised(self, i: int) -> Verdict | None:
+        """The gate between outline and rim that stopped a circle, if one did: its face or the board."""
+        label, reading, candidate = self.plane.labels[i], self.reading, self.fit.index[i]
+        count = int(self.fit.fits().sum())
+        if self.is_board:
+            if reading.board is not None:
+                return None if candidate in reading.board.candidates else Verdict(label, "board_grid")
+            needed = int(np.ceil(needed_dots(self.board)))
+            return Verdict(label, "board_dots" if count < needed else "board_grid", count, needed, "dots")
+        named = [r for r in reading.faces.faces if r.face.id == self.plane.plane]
+        if named:
+            return None if candidate in named[0].used() else Verdict(label, "pattern")
+        for refused in reading.faces.refused:
+            if set(refused.used) & set(self.fit.index[self.fit.fits()]):
+                unit = "other readings" if refused.gate == "face_readings" else "grey values"
+                return Verdict(label, refused.gate, refused.value, refused.limit, unit)
+        needed = needed_circles(self.target.face(self.plane.plane))
+        return Verdict(label, "face_circles" if count < needed else "face_pattern", count, needed, "circles")
+
+    def _rim(self, i: int) -> Verdict:
+        """The last gate of an image."""
+        ellipse = self.ellipses.select(self.fit.index[i : i + 1])
+        measured = measure_centres(grey_fine(self.image), self.camera, ellipse, self.reading.found[self.polarity])
+        if not measured.ok[0]:
+            return Verdict(self.plane.labels[i], "rim", float(measured.rim[0]), MIN_RIM, "of the rim")
+        return Verdict(self.plane.labels[i], "board_numbering" if self.is_board else "found_now")
+
+    def _pattern(self, i: int) -> Verdict:
+        """Something elliptic is at the place of a circle, but not just there, or of another size or shape."""
+        fit, label = self.fit, self.plane.labels[i]
+        if not fit.in_place()[i]:
+            off, allowed = fit.distance[i] / fit.radius[i], fit.max_distance[i] / fit.radius[i]
+            return Verdict(label, "position", float(off), float(allowed), "radii")
+        stretch = max(fit.widest[i], 1 / max(fit.narrowest[i], 1e-9))
+        return Verdict(label, "shape", float(stretch), float(fit.max_stretch[i]))
+
+
+def by_geometry(planes: list[Expected], camera: Camera, options: EllipseOptions) -> list[Verdict]:
+    """What the predicted size alone says of missing circles, for want of the image."""
+    smallest, largest = diameter_limits_px(camera.width * camera.height, options)
+    verdicts = []
+    for plane in planes:
+        diameter = 2 * np.sqrt(np.abs(np.linalg.det(plane.in_px(camera)[1])))
+        for i in np.flatnonzero(plane.missing):
+            gate, limit = "not_examined", None
+            if diameter[i] < smallest:
+                gate, limit = "min_diameter", smallest
+            elif diameter[i] > largest:
+                gate, limit = "max_diameter", largest
+            verdicts.append(Verdict(plane.labels[i], gate, float(diameter[i]), limit, "px"))
+    return verdicts
+
+
+def trials(verdicts: Sequence[Verdict], pixels: int, options: EllipseOptions) -> list[Trial]:
+    """Options that could let circles in, loosened as far as these ask for, and to the end; gentle ones first."""
+    found = []
+    smallest, _ = diameter_limits_px(pixels, options)
+    small = [v.value for v in verdicts if v.gate == "min_diameter" and v.value >= LEAST_MIN_DIAMETER_PX and not v.cause]
+    half_px = np.floor(2 * min(small, default=LEAST_MIN_DIAMETER_PX)) / 2
+    for diameter in dict.fromkeys((half_px, LEAST_MIN_DIAMETER_PX)):
+        if diameter < smallest:
+            looser = replace(options, min_diameter_px=float(diameter))
+            found.append(Trial("min_diameter", f"--min-diameter {diameter:g}", looser))
+    if large := [v.value for v in verdicts if v.gate == "max_diameter" and not v.cause]:
+        for diameter in dict.fromkeys(10 * np.ceil(factor * max(large) / 10) for factor in LARGER):
+            looser = replace(options, max_diameter_px=float(diameter))
+            found.append(Trial("max_diameter", f"--max-diameter {diameter:g}", looser))
+    for gate in ("min_contrast", "min_axis_ratio"):
+        if any(v.gate == gate and not v.cause for v in verdicts):
+            for factor in LOOSER:
+                limit = float(f"{factor * getattr(options, gate):.2g}")
+                found.append(Trial(gate, f"EllipseOptions({gate}={limit:g})", replace(options, **{gate: limit})))
+    return found
+
+
+def labels_found(
+    image: np.ndarray,
+    camera: Camera,
+    target: TargetDesign,
+    board: BoardDesign,
+    options: EllipseOptions,
+    planes: list[Expected],
+) -> set[str]:
+    """Labels that detection with these options finds; a dot of the board is told by its place, of those expected."""
+    detection = detect_image(image, camera, target, board, options)
+    if detection.repeated:  # a run would end there
+        return set()
+    found = set(detection.target_labels)
+    dots = detection.centres.centre_px[len(detection.target_labels) :]
+    for plane in planes:
+        if plane.plane == BOARD and len(dots):
+            centre, shape = plane.in_px(camera)
+            near = np.maximum(MAX_POSITION_ERROR * np.sqrt(np.abs(np.linalg.det(shape))), MAX_POSITION_ERROR_PX)
+            distance = np.linalg.norm(centre[:, None] - dots, axis=2).min(1)
+            found |= {label for label, seen in zip(plane.labels, distance < near, strict=True) if seen}
+    return found

@@ -1,0 +1,219 @@
+"""What the doctor finds, in words: the advice at every gate, the order of findings, table and JSON."""
+
+import math
+from collections.abc import Iterable
+from dataclasses import asdict, dataclass
+from itertools import groupby
+
+from stcal.sfm.data.observations import face_of, is_board
+
+AT_MOST = ("max_diameter", "outline_area", "outline_deviation", "position", "shape", "face_readings", "residual")
+"""Gates whose limit is the largest value allowed; those of the others are the smallest needed."""
+ADVICE = {
+    "border": "it touches the image's border: keep it inside",
+    "min_diameter": "come {closer} % closer, or use a longer lens",
+    "max_diameter": "step back, or use a shorter lens",
+    "min_axis_ratio": "photograph it less obliquely, or without motion blur",
+    "min_contrast": "light it, expose longer, or cover what is brighter",
+    "hidden": "hidden or dark: uncover it, light it",
+    "outline": "nothing round stands out there: uncover it, or cover what outshines it",
+    "ellipse": "its outline is no ellipse: uncover it",
+    "outline_area": "its outline is no ellipse: uncover it, photograph it sharper or from closer",
+    "outline_deviation": "its outline is no ellipse: uncover it, photograph it sharper or from closer",
+    "position": "something else is there, or a part of the circle: uncover it; is the place in the target file right?",
+    "shape": "something else is there, or a part of the circle: uncover it; is the radius in the target file right?",
+    "pattern": "two circles claim the same outline: uncover the other one",
+    "face_circles": "found, but too few of its face: let in those that have lines of their own",
+    "face_pattern": "found, but not put together as a face: mend its circles with lines of their own, cover other dots",
+    "face_contrast": "found, but faint as a reflection: light it as brightly as the rest, or cover what is brighter",
+    "face_readings": "found, but another reading fits as well: show the circles that tell the faces apart",
+    "board_dots": "found, but too few of the board: let in dots that have lines of their own",
+    "board_grid": "found, but not joined to the board's grid: show the dots between, cover what is like a dot",
+    "board_numbering": "found, but the board's numbering stays open: show a face that the group's other images show",
+    "rim": "partly hidden, reflecting or disturbed: uncover it",
+    "not_examined": "give the folder of the images with --images",
+    "found_now": "found now: the image or the program has changed since the run; run it again",
+    "views": "photograph it from another place too",
+    "ray_angle": "photograph it from places further apart",
+    "residual": "contradicts the other images: look for glare, dirt, a part hidden, or something that moved",
+}
+CAUSES = {
+    "merged": "it runs into something bright beside it: move or cover that, or photograph it from elsewhere",
+    "cut": "only a part of it shows: uncover it, or photograph it from elsewhere",
+}
+TRIFLES = ("views", "hidden", "note", "copy", "file_type", "folder")
+"""Gates of what can hardly be helped, or needs no help."""
+MAX_LABELS = 12
+MAX_LINES = 40
+
+
+@dataclass(frozen=True, slots=True)
+class Finding:
+    """Something that was left out.
+
+    ``image`` : name, empty for what concerns the whole run; ``labels`` : circles, none for a whole file or image;
+    ``gate`` : name of the threshold; ``value``, ``limit``, ``unit`` : what was measured there and what is allowed or
+    needed, None where there is no number; ``remedy`` : what to do with the scene; ``options`` : each lets it in, as
+    tried on the image, the gentlest first.
+    """
+
+    image: str
+    labels: tuple[str, ...]
+    gate: str
+    value: float | str | None
+    limit: float | str | None
+    unit: str
+    remedy: str
+    options: tuple[str, ...] = ()
+
+
+@dataclass(frozen=True, slots=True)
+class Diagnosis:
+    """``files`` given, ``images`` of them that could be used, ``mapped`` images, ``circles`` : observations in the
+    model; ``findings`` : what was left out, the most useful to know first."""
+
+    files: int
+    images: int
+    mapped: int
+    circles: int
+    findings: tuple[Finding, ...]
+
+
+def advice(gate: str, value: float | None = None, limit: float | None = None, cause: str = "") -> str:
+    """What to do with the scene for a circle that a gate stopped; ``cause`` as of the examination."""
+    closer = math.ceil(100 * (1 - value / limit)) if gate == "min_diameter" else 0
+    return CAUSES.get(cause) or ADVICE[gate].format(closer=closer)
+
+
+def in_order(findings: Iterable[Finding]) -> tuple[Finding, ...]:
+    """Equal reasons of one image and face together; the most useful first: whole images and faces, what an option
+    lets in, then by the number of circles; last what can hardly be helped."""
+    together = [list(own) for _, own in groupby(sorted(findings, key=_key), key=_key)]
+    together.sort(key=lambda own: (_rank(own[0]), -sum(len(f.labels) for f in own), _key(own[0])))
+    return tuple(finding for own in together for finding in own)
+
+
+def _key(finding: Finding) -> tuple[str, ...]:
+    """What findings of one line have in common."""
+    plane = face_of(finding.labels[0]) if finding.labels else ""
+    advised = finding.remedy.partition("%")[2] or finding.remedy
+    return finding.image, plane, finding.gate, *finding.options[:1], advised
+
+
+def _rank(finding: Finding) -> int:
+    if finding.gate in TRIFLES and (finding.image or not finding.value):
+        return 3
+    if not (finding.image and finding.labels):
+        return 0
+    return 1 if finding.options else 2
+
+
+def to_json(diagnosis: Diagnosis) -> dict:
+    """Plain values; see ``data_layout.md``."""
+    return {
+        "format": "stcal doctor 1",
+        "summary": {name: getattr(diagnosis, name) for name in ("files", "images", "mapped", "circles")},
+        "gates": _by_gate(diagnosis.findings),
+        "findings": [asdict(finding) for finding in diagnosis.findings],
+    }
+
+
+def _by_gate(findings: tuple[Finding, ...]) -> dict[str, dict[str, int]]:
+    counts: dict[str, dict[str, int]] = {}
+    images: dict[str, set[str]] = {}
+    for finding in findings:
+        if not finding.image:  # what is said of the whole run is no circle of an image
+            continue
+        own = counts.setdefault(finding.gate, {"circles": 0, "images": 0, "by_option": 0})
+        own["circles"] += len(finding.labels)
+        own["by_option"] += len(finding.labels) if finding.options else 0
+        images.setdefault(finding.gate, set()).add(finding.image)
+    for gate, names in images.items():
+        counts[gate]["images"] = len(names)
+    return counts
+
+
+def table(diagnosis: Diagnosis, lines: int | None = MAX_LINES) -> str:
+    """Counts, what options let in, and one line for each reason; no more than ``lines`` of them."""
+    found = diagnosis.findings
+    heading = f"{diagnosis.mapped} of {diagnosis.images} images mapped, {diagnosis.circles} circles in the model"
+    if not found:
+        return f"nothing was left out: {heading}, every circle in view has a label"
+    files = _number(diagnosis.files - diagnosis.images, "file")
+    images = _number(diagnosis.images - diagnosis.mapped, "image")
+    text = [f"{heading}; left out: {files}, {images}, {_circles(found)}"]
+    for gate, count in sorted(_by_gate(found).items(), key=lambda item: (-item[1]["circles"], -item[1]["images"])):
+        circles = f"{_number(count['circles'], 'circle')} of " if count["circles"] else ""
+        text.append(f"  {gate:<18}{circles}{_number(count['images'], 'image')}")
+    helping: dict[str, list[Finding]] = {}
+    for finding in found:
+        for option in finding.options:
+            helping.setdefault(option, []).append(finding)
+    for option, own in sorted(helping.items(), key=lambda item: -len(item[1])):
+        whole = sum(not finding.labels for finding in own)
+        parts = [_number(whole, "whole image")] * bool(whole) + [_circles(own)] * (whole < len(own))
+        text.append(f"{option} lets in {', '.join(parts)}")
+    text.append("")
+    rows = [_line(list(own)) for _, own in groupby(found, key=_key)]
+    text += rows[:lines]
+    if lines is not None and len(rows) > lines:
+        text.append(f"… {len(rows) - lines} more lines with --all")
+    return "\n".join(text)
+
+
+def _circles(findings: Iterable[Finding]) -> str:
+    own = [finding for finding in findings if finding.labels and finding.image]
+    images = len({finding.image for finding in own})
+    circles = _number(sum(len(finding.labels) for finding in own), "circle")
+    return f"{circles} of {_number(images, 'image')}" if own else circles
+
+
+def _number(count: int, what: str) -> str:
+    return f"{count} {what}{'' if count == 1 else 's'}"
+
+
+def _line(own: list[Finding]) -> str:
+    first = min(own, key=lambda f: f.value if isinstance(f.value, float) else 0.0)  # asks most of whoever comes closer
+    labels = [label for finding in own for label in finding.labels]
+    where = "  ".join(part for part in (first.image, _listed(labels)) if part) or "the run"
+    values, limits = [f.value for f in own], [f.limit for f in own]
+    # Digits enough to tell value from limit.
+    digits = next((n for n in range(3, 7) if _range(values, n) != _range(limits, n)), 3)
+    value, limit = _range(values, digits), _range(limits, digits)
+    with_unit = " ".join(part for part in (limit or value, first.unit) if part)
+    bound = f"at most {with_unit}" if first.gate in AT_MOST else f"{with_unit} needed"
+    measured = ", ".join(part for part in (value, bound) if part) if limit else with_unit if value else ""
+    remedy = first.remedy
+    if first.options:
+        python = ", from Python" if first.options[0].startswith("EllipseOptions") else ""
+        remedy = f"{first.options[0]} lets {'it' if len(labels) < 2 else 'them'} in{python}"
+    return f"{where}  {' '.join(part for part in (first.gate, measured) if part)}: {remedy}"
+
+
+def _range(values: list, digits: int) -> str:
+    """Smallest and largest of some values."""
+    known = [value for value in values if value is not None]
+    if not known:
+        return ""
+    if isinstance(known[0], str):
+        return known[0]
+    low, high = (f"{value:.{digits}g}" for value in (min(known), max(known)))
+    return low if low == high else f"{low} to {high}"
+
+
+def _listed(labels: list[str]) -> str:
+    """Labels, dots of one row of the board as ``board:2:0–5``."""
+    parts: list[str] = []
+    dots: dict[str, list[int]] = {}
+    for label in labels:
+        if is_board(label):
+            row, column = label.rsplit(":", 1)
+            dots.setdefault(row, []).append(int(column))
+        else:
+            parts.append(label)
+    for row, columns in dots.items():
+        for _, run in groupby(enumerate(sorted(columns)), key=lambda each: each[1] - each[0]):
+            first, *_, last = [column for _, column in run] * 2
+            parts.append(f"{row}:{first}" if first == last else f"{row}:{first}–{last}")
+    shown = ", ".join(parts[:MAX_LABELS])
+    return shown if len(parts) <= MAX_LABELS else f"{shown} … ({len(labels)} circles)"

@@ -1,0 +1,98 @@
+"""Which circles of the design are in view in an image, by the final model: also those that were never mapped."""
+
+import numpy as np
+
+from stcal.design import BOARD, BoardDesign, TargetDesign
+from stcal.errors import DegenerateError
+from stcal.geometry.align import align_rigid
+from stcal.geometry.camera import Camera
+from stcal.geometry.rigid import Rigid
+from stcal.sfm.data.model import GroupModel
+from stcal.sfm.data.observations import ImageObservations
+from stcal.sfm.diagnose.examine import Expected
+
+MAX_TILT_RAD = np.radians(70.0)
+"""Between a circle's normal and the line of sight; what is seen more obliquely need not be found."""
+MIN_MAPPED = 3
+"""Circles of a plane that place the others."""
+RIM = np.stack([np.cos(np.arange(24) * np.pi / 12), np.sin(np.arange(24) * np.pi / 12)], axis=1)
+BORDER_POINTS = 33
+
+
+def missing_circles(
+    model: GroupModel,
+    circles: dict[str, np.ndarray],
+    observations: dict[str, ImageObservations],
+    camera: Camera,
+    target: TargetDesign,
+    board: BoardDesign,
+) -> dict[str, list[Expected]]:
+    """Planes of which circles are in view and have no label, by image of one group.
+
+    Parameters
+    ----------
+    model : the group's, target frame, mm
+    circles : centres of the target's circles, (3,) by label, target frame, mm; the model's own go first
+    observations : by image
+    """
+    xyz = circles | dict(zip(model.labels, model.xyz_world, strict=True))
+    designs = [(f.id, f.labels(), f.xy_mm, f.radius_mm, 1) for f in target.faces]
+    designs.append((BOARD, board.labels(), board.xy_mm(), board.radii_mm(), -1))  # Z points into the board
+    placed = [(*design, pose) for design in designs if (pose := _target_from_plane(*design[1:3], xyz)) is not None]
+    border = ideal_border(camera)
+    found = {}
+    for name, camera_from_target in zip(model.images, model.camera_from_world, strict=True):
+        seen = set(observations[name].labels)
+        planes = []
+        for plane, labels, xy_mm, radius_mm, side, target_from_plane in placed:
+            pose = camera_from_target @ target_from_plane
+            missing = in_view(pose, xy_mm, radius_mm, side, camera, border)
+            missing &= [label not in seen for label in labels]
+            if missing.any():
+                homography = np.column_stack([pose.rotation[:, :2], pose.translation])
+                planes.append(Expected(plane, homography, tuple(labels), xy_mm, radius_mm, missing))
+        if planes:
+            found[name] = planes
+    return found
+
+
+def _target_from_plane(labels: list[str], xy_mm: np.ndarray, xyz: dict[str, np.ndarray]) -> Rigid | None:
+    """Rigid fit of the design to the mapped circles; None where they are too few or in line."""
+    own = [i for i, label in enumerate(labels) if label in xyz]
+    if len(own) < MIN_MAPPED:
+        return None
+    try:
+        return align_rigid(np.array([xyz[labels[i]] for i in own]), np.column_stack([xy_mm[own], np.zeros(len(own))]))
+    except DegenerateError:
+        return None
+
+
+def in_view(
+    camera_from_plane: Rigid, xy_mm: np.ndarray, radius_mm: np.ndarray, side: int, camera: Camera, border: np.ndarray
+) -> np.ndarray:
+    """Mask of the circles that face the camera and lie in the image with their whole rim.
+
+    ``side`` : 1 where the plane's Z is the side that the circles are seen from, −1 where it is the other;
+    ``border`` : of :func:`ideal_border`; beyond it a lens model may fold back.
+    """
+    axes = camera_from_plane.rotation
+    xyz = camera_from_plane @ np.column_stack([xy_mm, np.zeros(len(xy_mm))])
+    cosine = -side * (xyz @ axes[:, 2]) / np.linalg.norm(xyz, axis=1)
+    shown = (cosine > np.cos(MAX_TILT_RAD)) & (xyz[:, 2] > radius_mm)
+    rim = xyz[shown, None] + radius_mm[shown, None, None] * (RIM @ axes[:, :2].T)
+    ideal = rim[..., :2] / rim[..., 2:]
+    whole = ((ideal > border[0]) & (ideal < border[1])).all((1, 2))
+    rim_px = camera.pixel_from_normalised(np.clip(ideal, *border))
+    whole &= ((rim_px >= 0) & (rim_px <= [camera.width - 1, camera.height - 1])).all((1, 2))
+    shown[shown] = whole
+    return shown
+
+
+def ideal_border(camera: Camera) -> np.ndarray:
+    """Least and largest ideal coordinates, (2, 2), along the image's border."""
+    t = np.linspace(0, 1, BORDER_POINTS)
+    x, y = t * (camera.width - 1), t * (camera.height - 1)
+    zero = np.zeros(BORDER_POINTS)
+    sides = [(x, zero), (x, zero + camera.height - 1), (zero, y), (zero + camera.width - 1, y)]
+    ideal = camera.normalised_from_pixel(np.concatenate([np.column_stack(side) for side in sides]))
+    return np.stack([ideal.min(0), ideal.max(0)])

@@ -1,0 +1,321 @@
+"""The native COLMAP against ours: same database, same initial pairs, same thresholds, then the same scale and faces.
+
+Three comparisons, since they answer different questions. ``mapping``: the native program's models against those of
+pycolmap, both as COLMAP adjusts them (all observations weighed alike) and both through our scale and face stages: do
+the two programs agree? ``result``: the native models through our whole adjustment against ``faces.json``: does our
+answer depend on whose model it started from? ``plain``: the native models as they are against ``faces.json``: what the
+weights and the joint adjustment are worth; no tolerance applies to it.
+"""
+
+import tempfile
+from collections.abc import Callable
+from dataclasses import asdict, dataclass
+from pathlib import Path
+
+import numpy as np
+import pycolmap
+
+from stcal.errors import InputError, MappingError
+from stcal.geometry.rigid import Rigid
+from stcal.sfm.adjust.calibration import Calibration, calibrate
+from stcal.sfm.adjust.chain import CalibratedTarget
+from stcal.sfm.adjust.refine import refine
+from stcal.sfm.interop.export_database import export_database
+from stcal.sfm.interop.external import faces_from_models
+from stcal.sfm.interop.native import NativeColmap, find_colmap, map_natively, require_listable
+from stcal.sfm.interop.schema import schema_of_version
+from stcal.sfm.mapping.database import from_colmap_px, image_ids
+from stcal.sfm.mapping.incremental import labelled_model, pipeline_options, seeded_mapping
+from stcal.sfm.mapping.models import KEYPOINT_TOLERANCE_PX, ReadModel, find_models, open_model, read_model
+from stcal.sfm.run.saved import SavedRun
+
+MICRO = 1e3
+RENAMED = {
+    "ba_global_images_freq": "ba_global_frames_freq",
+    "ba_global_images_ratio": "ba_global_frames_ratio",
+    "local_ba_min_tri_angle": "ba_local_min_tri_angle",
+}
+"""Thresholds that older versions know by other names than pycolmap."""
+
+
+@dataclass(frozen=True, slots=True)
+class Tolerances:
+    """Largest differences allowed: faces and circles in the target frame, cameras against the target."""
+
+    face_um: float = 2.0
+    face_mdeg: float = 1.0
+    circle_um: float = 2.0
+    camera_um: float = 20.0
+    camera_mdeg: float = 2.0
+
+    def __post_init__(self):
+        for name, value in asdict(self).items():
+            if not 0 <= value < np.inf:
+                raise InputError(f"tolerance {name} {value:g}: a number of 0 or more needed; give another")
+
+
+def crosscheck(
+    run: SavedRun,
+    colmap: Path | None = None,
+    tolerances: Tolerances = Tolerances(),
+    timeout_s: float = 600.0,
+    progress: Callable[[str, int, int], None] | None = None,
+) -> dict:
+    """Map the run's database with the native program and compare; the content of ``report.json``'s ``crosscheck``.
+
+    Raises
+    ------
+    InputError
+        No native program, or one of a version that no schema is known for; a name that it cannot list; a database that
+        is not the run's.
+    MappingError
+        The native program fails, hangs, or makes no model of a group, or none of this database.
+    """
+    tell = progress or (lambda *_: None)
+    native = find_colmap(colmap)
+    schema = schema_of_version(native.version)
+    require_listable([image.name for image in run.observations])
+    ids = image_ids(run.observations)
+    theirs, ours, adjusted = [], [], []
+    groups = run.groups()
+    with tempfile.TemporaryDirectory(prefix="stcal-crosscheck-") as scratch:
+        folder = Path(scratch)
+        export_database(run.database, folder / "native.db", schema)
+        export_database(run.database, folder / "ours.db", "4.2")
+        _require_keypoints(run, folder / "ours.db", ids)
+        for done, (name, group) in enumerate(groups.items()):
+            tell("crosscheck", done, len(groups))
+            names = [image.name for image in group]
+            pair = _initial_pair(run, name, ids)
+            place = folder / f"group{done}"
+            options = mapper_options(native, names, pair)
+            map_natively(native, folder / "native.db", place, names, options, timeout_s)
+            path, read = _native_model(place / "models", name, native, run, ids)
+            theirs.append(read)
+            adjusted.append(_adjusted(path, group, ids, run))
+            ours.append(_own(folder, place, names, pair, name, run, ids))
+        tell("crosscheck", len(groups), len(groups))
+        foreign, own = faces_from_models(theirs, run), faces_from_models(ours, run)
+    again = calibrate(adjusted, run.camera, run.target, run.board, run.options.adjustment(run.target))
+    return _comparison(run, native, schema, foreign, own, again, tolerances)
+
+
+def mapper_options(native: NativeColmap, names: list[str], pair: tuple[int, int]) -> dict[str, str]:
+    """Our thresholds as options of the native mapper: every ``Mapper.*`` that it has and pycolmap's options know, but
+    for negative values, by which newer versions mean a choice of their own."""
+    own = pipeline_options(names, pair)
+    chosen = {}
+    for option in sorted(native.mapper_options):
+        prefix, _, key = option.partition(".")
+        if prefix == "Mapper":
+            key = RENAMED.get(key, key)
+            places = ((own, key), (own.mapper, key), (own.triangulation, key.removeprefix("tri_")))
+            value = next((getattr(place, k) for place, k in places if hasattr(place, k)), None)
+            if isinstance(value, bool | int | float) and value >= 0:
+                chosen[option] = str(int(value)) if isinstance(value, bool) else repr(value)
+    seed = next((o for o in ("random_seed", "default_random_seed") if o in native.mapper_options), None)
+    return chosen | ({seed: str(own.random_seed)} if seed else {})
+
+
+def _initial_pair(run: SavedRun, group: str, ids: dict[str, int]) -> tuple[int, int]:
+    chosen = next(each for each in run.report["groups"] if each["name"] == group)["pairs"][0]
+    return ids[chosen["first"]], ids[chosen["second"]]
+
+
+def _require_keypoints(run: SavedRun, copy: Path, ids: dict[str, int]) -> None:
+    """The database must hold the keypoints that the labels are of; ``copy`` may be changed."""
+    with pycolmap.Database.open(str(copy)) as opened:
+        names = {image.name: image.image_id for image in opened.read_all_images()}
+        found = {name: opened.read_keypoints(i)[:, :2] for name, i in names.items()} if names == ids else {}
+    for image, expected in zip(run.observations, run.corrected_px, strict=True):
+        xy = found.get(image.name)
+        same = xy is not None and len(xy) == len(expected)
+        if not same or np.abs(from_colmap_px(xy) - expected).max(initial=0.0) > KEYPOINT_TOLERANCE_PX:
+            raise InputError(
+                f"{run.database}: its keypoints of {image.name} are not those of {run.folder / 'labels.csv'}; run again"
+            )
+
+
+def _native_model(folder: Path, group: str, native: NativeColmap, run: SavedRun, ids) -> tuple[Path, ReadModel]:
+    """The largest of the native models, and the same read with labels."""
+    try:
+        found = find_models(folder)
+    except InputError as error:
+        raise MappingError(
+            f"group {group}: native COLMAP {native.version} makes no model from the run's initial pair; "
+            "see `stcal-sfm pairs` for the gate that stops it"
+        ) from error
+    try:
+        path = max(found, key=lambda each: open_model(each).num_reg_images())
+        return path, read_model(path, run.observations, ids, run.corrected_px)
+    except InputError as error:
+        raise MappingError(
+            f"group {group}: what native COLMAP {native.version} made of the run's database is of no use: {error}"
+        ) from error
+
+
+def _adjusted(path: Path, group, ids, run: SavedRun):
+    model = labelled_model(open_model(path), group, ids, run.camera)[0]
+    return refine(model, run.camera, run.target, run.board, run.options.eccentricity).model
+
+
+def _own(folder: Path, place: Path, names, pair, group: str, run: SavedRun, ids):
+    """The same mapping by pycolmap."""
+    reconstruction = seeded_mapping(folder / "ours.db", place / "own", names, pair)
+    if reconstruction is None:
+        raise MappingError(
+            f"group {group}: pycolmap makes no model from the run's initial pair alone (the run registered its own "
+            "relative pose); there is nothing to cross-check"
+        )
+    written = place / "own-model"
+    written.mkdir()
+    reconstruction.write_binary(str(written))
+    return read_model(written, run.observations, ids, run.corrected_px)
+
+
+def _comparison(run, native, schema, foreign: Calibration, own: Calibration, again: Calibration, tolerances) -> dict:
+    content = {
+        "native": native.version,
+        "pycolmap": pycolmap.__version__,
+        "schema": schema,
+        "tolerances": asdict(tolerances),
+        "images": {
+            "native": len(_images(foreign)),
+            "pycolmap": len(_images(own)),
+            "run": len(run.observations),
+            "only_native": sorted(_images(foreign) - _images(own)),
+            "only_pycolmap": sorted(_images(own) - _images(foreign)),
+        },
+        "residual_rms_px": {"native": _rms_px(foreign, run), "pycolmap": _rms_px(own, run), "run": _run_rms(run)},
+        "mapping": {
+            "faces": _faces(foreign.target.target_from_face, own.target.target_from_face),
+            "circles_um": _circles(foreign.target.circles, own.target.circles),
+            "cameras": _cameras(foreign, own),
+        },
+        "result": {
+            "faces": face_differences(again.target, run),
+            "circles_um": _circles(again.target.circles, run.faces["circles"]),
+        },
+        "plain": {"faces": face_differences(foreign.target, run)},
+        "notes": list(foreign.notes),
+    }
+    return content | {"differences": _differences(content, tolerances)}
+
+
+def face_differences(target: CalibratedTarget, run: SavedRun) -> dict:
+    """Differences of a target's faces from those of ``RUN/faces.json`` by face; None for what only one has."""
+    known = {face: Rigid.from_matrix(np.array(m)) for face, m in run.faces["target_from_face"].items()}
+    return _faces(target.target_from_face, known)
+
+
+def _faces(a: dict[str, Rigid], b: dict[str, Rigid]) -> dict:
+    """Differences by face, for those that both have; None for the others."""
+    rows = {}
+    for face in sorted(a.keys() | b.keys()):
+        if face in a and face in b:
+            turn = Rigid(a[face].rotation @ b[face].rotation.T)
+            shift = np.linalg.norm(a[face].translation - b[face].translation)
+            rows[face] = {
+                "translation_um": MICRO * float(shift),
+                "rotation_mdeg": MICRO * float(np.degrees(turn.angle_rad())),
+            }
+        else:
+            rows[face] = None
+    return rows
+
+
+def _circles(a: dict, b: dict) -> dict[str, float]:
+    return {label: MICRO * float(np.linalg.norm(np.subtract(a[label], b[label]))) for label in a if label in b}
+
+
+def _cameras(a: Calibration, b: Calibration) -> list[dict]:
+    """Differences of camera positions and attitudes against the target."""
+    poses = [{n: p for m in each.models for n, p in zip(m.images, m.camera_from_world, strict=True)} for each in (a, b)]
+    rows = []
+    for name in poses[0].keys() & poses[1].keys():
+        one, other = poses[0][name].inverse(), poses[1][name].inverse()
+        turn = Rigid(one.rotation @ other.rotation.T)
+        rows.append(
+            {
+                "image": name,
+                "position_um": MICRO * float(np.linalg.norm(one.translation - other.translation)),
+                "rotation_mdeg": MICRO * float(np.degrees(turn.angle_rad())),
+            }
+        )
+    return sorted(rows, key=lambda row: row["image"])
+
+
+def _images(calibration: Calibration) -> set[str]:
+    return {name for model in calibration.models for name in model.images}
+
+
+def _rms_px(calibration: Calibration, run: SavedRun) -> float:
+    residual = np.concatenate([model.residuals_px(run.camera) for model in calibration.models])
+    return float(np.sqrt((residual**2).mean()))
+
+
+def _run_rms(run: SavedRun) -> float:
+    return run.report["summary"]["residual_rms_px"]
+
+
+def comparison_text(check: dict) -> str:
+    """The comparison as a text table."""
+    limits, residual, images = check["tolerances"], check["residual_rms_px"], check["images"]
+    lines = [
+        f"COLMAP {check['native']} (schema {check['schema']}): {images['native']} of {images['run']} images, residual "
+        f"{residual['native']:.4f} px RMS",
+        f"pycolmap {check['pycolmap']}: {images['pycolmap']} of {images['run']} images, residual "
+        f"{residual['pycolmap']:.4f} px RMS; the run: {residual['run']:.4f} px",
+        f"{'':6} {'native – pycolmap':>19} {'adjusted – faces.json':>23} {'as it is – faces.json':>23}",
+        f"{'face':>6} {'µm':>10} {'mdeg':>8} {'µm':>14} {'mdeg':>8} {'µm':>14} {'mdeg':>8}",
+    ]
+    for face in check["mapping"]["faces"]:
+        parts = []
+        for key, width in (("mapping", 10), ("result", 14), ("plain", 14)):
+            row = check[key]["faces"].get(face)
+            parts.append(
+                f"{row['translation_um']:{width}.3f} {row['rotation_mdeg']:8.3f}" if row else f"{'–':>{width}} {'–':>8}"
+            )
+        lines.append(f"{face:>6} {' '.join(parts)}")
+    circles, cameras = check["mapping"]["circles_um"], check["mapping"]["cameras"]
+    lines.append(
+        f"largest between the two programs: circles {max(circles.values(), default=0.0):.3f} µm, cameras "
+        f"{max((c['position_um'] for c in cameras), default=0.0):.2f} µm and "
+        f"{max((c['rotation_mdeg'] for c in cameras), default=0.0):.3f} mdeg"
+    )
+    lines.append(
+        f"allowed: faces {limits['face_um']:g} µm and {limits['face_mdeg']:g} mdeg, circles {limits['circle_um']:g} "
+        f"µm, cameras {limits['camera_um']:g} µm and {limits['camera_mdeg']:g} mdeg: "
+        f"{'exceeded' if check['differences'] else 'they agree'}"
+    )
+    return "\n".join([*check["notes"], *lines])
+
+
+def _differences(content: dict, tolerances: Tolerances) -> list[str]:
+    """Where the two differ by more than is allowed, one clause each."""
+    found = []
+    images = content["images"]
+    for key, who in (("only_native", "native COLMAP"), ("only_pycolmap", "pycolmap")):
+        if images[key]:
+            more = f" and {len(images[key]) - 1} more" if len(images[key]) > 1 else ""
+            found.append(f"image {images[key][0]}{more}: registered by {who} only")
+    for key, what in (("mapping", "mapped by both"), ("result", "from the native model against faces.json")):
+        for face, row in content[key]["faces"].items():
+            if row is None:
+                found.append(f"face {face} ({what}): only one of the two has it")
+            elif row["translation_um"] > tolerances.face_um or row["rotation_mdeg"] > tolerances.face_mdeg:
+                found.append(
+                    f"face {face} ({what}) {row['translation_um']:.1f} µm, {row['rotation_mdeg']:.2f} mdeg; "
+                    f"{tolerances.face_um:g} µm, {tolerances.face_mdeg:g} mdeg allowed"
+                )
+        label, worst = max(content[key]["circles_um"].items(), key=lambda each: each[1], default=("", 0.0))
+        if worst > tolerances.circle_um:
+            found.append(f"circle {label} ({what}) {worst:.1f} µm; {tolerances.circle_um:g} µm allowed")
+    for what, key, limit, unit in (
+        ("position", "position_um", tolerances.camera_um, "µm"),
+        ("attitude", "rotation_mdeg", tolerances.camera_mdeg, "mdeg"),
+    ):
+        worst = max(content["mapping"]["cameras"], key=lambda row: row[key], default=None)
+        if worst and worst[key] > limit:
+            found.append(f"camera {worst['image']}: {what} {worst[key]:.1f} {unit}; {limit:g} {unit} allowed")
+    return found

@@ -1,0 +1,304 @@
+"""The database for other versions of COLMAP: a copy that holds the same, in that version's schema, or a refusal."""
+
+import os
+import re
+import sqlite3
+import tempfile
+from contextlib import closing
+from dataclasses import dataclass
+from itertools import zip_longest
+from pathlib import Path
+
+from stcal.errors import InputError, StcalError
+from stcal.sfm.interop.schema import SCHEMAS, SOURCE, Column, Index, Reference, Schema, Table, find_schema
+
+HEADER = b"SQLite format 3\0"
+WAL_MODE = b"\2\2"
+"""Bytes 18 and 19 of a database in write-ahead-log mode."""
+SIDE_FILES = ("-wal", "-shm", "-journal")
+CAMERA_SENSOR = 0
+"""COLMAP's number of the sensor type camera."""
+
+
+@dataclass(frozen=True, slots=True)
+class Exported:
+    """What the exported database holds.
+
+    ``pairs`` : pairs of images with a two-view geometry; ``camera_models`` : COLMAP's names.
+    """
+
+    path: Path
+    schema: str
+    images: int
+    pairs: int
+    camera_models: tuple[str, ...]
+
+
+def export_database(database: Path, out: Path, schema: str) -> Exported:
+    """Write ``out``, the content of ``database`` in the schema of another COLMAP version.
+
+    Ids, the order of keypoints, matches and pairs, and every blob stay. ``database`` is only read, and ``out`` is
+    compared with it and with the published schema before it appears; it appears complete or not at all.
+
+    Parameters
+    ----------
+    database : as pycolmap 4.2 writes it, with no other program at it
+    schema : name of a schema of :mod:`stcal.sfm.interop.schema`
+
+    Raises
+    ------
+    InputError
+        Unknown schema; ``out`` exists or cannot be written; ``database`` is in use, damaged or of another version; or
+        it holds something that has no place in the schema.
+    StcalError
+        The written copy is not what it should be.
+    """
+    database, out = Path(database), Path(out)
+    wanted = find_schema(schema)
+    if os.path.lexists(out):
+        raise _exists(out)
+    if not out.parent.is_dir():
+        raise InputError(f"{out}: no folder {out.parent}; make it, or give another place")
+    with closing(_open_unchanged(database)) as source, closing(sqlite3.connect("")) as copy:
+        _copy(database, source, copy)
+        _require_expressible(database, copy, wanted)
+        with tempfile.TemporaryDirectory(prefix=f".{out.name}-", dir=out.parent) as scratch:
+            partial = Path(scratch) / out.name
+            try:
+                _write(copy, partial, wanted)
+            except sqlite3.Error as error:
+                raise InputError(f"{out}: cannot be written ({error}); check the folder's space and rights") from error
+            with closing(_open_unchanged(partial)) as written:
+                _require_schema(written, wanted)
+                _require_same_content(source, written, wanted)
+            _publish(partial, out)
+        return _summary(copy, out, wanted)
+
+
+def read_tables(connection: sqlite3.Connection) -> dict[str, Table]:
+    """The tables of a database as SQLite describes them."""
+    listing = "SELECT name, sql FROM sqlite_master WHERE type = 'table' AND name NOT LIKE 'sqlite_%'"
+    return {name: _read_table(connection, name, sql) for name, sql in connection.execute(listing).fetchall()}
+
+
+def _read_table(connection: sqlite3.Connection, name: str, sql: str) -> Table:
+    def pragma(what: str, columns: str, of: str = name) -> list[tuple]:
+        return connection.execute(f"SELECT {columns} FROM pragma_{what}(?)", (of,)).fetchall()
+
+    references = pragma("foreign_key_list", '"from", "table", on_delete')
+    indices = pragma("index_list", "name, origin")
+    check = re.search(r"CHECK\s*\((.*?)\)", sql)
+    return Table(
+        name,
+        tuple(
+            Column(column, kind, bool(not_null), bool(key), default)
+            for column, kind, not_null, key, default in pragma("table_info", 'name, type, "notnull", pk, dflt_value')
+        ),
+        frozenset(Reference(column, to, rule == "CASCADE") for column, to, rule in references),
+        frozenset(
+            Index(index if origin == "c" else None, tuple(column for (column,) in pragma("index_info", "name", index)))
+            for index, origin in indices
+        ),
+        "AUTOINCREMENT" in sql,
+        check[1] if check else None,
+    )
+
+
+def _open_unchanged(path: Path) -> sqlite3.Connection:
+    """Open for reading without a trace; InputError where another program is at it, or where it is no database.
+
+    SQLite makes side files beside a database in WAL mode even for a reader. ``immutable`` prevents it; it also skips
+    the locks, which in WAL mode nobody holds while there are no side files.
+    """
+    try:
+        with path.open("rb") as stream:
+            header = stream.read(20)
+    except OSError as error:
+        raise InputError(f"{path}: {error.strerror or error}; give a readable database") from error
+    if not header.startswith(HEADER):
+        raise _damaged(path, "not an SQLite database")
+    beside = [name for name in (f"{path.name}{suffix}" for suffix in SIDE_FILES) if path.with_name(name).exists()]
+    if beside:
+        raise _in_use(path, f"{', '.join(beside)} beside it")
+    unlocked = "&immutable=1" if header[18:20] == WAL_MODE else ""
+    return sqlite3.connect(f"{path.absolute().as_uri()}?mode=ro{unlocked}", uri=True, timeout=0)
+
+
+def _copy(database: Path, source: sqlite3.Connection, copy: sqlite3.Connection) -> None:
+    """All pages of ``source`` in one step, and sound."""
+    try:
+        source.execute("BEGIN")
+        source.execute("SELECT 1 FROM sqlite_master").fetchone()  # takes the read lock; a backup waits for it for ever
+        source.backup(copy)
+        faults = [fault for (fault,) in copy.execute("PRAGMA integrity_check(1)") if fault != "ok"]
+        differences = table_differences(read_tables(copy), SOURCE)
+    except sqlite3.DatabaseError as error:
+        if error.sqlite_errorcode in (sqlite3.SQLITE_BUSY, sqlite3.SQLITE_LOCKED):
+            raise _in_use(database, str(error)) from error
+        raise _damaged(database, str(error)) from error
+    if faults:
+        raise _damaged(database, faults[0])
+    if differences:
+        raise _damaged(database, f"not as COLMAP {SOURCE.name} writes it: {differences[0]}")
+
+
+def _in_use(path: Path, sign: str) -> InputError:
+    return InputError(f"{path}: in use by another program ({sign}); close it, or make the run again")
+
+
+def _damaged(path: Path, sign: str) -> InputError:
+    return InputError(f"{path}: damaged ({sign}); make the run again")
+
+
+def table_differences(found: dict[str, Table], wanted: Schema) -> list[str]:
+    """What in the tables ``found`` is not as the schema has it, table by table and column by column."""
+    names = [*wanted.tables, *(name for name in found if name not in wanted.tables)]
+    return [line for name in names for line in _differences(name, found.get(name), wanted.tables.get(name))]
+
+
+def _differences(name: str, found: Table | None, wanted: Table | None) -> list[str]:
+    if found is None or wanted is None:
+        return [f"table {name} is {'missing' if found is None else 'not in the schema'}"]
+    lines = [
+        f"table {name} has {theirs or 'no column'} in place of {ours or 'no column'}"
+        for theirs, ours in zip_longest(found.columns, wanted.columns)
+        if theirs != ours
+    ]
+    if not lines and found != wanted:
+        lines.append(f"table {name} has other constraints: {found.statements()} in place of {wanted.statements()}")
+    return lines
+
+
+def _require_expressible(database: Path, copy: sqlite3.Connection, wanted: Schema) -> None:
+    """InputError for the first thing in the database that has no place in the schema."""
+    _require_known(database, copy, wanted, "camera", "cameras", "model", "camera_models")
+    _require_known(database, copy, wanted, "pair", "two_view_geometries", "config", "pair_configurations")
+    _require_known(database, copy, wanted, "image", "descriptors", "type", "descriptor_types")
+    if wanted.tables.get("pose_priors") != SOURCE.tables["pose_priors"]:
+        priors = _count(copy, "SELECT 1 FROM pose_priors")
+        if priors:
+            raise _no_place(database, wanted, f"{priors} pose priors; they are of another kind there", "4.0")
+    if "camera1" not in wanted.tables["two_view_geometries"].column_names():
+        pairs = _count(copy, "SELECT 1 FROM two_view_geometries WHERE camera1 NOT NULL OR camera2 NOT NULL")
+        if pairs:
+            raise _no_place(database, wanted, f"{pairs} pairs of images with cameras of their own", "4.2")
+    if "rigs" not in wanted.tables:
+        _require_no_rigs(database, copy, wanted)
+
+
+def _require_known(database, copy, wanted: Schema, what: str, table: str, column: str, enumeration: str) -> None:
+    """The number in ``column`` must have a meaning in the schema."""
+    key = SOURCE.tables[table].columns[0].name
+    known = getattr(wanted, enumeration)
+    for first, number in copy.execute(f"SELECT min({key}), {column} FROM {table} GROUP BY {column}"):
+        if number not in known:
+            having = [name for name, other in SCHEMAS.items() if number in getattr(other, enumeration)]
+            name = getattr(SOURCE, enumeration).get(number, "unknown")
+            raise _no_place(database, wanted, f"{what} {first} with {column} {number} ({name})", *having[:1])
+
+
+def _require_no_rigs(database: Path, copy: sqlite3.Connection, wanted: Schema) -> None:
+    """Before 3.12 each camera is alone and each image by itself, which is what COLMAP makes of it again later."""
+    shared = _count(copy, "SELECT 1 FROM rig_sensors")
+    if shared:
+        raise _no_place(database, wanted, f"a rig of more than one sensor ({shared} beside the first)", "3.12")
+    other = _count(
+        copy,
+        "SELECT 1 FROM rigs WHERE ref_sensor_type <> :camera OR rig_id <> ref_sensor_id"
+        " OR ref_sensor_id NOT IN (SELECT camera_id FROM cameras)",
+    )
+    if other:
+        raise _no_place(database, wanted, f"{other} rigs that are not each one camera of the same id", "3.12")
+    odd = _count(
+        copy,
+        "SELECT frame_id FROM frames LEFT JOIN frame_data USING (frame_id) LEFT JOIN images ON image_id = data_id"
+        " GROUP BY frame_id HAVING count(*) <> 1 OR sensor_type IS NOT :camera OR frame_id IS NOT image_id"
+        " OR sensor_id IS NOT camera_id OR rig_id IS NOT camera_id"
+        " UNION ALL SELECT image_id FROM images WHERE image_id NOT IN (SELECT frame_id FROM frames)",
+    )
+    if odd:
+        raise _no_place(database, wanted, f"{odd} frames that are not each one image of the same id", "3.12")
+
+
+def _count(connection: sqlite3.Connection, select: str) -> int:
+    (number,) = connection.execute(f"SELECT count(*) FROM ({select})", {"camera": CAMERA_SENSOR}).fetchone()
+    return number
+
+
+def _no_place(database: Path, wanted: Schema, what: str, since: str | None = None) -> InputError:
+    remedy = f"give --schema {since} or later" if since else "no version known here has it"
+    return InputError(f"{database}: {what}: schema {wanted.name} has no place for it; {remedy}")
+
+
+def _shared_columns(table: Table) -> str:
+    """The columns that the table has here and in our database, as SQL."""
+    return ", ".join(name for name in table.column_names() if name in SOURCE.tables[table.name].column_names())
+
+
+def _rows(connection: sqlite3.Connection, table: Table) -> sqlite3.Cursor:
+    return connection.execute(f"SELECT {_shared_columns(table)} FROM {table.name} ORDER BY rowid")
+
+
+def _write(copy: sqlite3.Connection, path: Path, wanted: Schema) -> None:
+    """A new file in rollback-journal mode: one file, which any program opens."""
+    with closing(sqlite3.connect(path)) as out, out:
+        for table in wanted.tables.values():
+            for statement in table.statements():
+                out.execute(statement)
+        for table in wanted.tables.values():
+            columns = _shared_columns(table)
+            places = ", ".join("?" for _ in columns.split(", "))
+            out.executemany(f"INSERT INTO {table.name} ({columns}) VALUES ({places})", _rows(copy, table))
+        out.execute(f"PRAGMA user_version = {wanted.user_version}")
+
+
+def _require_schema(written: sqlite3.Connection, wanted: Schema) -> None:
+    differences = table_differences(read_tables(written), wanted)
+    (version,) = written.execute("PRAGMA user_version").fetchone()
+    if version != wanted.user_version:
+        differences.append(f"user_version is {version} in place of {wanted.user_version}")
+    if differences:
+        raise StcalError(f"export for {wanted.name}: {differences[0]}; nothing is written; please report this")
+
+
+def _require_same_content(source: sqlite3.Connection, written: sqlite3.Connection, wanted: Schema) -> None:
+    """Row by row and value by value against our own database; columns that it has not are empty."""
+    for table in wanted.tables.values():
+        for row, (ours, theirs) in enumerate(zip_longest(_rows(source, table), _rows(written, table)), start=1):
+            if ours != theirs:
+                raise StcalError(
+                    f"export for {wanted.name}: row {row} of {table.name} differs from the database; nothing is "
+                    "written; see that no other program is at the database, and try again"
+                )
+        for name in table.column_names():
+            if name not in SOURCE.tables[table.name].column_names():
+                filled = _count(written, f"SELECT 1 FROM {table.name} WHERE {name} NOT NULL")
+                if filled:
+                    raise StcalError(f"export for {wanted.name}: {table.name}.{name} is not empty in {filled} rows")
+
+
+def _publish(partial: Path, out: Path) -> None:
+    """Give the finished file its name; unlike a rename, a link overwrites nothing that appeared meanwhile."""
+    try:
+        os.link(partial, out)
+    except FileExistsError as error:
+        raise _exists(out) from error
+    except OSError:  # the file system has no hard links
+        if os.path.lexists(out):
+            raise _exists(out) from None
+        partial.rename(out)
+
+
+def _exists(out: Path) -> InputError:
+    return InputError(f"{out}: exists, and is not overwritten; move it away, or give another name")
+
+
+def _summary(copy: sqlite3.Connection, out: Path, wanted: Schema) -> Exported:
+    models = copy.execute("SELECT DISTINCT model FROM cameras ORDER BY model").fetchall()
+    return Exported(
+        out,
+        wanted.name,
+        _count(copy, "SELECT 1 FROM images"),
+        _count(copy, "SELECT 1 FROM two_view_geometries"),
+        tuple(wanted.camera_models[model] for (model,) in models),
+    )

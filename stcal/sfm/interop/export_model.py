@@ -1,0 +1,246 @@
+"""The final model for other programs: COLMAP's two forms, PLY, NVM and Bundler; with labels beside it."""
+
+import csv
+import io
+import os
+import tempfile
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Literal, get_args
+
+import numpy as np
+import pycolmap
+
+from stcal.design import TargetDesign
+from stcal.errors import InputError
+from stcal.sfm.data.observations import face_of, is_board
+from stcal.sfm.mapping.database import colmap_camera, from_colmap_px
+from stcal.sfm.mapping.models import open_model, rigid_from_colmap
+from stcal.sfm.run.saved import SavedRun, load_run
+
+ModelFormat = Literal["colmap-bin", "colmap-txt", "ply", "nvm", "bundler"]
+FOLDERS = ("colmap-bin", "colmap-txt", "bundler")
+"""Formats of several files: OUT is a folder; that of the others is a file, with ``OUT.labels.csv`` beside it."""
+TARGET_MODEL = "target_model"
+BOARD_RGB = (150, 150, 150)
+FACES_RGB = (
+    (230, 159, 0),
+    (86, 180, 233),
+    (0, 158, 115),
+    (240, 228, 66),
+    (0, 114, 178),
+    (213, 94, 0),
+    (204, 121, 167),
+)
+"""By the face's place in the design, over again after the last: Okabe and Ito's palette, for the colour-blind too."""
+LABEL_COLUMNS = ["point", "group", "label", "x_mm", "y_mm", "z_mm", "sigma_x_um", "sigma_y_um", "sigma_z_um"]
+
+
+@dataclass(frozen=True, slots=True)
+class ExportedModel:
+    """What was written: ``path`` and ``labels``, counts, and where the format knows nothing better the ``focal_px``
+    and ``centre_px`` (OpenCV pixel origin) of the ideal camera in place of the run's."""
+
+    path: Path
+    labels: Path
+    images: int
+    points: int
+    focal_px: float | None
+    centre_px: tuple[float, float] | None
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Point:
+    """A point of the model: its ``id``; ``group``, empty where several have it in common; ``xyz`` (3,), target frame,
+    mm; ``rgb``; ``views`` : (image id, keypoint)."""
+
+    id: int
+    group: str
+    label: str
+    xyz: list[float]
+    rgb: tuple[int, int, int]
+    views: tuple[tuple[int, int], ...]
+
+
+def export_model(run: str | Path, out: str | Path, kind: str) -> ExportedModel:
+    """Write a run's final model, mm, target frame, in another program's format; it appears complete or not at all.
+
+    NVM and Bundler know one focal length, little distortion and a centred principal point. They get an ideal camera,
+    without distortion, and the keypoints where that camera sees them; it is exact, but photographs have to be
+    undistorted to match.
+
+    Parameters
+    ----------
+    out : new, or an empty folder for a format that is a folder
+    kind : a :data:`ModelFormat`
+
+    Raises
+    ------
+    InputError
+        Not a finished run, a damaged model in it, an unknown format, or an ``out`` that exists.
+    """
+    out = Path(out)
+    if kind not in get_args(ModelFormat):
+        raise InputError(f"format {kind}: unknown; give one of {', '.join(get_args(ModelFormat))}")
+    labels = out / "labels.csv" if kind in FOLDERS else out.with_name(f"{out.name}.labels.csv")
+    _require_free(out, labels, kind)
+    saved = load_run(run)
+    reconstruction, points = _labelled_points(saved)
+    ideal = kind in ("nvm", "bundler")
+    camera = saved.camera
+    focal_px = float(camera.focal.mean()) if ideal else None
+    with tempfile.TemporaryDirectory(prefix=f".{out.name}.partial-", dir=out.parent) as scratch:
+        partial = Path(scratch) / out.name
+        beside = partial / labels.name if kind in FOLDERS else Path(scratch) / labels.name
+        if kind in FOLDERS:
+            partial.mkdir()
+        beside.write_text(_labels_csv(points, saved.faces, kind), encoding="utf-8")
+        match kind:
+            case "colmap-bin":
+                reconstruction.write_binary(str(partial))
+            case "colmap-txt":
+                reconstruction.write_text(str(partial))
+            case "ply":
+                partial.write_text(_ply(points), encoding="utf-8")
+            case "nvm":
+                partial.write_text(_nvm(reconstruction, points, saved, focal_px), encoding="utf-8")
+            case "bundler":
+                bundle, names = _bundler(reconstruction, points, saved, focal_px)
+                (partial / "bundle.out").write_text(bundle, encoding="utf-8")
+                (partial / "list.txt").write_text(names, encoding="utf-8")
+        if kind not in FOLDERS:
+            os.replace(beside, labels)
+        elif out.exists():
+            out.rmdir()  # empty; not every system lets a folder take its place
+        os.replace(partial, out)
+    centre_px = ((camera.width - 1) / 2, (camera.height - 1) / 2) if ideal else None
+    return ExportedModel(out, labels, reconstruction.num_reg_images(), len(points), focal_px, centre_px)
+
+
+def _require_free(out: Path, labels: Path, kind: str) -> None:
+    if not out.parent.is_dir():
+        raise InputError(f"{out}: no folder {out.parent}; make it, or give another place")
+    empty = kind in FOLDERS and out.is_dir() and not any(out.iterdir())
+    for path in (out, labels):
+        if os.path.lexists(path) and not (path == out and empty):
+            wanted = "a new or empty folder" if kind in FOLDERS else "a new file"
+            raise InputError(f"{path}: exists, and nothing is overwritten; give {wanted} for {kind}")
+
+
+def _labelled_points(run: SavedRun) -> tuple[pycolmap.Reconstruction, list[_Point]]:
+    """The run's model, its points coloured, and the points by ascending id."""
+    path = run.folder / TARGET_MODEL
+    if not path.is_dir():
+        raise InputError(f"run {run.folder}: of another version, no {TARGET_MODEL}; run it again")
+    reconstruction = open_model(path)
+    native = colmap_camera(run.camera, run.colmap_model)
+    if [camera.params.tolist() for camera in reconstruction.cameras.values()] != [native.params.tolist()]:
+        raise InputError(f"model {path}: its camera is not that of the run's cameras.txt; run it again")
+    by_name = {image.name: image for image in run.observations}
+    image_of = {}
+    for image_id, image in reconstruction.images.items():
+        observed = by_name.get(image.name)
+        if observed is None or len(observed) != image.num_points2D():
+            raise InputError(f"model {path}: image {image.name} is not as in the run's labels.csv; run it again")
+        image_of[image_id] = observed
+    rgb = _colours(run.target)
+    points = []
+    for point_id, point in sorted(reconstruction.points3D.items()):
+        views = tuple((element.image_id, element.point2D_idx) for element in point.track.elements)
+        names = {image_of[image_id].labels[k] for image_id, k in views}
+        if len(names) != 1:
+            raise InputError(f"model {path}: point {point_id} is of {len(names)} labels, 1 needed; run it again")
+        label = names.pop()
+        groups = {image_of[image_id].group for image_id, _ in views}
+        colour = BOARD_RGB if is_board(label) else rgb[face_of(label)]
+        point.color = np.array(colour, np.uint8)
+        group = groups.pop() if len(groups) == 1 else ""
+        points.append(_Point(point_id, group, label, point.xyz.tolist(), colour, views))
+    return reconstruction, points
+
+
+def _colours(target: TargetDesign) -> dict[str, tuple[int, int, int]]:
+    return {face.id: FACES_RGB[i % len(FACES_RGB)] for i, face in enumerate(target.faces)}
+
+
+def _labels_csv(points: Sequence[_Point], faces: dict, kind: str) -> str:
+    """``labels.csv``: COLMAP's files name points by id, the others by their place, from 0."""
+    covariance = faces.get("circle_covariance_mm2", {})
+    stream = io.StringIO()
+    writer = csv.writer(stream, lineterminator="\n")
+    writer.writerow(LABEL_COLUMNS)
+    for place, point in enumerate(points):
+        sigma = [""] * 3
+        if point.label in covariance:
+            sigma = [f"{1e3 * s:.3f}" for s in np.sqrt(np.diag(covariance[point.label]))]
+        name = point.id if kind.startswith("colmap") else place
+        writer.writerow([name, point.group, point.label, *map(repr, point.xyz), *sigma])
+    return stream.getvalue()
+
+
+def _ply(points: Sequence[_Point]) -> str:
+    """Text PLY in double precision: pycolmap's own has single, and its points in an order that is not documented."""
+    header = ["ply", "format ascii 1.0", "comment mm, target frame", f"element vertex {len(points)}"]
+    header += [f"property double {axis}" for axis in "xyz"]
+    header += [f"property uchar {name}" for name in ("red", "green", "blue")]
+    return "\n".join([*header, "end_header", *(_numbers(*p.xyz, *p.rgb) for p in points), ""])
+
+
+def _nvm(reconstruction: pycolmap.Reconstruction, points: Sequence[_Point], run: SavedRun, focal_px: float) -> str:
+    """VisualSFM's format (ccwu.me/vsfm/doc.html#nvm): y down, z forward, measurements relative to the principal point.
+
+    MeshLab wants the spaces at the ends of the first lines; a space in a name is written as a quotation mark.
+    """
+    images = _images(reconstruction)
+    place = {image.image_id: i for i, image in enumerate(images)}
+    lines = ["NVM_V3 ", " ", f"{len(images)}  "]
+    for image in images:
+        pose = image.cam_from_world()
+        x, y, z, w = pose.rotation.quat.tolist()
+        centre = image.projection_center().tolist()
+        lines.append(f"{image.name.replace(' ', chr(34))} {_numbers(focal_px, w, x, y, z, *centre, 0, 0)}")
+    lines += ["", str(len(points))]
+    for point, xy in zip(points, _ideal_px(reconstruction, points, run, focal_px), strict=True):
+        views = [(place[i], k, *at) for (i, k), at in zip(point.views, xy.tolist(), strict=True)]
+        lines.append(_numbers(*point.xyz, *point.rgb, len(views), *(value for view in views for value in view)))
+    return "\n".join([*lines, "", "0", ""])
+
+
+def _bundler(
+    reconstruction: pycolmap.Reconstruction, points: Sequence[_Point], run: SavedRun, focal_px: float
+) -> tuple[str, str]:
+    """``bundle.out`` and ``list.txt`` (Bundler's manual, section VI): y up, the camera looks along −z, views relative
+    to the image's centre."""
+    images = _images(reconstruction)
+    place = {image.image_id: i for i, image in enumerate(images)}
+    lines = ["# Bundle file v0.3", f"{len(images)} {len(points)}"]
+    up_from_down = np.diag([1.0, -1.0, -1.0])
+    for image in images:
+        pose = rigid_from_colmap(image.cam_from_world())
+        rows = [*(up_from_down @ pose.rotation), up_from_down @ pose.translation]
+        lines += [_numbers(focal_px, 0, 0), *(_numbers(*row.tolist()) for row in rows)]
+    for point, xy in zip(points, _ideal_px(reconstruction, points, run, focal_px), strict=True):
+        views = [(place[i], k, x, -y) for (i, k), (x, y) in zip(point.views, xy.tolist(), strict=True)]
+        lines += [_numbers(*point.xyz), _numbers(*point.rgb)]
+        lines.append(_numbers(len(views), *(value for view in views for value in view)))
+    return "\n".join([*lines, ""]), "".join(f"{image.name}\n" for image in images)
+
+
+def _images(reconstruction: pycolmap.Reconstruction) -> list[pycolmap.Image]:
+    return [reconstruction.image(image_id) for image_id in sorted(reconstruction.reg_image_ids())]
+
+
+def _ideal_px(
+    reconstruction: pycolmap.Reconstruction, points: Sequence[_Point], run: SavedRun, focal_px: float
+) -> list[np.ndarray]:
+    """Where the ideal camera sees the views of every point, (n, 2), relative to its principal point, y down."""
+    xy_px = [[reconstruction.image(i).points2D[k].xy for i, k in point.views] for point in points]
+    counts = np.cumsum([len(each) for each in xy_px])
+    ideal = focal_px * run.camera.normalised_from_pixel(from_colmap_px(np.concatenate(xy_px)))
+    return np.split(ideal, counts[:-1])
+
+
+def _numbers(*values: float) -> str:
+    """Shortest text that reads back as the same numbers."""
+    return " ".join(map(repr, values))

@@ -1,0 +1,71 @@
+"""Scale and faces from COLMAP models that someone made or edited elsewhere: the native mapper, the GUI."""
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+
+from stcal.errors import InputError, MappingError
+from stcal.geometry.camera import Camera
+from stcal.sfm.adjust.calibration import Calibration, calibrate
+from stcal.sfm.data.model import GroupModel
+from stcal.sfm.mapping.models import ReadModel
+from stcal.sfm.run.saved import SavedRun
+
+
+def faces_from_models(read: Sequence[ReadModel], run: SavedRun) -> Calibration:
+    """Our scale and face stages, group by group and chained, on models of the run's groups as they are.
+
+    Raises
+    ------
+    InputError
+        The models state different cameras.
+    ScaleError
+        A group's board is not in its model.
+    MappingError
+        The reference face is in none of the models, or a face is not linked to it.
+    """
+    models: dict[str, GroupModel] = {}
+    notes = []
+    for source in read:
+        if not source.camera.same_as(read[0].camera):
+            raise InputError(
+                f"models {read[0].path}, {source.path}: different cameras; keep the intrinsics fixed in the mapper, "
+                "or give one model at a time"
+            )
+        if not source.camera.same_as(run.camera):
+            notes.append(
+                f"model {source.path}: its camera is up to {_camera_change_px(source.camera, run):.2g} px off the "
+                "run's at the keypoints; the model's is used"
+            )
+        if source.unlabelled:
+            notes.append(
+                f"model {source.path}: points left out, since their keypoints name no one circle: {source.unlabelled}"
+            )
+        if source.split:
+            notes.append(
+                f"model {source.path}: circles that are several points each, longest tracks taken: {source.split}"
+            )
+        if source.absent:
+            notes.append(
+                f"model {source.path}: points that keypoints name, but the model does not have: {source.absent}"
+            )
+        for model in source.groups:
+            if model.group in models:
+                notes.append(f"group {model.group}: in several models; the one with the most images was taken")
+            if model.group not in models or len(model.images) > len(models[model.group].images):
+                models[model.group] = model
+    notes += [f"group {name}: in none of the models" for name in run.groups() if name not in models]
+    options = replace(run.options, solve="chain").adjustment(run.target)
+    ordered = [models[name] for name in run.groups() if name in models]
+    try:
+        calibration = calibrate(ordered, read[0].camera, run.target, run.board, options)
+    except MappingError as error:
+        raise MappingError("; ".join([str(error), *notes])) from error
+    return replace(calibration, notes=(*notes, *calibration.notes))
+
+
+def _camera_change_px(camera: Camera, run: SavedRun) -> float:
+    """How far another camera moves the images of what the run's keypoints show, at most."""
+    ideal = np.concatenate([image.centre for image in run.observations])
+    return float(np.abs(camera.pixel_from_normalised(ideal) - run.camera.pixel_from_normalised(ideal)).max())

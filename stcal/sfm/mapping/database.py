@@ -1,0 +1,135 @@
+"""The COLMAP database: one camera, an image and a frame each, labelled keypoints and matches."""
+
+import csv
+import io
+import os
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+import pycolmap
+
+from stcal.errors import InputError
+from stcal.geometry.camera import Camera
+from stcal.io.camera import COLMAP_PIXEL_ORIGIN, colmap_params
+from stcal.sfm.data.observations import ImageObservations, is_board
+
+CAMERA_ID = 1
+RIG_ID = 1
+
+
+def colmap_camera(camera: Camera, colmap_model: str) -> pycolmap.Camera:
+    """The camera as COLMAP has it, its pixel origin included."""
+    return pycolmap.Camera(
+        camera_id=CAMERA_ID,
+        model=colmap_model,
+        width=camera.width,
+        height=camera.height,
+        params=colmap_params(camera, colmap_model),
+        has_prior_focal_length=True,
+    )
+
+
+def to_colmap_px(xy_px: np.ndarray) -> np.ndarray:
+    """OpenCV pixels to COLMAP's: the one place where the pixel origin moves on the way out."""
+    return np.asarray(xy_px, float) + COLMAP_PIXEL_ORIGIN
+
+
+def from_colmap_px(xy_px: np.ndarray) -> np.ndarray:
+    """COLMAP pixels to OpenCV's: the one place where the pixel origin moves on the way in."""
+    return np.asarray(xy_px, float) - COLMAP_PIXEL_ORIGIN
+
+
+def image_ids(observations: Sequence[ImageObservations]) -> dict[str, int]:
+    """COLMAP's image id (and frame id) of every image name: 1, 2, … in the order given."""
+    return {image.name: i for i, image in enumerate(observations, start=1)}
+
+
+def match_labels(a: ImageObservations, b: ImageObservations) -> np.ndarray:
+    """Keypoint indices (n, 2) of what both images show; dots of the board are the same point in one group only."""
+    where = {label: j for j, label in enumerate(b.labels)}
+    same_board = a.group == b.group
+    pairs = [
+        (i, where[label]) for i, label in enumerate(a.labels) if label in where and (same_board or not is_board(label))
+    ]
+    return np.array(pairs, dtype=np.uint32).reshape(-1, 2)
+
+
+def write_database(
+    path: str | Path,
+    camera: Camera,
+    colmap_model: str,
+    observations: Sequence[ImageObservations],
+    pairs: np.ndarray,
+    keypoints_px: Sequence[np.ndarray] | None = None,
+) -> None:
+    """Write a new database at once: it appears complete or not at all.
+
+    Parameters
+    ----------
+    pairs : (n, 2) indices of the images to match, see :func:`stcal.sfm.mapping.graph.image_graph`
+    keypoints_px : one (n, 2) array for each image, OpenCV pixel origin; the measured centres where not given
+    """
+    path = Path(path)
+    partial = path.with_name(path.name + ".partial")
+    remove_database(partial)
+    try:
+        with pycolmap.Database.open(str(partial)) as database:
+            _write(database, camera, colmap_model, observations, pairs, keypoints_px)
+    except RuntimeError as error:
+        remove_database(partial)
+        raise InputError(
+            f"database {path}: cannot be written ({error}); check the folder's space and rights"
+        ) from error
+    for suffix in ("-wal", "-shm"):
+        Path(f"{path}{suffix}").unlink(missing_ok=True)
+    os.replace(partial, path)
+
+
+def remove_database(path: Path) -> None:
+    """Remove a database with its side files."""
+    for suffix in ("", "-wal", "-shm", "-journal"):
+        Path(f"{path}{suffix}").unlink(missing_ok=True)
+
+
+def _write(database, camera, colmap_model, observations, pairs, keypoints_px) -> None:
+    with pycolmap.DatabaseTransaction(database):
+        native = colmap_camera(camera, colmap_model)
+        database.write_camera(native, use_camera_id=True)
+        rig = pycolmap.Rig(rig_id=RIG_ID)
+        rig.add_ref_sensor(native.sensor_id)
+        database.write_rig(rig, use_rig_id=True)
+        ids = image_ids(observations)
+        for i, image in enumerate(observations):
+            record = pycolmap.Image(name=image.name, camera_id=CAMERA_ID, image_id=ids[image.name])
+            frame = pycolmap.Frame(frame_id=ids[image.name], rig_id=RIG_ID)
+            frame.add_data_id(record.data_id)
+            database.write_image(record, use_image_id=True)
+            database.write_frame(frame, use_frame_id=True)
+            xy = image.centre_px if keypoints_px is None else keypoints_px[i]
+            database.write_keypoints(ids[image.name], to_colmap_px(xy).astype(np.float32))
+        for i, j in pairs:
+            a, b = observations[i], observations[j]
+            matches = match_labels(a, b)
+            database.write_matches(ids[a.name], ids[b.name], matches)
+            geometry = pycolmap.TwoViewGeometry(inlier_matches=matches)
+            # 4.x skips pairs of configuration UNDEFINED without a word.
+            geometry.config = pycolmap.TwoViewGeometryConfiguration.CALIBRATED
+            database.write_two_view_geometry(ids[a.name], ids[b.name], geometry)
+
+
+def labels_csv(observations: Sequence[ImageObservations], corrected_px: Sequence[np.ndarray]) -> str:
+    """Text of ``labels.csv``: label, float64 measured and corrected centre and σ of every (image, keypoint)."""
+    stream = io.StringIO()
+    writer = csv.writer(stream, lineterminator="\n")
+    columns = (
+        "image_id keypoint image group label x_px y_px corrected_x_px corrected_y_px var_x_px2 cov_xy_px2 var_y_px2"
+    )
+    writer.writerow(columns.split())
+    ids = image_ids(observations)
+    for image, corrected in zip(observations, corrected_px, strict=True):
+        covariance = image.covariance_px2.reshape(-1, 4)[:, [0, 1, 3]]
+        values = np.column_stack([image.centre_px, corrected, covariance]).tolist()
+        for k, label in enumerate(image.labels):
+            writer.writerow([ids[image.name], k, image.name, image.group, label, *map(repr, values[k])])
+    return stream.getvalue()

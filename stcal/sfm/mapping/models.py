@@ -1,0 +1,372 @@
+"""COLMAP's models: ours written in its form, and models that COLMAP made or someone edited read back with labels."""
+
+import os
+import struct
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import pycolmap
+
+from stcal.errors import InputError
+from stcal.geometry.camera import Camera
+from stcal.geometry.rigid import Rigid
+from stcal.io.camera import camera_from_colmap
+from stcal.sfm.data.model import GroupModel
+from stcal.sfm.data.observations import ImageObservations, is_board
+from stcal.sfm.mapping.database import CAMERA_ID, colmap_camera, from_colmap_px, to_colmap_px
+
+LOG_NOTHING = 4
+"""Errors come as exceptions."""
+KEYPOINT_TOLERANCE_PX = 0.002
+"""A model's keypoints are the database's: float32 has steps of 0.0005 px at x = 5000 and 0.002 px at x = 30 000."""
+MAX_RMS_PX = 4.0
+"""Of a model's keypoints about the images of their points, per axis; what is further off COLMAP leaves out."""
+MAX_LENGTH_ERROR = 1e-3
+"""A text may state quaternions with few digits; they are normalised."""
+
+
+def rigid_from_colmap(pose: pycolmap.Rigid3d) -> Rigid:
+    """Our transform of COLMAP's."""
+    return Rigid(pose.rotation.matrix(), pose.translation)
+
+
+def to_reconstruction(
+    models: Sequence[GroupModel],
+    observations: Sequence[ImageObservations],
+    ids: dict[str, int],
+    camera: Camera,
+    colmap_model: str,
+) -> tuple[pycolmap.Reconstruction, dict[int, tuple[str, str]]]:
+    """COLMAP's form of models that share one world, and (group, label) of every point id.
+
+    Keypoints are all of the image, in the database's order, corrected where the model has them. A circle that two
+    groups have in the same place is one point; its group is then empty.
+    """
+    reconstruction = pycolmap.Reconstruction()
+    reconstruction.add_camera_with_trivial_rig(colmap_camera(camera, colmap_model))
+    by_name = {image.name: image for image in observations}
+    tracks: dict[tuple[str, tuple[float, ...]], pycolmap.Track] = {}
+    groups: dict[tuple[str, tuple[float, ...]], set[str]] = {}
+    for model in models:
+        places = [(label, tuple(xyz)) for label, xyz in zip(model.labels, model.xyz_world.tolist(), strict=True)]
+        for place in places:
+            tracks.setdefault(place, pycolmap.Track())
+            groups.setdefault(place, set()).add(model.group)
+        for name, pose, rows in zip(model.images, model.camera_from_world, model.rows_by_image(), strict=True):
+            image = pycolmap.Image(name=name, camera_id=CAMERA_ID, image_id=ids[name])
+            keypoints = to_colmap_px(model.keypoints_px(by_name[name], rows))
+            image.points2D = [pycolmap.Point2D(each) for each in keypoints]
+            reconstruction.add_image_with_trivial_frame(
+                image, pycolmap.Rigid3d(pycolmap.Rotation3d(pose.rotation), pose.translation)
+            )
+            for row in rows:
+                tracks[places[model.point_index[row]]].add_element(ids[name], int(model.keypoint[row]))
+    names = {}
+    for (label, xyz), track in tracks.items():
+        own = groups[label, xyz]
+        names[reconstruction.add_point3D(np.array(xyz), track)] = (own.pop() if len(own) == 1 else "", label)
+    reconstruction.update_point_3d_errors()
+    return reconstruction, names
+
+
+def write_model(
+    folder: Path,
+    models: Sequence[GroupModel],
+    observations: Sequence[ImageObservations],
+    ids: dict[str, int],
+    camera: Camera,
+    colmap_model: str,
+) -> None:
+    """Write models that share one world as COLMAP's binary files."""
+    folder.mkdir(parents=True, exist_ok=True)
+    to_reconstruction(models, observations, ids, camera, colmap_model)[0].write_binary(str(folder))
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class ReadModel:
+    """A COLMAP model with labels: one :class:`GroupModel` for each group that it has images of, all in its world.
+
+    ``camera`` : the model's own, refined perhaps; ``unlabelled`` : points whose keypoints name no label, or several;
+    ``split`` : labels that more than one point stands for, the longest track was taken; ``absent`` : points that
+    keypoints name, but the model does not have.
+    """
+
+    path: Path
+    camera: Camera
+    groups: tuple[GroupModel, ...]
+    unlabelled: int
+    split: int
+    absent: int
+
+
+def find_models(folder: str | Path) -> list[Path]:
+    """Folders with a COLMAP model: this one, or those in it (as the mapper writes them: 0, 1, …).
+
+    Raises
+    ------
+    InputError
+        There is none.
+    """
+    folder = Path(folder)
+    found = []
+    if folder.is_dir():
+        inner = sorted([folder, *folder.glob("*"), *folder.glob("*/*")])
+        found = [p for p in inner if any(os.path.exists(p / f"images.{kind}") for kind in ("bin", "txt"))]
+    if not found:
+        raise InputError(
+            f"model {folder}: no COLMAP model (cameras, images and points3D as .bin or .txt) there; "
+            "give the folder that the mapper or the GUI wrote"
+        )
+    return found
+
+
+def read_model(
+    path: Path, observations: Sequence[ImageObservations], ids: dict[str, int], corrected_px: Sequence[np.ndarray]
+) -> ReadModel:
+    """Read a model that rests on the keypoints of our database; labels come by (image, keypoint).
+
+    Raises
+    ------
+    InputError
+        A damaged model, more than one camera, an image that is not of the run, keypoints of another database, or
+        poses and points that do not fit them.
+    """
+    reconstruction = open_model(path)
+    cameras = list(reconstruction.cameras.values())
+    if len(cameras) != 1:
+        raise InputError(f"model {path}: {len(cameras)} cameras, 1 needed; map the exported database as it is")
+    native = cameras[0]
+    camera = camera_from_colmap(native.model.name, native.width, native.height, list(native.params), path)
+    place = {image.name: i for i, image in enumerate(observations)}
+    members: dict[str, list] = {}
+    for image in reconstruction.images.values():
+        if not image.has_pose:
+            continue
+        if image.name not in place:
+            cut = any(" " in name and name.split()[0] == image.name for name in place)
+            remedy = (
+                "COLMAP reads names in texts up to a space: write the model as binary"
+                if cut
+                else "give the run that the model's database came from"
+            )
+            raise InputError(
+                f"model {path}: image {image.name} is not of this run ({observations[0].name} … "
+                f"{observations[-1].name}); {remedy}"
+            )
+        i = place[image.name]
+        _require_keypoints(path, image, observations[i].labels, corrected_px[i])
+        members.setdefault(observations[i].group, []).append((observations[i], corrected_px[i], image))
+    point_label, unlabelled = _labels_of_points(reconstruction, place, observations)
+    groups, split = [], 0
+    for name, images in sorted(members.items()):
+        images.sort(key=lambda each: ids[each[0].name])
+        model, several = _group_model(path, name, images, reconstruction, point_label)
+        split += several
+        if model is not None:
+            _require_fit(path, model, camera.sized(0, 0))
+            groups.append(model)
+    if not groups:
+        raise InputError(f"model {path}: no image with a pose and labelled points; map again")
+    named = {p.point3D_id for image in reconstruction.images.values() for p in image.points2D if p.has_point3D()}
+    absent = len(named - set(reconstruction.points3D))
+    return ReadModel(path, camera.sized(0, 0), tuple(groups), unlabelled, split, absent)
+
+
+def open_model(path: Path) -> pycolmap.Reconstruction:
+    """A model's files as COLMAP's object.
+
+    Raises
+    ------
+    InputError
+        They are damaged, or one is missing.
+    """
+    pycolmap.logging.minloglevel = LOG_NOTHING
+    try:
+        for name, skip in _RECORDS.items():
+            file = Path(path) / f"{name}.bin"
+            if file.exists():
+                _require_whole(file, skip)
+        return pycolmap.Reconstruction(str(path))
+    except (RuntimeError, ValueError, IndexError, MemoryError, OverflowError, OSError) as error:
+        reason = " ".join(str(error).split())[-150:]
+        raise InputError(f"model {path}: damaged or incomplete ({reason}); write or copy it again") from error
+
+
+class _Walk:
+    """A place in a binary file that only moves on."""
+
+    def __init__(self, data: bytes):
+        self.data, self.at = data, 0
+
+    def skip(self, size: int) -> None:
+        """Pass over bytes; ValueError at the end of the file."""
+        self.at += size
+        if self.at > len(self.data):
+            raise ValueError("ends too soon")
+
+    def number(self, kind: str) -> int:
+        """The next number, of a kind of :mod:`struct`."""
+        start = self.at
+        self.skip(struct.calcsize(f"<{kind}"))
+        return struct.unpack_from(f"<{kind}", self.data, start)[0]
+
+    def skip_text(self) -> None:
+        """Pass over text and the zero behind it."""
+        end = self.data.find(b"\0", self.at)
+        self.skip(end + 1 - self.at if end >= 0 else len(self.data) + 1)
+
+
+def _skip_camera(walk: _Walk) -> None:
+    walk.skip(4)
+    model = pycolmap.CameraModelId(walk.number("i"))
+    walk.skip(16 + 8 * len(pycolmap.Camera.create_from_model_id(1, model, 1.0, 1, 1).params))
+
+
+def _skip_rig(walk: _Walk) -> None:
+    walk.skip(4)
+    sensors = walk.number("I")
+    walk.skip(8 if sensors else 0)
+    for _ in range(sensors - 1):
+        walk.skip(8)
+        walk.skip(56 if walk.number("B") else 0)
+
+
+def _skip_frame(walk: _Walk) -> None:
+    walk.skip(64)
+    walk.skip(16 * walk.number("I"))
+
+
+def _skip_image(walk: _Walk) -> None:
+    walk.skip(64)
+    walk.skip_text()
+    walk.skip(24 * walk.number("Q"))
+
+
+def _skip_point(walk: _Walk) -> None:
+    walk.skip(43)
+    walk.skip(8 * walk.number("Q"))
+
+
+_RECORDS: dict[str, Callable[[_Walk], None]] = {
+    "cameras": _skip_camera,
+    "rigs": _skip_rig,
+    "frames": _skip_frame,
+    "images": _skip_image,
+    "points3D": _skip_point,
+}
+"""How to pass over one record of each binary file; a file is a count and so many records."""
+
+
+def _require_whole(file: Path, skip: Callable[[_Walk], None]) -> None:
+    """The counts in a file must fit its size, or ValueError: behind the end of a file pycolmap reads on without a word,
+    for hours and into all memory, or takes for the missing numbers what it read last."""
+    walk = _Walk(file.read_bytes())
+    try:
+        for _ in range(walk.number("Q")):
+            skip(walk)
+    except ValueError as error:
+        raise ValueError(f"{file.name}, {len(walk.data)} bytes: {error}") from error
+    if walk.at != len(walk.data):
+        raise ValueError(f"{file.name}: {len(walk.data)} bytes, {walk.at} by its own counts")
+
+
+def _require_keypoints(path: Path, image, labels: Sequence[str], corrected_px: np.ndarray) -> None:
+    """The model must rest on our keypoints, or (image, keypoint) names nothing."""
+    xy = from_colmap_px(np.array([point.xy for point in image.points2D]).reshape(-1, 2))
+    if len(xy) != len(corrected_px):
+        raise InputError(
+            f"model {path}: image {image.name} has {len(xy)} keypoints, the run {len(corrected_px)}; "
+            "give the run that the model's database came from"
+        )
+    off = np.abs(xy - corrected_px).max(axis=1, initial=0.0)
+    if not (off <= KEYPOINT_TOLERANCE_PX).all():
+        k = int(np.argmax(off))
+        raise InputError(
+            f"model {path}: image {image.name}: keypoint {k} ({labels[k]}) is {off[k]:.4f} px off the run's, "
+            f"{KEYPOINT_TOLERANCE_PX:g} allowed; give the run that the model's database came from"
+        )
+
+
+def _require_fit(path: Path, model: GroupModel, camera: Camera) -> None:
+    """Poses, points and camera must go with the keypoints: damaged numbers are numbers still."""
+    with np.errstate(all="ignore"):
+        residual = np.linalg.norm(model.residuals_px(camera), axis=1)
+        rms = float(np.sqrt((residual**2).mean() / 2))
+    if not rms <= MAX_RMS_PX:
+        k = int(np.argmax(residual))
+        raise InputError(
+            f"model {path}: group {model.group}: keypoints are {rms:.3g} px RMS off the images of their points, "
+            f"{MAX_RMS_PX:g} allowed, most of all {model.labels[model.point_index[k]]} in "
+            f"{model.images[model.image_index[k]]}; adjust its bundle, or write or copy it again"
+        )
+
+
+def _pose(path: Path, image) -> Rigid:
+    """camera_from_world of an image of the model."""
+    pose = image.cam_from_world()
+    length = float(np.linalg.norm(pose.rotation.quat))
+    if not (abs(length - 1) <= MAX_LENGTH_ERROR and np.isfinite(pose.translation).all()):
+        raise InputError(
+            f"model {path}: image {image.name}: no pose (quaternion of length {length:.4g}, 1 needed; translation "
+            f"{pose.translation.tolist()}); write or copy it again"
+        )
+    pose.rotation.normalize()
+    return rigid_from_colmap(pose)
+
+
+def _labels_of_points(reconstruction, place, observations) -> tuple[dict[int, tuple[str, str]], int]:
+    """(group, label) of each point by its track; the group is empty for circles, which are the same in all groups."""
+    found, unlabelled = {}, 0
+    for point_id, point in reconstruction.points3D.items():
+        names = set()
+        for element in point.track.elements:
+            image = observations[place[reconstruction.image(element.image_id).name]]
+            label = image.labels[element.point2D_idx]
+            names.add((image.group if is_board(label) else "", label))
+        if len(names) == 1:
+            found[point_id] = names.pop()
+        else:
+            unlabelled += 1
+    return found, unlabelled
+
+
+def _group_model(path: Path, group: str, images, reconstruction, point_label) -> tuple[GroupModel | None, int]:
+    """One group of the model, and how many labels had several points."""
+    rows = []  # image, keypoint, point id
+    for i, (_, _, image) in enumerate(images):
+        for k, point in enumerate(image.points2D):
+            if point.has_point3D() and point.point3D_id in point_label:
+                rows.append((i, k, point.point3D_id))
+    if not rows:
+        return None, 0
+    length: dict[str, dict[int, int]] = {}
+    for _, _, point_id in rows:
+        votes = length.setdefault(point_label[point_id][1], {})
+        votes[point_id] = votes.get(point_id, 0) + 1
+    chosen = {label: max(sorted(votes), key=votes.get) for label, votes in length.items()}
+    labels = sorted(chosen)
+    index = {chosen[label]: i for i, label in enumerate(labels)}
+    image_index, keypoint, point_id = np.array([row for row in rows if row[2] in index]).T
+    observed = [images[i][0] for i in image_index]
+    measured = np.array([o.centre_px[k] for o, k in zip(observed, keypoint, strict=True)])
+    corrected = np.array([images[i][1][k] for i, k in zip(image_index, keypoint, strict=True)])
+    xyz = np.array([reconstruction.point3D(chosen[label]).xyz for label in labels])
+    if not np.isfinite(xyz).all():
+        lost = labels[int(np.argmin(np.isfinite(xyz).all(axis=1)))]
+        raise InputError(f"model {path}: point {chosen[lost]} ({lost}) is not finite; write or copy it again")
+    model = GroupModel(
+        group,
+        tuple(o.name for o, _, _ in images),
+        tuple(_pose(path, image) for _, _, image in images),
+        tuple(labels),
+        xyz,
+        image_index,
+        np.array([index[p] for p in point_id.tolist()]),
+        keypoint,
+        measured,
+        measured - corrected,
+        np.array([o.covariance_px2[k] for o, k in zip(observed, keypoint, strict=True)]),
+    )
+    return model, sum(len(votes) > 1 for votes in length.values())

@@ -1,0 +1,166 @@
+"""The initial pair, as in Zhang & Wei (2017): of all pairs the largest median ray angle that is still safe."""
+
+from dataclasses import dataclass, replace
+from itertools import combinations
+
+import cv2
+import numpy as np
+
+from stcal.errors import MappingError
+from stcal.geometry.camera import Camera
+from stcal.geometry.rigid import Rigid
+from stcal.sfm.data.observations import ImageObservations
+from stcal.sfm.mapping.database import match_labels
+
+RANSAC_PX = 1.0
+MIN_LABELS = 8
+"""Shared labels that a pair needs: five fix an essential matrix, the others choose among its solutions."""
+MIN_IN_FRONT = 0.9
+OVER_LIMIT = "median angle over the limit"
+SAFE_ANGLE_RAD = np.radians(60.0)
+MIN_ANGLE_RAD = np.radians(1.0)
+"""Below this median angle the camera has not moved as far as reconstruction is concerned."""
+
+
+@dataclass(frozen=True, slots=True)
+class PairOptions:
+    """``max_angle_rad`` : largest median ray angle that is still safe.
+
+    Where None, 60°; and should every pair of a group be beyond that, the one with the smallest angle is taken.
+    """
+
+    max_angle_rad: float | None = None
+
+    def limit_rad(self) -> float:
+        """The limit in force."""
+        return SAFE_ANGLE_RAD if self.max_angle_rad is None else self.max_angle_rad
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class PairScore:
+    """One pair: ``first``, ``second`` image names; ``shared`` labels; ``median_angle_rad`` over the triangulated
+    points; ``in_front`` share of them; ``forward`` |t_z|/‖t‖; ``second_from_first`` with unit translation;
+    ``verdict`` : ``chosen``, ``usable`` or why not."""
+
+    first: str
+    second: str
+    shared: int
+    median_angle_rad: float
+    in_front: float
+    forward: float
+    second_from_first: Rigid | None
+    verdict: str
+
+
+def rank_pairs(group: list[ImageObservations], camera: Camera, options: PairOptions) -> list[PairScore]:
+    """All pairs of a group, the chosen one first, then the usable by angle, then the rest.
+
+    Raises
+    ------
+    MappingError
+        No pair is usable: too few common labels, or a camera that did not move.
+    """
+    scores = [_score(a, b, camera, options) for a, b in combinations(group, 2)]
+    scores.sort(key=lambda s: (s.verdict != "usable", -round(s.median_angle_rad, 9), -s.shared, s.first, s.second))
+    over = [s for s in scores if s.verdict.startswith(OVER_LIMIT)]
+    if over and scores[0].verdict != "usable" and options.max_angle_rad is None:
+        scores.remove(over[-1])
+        return [replace(over[-1], verdict=f"chosen: the smallest {OVER_LIMIT}, none is under it"), *scores]
+    if not scores or scores[0].verdict != "usable":
+        raise MappingError(_no_pair(group, scores, options))
+    return [replace(scores[0], verdict="chosen"), *scores[1:]]
+
+
+def _no_pair(group, scores: list[PairScore], options: PairOptions) -> str:
+    where = f"group {group[0].group}: no initial pair"
+    if not scores:
+        return f"{where}: 1 usable image, 2 needed; add photographs from other places"
+    angle = max(s.median_angle_rad for s in scores)
+    shared = max(s.shared for s in scores)
+    if shared < MIN_LABELS:
+        return f"{where}: at most {shared} circles in common, {MIN_LABELS} needed; photograph faces and board together"
+    if angle < MIN_ANGLE_RAD:
+        return (
+            f"{where}: the camera did not move (largest median ray angle {np.degrees(angle):.2f}°, "
+            f"{np.degrees(MIN_ANGLE_RAD):.0f}° needed); take the photographs from different places"
+        )
+    behind = [s for s in scores if MIN_ANGLE_RAD <= s.median_angle_rad <= options.limit_rad()]
+    if behind:
+        best = max(behind, key=lambda s: s.in_front)
+        return (
+            f"{where}: {best.first}, {best.second}: {best.verdict}; check that the camera file belongs to the images, "
+            "and that nothing but the camera moved"
+        )
+    smallest = min(s.median_angle_rad for s in scores if s.median_angle_rad > 0)
+    return (
+        f"{where} with a median ray angle of {np.degrees(MIN_ANGLE_RAD):.0f}° to "
+        f"{np.degrees(options.limit_rad()):.0f}° (measured {np.degrees(smallest):.1f}° to {np.degrees(angle):.1f}°); "
+        "add views in between, raise --max-angle, or check that the camera file belongs to the images"
+    )
+
+
+def _score(a: ImageObservations, b: ImageObservations, camera: Camera, options: PairOptions) -> PairScore:
+    matches = match_labels(a, b)
+    n = len(matches)
+    if n < MIN_LABELS:
+        return PairScore(a.name, b.name, n, 0.0, 0.0, 0.0, None, f"{n} labels in common, {MIN_LABELS} needed")
+    xy_a, xy_b = a.centre[matches[:, 0]], b.centre[matches[:, 1]]
+    pose = _relative_pose(xy_a, xy_b, RANSAC_PX / float(np.sqrt(camera.focal.prod())))
+    if pose is None:
+        return PairScore(a.name, b.name, n, 0.0, 0.0, 0.0, None, "no essential matrix")
+    xyz, front = triangulate(xy_a, xy_b, pose)
+    to_a, to_b = xyz, xyz + pose.rotation.T @ pose.translation
+    cosine = (to_a * to_b).sum(1) / np.maximum(np.linalg.norm(to_a, axis=1) * np.linalg.norm(to_b, axis=1), 1e-300)
+    angle = float(np.median(np.arccos(np.clip(cosine, -1, 1))))
+    in_front, forward = float(front.mean()), float(abs(pose.translation[2]))
+    # Where a rotation explains the pair, noise alone fixes the translation: angles and depths mean nothing then.
+    if _is_rotation(xy_a, xy_b, camera):
+        angle = min(angle, MIN_ANGLE_RAD / 2)
+        verdict = "a mere rotation explains the pair: the camera hardly moved"
+    elif angle < MIN_ANGLE_RAD:
+        verdict = f"median angle under {np.degrees(MIN_ANGLE_RAD):.0f}°: the camera hardly moved"
+    elif in_front < MIN_IN_FRONT:
+        verdict = f"{100 * in_front:.0f} % of the points in front of both cameras, {100 * MIN_IN_FRONT:.0f} % needed"
+    elif angle > options.limit_rad():
+        verdict = f"{OVER_LIMIT} of {np.degrees(options.limit_rad()):.0f}°"
+    else:
+        verdict = "usable"
+    return PairScore(a.name, b.name, n, angle, in_front, forward, pose, verdict)
+
+
+def _is_rotation(xy_a: np.ndarray, xy_b: np.ndarray, camera: Camera) -> bool:
+    """Whether a mere rotation of the camera explains the pair to a pixel."""
+    rays_a = np.column_stack([xy_a, np.ones(len(xy_a))])
+    rays_b = np.column_stack([xy_b, np.ones(len(xy_b))])
+    rays_a /= np.linalg.norm(rays_a, axis=1)[:, None]
+    rays_b /= np.linalg.norm(rays_b, axis=1)[:, None]
+    u, _, vt = np.linalg.svd(rays_b.T @ rays_a)
+    rotation = u @ np.diag([1, 1, np.linalg.det(u @ vt)]) @ vt
+    error = np.linalg.norm(rays_b - rays_a @ rotation.T, axis=1)
+    return bool(np.sqrt((error**2).mean()) * camera.focal.max() < RANSAC_PX)
+
+
+def _relative_pose(xy_a: np.ndarray, xy_b: np.ndarray, threshold: float) -> Rigid | None:
+    """b_from_a with unit translation: five-point RANSAC (Nistér 2004) and decomposition, on normalised points."""
+    essential, inliers = cv2.findEssentialMat(
+        xy_a, xy_b, np.eye(3), method=cv2.RANSAC, prob=0.999, threshold=threshold, maxIters=200
+    )
+    if essential is None or essential.shape != (3, 3) or not np.isfinite(essential).all():
+        return None
+    _, rotation, translation, _ = cv2.recoverPose(essential, xy_a, xy_b, np.eye(3), mask=inliers)
+    if not np.isfinite(rotation).all() or np.linalg.norm(translation) == 0:
+        return None
+    return Rigid(rotation, translation.ravel())
+
+
+def triangulate(xy_a: np.ndarray, xy_b: np.ndarray, b_from_a: Rigid) -> tuple[np.ndarray, np.ndarray]:
+    """Points (n, 3) in frame a by the linear method, and the mask of those in front of both cameras."""
+    rows = np.zeros((len(xy_a), 4, 4))
+    p = np.hstack([b_from_a.rotation, b_from_a.translation[:, None]])
+    for k in range(2):
+        rows[:, k, k], rows[:, k, 2] = -1, xy_a[:, k]
+        rows[:, 2 + k] = xy_b[:, k, None] * p[2] - p[k]
+    homogeneous = np.linalg.svd(rows)[2][:, 3]
+    w = np.where(np.abs(homogeneous[:, 3:]) < 1e-12, 1e-12, homogeneous[:, 3:])
+    xyz = homogeneous[:, :3] / w
+    return xyz, (xyz[:, 2] > 0) & ((b_from_a @ xyz)[:, 2] > 0)

@@ -1,0 +1,1 @@
+"""The calibrated target at work: its pose in each image."""

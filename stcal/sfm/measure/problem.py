@@ -1,0 +1,93 @@
+"""What one image says of a target's pose, and the descent to the poses that fit it best, several at once."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from stcal.geometry import pose_descent
+from stcal.geometry.pose_descent import Minima, Normal, PoseStack, block_diagonal
+from stcal.geometry.rigid import Rigid
+from stcal.sfm.data.projection import CircleImages, project_circles
+
+SETTLED = 1e-4
+"""A step that lowers χ² by less moves the pose by less than a hundredth of its σ, and the two steps that weigh the
+centres anew are still to come; a rival with a large χ² need not be better known than that, relatively."""
+HOPELESS = 500.0
+"""In χ²: what whatever weights cannot make up for."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class PoseProblem:
+    """n circles, what was measured of them, and what is known of everything else; the lens taken out.
+
+    ``xyz``, ``normal`` : (n, 3) target frame; ``radius`` : (n,); ``centre`` : (n, 2) of the ellipses, normalised
+    coordinates; ``slope`` : (n, 2, 2) px by those; ``noise`` : (n, 2, 2) covariance of ``centre``; ``by_camera`` :
+    (n, 2, q) derivative of ``centre`` by the intrinsics, q = 0 where they are held, ``prior`` : (q, q) their
+    covariance; ``shape`` : (3n, 3n) mm² covariance of the circles.
+    """
+
+    xyz: np.ndarray
+    normal: np.ndarray
+    radius: np.ndarray
+    centre: np.ndarray
+    slope: np.ndarray
+    noise: np.ndarray
+    by_camera: np.ndarray
+    prior: np.ndarray
+    shape: np.ndarray
+
+    def seen(self, poses: PoseStack) -> tuple[np.ndarray, CircleImages]:
+        """Measured minus projected (h, n, 2), and the projections with their derivatives, for h poses."""
+        image = project_circles(self.xyz, self.normal, self.radius, poses.rotation, poses.translation)
+        return self.centre - image.centre, image
+
+    def in_px(self, residual: np.ndarray) -> np.ndarray:
+        """Residuals (n, 2) in the image as it is, px."""
+        return (self.slope @ residual[..., None])[..., 0]
+
+    def select(self, keep: np.ndarray) -> "PoseProblem":
+        """Those circles only."""
+        rows = (3 * keep[:, None] + np.arange(3)).ravel()
+        own = (self.xyz, self.normal, self.radius, self.centre, self.slope, self.noise, self.by_camera)
+        return PoseProblem(*(a[keep] for a in own), self.prior, self.shape[np.ix_(rows, rows)])
+
+
+def rigid_of(poses: PoseStack, row: int) -> Rigid:
+    """camera_from_target of one of them."""
+    return Rigid(poses.rotation[row], poses.translation[row])
+
+
+def step_between(pose: PoseStack, other: PoseStack) -> np.ndarray:
+    """(6,) left perturbation that leads from the one pose to the other, stacks of one each."""
+    turn = Rotation.from_matrix(other.rotation[0] @ pose.rotation[0].T).as_rotvec()
+    return np.concatenate([turn, other.translation[0] - pose.translation[0]])
+
+
+def covariance_of_centres(problem: PoseProblem, image: CircleImages, noise: np.ndarray) -> np.ndarray:
+    """(h, 2n, 2n) of all centres together: noise (h, n, 2, 2), the target's circles, and the intrinsics."""
+    by_circle = block_diagonal(image.by_circle)
+    full = block_diagonal(noise) + by_circle @ problem.shape @ np.swapaxes(by_circle, 1, 2)
+    by_camera = problem.by_camera.reshape(full.shape[-1], -1)
+    return full + by_camera @ problem.prior @ by_camera.T
+
+
+def whitening_by_centre(problem: PoseProblem, poses: PoseStack) -> np.ndarray:
+    """(h, 2n, 2n) that make each centre's residual one of σ 1, the others apart: noise and its own circle's σ."""
+    by_circle = problem.seen(poses)[1].by_circle
+    n = len(problem.xyz)
+    own = problem.shape.reshape(n, 3, n, 3)[np.arange(n), :, np.arange(n)]
+    root = np.linalg.inv(np.linalg.cholesky(problem.noise + by_circle @ own @ np.swapaxes(by_circle, -1, -2)))
+    return block_diagonal(root)
+
+
+def descend(problem: PoseProblem, poses: PoseStack, whiten: np.ndarray, huber: float) -> Minima:
+    """The minima next to h poses, Huber's loss on the residuals whitened by (h or 1, 2n, 2n)."""
+    h, n = len(poses), len(problem.xyz)
+
+    def evaluate(poses: PoseStack) -> Normal:
+        residual, image = problem.seen(poses)
+        r = (whiten @ residual.reshape(h, 2 * n, 1)).reshape(h, n, 2)
+        return Normal.of(r, whiten @ image.by_pose.reshape(h, 2 * n, 6), (image.depth > 0).all(1), huber)
+
+    return pose_descent.descend(evaluate, poses, SETTLED, HOPELESS)

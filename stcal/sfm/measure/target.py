@@ -1,0 +1,171 @@
+"""A calibrated target as one image of it is measured by: its circles in the target frame with their covariance."""
+
+import json
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import numpy as np
+
+from stcal.design import TargetDesign
+from stcal.errors import DegenerateError, InputError
+from stcal.geometry.align import align_rigid
+from stcal.geometry.arrays import frozen
+from stcal.geometry.plane import fit_plane
+from stcal.geometry.rigid import Rigid
+from stcal.sfm.adjust.chain import CalibratedTarget
+from stcal.sfm.data.observations import face_of
+
+SAME_DESIGN_MM = 0.5
+"""RMS by which a face's circles may differ from the design: made to a tenth of that, and drawn to far more."""
+SAME_RADIUS_MM = 1e-6
+NOT_NEGATIVE = 1e-6
+"""A covariance may have eigenvalues this far below zero, of its largest: it is singular, and its digits are rounded."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class TargetCircles:
+    """The c circles of a calibrated target, target frame, mm.
+
+    ``labels`` ; ``xyz`` : (c, 3) centres; ``radius`` : (c,); ``covariance`` : (3c, 3c) mm² of all centres together,
+    zero where nothing is known; ``sigma_factor`` : by which centres' own σ are too small, as the run found it;
+    ``notes`` : what the covariance lacks. ``normal`` : (c, 3) of the plane of each circle's face, ``target_from_plane``
+    of each face, the plane's origin amid its circles, and ``place`` of each label follow from the centres.
+
+    Raises
+    ------
+    DegenerateError
+        The circles of a face lie in line.
+    InputError
+        A wrong shape or number, a label twice, or a covariance that is none.
+    """
+
+    labels: tuple[str, ...]
+    xyz: np.ndarray
+    radius: np.ndarray
+    covariance: np.ndarray
+    sigma_factor: float = 1.0
+    notes: tuple[str, ...] = ()
+    normal: np.ndarray = field(init=False)
+    target_from_plane: dict[str, Rigid] = field(init=False)
+    place: dict[str, int] = field(init=False)
+
+    def __post_init__(self):
+        c = len(self.labels)
+        object.__setattr__(self, "xyz", frozen(self.xyz, (c, 3), "circles"))
+        object.__setattr__(self, "radius", frozen(self.radius, (c,), "radii"))
+        object.__setattr__(self, "covariance", frozen(self.covariance, (3 * c, 3 * c), "circles' covariance"))
+        object.__setattr__(self, "place", {label: i for i, label in enumerate(self.labels)})
+        if len(self.place) < c or not (self.radius > 0).all():
+            raise InputError("circles: a label twice, or a radius that is not positive; correct them")
+        if not (np.isfinite(self.sigma_factor) and self.sigma_factor > 0):
+            raise InputError(f"σ factor {self.sigma_factor}: a positive number needed")
+        normal, planes = np.zeros((c, 3)), {}
+        for face_id in dict.fromkeys(map(face_of, self.labels)):
+            rows = [i for i, label in enumerate(self.labels) if face_of(label) == face_id]
+            if len(rows) < 3:
+                continue  # no plane of its own: such a face is not measured
+            try:
+                axis = fit_plane(self.xyz[rows]).normal
+            except DegenerateError as error:
+                raise DegenerateError(f"face {face_id}: {error}") from error
+            normal[rows] = axis
+            across = np.linalg.svd(axis[None])[2][1:]
+            turn = np.column_stack([across[0], np.cross(axis, across[0]), axis])
+            planes[face_id] = Rigid(turn, self.xyz[rows].mean(0))
+        object.__setattr__(self, "normal", frozen(normal))
+        object.__setattr__(self, "target_from_plane", planes)
+
+    @classmethod
+    def of(cls, target: CalibratedTarget, design: TargetDesign, sigma_factor: float = 1.0) -> "TargetCircles":
+        """Of the result of a run in memory; ``sigma_factor`` : that of its calibration."""
+        labels, radius = tuple(target.circles), design.radius_of()
+        covariance, notes = _covariance(labels, target.covariance_mm2, target.circle_covariance)
+        xyz = np.array([target.circles[label] for label in labels])
+        return cls(labels, xyz, np.array([radius[label] for label in labels]), covariance, sigma_factor, notes)
+
+
+def read_target(path: str | Path, design: TargetDesign) -> TargetCircles:
+    """Read a ``faces.json`` and check that it is of this design.
+
+    Raises
+    ------
+    InputError
+        Not a ``faces.json``, or one of another design.
+    """
+    path = Path(path)
+    try:
+        content = json.loads(path.read_text(encoding="utf-8"))
+    except OSError as error:
+        raise InputError(f"faces {path}: {error.strerror or error}; give RUN/faces.json") from error
+    except ValueError as error:
+        raise InputError(f"faces {path}: not JSON ({str(error)[:100]}); give RUN/faces.json") from error
+    try:
+        labels = tuple(content["circles"])
+        xyz = frozen([content["circles"][label] for label in labels], (None, 3), "circles")
+        radius = frozen([content["radius_mm"][label] for label in labels], (len(labels),), "radii")
+        single = {k: frozen(c, (3, 3), k) for k, c in content.get("circle_covariance_mm2", {}).items()}
+        covariance, notes = _covariance(labels, _joint(content, labels), single)
+        if "centre_sigma_factor" not in content:
+            notes += ("faces.json states no centre_sigma_factor: the centres' own σ are used; run it again",)
+        factor = float(content.get("centre_sigma_factor", 1.0))
+        target = TargetCircles(labels, xyz, radius, covariance, factor, notes)
+    except (InputError, DegenerateError, LookupError, TypeError, ValueError, AttributeError) as error:
+        reason = f"no {error}" if isinstance(error, KeyError) else str(error)[:150]
+        raise InputError(f"faces {path}: not the faces.json of a run ({reason}); give RUN/faces.json") from error
+    _require_design(target, design, path)
+    return target
+
+
+def _joint(content: dict, labels: tuple[str, ...]) -> np.ndarray | None:
+    """(3c, 3c) in the order of ``labels``; None where the file has none."""
+    if "circles_joint_covariance_mm2" not in content:
+        return None
+    joint = content["circles_joint_covariance_mm2"]
+    if sorted(joint["labels"]) != sorted(labels):
+        raise InputError("its joint covariance is not of its circles")
+    size = 3 * len(labels)
+    full = np.zeros((size, size))
+    i, j = np.triu_indices(size)
+    full[i, j] = full[j, i] = frozen(joint["upper_triangle"], (len(i),), "joint covariance")
+    order = [joint["labels"].index(label) for label in labels]
+    rows = (3 * np.array(order)[:, None] + np.arange(3)).ravel()
+    return full[np.ix_(rows, rows)]
+
+
+def _covariance(labels, joint: np.ndarray | None, single: dict[str, np.ndarray]) -> tuple[np.ndarray, tuple[str, ...]]:
+    """The best covariance (3c, 3c) that there is, and what it lacks."""
+    notes: tuple[str, ...] = ()
+    if joint is None:
+        joint = np.zeros((3 * len(labels), 3 * len(labels)))
+        for i, label in enumerate(labels if single else ()):
+            joint[3 * i : 3 * i + 3, 3 * i : 3 * i + 3] = single[label]
+        what = "covariances between circles" if single else "covariances of its circles"
+        notes = (f"the target states no {what}: they are taken as zero in the poses' covariances",)
+    value = np.linalg.eigvalsh(joint)
+    if value[0] < -NOT_NEGATIVE * max(value[-1], 0.0):
+        raise InputError("its covariance is not positive semi-definite")
+    return joint, notes
+
+
+def _require_design(target: TargetCircles, design: TargetDesign, path: Path) -> None:
+    radius = design.radius_of()
+    for label, own in zip(target.labels, target.radius, strict=True):
+        if label not in radius:
+            raise InputError(f"faces {path}: circle {label} is not in target {design.name}; give its own --target")
+        if abs(own - radius[label]) > SAME_RADIUS_MM:
+            raise InputError(
+                f"faces {path}: circle {label} has radius {own:g} mm, {radius[label]:g} mm in target {design.name}; "
+                "give the target.toml of that run"
+            )
+    for face in design.faces:
+        own = [i for i, label in enumerate(face.labels()) if label in target.place]
+        if len(own) < 3:
+            continue
+        flat = np.column_stack([face.xy_mm[own], np.zeros(len(own))])
+        xyz = target.xyz[[target.place[face.labels()[i]] for i in own]]
+        off = float(np.sqrt(((align_rigid(xyz, flat) @ flat - xyz) ** 2).sum(1).mean()))
+        if off > SAME_DESIGN_MM:
+            raise InputError(
+                f"faces {path}: face {face.id} is {off:.3g} mm RMS off that of target {design.name}, "
+                f"{SAME_DESIGN_MM:g} mm allowed; give the target.toml of that run"
+            )

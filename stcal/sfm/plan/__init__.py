@@ -1,0 +1,1 @@
+"""Which photographs to take: before any is taken, and after a run."""

@@ -1,0 +1,208 @@
+"""After a run: which further photographs would make its worst face better, and when only a better board would."""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from itertools import combinations
+
+import numpy as np
+
+from stcal.errors import DegenerateError
+from stcal.geometry.rigid import Rigid
+from stcal.io.camera import camera_prior, read_camera
+from stcal.sfm.adjust.calibration import with_sigma
+from stcal.sfm.adjust.chain import CalibratedTarget
+from stcal.sfm.adjust.joint import JointResult, adjust_jointly
+from stcal.sfm.data.model import GroupModel
+from stcal.sfm.mapping.database import image_ids
+from stcal.sfm.mapping.models import read_model
+from stcal.sfm.plan.forecast import CentreNoise, Forecast, Setup, forecast, variance_shares, without_sources
+from stcal.sfm.plan.simulated import observe, true_models
+from stcal.sfm.plan.views import View, candidates, known_scene, with_view
+from stcal.sfm.run.saved import CAMERA, SavedRun
+from stcal.synthetic.placement import GroupShape, place_group, viewing_axes
+from stcal.synthetic.scene import Group, Scene, group_name
+
+SHORTLIST = 8
+"""After the first choice only candidates that were among so many best for one of the faces are looked at again."""
+NEW_GROUP_SPREAD_RAD = float(np.radians(40))
+MIN_NEW_GROUP = 3
+"""Images that a new group needs to be mapped."""
+BOARD_DOMINATES = 0.5
+"""Share of the worst face's variance from which more views are said not to help."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Choice:
+    """A view to add, and the face that is worst after it (and those before it in the list), σ in mm."""
+
+    view: View
+    face: str
+    sigma_mm: float
+
+
+@dataclass(frozen=True, slots=True)
+class NewGroup:
+    """Faces to photograph together for the first time in ``images`` views, and the worst face after that, σ in mm."""
+
+    faces: tuple[str, str]
+    images: int
+    face: str
+    sigma_mm: float
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Advice:
+    """``now`` : the run's own geometry; ``shares`` of its variance by face and source; ``choices`` one after the other;
+    ``new_groups`` the best first; ``better_board`` : now with half the board's σ; ``tried`` candidates."""
+
+    now: Forecast
+    shares: dict[str, dict[str, float]]
+    noise: CentreNoise
+    choices: tuple[Choice, ...]
+    new_groups: tuple[NewGroup, ...]
+    better_board: Forecast
+    tried: int
+
+    @property
+    def board_dominates(self) -> bool:
+        """More views will not help much."""
+        return self.shares[self.now.worst()[0]]["board"] > BOARD_DOMINATES
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Known:
+    """A run as the forecast sees it: models in mm in the target frame, σ as in the run's adjustment."""
+
+    models: tuple[GroupModel, ...]
+    joint: JointResult
+    setup: Setup
+    noise: CentreNoise
+    scene: Scene
+
+
+def known_of(run: SavedRun) -> Known:
+    """The geometry of a finished run, adjusted once more (which moves nothing), for what ``faces.json`` does not say.
+
+    Raises
+    ------
+    InputError
+        The run's ``target_model`` is missing or damaged.
+    """
+    read = read_model(run.folder / "target_model", run.observations, image_ids(run.observations), run.corrected_px)
+    models = [with_sigma(model, run.report["summary"]["sigma_factor"]) for model in read.groups]
+    start = CalibratedTarget(
+        run.faces["reference_face"],
+        {face: Rigid.from_matrix(m) for face, m in run.faces["target_from_face"].items()},
+        {label: np.array(xyz) for label, xyz in run.faces["circles"].items()},
+        {model.group: Rigid() for model in models},
+    )
+    prior = camera_prior(read_camera(run.folder / CAMERA), run.camera) if run.options.refine_camera else None
+    joint = adjust_jointly(models, run.board, run.camera, run.options.flatness_mm, prior, read.camera)
+    setup = Setup(
+        run.target,
+        run.board,
+        joint.camera,
+        start,
+        run.faces["frame"],
+        run.options.flatness_mm,
+        prior,
+        joint.board_common,
+        joint.sigma0,
+    )
+    noise = CentreNoise.measured(joint.models, joint.camera, setup.radius_mm())
+    return Known(joint.models, joint, setup, noise, known_scene(joint.models, joint, setup, run.colmap_model))
+
+
+def advise(known: Known, count: int = 5, progress: Callable[[str, int, int], None] | None = None) -> Advice:
+    """The ``count`` views that, taken one after the other, lower the σ of the worst face most, and new groups of as
+    many images. ``progress`` is told (stage, done, total)."""
+    now = forecast(known.models, known.setup)
+    shares = variance_shares(now, without_sources(known.models, known.setup, now.derivatives))
+    views = [v for model in known.models for v in candidates(known.scene, model, known.setup, known.noise)]
+    return Advice(
+        now,
+        shares,
+        known.noise,
+        tuple(_greedy(known, views, now, count, progress or (lambda *_: None))),
+        tuple(_new_groups(known, now, max(count, MIN_NEW_GROUP))),
+        forecast(known.models, known.setup.better_board(0.5), now.derivatives),
+        len(views),
+    )
+
+
+def after(known: Known, views: Sequence[View], now: Forecast) -> Forecast:
+    """The forecast with further views."""
+    models = {model.group: model for model in known.models}
+    for view in views:
+        models[view.group] = with_view(models[view.group], view)
+    return forecast(list(models.values()), known.setup, now.derivatives)
+
+
+def _greedy(known: Known, views: list[View], now: Forecast, count: int, tell) -> list[Choice]:
+    """Always the view that leaves the worst face best, given those chosen before."""
+    chosen: list[Choice] = []
+    while views and len(chosen) < count:
+        have = [choice.view for choice in chosen]
+        results = []
+        for view in views:
+            tell(f"view {len(have) + 1}", len(results), len(views))
+            results.append(after(known, [*have, view], now))
+        tell(f"view {len(have) + 1}", len(views), len(views))
+        best = int(np.argmin([result.worst()[1] for result in results]))
+        chosen.append(Choice(views[best], *results[best].worst()))
+        keep = _promising(results) - {best}
+        views = [views[i] for i in sorted(keep)]
+    return chosen
+
+
+def _promising(results: list[Forecast]) -> set[int]:
+    """The best for any face: which one is worst may change."""
+    by_view = [result.position_sigma_mm() for result in results]
+    return {i for face in by_view[0] for i in sorted(range(len(by_view)), key=lambda k: by_view[k][face])[:SHORTLIST]}
+
+
+def _new_groups(known: Known, now: Forecast, images: int) -> list[NewGroup]:
+    """Pairs of faces that no group shows together, where the geometry allows to."""
+    together = {
+        pair
+        for model in known.models
+        for pair in combinations(sorted(key for key in model.points_by_face() if key != "board"), 2)
+    }
+    found = []
+    for pair in combinations(sorted(face.id for face in known.scene.target.faces), 2):
+        if pair not in together:
+            try:
+                model = _new_model(known, pair, images)
+            except DegenerateError:
+                continue  # the two cannot be seen together at this distance
+            found.append(
+                NewGroup(pair, images, *forecast([*known.models, model], known.setup, now.derivatives).worst())
+            )
+    return sorted(found, key=lambda each: each.sigma_mm)
+
+
+def _new_model(known: Known, pair: tuple[str, str], images: int) -> GroupModel:
+    """A group of two faces with the board beside them, photographed from the distance of the present ones."""
+    scene = known.scene
+    name = f"new {group_name(pair)}"
+    normals = [scene.target_from_face[face].rotation[:, 2] for face in pair]
+    axes = viewing_axes(*normals, name)
+    present = next(iter(scene.groups))
+    dots = np.column_stack([scene.board.xy_mm(), np.zeros(scene.board.rows * scene.board.columns)])
+    shape = GroupShape(
+        name,
+        np.vstack([scene.face_circles(face) for face in pair]),
+        np.repeat(normals, [len(scene.target.face(face).ids) for face in pair], axis=0),
+        axes,
+        np.vstack([scene.face_outline(face.id) for face in scene.target.faces]),
+        dots,
+        scene.groups[present].target_from_board.inverse() @ scene.board_outline(present),
+    )
+    depth = np.median(np.concatenate([model.xyz_camera()[:, 2] for model in known.models]))
+    target_from_board, poses = place_group(
+        shape, scene.camera, images, float(depth), NEW_GROUP_SPREAD_RAD, np.random.default_rng(0)
+    )
+    group = Group(name, pair, axes, target_from_board, target_from_board @ dots, tuple(poses))
+    alone = replace(scene, groups={name: group})
+    (model,) = true_models(alone, observe(alone, 0.0, np.random.default_rng(0)))
+    return known.noise.applied(model, scene.camera, known.setup.radius_mm())

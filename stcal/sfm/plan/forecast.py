@@ -1,0 +1,203 @@
+"""The σ to expect of a geometry, photographed or only planned: centring noise by the size and tilt of the circles, then
+the covariance of the joint adjustment itself."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from stcal.design import BoardDesign, TargetDesign
+from stcal.geometry.arrays import frozen
+from stcal.geometry.camera import Camera
+from stcal.geometry.plane import fit_plane
+from stcal.io.camera import CameraPrior
+from stcal.sfm.adjust.chain import CalibratedTarget
+from stcal.sfm.adjust.faces import FrameKind
+from stcal.sfm.adjust.joint import covariance_of
+from stcal.sfm.adjust.uncertainty import Derivatives, derivatives, scale_sigma
+from stcal.sfm.data.model import GroupModel
+from stcal.synthetic.observe import rim_points
+
+IMAGE_NOISE = 0.01
+"""Standard deviation of the grey values, as a fraction of full scale."""
+CONTRAST = 0.7
+"""Of circle and surroundings, as a fraction of full scale."""
+BLUR_PX = 0.76
+"""Of an edge, standard deviation: a lens of 0.7 px and the pixels themselves, 1/√12 px."""
+PRACTICE = 1.3
+"""Centres against the Cramér–Rao bound, as runs on rendered photographs have them: brightness gradients to be
+estimated, quantisation, neighbouring edges."""
+ONE_PLATE = 0.99
+"""Share of the board's variance that all groups have in common where one plate is in all of them."""
+OFF = 1e-2
+"""A source of error that is switched off keeps this share of its σ, so that nothing becomes singular."""
+
+
+@dataclass(frozen=True, slots=True)
+class CentreNoise:
+    """What a measured centre is worth: covariance = edge² (1 + (narrow/b)²) (∮ n nᵀ ds)⁻¹ + floor² 1.
+
+    The integral runs over the rim (normals n, arc ds, px), b is the minor semi-axis. A straight edge fixes its place
+    along its normal with an information of 1/edge² per pixel of its length. For noise s, contrast C and a blur β that
+    bound is edge = s/C √(2 √π β) (∫ of the squared slope over s²: Kay 1993, Fundamentals of Statistical Signal
+    Processing, example 3.13), so that the centre of a circle of radius r has σ = edge/√(π r): noise by the root of its
+    perimeter.
+
+    ``edge`` : px^1.5; ``narrow_px`` : rims so close together lose half of their information, 0 for none; ``floor_px`` :
+    what no size removes, per axis.
+    """
+
+    edge: float
+    narrow_px: float = 0.0
+    floor_px: float = 0.0
+
+    @classmethod
+    def expected(cls) -> "CentreNoise":
+        """Of good photographs: see the constants of this file."""
+        return cls(PRACTICE * IMAGE_NOISE / CONTRAST * float(np.sqrt(2 * np.sqrt(np.pi) * BLUR_PX)))
+
+    @classmethod
+    def measured(cls, models: Sequence[GroupModel], camera: Camera, radius_mm: dict[str, float]) -> "CentreNoise":
+        """Fitted to the covariances that the observations of metric models carry."""
+        rims = [_Rims.of(model, camera, radius_mm) for model in models]
+        ratio = np.concatenate(
+            [
+                np.trace(rim.information @ m.covariance_px2, axis1=1, axis2=2) / 2
+                for rim, m in zip(rims, models, strict=True)
+            ]
+        )
+        narrow = np.concatenate([rim.minor_px for rim in rims]) ** -2
+        usual = ratio <= 4 * np.median(ratio)
+        slope, level = np.polyfit(narrow[usual], ratio[usual], 1)
+        if slope <= 0 or level <= 0:
+            return cls(float(np.sqrt(ratio[usual].mean())))
+        return cls(float(np.sqrt(level)), float(np.sqrt(slope / level)))
+
+    def scaled(self, factor: float) -> "CentreNoise":
+        """The same with all σ multiplied."""
+        return replace(self, edge=factor * self.edge, floor_px=factor * self.floor_px)
+
+    def applied(self, model: GroupModel, camera: Camera, radius_mm: dict[str, float]) -> GroupModel:
+        """The metric model with the covariances that its observations are to have."""
+        rims = _Rims.of(model, camera, radius_mm)
+        size = self.edge**2 * (1 + (self.narrow_px / rims.minor_px) ** 2)
+        covariance = size[:, None, None] * np.linalg.inv(rims.information) + self.floor_px**2 * np.eye(2)
+        return replace(model, covariance_px2=covariance)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Rims:
+    """Images of n circles: ``information`` : (n, 2, 2) ∮ n nᵀ ds, px; ``minor_px`` : (n,) minor semi-axis."""
+
+    information: np.ndarray
+    minor_px: np.ndarray
+
+    @classmethod
+    def of(cls, model: GroupModel, camera: Camera, radius_mm: dict[str, float]) -> "_Rims":
+        normal = np.zeros((len(model.labels), 3))
+        for members in model.points_by_face().values():
+            normal[members] = fit_plane(model.xyz_world[members]).normal
+        rotation = np.stack([pose.rotation for pose in model.camera_from_world])[model.image_index]
+        normal_camera = np.einsum("nij,nj->ni", rotation, normal[model.point_index])
+        radius = np.array([radius_mm[label] for label in model.labels])[model.point_index]
+        rim = camera.project(rim_points(model.xyz_camera(), normal_camera, radius))
+        side = np.roll(rim, -1, axis=1) - rim
+        across = np.stack([side[..., 1], -side[..., 0]], axis=-1)
+        length = np.linalg.norm(side, axis=2, keepdims=True)
+        spread = rim - rim.mean(1, keepdims=True)
+        moment = np.einsum("nki,nkj->nij", spread, spread) / rim.shape[1]
+        return cls(np.einsum("nki,nkj->nij", across / length, across), np.sqrt(2 * np.linalg.eigvalsh(moment)[:, 0]))
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Setup:
+    """What a forecast rests on besides the views: hardware, and what the adjustment is told.
+
+    ``start`` : the target as it is, for the reference face and the sides that faces look to; ``prior`` : of the
+    intrinsics, None where they are fixed; ``common`` : see :func:`stcal.sfm.adjust.joint.covariance_of`; ``sigma0`` :
+    factor on all σ.
+    """
+
+    target: TargetDesign
+    board: BoardDesign
+    camera: Camera
+    start: CalibratedTarget
+    frame: FrameKind
+    flatness_mm: float | None
+    prior: CameraPrior | None
+    common: float
+    sigma0: float = 1.0
+
+    def radius_mm(self) -> dict[str, float]:
+        """Radius by label."""
+        return self.target.radius_of() | self.board.radius_of()
+
+    def better_board(self, factor: float) -> "Setup":
+        """The same with another σ of the board."""
+        return replace(self, board=replace(self.board, sigma_mm=factor * self.board.sigma_mm))
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Forecast:
+    """σ to expect, target frame.
+
+    ``face_covariance`` : (6, 6) by face but the reference, rad and mm; ``circle_sigma_mm`` by label: root of the trace;
+    ``scale_sigma`` : of the target's size, relative; ``derivatives`` : serves other views of the same circles.
+    """
+
+    face_covariance: dict[str, np.ndarray]
+    circle_sigma_mm: dict[str, float]
+    scale_sigma: float
+    derivatives: Derivatives
+
+    def __post_init__(self):
+        fixed = {face: frozen(c, (6, 6), f"face {face}: covariance") for face, c in self.face_covariance.items()}
+        object.__setattr__(self, "face_covariance", fixed)
+
+    def position_sigma_mm(self) -> dict[str, float]:
+        """By face: root of the trace, so that it is the RMS length of the error."""
+        return {face: float(np.sqrt(np.trace(c[3:, 3:]))) for face, c in self.face_covariance.items()}
+
+    def worst(self) -> tuple[str, float]:
+        """The face whose position is known worst, and its σ in mm."""
+        sigma = self.position_sigma_mm()
+        face = max(sigma, key=sigma.get)
+        return face, sigma[face]
+
+
+def forecast(models: Sequence[GroupModel], setup: Setup, known: Derivatives | None = None) -> Forecast:
+    """σ of the target from metric models, mm, target frame, as the joint adjustment would state them.
+
+    ``known`` : derivatives of an earlier forecast of the same circles.
+    """
+    joint = covariance_of(models, setup.board, setup.camera, setup.flatness_mm, setup.prior, setup.common)
+    own = known or derivatives(joint, setup.start, setup.target, setup.frame)
+    covariance = setup.sigma0**2 * joint.covariance_mm2
+    reference = setup.start.reference_face
+    circles = np.sqrt(np.trace(own.circle_covariance(covariance), axis1=1, axis2=2))
+    return Forecast(
+        {face: c for face, c in own.face_covariance(covariance).items() if face != reference},
+        dict(zip(joint.labels, circles.tolist(), strict=True)),
+        scale_sigma(joint.xyz_world, covariance),
+        own,
+    )
+
+
+def without_sources(models: Sequence[GroupModel], setup: Setup, known: Derivatives) -> dict[str, Forecast]:
+    """The forecast with each source of error in turn switched off: images, board, intrinsics where they are refined."""
+    quiet = [replace(m, covariance_px2=OFF**2 * m.covariance_px2) for m in models]
+    found = {
+        "image noise": forecast(quiet, setup, known),
+        "board": forecast(models, setup.better_board(OFF), known),
+    }
+    if setup.prior is not None:
+        found["intrinsics"] = forecast(models, replace(setup, prior=None), known)
+    return found
+
+
+def variance_shares(whole: Forecast, without: dict[str, Forecast]) -> dict[str, dict[str, float]]:
+    """By face and source: the share of the variance of the face's position that goes with the source."""
+    return {
+        face: {source: 1 - (each.position_sigma_mm()[face] / sigma) ** 2 for source, each in without.items()}
+        for face, sigma in whole.position_sigma_mm().items()
+    }

@@ -1,0 +1,210 @@
+"""Before any image exists: the σ to expect of a plan, and what would help most."""
+
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+
+from stcal.design import BoardDesign, TargetDesign
+from stcal.errors import DegenerateError, InputError
+from stcal.geometry.camera import Camera
+from stcal.geometry.rigid import Rigid
+from stcal.io.camera import CameraModel, camera_prior, refinable
+from stcal.sfm.adjust.chain import CalibratedTarget
+from stcal.sfm.data.model import GroupModel
+from stcal.sfm.plan.forecast import ONE_PLATE, CentreNoise, Forecast, Setup, forecast, variance_shares, without_sources
+from stcal.sfm.plan.simulated import observe, true_models
+from stcal.sfm.run.options import RunOptions
+from stcal.synthetic.scene import Scene, SceneOptions, make_scene
+
+SPREADS_DEG = (80.0, 70.0, 60.0, 50.0, 40.0)
+"""Tried from the largest down: the tilts that a view may have keep the views closer together than that."""
+NEARER = 0.8
+MIN_IMAGES = 2
+
+
+@dataclass(frozen=True, slots=True)
+class PlanOptions:
+    """What is planned.
+
+    ``images`` of each group; ``spread_deg`` : ± about the view that shows both faces equally; ``width`` : px, 3:2
+    images of a 24 mm lens, where no ``camera`` is given; ``groups`` : pairs of face ids, those of the design where
+    None; ``one_board`` : the same plate in all groups, else made anew for each; ``run`` : flatness, frame, refined
+    intrinsics and reference face; ``seed`` : of where board and cameras happen to stand.
+    """
+
+    images: int = 10
+    spread_deg: float = 40.0
+    distance_mm: float = 1000.0
+    width: int = 5184
+    camera: CameraModel | None = None
+    groups: tuple[tuple[str, str], ...] | None = None
+    noise: CentreNoise = field(default_factory=CentreNoise.expected)
+    one_board: bool = True
+    run: RunOptions = field(default_factory=RunOptions)
+    seed: int = 0
+
+    def __post_init__(self):
+        if self.images < MIN_IMAGES:
+            raise InputError(f"plan: {self.images} images in each group, {MIN_IMAGES} needed; plan for more")
+        if self.camera is not None and self.camera.width is None:
+            raise InputError(f"plan: camera file {self.camera.source} states no image size; add it to the file")
+
+
+@dataclass(frozen=True, slots=True)
+class Remedy:
+    """What could be done: ``sigma_mm`` of the face that is then worst, or None and ``reason`` where it cannot."""
+
+    what: str
+    sigma_mm: float | None
+    reason: str = ""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Plan:
+    """The answer. ``centre_sigma_px`` : RMS over all centres; ``shares`` of the variance by face and source."""
+
+    options: PlanOptions
+    setup: Setup
+    groups: tuple[str, ...]
+    observations: int
+    centre_sigma_px: float
+    forecast: Forecast
+    shares: dict[str, dict[str, float]]
+    remedies: tuple[Remedy, ...]
+
+
+def plan(
+    options: PlanOptions, target: TargetDesign, board: BoardDesign, nominal: dict[str, Rigid] | None = None
+) -> Plan:
+    """Forecast of a plan: nominal geometry, board and cameras where a simulated session would have them.
+
+    ``nominal`` : pose of every face in one frame.
+
+    Raises
+    ------
+    InputError
+        A face without nominal pose, or an unknown face in a group.
+    DegenerateError
+        A group cannot be photographed like that.
+    """
+    scene = _scene(options, target, board, nominal)
+    setup, models = _setup(scene, options, board), _models(scene, options)
+    whole = forecast(models, setup)
+    half_board = forecast(models, setup.better_board(0.5), whole.derivatives)
+    remedies = [
+        _remedy("twice the images", replace(options, images=2 * options.images), target, board, nominal),
+        _wider(options, target, board, nominal),
+        Remedy("a board of half the σ", half_board.worst()[1]),
+        _remedy("nearer by 20 %", replace(options, distance_mm=NEARER * options.distance_mm), target, board, nominal),
+    ]
+    return Plan(
+        options,
+        setup,
+        tuple(scene.groups),
+        sum(len(m.image_index) for m in models),
+        float(np.sqrt(np.concatenate([m.sigma_px() ** 2 for m in models]).mean())),
+        whole,
+        variance_shares(whole, without_sources(models, setup, whole.derivatives)),
+        tuple(remedies),
+    )
+
+
+def _scene(options: PlanOptions, target: TargetDesign, board: BoardDesign, nominal) -> Scene:
+    """The nominal geometry: nothing is misplaced."""
+    file = options.camera
+    height = round(options.width * 2 / 3)
+    optics = {"width": options.width, "height": height}
+    if file is not None:
+        optics = {
+            "width": file.width,
+            "height": file.height,
+            "focal_px": float(np.sqrt(file.focal.prod())),
+            "distortion": tuple(file.distortion),
+        }
+    shape = SceneOptions(
+        seed=options.seed,
+        centre_sigma=0.0,
+        distance_mm=options.distance_mm,
+        spread_deg=options.spread_deg,
+        images_per_group=options.images,
+        groups=options.groups,
+        circle_sigma_mm=0.0,
+        face_shift_mm=0.0,
+        face_turn_deg=0.0,
+        **optics,
+    )
+    scene = make_scene(shape, target, replace(board, sigma_mm=0.0), nominal)
+    return scene if file is None else replace(scene, camera=file.sized(0, 0), colmap_model=file.colmap_model)
+
+
+def _setup(scene: Scene, options: PlanOptions, board: BoardDesign) -> Setup:
+    run = options.run.settled(scene.target)
+    linked = _linked(run.reference_face, [group.faces for group in scene.groups.values()])
+    start = CalibratedTarget(
+        run.reference_face,
+        {face: pose for face, pose in scene.target_from_face.items() if face in linked},
+        scene.circles_target,
+        dict.fromkeys(scene.groups, Rigid()),
+    )
+    own = options.camera or _stated(scene.camera, scene.colmap_model)
+    return Setup(
+        scene.target,
+        board,
+        scene.camera,
+        start,
+        run.frame,
+        run.flatness_mm,
+        camera_prior(refinable(own), scene.camera) if run.refine_camera else None,
+        ONE_PLATE if options.one_board else 0.0,
+    )
+
+
+def _linked(reference: str, pairs: list[tuple[str, str]]) -> set[str]:
+    """The faces of all groups, each linked to the reference face.
+
+    Raises
+    ------
+    InputError
+        One is not.
+    """
+    planned = {face for pair in pairs for face in pair}
+    linked = {reference}
+    for _ in planned:
+        linked |= {face for pair in pairs if linked & set(pair) for face in pair}
+    if len(linked) < 2 or planned - linked:
+        apart = ", ".join(sorted(planned - linked)) or "any other face"
+        raise InputError(
+            f"plan: no group links face {apart} to reference face {reference}; add a group that shows one of each"
+        )
+    return linked
+
+
+def _stated(camera: Camera, colmap_model: str) -> CameraModel:
+    return CameraModel(
+        camera.focal, camera.centre, camera.distortion, colmap_model, camera.width, camera.height, "simulated"
+    )
+
+
+def _models(scene: Scene, options: PlanOptions) -> list[GroupModel]:
+    radius = scene.target.radius_of() | scene.board.radius_of()
+    exact = true_models(scene, observe(scene, 0.0, np.random.default_rng(0)))
+    return [options.noise.applied(model, scene.camera, radius) for model in exact]
+
+
+def _remedy(what: str, options: PlanOptions, target: TargetDesign, board: BoardDesign, nominal) -> Remedy:
+    try:
+        scene = _scene(options, target, board, nominal)
+    except DegenerateError as error:
+        return Remedy(what, None, str(error))
+    return Remedy(what, forecast(_models(scene, options), _setup(scene, options, board)).worst()[1])
+
+
+def _wider(options: PlanOptions, target: TargetDesign, board: BoardDesign, nominal) -> Remedy:
+    """The largest spread that leaves enough views."""
+    remedy = Remedy("larger spread", None, f"±{options.spread_deg:g}° is as far as both faces and the board show")
+    for spread in SPREADS_DEG:
+        if spread > options.spread_deg:
+            remedy = _remedy(f"spread of ±{spread:g}°", replace(options, spread_deg=spread), target, board, nominal)
+            if remedy.sigma_mm is not None:
+                break
+    return remedy

@@ -1,0 +1,219 @@
+"""What ``plan`` and ``advise`` answer, as text for people and as the content of their JSON files."""
+
+import numpy as np
+
+from stcal.sfm.data.observations import face_of
+from stcal.sfm.plan.advise import Advice, Choice
+from stcal.sfm.plan.forecast import Forecast
+from stcal.sfm.plan.session import Plan
+from stcal.sfm.plan.views import View
+
+MICRO = 1e3
+PPM = 1e6
+
+
+def forecast_json(forecast: Forecast, shares: dict[str, dict[str, float]]) -> dict:
+    """Faces, worst face and scale of a forecast."""
+    worst, sigma = forecast.worst()
+    return {
+        "worst_face": worst,
+        "worst_sigma_um": MICRO * sigma,
+        "scale_sigma_ppm": PPM * forecast.scale_sigma,
+        "faces": {
+            face: {
+                "translation_sigma_um": (MICRO * np.sqrt(np.diag(covariance)[3:])).tolist(),
+                "rotation_sigma_mdeg": (MICRO * np.degrees(np.sqrt(np.diag(covariance)[:3]))).tolist(),
+                "position_sigma_um": MICRO * forecast.position_sigma_mm()[face],
+                "worst_circle": _worst_circle(forecast, face)[0],
+                "worst_circle_sigma_um": MICRO * _worst_circle(forecast, face)[1],
+                "variance_shares": shares[face],
+            }
+            for face, covariance in forecast.face_covariance.items()
+        },
+    }
+
+
+def _worst_circle(forecast: Forecast, face: str) -> tuple[str, float]:
+    own = {label: sigma for label, sigma in forecast.circle_sigma_mm.items() if face_of(label) == face}
+    return max(own.items(), key=lambda each: each[1])
+
+
+def forecast_table(forecast: Forecast, shares: dict[str, dict[str, float]]) -> list[str]:
+    """One line for each face."""
+    lines = [
+        f"{'face':>6} {'σ position µm':^23} {'σ rotation mdeg':^17}  {'worst circle µm':<16} of the variance",
+        f"{'':>6} {'x':>5} {'y':>5} {'z':>5} {'all':>5} {'x':>5} {'y':>5} {'z':>5}",
+    ]
+    for face, row in forecast_json(forecast, shares)["faces"].items():
+        position = " ".join(f"{s:5.2f}" for s in [*row["translation_sigma_um"], row["position_sigma_um"]])
+        rotation = " ".join(f"{s:5.2f}" for s in row["rotation_sigma_mdeg"])
+        circle = f"{row['worst_circle']} {row['worst_circle_sigma_um']:.2f}"
+        lines.append(f"{face:>6} {position} {rotation}  {circle:<16} {_shares_text(row['variance_shares'])}")
+    return lines
+
+
+def _shares_text(shares: dict[str, float]) -> str:
+    """The largest first."""
+    ordered = sorted(shares.items(), key=lambda each: -each[1])
+    return ", ".join(f"{source} {100 * max(share, 0.0):.0f} %" for source, share in ordered)
+
+
+def plan_json(plan: Plan) -> dict:
+    """The content of ``plan --json``."""
+    options = plan.options
+    return {
+        "format": "stcal plan 1",
+        "images_per_group": options.images,
+        "groups": list(plan.groups),
+        "spread_deg": options.spread_deg,
+        "distance_mm": options.distance_mm,
+        "size_px": [plan.setup.camera.width, plan.setup.camera.height],
+        "focal_px": plan.setup.camera.focal.tolist(),
+        "refine_camera": options.run.refine_camera,
+        "one_board": options.one_board,
+        "board_sigma_um": MICRO * plan.setup.board.sigma_mm,
+        "reference_face": plan.setup.start.reference_face,
+        "observations": plan.observations,
+        "centre_sigma_rms_px": plan.centre_sigma_px,
+        **forecast_json(plan.forecast, plan.shares),
+        "remedies": [
+            {
+                "what": remedy.what,
+                "worst_sigma_um": None if remedy.sigma_mm is None else MICRO * remedy.sigma_mm,
+                "reason": remedy.reason,
+            }
+            for remedy in plan.remedies
+        ],
+    }
+
+
+def plan_text(plan: Plan, noise: str) -> str:
+    """The forecast as a table; ``noise`` : where the σ of the centres comes from."""
+    camera, options = plan.setup.camera, plan.options
+    kept = "the same board in all groups" if options.one_board else "a board of its own in each group"
+    worst, sigma = plan.forecast.worst()
+    lines = [
+        f"groups {', '.join(plan.groups)}, {options.images} images each, {camera.width}×{camera.height} px, "
+        f"{options.distance_mm:g} mm away, spread ±{options.spread_deg:g}°; {kept}, σ "
+        f"{MICRO * plan.setup.board.sigma_mm:g} µm",
+        f"{plan.observations} centres, σ {plan.centre_sigma_px:.4f} px RMS: {noise}",
+        *forecast_table(plan.forecast, plan.shares),
+        f"scale: σ {PPM * plan.forecast.scale_sigma:.1f} ppm; worst is face {worst}, {MICRO * sigma:.2f} µm, against "
+        f"face {plan.setup.start.reference_face}",
+        "",
+        f"{'what would help':<28} worst face µm",
+    ]
+    reachable = [remedy for remedy in plan.remedies if remedy.sigma_mm is not None]
+    for remedy in sorted(reachable, key=lambda each: each.sigma_mm):
+        change = 100 * (remedy.sigma_mm / sigma - 1)
+        lines.append(f"{remedy.what:<28} {MICRO * remedy.sigma_mm:6.2f}   {change:+.0f} %")
+    lines += [f"{r.what:<28}      –   {r.reason}" for r in plan.remedies if r.sigma_mm is None]
+    lines.append("where board and cameras happen to stand (--seed) makes about ±3 %")
+    return "\n".join(lines)
+
+
+def advice_json(advice: Advice) -> dict:
+    """The content of ``advise --json``."""
+    return {
+        "format": "stcal advice 1",
+        **forecast_json(advice.now, advice.shares),
+        "views": [_choice_json(choice) for choice in advice.choices],
+        "new_groups": [
+            {
+                "faces": list(each.faces),
+                "images": each.images,
+                "worst_face": each.face,
+                "worst_sigma_um": MICRO * each.sigma_mm,
+            }
+            for each in advice.new_groups
+        ],
+        "board_dominates": advice.board_dominates,
+        "half_board_sigma_um": MICRO * advice.better_board.worst()[1],
+        "candidates": advice.tried,
+    }
+
+
+def _choice_json(choice: Choice) -> dict:
+    view = choice.view
+    return {
+        "group": view.group,
+        "from_image": view.middle,
+        "right_deg": view.azimuth_deg,
+        "up_deg": view.elevation_deg,
+        "roll_deg": view.roll_deg,
+        "distance_mm": view.distance_mm,
+        "tilts_deg": view.tilts_deg,
+        "nearest_image": view.nearest,
+        "nearest_deg": view.nearest_deg,
+        "camera_from_target": view.model.camera_from_world[0].matrix().tolist(),
+        "labels": [view.model.labels[i] for i in view.model.point_index],
+        "worst_face": choice.face,
+        "worst_sigma_um": MICRO * choice.sigma_mm,
+    }
+
+
+def advice_text(advice: Advice) -> str:
+    """What to photograph next, as a table that a photographer can follow."""
+    worst, sigma = advice.now.worst()
+    lines = [*forecast_table(advice.now, advice.shares), f"worst is face {worst}, {MICRO * sigma:.2f} µm"]
+    if advice.board_dominates:
+        lines.append(
+            f"{100 * advice.shares[worst]['board']:.0f} % of its variance is the board's: further views will help "
+            f"little; with a board of half the σ: {MICRO * advice.better_board.worst()[1]:.2f} µm"
+        )
+    lines += ["", f"further views, one after the other, the best of {advice.tried}:"]
+    lines.append(
+        f"{'group':>6}  {'from':<20} {'go':<26} {'mm':>5}  {'worst face, µm':<18} seen at, and nearest photograph"
+    )
+    before = f"{worst}: {MICRO * sigma:.2f}"
+    for choice in advice.choices:
+        view = choice.view
+        after = f"{choice.face}: {MICRO * choice.sigma_mm:.2f}"
+        change = f"{before} → {after}"
+        tilts = ", ".join(f"{'' if key == 'board' else 'face '}{key} {t:.0f}°" for key, t in view.tilts_deg.items())
+        lines.append(
+            f"{view.group:>6}  {view.middle:<20} {where(view):<26} {view.distance_mm:5.0f}  {change:<18} "
+            f"{tilts}; {view.nearest} {view.nearest_deg:.0f}° away"
+        )
+        before = after
+    if not advice.choices:
+        lines.append("none: no other view within ±50° shows the whole board and a face")
+    lines += [
+        "go right and up as seen in the photograph named, about the middle of board and faces, which is to be in the",
+        "middle of the image, mm away; degrees of board and faces are from their normal. If board or target have",
+        "been moved since, photograph a new group.",
+    ]
+    if advice.new_groups:
+        lines += ["", "faces not photographed together yet, with the board beside them, as a new group:"]
+        for each in advice.new_groups:
+            lines.append(
+                f"  faces {each.faces[0]} and {each.faces[1]}, {each.images} images: worst is face {each.face}, "
+                f"{MICRO * sigma:.2f} → {MICRO * each.sigma_mm:.2f} µm"
+            )
+    return "\n".join([*lines, "", _verdict(advice)])
+
+
+def where(view: View) -> str:
+    """``25° right, 12° up``, as the photograph to go from shows them."""
+    parts = []
+    for angle, names in ((view.azimuth_deg, ("right", "left")), (view.elevation_deg, ("up", "down"))):
+        if angle:
+            parts.append(f"{abs(angle):g}° {names[angle < 0]}")
+    if view.roll_deg:
+        parts.append("camera on end")
+    return ", ".join(parts) or "the same place"
+
+
+def _verdict(advice: Advice) -> str:
+    """The best of what was computed."""
+    board = advice.better_board.worst()[1]
+    ways = [(board, "a board of half the σ")]
+    if advice.choices:
+        count = len(advice.choices)
+        ways.append((advice.choices[-1].sigma_mm, f"the {count} views together" if count > 1 else "the one view"))
+    if advice.new_groups:
+        best = advice.new_groups[0]
+        ways.append((best.sigma_mm, f"{best.images} images of faces {best.faces[0]} and {best.faces[1]}"))
+    ways.sort()
+    told = "; ".join(f"{MICRO * sigma:.2f} µm with {what}" for sigma, what in ways)
+    return f"worst face afterwards, the best first: {told}"

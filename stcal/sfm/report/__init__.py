@@ -1,0 +1,1 @@
+"""The run's report for people, and the comparison with a known truth."""

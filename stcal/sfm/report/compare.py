@@ -1,0 +1,192 @@
+"""Errors of a run against a known truth, in the format of ``truth.json`` (``data_layout.md``)."""
+
+import csv
+import json
+from pathlib import Path
+
+import numpy as np
+
+from stcal.design import BOARD
+from stcal.errors import DegenerateError, InputError
+from stcal.geometry.align import align_rigid
+from stcal.geometry.arrays import frozen
+from stcal.geometry.rigid import Rigid
+from stcal.sfm.data.observations import face_of, is_board
+
+FACES = "faces.json"
+DETECTIONS = "detections.csv"
+NEAR_PX = 1.5
+"""A label is right when its ellipse centre is this near to the image of the circle's centre; eccentricity makes 0.2."""
+
+
+def compare(run: str | Path, truth: str | Path) -> dict:
+    """Errors of ``RUN/faces.json`` (or of the file itself) against a truth file.
+
+    Returns
+    -------
+    dict
+        ``faces`` : by face ``translation_um`` and ``rotation_mdeg`` of target_from_face, ``circles_mean_um`` and
+        ``circles_max_um`` after a rigid fit of the face, ``circles`` compared, and where the run states σ,
+        ``translation_sigma_um``, ``rotation_sigma_mdeg`` and ``normalised_error`` (√(eᵀC⁻¹e/6), about 1 when σ is
+        true); ``missing`` faces of the truth; ``worst`` over all faces; and, where the truth lists images and the run
+        is a folder, ``labels`` : ``wrong``, and ``found`` of the ``visible`` circles (those the truth calls
+        must_find) in the images that both have.
+
+    Raises
+    ------
+    InputError
+        A file is missing or has another form, or the reference faces differ.
+    """
+    run = Path(run)
+    found = _read(run / FACES if run.is_dir() else run, "run")
+    known = _read(Path(truth), "truth")
+    if found["reference_face"] != known["reference_face"]:
+        raise InputError(
+            f"reference face {found['reference_face']} in the run, {known['reference_face']} in the truth; "
+            f"run again with --reference-face {known['reference_face']}"
+        )
+    if not set(known["target_from_face"]) & set(found["target_from_face"]):
+        raise InputError(f"run {run}, truth {truth}: no face in common; give the truth of the same target")
+    faces = {
+        face_id: _face(face_id, found, known)
+        for face_id in known["target_from_face"]
+        if face_id in found["target_from_face"]
+    }
+    labels = _labels(run / DETECTIONS, known) if run.is_dir() and _is(known, "groups", dict) else None
+    measures = ("translation_um", "rotation_mdeg", "circles_mean_um")
+    return {
+        "reference_face": known["reference_face"],
+        "faces": faces,
+        "missing": [face_id for face_id in known["target_from_face"] if face_id not in faces],
+        "worst": {m: max((f[m] for f in faces.values() if f[m] is not None), default=None) for m in measures},
+        **({"labels": labels} if labels else {}),
+    }
+
+
+def _labels(path: Path, known: dict) -> dict | None:
+    """Labels of ``detections.csv`` against the truth; a board's numbers are known up to its own symmetry, but for a
+    whole group at once."""
+    try:
+        with open(path, encoding="utf-8", newline="") as stream:
+            rows = list(csv.DictReader(stream))
+        measured: dict[str, dict[str, tuple[float, float]]] = {}
+        for row in rows:
+            measured.setdefault(row["image"], {})[row["label"]] = (float(row["x_px"]), float(row["y_px"]))
+        for labels in measured.values():  # circles that the truth does not know are neither right nor wrong
+            for label in [x for x in labels if not is_board(x) and x not in known["circles"]]:
+                del labels[label]
+        total = np.zeros(3, int)
+        for group in known["groups"].values():
+            count = len(group["board_circles_target"])
+            grid = np.arange(count).reshape(-1, _columns(group["board_circles_target"]))
+            turns = [grid, np.rot90(grid, 2)]
+            turns += [np.rot90(grid), np.rot90(grid, 3)] if grid.shape[0] == grid.shape[1] else []
+            counts = [_count(measured, group["images"], turn) for turn in turns]
+            total += min(counts, key=lambda c: (c[0], -c[1]))
+    except (OSError, KeyError, ValueError, TypeError, IndexError):
+        return None
+    if not total.any():
+        return None
+    return dict(zip(("wrong", "found", "visible"), total.tolist(), strict=True))
+
+
+def _columns(dots: list) -> int:
+    """Columns of a board from its dots in row-major order: where the first step back to the row's begin is."""
+    steps = np.diff(np.asarray(dots, float), axis=0)
+    turned = np.flatnonzero(steps @ steps[0] < 0)
+    return int(turned[0]) + 1 if len(turned) else len(dots)
+
+
+def _count(measured: dict, images: dict, numbers: np.ndarray) -> tuple[int, int, int]:
+    """(wrong, found, visible) with the board's dots numbered as ``numbers``, (rows, columns), has them."""
+    wrong = found = visible = 0
+    for name in images.keys() & measured.keys():
+        circles = images[name]["circles"]
+        visible += sum(bool(c["must_find"]) for c in circles.values())
+        for label, centre in measured[name].items():
+            key = label
+            if is_board(label):
+                row, column = (int(v) for v in label.split(":")[1:])
+                inside = 0 <= row < numbers.shape[0] and 0 <= column < numbers.shape[1]
+                key = f"{BOARD}:{numbers[row, column]}" if inside else label
+            near = key in circles and np.linalg.norm(np.subtract(centre, circles[key]["centre_px"])) < NEAR_PX
+            wrong += not near
+            found += near and bool(circles[key]["must_find"])
+    return wrong, found, visible
+
+
+def _read(path: Path, what: str) -> dict:
+    try:
+        content = json.loads(path.read_text(encoding="utf-8"))
+    except OSError as error:
+        raise InputError(f"{what} {path}: {error.strerror or error}; give a finished run, and truth.json") from error
+    except ValueError as error:
+        raise InputError(f"{what} {path}: not JSON ({error}); give faces.json of a run, and truth.json") from error
+    wanted = {"unit": str, "reference_face": str, "target_from_face": dict, "circles": dict}
+    missing = [key for key, kind in wanted.items() if not (isinstance(content, dict) and _is(content, key, kind))]
+    if missing:
+        raise InputError(f"{what} {path}: no {', '.join(missing)} as data_layout.md has it; give the right file")
+    if content["unit"] != "mm":
+        raise InputError(f"{what} {path}: unit {content['unit']}, mm needed; convert it")
+    return content
+
+
+def _is(content: dict, key: str, kind: type) -> bool:
+    return isinstance(content.get(key), kind)
+
+
+def _face(face_id: str, found: dict, known: dict) -> dict:
+    try:
+        estimate = Rigid.from_matrix(found["target_from_face"][face_id])
+        true = Rigid.from_matrix(known["target_from_face"][face_id])
+        labels = [label for label in known["circles"] if face_of(label) == face_id and label in found["circles"]]
+        a, b = (frozen([each["circles"][k] for k in labels], what="circles").reshape(-1, 3) for each in (known, found))
+    except (ValueError, TypeError, InputError) as error:
+        reason = str(error)[:120]
+        raise InputError(f"face {face_id}: {reason}; a 4×4 matrix and circles of three numbers needed") from error
+    shift = estimate.translation - true.translation
+    turn = Rigid(estimate.rotation @ true.rotation.T)
+    row = {
+        "translation_um": 1e3 * float(np.linalg.norm(shift)),
+        "rotation_mdeg": 1e3 * float(np.degrees(turn.angle_rad())),
+        "circles": len(labels),
+        "circles_mean_um": None,
+        "circles_max_um": None,
+    }
+    try:
+        error = 1e3 * np.linalg.norm(align_rigid(a, b) @ b - a, axis=1)
+        row |= {"circles_mean_um": float(error.mean()), "circles_max_um": float(error.max())}
+    except DegenerateError:
+        pass  # fewer than three circles in common: there is no rigid fit, and the row says how many there were
+    covariance = found.get("target_from_face_covariance", {}).get(face_id)
+    if covariance is not None:
+        c = np.array(covariance, float)
+        sigma = np.sqrt(np.maximum(np.diag(c), 0))
+        row |= {
+            "translation_sigma_um": (1e3 * sigma[3:]).tolist(),
+            "rotation_sigma_mdeg": (1e3 * np.degrees(sigma[:3])).tolist(),
+        }
+        if np.linalg.eigvalsh(c)[0] > 0 and face_id != known["reference_face"]:
+            e = np.concatenate([turn.log()[:3], shift])
+            row["normalised_error"] = float(np.sqrt(e @ np.linalg.solve(c, e) / 6))
+    return row
+
+
+def comparison_table(comparison: dict) -> str:
+    """The comparison as a text table."""
+    lines = [
+        f"{'face':>6} {'position':>10} {'rotation':>10} {'circles':>10} {'worst':>8} {'of':>4}  error / σ",
+        f"{'':>6} {'µm':>10} {'mdeg':>10} {'mean µm':>10} {'µm':>8}",
+    ]
+    for face_id, row in comparison["faces"].items():
+        mean, worst = (f"{row[k]:.2f}" if row[k] is not None else "–" for k in ("circles_mean_um", "circles_max_um"))
+        ratio = f"{row['normalised_error']:.2f}" if "normalised_error" in row else "–"
+        place = "reference" if face_id == comparison["reference_face"] else f"{row['translation_um']:.1f}"
+        turn = "" if face_id == comparison["reference_face"] else f"{row['rotation_mdeg']:.2f}"
+        lines.append(f"{face_id:>6} {place:>10} {turn:>10} {mean:>10} {worst:>8} {row['circles']:>4}  {ratio:>9}")
+    if "labels" in comparison:
+        n = comparison["labels"]
+        lines.append(f"labels: {n['wrong']} wrong; {n['found']} of {n['visible']} visible circles found")
+    if comparison["missing"]:
+        lines.append(f"not in the run: face {', '.join(comparison['missing'])}")
+    return "\n".join(lines)

@@ -1,0 +1,173 @@
+"""Plots of the report of a run."""
+
+import numpy as np
+
+from stcal.report.page import (
+    AXIS_COLOURS,
+    COLOURS,
+    FAINT,
+    INK,
+    SMALL,
+    calm,
+    locator,
+    new_figure,
+    round_below,
+    swatch,
+    uri,
+)
+from stcal.sfm.data.observations import face_of
+
+
+def legend(colours: dict[str, str]) -> str:
+    entries = " ".join(f"<span>{swatch(name, colour)}</span>" for name, colour in colours.items())
+    return f'<p class="legend">Groups: {entries}</p>\n'
+
+
+def group_colours(names: list[str]) -> dict[str, str]:
+    """A colour for each group, by its place in the list."""
+    return {name: COLOURS[i % len(COLOURS)] for i, name in enumerate(names)}
+
+
+def board_residuals(residuals_um: dict[str, list[float]], reach_um: float, height_um: float) -> str:
+    """Residual vectors of the board's dots on its grid, row 0 at the top; colour is the out-of-plane part.
+
+    Parameters
+    ----------
+    residuals_um : by ``board:row:column``, (3,) each
+    reach_um : the length drawn as the grid's pitch, and ``height_um`` the end of the colour scale for the out-of-plane
+        part: the same for all groups so that they can be compared
+    """
+    cells = np.array([[int(v) for v in label.split(":")[1:]] for label in residuals_um], float).reshape(-1, 2)
+    vectors = np.array(list(residuals_um.values()), float).reshape(-1, 3)
+    per_cell = reach_um if reach_um > 0 else 1.0
+    height_um = height_um if height_um > 0 else 1.0
+    bar_um = round_below(per_cell)
+    figure = new_figure(4.3, 3.5)
+    axes = figure.add_axes((0.08, 0.16, 0.76, 0.80))
+    dots = axes.scatter(
+        *cells[:, ::-1].T, c=vectors[:, 2], s=30, cmap="RdBu_r", vmin=-height_um, vmax=height_um, zorder=2
+    )
+    dots.set(edgecolor="#777777", linewidth=0.5)
+    axes.quiver(
+        *cells[:, ::-1].T, *(vectors[:, :2] / per_cell).T, angles="xy", scale_units="xy", scale=1, width=0.006, zorder=3
+    )
+    last = cells.max(0) if len(cells) else np.zeros(2)
+    axes.set(xlim=(-1.2, last[1] + 1.2), ylim=(last[0] + 2.0, -1.2), aspect="equal")
+    axes.plot([0, bar_um / per_cell], [last[0] + 1.45] * 2, color=INK, linewidth=2.5, solid_capstyle="butt")
+    axes.text(bar_um / per_cell + 0.25, last[0] + 1.45, f"{bar_um:g} µm", va="center", fontsize=SMALL + 1)
+    axes.set_xlabel("column", fontsize=SMALL)
+    axes.set_ylabel("row", fontsize=SMALL)
+    axes.set(xticks=np.arange(0, last[1] + 1, 2), yticks=np.arange(0, last[0] + 1, 2))
+    calm(axes)
+    bar = figure.colorbar(dots, cax=figure.add_axes((0.88, 0.30, 0.022, 0.52)))
+    bar.ax.tick_params(labelsize=SMALL - 1, length=2)
+    bar.outline.set_visible(False)
+    bar.ax.set_title("z, µm", fontsize=SMALL)
+    return uri(figure)
+
+
+def image_bars(rows: list[dict], colours: dict[str, str]) -> str:
+    """RMS residual of each image as a bar in its group's colour, its largest residual as a tick; all over their number
+    in the table."""
+    figure = new_figure(10.5, 2.9)
+    axes = figure.add_axes((0.055, 0.15, 0.935, 0.80))
+    place = np.arange(1, len(rows) + 1)
+    axes.bar(place, [row["rms_px"] for row in rows], 0.72, color=[colours.get(row["group"], INK) for row in rows])
+    axes.plot(place, [row["max_px"] for row in rows], "_", color=INK, markersize=9, markeredgewidth=1.4)
+    axes.set(xlim=(0.2, len(rows) + 0.8), ylim=(0, None))
+    step = max(1, int(np.ceil(len(rows) / 40)))
+    axes.set_xticks(place[::step])
+    axes.set_xlabel("number of the image in the table below", fontsize=SMALL + 0.5)
+    axes.set_ylabel("residual, px", fontsize=SMALL + 0.5)
+    axes.grid(axis="y", color=FAINT, linewidth=0.6)
+    axes.set_axisbelow(True)
+    calm(axes)
+    return uri(figure)
+
+
+def scene_view(scene: dict, camera: dict, colours: dict[str, str], azimuth: float) -> str:
+    """Cameras, boards and the target's circles, in the target frame."""
+    from mpl_toolkits.mplot3d.art3d import Line3DCollection
+
+    target = np.array(list(scene["circles"].values()), float).reshape(-1, 3)
+    positions = np.array([each["position_mm"] for each in scene["cameras"]], float).reshape(-1, 3)
+    boards = {name: np.array(xyz, float).reshape(-1, 3) for name, xyz in scene["boards"].items()}
+    everything = np.vstack([target, positions, *boards.values()])
+    depth = 0.07 * float(np.ptp(everything, axis=0).max()) if len(everything) else 1.0
+    figure, axes = _space(everything, 5.4, 4.9, elevation=22, azimuth=azimuth)
+    lines, ink = [], []
+    for each in scene["cameras"]:
+        frustum = _frustum(each, camera, depth)
+        lines += frustum
+        ink += [colours.get(each["group"], INK)] * len(frustum)
+    axes.add_collection3d(Line3DCollection(lines, colors=ink, linewidths=0.9), autolim=False)
+    for name, xyz in boards.items():
+        axes.scatter(*xyz.T, s=2, color=colours.get(name, INK), depthshade=False)
+    axes.scatter(*target.T, s=4, color="black", depthshade=False)
+    return uri(figure)
+
+
+def target_view(circles: dict[str, list[float]], faces: dict[str, dict], azimuth: float) -> str:
+    """The target's circles, and the frame of each face with its name at the end of the normal."""
+    from mpl_toolkits.mplot3d.art3d import Line3DCollection, Poly3DCollection
+
+    xyz = np.array(list(circles.values()), float).reshape(-1, 3)
+    reach = 0.2 * float(np.ptp(xyz, axis=0).max()) if len(xyz) else 1.0
+    lines, ink, names, sheets = [], [], [], []
+    for name, face in faces.items():
+        own = np.array([p for label, p in circles.items() if face_of(label) == name], float).reshape(-1, 3)
+        pose = np.array(face["target_from_face"], float)
+        lines += [np.array([pose[:3, 3], pose[:3, 3] + reach * pose[:3, i]]) for i in range(3)]
+        ink += AXIS_COLOURS
+        sheets += _outline(own, pose)
+        names.append((name, (own.mean(0) if len(own) else pose[:3, 3]) + 0.9 * reach * pose[:3, 2]))
+    figure, axes = _space(np.vstack([xyz, *lines, *[at for _, at in names]]), 5.4, 4.9, elevation=24, azimuth=azimuth)
+    axes.add_collection3d(Poly3DCollection(sheets, facecolors="#7f93a8", alpha=0.16), autolim=False)
+    axes.scatter(*xyz.T, s=9, color=INK, depthshade=False)
+    axes.add_collection3d(Line3DCollection(lines, colors=ink, linewidths=1.6), autolim=False)
+    for name, at in names:
+        axes.text(*at, name, fontsize=11, weight="bold", ha="center", va="center", parse_math=False)
+    return uri(figure)
+
+
+def _outline(xyz: np.ndarray, target_from_face: np.ndarray) -> list[np.ndarray]:
+    """The convex hull of a face's circles in its plane, or nothing where they span none."""
+    from scipy.spatial import ConvexHull, QhullError
+
+    try:
+        return [xyz[ConvexHull((xyz - target_from_face[:3, 3]) @ target_from_face[:3, :2]).vertices]]
+    except (QhullError, ValueError):
+        return []
+
+
+def _frustum(pose: dict, camera: dict, depth: float) -> list[np.ndarray]:
+    """Lines of a camera's pyramid; rows of ``axes`` are the camera's axes, Z the way it looks."""
+    at, axes = np.array(pose["position_mm"], float), np.array(pose["axes"], float)
+    half = depth * np.array(camera["size_px"]) / (2 * np.array(camera["focal_px"]))
+    around = [(-1, -1), (1, -1), (1, 1), (-1, 1)]
+    corners = [at + depth * axes[2] + sx * half[0] * axes[0] + sy * half[1] * axes[1] for sx, sy in around]
+    sides = [np.array([at, corner]) for corner in corners]
+    return [*sides, np.array([*corners, corners[0]]), np.array([at, at + 2.2 * depth * axes[2]])]
+
+
+def _space(xyz: np.ndarray, width: float, height: float, elevation: float, azimuth: float):
+    """Figure and axes in space, one scale for X, Y and Z, just large enough for the points."""
+    from mpl_toolkits.mplot3d import Axes3D
+
+    low, high = (xyz.min(0), xyz.max(0)) if len(xyz) else (-np.ones(3), np.ones(3))
+    margin = 0.03 * max(float((high - low).max()), 1e-6)
+    low, high = low - margin, high + margin
+    figure = new_figure(width, height)
+    axes = figure.add_axes(Axes3D(figure, rect=(0.0, 0.03, 0.95, 0.94)))
+    axes.set(xlim=(low[0], high[0]), ylim=(low[1], high[1]), zlim=(low[2], high[2]))
+    axes.set_box_aspect(high - low, zoom=1.08)
+    axes.set_proj_type("ortho")
+    axes.view_init(elevation, azimuth)
+    for axis, name in ((axes.xaxis, "X"), (axes.yaxis, "Y"), (axes.zaxis, "Z")):
+        axis.set_pane_color((0.955, 0.965, 0.975, 1))
+        axis.set_label_text(f"{name}, mm", fontsize=SMALL + 0.5)
+        axis.line.set_color("#9aa0a8")
+        axis.set_major_locator(locator())
+    axes.tick_params(labelsize=SMALL - 0.5, pad=0)
+    axes.grid(False)
+    return figure, axes

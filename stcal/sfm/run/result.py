@@ -1,0 +1,48 @@
+"""What a run answers."""
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from stcal.design import BoardDesign, TargetDesign
+from stcal.geometry.camera import Camera
+from stcal.sfm.adjust.calibration import Calibration
+from stcal.sfm.adjust.chain import Chain
+from stcal.sfm.checks.verdict import Check
+from stcal.sfm.data.observations import ImageObservations
+from stcal.sfm.detect.files import DetectionResult
+from stcal.sfm.detect.labels import LabelledImage
+from stcal.sfm.mapping.graph import ImageGraph
+from stcal.sfm.run.options import RunOptions
+from stcal.sfm.run.solve import GroupSolution
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class RunResult:
+    """Everything a run found; ``calibration.target`` is the answer, ``camera_covariance`` the camera file's."""
+
+    out: Path
+    camera: Camera
+    colmap_model: str
+    camera_covariance: np.ndarray | None
+    target_design: TargetDesign
+    board_design: BoardDesign
+    options: RunOptions
+    detection: DetectionResult
+    labelled: tuple[LabelledImage, ...]
+    graph: ImageGraph
+    solutions: tuple[GroupSolution, ...]
+    calibration: Calibration
+    chains: dict[str, tuple[Chain, ...]]
+    notes: tuple[str, ...]
+    checks: tuple[Check, ...] = ()
+
+    @property
+    def target(self):
+        """The calibrated target."""
+        return self.calibration.target
+
+    def observations(self) -> list[ImageObservations]:
+        """Labelled centres of all images, in the database's order."""
+        return [each.observations for each in self.labelled]

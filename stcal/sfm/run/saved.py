@@ -1,0 +1,177 @@
+"""A finished run read back from its folder, for every command that goes on from it."""
+
+import csv
+import json
+from collections.abc import Collection, Iterator
+from contextlib import contextmanager
+from dataclasses import asdict, dataclass
+from pathlib import Path
+
+import numpy as np
+
+from stcal.design import BoardDesign, TargetDesign
+from stcal.errors import InputError, StcalError
+from stcal.geometry.arrays import frozen
+from stcal.geometry.camera import Camera
+from stcal.geometry.rigid import Rigid
+from stcal.io.camera import read_camera
+from stcal.io.design import load_board, load_target
+from stcal.io.images import RUN_MARKER
+from stcal.sfm.data.observations import ImageObservations, by_group
+from stcal.sfm.detect.ellipses import EllipseOptions
+from stcal.sfm.mapping.pairs import PairOptions
+from stcal.sfm.run.options import RunOptions
+
+CAMERA, TARGET, BOARD = "cameras.txt", "target.toml", "board.toml"
+"""Copies of what the run was given."""
+
+
+COVARIANCE = ("var_x_px2", "cov_xy_px2", "var_y_px2")
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class SavedRun:
+    """What a run's folder holds.
+
+    ``images`` : the folder of photographs as the run was given it; ``observations`` : of all images, in the database's
+    order, without the shapes of the ellipses (zero); ``corrected_px`` : by image, (n, 2), what the database holds;
+    ``faces``, ``report`` : content of ``faces.json`` and ``report.json``.
+    """
+
+    folder: Path
+    images: Path
+    options: RunOptions
+    camera: Camera
+    colmap_model: str
+    target: TargetDesign
+    board: BoardDesign
+    observations: tuple[ImageObservations, ...]
+    corrected_px: tuple[np.ndarray, ...]
+    faces: dict
+    report: dict
+
+    @property
+    def database(self) -> Path:
+        """COLMAP's database."""
+        return self.folder / "database.db"
+
+    def groups(self) -> dict[str, list[ImageObservations]]:
+        """Observations by group, in order."""
+        return by_group(self.observations)
+
+
+def marker_json(images: str | Path, options: RunOptions | None) -> dict:
+    """What ``stcal-run.json`` says of a run besides program and version."""
+    return {"images": str(Path(images).absolute()), "options": None if options is None else asdict(options)}
+
+
+def load_run(folder: str | Path) -> SavedRun:
+    """Read a finished run.
+
+    Raises
+    ------
+    InputError
+        Not a run's folder, an unfinished one, or a damaged file in it.
+    """
+    folder = Path(folder)
+    if not (folder / RUN_MARKER).is_file():
+        raise InputError(f"run {folder}: not a run's folder (no {RUN_MARKER}); give the --out of a finished run")
+    needed = (CAMERA, TARGET, BOARD, "labels.csv", "database.db", "report.json", "faces.json")
+    missing = [name for name in needed if not (folder / name).is_file()]
+    if missing:
+        raise InputError(f"run {folder}: unfinished, or of another version: no {', '.join(missing)}; run it again")
+    marker, faces, report = (_json(folder / name) for name in (RUN_MARKER, "faces.json", "report.json"))
+    model = read_camera(folder / CAMERA)
+    camera = model.sized(0, 0)
+    target, board = load_target(folder / TARGET), load_board(folder / BOARD)
+    with _as_written(folder / RUN_MARKER):
+        options, images = _options(marker["options"]).settled(target), Path(marker["images"])
+    with _as_written(folder / "report.json"):
+        names = _require_report(report)
+    with _as_written(folder / "faces.json"):
+        _require_faces(faces)
+    with _as_written(folder / "labels.csv"):
+        known = {*target.radius_of(), *board.radius_of()}
+        observations, corrected = _labels(folder / "labels.csv", names, camera, known)
+    return SavedRun(
+        folder, images, options, camera, model.colmap_model, target, board, observations, corrected, faces, report
+    )
+
+
+def _options(stored: dict) -> RunOptions:
+    pairs, ellipses = PairOptions(**stored["pairs"]), EllipseOptions(**stored["ellipses"])
+    return RunOptions(**(stored | {"pairs": pairs, "ellipses": ellipses}))
+
+
+@contextmanager
+def _as_written(path: Path) -> Iterator[None]:
+    """InputError that names the file for whatever is not as a run of this version writes it."""
+    try:
+        yield
+    except (OSError, LookupError, TypeError, ValueError, AttributeError, csv.Error, StcalError) as error:
+        reason = f"no {error}" if isinstance(error, KeyError) else error
+        raise InputError(f"{path}: damaged, or of another version ({reason}); run it again") from error
+
+
+def _json(path: Path) -> dict:
+    try:
+        content = json.loads(path.read_text(encoding="utf-8"))
+    except (OSError, ValueError, RecursionError) as error:
+        raise InputError(f"{path}: cannot be read ({error}); run it again") from error
+    if not isinstance(content, dict):
+        raise InputError(f"{path}: not a JSON object; run it again")
+    return content
+
+
+def _require_report(report: dict) -> list[tuple[str, str, int]]:
+    """(name, group, circles) of the images in the database's order; what later commands read is there."""
+    names = [(each["name"], each["group"], each["circles"]) for each in report["images"]]
+    pairs = {each["name"]: each["pairs"][0] for each in report["groups"]}
+    for group in {group for _, group, _ in names}:
+        own = {name for name, of, _ in names if of == group}
+        if not {pairs[group]["first"], pairs[group]["second"]} <= own:
+            raise ValueError(f"group {group}: its initial pair is not of its images")
+    float(report["summary"]["residual_rms_px"])
+    return names
+
+
+def _require_faces(faces: dict) -> None:
+    for matrix in faces["target_from_face"].values():
+        Rigid.from_matrix(matrix)
+    for label, xyz in faces["circles"].items():
+        frozen(xyz, (3,), f"circle {label}")
+
+
+def _labels(path: Path, names: list[tuple[str, str, int]], camera: Camera, known: Collection[str]):
+    """Observations and corrected centres of ``labels.csv`` for the images (name, group, circles) of the database."""
+    rows: dict[str, list[dict]] = {name: [] for name, _, _ in names}
+    with open(path, encoding="utf-8", newline="") as stream:
+        for row in csv.DictReader(stream):
+            rows[row["image"]].append(row)
+    observations, corrected = [], []
+    for name, group, circles in names:
+        own = rows[name]
+        if [int(row["keypoint"]) for row in own] != list(range(circles)):
+            raise ValueError(f"image {name}: its keypoints are not 0 to {circles - 1} in the order of the database")
+        labels = tuple(row["label"] for row in own)
+        unknown = [label for label in labels if label not in known]
+        if unknown or len(set(labels)) < len(labels):
+            raise ValueError(f"image {name}: {f'no circle {unknown[0]}' if unknown else 'a label twice'}")
+        columns = ("x_px", "y_px", "corrected_x_px", "corrected_y_px", *COVARIANCE)
+        values = frozen([[row[column] for column in columns] for row in own] or np.zeros((0, 7)), (None, 7), name)
+        covariance = values[:, [4, 5, 5, 6]].reshape(-1, 2, 2)
+        if not ((values[:, 4] > 0) & (np.linalg.det(covariance) > 0)).all():
+            raise ValueError(f"image {name}: a σ that is not positive")
+        observations.append(
+            ImageObservations(
+                name,
+                group,
+                labels,
+                values[:, :2],
+                camera.normalised_from_pixel(values[:, :2]),
+                np.zeros((len(own), 2, 2)),
+                covariance,
+            )
+        )
+        corrected.append(values[:, 2:4])
+    return tuple(observations), tuple(corrected)

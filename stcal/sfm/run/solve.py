@@ -1,0 +1,208 @@
+"""One group from labels to a corrected model: pairs, mapping, refinement; kept by its inputs."""
+
+import hashlib
+import io
+import json
+import zipfile
+import zlib
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass, fields
+from pathlib import Path
+
+import numpy as np
+
+from stcal.design import BoardDesign, TargetDesign
+from stcal.errors import MappingError
+from stcal.geometry.camera import Camera
+from stcal.geometry.rigid import Rigid
+from stcal.io.images import SUFFIXES, TOP_GROUP, Skipped
+from stcal.io.saving import save
+from stcal.sfm.adjust.refine import refine
+from stcal.sfm.data.model import GroupModel, Outlier
+from stcal.sfm.data.observations import ImageObservations, is_board
+from stcal.sfm.mapping.incremental import left_out, map_group
+from stcal.sfm.mapping.pairs import PairOptions, PairScore, rank_pairs
+
+CACHE_VERSION = 4
+_ARRAYS = ("xyz_world", "image_index", "point_index", "keypoint", "measured_px", "shift_px", "covariance_px2")
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class GroupSolution:
+    """One group solved in a world without unit.
+
+    ``pairs`` : the ranking, the chosen pair first; ``model`` ; ``seeded`` : how the pair was registered; ``rounds`` of
+    refinement; ``left_out`` : image → reason; ``outliers`` : observations left out.
+    """
+
+    pairs: tuple[PairScore, ...]
+    model: GroupModel
+    seeded: str
+    rounds: int
+    left_out: dict[str, str]
+    outliers: tuple[Outlier, ...]
+
+
+def require_groups(groups: dict[str, list[ImageObservations]], skipped: Sequence[Skipped]) -> None:
+    """Refuse groups that cannot be solved, those of which every image was skipped included; before anything is mapped.
+
+    Raises
+    ------
+    MappingError
+        No image or one, no board, or no face in a whole group.
+    """
+    lost: dict[str, list[Skipped]] = {}
+    for each in skipped:
+        # A folder of mere copies is no group of its own.
+        group = each.name.rpartition("/")[0] or TOP_GROUP
+        if each.name.lower().endswith(SUFFIXES) and (group in groups or not each.reason.startswith("the same image")):
+            lost.setdefault(group, []).append(each)
+    for name in sorted(groups.keys() | lost.keys()):
+        group, first = groups.get(name, []), lost.get(name, [])[:1]
+        if len(group) < 2:
+            usable = f"1 usable image ({group[0].name})" if group else "0 usable images"
+            why = "".join(f", not {s.name}: {s.reason}" for s in first)
+            raise MappingError(f"group {name}: {usable}, 2 needed{why}; add photographs from other places")
+        require_usable(group)
+
+
+def require_usable(group: list[ImageObservations]) -> None:
+    """Refuse a group that cannot be solved, before anything is mapped.
+
+    Raises
+    ------
+    MappingError
+        One image, no board, or no face in the whole group.
+    """
+    where = f"group {group[0].group}"
+    if len(group) < 2:
+        raise MappingError(f"{where}: 1 usable image ({group[0].name}), 2 needed; add photographs from other places")
+    if not any(image.face_ids() for image in group):
+        raise MappingError(
+            f"{where}: no face of the target recognised in {len(group)} images; look at the overlays, "
+            "check target.toml (radii, polarity) and the exposure"
+        )
+    if not any(is_board(label) for image in group for label in image.labels):
+        raise MappingError(
+            f"{where}: no board recognised in {len(group)} images; keep the whole board in view, "
+            "check board.toml (rows, columns, polarity)"
+        )
+
+
+def solve_group(
+    group: list[ImageObservations],
+    skeleton: Sequence[str],
+    database: Path,
+    scratch: Path,
+    ids: dict[str, int],
+    camera: Camera,
+    target: TargetDesign,
+    board: BoardDesign,
+    pair_options: PairOptions,
+    eccentricity: bool,
+    cache: Path,
+) -> GroupSolution:
+    """Solve one group, or take the solution of an earlier run with the same inputs.
+
+    The initial pair is chosen among the images of the ``skeleton``, which are mapped first.
+
+    Raises
+    ------
+    MappingError, ScaleError, ConvergenceError
+    """
+    key = _key(group, skeleton, ids, camera, target, board, pair_options, eccentricity)
+    path = cache / f"group-{key}.npz"
+    kept = _load(path)
+    if kept is not None:
+        return kept
+    pairs = rank_pairs([image for image in group if image.name in skeleton], camera, pair_options)
+    mapping = map_group(database, scratch, group, skeleton, ids, pairs, camera)
+    refined = refine(mapping.model, camera, target, board, eccentricity)
+    solution = GroupSolution(
+        tuple(pairs),
+        refined.model,
+        mapping.seeded,
+        refined.rounds,
+        mapping.left_out | left_out([i for i in group if i.name in mapping.model.images], refined.model),
+        (*mapping.outliers, *refined.outliers),
+    )
+    _save(path, solution)
+    return solution
+
+
+def _key(
+    group, skeleton, ids, camera: Camera, target: TargetDesign, board: BoardDesign, pair_options, eccentricity: bool
+) -> str:
+    hasher = hashlib.sha256()
+    for image in group:
+        hasher.update(f"{image.name}\0{ids[image.name]}\0{image.labels}\0".encode())
+        hasher.update(image.centre_px.tobytes() + image.covariance_px2.tobytes())
+    plain = [
+        CACHE_VERSION,
+        list(skeleton),
+        asdict(camera),
+        asdict(target),
+        asdict(board),
+        asdict(pair_options),
+        eccentricity,
+    ]
+    hasher.update(json.dumps(plain, default=lambda v: v.tolist() if isinstance(v, np.ndarray) else str(v)).encode())
+    return hasher.hexdigest()[:40]
+
+
+def _save(path: Path, solution: GroupSolution) -> None:
+    model = solution.model
+    meta = {
+        "group": model.group,
+        "images": model.images,
+        "labels": model.labels,
+        "seeded": solution.seeded,
+        "rounds": solution.rounds,
+        "left_out": solution.left_out,
+        "outliers": [asdict(o) for o in solution.outliers],
+        "pairs": [
+            {f.name: getattr(p, f.name) for f in fields(PairScore) if f.name != "second_from_first"}
+            for p in solution.pairs
+        ],
+        "pair_poses": [
+            None if p.second_from_first is None else p.second_from_first.matrix().tolist() for p in solution.pairs
+        ],
+    }
+    stream = io.BytesIO()
+    poses = np.stack([pose.matrix() for pose in model.camera_from_world])
+    arrays = {name: getattr(model, name) for name in _ARRAYS}
+    np.savez(stream, poses=poses, meta=np.frombuffer(json.dumps(meta).encode(), np.uint8), **arrays)
+    save(path, stream.getvalue())
+
+
+def _load(path: Path) -> GroupSolution | None:
+    """What was kept; None where there is nothing, or it is damaged."""
+    try:
+        with np.load(io.BytesIO(path.read_bytes())) as stored:
+            meta = json.loads(stored["meta"].tobytes())
+            model = GroupModel(
+                meta["group"],
+                tuple(meta["images"]),
+                tuple(Rigid(m[:3, :3], m[:3, 3]) for m in stored["poses"]),
+                tuple(meta["labels"]),
+                **{name: stored[name] for name in _ARRAYS},
+            )
+            pairs = tuple(
+                PairScore(**p, second_from_first=None if m is None else Rigid.from_matrix(m))
+                for p, m in zip(meta["pairs"], meta["pair_poses"], strict=True)
+            )
+            outliers = tuple(Outlier(**o) for o in meta["outliers"])
+            return GroupSolution(pairs, model, meta["seeded"], meta["rounds"], meta["left_out"], outliers)
+    except (OSError, ValueError, KeyError, EOFError, TypeError, zipfile.BadZipFile, zlib.error):
+        return None
+
+
+def unseen_board(solutions: list[GroupSolution], board: BoardDesign) -> list[str]:
+    """Rows and columns of the board that no image shows: hidden everywhere, or not there at all."""
+    seen = {label for s in solutions for label in s.model.labels if is_board(label)}
+    notes = []
+    for what, count, place in (("row", board.rows, 1), ("column", board.columns, 2)):
+        missing = [str(i) for i in range(count) if not any(int(x.split(":")[place]) == i for x in seen)]
+        if missing:
+            notes.append(f"board {what} {', '.join(missing)}: not seen in any image; check {what}s in the board file")
+    return notes

@@ -1,0 +1,94 @@
+"""Simulated poses and corners with known truth, for tests and studies."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from stcal.geometry.camera import Camera
+from stcal.geometry.rigid import Poses, Rigid
+from stcal.handeye.data.loop import Setup
+from stcal.handeye.data.pairs import HandEyePoses
+from stcal.handeye.data.views import View, Views, pairs_of_views
+
+FLANGE_FROM_CAMERA = Rigid(Rotation.from_euler("zyx", [90, 4, -7], degrees=True).as_matrix(), [35.0, -62.0, 84.0])
+BASE_FROM_BOARD = Rigid(Rotation.from_euler("zyx", [30, 176, 3], degrees=True).as_matrix(), [780.0, 120.0, 60.0])
+BASE_FROM_CAMERA = Rigid(Rotation.from_euler("zyx", [80, -10, -115], degrees=True).as_matrix(), [1250.0, -150.0, 640.0])
+FLANGE_FROM_BOARD = Rigid(Rotation.from_euler("zyx", [20, 178, 4], degrees=True).as_matrix(), [40.0, -55.0, 130.0])
+
+
+CAMERA = Camera(1280, 1024, [1450.0, 1450.0], [639.5, 511.5], [-0.08, 0.05, 2e-4, -1e-4, 0, 0, 0, 0])
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Truth:
+    """``pairs``, ``views`` : as measured; ``mount_from_camera``, ``stand_from_board`` : true; ``setup``."""
+
+    pairs: HandEyePoses
+    views: Views | None
+    mount_from_camera: Rigid
+    stand_from_board: Rigid
+    setup: Setup
+
+
+def simulated(
+    rng: np.random.Generator,
+    count: int = 15,
+    setup: Setup = "eye-in-hand",
+    robot: tuple[float, float] = (0.0, 0.0),
+    camera: tuple[float, float] = (0.0, 0.0),
+    tilt: float = 0.5,
+) -> Truth:
+    """Pose pairs; σ (rad, mm) of robot and camera are those of :class:`~stcal.handeye.methods.noise.Noise`; ``tilt`` in
+    rad."""
+    camera_from_board, base_from_flange, x, z = _poses(rng, count, setup, tilt)
+    pairs = HandEyePoses(disturbed(rng, base_from_flange, *robot), disturbed(rng, camera_from_board, *camera))
+    return Truth(pairs, None, x, z, setup)
+
+
+def simulated_views(
+    rng: np.random.Generator,
+    count: int = 15,
+    setup: Setup = "eye-in-hand",
+    robot: tuple[float, float] = (0.0, 0.0),
+    corner_px: float = 0.0,
+    board_mm: float = 0.0,
+    scale: float = 1.0,
+    camera: Camera = CAMERA,
+    tilt: float = 0.5,
+) -> Truth:
+    """Corners of a chessboard of 8×7 squares of 25 mm, whose corners are off by ``board_mm`` and whose size is off by
+    ``scale``; the views state the designed ones."""
+    camera_from_board, base_from_flange, x, z = _poses(rng, count, setup, tilt)
+    xyz = board_corners(8, 7, 25.0)
+    made = scale * xyz + rng.normal(0, 1, xyz.shape) * board_mm
+    views = tuple(
+        View(xyz, camera.project(pose @ made) + rng.normal(0, 1, (len(xyz), 2)) * corner_px)
+        for pose in camera_from_board
+    )
+    views = Views(camera, views)
+    return Truth(pairs_of_views(disturbed(rng, base_from_flange, *robot), views), views, x, z, setup)
+
+
+def board_corners(columns: int, rows: int, square_mm: float) -> np.ndarray:
+    """Inner corners (k, 3) of a chessboard of so many squares, mm."""
+    x, y = np.meshgrid(np.arange(1, columns), np.arange(1, rows))
+    return np.column_stack([x.ravel(), y.ravel(), np.zeros(x.size)]) * square_mm
+
+
+def disturbed(rng: np.random.Generator, poses: Poses, sigma_rad: float, sigma_mm: float) -> Poses:
+    """With Gaussian left perturbations."""
+    turn = Rotation.from_rotvec(rng.normal(0, 1, (len(poses), 3)) * sigma_rad).as_matrix()
+    return Poses(turn @ poses.rotation, poses.translation + rng.normal(0, 1, (len(poses), 3)) * sigma_mm)
+
+
+def _poses(rng: np.random.Generator, count: int, setup: Setup, tilt: float) -> tuple[Poses, Poses, Rigid, Rigid]:
+    """True camera_from_board, base_from_flange, X and Z: the board about 450 mm away, tilted by up to ``tilt`` about
+    both of its axes and turned by twice that about the optical axis."""
+    turn = rng.uniform(-tilt, tilt, (count, 3)) * [1, 1, 2]
+    place = rng.uniform(-1, 1, (count, 3)) * [50, 40, 100] + [-100, -87.5, 450]
+    camera_from_board = Poses(Rotation.from_rotvec(turn).as_matrix(), place)
+    in_hand = setup == "eye-in-hand"
+    x, z = (FLANGE_FROM_CAMERA, BASE_FROM_BOARD) if in_hand else (BASE_FROM_CAMERA, FLANGE_FROM_BOARD)
+    mount_from_stand = x @ camera_from_board @ z.inverse()
+    return camera_from_board, mount_from_stand.inverse() if in_hand else mount_from_stand, x, z

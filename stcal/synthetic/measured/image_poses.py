@@ -1,0 +1,107 @@
+"""Single images of a calibrated target with known truth, as labelled centres without pixels: for studies and tests."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+from scipy.stats import chi2
+
+from stcal.geometry.pose_descent import PoseStack
+from stcal.geometry.rigid import Rigid
+from stcal.sfm.adjust.chain import CalibratedTarget
+from stcal.sfm.adjust.joint import covariance_of
+from stcal.sfm.adjust.uncertainty import derivatives
+from stcal.sfm.data.observations import ImageObservations, is_board
+from stcal.sfm.measure.minima import mirrored
+from stcal.sfm.measure.pose import TargetPose
+from stcal.sfm.measure.target import TargetCircles
+from stcal.sfm.plan.simulated import observe, true_models
+from stcal.synthetic.scene import Scene
+
+FLATNESS_MM = 0.02
+"""As a run takes it by default."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class KnownTarget:
+    """The true circles, and ``root`` : (3c, r) of the covariance that a calibration would give them."""
+
+    truth: TargetCircles
+    root: np.ndarray
+
+    def measured(self, rng: np.random.Generator) -> TargetCircles:
+        """As a calibration would have it: errors drawn from the covariance."""
+        error = (self.root @ rng.standard_normal(self.root.shape[1])).reshape(-1, 3)
+        t = self.truth
+        return TargetCircles(t.labels, t.xyz + error, t.radius, t.covariance)
+
+
+def known_target(scene: Scene, noise_px: float) -> KnownTarget:
+    """The scene's target with the covariance of a calibration by its own images, centres of that noise."""
+    start = CalibratedTarget(
+        scene.reference_face, scene.target_from_face, scene.circles_target, dict.fromkeys(scene.groups, Rigid())
+    )
+    models = true_models(scene, observe(scene, noise_px, np.random.default_rng(scene.seed)))
+    joint = covariance_of(models, scene.board, scene.camera, FLATNESS_MM)
+    covariance = derivatives(joint, start, scene.target, "plane").all_circles_covariance(joint.covariance_mm2)
+    value, vector = np.linalg.eigh((covariance + covariance.T) / 2)
+    keep = value > 1e-12 * value[-1]
+    root = vector[:, keep] * np.sqrt(value[keep])
+    radius = scene.target.radius_of()
+    xyz = np.array([scene.circles_target[label] for label in joint.labels])
+    truth = TargetCircles(joint.labels, xyz, np.array([radius[label] for label in joint.labels]), root @ root.T)
+    return KnownTarget(truth, root)
+
+
+def view(towards: Rigid, tilt_rad: float, distance_mm: float, rng: np.random.Generator) -> Rigid:
+    """camera_from_target of a random view.
+
+    ``towards`` : target_from_any; its origin is in the line of sight, at that distance and up to 5° off the middle of
+    the image, and its Z tilted by ``tilt_rad`` from the line of sight, into any direction.
+    """
+    tilted = Rotation.from_euler("ZYZ", [rng.uniform(0, 2 * np.pi), tilt_rad, rng.uniform(0, 2 * np.pi)])
+    off_axis = Rotation.from_rotvec([*np.radians(rng.uniform(-3.5, 3.5, 2)), 0])
+    facing = np.diag([1.0, -1.0, -1.0])  # Z of what is seen points to the camera
+    rotation = off_axis.as_matrix() @ facing @ tilted.as_matrix()
+    return Rigid(rotation, off_axis.as_matrix()[:, 2] * distance_mm) @ towards.inverse()
+
+
+def see(
+    scene: Scene, camera_from_target: Rigid, faces: Sequence[str], noise_px: float, rng: np.random.Generator
+) -> ImageObservations:
+    """What one image shows of these faces."""
+    group = replace(next(iter(scene.groups.values())), faces=tuple(faces), camera_from_target=(camera_from_target,))
+    image = observe(replace(scene, groups={group.name: group}), noise_px, rng)[0]
+    return image.select([i for i, label in enumerate(image.labels) if not is_board(label)])
+
+
+def face_view(scene: Scene, face: str) -> Rigid:
+    """target_from_any amid the circles of a face, Z its normal: for :func:`view`."""
+    return Rigid(scene.target_from_face[face].rotation, scene.face_circles(face).mean(0))
+
+
+def faces_view(scene: Scene, faces: Sequence[str]) -> Rigid:
+    """target_from_any amid several faces, Z the mean of their normals: for :func:`view`."""
+    axis = sum(scene.target_from_face[face].rotation[:, 2] for face in faces)
+    axis = axis / np.linalg.norm(axis)
+    across = np.linalg.svd(axis[None])[2][1]
+    rotation = np.column_stack([across, np.cross(axis, across), axis])
+    return Rigid(rotation, np.mean([scene.face_circles(face).mean(0) for face in faces], axis=0))
+
+
+def pose_error(estimate: Rigid, truth: Rigid) -> np.ndarray:
+    """(6,) rad and mm: the left perturbation that leads from the truth to the estimate."""
+    turn = Rigid(estimate.rotation @ truth.rotation.T).log()[:3]
+    return np.concatenate([turn, estimate.translation - truth.translation])
+
+
+def is_flipped(pose: TargetPose, truth: Rigid, towards: Rigid) -> bool:
+    """Whether the pose is the truth's twin, mirrored at the line of sight to ``towards``: nearer to it in rotation than
+    to the truth, and off the truth by more than its own covariance explains but once in 10⁶."""
+    error = pose_error(pose.camera_from_target, truth)
+    if error @ np.linalg.solve(pose.covariance, error) < chi2.isf(1e-6, 6):
+        return False
+    twin = mirrored(PoseStack(truth.rotation[None], truth.translation[None]), towards).rotation[0]
+    off = Rigid(pose.camera_from_target.rotation @ twin.T).angle_rad()
+    return off < float(np.linalg.norm(error[:3]))

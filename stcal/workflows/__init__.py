@@ -1,0 +1,1 @@
+"""Work that needs several systems at once; nothing below composes systems."""

@@ -1,0 +1,250 @@
+"""Base and kinematics solved together, beside the transform: ``stcal register --robot`` composes two systems."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from html import escape
+from pathlib import Path
+
+import numpy as np
+from scipy.stats import chi2
+
+from stcal.errors import InputError, StcalError
+from stcal.geometry.align import align_rigid
+from stcal.io.table import read_table
+from stcal.register import register
+from stcal.register.core.pairs import WHAT, Pairs
+from stcal.register.report.page import matrix_lines, matrix_table
+from stcal.register.workspace.findings import Findings
+from stcal.report.page import number, table
+from stcal.robot.identify.solve import Identified, IdentifyOptions, identify
+from stcal.robot.kinematics.file import load_robot
+from stcal.robot.kinematics.forward import forward
+from stcal.robot.kinematics.measurements import Measurements, joint_values
+from stcal.robot.kinematics.model import Robot
+
+FIRST_NAMES = 6
+ROUNDS, CLEAN_SETS = 3, 0.01
+"""Rows are taken in that lie within the bound that a clean set exceeds anywhere in one case of a hundred."""
+SAME_MM = 0.01
+"""Positions of a and of the robot file agree, or a is of another base or tool."""
+FIGURES = ("mean_mm", "rms_mm", "max_mm")
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Comparison:
+    """Held-out errors of the same rows, mm, by the transform and by base and kinematics together.
+
+    ``rows`` : (m,) tried; ``transform_mm``, ``kinematics_mm`` : (m,); ``wild`` : (m,) outliers of both; ``off_mm`` :
+    RMS distance of a from the robot file's forward kinematics after a rigid fit.
+    """
+
+    robot: Robot
+    identified: Identified
+    model: str
+    lines: Sequence[int]
+    folds: int
+    rows: np.ndarray
+    transform_mm: np.ndarray
+    kinematics_mm: np.ndarray
+    wild: np.ndarray
+    off_mm: float
+
+    def errors(self) -> list[tuple[str, np.ndarray, np.ndarray]]:
+        """(which rows, errors by the transform, errors by base and kinematics)."""
+        found = [("all rows", self.transform_mm, self.kinematics_mm)]
+        if self.wild.any() and not self.wild.all():
+            name = f"without {self.wild.sum()} outliers"
+            found.append((name, self.transform_mm[~self.wild], self.kinematics_mm[~self.wild]))
+        return found
+
+    @property
+    def better(self) -> bool:
+        """Whether base and kinematics together predict better."""
+        _, transform, kinematics = self.errors()[-1]
+        return bool(len(transform) and kinematics.mean() < transform.mean())
+
+
+def compared(pairs: Pairs, file: Path, robot_file: Path, found: Findings, options: dict, folds: int) -> Comparison:
+    """Identify base and kinematics from the joint values of ``file``, and hold rows out of both ways.
+
+    ``options`` : of :func:`stcal.register.pipeline`, as ``found`` was made with.
+
+    Raises
+    ------
+    InputError
+        No joint values, or a robot that does not fit.
+    DegenerateError
+        Too few points for the robot's parameters.
+    """
+    robot = load_robot(robot_file)
+    data = _measurements(pairs, file, robot)
+    settings = IdentifyOptions("position", folds=0, seed=options["seed"], partial=True)
+    good = found.registration.inliers.copy()
+    if found.field is not None:
+        good[found.field.taken_back] = True
+    identified, used = grown(robot, data, good, settings)
+
+    def by_transform(train: np.ndarray, test: np.ndarray) -> np.ndarray:
+        own = {
+            name: None if values is None else values[train]
+            for name, values in (("weights", pairs.weights), ("covariances", pairs.covariances))
+        }
+        more = {"folds": 0, "allow_ambiguous": True}
+        return register(pairs.xyz_a[train], pairs.xyz_b[train], **options, **own, **more).b_from_a @ pairs.xyz_a[test]
+
+    def by_kinematics(train: np.ndarray, test: np.ndarray) -> np.ndarray:
+        return positions(grown(robot, data[train], good[train], settings)[0].robot, data[test])
+
+    done, rows, errors = held_out([by_transform, by_kinematics], pairs.xyz_b, folds, options["seed"])
+    wild = ~(found.registration.inliers | used)[rows]
+    nominal = positions(robot, data)
+    off = float(np.sqrt(((pairs.xyz_a - align_rigid(pairs.xyz_a, nominal) @ nominal) ** 2).sum(1).mean()))
+    return Comparison(robot, identified, found.registration.model, pairs.lines, done, rows, *errors, wild, off)
+
+
+def held_out(ways, xyz_b: np.ndarray, folds: int, seed: int) -> tuple[int, np.ndarray, np.ndarray]:
+    """Folds done, rows (m,) and the errors (ways, m) of each way, fitted to the other folds."""
+    fold = np.random.default_rng([seed, 4]).permutation(np.arange(len(xyz_b)) % max(folds, 1))
+    tried, errors = [], []
+    for k in range(folds if folds > 1 else 0):
+        train, test = np.flatnonzero(fold != k), np.flatnonzero(fold == k)
+        try:
+            found = [np.linalg.norm(xyz_b[test] - way(train, test), axis=1) for way in ways]
+        except StcalError:  # a fold that cannot be solved tells nothing of either way
+            continue
+        tried.append(test)
+        errors.append(found)
+    if not tried:
+        return 0, np.zeros(0, int), np.zeros((len(ways), 0))
+    rows = np.concatenate(tried)
+    order = np.argsort(rows)
+    return len(tried), rows[order], np.hstack(errors)[:, order]
+
+
+def _measurements(pairs: Pairs, file: Path, robot: Robot) -> Measurements:
+    table = read_table(file, WHAT)
+    try:
+        q = joint_values(table, robot)
+    except InputError as error:
+        raise InputError(f"{error} (--robot needs the joint values of each point)") from error
+    targets = tuple(table.text("target")) if "target" in table else ("",) * len(table)
+    return Measurements(pairs.where, pairs.lines, q, targets, pairs.xyz_b)
+
+
+def grown(robot: Robot, data: Measurements, good: np.ndarray, settings: IdentifyOptions):
+    """Identified from the rows that are good, and from those that it then explains: bent points are no outliers."""
+    found = identify(robot, data[good], settings)
+    for _ in range(ROUNDS):
+        error = np.linalg.norm(data.positions - positions(found.robot, data), axis=1)
+        explained = good | (error < found.weighting.sigma_mm * np.sqrt(chi2.isf(CLEAN_SETS / len(data), 3)))
+        if (explained == good).all():
+            break
+        good = explained
+        found = identify(robot, data[good], settings)
+    used = good.copy()
+    used[np.flatnonzero(good)[[row for row, _ in found.outliers()]]] = False
+    return found, used
+
+
+def positions(robot: Robot, data: Measurements) -> np.ndarray:
+    """(m, 3) of the targets, in the instrument's frame."""
+    out = np.empty((len(data), 3))
+    for name in set(data.targets):
+        own = [i for i, target in enumerate(data.targets) if target == name]
+        tool = name if name in robot.tools else ""
+        out[own] = robot.world_from_base @ forward(robot, data.q[own], tool).translation
+    return out
+
+
+def comparison_text(beside: Comparison) -> str:
+    """For the terminal."""
+    lines = [_title(beside), f"{'held out, mm':<52}{'points':>8}{'mean':>10}{'RMS':>10}{'max':>10}"]
+    for name, row in _rows(beside):
+        lines.append(f"{name:<52}" + "".join(f"{cell:>{8 if k == 0 else 10}}" for k, cell in enumerate(row)))
+    lines += ["b_from_base of the identified robot, mm", *matrix_lines(_b_from_base(beside))]
+    return "\n".join(lines + [f"{note}" for note in _notes(beside)])
+
+
+def comparison_json(beside: Comparison) -> dict:
+    """For programs (keys: ``data_layout.md``)."""
+    result = beside.identified
+    return {
+        "name": beside.robot.name,
+        "b_from_base": _b_from_base(beside).tolist(),
+        "rank": result.rank,
+        "parameters": len(result.names),
+        "undetermined": list(result.undetermined),
+        "sigma_mm": result.weighting.sigma_mm,
+        "a_off_robot_file_mm": beside.off_mm,
+        "better": beside.better,
+        "held_out": {
+            "folds": beside.folds,
+            "lines": [int(beside.lines[i]) for i in beside.rows],
+            "transform_mm": beside.transform_mm.tolist(),
+            "kinematics_mm": beside.kinematics_mm.tolist(),
+            "outliers_of_both": [int(beside.lines[i]) for i in beside.rows[beside.wild]],
+            "figures": [
+                {"rows": name, "points": len(t), "transform": _figures(t), "kinematics": _figures(k)}
+                for name, t, k in beside.errors()
+                if len(t)
+            ],
+        },
+    }
+
+
+def comparison_section(beside: Comparison) -> tuple[str, str, str]:
+    """For the page."""
+    rows = [[name, *cells] for name, cells in _rows(beside)]
+    text = (
+        f"<p>{escape(_title(beside))}. The robot's axes, its base and its tool are solved together from the joint "
+        "values and the positions in b; the same rows are held out of both ways.</p>\n"
+        + table(["<Held out", "Points", "Mean (mm)", "RMS (mm)", "Max (mm)"], rows)
+        + "<h3>b_from_base of the identified robot</h3>"
+        + matrix_table(_b_from_base(beside), "base")
+        + "".join(f"<p>{escape(note)}.</p>\n" for note in _notes(beside))
+    )
+    return "robot", "Base and kinematics together", text
+
+
+def _title(beside: Comparison) -> str:
+    result = beside.identified
+    return (
+        f"robot {beside.robot.name}: {result.rank} of {len(result.names)} parameters of axes, base and tool determined"
+    )
+
+
+def _rows(beside: Comparison) -> list[tuple[str, list[str]]]:
+    found = []
+    for name, transform, kinematics in beside.errors():
+        for way, errors in ((f"{beside.model} transform", transform), ("base and kinematics together", kinematics)):
+            if len(errors):
+                cells = [str(len(errors)), *(number(v, 4) for v in _figures(errors).values())]
+                found.append((f"{name}: {way}", cells))
+    return found
+
+
+def _notes(beside: Comparison) -> list[str]:
+    notes, open_ones = [], beside.identified.undetermined
+    if open_ones:
+        shown = ", ".join(open_ones[:FIRST_NAMES]) + (", …" if len(open_ones) > FIRST_NAMES else "")
+        notes.append(
+            f"the points leave open: {shown}; b_from_base and the tool may be off along these; vary the orientation "
+            "more"
+        )
+    if len(beside.rows) and not beside.better:
+        notes.append("base and kinematics together are no better here: trust the transform near its points")
+    if beside.off_mm > SAME_MM:
+        notes.append(
+            f"a is {beside.off_mm:.3g} mm RMS off the positions of the robot file, after a rigid fit: it comes from "
+            "another tool or other kinematics"
+        )
+    return notes
+
+
+def _b_from_base(beside: Comparison) -> np.ndarray:
+    return beside.identified.robot.world_from_base.matrix()
+
+
+def _figures(errors: np.ndarray) -> dict:
+    values = float(errors.mean()), float(np.sqrt((errors**2).mean())), float(errors.max())
+    return dict(zip(FIGURES, values, strict=True))

@@ -1,0 +1,146 @@
+"""Pose files and pose pairs."""
+
+import numpy as np
+import pytest
+
+from stcal.errors import InputError
+from stcal.geometry.rigid import Poses, Rigid
+from stcal.handeye import HandEyePoses, handeye, read_poses
+from stcal.handeye.data.pairs import inverse_covariance
+from stcal.io.table import COVARIANCE
+from stcal.synthetic.measured.handeye import disturbed, simulated
+
+CELLS = ("x", "y", "z", "qw", "qx", "qy", "qz")
+
+
+def write(path, sides, unit="mm", edit=None, extra=None):
+    """A file with the poses of ``sides``, name → Poses; ``edit`` : (row, column) → text."""
+    factor = {"mm": 1.0, "m": 1000.0}[unit]
+    header = [f"{name}_{c}" + (f"_{unit}" if c in "xyz" else "") for name in sides for c in CELLS]
+    rows = [
+        [repr(float(v)) for p in sides.values() for v in (*(p.translation[i] / factor), *p.quaternions()[i])]
+        for i in range(len(next(iter(sides.values()))))
+    ]
+    for (row, column), text in (edit or {}).items():
+        rows[row][header.index(column)] = text
+    for name, values in (extra or {}).items():
+        header.append(name)
+        for row, value in zip(rows, values, strict=True):
+            row.append(repr(float(value)))
+    path.write_text("\n".join(",".join(line) for line in [header, *rows]) + "\n")
+    return path
+
+
+@pytest.fixture(scope="module")
+def truth():
+    return simulated(np.random.default_rng(1), 8, camera=(1e-3, 0.3))
+
+
+@pytest.mark.parametrize("unit", ["mm", "m"])
+@pytest.mark.parametrize("robot", ["base_from_flange", "flange_from_base"])
+@pytest.mark.parametrize("camera", ["camera_from_board", "board_from_camera"])
+def test_files_in_every_form_say_the_same(tmp_path, truth, unit, robot, camera):
+    flange, board = truth.pairs.base_from_flange, truth.pairs.camera_from_board
+    sides = {
+        robot: flange if robot.startswith("base") else flange.inverse(),
+        camera: board if camera.startswith("camera") else board.inverse(),
+    }
+    pairs = read_poses(write(tmp_path / "poses.csv", sides, unit))
+    assert pairs.base_from_flange.difference(flange) == pytest.approx(np.zeros((8, 6)), abs=1e-9)
+    assert pairs.camera_from_board.difference(board) == pytest.approx(np.zeros((8, 6)), abs=1e-9)
+    assert pairs.names[:2] == ("line 2", "line 3")
+    found = handeye(pairs).flange_from_camera.translation
+    assert found == pytest.approx(handeye(truth.pairs).flange_from_camera.translation, abs=1e-5)
+
+
+@pytest.mark.parametrize(
+    ("edit", "message"),
+    [
+        ({(2, "base_from_flange_x_mm"): "nan"}, "line 4: base_from_flange_x_mm is 'nan', a finite number"),
+        ({(5, "camera_from_board_qz"): "3"}, "line 7: quaternion of length"),
+        ({(0, "camera_from_board_y_mm"): "abc"}, "line 2: camera_from_board_y_mm is 'abc'"),
+    ],
+)
+def test_bad_cells_are_named_by_line(tmp_path, truth, edit, message):
+    sides = {"base_from_flange": truth.pairs.base_from_flange, "camera_from_board": truth.pairs.camera_from_board}
+    with pytest.raises(InputError, match=message):
+        read_poses(write(tmp_path / "poses.csv", sides, edit=edit))
+
+
+def test_missing_and_doubled_sides(tmp_path, truth):
+    flange, board = truth.pairs.base_from_flange, truth.pairs.camera_from_board
+    with pytest.raises(InputError, match="no such columns, camera_from_board_x_mm … or board_from_camera_x_mm"):
+        read_poses(write(tmp_path / "a.csv", {"base_from_flange": flange}))
+    every = {"base_from_flange": flange, "flange_from_base": flange.inverse(), "camera_from_board": board}
+    with pytest.raises(InputError, match="both, base_from_flange_x_mm … or flange_from_base"):
+        read_poses(write(tmp_path / "b.csv", every))
+
+
+def test_identical_poses_are_named(tmp_path, truth):
+    rows = [0, 1, 2, 3, 1, 5]
+    sides = {"base_from_flange": truth.pairs.base_from_flange[rows]}
+    sides["camera_from_board"] = truth.pairs.camera_from_board[rows]
+    with pytest.raises(InputError, match="line 3 and line 6 are identical poses; take one"):
+        read_poses(write(tmp_path / "poses.csv", sides))
+
+
+def test_a_board_that_did_not_follow_is_named(truth):
+    board = truth.pairs.camera_from_board[[0, 1, 2, 3, 3, 5, 6, 7]]
+    with pytest.raises(InputError, match=r"pose 4 and pose 5: the board's pose is the same .* the flange moved by"):
+        HandEyePoses(truth.pairs.base_from_flange, board)
+
+
+def test_the_robot_may_stand_still(truth):
+    """Two photographs from one place: measured twice, not copied."""
+    rows = [0, 1, 2, 3, 4, 5, 6, 0]
+    board = disturbed(np.random.default_rng(0), truth.pairs.camera_from_board[rows], 1e-4, 0.01)
+    pairs = HandEyePoses(truth.pairs.base_from_flange[rows], board)
+    assert len(handeye(pairs).residuals) == 8
+
+
+def test_matrices_are_checked_one_by_one(truth):
+    flange = [p.matrix() for p in truth.pairs.base_from_flange]
+    board = [p.matrix() for p in truth.pairs.camera_from_board]
+    same = HandEyePoses.from_matrices(flange, board)
+    assert same.camera_from_board.translation == pytest.approx(truth.pairs.camera_from_board.translation)
+    mirrored = [m.copy() for m in board]
+    mirrored[3][:3, 2] *= -1
+    with pytest.raises(InputError, match=r"pose 4: camera_from_board: .*left-handed"):
+        HandEyePoses.from_matrices(flange, mirrored)
+    broken = [m.copy() for m in flange]
+    broken[1][0, 3] = np.inf
+    with pytest.raises(InputError, match=r"b\.png: base_from_flange: .*not finite"):
+        HandEyePoses.from_matrices(broken, board, names=tuple(f"{c}.png" for c in "abcdefgh"))
+    with pytest.raises(InputError, match="8 poses of the flange and 7 of the board"):
+        HandEyePoses.from_matrices(flange, board[:7])
+
+
+def test_covariances_are_read_and_turned_over(tmp_path, truth):
+    """The inverse's covariance, given under the inverse's name, comes back as the pose's own."""
+    rng = np.random.default_rng(2)
+    root = rng.normal(size=(8, 6, 6)) * np.repeat([1e-3, 0.3], 3)[:, None]
+    covariance = root @ np.swapaxes(root, 1, 2)
+    board = truth.pairs.camera_from_board
+    i, j = np.triu_indices(6)
+    inverse = inverse_covariance(board, covariance)
+    extra = {f"board_from_camera_{name}": inverse[:, i[k], j[k]] for k, name in enumerate(COVARIANCE)}
+    sides = {"base_from_flange": truth.pairs.base_from_flange, "board_from_camera": board.inverse()}
+    pairs = read_poses(write(tmp_path / "poses.csv", sides, extra=extra))
+    assert pairs.camera_from_board_covariance == pytest.approx(covariance, rel=1e-6, abs=1e-10)
+    assert pairs.base_from_flange_covariance is None
+    assert pairs[2:4].camera_from_board_covariance.shape == (2, 6, 6)
+
+
+def test_the_inverse_covariance_is_that_of_scattered_poses():
+    """From 20 000 draws: entries agree to their own scatter, √(2 / 20 000) = 1 %, of the largest."""
+    pose = Rigid.exp([0.4, -0.8, 1.1, 300.0, -200.0, 500.0])
+    rng = np.random.default_rng(3)
+    sigma = np.array([1e-3, 2e-3, 5e-4, 0.3, 0.1, 0.5])
+    many = Poses.of([pose] * 20_000)
+    steps = rng.normal(size=(20_000, 6)) * sigma
+    turn = np.array([Rigid.exp(s).rotation for s in steps])
+    drawn = Poses(turn @ many.rotation, many.translation + steps[:, 3:])
+    scatter = drawn.inverse().difference(many.inverse())
+    expected = inverse_covariance(many[:1], np.diag(sigma**2)[None])[0]
+    scale = np.sqrt(np.diag(expected))
+    assert np.cov(scatter.T) / np.outer(scale, scale) == pytest.approx(expected / np.outer(scale, scale), abs=0.04)

@@ -1,0 +1,226 @@
+"""Every method on simulated poses with known truth."""
+
+from itertools import combinations
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from stcal.errors import DegenerateError, InputError
+from stcal.geometry.rigid import Poses, Rigid
+from stcal.handeye import METHODS, HandEyeOptions, HandEyePoses, Noise, handeye
+from stcal.handeye.data.loop import Loop
+from stcal.handeye.data.motions import Motions, poses_with_log
+from stcal.handeye.methods.closed_form import AX_XB
+from stcal.handeye.methods.convex import convex, equations, smallest_largest
+from stcal.handeye.methods.evolution import EvolutionOptions, Objective, evolve, polish, three_others
+from stcal.synthetic.measured.handeye import simulated
+
+FROM_POSES = tuple(m for m in METHODS if m != "reprojection")
+EXACT = tuple(m for m in FROM_POSES if m != "de")
+"""Plain differential evolution ends where its last generation is."""
+SETUPS = ("eye-in-hand", "eye-to-hand")
+
+
+def off(found, truth, name="mount_from_camera"):
+    """Angle (rad) and distance (mm) from the truth."""
+    away = getattr(truth, name).inverse() @ getattr(found, name)
+    return away.angle_rad(), float(np.linalg.norm(away.translation))
+
+
+@pytest.mark.parametrize("setup", SETUPS)
+@pytest.mark.parametrize("method", EXACT)
+def test_exact_poses_give_the_truth(method, setup):
+    truth = simulated(np.random.default_rng(3), 12, setup)
+    found = handeye(truth.pairs, setup, method)
+    for name in ("mount_from_camera", "stand_from_board"):
+        angle, distance = off(found, truth, name)
+        assert angle < 1e-8
+        assert distance < 1e-5
+    assert np.abs(found.residuals).max() < 1e-5
+
+
+@pytest.mark.parametrize("method", FROM_POSES)
+def test_noisy_poses_give_about_the_truth(method):
+    """σ of X is about that of a pose over its lever and √m: 1 mrad × 450 mm over √20 ≈ 0.2 mm; 4 mm is a blunder.
+    Zhao's R_X need not be a rotation and takes up ten times more; plain evolution ends anywhere near the bottom."""
+    truth = simulated(np.random.default_rng(4), 20, robot=(2e-4, 0.1), camera=(1e-3, 0.3))
+    angle, distance = off(handeye(truth.pairs, method=method), truth)
+    assert 1e-6 < angle < {"de": 0.1}.get(method, 5e-3)
+    assert 1e-3 < distance < {"de": 100, "zhao": 15}.get(method, 4)
+
+
+@pytest.mark.parametrize("method", EXACT)
+def test_the_unit_of_the_poses_makes_no_difference(method):
+    """Poses in metres and σ in metres: the same answer in metres."""
+    truth = simulated(np.random.default_rng(5), 10, camera=(1e-3, 0.4))
+    sides = (truth.pairs.base_from_flange, truth.pairs.camera_from_board)
+    in_metres = HandEyePoses(*(Poses(p.rotation, p.translation / 1000) for p in sides))
+    known = [HandEyeOptions(noise=Noise(0.0, 0.0, 1e-3, mm)) for mm in (0.4, 0.0004)]
+    mm, m = (handeye(p, "eye-in-hand", method, options=o) for p, o in zip((truth.pairs, in_metres), known, strict=True))
+    assert mm.mount_from_camera.rotation == pytest.approx(m.mount_from_camera.rotation, abs=1e-6)
+    assert mm.mount_from_camera.translation == pytest.approx(1000 * m.mount_from_camera.translation, abs=2e-3)
+
+
+@pytest.mark.parametrize("method", EXACT)
+def test_motions_near_half_a_turn_are_no_trouble(method):
+    """Tilts of ±80° and turns of ±160°: some motions exceed 170°; only methods that take logarithms lose poses."""
+    truth = simulated(np.random.default_rng(1), 14, robot=(3e-4, 0.1), camera=(1e-3, 0.3), tilt=1.4)
+    angle, _ = off(found := handeye(truth.pairs, method=method), truth)
+    assert 1e-6 < angle < 4e-3
+    assert bool(found.notes) == (method in AX_XB)
+
+
+def test_poses_in_two_groups_half_a_turn_apart():
+    """Any motion between the groups turns by more than 170°: two poses with logarithms are left, Shah needs none."""
+    truth = simulated(np.random.default_rng(2), 4)
+    y, x, half = (Rotation.from_rotvec(np.radians(v)) for v in ([0, 30, 0], [30, 0, 0], [0, 0, 180]))
+    turns = [Rotation.identity(), y, half, half * x]
+    flange = Poses(np.array([t.as_matrix() for t in turns]), truth.pairs.base_from_flange.translation)
+    board = truth.mount_from_camera.inverse() @ (flange.inverse() @ truth.stand_from_board)
+    pairs = HandEyePoses(flange, board)
+    for method in ("shah", "pose"):
+        assert off(handeye(pairs, method=method), truth)[0] < 1e-8
+    with pytest.raises(DegenerateError, match="more than 170°"):
+        handeye(pairs, method="park-martin")
+    assert poses_with_log(Loop.of(pairs, "eye-in-hand")).sum() == 2
+
+
+def test_evolution_follows_its_rules():
+    """The best never gets worse, the same seed repeats itself, and without crossover nothing moves."""
+    truth = simulated(np.random.default_rng(6), 19, camera=(1e-3, 0.3))
+    motions = Motions.consecutive(Loop.of(truth.pairs, "eye-in-hand"))
+    objective = Objective(motions, 1000.0, 1.0)
+    runs = [evolve(objective, 500, EvolutionOptions(iterations=n, seed=3)) for n in range(0, 101, 2)]
+    costs = [objective.linear(x).cost for x in runs]
+    assert (np.diff(costs) <= 1e-12).all()
+    assert costs[0] > 2 * costs[10] > 4 * costs[50]
+    again = evolve(objective, 500, EvolutionOptions(seed=3))
+    assert objective.linear(again).cost == costs[50]
+    still = evolve(objective, 500, EvolutionOptions(seed=3, crossover=-1.0))
+    assert objective.linear(still).cost == pytest.approx(costs[0], rel=1e-12)
+
+
+def test_evolution_takes_three_others():
+    rng = np.random.default_rng(0)
+    for _ in range(100):
+        others = three_others(rng, 5)
+        assert all(len({i, *three}) == 4 for i, three in enumerate(others.T.tolist()))
+
+
+def test_evolution_and_its_polish_look_at_the_same_objective():
+    truth = simulated(np.random.default_rng(7), 10, camera=(1e-3, 0.3))
+    motions = Motions.consecutive(Loop.of(truth.pairs, "eye-in-hand"))
+    objective = Objective(motions, 800.0, 2.0)
+    x = Rigid.exp([0.3, -1.0, 0.5, 40.0, -20.0, 90.0])
+    a, b = motions.mount, motions.camera
+    by_hand = sum(
+        np.sum((al - x.rotation @ be) ** 2)
+        + 2.0 * np.sum((((ra - np.eye(3)) @ x.translation + ta - x.rotation @ tb) / 800) ** 2)
+        for al, be, ra, ta, tb in zip(
+            motions.alpha, motions.beta, a.rotation, a.translation, b.translation, strict=True
+        )
+    )
+    vector = np.concatenate([x.log()[:3], x.translation / 800])
+    assert objective.values(vector[None])[0] == pytest.approx(by_hand, rel=1e-12)
+    assert objective.linear(x).cost == pytest.approx(by_hand, rel=1e-12)
+    found = polish(objective, x)
+    assert np.abs(objective.linear(found).gradient).max() < 1e-6
+
+
+def test_the_convex_method_is_at_its_minimum():
+    """No step in any direction, small or large, makes the largest error smaller."""
+    truth = simulated(np.random.default_rng(8), 13, camera=(2e-3, 0.5))
+    c, d = equations(Motions.consecutive(Loop.of(truth.pairs, "eye-in-hand")), 1000.0)
+    start = np.linalg.lstsq(c.reshape(-1, 12), d.ravel(), rcond=None)[0]
+    x = smallest_largest(c, d, start)
+
+    def largest(x):
+        return np.linalg.norm(np.einsum("kij,j->ki", c, x) - d, axis=1).max()
+
+    assert largest(x) < 0.97 * largest(start)  # least squares is not the same
+    rng = np.random.default_rng(0)
+    for size in (1e-3, 1e-5):
+        steps = size * rng.normal(size=(300, 12))
+        assert min(largest(x + step) for step in steps) > largest(x) * (1 - 1e-4)
+
+
+def test_the_convex_equations_hold_for_the_truth():
+    truth = simulated(np.random.default_rng(9), 6)
+    motions = Motions.all(Loop.of(truth.pairs, "eye-in-hand"))
+    c, d = equations(motions, 500.0)
+    x = np.concatenate([truth.mount_from_camera.rotation.ravel(order="F"), truth.mount_from_camera.translation / 500])
+    assert np.abs(np.einsum("kij,j->ki", c, x) - d).max() < 1e-12
+    assert convex(motions).translation == pytest.approx(truth.mount_from_camera.translation, abs=1e-6)
+
+
+def test_result_by_its_names():
+    truth = simulated(np.random.default_rng(3), 6, "eye-to-hand")
+    found = handeye(truth.pairs, "eye-to-hand")
+    assert set(found.transforms) == {"base_from_camera", "flange_from_board"}
+    assert found.base_from_camera is found.mount_from_camera
+    with pytest.raises(InputError, match="eye-to-hand has no flange_from_camera"):
+        _ = found.flange_from_camera
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        ({"method": "tsai"}, "method 'tsai' is unknown; one of tsai-lenz"),
+        ({"setup": "hand-in-eye"}, "setup 'hand-in-eye'; eye-in-hand or eye-to-hand"),
+        ({"method": "reprojection"}, "reprojection needs the corners"),
+    ],
+)
+def test_wrong_arguments(arguments, message):
+    truth = simulated(np.random.default_rng(3), 6)
+    with pytest.raises(InputError, match=message):
+        handeye(truth.pairs, **arguments)
+
+
+def test_wrong_options():
+    with pytest.raises(InputError, match="population 3"):
+        EvolutionOptions(population=3)
+    with pytest.raises(InputError, match="one of σ_rot and σ_trans of the robot"):
+        Noise(robot_rad=1e-3)
+    with pytest.raises(InputError, match="0 to 10° and 100 mm possible"):
+        Noise(camera_rad=1e-3, camera_mm=-1.0)
+    with pytest.raises(InputError, match="corner_px is 0, more than 0"):
+        Noise(corner_px=0.0)
+    with pytest.raises(InputError, match="one of them must err"):
+        Noise(0.0, 0.1, 0.0, 0.1)
+
+
+def test_the_order_of_the_poses_makes_no_difference():
+    truth = simulated(np.random.default_rng(10), 12, camera=(1e-3, 0.3))
+    order = np.random.default_rng(0).permutation(12)
+    for method in ("pose", "shah"):  # OpenCV's AX = XB takes each motion in one direction only
+        one, other = (handeye(p, method=method).mount_from_camera for p in (truth.pairs, truth.pairs[order]))
+        assert one.translation == pytest.approx(other.translation, abs=1e-4)
+
+
+def test_park_and_martin_as_they_wrote_it():
+    """R_X = (MᵀM)^(−1/2) Mᵀ with M = Σ β αᵀ over all pairs of poses."""
+    truth = simulated(np.random.default_rng(11), 9, camera=(2e-3, 0.3))
+    motions = Motions.all(Loop.of(truth.pairs, "eye-in-hand"))
+    m = motions.beta.T @ motions.alpha
+    value, vector = np.linalg.eigh(m.T @ m)
+    rotation = vector @ np.diag(value**-0.5) @ vector.T @ m.T
+    found = handeye(truth.pairs, method="park-martin").mount_from_camera
+    assert found.rotation == pytest.approx(rotation, abs=1e-9)
+    shift = np.linalg.lstsq(
+        (motions.mount.rotation - np.eye(3)).reshape(-1, 3),
+        (motions.camera.translation @ rotation.T - motions.mount.translation).ravel(),
+        rcond=None,
+    )[0]
+    assert found.translation == pytest.approx(shift, abs=1e-6)
+
+
+def test_every_name_is_a_method_of_its_own():
+    """On noisy poses no two agree, and the separable methods share what they share: the translation's equations."""
+    truth = simulated(np.random.default_rng(12), 9, camera=(2e-3, 0.3))
+    found = {method: handeye(truth.pairs, method=method).mount_from_camera for method in FROM_POSES}
+    for one, other in combinations(found, 2):
+        apart = np.linalg.norm(found[one].translation - found[other].translation)
+        assert apart > 1e-6, (one, other)
+    horaud = found["horaud"].rotation  # Horaud's quaternion and Shah's product minimise the same over rotations only
+    assert horaud == pytest.approx(found["park-martin"].rotation, abs=3e-3)

@@ -1,0 +1,186 @@
+"""Reprojection adjustment: its covariance is true; camera, board and robot are told apart; bad views are named."""
+
+import numpy as np
+import pytest
+
+from stcal.errors import DegenerateError, InputError
+from stcal.geometry.camera import Camera
+from stcal.geometry.rigid import Poses, Rigid
+from stcal.handeye import HandEyeOptions, Noise, View, Views, handeye, pairs_of_views
+from stcal.handeye.data.loop import Loop
+from stcal.handeye.methods.bundle import Bundle
+from stcal.handeye.methods.reprojection import problem
+from stcal.io.camera import CameraModel, camera_prior, intrinsic_basis
+from stcal.synthetic.measured.handeye import simulated_views
+
+SETUPS = ("eye-in-hand", "eye-to-hand")
+
+
+def error(found, truth):
+    """Of X, (6,), as its covariance states it."""
+    x, true = found.mount_from_camera, truth.mount_from_camera
+    return Poses.of([x]).difference(Poses.of([true]))[0]
+
+
+def prior(camera, model):
+    """Intrinsics of a calibration of some age."""
+    return camera_prior(CameraModel(camera.focal, camera.centre, camera.distortion, model, None, None, ""), camera)
+
+
+def normalised(errors, covariances):
+    """RMS of errors in units of their covariances."""
+    return float(np.sqrt(np.mean([e @ np.linalg.solve(c, e) for e, c in zip(errors, covariances, strict=True)]) / 6))
+
+
+@pytest.mark.parametrize("setup", SETUPS)
+@pytest.mark.parametrize("method", ["pose", "reprojection"])
+def test_the_size_of_the_board_is_found(setup, method):
+    """A board of 0.8 of its stated size: first doubted, then solved for to within 4 σ."""
+    truth = simulated_views(np.random.default_rng(4), 12, setup, (2e-4, 0.05), 0.1, 0.01, scale=0.8)
+    doubtful = handeye(truth.pairs, setup, method, truth.views)
+    assert "times as large as stated" in doubtful.notes[-1]
+    found = handeye(truth.pairs, setup, method, truth.views, HandEyeOptions(with_scale=True))
+    assert abs(found.scale - 0.8) < 4 * found.sigma_scale < 0.01
+    assert np.abs(error(found, truth)) @ [200, 200, 200, 1, 1, 1] < 4
+
+
+@pytest.mark.parametrize("setup", SETUPS)
+def test_derivatives_of_the_corners(setup):
+    """Against central differences: of all shared unknowns, every ninth of the board's and the robot's."""
+    truth = simulated_views(np.random.default_rng(5), 4, setup)
+    loop = Loop.of(truth.pairs, setup)
+    noise = Noise(1e-3, 0.5, corner_px=0.2, board_mm=0.1)
+    flange = truth.pairs.base_from_flange
+    corners, _ = problem(loop, flange, truth.views, noise, prior(truth.views.camera, "FULL_OPENCV"), True)
+    state = Bundle(truth.mount_from_camera, truth.stand_from_board, flange, corners.xyz_board, truth.views.camera, 1.1)
+    groups, shared = corners.groups(state), corners.places()["board"].start
+    assert [g.names for g in groups] == [
+        ("corner_px",),
+        *((f"camera_{kind}",) for kind in ("focal", "centre", "radial", "tangential")),
+        ("board_mm",),
+        ("robot_rad", "robot_mm"),
+    ]
+    for k in (*range(shared), *range(shared, corners.count(), 9)):
+        step = np.zeros(corners.count())
+        step[k] = 1e-5
+        ahead, behind = (corners.groups(corners.moved(state, s * step)) for s in (1, -1))
+        for group, there, back in zip(groups, ahead, behind, strict=True):
+            slope, numeric = group.slope[:, k].toarray().ravel(), (there.white - back.white).ravel() / 2e-5
+            assert np.abs(slope - numeric).max() <= 1e-5 * max(np.abs(slope).max(), 1)
+
+
+@pytest.mark.parametrize("setup", SETUPS)
+def test_reprojection_knows_its_error(setup):
+    """20 trials of 6 numbers scatter by 1/√240 = 6.5 %; σ of 12 robot poses by 1/√(2·20·30) = 3 %, and it is
+    stated larger by 1/30 for caution."""
+    errors, covariances, sigma = [], [], []
+    for seed in range(20):
+        truth = simulated_views(np.random.default_rng(seed), 12, setup, (3e-4, 0.1), 0.1, 0.03)
+        found = handeye(truth.pairs, setup, views=truth.views)
+        errors.append(error(found, truth))
+        covariances.append(found.covariance)
+        sigma.append([found.sigma[name] for name in ("corner_px", "robot_rad", "robot_mm", "board_mm")])
+    assert 0.75 < normalised(errors, covariances) < 1.3
+    assert np.sqrt((np.array(sigma) ** 2).mean(0)) == pytest.approx([0.1, 3e-4, 0.1, 0.03], rel=0.15)
+
+
+def test_reprojection_beats_poses_where_the_board_is_rough():
+    """Corners 0.3 mm off make every pose of the board wrong alike: only the joint adjustment can tell. By 5 trials."""
+    squared = {"pose": [], "reprojection": []}
+    for seed in range(5):
+        truth = simulated_views(np.random.default_rng(seed), 12, robot=(1e-5, 0.01), corner_px=0.05, board_mm=0.3)
+        for method, values in squared.items():
+            found = handeye(truth.pairs, method=method, views=truth.views)
+            values.append(np.sum(error(found, truth)[3:] ** 2))
+    assert np.sqrt(np.mean(squared["reprojection"])) < 0.5 * np.sqrt(np.mean(squared["pose"]))
+
+
+def test_a_camera_file_that_is_wrong_is_said_and_mended():
+    """Distortion left out of the camera file: said; with the intrinsics solved for, the truth comes back."""
+    truth = simulated_views(np.random.default_rng(6), 15, "eye-to-hand", (2e-4, 0.05), 0.1)
+    good = truth.views.camera
+    plain = Camera(good.width, good.height, good.focal, good.centre, np.zeros(8))
+    views = Views(plain, truth.views.views)
+    pairs = pairs_of_views(truth.pairs.base_from_flange, views)
+    doubtful = handeye(pairs, "eye-to-hand", views=views)
+    assert doubtful.notes[-1].startswith("the camera file does not fit the corners")
+    options = HandEyeOptions(intrinsics=prior(plain, "OPENCV"))
+    found = handeye(pairs, "eye-to-hand", views=views, options=options)
+    # k1 is eight σ off what a calibration of some age may be, k2 five; the rest is right.
+    assert 3 < found.sigma["camera_radial"] < 16
+    assert found.sigma["camera_focal"] < 3
+    assert "the camera file: its σ were widened (radial distortion " in found.notes[-1]
+    off, off_doubtful = (np.linalg.norm(error(f, truth)[3:]) for f in (found, doubtful))
+    assert off < 0.7 < 2 * off_doubtful
+    assert found.reprojection.camera.distortion[0] == pytest.approx(-0.08, abs=0.02)
+    assert found.reprojection.camera_covariance.shape == (8, 8)
+
+
+def test_a_view_of_another_board_is_left_out():
+    truth = simulated_views(np.random.default_rng(7), 12, corner_px=0.1)
+    views = list(truth.views.views)
+    views[4] = View(views[4].xyz_board, views[4].xy_px[::-1])  # numbered from the other end
+    views = Views(truth.views.camera, tuple(views))
+    pairs = pairs_of_views(truth.pairs.base_from_flange, views)
+    found = handeye(pairs, views=views)
+    assert np.flatnonzero(found.outliers).tolist() == [4]
+    assert np.isnan(found.reprojection.rms_px(4))
+    assert found.reprojection.rms_px(3) == pytest.approx(0.1 * np.sqrt(2), rel=0.4)
+    assert np.abs(error(found, truth)) @ [200, 200, 200, 1, 1, 1] < 2
+
+
+def test_one_bad_corner_does_no_harm():
+    truth = simulated_views(np.random.default_rng(8), 8, corner_px=0.05)
+    bent = truth.views.views[2].xy_px.copy()
+    bent[10] += [30, -20]
+    views = list(truth.views.views)
+    views[2] = View(views[2].xyz_board, bent)
+    views = Views(truth.views.camera, tuple(views))
+    found = handeye(pairs_of_views(truth.pairs.base_from_flange, views), views=views)
+    assert not found.outliers.any()
+    assert np.linalg.norm(error(found, truth)[3:]) < 0.3
+
+
+def test_views_that_show_too_little_are_named():
+    truth = simulated_views(np.random.default_rng(9), 5)
+    view = truth.views.views[1]
+    for rows, message in (([0, 1, 2], "3 corners of the board, 4 needed"), ([0, 1, 2, 3, 4], "lie on a line")):
+        views = list(truth.views.views)
+        views[1] = View(view.xyz_board[rows], view.xy_px[rows])
+        with pytest.raises(DegenerateError, match=f"b.png: .*{message}"):
+            pairs_of_views(
+                truth.pairs.base_from_flange,
+                Views(truth.views.camera, tuple(views)),
+                tuple(f"{c}.png" for c in "abcde"),
+            )
+    with pytest.raises(InputError, match="5 poses of the flange and 4 views"):
+        pairs_of_views(truth.pairs.base_from_flange, truth.views[:4])
+
+
+def test_a_camera_file_that_is_right_keeps_its_sigma():
+    """Intrinsics drawn with the σ of the file: the factor is 1 or next to it, and the truth is within 4 σ."""
+    rng = np.random.default_rng(10)
+    truth = simulated_views(rng, 12, "eye-in-hand", (2e-4, 0.05), 0.1)
+    held = prior(good := truth.views.camera, "OPENCV")
+    drawn = good.parameters() + intrinsic_basis("OPENCV") @ rng.multivariate_normal(np.zeros(8), held.covariance)
+    views = Views(good.with_parameters(drawn), truth.views.views)
+    pairs = pairs_of_views(truth.pairs.base_from_flange, views)
+    found = handeye(pairs, views=views, options=HandEyeOptions(intrinsics=held))
+    factors = [value for name, value in found.sigma.items() if name.startswith("camera_")]
+    assert len(factors) == 4
+    assert 1 <= max(factors) < 2.5
+    assert found.notes == ()
+    off = intrinsic_basis("OPENCV").T @ (found.reprojection.camera.parameters() - good.parameters())
+    assert off @ np.linalg.solve(found.reprojection.camera_covariance, off) < 4 * 8
+
+
+def test_a_pose_of_the_robot_that_is_wrong_is_left_out():
+    """By 1° and 5 mm, 100 σ: not gross, but told by the other poses."""
+    truth = simulated_views(np.random.default_rng(11), 12, robot=(2e-4, 0.05), corner_px=0.1)
+    flange = list(truth.pairs.base_from_flange)
+    flange[7] = Rigid.exp([0.01, -0.012, 0.008, 3, -2, 3.5]) @ flange[7]
+    pairs = pairs_of_views(Poses.of(flange), truth.views)
+    found = handeye(pairs, views=truth.views)
+    assert np.flatnonzero(found.outliers).tolist() == [7]
+    assert "pose 8 contradicts the others" in found.notes[0]
+    assert found.sigma["robot_mm"] == pytest.approx(0.05, rel=0.5)

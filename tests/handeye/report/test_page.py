@@ -1,0 +1,142 @@
+"""What is printed, written and drawn."""
+
+import json
+import math
+from dataclasses import replace
+from html.parser import HTMLParser
+
+import numpy as np
+import pytest
+
+from stcal.handeye import HandEyeOptions, handeye
+from stcal.handeye.report.file import Outcome, calibration_json, outcome_json
+from stcal.handeye.report.page import outcome_page, outcome_text
+from stcal.handeye.solve import FACTORS
+from stcal.handeye.validate import Compared, compare, cross_validate, splits
+from stcal.io.camera import CameraModel, camera_prior
+from stcal.synthetic.measured.handeye import simulated, simulated_views
+
+VOID = {"meta", "img", "br"}
+
+
+class Tags(HTMLParser):
+    """Fails where tags do not close in order; collects the text."""
+
+    def __init__(self):
+        super().__init__()
+        self.open, self.images, self.text = [], 0, []
+
+    def handle_starttag(self, tag, attrs):
+        self.images += tag == "img"
+        if tag not in VOID:
+            self.open.append(tag)
+
+    def handle_endtag(self, tag):
+        assert self.open.pop() == tag
+
+    def handle_data(self, data):
+        self.text.append(data)
+
+
+def read(page: str) -> Tags:
+    tags = Tags()
+    tags.feed(page)
+    assert tags.open == []
+    return tags
+
+
+@pytest.fixture(scope="module")
+def of_views() -> Outcome:
+    truth = simulated_views(np.random.default_rng(2), 10, "eye-to-hand", (2e-4, 0.1), 0.1)
+    options = HandEyeOptions(with_scale=True)
+    result = handeye(truth.pairs, truth.setup, None, truth.views, options)
+    result = replace(result, notes=("a note with <markup> & more",))
+    held_out = cross_validate(truth.pairs, truth.setup, None, truth.views, options, splits(10, 2, 2))
+    return Outcome("images & poses", result, held_out, pitch_mm=25.0, left_out=(("x<1>.png", "no board"),))
+
+
+@pytest.fixture(scope="module")
+def of_methods() -> Outcome:
+    truth = simulated(np.random.default_rng(3), 10, robot=(2e-4, 0.1), camera=(5e-4, 0.2))
+    compared = compare(truth.pairs, methods=("tsai-lenz", "pose"), rows=splits(10, 2, 2))
+    failed = Compared("zhao", None, None, "hand-eye: zhao finds no rotation")
+    return Outcome("poses.csv", compared[1].result, compared[1].held_out, (*compared, failed))
+
+
+def test_the_text_has_the_transform_with_its_sigma(of_views):
+    result = of_views.result
+    lines = outcome_text(of_views).splitlines()
+    row = next(i for i, line in enumerate(lines) if line.startswith("base_from_camera"))
+    for k, axis in enumerate("xyz"):
+        name, shift, sigma, _, turn_sigma = lines[row + 1 + k].split()
+        assert name == axis
+        assert float(shift) == pytest.approx(result.base_from_camera.translation[k], abs=1e-4)
+        assert float(sigma) == pytest.approx(math.sqrt(result.covariance[3 + k, 3 + k]), abs=1e-4)
+        assert float(turn_sigma) == pytest.approx(math.degrees(math.sqrt(result.covariance[k, k])), abs=1e-4)
+    text = "\n".join(lines)
+    assert f"pitch {25 * result.scale:.4f} ± {25 * result.sigma_scale:.4f} mm, stated 25 mm" in text
+    assert "held out (2 × 2 of 10 poses): rotation" in text
+    assert "σ of corner in the image: " in text
+    assert " px (estimated)" in text
+
+
+def test_every_sigma_that_there_is_has_a_name():
+    """A camera file that is off: its σ are widened, and the factor is among the σ."""
+    truth = simulated_views(np.random.default_rng(2), 10, "eye-in-hand", (2e-4, 0.1), 0.1)
+    camera = truth.views.camera
+    wrong = replace(camera, focal=1.02 * camera.focal)
+    views = replace(truth.views, camera=wrong)
+    prior = camera_prior(CameraModel(wrong.focal, wrong.centre, wrong.distortion, "PINHOLE", None, None, ""), wrong)
+    result = handeye(truth.pairs, truth.setup, None, views, HandEyeOptions(intrinsics=prior))
+    outcome = Outcome("images", result, colmap_model="PINHOLE")
+    assert "σ of camera file, focal length: " in outcome_text(outcome)
+    assert "Camera, as adjusted" in outcome_page(outcome)
+    assert max(v for k, v in calibration_json(outcome)["sigma"].items() if k in FACTORS) > 1.5
+
+
+def test_corners_with_sigmas_of_their_own_have_a_factor(of_views):
+    text = outcome_text(replace(of_views, own_sigmas=True))
+    assert " times its own σ (estimated)" in text
+    assert " px (estimated)" not in text
+
+
+def test_the_page_is_whole_and_shows_every_part(of_views, of_methods):
+    page = read(outcome_page(of_views))
+    assert page.images == 3
+    text = " ".join(page.text)
+    for part in ("base_from_camera", "flange_from_board", "a note with <markup> & more", "x<1>.png", "pose 10"):
+        assert part in text
+    page = read(outcome_page(of_methods))
+    assert page.images == 1
+    text = " ".join(page.text)
+    assert "tsai-lenz" in text
+    assert "zhao finds no rotation" in text
+
+
+def test_an_outlier_is_marked_in_text_page_and_file(of_methods):
+    bad = np.zeros(10, bool)
+    bad[4] = True
+    outcome = replace(of_methods, result=replace(of_methods.result, outliers=bad))
+    assert "9 poses, without 1 that contradicts them: pose 5" in outcome_text(outcome)
+    assert "left out, contradicting the others" in " ".join(read(outcome_page(outcome)).text)
+    assert calibration_json(outcome)["outliers"] == ["pose 5"]
+
+
+def test_the_file_is_plain_json_and_gives_the_transform_back(of_views, of_methods):
+    data = json.loads(json.dumps(outcome_json(of_views), allow_nan=False))
+    assert data["base_from_camera"] == of_views.result.base_from_camera.matrix().tolist()
+    assert np.array(data["covariance"]) == pytest.approx(of_views.result.covariance, rel=1e-15)
+    assert data["board"]["pitch_mm"] == pytest.approx(25 * of_views.result.scale)
+    assert [len(split["board_mm"]) for split in data["splits"]] == [2, 2]
+    mean = np.mean([split["board_mm"] for split in data["splits"]])
+    assert data["held_out"]["board_mm"] == pytest.approx(mean)
+    data = json.loads(json.dumps(outcome_json(of_methods), allow_nan=False))
+    assert [row["reason"] for row in data["methods"]] == [None, None, "hand-eye: zhao finds no rotation"]
+    assert "methods" not in calibration_json(of_methods)
+
+
+def test_methods_of_which_none_could_be_validated_are_listed(of_methods):
+    each = replace(of_methods.compared[0], held_out=None, reason="without pose 1: too few")
+    outcome = replace(of_methods, held_out=None, compared=(each,))
+    assert "tsai-lenz" in outcome_text(outcome)
+    assert "without pose 1: too few" in " ".join(read(outcome_page(outcome)).text)

@@ -1,0 +1,309 @@
+"""Camera files: each kind with its pixel origin, and one test per way in which a file can be wrong."""
+
+import re
+
+import cv2
+import numpy as np
+import pycolmap
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from stcal.errors import InputError
+from stcal.geometry.camera import Camera
+from stcal.io.camera import colmap_params, read_camera, write_cameras_txt
+
+K = [[1000.0, 0, 500], [0, 1100, 400], [0, 0, 1]]
+D5 = [0.1, -0.2, 0.003, -0.004, 0.05]
+
+# Model, its parameters in COLMAP's order, and what they are in ours (focal, centre, distortion).
+COLMAP_CASES = {
+    "SIMPLE_PINHOLE": ([1000, 500.5, 400.5], [1000, 1000], []),
+    "PINHOLE": ([1000, 1100, 500.5, 400.5], [1000, 1100], []),
+    "SIMPLE_RADIAL": ([1000, 500.5, 400.5, 0.1], [1000, 1000], [0.1]),
+    "RADIAL": ([1000, 500.5, 400.5, 0.1, -0.2], [1000, 1000], [0.1, -0.2]),
+    "OPENCV": ([1000, 1100, 500.5, 400.5, 0.1, -0.2, 3e-3, -4e-3], [1000, 1100], [0.1, -0.2, 3e-3, -4e-3]),
+    "FULL_OPENCV": (
+        [1000, 1100, 500.5, 400.5, 0.1, -0.2, 3e-3, -4e-3, 0.05, 0.06, 0.07, 0.08],
+        [1000, 1100],
+        [0.1, -0.2, 3e-3, -4e-3, 0.05, 0.06, 0.07, 0.08],
+    ),
+}
+
+ROS = """\
+image_width: 640
+image_height: 480
+camera_name: narrow_stereo
+camera_matrix:
+  rows: 3
+  cols: 3
+  data: [1000.000000, 0.000000, 500.000000, 0.000000, 1100.000000, 400.000000, 0.000000, 0.000000, 1.000000]
+distortion_model: {model}
+distortion_coefficients:
+  rows: 1
+  cols: 5
+  data: [0.1, -0.2, 0.003, -0.004, 5e-02]
+rectification_matrix:
+  rows: 3
+  cols: 3
+  data: [1, 0, 0, 0, 1, 0, 0, 0, 1]
+projection_matrix:
+  rows: 3
+  cols: 4
+  data: [1, 0, 2, 0, 0, 1, 2, 0, 0, 0, 1, 0]
+"""
+
+
+def yaml_text(k="[1000, 0, 500, 0, 1100, 400, 0, 0, 1]", d="[]", more="") -> str:
+    return f"camera_matrix: {k}\ndistortion_coefficients: {d}\n{more}"
+
+
+def padded(distortion) -> list[float]:
+    return [*distortion, *[0.0] * (8 - len(distortion))]
+
+
+def read(tmp_path, content: str | bytes, name="camera.txt"):
+    path = tmp_path / name
+    path.write_bytes(content.encode() if isinstance(content, str) else content)
+    return read_camera(path)
+
+
+@pytest.mark.parametrize("name", COLMAP_CASES)
+def test_colmap_models_come_in_with_opencvs_pixel_origin(tmp_path, name):
+    params, focal, distortion = COLMAP_CASES[name]
+    text = (
+        f"# Camera list\n# CAMERA_ID, MODEL, WIDTH, HEIGHT, PARAMS[]\n1 {name} 1001 801 {' '.join(map(str, params))}\n"
+    )
+    model = read(tmp_path, text)
+    assert (model.width, model.height, model.colmap_model) == (1001, 801, name)
+    np.testing.assert_array_equal(model.focal, focal)
+    np.testing.assert_array_equal(model.centre, [500, 400])  # 0.5 px less than COLMAP's
+    np.testing.assert_array_equal(model.distortion, padded(distortion))
+
+
+@pytest.mark.parametrize("name", COLMAP_CASES)
+def test_projection_agrees_with_pycolmap(tmp_path, name):
+    params, _, _ = COLMAP_CASES[name]
+    camera = read(tmp_path, f"1 {name} 1000 800 {' '.join(map(str, params))}\n").sized(1000, 800)
+    xyz = np.random.default_rng(0).uniform([-0.4, -0.3, 1], [0.4, 0.3, 1], (20, 3))
+    theirs = pycolmap.Camera(model=name, width=1000, height=800, params=params).img_from_cam(xyz)
+    np.testing.assert_allclose(camera.project(xyz), theirs - 0.5, atol=1e-9)  # rounding at 1000 px
+    np.testing.assert_allclose(colmap_params(camera, name), params, rtol=1e-15)
+
+
+@given(
+    st.sampled_from(sorted(COLMAP_CASES)),
+    st.lists(st.floats(100, 20000), min_size=4, max_size=4),
+    st.lists(st.floats(-1, 1), min_size=8, max_size=8),
+)
+def test_cameras_txt_round_trip(tmp_path_factory, name, lengths, coefficients):
+    _, focal, distortion = COLMAP_CASES[name]
+    k = np.array(coefficients)
+    k[len(distortion) :] = 0
+    fx, fy = lengths[0], lengths[0] if focal[0] == focal[1] else lengths[1]
+    camera = Camera(6000, 4000, [fx, fy], lengths[2:], k)
+    path = tmp_path_factory.mktemp("round") / "cameras.txt"
+    write_cameras_txt(path, camera, name)
+    found = read_camera(path)
+    assert (found.colmap_model, found.width, found.height) == (name, 6000, 4000)
+    np.testing.assert_array_equal(found.focal, camera.focal)
+    np.testing.assert_array_equal(found.distortion, camera.distortion)
+    np.testing.assert_allclose(found.centre, camera.centre, rtol=0, atol=4e-12)  # +0.5 − 0.5 at 20 000 px: one ulp
+
+
+def test_pycolmap_reads_what_is_written(tmp_path):
+    camera = Camera(1000, 800, [1000, 1100], [500, 400], COLMAP_CASES["FULL_OPENCV"][2])
+    write_cameras_txt(tmp_path / "cameras.txt", camera)
+    (tmp_path / "images.txt").write_text("")
+    (tmp_path / "points3D.txt").write_text("")
+    reconstruction = pycolmap.Reconstruction()
+    try:
+        reconstruction.read_text(str(tmp_path))
+        theirs = reconstruction.cameras[1]
+    except (ValueError, RuntimeError, KeyError) as error:
+        pytest.fail(f"pycolmap does not read it: {error}")
+    assert (theirs.model_name, theirs.width, theirs.height) == ("FULL_OPENCV", 1000, 800)
+    np.testing.assert_allclose(theirs.params, COLMAP_CASES["FULL_OPENCV"][0], rtol=1e-15)
+
+
+@pytest.mark.parametrize("suffix", ["yaml", "yml", "xml", "json"])
+def test_file_storage_of_opencv(tmp_path, suffix):
+    path = tmp_path / f"camera.{suffix}"
+    storage = cv2.FileStorage(str(path), cv2.FILE_STORAGE_WRITE)
+    storage.write("calibration_time", "Mon Jan  1 12:00:00 2024")
+    storage.write("image_width", 1001)
+    storage.write("image_height", 801)
+    storage.write("camera_matrix", np.array(K))
+    storage.write("distortion_coefficients", np.array([[1e-7, -0.2, 3e-20, -4e-3, 0.05]]).T)
+    storage.write("avg_reprojection_error", 0.2)
+    storage.release()
+    model = read_camera(path)
+    assert (model.width, model.height, model.colmap_model) == (1001, 801, "FULL_OPENCV")
+    np.testing.assert_array_equal(model.focal, [1000, 1100])
+    np.testing.assert_array_equal(model.centre, [500, 400])  # OpenCV's origin is ours: nothing is subtracted
+    np.testing.assert_array_equal(model.distortion, padded([1e-7, -0.2, 3e-20, -4e-3, 0.05]))
+
+
+def test_ros_camera_info(tmp_path):
+    model = read(tmp_path, ROS.format(model="plumb_bob"))
+    assert (model.width, model.height) == (640, 480)
+    np.testing.assert_array_equal(model.focal, [1000, 1100])
+    np.testing.assert_array_equal(model.centre, [500, 400])
+    np.testing.assert_array_equal(model.distortion, padded(D5))
+
+
+@pytest.mark.parametrize("names", [("K", "D"), ("cameraMatrix", "distCoeffs"), ("camera_matrix", "dist_coeffs")])
+def test_other_names_in_use(tmp_path, names):
+    model = read(tmp_path, f"{names[0]}: {K}\n{names[1]}: [{D5}]\n")
+    np.testing.assert_array_equal(model.focal, [1000, 1100])
+    np.testing.assert_array_equal(model.distortion, padded(D5))
+
+
+@pytest.mark.parametrize(
+    ("distortion", "expected"),
+    [
+        ("[]", "PINHOLE"),
+        ("[0, 0, 0, 0, 0]", "PINHOLE"),
+        ("[0.1, 0, 0, 0]", "OPENCV"),
+        ("[0.1, 0, 0, 0, 0]", "OPENCV"),
+        ("[0.1, 0, 0, 0, 0.1]", "FULL_OPENCV"),
+        ("[0, 0, 0, 0, 0, 0, 0, 0.1]", "FULL_OPENCV"),
+        ("[0.1, 0, 0, 0, 0, 0, 0, 0, 0, 0, 0, 0, 0, 0]", "OPENCV"),  # the rest is zero: held exactly
+    ],
+)
+def test_the_smallest_colmap_model_that_holds_it(tmp_path, distortion, expected):
+    assert read(tmp_path, yaml_text(d=distortion)).colmap_model == expected
+
+
+def test_ros_industrial(tmp_path):
+    """Its form has no distortion, but the lens may have some: OPENCV, so that it can be adjusted."""
+    path = tmp_path / "cal_data.yaml"
+    path.write_text("data: []\nintrinsics:\n  fx: 1352.5  # px\n  fy: 1356\n  cx: 789.7\n  cy: 627.3\n")
+    camera = read_camera(path)
+    assert camera.focal.tolist() == [1352.5, 1356]
+    assert camera.centre.tolist() == [789.7, 627.3]
+    assert (camera.colmap_model, camera.width) == ("OPENCV", None)
+    path.write_text("intrinsics:\n  fx: 1352.5\n  cx: 789.7\n")
+    with pytest.raises(InputError, match="intrinsics without fy, cy; fx, fy, cx, cy needed"):
+        read_camera(path)
+
+
+def test_no_distortion_key_is_no_distortion(tmp_path):
+    model = read(tmp_path, f"camera_matrix: {K}\n")
+    np.testing.assert_array_equal(model.distortion, np.zeros(8))
+
+
+def test_a_size_that_the_file_does_not_state_is_the_images(tmp_path):
+    model = read(tmp_path, yaml_text())
+    assert (model.width, model.height) == (None, None)
+    camera = model.sized(640, 480)
+    assert (camera.width, camera.height) == (640, 480)
+    stated = read(tmp_path, yaml_text(more="image_width: 1000\nimage_height: 800.0\n")).sized(640, 480)
+    assert (stated.width, stated.height) == (1000, 800)
+
+
+def test_byte_order_mark_and_windows_line_ends(tmp_path):
+    model = read(tmp_path, b"\xef\xbb\xbf# list\r\n\r\n1 PINHOLE 1000 800 1000 1100 500.5 400.5\r\n")
+    np.testing.assert_array_equal(model.centre, [500, 400])
+
+
+# fmt: off
+WRONG = {
+    "empty": ("", "neither COLMAP's cameras.txt nor OpenCV's"),
+    "comments only": ("# nothing\n# here\n", "neither COLMAP's"),
+    "prose": ("hello", "neither COLMAP's"),
+    "a list": ("- 1\n- 2\n", "neither COLMAP's"),
+    "control characters": (b"\0\1\2", "neither COLMAP's"),
+    "binary": (bytes(range(256)), "not a text file"),
+    "a photograph": (b"\xff\xd8\xff\xe0\x00\x10JFIF", "not a text file"),
+    "UTF-16": ("1 PINHOLE 10 10 1 1 1 1".encode("utf-16"), "not a text file"),
+    "COLMAP: two cameras": ("1 PINHOLE 9 9 1 1 1 1\n2 PINHOLE 9 9 1 1 1 1\n", "2 cameras, 1 needed"),
+    "COLMAP: fisheye": ("1 OPENCV_FISHEYE 9 9 1 1 1 1 0 0 0 0", "OPENCV_FISHEYE is not supported; use one of SIMPLE_"),
+    "COLMAP: too few": ("1 PINHOLE 9 9 1 1 1", "3 parameters for PINHOLE, 4 needed"),
+    "COLMAP: far too few": ("1 SIMPLE_PINHOLE 9 9 1", "1 parameters for SIMPLE_PINHOLE, 3 needed"),
+    "COLMAP: too many": ("1 SIMPLE_PINHOLE 9 9 1 1 1 1", "4 parameters for SIMPLE_PINHOLE, 3 needed"),
+    "COLMAP: a word": ("1 PINHOLE 9 9 1 one 1 1", "'one'; numbers needed"),
+    "COLMAP: width a word": ("1 PINHOLE wide 9 1 1 1 1", "'wide'; numbers needed"),
+    "COLMAP: negative width": ("1 PINHOLE -9 9 1 1 1 1", "image side -9 px; a whole number"),
+    "COLMAP: zero height": ("1 PINHOLE 9 0 1 1 1 1", "image side 0 px; a whole number"),
+    "COLMAP: half a pixel": ("1 PINHOLE 9.5 9 1 1 1 1", "image side 9.5 px; a whole number"),
+    "COLMAP: 5000 digits": (f"1 PINHOLE {'9' * 5000} 9 1 1 1 1", "image side inf px"),
+    "COLMAP: NaN focal": ("1 PINHOLE 9 9 nan 1 1 1", "not a finite number"),
+    "COLMAP: NaN centre": ("1 PINHOLE 9 9 1 1 nan 1", "not a finite number"),
+    "COLMAP: inf distortion": ("1 SIMPLE_RADIAL 9 9 1 1 1 inf", "not a finite number"),
+    "COLMAP: negative focal": ("1 PINHOLE 9 9 1 -7 1 1", "focal length 1, -7 px; positive numbers needed"),
+    "COLMAP: zero focal": ("1 SIMPLE_PINHOLE 9 9 0 1 1", "focal length 0, 0 px; positive numbers needed"),
+    "YAML: broken": ("camera_matrix: [1, 2", "neither COLMAP's"),
+    "YAML: unknown tag": ("a: !!python/object/apply:os.getcwd []", "could not determine a constructor"),
+    "YAML: matrix tag on a number": ("camera_matrix: !!opencv-matrix 5", "expected a mapping node"),
+    "YAML: a list as key": ("? [a, b]\n: 1\n", "unhashable key"),
+    "YAML: nested too deep": ("[" * 5000, "neither COLMAP's"),
+    "YAML: contains itself": ("camera_matrix: &a [*a]", "neither COLMAP's"),
+    "YAML: no matrix": ("image_width: 640\n", "no camera_matrix; write it with"),
+    "YAML: matrix without data": ("camera_matrix: {rows: 3, cols: 3}", "neither COLMAP's"),
+    "YAML: matrix 2×2": (yaml_text("[1000, 0, 0, 1000]"), "camera_matrix of 4 numbers; 3×3 needed"),
+    "YAML: matrix 3×4": (yaml_text("[1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1, 0]"), "camera_matrix of 12 numbers"),
+    "YAML: matrix empty": (yaml_text("[]"), "camera_matrix of 0 numbers"),
+    "YAML: matrix null": (yaml_text("null"), "camera_matrix of 1 numbers"),
+    "YAML: matrix ragged": (yaml_text("[[1, 0, 2], [0, 1], [0, 0, 1]]"), "inhomogeneous"),
+    "YAML: matrix of words": (yaml_text("[a, b, c]"), "could not convert string to float"),
+    "YAML: matrix transposed": (yaml_text("[1000, 0, 0, 0, 1000, 0, 500, 400, 1]"), "is it transposed"),
+    "YAML: matrix doubled": (yaml_text("[2000, 0, 1000, 0, 2000, 800, 0, 0, 2]"), r"not \[fx 0 cx; 0 fy cy; 0 0 1\]"),
+    "YAML: matrix sheared": (yaml_text("[1000, 0, 500, 5, 1000, 400, 0, 0, 1]"), r"not \[fx 0 cx; 0 fy cy; 0 0 1\]"),
+    "YAML: skew": (yaml_text("[1000, 0.5, 500, 0, 1000, 400, 0, 0, 1]"), "skew 0.5 is not supported"),
+    "YAML: NaN skew": (yaml_text("[1000, .nan, 500, 0, 1000, 400, 0, 0, 1]"), "skew nan is not supported"),
+    "YAML: NaN focal": (yaml_text("[.nan, 0, 500, 0, 1000, 400, 0, 0, 1]"), "not a finite number"),
+    "YAML: NaN centre": (yaml_text("[1000, 0, .nan, 0, 1000, 400, 0, 0, 1]"), "not a finite number"),
+    "YAML: NaN distortion": (yaml_text(d="[.nan, 0, 0, 0]"), "not a finite number"),
+    "YAML: negative focal": (yaml_text("[-1000, 0, 500, 0, 1000, 400, 0, 0, 1]"), "focal length -1000, 1000 px"),
+    "YAML: thin prism": (yaml_text(d="[0, 0, 0, 0, 0, 0, 0, 0, 0.1, 0, 0, 0]"), "12 distortion .*, at most 8"),
+    "YAML: k1 k2 k3": (yaml_text(d="[0.1, 0.2, 0.3]"), "3 distortion coefficients; 0, 4, 5, 8, 12, 14 are possible"),
+    "YAML: distortion null": (yaml_text(d="null"), "1 distortion coefficients"),
+    "YAML: distortion a mapping": (yaml_text(d="{a: 1}"), "neither COLMAP's"),
+    "YAML: negative width": (yaml_text(more="image_width: -5"), "image side -5 px"),
+    "YAML: infinite width": (yaml_text(more="image_width: .inf"), "image side inf px"),
+    "YAML: NaN height": (yaml_text(more="image_height: .nan"), "image side nan px"),
+    "YAML: fractional width": (yaml_text(more="image_width: 10.7"), "image side 10.7 px"),
+    "YAML: width a word": (yaml_text(more="image_width: wide"), "could not convert string to float: 'wide'"),
+    "YAML: width a list": (yaml_text(more="image_width: [5]"), "neither COLMAP's"),
+    "YAML: fisheye": (ROS.format(model="equidistant"), "distortion model 'equidistant' is not supported"),
+    "YAML: model of two lines": (yaml_text(more='distortion_model: "a\\nb"'), "distortion model 'a.*b' is not"),
+    "XML: cut off": ("<opencv_storage><camera_matrix>", "neither COLMAP's"),
+    "XML: a web page": ("<!DOCTYPE html><html><body>404</body></html>", "no camera_matrix"),
+    "XML: words": ("<o><camera_matrix><data>a b</data></camera_matrix></o>", "could not convert string to float: 'a'"),
+    "XML: short": ("<o><camera_matrix><data>1 2 3</data></camera_matrix></o>", "camera_matrix of 3 numbers"),
+    "XML: no data": ("<o><camera_matrix>5</camera_matrix></o>", "camera_matrix of 1 numbers"),
+}
+# fmt: on
+
+
+@pytest.mark.parametrize("case", WRONG)
+def test_a_wrong_file_is_named_in_one_line(tmp_path, case):
+    content, message = WRONG[case]
+    with pytest.raises(InputError, match=f"^camera file {re.escape(str(tmp_path))}.*{message}") as caught:
+        read(tmp_path, content)
+    assert len(str(caught.value).splitlines()) == 1
+    assert len(str(caught.value)) < 350 + len(str(tmp_path))  # a line to read, not a dump of the file
+
+
+@pytest.mark.parametrize(
+    ("name", "message"),
+    [
+        (".", "Is a directory"),
+        ("missing.txt", "No such file"),
+        ("x" * 300, "File name too long"),
+        ("a\0b", "not a text"),
+    ],
+)
+def test_a_path_that_cannot_be_read(tmp_path, name, message):
+    with pytest.raises(InputError, match=message):
+        read_camera(tmp_path / name)
+
+
+@given(st.binary(max_size=80))
+def test_any_bytes_give_a_camera_or_one_line(tmp_path_factory, content):
+    path = tmp_path_factory.getbasetemp() / "any_camera"
+    path.write_bytes(content)
+    with pytest.raises(InputError) as caught:  # 80 random bytes are no camera
+        read_camera(path)
+    assert len(str(caught.value).splitlines()) == 1

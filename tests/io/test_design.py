@@ -1,0 +1,278 @@
+"""``target.toml`` and ``board.toml``: what is written is read, frames are normalised, and every mistake is named."""
+
+import re
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from stcal.design import BoardDesign, FaceDesign, TargetDesign, reference_board, reference_target
+from stcal.errors import InputError
+from stcal.io.design import MIN_SINE, board_toml, load_board, load_target, target_toml
+
+ROUNDED_MM = 1e-9
+"""Lengths are written with nine decimals: half a unit of the last is 5e-10 mm."""
+
+CIRCLES = """\
+  { id = "1", x_mm = 0, y_mm = 0, radius_mm = 8 },
+  { id = "2", x_mm = 40, y_mm = 0, radius_mm = 8 },
+  { id = "3", x_mm = 0, y_mm = 40, radius_mm = 8 },
+  { id = "4", x_mm = 40, y_mm = 40, radius_mm = 4 },
+"""
+HEAD = 'name = "t"\npolarity = "bright"\n'
+FACE = f'[[face]]\nid = "1"\norigin = "1"\nx = "2"\ny = "3"\ncircles = [\n{CIRCLES}]\n'
+TARGET = HEAD + FACE
+BOARD = 'rows = 7\ncolumns = 9\npitch_mm = 30.0\nradius_mm = 7.5\npolarity = "bright"\n'
+
+
+def corner(row=0, column=0, radius_mm=11.0) -> str:
+    return f"[corner]\nrow = {row}\ncolumn = {column}\nradius_mm = {radius_mm}\n"
+
+
+def target_of(tmp_path, content: str | bytes) -> TargetDesign:
+    path = tmp_path / "target.toml"
+    path.write_bytes(content.encode() if isinstance(content, str) else content)
+    return load_target(path)
+
+
+def board_of(tmp_path, content: str | bytes) -> BoardDesign:
+    path = tmp_path / "board.toml"
+    path.write_bytes(content.encode() if isinstance(content, str) else content)
+    return load_board(path)
+
+
+def changed(old: str, new: str, text: str = TARGET) -> str:
+    assert old in text
+    return text.replace(old, new)
+
+
+def assert_same_target(found: TargetDesign, expected: TargetDesign):
+    assert (found.name, found.polarity) == (expected.name, expected.polarity)
+    assert [face.id for face in found.faces] == [face.id for face in expected.faces]
+    for one, other in zip(found.faces, expected.faces, strict=True):
+        assert (one.ids, one.origin, one.x, one.y) == (other.ids, other.origin, other.x, other.y)
+        np.testing.assert_allclose(one.xy_mm, other.xy_mm, rtol=0, atol=2 * ROUNDED_MM)
+        np.testing.assert_allclose(one.radius_mm, other.radius_mm, rtol=0, atol=ROUNDED_MM)
+
+
+def test_reference_target_round_trip(tmp_path):
+    assert_same_target(target_of(tmp_path, target_toml(reference_target())), reference_target())
+
+
+def test_the_reference_has_the_published_layout():
+    # Zhang & Wei 2017, fig. 1: five faces, each of seven big (r = 8 mm) and three small (r = 4 mm) circles.
+    target = reference_target()
+    assert len(target.faces) == 5
+    for face in target.faces:
+        assert sorted(face.radius_mm.tolist()) == [4.0] * 3 + [8.0] * 7
+        assert face.labels()[0] == f"{face.id}:1"
+    assert target.radius_of()["3:c"] == 4
+    assert target.face("2").id == "2"
+    with pytest.raises(InputError, match="no face 9; the design has 1, 2, 3, 4, 5"):
+        target.face("9")
+
+
+@pytest.mark.parametrize(
+    "board",
+    [
+        reference_board(),
+        BoardDesign(3, 4, 12.5, 3.0, "dark", 0.02, (0, 3), 4.5),
+        BoardDesign(3, 4, 12.5, 3.0, "dark", 0.02, (2, 0), 4.5),
+    ],
+)
+def test_board_round_trip(tmp_path, board):
+    found = board_of(tmp_path, board_toml(board))
+    for name in ("rows", "columns", "pitch_mm", "radius_mm", "polarity", "sigma_mm", "corner", "corner_radius_mm"):
+        assert getattr(found, name) == getattr(board, name)
+
+
+def test_the_commented_corner_is_right_once_uncommented(tmp_path):
+    text = re.sub(r"^# (\[corner\]|row|column|radius_mm)", r"\1", board_toml(reference_board()), flags=re.MULTILINE)
+    found = board_of(tmp_path, text)
+    assert (found.corner, found.corner_radius_mm) == ((0, 0), 11.25)
+
+
+def test_board_arrays():
+    board = BoardDesign(2, 3, 10.0, 2.0, "dark", 0.005, (1, 2), 3.0)
+    np.testing.assert_array_equal(board.xy_mm(), [[0, 0], [10, 0], [20, 0], [0, 10], [10, 10], [20, 10]])
+    assert board.labels() == ["board:0:0", "board:0:1", "board:0:2", "board:1:0", "board:1:1", "board:1:2"]
+    assert board.radius_of() == dict(zip(board.labels(), [2.0, 2, 2, 2, 2, 3], strict=True))
+
+
+@given(st.floats(-np.pi, np.pi), st.floats(-500, 500), st.floats(-500, 500))
+@settings(max_examples=40)
+def test_any_right_handed_drawing_frame_gives_the_same_face(tmp_path_factory, angle, x, y):
+    turn = np.array([[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]])
+    reference = reference_target()
+    drawn = [
+        FaceDesign(f.id, f.ids, f.xy_mm @ turn.T + [x, y], f.radius_mm, f.origin, f.x, f.y) for f in reference.faces
+    ]
+    path = tmp_path_factory.getbasetemp() / "drawn.toml"
+    path.write_text(target_toml(TargetDesign(reference.name, reference.polarity, tuple(drawn))))
+    found = load_target(path)
+    for face, expected in zip(found.faces, reference.faces, strict=True):
+        # Nine decimals over a frame of 80 mm, at circles up to 130 mm from its origin: a few roundings.
+        np.testing.assert_allclose(face.xy_mm, expected.xy_mm, atol=5 * ROUNDED_MM)
+
+
+identifiers = st.text(
+    st.characters(codec="utf-8", exclude_categories=["C", "Z"], exclude_characters=":,/\\"), min_size=1
+)
+
+
+@given(st.lists(identifiers, min_size=4, max_size=4, unique=True), st.text(st.characters(codec="utf-8")))
+@settings(max_examples=60)
+def test_any_allowed_id_and_any_name_survive(tmp_path_factory, ids, name):
+    xy = [[0, 0], [40, 0], [0, 40], [40, 40]]
+    target = TargetDesign(name, "dark", (FaceDesign("f", tuple(ids), xy, [5.0] * 4, *ids[:3]),))
+    path = tmp_path_factory.getbasetemp() / "names.toml"
+    path.write_text(target_toml(target), encoding="utf-8", newline="\n")
+    found = load_target(path)
+    assert found.name == " ".join(name.split())  # a name is one line
+    assert found.faces[0].ids == tuple(ids)
+
+
+def test_whole_numbers_are_ids_and_lengths_too(tmp_path):
+    text = re.sub(r'"(\d)"', r"\1", TARGET)
+    face = target_of(tmp_path, text).faces[0]
+    assert (face.id, face.ids, face.x) == ("1", ("1", "2", "3", "4"), "2")
+
+
+def test_byte_order_mark_and_windows_line_ends(tmp_path):
+    content = b"\xef\xbb\xbf" + TARGET.replace("\n", "\r\n").encode()
+    assert target_of(tmp_path, content).faces[0].ids == ("1", "2", "3", "4")
+
+
+def test_a_frame_just_inside_the_smallest_angle_is_taken(tmp_path):
+    def bent(sine):
+        # Origin at (100, 50): the angle is at the origin circle, wherever it was drawn.
+        xy = np.array([[0, 0], [40, 0], [80 * np.sqrt(1 - sine**2), 80 * sine], [40, 40]]) + np.array([100, 50])
+        face = FaceDesign("f", ("1", "2", "3", "4"), xy, [5.0] * 4, "1", "2", "3")
+        return target_toml(TargetDesign("bent", "dark", (face,)))
+
+    # y of the third circle is 80 mm times the sine
+    assert target_of(tmp_path, bent(1.01 * MIN_SINE)).faces[0].xy_mm[2, 1] == pytest.approx(80.8 * MIN_SINE, abs=1e-8)
+    with pytest.raises(InputError, match="collinear"):
+        target_of(tmp_path, bent(0.99 * MIN_SINE))
+
+
+def test_no_negative_zero_is_written():
+    face = FaceDesign("f", ("1", "2", "3", "4"), [[-0.0, 0], [40, -1e-12], [0, 40], [40, 40]], [5.0] * 4, "1", "2", "3")
+    assert "-0.0" not in target_toml(TargetDesign("t", "dark", (face,)))
+
+
+# fmt: off
+WRONG_TARGETS = {
+    "empty": ("", "polarity: key missing; add it (and 1 more)"),
+    "prose": ("hello", "not valid TOML"),
+    "binary": (bytes(range(256)), "not valid TOML"),
+    "NUL": ("a = \0", "not valid TOML"),
+    "5000 digits": (changed("x_mm = 40", f"x_mm = {'9' * 5000}"), "not valid TOML"),
+    "nested too deep": ("a = " + "[" * 5000, "not valid TOML"),
+    "no faces": ('polarity = "dark"\nface = []\n', "face: []: list should have at least 1 item"),
+    "face not a list": (changed("[[face]]", "[face]"), "face: {'id': '1'"),
+    "three circles": (changed('  { id = "4", x_mm = 40, y_mm = 40, radius_mm = 4 },\n', ""),
+                      "list should have at least 4 items"),
+    "unknown key": (changed('x = "2"', 'x = "2"\ncolour = 1'), "face.1.colour: unknown key"),
+    "key of two lines": (changed('x = "2"', 'x = "2"\n"a\\nb" = 1'), "face.1.a b: unknown key"),
+    "misspelt key": (changed("polarity", "polarty"), "polarity: key missing"),
+    "polarity": (changed('"bright"', '"grey"'), "polarity: 'grey': input should be 'bright' or 'dark'"),
+    "long polarity": (changed('"bright"', f'"{"a" * 9999}"'), "aaa…: input should be 'bright' or 'dark'"),
+    "boolean face id": (changed('[[face]]\nid = "1"', "[[face]]\nid = true"), "face.1.id: True: input should be"),
+    "boolean circle id": (changed('{ id = "4"', "{ id = true"), "face.1.circles.4.id: True: input should be a valid"),
+    "boolean origin": (changed('origin = "1"', "origin = false"), "face.1.origin: False: input should be a valid"),
+    "fractional id": (changed('{ id = "4"', "{ id = 1.5"), "face.1.circles.4.id: 1.5: input should be a valid string"),
+    "date as id": (changed('{ id = "4"', "{ id = 1979-05-27"), "input should be a valid string"),
+    "empty id": (changed('{ id = "4"', '{ id = ""'), "face.1.circles.4.id: ''"),
+    "id with space": (changed('{ id = "4"', '{ id = "a b"'), "'a b': spaces, colons, commas, slashes"),
+    "id with colon": (changed('{ id = "4"', '{ id = "a:b"'), "'a:b': spaces, colons, commas, slashes"),
+    "id with slash": (changed('{ id = "4"', '{ id = "../b"'), "'../b': spaces, colons, commas, slashes"),
+    "id with line break": (changed('{ id = "4"', '{ id = "a\\n"'), "spaces, colons, commas, slashes"),
+    "id with invisible space": (changed('{ id = "4"', '{ id = "a\\u200b"'), "spaces, colons, commas, slashes"),
+    "duplicate faces": (TARGET + FACE, "face id 1 occurs twice; ids must differ"),
+    "duplicate circles": (changed('{ id = "4"', '{ id = "2"'), "face 1: circle id 2 occurs twice; ids must differ"),
+    "duplicate as number": (changed('{ id = "4"', "{ id = 2"), "face 1: circle id 2 occurs twice"),
+    "face named board": (changed('[[face]]\nid = "1"', '[[face]]\nid = "board"'), "face id board is taken"),
+    "negative radius": (changed("radius_mm = 4", "radius_mm = -4"), "radius_mm: -4: input should be greater than 0"),
+    "zero radius": (changed("radius_mm = 4", "radius_mm = 0"), "radius_mm: 0: input should be greater than 0"),
+    "NaN radius": (changed("radius_mm = 4", "radius_mm = nan"), "radius_mm: nan: input should be a finite number"),
+    "infinite radius": (changed("radius_mm = 4", "radius_mm = inf"), "radius_mm: inf: input should be"),
+    "NaN position": (changed("y_mm = 40, radius_mm = 4", "y_mm = nan, radius_mm = 4"), "circles.4.y_mm: nan"),
+    "boolean position": (changed("y_mm = 40, radius_mm = 4", "y_mm = true, radius_mm = 4"), "circles.4.y_mm: True"),
+    "quoted position": (changed("y_mm = 40, radius_mm = 4", 'y_mm = "40", radius_mm = 4'), "circles.4.y_mm: '40'"),
+    "position of a kilometre": (changed("y_mm = 40, radius_mm = 4", "y_mm = 1e7, radius_mm = 4"),
+                                "circles.4.y_mm: 10000000.0: input should be less than or equal to"),
+    "overlapping": (changed("x_mm = 40, y_mm = 0", "x_mm = 10, y_mm = 0"), "face 1: circles 1 and 2 overlap"),
+    "overlapping far from zero": (changed("x_mm = 40, y_mm = 40", "x_mm = 10, y_mm = 40"),
+                                  "face 1: circles 3 and 4 overlap"),
+    "touching": (changed("x_mm = 40, y_mm = 0", "x_mm = 16, y_mm = 0"), "face 1: circles 1 and 2 overlap"),
+    "on one another": (changed("x_mm = 40, y_mm = 0", "x_mm = 0, y_mm = 0"), "face 1: circles 1 and 2 overlap"),
+    "frame circle missing": (changed('y = "3"', 'y = "9"'), "face 1: y circle 9 is not among the circles 1, 2, 3, 4"),
+    "origin twice": (changed('x = "2"', 'x = "1"'), "frame circles 1, 1, 3; three different ones needed"),
+    "x and y the same": (changed('y = "3"', 'y = "2"'), "frame circles 1, 2, 2 are collinear"),
+    "collinear": (changed("x_mm = 0, y_mm = 40", "x_mm = 80, y_mm = 0"), "frame circles 1, 2, 3 are collinear"),
+    "collinear, opposite": (changed("x_mm = 0, y_mm = 40", "x_mm = -80, y_mm = 0"), "1, 2, 3 are collinear"),
+    "left-handed": (changed("x_mm = 0, y_mm = 40", "x_mm = 0, y_mm = -40"), "turns clockwise seen from outside"),
+    "left-handed by exchange": (changed('x = "2"\ny = "3"', 'x = "3"\ny = "2"'), "through 3 and 2 turns clockwise"),
+    "a board": (BOARD, "face: key missing"),
+}
+WRONG_BOARDS = {
+    "empty": ("", "rows: key missing; add it (and 4 more)"),
+    "a target": (TARGET, "rows: key missing"),
+    "binary": (bytes(range(256)), "not valid TOML"),
+    "one row": (changed("rows = 7", "rows = 1", BOARD), "rows: 1: input should be greater than or equal to 2"),
+    "negative columns": (changed("columns = 9", "columns = -9", BOARD), "columns: -9: input should be greater"),
+    "boolean rows": (changed("rows = 7", "rows = true", BOARD), "rows: True: input should be a valid integer"),
+    "fractional rows": (changed("rows = 7", "rows = 7.5", BOARD), "rows: 7.5: input should be a valid integer"),
+    "quoted rows": (changed("rows = 7", 'rows = "7"', BOARD), "rows: '7': input should be a valid integer"),
+    "a million rows": (changed("rows = 7", "rows = 1000000", BOARD), "rows: 1000000: input should be less"),
+    "negative radius": (changed("radius_mm = 7.5", "radius_mm = -1", BOARD), "radius_mm: -1: input should be greater"),
+    "NaN radius": (changed("radius_mm = 7.5", "radius_mm = nan", BOARD), "radius_mm: nan: input should be a finite"),
+    "infinite pitch": (changed("pitch_mm = 30.0", "pitch_mm = inf", BOARD), "pitch_mm: inf: input should be"),
+    "boolean pitch": (changed("pitch_mm = 30.0", "pitch_mm = true", BOARD), "pitch_mm: True: input should be a valid"),
+    "dots that touch": (changed("radius_mm = 7.5", "radius_mm = 15", BOARD), "radius 15 mm, under half the pitch"),
+    "zero sigma": (BOARD + "sigma_mm = 0\n", "sigma_mm: 0: input should be greater than 0"),
+    "polarity": (changed('"bright"', '"white"', BOARD), "polarity: 'white'"),
+    "unknown key": (BOARD + "colour = 1\n", "colour: unknown key"),
+    "corner inside": (BOARD + corner(3, 3), "corner dot at row 3, column 3; a corner of the grid needed"),
+    "corner outside": (BOARD + corner(0, 9), "corner dot at row 0, column 9; a corner of the grid needed"),
+    "corner negative": (BOARD + corner(-1, 0), "corner.row: -1: input should be greater than or equal to 0"),
+    "corner boolean": (BOARD + corner("true", 0), "corner.row: True: input should be a valid integer"),
+    "corner empty": (BOARD + "[corner]\n", "corner.row: key missing; add it (and 2 more)"),
+    "corner no larger": (BOARD + corner(0, 0, 8), "corner radius 8 mm; at least 8.625 mm and under 22.5 mm needed"),
+    "corner touches": (BOARD + corner(0, 0, 22.5), "corner radius 22.5 mm; at least 8.625 mm and under 22.5 mm needed"),
+    "corner twice": (BOARD + corner() * 2, "not valid TOML: Cannot declare ('corner',) twice"),
+}
+# fmt: on
+
+
+def assert_refused(load, content, message):
+    with pytest.raises(InputError, match=re.escape(message)) as caught:
+        load(content)
+    text = str(caught.value)
+    assert re.match(r"(target|board) file \S+\.toml: ", text)
+    assert len(text.splitlines()) == 1
+    assert len(text) < 400  # a line to read, not a dump of the file
+
+
+@pytest.mark.parametrize("case", WRONG_TARGETS)
+def test_a_wrong_target_is_named_in_one_line(tmp_path, case):
+    assert_refused(lambda content: target_of(tmp_path, content), *WRONG_TARGETS[case])
+
+
+@pytest.mark.parametrize("case", WRONG_BOARDS)
+def test_a_wrong_board_is_named_in_one_line(tmp_path, case):
+    assert_refused(lambda content: board_of(tmp_path, content), *WRONG_BOARDS[case])
+
+
+@pytest.mark.parametrize("load", [load_target, load_board])
+@pytest.mark.parametrize(("name", "message"), [(".", "Is a directory"), ("missing.toml", "No such file.*init DIR")])
+def test_a_path_that_cannot_be_read(tmp_path, load, name, message):
+    with pytest.raises(InputError, match=message):
+        load(tmp_path / name)
+
+
+@pytest.mark.parametrize("radius_mm", [8.625, 22.49])
+def test_corner_radii_at_the_bounds_are_taken(tmp_path, radius_mm):
+    assert board_of(tmp_path, BOARD + corner(6, 8, radius_mm)).radii_mm()[-1] == radius_mm

@@ -1,0 +1,61 @@
+"""Files found group by group, and decoded as the sensor gave them."""
+
+import cv2
+import numpy as np
+import pytest
+
+from stcal.errors import InputError
+from stcal.io.images import RUN_MARKER, TOP_GROUP, decode, find_images
+
+
+def encoded(suffix, image=None, params=()):
+    image = np.arange(48 * 64, dtype=np.uint8).reshape(48, 64) if image is None else image
+    return cv2.imencode(suffix, image, list(params))[1].tobytes()
+
+
+def test_groups_and_order(tmp_path):
+    for name in ("b/2.JPG", "b/1.png", "a ä/x y.tiff", "top.bmp", "b/notes.txt", ".hidden", "b/.DS_Store"):
+        (tmp_path / name).parent.mkdir(exist_ok=True)
+        (tmp_path / name).write_bytes(b"x")
+    (tmp_path / "run").mkdir()
+    (tmp_path / "run" / RUN_MARKER).write_text("{}")
+    (tmp_path / "run" / "picture.jpg").write_bytes(b"x")
+    files, skipped = find_images(tmp_path)
+    assert [(f.group, f.name) for f in files] == [
+        (TOP_GROUP, "top.bmp"),
+        ("a ä", "a ä/x y.tiff"),
+        ("b", "b/1.png"),
+        ("b", "b/2.JPG"),
+    ]
+    assert [(s.name, s.reason) for s in skipped] == [("b/notes.txt", "not an image file")]
+
+
+@pytest.mark.parametrize("suffix", [".jpg", ".png", ".bmp", ".tif"])
+def test_whole_files_are_read_and_truncated_ones_refused(suffix):
+    data = encoded(suffix)
+    assert decode(data, "x").shape == (48, 64)
+    with pytest.raises(InputError, match=r"truncated|not readable"):
+        decode(data[: len(data) * 2 // 3], "x")
+
+
+def test_sixteen_bit_and_colour():
+    deep = (np.arange(48 * 64, dtype=np.uint16) * 20).reshape(48, 64)
+    np.testing.assert_array_equal(decode(encoded(".png", deep), "x"), deep)
+    colour = np.dstack([np.full((48, 64), v, np.uint8) for v in (10, 20, 30)])
+    # Rec. 601 luma: 0.114·10 + 0.587·20 + 0.299·30 = 21.85.
+    assert abs(int(decode(encoded(".png", colour), "x")[0, 0]) - 22) <= 1
+
+
+def test_exif_orientation_is_ignored():
+    data = encoded(".jpg")
+    # A minimal APP1 segment with orientation 6 (turn by 90°), put behind the start of image.
+    exif = b"Exif\0\0MM\0*\0\0\0\x08\0\x01\x01\x12\0\x03\0\0\0\x01\0\x06\0\0\0\0\0\0"
+    turned = data[:2] + b"\xff\xe1" + (len(exif) + 2).to_bytes(2, "big") + exif + data[2:]
+    np.testing.assert_array_equal(decode(turned, "x"), decode(data, "x"))
+    assert cv2.imdecode(np.frombuffer(turned, np.uint8), cv2.IMREAD_GRAYSCALE).shape == (64, 48)
+
+
+@pytest.mark.parametrize(("data", "reason"), [(b"", "0 bytes"), (b"text", "not readable")])
+def test_what_is_no_image_says_so(data, reason):
+    with pytest.raises(InputError, match=reason):
+        decode(data, "x")

@@ -1,0 +1,82 @@
+"""From the camera to the robot's base."""
+
+import json
+
+import numpy as np
+import pytest
+
+from stcal.errors import InputError
+from stcal.geometry.rigid import Rigid
+from stcal.geometry.uncertain import UncertainRigid
+from stcal.io.table import COVARIANCE, POSE, pose_cells
+from stcal.locate.report.chain import read_chain
+
+MOUNT = Rigid.exp([0.1, 0.2, 0.3, 10, 20, 30])
+FLANGE = Rigid.exp([1.0, 0, 0.5, 400, 0, 600])
+SEEN = UncertainRigid(Rigid.exp([0.2, 0, 0, 5, 6, 700]), np.diag([1e-6] * 3 + [0.01] * 3))
+OFFSET = Rigid.exp([0, 0, 0.5, 0, 0, -100])
+
+
+@pytest.fixture
+def files(tmp_path):
+    hand_eye, poses, offset = (tmp_path / name for name in ("he.json", "poses.csv", "offset.json"))
+    sigma = np.diag([1e-8] * 3 + [1e-4] * 3)
+    hand_eye.write_text(json.dumps({"flange_from_camera": MOUNT.matrix().tolist(), "covariance": sigma.tolist()}))
+    poses.write_text(",".join(["scene", *POSE]) + "\n" + ",".join(["a", *pose_cells(FLANGE)]) + "\n")
+    offset.write_text(json.dumps({"obj_from_goal": OFFSET.matrix().tolist()}))
+    return hand_eye, poses, offset
+
+
+def test_the_chain_is_the_product(files):
+    chain = read_chain(*files)
+    goal = chain.base_from_goal("a", SEEN)
+    assert np.allclose(goal.rigid.matrix(), (FLANGE @ MOUNT @ SEEN.rigid @ OFFSET).matrix(), atol=1e-9)
+    assert (np.linalg.eigvalsh(goal.covariance) > 0).all()
+    # A turn of the camera's pose by σ = 1e-3 rad is an arc at the goal, 100 mm off: more than its own 0.1 mm.
+    exact = UncertainRigid(SEEN.rigid, np.diag([0.0] * 3 + [0.01] * 3))
+    assert np.trace(goal.covariance[3:, 3:]) > np.trace(chain.base_from_goal("a", exact).covariance[3:, 3:]) + 0.015
+
+
+def test_covariances_of_the_robot_add_up(files):
+    hand_eye, poses, _ = files
+    plain = read_chain(hand_eye, poses).base_from_goal("a", SEEN).covariance
+    own = np.diag([1e-7] * 3 + [0.04] * 3)
+    text = ",".join(["scene", *POSE, *COVARIANCE]) + "\n" + ",".join(["a", *pose_cells(FLANGE, own)]) + "\n"
+    poses.write_text(text)
+    more = read_chain(hand_eye, poses).base_from_goal("a", SEEN).covariance
+    assert np.allclose(np.diag(more - plain)[:3], 1e-7)
+    assert (np.diag(more - plain)[3:] > 0.04).all()
+
+
+def test_a_fixed_camera_needs_no_robot_poses(files, tmp_path):
+    fixed = tmp_path / "fixed.json"
+    fixed.write_text(json.dumps({"base_from_camera": MOUNT.matrix().tolist(), "covariance": None}))
+    goal = read_chain(fixed, None).base_from_goal("any", SEEN)
+    assert np.allclose(goal.rigid.matrix(), (MOUNT @ SEEN.rigid).matrix())
+    with pytest.raises(InputError, match="camera is fixed"):
+        read_chain(fixed, files[1])
+
+
+def test_what_is_wrong_is_named(files, tmp_path):
+    hand_eye, poses, offset = files
+    with pytest.raises(InputError, match="on the flange; robot poses"):
+        read_chain(hand_eye, None)
+    with pytest.raises(InputError, match="none of scene b"):
+        read_chain(hand_eye, poses).base_from_goal("b", SEEN)
+    poses.write_text(poses.read_text() + poses.read_text().splitlines()[1] + "\n")
+    with pytest.raises(InputError, match="line 3: scene a again"):
+        read_chain(hand_eye, poses)
+    for content, reason in [
+        ("{", "not JSON"),
+        ("[]", "an object"),
+        ("{}", "neither; flange_from_camera or base_from_camera"),
+        (json.dumps({"flange_from_camera": [[1, 2], [3, 4]]}), "flange_from_camera: .*4×4 needed"),
+        (json.dumps({"flange_from_camera": "x"}), "not a matrix of numbers"),
+    ]:
+        hand_eye.write_text(content)
+        with pytest.raises(InputError, match=reason):
+            read_chain(hand_eye, poses)
+    offset.write_text("{}")
+    hand_eye.write_text(json.dumps({"base_from_camera": np.eye(4).tolist()}))
+    with pytest.raises(InputError, match="no obj_from_goal"):
+        read_chain(hand_eye, None, offset)

@@ -1,0 +1,184 @@
+"""The residual field, and the cubes: what is systematic, and where a registration holds."""
+
+import numpy as np
+import pytest
+
+from stcal.geometry.rigid import Rigid
+from stcal.register import register
+from stcal.register.workspace.cubes import cubes
+from stcal.register.workspace.field import MOST_POINTS, residual_field
+
+B_FROM_A = Rigid.exp([0.3, -0.4, 1.1, 2500.0, -300.0, 800.0])
+SIGMA = 0.05
+
+
+def bend(xyz: np.ndarray) -> np.ndarray:
+    """Smooth, some tenths of a mm, and no transform."""
+    x, y, z = (xyz / 100).T
+    return 0.3 * np.column_stack([np.sin(1.5 * y) + 0.5 * x * z, np.cos(1.2 * z), x**2])
+
+
+def bent(seed: int, n: int, sigma: float = SIGMA, half: float = 100.0):
+    """Points, and what is measured of them in a bent frame."""
+    rng = np.random.default_rng(seed)
+    a = rng.uniform(-half, half, (n, 3))
+    return a, B_FROM_A @ (a + bend(a)) + rng.normal(0, sigma, a.shape)
+
+
+def fitted(a, b, **options):
+    found = register(a, b, method="least-squares", folds=0)
+    return found, residual_field(found, a, b, **options)
+
+
+def test_noise_is_not_taken_for_a_field():
+    """One case in a hundred may be: more than two of 40 has a chance of 1 %."""
+    seen = 0
+    for seed in range(40):
+        rng = np.random.default_rng(seed)
+        a = rng.uniform(-100, 100, (30, 3))
+        seen += fitted(a, B_FROM_A @ a + rng.normal(0, SIGMA, a.shape))[1].seen
+    assert seen <= 2
+
+
+def test_field_predicts_new_places_and_knows_how_well():
+    squares, plain, corrected = [], [], []
+    for seed in range(6):
+        a, b = bent(seed, 100)
+        found, field = fitted(a, b)
+        assert field.seen
+        new = np.random.default_rng(100 + seed).uniform(-100, 100, (300, 3))
+        true = B_FROM_A @ (new + bend(new)) - found.b_from_a @ new
+        error, covariance = field.at(new)
+        off = true - error
+        squares.append(np.einsum("ni,ni->n", off, np.linalg.solve(covariance, off[:, :, None])[:, :, 0]).mean() / 3)
+        plain.append(np.linalg.norm(true, axis=1).mean())
+        corrected.append(np.linalg.norm(off, axis=1).mean())
+        # 300 numbers of noise, of which the field takes up to a third: σ is known to 5 %
+        assert field.noise_mm == pytest.approx(SIGMA, rel=0.2)
+        assert field.sigma_ratio == pytest.approx(1, abs=0.1)
+    assert np.mean(corrected) < np.mean(plain) / 3
+    # Errors of neighbours go together, so that 6 × 300 places tell the ratio to some 20 % only.
+    assert 0.7 < np.mean(squares) < 1.4
+
+
+def test_errors_of_points_left_out_are_those_of_refits():
+    a, b = bent(3, 25)
+    _, field = fitted(a, b)
+    for i in range(0, 25, 6):
+        rest = np.delete(np.arange(25), i)
+        refit = register(a[rest], b[rest], method="least-squares", folds=0).b_from_a
+        # the field takes small motions to be linear: good to their square, 1e-6
+        assert field.plain_mm[i] == pytest.approx(np.linalg.norm(b[i] - refit @ a[i]), rel=1e-3)
+    assert field.corrected_mm.mean() < field.plain_mm.mean()
+
+
+def test_far_away_the_field_knows_less():
+    a, b = bent(1, 80)
+    _, field = fitted(a, b)
+    sigma = np.sqrt(np.trace(field.at(np.array([[0.0, 0, 0], [150, 150, 150], [600, 600, 600]]))[1], axis1=1, axis2=2))
+    assert sigma[0] < SIGMA < sigma[1] < sigma[2]
+    assert sigma[2] > 10 * sigma[0]
+
+
+def test_frame_b_does_not_matter():
+    a, b = bent(2, 50)
+    move = Rigid.exp([-0.7, 0.2, 0.1, 40.0, 900.0, -70.0])
+    here, there = fitted(a, b)[1], fitted(a, move @ b)[1]
+    places = np.random.default_rng(0).uniform(-150, 150, (20, 3))
+    error, moved = here.at(places)[0], there.at(places)[0]
+    # the search for the length ends within 2 %
+    np.testing.assert_allclose(error @ move.rotation.T, moved, atol=2e-3)
+    assert there.noise_mm == pytest.approx(here.noise_mm, rel=1e-2)
+
+
+def test_bent_points_are_taken_back_and_wild_ones_are_not():
+    a, b = bent(4, 120)
+    wild = [5, 50, 90]
+    b[wild] += [[2.0, 0, 0], [0, -3, 0], [0, 0, 4]]
+    found = register(a, b, threshold_mm=0.25, folds=0)
+    lost = set(found.outliers) - set(wild)
+    assert len(lost) >= 5
+    field = residual_field(found, a, b)
+    assert set(field.taken_back) <= lost
+    assert len(field.taken_back) > len(lost) / 2
+
+
+def test_points_of_different_sigma():
+    """A third of the points is ten times as noisy: told so, the field is far better than without."""
+    rng = np.random.default_rng(6)
+    a = rng.uniform(-100, 100, (90, 3))
+    sigma = np.where(np.arange(90) % 3 == 0, 10 * SIGMA, SIGMA)
+    b = B_FROM_A @ (a + bend(a)) + rng.normal(0, 1, a.shape) * sigma[:, None]
+    new = rng.uniform(-100, 100, (200, 3))
+    errors = {}
+    for name, given in (("told", sigma**2), ("untold", None)):
+        found = register(a, b, method="least-squares", covariances=given, folds=0)
+        field = residual_field(found, a, b, covariances=given)
+        off = B_FROM_A @ (new + bend(new)) - found.b_from_a @ new - field.at(new)[0]
+        errors[name] = np.linalg.norm(off, axis=1).mean()
+        if name == "told":
+            assert field.sigma_ratio == pytest.approx(1, abs=0.12)
+            assert field.noise_mm == pytest.approx(np.sqrt(np.mean(sigma**2)), rel=0.2)
+    assert errors["told"] < 0.7 * errors["untold"]
+
+
+def test_few_points_and_many():
+    a, b = bent(0, 5)
+    assert fitted(a, b)[1] is None
+    a, b = bent(0, 3 * MOST_POINTS)
+    assert len(fitted(a, b)[1].rows) == MOST_POINTS
+
+
+def test_other_models_leave_less_to_the_field():
+    a, b = bent(5, 100)
+    sizes = []
+    for model in ("rigid", "affine"):
+        found = register(a, b, model=model, method="least-squares", folds=0)
+        sizes.append(residual_field(found, a, b).size_mm)
+    assert sizes[1] < sizes[0]
+
+
+def test_cubes_by_hand():
+    """A grid, undisturbed within 100 mm of its middle, the rest shifted by 5 mm."""
+    steps = np.linspace(-200, 200, 9)
+    a = np.stack(np.meshgrid(steps, steps, steps), -1).reshape(-1, 3) + np.array([800, 200, 700])
+    far = np.abs(a - [800, 200, 700]).max(1) > 110
+    b = B_FROM_A @ a + np.where(far[:, None], [3.0, 0.0, 4.0], 0.0)
+    found = register(a, b, threshold_mm=10.0, folds=0)
+    assert found.inliers.all()
+    result = cubes(found, a, b)
+    np.testing.assert_allclose(result.middle, [800, 200, 700])
+    np.testing.assert_allclose(result.sides_mm, [100, 200, 300, 400])
+    inner = result.errors[0]
+    assert [e.points for e in inner] == [27, 125 - 27, 343 - 125, 729 - 343]
+    np.testing.assert_allclose([e.max_mm for e in inner], [0, 0, 5, 5], atol=1e-9)
+    np.testing.assert_allclose([e.mean_mm for e in inner], [0, 0, 5, 5], atol=1e-9)
+    # fitted to all, the error is shared: of 729 points 125 stand still, so that the shift is 5 · 604/729 in the middle
+    outer = result.errors[3]
+    assert outer[0].mean_mm == pytest.approx(5 * 604 / 729, rel=0.02)
+    assert outer[3].mean_mm == pytest.approx(5 * 125 / 729, rel=0.05)
+
+
+def test_points_in_the_cube_are_held_out():
+    """Ten points in it: a fit to them has residuals 1 − 6/30 of the noise's square, held out it is above."""
+    inside = []
+    for seed in range(25):
+        rng = np.random.default_rng(seed)
+        a = np.vstack([rng.uniform(-50, 50, (10, 3)), rng.uniform(-50, 50, (10, 3)) + np.array([0, 0, 150])])
+        b = B_FROM_A @ a + rng.normal(0, 1, a.shape)
+        found = register(a, b, threshold_mm=50.0, folds=0)
+        result = cubes(found, a, b, folds=10)
+        inside.append(result.errors[-1][-1].rms_mm if result.errors[-1][-1] else np.nan)
+    # 20 points: held out 1 + 6/60 of the noise's variance of 3, in sample 1 − 6/60
+    assert np.sqrt(3) < np.nanmean(inside) < np.sqrt(3 * 1.25)
+
+
+def test_cubes_without_points_or_width():
+    a, b = bent(0, 8)
+    assert cubes(register(a, b, folds=0), a, b) is None
+    rng = np.random.default_rng(0)
+    flat = np.vstack([rng.uniform(-50, 50, (20, 3)) * [1, 1, 0], rng.uniform(-200, 200, (60, 3))])
+    found = register(flat, B_FROM_A @ flat, model="affine", method="least-squares", folds=0)
+    result = cubes(found, flat, B_FROM_A @ flat)
+    assert result is not None
+    assert result.sides_mm[0] > 100  # the plane in the middle determines no affine transform: left out

@@ -1,0 +1,346 @@
+"""The axis method on simulated arms, where everything is known, and on tracked sweeps of a Fanuc."""
+
+import json
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from typer.testing import CliRunner
+
+from stcal.cli.robot import app
+from stcal.errors import DegenerateError, InputError
+from stcal.geometry.rigid import Rigid
+from stcal.robot.axes.model import fit_axes, pairs_of, robot_from_sweeps
+from stcal.robot.axes.sweeps import find_arcs
+from stcal.robot.kinematics.file import load_robot, robot_toml
+from stcal.robot.kinematics.forward import flange_poses, forward, joint_frames
+from stcal.robot.kinematics.measurements import Measurements, read_measurements
+from stcal.robot.kinematics.model import DHRow, Joint, Robot
+from stcal.synthetic.measured.arms import joint_vectors, made, mh80, placed
+
+SIGMA = 0.03
+WORLD = Rigid.exp([0.1, -0.05, 2.1, 2500.0, -900.0, 400.0])
+TOOLS = {"A": Rigid(np.eye(3), [180, 20, 150]), "B": Rigid(np.eye(3), [-120, 130, 90])}
+TOOLS["C"] = Rigid(np.eye(3), [-60, -170, 210])
+RNG_SEED = 5
+
+
+def scara() -> Robot:
+    rows = tuple(DHRow(*r) for r in ((325, 0, 400, 0), (225, np.pi, 0, 0), (0, 0, 0, 0), (0, 0, 60, 0)))
+    kinds = (Joint(), Joint(), Joint("prismatic", 0, 200), Joint())
+    return Robot("SCARA", "standard", rows, kinds)
+
+
+def craig() -> Robot:
+    d = np.radians
+    rows = ((0, 0, 450, 0), (150, -90, 0, -90), (600, 0, 0, 0), (120, -90, 640, 0), (0, 90, 0, 0), (0, -90, 100, 0))
+    rows = tuple(DHRow(a, float(d(alpha)), dd, float(d(theta))) for a, alpha, dd, theta in rows)
+    return Robot("Craig", "modified", rows, (Joint("revolute", -2.0, 2.0),) * 6)
+
+
+def coupled() -> Robot:
+    coupling = np.eye(6)
+    coupling[2, 1], coupling[5, 4] = 1, -0.5
+    return replace(mh80(), name="coupled", coupling=coupling)
+
+
+NOMINALS = {"MH80": mh80, "Craig": craig, "SCARA": scara, "coupled": coupled}
+
+
+def arm(nominal: Robot) -> Robot:
+    """As made, where an instrument sees it, with three reflectors."""
+    return placed(made(nominal, np.random.default_rng(11)), WORLD, TOOLS)
+
+
+def sweep_values(robot: Robot, count: int = 9, rests: int = 1) -> np.ndarray:
+    """Controller's values: each joint swept alone in kinematic values, from rests that all share."""
+    n = len(robot.rows)
+    q = []
+    for rest in range(rests):
+        home = np.where(robot.prismatic, 30.0, 0.25 + 0.3 * rest) * np.where(np.arange(n) % 2, 1, -1)
+        q.append(home)
+        for j in range(n):
+            way = np.linspace(0, 150, count) if robot.prismatic[j] else np.linspace(-1.1, 1.1, count)
+            for value in way:
+                q.append(np.where(np.arange(n) == j, value, home))
+    return np.array(q) @ np.linalg.inv(robot.coupling).T
+
+
+def measured(robot: Robot, q: np.ndarray, sigma: float = 0.0, seed: int = 0) -> Measurements:
+    """Positions of all reflectors at each joint vector, reflectors side by side in the rows."""
+    seen = np.stack([robot.world_from_base @ forward(robot, q, name).translation for name in robot.tools], axis=1)
+    points = seen.reshape(-1, 3) + np.random.default_rng(seed).normal(0, 1, (seen.size // 3, 3)) * sigma
+    k = len(robot.tools)
+    lines = range(2, 2 + len(points))
+    return Measurements("sweeps", lines, np.repeat(q, k, axis=0), tuple(robot.tools) * len(q), points)
+
+
+def moved(data: Measurements, positions: np.ndarray) -> Measurements:
+    return replace(data, positions=positions)
+
+
+@pytest.mark.parametrize("name", NOMINALS)
+def test_without_noise_the_arm_comes_back(name):
+    nominal = NOMINALS[name]()
+    true = arm(nominal)
+    result = robot_from_sweeps(measured(true, sweep_values(true, rests=2)), nominal)
+    q = joint_vectors(nominal, 50, np.random.default_rng(3))
+    for tool in true.tools:
+        there = true.world_from_base @ forward(true, q, tool).translation
+        here = result.robot.world_from_base @ forward(result.robot, q, tool).translation
+        # rounding of coordinates of 3000 mm is 5e-13 mm; axes far outside the measured arcs enlarge it
+        assert np.abs(here - there).max() < 1e-9
+    assert not result.notes
+    assert max(fit.sigma_mm for fit in result.fits) < 1e-11
+
+
+@pytest.mark.parametrize("name", NOMINALS)
+def test_rows_and_chain_of_axes_make_the_same_poses(name):
+    nominal = NOMINALS[name]()
+    true = arm(nominal)
+    result = robot_from_sweeps(measured(true, sweep_values(true), SIGMA), nominal)
+    q = joint_vectors(nominal, 40, np.random.default_rng(4))
+    axes, rows = flange_poses(result.chain, q), flange_poses(result.robot.chain(), q)
+    between = axes.inverse() @ rows  # flange in the last joint's frame: one and the same
+    assert np.abs(between.translation - between.translation[0]).max() < 1e-9
+    assert np.abs(between.rotation - between.rotation[0]).max() < 1e-12
+
+
+def true_axes(robot: Robot) -> tuple[np.ndarray, np.ndarray]:
+    rotation, origin = joint_frames(robot.chain(), np.zeros((1, len(robot.rows))))
+    return rotation[:, 0, :, 2], origin[:, 0]
+
+
+def axis_error(frame: Rigid, z: np.ndarray, origin: np.ndarray, sliding: bool) -> np.ndarray:
+    """rx, ry, tx, ty of the true axis in the found one's frame."""
+    direction, place = frame.rotation.T @ z, frame.inverse() @ origin
+    place = place - direction * place[2] / direction[2]
+    return np.array([-direction[1], direction[0], *place[:2]])[: 2 if sliding else 4]
+
+
+@pytest.mark.parametrize(("name", "rests"), [("MH80", 1), ("coupled", 2), ("SCARA", 1)])
+def test_errors_of_the_axes_are_as_large_as_their_covariance(name, rests):
+    nominal = NOMINALS[name]()
+    true = arm(nominal)
+    z, origin = true_axes(true)
+    q = sweep_values(true, 7 if rests == 1 else 5, rests)
+    arcs, _ = find_arcs(measured(true, q), nominal)
+    squares, freedom, coordinates = [], 0, []
+    for seed in range(100):
+        fits, covariance, _ = fit_axes(measured(true, q, SIGMA, seed), nominal, arcs)
+        error = np.concatenate(
+            [axis_error(f.world_from_axis, z[i], origin[i], nominal.prismatic[i]) for i, f in enumerate(fits)]
+        )
+        squares.append(error @ np.linalg.solve(covariance, error))
+        freedom = len(error)
+        coordinates.append([fit.sigma_mm / SIGMA for fit in fits])
+    dof = min(fit.dof for fit in fits)
+    # normal errors over an estimated σ: the mean of their squares is dof / (dof − 2); 100 draws of 14 to 24
+    # coordinates scatter by √(2 / 1400) = 4 % at most
+    assert 0.9 < np.mean(squares) / freedom < 1.1 * dof / (dof - 2)
+    assert np.mean(np.square(coordinates)) == pytest.approx(1, abs=0.03)  # 100 draws × 4 axes × dof ≥ 30
+
+
+def test_errors_of_pairs_are_as_large_as_their_sigma():
+    nominal = mh80()
+    true = arm(nominal)
+    q = sweep_values(true, 7)
+    arcs, _ = find_arcs(measured(true, q), nominal)
+    fits, covariance, _ = fit_axes(measured(true, q), nominal, arcs)
+    wanted = pairs_of([f.world_from_axis for f in fits], covariance, nominal)
+    scores = []
+    for seed in range(60):
+        fits, covariance, _ = fit_axes(measured(true, q, SIGMA, seed), nominal, arcs)
+        pairs = pairs_of([f.world_from_axis for f in fits], covariance, nominal)
+        for one, two in zip(pairs[:3], wanted[:3], strict=True):  # the others cross: the sign of 0 is not kept
+            scores.append(
+                [(one.distance - two.distance) / one.distance_sigma, (one.angle - two.angle) / one.angle_sigma]
+            )
+    # 180 each, not all independent: the mean square scatters by √(2 / 180) = 11 % or somewhat more
+    assert np.mean(np.square(scores), axis=0) == pytest.approx([1, 1], abs=0.33)
+
+
+def test_leaving_out_a_row_is_fitting_without_it():
+    nominal = mh80()
+    data = measured(arm(nominal), sweep_values(nominal, 6), SIGMA, 2)
+    whole = robot_from_sweeps(data, nominal)
+    for instant in (3, 12, 30):
+        rows = np.arange(len(data)) // 3 != instant
+        index = whole.without_one.lines.index(2 + 3 * instant)
+        again = robot_from_sweeps(data[rows], nominal)
+        found = np.abs(whole.without_one.distance[index])
+        # the same weights are kept, which is a small part of σ where a residual is above 3 σ
+        sigma = np.array([p.distance_sigma for p in whole.pairs])
+        assert (np.abs(found - [p.distance for p in again.pairs]) < 0.1 * sigma).all()
+        assert np.abs(found - [p.distance for p in whole.pairs]).max() > 1e-4
+
+
+@pytest.mark.parametrize("off_mm", [0.5, 20.0, 300.0, 2000.0])
+def test_a_gross_error_is_named_and_left_out(off_mm):
+    nominal = mh80()
+    data = measured(arm(nominal), sweep_values(nominal, 6), SIGMA, 7)
+    clean = robot_from_sweeps(data, nominal)
+    positions = np.array(data.positions)
+    positions[40] += off_mm * np.array([0.6, -0.48, 0.64])
+    result = robot_from_sweeps(moved(data, positions), nominal)
+    assert [note for note in result.notes if f"line {data.lines[40]}, reflector B" in note and "left out" in note]
+    assert len(result.notes) == 1
+    for one, two in zip(result.pairs, clean.pairs, strict=True):
+        assert abs(one.distance - two.distance) < 3 * two.distance_sigma  # one of 18 points less
+
+
+def test_a_reflector_on_the_axis_says_nothing_and_breaks_nothing():
+    nominal = mh80()
+    true = replace(arm(nominal), tools=TOOLS | {"D": Rigid(np.eye(3), [0.01, 0, 300])})
+    result = robot_from_sweeps(measured(true, sweep_values(nominal), SIGMA), nominal)
+    assert [arc.target for arc in result.fits[5].near] == ["D"]
+    assert "reflector D: too close to the axis of joint 6" in result.notes[0]
+    z, origin = true_axes(true)
+    error = axis_error(result.fits[5].world_from_axis, z[5], origin[5], False)
+    assert np.abs(error[2:]).max() < 5 * np.sqrt(np.diag(result.fits[5].covariance)[2:].max())
+    alone = replace(true, tools={"D": true.tools["D"]})
+    with pytest.raises(DegenerateError, match=r"joint 6: .*put a reflector off the axis"):
+        robot_from_sweeps(measured(alone, sweep_values(nominal), SIGMA), nominal)
+
+
+def test_full_turns_and_arcs_too_short_to_use():
+    nominal = mh80()
+    true = arm(nominal)
+    q = sweep_values(true, 5)
+    turned = np.repeat(q[:1], 4, axis=0)
+    turned[:, 5] = np.radians([-360, -120, 120, 360])
+    two = np.repeat(q[:1], 2, axis=0)
+    two[:, 0] = 1.0
+    two[1, 5] = 0.9
+    _, notes = find_arcs(measured(true, np.vstack([q, turned, two])), nominal)
+    assert len(notes) == 3  # of each reflector
+    assert all("joint 6" in note and "an arc of 2 positions is not used" in note for note in notes)
+    result = robot_from_sweeps(measured(true, np.vstack([q, turned])), nominal)
+    assert np.degrees(result.fits[5].span) == pytest.approx(720)
+
+
+def test_the_arms_that_cannot_be_had():
+    nominal = mh80()
+    true = arm(nominal)
+    q = sweep_values(true, 6)
+    good = measured(true, q, SIGMA)
+    still = good[np.abs(good.q[:, 3] - good.q[0, 3]) < 1e-9]
+    with pytest.raises(InputError, match="sweeps: joint 4 is never swept"):
+        robot_from_sweeps(still, nominal)
+    fixed = np.array(good.positions)
+    fixed[1::3] = fixed[1]
+    with pytest.raises(InputError, match="reflector B does not move"):
+        robot_from_sweeps(moved(good, fixed), nominal)
+    with pytest.raises(InputError, match="mirror image of robot MH80"):
+        robot_from_sweeps(moved(good, good.positions * [1, -1, 1]), nominal)
+    with pytest.raises(InputError, match=r"motion seen is off its values by up to .*unit"):
+        robot_from_sweeps(replace(good, q=np.radians(good.q)), nominal, 1e-6)
+    with pytest.raises(InputError, match="joint 3 counts against robot MH80"):
+        robot_from_sweeps(replace(good, q=good.q * [1, 1, -1, 1, 1, 1]), nominal)
+    with pytest.raises(InputError, match="distances only"):
+        robot_from_sweeps(replace(good, positions=None), nominal)
+    with pytest.raises(InputError, match=r"never swept.*coupling"):
+        robot_from_sweeps(measured(arm(coupled()), sweep_values(coupled(), 6)), nominal)
+    short = q[0] + 0.01 * (q - q[0])  # 1.3°: σ of a direction is beyond what its covariance can say
+    with pytest.raises(DegenerateError, match=r"joint \d: σ of the direction .* sweep further"):
+        robot_from_sweeps(measured(true, short, SIGMA), nominal)
+    few = measured(replace(true, tools={"A": TOOLS["A"]}), sweep_values(true, 3)[1:])
+    with pytest.raises(DegenerateError, match="joint 1: 3 positions on 1 arcs leave no redundancy"):
+        robot_from_sweeps(few, nominal)
+
+
+def test_a_mirrored_scara_is_seen_by_its_sliding_joint():
+    nominal = scara()
+    data = measured(arm(nominal), sweep_values(nominal), SIGMA)
+    robot_from_sweeps(data, nominal)
+    with pytest.raises(InputError, match="mirror image of robot SCARA"):
+        robot_from_sweeps(moved(data, data.positions[:, [1, 0, 2]]), nominal)
+
+
+def test_exactly_parallel_axes_have_no_common_normal():
+    nominal = mh80()
+    result = robot_from_sweeps(measured(placed(nominal, Rigid(), TOOLS), sweep_values(nominal)), nominal)
+    pair = result.pairs[1]
+    assert pair.parallel
+    assert pair.distance == pytest.approx(870, abs=1e-8)
+    assert pair.refused
+
+
+@pytest.fixture(scope="module")
+def fanuc(shared_data, tmp_path_factory):
+    """The tracked sweeps as our files: three rows for each of theirs, and an R-2000's nominal rows."""
+    file = shared_data / "fanuc_sweeps" / "N1N2N3Jval.csv"
+    if not file.is_file():
+        pytest.skip("the tracked sweeps are not among the shared data sets")
+    raw = np.loadtxt(file)
+    folder = tmp_path_factory.mktemp("fanuc")
+    lines = ["target,q1_deg,q2_deg,q3_deg,q4_deg,q5_deg,q6_deg,x_mm,y_mm,z_mm"]
+    for row in raw:
+        for k, target in enumerate(("N1", "N2", "N3")):
+            lines.append(",".join([target, *map(repr, [*row[15:].tolist(), *row[3 * k : 3 * k + 3].tolist()])]))
+    (folder / "sweeps.csv").write_text("\n".join(lines) + "\n")
+    rows = ((312, -90, 0, 0), (1075, 180, 0, -90), (225, -90, 0, 0), (0, 90, -1280, 0), (0, -90, 0, 0))
+    rows = [DHRow(a, float(np.radians(al)), d, float(np.radians(t))) for a, al, d, t in (*rows, (0, 180, -215, 0))]
+    coupling = np.eye(6)
+    coupling[2, 1] = 1
+    robot = Robot("R-2000", "standard", tuple(rows), (Joint(),) * 6, coupling)
+    (folder / "robot.toml").write_text(robot_toml(robot))
+    nominal = load_robot(folder / "robot.toml")
+    return folder, robot_from_sweeps(read_measurements(folder / "sweeps.csv", nominal), nominal)
+
+
+def test_tracked_sweeps_lie_on_their_circles(fanuc):
+    _, result = fanuc
+    rms = [np.sqrt((fit.lengths() ** 2).mean()) for fit in result.fits]  # of the points' vectors
+    assert min(rms) > 0.02
+    assert max(rms) < 0.04
+    assert [len(fit.rows) for fit in result.fits] == [18] * 6
+    assert not result.notes
+
+
+def test_tracked_sweeps_give_the_arms_lengths(fanuc):
+    """Against 311.45, 1075.58, 226.08 mm of separate circle fits (SOURCE.txt), printed to 0.005 mm."""
+    _, result = fanuc
+    for pair, wanted in zip(result.pairs, (311.45, 1075.58, 226.08), strict=False):
+        # other estimators of the same data: they differ by less than the σ of the data
+        assert abs(pair.distance - wanted) < pair.distance_sigma + 0.005
+        assert 0.02 < pair.distance_sigma < 0.2
+    assert [abs(row.a) for row in result.robot.rows[:3]] == pytest.approx([p.distance for p in result.pairs[:3]])
+
+
+def test_denavit_and_hartenberg_is_refused_for_the_nearly_parallel_pair(fanuc):
+    _, result = fanuc
+    pair = result.pairs[1]
+    assert np.pi - pair.angle == pytest.approx(np.radians(0.0104), abs=2 * pair.angle_sigma)
+    assert abs(pair.foot) == pytest.approx(5.9e6, abs=2 * pair.foot_sigma)
+    assert pair.parallel
+    assert "foot 59" in pair.refused
+    assert "1 mm needed" in pair.refused
+    assert result.robot.rows[1].beta != 0
+    assert [p.refused for p in result.pairs if p.joint != 1] == [""] * 4
+    distance, normal = (result.without_one.spread(key)[1] for key in ("distance", "normal"))
+    assert len(result.without_one.lines) == 36
+    assert 0.005 < distance < 0.1
+    assert normal > 100
+
+
+def test_command(fanuc, tmp_path):
+    folder, result = fanuc
+    names = {key: tmp_path / f"axes.{key}" for key in ("toml", "json", "html")}
+    options = ["--robot", folder / "robot.toml", "--out", names["toml"]]
+    options += ["--json", names["json"], "--report", names["html"]]
+    done = CliRunner().invoke(app, ["axes", str(folder / "sweeps.csv"), *map(str, options)])
+    assert done.exit_code == 0, done.output
+    assert "refused D-H value of joints 2–3: foot 59" in done.output
+    assert "1075.57" in done.output
+    again = load_robot(names["toml"])
+    assert again.rows[1].a == result.robot.rows[1].a
+    assert set(again.tools) == {"", "N1", "N2", "N3"}
+    content = json.loads(names["json"].read_text())
+    assert content["format"] == "stcal axes 1"
+    assert len(content["axes"]) == 6
+    assert content["pairs"][1]["hayati"] is True
+    assert np.array(content["covariance"]).shape == (24, 24)
+    page = names["html"].read_text()
+    assert "D-H value of joints 2–3 refused" in page
+    assert page.count("data:image/svg+xml") == 1

@@ -1,0 +1,58 @@
+"""Variance components against closed forms of the textbook."""
+
+import numpy as np
+import pytest
+
+from stcal.robot.identify.variances import Components
+
+
+def regression(
+    rng: np.random.Generator, rows: int, width: int = 4, groups: int = 0, sigma: float = 1.0, tau: float = 1.0
+):
+    """A linear model of ``width`` parameters, the last ``groups`` of them drawn with ``tau`` about 0; about zero."""
+    design = rng.normal(size=(rows, width))
+    drawn = rng.normal(size=width) * tau * (np.arange(width) >= width - groups)
+    seen = design @ drawn + rng.normal(size=rows) * sigma
+    parts = [(design.T @ design, design.T @ seen, seen @ seen, rows, 0.0, np.inf, -np.inf)]
+    if groups:
+        mine = np.diag((np.arange(width) >= width - groups).astype(float))
+        parts.append((mine, np.zeros(width), 0.0, groups, 0.0, 1.0, -np.inf))
+    fixed, none = 1e-12 * np.eye(width), np.zeros(width)
+    parts = [np.array(each, float) for each in zip(*parts, strict=True)]
+    return Components(*parts, fixed, none, np.ones(width)), design, seen, drawn
+
+
+@pytest.mark.parametrize("rows", [14, 24, 104])
+def test_one_sigma_is_that_of_least_squares_and_the_covariance_that_of_t(rows):
+    parts, design, seen, _ = regression(np.random.default_rng(rows), rows)
+    freedom = rows - 4
+    left = np.linalg.lstsq(design, seen, rcond=None)[1][0]
+    best = parts.best()
+    assert np.exp(2 * best[0]) == pytest.approx(left / freedom, rel=1e-6)
+    wanted = left / (freedom - 2) * np.linalg.inv(design.T @ design)  # of a t distribution with so many degrees
+    # three nodes are exact to the fourth order of the spread of log σ, 1 / √(2 · freedom)
+    assert parts.covariance(best) == pytest.approx(wanted, rel=3 / freedom**2 + 1e-3)
+
+
+def test_of_several_parts_the_covariance_is_true_on_average():
+    error = []
+    for seed in range(400):
+        parts, _, _, drawn = regression(np.random.default_rng(seed), 30, 10, 6, 1.0, 0.6)
+        best = parts.best()
+        step = parts.at(best[None])[2][0]
+        away = step - drawn
+        error.append(away @ np.linalg.solve(parts.covariance(best), away) / 10)
+    # With the σ taken for known it is 1.18. Three standard errors of the mean of 400 draws:
+    assert np.mean(error) == pytest.approx(1, abs=0.1)
+
+
+def test_parts_without_noise_do_not_break_it():
+    design = np.random.default_rng(3).normal(size=(20, 3))
+    exact = design @ [1.0, 2.0, 3.0]
+    parts = [(design.T @ design, design.T @ exact, exact @ exact, 20, 0.0, np.inf, -2.0)]
+    parts = Components(
+        *(np.array(each, float) for each in zip(*parts, strict=True)), np.zeros((3, 3)), np.zeros(3), np.ones(3)
+    )
+    best = parts.best()
+    assert best == pytest.approx([-2.0])
+    assert np.isfinite(parts.covariance(best)).all()

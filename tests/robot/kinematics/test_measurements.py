@@ -1,0 +1,152 @@
+"""Measured data of robots: units, kinds, and every mistake named by its line."""
+
+import json
+import re
+
+import numpy as np
+import pytest
+
+from stcal.errors import InputError
+from stcal.geometry.rigid import Poses, Rigid
+from stcal.io.table import COVARIANCE, POSE, common_columns, pose_cells
+from stcal.robot.kinematics.file import save_robot
+from stcal.robot.kinematics.measurements import Measurements, read_measurements
+from stcal.robot.kinematics.model import DHRow, Joint, Robot
+from stcal.robot.use.compensation import joint_cells, joint_columns
+from stcal.synthetic.measured.arms import joint_vectors, made, measured, mh80, placed
+
+GANTRY = Robot("gantry", "standard", (DHRow(0, 0.3, 0, 0), DHRow(100, 0, 50, 0)), (Joint("prismatic"), Joint()))
+POSES = Poses.of([Rigid.exp([0.1, 0.2, 0.3, 4, 5, 6]), Rigid.exp([-0.4, 0, 0.3, 40, 50, 60])])
+
+
+def read(tmp_path, text: str, robot: Robot = GANTRY) -> Measurements:
+    (tmp_path / "data.csv").write_text(text)
+    return read_measurements(tmp_path / "data.csv", robot)
+
+
+def test_units_and_targets(tmp_path):
+    data = read(tmp_path, "# a note\nq1_m,q2_deg,x_um,y_mm,z_in,target\n\n0.25,90,1000,2,1,N1\n0.5,-45,0,0,0,N2\n")
+    assert data.q == pytest.approx(np.array([[250, np.pi / 2], [500, -np.pi / 4]]))
+    assert data.positions == pytest.approx(np.array([[1, 2, 25.4], [0, 0, 0]]))
+    assert data.targets == ("N1", "N2")
+    assert list(data.lines) == [4, 5]
+    assert data.rotations is None
+    with pytest.raises(InputError, match="positions without orientation"):
+        data.poses()
+
+
+def test_poses_with_covariance(tmp_path):
+    covariance = np.diag([1e-8, 2e-8, 3e-8, 1e-4, 2e-4, 3e-4])
+    rows = [["1", "2", *pose_cells(pose, covariance)] for pose in POSES]
+    data = read(tmp_path, "\n".join(",".join(r) for r in [["q1_mm", "q2_rad", *POSE, *COVARIANCE], *rows]))
+    assert np.abs(data.poses().difference(POSES)).max() < 1e-12
+    assert data.covariance == pytest.approx(np.array([covariance] * 2))
+    assert data[1:].covariance.shape == (1, 6, 6)
+
+
+def common_text(common, names=None, covariance=None):
+    """Two poses with the covariance 1e-8 rad², 1e-4 mm² and common errors (2, 6, r)."""
+    covariance = np.diag([1e-8] * 3 + [1e-4] * 3) if covariance is None else covariance
+    columns = common_columns(common.shape[2]) if names is None else names
+    cells = [[f"{v:g}" for v in each.T.ravel()] for each in common]
+    rows = [["1", "2", *pose_cells(p, covariance), *c] for p, c in zip(POSES, cells, strict=True)]
+    return "\n".join(",".join(row) for row in [["q1_mm", "q2_deg", *POSE, *COVARIANCE, *columns], *rows])
+
+
+def test_common_errors_of_poses(tmp_path):
+    common = np.random.default_rng(0).normal(size=(2, 6, 3)) * 0.3 * np.repeat([1e-4, 1e-2], 3)[:, None]
+    data = read(tmp_path, common_text(common))
+    assert data.common == pytest.approx(common, rel=1e-5)
+    assert data[1:].common == pytest.approx(common[1:], rel=1e-5)
+    assert data.own_covariance() == pytest.approx(data.covariance - common @ np.swapaxes(common, 1, 2), rel=1e-5)
+    with pytest.raises(InputError, match=r"line 2: common errors are larger than the covariance"):
+        read(tmp_path, common_text(4 * common))
+    with pytest.raises(InputError, match=r"common1_rx is missing; all columns common1_rx … or none"):
+        read(tmp_path, common_text(common, ["common1_r", *common_columns(3)[1:]]))
+    without = ",".join(["q1_mm,q2_deg", *POSE, *common_columns(1)]) + "\n1,2,0,0,0,1,0,0,0,0,0,0,0,0,0\n"
+    with pytest.raises(InputError, match=r"columns common1_… without columns cov_…"):
+        read(tmp_path, without)
+
+
+def test_distances_from_rows(tmp_path):
+    data = read(tmp_path, "q1_mm,q2_deg,distance_mm,from_row\n0,0,0,1\n10,5,20,1\n20,10,30,2\n")
+    assert data.distances == pytest.approx([0, 20, 30])
+    assert data.from_row.tolist() == [0, 0, 1]
+    assert read(tmp_path, "q1_mm,q2_deg,distance_mm\n0,0,0\n10,5,20\n").from_row.tolist() == [0, 0]
+    with pytest.raises(InputError, match="distances refer to other rows"):
+        data[:2]
+
+
+@pytest.mark.parametrize(
+    ("text", "words"),
+    [
+        ("", "empty"),
+        ("q1_mm,q2_deg,x_mm,y_mm,z_mm\n", "a header but no rows"),
+        ("q1_mm,x_mm,y_mm,z_mm\n1,2,3,4\n", "q2_rad or q2_deg needed"),
+        ("q1_deg,q2_deg,x_mm,y_mm,z_mm\n1,2,3,4,5\n", "q1_mm or"),
+        ("q1_mm,q2_deg,q3_deg,x_mm,y_mm,z_mm\n1,2,3,4,5,6\n", "gantry has 2 joints"),
+        ("q1_mm,q2_deg,x_mm,y_mm,z_mm\n1,2,3,4,nan\n", "line 2: z_mm is 'nan'"),
+        ("q1_mm,q2_deg,x_mm,y_mm,z_mm\n1,2,3,4,5\n1,2,inf,4,5\n", "line 3: x_mm is 'inf'"),
+        ("q1_mm,q2_rad,x_mm,y_mm,z_mm\n1,90,3,4,5\n", "line 2: q2_rad is 90, over 4 turns"),
+        ("q1_mm,q2_rad\n1,0\n", "neither x_mm, y_mm, z_mm nor distance_mm"),
+        ("q1_mm,q2_rad,distance_mm,from_row\n1,0,3,7\n", "from_row is 7, 1 … 1 needed"),
+        ("q1_mm,q2_rad,x_mm,y_mm,z_mm,qw,qx\n1,0,3,7,4,1,0\n", "qw, qx without qy, qz"),
+        ("q1_mm,q2_rad,x_mm,y_mm,z_mm,qw,qx,qy,qz\n1,0,3,7,4,1,1,0,0\n", "quaternion of length 1.414"),
+    ],
+)
+def test_mistakes_are_named(tmp_path, text, words):
+    with pytest.raises(InputError, match=f"data.csv.*{re.escape(words)}"):
+        read(tmp_path, text)
+
+
+@pytest.fixture
+def undecided(tmp_path):
+    """As ``stcal-sfm measure --joints`` writes it: of 40 poses two are flipped, and said to be ambiguous."""
+    rng = np.random.default_rng(5)
+    true = placed(made(mh80(), rng), Rigid.exp([0.1, 0.2, 0.3, 500, 600, 700]), {"": Rigid()})
+    seen = measured(true, joint_vectors(true, 40, rng), rng)
+    status = ["certain"] * 38
+    status[3:3], status[20:20] = ["ambiguous"], ["ambiguous"]
+    lines = [",".join(["image", "status", *POSE, *joint_columns(true)])]
+    for i, (word, pose, q) in enumerate(zip(status, seen.poses(), seen.q, strict=True)):
+        given = pose @ Rigid.exp([0.5, 0, 0, 0, 0, 0]) if word == "ambiguous" else pose
+        lines.append(",".join([f"{i}.jpg", word, *pose_cells(given), *map(str, joint_cells(true, q))]))
+    save_robot(tmp_path / "robot.toml", mh80())
+    (tmp_path / "poses.csv").write_text("\n".join(lines) + "\n")
+    return tmp_path
+
+
+def test_ambiguous_poses_are_left_out_and_told(undecided, stcal_robot):
+    data = read_measurements(undecided / "poses.csv", mh80())
+    assert len(data) == 38
+    assert list(data.lines)[:4] == [2, 3, 4, 6]
+    code, out, _ = stcal_robot(
+        "identify", undecided / "poses.csv", "--robot", undecided / "robot.toml", "--folds", 0, "--json",
+        undecided / "found.json",
+    )  # fmt: skip
+    assert code == 0
+    assert "note: " in out
+    assert "2 of 40 rows left out, first line 5: their status is ambiguous" in out
+    assert "38 poses, 30 parameters" in out
+    assert "outliers" not in out
+    assert "2 of 40 rows" in json.loads((undecided / "found.json").read_text())["notes"][0]
+
+
+def test_ambiguous_poses_alone_are_no_data(undecided):
+    text = (undecided / "poses.csv").read_text().replace("certain", "ambiguous")
+    (undecided / "poses.csv").write_text(text)
+    with pytest.raises(InputError, match="40 of 40 rows left out"):
+        read_measurements(undecided / "poses.csv", mh80())
+
+
+def test_a_value_beyond_all_lengths_is_named(tmp_path):
+    with pytest.raises(InputError, match=r"line 3: x_mm is 1e\+200, up to 1e\+12 possible"):
+        read(tmp_path, "q1_mm,q2_deg,x_mm,y_mm,z_mm\n1,2,3,4,5\n1,2,1e200,4,5\n")
+
+
+def test_a_quote_without_end_is_named_by_its_line(tmp_path):
+    """However long the rest is: the csv module gives up at 131 072 characters."""
+    rows = ["1,2,3,4,5,ok"] * 20_000
+    rows[6] = '1,2,3,4,5,"moved'
+    with pytest.raises(InputError, match=r"line 8: a quoted cell goes over several lines"):
+        read(tmp_path, "\n".join(["q1_mm,q2_deg,x_mm,y_mm,z_mm,note", *rows]))

@@ -1,0 +1,209 @@
+"""Compensation: the identified robot gets to where the nominal one only believes to be."""
+
+import csv
+import json
+import re
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from stcal.cli.main import main
+from stcal.errors import InputError
+from stcal.geometry.rigid import Rigid
+from stcal.io.table import POSE, pose_cells
+from stcal.robot.kinematics.file import load_robot, robot_toml
+from stcal.robot.kinematics.forward import forward
+from stcal.robot.kinematics.model import Joint
+from stcal.robot.use.compensation import compensate, compensated_csv, compensated_json, read_targets
+from stcal.synthetic.measured.arms import joint_vectors, made, mh80
+
+JOINTS = [f"q{i}_deg" for i in range(1, 7)]
+
+
+class Case:
+    """Nominal and real robot as files, and 20 commanded poses."""
+
+    def __init__(self, folder: Path):
+        self.folder = folder
+        rng = np.random.default_rng(21)
+        tools = {"": Rigid.exp([0, 0, 0, 10, 20, 150]), "ball": Rigid.exp([0, 0.3, 0, -40, 0, 90])}
+        self.nominal = replace(mh80(), tools=tools)
+        self.real = made(self.nominal, rng)
+        self.q = joint_vectors(self.nominal, 20, rng, 0.7)
+        self.poses = forward(self.nominal, self.q)
+        (folder / "nominal.toml").write_text(robot_toml(self.nominal))
+        (folder / "identified.toml").write_text(robot_toml(self.real))
+
+    def write(self, header: list[str], rows: list[list[str]]) -> Path:
+        path = self.folder / "targets.csv"
+        path.write_text("\n".join(",".join(r) for r in [header, *rows]) + "\n")
+        return path
+
+    def pose_rows(self) -> list[list[str]]:
+        return [pose_cells(p) for p in self.poses]
+
+    def joint_rows(self, q=None) -> list[list[str]]:
+        return [[repr(float(v)) for v in np.degrees(row)] for row in (self.q if q is None else q)]
+
+
+@pytest.fixture
+def case(tmp_path):
+    return Case(tmp_path)
+
+
+def test_joint_values_command_what_the_nominal_robot_makes_of_them(case):
+    targets = read_targets(case.write(JOINTS, case.joint_rows()), case.real)
+    result = compensate(case.real, targets, case.nominal)
+    reached = forward(case.real, result.found.q)
+    assert result.found.usable.all()
+    np.testing.assert_allclose(reached.translation, case.poses.translation, atol=1e-8)
+    np.testing.assert_allclose(result.nominal.q, case.q, atol=1e-9)
+    # What is taken away is what the real robot errs with the nominal values: millimetres at 2 m and 0.5 mrad.
+    expected = np.linalg.norm(forward(case.real, case.q).translation - case.poses.translation, axis=1)
+    np.testing.assert_allclose(result.before_mm, expected, atol=1e-8)
+    assert 0.5 < expected.mean() < 5
+    # The same branch: others are about π away, and at the wrist 0.5 mrad over 8 mrad of bend are 0.1 rad.
+    assert np.abs(result.found.q - case.q).max() < 1
+
+
+def test_poses_alone_need_no_nominal_robot(case):
+    targets = read_targets(case.write(list(POSE), case.pose_rows()), case.real)
+    result = compensate(case.real, targets)
+    assert result.found.usable.all()
+    assert result.before_mm is None
+    np.testing.assert_allclose(forward(case.real, result.found.q).translation, case.poses.translation, atol=1e-8)
+
+
+def test_joint_values_beside_poses_choose_the_branch(case):
+    flipped = case.q + np.array([0, 0, 0, np.pi, 0, np.pi])
+    flipped[:, 4] *= -1
+    flipped[:, 3] -= 2 * np.pi * (flipped[:, 3] > 2 * np.pi)
+    rows = [p + q for p, q in zip(case.pose_rows(), case.joint_rows(flipped), strict=True)]
+    targets = read_targets(case.write([*POSE, *JOINTS], rows), case.real)
+    found = compensate(case.real, targets).found
+    low, high = case.real.limits().T
+    inside = ((flipped > low + 0.1) & (flipped < high - 0.1)).all(axis=1) & (np.abs(case.q[:, 4]) > 0.2)
+    assert inside.sum() > 5
+    assert np.abs(found.q - flipped)[inside].max() < 0.1
+
+
+def test_a_tool_that_the_nominal_file_lacks_is_said(case, capsys, monkeypatch):
+    """Commanded poses are then of another point: 150 mm off, none may be reached."""
+    bare = replace(case.nominal, tools={"": Rigid()})
+    targets = read_targets(case.write(POSE, case.pose_rows()), case.real)
+    notes = compensate(case.real, targets, bare).notes()
+    assert re.match(r"tool of the robot files differs by 151\.\d mm and 0° between", notes[0])
+    assert not any("differs by" in note for note in compensate(case.real, targets, case.nominal).notes())
+    far = [pose_cells(Rigid(p.rotation, p.translation + np.array([9000, 0, 0]))) for p in case.poses]
+    command = ["stcal", "robot", "compensate", str(case.write(POSE, far)), "--robot", f"{case.folder}/identified.toml"]
+    monkeypatch.setattr("sys.argv", command)
+    with pytest.raises(SystemExit) as end:
+        main()
+    assert end.value.code == 3
+    assert "none of 20 poses is reached" in capsys.readouterr().err
+
+
+def test_every_tool_by_its_name(case):
+    names = ["ball" if i % 2 else "" for i in range(20)]
+    rows = [[n, *q] for n, q in zip(names, case.joint_rows(), strict=True)]
+    result = compensate(case.real, read_targets(case.write(["target", *JOINTS], rows), case.real), case.nominal)
+    for name in ("ball", ""):
+        own = np.array([n == name for n in names])
+        wanted, reached = forward(case.nominal, case.q[own], name), forward(case.real, result.found.q[own], name)
+        np.testing.assert_allclose(reached.translation, wanted.translation, atol=1e-8)
+    rows[3][0] = "cube"
+    with pytest.raises(InputError, match=r"line 5: target 'cube' is not in robot MH80; there are '', 'ball'"):
+        compensate(case.real, read_targets(case.write(["target", *JOINTS], rows), case.real), case.nominal)
+
+
+def test_what_is_not_reached_keeps_its_row_without_joint_values(case):
+    rows = case.pose_rows()
+    rows[4][:3] = ["5000", "0", "0"]
+    result = compensate(case.real, read_targets(case.write(list(POSE), rows), case.real), case.nominal)
+    assert result.found.status[4] == "unreachable"
+    note = result.notes()[0]
+    assert note.startswith("line 6: no joint values reach it; ")
+    table = list(csv.DictReader(compensated_csv(result, case.real).splitlines()))
+    assert len(table) == 20
+    assert [table[4][c] for c in ("status", "q1_deg", "nominal_q1_deg", "nominal_error_mm")] == [
+        "unreachable",
+        "",
+        "",
+        "",
+    ]
+    assert float(table[4]["error_mm"]) > 2000
+    assert all(table[i]["status"] == "reached" for i in range(20) if i != 4)
+    back = np.radians([[float(table[i][c]) for c in JOINTS] for i in range(20) if i != 4])
+    kept = np.arange(20) != 4
+    # Nine decimals of a degree at 2 m: 2 m · 1.7e-11 · some joints.
+    np.testing.assert_allclose(forward(case.real, back).translation, case.poses.translation[kept], atol=1e-6)
+    content = compensated_json(result, case.real)
+    assert content["counts"] == {"reached": 19, "unreachable": 1}
+    assert content["poses"][4]["joints"] is None
+
+
+def test_limits_of_the_controller_are_respected(case):
+    joints = [Joint("revolute", q - 1e-5, q + 1e-5) for q in case.q[0]]
+    tight = replace(case.real, joints=tuple(joints))
+    result = compensate(tight, read_targets(case.write(JOINTS, case.joint_rows()[:1]), tight), case.nominal)
+    assert result.found.status == ("limit",)  # errors of 0.5 mrad need more than 0.01 mrad
+    assert np.abs(result.found.q[0] - case.q[0]).max() <= 1e-5 + 1e-9
+    assert 0.1 < result.found.error_mm[0] < result.before_mm[0]
+    assert "beyond the limits" in result.notes()[0]
+
+
+def test_a_long_way_near_a_singularity_is_told(case):
+    """Wrist bent by 2 mrad: errors of half of that turn its joints by several degrees."""
+    q = np.array([[0.3, 0.4, -0.2, 0.5, 2e-3, 0.7]])
+    result = compensate(case.real, read_targets(case.write(JOINTS, case.joint_rows(q)), case.real), case.nominal)
+    moved = np.degrees(np.abs(result.found.q - q).max())
+    assert moved > 1
+    assert result.notes() == [f"line 2: a joint moves by {moved:.1f}°: near a singular pose"]
+
+
+def test_bad_targets_are_named(case):
+    with pytest.raises(InputError, match="neither poses x_mm … qz nor joint values"):
+        read_targets(case.write(["a", "b"], [["1", "2"]]), case.real)
+    with pytest.raises(InputError, match="positions without orientation"):
+        read_targets(case.write(["x_mm", "y_mm", "z_mm"], [["1", "2", "3"]]), case.real)
+    with pytest.raises(InputError, match="give its file with --nominal"):
+        compensate(case.real, read_targets(case.write(JOINTS, case.joint_rows()), case.real))
+    shorter = replace(case.nominal, rows=case.nominal.rows[:5], joints=case.nominal.joints[:5], coupling=None)
+    with pytest.raises(InputError, match="files of the same robot needed"):
+        compensate(case.real, read_targets(case.write(list(POSE), case.pose_rows()), case.real), shorter)
+
+
+def run(monkeypatch, capsys, *arguments) -> tuple[int, str, str]:
+    monkeypatch.setattr("sys.argv", ["stcal", "robot", *map(str, arguments)])
+    with pytest.raises(SystemExit) as caught:
+        main()
+    out = capsys.readouterr()
+    return caught.value.code, out.out, out.err
+
+
+def test_command_line(case, monkeypatch, capsys):
+    path = case.write(list(POSE), case.pose_rows())
+    files = {k: case.folder / f"new/out.{k}" for k in ("csv", "json", "html")}
+    robots = ["--robot", case.folder / "identified.toml", "--nominal", case.folder / "nominal.toml"]
+    saved = ["--out", files["csv"], "--json", files["json"], "--report", files["html"]]
+    code, out, _ = run(monkeypatch, capsys, "compensate", path, *robots, *saved)
+    assert code == 0
+    assert "20 of 20 poses reached" in out
+    content = json.loads(files["json"].read_text())
+    real = load_robot(case.folder / "identified.toml")
+    q = np.radians([list(p["joints"].values()) for p in content["poses"]])
+    np.testing.assert_allclose(forward(real, q).translation, case.poses.translation, atol=1e-8)
+    assert len(files["csv"].read_text().splitlines()) == 21
+    assert "<h2>Joint values</h2>" in files["html"].read_text()
+    assert sorted(p.name for p in (case.folder / "new").iterdir()) == ["out.csv", "out.html", "out.json"]
+
+
+def test_command_line_names_mistakes_in_one_line(case, monkeypatch, capsys):
+    code, _, error = run(
+        monkeypatch, capsys, "compensate", case.folder / "no.csv", "--robot", case.folder / "nominal.toml"
+    )
+    assert code == 2
+    assert error.startswith("error: targets ")
+    assert len(error.splitlines()) == 1

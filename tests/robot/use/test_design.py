@@ -1,0 +1,209 @@
+"""Observability indices by hand; chosen measurement poses against random ones."""
+
+import json
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from stcal.cli.main import main
+from stcal.errors import DegenerateError, InputError
+from stcal.geometry.rigid import Poses, Rigid
+from stcal.io.table import read_table
+from stcal.robot.identify.observability import Observability, identification_jacobian, parameter_scale
+from stcal.robot.identify.solve import IdentifyOptions, identify
+from stcal.robot.kinematics.file import robot_toml
+from stcal.robot.kinematics.forward import chain_parameters, flange_poses, forward, moved_chain
+from stcal.robot.kinematics.model import Joint
+from stcal.robot.use.design import DesignOptions, choose, design
+from stcal.synthetic.measured.arms import joint_vectors, made, measured, mh80
+
+TOOL = Rigid.exp([0.1, 0.2, -0.3, 40.0, -25.0, 110.0])
+ARM = replace(mh80(), tools={"": TOOL})
+
+
+def test_indices_by_hand():
+    found = Observability.of([2.0, 8.0, 4.0], 4)
+    assert found.o1 == pytest.approx(64 ** (1 / 3) / 2)  # cube root of 2·4·8 over √4
+    assert found.o2 == pytest.approx(0.25)
+    assert found.o3 == pytest.approx(2)
+    assert found.o4 == pytest.approx(0.5)  # 2² / 8
+    assert found.o5 == pytest.approx(8 / 7)  # 1 / (1/2 + 1/4 + 1/8)
+    assert Observability.of([3.0, 0.0], 1).values() == dict.fromkeys(("O1", "O2", "O3", "O4", "O5"), 0.0)
+
+
+def test_indices_of_many_poses_neither_overflow_nor_depend_on_order():
+    sigma = np.geomspace(1e-12, 1e12, 400)
+    assert Observability.of(sigma, 1).o1 == pytest.approx(1)
+    assert Observability.of(sigma[::-1], 1).o4 == pytest.approx(1e-36)
+
+
+@pytest.mark.parametrize(("sigma", "count"), [([], 3), ([1.0, -1.0], 3), ([1.0], 0), ([np.nan], 1)])
+def test_no_index_of_nothing(sigma, count):
+    with pytest.raises(InputError, match="singular values of"):
+        Observability.of(sigma, count)
+
+
+@pytest.mark.parametrize("observe", ["pose", "position"])
+def test_jacobian_against_differences(observe):
+    robot = made(ARM, np.random.default_rng(2))
+    robot = replace(robot, world_from_base=Rigid.exp([0.3, 0.1, -0.8, 500.0, -900.0, 300.0]))
+    q = joint_vectors(robot, 4, np.random.default_rng(1))
+    rows = identification_jacobian(robot, q, observe, 0.02, 3e-4)
+    chain = robot.chain()
+    axes = len(chain_parameters(chain))
+    k = axes + (6 if observe == "pose" else 3)
+    assert rows.shape == (4, 6 if observe == "pose" else 3, k)
+    weight = 1 / np.array([3e-4] * 3 + [0.02] * 3)
+
+    def at(step: np.ndarray) -> Poses:
+        own = step[axes:] if observe == "pose" else [0, 0, 0, *step[axes:]]
+        return flange_poses(moved_chain(chain, step[:axes]), q) @ (robot.tool() @ Rigid.exp(own))
+
+    h = 1e-6
+    for i in range(k):
+        step = np.zeros(k)
+        step[i] = h
+        numeric = at(step).difference(at(-step)) / (2 * h) * weight
+        # Rounding of 3 m over 2e-6, divided by σ = 0.02: 1e-16 · 3e3 / 2e-6 / 0.02 ≈ 1e-5 of columns that reach 1e5
+        np.testing.assert_allclose(rows[:, :, i], numeric[:, -rows.shape[1] :], atol=1e-3, rtol=1e-7)
+
+
+def test_parameters_are_counted_by_the_arc_at_full_reach():
+    scale = parameter_scale(ARM, "pose")
+    tool = np.linalg.norm(np.array([0, 0, 175]) + TOOL.translation)
+    links = np.hypot(145, 540) + 870 + 210 + 1025
+    assert len(scale) == 30
+    assert scale.max() == 1
+    # The last link and the tool may point along one line or not: the sum of both is the bound.
+    assert links + tool - 1 < 1 / scale.min() < np.hypot(145, 540) + links + 175 + np.linalg.norm(TOOL.translation)
+
+
+@pytest.mark.parametrize(("observe", "parameters"), [("position", 27), ("pose", 30)])
+def test_chosen_poses_beat_every_random_set(observe, parameters):
+    result = design(ARM, DesignOptions(count=30, observe=observe, candidates=600, seed=3))
+    assert (result.seen, result.parameters) == (parameters, parameters)
+    assert len(result.random) == 20
+    assert result.chosen.o1 > 1.02 * max(each.o1 for each in result.random)
+    assert result.sigma_mm < 0.97 * result.random_sigma_mm
+    assert result.exchanges > 0
+
+
+@pytest.mark.parametrize("observe", ["position", "pose"])
+def test_identification_states_the_indices_that_the_design_promised(observe):
+    """With σ₀ out of the σ that the residuals tell; the arm as made differs from its drawing by a thousandth."""
+    options = DesignOptions(count=40, observe=observe, candidates=300, sigma_mm=0.05, sigma_rad=2e-4)
+    planned = design(ARM, options)
+    true, rng = made(ARM, np.random.default_rng(2)), np.random.default_rng(3)
+    data = measured(true, planned.q, rng, 0.05, 2e-4)
+    found = identify(ARM, data, IdentifyOptions(observe, 0.05, 2e-4, folds=0))
+    for name, value in planned.chosen.values().items():
+        scale = 1.0 if name == "O2" else found.sigma0
+        assert found.observability.values()[name] * scale == pytest.approx(value, rel=0.02)
+
+
+def test_exchange_finds_the_best_of_all_sets_of_a_small_problem():
+    """Against every set of three out of twelve."""
+    from itertools import combinations
+
+    hits = 0
+    for seed in range(10):
+        rows = np.random.default_rng(seed).normal(size=(12, 2, 4))
+        chosen, _ = choose(rows, 3)
+
+        def volume(index, rows=rows):
+            return np.linalg.slogdet(np.einsum("mri,mrj->ij", rows[list(index)], rows[list(index)]))[1]
+
+        best = max(volume(c) for c in combinations(range(12), 3))
+        assert len(set(chosen.tolist())) == 3
+        assert volume(chosen) > best - 1.0
+        hits += volume(chosen) > best - 1e-9
+    assert hits >= 6  # single exchanges may end in a local best, mostly they do not
+
+
+def test_no_pose_is_taken_twice_however_good_it_is():
+    rows = np.full((6, 1, 1), 0.1) * np.eye(2)
+    rows[2] *= 100
+    chosen, _ = choose(rows, 3)
+    assert 2 in chosen
+    assert len(set(chosen.tolist())) == 3
+
+
+def test_predicted_sigma_is_that_of_simulated_identifications():
+    """Linear least squares on noisy positions: spread of predicted positions against the stated σ."""
+    options = DesignOptions(count=25, candidates=300, sigma_mm=0.05)
+    result = design(ARM, options)
+    rng = np.random.default_rng(0)
+    rows = identification_jacobian(ARM, result.q, "position", options.sigma_mm).reshape(-1, 27)
+    other = joint_vectors(ARM, 300, rng, 1.0)
+    predict = identification_jacobian(ARM, other, "position")
+    found = np.linalg.pinv(rows, rcond=1e-13) @ rng.normal(size=(len(rows), 200))
+    spread = np.sqrt(np.mean((predict @ found) ** 2))
+    # 200 draws of 27 correlated parameters, and 200 against 300 poses: about 5 %.
+    assert spread == pytest.approx(result.sigma_mm, rel=0.15)
+
+
+def test_same_seed_same_poses_within_limits_and_box():
+    box = (600.0, -700.0, 300.0, 1700.0, 700.0, 1500.0)
+    options = DesignOptions(count=12, candidates=200, seed=5, box=box)
+    first, second = design(ARM, options), design(ARM, options)
+    np.testing.assert_array_equal(first.q, second.q)
+    assert not np.array_equal(first.q, design(ARM, replace(options, seed=6)).q)
+    low, high = ARM.limits().T
+    assert ((first.q >= low) & (first.q <= high)).all()
+    at = forward(ARM, first.q).translation
+    assert (at >= box[:3]).all()
+    assert (at <= box[3:]).all()
+    np.testing.assert_allclose(first.poses.translation, at)
+
+
+def test_what_no_pose_shows_is_left_out_and_told():
+    """A tool on the last axis: two tilts of that axis look like two shifts."""
+    from stcal.robot.use.design import design_text
+
+    result = design(mh80(), DesignOptions(count=20, candidates=200))
+    assert (result.seen, result.parameters) == (25, 27)
+    assert result.chosen.o3 > 0
+    assert "2 of 27 combinations of parameters move nothing" in design_text(result)
+
+
+def test_mistakes_are_named():
+    with pytest.raises(DegenerateError, match=r"8 poses with 3 values each for 27 parameters; at least 9 needed"):
+        design(ARM, DesignOptions(count=8, candidates=100))
+    with pytest.raises(InputError, match="more candidates than poses"):
+        DesignOptions(count=50, candidates=50)
+    with pytest.raises(InputError, match="each minimum below its maximum"):
+        DesignOptions(box=(0, 0, 0, 1, 1, -1))
+    with pytest.raises(InputError, match="positive numbers needed"):
+        DesignOptions(sigma_mm=0)
+    with pytest.raises(InputError, match=r"0 bring the tool into the box 5000,"):
+        design(ARM, DesignOptions(count=10, candidates=50, box=(5000, 0, 0, 6000, 1, 1)))
+    sliding = replace(ARM, joints=(*ARM.joints[:2], Joint("prismatic"), *ARM.joints[3:]))
+    with pytest.raises(InputError, match="joint 3 is prismatic without limits"):
+        design(sliding)
+
+
+def test_command_line(tmp_path, monkeypatch, capsys):
+    (tmp_path / "robot.toml").write_text(robot_toml(ARM))
+    out = tmp_path / "poses.csv"
+    arguments = ["--robot", str(tmp_path / "robot.toml"), "--count", "15", "--candidates", "150", "--out", str(out)]
+    arguments += ["--report", str(tmp_path / "poses.html"), "--json", str(tmp_path / "poses.json")]
+    monkeypatch.setattr(
+        "sys.argv", ["stcal", "robot", "design", *arguments, "--box", "-2500,-2500,-500,2500,2500,3000"]
+    )
+    with pytest.raises(SystemExit) as caught:
+        main()
+    assert caught.value.code == 0
+    assert "15 poses for 27 parameters" in capsys.readouterr().out
+    html, content = (tmp_path / "poses.html").read_text(), json.loads((tmp_path / "poses.json").read_text())
+    for name, value in content["chosen"].items():
+        assert f'<th scope="row" class="l">{name}</th><td>{value:.4g}</td>' in html
+    assert html.count("<img") == 3
+    table = read_table(out, "poses")
+    q = np.column_stack([table.numbers(f"q{i}_deg") for i in range(1, 7)])
+    reached = forward(ARM, np.radians(q))
+    np.testing.assert_allclose(reached.translation, table.poses("nominal_").translation, atol=1e-6)
+    monkeypatch.setattr("sys.argv", ["stcal", "robot", "design", *arguments, "--box", "1,2,three"])
+    with pytest.raises(SystemExit) as caught:
+        main()
+    assert caught.value.code == 2

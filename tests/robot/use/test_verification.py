@@ -1,0 +1,156 @@
+"""The test of the paper: distances from the first position, before and after."""
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from stcal.cli.main import main
+from stcal.errors import InputError
+from stcal.geometry.rigid import Rigid
+from stcal.robot.use.verification import read_measured, verified_json, verified_text, verify
+
+HEAD = "set,commanded_x_mm,commanded_y_mm,commanded_z_mm,x_mm,y_mm,z_mm"
+COMMANDED = np.array([[0, 0, 0], [30, 0, 0], [0, 40, 0], [0, 0, 50], [60, 80, 0]], float)
+SHIFTS = {"before": [0.0, 0.3, -0.4, 0.2, 0.5], "after": [0.0, 0.1, -0.1, 0.2, 0.0]}
+"""Each position is moved so far along its line from the first one."""
+
+
+def measured(name: str) -> np.ndarray:
+    """In another frame, so that positions compare only by distances."""
+    length = np.linalg.norm(COMMANDED, axis=1)
+    along = COMMANDED / np.where(length, length, 1)[:, None]
+    return Rigid.exp([0.4, -1.0, 2.0, 500.0, -300.0, 90.0]) @ (COMMANDED + along * np.array(SHIFTS[name])[:, None])
+
+
+def written(folder: Path, lines: list[str], head: str = HEAD) -> Path:
+    path = folder / "measured.csv"
+    path.write_text("\n".join([head, *lines]) + "\n")
+    return path
+
+
+def lines_of(name: str, leave_out: int | None = None) -> list[str]:
+    rows = zip(COMMANDED, measured(name), strict=True)
+    return [
+        f"{name}," + ",".join(map(repr, [*c, *m])).replace("np.float64(", "").replace(")", "")
+        for i, (c, m) in enumerate(rows)
+        if i != leave_out
+    ]
+
+
+def test_figures_by_hand(tmp_path):
+    result = verify(read_measured(written(tmp_path, lines_of("before") + lines_of("after"))))
+    before, after = result.sets
+    np.testing.assert_allclose(before.error_mm, [0.3, -0.4, 0.2, 0.5], atol=1e-9)
+    np.testing.assert_allclose(result.distance_mm, [30, 40, 50, 100])
+    assert before.mean_mm == pytest.approx(0.35)
+    assert before.std_mm == pytest.approx(np.sqrt((0.05**2 + 0.05**2 + 0.15**2 + 0.15**2) / 3))
+    assert before.max_mm == pytest.approx(0.5)
+    assert after.mean_mm == pytest.approx(0.1)
+    reduced = result.reduction(1)
+    assert reduced["mean"] == pytest.approx(100 * (1 - 0.1 / 0.35))
+    assert reduced["max"] == pytest.approx(60)
+    # All ten pairs: the four from the first, and six written out.
+    moved = COMMANDED + np.diag([0, 0.3, -0.4, 0.2, 0.5]) @ (COMMANDED / np.array([1, 30, 40, 50, 100])[:, None])
+    pairs = [(i, j) for i in range(5) for j in range(i)]
+    squares = [
+        (np.linalg.norm(moved[i] - moved[j]) - np.linalg.norm(COMMANDED[i] - COMMANDED[j])) ** 2 for i, j in pairs
+    ]
+    assert before.pairs_rms_mm == pytest.approx(np.sqrt(np.mean(squares)))
+    text = verified_text(result)
+    assert "RMS over all pairs depends less on any one" in text
+    assert "0.3500" in text
+    assert "71.4 %" in text
+
+
+def test_no_common_frame_is_needed(tmp_path):
+    here = verify(read_measured(written(tmp_path, lines_of("before"))))
+    turned = Rigid.exp([1, 2, -0.5, 1e4, 0, 3]) @ measured("before")
+    rows = [f"before,{','.join(f'{v:.12g}' for v in (*c, *m))}" for c, m in zip(COMMANDED, turned, strict=True)]
+    there = verify(read_measured(written(tmp_path, rows)))
+    np.testing.assert_allclose(here.sets[0].error_mm, there.sets[0].error_mm, atol=1e-7)
+    assert len(here.sets) == 1
+
+
+def test_a_missing_pose_is_named_and_left_out_of_all(tmp_path):
+    result = verify(read_measured(written(tmp_path, lines_of("before") + lines_of("after", leave_out=2))))
+    assert result.poses == ("1", "2", "4", "5")
+    assert result.missing == {"before": (), "after": ("3",)}
+    assert "set after: missing poses, left out of all sets (1): 3" in result.warnings()
+    np.testing.assert_allclose(result.sets[0].error_mm, [0.3, 0.2, 0.5], atol=1e-9)
+
+
+def test_poses_by_name_in_any_order(tmp_path):
+    head = "pose," + HEAD
+    names = ["a", "b", "c", "d", "e"]
+    before = [f"{n},{row}" for n, row in zip(names, lines_of("before"), strict=True)]
+    after = [f"{n},{row}" for n, row in zip(names, lines_of("after"), strict=True)][::-1]
+    result = verify(read_measured(written(tmp_path, before + after, head)))
+    np.testing.assert_allclose(result.sets[1].error_mm, [0.1, -0.1, 0.2, 0.0], atol=1e-9)
+    with pytest.raises(InputError, match=r"line 7: pose a of set before stands on line 2 already"):
+        read_measured(written(tmp_path, [*before, before[0]], head))
+    moved = [row.replace("after,30", "after,31") for row in after]
+    with pytest.raises(InputError, match=r"pose b is commanded 1 mm apart in sets before and after"):
+        verify(read_measured(written(tmp_path, before + moved, head)))
+
+
+def test_the_same_command_twice_is_two_poses(tmp_path):
+    rows = lines_of("before")
+    result = verify(read_measured(written(tmp_path, [*rows, rows[0]])))
+    assert len(result.poses) == 6
+    assert result.sets[0].error_mm[-1] == pytest.approx(0, abs=1e-9)
+
+
+def test_too_few_and_other_units_are_named(tmp_path):
+    with pytest.raises(InputError, match="2 poses in before; at least 3 needed"):
+        verify(read_measured(written(tmp_path, lines_of("before")[:2])))
+    inches = written(tmp_path, lines_of("before"), HEAD.replace(",x_mm,y_mm,z_mm", ",x_in,y_in,z_in"))
+    [warning] = verify(read_measured(inches)).warnings()
+    assert "times the commanded ones; check units" in warning
+    assert verify(read_measured(written(tmp_path, lines_of("before")))).warnings() == []
+    still = [f"before,1,2,3,{i},0,0" for i in range(4)]
+    with pytest.raises(InputError, match="all commanded positions are the same"):
+        verify(read_measured(written(tmp_path, still)))
+    with pytest.raises(InputError, match="commanded_x_mm"):
+        read_measured(written(tmp_path, ["1,2,3"], "x_mm,y_mm,z_mm"))
+
+
+def test_no_error_at_all_gives_no_reduction(tmp_path):
+    rows = [f"{s},{','.join(f'{v:g}' for v in (*c, *c))}" for s in ("a", "b") for c in COMMANDED]
+    content = verified_json(verify(read_measured(written(tmp_path, rows))))
+    assert content["sets"][1]["reduced"]["mean_percent"] is None
+    json.dumps(content, allow_nan=False)
+
+
+def test_command_line(tmp_path, monkeypatch, capsys):
+    path = written(tmp_path, lines_of("before") + lines_of("after"))
+    made = [tmp_path / "plot.png", tmp_path / "plot.svg", tmp_path / "v.json", tmp_path / "v.html"]
+    for plot in made[:2]:
+        monkeypatch.setattr(
+            "sys.argv",
+            [
+                "stcal",
+                "robot",
+                "verify",
+                str(path),
+                "--plot",
+                str(plot),
+                "--json",
+                str(made[2]),
+                "--report",
+                str(made[3]),
+            ],
+        )
+        with pytest.raises(SystemExit) as caught:
+            main()
+        assert caught.value.code == 0
+    assert "71.4 %" in capsys.readouterr().out
+    assert made[0].read_bytes().startswith(b"\x89PNG")
+    assert "<svg" in made[1].read_text()
+    assert json.loads(made[2].read_text())["sets"][0]["mean_mm"] == pytest.approx(0.35)
+    assert "RMS of all pairs" in made[3].read_text()
+    monkeypatch.setattr("sys.argv", ["stcal", "robot", "verify", str(path), "--plot", "x.pdf"])
+    with pytest.raises(SystemExit) as caught:
+        main()
+    assert caught.value.code == 2

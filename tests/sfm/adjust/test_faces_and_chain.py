@@ -1,0 +1,123 @@
+"""Face frames and their chaining into the target frame."""
+
+import numpy as np
+import pytest
+
+from stcal.design import reference_target
+from stcal.errors import DegenerateError, InputError, MappingError
+from stcal.geometry.rigid import Rigid
+from stcal.sfm.adjust.chain import chain_faces, measure_chains
+from stcal.sfm.adjust.faces import FaceInGroup, face_frame
+
+TARGET = reference_target()
+FACE = TARGET.face("1")
+WORLD_FROM_FACE = Rigid.exp([0.5, -1.0, 0.3, 100.0, -50.0, 900.0])
+
+
+def circles(noise=0.0, seed=0, keep=None):
+    xyz = np.column_stack([FACE.xy_mm, np.zeros(10)])
+    xyz = WORLD_FROM_FACE @ (xyz + np.random.default_rng(seed).normal(0, noise, xyz.shape))
+    return {c: p for c, p in zip(FACE.ids, xyz, strict=True) if keep is None or c in keep}
+
+
+@pytest.mark.parametrize("kind", ["plane", "three-point"])
+def test_both_frames_are_exact_on_exact_circles(kind):
+    frame = face_frame(FACE, circles(), kind, WORLD_FROM_FACE.rotation[:, 2])
+    np.testing.assert_allclose(frame.matrix(), WORLD_FROM_FACE.matrix(), atol=1e-12)
+
+
+def test_the_plane_frame_spreads_less():
+    """Z of ten circles against Z of three, with the same noise."""
+    spread = {}
+    for kind in ("plane", "three-point"):
+        angles = [
+            np.arccos(
+                min(
+                    1.0,
+                    face_frame(FACE, circles(0.01, s), kind, WORLD_FROM_FACE.rotation[:, 2]).rotation[:, 2]
+                    @ WORLD_FROM_FACE.rotation[:, 2],
+                )
+            )
+            for s in range(200)
+        ]
+        spread[kind] = np.sqrt(np.mean(np.square(angles)))
+    assert 0.3 < spread["plane"] / spread["three-point"] < 0.8
+
+
+def test_the_normal_is_taken_towards_the_camera():
+    away = face_frame(FACE, circles(), "plane", -WORLD_FROM_FACE.rotation[:, 2])
+    toward = face_frame(FACE, circles(), "plane", WORLD_FROM_FACE.rotation[:, 2])
+    np.testing.assert_allclose(away.matrix(), toward.matrix(), atol=1e-9)  # X and Y fix the side by themselves
+
+
+def test_a_missing_frame_circle_is_named():
+    with pytest.raises(DegenerateError, match="frame circle 1:3 and 1:5 not mapped; add views"):
+        face_frame(FACE, circles(keep="12467abc"), "plane", np.array([0, 0, 1.0]))
+
+
+# Chains ---------------------------------------------------------------------------------------------------------
+
+TRUE = {
+    "1": Rigid(),
+    "2": Rigid.exp([0, np.pi / 2, 0, 138, 0, -58]),
+    "3": Rigid.exp([0, np.pi, 0, 78, 0, -198]),
+    "4": Rigid.exp([0, -np.pi / 2, 0, -58, 0, -138]),
+}
+
+
+def in_group(group, face_id, error=None, weight=1.0):
+    target_from_group = Rigid.exp([0.1 * len(group), 0.2, -0.1, *(50.0 * (ord(group[-1]) % 5), 20, 700)])
+    pose = target_from_group.inverse() @ TRUE[face_id] @ (Rigid.exp(error) if error is not None else Rigid())
+    face = TARGET.face(face_id)
+    xyz = np.column_stack([face.xy_mm, np.zeros(10)])
+    information = np.tile(weight * 1e6 * np.eye(3), (10, 1, 1))
+    return FaceInGroup(group, face_id, pose, tuple(face.labels()), xyz, information, 4)
+
+
+def test_exact_groups_chain_exactly():
+    faces = [in_group(g, f) for g, pair in (("a", "12"), ("b", "14"), ("c", "23")) for f in pair]
+    target = chain_faces(faces, TARGET, "1")
+    for face_id, pose in TRUE.items():
+        np.testing.assert_allclose(target.target_from_face[face_id].matrix(), pose.matrix(), atol=1e-9)
+    np.testing.assert_allclose(target.circles["3:2"], TRUE["3"] @ [40.0, 0, 0], atol=1e-9)
+
+
+def test_another_reference_face_moves_the_frame_and_nothing_else():
+    faces = [in_group(g, f) for g, pair in (("a", "12"), ("b", "14"), ("c", "23")) for f in pair]
+    one, two = chain_faces(faces, TARGET, "1"), chain_faces(faces, TARGET, "2")
+    two_from_one = two.target_from_face["1"]
+    for face_id, pose in one.target_from_face.items():
+        np.testing.assert_allclose((two_from_one @ pose).matrix(), two.target_from_face[face_id].matrix(), atol=1e-9)
+
+
+def test_two_ways_to_a_face_are_combined_and_their_disagreement_is_told():
+    error = [0, 0, 0, 0.0, 0.03, 0.0]
+    faces = [in_group(g, f) for g, pair in (("a", "12"), ("b", "14"), ("c", "23")) for f in pair]
+    faces += [in_group("d", "3", error), in_group("d", "4")]
+    target = chain_faces(faces, TARGET, "1")
+    shift = target.target_from_face["3"].translation - TRUE["3"].translation
+    assert 0.005 < np.linalg.norm(shift) < 0.025  # between the two ways, 30 µm apart
+    ways = measure_chains(faces, target)["3"]
+    assert {way.groups for way in ways} == {("a", "c"), ("b", "d")}
+    assert sum(way.translation_mm for way in ways) == pytest.approx(0.03, rel=0.2)
+
+
+def test_a_better_fixed_face_weighs_more():
+    error = [0, 0, 0, 0.0, 0.03, 0.0]
+    faces = [in_group("a", "1", weight=100), in_group("a", "2", weight=100), in_group("b", "1", weight=100)]
+    faces += [in_group("b", "2", error, weight=1)]
+    shift = chain_faces(faces, TARGET, "1").target_from_face["2"].translation - TRUE["2"].translation
+    assert np.linalg.norm(shift) < 0.003
+
+
+def test_an_unlinked_face_is_named_with_the_remedy():
+    faces = [in_group("a", "1"), in_group("a", "2"), in_group("b", "3"), in_group("b", "4")]
+    with pytest.raises(MappingError, match=r"face 3, 4: never linked to reference face 1; add a group"):
+        chain_faces(faces, TARGET, "1")
+
+
+def test_the_reference_face_must_be_there():
+    with pytest.raises(MappingError, match="reference face 5: not mapped"):
+        chain_faces([in_group("a", "1"), in_group("a", "2")], TARGET, "5")
+    with pytest.raises(InputError, match="no face 9; the design has 1, 2, 3, 4, 5"):
+        chain_faces([in_group("a", "1")], TARGET, "9")

@@ -1,0 +1,246 @@
+"""Intrinsics from board views: without pixels against the truth and their own σ, with pixels, and refusals."""
+
+import json
+from dataclasses import replace
+from types import SimpleNamespace
+
+import cv2
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+from scipy.stats import chi2
+
+from stcal.design import reference_board
+from stcal.errors import DegenerateError
+from stcal.geometry.camera import Camera
+from stcal.geometry.conic import circle_image_offset
+from stcal.io.camera import camera_prior, parameter_names, read_camera
+from stcal.sfm.camera.calibrate import require_determined
+from stcal.sfm.camera.intrinsics import adjust_intrinsics, model_parameters
+from stcal.sfm.camera.trust import projection_sigma, split_half
+from stcal.sfm.camera.views import board_views, closed_form, start_camera
+from stcal.sfm.data.observations import ImageObservations
+from stcal.sfm.detect.centres import Centres
+
+TRUE = Camera(2592, 1728, [2790.0, 2784.0], [1301.0, 859.0], [-0.06, 0.045, 1.5e-4, -1e-4, 0, 0, 0, 0])
+BOARD = reference_board()
+RAYS = np.array([[x, y, 1.0] for x in (-0.35, 0.0, 0.35) for y in (-0.25, 0.0, 0.25)])
+MIDDLE_MM = np.array([120.0, 90.0, 0.0])
+
+
+def views_of(rng, count=12, noise_px=0.02, tilt_deg=35.0, camera=TRUE, made=None) -> list[ImageObservations]:
+    """Ellipse centres of the dots that a hand-held board, 0.3 to 0.6 m away, shows in the image."""
+    if made is None:
+        made = np.column_stack([BOARD.xy_mm(), np.zeros(63)]) + BOARD.sigma_mm * rng.standard_normal((63, 3))
+    size = np.array([camera.width, camera.height])
+    views = []
+    while len(views) < count:
+        angles = [rng.uniform(-180, 180), *rng.uniform(-tilt_deg, tilt_deg, 2)]
+        rotation = Rotation.from_euler("zxy", angles, degrees=True).as_matrix()
+        depth = rng.uniform(300, 600)
+        place = np.append(rng.uniform(-0.35, 0.35, 2) * size / camera.focal * depth, depth)
+        xyz = (made - MIDDLE_MM) @ rotation.T + place
+        normal = np.tile(rotation[:, 2], (63, 1))
+        xy = camera.project(circle_image_offset(xyz, normal, BOARD.radii_mm()))
+        seen = ((xy > 20) & (xy < size - 20)).all(1)
+        if seen.sum() < 30:
+            continue
+        labels = tuple(label for label, s in zip(BOARD.labels(), seen, strict=True) if s)
+        n = len(labels)
+        xy = xy[seen] + noise_px * rng.standard_normal((n, 2))
+        shape, covariance = np.tile(np.eye(2), (n, 1, 1)), np.tile(noise_px**2 * np.eye(2), (n, 1, 1))
+        views.append(ImageObservations(f"{len(views)}.jpg", ".", labels, xy, np.zeros((n, 2)), shape, covariance))
+    return views
+
+
+def calibrated(views, model="OPENCV"):
+    start = closed_form(views, BOARD, start_camera(TRUE.width, TRUE.height))
+    return adjust_intrinsics(views, BOARD, start, model)
+
+
+def error(result, truth=TRUE) -> np.ndarray:
+    return model_parameters(result.camera, result.colmap_model) - model_parameters(truth, result.colmap_model)
+
+
+def test_truth_within_predicted_sigma():
+    # 40 calibrations from nothing; the normalised squared error of 8 parameters scatters by 8 % about 1.
+    squares, factors = [], []
+    for seed in range(40):
+        result = calibrated(views_of(np.random.default_rng(seed)))
+        e = error(result)
+        squares.append(e @ np.linalg.solve(result.covariance, e) / 8)
+        factors.append(result.factors.centres)
+    assert 0.8 < np.mean(squares) < 1.2
+    assert 0.98 < np.mean(factors) < 1.02
+    # Of a 24 mm lens on a 22 mm sensor, 1 px is 4e-4: σ of 0.02 px centres must be far below.
+    assert 0.05 < result.sigma()[0] < 0.2
+
+
+def test_sigma_follows_what_the_centres_do():
+    # Centres five times as bad as they say: found out, and σ grow as much.
+    views = views_of(np.random.default_rng(5), noise_px=0.1)
+    honest = calibrated(views)
+    boastful = calibrated([replace(v, covariance_px2=v.covariance_px2 / 25) for v in views])
+    assert boastful.factors.centres == pytest.approx(5 * honest.factors.centres, rel=0.02)
+    assert boastful.sigma() == pytest.approx(honest.sigma(), rel=0.05)
+
+
+def test_a_bad_dot_is_weighed_down():
+    views = views_of(np.random.default_rng(6))
+    shifted = views[3].centre_px + 1.0 * (np.arange(len(views[3])) == 7)[:, None]
+    spoilt = calibrated([*views[:3], replace(views[3], centre_px=shifted), *views[4:]])
+    assert (np.abs(error(spoilt)) < 4 * spoilt.sigma()).all()
+    weights = spoilt.weights()[0]
+    model = spoilt.models[0]
+    worst = int(np.argmin(weights))
+    assert weights[worst] < 0.1
+    assert (model.images[model.image_index[worst]], model.labels[model.point_index[worst]]) == (
+        "3.jpg",
+        views[3].labels[7],
+    )
+
+
+@pytest.mark.parametrize(
+    ("model", "distortion"),
+    [("SIMPLE_PINHOLE", []), ("SIMPLE_RADIAL", [-0.1]), ("RADIAL", [-0.1, 0.05]), ("PINHOLE", [])],
+)
+def test_models(model, distortion):
+    camera = replace(TRUE, focal=[2790.0, 2790.0], distortion=np.pad(np.array(distortion), (0, 8 - len(distortion))))
+    result = calibrated(views_of(np.random.default_rng(7), camera=camera), model)
+    e = error(result, camera)
+    assert 0.01 < e @ np.linalg.solve(result.covariance, e) / chi2.ppf(0.999, len(e)) < 1
+
+
+def test_rational_model_knows_projections_though_not_its_coefficients():
+    result = calibrated(views_of(np.random.default_rng(8)), "FULL_OPENCV")
+    sigma = projection_sigma(result)
+    moved = np.abs(result.camera.project(RAYS) - TRUE.project(RAYS)).max()
+    middle = np.linalg.norm(sigma.xy_px - [1296, 864], axis=1) < 900
+    assert result.sigma()[4] > 0.1
+    assert sigma.sigma_px[middle].max() < 0.1
+    assert 0.001 < moved < 0.5
+
+
+def test_closed_form_finds_the_focal_length():
+    # Exact but for the eccentricity of the dots, and the principal point 6 px off the middle; then with distortion.
+    pinhole = replace(TRUE, focal=[2790.0, 2790.0], distortion=np.zeros(8))
+    start = start_camera(TRUE.width, TRUE.height)
+    for camera, tolerance in ((pinhole, 5e-3), (TRUE, 0.05)):
+        found = closed_form(views_of(np.random.default_rng(9), noise_px=1e-3, camera=camera), BOARD, start).focal
+        assert found == pytest.approx([2790, 2790], rel=tolerance)
+        assert (found != start.focal).all()
+
+
+def test_boards_of_one_direction_are_refused():
+    views = views_of(np.random.default_rng(1), tilt_deg=0.02)
+    with pytest.raises(DegenerateError, match=r"focal length determined to .* by 12 views, 1 % needed.*tilted"):
+        require_determined(calibrated(views), views)
+
+
+def test_a_model_that_does_not_fit_is_refused():
+    bent = replace(TRUE, distortion=[-0.3, 0.1, 0, 0, 0, 0, 0, 0])
+    views = views_of(np.random.default_rng(2), camera=bent)
+    with pytest.raises(DegenerateError, match="PINHOLE puts them"):
+        require_determined(calibrated(views, "PINHOLE"), views)
+
+
+def test_split_half_passes_honest_views_and_fails_a_changed_focus():
+    p = []
+    for seed in range(8):
+        rng = np.random.default_rng(seed)
+        views = views_of(rng)
+        p.append(split_half(calibrated(views), views, BOARD).p_value)
+    assert min(p) > 1e-3
+    assert np.mean(p) == pytest.approx(0.5, abs=0.3)  # uniform: σ of the mean 0.1
+
+    made = np.column_stack([BOARD.xy_mm(), np.zeros(63)])
+    refocused = replace(TRUE, focal=1.002 * TRUE.focal)
+    both = zip(views_of(rng, 6, made=made), views_of(rng, 6, camera=refocused, made=made), strict=True)
+    views = [replace(v, name=f"{i}.jpg") for i, v in enumerate(v for pair in both for v in pair)]
+    check = split_half(calibrated(views), views, BOARD)
+    assert check.verdict == "failed"
+    assert check.difference[0] == pytest.approx(0.002 * 2790, rel=0.1)
+    # 0.2 % of the distance to the corner, less what a rotation of the camera does: at least half of it.
+    assert 1.5 < check.largest_px < 3.5
+
+
+def test_few_views_have_no_split_half():
+    views = views_of(np.random.default_rng(3), count=5)
+    assert split_half(calibrated(views), views, BOARD) is None
+
+
+def test_a_board_upside_down_is_numbered_like_the_others():
+    rng = np.random.default_rng(4)
+    images, truth = [], []
+    for i, view in enumerate(views_of(rng, noise_px=0.005)):
+        cells = np.array([[int(v) for v in label.split(":")[1:]] for label in view.labels])
+        both = np.stack([cells, [BOARD.rows - 1, BOARD.columns - 1] - cells])
+        n = len(view)
+        zeros, ok = np.zeros(n), np.ones(n, bool)
+        centres = Centres(view.centre_px, view.centre, view.shape, view.covariance_px2, zeros, zeros, zeros, ok)
+        detection = SimpleNamespace(numberings=both[::-1] if i % 3 == 1 else both, centres=centres)
+        images.append(SimpleNamespace(file=SimpleNamespace(name=view.name, group="."), detection=detection))
+        truth.append(view.labels)
+    found = [view.labels for view in board_views(images, BOARD, TRUE)]
+    agree = [a == b for a, b in zip(found, truth, strict=True)]
+    assert all(agree) or not any(agree)  # which way up is by convention
+
+
+def test_photographs_give_a_camera_file_that_runs_take_as_prior(stcal_sfm, small_dataset, tmp_path):
+    out = tmp_path / "camera.txt"
+    code, printed, _ = stcal_sfm("calibrate-camera", small_dataset / "images", "--out", out, "--workers", 1)
+    assert code == 0
+    assert "split-half check" in printed
+    model, truth = read_camera(out), read_camera(small_dataset / "cameras.txt")
+    camera = model.sized(1296, 864)
+    prior = camera_prior(model, camera)
+    assert prior.colmap_model == "OPENCV"
+    e = model_parameters(camera, "OPENCV") - model_parameters(truth.sized(1296, 864), "OPENCV")
+    assert 0.05 < e @ np.linalg.solve(prior.covariance, e) / 8 < chi2.ppf(0.999, 8) / 8
+    assert (np.sqrt(np.diag(prior.covariance))[:2] < 1e-3 * 1393).all()
+
+    summary = json.loads(out.with_suffix(".json").read_text(encoding="utf-8"))
+    assert list(summary["parameters"]) == parameter_names("OPENCV")
+    assert summary["parameters"]["cx"]["value"] == pytest.approx(camera.centre[0], abs=1e-9)
+    assert summary["parameters"]["cx"]["sigma"] == pytest.approx(np.sqrt(prior.covariance[2, 2]))
+    assert summary["residual_rms_px"] < 0.02
+    assert len(summary["images"]) == 8
+    assert summary["split_half"]["verdict"] == "passed"
+    # Eight views that keep to the middle: their corners are extrapolated, and the report says so.
+    assert any("no dots near the corner" in warning for warning in summary["warnings"])
+
+
+def test_images_without_a_board_are_refused(stcal_sfm, tmp_path):
+    (tmp_path / "images").mkdir()
+    for i in range(3):
+        cv2.imwrite(str(tmp_path / "images" / f"{i}.png"), np.full((300, 400), 60 + i, np.uint8))
+    code, _, message = stcal_sfm("calibrate-camera", tmp_path / "images", "--out", tmp_path / "c.txt", "--workers", 1)
+    assert code == 3
+    assert "error: camera: no board recognised in 3 images; 0.png: no board recognised; check the board" in message
+    assert not (tmp_path / "c.txt").exists()
+
+
+def test_two_views_are_refused_and_another_size_is_named(stcal_sfm, small_set):
+    own = small_set("12", detected=False)
+    own.image(3).unlink()
+    cv2.imwrite(str(own.image(2)), np.zeros((400, 600), np.uint8))
+    out = own.folder / "c.txt"
+    code, _, message = stcal_sfm("calibrate-camera", own.images, "--out", out, "--workers", 1)
+    assert code == 3
+    assert "2 of 3 images show the board, 3 needed" in message
+    assert "12/IMG_1002.jpg: 600×400 px, but the first readable image says 1296×864 px" in message
+
+
+@pytest.mark.parametrize(
+    ("more", "message"),
+    [
+        (["--model", "FISHEYE"], "camera model FISHEYE: not supported; use one of SIMPLE_PINHOLE"),
+        (["--out", "target.toml"], "target.toml: exists; give a new file with --out"),
+    ],
+)
+def test_impossible_options(stcal_sfm, small_dataset, monkeypatch, more, message):
+    monkeypatch.chdir(small_dataset)
+    monkeypatch.setattr("pathlib.Path.write_text", lambda *_, **__: pytest.fail("nothing may be written"))
+    code, _, printed = stcal_sfm("calibrate-camera", "images", "--out", "new.txt", *more)
+    assert code == 2
+    assert message in printed

@@ -1,0 +1,273 @@
+"""Planted faults are caught by a check that names them; honest runs pass. Labels only, but for a blurred photograph."""
+
+import json
+from dataclasses import replace
+
+import cv2
+import numpy as np
+import pytest
+
+from stcal.geometry.conic import circle_conic, ellipse_of_conic
+from stcal.geometry.rigid import Rigid
+from stcal.sfm.adjust import joint
+from stcal.sfm.adjust.calibration import calibrate
+from stcal.sfm.adjust.joint import SETTLED_PX
+from stcal.sfm.adjust.options import AdjustOptions
+from stcal.sfm.adjust.refine import refine
+from stcal.sfm.checks.suite import Evidence, run_checks
+from stcal.sfm.checks.verdict import FAILED, SUSPICIOUS, Trial, judge
+from stcal.sfm.pipeline import run
+from stcal.sfm.report.checks import checks_section, count_verdicts
+from stcal.sfm.run.options import RunOptions
+from stcal.synthetic.observe import image_circles
+from stcal.synthetic.render import RenderOptions, render
+from stcal.synthetic.scene import SceneOptions, make_scene
+
+NOISE_PX = 0.005
+JOINT = {"agreement", "halves", "groups", "loops"}
+
+
+@pytest.fixture(scope="module")
+def full_scene():
+    """The paper's camera, six images in each of three groups."""
+    options = SceneOptions(seed=3, images_per_group=6, groups=(("1", "2"), ("1", "4"), ("1", "5")))
+    return make_scene(options)
+
+
+class Lab:
+    """Simulated runs."""
+
+    def __init__(self, labels_only):
+        self.labels_only = labels_only
+
+    def observe(self, scene, noise_px=NOISE_PX, seed=1):
+        """Centres with noise, and the ellipses' true shapes."""
+        images = self.labels_only.observations(scene, noise_px, np.random.default_rng(seed))
+        return [replace(image, shape=self._shapes(scene, image)) for image in images]
+
+    @staticmethod
+    def _shapes(scene, image):
+        seen = image_circles(scene, image.group, int(image.name.rpartition("/")[2]))
+        own = [seen.labels.index(label) for label in image.labels]
+        conics = (circle_conic(seen.xyz_camera[k], seen.normal_camera[k], seen.radius_mm[k]) for k in own)
+        return np.array([ellipse_of_conic(conic)[1] for conic in conics])
+
+    def check(self, scene, images, camera=None, board=None, solve="chain"):
+        """All checks by key."""
+        camera, board = camera or scene.camera, board or scene.board
+        refined, calibration, options = self.calibrate(scene, images, camera, board, solve)
+        models = tuple(each.model for each in refined)
+        outliers = tuple(o for each in refined for o in each.outliers)
+        evidence = Evidence(
+            models, outliers, tuple(images), camera, "OPENCV", scene.target, board, options, calibration, None, {}
+        )
+        return {check.key: check for check in run_checks(evidence)}
+
+    def calibrate(self, scene, images, camera=None, board=None, solve="chain"):
+        """Refined groups, their calibration, and its options."""
+        camera, board = camera or scene.camera, board or scene.board
+        refined = [refine(m, camera, scene.target, board) for m in self.labels_only.models(scene, images)]
+        options = AdjustOptions(scene.target.faces[0].id, solve)
+        models = [each.model for each in refined]
+        return refined, calibrate(models, camera, scene.target, board, options), options
+
+
+@pytest.fixture(scope="module")
+def lab(labels_only):
+    return Lab(labels_only)
+
+
+def not_passed(checks):
+    return {key: check.verdict for key, check in checks.items() if check.verdict not in ("passed", "not possible")}
+
+
+@pytest.mark.parametrize(("noise_px", "seed"), [(0.005, 1), (0.015, 2), (0.05, 3)])
+def test_honest_runs_pass(full_scene, lab, noise_px, seed):
+    checks = lab.check(full_scene, lab.observe(full_scene, noise_px, seed))
+    assert not_passed(checks) == {}
+    assert {key for key, check in checks.items() if check.verdict == "not possible"} == JOINT
+    control = checks["control"].measured
+    assert 20 < max(m.value for m in control if m.unit == "µm") < 300  # tens of µm, at residuals of a hundredth of a px
+
+
+def test_the_joint_result_is_checked_by_its_parts(labels_only, lab):
+    """A loop of three groups: halves, groups left out and ways around the loop agree."""
+    options = SceneOptions(seed=5, images_per_group=4, width=2592, height=1728)
+    scene = make_scene(replace(options, groups=(("1", "2"), ("1", "5"), ("2", "5"))))
+    checks = lab.check(scene, lab.observe(scene), solve="joint")
+    assert not_passed(checks) == {}
+    assert {checks[key].verdict for key in JOINT} == {"passed"}
+    assert checks["groups"].tested >= 3
+    for key, low, high in (("halves", 0.05, 50), ("groups", 0.05, 50), ("loops", 0.05, 50)):
+        worst = checks[key].measured[0]
+        assert low < worst.value < worst.limit < high
+
+
+def test_exchanged_labels_are_named(full_scene, lab):
+    images = lab.observe(full_scene)
+    place = [images[3].labels.index(label) for label in ("1:2", "1:6")]
+    centre = images[3].centre_px.copy()
+    centre[place] = centre[place[::-1]]
+    images[3] = replace(images[3], centre_px=centre)
+    check = lab.check(full_scene, images)["labels"]
+    assert check.verdict == "failed"
+    assert check.names[0] in ("12/0003: 1:2 and 1:6", "12/0003: 1:6 and 1:2")
+
+
+def test_a_wrong_pitch_is_named(full_scene, lab):
+    """0.1 % on the board: no residual sees it, the target's design does."""
+    board = replace(full_scene.board, pitch_mm=1.001 * full_scene.board.pitch_mm)
+    checks = lab.check(full_scene, lab.observe(full_scene), board=board)
+    assert not_passed(checks) == {"pitch": "failed"}
+    assert checks["pitch"].names == ("board pitch",)
+    assert checks["pitch"].measured[0].value == pytest.approx(1000, abs=250)
+
+
+@pytest.mark.parametrize(("stated", "caught"), [(5, {"sharpness": "suspicious"}), (1, {"image-residuals": "failed"})])
+def test_a_blurred_image_is_named(full_scene, lab, stated, caught):
+    """Five times the noise, whether the centres' σ say so or not."""
+    images = lab.observe(full_scene)
+    image = images[4]
+    noise = np.random.default_rng(0).normal(0, np.sqrt(24) * NOISE_PX, image.centre_px.shape)
+    images[4] = replace(image, centre_px=image.centre_px + noise, covariance_px2=stated**2 * image.covariance_px2)
+    checks = lab.check(full_scene, images)
+    for key, verdict in caught.items():
+        assert checks[key].verdict == verdict
+        assert checks[key].names == (image.name,)
+
+
+@pytest.mark.parametrize(("over", "verdict"), [(1, "passed"), (3, "suspicious"), (6, "failed")])
+def test_noise_beyond_the_centres_own_sigma_is_said(full_scene, lab, over, verdict):
+    """σ stated too small for all centres alike: no image stands out, and the result's σ are scaled."""
+    images = [replace(i, covariance_px2=i.covariance_px2 / over**2) for i in lab.observe(full_scene, over * NOISE_PX)]
+    check = lab.check(full_scene, images)["centres"]
+    assert check.verdict == verdict
+    assert check.measured[0].value == pytest.approx(over, rel=0.05)  # 3000 degrees of freedom: 1.3 %
+
+
+@pytest.mark.parametrize("solve", ["chain", "joint"])
+def test_a_moved_target_is_named(full_scene, lab, solve):
+    """0.2 mm and 0.05° against the board, in half of the images of a group; the others are innocent."""
+    motion = Rigid.exp([np.radians(0.05), 0, 0, 0.2, 0, 0])
+    group = full_scene.groups["14"]
+    elsewhere = replace(
+        group,
+        camera_from_target=tuple(pose @ motion for pose in group.camera_from_target),
+        board_circles_target=motion.inverse() @ group.board_circles_target,
+        target_from_board=motion.inverse() @ group.target_from_board,
+    )
+    moved = lab.observe(replace(full_scene, groups=full_scene.groups | {"14": elsewhere}))
+    names = {"14/0000", "14/0001", "14/0002"}
+    images = [b if b.name in names else a for a, b in zip(lab.observe(full_scene), moved, strict=True)]
+    check = lab.check(full_scene, images, solve=solve)["moved"]
+    assert check.verdict == "failed"
+    assert {name[:3] for name in check.names} == {"14/"}
+    assert check.measured[0].value > 80  # µm
+
+
+def test_an_adjustment_that_has_not_settled_is_flagged(full_scene, lab, monkeypatch):
+    """One step comes within a hundredth of a pixel of the minimum, which is not at it."""
+    images = lab.observe(full_scene)
+    settled = lab.calibrate(full_scene, images, solve="joint")[1]
+    assert settled.joint.settled
+    assert 0 < settled.joint.last_move_px < SETTLED_PX
+    assert settled.notes == ()
+    monkeypatch.setattr(joint, "MAX_STEPS", 1)
+    monkeypatch.setattr(joint, "HUBER", 1.0)  # a third of the residuals is reweighted: one step is not enough
+    stopped = lab.calibrate(full_scene, images, solve="joint")[1]
+    assert not stopped.joint.settled
+    assert SETTLED_PX < stopped.joint.last_move_px < joint.MAX_MOVE_PX
+    (note,) = stopped.notes
+    assert note.startswith("joint adjustment: not settled")
+    checks = lab.check(full_scene, images, solve="joint")
+    assert checks["agreement"].verdict == "suspicious"
+    assert checks["agreement"].names == ("last step",)
+    assert checks["agreement"].remedy
+
+
+def test_a_circle_out_of_its_plane_is_named(full_scene, lab):
+    normal = full_scene.target_from_face["4"].rotation[:, 2]
+    circles = full_scene.circles_target | {"4:6": full_scene.circles_target["4:6"] + 0.2 * normal}
+    scene = replace(full_scene, circles_target=circles)
+    check = lab.check(scene, lab.observe(scene))["flatness"]
+    assert check.verdict == "failed"
+    assert check.names[0] == "4:6"
+    assert check.measured[0].value == pytest.approx(200, rel=0.1)
+
+
+def test_wrong_intrinsics_name_the_camera(full_scene, lab):
+    parameters = full_scene.camera.parameters().copy()
+    parameters[:2] *= 1.0003
+    parameters[2:4] += 2
+    parameters[4] *= 1.01
+    check = lab.check(full_scene, lab.observe(full_scene), full_scene.camera.with_parameters(parameters))["camera"]
+    assert check.verdict == "failed"
+    assert check.names == ("camera",)
+    by_name = {m.name: m.value for m in check.measured}
+    assert by_name["fx"] == pytest.approx(-1.67, abs=0.8)
+    assert by_name["cx"] == pytest.approx(-2, abs=1)
+
+
+def test_a_circle_of_another_radius_is_named(full_scene, lab):
+    images = []
+    for image in lab.observe(full_scene):
+        shape = image.shape.copy()
+        shape[[label == "1:4" for label in image.labels]] *= 1.03
+        images.append(replace(image, shape=shape))
+    checks = lab.check(full_scene, images)
+    assert (checks["radius"].verdict, checks["radius"].names) == ("failed", ("1:4",))
+    assert checks["radius"].measured[0].value == pytest.approx(240, rel=0.02)
+
+
+def test_a_bad_row_of_the_board_is_named(full_scene, lab):
+    """Row 2 stretched by 0.05 % and stated nowhere: ±60 µm at its ends."""
+    groups = {}
+    for name, group in full_scene.groups.items():
+        board_from_target = group.target_from_board.inverse()
+        dots = board_from_target @ group.board_circles_target
+        dots[2 * 9 : 3 * 9, 0] += 5e-4 * (dots[2 * 9 : 3 * 9, 0] - 120)
+        groups[name] = replace(group, board_circles_target=group.target_from_board @ dots)
+    scene = replace(full_scene, groups=groups)
+    check = lab.check(scene, lab.observe(scene))["board-lines"]
+    assert check.verdict == "failed"
+    assert {name.split(" ", 2)[2] for name in check.names} == {"row 2"}
+
+
+def test_a_run_reports_a_blurred_photograph(small_set, small_scene):
+    """With pixels: one image out of focus."""
+    own = small_set("12", "14")
+    picture = render(small_scene, "12", 1, RenderOptions(blur_px=2.5))
+    cv2.imwrite(str(own.image(1)), picture, [cv2.IMWRITE_JPEG_QUALITY, 95])
+    folder = own.folder
+    result = run(own.images, own.camera, own.out, folder / "target.toml", folder / "board.toml", RunOptions(workers=1))
+    checks = {check.key: check for check in result.checks}
+    assert checks["sharpness"].verdict == "suspicious"
+    assert set(checks["sharpness"].names) == {"12/IMG_1001.jpg"}
+    text = (own.out / "report.html").read_text(encoding="utf-8")
+    assert 'id="checks"' in text
+    assert "Sharpness of each image" in text
+
+
+def test_a_run_of_photographs_passes(small_run):
+    checks = json.loads((small_run / "report.json").read_text(encoding="utf-8"))["checks"]
+    assert {check["verdict"] for check in checks} <= {"passed", "not possible"}
+    assert len({check["key"] for check in checks}) == len(checks) == 18
+    assert all(set(check) == set(checks[0]) for check in checks)
+    assert "18 " not in count_verdicts([check["verdict"] for check in checks])
+    assert "not possible" in checks_section(checks)
+
+
+def test_verdicts_are_tests_of_significance():
+    """Chance alone: as many suspicious as are promised, and fewer failures."""
+    rng = np.random.default_rng(0)
+    found = {"passed": 0, "suspicious": 0, "failed": 0}
+    for _ in range(1500):
+        trials = [Trial(str(i), 1.0, "", float(s), 6, 1e9) for i, s in enumerate(rng.chisquare(6, 10))]
+        found[judge("k", "t", trials, "things", "do").verdict] += 1
+    assert found["suspicious"] <= 1500 * SUSPICIOUS + 4 * np.sqrt(1500 * SUSPICIOUS)
+    assert found["failed"] <= 1500 * FAILED + 1
+    edge = Trial("x", 2.0, "mm", 4.0, 1, 1e9)
+    limit = edge.limit(1)
+    at = [judge("k", "t", [replace(edge, statistic=s)], "things", "do") for s in ((limit**2) * 0.99, limit**2 * 1.01)]
+    assert [check.verdict for check in at] == ["passed", "suspicious"]
+    assert [check.remedy for check in at] == ["", "do"]

@@ -1,0 +1,631 @@
+"""The native COLMAP against ours; and native programs that are absent, something else, broken, or wrong."""
+
+import errno
+import json
+import os
+import re
+import shutil
+import signal
+import sqlite3
+import subprocess
+import sys
+import tempfile
+import time
+from contextlib import closing
+from dataclasses import replace
+from hashlib import sha256
+from pathlib import Path
+
+import pytest
+
+from stcal.errors import InputError, MappingError
+from stcal.sfm.interop import native
+from stcal.sfm.interop.crosscheck import Tolerances, crosscheck, mapper_options
+from stcal.sfm.interop.native import NativeColmap, find_colmap, map_natively, require_listable
+from stcal.sfm.mapping.database import image_ids
+from stcal.sfm.mapping.incremental import pipeline_options
+from stcal.sfm.pipeline import write_report
+from stcal.sfm.run.saved import load_run
+from tests.outcome import COMPUTATION, INPUT, INTERRUPTED, assert_error, lines_of
+
+INSTALL = "install it with `sudo apt-get install colmap`"
+
+
+def state_of(folder) -> dict[str, str]:
+    """Every file below a folder, and a digest of its content."""
+    files = [path for path in folder.rglob("*") if path.is_file()]
+    return {path.relative_to(folder).as_posix(): sha256(path.read_bytes()).hexdigest() for path in files}
+
+
+@pytest.fixture
+def own_run(small_run, tmp_path):
+    """A copy of the small run to add to."""
+    return shutil.copytree(small_run, tmp_path / "run", ignore=shutil.ignore_patterns("cache"))
+
+
+@pytest.fixture(autouse=True)
+def nothing_is_left(tmp_path, monkeypatch):
+    """Temporary folders are made in one that must be empty in the end."""
+    folder = tmp_path / "temporary"
+    folder.mkdir()
+    monkeypatch.setattr(tempfile, "tempdir", str(folder))
+    monkeypatch.setenv("TMPDIR", str(folder))
+    yield
+    assert list(folder.iterdir()) == []
+
+
+@pytest.fixture(scope="session")
+def colmap() -> str:
+    """The native program, of any version that there is a schema for."""
+    found = shutil.which("colmap")
+    if found is None:
+        pytest.skip("native colmap is not on PATH")
+    return found
+
+
+def command(*arguments) -> list[str]:
+    """``stcal-sfm`` as a process of its own."""
+    return [sys.executable, "-c", "from stcal.cli.main import main_sfm; main_sfm()", *map(str, arguments)]
+
+
+# --- the real program ---
+
+
+@pytest.fixture(scope="module")
+def checked(small_run, colmap, tmp_path_factory):
+    """A run that was cross-checked: its folder, its state before, and what the process said."""
+    run = tmp_path_factory.mktemp("checked") / "run"
+    shutil.copytree(small_run, run, ignore=shutil.ignore_patterns("cache"))
+    before = state_of(run)
+    done = subprocess.run(command("crosscheck", run), capture_output=True, text=True, timeout=60)
+    return run, before, done
+
+
+def test_the_two_programs_agree(checked):
+    run, _, done = checked
+    assert done.returncode == 0, done.stderr
+    assert lines_of(done.stderr) == []
+    assert "allowed: faces 2 µm and 1 mdeg, circles 2 µm, cameras 20 µm and 2 mdeg: they agree" in done.stdout
+    assert done.stdout.splitlines()[-1] == f"report: {run / 'report.html'}"
+    check = json.loads((run / "report.json").read_text(encoding="utf-8"))["crosscheck"]
+    assert check["differences"] == check["notes"] == []
+    assert check["images"] == {"native": 8, "pycolmap": 8, "run": 8, "only_native": [], "only_pycolmap": []}
+    assert check["mapping"]["faces"].keys() == check["result"]["faces"].keys() == {"1", "2", "4", "5"}
+    assert len(check["mapping"]["cameras"]) == 8
+    assert len(check["mapping"]["circles_um"]) == len(json.loads((run / "faces.json").read_text())["circles"])
+
+
+def test_the_differences_are_small_but_there(checked):
+    """Two programs that adjust by themselves differ where their iterations end; ours forgets where it started; and as
+    COLMAP leaves a model it lacks our weights and the joint adjustment."""
+    run, _, _ = checked
+    check = json.loads((run / "report.json").read_text(encoding="utf-8"))["crosscheck"]
+    worst = {
+        key: max(row["translation_um"] for row in check[key]["faces"].values())
+        for key in ("mapping", "result", "plain")
+    }
+    assert 1e-4 < worst["mapping"] < 2
+    assert worst["result"] < 0.05
+    assert 2 < worst["plain"] < 50
+    assert 1e-4 < max(check["mapping"]["circles_um"].values()) < 2
+    assert 1e-3 < max(row["position_um"] for row in check["mapping"]["cameras"]) < 20
+    assert 0.001 < check["residual_rms_px"]["native"] < 0.02
+    assert check["residual_rms_px"]["native"] == pytest.approx(check["residual_rms_px"]["pycolmap"], rel=1e-3)
+
+
+def test_only_the_report_changes(checked):
+    run, before, _ = checked
+    after = state_of(run)
+    assert {name for name in after if after[name] != before.get(name)} == {"report.json", "report.html"}
+    assert after.keys() == before.keys()
+    assert after["database.db"] == before["database.db"]
+
+
+def test_the_report_has_the_section_and_the_rest_stays(checked, small_run):
+    run, _, _ = checked
+    report = json.loads((run / "report.json").read_text(encoding="utf-8"))
+    known = json.loads((small_run / "report.json").read_text(encoding="utf-8"))
+    check = report.pop("crosscheck")
+    assert report == known
+    page = (run / "report.html").read_text(encoding="utf-8")
+    section = page.split('<section id="crosscheck">')[1].split("</section>")[0]
+    assert "They agree." in section
+    assert f"Native COLMAP {check['native']} and pycolmap {check['pycolmap']}" in section
+    assert "12/IMG_1003.jpg" in section
+    assert '<section id="crosscheck">' not in (small_run / "report.html").read_text(encoding="utf-8")
+
+
+def test_outside_the_tolerances_it_says_where(colmap, checked, stcal_sfm):
+    """Nothing is allowed: every face but the reference, a circle and a camera are named, and the report is written."""
+    run = checked[0]
+    (run / "report.html").write_text("", encoding="utf-8")
+    outcome = stcal_sfm("crosscheck", run, "--tolerance-um", 0, "--camera-tolerance-um", 0)
+    line = assert_error(outcome, COMPUTATION, "cross-check: native COLMAP ", " and stcal differ: ")
+    for face in ("2", "4", "5"):
+        assert re.search(rf"face {face} \(mapped by both\) \d\.\d µm, 0\.\d\d mdeg; 0 µm, 1 mdeg allowed", line)
+    assert "face 1 (mapped" not in line
+    assert re.search(r"circle \d:\w \(mapped by both\) \d\.\d µm; 0 µm allowed", line)
+    assert re.search(r"camera 1[24]/IMG_100\d.jpg: position \d\.\d µm; 0 µm allowed", line)
+    assert "exceeded" in outcome[1]
+    assert json.loads((run / "report.json").read_text(encoding="utf-8"))["crosscheck"]["differences"]
+    assert "They differ: face " in (run / "report.html").read_text(encoding="utf-8")
+
+
+def test_names_and_places_with_spaces_and_beyond_ascii(colmap, small_set, stcal_sfm):
+    """Images directly in their folder, too: the group is named "."."""
+    small = small_set("12")
+    for i, name in enumerate(["zwei Flächen 1.JPG", "Bild, nr. 2.jpeg", "三.Jpg", "a\"quote'.jpg"]):
+        small.image(i).rename(small.images / name)
+    (small.images / "12").rmdir()
+    assert stcal_sfm(*small.arguments())[0] == 0
+    run = small.out.rename(small.folder / "Läufe 三 'q\" x")
+    code, out, _ = stcal_sfm("crosscheck", run)
+    assert code == 0
+    assert ": 4 of 4 images" in out
+    names = [r["image"] for r in json.loads((run / "report.json").read_text())["crosscheck"]["mapping"]["cameras"]]
+    assert "zwei Flächen 1.JPG" in names
+
+
+def test_a_run_with_other_options(colmap, small_set, stcal_sfm):
+    """Chained, frames of three points, another reference face: the native models go through the same."""
+    small = small_set("12", "14")
+    assert stcal_sfm(*small.arguments("--solve", "chain", "--frame", "three-point", "--reference-face", "2"))[0] == 0
+    code, _, _ = stcal_sfm("crosscheck", small.out)
+    assert code == 0
+    check = json.loads((small.out / "report.json").read_text(encoding="utf-8"))["crosscheck"]
+    assert check["mapping"]["faces"]["2"]["translation_um"] < 1e-6  # the reference, where all is zero
+    assert check["result"]["faces"]["1"]["translation_um"] < 0.05
+    assert check["mapping"]["faces"]["1"]["translation_um"] > 1e-4
+
+
+# --- thresholds ---
+
+
+def numbers(options, prefix: str = "") -> dict[str, float]:
+    """Numbers and choices of pycolmap's options by name."""
+    values = {name: getattr(options, name) for name in dir(options) if not name.startswith("_")}
+    return {prefix + name: value for name, value in values.items() if isinstance(value, bool | int | float)}
+
+
+def test_the_native_mapper_is_given_every_threshold_that_it_has(colmap):
+    found = find_colmap()
+    given = mapper_options(found, ["a", "b"], (7, 9))
+    own = pipeline_options(["a", "b"], (7, 9))
+    ours = numbers(own.triangulation, "tri_") | numbers(own.mapper) | numbers(own)
+    offered = {option.removeprefix("Mapper."): option for option in found.mapper_options if "Mapper." in option}
+    shared = {key for key in ours.keys() & offered.keys() if ours[key] >= 0}
+    assert len(shared) >= 40
+    for key in shared:
+        assert float(given[offered[key]]) == float(ours[key]), key
+        assert given[offered[key]] in ("0", "1") or not isinstance(ours[key], bool), key
+    assert given.keys() <= found.mapper_options
+
+
+def test_the_thresholds_for_few_points_by_name(colmap):
+    """What the mapping of 80 labelled points hangs on, by 3.8's names."""
+    given = {key: float(value) for key, value in mapper_options(find_colmap(), ["a"], (7, 9)).items()}
+    expected = {
+        "min_num_matches": 6,
+        "min_model_size": 2,
+        "multiple_models": 0,
+        "extract_colors": 0,
+        "ba_refine_focal_length": 0,
+        "ba_refine_extra_params": 0,
+        "ba_refine_principal_point": 0,
+        "init_image_id1": 7,
+        "init_image_id2": 9,
+        "init_min_num_inliers": 8,
+        "init_min_tri_angle": 1,
+        "abs_pose_min_num_inliers": 6,
+        "filter_max_reproj_error": 4,
+        "filter_min_tri_angle": 0.5,
+        "tri_min_angle": 0.5,
+        "tri_ignore_two_view_tracks": 0,
+    }
+    assert {key: given[f"Mapper.{key}"] for key in expected} == expected
+
+
+def test_older_names_and_unknown_options():
+    names = ["Mapper.local_ba_min_tri_angle", "Mapper.ba_global_images_freq", "Mapper.tri_min_angle", "random_seed"]
+    theirs = [
+        "Mapper.num_threads",
+        "Mapper.of_tomorrow",
+        "Mapper.snapshot_path",
+        "GlobalMapper.min_num_matches",
+        "help",
+    ]
+    found = NativeColmap(Path("colmap"), "3.8", frozenset(names + theirs))
+    given = mapper_options(found, ["a"], (1, 2))
+    assert given == dict(zip(names, ("6.0", "500", "0.5", "1"), strict=True))
+    later = replace(found, mapper_options=frozenset({"default_random_seed"}))
+    assert mapper_options(later, ["a"], (1, 2)) == {"default_random_seed": "1"}
+
+
+# --- programs that are not what they should be ---
+
+
+def program(folder, mapper: str, version: str = "3.8", asked: str = "") -> Path:
+    """A shell script that answers as COLMAP does, and maps as ``mapper`` says; ``asked`` comes before all answers."""
+    path = folder / "colmap"
+    path.write_text(
+        f"""#!/bin/sh
+{asked}
+case "$1 $2" in
+"help "*) echo "COLMAP {version} -- Structure-from-Motion and Multi-View Stereo"; exit ;;
+"mapper -h") echo "  --Mapper.min_num_matches arg (=15)"; echo "  --Mapper.multiple_models arg (=1)"; exit ;;
+esac
+for word; do
+  case $before in
+  --database_path) database=$word ;;
+  --output_path) models=$word ;;
+  --image_list_path) list=$word ;;
+  esac
+  before=$word
+done
+{mapper}
+"""
+    )
+    path.chmod(0o755)
+    return path
+
+
+@pytest.fixture
+def refused(own_run, stcal_sfm, tmp_path):
+    """The cross-check with a program must end in one line, and the run stay as it is."""
+
+    def check(colmap, code: int, *parts: str, more=()) -> str:
+        before = state_of(own_run)
+        line = assert_error(stcal_sfm("crosscheck", own_run, "--colmap", colmap, *more), code, *parts)
+        assert state_of(own_run) == before
+        return line
+
+    return check
+
+
+def test_no_native_program(own_run, stcal_sfm, tmp_path, monkeypatch):
+    monkeypatch.setenv("PATH", str(tmp_path))
+    outcome = stcal_sfm("crosscheck", own_run)
+    assert_error(outcome, INPUT, "native COLMAP: no program on the PATH", INSTALL, "or give its path with --colmap")
+
+
+def test_no_program_there(refused, tmp_path):
+    (tmp_path / "text").write_text("no program")
+    for place in (tmp_path / "none", tmp_path, tmp_path / "text"):
+        refused(place, INPUT, f"native COLMAP: no program at {place} that can be executed", INSTALL)
+
+
+def test_a_program_that_cannot_be_started(refused, tmp_path):
+    (tmp_path / "text").write_text("neither a program nor a script")
+    (tmp_path / "text").chmod(0o755)
+    refused(tmp_path / "text", INPUT, "cannot be started (Exec format error)", INSTALL)
+
+
+def test_a_program_that_is_not_colmap(refused, tmp_path):
+    refused(shutil.which("true"), INPUT, "does not say a COLMAP version", INSTALL, "or give another --colmap")
+    refused(shutil.which("false"), INPUT, "help` ended with code 1: no message", INSTALL)
+    refused(sys.executable, INPUT, " help` ended with code 2: ", INSTALL)
+
+
+@pytest.mark.parametrize("version", ["2.0", "3.7", "99.1"])
+def test_a_version_without_a_known_schema(refused, tmp_path, version):
+    colmap = program(tmp_path, "touch started", version)
+    refused(colmap, INPUT, f"COLMAP {version}: its database schema is not known; use a release of 3.8, ")
+
+
+FAILURES = {
+    "exits with a message": (
+        'echo "doing well"; echo "ERROR: no space left on device" >&2; exit 1',
+        "mapper` ended with code 1: doing well ERROR: no space left on device; check the program",
+    ),
+    "exits without a word": ("exit 7", "mapper` ended with code 7: no message"),
+    "is killed": ("kill -9 $$", "mapper` was ended by signal 9: no message"),
+    "writes no model": ("exit 0", "group 12: native COLMAP 3.8 makes no model from the run's initial pair"),
+    "writes an empty folder": ('mkdir "$models/0"', "group 12: native COLMAP 3.8 makes no model"),
+    "writes something else": (
+        'mkdir "$models/0"; for f in cameras images points3D; do echo hello > "$models/0/$f.bin"; done',
+        "group 12: what native COLMAP 3.8 made of the run's database is of no use: model ",
+    ),
+    "writes to the end of the log": (
+        "i=0; while [ $i -lt 500 ]; do echo 0123456789; i=$((i+1)); done; echo last words; exit 1",
+        "89 last words; check the program",
+    ),
+}
+
+
+@pytest.mark.parametrize("case", FAILURES)
+def test_a_mapper_that_fails(refused, tmp_path, case):
+    mapper, part = FAILURES[case]
+    line = refused(program(tmp_path, mapper), COMPUTATION, part)
+    assert len(line) < 700
+
+
+def test_a_damaged_model(refused, tmp_path, colmap):
+    """The true program's, cut to 500 bytes."""
+    cut = 'cd "$models/0" && head -c 500 points3D.bin > part && mv part points3D.bin'
+    path = program(tmp_path, f'{colmap} "$@" && {cut}', asked=answers_of(colmap))
+    parts = ("group 12: what native COLMAP 3.", "damaged or incomplete (points3D.bin, 500 bytes: ends too soon)")
+    refused(path, COMPUTATION, *parts)
+
+
+def answers_of(colmap: str) -> str:
+    """The true program's answers about itself."""
+    return f'case "$1 $2" in "help "*|"mapper -h") exec {colmap} "$@" ;; esac'
+
+
+# --- programs that hang ---
+
+
+def has_ended(pid: int) -> bool:
+    """Whether a process is no more, or only waits to be collected; five seconds to get there."""
+    until = time.monotonic() + 5
+    while time.monotonic() < until:
+        try:
+            os.kill(pid, 0)
+            if Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[0] == "Z":
+                return True
+        except (ProcessLookupError, FileNotFoundError):
+            return True
+        time.sleep(0.01)
+    return False
+
+
+def assert_all_ended(pids: Path, count: int) -> None:
+    found = [int(word) for word in pids.read_text().split()]
+    assert len(found) == count
+    assert all(has_ended(pid) for pid in found)
+
+
+def test_a_mapper_that_hangs_with_a_child(refused, tmp_path):
+    pids = tmp_path / "pids"
+    path = program(tmp_path, f'sleep 61 & echo $$ $! > "{pids}"; wait')
+    start = time.monotonic()
+    refused(path, COMPUTATION, "mapper` still runs after 1 s; raise --timeout", more=("--timeout", 1))
+    assert 1 < time.monotonic() - start < 30
+    assert_all_ended(pids, 2)
+
+
+def test_a_program_that_hangs_when_asked(refused, tmp_path, monkeypatch):
+    monkeypatch.setattr(native, "ASK_SECONDS", 1.5)
+    pids = tmp_path / "pids"
+    path = program(tmp_path, "exit 0", asked=f'sleep 61 & echo $$ $! > "{pids}"; wait')
+    refused(path, INPUT, "help` does not end in 1.5 s", INSTALL)
+    assert_all_ended(pids, 2)
+
+
+def test_a_child_that_outlives_the_mapper(refused, tmp_path):
+    """It holds the pipe open; the mapper's end is the end."""
+    pids = tmp_path / "pids"
+    path = program(tmp_path, f'sleep 61 & echo $! > "{pids}"; exit 0')
+    start = time.monotonic()
+    refused(path, COMPUTATION, "makes no model")
+    assert time.monotonic() - start < 30
+    assert_all_ended(pids, 1)
+
+
+def test_a_mapper_that_prints_without_end(tmp_path):
+    """A disk's worth in an hour; only the end is kept."""
+    found = NativeColmap(program(tmp_path, "exec yes 0123456789"), "3.8", frozenset())
+    with pytest.raises(MappingError, match=r"still runs after 1 s"):
+        map_natively(found, tmp_path / "no.db", tmp_path / "place", ["a"], {}, 1.0)
+    log = (tmp_path / "place" / "mapper.log").read_bytes()
+    assert len(log) == native.MAX_OUTPUT
+    assert log.count(b"0123456789\n") > 90_000
+
+
+def test_an_interrupted_cross_check(own_run, tmp_path):
+    """Ctrl-C while the native mapper works: 130, no folder and no process is left, and the report is as it was."""
+    pids, before = tmp_path / "pids", state_of(own_run)
+    path = program(tmp_path, f'sleep 61 & echo $$ $! > "{pids}.new"; mv "{pids}.new" "{pids}"; wait')
+    running = subprocess.Popen(
+        command("crosscheck", own_run, "--colmap", path), stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
+    )
+    until = time.monotonic() + 30
+    while not pids.exists() and running.poll() is None and time.monotonic() < until:
+        time.sleep(0.01)
+    assert len(list((tmp_path / "temporary").iterdir())) == 1
+    running.send_signal(signal.SIGINT)
+    out, err = running.communicate(timeout=30)
+    assert (running.returncode, out) == (INTERRUPTED, "")
+    assert len(err.splitlines()) == 1
+    assert err.startswith("interrupted")
+    assert_all_ended(pids, 2)
+    assert list((tmp_path / "temporary").iterdir()) == []
+    assert state_of(own_run) == before
+
+
+# --- programs that answer wrongly ---
+
+
+def test_what_the_mapper_is_given(own_run, refused, tmp_path):
+    """Names of one group, its pair by the database's ids, choices as 0 and 1, an empty folder, no screen."""
+    said = tmp_path / "said"
+    keep = f'printf "%s\\n" "$@" > "{said}"; cat "$list" > "{said}.list"; ls -A "$models" > "{said}.models"'
+    path = program(tmp_path, f'{keep}; echo $QT_QPA_PLATFORM > "{said}.screen"; exit 1')
+    refused(path, COMPUTATION, "ended with code 1")
+    words = said.read_text().split()
+    assert words[0] == "mapper"
+    given = dict(zip(words[1::2], words[2::2], strict=True))
+    assert given["--Mapper.multiple_models"] == "0"
+    assert given["--Mapper.min_num_matches"] == "6"
+    assert len(given) == 6
+    assert (tmp_path / "said.list").read_text().splitlines() == [f"12/IMG_100{i}.jpg" for i in range(4)]
+    assert (tmp_path / "said.models").read_text() == ""
+    assert (tmp_path / "said.screen").read_text() == "offscreen\n"
+    assert not given["--database_path"].startswith(str(own_run))
+
+
+def test_a_model_that_lacks_an_image(own_run, stcal_sfm, colmap, tmp_path):
+    """One that is not of the initial pair, taken from the list."""
+    path = program(tmp_path, f'sed -i "/IMG_1002/d" "$list"; exec {colmap} "$@"', asked=answers_of(colmap))
+    outcome = stcal_sfm("crosscheck", own_run, "--colmap", path)
+    assert_error(outcome, COMPUTATION, "differ: image 12/IMG_1002.jpg and 1 more: registered by pycolmap only; ")
+    assert ": 6 of 8 images" in outcome[1]
+    check = json.loads((own_run / "report.json").read_text(encoding="utf-8"))["crosscheck"]
+    assert check["images"]["only_pycolmap"] == ["12/IMG_1002.jpg", "14/IMG_1002.jpg"]
+    assert max(row["translation_um"] for row in check["result"]["faces"].values()) < 0.05  # resected by its labels
+
+
+SPOIL = """
+import json, os, shutil, sqlite3, subprocess, sys
+import numpy as np
+colmap, shown, spoilt, *words = sys.argv[1:]
+database = words[words.index("--database_path") + 1]
+shutil.copy(database, database + ".spoilt")
+with sqlite3.connect(database + ".spoilt") as opened:
+    for image, keypoints in json.loads(spoilt).items():
+        (data, columns) = opened.execute("SELECT data, cols FROM keypoints WHERE image_id = ?", [image]).fetchone()
+        xy = np.frombuffer(data, np.float32).reshape(-1, columns).copy()
+        xy[keypoints, 0] += 0.3
+        opened.execute("UPDATE keypoints SET data = ? WHERE image_id = ?", [xy.tobytes(), image])
+opened.close()
+words[words.index("--database_path") + 1] = database + ".spoilt"
+subprocess.run([colmap, *words], check=True)
+if shown == "hidden":
+    import pycolmap
+    place = words[words.index("--output_path") + 1] + "/0"
+    model = pycolmap.Reconstruction(place)
+    for image_id, image in model.images.items():
+        for k in json.loads(spoilt).get(str(image_id), []):
+            image.points2D[k].xy = image.points2D[k].xy - [np.float32(0.3), 0]
+    model.write_binary(place)
+"""
+
+
+def spoiling(tmp_path, colmap: str, run, shown: str) -> Path:
+    """The true program on a copy of the database where the circles of face 2 are 0.3 px to the right."""
+    observations = load_run(run).observations
+    spoilt = {
+        i: [k for k, label in enumerate(image.labels) if label.startswith("2:")]
+        for i, image in enumerate(observations, start=1)
+    }
+    (tmp_path / "spoil.py").write_text(SPOIL)
+    words = f"'{sys.executable}' '{tmp_path / 'spoil.py'}' {colmap} {shown} '{json.dumps(spoilt)}'"
+    return program(tmp_path, f'exec {words} "$@"', asked=answers_of(colmap))
+
+
+def test_other_keypoints_are_noticed(own_run, refused, colmap, tmp_path):
+    path = spoiling(tmp_path, colmap, own_run, "plain")
+    line = refused(path, COMPUTATION, "group 12: what native COLMAP 3", "0.3000 px off the run's, 0.002 allowed")
+    assert re.search(r"image 12/IMG_\d+.jpg: keypoint \d+ \(2:\w\) is 0\.3000 px off", line)
+
+
+def test_another_geometry_is_noticed(own_run, stcal_sfm, colmap, tmp_path):
+    """The same, but the model says our keypoints: face 2 is where the others are not. At 1 m and f = 1393 px, 0.3 px
+    are 0.2 mm across; the images see it from sides that differ."""
+    path = spoiling(tmp_path, colmap, own_run, "hidden")
+    outcome = stcal_sfm("crosscheck", own_run, "--colmap", path)
+    line = assert_error(outcome, COMPUTATION, "face 2 (mapped by both)", "2 µm, 1 mdeg allowed", "circle 2:")
+    assert 70 < float(re.search(r"face 2 \(mapped by both\) ([\d.]+) µm", line)[1]) < 600
+    check = json.loads((own_run / "report.json").read_text(encoding="utf-8"))["crosscheck"]
+    assert "face 4 (" not in line  # in group 14, which does not show face 2
+    # A pattern pushed 0.3 px alike in all images leaves a sixth of that as residuals.
+    assert 0.02 < check["residual_rms_px"]["native"] < 0.1
+    assert check["residual_rms_px"]["pycolmap"] < 0.01
+    assert max(row["translation_um"] for row in check["result"]["faces"].values()) < 0.05  # from our own centres again
+
+
+# --- the run ---
+
+
+def never(tmp_path) -> Path:
+    """A program whose mapper must not be reached."""
+    return program(tmp_path, "echo the mapper was started; exit 1")
+
+
+def test_a_database_in_use(own_run, refused, tmp_path):
+    with closing(sqlite3.connect(own_run / "database.db")) as other:
+        other.execute("BEGIN EXCLUSIVE")
+        refused(never(tmp_path), INPUT, f"{own_run / 'database.db'}: in use by another program", "close it")
+
+
+def test_the_database_of_another_run(own_run, refused, tmp_path):
+    with closing(sqlite3.connect(own_run / "database.db")) as opened, opened:
+        opened.execute("PRAGMA journal_mode = DELETE")
+        (data,) = opened.execute("SELECT data FROM keypoints WHERE image_id = 6").fetchone()
+        opened.execute("UPDATE keypoints SET data = ? WHERE image_id = 6", [data[4:] + data[:4]])
+    parts = (f"{own_run / 'database.db'}: its keypoints of 14/IMG_1001.jpg are not those of", "labels.csv; run again")
+    refused(never(tmp_path), INPUT, *parts)
+
+
+def test_a_database_with_other_images(own_run, refused, tmp_path):
+    with closing(sqlite3.connect(own_run / "database.db")) as opened, opened:
+        opened.execute("PRAGMA journal_mode = DELETE")
+        opened.execute("UPDATE images SET name = 'other.jpg' WHERE image_id = 6")
+    refused(never(tmp_path), INPUT, f"{own_run / 'database.db'}: its keypoints of ", "run again")
+
+
+def test_a_run_that_is_none(own_run, stcal_sfm, tmp_path):
+    for place in (tmp_path / "nothing", own_run / "faces.json", tmp_path):
+        assert_error(stcal_sfm("crosscheck", place), INPUT, f"run {place}: not a run's folder")
+
+
+SPOILT_REPORTS = {
+    "of another version": (
+        lambda run: edit(run, lambda report: report.pop("scene")),
+        "of another version (no 'scene')",
+    ),
+    "damaged": (lambda run: edit(run, lambda report: report.update(faces=[1])), "damaged, or of another version"),
+    "without an overlay": (lambda run: (run / "overlays/12/IMG_1000.jpg.jpg").unlink(), "IMG_1000.jpg.jpg: No such"),
+}
+
+
+def edit(run, change) -> None:
+    report = json.loads((run / "report.json").read_text(encoding="utf-8"))
+    change(report)
+    (run / "report.json").write_text(json.dumps(report), encoding="utf-8")
+
+
+@pytest.mark.parametrize("case", SPOILT_REPORTS)
+def test_a_report_that_cannot_be_added_to(own_run, refused, tmp_path, case):
+    """It is said before the mapping, which takes minutes on large sets."""
+    spoil, part = SPOILT_REPORTS[case]
+    spoil(own_run)
+    refused(never(tmp_path), INPUT, part, "run it again")
+
+
+def test_no_half_of_a_report(own_run):
+    """Should an overlay go meanwhile, neither file is written."""
+    (own_run / "overlays/12/IMG_1000.jpg.jpg").unlink()
+    before = state_of(own_run)
+    with pytest.raises(FileNotFoundError):
+        write_report(own_run, load_run(own_run).report | {"notes": ["new"]})
+    assert state_of(own_run) == before
+
+
+def test_a_run_that_cannot_be_written_to(own_run, refused, tmp_path, monkeypatch):
+    may = os.access
+    monkeypatch.setattr(os, "access", lambda path, mode: mode != os.W_OK and may(path, mode))
+    refused(never(tmp_path), INPUT, f"run {own_run}: cannot be written to", "copy it")
+
+
+def test_no_room_for_temporary_files(own_run, refused, tmp_path, monkeypatch):
+    """What Python says where neither TMPDIR nor any other place can be written to."""
+
+    def nowhere(**_):
+        raise FileNotFoundError(errno.ENOENT, "No usable temporary directory found in ['/tmp']")
+
+    monkeypatch.setattr(tempfile, "TemporaryDirectory", nowhere)
+    parts = ("No usable temporary directory found in ['/tmp']; check the path, its rights and the free space",)
+    refused(never(tmp_path), INPUT, *parts)
+
+
+def test_a_name_that_a_list_cannot_hold(own_run, tmp_path):
+    saved = load_run(own_run)
+    odd = replace(saved.observations[0], name=" 12/IMG_1000.jpg")
+    with pytest.raises(InputError, match=r"image ' 12/IMG_1000.jpg': .* rename the image or its folder"):
+        crosscheck(replace(saved, observations=(odd, *saved.observations[1:])), never(tmp_path))
+    require_listable([*image_ids(saved.observations), "12/ inner space.jpg"])
+
+
+@pytest.mark.parametrize("value", ["-1", "inf", "nan", "1e9", "two"])
+@pytest.mark.parametrize("option", ["--tolerance-um", "--tolerance-mdeg", "--camera-tolerance-um", "--timeout"])
+def test_a_limit_that_is_none(own_run, stcal_sfm, option, value):
+    before = state_of(own_run)
+    assert_error(stcal_sfm("crosscheck", own_run, option, value), INPUT, option, "`stcal-sfm crosscheck --help`")
+    assert state_of(own_run) == before
+
+
+def test_a_tolerance_that_is_none():
+    for value in (-1.0, float("nan"), float("inf")):
+        with pytest.raises(InputError, match=r"tolerance camera_mdeg .*: a number of 0 or more needed"):
+            Tolerances(camera_mdeg=value)

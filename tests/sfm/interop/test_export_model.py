@@ -1,0 +1,398 @@
+"""The exported model read back: by COLMAP, old and new, and by small readers of what the formats' documents say."""
+
+import csv
+import json
+import os
+import re
+import shutil
+import subprocess
+from dataclasses import replace
+
+import numpy as np
+import pycolmap
+import pytest
+from scipy.spatial.transform import Rotation
+
+from stcal.errors import InputError
+from stcal.io.camera import colmap_params, read_camera, write_cameras_txt
+from stcal.sfm.interop.export_model import export_model
+
+AGAIN_PX = 5e-5
+"""The eccentricity, settled group by group in ``labels.csv``, is computed again in the joint adjustment: nanometres."""
+FORMATS = ("colmap-bin", "colmap-txt", "ply", "nvm", "bundler")
+
+
+@pytest.fixture(scope="module")
+def exported(small_run, tmp_path_factory):
+    """Path of the exported model by format."""
+    folder = tmp_path_factory.mktemp("exported")
+    paths = {kind: folder / f"model.{kind}" for kind in FORMATS}
+    for kind, path in paths.items():
+        export_model(small_run, path, kind)
+    return paths
+
+
+@pytest.fixture(scope="module")
+def known(small_run):
+    """``faces.json``, and ``report.json``'s scene: camera_from_target (R, t) by image."""
+    faces = json.loads((small_run / "faces.json").read_text(encoding="utf-8"))
+    scene = json.loads((small_run / "report.json").read_text(encoding="utf-8"))["scene"]
+    poses = {}
+    for camera in scene["cameras"]:
+        rotation = np.array(camera["axes"])
+        poses[camera["image"]] = rotation, -rotation @ np.array(camera["position_mm"])
+    return faces, scene, poses
+
+
+@pytest.fixture(scope="module")
+def keypoints(small_run):
+    """Label and corrected centre, OpenCV pixel origin, by (image, keypoint)."""
+    with open(small_run / "labels.csv", encoding="utf-8", newline="") as stream:
+        return {
+            (row["image"], int(row["keypoint"])): (
+                row["label"],
+                np.array([float(row["corrected_x_px"]), float(row["corrected_y_px"])]),
+            )
+            for row in csv.DictReader(stream)
+        }
+
+
+def labels_of(path) -> list[dict]:
+    beside = path / "labels.csv" if path.is_dir() else path.with_name(f"{path.name}.labels.csv")
+    with open(beside, encoding="utf-8", newline="") as stream:
+        return list(csv.DictReader(stream))
+
+
+def xyz_of(row: dict) -> np.ndarray:
+    return np.array([float(row[f"{axis}_mm"]) for axis in "xyz"])
+
+
+# --- readers, from the formats' documents -----------------------------------------------------------------------------
+
+
+def read_ply(path):
+    lines = path.read_text(encoding="ascii").splitlines()
+    start = lines.index("end_header") + 1
+    values = np.array([line.split() for line in lines[start:]], float)
+    assert f"element vertex {len(values)}" in lines[:start]
+    return values[:, :3], values[:, 3:].astype(int)
+
+
+def read_nvm(path):
+    """Cameras as (name, f, R, t), points as (xyz, rgb, views). VisualSFM: quaternion w x y z, camera centre,
+    distortion, 0; measurements relative to the principal point, x right, y down."""
+    lines = path.read_text(encoding="utf-8").split("\n")
+    assert lines[0].split() == ["NVM_V3"]
+    words = " ".join(lines[1:]).split()
+    count, words = int(words[0]), words[1:]
+    cameras = []
+    for i in range(count):
+        name, *numbers = words[11 * i : 11 * i + 11]
+        f, w, x, y, z, *centre, distortion, end = map(float, numbers)
+        assert distortion == end == 0
+        rotation = Rotation.from_quat([x, y, z, w]).as_matrix()
+        cameras.append((name.replace('"', " "), f, rotation, -rotation @ centre))
+    words = words[11 * count :]
+    points, words = [], iter(words[1:])
+    for _ in range(int(lines[lines.index("", 2) + 1])):
+        xyz, rgb = [float(next(words)) for _ in range(3)], [int(next(words)) for _ in range(3)]
+        views = [
+            (int(next(words)), int(next(words)), float(next(words)), float(next(words)))
+            for _ in range(int(next(words)))
+        ]
+        points.append((np.array(xyz), rgb, views))
+    assert list(words) == ["0"]
+    return cameras, points
+
+
+def project_nvm(camera, xyz):
+    _, f, rotation, translation = camera
+    x, y, z = rotation @ xyz + translation
+    assert z > 0
+    return f * np.array([x, y]) / z
+
+
+def read_bundler(path):
+    """As :func:`read_nvm`. Bundler's manual: P = R X + t, p = -P / P.z, p' = f p; x right, y up from the centre."""
+    lines = (path / "bundle.out").read_text(encoding="ascii").splitlines()
+    names = (path / "list.txt").read_text(encoding="utf-8").splitlines()
+    assert lines[0] == "# Bundle file v0.3"
+    images, count = map(int, lines[1].split())
+    assert images == len(names)
+    rows = [np.array(line.split(), float) for line in lines[2:]]
+    cameras = []
+    for i, name in enumerate(names):
+        (f, k1, k2), *rotation, translation = rows[5 * i : 5 * i + 5]
+        assert k1 == k2 == 0
+        cameras.append((name, f, np.array(rotation), translation))
+    points = []
+    for k in range(count):
+        xyz, rgb, views = rows[5 * images + 3 * k : 5 * images + 3 * k + 3]
+        quadruples = views[1:].reshape(-1, 4)
+        assert views[0] == len(quadruples)
+        points.append((xyz, rgb.astype(int).tolist(), [(int(i), int(k), x, y) for i, k, x, y in quadruples]))
+    return cameras, points
+
+
+def project_bundler(camera, xyz):
+    _, f, rotation, translation = camera
+    p = rotation @ xyz + translation
+    assert p[2] < 0
+    return -f * p[:2] / p[2]
+
+
+# --- COLMAP -----------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("kind", ["colmap-bin", "colmap-txt"])
+def test_colmap_has_the_runs_circles_poses_and_keypoints(exported, known, keypoints, kind):
+    faces, scene, poses = known
+    read = pycolmap.Reconstruction(str(exported[kind]))
+    rows = labels_of(exported[kind])
+    assert {int(row["point"]) for row in rows} == set(read.point3D_ids())
+    for row in rows:
+        xyz = read.point3D(int(row["point"])).xyz
+        assert np.abs(xyz - xyz_of(row)).max() < 1e-9
+        if row["label"] in faces["circles"]:
+            assert np.abs(xyz - faces["circles"][row["label"]]).max() < 1e-9
+    assert {row["label"] for row in rows if not row["label"].startswith("board")} == set(faces["circles"])
+    for group, dots in scene["boards"].items():
+        own = [xyz_of(row) for row in rows if row["group"] == group and row["label"].startswith("board")]
+        assert np.abs(np.array(own) - dots).max() < 1e-9
+    images = {read.image(i).name: read.image(i) for i in read.reg_image_ids()}
+    assert images.keys() == poses.keys()
+    for name, (rotation, translation) in poses.items():
+        pose = images[name].cam_from_world()
+        assert np.abs(pose.rotation.matrix() - rotation).max() < 1e-9
+        assert np.abs(pose.translation - translation).max() < 1e-9
+        for k, point in enumerate(images[name].points2D):
+            assert np.abs(point.xy - 0.5 - keypoints[name, k][1]).max() < AGAIN_PX
+
+
+@pytest.mark.parametrize("kind", ["colmap-bin", "colmap-txt"])
+def test_native_colmap_reads_it(exported, kind, tmp_path):
+    """Another version than pycolmap's, 3.8 for one, which knows no rigs and frames and passes over their files."""
+    if not shutil.which("colmap"):
+        pytest.skip("no colmap program")
+
+    def colmap(*arguments):
+        environment = os.environ | {"QT_QPA_PLATFORM": "offscreen"}
+        done = subprocess.run(
+            ["colmap", *map(str, arguments)], env=environment, capture_output=True, text=True, check=True
+        )
+        return done.stdout + done.stderr
+
+    ours = pycolmap.Reconstruction(str(exported[kind]))
+    said = colmap("model_analyzer", "--path", exported[kind])
+    number = {key: float(re.search(rf"{key}: ([\d.]+)", said)[1]) for key in ("Registered images", "Points", "error")}
+    assert number["Registered images"] == ours.num_reg_images()
+    assert number["Points"] == ours.num_points3D()
+    assert number["error"] == pytest.approx(ours.compute_mean_reprojection_error(), abs=2e-6)
+    colmap("model_converter", "--input_path", exported[kind], "--output_path", tmp_path, "--output_type", "TXT")
+    for line in (tmp_path / "points3D.txt").read_text(encoding="ascii").splitlines():
+        if not line.startswith("#"):
+            point_id, *xyz = line.split()[:4]
+            assert np.abs(np.array(xyz, float) - ours.point3D(int(point_id)).xyz).max() < 1e-9
+
+
+# --- the other formats ------------------------------------------------------------------------------------------------
+
+
+def test_ply_by_row_and_by_colmaps_reader(exported, tmp_path):
+    xyz, rgb = read_ply(exported["ply"])
+    rows = labels_of(exported["ply"])
+    assert [int(row["point"]) for row in rows] == list(range(len(xyz)))
+    assert np.abs(xyz - [xyz_of(row) for row in rows]).max() == 0
+    theirs = pycolmap.Reconstruction()
+    theirs.import_PLY(str(exported["ply"]))
+    points = list(theirs.points3D.values())
+    # COLMAP keeps single precision: steps of 6e-5 mm at 512 … 1024 mm.
+    key = np.array([[*p.xyz, *p.color] for p in points])
+    ours = np.column_stack([xyz, rgb])
+    order, theirs_order = (np.lexsort(np.round(values[:, :3], 2).T) for values in (ours, key))
+    np.testing.assert_allclose(key[theirs_order], ours[order], atol=6e-5)
+
+
+def test_faces_and_board_differ_in_colour(exported):
+    _, rgb = read_ply(exported["ply"])
+    by_face = {}
+    for row, colour in zip(labels_of(exported["ply"]), rgb.tolist(), strict=True):
+        by_face.setdefault(row["label"].split(":")[0], set()).add(tuple(colour))
+    assert by_face.keys() == {"board", "1", "2", "4", "5"}
+    assert all(len(colours) == 1 for colours in by_face.values())
+    assert len(set.union(*by_face.values())) == len(by_face)
+    read = pycolmap.Reconstruction(str(exported["colmap-bin"]))
+    for row, colour in zip(labels_of(exported["colmap-bin"]), rgb.tolist(), strict=True):
+        assert read.point3D(int(row["point"])).color.tolist() == colour
+
+
+@pytest.mark.parametrize(
+    ("kind", "read", "project", "up"),
+    [("nvm", read_nvm, project_nvm, 1), ("bundler", read_bundler, project_bundler, -1)],
+)
+def test_one_ideal_camera_sees_what_the_run_saw(small_run, exported, known, keypoints, kind, read, project, up):
+    camera = read_camera(small_run / "cameras.txt").sized(0, 0)
+    cameras, points = read(exported[kind])
+    rows = labels_of(exported[kind])
+    assert [int(row["point"]) for row in rows] == list(range(len(points)))
+    assert {name for name, *_ in cameras} == known[2].keys()
+    residuals, seen = [], 0
+    for row, (xyz, _, views) in zip(rows, points, strict=True):
+        assert np.abs(xyz - xyz_of(row)).max() < 1e-9
+        for i, k, x, y in views:
+            name, focal, *_ = cameras[i]
+            label, corrected_px = keypoints[name, k]
+            assert label == row["label"]
+            # Seen through the run's own lens, the keypoint is where the run has it.
+            assert np.abs(camera.pixel_from_normalised(np.array([x, up * y]) / focal) - corrected_px).max() < AGAIN_PX
+            rotation, translation = known[2][name]
+            truth = rotation @ xyz + translation
+            projected = project(cameras[i], xyz)
+            assert np.abs(projected - focal * truth[:2] / truth[2] * [1, up]).max() < 1e-6
+            residuals.append(projected - [x, y])
+            seen += 1
+    own = json.loads((small_run / "report.json").read_text(encoding="utf-8"))["summary"]
+    assert seen == own["observations"]
+    # The lens stretches residuals by a few per cent.
+    assert np.sqrt(np.mean(np.square(residuals))) == pytest.approx(own["residual_rms_px"], rel=0.1)
+    assert own["residual_rms_px"] < 0.02
+
+
+def refusal(run, out) -> str:
+    with pytest.raises(InputError) as refused:
+        export_model(run, out, "colmap-bin")
+    return str(refused.value)
+
+
+def test_two_focal_lengths_become_one(small_run, tmp_path, keypoints):
+    own = tmp_path / "run"
+    shutil.copytree(small_run, own)
+    model = read_camera(own / "cameras.txt")
+    camera = replace(model.sized(0, 0), focal=model.focal * [1.02, 1.0])
+    write_cameras_txt(own / "cameras.txt", camera, model.colmap_model)
+    assert "its camera is not that of the run" in refusal(own, tmp_path / "refused")
+    native = pycolmap.Reconstruction(str(own / "target_model"))
+    native.camera(1).params = colmap_params(camera, model.colmap_model)
+    native.write_binary(str(own / "target_model"))
+    written = export_model(own, tmp_path / "model.nvm", "nvm")
+    assert written.focal_px == pytest.approx(1.01 * model.focal[1], abs=1e-9)
+    cameras, points = read_nvm(tmp_path / "model.nvm")
+    for _, _, views in points:
+        for i, k, x, y in views:
+            name, focal, *_ = cameras[i]
+            assert focal == written.focal_px
+            seen = camera.pixel_from_normalised(np.array([x, y]) / focal)
+            assert np.abs(seen - keypoints[name, k][1]).max() < AGAIN_PX
+
+
+def test_labels_carry_group_and_sigma(exported, known):
+    rows = {(row["group"], row["label"]): row for row in labels_of(exported["nvm"])}
+    faces = known[0]
+    assert {group for group, label in rows if label.startswith("board:")} == {"12", "14"}
+    assert {group for group, label in rows if label.startswith("1:")} == {""}  # both groups have it in common
+    assert {group for group, label in rows if label.startswith("2:")} == {"12"}
+    for (_, label), row in rows.items():
+        sigma = [row[f"sigma_{axis}_um"] for axis in "xyz"]
+        if label.startswith("board:"):
+            assert sigma == ["", "", ""]
+        else:
+            covariance = np.array(faces["circle_covariance_mm2"][label])
+            np.testing.assert_allclose(np.array(sigma, float) ** 2, 1e6 * np.diag(covariance), atol=0.01, rtol=0.01)
+
+
+def test_a_chained_run_has_no_sigma(small_run, tmp_path):
+    own = tmp_path / "run"
+    shutil.copytree(small_run, own)
+    faces = json.loads((own / "faces.json").read_text(encoding="utf-8"))
+    del faces["circle_covariance_mm2"]
+    (own / "faces.json").write_text(json.dumps(faces), encoding="utf-8")
+    export_model(own, tmp_path / "model.ply", "ply")
+    assert {row[f"sigma_{axis}_um"] for row in labels_of(tmp_path / "model.ply") for axis in "xyz"} == {""}
+
+
+def test_a_space_in_a_name_is_a_quotation_mark_in_nvm(small_run, tmp_path):
+    own = tmp_path / "run"
+    shutil.copytree(small_run, own)
+    for name in ("labels.csv", "report.json"):
+        text = (own / name).read_text(encoding="utf-8")
+        (own / name).write_text(text.replace("IMG_1000", "IMG 1000"), encoding="utf-8")
+    model = pycolmap.Reconstruction(str(own / "target_model"))
+    for image_id in model.reg_image_ids():
+        model.image(image_id).name = model.image(image_id).name.replace("IMG_1000", "IMG 1000")
+    model.write_binary(str(own / "target_model"))
+    export_model(own, tmp_path / "model.nvm", "nvm")
+    assert '\n12/IMG"1000.jpg ' in (tmp_path / "model.nvm").read_text(encoding="utf-8")
+    assert "12/IMG 1000.jpg" in {name for name, *_ in read_nvm(tmp_path / "model.nvm")[0]}
+
+
+# --- the command ------------------------------------------------------------------------------------------------------
+
+
+def test_the_command(small_run, stcal_sfm, tmp_path):
+    (tmp_path / "empty").mkdir()
+    code, out, _ = stcal_sfm("export-model", small_run, tmp_path / "empty", "--format", "bundler")
+    assert code == 0
+    assert sorted(path.name for path in (tmp_path / "empty").iterdir()) == ["bundle.out", "labels.csv", "list.txt"]
+    assert "8 images" in out
+    camera = read_camera(small_run / "cameras.txt")
+    assert f"f = {camera.focal.mean():.4f} px" in out
+    assert "(647.5, 431.5)" in out  # 1296 × 864 px, centre of the first pixel at (0, 0)
+    code, out, _ = stcal_sfm("export-model", small_run, tmp_path / "model.ply", "--format", "ply")
+    assert (code, "ideal" in out) == (0, False)
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["empty", "model.ply", "model.ply.labels.csv"]
+
+
+@pytest.mark.parametrize("kind", FORMATS)
+def test_nothing_is_overwritten(small_run, stcal_sfm, tmp_path, kind):
+    (tmp_path / "file").write_text("mine", encoding="utf-8")
+    (tmp_path / "full").mkdir()
+    (tmp_path / "full" / "file").write_text("mine", encoding="utf-8")
+    for name in ("file", "full"):
+        code, out, error = stcal_sfm("export-model", small_run, tmp_path / name, "--format", kind)
+        assert (code, out, error.count("\n")) == (2, "", 1)
+        assert "exists, and nothing is overwritten" in error
+    assert (tmp_path / "file").read_text(encoding="utf-8") == "mine"
+    assert sorted(path.name for path in tmp_path.rglob("*")) == ["file", "file", "full"]
+
+
+def test_labels_are_not_overwritten_either(small_run, stcal_sfm, tmp_path):
+    (tmp_path / "m.ply.labels.csv").write_text("mine", encoding="utf-8")
+    code, _, error = stcal_sfm("export-model", small_run, tmp_path / "m.ply", "--format", "ply")
+    assert (code, "m.ply.labels.csv: exists" in error) == (2, True)
+    assert not (tmp_path / "m.ply").exists()
+
+
+def test_errors(small_run, stcal_sfm, tmp_path):
+    def refused(run, out, kind="ply"):
+        code, printed, error = stcal_sfm("export-model", run, out, "--format", kind)
+        assert (code, printed, error.count("\n")) == (2, "", 1)
+        assert not out.exists()
+        return error
+
+    out = tmp_path / "out" / "m"
+    assert "no folder" in refused(small_run, out)
+    out.parent.mkdir()
+    assert "format obj: unknown; give one of colmap-bin" in refused(small_run, out, "obj")
+    assert "not a run's folder" in refused(tmp_path, out)
+    own = tmp_path / "run"
+    shutil.copytree(small_run, own)
+    model = own / "target_model"
+    labels = (own / "labels.csv").read_text(encoding="utf-8")
+    head, *rows = labels.splitlines(keepends=True)
+    assert ",2:1," in rows[0]
+    assert ",2:2," in rows[1]
+    swapped = [rows[0].replace(",2:1,", ",2:2,"), rows[1].replace(",2:2,", ",2:1,")]
+    (own / "labels.csv").write_text("".join([head, *swapped, *rows[2:]]), encoding="utf-8")
+    assert "is of 2 labels, 1 needed" in refused(own, out)
+    (own / "labels.csv").write_text(labels, encoding="utf-8")
+    other = pycolmap.Reconstruction(str(model))
+    other.image(1).name = "12/other.jpg"
+    other.write_binary(str(model))
+    assert "image 12/other.jpg is not as in the run's labels.csv" in refused(own, out)
+    points = (model / "points3D.bin").read_bytes()
+    (model / "points3D.bin").write_bytes(points[: len(points) // 2])
+    for kind in FORMATS:
+        assert "damaged or incomplete" in refused(own, out, kind)
+    shutil.rmtree(model)
+    assert "no target_model; run it again" in refused(own, out)
+    assert list(out.parent.iterdir()) == []

@@ -1,0 +1,734 @@
+"""COLMAP models read back with labels: made by the mapper, edited, damaged, or of something else."""
+
+import csv
+import json
+import random
+import shutil
+import sqlite3
+import subprocess
+import sys
+from contextlib import closing
+from dataclasses import replace
+
+import numpy as np
+import pycolmap
+import pytest
+
+from stcal.errors import InputError, MappingError, ScaleError
+from stcal.sfm.interop.export_database import export_database
+from stcal.sfm.interop.external import faces_from_models
+from stcal.sfm.mapping.database import image_ids
+from stcal.sfm.mapping.incremental import seeded_mapping
+from stcal.sfm.mapping.models import find_models, open_model, read_model, write_model
+from stcal.sfm.pipeline import calibrate_models
+from stcal.sfm.run.saved import load_run
+from tests.outcome import COMPUTATION, INPUT, assert_error
+
+FILES = ("cameras", "rigs", "frames", "images", "points3D")
+SAME_MM = 1e-9
+"""Between results of the same numbers: they are summed in another order at most."""
+
+
+@pytest.fixture(scope="module")
+def saved(small_run):
+    return load_run(small_run)
+
+
+def read(path, saved):
+    return read_model(path, saved.observations, image_ids(saved.observations), saved.corrected_px)
+
+
+@pytest.fixture(scope="module")
+def plain(saved):
+    """What the model of group 12 as the run wrote it says."""
+    return calibrate_models(saved.folder / "models" / "12", saved)
+
+
+class Model(pycolmap.Reconstruction):
+    """The run's model of group 12, to be edited and written."""
+
+    def __init__(self, saved, folder):
+        super().__init__(str(saved.folder / "models" / "12"))
+        self.folder = folder
+        self.labels = {image.name: image.labels for image in saved.observations}
+
+    def point(self, label: str) -> int:
+        """Id of a circle's point."""
+        return next(i for i, _, found in self.seen() if found == label)
+
+    def seen(self):
+        """(point id, (image id, keypoint), label) of every observation."""
+        for image_id, image in self.images.items():
+            for k, each in enumerate(image.points2D):
+                if each.has_point3D():
+                    yield each.point3D_id, (image_id, k), self.labels[image.name][k]
+
+    def as_binary(self):
+        self.folder.mkdir()
+        self.write_binary(str(self.folder))
+        return self.folder
+
+    def as_text(self):
+        self.folder.mkdir()
+        self.write_text(str(self.folder))
+        return self.folder
+
+
+@pytest.fixture
+def model(saved, tmp_path):
+    return Model(saved, tmp_path / "model")
+
+
+def assert_same_faces(found, known, missing=()) -> None:
+    """The same faces but for those missing, in the same places."""
+    assert found.target.target_from_face.keys() == known.target.target_from_face.keys() - set(missing)
+    for face, pose in found.target.target_from_face.items():
+        assert np.allclose(pose.matrix(), known.target.target_from_face[face].matrix(), rtol=0, atol=SAME_MM), face
+
+
+NOT_THERE = "group 14: in none of the models"
+
+
+# --- pixel, database, mapping, model, pixel ---
+
+
+@pytest.fixture(scope="module")
+def mapped(saved, tmp_path_factory):
+    """Group 12 of a copy of the run's database, mapped by pycolmap as the run does; its folder."""
+    folder = tmp_path_factory.mktemp("mapped")
+    export_database(saved.database, folder / "copy.db", "4.2")
+    ids = image_ids(saved.observations)
+    pair = saved.report["groups"][0]["pairs"][0]
+    names = [image.name for image in saved.groups()["12"]]
+    made = seeded_mapping(folder / "copy.db", folder / "scratch", names, (ids[pair["first"]], ids[pair["second"]]))
+    (folder / "model").mkdir()
+    made.write_binary(str(folder / "model"))
+    return folder
+
+
+def float32_step(xy: np.ndarray) -> np.ndarray:
+    """Half the distance of neighbouring float32 numbers at COLMAP's coordinates: the largest rounding error."""
+    return np.spacing(np.abs(xy + 0.5).astype(np.float32)).astype(float) / 2
+
+
+def test_a_pixel_comes_back_from_database_and_model_to_float32_rounding(saved, mapped):
+    """OpenCV's pixel + 0.5 in the database and in the model; both are read here without our functions."""
+    model = pycolmap.Reconstruction(str(mapped / "model"))
+    with closing(sqlite3.connect(mapped / "copy.db")) as opened:
+        select = "SELECT name, data, cols FROM keypoints JOIN images USING (image_id)"
+        stored = {name: np.frombuffer(data, "<f4").reshape(-1, cols) for name, data, cols in opened.execute(select)}
+        (params,) = opened.execute("SELECT params FROM cameras").fetchone()
+    of = {image.name: image for image in model.images.values()}
+    worst = 0.0
+    for image, xy in zip(saved.observations, saved.corrected_px, strict=True):
+        assert (np.abs(stored[image.name][:, :2].astype(float) - 0.5 - xy) <= float32_step(xy)).all()
+        if image.group == "12":
+            back = np.array([each.xy for each in of[image.name].points2D]) - 0.5
+            assert (np.abs(back - xy) <= float32_step(xy)).all()
+            worst = max(worst, np.abs(back - xy).max())
+    assert 1e-5 < worst < 1e-4  # there was a rounding, of half a step of 2⁻¹³ px at x > 1024
+    assert np.array_equal(np.frombuffer(params, "<f8")[2:4] - 0.5, saved.camera.centre)
+
+
+def test_the_model_read_back_has_our_float64_centres_by_label(saved, mapped):
+    found = read(mapped / "model", saved)
+    (group,) = found.groups
+    observed = {image.name: image for image in saved.observations}
+    corrected = {image.name: xy for image, xy in zip(saved.observations, saved.corrected_px, strict=True)}
+    names = [group.images[i] for i in group.image_index]
+    assert len(names) > 300
+    for name, k, point, xy, measured in zip(
+        names, group.keypoint, group.point_index, group.corrected_px(), group.measured_px, strict=True
+    ):
+        assert observed[name].labels[k] == group.labels[point]
+        assert np.array_equal(measured, observed[name].centre_px[k])
+        assert np.allclose(xy, corrected[name][k], rtol=0, atol=1e-12)  # measured − (measured − corrected)
+    assert (found.unlabelled, found.split, found.absent) == (0, 0, 0)
+    assert found.camera.same_as(saved.camera)
+
+
+def test_projections_are_colmap_s_own_less_half_a_pixel(saved, mapped):
+    """Our camera at our pixel origin against COLMAP's camera at its own; and what is left is centring noise."""
+    model = pycolmap.Reconstruction(str(mapped / "model"))
+    found = read(mapped / "model", saved)
+    (group,) = found.groups
+    projected = group.corrected_px() - group.residuals_px(found.camera)
+    of = {image.name: image for image in model.images.values()}
+    (camera,) = model.cameras.values()
+    xyz = {}
+    for point in model.points3D.values():
+        element = point.track.elements[0]
+        name = model.image(element.image_id).name
+        xyz[next(i.labels[element.point2D_idx] for i in saved.observations if i.name == name)] = point.xyz
+    for i, point, xy in zip(group.image_index, group.point_index, projected, strict=True):
+        image = of[group.images[i]]
+        theirs = camera.img_from_cam(image.cam_from_world() * xyz[group.labels[point]])
+        assert np.allclose(xy, theirs - 0.5, rtol=0, atol=1e-9)  # two implementations in float64
+    rms = np.sqrt((group.residuals_px(found.camera) ** 2).mean())
+    assert 0.001 < rms < 0.02  # good edges reach 0.005 px
+
+
+# --- labels ---
+
+
+def test_points_have_the_label_of_their_keypoints(saved):
+    """Against labels.csv, read by itself."""
+    with (saved.folder / "labels.csv").open(encoding="utf-8", newline="") as stream:
+        labels = {(row["image"], int(row["keypoint"])): row["label"] for row in csv.DictReader(stream)}
+    raw = pycolmap.Reconstruction(str(saved.folder / "models" / "14"))
+    expected = {}
+    for point in raw.points3D.values():
+        (label,) = {labels[raw.image(e.image_id).name, e.point2D_idx] for e in point.track.elements}
+        expected[label] = point.xyz
+    (group,) = read(saved.folder / "models" / "14", saved).groups
+    assert group.group == "14"
+    assert list(group.labels) == sorted(expected)
+    assert len(expected) >= 80
+    assert np.array_equal(group.xyz_world, [expected[label] for label in group.labels])
+
+
+def test_text_is_as_good_as_binary(saved, model, plain):
+    found = calibrate_models(model.as_text(), saved)
+    assert_same_faces(found, plain)
+    assert found.notes == (NOT_THERE,)
+
+
+def test_a_text_with_fewer_digits(saved, model, plain):
+    """Quaternions of four digits are of length 1 to 1e-4 only; at f = 1393 px they move images by 0.2 px at most."""
+    path = model.as_text() / "frames.txt"
+    lines = [line.split() for line in path.read_text().splitlines()]
+    short = [[*w[:2], *(f"{float(q):.4f}" for q in w[2:6]), *w[6:]] if w[0] != "#" else w for w in lines]
+    path.write_text("\n".join(" ".join(words) for words in short) + "\n")
+    found = calibrate_models(path.parent, saved)
+    assert_same_faces(found, plain)  # a frame is made of points
+    (group,) = read(path.parent, saved).groups
+    assert 1e-6 < np.abs(group.camera_from_world[0].rotation - plain_rotation(saved)).max() < 4e-4
+
+
+def plain_rotation(saved) -> np.ndarray:
+    (group,) = read(saved.folder / "models" / "12", saved).groups
+    return group.camera_from_world[0].rotation
+
+
+# --- edited models ---
+
+
+def test_a_deleted_observation(saved, model, plain):
+    (image_id, k) = next(where for _, where, label in model.seen() if label == "2:4")
+    model.delete_observation(image_id, k)
+    path = model.as_binary()
+    found = calibrate_models(path, saved)
+    assert_same_faces(found, plain)
+    assert found.notes == (NOT_THERE,)
+    assert len(found.models[0].image_index) == len(plain.models[0].image_index) - 1
+
+
+def test_a_deleted_circle(saved, model, plain):
+    model.delete_point3D(model.point("2:4"))
+    found = calibrate_models(model.as_binary(), saved)
+    assert found.target.circles.keys() == plain.target.circles.keys() - {"2:4"}
+    assert found.target.target_from_face.keys() == plain.target.target_from_face.keys()
+    assert found.notes == (NOT_THERE,)
+
+
+def test_a_deleted_frame_circle_costs_its_face(saved, model, plain):
+    circle = saved.target.face("2").x
+    model.delete_point3D(model.point(f"2:{circle}"))
+    found = calibrate_models(model.as_binary(), saved)
+    assert_same_faces(found, plain, missing="2")
+    assert found.notes == (NOT_THERE, f"group 12: face 2: frame circle 2:{circle} not mapped; add views that show it")
+
+
+def test_a_deleted_frame_circle_of_the_reference_face_is_named(saved, model, stcal_sfm):
+    circle = saved.target.face("1").y
+    model.delete_point3D(model.point(f"1:{circle}"))
+    outcome = stcal_sfm("faces", model.as_binary(), "--run", saved.folder)
+    parts = ("reference face 1: not mapped in any group", f"face 1: frame circle 1:{circle} not mapped", NOT_THERE)
+    assert_error(outcome, COMPUTATION, *parts)
+
+
+def test_points_of_two_labels_merged(saved, model, plain):
+    """Merged, they name neither circle."""
+    model.merge_points3D(model.point("2:4"), model.point("2:6"))
+    path = model.as_binary()
+    found = calibrate_models(path, saved)
+    assert found.target.circles.keys() == plain.target.circles.keys() - {"2:4", "2:6"}
+    assert found.notes == (
+        f"model {path}: points left out, since their keypoints name no one circle: 1",
+        NOT_THERE,
+    )
+
+
+def test_a_split_track(saved, model, plain):
+    """The one of the two points that more images see counts; the other one lies elsewhere."""
+    origin = saved.target.face("2").origin
+    point = model.point(f"2:{origin}")
+    xyz = model.point3D(point).xyz
+    first = next(where for i, where, _ in model.seen() if i == point)
+    model.delete_observation(*first)
+    track = pycolmap.Track()
+    track.add_element(*first)
+    model.add_point3D(xyz + 0.02, track)
+    path = model.as_binary()
+    found = calibrate_models(path, saved)
+    assert_same_faces(found, plain)
+    assert found.notes == (f"model {path}: circles that are several points each, longest tracks taken: 1", NOT_THERE)
+
+
+def test_a_deregistered_image(saved, model, plain):
+    """One that does not show face 5, which only two images do."""
+    gone = next(i for i in model.images.values() if not any(x.startswith("5:") for x in model.labels[i.name]))
+    model.deregister_frame(gone.frame_id)
+    found = calibrate_models(model.as_binary(), saved)
+    assert_same_faces(found, plain)
+    assert found.models[0].images == tuple(n for n in plain.models[0].images if n != gone.name)
+
+
+def test_a_deleted_board(saved, model):
+    for point in {i for i, _, label in model.seen() if label.startswith("board:") and label[-1] > "2"}:
+        model.delete_point3D(point)
+    for point in {i for i, _, label in model.seen() if label.startswith("board:") and label[6] > "0"}:
+        model.delete_point3D(point)
+    with pytest.raises(ScaleError, match="group 12: scale: 3 board dots mapped, 4 needed"):
+        calibrate_models(model.as_binary(), saved)
+
+
+def test_points_deleted_from_a_text_by_hand(saved, model, plain):
+    """Images then name points that are not there."""
+    lost = model.point("2:4")
+    path = model.as_text() / "points3D.txt"
+    lines = path.read_text().splitlines(keepends=True)
+    path.write_text("".join(line for line in lines if line.split()[0] != str(lost)))
+    found = calibrate_models(path.parent, saved)
+    assert found.target.circles.keys() == plain.target.circles.keys() - {"2:4"}
+    assert found.notes[0] == f"model {path.parent}: points that keypoints name, but the model does not have: 1"
+
+
+def test_a_world_of_another_size_place_and_attitude(saved, model, plain):
+    turn = pycolmap.Rotation3d(np.array([0.5, -0.5, 0.5, 0.5]))
+    model.transform(pycolmap.Sim3d(0.037, turn, np.array([3.0, -20.0, 7.0])))
+    found = calibrate_models(model.as_binary(), saved)
+    for face, pose in found.target.target_from_face.items():
+        # The same numbers through a rotation and a scale: 1e-16 of some 100 mm, and the fit of a plane.
+        known = plain.target.target_from_face[face].matrix()
+        assert np.allclose(pose.matrix(), known, rtol=0, atol=1e-8), face
+    scale = found.scales["12"].mm_per_unit / plain.scales["12"].mm_per_unit
+    assert scale == pytest.approx(1 / 0.037, rel=1e-12)
+
+
+# --- several groups, several models ---
+
+
+def test_the_models_of_all_groups(saved):
+    found = calibrate_models(saved.folder / "models", saved)
+    assert [m.group for m in found.models] == ["12", "14"]
+    assert found.notes == ()
+    assert found.target.target_from_face.keys() == saved.faces["target_from_face"].keys()
+
+
+def test_all_groups_in_one_world(saved, tmp_path):
+    """As two models, and brought together as one: each group keeps its own points, scale and faces."""
+    apart = calibrate_models(saved.folder / "models", saved)
+    ids = image_ids(saved.observations)
+    write_model(tmp_path / "one", apart.models, saved.observations, ids, saved.camera, saved.colmap_model)
+    assert len(pycolmap.Reconstruction(str(tmp_path / "one")).images) == 8
+    together = calibrate_models(tmp_path / "one", saved)
+    assert [m.group for m in together.models] == ["12", "14"]
+    assert together.notes == ()
+    for face, pose in together.target.target_from_face.items():
+        known = apart.target.target_from_face[face].matrix()
+        assert np.allclose(pose.matrix(), known, rtol=0, atol=1e-8), face  # as above: moved, and scaled to mm
+
+
+def test_circles_that_are_one_point_in_all_groups(saved):
+    """The run's final model: the circles of face 1 are seen by both groups, the board of each is its own."""
+    path = saved.folder / "target_model"
+    groups = {group.group: group for group in read(path, saved).groups}
+    place = {g: dict(zip(m.labels, m.xyz_world.tolist(), strict=True)) for g, m in groups.items()}
+    shared = [label for label in place["12"] if label in place["14"]]
+    assert {label for label in shared if label.startswith("1:")} == {f"1:{c}" for c in saved.target.face("1").ids}
+    for label in shared:
+        same = place["12"][label] == place["14"][label]
+        assert same != label.startswith("board:"), label
+    assert [m.group for m in calibrate_models(path, saved).models] == ["12", "14"]
+
+
+def test_boards_of_two_groups_merged(saved, tmp_path):
+    """The same dot, but the board was moved between the groups: the point is neither's."""
+    target = pycolmap.Reconstruction(str(saved.folder / "target_model"))
+    labels = {image.name: image.labels for image in saved.observations}
+    dot = {}
+    for point_id, point in target.points3D.items():
+        element = point.track.elements[0]
+        name = target.image(element.image_id).name
+        if labels[name][element.point2D_idx] == "board:3:4":
+            dot[name.split("/")[0]] = point_id
+    target.merge_points3D(dot["12"], dot["14"])
+    (tmp_path / "merged").mkdir()
+    target.write_binary(str(tmp_path / "merged"))
+    found = read(tmp_path / "merged", saved)
+    assert (found.unlabelled, found.split) == (1, 0)
+    assert all("board:3:4" not in group.labels and "board:3:5" in group.labels for group in found.groups)
+
+
+def test_a_group_in_two_models(saved, model, plain, tmp_path):
+    """As the mapper writes them: 0, 1, …; the larger one counts."""
+    gone = next(iter(model.images.values())).frame_id
+    model.deregister_frame(gone)
+    model.folder = tmp_path / "sparse" / "0"
+    model.folder.parent.mkdir()
+    model.as_binary()
+    shutil.copytree(saved.folder / "models" / "12", tmp_path / "sparse" / "1")
+    found = calibrate_models(tmp_path / "sparse", saved)
+    assert_same_faces(found, plain)
+    assert len(found.models[0].images) == 4
+    assert found.notes == ("group 12: in several models; the one with the most images was taken", NOT_THERE)
+
+
+def test_models_with_different_cameras(saved, model, tmp_path):
+    shutil.copytree(saved.folder / "models" / "14", tmp_path / "both" / "1")
+    model.cameras[1].params = model.cameras[1].params * (1 + 1e-9)
+    model.folder = tmp_path / "both" / "0"
+    model.as_binary()
+    with pytest.raises(InputError, match=r"both/0, .*both/1: different cameras; keep the intrinsics fixed"):
+        calibrate_models(tmp_path / "both", saved)
+
+
+def test_models_are_found_two_folders_deep(saved, tmp_path):
+    for place in ("a", "a/0", "a/0/deeper", "b/0"):
+        shutil.copytree(saved.folder / "models" / "12", tmp_path / "all" / place)
+    (tmp_path / "all" / "notes.txt").write_text("")
+    assert find_models(tmp_path / "all") == [tmp_path / "all" / p for p in ("a", "a/0", "b/0")]
+    assert find_models(str(tmp_path / "all" / "a" / "0" / "deeper")) == [tmp_path / "all/a/0/deeper"]
+
+
+# --- a model of something else ---
+
+
+def test_intrinsics_refined_elsewhere_are_used_and_said(saved, model, plain):
+    """0.1 px more focal length and 0.02 px more of the centre: a little off, and no reason to refuse it."""
+    params = np.array(model.cameras[1].params)
+    model.cameras[1].params = params + np.array([0.1, 0.1, 0.02, 0.02, *np.zeros(len(params) - 4)])
+    path = model.as_binary()
+    found = calibrate_models(path, saved)
+    note = found.notes[0]
+    assert note.startswith(f"model {path}: its camera is up to 0.0")
+    assert note.endswith("px off the run's at the keypoints; the model's is used")
+    change = float(note.split("up to ")[1].split(" px")[0])
+    assert 0.02 < change < 0.1  # the centre's 0.02, and less than the half image's 0.5 of 0.1
+    assert found.target.target_from_face.keys() == plain.target.target_from_face.keys()
+
+
+def test_keypoints_of_another_database(saved, model, stcal_sfm):
+    image = next(i for i in model.images.values() if i.name == "12/IMG_1003.jpg")
+    k = model.labels[image.name].index("2:5")
+    image.points2D[k].xy = image.points2D[k].xy + np.array([0.0, 0.3])
+    path = model.as_binary()
+    outcome = stcal_sfm("faces", path, "--run", saved.folder)
+    parts = (f"model {path}: image 12/IMG_1003.jpg: keypoint {k} (2:5) is 0.3000 px off the run's, 0.002 allowed",)
+    assert_error(outcome, INPUT, *parts, "give the run that the model's database came from")
+
+
+def test_half_a_pixel_is_another_database(saved, model):
+    """As a program makes it that takes our pixels for COLMAP's."""
+    for image in model.images.values():
+        for point in image.points2D:
+            point.xy = point.xy - 0.5
+    with pytest.raises(InputError, match=r"image 12/IMG_\d+.jpg: keypoint \d+ \(.*\) is 0.500\d px off the run's"):
+        read(model.as_binary(), saved)
+
+
+def test_the_measured_centres_are_another_database_than_the_corrected(saved, model):
+    """Eccentricity moves them by tenths of a pixel at most, the tolerance is 0.002 px."""
+    for image in model.images.values():
+        observed = next(i for i in saved.observations if i.name == image.name)
+        for point, xy in zip(image.points2D, observed.centre_px, strict=True):
+            point.xy = xy + 0.5
+    with pytest.raises(InputError, match=r"px off the run's, 0.002 allowed"):
+        read(model.as_binary(), saved)
+
+
+def test_other_image_names(saved, model, stcal_sfm):
+    next(i for i in model.images.values() if i.name == "12/IMG_1003.jpg").name = "other.jpg"
+    path = model.as_binary()
+    outcome = stcal_sfm("faces", path, "--run", saved.folder)
+    parts = (f"model {path}: image other.jpg is not of this run (12/IMG_1000.jpg … 14/IMG_1003.jpg)",)
+    assert_error(outcome, INPUT, *parts, "give the run that the model's database came from")
+
+
+def test_a_name_with_a_space_in_a_text(saved, model):
+    """COLMAP writes it whole and reads it up to the space."""
+    renamed = [replace(i, name=f"12/zwei Flächen {k}.jpg") for k, i in enumerate(saved.observations)]
+    ids, of = image_ids(renamed), {i.name: j.name for i, j in zip(saved.observations, renamed, strict=True)}
+    for image in model.images.values():
+        image.name = of[image.name]
+    corrected = saved.corrected_px
+    for i, write in enumerate((model.as_binary, model.as_text)):
+        model.folder = model.folder.with_name(f"as {i}")
+        path = write()
+        if i == 0:
+            (group,) = read_model(path, renamed, ids, corrected).groups
+            assert group.images[2] == "12/zwei Flächen 2.jpg"
+        else:
+            with pytest.raises(InputError, match=r"image 12/zwei is not of this run .* write the model as binary"):
+                read_model(path, renamed, ids, corrected)
+
+
+def test_another_number_of_keypoints(saved, model):
+    """The run's other images have other circles."""
+    image = next(i for i in model.images.values() if i.name == "12/IMG_1003.jpg")
+    other = min(i.name for i in saved.observations if i.group == "14" and len(i) != len(image.points2D))
+    image.name = other
+    with pytest.raises(InputError, match=rf"image {other} has {len(image.points2D)} keypoints, the run \d+; give"):
+        read(model.as_binary(), saved)
+
+
+def test_two_cameras(saved, model):
+    second = pycolmap.Camera(camera_id=2, model="PINHOLE", width=99, height=99, params=[50, 50, 49, 49])
+    model.add_camera_with_trivial_rig(second)
+    with pytest.raises(InputError, match="2 cameras, 1 needed; map the exported database as it is"):
+        read(model.as_binary(), saved)
+
+
+def test_a_camera_model_that_stcal_has_not(saved, model):
+    model.cameras[1] = pycolmap.Camera(
+        camera_id=1, model="OPENCV_FISHEYE", width=1296, height=864, params=[1393.0, 1393, 648, 432, 0, 0, 0, 0]
+    )
+    with pytest.raises(InputError, match="OPENCV_FISHEYE is not supported; use one of"):
+        read(model.as_binary(), saved)
+
+
+def test_a_model_of_a_like_run(saved, small_set, stcal_sfm):
+    """Another run of the same images without the correction: the same names and counts, other pixels."""
+    small = small_set("12", "14")
+    stcal_sfm(*small.arguments("--no-eccentricity"))
+    outcome = stcal_sfm("faces", small.out / "models", "--run", saved.folder)
+    assert_error(outcome, INPUT, "px off the run's", "give the run that the model's database came from")
+
+
+# --- damaged models ---
+
+
+def test_numbers_that_do_not_go_together(saved, model, stcal_sfm):
+    """A file can be whole and its numbers damaged: a focal length that lost a digit."""
+    model.cameras[1].params = np.array([139.3, *model.cameras[1].params[1:]])
+    path = model.as_binary()
+    outcome = stcal_sfm("faces", path, "--run", saved.folder)
+    assert_error(outcome, INPUT, f"model {path}: group 12: keypoints are ", "px RMS off the images", "4 allowed")
+
+
+@pytest.mark.parametrize("wrong", ["nan", "1e300", "inf"])
+def test_points_and_poses_that_are_no_places(saved, model, wrong):
+    path = model.as_text()
+    points, frames = path / "points3D.txt", path / "frames.txt"
+    whole = points.read_text()
+    lines = whole.splitlines(keepends=True)
+    words = lines[-1].split(" ")
+    points.write_text("".join([*lines[:-1], " ".join([words[0], wrong, *words[2:]])]))
+    with pytest.raises(InputError, match=f"model {path}: "):
+        read(path, saved)
+    points.write_text(whole)
+    lines = frames.read_text().splitlines(keepends=True)
+    words = lines[-1].split(" ")
+    frames.write_text("".join([*lines[:-1], " ".join([*words[:6], wrong, *words[7:]])]))
+    with pytest.raises(InputError, match=f"model {path}: "):
+        read(path, saved)
+
+
+def test_a_quaternion_that_is_none(saved, model):
+    path = model.as_text() / "frames.txt"
+    lines = path.read_text().splitlines(keepends=True)
+    words = lines[-1].split(" ")
+    path.write_text("".join([*lines[:-1], " ".join([*words[:2], "0", "0", "0", "0", *words[6:]])]))
+    with pytest.raises(InputError, match=r"image 12/IMG_1003.jpg: no pose \(quaternion of length 0, 1 needed"):
+        read(path.parent, saved)
+
+
+READ_ALL = """
+import json, resource, sys, time
+resource.setrlimit(resource.RLIMIT_AS, (2 << 30, 2 << 30))
+from stcal.errors import InputError
+from stcal.sfm.mapping.models import open_model
+from tests.outcome import COMPUTATION, INPUT, assert_error
+for folder in json.load(sys.stdin):
+    start = time.monotonic()
+    try:
+        open_model(folder)
+        said = "read"
+    except InputError as error:
+        said = str(error)
+    print(json.dumps([folder, said, time.monotonic() - start]), flush=True)
+"""
+
+
+def test_damaged_files_neither_crash_nor_hang_nor_eat_memory(saved, tmp_path):
+    """Each file cut at its start, its end and at random places, and with counts of up to 2⁶⁴: pycolmap alone reads on
+    behind the end, for hours or into all memory. In a process of its own, with a limit on both."""
+    source, rng, cases = saved.folder / "models" / "12", random.Random(1), []
+    for name in FILES:
+        data = (source / f"{name}.bin").read_bytes()
+        cuts = [0, 1, 8, len(data) - 1, *(rng.randrange(8, len(data)) for _ in range(8))]
+        spoilt = [data[:cut] for cut in cuts] + [data + b"\0", data + data]
+        spoilt += [n.to_bytes(8, "little") + data[8:] for n in (0, 2, 2**31, 2**40, 2**64 - 1)]
+        for i, content in enumerate(spoilt):
+            if content[:8] == data[:8] and len(content) == len(data):
+                continue
+            folder = tmp_path / f"{name}{i}"
+            shutil.copytree(source, folder)
+            (folder / f"{name}.bin").write_bytes(content)
+            cases.append((str(folder), name))
+    done = subprocess.run(
+        [sys.executable, "-c", READ_ALL],
+        input=json.dumps([folder for folder, _ in cases]),
+        capture_output=True,
+        text=True,
+        timeout=60,
+    )
+    assert (done.returncode, done.stderr) == (0, "")
+    answers = [json.loads(line) for line in done.stdout.splitlines()]
+    assert len(answers) == len(cases) > 80
+    for (folder, name), (_, said, seconds) in zip(cases, answers, strict=True):
+        assert said.startswith(f"model {folder}: damaged or incomplete ({name}.bin"), said
+        assert said.endswith("; write or copy it again")
+        assert seconds < 5, said
+
+
+def test_counts_inside_the_records(saved, tmp_path):
+    """The track of the first point and the keypoints of the first image are said to be 2⁴⁰ long."""
+    for name, at in (("points3D", 8 + 43), ("images", 8 + 64 + len("12/IMG_1000.jpg\0"))):
+        folder = shutil.copytree(saved.folder / "models" / "12", tmp_path / name)
+        data = bytearray((folder / f"{name}.bin").read_bytes())
+        data[at + 5] = 1
+        (folder / f"{name}.bin").write_bytes(data)
+        with pytest.raises(InputError, match=rf"\({name}.bin, {len(data)} bytes: ends too soon\)"):
+            open_model(folder)
+
+
+@pytest.mark.parametrize("name", FILES)
+def test_a_file_that_is_another_one(saved, tmp_path, name):
+    for other in FILES:
+        if other != name:
+            folder = shutil.copytree(saved.folder / "models" / "12", tmp_path / other)
+            shutil.copy(folder / f"{other}.bin", folder / f"{name}.bin")
+            with pytest.raises(InputError, match=rf"damaged or incomplete \({name}.bin"):
+                open_model(folder)
+
+
+@pytest.mark.parametrize("name", ["cameras", "points3D", "images"])
+def test_a_file_is_missing(saved, tmp_path, name):
+    folder = shutil.copytree(saved.folder / "models" / "12", tmp_path / "model")
+    (folder / f"{name}.bin").unlink()
+    with pytest.raises(InputError, match="damaged or incomplete" if name != "images" else "no COLMAP model"):
+        calibrate_models(folder, saved)
+
+
+def test_a_folder_in_place_of_a_file(saved, tmp_path):
+    folder = shutil.copytree(saved.folder / "models" / "12", tmp_path / "model")
+    (folder / "points3D.bin").unlink()
+    (folder / "points3D.bin").mkdir()
+    with pytest.raises(InputError, match=r"damaged or incomplete .*Is a directory"):
+        open_model(folder)
+
+
+def test_every_whole_model_passes(tmp_path):
+    """Rigs of several sensors, frames of several images, points without a track, images without keypoints, and every
+    camera model that pycolmap has: what is checked before reading must not refuse what can be read."""
+    options = pycolmap.SyntheticDatasetOptions(num_rigs=2, num_cameras_per_rig=3, num_frames_per_rig=2, num_points3D=20)
+    pycolmap.set_random_seed(1)
+    made = pycolmap.synthesize_dataset(options)
+    made.add_point3D(np.zeros(3), pycolmap.Track())
+    number = max(made.cameras)
+    for model in range(30):
+        try:
+            camera = pycolmap.Camera.create_from_model_id(number + 1, pycolmap.CameraModelId(model), 9.0, 8, 6)
+        except ValueError:
+            break
+        number += 1
+        made.add_camera_with_trivial_rig(camera)
+    bare = pycolmap.Image(name="Ümlaut 三.jpg", camera_id=number, image_id=1000)
+    made.add_image_with_trivial_frame(bare, pycolmap.Rigid3d())
+    made.write_binary(str(tmp_path))
+    found = open_model(tmp_path)
+    assert (len(found.cameras), len(found.images), len(found.rigs)) == (6 + model, 13, 2 + model)
+    assert model >= 17  # as many as 4.2 has
+
+
+def test_a_model_of_an_older_version_has_no_rigs(saved, tmp_path, plain):
+    """As native 3.8 writes them: three files."""
+    folder = shutil.copytree(saved.folder / "models" / "12", tmp_path / "model")
+    for name in ("rigs", "frames"):
+        (folder / f"{name}.bin").unlink()
+    assert_same_faces(calibrate_models(folder, saved), plain)
+
+
+# --- nothing there ---
+
+
+def test_an_empty_model(saved, model, stcal_sfm, tmp_path):
+    for point in list(model.points3D):
+        model.delete_point3D(point)
+    path = model.as_binary()
+    outcome = stcal_sfm("faces", path, "--run", saved.folder)
+    assert_error(outcome, INPUT, f"model {path}: no image with a pose and labelled points; map again")
+    (tmp_path / "none").mkdir()
+    pycolmap.Reconstruction().write_binary(str(tmp_path / "none"))
+    outcome = stcal_sfm("faces", tmp_path / "none", "--run", saved.folder)
+    assert_error(outcome, INPUT, "0 cameras, 1 needed")
+
+
+def test_no_model(saved, stcal_sfm, tmp_path):
+    (tmp_path / "file").write_text("")
+    (tmp_path / "empty").mkdir()
+    for place in ("missing", "file", "empty"):
+        outcome = stcal_sfm("faces", tmp_path / place, "--run", saved.folder)
+        assert_error(outcome, INPUT, f"model {tmp_path / place}: no COLMAP model", "give the folder that the mapper")
+
+
+# --- the command ---
+
+
+def test_the_command_says_what_the_models_say(saved, stcal_sfm, tmp_path):
+    code, out, err = stcal_sfm("faces", saved.folder / "models", "--run", saved.folder, "--out", tmp_path / "f.json")
+    assert (code, err) == (0, "")
+    found = calibrate_models(saved.folder / "models", saved)
+    written = json.loads((tmp_path / "f.json").read_text(encoding="utf-8"))
+    assert (written["format"], written["unit"], written["solve"]) == ("stcal faces 1", "mm", "chain")
+    for face, pose in found.target.target_from_face.items():
+        assert np.array_equal(written["target_from_face"][face], pose.matrix())
+        x, y, z = pose.translation
+        assert f"{face:>6} {x:11.4f} {y:11.4f} {z:11.4f} " in out
+    assert "group 12: 4 images, " in out
+    assert out.splitlines()[-1] == f"faces: {tmp_path / 'f.json'}"
+    outcome = stcal_sfm("compare", tmp_path / "f.json", tmp_path / "f.json")  # it is a faces.json like any other
+    assert outcome[0] == 0
+
+
+def test_nothing_is_overwritten(saved, stcal_sfm, tmp_path):
+    (tmp_path / "mine").write_text("mine")
+    (tmp_path / "link").symlink_to(tmp_path / "elsewhere")
+    for name in ("mine", "link", "."):
+        out = tmp_path / name
+        outcome = stcal_sfm("faces", saved.folder / "models", "--run", saved.folder, "--out", out)
+        assert_error(outcome, INPUT, f"{out}: exists; give a new file with --out")
+    out = tmp_path / "no" / "f.json"
+    outcome = stcal_sfm("faces", saved.folder / "models", "--run", saved.folder, "--out", out)
+    assert_error(outcome, INPUT, f"{out}: no folder {out.parent}; make it, or give another place with --out")
+    assert (tmp_path / "mine").read_text() == "mine"
+    assert sorted(p.name for p in tmp_path.iterdir()) == ["link", "mine"]
+
+
+def test_no_file_of_half_an_answer(saved, model, stcal_sfm, tmp_path):
+    model.delete_point3D(model.point("1:1"))
+    outcome = stcal_sfm("faces", model.as_binary(), "--run", saved.folder, "--out", tmp_path / "f.json")
+    assert outcome[0] == COMPUTATION
+    assert not (tmp_path / "f.json").exists()
+
+
+def test_a_lost_group_is_said_where_a_face_hangs_on_it(saved):
+    """Group 14 alone has no face 2; group 12 is missing and named."""
+    options = replace(saved.options, reference_face="2")
+    only = read(saved.folder / "models" / "14", saved)
+    with pytest.raises(
+        MappingError, match=r"reference face 2: not mapped in any group.*group 12: in none of the models"
+    ):
+        faces_from_models([only], replace(saved, options=options))

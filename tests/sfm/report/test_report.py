@@ -1,0 +1,412 @@
+"""The page, from a small report made by hand."""
+
+import base64
+import copy
+import re
+from html import unescape
+from html.parser import HTMLParser
+
+import pytest
+
+from stcal.report.page import Html, number, round_below, table
+from stcal.sfm.report.page import FIRST_IMAGES, report_html, shown_overlays
+
+NASTY = 'a/<script>alert("1")</script>&$_.jpg'
+VOID = {"meta", "img", "br", "link", "hr", "input"}
+JPEG = b"\xff\xd8 not a picture, but bytes \xff\xd9"
+IDENTITY = [[1.0, 0.0, 0.0, 0.0], [0.0, 1.0, 0.0, 0.0], [0.0, 0.0, 1.0, 0.0], [0.0, 0.0, 0.0, 1.0]]
+TURNED = [[0.0, 0.0, 1.0, 150.0], [0.0, 1.0, 0.0, -0.00001], [-1.0, 0.0, 0.0, -60.1234567], [0.0, 0.0, 0.0, 1.0]]
+CIRCLES = {
+    **{f"1:{i}": [40.0 * (i % 2), 40.0 * (i // 2), 0.0] for i in range(4)},
+    **{f"2:{i}": [150.0, 40.0 * (i % 2), -60.0 - 40.0 * (i // 2)] for i in range(4)},
+}
+
+
+def face(pose: list, sigma: bool) -> dict:
+    return {
+        "target_from_face": pose,
+        "translation_mm": [row[3] for row in pose[:3]],
+        "angle_to_reference_deg": 0.0,
+        "translation_sigma_um": [1.04, 2.06, 3.08] if sigma else None,
+        "rotation_sigma_mdeg": [0.501, 0.612, 0.723] if sigma else None,
+        "circles": 4,
+        "circles_of_design": 10,
+        "plane_rms_um": 0.44,
+        "groups": ["a"],
+        "images": 2,
+    }
+
+
+def pair(i: int) -> dict:
+    return {
+        "first": NASTY,
+        "second": f"a/{i}.jpg",
+        "shared": 20,
+        "median_angle_deg": 50.0 - i,
+        "in_front": 1.0,
+        "forward": 0.25,
+        "verdict": "usable" if i else "chosen",
+    }
+
+
+def group() -> dict:
+    residuals = {f"board:{r}:{c}": [3.0 * r, -4.0 * c, 0.5] for r in range(2) for c in range(2)}
+    return {
+        "name": "a",
+        "images": [NASTY, "a/1.jpg"],
+        "faces": ["1", "2"],
+        "points": 12,
+        "seeded": "COLMAP's estimate of the chosen pair",
+        "rounds": 3,
+        "pairs": [pair(i) for i in range(17)],
+        "scale": {
+            "mm_per_unit": 116.2175381,
+            "mm_per_unit_rows": 116.2175976,
+            "rows": [0, 1],
+            "difference_ppm": -0.5119,
+            "sigma_ppm": 6.4293,
+            "dots": 4,
+            "board_mean_um": 3.0,
+            "board_rms_um": 3.6,
+            "board_residuals_um": residuals,
+        },
+    }
+
+
+def by_image(name: str) -> dict:
+    return {"image": name, "group": "a", "observations": 12, "rms_px": 0.0035312, "max_px": 0.01079, "worst": "1:0"}
+
+
+def by_label(label: str, of_group: str | None) -> dict:
+    return {"label": label, "group": of_group, "observations": 2, "rms_px": 0.0046, "max_px": 0.0166}
+
+
+def camera_in_space(name: str, x: float) -> dict:
+    axes = [[1.0, 0.0, 0.0], [0.0, -1.0, 0.0], [0.0, 0.0, -1.0]]
+    return {"image": name, "group": "a", "position_mm": [x, 0.0, 900.0], "axes": axes}
+
+
+def make(sigma: bool = True, eccentricity: bool = True) -> dict:
+    """A report of a joint adjustment, or of chains only where ``sigma`` is off: those have null values."""
+    return {
+        "format": "stcal report 1",
+        "version": "0.1.0",
+        "target": "target <one>",
+        "reference_face": "1",
+        "options": {
+            "solve": "joint" if sigma else "chain",
+            "frame": "plane",
+            "eccentricity": eccentricity,
+            "max_pair_angle_deg": 60.0,
+        },
+        "camera": {
+            "model": "OPENCV",
+            "size_px": [2592, 1728],
+            "focal_px": [2785.28891198, 2785.43592782],
+            "centre_px": [1299.14276961, 857.667041202],
+            "distortion": [-0.05, 0.05, 0.0, 0.0],
+        },
+        "summary": {
+            "files": 3,
+            "images": 2,
+            "images_mapped": 2,
+            "groups": 1,
+            "faces": 2,
+            "faces_not_seen": [],
+            "observations": 24,
+            "residual_rms_px": 0.0037931,
+            "centre_sigma_rms_px": 0.0044,
+            "sigma_factor": 1.494,
+            "sigma0": 0.9312 if sigma else None,
+            "redundancy": 17 if sigma else None,
+            "last_move_px": 3.14e-8 if sigma else None,
+        },
+        "faces": {"1": face(IDENTITY, sigma), "2": face(TURNED, sigma)},
+        "between_faces": [{"a": "1", "b": "2", "distance_mm": 161.59991, "distance_sigma_um": 3.2, "angle_deg": 90.0}],
+        "chains": {
+            "1": [],
+            "2": [{"faces": ["1", "2"], "groups": ["a"], "translation_um": 13.137, "rotation_mdeg": 7.2508}],
+        },
+        "groups": [group()],
+        "residuals_by_image": [by_image(NASTY), by_image("a/1.jpg")],
+        "residuals_by_label": [*(by_label(c, None) for c in CIRCLES), by_label("board:0:0", "a")],
+        "left_out": {"files": [], "images": [], "circles": [], "notes": []},
+        "notes": [],
+        "images": [{"image_id": i, "name": n, "group": "a", "circles": 12} for i, n in enumerate(OVERLAYS, start=1)],
+        "scene": {
+            "cameras": [camera_in_space(NASTY, -100.0), camera_in_space("a/1.jpg", 400.0)],
+            "boards": {"a": [[200.0, 0.0, 0.0], [230.0, 0.0, 0.0], [200.0, 30.0, 0.0], [230.0, 30.0, 0.0]]},
+            "circles": CIRCLES,
+        },
+    }
+
+
+OVERLAYS = {NASTY: JPEG, "a/1.jpg": JPEG, "a/not mapped.jpg": JPEG}
+
+
+class Page(HTMLParser):
+    """Collects tags, references and text; fails where tags are not balanced."""
+
+    def __init__(self, page: str):
+        super().__init__()
+        self.open: list[str] = []
+        self.tags: list[str] = []
+        self.references: list[str] = []
+        self.ids: list[str] = []
+        self.text = ""
+        self.feed(page)
+        self.close()
+        assert self.open == []
+
+    def handle_starttag(self, tag, attrs):
+        self.tags.append(tag)
+        self.references += [value for name, value in attrs if name in ("src", "href", "srcset", "data", "action")]
+        self.ids += [value for name, value in attrs if name == "id"]
+        if tag not in VOID:
+            self.open.append(tag)
+
+    def handle_endtag(self, tag):
+        assert self.open.pop() == tag
+
+    def handle_data(self, data):
+        if self.open and self.open[-1] != "style":
+            self.text += data
+
+
+@pytest.fixture(scope="module")
+def joint() -> str:
+    return report_html(make(), OVERLAYS)
+
+
+@pytest.fixture(scope="module")
+def chained() -> str:
+    return report_html(make(sigma=False, eccentricity=False), OVERLAYS)
+
+
+@pytest.fixture(params=["joint", "chained"])
+def page(request) -> str:
+    return request.getfixturevalue(request.param)
+
+
+def rows_of(page: str, section: str) -> list[list[str]]:
+    """Cells of all table rows of a section, without markup."""
+    part = page.split(f'<section id="{section}">')[1].split("</section>")[0]
+    lines = re.findall(r"<tr>(.*?)</tr>", part, re.DOTALL)
+    return [
+        [unescape(re.sub("<.*?>", "", cell)) for cell in re.findall(r"<t[hd].*?>(.*?)</t[hd]>", line)] for line in lines
+    ]
+
+
+def test_tags_are_balanced_and_ids_unique(page):
+    parsed = Page(page)
+    assert parsed.tags.count("section") == parsed.tags.count("h2") == 9
+    assert len(parsed.ids) == len(set(parsed.ids))
+
+
+def test_the_page_stands_alone(page):
+    parsed = Page(page)
+    inside = [r for r in parsed.references if r.startswith("#")]
+    embedded = [r for r in parsed.references if r.startswith(("data:image/svg+xml;base64,", "data:image/jpeg;base64,"))]
+    assert sorted(inside + embedded) == sorted(parsed.references)
+    assert {r[1:] for r in inside} <= set(parsed.ids)
+    assert {"script", "link", "iframe", "object"}.isdisjoint(parsed.tags)
+    assert not re.search(r"url\(|@import|https?:", page)
+
+
+def test_plots_refer_to_nothing_outside(joint):
+    plots = re.findall(r"data:image/svg\+xml;base64,([A-Za-z0-9+/=]+)", joint)
+    assert len(plots) == 1 + 4 + 1  # board of the one group, four views in space, bars
+    for plot in plots:
+        references = re.findall(r'(?:href|src)="([^"]*)"', base64.b64decode(plot).decode())
+        assert all(reference.startswith(("#", "data:image/png")) for reference in references)
+
+
+def test_overlays_are_embedded_whole(joint):
+    found = re.findall(r"data:image/jpeg;base64,([A-Za-z0-9+/=]+)", joint)
+    assert [base64.b64decode(each) for each in found] == [JPEG] * 3
+    assert "a/not mapped.jpg not mapped" in Page(joint).text
+
+
+def test_names_are_escaped(page):
+    assert "<script" not in page
+    assert NASTY in Page(page).text
+    assert "target <one>" in Page(page).text
+
+
+def test_banner_only_where_eccentricity_is_off(joint, chained):
+    assert "tens of µm" not in joint
+    assert 'role="alert"' not in joint
+    assert 'role="alert"' in chained
+    assert "biased along their normals by tens of µm; residuals do not show it" in Page(chained).text
+
+
+def test_numbers_have_their_digits(joint):
+    text = Page(joint).text
+    assert "2 images in 1 groups, 2 mapped, 2 faces" in text
+    assert "residuals are 1.5 times the centres' own σ" in text
+    faces = rows_of(joint, "faces")
+    assert ["1 (datum)", "0.0000", "0.0000", "0.0000", *["0"] * 6, "4", "10", "0.4", "2", "a"] in faces
+    pose, sigma = ["150.0000", "0.0000", "-60.1235"], ["1.0", "2.1", "3.1", "0.50", "0.61", "0.72"]
+    assert ["2", *pose, *sigma, "4", "10", "0.4", "2", "a"] in faces
+    assert ["1 – 2", "161.5999", "3.2", "90.0000"] in faces
+    assert ["2", "1 → 2", "a", "13.1", "7.25"] in faces
+    scale = ["a", "116.217538", "116.217598", "0 and 1", "-0.5", "6.4", "4", "3.0", "3.6", "5.0"]
+    assert scale in rows_of(joint, "scale")
+    assert ["1:0", "2", "0.0046", "0.0166"] in rows_of(joint, "residuals")
+
+
+def test_axes_of_a_face_are_columns_of_its_rotation(joint):
+    row = next(row for row in rows_of(joint, "faces") if len(row) == 11 and row[0] == "2")
+    assert [float(v) for v in row[1:10]] == [0, 0, -1, 0, 1, 0, 1, 0, 0]
+
+
+def test_what_was_not_computed_is_a_dash(chained):
+    face_row = next(row for row in rows_of(chained, "faces") if row[0] == "2" and len(row) == 15)
+    assert face_row[4:10] == ["–"] * 6
+    trust = {row[0]: row[1:] for row in rows_of(chained, "trust")}
+    assert trust["σ of a face's position (µm)"] == ["–", "–", "not computed"]
+    assert "None" not in Page(chained).text
+
+
+def test_trust_names_the_worst(joint):
+    trust = {row[0]: row[1:3] for row in rows_of(joint, "trust")}
+    assert trust["σ of a face's position (µm)"][0] == "3.1"
+    # The only way to a face agrees with itself: that is no check.
+    assert trust["Disagreement of chains, position (µm)"] == ["–", "–"]
+    assert trust["λ by rows against least squares (ppm)"] == ["0.5", "group a"]
+    assert "σ hold for the given intrinsics" in joint
+    assert "no second way confirms them: face 2." in joint
+
+
+def test_two_ways_to_a_face_are_a_check():
+    two = make()
+    (way,) = two["chains"]["2"]
+    two["chains"]["2"] = [way, way | {"groups": ["b"], "translation_um": 20.04}]
+    trust = {row[0]: row[1:3] for row in rows_of(report_html(two, OVERLAYS), "trust")}
+    assert trust["Disagreement of chains, position (µm)"] == ["20.0", "face 2 by b"]
+
+
+def test_long_rankings_are_folded(joint):
+    assert "2 more pairs" in joint
+    pairs = [row for row in rows_of(joint, "pairs") if len(row) == 7]
+    assert [row[6] for row in pairs if row[0] != "First"] == ["chosen"] + 16 * ["usable"]
+
+
+def test_nothing_left_out(joint):
+    assert "Nothing was left out." in joint
+
+
+def test_left_out_with_reasons():
+    report = make()
+    report["summary"]["faces_not_seen"] = ["6"]
+    report["notes"] = ["group a: face <6> has no frame"]
+    report["left_out"] = {
+        "files": [{"name": "readme<b>.txt", "reason": "not an image"}],
+        "images": [{"name": "a/9.jpg", "reason": "not registered"}],
+        "circles": [{"image": "a/1.jpg", "label": f"5:{i}", "reason": "seen once"} for i in range(3)],
+        "notes": [{"image": "a/1.jpg", "note": "board of 20 dots left out"}],
+    }
+    page = report_html(report, {})
+    assert "Nothing was left out." not in page
+    rows = rows_of(page, "left-out")
+    assert ["readme<b>.txt", "not an image"] in rows
+    assert ["a/9.jpg", "not registered"] in rows
+    assert ["a/1.jpg", "3", "5:0, 5:1, 5:2", "seen once"] in rows  # one row for one reason
+    assert ["a/1.jpg", "board of 20 dots left out"] in rows
+    assert ["1", "group a: face <6> has no frame"] in rows
+    assert "Faces of the design not seen: 6." in Page(page).text
+
+
+def test_same_report_same_page(joint):
+    assert report_html(copy.deepcopy(make()), OVERLAYS) == joint
+
+
+def test_odd_names_of_faces_and_groups_are_drawn():
+    """``$`` starts a formula for matplotlib, ``_`` hides a label, and no font has every script."""
+    report = make()
+    report["faces"] = {"$x^{": report["faces"]["1"], "面": report["faces"]["2"]}
+    report["groups"][0]["name"] = "_$\\frac"
+    assert "_$\\frac" in Page(report_html(report, OVERLAYS)).text
+
+
+@pytest.mark.parametrize(
+    ("value", "digits", "text"),
+    [
+        (None, 1, "–"),
+        (float("nan"), 1, "–"),
+        (-0.04, 1, "0.0"),
+        (-0.06, 1, "-0.1"),
+        (0.0, 2, "0.00"),
+        (100.0, 0, "100"),
+        (-100.0, 0, "-100"),
+        (1.23456, 4, "1.2346"),
+    ],
+)
+def test_number(value, digits, text):
+    assert number(value, digits) == text
+
+
+@pytest.mark.parametrize(
+    ("value", "below"), [(7.3, 5), (5.0, 5), (0.0299, 0.02), (1.0, 1), (3000, 2000), (0.0, 1), (float("nan"), 1)]
+)
+def test_round_below(value, below):
+    assert round_below(value) == pytest.approx(below)
+
+
+def test_table_escapes_all_but_markup():
+    page = table(["<Name", "x < y (mm)"], [["<b>", Html("<i>1</i>")]])
+    assert '<th scope="row" class="l">&lt;b&gt;</th><td><i>1</i></td>' in page
+    assert '<th scope="col">x &lt; y (mm)</th>' in page
+
+
+def test_a_large_set_shows_the_overlays_that_deserve_a_look():
+    report = make()
+    names = [f"a/{i}.jpg" for i in range(FIRST_IMAGES + 50)]
+    report["images"] = [{"image_id": i, "name": n, "group": "a", "circles": 12} for i, n in enumerate(names, 1)]
+    report["residuals_by_image"] = [by_image(n) | {"max_px": 0.01 + 1e-5 * i} for i, n in enumerate(names)][:-1]
+    report["left_out"]["notes"] = [{"image": "a/3.jpg", "note": "board left out"}]
+    shown = shown_overlays(report)
+    assert len(shown) == FIRST_IMAGES
+    assert {"a/3.jpg", names[-1], names[-2]} <= set(shown)  # a note, not mapped, the largest residual
+    assert "a/4.jpg" not in shown
+    assert shown == sorted(shown, key=names.index)
+    page = report_html(report, dict.fromkeys(shown, JPEG))
+    assert "the other 50 are in overlays/" in page
+    assert f"All {len(names) - 1} images" in page
+
+
+def crosscheck(differences: list[str]) -> dict:
+    row = {"translation_um": 0.7631, "rotation_mdeg": 0.3037}
+    faces = {"1": {"translation_um": 0.0, "rotation_mdeg": 0.0}, "2": row}
+    return {
+        "native": "3.8",
+        "pycolmap": "4.2.1",
+        "schema": "3.8",
+        "tolerances": {"face_um": 2, "face_mdeg": 1, "circle_um": 2, "camera_um": 20, "camera_mdeg": 2},
+        "images": {"native": 2, "pycolmap": 2, "run": 2},
+        "residual_rms_px": {"native": 0.00356, "pycolmap": 0.00357, "run": 0.00386},
+        "mapping": {
+            "faces": faces,
+            "circles_um": {"1:0": 0.1, "2:0": 0.765},
+            "cameras": [{"image": NASTY, "position_um": 9.184, "rotation_mdeg": 0.536}],
+        },
+        "result": {"faces": faces, "circles_um": {}},
+        "plain": {"faces": faces | {"2": None}},
+        "notes": ["group b: <none>"],
+        "differences": differences,
+    }
+
+
+def test_the_crosscheck_is_a_section_of_its_own():
+    page = report_html(make() | {"crosscheck": crosscheck([])}, OVERLAYS)
+    parsed = Page(page)
+    assert parsed.tags.count("h2") == 10
+    assert "They agree." in parsed.text
+    rows = rows_of(page, "crosscheck")
+    assert ["COLMAP 3.8", "2", "0.0036"] in rows
+    assert ["2", "0.763", "0.304", "0.763", "0.304", "–", "–"] in rows
+    assert [NASTY, "9.18", "0.536"] in rows
+    assert "group b: <none>" in parsed.text
+    differing = Page(report_html(make() | {"crosscheck": crosscheck(["face <2> 5 µm"])}, OVERLAYS)).text
+    assert "They differ: face <2> 5 µm." in differing
+    assert "They agree." not in differing
