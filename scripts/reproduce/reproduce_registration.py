@@ -31,10 +31,11 @@ from stcal.register.workspace.field import residual_field
 from stcal.report.figure import save
 from stcal.robot.identify.solve import IdentifyOptions
 from stcal.robot.kinematics.damped import Problem, solve
+from stcal.robot.kinematics.example import mh80
 from stcal.robot.kinematics.forward import forward
 from stcal.robot.kinematics.measurements import Measurements
 from stcal.robot.kinematics.model import Robot
-from stcal.synthetic.measured.arms import made, mh80
+from stcal.synthetic.measured.arms import made
 from stcal.workflows.register_robot import grown, positions
 
 MIDDLE = np.array([800.0, 200.0, 700.0])

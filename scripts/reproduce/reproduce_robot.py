@@ -31,6 +31,7 @@ from stcal.robot.axes.model import robot_from_sweeps
 from stcal.robot.identify.residuals import jacobian as jacobian_of
 from stcal.robot.identify.residuals import observed, residuals
 from stcal.robot.identify.solve import Identified, IdentifyOptions, identify
+from stcal.robot.kinematics.example import mh80
 from stcal.robot.kinematics.forward import forward, jacobian
 from stcal.robot.kinematics.inverse import inverse
 from stcal.robot.kinematics.measurements import Measurements
@@ -41,7 +42,7 @@ from stcal.sfm.data.observations import face_of
 from stcal.sfm.measure.common_errors import common_errors
 from stcal.sfm.measure.pose import pose_from_circles
 from stcal.sfm.measure.target import TargetCircles
-from stcal.synthetic.measured.arms import joint_vectors, made, mh80, placed
+from stcal.synthetic.measured.arms import joint_vectors, made, placed
 from stcal.synthetic.measured.image_poses import KnownTarget, known_target, pose_error, see
 from stcal.synthetic.scene import Scene, SceneOptions, make_scene
 

@@ -19,9 +19,10 @@ import numpy as np
 from stcal.geometry.rigid import Rigid
 from stcal.robot.identify.residuals import Observed, State, jacobian, observed, residuals, tips
 from stcal.robot.identify.solve import Identified, IdentifyOptions, identify
+from stcal.robot.kinematics.example import mh80
 from stcal.robot.kinematics.measurements import Measurements
 from stcal.robot.kinematics.model import Robot
-from stcal.synthetic.measured.arms import joint_vectors, made, measured, mh80, placed
+from stcal.synthetic.measured.arms import joint_vectors, made, measured, placed
 
 SIGMA_MM, SIGMA_RAD = 0.05, 2e-4
 NEW_POSES = 50

@@ -28,8 +28,8 @@ def init(
     file: Annotated[Path, typer.Argument(help="Robot file to write; must not exist.")] = Path("robot.toml"),
 ) -> None:
     """Write an example of a robot file, to edit: a six-axis arm of 2 m reach."""
+    from stcal.robot.kinematics.example import mh80
     from stcal.robot.kinematics.file import robot_toml
-    from stcal.synthetic.measured.arms import mh80
 
     if file.exists():
         raise InputError(f"robot file {file}: exists already; give another name or move it away")

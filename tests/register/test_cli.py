@@ -9,9 +9,10 @@ import pytest
 from stcal.cli.main import main
 from stcal.errors import DegenerateError
 from stcal.geometry.rigid import Rigid
+from stcal.robot.kinematics.example import mh80
 from stcal.robot.kinematics.file import load_robot, robot_toml
 from stcal.robot.kinematics.forward import forward
-from stcal.synthetic.measured.arms import joint_vectors, made, mh80, placed
+from stcal.synthetic.measured.arms import joint_vectors, made, placed
 from stcal.workflows.register_robot import held_out
 
 HEAD = "ax_mm,ay_mm,az_mm,bx_mm,by_mm,bz_mm"

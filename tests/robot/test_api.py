@@ -11,8 +11,9 @@ import pytest
 from stcal import robot
 from stcal.geometry.rigid import Rigid
 from stcal.io.table import POSE, pose_cells
+from stcal.robot.kinematics.example import mh80
 from stcal.robot.use.compensation import joint_cells, joint_columns
-from stcal.synthetic.measured.arms import joint_vectors, made, measured, mh80, placed
+from stcal.synthetic.measured.arms import joint_vectors, made, measured, placed
 
 
 def write(path, header, rows) -> None:

@@ -1,4 +1,4 @@
-"""Simulated arms: a nominal one of a known size, and others as they leave the factory."""
+"""Simulated arms as they leave the factory, and what an instrument sees of them."""
 
 from collections.abc import Sequence
 from dataclasses import replace
@@ -11,20 +11,7 @@ from stcal.robot.identify.residuals import State, tips
 from stcal.robot.kinematics.dh import robot_from_chain
 from stcal.robot.kinematics.forward import chain_parameters, moved_chain
 from stcal.robot.kinematics.measurements import Measurements
-from stcal.robot.kinematics.model import DHRow, Joint, Robot
-
-
-def mh80() -> Robot:
-    """An arm with the size, reach (2061 mm) and ranges of Yaskawa's Motoman MH80, from its data sheet; J3 coupled to
-    nothing, tool at the flange."""
-    rows = ((145, -90, 540, 0), (870, 0, 0, -90), (210, -90, 0, 0), (0, 90, 1025, 0), (0, -90, 0, 0), (0, 0, 175, 0))
-    ranges = ((-180, 180), (-90, 155), (-80, 90), (-360, 360), (-125, 125), (-360, 360))
-    return Robot(
-        "MH80",
-        "standard",
-        tuple(DHRow(a, float(np.radians(alpha)), d, float(np.radians(theta))) for a, alpha, d, theta in rows),
-        tuple(Joint("revolute", *np.radians(r).tolist()) for r in ranges),
-    )
+from stcal.robot.kinematics.model import Robot
 
 
 def made(robot: Robot, rng: np.random.Generator, sigma_mm: float = 0.3, sigma_rad: float = 5e-4) -> Robot:

@@ -12,11 +12,12 @@ from stcal.errors import DegenerateError, InputError
 from stcal.geometry.rigid import Rigid
 from stcal.robot.axes.model import fit_axes, pairs_of, robot_from_sweeps
 from stcal.robot.axes.sweeps import find_arcs
+from stcal.robot.kinematics.example import mh80
 from stcal.robot.kinematics.file import load_robot, robot_toml
 from stcal.robot.kinematics.forward import flange_poses, forward, joint_frames
 from stcal.robot.kinematics.measurements import Measurements, read_measurements
 from stcal.robot.kinematics.model import DHRow, Joint, Robot
-from stcal.synthetic.measured.arms import joint_vectors, made, mh80, placed
+from stcal.synthetic.measured.arms import joint_vectors, made, placed
 
 SIGMA = 0.03
 WORLD = Rigid.exp([0.1, -0.05, 2.1, 2500.0, -900.0, 400.0])

@@ -16,11 +16,12 @@ from stcal.robot.identify.nominal import dh_values
 from stcal.robot.identify.report import identified_json, identified_page, identified_text
 from stcal.robot.identify.residuals import jacobian, moved, observed, residuals, tips
 from stcal.robot.identify.solve import IdentifyOptions, identify
+from stcal.robot.kinematics.example import mh80
 from stcal.robot.kinematics.file import load_robot, robot_toml
 from stcal.robot.kinematics.forward import flange_poses
 from stcal.robot.kinematics.measurements import Measurements, read_measurements
 from stcal.robot.kinematics.model import DHRow, Joint, Robot
-from stcal.synthetic.measured.arms import joint_vectors, made, measured, mh80, placed
+from stcal.synthetic.measured.arms import joint_vectors, made, measured, placed
 from tests.scripts import load_script
 
 ROKAE = Path(__file__).resolve().parents[4] / "shared" / "data" / "rokae_tracker" / "data"

@@ -11,6 +11,7 @@ from hypothesis import strategies as st
 from stcal.errors import InputError
 from stcal.geometry.rigid import Poses, Rigid
 from stcal.robot.kinematics.dh import robot_from_chain
+from stcal.robot.kinematics.example import mh80
 from stcal.robot.kinematics.forward import (
     CHUNK,
     chain_jacobian,
@@ -21,7 +22,7 @@ from stcal.robot.kinematics.forward import (
     moved_chain,
 )
 from stcal.robot.kinematics.model import DHRow, Joint, Robot
-from stcal.synthetic.measured.arms import joint_vectors, made, mh80
+from stcal.synthetic.measured.arms import joint_vectors, made
 
 
 def arm(seed: int, joints: int, convention: str) -> Robot:

@@ -11,10 +11,11 @@ from hypothesis import strategies as st
 
 from stcal.errors import InputError
 from stcal.geometry.rigid import Poses, Rigid
+from stcal.robot.kinematics.example import mh80
 from stcal.robot.kinematics.forward import forward
 from stcal.robot.kinematics.inverse import branches, inverse
 from stcal.robot.kinematics.model import DHRow, Joint, Robot
-from stcal.synthetic.measured.arms import joint_vectors, made, mh80
+from stcal.synthetic.measured.arms import joint_vectors, made
 
 TOOL = Rigid.exp([0.2, -0.4, 0.9, 60.0, -35.0, 120.0])
 

@@ -13,11 +13,12 @@ from stcal.cli.main import main
 from stcal.errors import InputError
 from stcal.geometry.rigid import Rigid
 from stcal.io.table import POSE, pose_cells
+from stcal.robot.kinematics.example import mh80
 from stcal.robot.kinematics.file import load_robot, robot_toml
 from stcal.robot.kinematics.forward import forward
 from stcal.robot.kinematics.model import Joint
 from stcal.robot.use.compensation import compensate, compensated_csv, compensated_json, read_targets
-from stcal.synthetic.measured.arms import joint_vectors, made, mh80
+from stcal.synthetic.measured.arms import joint_vectors, made
 
 JOINTS = [f"q{i}_deg" for i in range(1, 7)]
 

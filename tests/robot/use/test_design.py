@@ -12,11 +12,12 @@ from stcal.geometry.rigid import Poses, Rigid
 from stcal.io.table import read_table
 from stcal.robot.identify.observability import Observability, identification_jacobian, parameter_scale
 from stcal.robot.identify.solve import IdentifyOptions, identify
+from stcal.robot.kinematics.example import mh80
 from stcal.robot.kinematics.file import robot_toml
 from stcal.robot.kinematics.forward import chain_parameters, flange_poses, forward, moved_chain
 from stcal.robot.kinematics.model import Joint
 from stcal.robot.use.design import DesignOptions, choose, design
-from stcal.synthetic.measured.arms import joint_vectors, made, measured, mh80
+from stcal.synthetic.measured.arms import joint_vectors, made, measured
 
 TOOL = Rigid.exp([0.1, 0.2, -0.3, 40.0, -25.0, 110.0])
 ARM = replace(mh80(), tools={"": TOOL})
