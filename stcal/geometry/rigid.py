@@ -1,9 +1,11 @@
 """Rigid and similarity transforms: ``a_from_b @ b_from_c == a_from_c`` and ``xyz_a = a_from_b @ xyz_b``."""
 
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, overload
 
 import numpy as np
+from numpy.typing import ArrayLike
 from scipy.spatial.transform import Rotation
 
 from stcal.errors import InputError
@@ -13,7 +15,7 @@ UNIT_WITHIN = 1e-3
 """A quaternion's length may differ so much from 1: what four printed digits make of it."""
 
 
-def skew(v: np.ndarray) -> np.ndarray:
+def skew(v: ArrayLike) -> np.ndarray:
     """Cross-product matrices, shape (..., 3, 3), of vectors of shape (..., 3)."""
     v = np.asarray(v, float)
     m = np.zeros((*v.shape[:-1], 3, 3))
@@ -36,6 +38,10 @@ class Rigid:
     rotation: np.ndarray = field(default_factory=lambda: np.eye(3))
     translation: np.ndarray = field(default_factory=lambda: np.zeros(3))
 
+    if TYPE_CHECKING:  # lists are as good: they become arrays below
+
+        def __init__(self, rotation: ArrayLike = ..., translation: ArrayLike = ...) -> None: ...
+
     def __post_init__(self):
         object.__setattr__(self, "rotation", frozen(self.rotation, (3, 3), "rotation"))
         object.__setattr__(self, "translation", frozen(self.translation, (3,), "translation"))
@@ -48,7 +54,7 @@ class Rigid:
             object.__setattr__(self, "rotation", frozen(u @ vt))
 
     @classmethod
-    def from_matrix(cls, matrix) -> "Rigid":
+    def from_matrix(cls, matrix: ArrayLike) -> "Rigid":
         """From a 4×4 (or 3×4) homogeneous matrix; the rotation part is projected onto SO(3)."""
         m = frozen(matrix, what="rigid transform")
         if m.shape not in ((4, 4), (3, 4)):
@@ -61,7 +67,7 @@ class Rigid:
         return cls(u @ vt, m[:3, 3])
 
     @classmethod
-    def exp(cls, twist) -> "Rigid":
+    def exp(cls, twist: ArrayLike) -> "Rigid":
         """From a rotation vector (rad) and a translation (mm), (6,): not the SE(3) exponential of the twist,
         but the product perturbation ``(exp(w), t)`` in which the package states pose covariances."""
         twist = np.asarray(twist, float)
@@ -81,6 +87,10 @@ class Rigid:
         """b_from_a."""
         return Rigid(self.rotation.T, -self.rotation.T @ self.translation)
 
+    @overload
+    def __matmul__(self, other: "Rigid") -> "Rigid": ...
+    @overload
+    def __matmul__(self, other: ArrayLike) -> np.ndarray: ...
     def __matmul__(self, other):
         if isinstance(other, Rigid):
             return Rigid(self.rotation @ other.rotation, self.rotation @ other.translation + self.translation)
@@ -112,6 +122,10 @@ class Similarity:
         inverse = self.rigid.inverse()
         return Similarity(1 / self.scale, Rigid(inverse.rotation, inverse.translation / self.scale))
 
+    @overload
+    def __matmul__(self, other: "Similarity | Rigid") -> "Similarity": ...
+    @overload
+    def __matmul__(self, other: ArrayLike) -> np.ndarray: ...
     def __matmul__(self, other):
         if isinstance(other, Similarity):
             return Similarity(
@@ -122,7 +136,7 @@ class Similarity:
             return self @ Similarity(1.0, other)
         return self.scale * (np.asarray(other, float) @ self.rigid.rotation.T) + self.rigid.translation
 
-    def __rmatmul__(self, other):
+    def __rmatmul__(self, other: Rigid) -> "Similarity":
         if isinstance(other, Rigid):
             return Similarity(1.0, other) @ self
         return NotImplemented
@@ -137,6 +151,10 @@ class Poses:
 
     rotation: np.ndarray
     translation: np.ndarray
+
+    if TYPE_CHECKING:
+
+        def __init__(self, rotation: ArrayLike, translation: ArrayLike) -> None: ...
 
     def __post_init__(self):
         object.__setattr__(self, "translation", frozen(self.translation, (None, 3), "translations"))
@@ -154,7 +172,7 @@ class Poses:
         return cls(rotation, np.array([t.translation for t in transforms]).reshape(-1, 3))
 
     @classmethod
-    def from_quaternions(cls, wxyz: np.ndarray, translation: np.ndarray) -> "Poses":
+    def from_quaternions(cls, wxyz: ArrayLike, translation: ArrayLike) -> "Poses":
         """From quaternions (m, 4), w first, unit to 1e-3, and translations (m, 3), mm."""
         wxyz = np.asarray(wxyz, float)
         off = np.abs(np.linalg.norm(wxyz, axis=1) - 1)
@@ -169,6 +187,10 @@ class Poses:
     def __len__(self) -> int:
         return len(self.translation)
 
+    @overload
+    def __getitem__(self, index: int | np.integer) -> Rigid: ...
+    @overload
+    def __getitem__(self, index: slice | Sequence[int] | np.ndarray) -> "Poses": ...
     def __getitem__(self, index):
         """One :class:`Rigid` for an integer, :class:`Poses` for a slice, mask or list."""
         if np.ndim(index) == 0 and not isinstance(index, slice):
@@ -188,6 +210,10 @@ class Poses:
         back = np.swapaxes(self.rotation, 1, 2)
         return Poses(back, -np.einsum("mij,mj->mi", back, self.translation))
 
+    @overload
+    def __matmul__(self, other: "Rigid | Poses") -> "Poses": ...
+    @overload
+    def __matmul__(self, other: ArrayLike) -> np.ndarray: ...
     def __matmul__(self, other):
         """With :class:`Rigid` or as many :class:`Poses`: a_from_c; with one point (3,) or m: (m, 3)."""
         if isinstance(other, Rigid | Poses):
@@ -198,7 +224,7 @@ class Poses:
         points = np.broadcast_to(np.asarray(other, float), self.translation.shape)
         return np.einsum("mij,mj->mi", self.rotation, points) + self.translation
 
-    def __rmatmul__(self, other):
+    def __rmatmul__(self, other: Rigid) -> "Poses":
         if isinstance(other, Rigid):
             return Poses(other.rotation @ self.rotation, self.translation @ other.rotation.T + other.translation)
         return NotImplemented
