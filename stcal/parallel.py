@@ -1,4 +1,4 @@
-"""Run one function over many jobs on all cores."""
+"""Run one function over many jobs on all cores, and BLAS on one."""
 
 import contextlib
 import multiprocessing
@@ -10,7 +10,36 @@ from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor, as_completed
 
 ONE_THREAD = ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS", "OPENCV_FOR_THREADS_NUM")
-"""Libraries take their number of threads from these: processes that run side by side need one each."""
+"""Libraries take their number of threads from these when they are loaded; processes side by side need one each."""
+_lock = threading.Lock()
+_limit = contextlib.ExitStack()
+_inside = 0
+
+
+@contextlib.contextmanager
+def one_thread() -> Iterator[None]:
+    """Keep BLAS and OpenMP to one thread meanwhile; as a decorator, ``@one_thread()``, during each call.
+
+    The matrices here are small, or sparse: threads that wait for each other took the larger part of a run's processor
+    time. The limit stands at the heavy public functions, not at the program's start: the program and a caller from
+    Python get the same, libraries that are loaded after the start are limited too, and the caller's own process is as
+    before when the function returns. Calls may be nested and come from several threads; the outermost sets the limit
+    and the last to end lifts it.
+    """
+    global _inside
+    from threadpoolctl import threadpool_limits  # 40 ms that `stcal --version` need not wait for
+
+    with _lock:
+        if not _inside:
+            _limit.enter_context(threadpool_limits(1))
+        _inside += 1
+    try:
+        yield
+    finally:
+        with _lock:
+            _inside -= 1
+            if not _inside:
+                _limit.close()
 
 
 def run_parallel(function: Callable, jobs: Sequence[tuple], workers: int | None = None) -> Iterator[tuple[int, object]]:

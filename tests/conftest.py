@@ -1,5 +1,12 @@
 """What tests share: the data sets beside the repository, and a calibration without pixels."""
 
+import os
+
+from stcal.parallel import ONE_THREAD
+
+os.environ.update(dict.fromkeys(ONE_THREAD, "1"))  # before numpy is loaded; for the commands that tests start, too
+
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
@@ -20,14 +27,25 @@ from stcal.sfm.plan.simulated import observe, true_models
 from stcal.synthetic.scene import Scene, SceneOptions, make_scene
 
 SHARED = Path(__file__).resolve().parents[2] / "shared" / "data"
+SAMPLE = Path(__file__).parent / "data" / "sample"
 
 
 @pytest.fixture(scope="session")
-def shared_data():
-    """The folder of shared data sets; tests that ask for it are skipped without it."""
-    if not SHARED.is_dir():
-        pytest.skip("the shared data sets are not beside the repository")
-    return SHARED
+def shared_data() -> Callable[[str], Path]:
+    """A data set that is not part of the repository, by its place in ``../shared/data``; without it, skips the test."""
+
+    def find(place: str) -> Path:
+        if not (SHARED / place).exists():
+            pytest.skip("data sets that may not be passed on lie in ../shared/data alone")
+        return SHARED / place
+
+    return find
+
+
+@pytest.fixture(scope="session")
+def sample() -> Path:
+    """Twelve rendered images of the reference target, with truth: see its README. Not to be written to."""
+    return SAMPLE
 
 
 @pytest.fixture(scope="session")

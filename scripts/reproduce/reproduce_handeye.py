@@ -13,10 +13,6 @@ the errors of the predicted Â_N = X B_N X⁻¹ of the six motions (the paper's 
 Draws the paper's figures 4 and 5: translation and rotation error of each held-out motion.
 """
 
-import os
-
-os.environ["OMP_NUM_THREADS"] = os.environ["OPENBLAS_NUM_THREADS"] = "1"
-
 import argparse
 from concurrent.futures import ProcessPoolExecutor
 from pathlib import Path
@@ -31,6 +27,7 @@ from stcal.handeye.data.loop import Loop
 from stcal.handeye.data.motions import Motions
 from stcal.handeye.methods.evolution import EvolutionOptions, Objective, evolve, polish
 from stcal.handeye.solve import UNIT_MM
+from stcal.parallel import one_thread
 from stcal.report.figure import save
 from stcal.synthetic.measured.handeye import Truth, simulated_views
 
@@ -131,6 +128,7 @@ def draw(trials: list[dict], path: Path, part: int) -> None:
     plt.close(figure)
 
 
+@one_thread()
 def main() -> None:
     """Run the seeds; print and draw."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)

@@ -25,6 +25,7 @@ import numpy as np
 
 from stcal.geometry.align import align_rigid
 from stcal.geometry.rigid import Rigid
+from stcal.parallel import one_thread
 from stcal.report.figure import save
 from stcal.sfm import run
 from stcal.sfm.adjust.faces import faces_of_group
@@ -229,6 +230,7 @@ def draw(trials: list[dict[str, Errors]], path: Path, width: int) -> None:
     save(figure, path)
 
 
+@one_thread()
 def main() -> None:
     """Run the trials; print and draw."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)

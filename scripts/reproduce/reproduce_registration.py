@@ -25,6 +25,7 @@ from scipy.special import comb
 
 from stcal.errors import DegenerateError, StcalError
 from stcal.geometry.rigid import Poses, Rigid
+from stcal.parallel import one_thread
 from stcal.register import register
 from stcal.register.core.liu2017 import Liu2017Options, affine_least_squares, liu2017
 from stcal.register.workspace.field import residual_field
@@ -248,6 +249,7 @@ def draw(shares: dict, first: dict, path: Path) -> None:
     save(figure, path)
 
 
+@one_thread()
 def main() -> None:
     """Run the trials; print and draw."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)

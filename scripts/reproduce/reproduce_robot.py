@@ -10,10 +10,6 @@ compared with the commanded ones. Labels are simulated, no pixels; the distances
 camera measures, and the true ones of 51 other positions all over the arm's reach.
 """
 
-import os
-
-os.environ["OMP_NUM_THREADS"] = os.environ["OPENBLAS_NUM_THREADS"] = "1"
-
 import argparse
 import time
 from concurrent.futures import ProcessPoolExecutor
@@ -26,6 +22,7 @@ import numpy as np
 
 from stcal.geometry.align import align_rigid
 from stcal.geometry.rigid import Poses, Rigid
+from stcal.parallel import one_thread
 from stcal.report.figure import save
 from stcal.robot.axes.model import robot_from_sweeps
 from stcal.robot.identify.residuals import jacobian as jacobian_of
@@ -368,6 +365,7 @@ def draw_figure(draws: list[Draw], path: Path) -> None:
     save(figure, path)
 
 
+@one_thread()
 def main() -> None:
     """Print the table; draw."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)

@@ -8,10 +8,6 @@ were put in (Cramér–Rao); 1 is the least that an unbiased method can have. "C
 covariance that the result states; 1 is true, more is too sure of itself. Prints Markdown.
 """
 
-import os
-
-os.environ["OMP_NUM_THREADS"] = os.environ["OPENBLAS_NUM_THREADS"] = "1"
-
 import argparse
 from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass
@@ -27,6 +23,7 @@ from stcal.handeye.data.loop import SETUPS, Loop
 from stcal.handeye.methods.bundle import Bundle
 from stcal.handeye.methods.noise import components
 from stcal.handeye.methods.reprojection import problem
+from stcal.parallel import one_thread
 from stcal.synthetic.measured.handeye import Truth, simulated, simulated_views
 
 CORNERS = {"corner_px": 0.1, "board_mm": 0.03}
@@ -95,6 +92,7 @@ def corner_bound(exact: Truth, noise: Noise) -> np.ndarray:
     return np.linalg.inv(corners.linear(state).normal)[:6, :6]
 
 
+@one_thread()
 def main() -> None:
     """Run all cases; print."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)

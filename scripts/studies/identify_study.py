@@ -17,6 +17,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from stcal.geometry.rigid import Rigid
+from stcal.parallel import one_thread
 from stcal.robot.identify.residuals import Observed, State, jacobian, observed, residuals, tips
 from stcal.robot.identify.solve import Identified, IdentifyOptions, identify
 from stcal.robot.kinematics.example import mh80
@@ -133,6 +134,7 @@ def without_noise(true: Robot, q: np.ndarray, kind: str) -> Observed:
     return observed(replace(data, positions=None, rotations=None, distances=apart, from_row=start))
 
 
+@one_thread()
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
     parser.add_argument("--draws", type=int, default=200)

@@ -32,6 +32,7 @@ from stcal.locate.pose.estimate import locate
 from stcal.locate.pose.merge import merge
 from stcal.locate.pose.patent import PatentOptions
 from stcal.locate.pose.verdict import VerdictOptions, judge
+from stcal.parallel import one_thread
 from stcal.synthetic.exposure import Light, expose
 from stcal.synthetic.measured.tags import CAMERA, CornerNoise, example_layout, random_pose, simulated_exposures
 
@@ -202,6 +203,7 @@ def timing(folder: Path, images: CalibrationImages, rounds: int = 5) -> None:
             )
 
 
+@one_thread()
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.split("\n\n")[0])
     parser.add_argument("folder", type=Path)

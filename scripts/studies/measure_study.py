@@ -16,6 +16,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from stcal.io.camera import CameraPrior, intrinsic_basis
+from stcal.parallel import one_thread
 from stcal.sfm.data.observations import ImageObservations
 from stcal.sfm.measure.pose import TargetPose, pose_from_circles
 from stcal.synthetic.measured.image_poses import (
@@ -95,6 +96,7 @@ def rows_of(case: Case, images: range) -> list[tuple]:
     return rows
 
 
+@one_thread()
 def main() -> None:
     """Print the table."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)

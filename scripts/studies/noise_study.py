@@ -9,10 +9,6 @@ of the position and rotation errors, the Cramér–Rao bound of the position (th
 was put in, σ₀ = 1), and the position error of the uncorrected control (no eccentricity, chained), in the same labels.
 """
 
-import os
-
-os.environ["OMP_NUM_THREADS"] = os.environ["OPENBLAS_NUM_THREADS"] = "1"
-
 import argparse
 from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass, replace
@@ -24,6 +20,7 @@ import numpy as np
 
 from stcal.design import BoardDesign, TargetDesign, reference_board, reference_target
 from stcal.geometry.rigid import Rigid
+from stcal.parallel import one_thread
 from stcal.report.figure import save
 from stcal.sfm.adjust.calibration import Calibration, calibrate
 from stcal.sfm.adjust.group import adjust
@@ -146,6 +143,7 @@ def _tidy(axes) -> None:
     axes.yaxis.set_major_formatter("{x:g}")
 
 
+@one_thread()
 def main() -> None:
     """Print the table; draw."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)

@@ -31,6 +31,7 @@ from stcal.errors import DegenerateError
 from stcal.geometry.affine import Affine
 from stcal.geometry.align import align_rigid
 from stcal.geometry.rigid import Rigid, Similarity, skew
+from stcal.parallel import one_thread
 from stcal.register import Liu2017Options, Registration, register
 from stcal.register.core.liu2017 import affine_least_squares
 from stcal.register.core.models import parts
@@ -227,6 +228,7 @@ SECTIONS = {
 }
 
 
+@one_thread()
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--trials", type=int, default=200)

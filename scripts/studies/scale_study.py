@@ -16,6 +16,7 @@ from pathlib import Path
 
 import numpy as np
 
+from stcal.parallel import one_thread
 from stcal.sfm.adjust.calibration import Calibration, calibrate
 from stcal.sfm.adjust.options import AdjustOptions
 from stcal.sfm.checks.suite import Evidence, run_checks
@@ -126,6 +127,7 @@ def measure(count: int, kind: str) -> dict:
     }
 
 
+@one_thread()
 def main() -> None:
     """Print the table."""
     parser = argparse.ArgumentParser(description=__doc__)

@@ -16,6 +16,7 @@ import numpy as np
 from stcal.design import reference_board
 from stcal.geometry.rigid import Rigid
 from stcal.io.camera import CameraPrior, intrinsic_basis
+from stcal.parallel import one_thread
 from stcal.sfm.adjust.calibration import calibrate
 from stcal.sfm.adjust.group import adjust
 from stcal.sfm.adjust.refine import eccentricity_px
@@ -60,6 +61,7 @@ def one_run(seed: int, board_sigma_mm: float, refine: bool) -> list[tuple[float,
     return rows
 
 
+@one_thread()
 def main() -> None:
     """Print the table."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)

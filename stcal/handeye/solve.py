@@ -24,6 +24,7 @@ from stcal.handeye.methods.pose_adjustment import State, adjust_poses
 from stcal.handeye.methods.reprojection import adjust_views, resected
 from stcal.handeye.result import HandEye
 from stcal.io.camera import CameraPrior
+from stcal.parallel import one_thread
 
 OTHERS = ("zhao", "de", "de-polished", "pose", "reprojection")
 METHODS = (*AX_XB, *AX_ZB, *OTHERS)
@@ -95,6 +96,7 @@ class _Task:
         return start.robust(loop, with_scale)
 
 
+@one_thread()
 def handeye(
     pairs: HandEyePoses,
     setup: Setup = "eye-in-hand",

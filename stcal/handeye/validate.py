@@ -15,7 +15,7 @@ from stcal.handeye.data.views import View, Views, resect
 from stcal.handeye.judge.symmetry import repair
 from stcal.handeye.result import HandEye
 from stcal.handeye.solve import METHODS, HandEyeOptions, handeye
-from stcal.parallel import run_parallel
+from stcal.parallel import one_thread, run_parallel
 
 LEAST_LEFT = 3
 """Poses that must be left to solve with."""
@@ -94,6 +94,7 @@ def splits(count: int, held_out: int | None = None, repeats: int = 15, seed: int
     return np.array(chosen[:repeats])
 
 
+@one_thread()
 def cross_validate(
     pairs: HandEyePoses,
     setup: Setup = "eye-in-hand",
@@ -169,6 +170,7 @@ def predicted(result: HandEye, pairs: HandEyePoses, views: Views | None) -> tupl
     )
 
 
+@one_thread()
 def compare(
     pairs: HandEyePoses,
     setup: Setup = "eye-in-hand",

@@ -7,6 +7,7 @@ from functools import partial
 import numpy as np
 
 from stcal.errors import DegenerateError, InputError
+from stcal.parallel import one_thread
 from stcal.register.core.covariance import Noise, covariance_of, noise_of, sigma_within
 from stcal.register.core.liu2017 import Liu2017Options, liu2017
 from stcal.register.core.models import MODELS, Model, fit, parts, squares
@@ -34,6 +35,7 @@ SUSPICIOUS_SIGMA = 0.05
 """Fewer inliers, or a σ above this share of the points' spread: a mirrored frame is tried."""
 
 
+@one_thread()
 def register(
     xyz_a: np.ndarray,
     xyz_b: np.ndarray,

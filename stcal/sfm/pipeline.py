@@ -17,6 +17,7 @@ from stcal.io.camera import CameraModel, CameraPrior, camera_prior, read_camera,
 from stcal.io.design import board_toml, load_board, load_target, target_toml
 from stcal.io.images import RUN_MARKER, find_images
 from stcal.io.saving import json_text, save
+from stcal.parallel import one_thread
 from stcal.sfm.adjust.calibration import Calibration, calibrate
 from stcal.sfm.adjust.chain import measure_chains
 from stcal.sfm.checks.suite import Evidence, run_checks
@@ -44,6 +45,7 @@ Progress = Callable[[str, int, int], None]
 """Called with (stage, done, total)."""
 
 
+@one_thread()
 def run(
     images: str | Path,
     camera: str | Path | CameraModel,
@@ -174,6 +176,7 @@ def crosscheck_run(
     return check
 
 
+@one_thread()
 def calibrate_models(model: Path, saved: SavedRun) -> Calibration:
     """Scale and faces from a COLMAP model, or the models in a folder, that rest on the run's database."""
     ids = image_ids(saved.observations)

@@ -1,7 +1,5 @@
 """Boards and tags drawn in perspective: every corner where the drawing puts it."""
 
-from pathlib import Path
-
 import cv2
 import numpy as np
 import pytest
@@ -15,7 +13,6 @@ from stcal.errors import InputError
 from stcal.geometry.plane import apply_homography
 from tests.boards.drawn import IMAGE_FROM_MM, chessboard_mm, photograph
 
-CHARUCO_IMAGES = Path(__file__).parents[3] / "shared/data/charuco_handeye/test_set_charuco/images"
 CORNER_PX = 0.12
 """cv2 warps in steps of 1/32 px, here of a third; blur and 1.5 grey values of noise do the rest (0.08 px seen)."""
 
@@ -80,12 +77,11 @@ def test_nothing_in_an_empty_image():
     assert len(find_tags(grey, ["DICT_6X6_250"])) == 0
 
 
-@pytest.mark.skipif(not CHARUCO_IMAGES.is_dir(), reason="shared data not here")
-def test_all_corners_of_a_real_charuco_board():
+def test_all_corners_of_a_real_charuco_board(shared_data):
     """24 corners in each of 16 real images; OpenCV's own settings lose 28 % of them."""
     board = CharucoDesign(7, 5, 36.195, 18.256, "DICT_6X6_250")
     seen = []
-    for path in sorted(CHARUCO_IMAGES.glob("*.png")):
+    for path in sorted(shared_data("charuco_handeye/test_set_charuco/images").glob("*.png")):
         view = find_charuco(cv2.imread(str(path), cv2.IMREAD_GRAYSCALE), path.name, board)
         seen.append(len(view))
     assert seen == [24] * 16

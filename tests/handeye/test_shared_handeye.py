@@ -21,9 +21,7 @@ MEAN_MM = 0.75
 
 @pytest.fixture(scope="module")
 def charuco(shared_data):
-    folder = shared_data / "charuco_handeye"
-    if not folder.is_dir():
-        pytest.skip("charuco_handeye is not among the shared data sets")
+    folder = shared_data("charuco_handeye")
     k = yaml.safe_load((folder / "test_set_charuco" / "cal_data.yaml").read_text())["intrinsics"]
     camera = Camera(1600, 1200, [k["fx"], k["fy"]], [k["cx"], k["cy"]], np.zeros(8))
     rows = list(csv.DictReader((folder / "charuco_corners_opencv4.14.csv").read_text().splitlines()))

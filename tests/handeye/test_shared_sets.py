@@ -1,7 +1,5 @@
 """Two real data sets through the command line, from photographs: the acceptance figures."""
 
-from pathlib import Path
-
 import numpy as np
 import pytest
 
@@ -20,14 +18,8 @@ def script():
     return load_script("handeye_shared")
 
 
-def present(shared_data: Path, name: str) -> Path:
-    if not (shared_data / name).is_dir():
-        pytest.skip(f"{name} is not among the shared data sets")
-    return shared_data
-
-
 def test_charuco_photographs(script, shared_data, tmp_path):
-    data = present(shared_data, "charuco_handeye")
+    data = shared_data("charuco_handeye").parent
     ours, text = script.charuco(data, tmp_path / "a", "--workers", "1", *script.SPLITS)
     park, _ = script.charuco(data, tmp_path / "b", "--workers", "1", *script.SPLITS, "--method", "park-martin")
     errors, others = script.by_split(ours), script.by_split(park)
@@ -41,7 +33,7 @@ def test_charuco_photographs(script, shared_data, tmp_path):
 
 
 def test_the_pitch_of_the_dots_is_found(script, shared_data, tmp_path):
-    found, text = script.dots(present(shared_data, "dotgrid_handeye"), tmp_path, "--workers", "1", "--splits", "0")
+    found, text = script.dots(shared_data("dotgrid_handeye").parent, tmp_path, "--workers", "1", "--splits", "0")
     board = found["board"]
     sigma_mm = 20 * board["scale_sigma"]
     assert len(found["poses"]) == 15

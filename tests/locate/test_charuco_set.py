@@ -28,10 +28,7 @@ PLAN = LayoutPlan(
 
 @pytest.fixture(scope="module")
 def folder(shared_data) -> Path:
-    found = shared_data / "charuco_handeye/test_set_charuco"
-    if not found.is_dir():
-        pytest.skip("the ChArUco set is not among the shared data sets")
-    return found
+    return shared_data("charuco_handeye/test_set_charuco")
 
 
 @pytest.fixture(scope="module")

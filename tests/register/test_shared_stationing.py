@@ -17,9 +17,7 @@ def script():
 @pytest.fixture(scope="module")
 def data(script, shared_data):
     """Stations by name, and the robot of the URDF."""
-    root = shared_data / "hilti_stationing"
-    if not root.is_dir():
-        pytest.skip("hilti_stationing is not among the shared data sets")
+    root = shared_data("hilti_stationing")
     return root, script.stations(root), script.robot_of(root / "data" / "trailblazer.urdf")
 
 

@@ -25,9 +25,7 @@ BOUNDS = {"clean": (10, 20, 7, 9, 4, 0.99), "clutter": (30, 50, 15, 20, 8, 0.97)
 
 @pytest.fixture(scope="module", params=["clean", "clutter"])
 def rendered(request, shared_data, tmp_path_factory):
-    folder = shared_data / "stereo_target" / request.param
-    if not folder.is_dir():
-        pytest.skip(f"{request.param} is not among the shared data sets")
+    folder = shared_data(f"stereo_target/{request.param}")
     out = tmp_path_factory.mktemp(request.param) / "run"
     result = run(folder / "images", folder / "cameras.txt", out)
     truth = json.loads((folder / "truth.json").read_text())
@@ -103,7 +101,7 @@ def test_the_native_program_agrees(rendered):
 
 def test_the_uncorrected_control_shows_the_bias_that_residuals_hide(shared_data, tmp_path):
     """The bias r²cosθ/D is 40–64 µm for the big circles at 0–50° and 1 m; a face is one circle against another's."""
-    folder = shared_data / "stereo_target" / "clean"
+    folder = shared_data("stereo_target/clean")
     result = run(folder / "images", folder / "cameras.txt", tmp_path / "run", options=RunOptions(eccentricity=False))
     faces = compare(tmp_path / "run", folder / "truth.json")["faces"]
     for face_id in ("2", "4", "5"):
@@ -118,9 +116,7 @@ DOTGRID = BoardDesign(10, 10, 20.0, 5.0, "dark", 0.05, corner=(9, 0), corner_rad
 
 
 def dotgrid_images(shared_data):
-    folder = shared_data / "dotgrid_handeye" / "images"
-    if not folder.is_dir():
-        pytest.skip("dotgrid_handeye is not among the shared data sets")
+    folder = shared_data("dotgrid_handeye/images")
     return [(path.stem, cv2.imread(str(path), cv2.IMREAD_GRAYSCALE)) for path in sorted(folder.glob("*.png"))]
 
 
@@ -153,6 +149,6 @@ def _check_orientation(name, found):
 
 def test_camera_files_of_the_data_sets_are_read(shared_data):
     for name in ("clean", "clutter"):
-        model = read_camera(shared_data / "stereo_target" / name / "cameras.txt")
+        model = read_camera(shared_data(f"stereo_target/{name}") / "cameras.txt")
         assert (model.width, model.height) == (2592, 1728)
         assert 1250 < model.centre[0] < 1350

@@ -1,7 +1,6 @@
 """Data sets on disk: complete, readable by the package itself, and in the form of the shared data."""
 
 import json
-from pathlib import Path
 
 import cv2
 import numpy as np
@@ -14,7 +13,6 @@ from stcal.synthetic.dataset import truth, write_dataset
 from stcal.synthetic.render import RenderOptions, render
 from stcal.synthetic.scene import SceneOptions, make_scene, second_design
 
-SHARED = Path(__file__).resolve().parents[2] / ".." / "shared" / "data" / "stereo_target"
 OPTIONS = SceneOptions(seed=5, width=324, height=216, images_per_group=2)
 
 
@@ -34,12 +32,10 @@ def _keys(value):
     return type(value).__name__
 
 
-@pytest.mark.parametrize("name", ["clean", "clutter"])
-def test_truth_has_the_form_of_the_shared_data(scene, name):
-    path = SHARED / name / "truth.json"
-    if not path.exists():
-        pytest.skip("shared data not beside the repository")
-    shared, ours = json.loads(path.read_text()), json.loads(json.dumps(truth(scene)))
+@pytest.mark.parametrize("name", ["sample", "clean", "clutter"])
+def test_truth_has_the_form_of_the_rendered_sets(scene, sample, shared_data, name):
+    folder = sample if name == "sample" else shared_data(f"stereo_target/{name}")
+    shared, ours = json.loads((folder / "truth.json").read_text()), json.loads(json.dumps(truth(scene)))
     assert _keys(ours) == _keys(shared)
     assert list(ours["circles"]) == list(shared["circles"])
     assert list(ours["target_from_face"]) == list(shared["target_from_face"])

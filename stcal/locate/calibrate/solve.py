@@ -18,6 +18,7 @@ from stcal.geometry.plane import apply_homography, camera_from_plane, fit_homogr
 from stcal.geometry.rigid import Rigid
 from stcal.locate.calibrate.adjust import Adjusted, ImageCorners, adjust
 from stcal.locate.data.layout import LayoutPlan, TargetLayout, obj_from_plane
+from stcal.parallel import one_thread
 
 MIN_IMAGES = 2
 MIN_BOARD_POINTS = 4
@@ -52,6 +53,7 @@ class CalibratedLayout:
     left_out: tuple[str, ...]
 
 
+@one_thread()
 def calibrate(
     plan: LayoutPlan,
     views: Sequence[BoardView | None],

@@ -9,6 +9,7 @@ from scipy.spatial.transform import Rotation
 from stcal.errors import ConvergenceError, DegenerateError
 from stcal.geometry.arrays import frozen
 from stcal.geometry.rigid import Rigid
+from stcal.parallel import one_thread
 from stcal.robot.axes.checks import AGREES_RAD, require_like_nominal
 from stcal.robot.axes.fit import GROSS, TINY, AxisFit, fit_axis, refit_axis
 from stcal.robot.axes.sweeps import STILL_RAD, Arc, called, find_arcs
@@ -104,6 +105,7 @@ class AxesResult:
         object.__setattr__(self, "row_sigma", frozen(self.row_sigma, (None, 5), "σ of the rows"))
 
 
+@one_thread()
 def robot_from_sweeps(data: Measurements, nominal: Robot, still_rad: float = STILL_RAD) -> AxesResult:
     """The axis method: axes, robot, and how far to trust them.
 

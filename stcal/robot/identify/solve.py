@@ -7,6 +7,7 @@ import numpy as np
 from stcal.errors import DegenerateError, InputError
 from stcal.geometry.arrays import frozen
 from stcal.geometry.rigid import skew
+from stcal.parallel import one_thread
 from stcal.robot.identify.adjustment import (
     Solution,
     Weighting,
@@ -128,6 +129,7 @@ class Identified:
         return [(int(i), float(self.fitted_mm[i])) for i in np.flatnonzero(self.weights < OUTLIER_WEIGHT)]
 
 
+@one_thread()
 def identify(robot: Robot, data: Measurements, options: IdentifyOptions | None = None) -> Identified:
     """Identify the axes, base and tools of ``robot`` from ``data``.
 

@@ -12,6 +12,7 @@ from stcal.errors import InputError
 from stcal.geometry.arrays import frozen
 from stcal.geometry.rigid import Poses
 from stcal.io.table import LENGTHS, read_table
+from stcal.parallel import one_thread
 from stcal.robot.kinematics.forward import forward
 from stcal.robot.kinematics.inverse import LIMIT, ORIENTATION, SINGULAR_POSE, UNREACHABLE, Inverse, inverse
 from stcal.robot.kinematics.measurements import joint_values, within
@@ -165,6 +166,7 @@ def read_targets(path: str | Path, robot: Robot) -> Targets:
     )
 
 
+@one_thread()
 def compensate(identified: Robot, targets: Targets, nominal: Robot | None = None) -> Compensated:
     """Joint values for the commanded poses, by the identified robot and beside it by the nominal one.
 

@@ -15,6 +15,7 @@ from stcal.errors import DegenerateError, InputError
 from stcal.geometry.arrays import frozen
 from stcal.geometry.rigid import Poses
 from stcal.io.table import POSE, pose_cells
+from stcal.parallel import one_thread
 from stcal.robot.identify.observability import SEEN, Observability, identification_jacobian, parameter_scale
 from stcal.robot.kinematics.forward import forward
 from stcal.robot.kinematics.model import Robot
@@ -100,6 +101,7 @@ class DesignOptions:
             )
 
 
+@one_thread()
 def design(robot: Robot, options: DesignOptions | None = None) -> PoseDesign:
     """Choose poses for the identification of ``robot``, the same for the same seed.
 

@@ -12,6 +12,7 @@ from stcal.errors import DegenerateError, DetectionError, InputError
 from stcal.geometry.camera import Camera
 from stcal.io.camera import COLMAP_MODELS, CameraModel, parameter_names
 from stcal.io.images import ImageFile, Skipped, decode, find_images
+from stcal.parallel import one_thread
 from stcal.sfm.camera.intrinsics import Intrinsics, adjust_intrinsics, model_parameters
 from stcal.sfm.camera.trust import (
     MIN_REACH,
@@ -55,6 +56,7 @@ class CameraCalibration:
     warnings: tuple[str, ...]
 
 
+@one_thread()
 def calibrate_camera(
     images: str | Path,
     target: TargetDesign,

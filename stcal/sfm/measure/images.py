@@ -17,6 +17,7 @@ from stcal.geometry.rigid import Rigid
 from stcal.io.camera import CameraModel, CameraPrior
 from stcal.io.images import Skipped, find_images
 from stcal.io.table import COVARIANCE, POSE, Table, common_columns, pose_cells
+from stcal.parallel import one_thread
 from stcal.sfm.data.observations import ImageObservations, by_group
 from stcal.sfm.detect.ellipses import EllipseOptions
 from stcal.sfm.detect.files import DetectedImage, detect_files
@@ -74,6 +75,7 @@ class MeasureResult:
         object.__setattr__(self, "common", frozen(self.common, (len(self.images), 6, None), "common errors"))
 
 
+@one_thread()
 def measure(
     images: str | Path,
     camera: CameraModel,

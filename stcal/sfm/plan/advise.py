@@ -9,6 +9,7 @@ import numpy as np
 from stcal.errors import DegenerateError
 from stcal.geometry.rigid import Rigid
 from stcal.io.camera import camera_prior, read_camera
+from stcal.parallel import one_thread
 from stcal.sfm.adjust.calibration import with_sigma
 from stcal.sfm.adjust.chain import CalibratedTarget
 from stcal.sfm.adjust.joint import JointResult, adjust_jointly
@@ -113,6 +114,7 @@ def known_of(run: SavedRun) -> Known:
     return Known(joint.models, joint, setup, noise, known_scene(joint.models, joint, setup, run.colmap_model))
 
 
+@one_thread()
 def advise(known: Known, count: int = 5, progress: Callable[[str, int, int], None] | None = None) -> Advice:
     """The ``count`` views that, taken one after the other, lower the σ of the worst face most, and new groups of as
     many images. ``progress`` is told (stage, done, total)."""

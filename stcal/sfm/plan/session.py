@@ -9,6 +9,7 @@ from stcal.errors import DegenerateError, InputError
 from stcal.geometry.camera import Camera
 from stcal.geometry.rigid import Rigid
 from stcal.io.camera import CameraModel, camera_prior, refinable
+from stcal.parallel import one_thread
 from stcal.sfm.adjust.chain import CalibratedTarget
 from stcal.sfm.data.model import GroupModel
 from stcal.sfm.plan.forecast import ONE_PLATE, CentreNoise, Forecast, Setup, forecast, variance_shares, without_sources
@@ -73,6 +74,7 @@ class Plan:
     remedies: tuple[Remedy, ...]
 
 
+@one_thread()
 def plan(
     options: PlanOptions, target: TargetDesign, board: BoardDesign, nominal: dict[str, Rigid] | None = None
 ) -> Plan:

@@ -270,9 +270,7 @@ def test_exactly_parallel_axes_have_no_common_normal():
 @pytest.fixture(scope="module")
 def fanuc(shared_data, tmp_path_factory):
     """The tracked sweeps as our files: three rows for each of theirs, and an R-2000's nominal rows."""
-    file = shared_data / "fanuc_sweeps" / "N1N2N3Jval.csv"
-    if not file.is_file():
-        pytest.skip("the tracked sweeps are not among the shared data sets")
+    file = shared_data("fanuc_sweeps/N1N2N3Jval.csv")
     raw = np.loadtxt(file)
     folder = tmp_path_factory.mktemp("fanuc")
     lines = ["target,q1_deg,q2_deg,q3_deg,q4_deg,q5_deg,q6_deg,x_mm,y_mm,z_mm"]

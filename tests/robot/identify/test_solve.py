@@ -24,7 +24,6 @@ from stcal.robot.kinematics.model import DHRow, Joint, Robot
 from stcal.synthetic.measured.arms import joint_vectors, made, measured, placed
 from tests.scripts import load_script
 
-ROKAE = Path(__file__).resolve().parents[4] / "shared" / "data" / "rokae_tracker" / "data"
 QUICK = IdentifyOptions(folds=0)
 
 
@@ -276,14 +275,14 @@ def test_an_arm_whose_rows_are_singular_is_identified():
     assert again.difference(tips(found.state, data.q, data.targets)) == pytest.approx(np.zeros((60, 6)), abs=1e-9)
 
 
-def rokae() -> tuple[Robot, str]:
+def rokae(folder: Path) -> tuple[Robot, str]:
     """The data set in the form of our files; orientation as Euler angles xyz in degrees (its SOURCE.txt)."""
-    dh = np.loadtxt(ROKAE / "dh.csv", delimiter=",", skiprows=1)
+    dh = np.loadtxt(folder / "dh.csv", delimiter=",", skiprows=1)
     rows = tuple(DHRow(a, float(np.radians(alpha)), d, float(np.radians(theta))) for alpha, a, d, theta in dh)
     numbers = re.compile(r"j:\{([^}]*)\}")
-    lines = [numbers.search(line) for line in (ROKAE / "joint_angle.csv").read_text().splitlines()]
+    lines = [numbers.search(line) for line in (folder / "joint_angle.csv").read_text().splitlines()]
     q = [[cell.strip() for cell in line.group(1).split(",")[:6]] for line in lines if line]
-    pose = [line.split()[7:13] for line in (ROKAE / "laser_pos.csv").read_text().splitlines() if line.strip()]
+    pose = [line.split()[7:13] for line in (folder / "laser_pos.csv").read_text().splitlines() if line.strip()]
     wxyz = Rotation.from_euler("xyz", [[float(v) for v in p[3:]] for p in pose], degrees=True).as_quat()[
         :, [3, 0, 1, 2]
     ]
@@ -293,9 +292,8 @@ def rokae() -> tuple[Robot, str]:
     return Robot("Rokae", "modified", rows, (Joint(),) * 6), text
 
 
-@pytest.mark.skipif(not ROKAE.exists(), reason="shared data absent")
-def test_rokae_held_out(tmp_path):
-    robot, text = rokae()
+def test_rokae_held_out(shared_data, tmp_path):
+    robot, text = rokae(shared_data("rokae_tracker/data"))
     (tmp_path / "rokae.csv").write_text(text)
     data = read_measurements(tmp_path / "rokae.csv", robot)
     assert len(data) == 30

@@ -371,9 +371,7 @@ def test_rendered_images_are_measured_as_predicted(measured, small_dataset):
 def test_the_shared_rendered_set(shared_data, tmp_path):
     """The whole chain on images of another program: calibrated, then measured. Its README says that one face in eight
     is 2 of its own σ off, and this is in the poses: 2² = 4."""
-    folder = shared_data / "stereo_target" / "clean"
-    if not folder.is_dir():
-        pytest.skip("clean is not among the shared data sets")
+    folder = shared_data("stereo_target/clean")
     run(folder / "images", folder / "cameras.txt", tmp_path / "run", options=RunOptions(workers=1))
     target = read_target(tmp_path / "run" / "faces.json", reference_target())
     result = measure(folder / "images", read_camera(folder / "cameras.txt"), target, reference_target())

@@ -1,0 +1,86 @@
+"""Threads of BLAS: one while heavy functions work, the caller's own number before and after; one in each worker."""
+
+import os
+import subprocess
+import sys
+
+from threadpoolctl import threadpool_info
+
+from stcal.parallel import ONE_THREAD
+
+UNLIMITED = {name: value for name, value in os.environ.items() if name not in ONE_THREAD}
+
+CORES = str(len(os.sched_getaffinity(0)))
+"""OpenBLAS begins as many threads."""
+
+
+def threads() -> set[int]:
+    return {library["num_threads"] for library in threadpool_info()}
+
+
+def said_by(code: str) -> list[str]:
+    """What a program says whose number of threads nobody limits."""
+    code = f"import numpy, scipy.linalg\nfrom threadpoolctl import threadpool_info\n{code}"
+    done = subprocess.run([sys.executable, "-c", code], env=UNLIMITED, capture_output=True, text=True, check=True)
+    return done.stdout.split()
+
+
+def test_tests_have_one_thread():
+    assert threads() == {1}
+
+
+def test_the_limit_ends_with_the_outermost_call():
+    code = """
+from stcal.parallel import one_thread
+say = lambda: print(*{library["num_threads"] for library in threadpool_info()})
+say()
+with one_thread():
+    say()
+    one_thread()(say)()
+    say()
+say()
+"""
+    assert said_by(code) == [CORES, "1", "1", "1", CORES]
+
+
+def test_calls_of_several_threads_leave_the_caller_his_own():
+    """The first to begin is the first to end: a limit kept by each call would be lifted early, or never."""
+    code = """
+from stcal.parallel import one_thread
+say = lambda: print(*{library["num_threads"] for library in threadpool_info()})
+began, first_ended = threading.Event(), threading.Event()
+def second():
+    with one_thread():
+        began.set()
+        first_ended.wait(10)
+        say()
+other = threading.Thread(target=second)
+with one_thread():
+    other.start()
+    began.wait(10)
+first_ended.set()
+other.join()
+say()
+"""
+    assert said_by(code) == ["1", CORES]
+
+
+def test_an_error_lifts_the_limit():
+    code = """
+from stcal.parallel import one_thread
+try:
+    with one_thread():
+        raise ValueError
+except ValueError:
+    print(*{library["num_threads"] for library in threadpool_info()})
+"""
+    assert said_by(code) == [CORES]
+
+
+def test_workers_have_one_thread():
+    code = """
+from stcal.parallel import run_parallel
+from tests.test_parallel import threads
+print(*(number for _, found in run_parallel(threads, [(), ()], 2) for number in found))
+"""
+    assert said_by(code) == ["1", "1"]
