@@ -11,9 +11,7 @@ from concurrent.futures import ProcessPoolExecutor, as_completed
 
 ONE_THREAD = ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS", "OPENCV_FOR_THREADS_NUM")
 """Libraries take their number of threads from these when they are loaded; processes side by side need one each."""
-_lock = threading.Lock()
-_limit = contextlib.ExitStack()
-_inside = 0
+_limited = threading.Lock()
 
 
 @contextlib.contextmanager
@@ -23,23 +21,19 @@ def one_thread() -> Iterator[None]:
     The matrices here are small, or sparse: threads that wait for each other took the larger part of a run's processor
     time. The limit stands at the heavy public functions, not at the program's start: the program and a caller from
     Python get the same, libraries that are loaded after the start are limited too, and the caller's own process is as
-    before when the function returns. Calls may be nested and come from several threads; the outermost sets the limit
-    and the last to end lifts it.
+    before when the function returns. Calls inside another, or while one of another thread lasts, leave it to that one:
+    two that each restored what they had found could leave the limit behind.
     """
-    global _inside
-    from threadpoolctl import threadpool_limits  # 40 ms that `stcal --version` need not wait for
-
-    with _lock:
-        if not _inside:
-            _limit.enter_context(threadpool_limits(1))
-        _inside += 1
-    try:
+    if not _limited.acquire(blocking=False):
         yield
+        return
+    try:
+        from threadpoolctl import threadpool_limits  # 40 ms that `stcal --version` need not wait for
+
+        with threadpool_limits(1):
+            yield
     finally:
-        with _lock:
-            _inside -= 1
-            if not _inside:
-                _limit.close()
+        _limited.release()
 
 
 def run_parallel(function: Callable, jobs: Sequence[tuple], workers: int | None = None) -> Iterator[tuple[int, object]]:

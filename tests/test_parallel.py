@@ -4,6 +4,7 @@ import os
 import subprocess
 import sys
 
+import numpy as np
 from threadpoolctl import threadpool_info
 
 from stcal.parallel import ONE_THREAD
@@ -15,6 +16,7 @@ CORES = str(len(os.sched_getaffinity(0)))
 
 
 def threads() -> set[int]:
+    assert np.eye(1) == 1
     return {library["num_threads"] for library in threadpool_info()}
 
 
@@ -43,24 +45,28 @@ say()
     assert said_by(code) == [CORES, "1", "1", "1", CORES]
 
 
-def test_calls_of_several_threads_leave_the_caller_his_own():
-    """The first to begin is the first to end: a limit kept by each call would be lifted early, or never."""
+def test_calls_of_several_threads_leave_no_limit_behind():
+    """The first to begin is the first to end; the second found one thread, and must not restore that."""
     code = """
+import threading
 from stcal.parallel import one_thread
-say = lambda: print(*{library["num_threads"] for library in threadpool_info()})
 began, first_ended = threading.Event(), threading.Event()
 def second():
     with one_thread():
+        print(*{library["num_threads"] for library in threadpool_info()})
         began.set()
         first_ended.wait(10)
-        say()
+def first():
+    with one_thread():
+        other.start()
+        began.wait(10)
+    first_ended.set()
 other = threading.Thread(target=second)
-with one_thread():
-    other.start()
-    began.wait(10)
-first_ended.set()
+starter = threading.Thread(target=first)
+starter.start()
+starter.join()
 other.join()
-say()
+print(*{library["num_threads"] for library in threadpool_info()})
 """
     assert said_by(code) == ["1", CORES]
 
