@@ -6,7 +6,7 @@ from typing import Literal
 import numpy as np
 
 from stcal.errors import InputError
-from stcal.geometry.arrays import frozen
+from stcal.geometry.arrays import Array, freeze
 
 Polarity = Literal["bright", "dark"]
 BOARD = "board"
@@ -27,15 +27,15 @@ class FaceDesign:
 
     id: str
     ids: tuple[str, ...]
-    xy_mm: np.ndarray
-    radius_mm: np.ndarray
+    xy_mm: Array
+    radius_mm: Array
     origin: str
     x: str
     y: str
 
     def __post_init__(self):
-        object.__setattr__(self, "xy_mm", frozen(self.xy_mm, (len(self.ids), 2), f"face {self.id}: circles"))
-        object.__setattr__(self, "radius_mm", frozen(self.radius_mm, (len(self.ids),), f"face {self.id}: radii"))
+        freeze(self, "xy_mm", (len(self.ids), 2), f"face {self.id}: circles")
+        freeze(self, "radius_mm", (len(self.ids),), f"face {self.id}: radii")
 
     def labels(self) -> list[str]:
         """``face:circle`` for every circle, in order."""

@@ -78,6 +78,8 @@ def _follow_parent() -> None:
     """In a worker: leave Ctrl-C to the parent, which stops the pool in order; end when the parent is killed."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     parent = multiprocessing.parent_process()
+    if parent is None:
+        return
 
     def watch() -> None:
         parent.join()

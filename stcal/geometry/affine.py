@@ -1,11 +1,13 @@
 """Affine transforms: ``xyz_a = linear @ xyz_b + translation``, any 3×3 part."""
 
 from dataclasses import dataclass
+from typing import overload
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from stcal.errors import DegenerateError
-from stcal.geometry.arrays import frozen
+from stcal.geometry.arrays import Array, freeze
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -19,12 +21,12 @@ class Affine:
         Image of b's origin in a, mm.
     """
 
-    linear: np.ndarray
-    translation: np.ndarray
+    linear: Array
+    translation: Array
 
     def __post_init__(self):
-        object.__setattr__(self, "linear", frozen(self.linear, (3, 3), "linear part"))
-        object.__setattr__(self, "translation", frozen(self.translation, (3,), "translation"))
+        freeze(self, "linear", (3, 3), "linear part")
+        freeze(self, "translation", (3,), "translation")
 
     def matrix(self) -> np.ndarray:
         """Homogeneous 4×4 matrix."""
@@ -45,7 +47,12 @@ class Affine:
         back = np.linalg.inv(self.linear)
         return Affine(back, -back @ self.translation)
 
+    @overload
+    def __matmul__(self, other: "Affine") -> "Affine": ...
+    @overload
+    def __matmul__(self, other: ArrayLike) -> np.ndarray: ...
     def __matmul__(self, other):
+        """a_from_c of b_from_c, or points (..., 3) of frame a of such of frame b, mm."""
         if isinstance(other, Affine):
             return Affine(self.linear @ other.linear, self.linear @ other.translation + self.translation)
         return np.asarray(other, float) @ self.linear.T + self.translation

@@ -1,12 +1,45 @@
-"""Read-only float arrays with a checked shape, for the frozen dataclasses of the package."""
+"""Read-only arrays of a checked shape, for the fields of the package's frozen dataclasses."""
+
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
+from numpy.typing import ArrayLike, DTypeLike
 
 from stcal.errors import InputError
 
+Shape = tuple[int | None, ...]
 
-def frozen(values, shape: tuple[int | None, ...] | None = None, what: str = "array", dtype=float) -> np.ndarray:
-    """Return a read-only copy of ``values``; ``None`` in ``shape`` admits any length.
+if TYPE_CHECKING:
+
+    class Array:
+        """Type of a dataclass field that takes anything like an array and holds what :func:`freeze` makes of it.
+
+        To a type checker it is a descriptor: the constructor accepts lists and tuples of numbers, reading gives an
+        ``np.ndarray``. At run time it is ``np.ndarray``. Only for fields; an optional one is ``np.ndarray | None``.
+        """
+
+        def __get__(self, instance: object, owner: Any) -> np.ndarray: ...
+        def __set__(self, instance: object, value: ArrayLike) -> None: ...
+
+else:
+    Array = np.ndarray
+
+
+def frozen(values: ArrayLike, shape: Shape | None = None, what: str = "array", dtype: DTypeLike = float) -> np.ndarray:
+    """Return a read-only copy.
+
+    Parameters
+    ----------
+    values : array-like
+    shape : tuple of int or None, optional
+        The shape needed; ``None`` in it admits any length. Any shape where not given.
+    what : str
+        Names the values in messages.
+    dtype : data type
+
+    Returns
+    -------
+    array of ``shape``
 
     Raises
     ------
@@ -22,3 +55,24 @@ def frozen(values, shape: tuple[int | None, ...] | None = None, what: str = "arr
         raise InputError(f"{what}: holds values that are not finite")
     array.flags.writeable = False
     return array
+
+
+def freeze(
+    instance: object, field: str, shape: Shape | None = None, what: str = "array", dtype: DTypeLike = float
+) -> None:
+    """Replace a field of a frozen dataclass by its read-only copy; to be called in ``__post_init__``.
+
+    Parameters
+    ----------
+    instance : dataclass instance
+    field : str
+        Name of its field.
+    shape, what, dtype :
+        As of :func:`frozen`.
+
+    Raises
+    ------
+    InputError
+        As :func:`frozen`.
+    """
+    object.__setattr__(instance, field, frozen(getattr(instance, field), shape, what, dtype))

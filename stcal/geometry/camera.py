@@ -5,7 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from stcal.errors import ConvergenceError, InputError
-from stcal.geometry.arrays import frozen
+from stcal.geometry.arrays import Array, freeze
 
 MAX_NEWTON_STEPS = 50
 UNDISTORT_TOLERANCE = 1e-12
@@ -30,14 +30,14 @@ class Camera:
 
     width: int
     height: int
-    focal: np.ndarray
-    centre: np.ndarray
-    distortion: np.ndarray
+    focal: Array
+    centre: Array
+    distortion: Array
 
     def __post_init__(self):
-        object.__setattr__(self, "focal", frozen(self.focal, (2,), "focal length"))
-        object.__setattr__(self, "centre", frozen(self.centre, (2,), "principal point"))
-        object.__setattr__(self, "distortion", frozen(self.distortion, (8,), "distortion"))
+        freeze(self, "focal", (2,), "focal length")
+        freeze(self, "centre", (2,), "principal point")
+        freeze(self, "distortion", (8,), "distortion")
         if (self.focal <= 0).any():
             raise InputError(f"camera: focal length {self.focal.tolist()} px, positive numbers needed")
         if self.width < 1 or self.height < 1:
@@ -75,39 +75,70 @@ class Camera:
         return jacobian
 
     def distort(self, xy: np.ndarray) -> np.ndarray:
-        """Normalised distorted coordinates (..., 2) of normalised ideal ones."""
-        return self._distort(np.asarray(xy, float), jacobian=False)[0]
+        """Distort.
+
+        Parameters
+        ----------
+        xy : (..., 2) array
+            Ideal normalised coordinates.
+
+        Returns
+        -------
+        (..., 2) array
+            Distorted normalised coordinates.
+        """
+        xy = np.asarray(xy, float)
+        return self._distorted(xy, self._radial(xy))
 
     def distort_jacobian(self, xy: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Distorted coordinates (..., 2) and their derivative by the ideal ones (..., 2, 2)."""
-        return self._distort(np.asarray(xy, float), jacobian=True)
+        """Distort, with the derivative.
 
-    def _distort(self, xy, jacobian: bool):
+        Parameters
+        ----------
+        xy : (..., 2) array
+            Ideal normalised coordinates.
+
+        Returns
+        -------
+        distorted : (..., 2) array
+            Distorted normalised coordinates.
+        jacobian : (..., 2, 2) array
+            Their derivative by the ideal ones.
+        """
+        xy = np.asarray(xy, float)
         k1, k2, p1, p2, k3, k4, k5, k6 = self.distortion
         x, y = xy[..., 0], xy[..., 1]
         r2 = x * x + y * y
-        top = 1 + r2 * (k1 + r2 * (k2 + r2 * k3))
+        radial = self._radial(xy)
         bottom = 1 + r2 * (k4 + r2 * (k5 + r2 * k6))
-        radial = top / bottom
-        out = np.stack(
+        by_r2 = (k1 + r2 * (2 * k2 + 3 * r2 * k3) - radial * (k4 + r2 * (2 * k5 + 3 * r2 * k6))) / bottom
+        cross = 2 * x * y * by_r2 + 2 * p1 * x + 2 * p2 * y
+        jacobian = np.stack(
+            [
+                np.stack([radial + 2 * x * x * by_r2 + 2 * p1 * y + 6 * p2 * x, cross], axis=-1),
+                np.stack([cross, radial + 2 * y * y * by_r2 + 6 * p1 * y + 2 * p2 * x], axis=-1),
+            ],
+            axis=-2,
+        )
+        return self._distorted(xy, radial), jacobian
+
+    def _radial(self, xy: np.ndarray) -> np.ndarray:
+        """Factor (...) by which the rational model moves a point outwards."""
+        k1, k2, _, _, k3, k4, k5, k6 = self.distortion
+        r2 = xy[..., 0] * xy[..., 0] + xy[..., 1] * xy[..., 1]
+        return (1 + r2 * (k1 + r2 * (k2 + r2 * k3))) / (1 + r2 * (k4 + r2 * (k5 + r2 * k6)))
+
+    def _distorted(self, xy: np.ndarray, radial: np.ndarray) -> np.ndarray:
+        p1, p2 = self.distortion[2:4]
+        x, y = xy[..., 0], xy[..., 1]
+        r2 = x * x + y * y
+        return np.stack(
             [
                 x * radial + 2 * p1 * x * y + p2 * (r2 + 2 * x * x),
                 y * radial + p1 * (r2 + 2 * y * y) + 2 * p2 * x * y,
             ],
             axis=-1,
         )
-        if not jacobian:
-            return out, None
-        slope = (k1 + r2 * (2 * k2 + 3 * r2 * k3) - radial * (k4 + r2 * (2 * k5 + 3 * r2 * k6))) / bottom
-        cross = 2 * x * y * slope + 2 * p1 * x + 2 * p2 * y
-        jac = np.stack(
-            [
-                np.stack([radial + 2 * x * x * slope + 2 * p1 * y + 6 * p2 * x, cross], axis=-1),
-                np.stack([cross, radial + 2 * y * y * slope + 6 * p1 * y + 2 * p2 * x], axis=-1),
-            ],
-            axis=-2,
-        )
-        return out, jac
 
     def undistort(self, xy_distorted: np.ndarray) -> np.ndarray:
         """Inverse of :meth:`distort` by Newton's method to 1e-12.
@@ -122,15 +153,16 @@ class Camera:
             return target.copy()
         if not np.isfinite(target).all():
             raise ConvergenceError("camera: a pixel to undistort is not finite; finite coordinates needed")
-        xy = target.copy()
+        xy, steps = target.copy(), 0
         with np.errstate(over="ignore", invalid="ignore"):  # where it diverges; reported below
-            for _ in range(MAX_NEWTON_STEPS):
+            while True:
                 value, jac = self.distort_jacobian(xy)
                 residual = value - target
                 (a, b), (c, d) = np.moveaxis(jac, (-2, -1), (0, 1))
                 det = a * d - b * c
                 done = np.abs(residual).max(-1) < UNDISTORT_TOLERANCE
-                if done.all():
+                steps += 1
+                if done.all() or steps == MAX_NEWTON_STEPS:
                     break
                 step = [d * residual[..., 0] - b * residual[..., 1], a * residual[..., 1] - c * residual[..., 0]]
                 xy = xy - np.moveaxis(np.stack(step) / np.where(np.abs(det) > 1e-9, det, 1e-9), 0, -1)

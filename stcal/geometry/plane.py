@@ -6,7 +6,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from stcal.errors import DegenerateError
-from stcal.geometry.arrays import frozen
+from stcal.geometry.arrays import Array, freeze
 from stcal.geometry.rigid import Rigid, skew
 
 
@@ -17,12 +17,12 @@ class Plane:
     ``normal`` : (3,) unit vector; ``offset``, ``rms`` : in the unit of the points.
     """
 
-    normal: np.ndarray
+    normal: Array
     offset: float
     rms: float
 
     def __post_init__(self):
-        object.__setattr__(self, "normal", frozen(self.normal, (3,), "plane normal"))
+        freeze(self, "normal", (3,), "plane normal")
 
     def distance(self, xyz: np.ndarray) -> np.ndarray:
         """Signed distances, (n,), of points (n, 3)."""

@@ -2,14 +2,14 @@
 
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, overload
+from typing import Any, overload
 
 import numpy as np
 from numpy.typing import ArrayLike
 from scipy.spatial.transform import Rotation
 
 from stcal.errors import InputError
-from stcal.geometry.arrays import frozen
+from stcal.geometry.arrays import Array, freeze, frozen
 
 UNIT_WITHIN = 1e-3
 """A quaternion's length may differ so much from 1: what four printed digits make of it."""
@@ -21,6 +21,14 @@ def skew(v: ArrayLike) -> np.ndarray:
     m = np.zeros((*v.shape[:-1], 3, 3))
     m[..., 0, 1], m[..., 0, 2], m[..., 1, 2] = -v[..., 2], v[..., 1], -v[..., 0]
     return m - np.swapaxes(m, -1, -2)
+
+
+def _no_turn() -> Any:
+    return np.eye(3)
+
+
+def _no_shift() -> Any:
+    return np.zeros(3)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -35,16 +43,12 @@ class Rigid:
         Origin of b in a, mm.
     """
 
-    rotation: np.ndarray = field(default_factory=lambda: np.eye(3))
-    translation: np.ndarray = field(default_factory=lambda: np.zeros(3))
-
-    if TYPE_CHECKING:  # lists are as good: they become arrays below
-
-        def __init__(self, rotation: ArrayLike = ..., translation: ArrayLike = ...) -> None: ...
+    rotation: Array = field(default_factory=_no_turn)
+    translation: Array = field(default_factory=_no_shift)
 
     def __post_init__(self):
-        object.__setattr__(self, "rotation", frozen(self.rotation, (3, 3), "rotation"))
-        object.__setattr__(self, "translation", frozen(self.translation, (3,), "translation"))
+        freeze(self, "rotation", (3, 3), "rotation")
+        freeze(self, "translation", (3,), "translation")
         r = self.rotation
         deviation = np.abs(r @ r.T - np.eye(3)).max()
         if deviation > 1e-6 or np.linalg.det(r) < 0:
@@ -70,8 +74,8 @@ class Rigid:
     def exp(cls, twist: ArrayLike) -> "Rigid":
         """From a rotation vector (rad) and a translation (mm), (6,): not the SE(3) exponential of the twist,
         but the product perturbation ``(exp(w), t)`` in which the package states pose covariances."""
-        twist = np.asarray(twist, float)
-        return cls(Rotation.from_rotvec(twist[:3]).as_matrix(), twist[3:])
+        motion = np.asarray(twist, float)
+        return cls(Rotation.from_rotvec(motion[:3]).as_matrix(), motion[3:])
 
     def log(self) -> np.ndarray:
         """Inverse of :meth:`exp`: rotation vector (rad) and translation (mm), (6,)."""
@@ -92,6 +96,7 @@ class Rigid:
     @overload
     def __matmul__(self, other: ArrayLike) -> np.ndarray: ...
     def __matmul__(self, other):
+        """a_from_c of b_from_c, or points (..., 3) of frame a of such of frame b, mm."""
         if isinstance(other, Rigid):
             return Rigid(self.rotation @ other.rotation, self.rotation @ other.translation + self.translation)
         if isinstance(other, Similarity | Poses):
@@ -127,6 +132,7 @@ class Similarity:
     @overload
     def __matmul__(self, other: ArrayLike) -> np.ndarray: ...
     def __matmul__(self, other):
+        """a_from_c of b_from_c, or points (..., 3) of frame a of such of frame b."""
         if isinstance(other, Similarity):
             return Similarity(
                 self.scale * other.scale,
@@ -149,16 +155,12 @@ class Poses:
     ``rotation`` : (m, 3, 3), proper to 1e-6; ``translation`` : (m, 3), origin of b in a, mm.
     """
 
-    rotation: np.ndarray
-    translation: np.ndarray
-
-    if TYPE_CHECKING:
-
-        def __init__(self, rotation: ArrayLike, translation: ArrayLike) -> None: ...
+    rotation: Array
+    translation: Array
 
     def __post_init__(self):
-        object.__setattr__(self, "translation", frozen(self.translation, (None, 3), "translations"))
-        object.__setattr__(self, "rotation", frozen(self.rotation, (len(self.translation), 3, 3), "rotations"))
+        freeze(self, "translation", (None, 3), "translations")
+        freeze(self, "rotation", (len(self.translation), 3, 3), "rotations")
         r = self.rotation
         left_handed = np.einsum("mi,mi->m", np.cross(r[:, 0], r[:, 1]), r[:, 2]) < 0
         if len(r) and (left_handed.any() or np.abs(r @ np.swapaxes(r, 1, 2) - np.eye(3)).max() > 1e-6):
@@ -190,7 +192,7 @@ class Poses:
     @overload
     def __getitem__(self, index: int | np.integer) -> Rigid: ...
     @overload
-    def __getitem__(self, index: slice | Sequence[int] | np.ndarray) -> "Poses": ...
+    def __getitem__(self, index: slice | np.ndarray | Sequence[int]) -> "Poses": ...
     def __getitem__(self, index):
         """One :class:`Rigid` for an integer, :class:`Poses` for a slice, mask or list."""
         if np.ndim(index) == 0 and not isinstance(index, slice):

@@ -4,7 +4,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from stcal.geometry.arrays import frozen
+from stcal.geometry.arrays import Array, freeze
 from stcal.geometry.rigid import Rigid, skew
 
 
@@ -13,10 +13,10 @@ class UncertainRigid:
     """a_from_b with ``covariance`` (6, 6): R' = exp(w) R, t' = t + dt; exact where it is zero."""
 
     rigid: Rigid
-    covariance: np.ndarray
+    covariance: Array
 
     def __post_init__(self):
-        object.__setattr__(self, "covariance", frozen(self.covariance, (6, 6), "pose covariance"))
+        freeze(self, "covariance", (6, 6), "pose covariance")
 
     @classmethod
     def exact(cls, rigid: Rigid) -> "UncertainRigid":

@@ -3,7 +3,7 @@
 from dataclasses import dataclass, replace
 
 import numpy as np
-from scipy.spatial import cKDTree
+from scipy.spatial import KDTree
 from scipy.stats import f
 
 from stcal.errors import DegenerateError
@@ -76,7 +76,7 @@ class Reprojection:
 
     def board(self, xyz_board: np.ndarray) -> np.ndarray:
         """Where corners of the design (k, 3) really are, mm; those that were not seen keep their place, scaled."""
-        distance, nearest = cKDTree(self.designed).query(xyz_board)
+        distance, nearest = KDTree(self.designed).query(xyz_board)
         scale = np.linalg.norm(self.corners) / np.linalg.norm(self.designed)
         return np.where((distance < 10.0**-SAME_DIGITS)[:, None], self.corners[nearest], scale * np.asarray(xyz_board))
 

@@ -4,7 +4,7 @@ from collections.abc import Callable, Sequence
 from itertools import pairwise
 
 import numpy as np
-from scipy.spatial import cKDTree
+from scipy.spatial import KDTree
 from scipy.spatial.distance import pdist
 from scipy.spatial.transform import Rotation
 
@@ -107,7 +107,7 @@ def symmetry(xyz: np.ndarray, tolerance_mm: float) -> tuple[float, np.ndarray] |
         & (np.abs(radius - radius[second]) < 2 * tolerance_mm)
         & (np.abs(apart - apart[first, second]) < 2 * tolerance_mm)
     )
-    tree = cKDTree(centred)
+    tree = KDTree(centred)
     best = None
     for i, j in np.argwhere(fits):
         if (i, j) == (first, second):

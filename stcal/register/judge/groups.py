@@ -13,7 +13,7 @@ along one axis would be parted so, but is no false alarm below 50 points; of lar
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.spatial import cKDTree
+from scipy.spatial import KDTree
 from scipy.special import gammaln
 from scipy.stats import binom, chi2
 
@@ -107,7 +107,7 @@ def wilks_bound(log_ratio: float, of_error: float, of_hypothesis: float) -> floa
 
 def lies_together(xyz_a: np.ndarray, group: np.ndarray) -> bool:
     """Whether neighbours are in the same group more often than chance would have it."""
-    nearest = cKDTree(xyz_a).query(xyz_a, k=2)[1][:, 1]
+    nearest = KDTree(xyz_a).query(xyz_a, k=2)[1][:, 1]
     same = int((group[nearest] == group).sum())
     share = group.mean()
     return bool(binom.sf(same - 1, len(group), share**2 + (1 - share) ** 2) < TOGETHER)

@@ -3,7 +3,7 @@
 from collections.abc import Callable
 
 import numpy as np
-from scipy.spatial import cKDTree
+from scipy.spatial import KDTree
 from scipy.spatial.transform import Rotation
 from scipy.stats import binom
 from scipy.stats import f as fisher
@@ -108,7 +108,7 @@ def outlier_notes(transform: Transform, fitted: Fitted, xyz_a: np.ndarray, xyz_b
     reach = fitted.threshold
     notes = []
     mapped = transform @ xyz_a[rows]
-    distance, nearest = cKDTree(mapped).query(xyz_b[rows])
+    distance, nearest = KDTree(mapped).query(xyz_b[rows])
     swapped = np.flatnonzero((distance <= reach) & (nearest != np.arange(len(rows))))
     taken = np.minimum(1, 2 * reach / np.maximum(np.ptp(mapped, axis=0), 1e-300)).prod()
     by_chance = binom.sf(len(swapped) - 1, len(rows), 1 - (1 - taken) ** (len(rows) - 1))

@@ -11,7 +11,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from scipy.optimize import minimize_scalar
-from scipy.spatial import cKDTree
+from scipy.spatial import KDTree
 from scipy.spatial.distance import cdist
 from scipy.stats import chi2
 
@@ -188,7 +188,7 @@ class _Likelihood:
 
     def best(self) -> tuple[float, float, float, float]:
         """Length, ratio, −2 log L there, and without f."""
-        nearest = cKDTree(self.xyz_a).query(self.xyz_a, k=2)[0][:, 1]
+        nearest = KDTree(self.xyz_a).query(self.xyz_a, k=2)[0][:, 1]
         low, high = max(np.median(nearest), 1e-6 * self.distance.max()), 2 * self.distance.max()
         lengths = np.geomspace(low, high, LENGTHS)
         values = [self._at_length(length)[0] for length in lengths]

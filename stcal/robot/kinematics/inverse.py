@@ -8,7 +8,7 @@ without unit: lengths, also the values of prismatic joints, are divided by the a
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.spatial import cKDTree
+from scipy.spatial import KDTree
 from scipy.stats import qmc
 
 from stcal.errors import InputError
@@ -192,7 +192,7 @@ def _every_solution(problem: Problem, poses: Poses, more: np.ndarray | None = No
     half = np.where(problem.turns, whole, np.where(np.isfinite(high - low), (high - low) / 2, 1.0))
     pool = problem.middle + (2 * qmc.Halton(n, scramble=False).random(POOL + 1)[1:] - 1) * half
     reach = problem.reach
-    tree = cKDTree(_embedded(forward(problem.robot, pool * problem.unit, problem.tool), reach))
+    tree = KDTree(_embedded(forward(problem.robot, pool * problem.unit, problem.tool), reach))
     chosen = tree.query(_embedded(poses, reach), k=STARTS)[1].ravel()
     repeated = np.repeat(np.arange(m), STARTS)
     found = solve(problem, poses[repeated], pool[chosen]).reshape(m, STARTS, n)

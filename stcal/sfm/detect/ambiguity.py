@@ -3,7 +3,7 @@
 from functools import lru_cache
 
 import numpy as np
-from scipy.spatial import cKDTree
+from scipy.spatial import KDTree
 
 from stcal.design import FaceDesign, TargetDesign
 
@@ -65,7 +65,7 @@ def _coincide(xy, radius, other_xy, other_radius, origin, step, other_step, same
     c, s = np.cos(turn)[:, None], np.sin(turn)[:, None]
     x, y = np.moveaxis(xy - xy[origin[0]][:, None], 2, 0)
     moved = np.stack([c * x - s * y, s * x + c * y], -1) + other_xy[origin[1]][:, None]
-    gap, nearest = cKDTree(other_xy).query(moved)
+    gap, nearest = KDTree(other_xy).query(moved)
     fits = (gap < MAX_GAP * np.minimum(radius, other_radius[nearest])) & _alike(radius[None], other_radius[nearest])
     if same:  # the reading itself is no rival
         fits = fits[~((nearest == np.arange(len(xy))) | ~fits).all(1)]

@@ -3,7 +3,7 @@
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.spatial import cKDTree
+from scipy.spatial import KDTree
 
 from stcal.errors import DegenerateError
 from stcal.geometry.camera import Camera
@@ -32,7 +32,7 @@ class Candidates:
     radius: np.ndarray
     contrast: np.ndarray
     px: float
-    tree: cKDTree
+    tree: KDTree
 
     @classmethod
     def of(cls, ellipses: Ellipses, camera: Camera) -> "Candidates":
@@ -41,7 +41,7 @@ class Candidates:
         _, distorted_by_ideal = camera.distort_jacobian(xy)
         shape = np.linalg.solve(distorted_by_ideal, ellipses.shape_px / camera.focal[:, None])
         radius = np.sqrt(np.abs(np.linalg.det(shape))) if len(xy) else np.zeros(0)
-        return cls(xy, shape, radius, ellipses.contrast, 1 / float(np.sqrt(camera.focal.prod())), cKDTree(xy))
+        return cls(xy, shape, radius, ellipses.contrast, 1 / float(np.sqrt(camera.focal.prod())), KDTree(xy))
 
     def __len__(self) -> int:
         return len(self.xy)

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 
 import cv2
 import numpy as np
-from scipy.spatial import cKDTree
+from scipy.spatial import KDTree
 
 from stcal.design import Polarity
 from stcal.geometry.arrays import frozen
@@ -258,7 +258,7 @@ def distinct(table: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         return np.zeros((0, 2)), np.zeros((0, 2, 2))
     centre = table[:, :2]
     radius = np.sqrt(table[:, 2] * table[:, 3]) / 2
-    pairs = cKDTree(centre).query_pairs(0.5 * radius.max(), output_type="ndarray")
+    pairs = KDTree(centre).query_pairs(0.5 * radius.max(), output_type="ndarray")
     smaller = np.minimum(radius[pairs[:, 0]], radius[pairs[:, 1]])
     larger = np.maximum(radius[pairs[:, 0]], radius[pairs[:, 1]])
     near = np.linalg.norm(centre[pairs[:, 0]] - centre[pairs[:, 1]], axis=1) < 0.3 * smaller + 0.5
