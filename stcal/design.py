@@ -1,5 +1,6 @@
 """What the hardware is: the target's faces and circles, and the dot board. Files: ``io/design.py``."""
 
+from collections.abc import Iterable
 from dataclasses import dataclass
 from typing import Literal
 
@@ -7,14 +8,9 @@ import numpy as np
 
 from stcal.errors import InputError
 from stcal.geometry.arrays import Array, freeze
+from stcal.labels import CircleLabel, DotLabel, Label, dot_cells
 
 Polarity = Literal["bright", "dark"]
-BOARD = "board"
-
-
-def board_label(row: int, column: int) -> str:
-    """``board:row:column``."""
-    return f"{BOARD}:{row}:{column}"
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -37,9 +33,9 @@ class FaceDesign:
         freeze(self, "xy_mm", (len(self.ids), 2), f"face {self.id}: circles")
         freeze(self, "radius_mm", (len(self.ids),), f"face {self.id}: radii")
 
-    def labels(self) -> list[str]:
+    def labels(self) -> list[CircleLabel]:
         """``face:circle`` for every circle, in order."""
-        return [f"{self.id}:{circle}" for circle in self.ids]
+        return [CircleLabel(self.id, circle) for circle in self.ids]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -58,7 +54,7 @@ class TargetDesign:
         known = ", ".join(face.id for face in self.faces)
         raise InputError(f"target {self.name}: no face {face_id}; the design has {known}, choose one of them")
 
-    def radius_of(self) -> dict[str, float]:
+    def radius_of(self) -> dict[CircleLabel, float]:
         """Radius in mm by label."""
         return {
             label: float(radius)
@@ -96,11 +92,16 @@ class BoardDesign:
             radii[self.corner[0] * self.columns + self.corner[1]] = self.corner_radius_mm
         return radii
 
-    def labels(self) -> list[str]:
+    def labels(self) -> list[DotLabel]:
         """``board:row:column``, row-major."""
-        return [board_label(r, c) for r in range(self.rows) for c in range(self.columns)]
+        return [DotLabel(r, c) for r in range(self.rows) for c in range(self.columns)]
 
-    def radius_of(self) -> dict[str, float]:
+    def places_mm(self, labels: Iterable[Label]) -> np.ndarray:
+        """Grid positions of these dots, (n, 3), board frame."""
+        cells = dot_cells(labels)
+        return np.column_stack([self.pitch_mm * cells[:, ::-1], np.zeros(len(cells))])
+
+    def radius_of(self) -> dict[DotLabel, float]:
         """Radius in mm by label."""
         return dict(zip(self.labels(), self.radii_mm().tolist(), strict=True))
 

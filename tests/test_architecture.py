@@ -17,7 +17,7 @@ MOST_ENTRIES = 15
 LAYERS = (
     ("errors", "front", "parallel"),
     ("geometry",),
-    ("design",),
+    ("design", "labels"),
     ("io",),
     ("boards", "report"),
     ("synthetic",),
@@ -179,7 +179,7 @@ def test_no_file_repeats_its_folder():
     ("path", "source"),
     [
         ("errors.py", "import stcal.geometry"),
-        ("geometry/plane.py", "from stcal.design import BOARD"),
+        ("geometry/plane.py", "from stcal.labels import BOARD"),
         ("geometry/plane.py", "from stcal import design"),
         ("geometry/plane.py", "from .. import sfm"),
         ("geometry/plane.py", "from ..io.design import load_target"),

@@ -25,6 +25,7 @@ import numpy as np
 
 from stcal.geometry.align import align_rigid
 from stcal.geometry.rigid import Rigid
+from stcal.labels import dot_cells
 from stcal.parallel import one_thread
 from stcal.report.figure import save
 from stcal.sfm import run
@@ -129,7 +130,7 @@ def board_errors(model: GroupModel, mm_per_unit: float, scene: Scene) -> tuple[f
     """Mean length of the scaled board's residuals against the design and against the true dots, µm."""
     rows, columns = scene.board.rows, scene.board.columns
     members = model.points_by_face()["board"]
-    cells = np.array([[int(v) for v in model.labels[i].split(":")[1:]] for i in members])
+    cells = dot_cells(model.labels[i] for i in members)
     numbers = cells[:, 0] * columns + cells[:, 1]
     design = np.column_stack([scene.board.xy_mm(), np.zeros(rows * columns)])
     answers = []

@@ -22,6 +22,7 @@ import numpy as np
 
 from stcal.geometry.align import align_rigid
 from stcal.geometry.rigid import Poses, Rigid
+from stcal.labels import parse_label
 from stcal.parallel import one_thread
 from stcal.report.figure import save
 from stcal.robot.axes.model import robot_from_sweeps
@@ -35,7 +36,6 @@ from stcal.robot.kinematics.measurements import Measurements
 from stcal.robot.kinematics.model import Joint, Robot
 from stcal.robot.use.compensation import Targets, compensate
 from stcal.robot.use.verification import Measured, SetResult, verify
-from stcal.sfm.data.observations import face_of
 from stcal.sfm.measure.common_errors import common_errors
 from stcal.sfm.measure.pose import pose_from_circles
 from stcal.sfm.measure.target import TargetCircles
@@ -140,7 +140,7 @@ def in_view(q: np.ndarray) -> np.ndarray:
 
 def enough(labels) -> bool:
     """Two faces or more."""
-    _, counts = np.unique([face_of(label) for label in labels], return_counts=True)
+    _, counts = np.unique([parse_label(label).plane for label in labels], return_counts=True)
     return (counts >= CIRCLES).sum() >= FACES
 
 

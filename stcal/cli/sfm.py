@@ -14,6 +14,7 @@ from stcal.errors import InputError
 from stcal.io.camera import read_camera
 from stcal.io.design import board_toml, load_board, load_target, target_toml
 from stcal.io.saving import json_text, save
+from stcal.labels import DotLabel
 
 app = typer.Typer(
     name="stcal-sfm",
@@ -161,7 +162,7 @@ def detect(
         detection, labelled = pipeline.detect(images, model, folder, target_design, board_design, options, progress)
     for each in labelled:
         image = each.observations
-        dots = sum(label.startswith("board:") for label in image.labels)
+        dots = sum(isinstance(label, DotLabel) for label in image.labels)
         faces = ", ".join(sorted(image.face_ids())) or "none"
         print(f"{image.name}: faces {faces} ({len(image) - dots} circles), board {dots} dots")
         for note in each.notes:

@@ -7,9 +7,10 @@ from typing import Annotated
 import numpy as np
 from pydantic import AfterValidator, BeforeValidator, Field
 
-from stcal.design import BOARD, BoardDesign, FaceDesign, Polarity, TargetDesign
+from stcal.design import BoardDesign, FaceDesign, Polarity, TargetDesign
 from stcal.errors import InputError
 from stcal.io.toml import Finite, Positive, Strict, load_toml
+from stcal.labels import BOARD
 
 REMEDY = "`stcal-sfm init DIR` writes one"
 MIN_SINE = 0.02

@@ -6,10 +6,10 @@ from pathlib import Path
 
 import numpy as np
 
-from stcal.design import BOARD
 from stcal.errors import InputError
 from stcal.io.camera import write_cameras_txt
 from stcal.io.design import board_toml, target_toml
+from stcal.labels import BOARD
 from stcal.parallel import run_parallel
 from stcal.synthetic.observe import image_circles
 from stcal.synthetic.render import RenderOptions, encode, render

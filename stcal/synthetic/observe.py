@@ -4,9 +4,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from stcal.design import BOARD
 from stcal.geometry.arrays import frozen
 from stcal.geometry.conic import circle_image_offset
+from stcal.labels import DotLabel, Label
 from stcal.synthetic.scene import Scene
 
 MAX_FOUND_TILT_RAD = np.radians(70)
@@ -24,7 +24,7 @@ class ImageCircles:
     centre; ``must_find`` : (n,) bool, of the group's faces or the board, tilt up to 70°, all of it in the image.
     """
 
-    labels: tuple[str, ...]
+    labels: tuple[Label, ...]
     xyz_camera: np.ndarray
     normal_camera: np.ndarray
     radius_mm: np.ndarray
@@ -97,7 +97,7 @@ def rim_points(xyz: np.ndarray, normal: np.ndarray, radius: np.ndarray, count: i
 
 def simulate_centres(
     scene: Scene, group: str, image: int, noise_px: float, rng: np.random.Generator
-) -> dict[str, np.ndarray]:
+) -> dict[Label, np.ndarray]:
     """Measured ellipse centres by label, (2,) px, of one image: what a detector with that noise would give.
 
     The centre of the ideal ellipse (not the image of the circle's centre), distorted by the lens, plus Gaussian
@@ -106,5 +106,5 @@ def simulate_centres(
     seen = image_circles(scene, group, image)
     ellipse_centre = scene.camera.project(circle_image_offset(seen.xyz_camera, seen.normal_camera, seen.radius_mm))
     measured = ellipse_centre + noise_px * rng.standard_normal(ellipse_centre.shape)
-    keep = (seen.tilt_rad <= MAX_FOUND_TILT_RAD) | np.array([label.startswith(f"{BOARD}:") for label in seen.labels])
+    keep = (seen.tilt_rad <= MAX_FOUND_TILT_RAD) | np.array([isinstance(label, DotLabel) for label in seen.labels])
     return {label: xy for label, xy, k in zip(seen.labels, measured, keep, strict=True) if k}

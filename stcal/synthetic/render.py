@@ -5,9 +5,9 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 
-from stcal.design import BOARD
 from stcal.errors import InputError
 from stcal.geometry.camera import Camera
+from stcal.labels import DotLabel
 from stcal.synthetic.background import draw_background, look_of
 from stcal.synthetic.observe import ImageCircles, image_circles, rim_points
 from stcal.synthetic.scene import Scene
@@ -75,7 +75,7 @@ def render(scene: Scene, group: str, image: int, options: RenderOptions | None =
     circles = image_circles(scene, group, image)
     picture = draw_background(scene, group, image, options.clutter, options.seed).astype(np.float32)
     board, face = look_of(scene.board.polarity).circle, look_of(scene.target.polarity).circle
-    base = np.array([board if label.startswith(f"{BOARD}:") else face for label in circles.labels])
+    base = np.array([board if isinstance(label, DotLabel) else face for label in circles.labels])
     levels = base * (1 + options.spread * rng.standard_normal(len(base)))
     picture = _add_circles(picture, scene.camera, circles, levels, options.blur_px)
     return _expose(picture, options, rng)

@@ -10,6 +10,7 @@ from stcal.errors import DegenerateError, InputError
 from stcal.geometry.arrays import frozen
 from stcal.geometry.camera import Camera
 from stcal.geometry.rigid import Rigid
+from stcal.labels import CircleLabel
 from stcal.synthetic.designs import REFERENCE_GROUPS, nominal_target_from_face, second_design, three_point_frame
 from stcal.synthetic.placement import GroupShape, place_group, viewing_axes
 
@@ -107,7 +108,7 @@ class Scene:
     camera: Camera
     colmap_model: str
     target_from_face: dict[str, Rigid]
-    circles_target: dict[str, np.ndarray]
+    circles_target: dict[CircleLabel, np.ndarray]
     groups: dict[str, Group]
     seed: int
 
@@ -179,7 +180,7 @@ def group_name(pair: tuple[str, str]) -> str:
     return ("" if all(len(face) == 1 for face in pair) else "-").join(pair)
 
 
-def _made_target(target, nominal, options, rng) -> tuple[dict[str, Rigid], dict[str, np.ndarray]]:
+def _made_target(target, nominal, options, rng) -> tuple[dict[str, Rigid], dict[CircleLabel, np.ndarray]]:
     """True poses and circles, in the frame of the reference face."""
     placed, frames = {}, {}
     for face in target.faces:

@@ -7,6 +7,7 @@ import numpy as np
 from stcal.design import TargetDesign
 from stcal.errors import MappingError
 from stcal.geometry.rigid import Rigid, skew
+from stcal.labels import CircleLabel
 from stcal.sfm.adjust.faces import FaceInGroup
 
 MAX_CHAIN_STEPS = 4
@@ -39,10 +40,10 @@ class CalibratedTarget:
 
     reference_face: str
     target_from_face: dict[str, Rigid]
-    circles: dict[str, np.ndarray]
+    circles: dict[CircleLabel, np.ndarray]
     target_from_group: dict[str, Rigid]
     face_covariance: dict[str, np.ndarray] = field(default_factory=dict)
-    circle_covariance: dict[str, np.ndarray] = field(default_factory=dict)
+    circle_covariance: dict[CircleLabel, np.ndarray] = field(default_factory=dict)
     distance_sigma_mm: dict[tuple[str, str], float] = field(default_factory=dict)
     scale_sigma: float | None = None
     covariance_mm2: np.ndarray | None = None
@@ -176,8 +177,8 @@ def _adjust(faces: list[FaceInGroup], chains, reference: str) -> tuple[dict[str,
 
 def _circles(faces: list[FaceInGroup], target_from_face: dict[str, Rigid], target: TargetDesign) -> dict:
     """Circle centres in the target frame: weighted means over the groups, in the face frame."""
-    weight: dict[str, np.ndarray] = {}
-    total: dict[str, np.ndarray] = {}
+    weight: dict[CircleLabel, np.ndarray] = {}
+    total: dict[CircleLabel, np.ndarray] = {}
     for each in faces:
         for label, xyz, information in zip(each.labels, each.xyz_face, each.information, strict=True):
             weight[label] = weight.get(label, 0) + information

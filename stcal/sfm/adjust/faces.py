@@ -11,6 +11,7 @@ from stcal.geometry.arrays import frozen
 from stcal.geometry.camera import Camera
 from stcal.geometry.plane import fit_plane
 from stcal.geometry.rigid import Rigid
+from stcal.labels import CircleLabel
 from stcal.sfm.adjust.group import projection_jacobians
 from stcal.sfm.data.model import GroupModel
 
@@ -28,7 +29,7 @@ class FaceInGroup:
     group: str
     face: str
     group_from_face: Rigid
-    labels: tuple[str, ...]
+    labels: tuple[CircleLabel, ...]
     xyz_face: np.ndarray
     information: np.ndarray
     images: int
@@ -81,7 +82,7 @@ def faces_of_group(
         members = model.points_by_face().get(face.id, np.zeros(0, int))
         if not len(members):
             continue
-        place = {model.labels[i].split(":", 1)[1]: xyz[i] for i in members}
+        place = {model.labels[i].circle: xyz[i] for i in members}
         observed = np.isin(model.point_index, members)
         seen_by = np.unique(model.image_index[observed])
         try:

@@ -18,10 +18,10 @@ from stcal.geometry.camera import Camera
 from stcal.geometry.plane import fit_plane
 from stcal.geometry.rigid import Rigid, skew
 from stcal.io.camera import CameraPrior, intrinsic_basis
+from stcal.labels import CircleLabel, DotLabel, dot_cells
 from stcal.sfm.adjust.blocks import Block, Shared, condense, moved, normalised, robust_weights
 from stcal.sfm.adjust.scale import MIN_DOTS
 from stcal.sfm.data.model import GroupModel
-from stcal.sfm.data.observations import face_of, is_board
 
 MAX_STEPS = 100
 MAX_MOVE_PX = 0.02
@@ -54,7 +54,7 @@ class JointResult:
 
     models: tuple[GroupModel, ...]
     world_from_board: dict[str, Rigid]
-    labels: tuple[str, ...]
+    labels: tuple[CircleLabel, ...]
     xyz_world: np.ndarray
     covariance_mm2: np.ndarray
     sigma0: float
@@ -81,7 +81,7 @@ class JointResult:
 class _Setting:
     """What stays the same in one minimisation."""
 
-    labels: tuple[str, ...]
+    labels: tuple[CircleLabel, ...]
     board: BoardDesign
     common: float
     flatness_mm: float | None
@@ -147,7 +147,7 @@ def covariance_of(
 
 def _start(models, board: BoardDesign, camera: Camera, flatness_mm, prior: CameraPrior | None, start: Camera):
     """Groups, what they share, and the setting: each group with its own board, no residual too long."""
-    labels = tuple(sorted({label for model in models for label in model.labels if not is_board(label)}))
+    labels = tuple(sorted({label for model in models for label in model.labels if isinstance(label, CircleLabel)}))
     basis = intrinsic_basis(prior.colmap_model) if prior else np.zeros((12, 0))
     weight = np.linalg.inv(prior.covariance) if prior else np.zeros((0, 0))
     blocks = [_block(model, board, labels) for model in models]
@@ -195,17 +195,16 @@ def _minimise(blocks: list[Block], shared: Shared, setting: _Setting) -> tuple[l
     return blocks, shared, float(move)
 
 
-def _block(model: GroupModel, board: BoardDesign, labels: tuple[str, ...]) -> Block:
+def _block(model: GroupModel, board: BoardDesign, labels: tuple[CircleLabel, ...]) -> Block:
     place = {label: i for i, label in enumerate(labels)}
-    dots = np.array([i for i, label in enumerate(model.labels) if is_board(label)])
-    circles = np.array([i for i, label in enumerate(model.labels) if not is_board(label)], int)
+    dots = np.array([i for i, label in enumerate(model.labels) if isinstance(label, DotLabel)])
+    circles = np.array([i for i, label in enumerate(model.labels) if isinstance(label, CircleLabel)], int)
     if len(dots) < MIN_DOTS:
         raise ScaleError(
             f"group {model.group}: {len(dots)} board dots in the joint adjustment, {MIN_DOTS} needed; "
             "photograph the board with the faces"
         )
-    cells = np.array([[int(v) for v in model.labels[i].split(":")[1:]] for i in dots])
-    design = np.column_stack([board.pitch_mm * cells[:, ::-1], np.zeros(len(cells))])
+    design = board.places_mm(model.labels[i] for i in dots)
     return Block(
         model,
         align_rigid(model.xyz_world[dots], design),
@@ -219,7 +218,7 @@ def _block(model: GroupModel, board: BoardDesign, labels: tuple[str, ...]) -> Bl
 
 
 def _dot_place(model: GroupModel, dots: np.ndarray, board: BoardDesign) -> np.ndarray:
-    cells = np.array([[int(v) for v in model.labels[i].split(":")[1:]] for i in dots])
+    cells = dot_cells(model.labels[i] for i in dots)
     return cells[:, 0] * board.columns + cells[:, 1]
 
 
@@ -307,7 +306,7 @@ def _planes(shared: Shared, setting: _Setting):
         return
     faces: dict[str, list[int]] = {}
     for i, label in enumerate(setting.labels):
-        faces.setdefault(face_of(label), []).append(i)
+        faces.setdefault(label.face, []).append(i)
     for own in faces.values():
         if len(own) > 3:
             members = np.array(own)

@@ -9,6 +9,7 @@ from stcal.errors import ConvergenceError, DegenerateError, MappingError
 from stcal.geometry.camera import Camera
 from stcal.geometry.conic import circle_image_offset
 from stcal.geometry.plane import fit_plane
+from stcal.labels import Label
 from stcal.sfm.adjust.group import adjust
 from stcal.sfm.adjust.scale import find_scale
 from stcal.sfm.data.model import GroupModel, Outlier
@@ -88,7 +89,7 @@ def _require_few(outliers: list[Outlier], observations: int, group: str) -> None
         )
 
 
-def eccentricity_px(model: GroupModel, camera: Camera, radius_mm: dict[str, float], mm_per_unit: float) -> np.ndarray:
+def eccentricity_px(model: GroupModel, camera: Camera, radius_mm: dict[Label, float], mm_per_unit: float) -> np.ndarray:
     """Image of the ellipse's centre minus image of the circle's centre, (n, 2), for every observation.
 
     Raises

@@ -9,6 +9,7 @@ from stcal.errors import DegenerateError, ScaleError
 from stcal.geometry.align import align_similarity
 from stcal.geometry.arrays import frozen
 from stcal.geometry.rigid import Similarity
+from stcal.labels import DotLabel, dot_cells
 from stcal.sfm.data.model import GroupModel
 
 MIN_DOTS = 4
@@ -27,7 +28,7 @@ class Scale:
     board_from_world: Similarity
     rows_mm_per_unit: float
     rows: tuple[int, int]
-    labels: tuple[str, ...]
+    labels: tuple[DotLabel, ...]
     residuals_mm: np.ndarray
     sigma_mm_per_unit: float
 
@@ -64,8 +65,8 @@ def find_scale(model: GroupModel, board: BoardDesign) -> Scale:
             "check that the camera file belongs to the images and the board file to the board"
         )
     labels = [model.labels[i] for i in members]
-    cells = np.array([[int(v) for v in label.split(":")[1:]] for label in labels])
-    xyz_board = np.column_stack([board.pitch_mm * cells[:, ::-1], np.zeros(len(cells))])
+    cells = dot_cells(labels)
+    xyz_board = board.places_mm(labels)
     xyz_world = model.xyz_world[members]
     try:
         board_from_world = align_similarity(xyz_board, xyz_world)

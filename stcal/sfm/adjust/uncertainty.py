@@ -11,7 +11,6 @@ from stcal.geometry.rigid import Rigid
 from stcal.sfm.adjust.chain import CalibratedTarget
 from stcal.sfm.adjust.faces import FrameKind, face_frame
 from stcal.sfm.adjust.joint import JointResult
-from stcal.sfm.data.observations import face_of
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -91,7 +90,7 @@ def derivatives(result: JointResult, start: CalibratedTarget, target: TargetDesi
             for sign in (1, -1):
                 xyz = result.xyz_world.copy()
                 xyz[i, axis] += sign * step
-                moved = _frames(result, xyz, start, target, kind, only=face_of(label))
+                moved = _frames(result, xyz, start, target, kind, only=label.face)
                 ends.append(_in_target_frame(own | moved, xyz, start))
             ahead, behind = ends
             twists.append({f: _perturbation(ahead[0][f], behind[0][f]) / (2 * step) for f in own})
@@ -114,9 +113,7 @@ def _frames(
     for face in target.faces:
         if face.id in start.target_from_face and only in (None, face.id):
             own = {
-                label.split(":", 1)[1]: xyz
-                for label, xyz in zip(result.labels, xyz_world, strict=True)
-                if face_of(label) == face.id
+                label.circle: xyz for label, xyz in zip(result.labels, xyz_world, strict=True) if label.face == face.id
             }
             frames[face.id] = face_frame(face, own, kind, start.target_from_face[face.id].rotation[:, 2])
     return frames

@@ -16,9 +16,10 @@ from stcal.errors import ConvergenceError
 from stcal.geometry.camera import Camera
 from stcal.geometry.rigid import Rigid
 from stcal.io.camera import intrinsic_basis
+from stcal.labels import DotLabel
 from stcal.sfm.adjust.blocks import image_cost, normalised, robust_weights, without_cameras
 from stcal.sfm.adjust.refine import eccentricity_px
-from stcal.sfm.camera.views import design_mm, start_pose
+from stcal.sfm.camera.views import start_pose
 from stcal.sfm.data.model import GroupModel
 from stcal.sfm.data.observations import ImageObservations, by_group
 
@@ -155,7 +156,7 @@ def adjust_intrinsics(
     basis = intrinsic_basis(colmap_model)
     state = _start_state(views, camera_of_view or [0] * len(views), board, start)
     own = [m.covariance_px2 for m in state.models]
-    design = {f: design_mm(m.labels, board) for f, m in zip(state.folder, state.models, strict=True)}
+    design = {f: board.places_mm(m.labels) for f, m in zip(state.folder, state.models, strict=True)}
     weight = np.linalg.inv(vague_prior(start, colmap_model))
     setting = _Setting(basis, weight, start, design, board.sigma_mm, np.inf)
     known, factors = factors, factors or SigmaFactors()
@@ -197,7 +198,7 @@ def _start_state(views, camera_of_view, board: BoardDesign, start: Camera) -> _S
     return _State(tuple(models), tuple(folders), tuple(which), (start,) * (max(which) + 1))
 
 
-def _model(folder: str, labels: tuple[str, ...], views, board: BoardDesign, camera: Camera) -> GroupModel:
+def _model(folder: str, labels: tuple[DotLabel, ...], views, board: BoardDesign, camera: Camera) -> GroupModel:
     """The views of a folder around its board, which stands still in the world."""
     place = {label: i for i, label in enumerate(labels)}
     rows = [(i, place[label], k) for i, v in enumerate(views) for k, label in enumerate(v.labels)]
@@ -207,7 +208,7 @@ def _model(folder: str, labels: tuple[str, ...], views, board: BoardDesign, came
         tuple(v.name for v in views),
         tuple(start_pose(v, board, camera) for v in views),
         labels,
-        design_mm(labels, board),
+        board.places_mm(labels),
         image_index,
         point_index,
         keypoint,

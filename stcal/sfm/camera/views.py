@@ -5,10 +5,11 @@ from dataclasses import replace
 
 import numpy as np
 
-from stcal.design import BoardDesign, board_label
+from stcal.design import BoardDesign
 from stcal.geometry.camera import Camera
 from stcal.geometry.plane import apply_homography, camera_from_plane, fit_homography, refine_planar_pose
 from stcal.geometry.rigid import Rigid
+from stcal.labels import DotLabel
 from stcal.sfm.data.observations import ImageObservations, by_group
 from stcal.sfm.detect.files import DetectedImage
 
@@ -55,19 +56,11 @@ def start_pose(image: ImageObservations, board: BoardDesign, camera: Camera) -> 
         The dots do not determine it.
     """
     pose = camera_from_plane(_homography(image, board, camera))
-    return refine_planar_pose(
-        pose, design_mm(image.labels, board)[:, :2], camera.normalised_from_pixel(image.centre_px)
-    )
-
-
-def design_mm(labels: Sequence[str], board: BoardDesign) -> np.ndarray:
-    """Places of dots, (n, 3), board frame."""
-    cells = np.array([[int(v) for v in label.split(":")[1:]] for label in labels])
-    return np.column_stack([board.pitch_mm * cells[:, ::-1], np.zeros(len(cells))])
+    return refine_planar_pose(pose, board.places_mm(image.labels)[:, :2], camera.normalised_from_pixel(image.centre_px))
 
 
 def _homography(image: ImageObservations, board: BoardDesign, camera: Camera) -> np.ndarray:
-    return fit_homography(design_mm(image.labels, board)[:, :2], camera.normalised_from_pixel(image.centre_px))
+    return fit_homography(board.places_mm(image.labels)[:, :2], camera.normalised_from_pixel(image.centre_px))
 
 
 def board_views(images: Sequence[DetectedImage], board: BoardDesign, camera: Camera) -> list[ImageObservations]:
@@ -82,7 +75,7 @@ def board_views(images: Sequence[DetectedImage], board: BoardDesign, camera: Cam
         count = image.detection.numberings.shape[1]
         if count:
             dots = image.detection.centres.select(np.arange(-count, 0))
-            labels = tuple(board_label(0, i) for i in range(count))
+            labels = tuple(DotLabel(0, i) for i in range(count))
             views.append(
                 ImageObservations(
                     image.file.name,
@@ -101,9 +94,7 @@ def board_views(images: Sequence[DetectedImage], board: BoardDesign, camera: Cam
         settled |= {
             v.name: numberings[v.name][choice] for v, choice in zip(members, _choose_alike(fields), strict=True)
         }
-    return [
-        replace(v, labels=tuple(board_label(row, column) for row, column in settled[v.name].tolist())) for v in views
-    ]
+    return [replace(v, labels=tuple(DotLabel(row, column) for row, column in settled[v.name].tolist())) for v in views]
 
 
 def _deviations(numberings: np.ndarray, xy_normalised: np.ndarray, board: BoardDesign) -> np.ndarray:

@@ -8,11 +8,11 @@ import numpy as np
 from stcal.design import BoardDesign, TargetDesign
 from stcal.geometry.align import align_similarity
 from stcal.geometry.rigid import skew
+from stcal.labels import DotLabel, dot_cells
 from stcal.sfm.adjust.chain import CalibratedTarget
 from stcal.sfm.adjust.network import Network
 from stcal.sfm.checks.radii import Radii, Size, size_by_radii
 from stcal.sfm.checks.verdict import Check, Measured, Trial, impossible, judge
-from stcal.sfm.data.observations import is_board
 
 DESIGN_SCALE = 1e-4
 """σ of the target's size as a whole against its design: what 4 K do to aluminium, or a printer to a film."""
@@ -25,7 +25,7 @@ def board_checks(networks: Sequence[Network], board: BoardDesign) -> list[Check]
     against the rest, where a board that is as a whole worse than stated is judged by its own measure."""
     whole, lines = [], []
     for network in networks:
-        dots = np.array([i for i, label in enumerate(network.model.labels) if is_board(label)])
+        dots = np.array([i for i, label in enumerate(network.model.labels) if isinstance(label, DotLabel)])
         if len(dots) < MIN_DOTS:
             continue
         gap, weight, cells = _board_gap(network, dots, board)
@@ -48,8 +48,8 @@ def board_checks(networks: Sequence[Network], board: BoardDesign) -> list[Check]
 def _board_gap(network: Network, dots: np.ndarray, board: BoardDesign):
     """Dots less grid after a similarity, (3d,) mm, board frame; its inverse covariance (pseudo); cells (d, 2)."""
     labels = [network.model.labels[i] for i in dots]
-    cells = np.array([[int(v) for v in label.split(":")[1:]] for label in labels])
-    design = np.column_stack([board.pitch_mm * cells[:, ::-1], np.zeros(len(cells))])
+    cells = dot_cells(labels)
+    design = board.places_mm(labels)
     xyz = network.model.xyz_world[dots]
     board_from_world = align_similarity(design, xyz)
     turn = np.kron(np.eye(len(dots)), board_from_world.scale * board_from_world.rigid.rotation)

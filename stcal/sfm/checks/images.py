@@ -8,10 +8,10 @@ from scipy.stats import f as fisher
 from stcal.geometry.camera import Camera
 from stcal.geometry.rigid import skew
 from stcal.io.camera import CameraPrior, intrinsic_basis
+from stcal.labels import CircleLabel
 from stcal.sfm.adjust.calibration import Calibration
 from stcal.sfm.adjust.network import Network, solve_score
 from stcal.sfm.checks.verdict import SUSPICIOUS, Check, Measured, Trial, judge
-from stcal.sfm.data.observations import is_board
 
 MIN_CIRCLES = 3
 """Of the faces, and of the board, in an image that can tell whether the one moved against the other."""
@@ -182,7 +182,7 @@ def moved_check(networks: Sequence[Network]) -> Check:
     trials = []
     for network in networks:
         model = network.model
-        on_face = np.array([not is_board(label) for label in model.labels])
+        on_face = np.array([isinstance(label, CircleLabel) for label in model.labels])
         if on_face.all() or not on_face.any():
             continue
         middle = model.xyz_world[on_face].mean(0)

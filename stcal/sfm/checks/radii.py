@@ -8,9 +8,10 @@ import numpy as np
 from stcal.geometry.arrays import frozen
 from stcal.geometry.camera import Camera
 from stcal.geometry.plane import fit_plane
+from stcal.labels import CircleLabel, DotLabel, Label
 from stcal.sfm.adjust.network import Network
 from stcal.sfm.checks.verdict import Check, Trial, judge
-from stcal.sfm.data.observations import ImageObservations, is_board
+from stcal.sfm.data.observations import ImageObservations
 
 EDGE_BIAS_PX = 0.05
 """σ of what light, lens and threshold add to all radii alike; it moves no centre."""
@@ -32,7 +33,7 @@ class Radii:
     radius in the images, geometric mean of the ellipse's axes, median.
     """
 
-    labels: tuple[str, ...]
+    labels: tuple[Label, ...]
     design_mm: np.ndarray
     ratio: np.ndarray
     size_px: np.ndarray
@@ -45,7 +46,8 @@ class Radii:
         """Places of circles that are made alike, by name."""
         found: dict[str, list[int]] = {}
         for i, (label, radius) in enumerate(zip(self.labels, self.design_mm, strict=True)):
-            found.setdefault(f"{'dots' if is_board(label) else 'circles'} of radius {radius:g} mm", []).append(i)
+            kind = "dots" if isinstance(label, DotLabel) else "circles"
+            found.setdefault(f"{kind} of radius {radius:g} mm", []).append(i)
         return {name: np.array(members) for name, members in found.items()}
 
 
@@ -60,7 +62,7 @@ class Size:
 
 
 def measure_radii(
-    networks: Sequence[Network], images: Sequence[ImageObservations], design_mm: dict[str, float], camera: Camera
+    networks: Sequence[Network], images: Sequence[ImageObservations], design_mm: dict[Label, float], camera: Camera
 ) -> Radii:
     """Radii from the ellipses' areas and the circles' places and planes."""
     shapes = {image.name: image.shape for image in images}
@@ -137,7 +139,7 @@ def radius_checks(radii: Radii) -> list[Check]:
 
 def size_by_radii(radii: Radii) -> Size | None:
     """Slope of measured over designed radii of the target's circles, less 1; None where all are alike."""
-    own = np.array([not is_board(label) for label in radii.labels])
+    own = np.array([isinstance(label, CircleLabel) for label in radii.labels])
     size = radii.size_px[own]
     design = radii.design_mm[own]
     if len(size) < MIN_PEERS or np.ptp(design) == 0:

@@ -7,7 +7,8 @@ import numpy as np
 from stcal.geometry.arrays import frozen
 from stcal.geometry.camera import Camera
 from stcal.geometry.rigid import Rigid, Similarity
-from stcal.sfm.data.observations import ImageObservations, face_of, is_board
+from stcal.labels import Label, parse_labels
+from stcal.sfm.data.observations import ImageObservations
 
 _PER_OBSERVATION = ("image_index", "point_index", "keypoint", "measured_px", "shift_px", "covariance_px2")
 MIN_POINTS = 6
@@ -19,7 +20,7 @@ class Outlier:
     """An observation that is left out: it contradicts all others."""
 
     image: str
-    label: str
+    label: Label
     residual_px: float
     limit_px: float
 
@@ -37,7 +38,7 @@ class GroupModel:
     group: str
     images: tuple[str, ...]
     camera_from_world: tuple[Rigid, ...]
-    labels: tuple[str, ...]
+    labels: tuple[Label, ...]
     xyz_world: np.ndarray
     image_index: np.ndarray
     point_index: np.ndarray
@@ -47,6 +48,7 @@ class GroupModel:
     covariance_px2: np.ndarray
 
     def __post_init__(self):
+        object.__setattr__(self, "labels", parse_labels(self.labels))
         n = len(self.image_index)
         object.__setattr__(self, "xyz_world", frozen(self.xyz_world, (len(self.labels), 3), "points"))
         for name, shape in (("measured_px", (n, 2)), ("shift_px", (n, 2)), ("covariance_px2", (n, 2, 2))):
@@ -109,7 +111,7 @@ class GroupModel:
         """Indices of the points of every face, and of the board under ``board``."""
         members: dict[str, list[int]] = {}
         for i, label in enumerate(self.labels):
-            members.setdefault("board" if is_board(label) else face_of(label), []).append(i)
+            members.setdefault(label.plane, []).append(i)
         return {key: np.array(indices) for key, indices in members.items()}
 
     def without(self, drop: np.ndarray) -> "GroupModel":

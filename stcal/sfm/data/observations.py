@@ -7,8 +7,8 @@ from dataclasses import dataclass, fields
 
 import numpy as np
 
-from stcal.design import BOARD
 from stcal.geometry.arrays import frozen
+from stcal.labels import CircleLabel, Label, parse_labels
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -21,13 +21,14 @@ class ImageObservations:
 
     name: str
     group: str
-    labels: tuple[str, ...]
+    labels: tuple[Label, ...]
     centre_px: np.ndarray
     centre: np.ndarray
     shape: np.ndarray
     covariance_px2: np.ndarray
 
     def __post_init__(self):
+        object.__setattr__(self, "labels", parse_labels(self.labels))
         n = len(self.labels)
         for field, shape in (("centre_px", (n, 2)), ("centre", (n, 2)), ("shape", (n, 2, 2))):
             object.__setattr__(self, field, frozen(getattr(self, field), shape, field))
@@ -42,7 +43,7 @@ class ImageObservations:
 
     def face_ids(self) -> list[str]:
         """Faces of the target that the labels name, in order."""
-        return list(dict.fromkeys(face_of(label) for label in self.labels if not is_board(label)))
+        return list(dict.fromkeys(label.face for label in self.labels if isinstance(label, CircleLabel)))
 
     def select(self, keep) -> "ImageObservations":
         """Those of the indices ``keep``."""
@@ -56,16 +57,6 @@ def by_group(observations: Sequence[ImageObservations]) -> dict[str, list[ImageO
     for image in observations:
         groups.setdefault(image.group, []).append(image)
     return groups
-
-
-def is_board(label: str) -> bool:
-    """Whether a label names a dot of the board."""
-    return label.startswith(BOARD + ":")
-
-
-def face_of(label: str) -> str:
-    """Face id of a target label."""
-    return label.split(":", 1)[0]
 
 
 def detections_csv(observations: list[ImageObservations]) -> str:

@@ -18,6 +18,7 @@ from stcal.geometry.camera import Camera
 from stcal.io.camera import CameraModel
 from stcal.io.images import ImageFile, Skipped, decode, grey_8bit, thumbnail
 from stcal.io.saving import save
+from stcal.labels import parse_labels
 from stcal.parallel import run_parallel
 from stcal.sfm.detect.centres import Centres
 from stcal.sfm.detect.ellipses import EllipseOptions
@@ -214,14 +215,14 @@ def _load(file: ImageFile, path: Path, reused: bool) -> DetectedImage | None:
             meta = json.loads(stored["meta"].tobytes())
             detection = ImageDetection(
                 Centres(*(stored[f.name] for f in fields(Centres))),
-                tuple(meta["target_labels"]),
+                parse_labels(meta["target_labels"]),
                 stored["numberings"],
                 tuple(meta["notes"]),
                 tuple(meta["repeated"]),
                 meta["candidates"],
             )
             return DetectedImage(file, detection, meta["digest"], stored["thumbnail"].tobytes(), meta["scale"], reused)
-    except (OSError, ValueError, KeyError, EOFError, TypeError, zipfile.BadZipFile, zlib.error):
+    except (OSError, InputError, ValueError, KeyError, EOFError, TypeError, zipfile.BadZipFile, zlib.error):
         if not reused:
             raise
         return None

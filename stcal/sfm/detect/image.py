@@ -7,6 +7,7 @@ import numpy as np
 from stcal.design import BoardDesign, Polarity, TargetDesign
 from stcal.geometry.camera import Camera
 from stcal.io.images import grey_8bit, grey_fine
+from stcal.labels import CircleLabel
 from stcal.sfm.detect.board import BoardReading, find_boards
 from stcal.sfm.detect.candidates import Candidates
 from stcal.sfm.detect.centres import Centres, measure_centres
@@ -29,7 +30,7 @@ class ImageDetection:
     """
 
     centres: Centres
-    target_labels: tuple[str, ...]
+    target_labels: tuple[CircleLabel, ...]
     numberings: np.ndarray
     notes: tuple[str, ...] = ()
     repeated: tuple[str, ...] = ()
@@ -37,7 +38,7 @@ class ImageDetection:
 
     def face_ids(self) -> list[str]:
         """Faces seen, in order of their labels."""
-        return list(dict.fromkeys(label.split(":")[0] for label in self.target_labels))
+        return list(dict.fromkeys(label.face for label in self.target_labels))
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -126,7 +127,7 @@ def _rows(labels, centres: Centres):
     return zip(labels, centres.rim, centres.ok, strict=True)
 
 
-def _rim_note(label: str, rim: float) -> str:
+def _rim_note(label: CircleLabel, rim: float) -> str:
     return (
         f"{label}: {100 * rim:.0f} % of its rim follows an ellipse, 80 % needed; partly hidden or disturbed, left out"
     )

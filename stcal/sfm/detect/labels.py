@@ -5,10 +5,11 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from stcal.design import BoardDesign, FaceDesign, TargetDesign, board_label
+from stcal.design import BoardDesign, FaceDesign, TargetDesign
 from stcal.errors import DegenerateError
 from stcal.geometry.plane import camera_from_plane, fit_homography, refine_planar_pose
 from stcal.geometry.rigid import Rigid
+from stcal.labels import DotLabel, Label
 from stcal.sfm.data.observations import ImageObservations
 from stcal.sfm.detect.image import ImageDetection
 
@@ -35,11 +36,11 @@ def label_group(
     labelled = []
     for i, (name, group, detection) in enumerate(images):
         notes = list(detection.notes)
-        labels = list(detection.target_labels)
+        labels: list[Label] = list(detection.target_labels)
         keep = np.arange(len(labels))
         if i in chosen:
             numbering = detection.numberings[chosen[i]]
-            labels += [board_label(row, column) for row, column in numbering.tolist()]
+            labels += [DotLabel(row, column) for row, column in numbering.tolist()]
             keep = np.arange(len(labels))
         elif len(detection.numberings):
             notes.append(

@@ -3,8 +3,8 @@
 import cv2
 import numpy as np
 
-from stcal.design import BOARD
-from stcal.sfm.data.observations import ImageObservations, face_of, is_board
+from stcal.labels import BOARD, CircleLabel, DotLabel
+from stcal.sfm.data.observations import ImageObservations
 
 # OpenCV's order: blue, green, red. The palette of Okabe & Ito (2008), for all kinds of colour vision.
 PALETTE = [(0, 159, 230), (115, 158, 0), (66, 228, 240), (167, 121, 204), (0, 94, 213), (178, 114, 0)]
@@ -38,13 +38,13 @@ def draw_overlay(
     colours = {face: PALETTE[i % len(PALETTE)] for i, face in enumerate(faces)} | {BOARD: BOARD_COLOUR}
     numbered = _numbered_dots(observations, MIN_LABEL_GAP * size / scale)
     for label, centre, shape in zip(observations.labels, observations.centre_px, observations.shape, strict=True):
-        key = BOARD if is_board(label) else face_of(label)
+        key = label.plane
         rim = _rim(centre, shape * focal_px[:, None], scale)
         cv2.polylines(picture, [rim], True, colours[key], 1, cv2.LINE_AA, shift=4)
         at = ((centre + 0.5) * scale - 0.5).round().astype(int)
         cv2.drawMarker(picture, at.tolist(), colours[key], cv2.MARKER_CROSS, 5, 1, cv2.LINE_AA)
-        text = label.split(":", 1)[1].replace(":", ",")
-        if label in numbered or not is_board(label):
+        text = f"{label.row},{label.column}" if isinstance(label, DotLabel) else label.circle
+        if label in numbered or isinstance(label, CircleLabel):
             reach = np.abs(shape * focal_px[:, None]).sum(1).max() * scale
             _text(picture, text, (at[0] + int(0.75 * reach) + 1, at[1] - int(0.75 * reach)), size, colours[key])
     _name_faces(picture, observations, scale, colours, size)
@@ -60,12 +60,14 @@ def draw_overlay(
     return jpeg.tobytes()
 
 
-def _numbered_dots(observations: ImageObservations, gap_px: float) -> set[str]:
+def _numbered_dots(observations: ImageObservations, gap_px: float) -> set[DotLabel]:
     """Dots of the first row and column that carry their number: the first and last, and all where there is room."""
-    place = {x: p for x, p in zip(observations.labels, observations.centre_px, strict=True) if is_board(x)}
+    place = {x: p for x, p in zip(observations.labels, observations.centre_px, strict=True) if isinstance(x, DotLabel)}
     chosen = set()
-    for axis in (1, 2):
-        line = [x for x in sorted(place, key=lambda x: int(x.split(":")[axis])) if x.split(":")[3 - axis] == "0"]
+    for line in (
+        sorted((x for x in place if x.column == 0), key=lambda x: x.row),
+        sorted((x for x in place if x.row == 0), key=lambda x: x.column),
+    ):
         if line:
             steps = np.linalg.norm(np.diff([place[x] for x in line], axis=0), axis=1)
             roomy = len(line) > 1 and np.median(steps) > gap_px
@@ -82,7 +84,7 @@ def _rim(centre_px: np.ndarray, shape_px: np.ndarray, scale: float) -> np.ndarra
 
 def _name_faces(picture, observations: ImageObservations, scale: float, colours: dict, size: float) -> None:
     for face in observations.face_ids():
-        members = [i for i, label in enumerate(observations.labels) if face_of(label) == face and not is_board(label)]
+        members = [i for i, x in enumerate(observations.labels) if isinstance(x, CircleLabel) and x.face == face]
         low, high = observations.centre_px[members].min(0), observations.centre_px[members].max(0)
         at = (np.array([(low[0] + high[0]) / 2, low[1]]) * scale).astype(int)
         _text(picture, f"face {face}", (at[0] - int(45 * size), at[1] - int(45 * size)), 1.5 * size, colours[face])

@@ -9,11 +9,12 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from stcal.design import BOARD, BoardDesign, TargetDesign
+from stcal.design import BoardDesign, TargetDesign
 from stcal.geometry.arrays import frozen
 from stcal.geometry.camera import Camera
 from stcal.geometry.plane import apply_homography, homography_jacobian
 from stcal.io.images import grey_8bit, grey_fine
+from stcal.labels import BOARD
 from stcal.sfm.detect.board import needed_dots
 from stcal.sfm.detect.candidates import (
     MAX_POSITION_ERROR,

@@ -5,7 +5,7 @@ from collections.abc import Iterable
 from dataclasses import asdict, dataclass
 from itertools import groupby
 
-from stcal.sfm.data.observations import face_of, is_board
+from stcal.labels import BOARD, DotLabel, parse_label, parse_labels
 
 AT_MOST = ("max_diameter", "outline_area", "outline_deviation", "position", "shape", "face_readings", "residual")
 """Gates whose limit is the largest value allowed; those of the others are the smallest needed."""
@@ -95,7 +95,7 @@ def in_order(findings: Iterable[Finding]) -> tuple[Finding, ...]:
 
 def _key(finding: Finding) -> tuple[str, ...]:
     """What findings of one line have in common."""
-    plane = face_of(finding.labels[0]) if finding.labels else ""
+    plane = parse_label(finding.labels[0]).plane if finding.labels else ""
     advised = finding.remedy.partition("%")[2] or finding.remedy
     return finding.image, plane, finding.gate, *finding.options[:1], advised
 
@@ -205,10 +205,9 @@ def _listed(labels: list[str]) -> str:
     """Labels, dots of one row of the board as ``board:2:0–5``."""
     parts: list[str] = []
     dots: dict[str, list[int]] = {}
-    for label in labels:
-        if is_board(label):
-            row, column = label.rsplit(":", 1)
-            dots.setdefault(row, []).append(int(column))
+    for label in parse_labels(labels):
+        if isinstance(label, DotLabel):
+            dots.setdefault(f"{BOARD}:{label.row}", []).append(label.column)
         else:
             parts.append(label)
     for row, columns in dots.items():

@@ -2,11 +2,12 @@
 
 import numpy as np
 
-from stcal.design import BOARD, BoardDesign, TargetDesign
+from stcal.design import BoardDesign, TargetDesign
 from stcal.errors import DegenerateError
 from stcal.geometry.align import align_rigid
 from stcal.geometry.camera import Camera
 from stcal.geometry.rigid import Rigid
+from stcal.labels import BOARD
 from stcal.sfm.data.model import GroupModel
 from stcal.sfm.data.observations import ImageObservations
 from stcal.sfm.diagnose.examine import Expected

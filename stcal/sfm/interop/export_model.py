@@ -14,7 +14,7 @@ import pycolmap
 
 from stcal.design import TargetDesign
 from stcal.errors import InputError
-from stcal.sfm.data.observations import face_of, is_board
+from stcal.labels import DotLabel, Label
 from stcal.sfm.mapping.database import colmap_camera, from_colmap_px
 from stcal.sfm.mapping.models import open_model, rigid_from_colmap
 from stcal.sfm.run.saved import SavedRun, load_run
@@ -57,7 +57,7 @@ class _Point:
 
     id: int
     group: str
-    label: str
+    label: Label
     xyz: list[float]
     rgb: tuple[int, int, int]
     views: tuple[tuple[int, int], ...]
@@ -153,7 +153,7 @@ def _labelled_points(run: SavedRun) -> tuple[pycolmap.Reconstruction, list[_Poin
             raise InputError(f"model {path}: point {point_id} is of {len(names)} labels, 1 needed; run it again")
         label = names.pop()
         groups = {image_of[image_id].group for image_id, _ in views}
-        colour = BOARD_RGB if is_board(label) else rgb[face_of(label)]
+        colour = BOARD_RGB if isinstance(label, DotLabel) else rgb[label.face]
         point.color = np.array(colour, np.uint8)
         group = groups.pop() if len(groups) == 1 else ""
         points.append(_Point(point_id, group, label, point.xyz.tolist(), colour, views))

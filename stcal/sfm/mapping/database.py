@@ -12,7 +12,8 @@ import pycolmap
 from stcal.errors import InputError
 from stcal.geometry.camera import Camera
 from stcal.io.camera import COLMAP_PIXEL_ORIGIN, colmap_params
-from stcal.sfm.data.observations import ImageObservations, is_board
+from stcal.labels import CircleLabel
+from stcal.sfm.data.observations import ImageObservations
 
 CAMERA_ID = 1
 RIG_ID = 1
@@ -50,7 +51,9 @@ def match_labels(a: ImageObservations, b: ImageObservations) -> np.ndarray:
     where = {label: j for j, label in enumerate(b.labels)}
     same_board = a.group == b.group
     pairs = [
-        (i, where[label]) for i, label in enumerate(a.labels) if label in where and (same_board or not is_board(label))
+        (i, where[label])
+        for i, label in enumerate(a.labels)
+        if label in where and (same_board or isinstance(label, CircleLabel))
     ]
     return np.array(pairs, dtype=np.uint32).reshape(-1, 2)
 

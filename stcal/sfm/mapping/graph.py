@@ -17,7 +17,8 @@ from scipy.sparse.csgraph import connected_components
 from stcal.design import BoardDesign
 from stcal.errors import DegenerateError
 from stcal.geometry.plane import camera_from_plane, fit_homography
-from stcal.sfm.data.observations import ImageObservations, is_board
+from stcal.labels import DotLabel
+from stcal.sfm.data.observations import ImageObservations
 
 GraphKind = Literal["all", "sparse"]
 SPARSE_FROM = 80
@@ -75,7 +76,7 @@ def incidence(observations: Sequence[ImageObservations]) -> np.ndarray:
     rows, columns = [], []
     for i, image in enumerate(observations):
         for label in image.labels:
-            columns.append(column.setdefault((image.group if is_board(label) else "", label), len(column)))
+            columns.append(column.setdefault((image.group if isinstance(label, DotLabel) else "", label), len(column)))
         rows += [i] * len(image)
     seen = np.zeros((len(observations), len(column)), bool)
     seen[rows, columns] = True
@@ -84,11 +85,11 @@ def incidence(observations: Sequence[ImageObservations]) -> np.ndarray:
 
 def _direction(image: ImageObservations, board: BoardDesign) -> np.ndarray:
     """Unit vector (3,) from the board's middle to the camera, board frame; nan where the board does not tell."""
-    dots = [k for k, label in enumerate(image.labels) if is_board(label)]
+    dots = [k for k, label in enumerate(image.labels) if isinstance(label, DotLabel)]
     if len(dots) >= MIN_DOTS:
-        cells = np.array([[int(v) for v in image.labels[k].split(":")[1:]] for k in dots], float)
+        design = board.places_mm(image.labels[k] for k in dots)[:, :2]
         try:
-            camera_from_board = camera_from_plane(fit_homography(board.pitch_mm * cells[:, ::-1], image.centre[dots]))
+            camera_from_board = camera_from_plane(fit_homography(design, image.centre[dots]))
         except DegenerateError:
             return np.full(3, np.nan)
         middle = board.pitch_mm * np.array([board.columns - 1, board.rows - 1, 0]) / 2

@@ -13,8 +13,9 @@ from stcal.errors import InputError
 from stcal.geometry.camera import Camera
 from stcal.geometry.rigid import Rigid
 from stcal.io.camera import camera_from_colmap
+from stcal.labels import DotLabel
 from stcal.sfm.data.model import GroupModel
-from stcal.sfm.data.observations import ImageObservations, is_board
+from stcal.sfm.data.observations import ImageObservations
 from stcal.sfm.mapping.database import CAMERA_ID, colmap_camera, from_colmap_px, to_colmap_px
 
 LOG_NOTHING = 4
@@ -324,7 +325,7 @@ def _labels_of_points(reconstruction, place, observations) -> tuple[dict[int, tu
         for element in point.track.elements:
             image = observations[place[reconstruction.image(element.image_id).name]]
             label = image.labels[element.point2D_idx]
-            names.add((image.group if is_board(label) else "", label))
+            names.add((image.group if isinstance(label, DotLabel) else "", label))
         if len(names) == 1:
             found[point_id] = names.pop()
         else:

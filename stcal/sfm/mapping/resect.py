@@ -5,6 +5,7 @@ import pycolmap
 
 from stcal.geometry.camera import Camera
 from stcal.geometry.rigid import Rigid
+from stcal.labels import Label
 from stcal.sfm.data.model import MIN_POINTS, GroupModel
 from stcal.sfm.data.observations import ImageObservations
 from stcal.sfm.mapping.models import rigid_from_colmap
@@ -35,7 +36,9 @@ def complete(model: GroupModel, group: list[ImageObservations], camera: Camera, 
     return assemble(model.group, placed, [poses[image.name] for image in placed], xyz)
 
 
-def assemble(group: str, images: list[ImageObservations], poses: list[Rigid], xyz: dict[str, np.ndarray]) -> GroupModel:
+def assemble(
+    group: str, images: list[ImageObservations], poses: list[Rigid], xyz: dict[Label, np.ndarray]
+) -> GroupModel:
     """The model of placed images and labelled points with all observations that they have of one another."""
     labels = sorted(xyz)
     index = {label: i for i, label in enumerate(labels)}
@@ -59,7 +62,9 @@ def assemble(group: str, images: list[ImageObservations], poses: list[Rigid], xy
     )
 
 
-def _resect(image: ImageObservations, xyz: dict[str, np.ndarray], camera: Camera, max_error_px: float) -> Rigid | None:
+def _resect(
+    image: ImageObservations, xyz: dict[Label, np.ndarray], camera: Camera, max_error_px: float
+) -> Rigid | None:
     known = [k for k, label in enumerate(image.labels) if label in xyz]
     if len(known) < MIN_POINTS:
         return None
@@ -76,7 +81,7 @@ def _resect(image: ImageObservations, xyz: dict[str, np.ndarray], camera: Camera
     return rigid_from_colmap(answer["cam_from_world"])
 
 
-def _triangulated(images: list[ImageObservations], poses: dict[str, Rigid], known) -> dict[str, np.ndarray]:
+def _triangulated(images: list[ImageObservations], poses: dict[str, Rigid], known) -> dict[Label, np.ndarray]:
     """Circles that are not known, each where its rays meet best (least squares of distances), by label."""
     rays: dict[str, list[tuple[np.ndarray, np.ndarray]]] = {}
     for image in images:

@@ -6,8 +6,8 @@ from stcal.errors import ConvergenceError, DegenerateError
 from stcal.geometry.plane import camera_from_plane, fit_homography
 from stcal.geometry.pose_descent import Minima, PoseStack
 from stcal.geometry.rigid import Rigid
+from stcal.labels import CircleLabel
 from stcal.sfm.data.model import Outlier
-from stcal.sfm.data.observations import face_of
 from stcal.sfm.measure.problem import PoseProblem, descend, step_between, whitening_by_centre
 from stcal.sfm.measure.target import TargetCircles
 
@@ -27,11 +27,13 @@ SAME = 1.0
 """Minima nearer than this, in σ, are one: its covariance covers both."""
 
 
-def start_pose(names: list[str], problem: PoseProblem, target: TargetCircles, where: str) -> tuple[PoseStack, Rigid]:
+def start_pose(
+    names: list[CircleLabel], problem: PoseProblem, target: TargetCircles, where: str
+) -> tuple[PoseStack, Rigid]:
     """Pose by the homography of the face with the most circles, and target_from_plane of that face."""
     faces: dict[str, list[int]] = {}
     for i, name in enumerate(names):
-        faces.setdefault(face_of(name), []).append(i)
+        faces.setdefault(name.face, []).append(i)
     by_size = sorted((f for f in faces if f in target.target_from_plane), key=lambda f: -len(faces[f]))
     if not by_size or len(faces[by_size[0]]) < MIN_CIRCLES:
         seen = f"{len(faces[by_size[0]])} of face {by_size[0]}" if by_size else "0"
@@ -70,10 +72,10 @@ def mirrored(poses: PoseStack, target_from_plane: Rigid) -> PoseStack:
     return PoseStack(rotation, middle - rotation @ target_from_plane.translation)
 
 
-def minima_without_outliers(problem: PoseProblem, start: PoseStack, plane: Rigid, names: list[str], where: str):
+def minima_without_outliers(problem: PoseProblem, start: PoseStack, plane: Rigid, names: list[CircleLabel], where: str):
     """The minima by single centres without those that contradict the others, the indices kept, and the outliers."""
     keep, outliers = np.arange(len(names)), []
-    alone = len({face_of(name) for name in names}) == 1
+    alone = len({name.face for name in names}) == 1
     poses = start.plus(mirrored(start, plane))
     while True:
         part = problem if len(keep) == len(names) else problem.select(keep)

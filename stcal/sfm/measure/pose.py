@@ -18,8 +18,8 @@ from stcal.geometry.camera import Camera
 from stcal.geometry.pose_descent import Minima, PoseStack, block_diagonal
 from stcal.geometry.rigid import Rigid
 from stcal.io.camera import CameraPrior, intrinsic_basis
+from stcal.labels import CircleLabel, parse_labels
 from stcal.sfm.data.model import Outlier
-from stcal.sfm.data.observations import face_of, is_board
 from stcal.sfm.data.projection import CircleImages
 from stcal.sfm.measure.likelihood import spread
 from stcal.sfm.measure.minima import HUBER, MIN_CIRCLES, distinct, minima_without_outliers, start_pose
@@ -82,7 +82,7 @@ class TargetPose:
     by_intrinsics: np.ndarray
     status: Status
     faces: tuple[str, ...]
-    labels: tuple[str, ...]
+    labels: tuple[CircleLabel, ...]
     residuals_px: np.ndarray
     weights: np.ndarray
     outliers: tuple[Outlier, ...]
@@ -137,7 +137,7 @@ def pose_from_circles(
 
     Parameters
     ----------
-    labels : n labels ``face:circle``; dots of the board are passed over
+    labels : n labels ``face:circle``, or texts of that form; dots of the board are passed over
     centre_px : (n, 2) ellipse centres in the image as it is, px
     covariance_px2 : (n, 2, 2) their own, without the σ factor
     prior : covariance of the intrinsics, which are exact where None
@@ -153,6 +153,7 @@ def pose_from_circles(
         No minimum is reached.
     """
     options = options or PoseOptions()
+    labels = parse_labels(labels)
     used, problem = _problem(labels, centre_px, covariance_px2, target, camera, options, prior, where)
     names = [labels[i] for i in used]
     start, plane = start_pose(names, problem, target, where)
@@ -173,7 +174,7 @@ def _problem(labels, centre_px, covariance_px2, target: TargetCircles, camera, o
     """Indices of the target's circles among the labels, and the problem that they make."""
     n = len(labels)
     centre, noise = frozen(centre_px, (n, 2), "centres"), frozen(covariance_px2, (n, 2, 2), "centres' covariance")
-    used = [i for i, label in enumerate(labels) if not is_board(label)]
+    used = [i for i, label in enumerate(labels) if isinstance(label, CircleLabel)]
     used.sort(key=lambda i: target.place.get(labels[i], -1))
     if len({labels[i] for i in used}) < len(used):
         raise InputError(f"{where}: a label twice; every circle is seen once")
@@ -229,11 +230,11 @@ def _gain(image: CircleImages, full: np.ndarray) -> np.ndarray:
 
 
 def _answer(
-    problem: PoseProblem, found: Minima, names: list[str], plane: Rigid, dof: int, options: PoseOptions
+    problem: PoseProblem, found: Minima, names: list[CircleLabel], plane: Rigid, dof: int, options: PoseOptions
 ) -> TargetPose:
     """Decide between the minima, or what there is of a second one, and collect."""
     delta, rival = _rivalry(problem, found, dof)
-    alone = rival is None and len({face_of(name) for name in names}) == 1
+    alone = rival is None and len({name.face for name in names}) == 1
     pose = _weighed(problem, found, 0, rival, names, dof, plane if alone else None, options)
     needed = options.needed(pose.chi2_per_dof())
     pose = replace(pose, delta_chi2=min(delta, pose.delta_chi2), needed_chi2=needed)
@@ -272,7 +273,7 @@ def _weighed(
     found: Minima,
     row: int,
     other: PoseStack | None,
-    names: list[str],
+    names: list[CircleLabel],
     dof: int,
     plane: Rigid | None,
     options: PoseOptions,
@@ -308,7 +309,7 @@ def _weighed(
         by_circles,
         by_intrinsics,
         "ambiguous",
-        tuple(dict.fromkeys(face_of(name) for name in names)),
+        tuple(dict.fromkeys(name.face for name in names)),
         tuple(names),
         problem.in_px(last.residual[0]),
         weights,

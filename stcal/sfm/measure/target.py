@@ -12,8 +12,8 @@ from stcal.geometry.align import align_rigid
 from stcal.geometry.arrays import frozen
 from stcal.geometry.plane import fit_plane
 from stcal.geometry.rigid import Rigid
+from stcal.labels import CircleLabel, circle_labels
 from stcal.sfm.adjust.chain import CalibratedTarget
-from stcal.sfm.data.observations import face_of
 
 SAME_DESIGN_MM = 0.5
 """RMS by which a face's circles may differ from the design: made to a tenth of that, and drawn to far more."""
@@ -39,7 +39,7 @@ class TargetCircles:
         A wrong shape or number, a label twice, or a covariance that is none.
     """
 
-    labels: tuple[str, ...]
+    labels: tuple[CircleLabel, ...]
     xyz: np.ndarray
     radius: np.ndarray
     covariance: np.ndarray
@@ -47,9 +47,10 @@ class TargetCircles:
     notes: tuple[str, ...] = ()
     normal: np.ndarray = field(init=False)
     target_from_plane: dict[str, Rigid] = field(init=False)
-    place: dict[str, int] = field(init=False)
+    place: dict[CircleLabel, int] = field(init=False)
 
     def __post_init__(self):
+        object.__setattr__(self, "labels", circle_labels(self.labels))
         c = len(self.labels)
         object.__setattr__(self, "xyz", frozen(self.xyz, (c, 3), "circles"))
         object.__setattr__(self, "radius", frozen(self.radius, (c,), "radii"))
@@ -60,8 +61,8 @@ class TargetCircles:
         if not (np.isfinite(self.sigma_factor) and self.sigma_factor > 0):
             raise InputError(f"σ factor {self.sigma_factor}: a positive number needed")
         normal, planes = np.zeros((c, 3)), {}
-        for face_id in dict.fromkeys(map(face_of, self.labels)):
-            rows = [i for i, label in enumerate(self.labels) if face_of(label) == face_id]
+        for face_id in dict.fromkeys(label.face for label in self.labels):
+            rows = [i for i, label in enumerate(self.labels) if label.face == face_id]
             if len(rows) < 3:
                 continue  # no plane of its own: such a face is not measured
             try:
@@ -100,7 +101,7 @@ def read_target(path: str | Path, design: TargetDesign) -> TargetCircles:
     except ValueError as error:
         raise InputError(f"faces {path}: not JSON ({str(error)[:100]}); give RUN/faces.json") from error
     try:
-        labels = tuple(content["circles"])
+        labels = circle_labels(content["circles"])
         xyz = frozen([content["circles"][label] for label in labels], (None, 3), "circles")
         radius = frozen([content["radius_mm"][label] for label in labels], (len(labels),), "radii")
         single = {k: frozen(c, (3, 3), k) for k, c in content.get("circle_covariance_mm2", {}).items()}
@@ -116,7 +117,7 @@ def read_target(path: str | Path, design: TargetDesign) -> TargetCircles:
     return target
 
 
-def _joint(content: dict, labels: tuple[str, ...]) -> np.ndarray | None:
+def _joint(content: dict, labels: tuple[CircleLabel, ...]) -> np.ndarray | None:
     """(3c, 3c) in the order of ``labels``; None where the file has none."""
     if "circles_joint_covariance_mm2" not in content:
         return None

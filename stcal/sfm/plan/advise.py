@@ -9,6 +9,7 @@ import numpy as np
 from stcal.errors import DegenerateError
 from stcal.geometry.rigid import Rigid
 from stcal.io.camera import camera_prior, read_camera
+from stcal.labels import circle_labels
 from stcal.parallel import one_thread
 from stcal.sfm.adjust.calibration import with_sigma
 from stcal.sfm.adjust.chain import CalibratedTarget
@@ -94,7 +95,7 @@ def known_of(run: SavedRun) -> Known:
     start = CalibratedTarget(
         run.faces["reference_face"],
         {face: Rigid.from_matrix(m) for face, m in run.faces["target_from_face"].items()},
-        {label: np.array(xyz) for label, xyz in run.faces["circles"].items()},
+        dict(zip(circle_labels(run.faces["circles"]), map(np.array, run.faces["circles"].values()), strict=True)),
         {model.group: Rigid() for model in models},
     )
     prior = camera_prior(read_camera(run.folder / CAMERA), run.camera) if run.options.refine_camera else None

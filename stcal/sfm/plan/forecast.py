@@ -11,6 +11,7 @@ from stcal.geometry.arrays import frozen
 from stcal.geometry.camera import Camera
 from stcal.geometry.plane import fit_plane
 from stcal.io.camera import CameraPrior
+from stcal.labels import CircleLabel, Label
 from stcal.sfm.adjust.chain import CalibratedTarget
 from stcal.sfm.adjust.faces import FrameKind
 from stcal.sfm.adjust.joint import covariance_of
@@ -57,7 +58,7 @@ class CentreNoise:
         return cls(PRACTICE * IMAGE_NOISE / CONTRAST * float(np.sqrt(2 * np.sqrt(np.pi) * BLUR_PX)))
 
     @classmethod
-    def measured(cls, models: Sequence[GroupModel], camera: Camera, radius_mm: dict[str, float]) -> "CentreNoise":
+    def measured(cls, models: Sequence[GroupModel], camera: Camera, radius_mm: dict[Label, float]) -> "CentreNoise":
         """Fitted to the covariances that the observations of metric models carry."""
         rims = [_Rims.of(model, camera, radius_mm) for model in models]
         ratio = np.concatenate(
@@ -77,7 +78,7 @@ class CentreNoise:
         """The same with all σ multiplied."""
         return replace(self, edge=factor * self.edge, floor_px=factor * self.floor_px)
 
-    def applied(self, model: GroupModel, camera: Camera, radius_mm: dict[str, float]) -> GroupModel:
+    def applied(self, model: GroupModel, camera: Camera, radius_mm: dict[Label, float]) -> GroupModel:
         """The metric model with the covariances that its observations are to have."""
         rims = _Rims.of(model, camera, radius_mm)
         size = self.edge**2 * (1 + (self.narrow_px / rims.minor_px) ** 2)
@@ -93,7 +94,7 @@ class _Rims:
     minor_px: np.ndarray
 
     @classmethod
-    def of(cls, model: GroupModel, camera: Camera, radius_mm: dict[str, float]) -> "_Rims":
+    def of(cls, model: GroupModel, camera: Camera, radius_mm: dict[Label, float]) -> "_Rims":
         normal = np.zeros((len(model.labels), 3))
         for members in model.points_by_face().values():
             normal[members] = fit_plane(model.xyz_world[members]).normal
@@ -128,7 +129,7 @@ class Setup:
     common: float
     sigma0: float = 1.0
 
-    def radius_mm(self) -> dict[str, float]:
+    def radius_mm(self) -> dict[Label, float]:
         """Radius by label."""
         return self.target.radius_of() | self.board.radius_of()
 
@@ -146,7 +147,7 @@ class Forecast:
     """
 
     face_covariance: dict[str, np.ndarray]
-    circle_sigma_mm: dict[str, float]
+    circle_sigma_mm: dict[CircleLabel, float]
     scale_sigma: float
     derivatives: Derivatives
 

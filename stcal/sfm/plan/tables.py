@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from stcal.sfm.data.observations import face_of
+from stcal.labels import CircleLabel
 from stcal.sfm.plan.advise import Advice, Choice
 from stcal.sfm.plan.forecast import Forecast
 from stcal.sfm.plan.session import Plan
@@ -33,8 +33,8 @@ def forecast_json(forecast: Forecast, shares: dict[str, dict[str, float]]) -> di
     }
 
 
-def _worst_circle(forecast: Forecast, face: str) -> tuple[str, float]:
-    own = {label: sigma for label, sigma in forecast.circle_sigma_mm.items() if face_of(label) == face}
+def _worst_circle(forecast: Forecast, face: str) -> tuple[CircleLabel, float]:
+    own = {label: sigma for label, sigma in forecast.circle_sigma_mm.items() if label.face == face}
     return max(own.items(), key=lambda each: each[1])
 
 

@@ -8,9 +8,9 @@ from stcal.design import TargetDesign
 from stcal.geometry.arrays import frozen
 from stcal.geometry.camera import Camera
 from stcal.geometry.rigid import Rigid
+from stcal.labels import CircleLabel, DotLabel, Label
 from stcal.sfm.adjust.joint import JointResult
 from stcal.sfm.data.model import GroupModel
-from stcal.sfm.data.observations import face_of, is_board
 from stcal.sfm.plan.forecast import CentreNoise, Setup
 from stcal.synthetic.observe import MAX_FOUND_TILT_RAD, image_circles
 from stcal.synthetic.scene import Group, Scene
@@ -92,7 +92,7 @@ def known_scene(models: tuple[GroupModel, ...], joint: JointResult, setup: Setup
     circles = dict(zip(joint.labels, joint.xyz_world, strict=True))
     groups = {}
     for model in models:
-        faces = tuple(sorted({face_of(label) for label in model.labels if not is_board(label)}))
+        faces = tuple(sorted({label.face for label in model.labels if isinstance(label, CircleLabel)}))
         target_from_board = joint.world_from_board[model.group]
         dots = np.column_stack([setup.board.xy_mm(), np.zeros(setup.board.rows * setup.board.columns)])
         groups[model.group] = Group(
@@ -153,7 +153,7 @@ def _largest_tilt(scene: Scene, model: GroupModel) -> float:
     """Of the circles that the run found in this group, rad; no more than a simulation believes in."""
     normal = {face.id: scene.target_from_face[face.id].rotation[:, 2] for face in scene.target.faces}
     board = -scene.groups[model.group].target_from_board.rotation[:, 2]
-    normals = np.array([board if is_board(label) else normal.get(face_of(label), board) for label in model.labels])
+    normals = np.array([board if isinstance(x, DotLabel) else normal.get(x.face, board) for x in model.labels])
     centres = np.array([pose.inverse().translation for pose in model.camera_from_world])[model.image_index]
     ray = centres - model.xyz_world[model.point_index]
     cosine = (ray * normals[model.point_index]).sum(1) / np.linalg.norm(ray, axis=1)
@@ -183,16 +183,16 @@ def _behind(xyz_camera: np.ndarray, corners_camera: np.ndarray) -> np.ndarray:
         return (part > 0) & (part < 1 - 1e-3) & (u > 0) & (u < 1) & (v > 0) & (v < 1)
 
 
-def _worth_it(seen: set[str], model: GroupModel) -> bool:
+def _worth_it(seen: set[Label], model: GroupModel) -> bool:
     members = {key: {model.labels[i] for i in rows} for key, rows in model.points_by_face().items()}
     return members["board"] <= seen and any(own <= seen for key, own in members.items() if key != "board")
 
 
-def _tilts_deg(scene: Scene, group: str, position: np.ndarray, seen: set[str]) -> dict[str, float]:
+def _tilts_deg(scene: Scene, group: str, position: np.ndarray, seen: set[Label]) -> dict[str, float]:
     """Between normals and lines of sight of the board and of the faces in view."""
     board = scene.groups[group].target_from_board.rotation[:, 2]
     plates = {"board": (-board, scene.board_outline(group).mean(0))}
-    for face_id in sorted({face_of(label) for label in seen if not is_board(label)}):
+    for face_id in sorted({label.face for label in seen if isinstance(label, CircleLabel)}):
         plates[face_id] = scene.target_from_face[face_id].rotation[:, 2], scene.face_outline(face_id).mean(0)
     return {
         key: float(np.degrees(np.arccos(np.clip(normal @ (position - at) / np.linalg.norm(position - at), -1, 1))))
@@ -200,7 +200,7 @@ def _tilts_deg(scene: Scene, group: str, position: np.ndarray, seen: set[str]) -
     }
 
 
-def _single(model: GroupModel, name: str, pose: Rigid, labels: list[str], camera: Camera) -> GroupModel:
+def _single(model: GroupModel, name: str, pose: Rigid, labels: list[Label], camera: Camera) -> GroupModel:
     """The model of one image of the group that sees these points."""
     place = {label: i for i, label in enumerate(model.labels)}
     points = np.array([place[label] for label in labels])

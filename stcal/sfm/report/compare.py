@@ -6,12 +6,11 @@ from pathlib import Path
 
 import numpy as np
 
-from stcal.design import BOARD
 from stcal.errors import DegenerateError, InputError
 from stcal.geometry.align import align_rigid
 from stcal.geometry.arrays import frozen
 from stcal.geometry.rigid import Rigid
-from stcal.sfm.data.observations import face_of, is_board
+from stcal.labels import BOARD, CircleLabel, DotLabel, parse_label, parse_labels
 
 FACES = "faces.json"
 DETECTIONS = "detections.csv"
@@ -71,9 +70,9 @@ def _labels(path: Path, known: dict) -> dict | None:
             rows = list(csv.DictReader(stream))
         measured: dict[str, dict[str, tuple[float, float]]] = {}
         for row in rows:
-            measured.setdefault(row["image"], {})[row["label"]] = (float(row["x_px"]), float(row["y_px"]))
+            measured.setdefault(row["image"], {})[parse_label(row["label"])] = (float(row["x_px"]), float(row["y_px"]))
         for labels in measured.values():  # circles that the truth does not know are neither right nor wrong
-            for label in [x for x in labels if not is_board(x) and x not in known["circles"]]:
+            for label in [x for x in labels if isinstance(x, CircleLabel) and x not in known["circles"]]:
                 del labels[label]
         total = np.zeros(3, int)
         for group in known["groups"].values():
@@ -83,7 +82,7 @@ def _labels(path: Path, known: dict) -> dict | None:
             turns += [np.rot90(grid), np.rot90(grid, 3)] if grid.shape[0] == grid.shape[1] else []
             counts = [_count(measured, group["images"], turn) for turn in turns]
             total += min(counts, key=lambda c: (c[0], -c[1]))
-    except (OSError, KeyError, ValueError, TypeError, IndexError):
+    except (OSError, KeyError, ValueError, TypeError, IndexError, InputError):
         return None
     if not total.any():
         return None
@@ -105,8 +104,8 @@ def _count(measured: dict, images: dict, numbers: np.ndarray) -> tuple[int, int,
         visible += sum(bool(c["must_find"]) for c in circles.values())
         for label, centre in measured[name].items():
             key = label
-            if is_board(label):
-                row, column = (int(v) for v in label.split(":")[1:])
+            if isinstance(label, DotLabel):
+                row, column = label.row, label.column
                 inside = 0 <= row < numbers.shape[0] and 0 <= column < numbers.shape[1]
                 key = f"{BOARD}:{numbers[row, column]}" if inside else label
             near = key in circles and np.linalg.norm(np.subtract(centre, circles[key]["centre_px"])) < NEAR_PX
@@ -139,7 +138,9 @@ def _face(face_id: str, found: dict, known: dict) -> dict:
     try:
         estimate = Rigid.from_matrix(found["target_from_face"][face_id])
         true = Rigid.from_matrix(known["target_from_face"][face_id])
-        labels = [label for label in known["circles"] if face_of(label) == face_id and label in found["circles"]]
+        labels = [
+            label for label in parse_labels(known["circles"]) if label.plane == face_id and label in found["circles"]
+        ]
         a, b = (frozen([each["circles"][k] for k in labels], what="circles").reshape(-1, 3) for each in (known, found))
     except (ValueError, TypeError, InputError) as error:
         reason = str(error)[:120]

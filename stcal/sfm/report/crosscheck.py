@@ -2,8 +2,8 @@
 
 from html import escape
 
+from stcal.labels import parse_label
 from stcal.report.page import Html, cells, fold, number, table
-from stcal.sfm.data.observations import face_of
 
 QUESTIONS = {
     "mapping": "Native – pycolmap",
@@ -61,7 +61,7 @@ def _faces(check: dict) -> Html:
 def _circles(check: dict) -> str:
     faces: dict[str, list[tuple[float, str]]] = {}
     for label, value in check["mapping"]["circles_um"].items():
-        faces.setdefault(face_of(label), []).append((value, label))
+        faces.setdefault(parse_label(label).plane, []).append((value, label))
     rows = [
         [face, len(own), number(sum(v for v, _ in own) / len(own), 3), number(max(own)[0], 3), max(own)[1]]
         for face, own in sorted(faces.items())

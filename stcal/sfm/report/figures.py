@@ -2,6 +2,7 @@
 
 import numpy as np
 
+from stcal.labels import dot_cells, parse_label, parse_labels
 from stcal.report.page import (
     AXIS_COLOURS,
     COLOURS,
@@ -15,7 +16,6 @@ from stcal.report.page import (
     swatch,
     uri,
 )
-from stcal.sfm.data.observations import face_of
 
 
 def legend(colours: dict[str, str]) -> str:
@@ -37,7 +37,7 @@ def board_residuals(residuals_um: dict[str, list[float]], reach_um: float, heigh
     reach_um : the length drawn as the grid's pitch, and ``height_um`` the end of the colour scale for the out-of-plane
         part: the same for all groups so that they can be compared
     """
-    cells = np.array([[int(v) for v in label.split(":")[1:]] for label in residuals_um], float).reshape(-1, 2)
+    cells = dot_cells(parse_labels(residuals_um)).astype(float)
     vectors = np.array(list(residuals_um.values()), float).reshape(-1, 3)
     per_cell = reach_um if reach_um > 0 else 1.0
     height_um = height_um if height_um > 0 else 1.0
@@ -115,7 +115,7 @@ def target_view(circles: dict[str, list[float]], faces: dict[str, dict], azimuth
     reach = 0.2 * float(np.ptp(xyz, axis=0).max()) if len(xyz) else 1.0
     lines, ink, names, sheets = [], [], [], []
     for name, face in faces.items():
-        own = np.array([p for label, p in circles.items() if face_of(label) == name], float).reshape(-1, 3)
+        own = np.array([p for label, p in circles.items() if parse_label(label).plane == name], float).reshape(-1, 3)
         pose = np.array(face["target_from_face"], float)
         lines += [np.array([pose[:3, 3], pose[:3, 3] + reach * pose[:3, i]]) for i in range(3)]
         ink += AXIS_COLOURS

@@ -4,8 +4,8 @@ import base64
 import math
 from html import escape
 
+from stcal.labels import BOARD, parse_label
 from stcal.report.page import NONE, Html, cells, fold, join, number, page, plot, swatch, table
-from stcal.sfm.data.observations import face_of, is_board
 from stcal.sfm.report import figures
 from stcal.sfm.report.checks import checks_section
 from stcal.sfm.report.crosscheck import crosscheck_section
@@ -296,12 +296,13 @@ def _residuals(report: dict, colours: dict[str, str]) -> str:
         for i, row in enumerate(images, 1)
     ]
     columns = ["No.", "<Image", "<Group", "Centres", "RMS (px)", "Max (px)", "<Worst label"]
-    by_face: dict[str, list] = {}
+    by_face: dict[tuple[bool, str], list] = {}
     for row in labels:
-        key = f"Board, group {row['group']}" if is_board(row["label"]) else f"Face {face_of(row['label'])}"
+        plane = parse_label(row["label"]).plane
+        key = (True, f"Board, group {row['group']}") if plane == BOARD else (False, f"Face {plane}")
         by_face.setdefault(key, []).append(row)
-    board = "".join(_labels(key, own) for key, own in by_face.items() if is_board(own[0]["label"]))
-    target = "".join(_labels(key, own) for key, own in by_face.items() if not is_board(own[0]["label"]))
+    board = "".join(_labels(key, own) for (on_board, key), own in by_face.items() if on_board)
+    target = "".join(_labels(key, own) for (on_board, key), own in by_face.items() if not on_board)
     worst = max(labels, key=lambda row: row["rms_px"], default=None)
     text = "RMS is per axis, max is the length of the largest vector."
     if worst:

@@ -8,11 +8,12 @@ import numpy as np
 import stcal
 from stcal.design import TargetDesign
 from stcal.geometry.plane import fit_plane
+from stcal.labels import DotLabel
 from stcal.sfm.adjust.chain import CalibratedTarget
 from stcal.sfm.adjust.options import AdjustOptions
 from stcal.sfm.checks.verdict import Check
 from stcal.sfm.data.model import MIN_POINTS, GroupModel
-from stcal.sfm.data.observations import ImageObservations, face_of, is_board
+from stcal.sfm.data.observations import ImageObservations
 from stcal.sfm.mapping.resect import MIN_RAY_ANGLE_RAD
 from stcal.sfm.run.result import RunResult
 
@@ -130,7 +131,7 @@ def _final_models(result: RunResult) -> dict[str, GroupModel]:
 
 def _face(result: RunResult, face_id: str) -> dict:
     pose = result.target.target_from_face[face_id]
-    labels = [label for label in result.target.circles if face_of(label) == face_id]
+    labels = [label for label in result.target.circles if label.face == face_id]
     members = [each for each in result.calibration.faces if each.face == face_id]
     covariance = result.target.face_covariance.get(face_id)
     sigma = None if covariance is None else np.sqrt(np.maximum(np.diag(covariance), 0))
@@ -230,7 +231,7 @@ def _by_label(models: dict[str, GroupModel], residual: dict[str, np.ndarray]) ->
     for name, model in models.items():
         for k, r in zip(model.point_index, residual[name], strict=True):
             label = model.labels[k]
-            gathered.setdefault((name if is_board(label) else "", label), []).append(r)
+            gathered.setdefault((name if isinstance(label, DotLabel) else "", label), []).append(r)
     return [
         {
             "label": label,
@@ -319,7 +320,7 @@ def _scene(result: RunResult) -> dict:
                     "axes": target_from_camera.rotation.T.tolist(),
                 }
             )
-        dots = [i for i, label in enumerate(model.labels) if is_board(label)]
+        dots = [i for i, label in enumerate(model.labels) if isinstance(label, DotLabel)]
         boards[model.group] = model.xyz_world[dots].tolist()
     return {
         "cameras": cameras,

@@ -12,14 +12,15 @@ from pathlib import Path
 import numpy as np
 
 from stcal.design import BoardDesign, TargetDesign
-from stcal.errors import MappingError
+from stcal.errors import InputError, MappingError
 from stcal.geometry.camera import Camera
 from stcal.geometry.rigid import Rigid
 from stcal.io.images import SUFFIXES, TOP_GROUP, Skipped
 from stcal.io.saving import save
+from stcal.labels import DotLabel, dot_cells, parse_labels
 from stcal.sfm.adjust.refine import refine
 from stcal.sfm.data.model import GroupModel, Outlier
-from stcal.sfm.data.observations import ImageObservations, is_board
+from stcal.sfm.data.observations import ImageObservations
 from stcal.sfm.mapping.incremental import left_out, map_group
 from stcal.sfm.mapping.pairs import PairOptions, PairScore, rank_pairs
 
@@ -82,7 +83,7 @@ def require_usable(group: list[ImageObservations]) -> None:
             f"{where}: no face of the target recognised in {len(group)} images; look at the overlays, "
             "check target.toml (radii, polarity) and the exposure"
         )
-    if not any(is_board(label) for image in group for label in image.labels):
+    if not any(isinstance(label, DotLabel) for image in group for label in image.labels):
         raise MappingError(
             f"{where}: no board recognised in {len(group)} images; keep the whole board in view, "
             "check board.toml (rows, columns, polarity)"
@@ -184,7 +185,7 @@ def _load(path: Path) -> GroupSolution | None:
                 meta["group"],
                 tuple(meta["images"]),
                 tuple(Rigid(m[:3, :3], m[:3, 3]) for m in stored["poses"]),
-                tuple(meta["labels"]),
+                parse_labels(meta["labels"]),
                 **{name: stored[name] for name in _ARRAYS},
             )
             pairs = tuple(
@@ -193,16 +194,16 @@ def _load(path: Path) -> GroupSolution | None:
             )
             outliers = tuple(Outlier(**o) for o in meta["outliers"])
             return GroupSolution(pairs, model, meta["seeded"], meta["rounds"], meta["left_out"], outliers)
-    except (OSError, ValueError, KeyError, EOFError, TypeError, zipfile.BadZipFile, zlib.error):
+    except (OSError, InputError, ValueError, KeyError, EOFError, TypeError, zipfile.BadZipFile, zlib.error):
         return None
 
 
 def unseen_board(solutions: list[GroupSolution], board: BoardDesign) -> list[str]:
     """Rows and columns of the board that no image shows: hidden everywhere, or not there at all."""
-    seen = {label for s in solutions for label in s.model.labels if is_board(label)}
+    seen = dot_cells(label for s in solutions for label in s.model.labels if isinstance(label, DotLabel))
     notes = []
-    for what, count, place in (("row", board.rows, 1), ("column", board.columns, 2)):
-        missing = [str(i) for i in range(count) if not any(int(x.split(":")[place]) == i for x in seen)]
+    for what, count, own in (("row", board.rows, seen[:, 0]), ("column", board.columns, seen[:, 1])):
+        missing = [str(i) for i in range(count) if i not in own]
         if missing:
             notes.append(f"board {what} {', '.join(missing)}: not seen in any image; check {what}s in the board file")
     return notes

@@ -9,10 +9,11 @@ from scipy.stats import chi2
 
 from stcal.geometry.pose_descent import PoseStack
 from stcal.geometry.rigid import Rigid
+from stcal.labels import CircleLabel
 from stcal.sfm.adjust.chain import CalibratedTarget
 from stcal.sfm.adjust.joint import covariance_of
 from stcal.sfm.adjust.uncertainty import derivatives
-from stcal.sfm.data.observations import ImageObservations, is_board
+from stcal.sfm.data.observations import ImageObservations
 from stcal.sfm.measure.minima import mirrored
 from stcal.sfm.measure.pose import TargetPose
 from stcal.sfm.measure.target import TargetCircles
@@ -73,7 +74,7 @@ def see(
     """What one image shows of these faces."""
     group = replace(next(iter(scene.groups.values())), faces=tuple(faces), camera_from_target=(camera_from_target,))
     image = observe(replace(scene, groups={group.name: group}), noise_px, rng)[0]
-    return image.select([i for i, label in enumerate(image.labels) if not is_board(label)])
+    return image.select([i for i, label in enumerate(image.labels) if isinstance(label, CircleLabel)])
 
 
 def face_view(scene: Scene, face: str) -> Rigid:
