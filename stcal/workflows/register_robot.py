@@ -15,7 +15,8 @@ from stcal.register import register
 from stcal.register.core.pairs import WHAT, Pairs
 from stcal.register.report.page import matrix_lines, matrix_table
 from stcal.register.workspace.findings import Findings
-from stcal.report.page import number, table
+from stcal.report.page import table
+from stcal.report.text import number
 from stcal.robot.identify.solve import Identified, IdentifyOptions, identify
 from stcal.robot.kinematics.file import load_robot
 from stcal.robot.kinematics.forward import forward

@@ -13,22 +13,9 @@ from stcal.handeye.result import HandEye
 from stcal.handeye.solve import FACTORS
 from stcal.handeye.validate import Compared
 from stcal.io.camera import PARAMETER_NAMES, parameter_names
-from stcal.report.page import (
-    COLOURS,
-    FAINT,
-    INK,
-    NONE,
-    SMALL,
-    calm,
-    fold,
-    new_figure,
-    number,
-    page,
-    plot,
-    swatch,
-    table,
-    uri,
-)
+from stcal.report.figure import COLOURS, FAINT, INK, SMALL, calm, new_figure, uri
+from stcal.report.page import fold, page, plot, swatch, table
+from stcal.report.text import NONE, number
 
 HEADS = ("", "mm", "± σ", "rotation vector °", "± σ")
 ERRORS = {

@@ -14,7 +14,9 @@ from stcal.locate.data.layout import TargetLayout
 from stcal.locate.pipeline import Located
 from stcal.locate.report.chain import Chain
 from stcal.locate.report.tables import accepted, camera_from_obj, uncertain
-from stcal.report.page import AXIS_COLOURS, COLOURS, Html, number, page, table
+from stcal.report.figure import AXIS_COLOURS, COLOURS
+from stcal.report.page import Html, page, table
+from stcal.report.text import number
 
 WIDE_PX, SMALL_PX = 900, 215
 COLOUR = {"accept": "#1b7f3b", "ambiguous": "#a15c00", "reject": "#b3261e"}

@@ -3,7 +3,7 @@
 import numpy as np
 
 from stcal.register.workspace.findings import Findings
-from stcal.report.page import COLOURS, FAINT, INK, SMALL, calm, locator, new_figure, round_below
+from stcal.report.figure import COLOURS, FAINT, INK, SMALL, calm, locator, new_figure, round_below
 
 VIEWS = ((0, 1), (0, 2), (1, 2))
 """Horizontal and vertical axis of each view."""

@@ -10,7 +10,9 @@ from stcal.geometry.rigid import Similarity
 from stcal.register.report.drawings import errors_figure, field_figure, space_figure
 from stcal.register.report.file import matrix_of
 from stcal.register.workspace.findings import Findings
-from stcal.report.page import COLOURS, fold, number, page, plot, swatch, table, uri
+from stcal.report.figure import COLOURS, uri
+from stcal.report.page import fold, page, plot, swatch, table
+from stcal.report.text import number
 
 FEW_ROWS = 24
 """Up to so many every row is listed, else the outliers and …"""

@@ -5,7 +5,9 @@ from html import escape
 import numpy as np
 
 import stcal
-from stcal.report.page import AXIS_COLOURS, FAINT, INK, SMALL, calm, new_figure, number, page, plot, swatch, table, uri
+from stcal.report.figure import AXIS_COLOURS, FAINT, INK, SMALL, calm, new_figure, uri
+from stcal.report.page import page, plot, swatch, table
+from stcal.report.text import number
 from stcal.robot.axes.fit import AxisFit
 from stcal.robot.axes.model import ROW_VALUES, AxesResult, Pair
 from stcal.robot.axes.sweeps import called

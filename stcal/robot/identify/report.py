@@ -4,7 +4,9 @@ from html import escape
 
 import numpy as np
 
-from stcal.report.page import COLOURS, NONE, calm, fold, new_figure, number, page, plot, table, uri
+from stcal.report.figure import COLOURS, calm, new_figure, uri
+from stcal.report.page import fold, page, plot, table
+from stcal.report.text import NONE, number
 from stcal.robot.identify.nominal import dh_values
 from stcal.robot.identify.observability import MEANING
 from stcal.robot.identify.solve import Identified

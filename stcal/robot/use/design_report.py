@@ -4,22 +4,9 @@ from html import escape
 
 import numpy as np
 
-from stcal.report.page import (
-    COLOURS,
-    FAINT,
-    INK,
-    NONE,
-    SMALL,
-    calm,
-    locator,
-    new_figure,
-    number,
-    page,
-    plane,
-    plot,
-    table,
-    uri,
-)
+from stcal.report.figure import COLOURS, FAINT, INK, SMALL, calm, locator, new_figure, plane, uri
+from stcal.report.page import page, plot, table
+from stcal.report.text import NONE, number
 from stcal.robot.identify.observability import MEANING
 from stcal.robot.kinematics.model import Robot
 from stcal.robot.use.compensation import joint_cells, joint_columns

@@ -5,21 +5,9 @@ from html import escape
 
 import numpy as np
 
-from stcal.report.page import (
-    COLOURS,
-    FAINT,
-    INK,
-    NONE,
-    SMALL,
-    calm,
-    locator,
-    new_figure,
-    number,
-    page,
-    plot,
-    table,
-    uri,
-)
+from stcal.report.figure import COLOURS, FAINT, INK, SMALL, calm, locator, new_figure, uri
+from stcal.report.page import page, plot, table
+from stcal.report.text import NONE, number
 from stcal.robot.kinematics.inverse import Inverse
 from stcal.robot.kinematics.model import Robot
 from stcal.robot.use.compensation import Compensated, compensated_summary, joint_columns

@@ -1,27 +1,21 @@
 """The page of ``measure``: where the target was, how well that is known, and what was left out."""
 
-from html import escape
-
 import numpy as np
 
-from stcal.report.page import (
+from stcal.report.figure import (
     COLOURS,
     FAINT,
     INK,
     SMALL,
     calm,
-    fold,
     locator,
     new_figure,
-    number,
-    page,
     plane,
-    plot,
     round_below,
-    swatch,
-    table,
     uri,
 )
+from stcal.report.page import render
+from stcal.report.text import number
 from stcal.sfm.measure.images import MeasuredImage, MeasureResult, fit_verdict, summary
 
 COLOUR_OF = {"certain": COLOURS[0], "resolved": COLOURS[2], "ambiguous": COLOURS[1]}
@@ -33,42 +27,36 @@ ELLIPSE_SHARE = 0.06
 
 def measure_page(result: MeasureResult, where: str) -> str:
     """The report of ``measure``."""
-    lines = summary(result)
-    banner = f'<h1>Poses of the target</h1><p class="counts">{escape(where)}: {escape(lines[0])}</p>\n'
-    notes = "".join(f'<p class="alarm">{escape(line)}</p>\n' for line in lines[1:])
-    sections = [
-        ("path", "Path in the camera frame", notes + _path(result)),
-        ("sigma", "Uncertainty", _sigma(result)),
-        ("poses", "Poses", _table(result)),
-    ]
-    if result.left_out or _outliers(result):
-        sections.append(("left-out", "Left out", _left_out(result)))
-    return page("Poses of the target", banner, sections)
-
-
-def _legend(result: MeasureResult) -> str:
-    found = [s for s in COLOUR_OF if any(each.pose.status == s for each in result.images)]
-    if len(found) < 2:
-        return ""
-    return f'<p class="legend">{" ".join(f"<span>{swatch(s, COLOUR_OF[s])}</span>" for s in found)}</p>\n'
-
-
-def _path(result: MeasureResult) -> str:
-    """Seen as the camera sees it, and from above, with the ellipses of σ enlarged."""
     at = np.array([each.pose.camera_from_target.translation for each in result.images])
     largest = np.sqrt(max(np.linalg.eigvalsh(each.pose.covariance[3:, 3:])[-1] for each in result.images))
-    size = max(float(np.ptp(at, axis=0).max()), 1.0)
-    times = round_below(ELLIPSE_SHARE * size / largest)
-    views = [
-        _view(result, at, 0, 1, "as the camera sees it", times),
-        _view(result, at, 0, 2, "from above, the camera below", times),
-    ]
-    shown = f"σ, {times:g} times enlarged" if times != 1 else "σ"
-    text = f"<p>Origin of the target, mm. Ellipses: {shown}. Lines join the images of a folder by name.</p>\n"
-    return text + _legend(result) + f'<div class="plots">{"".join(views)}</div>\n'
+    times = round_below(ELLIPSE_SHARE * max(float(np.ptp(at, axis=0).max()), 1.0) / largest)
+    verdicts = any(fit_verdict(each.pose) != "passed" for each in result.images)
+    found = {each.pose.status for each in result.images}
+    return render(
+        "sfm/measure/page.html.jinja",
+        where=where,
+        lines=summary(result),
+        times=times,
+        statuses={status: colour for status, colour in COLOUR_OF.items() if status in found},
+        views=[
+            (_view(result, at, 0, 1, times), "as the camera sees it"),
+            (_view(result, at, 0, 2, times), "from above, the camera below"),
+        ],
+        sigma=_sigma(result),
+        verdicts=verdicts,
+        rows=[_row(each, verdicts) for each in result.images[:MOST_ROWS]],
+        count=len(result.images),
+        left_out=[(each.name, each.reason) for each in result.left_out],
+        outliers=[
+            [each.name, o.label, number(o.residual_px, 3), number(o.limit_px, 3)]
+            for each in result.images
+            for o in each.pose.outliers
+        ],
+    )
 
 
-def _view(result: MeasureResult, at: np.ndarray, i: int, j: int, title: str, times: float) -> str:
+def _view(result: MeasureResult, at: np.ndarray, i: int, j: int, times: float) -> str:
+    """Plot of two coordinates of the path, with the ellipses of σ enlarged."""
     from matplotlib.patches import Ellipse
 
     figure = new_figure(5, 4.4)
@@ -85,7 +73,7 @@ def _view(result: MeasureResult, at: np.ndarray, i: int, j: int, title: str, tim
     plane(axes, f"{'xyz'[i]}, mm", f"{'xyz'[j]}, mm", 0.12)
     if j == 1:
         axes.invert_yaxis()  # y of a camera points down
-    return plot(uri(figure), f"path of the target {title}", title[0].upper() + title[1:])
+    return uri(figure)
 
 
 def _folders(images: tuple[MeasuredImage, ...]) -> list[list[int]]:
@@ -118,8 +106,7 @@ def _sigma(result: MeasureResult) -> str:
         calm(axes)
         axes.grid(axis="y", color=FAINT, lw=0.6)
         axes.set_axisbelow(True)
-    caption = "Position: filled along the line of sight, open RMS across it; rotation: RMS of the three axes"
-    return _legend(result) + plot(uri(figure), "σ of each pose", caption, "wide")
+    return uri(figure)
 
 
 def _split(each: MeasuredImage) -> tuple[float, float, float]:
@@ -131,43 +118,15 @@ def _split(each: MeasuredImage) -> tuple[float, float, float]:
     return np.sqrt(along), np.sqrt(max(across, 0.0)), float(np.sqrt(np.trace(covariance[:3, :3]) / 3))
 
 
-def _table(result: MeasureResult) -> str:
-    rows = []
-    verdicts = any(fit_verdict(each.pose) != "passed" for each in result.images)
-    for each in result.images[:MOST_ROWS]:
-        pose = each.pose
-        sigma = np.sqrt(np.diag(pose.covariance))
-        rows.append(
-            [each.name, ", ".join(pose.faces), str(len(pose.labels)), pose.status]
-            + [number(v, 3) for v in pose.camera_from_target.translation]
-            + [number(1e3 * v, 1) for v in sigma[3:]]
-            + [number(1e3 * np.degrees(v), 2) for v in sigma[:3]]
-            + [number(pose.rms_px(), 4), number(pose.chi2_per_dof(), 2)]
-            + ([fit_verdict(pose)] if verdicts else [])
-        )
-    heads = ["<image", "<faces", "circles", "<status", *(f"{a} mm" for a in "xyz"), *"xyz", *"xyz"]
-    heads += ["RMS px", "χ² / dof", *(["<fit"] if verdicts else [])]
-    over = [("", 4), ("origin of the target", 3), ("σ µm", 3), ("σ mdeg, about", 3), ("residuals", 2 + verdicts)]
-    more = f"<p>The first {MOST_ROWS} of {len(result.images)} images.</p>\n" if len(result.images) > MOST_ROWS else ""
-    return more + table(heads, rows, over)
-
-
-def _outliers(result: MeasureResult) -> list[list[str]]:
-    return [
-        [each.name, o.label, number(o.residual_px, 3), number(o.limit_px, 3)]
-        for each in result.images
-        for o in each.pose.outliers
-    ]
-
-
-def _left_out(result: MeasureResult) -> str:
-    text = ""
-    if result.left_out:
-        text += table(["<image or file", "<reason"], [[each.name, each.reason] for each in result.left_out], css="text")
-    outliers = _outliers(result)
-    if outliers:
-        heads = ["<image", "<circle", "residual px", "limit px"]
-        content = table(heads, outliers)
-        text += f"<p>{len(outliers)} circles contradict the others of their image.</p>\n"
-        text += content if len(outliers) <= 20 else fold("Circles left out", content)
-    return text
+def _row(each: MeasuredImage, verdicts: bool) -> list[str]:
+    """Of the table of poses."""
+    pose = each.pose
+    sigma = np.sqrt(np.diag(pose.covariance))
+    return (
+        [each.name, ", ".join(pose.faces), str(len(pose.labels)), pose.status]
+        + [number(v, 3) for v in pose.camera_from_target.translation]
+        + [number(1e3 * v, 1) for v in sigma[3:]]
+        + [number(1e3 * np.degrees(v), 2) for v in sigma[:3]]
+        + [number(pose.rms_px(), 4), number(pose.chi2_per_dof(), 2)]
+        + ([fit_verdict(pose)] if verdicts else [])
+    )

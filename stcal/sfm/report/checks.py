@@ -1,8 +1,7 @@
 """The report's section on the checks that residuals cannot fake."""
 
-from html import escape
-
-from stcal.report.page import NONE, Html, fold, number, table
+from stcal.report.page import verdict
+from stcal.report.text import NONE, number
 
 COLOURS = {"passed": "#1b7837", "suspicious": "#b26a00", "failed": "#b3261e", "not possible": "#556270"}
 ORDER = ("failed", "suspicious", "passed", "not possible")
@@ -15,34 +14,27 @@ def count_verdicts(verdicts: list[str]) -> str:
     return ", ".join(f"{verdicts.count(v)} {v}" for v in ORDER if v in verdicts) or "none"
 
 
-def checks_section(checks: list[dict]) -> str:
-    """HTML of ``report.json``'s ``checks``."""
+def checks_values(checks: list[dict]) -> dict:
+    """``report.json``'s ``checks`` as the template shows them."""
     ranked = sorted(checks, key=lambda check: ORDER.index(check["verdict"]))
     rows = [
-        [check["title"], _verdict(check["verdict"]), *_value(check), _names(check), check["reason"], check["remedy"]]
+        [
+            check["title"],
+            verdict(check["verdict"], COLOURS[check["verdict"]]),
+            *(_number(check["measured"][0]) if check["measured"] else [NONE, NONE]),
+            _names(check),
+            check["reason"],
+            check["remedy"],
+        ]
         for check in ranked
     ]
-    columns = ["<Check", "<Verdict", "Value", "Limit", "<Named", "<Found", "<What to do"]
-    detail = [
+    measured = [
         [check["title"], m["name"], *_number(m), NONE if m["probability"] is None else f"{m['probability']:.1g}"]
         for check in ranked
         for m in check["measured"]
     ]
-    heads = ["<Check", "<What", "Value", "Limit", "Probability by chance"]
-    return (
-        f"<p><strong>{escape(count_verdicts([check['verdict'] for check in checks]))}.</strong> Each check tests what "
-        "small residuals do not prove. Suspicious is what happens by chance in one run of a thousand, failed in one of "
-        "a hundred thousand, however many images or circles were tested.</p>\n"
-        f"{table(columns, rows, css='text')}{fold('What was measured', table(heads, detail, css='text'))}"
-    )
-
-
-def _verdict(verdict: str) -> Html:
-    return Html(f'<strong style="color:{COLOURS[verdict]}">{escape(verdict)}</strong>')
-
-
-def _value(check: dict) -> list[str]:
-    return _number(check["measured"][0]) if check["measured"] else [NONE, NONE]
+    verdicts = count_verdicts([check["verdict"] for check in checks])
+    return {"verdicts": verdicts, "check_rows": rows, "measured": measured}
 
 
 def _number(measured: dict) -> list[str]:

@@ -3,24 +3,7 @@
 import numpy as np
 
 from stcal.labels import dot_cells, parse_label, parse_labels
-from stcal.report.page import (
-    AXIS_COLOURS,
-    COLOURS,
-    FAINT,
-    INK,
-    SMALL,
-    calm,
-    locator,
-    new_figure,
-    round_below,
-    swatch,
-    uri,
-)
-
-
-def legend(colours: dict[str, str]) -> str:
-    entries = " ".join(f"<span>{swatch(name, colour)}</span>" for name, colour in colours.items())
-    return f'<p class="legend">Groups: {entries}</p>\n'
+from stcal.report.figure import AXIS_COLOURS, COLOURS, FAINT, INK, SMALL, calm, locator, new_figure, round_below, uri
 
 
 def group_colours(names: list[str]) -> dict[str, str]:

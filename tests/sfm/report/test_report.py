@@ -7,8 +7,11 @@ from html import unescape
 from html.parser import HTMLParser
 
 import pytest
+from markupsafe import Markup
 
-from stcal.report.page import Html, number, round_below, table
+from stcal.report.figure import round_below
+from stcal.report.page import environment
+from stcal.report.text import number
 from stcal.sfm.report.page import FIRST_IMAGES, report_html, shown_overlays
 
 NASTY = 'a/<script>alert("1")</script>&$_.jpg'
@@ -157,6 +160,7 @@ class Page(HTMLParser):
         self.feed(page)
         self.close()
         assert self.open == []
+        self.text = " ".join(self.text.split())
 
     def handle_starttag(self, tag, attrs):
         self.tags.append(tag)
@@ -354,7 +358,7 @@ def test_round_below(value, below):
 
 
 def test_table_escapes_all_but_markup():
-    page = table(["<Name", "x < y (mm)"], [["<b>", Html("<i>1</i>")]])
+    page = environment().globals["table"](["<Name", "x < y (mm)"], [["<b>", Markup("<i>1</i>")]])
     assert '<th scope="row" class="l">&lt;b&gt;</th><td><i>1</i></td>' in page
     assert '<th scope="col">x &lt; y (mm)</th>' in page
 
