@@ -17,7 +17,9 @@ def crosscheck_values(check: dict) -> dict:
         "run": "this result",
     }
     return {
-        "models": [[name, check["images"][key], number(check["residual_rms_px"][key], 4)] for key, name in programs],
+        "models": [
+            [name, check["images"][key], number(check["residual_rms_px"][key], 4)] for key, name in programs.items()
+        ],
         "faces": [_face_row(check, face) for face in check["mapping"]["faces"]],
         "circles": [
             [face, len(own), number(sum(v for v, _ in own) / len(own), 3), number(max(own)[0], 3), max(own)[1]]
