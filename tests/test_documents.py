@@ -25,3 +25,81 @@ def test_every_option_is_documented(name, command):
     text = "".join((ROOT / document).read_text(encoding="utf-8") for document in DOCUMENTS)
     options = [option for each in command.params for option in each.opts if option.startswith("--")]
     assert [option for option in options if option != "--help" and option not in text] == []
+
+
+VERBS = frozenset(
+    [
+        "Accept",
+        "Add",
+        "Adjust",
+        "Advise",
+        "Allow",
+        "Also",
+        "Answer",
+        "Assume",
+        "Blur",
+        "Calibrate",
+        "Call",
+        "Choose",
+        "Compare",
+        "Compute",
+        "Copy",
+        "Correct",
+        "Cross-validate",
+        "Decide",
+        "Detect",
+        "Divide",
+        "Draw",
+        "Explain",
+        "Find",
+        "Fit",
+        "Forecast",
+        "Give",
+        "Hold",
+        "Identify",
+        "Ignore",
+        "Keep",
+        "Lay",
+        "Match",
+        "Map",
+        "Measure",
+        "Multiply",
+        "Name",
+        "Photograph",
+        "Place",
+        "Plan",
+        "Print",
+        "Rank",
+        "Read",
+        "Reject",
+        "Render",
+        "Run",
+        "Set",
+        "Show",
+        "Solve",
+        "Spread",
+        "Start",
+        "End",
+        "Stop",
+        "Take",
+        "Tell",
+        "Treat",
+        "Use",
+        "Write",
+        "Count",
+    ]  # noqa: SIM905: one a cell would be sixty lines
+)
+"""With which a help text may begin; *Also* goes before one of the others."""
+
+
+@pytest.mark.parametrize(("name", "command"), list(commands(get_command(app))))
+def test_every_help_is_a_sentence_with_a_verb(name, command):
+    texts = {each.name: each.help for each in command.params if each.name != "help"}
+    texts["command"] = command.help
+    for what, text in texts.items():
+        first = (text or "").split("\n\n")[0].strip()
+        words = first.split()
+        assert words, f"{name} {what}: no help"
+        assert words[0] in VERBS, f"{name} {what}: {first}"
+        assert words[0] != "Also" or words[1] == "write", f"{name} {what}: {first}"
+        assert first.endswith((".", "….")), f"{name} {what}: {first}"

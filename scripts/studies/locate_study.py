@@ -19,7 +19,6 @@ import numpy as np
 
 from stcal.boards.design import CharucoDesign
 from stcal.boards.tags import Tags, find_tags
-from stcal.cli.locate import calibration_images
 from stcal.geometry.rigid import Poses
 from stcal.io.camera import CameraModel, read_camera
 from stcal.io.images import decode, find_images
@@ -35,6 +34,7 @@ from stcal.locate.pose.verdict import VerdictOptions, judge
 from stcal.parallel import one_thread
 from stcal.synthetic.exposure import Light, expose
 from stcal.synthetic.measured.tags import CAMERA, CornerNoise, example_layout, random_pose, simulated_exposures
+from stcal.workflows.locate import calibration_images
 
 BOARD = CharucoDesign(7, 5, 36.195, 18.256, "DICT_6X6_250")
 TAGS = 17

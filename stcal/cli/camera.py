@@ -3,11 +3,10 @@
 from pathlib import Path
 from typing import Annotated
 
-import numpy as np
 import typer
 
-from stcal.cli.progress import StageProgress
-from stcal.cli.sfm import BoardFile, TargetFile, Workers
+from stcal.cli.options import BoardFile, TargetFile, Workers
+from stcal.cli.terminal import StageProgress
 from stcal.design import reference_board, reference_target
 from stcal.errors import InputError
 from stcal.io.camera import write_cameras_txt
@@ -20,23 +19,30 @@ app = typer.Typer()
 @app.command(name="calibrate-camera")
 def calibrate_camera(
     images: Annotated[
-        Path, typer.Argument(help="Photographs that show the board, in one folder or in IMAGES/<group>/ as for run.")
+        Path,
+        typer.Argument(help="Read photographs that show the board from this folder, or from IMAGES/<group>/ as run."),
     ],
-    out: Annotated[Path, typer.Option("--out", help="The camera file; must not exist.")] = Path("cameras.txt"),
+    out: Annotated[Path, typer.Option("--out", help="Write the camera to this file, which must not exist.")] = Path(
+        "cameras.txt"
+    ),
     target: TargetFile = None,
     board: BoardFile = None,
     model: Annotated[
         str,
-        typer.Option(help="SIMPLE_PINHOLE, PINHOLE, SIMPLE_RADIAL, RADIAL, OPENCV or FULL_OPENCV, as in COLMAP."),
+        typer.Option(
+            help="Fit this model of COLMAP: SIMPLE_PINHOLE, PINHOLE, SIMPLE_RADIAL, RADIAL, OPENCV or FULL_OPENCV."
+        ),
     ] = "OPENCV",
     json_file: Annotated[
-        Path | None, typer.Option("--json", help="Figures and checks as JSON; beside the camera file if not given.")
+        Path | None,
+        typer.Option("--json", help="Write figures and checks to this file (JSON); beside --out if not given."),
     ] = None,
     workers: Workers = None,
 ) -> None:
-    """Intrinsics from views of the board, without any start: cameras.txt with σ and correlations, for run."""
+    """Calibrate the camera from views of the board, without any start: cameras.txt with σ and correlations, for run."""
     from stcal.sfm.camera.calibrate import calibrate_camera as calibrate
     from stcal.sfm.camera.calibrate import calibration_json
+    from stcal.sfm.camera.text import calibration_text
     from stcal.sfm.pipeline import load_design
 
     if out.exists():
@@ -49,32 +55,5 @@ def calibrate_camera(
     summary = calibration_json(result)
     json_file = json_file or out.with_suffix(".json")
     save(json_file, json_text(summary))
-    _print(result, summary)
+    print(calibration_text(result, summary))
     print(f"camera file: {out}\nfigures and checks: {json_file}")
-
-
-def _print(result, summary: dict) -> None:
-    for each in result.skipped:
-        print(f"skipped {each.name}: {each.reason}")
-    for each in summary["outliers"]:
-        print(f"outlier {each['image']} {each['label']}: residual {each['residual_px']:.3f} px")
-    width, height = summary["size_px"]
-    print(
-        f"{summary['model']}, {width}×{height} px: {len(result.views)} views of the board, "
-        f"{sum(len(v) for v in result.views)} dots, residual RMS {summary['residual_rms_px']:.4f} px, "
-        f"{result.rounds} rounds of detection"
-    )
-    for name, each in summary["parameters"].items():
-        print(f"{name:>4} {each['value']:14.6f} ± {each['sigma']:.6f}{' px' if name[0] in 'fc' else ''}")
-    print(
-        f"σ of a projection: {np.median(result.projection.sigma_px):.4f} px median over the image, "
-        f"{result.projection.corner_sigma_px.max():.4f} px in the worst corner"
-    )
-    if result.split:
-        split = result.split
-        print(
-            f"split-half check: {split.verdict}; p = {split.p_value:.2g}, largest difference {split.largest_px:.4f} px "
-            f"where {np.sqrt(2) * split.largest_sigma_px:.4f} px is expected"
-        )
-    for warning in result.warnings:
-        print(f"warning: {warning}")

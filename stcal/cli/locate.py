@@ -2,17 +2,14 @@
 
 from enum import StrEnum
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import Annotated
 
 import typer
 
-from stcal.cli.saving import keep_apart, save, save_json
+from stcal.cli.options import CameraFile, FlatBoardFile, JsonFile, LayoutFile, ReportFile, Workers
+from stcal.cli.terminal import StageProgress, print_each, write
 from stcal.errors import InputError
-
-if TYPE_CHECKING:
-    from stcal.io.camera import CameraModel
-    from stcal.locate.data.views import CalibrationImages
-    from stcal.workflows.board_views import Board
+from stcal.io.saving import keep_apart
 
 app = typer.Typer(
     name="stcal locate",
@@ -21,11 +18,6 @@ app = typer.Typer(
     add_completion=False,
     pretty_exceptions_enable=False,
 )
-
-CameraFile = Annotated[Path, typer.Option("--camera", help="Intrinsics: COLMAP cameras.txt, OpenCV or ROS file.")]
-LayoutFile = Annotated[Path, typer.Option("--layout", help="The target's tags (TOML).")]
-JsonFile = Annotated[Path | None, typer.Option("--json", help="Also write everything as JSON.")]
-ReportFile = Annotated[Path | None, typer.Option("--report", help="Also write a page with tables and pictures (HTML).")]
 NOTHING_ACCEPTED = 3
 
 
@@ -38,11 +30,11 @@ class MethodName(StrEnum):
 
 @app.command()
 def schedule(
-    shortest: Annotated[float, typer.Argument(help="Shortest exposure time, in any unit.")],
-    longest: Annotated[float, typer.Argument(help="Longest.")],
-    count: Annotated[int, typer.Argument(min=1, max=1000, help="How many.")],
+    shortest: Annotated[float, typer.Argument(help="Start with this exposure time, in any unit.")],
+    longest: Annotated[float, typer.Argument(help="End with this exposure time, in the same unit.")],
+    count: Annotated[int, typer.Argument(min=1, max=1000, help="Print so many exposure times.")],
 ) -> None:
-    """Exposure times in a geometric series."""
+    """Print exposure times in a geometric series."""
     from stcal.locate.data.exposures import exposure_times
 
     for time in exposure_times(shortest, longest, count):
@@ -51,21 +43,25 @@ def schedule(
 
 @app.command()
 def calibrate(
-    images: Annotated[Path, typer.Argument(help="Photographs of the target with a board in the same plane.")],
+    images: Annotated[
+        Path, typer.Argument(help="Read photographs of the target with a board in the same plane from this folder.")
+    ],
     camera: CameraFile,
-    board: Annotated[Path, typer.Option("--board", help="Dots, chessboard, ChArUco or tags (TOML).")],
+    board: FlatBoardFile,
     layout: LayoutFile,
-    out: Annotated[Path, typer.Option("--out", help="The calibrated layout (TOML).")] = Path("calibrated.toml"),
-    workers: Annotated[int | None, typer.Option(min=1, help="Processes; as many as cores if not given.")] = None,
+    out: Annotated[Path, typer.Option("--out", help="Write the calibrated layout to this file (TOML).")] = Path(
+        "calibrated.toml"
+    ),
+    workers: Workers = None,
     json_file: JsonFile = None,
 ) -> None:
-    """Where the corners of the target's tags lie, with σ; the frame in the middle of the layout's origin tag."""
+    """Find where the corners of the target's tags lie, with σ, in a frame in the middle of the layout's origin tag."""
     from stcal.boards.file import load_flat_board
-    from stcal.cli.progress import StageProgress
     from stcal.io.camera import read_camera
     from stcal.locate.calibrate.solve import calibrate as calibrated
     from stcal.locate.data.layout import layout_toml, load_plan
     from stcal.locate.report.calibration import calibrated_json, calibrated_text, warnings
+    from stcal.workflows.locate import calibration_images
 
     keep_apart({"--out": out, "--json": json_file}, (layout, board, camera))
     plan, design, model = load_plan(layout), load_flat_board(board), read_camera(camera)
@@ -74,60 +70,88 @@ def calibrate(
         found = calibration_images(images, model, design, dictionaries, workers, progress)
     result = calibrated(plan, found.views, found.tags, found.names, found.camera, found.symmetries)
     print(calibrated_text(result))
-    for each in (*found.left_out, *result.left_out):
-        print(f"left out: {each}")
-    for warning in warnings(result, plan.tags):
-        print(f"warning: {warning}")
-    save(out, layout_toml(result.layout, [f"Calibrated by stcal locate from {len(result.images)} images."]))
+    print_each("left out", (*found.left_out, *result.left_out))
+    print_each("warning", warnings(result, plan.tags))
+    write(out, layout_toml(result.layout, [f"Calibrated by stcal locate from {len(result.images)} images."]))
     if json_file:
-        save_json(json_file, calibrated_json(result))
+        write(json_file, calibrated_json(result))
 
 
 @app.command()
 def run(
     exposures: Annotated[
-        Path, typer.Argument(help="One image; a folder of exposures of one scene; or a folder of such folders.")
+        Path,
+        typer.Argument(help="Read one image, a folder of exposures of one scene, or a folder of such folders."),
     ],
     layout: LayoutFile,
     camera: CameraFile,
-    out: Annotated[Path | None, typer.Option("--out", help="Accepted poses (CSV).")] = None,
-    method: Annotated[MethodName, typer.Option(help="joint: all exposures together; patent: as published.")] = (
-        MethodName.joint
-    ),
+    out: Annotated[Path | None, typer.Option("--out", help="Write the accepted poses to this file (CSV).")] = None,
+    method: Annotated[
+        MethodName, typer.Option(help="Use joint, all exposures together, or patent, each by itself as published.")
+    ] = MethodName.joint,
     hand_eye: Annotated[
-        Path | None, typer.Option("--hand-eye", help="JSON of `stcal handeye`: poses in the robot's base too.")
+        Path | None,
+        typer.Option("--hand-eye", help="Add poses in the robot's base by this result of `stcal handeye` (JSON)."),
     ] = None,
     robot_poses: Annotated[
-        Path | None, typer.Option("--robot-poses", help="base_from_flange of each scene (CSV with a column scene).")
+        Path | None,
+        typer.Option("--robot-poses", help="Read base_from_flange of each scene from this file (CSV, column scene)."),
     ] = None,
     offset: Annotated[
-        Path | None, typer.Option("--offset", help="JSON with obj_from_goal, 4×4: where to go, in the target's frame.")
+        Path | None,
+        typer.Option(
+            "--offset", help="Add goal poses by obj_from_goal, 4×4 in the target's frame, of this file (JSON)."
+        ),
     ] = None,
-    min_tags: Annotated[int, typer.Option(min=1, help="Tags needed.")] = 1,
-    min_spread_px: Annotated[float, typer.Option("--min-spread-px", min=0, help="Extent of their corners.")] = 12.0,
+    min_tags: Annotated[int, typer.Option(min=1, help="Reject a pose from fewer tags.")] = 1,
+    min_spread_px: Annotated[
+        float, typer.Option("--min-spread-px", min=0, help="Reject a pose whose corners extend over less, px.")
+    ] = 12.0,
     min_foreshortening: Annotated[
-        float, typer.Option(min=0, max=1, help="Cosine between target's normal and line of sight: det J without scale.")
+        float,
+        typer.Option(
+            min=0, max=1, help="Reject a pose with a smaller cosine between the target's normal and the line of sight."
+        ),
     ] = 0.17,
-    max_p: Annotated[float, typer.Option(help="Odds of residuals as large, from which on a pose is rejected.")] = 1e-4,
-    flip_odds: Annotated[float, typer.Option(help="Odds of the other pose that are allowed.")] = 1e-6,
-    sigma_margin: Annotated[float, typer.Option(min=1, help="By which all σ may be too small.")] = 1.5,
-    equal_deg: Annotated[float, typer.Option("--equal-deg", min=0, help="Two poses nearer than this are one.")] = 1.0,
-    max_sigma_deg: Annotated[float, typer.Option("--max-sigma-deg", help="Largest σ of the rotation.")] = 2.0,
+    max_p: Annotated[float, typer.Option(help="Reject a pose whose χ² p-value is below this.")] = 1e-4,
+    flip_odds: Annotated[
+        float, typer.Option(help="Call a pose ambiguous whose second solution has larger odds than this.")
+    ] = 1e-6,
+    sigma_margin: Annotated[
+        float, typer.Option(min=1, help="Allow for σ that are all too small by up to this factor.")
+    ] = 1.5,
+    equal_deg: Annotated[
+        float, typer.Option("--equal-deg", min=0, help="Treat two solutions nearer than this as one.")
+    ] = 1.0,
+    max_sigma_deg: Annotated[
+        float, typer.Option("--max-sigma-deg", help="Reject a pose whose largest σ of rotation exceeds this.")
+    ] = 2.0,
     max_sigma_mm: Annotated[
-        float | None, typer.Option("--max-sigma-mm", help="Largest σ of the position; any if not given.")
+        float | None,
+        typer.Option("--max-sigma-mm", help="Reject a pose whose largest σ of position exceeds this; none by default."),
     ] = None,
     moved_px: Annotated[
-        float, typer.Option("--moved-px", help="Tags that shift by more between exposures have moved.")
+        float, typer.Option("--moved-px", help="Treat a tag as moved that shifts by more than this between exposures.")
     ] = 0.5,
-    s_dis: Annotated[float, typer.Option("--s-dis", help="The patent's share of the largest area.")] = 0.8,
-    j_lim: Annotated[float, typer.Option("--j-lim", help="The patent's limit of det J, 1/mm².")] = 1e-8,
-    e_lim_px: Annotated[float, typer.Option("--e-lim-px", help="The patent's limit of the error.")] = 1.0,
-    e_ratio: Annotated[float, typer.Option("--e-ratio", help="The patent's limit of the errors' ratio.")] = 2.0,
-    workers: Annotated[int | None, typer.Option(min=1, help="Threads; as many as cores if not given.")] = None,
+    s_dis: Annotated[
+        float, typer.Option("--s-dis", help="Set the patent's share of the largest area, for --method patent.")
+    ] = 0.8,
+    j_lim: Annotated[
+        float, typer.Option("--j-lim", help="Set the patent's limit of det J, 1/mm², for --method patent.")
+    ] = 1e-8,
+    e_lim_px: Annotated[
+        float, typer.Option("--e-lim-px", help="Set the patent's limit of the error, px, for --method patent.")
+    ] = 1.0,
+    e_ratio: Annotated[
+        float, typer.Option("--e-ratio", help="Set the patent's limit of the errors' ratio, for --method patent.")
+    ] = 2.0,
+    workers: Annotated[
+        int | None, typer.Option(min=1, help="Use this many threads; one per core if not given.")
+    ] = None,
     json_file: JsonFile = None,
     report: ReportFile = None,
 ) -> None:
-    """Pose of the target in each scene, with its 6×6 covariance, and accept, ambiguous or reject.
+    """Find the pose of the target in each scene, with its 6×6 covariance, and accept, ambiguous or reject.
 
     Exit code 3 when no pose is accepted.
     """
@@ -165,32 +189,15 @@ def run(
         raise InputError(f"robot poses {robot_poses}: none of scene {missing[0]}; add a row, or take the scene away")
     results = list(located(scenes, target, model, LocateOptions(method.value, limits, patent, moved_px, workers)))
     print(run_text(results, chain))
-    for scene in scenes:
-        for each in scene.skipped:
-            print(f"not used: {each}")
+    print_each("not used", (each for scene in scenes for each in scene.skipped))
     if out:
-        save(out, poses_csv(results, chain))
+        write(out, poses_csv(results, chain))
     if json_file:
-        save_json(json_file, run_json(results, target, chain))
+        write(json_file, run_json(results, target, chain))
     if report:
         from stcal.locate.report.page import run_page
 
-        save(report, run_page(results, scenes, target, model, chain))
+        write(report, run_page(results, scenes, target, model, chain))
     if not accepted(results):
         print(f"no pose accepted in {len(results)} scene{'s' * (len(results) > 1)}")
         raise typer.Exit(NOTHING_ACCEPTED)
-
-
-def calibration_images(
-    folder: Path, model: "CameraModel", board: "Board", dictionaries: tuple[str, ...], workers: int | None, progress
-) -> "CalibrationImages":
-    """Board and tags in all images of a folder; ``progress`` is told (stage, done, total)."""
-    from stcal.io.images import find_images
-    from stcal.locate.data.views import CalibrationImages
-    from stcal.workflows.board_views import look
-
-    files, skipped = find_images(folder)
-    sights = look(files, model, board, dictionaries, workers, lambda done, total: progress("images", done, total))
-    names, views, tags = zip(*((sight.name, sight.view, sight.tags) for sight in sights.images), strict=True)
-    left_out = tuple(f"{each.name}: {each.reason}" for each in (*skipped, *sights.skipped) if each.name not in names)
-    return CalibrationImages(names, views, tags, sights.camera, sights.symmetries, left_out)

@@ -6,7 +6,7 @@ from typing import NoReturn
 import typer
 
 import stcal
-from stcal.cli import camera, capture, colmap, handeye, locate, measure, register, robot, sfm
+from stcal.cli import camera, capture, colmap, handeye, locate, measure, register, robot, sfm, simulate
 from stcal.errors import StcalError
 
 INTERRUPTED = 130
@@ -22,6 +22,7 @@ app = typer.Typer(
     add_completion=False,
     pretty_exceptions_enable=False,
 )
+sfm.app.add_typer(simulate.app)
 sfm.app.add_typer(colmap.app)
 sfm.app.add_typer(capture.app)
 sfm.app.add_typer(camera.app)

@@ -5,50 +5,61 @@ from typing import Annotated
 
 import typer
 
-from stcal.cli.progress import StageProgress
-from stcal.cli.saving import keep_apart
-from stcal.cli.sfm import CameraFile, MaxDiameter, MinDiameter, TargetFile, Workers, ellipse_options
+from stcal.cli.options import CameraFile, MaxDiameter, MinDiameter, ReportFile, TargetFile, Workers, ellipse_options
+from stcal.cli.terminal import StageProgress, print_each, write
 from stcal.design import reference_target
 from stcal.errors import InputError
 from stcal.io.camera import read_camera
 from stcal.io.design import load_board, load_target
-from stcal.io.saving import json_text, save
+from stcal.io.saving import keep_apart
 
 app = typer.Typer()
 
 
 @app.command()
 def measure(
-    images: Annotated[Path, typer.Argument(help="Folder of images, in it or in its subfolders.")],
+    images: Annotated[Path, typer.Argument(help="Read the images of this folder and of its subfolders.")],
     camera: CameraFile,
-    faces: Annotated[Path, typer.Option("--faces", help="faces.json of the target's calibration.")],
+    faces: Annotated[Path, typer.Option("--faces", help="Read the calibrated target from this faces.json.")],
     target: TargetFile = None,
-    out: Annotated[Path, typer.Option("--out", help="Table of the poses (CSV).")] = Path("poses.csv"),
+    out: Annotated[Path, typer.Option("--out", help="Write the table of poses to this file (CSV).")] = Path(
+        "poses.csv"
+    ),
     json_file: Annotated[
-        Path | None, typer.Option("--json", help="Also write everything as JSON, both poses of an undecided image too.")
+        Path | None,
+        typer.Option(
+            "--json", help="Also write everything to this file, both solutions of an undecided image too (JSON)."
+        ),
     ] = None,
-    report: Annotated[
-        Path | None, typer.Option("--report", help="Also write a page with the poses, their σ and plots (HTML).")
-    ] = None,
+    report: ReportFile = None,
     joints: Annotated[
         Path | None,
-        typer.Option("--joints", help="CSV with a column image: its other columns, joint values say, join the table."),
+        typer.Option(
+            "--joints",
+            help="Add to the table the columns of this file, joint values say; it needs a column image (CSV).",
+        ),
     ] = None,
     board: Annotated[
-        Path | None, typer.Option("--board", help="board.toml of a dot board that is in view, to tell its dots apart.")
+        Path | None,
+        typer.Option("--board", help="Tell the dots of the board of this board.toml apart, if it is in view."),
     ] = None,
     previous: Annotated[
-        bool, typer.Option("--previous", help="Motions are small: the image before decides between two poses.")
+        bool, typer.Option("--previous", help="Decide between two solutions by the image before, as motions are small.")
     ] = False,
     sigma_factor: Annotated[
         float | None,
-        typer.Option("--sigma-factor", min=1e-3, max=1e3, help="On the centres' σ; that of faces.json if not given."),
+        typer.Option(
+            "--sigma-factor",
+            min=1e-3,
+            max=1e3,
+            help="Multiply the centres' σ by this; by the factor of faces.json if not given.",
+        ),
     ] = None,
     min_diameter: MinDiameter = None,
     max_diameter: MaxDiameter = 450.0,
     workers: Workers = None,
 ) -> None:
-    """Pose of a calibrated target in each image, from whatever faces it shows, with its 6×6 covariance."""
+    """Measure the pose of a calibrated target in each image, from whatever faces it shows, with its 6×6 covariance."""
     from stcal.io.table import read_table
     from stcal.sfm.measure import images as work
     from stcal.sfm.measure.pose import PoseOptions
@@ -71,15 +82,11 @@ def measure(
         )
     text, apart = work.poses_csv(result, table)
     print(work.measure_text(result))
-    for each in apart:
-        print(f"not joined: {each}")
-    save(out, text)
-    print(f"poses: {out}")
+    print_each("not joined", apart)
+    write(out, text, "poses")
     if json_file:
-        save(json_file, json_text(work.measure_json(result)))
-        print(f"as JSON: {json_file}")
+        write(json_file, work.measure_json(result), "as JSON")
     if report:
         from stcal.sfm.measure.report import measure_page
 
-        save(report, measure_page(result, str(images)))
-        print(f"report: {report}")
+        write(report, measure_page(result, str(images)), "report")

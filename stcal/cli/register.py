@@ -6,8 +6,10 @@ from typing import Annotated
 
 import typer
 
-from stcal.cli.saving import keep_apart, save, save_json
+from stcal.cli.options import ReportFile
+from stcal.cli.terminal import print_each, write
 from stcal.errors import ConvergenceError, DegenerateError, InputError
+from stcal.io.saving import keep_apart
 
 
 class Model(StrEnum):
@@ -28,29 +30,35 @@ class Method(StrEnum):
 
 def register(
     pairs_file: Annotated[
-        Path, typer.Argument(metavar="PAIRS", help="ax_mm,ay_mm,az_mm,bx_mm,by_mm,bz_mm of the same points (CSV).")
+        Path,
+        typer.Argument(
+            metavar="PAIRS", help="Read ax_mm,ay_mm,az_mm,bx_mm,by_mm,bz_mm of the same points from this file (CSV)."
+        ),
     ],
-    model: Annotated[Model, typer.Option(help="Of the transform.")] = Model.rigid,
-    method: Annotated[Method, typer.Option(help="liu2017: a published method, always affine.")] = Method.robust,
+    model: Annotated[Model, typer.Option(help="Fit a transform of this kind.")] = Model.rigid,
+    method: Annotated[
+        Method, typer.Option(help="Fit it with this method; liu2017 is a published one, always affine.")
+    ] = Method.robust,
     threshold: Annotated[
-        float | None, typer.Option(help="Inliers are nearer than this, mm; estimated from the data if not given.")
+        float | None,
+        typer.Option(help="Count points nearer than this as inliers, mm; estimated from the data if not given."),
     ] = None,
-    seed: Annotated[int, typer.Option(min=0, help="Of the random samples and of the cross-validation.")] = 0,
-    folds: Annotated[int, typer.Option(min=0, help="Of the cross-validation; 0 for none.")] = 6,
+    seed: Annotated[int, typer.Option(min=0, help="Draw random samples and folds with this seed.")] = 0,
+    folds: Annotated[int, typer.Option(min=0, help="Cross-validate with this many folds; 0 for none.")] = 6,
     allow_ambiguous: Annotated[
         bool, typer.Option("--allow-ambiguous", help="Answer even where another transform is about as good.")
     ] = False,
     robot_file: Annotated[
         Path | None,
-        typer.Option("--robot", help="Robot file (TOML), with q1_deg … in PAIRS: solve base and kinematics together."),
+        typer.Option("--robot", help="Solve base and kinematics of this robot (TOML) together; PAIRS needs q1_deg …."),
     ] = None,
     identified: Annotated[
-        Path | None, typer.Option("--identified", help="With --robot: the identified robot (TOML).")
+        Path | None, typer.Option("--identified", help="Write the robot identified with --robot to this file (TOML).")
     ] = None,
-    out: Annotated[Path | None, typer.Option("--out", help="Everything (JSON).")] = None,
-    report: Annotated[Path | None, typer.Option("--report", help="A page with tables and pictures (HTML).")] = None,
+    out: Annotated[Path | None, typer.Option("--out", help="Write everything to this file (JSON).")] = None,
+    report: ReportFile = None,
 ) -> None:
-    """b_from_a from points measured in two frames, some of which may be wrong; with σ, outliers and where it holds."""
+    """Find b_from_a from points measured in two frames, some of them wrong; with σ, outliers and where it holds."""
     from stcal.register import register as registered
     from stcal.register.core.pairs import read_pairs
     from stcal.register.report.file import registration_json
@@ -75,8 +83,7 @@ def register(
     )
     found = findings(pairs.where, pairs.lines, pairs.xyz_a, pairs.xyz_b, result, pairs.weights, pairs.covariances)
     print(registration_text(found))
-    for note in result.notes:
-        print(f"warning: {pairs.where}: {note}")
+    print_each(f"warning: {pairs.where}", result.notes)
     content, sections, failed = registration_json(found), [], None
     if robot_file:
         from stcal.robot.kinematics.file import robot_toml
@@ -89,11 +96,12 @@ def register(
             sections.append(comparison_section(beside))
             if identified:
                 comments = [f"Identified from {pairs_file.name}: {beside.identified.rank} parameters."]
-                save(identified, robot_toml(beside.identified.robot, comments))
+                write(identified, robot_toml(beside.identified.robot, comments))
         except (DegenerateError, ConvergenceError) as error:  # the transform stands all the same
             failed = error
-    save_json(out, content)
+    if out:
+        write(out, content)
     if report:
-        save(report, registration_page(found, sections))
+        write(report, registration_page(found, sections))
     if failed is not None:
         raise failed

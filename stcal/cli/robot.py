@@ -7,8 +7,10 @@ from typing import Annotated
 
 import typer
 
-from stcal.cli.saving import keep_apart, save, save_json
+from stcal.cli.options import JsonFile, ReportFile, RobotFile
+from stcal.cli.terminal import print_each, write
 from stcal.errors import DegenerateError, InputError
+from stcal.io.saving import keep_apart
 
 app = typer.Typer(
     name="stcal robot",
@@ -18,14 +20,10 @@ app = typer.Typer(
     pretty_exceptions_enable=False,
 )
 
-RobotFile = Annotated[Path, typer.Option("--robot", help="Robot file (TOML); `stcal robot init` writes one.")]
-JsonFile = Annotated[Path | None, typer.Option("--json", help="Also write everything as JSON.")]
-ReportFile = Annotated[Path | None, typer.Option("--report", help="Also write a page with tables and plots (HTML).")]
-
 
 @app.command()
 def init(
-    file: Annotated[Path, typer.Argument(help="Robot file to write; must not exist.")] = Path("robot.toml"),
+    file: Annotated[Path, typer.Argument(help="Write the robot file here; it must not exist.")] = Path("robot.toml"),
 ) -> None:
     """Write an example of a robot file, to edit: a six-axis arm of 2 m reach."""
     from stcal.robot.kinematics.example import mh80
@@ -38,21 +36,26 @@ def init(
         "Optional: min_deg, max_deg, beta_deg, base, tool, [[target]] for more tools, and coupling, which makes",
         "kinematic joint values of the controller's (Fanuc: its third row is [0, 1, 1, 0, 0, 0]).",
     )
-    save(file, robot_toml(mh80(), comments))
+    write(file, robot_toml(mh80(), comments))
 
 
 @app.command()
 def axes(
-    sweeps: Annotated[Path, typer.Argument(help="Joint values and positions of reflectors in sweeps (CSV).")],
+    sweeps: Annotated[
+        Path, typer.Argument(help="Read joint values and positions of reflectors in sweeps from this file (CSV).")
+    ],
     robot_file: RobotFile,
-    out: Annotated[Path | None, typer.Option("--out", help="The robot that the axes make (TOML).")] = None,
+    out: Annotated[
+        Path | None, typer.Option("--out", help="Write the robot that the axes make to this file (TOML).")
+    ] = None,
     still_deg: Annotated[
-        float, typer.Option(min=1e-9, max=1.0, help="Joints that change by less than this stand still.")
+        float,
+        typer.Option(min=1e-9, max=1.0, help="Take joints that change by less than this as standing still, degrees."),
     ] = 0.0015,
     json_file: JsonFile = None,
     report: ReportFile = None,
 ) -> None:
-    """The axis method: each joint's axis from sweeps of that joint alone, and the robot that follows."""
+    """Find each joint's axis from sweeps of that joint alone, and the robot that follows (the axis method)."""
     from stcal.robot.axes.model import robot_from_sweeps
     from stcal.robot.axes.report import axes_json, axes_page, axes_text
     from stcal.robot.kinematics.file import load_robot, robot_toml
@@ -63,13 +66,13 @@ def axes(
     data = read_measurements(sweeps, nominal)
     result = robot_from_sweeps(data, nominal, math.radians(still_deg))
     print(axes_text(result))
-    for note in result.notes:
-        print(f"warning: {data.where}: {note}")
+    print_each(f"warning: {data.where}", result.notes)
     if out:
-        save(out, robot_toml(result.robot, [f"Identified by the axis method from {sweeps.name}."]))
-    save_json(json_file, axes_json(result))
+        write(out, robot_toml(result.robot, [f"Identified by the axis method from {sweeps.name}."]))
+    if json_file:
+        write(json_file, axes_json(result))
     if report:
-        save(report, axes_page(result, data.where))
+        write(report, axes_page(result, data.where))
 
 
 class Kind(StrEnum):
@@ -82,21 +85,35 @@ class Kind(StrEnum):
 
 @app.command()
 def identify(
-    data_file: Annotated[Path, typer.Argument(metavar="DATA", help="Joint values with what was measured there (CSV).")],
+    data_file: Annotated[
+        Path,
+        typer.Argument(metavar="DATA", help="Read joint values with what was measured there from this file (CSV)."),
+    ],
     robot_file: RobotFile,
-    out: Annotated[Path | None, typer.Option("--out", help="The identified robot (TOML).")] = None,
-    observe: Annotated[Kind | None, typer.Option(help="What to use; the most that was measured if not given.")] = None,
+    out: Annotated[Path | None, typer.Option("--out", help="Write the identified robot to this file (TOML).")] = None,
+    observe: Annotated[
+        Kind | None, typer.Option(help="Use this of the measurements; the most that was measured if not given.")
+    ] = None,
     sigma_mm: Annotated[
-        float | None, typer.Option("--sigma-mm", min=1e-9, help="σ of a position's coordinate.")
+        float | None,
+        typer.Option("--sigma-mm", min=1e-9, help="Set σ of a measured position, mm per axis; estimated if not given."),
     ] = None,
     sigma_rad: Annotated[
-        float | None, typer.Option("--sigma-rad", min=1e-12, help="σ of an orientation's coordinate.")
+        float | None,
+        typer.Option(
+            "--sigma-rad", min=1e-12, help="Set σ of a measured orientation, rad per axis; estimated if not given."
+        ),
     ] = None,
-    folds: Annotated[int, typer.Option(min=0, help="Of the cross-validation; 0 for none.")] = 6,
-    seed: Annotated[int, typer.Option(min=0, help="Of its divisions.")] = 0,
-    robust: Annotated[bool, typer.Option("--robust/--least-squares", help="Whether outliers weigh less.")] = True,
+    folds: Annotated[int, typer.Option(min=0, help="Cross-validate with this many folds; 0 for none.")] = 6,
+    seed: Annotated[int, typer.Option(min=0, help="Divide the rows into folds with this seed.")] = 0,
+    robust: Annotated[
+        bool, typer.Option("--robust/--least-squares", help="Give outliers less weight, or all rows the same.")
+    ] = True,
     partial: Annotated[
-        bool, typer.Option("--partial", help="Keep nominal what the data leave open, in place of refusing them.")
+        bool,
+        typer.Option(
+            "--partial", help="Keep parameters nominal that the data leave open, rather than refuse the data."
+        ),
     ] = False,
     json_file: JsonFile = None,
     report: ReportFile = None,
@@ -116,26 +133,28 @@ def identify(
     result = identified_from(nominal, data, options)
     print(identified_text(result, nominal))
     if out:
-        save(out, robot_toml(result.robot, [f"Identified from {data_file.name}: {result.rank} parameters."]))
-    save_json(json_file, identified_json(result, nominal))
+        write(out, robot_toml(result.robot, [f"Identified from {data_file.name}: {result.rank} parameters."]))
+    if json_file:
+        write(json_file, identified_json(result, nominal))
     if report:
-        save(report, identified_page(result, nominal))
+        write(report, identified_page(result, nominal))
 
 
 @app.command()
 def compensate(
-    targets: Annotated[Path, typer.Argument(help="Commanded poses or joint values (CSV).")],
-    robot_file: Annotated[Path, typer.Option("--robot", help="The identified robot (TOML).")],
+    targets: Annotated[Path, typer.Argument(help="Read commanded poses or joint values from this file (CSV).")],
+    robot_file: Annotated[Path, typer.Option("--robot", help="Read the identified robot from this file (TOML).")],
     nominal: Annotated[
-        Path | None, typer.Option("--nominal", help="The robot as its controller believes it to be (TOML).")
+        Path | None, typer.Option("--nominal", help="Read the robot as its controller has it from this file (TOML).")
     ] = None,
     out: Annotated[
-        Path | None, typer.Option("--out", help="Joint values to send, with status and errors (CSV).")
+        Path | None,
+        typer.Option("--out", help="Write joint values to send, with status and errors, to this file (CSV)."),
     ] = None,
     json_file: JsonFile = None,
     report: ReportFile = None,
 ) -> None:
-    """Joint values that really reach commanded poses, beside the nominal ones."""
+    """Compute joint values that really reach commanded poses, beside the nominal ones."""
     from stcal.robot.kinematics.file import load_robot
     from stcal.robot.use import compensation as stage
 
@@ -146,15 +165,15 @@ def compensate(
     print(stage.compensated_text(result, identified))
     for line in stage.compensated_summary(result):
         print(line)
-    for note in result.notes():
-        print(f"warning: {wanted.where}: {note}")
+    print_each(f"warning: {wanted.where}", result.notes())
     if out:
-        save(out, stage.compensated_csv(result, identified))
-    save_json(json_file, stage.compensated_json(result, identified))
+        write(out, stage.compensated_csv(result, identified))
+    if json_file:
+        write(json_file, stage.compensated_json(result, identified))
     if report:
         from stcal.robot.use.report import compensation_page
 
-        save(report, compensation_page(result, identified))
+        write(report, compensation_page(result, identified))
     if not result.found.usable.any():
         raise DegenerateError(f"{wanted.where}: none of {len(result)} poses is reached; see the warnings above")
 
@@ -162,13 +181,16 @@ def compensate(
 @app.command()
 def verify(
     measured: Annotated[
-        Path, typer.Argument(help="commanded_x_mm … beside measured x_mm …; set: before, after (CSV).")
+        Path,
+        typer.Argument(help="Read commanded_x_mm … beside measured x_mm … from this file; set: before, after (CSV)."),
     ],
-    plot: Annotated[Path | None, typer.Option("--plot", help="Error of each pose and set (.png or .svg).")] = None,
+    plot: Annotated[
+        Path | None, typer.Option("--plot", help="Draw the error of each pose and set to this file (.png or .svg).")
+    ] = None,
     json_file: JsonFile = None,
     report: ReportFile = None,
 ) -> None:
-    """Distances of measured positions from the first, against the commanded ones; sets before and after compared."""
+    """Compare distances of measured positions from the first with the commanded ones, before and after."""
     from stcal.robot.use import verification as stage
 
     if plot and plot.suffix.lower() not in (".png", ".svg"):
@@ -176,17 +198,17 @@ def verify(
     keep_apart({"--plot": plot, "--json": json_file, "--report": report}, (measured,))
     result = stage.verify(stage.read_measured(measured))
     print(stage.verified_text(result))
-    for warning in result.warnings():
-        print(f"warning: {warning}")
+    print_each("warning", result.warnings())
     if plot:
         from stcal.robot.use.report import figure_bytes, verification_figure
 
-        save(plot, figure_bytes(verification_figure(result), plot.suffix.lower()[1:]))
-    save_json(json_file, stage.verified_json(result))
+        write(plot, figure_bytes(verification_figure(result), plot.suffix.lower()[1:]))
+    if json_file:
+        write(json_file, stage.verified_json(result))
     if report:
         from stcal.robot.use.report import verification_page
 
-        save(report, verification_page(result))
+        write(report, verification_page(result))
 
 
 class Observed(StrEnum):
@@ -199,17 +221,21 @@ class Observed(StrEnum):
 @app.command()
 def design(
     robot_file: RobotFile,
-    count: Annotated[int, typer.Option(min=1, max=2000, help="Poses.")] = 40,
-    seed: Annotated[int, typer.Option(min=0, help="Of the candidates.")] = 0,
-    out: Annotated[Path | None, typer.Option("--out", help="The poses (CSV).")] = None,
-    observe: Annotated[Observed, typer.Option(help="What the instrument measures.")] = Observed.position,
-    candidates: Annotated[int, typer.Option(min=2, max=100_000, help="Random poses to choose from.")] = 1000,
-    sigma_mm: Annotated[float, typer.Option("--sigma-mm", help="σ of measured positions, per axis.")] = 0.05,
-    sigma_rad: Annotated[float, typer.Option("--sigma-rad", help="σ of measured orientations, per axis.")] = 2e-4,
+    count: Annotated[int, typer.Option(min=1, max=2000, help="Choose this many poses.")] = 40,
+    seed: Annotated[int, typer.Option(min=0, help="Draw the candidates with this seed.")] = 0,
+    out: Annotated[Path | None, typer.Option("--out", help="Write the poses to this file (CSV).")] = None,
+    observe: Annotated[Observed, typer.Option(help="Plan for an instrument that measures this.")] = Observed.position,
+    candidates: Annotated[int, typer.Option(min=2, max=100_000, help="Choose from this many random poses.")] = 1000,
+    sigma_mm: Annotated[
+        float, typer.Option("--sigma-mm", help="Assume this σ of measured positions, mm per axis.")
+    ] = 0.05,
+    sigma_rad: Annotated[
+        float, typer.Option("--sigma-rad", help="Assume this σ of measured orientations, rad per axis.")
+    ] = 2e-4,
     box: Annotated[
-        str | None, typer.Option(help="Where the tool may be, mm in the base: xmin,ymin,zmin,xmax,ymax,zmax.")
+        str | None, typer.Option(help="Keep the tool inside this box, mm in the base: xmin,ymin,zmin,xmax,ymax,zmax.")
     ] = None,
-    target: Annotated[str, typer.Option(help="Name of the target (tool) that is measured.")] = "",
+    target: Annotated[str, typer.Option(help="Measure the target (tool) of this name.")] = "",
     json_file: JsonFile = None,
     report: ReportFile = None,
 ) -> None:
@@ -227,12 +253,13 @@ def design(
     also = f" and {sigma_rad:g} rad" if observe is Observed.pose else ""
     print(f"for an instrument whose {observe.value}s have σ {sigma_mm:g} mm{also} per axis (--sigma-mm, --sigma-rad)")
     if out:
-        save(out, stage.design_csv(result, robot))
-    save_json(json_file, stage.design_json(result))
+        write(out, stage.design_csv(result, robot))
+    if json_file:
+        write(json_file, stage.design_json(result))
     if report:
         from stcal.robot.use.design_report import design_page
 
-        save(report, design_page(result, robot))
+        write(report, design_page(result, robot))
 
 
 def _box(text: str) -> tuple[float, ...]:

@@ -1,7 +1,8 @@
-"""Files that appear complete or not at all."""
+"""Files that appear complete or not at all, and that replace no input."""
 
 import json
 import os
+from collections.abc import Sequence
 from contextlib import suppress
 from pathlib import Path
 
@@ -36,3 +37,30 @@ def save(path: Path, content: str | bytes) -> None:
 def json_text(content: dict) -> str:
     """As all JSON files of the package are written."""
     return json.dumps(content, indent=1, ensure_ascii=False, allow_nan=False) + "\n"
+
+
+def keep_apart(outputs: dict[str, Path | None], inputs: Sequence[Path | None]) -> None:
+    """Refuse, before the work, files that would replace an input or each other.
+
+    Parameters
+    ----------
+    outputs : by option
+
+    Raises
+    ------
+    InputError
+        Which, and what they would replace.
+    """
+    places: dict[Path, str] = {}
+    own = {path.resolve() for path in inputs if path}
+    for option, path in outputs.items():
+        if not path:
+            continue
+        place = path.resolve()
+        if place in own:
+            raise InputError(f"{option} {path}: is an input of this command; give another name")
+        if place in places:
+            raise InputError(f"{option} {path}: is also what {places[place]} writes; give each its own name")
+        if place.is_dir():
+            raise InputError(f"{option} {path}: is a folder; the name of a file needed")
+        places[place] = option

@@ -26,7 +26,7 @@ def write_dataset(
     image_format: str = "jpg",
     jpeg_quality: int = 95,
     workers: int | None = None,
-    progress: Callable[[str], None] | None = None,
+    progress: Callable[[int, int], None] | None = None,
 ) -> list[Path]:
     """Write ``images/<group>/IMG_1000.jpg`` …, ``cameras.txt``, ``target.toml``, ``board.toml``, ``truth.json``.
 
@@ -39,7 +39,7 @@ def write_dataset(
     workers : int, optional
         Processes that render; default one per core.
     progress : callable, optional
-        Called with the image's name, ``12/IMG_1000.jpg``, once per finished image, in any order.
+        Called with the number of images done, and that of all.
 
     Returns
     -------
@@ -75,10 +75,10 @@ def write_dataset(
         for i in range(len(g.camera_from_target))
     }
     paths = {name: folder / "images" / name for name in jobs}
-    names = list(jobs)
-    for i, _ in run_parallel(_write_image, [(paths[name], *jobs[name]) for name in names], workers):
+    written = run_parallel(_write_image, [(path, *jobs[name]) for name, path in paths.items()], workers)
+    for done, _ in enumerate(written, 1):
         if progress:
-            progress(names[i])
+            progress(done, len(jobs))
     return list(paths.values())
 
 

@@ -30,7 +30,7 @@ Board = BoardDesign | FlatBoard
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Sight:
+class BoardDetection:
     """One readable image: ``view`` of the board, None where ``why`` tells the reason; ``tags`` that were asked for."""
 
     name: str
@@ -41,28 +41,28 @@ class Sight:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Sights:
+class BoardDetections:
     """``camera`` : with its size; ``images`` : readable ones, in the order of the files; ``skipped`` : all that show no
     board that could be used, and why; ``symmetries`` : turns by which the numbering of a view may be off."""
 
     camera: Camera
-    images: tuple[Sight, ...]
+    images: tuple[BoardDetection, ...]
     skipped: tuple[Skipped, ...]
     symmetries: tuple[Rigid, ...]
 
     def views(self) -> dict[str, BoardView]:
         """By image, those that show the board."""
-        return {sight.name: sight.view for sight in self.images if sight.view is not None}
+        return {detection.name: detection.view for detection in self.images if detection.view is not None}
 
 
-def look(
+def detect_boards(
     files: Sequence[ImageFile],
     model: CameraModel,
     board: Board,
     dictionaries: Sequence[str] = (),
     workers: int | None = None,
     progress: Callable[[int, int], None] | None = None,
-) -> Sights:
+) -> BoardDetections:
     """Find the board in all images, and the tags of ``dictionaries`` beside it; trouble with one image skips it.
 
     Parameters
@@ -77,21 +77,21 @@ def look(
     if not files:
         raise InputError("no image; images of the board needed")
     jobs = [(file, model, board, tuple(dictionaries)) for file in files]
-    found: list[Sight | Skipped | None] = [None] * len(jobs)
-    for done, (i, sight) in enumerate(run_parallel(_look_at, jobs, workers), 1):
-        found[i] = sight
+    found: list[BoardDetection | Skipped | None] = [None] * len(jobs)
+    for done, (i, detection) in enumerate(run_parallel(_detect_board, jobs, workers), 1):
+        found[i] = detection
         if progress:
             progress(done, len(jobs))
-    sights = [each for each in found if isinstance(each, Sight)]
-    if not sights:
+    detections = [each for each in found if isinstance(each, BoardDetection)]
+    if not detections:
         raise InputError(f"no usable image among {len(files)}: {found[0].name}: {found[0].reason}")
-    size = sights[0].size
-    _require_inside(model, sights[0])
-    found = [_of_size(each, size, sights[0].name) for each in found]
-    sights = tuple(each for each in found if isinstance(each, Sight))
-    without = (Skipped(s.name, s.why, "board") for s in sights if s.view is None)
+    size = detections[0].size
+    _require_inside(model, detections[0])
+    found = [_of_size(each, size, detections[0].name) for each in found]
+    detections = tuple(each for each in found if isinstance(each, BoardDetection))
+    without = (Skipped(s.name, s.why, "board") for s in detections if s.view is None)
     skipped = (*(each for each in found if isinstance(each, Skipped)), *without)
-    return Sights(model.sized(*size), sights, skipped, tuple(symmetries(board)))
+    return BoardDetections(model.sized(*size), detections, skipped, tuple(symmetries(board)))
 
 
 def symmetries(board: Board) -> list[Rigid]:
@@ -103,7 +103,9 @@ def symmetries(board: Board) -> list[Rigid]:
     return turns(board.xy_mm(), [1, 2, 3] if board.rows == board.columns else [2])
 
 
-def _look_at(file: ImageFile, model: CameraModel, board: Board, dictionaries: tuple[str, ...]) -> Sight | Skipped:
+def _detect_board(
+    file: ImageFile, model: CameraModel, board: Board, dictionaries: tuple[str, ...]
+) -> BoardDetection | Skipped:
     try:
         image = decode(file.path.read_bytes(), file.name)
     except OSError as error:
@@ -119,7 +121,7 @@ def _look_at(file: ImageFile, model: CameraModel, board: Board, dictionaries: tu
         view, why = _find(image, file.name, model.sized(width, height), board)
     except StcalError as error:
         view, why = None, str(error)
-    return Sight(file.name, (width, height), view, why, tags)
+    return BoardDetection(file.name, (width, height), view, why, tags)
 
 
 def _find(image: np.ndarray, name: str, camera: Camera, board: Board) -> tuple[BoardView | None, str]:
@@ -193,7 +195,7 @@ def images_of_centres(
     return seen
 
 
-def _require_inside(model: CameraModel, first: Sight) -> None:
+def _require_inside(model: CameraModel, first: BoardDetection) -> None:
     """A file that states no size may be another camera's."""
     x, y = model.centre
     if not (0 < x < first.size[0] and 0 < y < first.size[1]):
@@ -203,7 +205,7 @@ def _require_inside(model: CameraModel, first: Sight) -> None:
         )
 
 
-def _of_size(each: Sight | Skipped, size: tuple[int, int], first: str) -> Sight | Skipped:
+def _of_size(each: BoardDetection | Skipped, size: tuple[int, int], first: str) -> BoardDetection | Skipped:
     if isinstance(each, Skipped) or each.size == size:
         return each
     own, wanted = ("{}×{} px".format(*s) for s in (each.size, size))

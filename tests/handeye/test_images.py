@@ -14,7 +14,7 @@ from stcal.geometry.conic import circle_conic, ellipse_of_conic
 from stcal.geometry.rigid import Rigid
 from stcal.io.camera import CameraModel
 from stcal.io.images import find_images
-from stcal.workflows.board_views import images_of_centres, look, symmetries
+from stcal.workflows.board_views import detect_boards, images_of_centres, symmetries
 from tests.boards.drawn import chessboard_mm
 from tests.handeye.photographed import (
     CAMERA,
@@ -72,7 +72,7 @@ def test_every_board_is_found_where_it_was_drawn(kind, tmp_path):
     cv2.imwrite(str(tmp_path / "small.png"), np.full((90, 120), 200, np.uint8))
     (tmp_path / "torn.png").write_bytes((tmp_path / "a.png").read_bytes()[:5000])
     files, _ = find_images(tmp_path)
-    found = look(files, MODEL, board, (FAMILY,), workers=1)
+    found = detect_boards(files, MODEL, board, (FAMILY,), workers=1)
     assert (found.camera.width, found.camera.height) == (800, 600)
     view = found.views()["a.png"]
     assert len(view) == len(board.xy_mm())
@@ -90,7 +90,7 @@ def test_dots_carry_a_covariance_like_their_errors(tmp_path):
     """Mean squared error in units of σ²: 2 per dot for true σ; drawing in steps adds to the noise that σ knows."""
     board, sheet, first = boards()["dots"]
     cv2.imwrite(str(tmp_path / "a.png"), take(sheet, first, SLANTED))
-    view = look(find_images(tmp_path)[0], MODEL, board, workers=1).views()["a.png"]
+    view = detect_boards(find_images(tmp_path)[0], MODEL, board, workers=1).views()["a.png"]
     off = CAMERA.project(SLANTED @ view.xyz_board) - view.xy_px
     squared = np.einsum("na,nab,nb->n", off, np.linalg.inv(view.covariance_px2), off)
     assert 0.5 < squared.mean() < 20
@@ -129,7 +129,7 @@ def test_a_plain_board_is_numbered_up_to_its_symmetry(tmp_path):
     board = dots()
     sheet, first = sheet_of_dots(board.xy_mm(), board.radii_mm())
     cv2.imwrite(str(tmp_path / "a.png"), take(sheet, first, SLANTED))
-    found = look(find_images(tmp_path)[0], MODEL, board, workers=1)
+    found = detect_boards(find_images(tmp_path)[0], MODEL, board, workers=1)
     view = found.views()["a.png"]
     errors = [
         np.linalg.norm(CAMERA.project(SLANTED @ (turn @ view.xyz_board)) - view.xy_px, axis=1).max()
@@ -143,7 +143,7 @@ def test_a_strip_hidden_is_said(tmp_path):
     board = dots()
     image = take(*sheet_of_dots(board.xy_mm()[board.xy_mm()[:, 0] < 139], board.radii_mm()[:42]), SLANTED)
     cv2.imwrite(str(tmp_path / "a.png"), image)
-    found = look(find_images(tmp_path)[0], MODEL, board, workers=1)
+    found = detect_boards(find_images(tmp_path)[0], MODEL, board, workers=1)
     assert found.views() == {}
     assert "strip" in found.skipped[0].reason
 
@@ -151,13 +151,13 @@ def test_a_strip_hidden_is_said(tmp_path):
 def test_a_camera_of_other_images_is_refused(tmp_path):
     cv2.imwrite(str(tmp_path / "a.png"), np.full((300, 400), 200, np.uint8))
     with pytest.raises(InputError, match=r"principal point \(406, 293\) px is outside of a.png"):
-        look(find_images(tmp_path)[0], MODEL, dots(), workers=1)
+        detect_boards(find_images(tmp_path)[0], MODEL, dots(), workers=1)
 
 
 def test_no_readable_image_is_said(tmp_path):
     (tmp_path / "a.png").write_bytes(b"")
     with pytest.raises(InputError, match=r"no usable image among 1: a\.png: empty"):
-        look(find_images(tmp_path)[0], MODEL, dots(), workers=1)
+        detect_boards(find_images(tmp_path)[0], MODEL, dots(), workers=1)
 
 
 @pytest.mark.parametrize(
@@ -173,5 +173,5 @@ def test_why_a_charuco_board_is_not_found(tmp_path, changed, reason):
     (tmp_path / "images").mkdir()
     cv2.imwrite(str(tmp_path / "images" / "0.png"), take(sheet, first, SLANTED))
     files, _ = find_images(tmp_path / "images")
-    found = look(files, MODEL, replace(design, **changed), workers=1)
+    found = detect_boards(files, MODEL, replace(design, **changed), workers=1)
     assert reason in found.skipped[0].reason

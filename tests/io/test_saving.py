@@ -5,9 +5,8 @@ from pathlib import Path
 
 import pytest
 
-from stcal.cli.saving import keep_apart
 from stcal.errors import InputError
-from stcal.io.saving import json_text, save
+from stcal.io.saving import json_text, keep_apart, save
 
 
 def test_text_bytes_and_folders(tmp_path):

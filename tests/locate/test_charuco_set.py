@@ -9,7 +9,6 @@ import pytest
 
 from stcal.boards.design import CharucoDesign
 from stcal.boards.tags import find_tags
-from stcal.cli.locate import calibration_images
 from stcal.io.camera import CameraModel, read_camera
 from stcal.io.images import decode
 from stcal.locate.calibrate.holdout import half_calibrated, subset_trials
@@ -19,6 +18,7 @@ from stcal.locate.data.views import CalibrationImages
 from stcal.locate.pipeline import run
 from stcal.locate.pose.merge import merge
 from stcal.synthetic.exposure import Light, expose
+from stcal.workflows.locate import calibration_images
 
 BOARD = CharucoDesign(7, 5, 36.195, 18.256, "DICT_6X6_250")
 PLAN = LayoutPlan(

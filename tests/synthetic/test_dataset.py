@@ -64,12 +64,14 @@ def test_truth_predicts_its_own_pixels(scene):
 def test_data_set_on_disk(tmp_path):
     scene = make_scene(OPTIONS, *second_design())
     finished = []
-    paths = write_dataset(tmp_path / "new", scene, RenderOptions(), workers=2, progress=finished.append)
+    paths = write_dataset(
+        tmp_path / "new", scene, RenderOptions(), workers=2, progress=lambda *count: finished.append(count)
+    )
     folder = tmp_path / "new"
     assert [str(p.relative_to(folder / "images")) for p in paths] == [
         f"{group}/IMG_100{i}.jpg" for group in ("top-left", "top-right", "left-right") for i in (0, 1)
     ]
-    assert sorted(finished) == sorted(str(p.relative_to(folder / "images")) for p in paths)
+    assert finished == [(done, 6) for done in range(1, 7)]
     picture = cv2.imread(str(paths[3]), cv2.IMREAD_GRAYSCALE).astype(float)
     rendered = render(scene, "top-right", 1).astype(float)
     assert 0.1 < np.sqrt(((picture - rendered) ** 2).mean()) < 3  # JPEG at quality 95

@@ -115,6 +115,17 @@ def known_of(run: SavedRun) -> Known:
     return Known(joint.models, joint, setup, noise, known_scene(joint.models, joint, setup, run.colmap_model))
 
 
+def doubts(run: SavedRun) -> str:
+    """Why the σ that advice rests on are not those of the run's faces; empty where nothing speaks against them."""
+    if not run.options.eccentricity:
+        return f"{run.folder} is an uncorrected control, whose faces are biased by tens of µm: these σ are not theirs"
+    failed = [check["title"] for check in run.report.get("checks", ()) if check["verdict"] == "failed"]
+    if failed:
+        what = f"{len(failed)} checks of {run.folder} failed, first {failed[0]}"
+        return f"{what}: its faces may be off by far more than these σ"
+    return ""
+
+
 @one_thread()
 def advise(known: Known, count: int = 5, progress: Callable[[str, int, int], None] | None = None) -> Advice:
     """The ``count`` views that, taken one after the other, lower the σ of the worst face most, and new groups of as

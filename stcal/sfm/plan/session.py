@@ -1,6 +1,7 @@
 """Before any image exists: the σ to expect of a plan, and what would help most."""
 
 from dataclasses import dataclass, field, replace
+from itertools import permutations
 
 import numpy as np
 
@@ -15,7 +16,7 @@ from stcal.sfm.data.model import GroupModel
 from stcal.sfm.plan.forecast import ONE_PLATE, CentreNoise, Forecast, Setup, forecast, variance_shares, without_sources
 from stcal.sfm.plan.simulated import observe, true_models
 from stcal.sfm.run.options import RunOptions
-from stcal.synthetic.scene import Scene, SceneOptions, make_scene
+from stcal.synthetic.scene import Scene, SceneOptions, group_name, make_scene
 
 SPREADS_DEG = (80.0, 70.0, 60.0, 50.0, 40.0)
 """Tried from the largest down: the tilts that a view may have keep the views closer together than that."""
@@ -72,6 +73,22 @@ class Plan:
     forecast: Forecast
     shares: dict[str, dict[str, float]]
     remedies: tuple[Remedy, ...]
+
+
+def pairs_of_faces(text: str, target: TargetDesign) -> tuple[tuple[str, str], ...]:
+    """``12,14`` or ``top-left,top-right`` as pairs of face ids.
+
+    Raises
+    ------
+    InputError
+        A name that is no pair of the target's faces.
+    """
+    known = {group_name(pair): pair for pair in permutations([face.id for face in target.faces], 2)}
+    names = [name.strip() for name in text.split(",")]
+    for name in names:
+        if name not in known:
+            raise InputError(f"--groups: {name!r} is no pair of faces; use such as {', '.join(list(known)[:3])}")
+    return tuple(known[name] for name in names)
 
 
 @one_thread()

@@ -1,16 +1,20 @@
-"""Progress of long work: a bar on a terminal, plain lines otherwise; on standard error."""
+"""What commands say beside their results: progress of long work, on standard error, and the files they write."""
 
 import sys
 import time
+from collections.abc import Iterable
+from pathlib import Path
 
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
+
+from stcal.io import saving
 
 LINE_EVERY_S = 5.0
 
 
 class StageProgress:
-    """A callable (stage, done, total) for the pipeline; use as a context manager."""
+    """A callable (stage, done, total): a bar on a terminal, plain lines otherwise; use as a context manager."""
 
     def __init__(self):
         self.bar = None
@@ -39,3 +43,15 @@ class StageProgress:
         if done == total or (done and now - self.last > LINE_EVERY_S):
             self.last = now
             print(f"{stage}: {done} of {total}", file=sys.stderr, flush=True)
+
+
+def write(path: Path, content: str | bytes | dict, said: str = "written") -> None:
+    """Save a file, of a dict as JSON, and say so."""
+    saving.save(path, saving.json_text(content) if isinstance(content, dict) else content)
+    print(f"{said}: {path}")
+
+
+def print_each(said: str, lines: Iterable[object]) -> None:
+    """Each on a line of its own, after the word."""
+    for line in lines:
+        print(f"{said}: {line}")

@@ -1,0 +1,57 @@
+"""Options that several commands share."""
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from stcal.errors import InputError
+
+if TYPE_CHECKING:
+    from stcal.sfm.detect.ellipses import EllipseOptions
+
+Images = Annotated[Path, typer.Argument(help="Read the images of this folder: IMAGES/<group>/*.jpg, png, tif, bmp.")]
+Run = Annotated[Path, typer.Argument(metavar="RUN", help="Read the finished run in this folder.")]
+CameraFile = Annotated[
+    Path, typer.Option("--camera", help="Read the intrinsics from this file: COLMAP cameras.txt, OpenCV or ROS.")
+]
+TargetFile = Annotated[
+    Path | None,
+    typer.Option("--target", help="Read the target's design from this target.toml, in place of the reference design."),
+]
+BoardFile = Annotated[
+    Path | None,
+    typer.Option("--board", help="Read the board's design from this board.toml, in place of the reference board."),
+]
+FlatBoardFile = Annotated[
+    Path, typer.Option("--board", help="Read the board from this file: dots, chessboard, ChArUco or tags (TOML).")
+]
+RobotFile = Annotated[
+    Path, typer.Option("--robot", help="Read the robot from this file (TOML); `stcal robot init` writes one.")
+]
+LayoutFile = Annotated[Path, typer.Option("--layout", help="Read the target's tags from this file (TOML).")]
+JsonFile = Annotated[Path | None, typer.Option("--json", help="Also write everything to this file (JSON).")]
+ReportFile = Annotated[
+    Path | None, typer.Option("--report", help="Also write a page with tables and plots to this file (HTML).")
+]
+Workers = Annotated[
+    int | None, typer.Option("--workers", min=1, help="Use this many processes; one per core if not given.")
+]
+MinDiameter = Annotated[
+    float | None,
+    typer.Option(
+        "--min-diameter",
+        min=4,
+        help="Ignore circles smaller than this, px; 4.5, and 9 over 8 megapixels, if not given.",
+    ),
+]
+MaxDiameter = Annotated[float, typer.Option("--max-diameter", min=8, help="Ignore circles larger than this, px.")]
+
+
+def ellipse_options(min_diameter: float | None, max_diameter: float) -> "EllipseOptions":
+    """Sizes of the circles that detection seeks."""
+    from stcal.sfm.detect.ellipses import EllipseOptions
+
+    if min_diameter is not None and max_diameter <= min_diameter:
+        raise InputError(f"--max-diameter {max_diameter:g} px, more than --min-diameter {min_diameter:g} px needed")
+    return EllipseOptions(min_diameter_px=min_diameter, max_diameter_px=max_diameter)

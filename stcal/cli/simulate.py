@@ -1,0 +1,111 @@
+"""``stcal-sfm``: designs to edit, simulated data sets, and runs against a known truth."""
+
+import tempfile
+from functools import partial
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from stcal.cli.options import JsonFile, Workers
+from stcal.cli.terminal import StageProgress, write
+from stcal.design import reference_board, reference_target
+from stcal.errors import InputError
+from stcal.io.design import board_toml, target_toml
+from stcal.io.saving import save
+
+app = typer.Typer()
+
+
+@app.command()
+def init(folder: Annotated[Path, typer.Argument(help="Write the two files to this folder.")]) -> None:
+    """Write target.toml and board.toml of the reference design, commented, to edit."""
+    folder.mkdir(parents=True, exist_ok=True)
+    texts = {"target.toml": target_toml(reference_target()), "board.toml": board_toml(reference_board())}
+    for name in texts:
+        if (folder / name).exists():
+            raise InputError(f"{folder / name}: exists; move it away, or give another folder")
+    for name, text in texts.items():
+        save(folder / name, text)
+        print(folder / name)
+
+
+@app.command()
+def simulate(
+    folder: Annotated[Path, typer.Argument(help="Write the data set to this new folder.")],
+    width: Annotated[int, typer.Option(min=320, help="Render images of this width, px; 3:2 images.")] = 2592,
+    images: Annotated[int, typer.Option("--images", min=2, help="Render this many images in each group.")] = 6,
+    distance: Annotated[float, typer.Option(min=200, help="Place the camera at this distance, mm.")] = 1000.0,
+    spread: Annotated[float, typer.Option(min=2, max=80, help="Spread the views by ± this, degrees.")] = 40.0,
+    noise: Annotated[float, typer.Option(min=0, max=0.2, help="Add noise of this fraction of full scale.")] = 0.01,
+    blur: Annotated[float, typer.Option(min=0, max=10, help="Blur by this standard deviation, px.")] = 0.7,
+    clutter: Annotated[bool, typer.Option("--clutter/--clean", help="Add lamps, discs and a checkered wall.")] = False,
+    second_design: Annotated[
+        bool, typer.Option("--second-design", help="Use three faces, dark on white, and another board.")
+    ] = False,
+    png: Annotated[bool, typer.Option("--png", help="Write PNG in place of JPEG.")] = False,
+    sixteen_bit: Annotated[bool, typer.Option("--16-bit", help="Write 16-bit PNG.")] = False,
+    seed: Annotated[int, typer.Option(help="Draw everything random with this seed.")] = 0,
+    workers: Workers = None,
+) -> None:
+    """Write a simulated data set with known truth: images, cameras.txt, target.toml, board.toml, truth.json."""
+    from stcal.synthetic.dataset import write_dataset
+    from stcal.synthetic.render import RenderOptions
+    from stcal.synthetic.scene import SceneOptions, make_scene
+    from stcal.synthetic.scene import second_design as other
+
+    options = SceneOptions(
+        seed=seed,
+        width=width,
+        height=round(width * 2 / 3),
+        distance_mm=distance,
+        spread_deg=spread,
+        images_per_group=images,
+    )
+    scene = make_scene(options, *(other() if second_design else ()))
+    rendering = RenderOptions(noise=noise, blur_px=blur, clutter=clutter, bit_depth=16 if sixteen_bit else 8, seed=seed)
+    kind = "png" if png or sixteen_bit else "jpg"
+    with StageProgress() as progress:
+        step = partial(progress, "render")
+        paths = write_dataset(folder, scene, rendering, image_format=kind, workers=workers, progress=step)
+    print(f"{len(paths)} images in {len(scene.groups)} groups: {folder}")
+
+
+@app.command()
+def compare(
+    run_folder: Annotated[Path, typer.Argument(metavar="RUN", help="Read this finished run, or its faces.json.")],
+    truth: Annotated[Path, typer.Argument(help="Read the truth from this truth.json.")],
+    out: JsonFile = None,
+) -> None:
+    """Compare a run with a known truth, as a table and as JSON."""
+    from stcal.sfm.report.compare import compare as against
+    from stcal.sfm.report.compare import comparison_table
+
+    comparison = against(run_folder, truth)
+    print(comparison_table(comparison))
+    target = out or (run_folder / "compare.json" if run_folder.is_dir() else None)
+    if target:
+        write(target, comparison, "as JSON")
+
+
+@app.command()
+def demo(
+    out: Annotated[
+        Path | None,
+        typer.Option("--out", help="Keep data set and run in this folder; a temporary one if not given."),
+    ] = None,
+    workers: Workers = None,
+) -> None:
+    """Render a small data set with known truth, calibrate it, and print the faces against the truth."""
+    from stcal.sfm.report.compare import comparison_table
+    from stcal.sfm.run.text import run_text
+    from stcal.workflows.demo import WHAT
+    from stcal.workflows.demo import demo as demonstrate
+
+    folder = out or Path(tempfile.mkdtemp(prefix="stcal-demo-"))
+    print(WHAT)
+    with StageProgress() as progress:
+        result, comparison = demonstrate(folder, workers, progress)
+    print(run_text(result))
+    print("\nagainst the truth:")
+    print(comparison_table(comparison))

@@ -1,0 +1,34 @@
+"""What a camera calibration found, in a few lines for the terminal."""
+
+import numpy as np
+
+from stcal.sfm.camera.calibrate import CameraCalibration
+
+
+def calibration_text(result: CameraCalibration, summary: dict) -> str:
+    """Parameters with σ, and what to look at; ``summary`` : :func:`~stcal.sfm.camera.calibrate.calibration_json`."""
+    lines = [f"skipped {each.name}: {each.reason}" for each in result.skipped]
+    lines += [
+        f"outlier {each['image']} {each['label']}: residual {each['residual_px']:.3f} px"
+        for each in summary["outliers"]
+    ]
+    width, height = summary["size_px"]
+    lines.append(
+        f"{summary['model']}, {width}×{height} px: {len(result.views)} views of the board, "
+        f"{sum(len(v) for v in result.views)} dots, residual RMS {summary['residual_rms_px']:.4f} px, "
+        f"{result.rounds} rounds of detection"
+    )
+    lines += [
+        f"{name:>4} {each['value']:14.6f} ± {each['sigma']:.6f}{' px' if name[0] in 'fc' else ''}"
+        for name, each in summary["parameters"].items()
+    ]
+    lines.append(
+        f"σ of a projection: {np.median(result.projection.sigma_px):.4f} px median over the image, "
+        f"{result.projection.corner_sigma_px.max():.4f} px in the worst corner"
+    )
+    if split := result.split:
+        lines.append(
+            f"split-half check: {split.verdict}; p = {split.p_value:.2g}, largest difference {split.largest_px:.4f} px "
+            f"where {np.sqrt(2) * split.largest_sigma_px:.4f} px is expected"
+        )
+    return "\n".join(lines + [f"warning: {warning}" for warning in result.warnings])

@@ -1,0 +1,51 @@
+"""What went to and came from other programs, in a few lines for the terminal."""
+
+from stcal.sfm.adjust.calibration import Calibration
+from stcal.sfm.interop.crosscheck import face_differences
+from stcal.sfm.interop.export_database import Exported
+from stcal.sfm.interop.export_model import ExportedModel
+from stcal.sfm.run.saved import SavedRun
+
+
+def database_text(written: Exported) -> str:
+    """What is in the copy, and how to open it."""
+    return (
+        f"schema {written.schema}, checked: {written.images} images, {written.pairs} pairs, "
+        f"camera model {', '.join(written.camera_models)}\n"
+        f"open it with: colmap gui --database_path {written.path} --image_path IMAGES"
+    )
+
+
+def model_text(written: ExportedModel, kind: str) -> str:
+    """What is in the model, and the ideal camera of a format that knows no other."""
+    lines = [
+        f"{written.images} images and {written.points} points, mm, target frame: {written.path}",
+        f"labels: {written.labels}",
+    ]
+    if written.focal_px is not None:
+        x, y = written.centre_px
+        lines.append(
+            f"{kind} knows one focal length and a principal point at the centre: the keypoints are those of an ideal "
+            f"camera without distortion, f = {written.focal_px:.4f} px, principal point ({x:g}, {y:g}) px; undistort "
+            "the photographs to it to match"
+        )
+    return "\n".join(lines)
+
+
+def faces_text(calibration: Calibration, run: SavedRun) -> str:
+    """Scale of each model, and the faces beside those of the run."""
+    lines = [*calibration.notes]
+    for each in calibration.models:
+        scale = calibration.scales[each.group]
+        lines.append(
+            f"group {each.group}: {len(each.images)} images, {len(each.labels)} circles, {scale.mm_per_unit:.6g} mm "
+            f"per unit, board within {1e3 * scale.rms_mm():.1f} µm RMS"
+        )
+    difference = face_differences(calibration.target, run)
+    lines.append(f"{'face':>6} {'x':>11} {'y':>11} {'z':>11} mm   against the run: µm     mdeg")
+    for face_id, pose in calibration.target.target_from_face.items():
+        x, y, z = pose.translation
+        row = difference.get(face_id)
+        beside = f"{row['translation_um']:22.2f} {row['rotation_mdeg']:8.3f}" if row else f"{'not in the run':>31}"
+        lines.append(f"{face_id:>6} {x:11.4f} {y:11.4f} {z:11.4f}   {beside}")
+    return "\n".join(lines)

@@ -1,0 +1,99 @@
+"""What a run and a detection found, in a few lines for the terminal."""
+
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+
+import numpy as np
+
+from stcal.io.images import Skipped
+from stcal.labels import DotLabel
+from stcal.sfm.checks.verdict import Check
+from stcal.sfm.detect.files import DetectionResult
+from stcal.sfm.detect.labels import LabelledImage
+from stcal.sfm.report.checks import count_verdicts
+from stcal.sfm.run.result import RunResult
+from stcal.sfm.run.solve import GroupSolution
+
+
+def run_text(result: RunResult) -> str:
+    """The answer: groups, what was left out, faces with σ and checks that did not pass."""
+    lines = [*_skipped(result.detection.skipped)]
+    for solution in result.solutions:
+        lines += _group(solution, result.calibration.scales[solution.model.group].rms_mm())
+    lines += result.notes
+    noted = sum(bool(each.notes) for each in result.labelled)
+    if noted:
+        lines.append(
+            f"something was left out in {noted} of {len(result.labelled)} images; the report says what and why"
+        )
+    if not result.options.eccentricity:
+        lines.append(
+            "uncorrected control: without the eccentricity faces are off by tens of µm, and no residual shows it"
+        )
+    reused = sum(image.reused for image in result.detection.images)
+    if reused:
+        lines.append(f"detections kept from an earlier run: {reused} of {len(result.detection.images)}")
+    lines += [*_faces(result), *_checks(result.checks)]
+    return "\n".join([*lines, f"faces:  {result.out / 'faces.json'}", f"report: {result.out / 'report.html'}"])
+
+
+def detection_text(detection: DetectionResult, labelled: Sequence[LabelledImage]) -> str:
+    """Faces and dots of each image, and what was left out."""
+    lines = []
+    for each in labelled:
+        image = each.observations
+        dots = sum(isinstance(label, DotLabel) for label in image.labels)
+        faces = ", ".join(sorted(image.face_ids())) or "none"
+        lines.append(f"{image.name}: faces {faces} ({len(image) - dots} circles), board {dots} dots")
+        lines += [f"  {note}" for note in each.notes]
+    lines += _skipped(detection.skipped)
+    for image in detection.images:
+        lines += [f"{image.file.name}: {what} found more than once; left out" for what in image.detection.repeated]
+    return "\n".join(lines)
+
+
+def _skipped(skipped: Sequence[Skipped]) -> Iterator[str]:
+    return (f"skipped {each.name}: {each.reason}" for each in skipped)
+
+
+def _group(solution: GroupSolution, board_rms_mm: float) -> Iterator[str]:
+    pair = solution.pairs[0]
+    yield (
+        f"group {solution.model.group}: {len(solution.model.images)} images, {len(solution.model.labels)} circles, "
+        f"initial pair {Path(pair.first).name} – {Path(pair.second).name} at "
+        f"{np.degrees(pair.median_angle_rad):.0f}°, board within {1e3 * board_rms_mm:.1f} µm RMS"
+    )
+    for name, reason in solution.left_out.items():
+        yield f"left out {name}: {reason}"
+    for outlier in solution.outliers:
+        yield f"left out {outlier.image} {outlier.label}: residual {outlier.residual_px:.3f} px"
+
+
+def _faces(result: RunResult) -> Iterator[str]:
+    target = result.target
+    sigma_heading = "   σ position µm      σ rotation mdeg" if target.face_covariance else ""
+    yield f"{'face':>6} {'x':>11} {'y':>11} {'z':>11} mm{sigma_heading}"
+    for face_id, pose in target.target_from_face.items():
+        x, y, z = pose.translation
+        line = f"{face_id:>6} {x:11.4f} {y:11.4f} {z:11.4f}"
+        covariance = target.face_covariance.get(face_id)
+        if face_id == target.reference_face:
+            line += "      reference"
+        elif covariance is not None:
+            sigma = np.sqrt(np.maximum(np.diag(covariance), 0))
+            position = " ".join(f"{1e3 * s:5.1f}" for s in sigma[3:])
+            rotation = " ".join(f"{1e3 * np.degrees(s):5.2f}" for s in sigma[:3])
+            line += f"    {position}   {rotation}"
+        yield line
+    unseen = [f.id for f in result.target_design.faces if f.id not in target.target_from_face]
+    if unseen:
+        yield f"not seen in any image: face {', '.join(unseen)}"
+
+
+def _checks(checks: Sequence[Check]) -> Iterator[str]:
+    """How many checks came out how, and those that did not pass."""
+    yield f"checks: {count_verdicts([check.verdict for check in checks])}"
+    for check in checks:
+        if check.verdict != "passed":
+            remedy = f"; {check.remedy}" if check.remedy else ""
+            yield f"  {check.verdict}: {check.title}: {check.reason}{remedy}"
