@@ -1,4 +1,4 @@
-"""Levenberg–Marquardt from several poses at once, with Huber's loss: for problems of which a pose has rivals."""
+"""Levenberg–Marquardt from several poses at once, with Huber's loss: for problems with several minima."""
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
@@ -6,13 +6,13 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from stcal.geometry.rigid import Poses
+from stcal.geometry.rigid import Poses, Rigid
 
 MAX_STEPS = 60
 ACCEPTED = 1e-2
 """What is still settled after all steps: a tenth of σ. In a flat valley steps are many, and short."""
 SLOW = 0.01
-"""A rival worse by ``hopeless`` in χ², which a step promises to improve by less than this share, is not followed
+"""A minimum worse by ``hopeless`` in χ², which a step promises to improve by less than this share, is not followed
 further: with large residuals the last steps are many, and short."""
 
 
@@ -22,6 +22,15 @@ class PoseStack:
 
     rotation: np.ndarray
     translation: np.ndarray
+
+    @classmethod
+    def of(cls, *poses: Rigid) -> "PoseStack":
+        """From single poses."""
+        return cls(np.array([pose.rotation for pose in poses]), np.array([pose.translation for pose in poses]))
+
+    def rigid(self, row: int) -> Rigid:
+        """One of them."""
+        return Rigid(self.rotation[row], self.translation[row])
 
     def __len__(self) -> int:
         return len(self.translation)
@@ -83,6 +92,15 @@ class Minima:
     length: np.ndarray
     settled: np.ndarray
 
+    def rows(self, index) -> "Minima":
+        """Those of a list, a mask or a slice."""
+        return Minima(*(getattr(self, name)[index] for name in Minima.__slots__))
+
+    def plus(self, other: "Minima") -> "Minima":
+        """These, and the other's after them."""
+        rest = [np.concatenate([getattr(self, name), getattr(other, name)]) for name in Minima.__slots__[1:]]
+        return Minima(self.poses.plus(other.poses), *rest)
+
 
 def descend(
     evaluate: Callable[[PoseStack | Poses], Normal],
@@ -95,7 +113,7 @@ def descend(
     Parameters
     ----------
     settled : a step that lowers χ² by less, or by less than that share, is the last
-    hopeless : by how much χ² a rival may be worse and still be followed to its end; see :data:`SLOW`
+    hopeless : by how much χ² a minimum may be worse and still be followed to its end; see :data:`SLOW`
     """
     now = evaluate(poses)
     damping, done = np.full(len(poses), 1e-6), np.zeros(len(poses), bool)

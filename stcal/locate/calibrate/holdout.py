@@ -9,6 +9,8 @@ import numpy as np
 from stcal.boards.tags import Tags
 from stcal.errors import StcalError
 from stcal.geometry.plane import camera_from_plane, fit_homography, refine_planar_pose
+from stcal.geometry.plane_poses import mirrored
+from stcal.geometry.pose_descent import PoseStack
 from stcal.geometry.rigid import Rigid
 from stcal.locate.calibrate.solve import CalibratedLayout, calibrate
 from stcal.locate.data.layout import LayoutPlan, TargetLayout
@@ -16,7 +18,6 @@ from stcal.locate.data.views import CalibrationImages
 from stcal.locate.pose.estimate import SeenTags, locate
 from stcal.locate.pose.merge import merge
 from stcal.locate.pose.patent import PatentOptions, locate_as_patent
-from stcal.locate.pose.problem import mirrored
 from stcal.locate.pose.verdict import Decision, VerdictOptions, judge
 
 
@@ -86,7 +87,9 @@ def _trial(images: CalibrationImages, i: int, part: SeenTags, layout: TargetLayo
     except StcalError:
         return Trial(name, rows, "reject")
     error = (pose @ truth.inverse()).angle_rad()
-    middle = layout.corners_mm[part.rows].reshape(-1, 2).mean(0)
-    to_mirror = (pose @ mirrored(truth, middle).inverse()).angle_rad()
+    middle = Rigid(np.eye(3), np.append(layout.corners_mm[part.rows].reshape(-1, 2).mean(0), 0.0))
+    second = mirrored(PoseStack.of(truth), middle).rigid(0)
     shift = float(np.linalg.norm(pose.translation - truth.translation))
-    return Trial(name, rows, verdict.decision, error, shift, error / sigma, to_mirror < error)
+    return Trial(
+        name, rows, verdict.decision, error, shift, error / sigma, (pose @ second.inverse()).angle_rad() < error
+    )

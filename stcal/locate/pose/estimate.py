@@ -1,45 +1,37 @@
-"""camera_from_obj from the corners of one scene, with covariance, and with the second pose that a plane may leave.
+"""camera_from_obj from the corners of one scene, with covariance, and with the second solution that a plane may leave.
 
-A plane seen from afar looks the same tilted to either side of the line of sight (Oberkampf et al. 1996; Schweighofer &
-Pinz 2006): the reprojection error has two minima. Both are found and refined, and compared by their χ².
+Both are found (:mod:`stcal.geometry.plane_poses`) and refined, and compared by their χ².
 """
 
 from dataclasses import dataclass, replace
+from functools import partial
 
 import numpy as np
 from scipy.linalg import block_diag
 from scipy.stats import chi2 as chi_square
 
 from stcal.boards.edges import corners_by_edges
-from stcal.errors import ConvergenceError, DegenerateError
+from stcal.errors import DegenerateError
 from stcal.geometry.arrays import frozen
 from stcal.geometry.camera import Camera
 from stcal.geometry.ippe import poses_of_plane
-from stcal.geometry.pose_descent import Minima
+from stcal.geometry.plane_poses import (
+    MAX_OUTLIER_SHARE,
+    MAX_SIGMA_RAD,
+    Weighed,
+    covariance_of_both,
+    huber_weights,
+    step_between,
+    two_minima,
+)
+from stcal.geometry.pose_descent import Minima, PoseStack
 from stcal.geometry.rigid import Poses, Rigid
 from stcal.io.camera import CameraPrior, intrinsic_basis
 from stcal.locate.data.layout import TargetLayout
-from stcal.locate.pose.problem import (
-    HUBER,
-    PlanarProblem,
-    Weighed,
-    descend,
-    mirrored,
-    own_whitening,
-    project,
-    weigh,
-)
+from stcal.locate.pose.problem import PlanarProblem, descent_near, project, weighed
 
 START_PX = 2.0
 """Scale of the loss by which a start is chosen: one tag's own pose is off so much at the other tags."""
-OUTLIER = 6.0
-"""In σ, or in the residuals' robust spread: by chance one corner in 6·10⁷ (Rayleigh). Its tag is left out and named."""
-RAYLEIGH_MEDIAN = float(np.sqrt(2 * np.log(2)))
-MAX_OUTLIER_SHARE = 1 / 3
-SAME = 1.0
-"""Minima nearer than this, in σ, are one: its covariance covers both."""
-MAX_SIGMA_RAD = 0.5
-"""A rotation whose σ is larger is none: linear propagation says nothing any more."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -76,10 +68,10 @@ class ObjPose:
 
     ``camera_from_obj``; ``covariance`` : (6, 6) rad and mm, left perturbation in the camera frame; ``rows`` : (k,) of
     the layout's tags used, ``outliers`` : of those left out because they contradict the others; ``residuals_px`` :
-    (4k, 2) measured minus projected; ``weights`` : (4k,) Huber's; ``chi2``, ``dof`` against the whole covariance;
-    ``delta_chi2`` : by which the other minimum is worse, infinite where there is none; ``twin`` : that minimum's pose;
-    ``foreshortening`` : cosine between the target's normal and the line of sight to the middle of its corners;
-    ``spread_px`` : extent of the corners in the image across their longer direction.
+    (4k, 2) measured minus projected; ``weights`` : (4k,) Huber's; ``chi2`` against the whole covariance,
+    ``redundancy``; ``foreshortening`` : cosine between the target's normal and the line of sight to the middle of its
+    corners; ``extent_px`` : of the corners in the image across their longer direction; ``delta_chi2`` : by which the
+    second solution is worse, infinite where there is none; ``second`` : that solution's pose.
     """
 
     camera_from_obj: Rigid
@@ -89,23 +81,23 @@ class ObjPose:
     residuals_px: np.ndarray
     weights: np.ndarray
     chi2: float
-    dof: int
-    delta_chi2: float
+    redundancy: int
     foreshortening: float
-    spread_px: float
-    twin: Rigid | None = None
+    extent_px: float
+    delta_chi2: float = np.inf
+    second: Rigid | None = None
 
     def rms_px(self) -> float:
         """Of the residuals, per coordinate."""
         return float(np.sqrt((self.residuals_px**2).mean()))
 
-    def chi2_per_dof(self) -> float:
+    def chi2_per_redundancy(self) -> float:
         """About 1 where the σ of corners, layout and intrinsics are true."""
-        return self.chi2 / self.dof
+        return self.chi2 / self.redundancy
 
     def p_value(self) -> float:
         """Probability of residuals as large, with those σ."""
-        return float(chi_square.sf(self.chi2, self.dof))
+        return float(chi_square.sf(self.chi2, self.redundancy))
 
     def sigma_rad(self) -> float:
         """Of the rotation, about the worst axis."""
@@ -134,11 +126,14 @@ def locate(
     if not len(seen):
         raise DegenerateError(f"{where}: no tag of the layout; 1 needed")
     problem = problem_of(seen, layout, camera, prior)
-    start = _start(problem, where)
+    start = PoseStack.of(_start(problem, where))
     keep, outliers, whole = np.arange(len(seen)), [], problem
+    failure = f"{where}: no pose found; check layout and camera file"
     while True:
-        found, limit = _two_minima(problem, start, where)
-        excess = found.length[0].reshape(-1, 4).max(1) / limit
+        middle = Rigid(np.eye(3), np.append(problem.xy.mean(0), 0.0))
+        both = two_minima(partial(descent_near, problem), start, middle, failure)
+        found = both.minima
+        excess = found.length[0].reshape(-1, 4).max(1) / both.outlier_limit
         worst = int(excess.argmax())
         if excess[worst] <= 1:
             break
@@ -151,7 +146,7 @@ def locate(
                 "camera file belong to the images"
             )
         problem = whole.select((4 * keep[:, None] + np.arange(4)).ravel())
-        start = found.poses[0]
+        start = found.poses[[0]]
     pose = _answer(problem, found, seen.rows[keep], tuple(outliers))
     if pose.sigma_rad() > MAX_SIGMA_RAD:
         raise DegenerateError(f"{where}: its tags leave the rotation open; show more tags, or larger ones")
@@ -163,8 +158,8 @@ def problem_of(seen: SeenTags, layout: TargetLayout, camera: Camera, prior: Came
     rows = (8 * seen.rows[:, None] + np.arange(8)).ravel()
     pixels = seen.corners_px.reshape(-1, 2)
     ideal = camera.normalised_from_pixel(pixels)
-    slope = camera.distort_jacobian(ideal)[1] * camera.focal[:, None]
-    back = np.linalg.inv(slope)
+    px_by_seen = camera.distort_jacobian(ideal)[1] * camera.focal[:, None]
+    back = np.linalg.inv(px_by_seen)
     common = np.concatenate([_by_edges(seen, back), _by_tag(len(seen), back)], axis=2)
     known = np.diag(np.append(seen.edge_sigma_px**2, np.full(2 * len(seen), layout.tag_sigma_px**2)))
     if prior is not None:
@@ -172,7 +167,7 @@ def problem_of(seen: SeenTags, layout: TargetLayout, camera: Camera, prior: Came
         common, known = np.concatenate([common, by_camera], axis=2), block_diag(known, prior.covariance)
     noise = back @ seen.covariance_px2.reshape(-1, 2, 2) @ np.swapaxes(back, 1, 2)
     xy = layout.corners_mm[seen.rows].reshape(-1, 2)
-    return PlanarProblem(xy, ideal, noise, slope, layout.covariance_mm2[np.ix_(rows, rows)], common, known)
+    return PlanarProblem(xy, ideal, noise, px_by_seen, layout.covariance_mm2[np.ix_(rows, rows)], common, known)
 
 
 def _by_edges(seen: SeenTags, back: np.ndarray) -> np.ndarray:
@@ -198,7 +193,7 @@ def _start(problem: PlanarProblem, where: str) -> Rigid:
         if poses is None:
             continue
         view = project(problem, poses)
-        off = np.linalg.norm((problem.slope @ view.residual[..., None])[..., 0], axis=2)
+        off = np.linalg.norm((problem.px_by_seen @ view.residual[..., None])[..., 0], axis=2)
         score = np.where(view.before, np.log1p((off / START_PX) ** 2).sum(1), np.inf)
         best = int(score.argmin())
         # Where all corners agree, none is wrong, and single tags have nothing to add.
@@ -218,83 +213,43 @@ def _poses(problem: PlanarProblem, sets: list[slice]) -> Poses | None:
     return Poses.of(found) if found else None
 
 
-def _two_minima(problem: PlanarProblem, start: Rigid, where: str) -> tuple[Minima, float]:
-    """One or two distinct minima by single corners, the better one first, and the outliers' limit in σ."""
-    middle = problem.xy.mean(0)
-    poses = Poses.of([start, mirrored(start, middle)])
-    spread = 1.0
-    for _ in range(2):  # the second time with the residuals' own spread, if that is larger
-        whiten = own_whitening(problem, poses[[0]])
-        found = descend(problem, poses, whiten, HUBER * spread)
-        best = int(np.argmin(found.cost))
-        poses = found.poses[[best, 1 - best]]
-        wider = float(np.median(found.length[best])) / RAYLEIGH_MEDIAN
-        if wider <= 1.1 * spread:
-            break
-        spread = wider
-    if not np.isfinite(found.cost[best]) or not found.settled[best]:
-        raise ConvergenceError(f"{where}: no pose found; check layout and camera file")
-    order = [best, 1 - best]
-    if not _distinct(found.poses[order], found.normal[best] / spread**2):  # perhaps both starts were on one side
-        again = descend(problem, Poses.of([mirrored(found.poses[best], middle)]), whiten, HUBER * spread)
-        found = _joined(found, best, again)
-        order = np.argsort(found.cost)
-        if not _distinct(found.poses[order], found.normal[order[0]] / spread**2):
-            order = order[:1]
-    order = [i for i in order if np.isfinite(found.cost[i])]
-    return _rows(found, order), OUTLIER * spread
-
-
-def _rows(found: Minima, rows) -> Minima:
-    return Minima(*(getattr(found, name)[rows] for name in Minima.__slots__))
-
-
-def _joined(found: Minima, row: int, other: Minima) -> Minima:
-    poses = Poses.of([found.poses[row], *other.poses])
-    rest = [np.concatenate([getattr(found, name)[[row]], getattr(other, name)]) for name in Minima.__slots__[1:]]
-    return Minima(poses, *rest)
-
-
-def _distinct(poses: Poses, normal: np.ndarray) -> bool:
-    """Whether the second of two poses is another than the first, which has this normal matrix."""
-    way = poses[[1]].difference(poses[[0]])[0]
-    return bool(way @ normal @ way > SAME**2)
-
-
 def _answer(problem: PlanarProblem, found: Minima, rows: np.ndarray, outliers: tuple[int, ...]) -> ObjPose:
     """Decide between the minima, and collect."""
-    huber = np.minimum(1.0, HUBER / np.maximum(found.length, HUBER))
+    own = huber_weights(found.length)
+    if len(own) == 1:
+        return _collected(problem, weighed(problem, found.poses, own[0]), own[0], rows, outliers)
     # Both minima weigh the corners alike, as the stricter of the two does, or an outlier of one of them could decide.
-    common = huber.min(0)
-    best = weigh(problem, found.poses[[0]], common if len(huber) == 1 else huber[0])
-    delta, twin = np.inf, None
-    if len(huber) == 2:
-        pair = [weigh(problem, found.poses[[i]], common) for i in range(2)]
-        delta, twin = pair[1].chi2 - pair[0].chi2, pair[1].pose[0]
-        if delta < 0:
-            best, delta, twin = weigh(problem, found.poses[[1]], huber[1]), -delta, pair[0].pose[0]
-            huber = huber[::-1]
-    return _collected(problem, best, huber[0], rows, outliers, float(delta), twin)
+    pair = [weighed(problem, found.poses[[i]], own.min(0)) for i in range(2)]
+    delta = float(pair[1].chi2[0] - pair[0].chi2[0])
+    better = int(delta < 0)
+    best = weighed(problem, found.poses[[better]], own[better])
+    pose = _collected(problem, best, own[better], rows, outliers)
+    return replace(pose, delta_chi2=abs(delta), second=pair[1 - better].poses.rigid(0))
 
 
-def _collected(
-    problem: PlanarProblem, best: Weighed, weights: np.ndarray, rows, outliers, delta: float, twin: Rigid | None
-) -> ObjPose:
-    pose = best.pose[0]
+def _collected(problem: PlanarProblem, best: Weighed, weights: np.ndarray, rows, outliers: tuple[int, ...]) -> ObjPose:
+    """One minimum, as if there were no second one."""
+    pose = best.poses.rigid(0)
     middle = pose @ np.append(problem.xy.mean(0), 0.0)
-    foreshortening = float(pose.rotation[:, 2] @ middle / np.linalg.norm(middle))
-    residuals = problem.in_px(best.residual)
     off = problem.in_px(problem.seen - problem.seen.mean(0))
-    spread = float(np.ptp(off @ np.linalg.svd(off, full_matrices=False)[2][1]))
-    dof = 2 * len(problem.xy) - 6
-    own = (best.covariance, rows, outliers, residuals, weights, best.chi2, dof, delta, foreshortening, spread, twin)
-    return ObjPose(pose, *own)
+    covariance = np.linalg.inv(best.normal[0])
+    return ObjPose(
+        camera_from_obj=pose,
+        covariance=(covariance + covariance.T) / 2,
+        rows=rows,
+        outliers=outliers,
+        residuals_px=problem.in_px(best.residual[0]),
+        weights=weights,
+        chi2=float(best.chi2[0]),
+        redundancy=2 * len(problem.xy) - 6,
+        foreshortening=float(pose.rotation[:, 2] @ middle / np.linalg.norm(middle)),
+        extent_px=float(np.ptp(off @ np.linalg.svd(off, full_matrices=False)[2][1])),
+    )
 
 
 def covering_both(pose: ObjPose) -> ObjPose:
-    """The pose with a covariance that covers its twin too, by the odds of both."""
-    if pose.twin is None:
+    """The pose with a covariance that covers its second solution too, by the odds of both."""
+    if pose.second is None:
         return pose
-    away = Poses.of([pose.twin]).difference(Poses.of([pose.camera_from_obj]))[0]
-    odds = np.exp(-pose.delta_chi2 / 2)
-    return replace(pose, covariance=pose.covariance + odds / (1 + odds) * np.outer(away, away))
+    away = step_between(PoseStack.of(pose.camera_from_obj), PoseStack.of(pose.second))
+    return replace(pose, covariance=covariance_of_both(pose.covariance, away, pose.delta_chi2))

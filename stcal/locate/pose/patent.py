@@ -45,13 +45,13 @@ class PatentOptions:
 @dataclass(frozen=True, slots=True, eq=False)
 class PatentPose:
     """``exposure`` : index of the one that was kept, of ``candidates``; ``errors_px`` : RMS of both poses there, the
-    smaller first; ``camera_from_obj`` : the better pose, ``twin`` the other; ``det_j`` : of the homography's derivative
-    at the normalised centre, 1/mm²; ``tags`` used."""
+    smaller first; ``camera_from_obj`` : the better pose, ``second`` the other; ``det_j`` : of the homography's
+    derivative at the normalised centre, 1/mm²; ``tags`` used."""
 
     exposure: int
     candidates: tuple[int, ...]
     camera_from_obj: Rigid
-    twin: Rigid
+    second: Rigid
     errors_px: tuple[float, float]
     det_j: float
     tags: int

@@ -7,6 +7,7 @@ import numpy as np
 from scipy.stats import chi2 as chi_square
 
 from stcal.errors import InputError
+from stcal.geometry.plane_poses import deciding_delta
 from stcal.geometry.rigid import Poses
 from stcal.locate.pose.estimate import ObjPose, covering_both
 
@@ -79,14 +80,16 @@ def judge(pose: ObjPose, options: VerdictOptions | None = None) -> tuple[ObjPose
     """The verdict on a pose, and the pose with a covariance that covers both where two are called one."""
     options = options or VerdictOptions()
     apart_deg = _apart_deg(pose)
-    if pose.twin is not None and apart_deg <= options.equal_deg:
+    if pose.second is not None and apart_deg <= options.equal_deg:
         pose = covering_both(pose)
     margin2 = options.sigma_margin**2
     checks = [
         Check("tags", len(pose.rows), at_least=options.min_tags),
-        Check("spread", pose.spread_px, at_least=options.min_spread_px, unit=" px"),
+        Check("spread", pose.extent_px, at_least=options.min_spread_px, unit=" px"),
         Check("foreshortening", pose.foreshortening, at_least=options.min_foreshortening),
-        Check("chi2 per dof", pose.chi2_per_dof(), at_most=margin2 * _chi2_limit(pose.dof, options.max_p)),
+        Check(
+            "chi2 per dof", pose.chi2_per_redundancy(), at_most=margin2 * _chi2_limit(pose.redundancy, options.max_p)
+        ),
         Check("sigma of rotation", float(np.degrees(pose.sigma_rad())), at_most=options.max_sigma_deg, unit="°"),
     ]
     if options.max_sigma_mm is not None:
@@ -104,17 +107,17 @@ def judge(pose: ObjPose, options: VerdictOptions | None = None) -> tuple[ObjPose
 
 
 def needed_delta(pose: ObjPose, options: VerdictOptions) -> float:
-    """Δχ² that decides between two poses: −2 ln of the odds, times the variance factor that is to be allowed for."""
-    return -2 * float(np.log(options.flip_odds)) * max(options.sigma_margin**2, pose.chi2_per_dof())
+    """Δχ² that decides between two poses."""
+    return deciding_delta(options.flip_odds, options.sigma_margin, pose.chi2_per_redundancy())
 
 
-def _chi2_limit(dof: int, p: float) -> float:
-    return float(chi_square.isf(p, dof) / dof)
+def _chi2_limit(redundancy: int, p: float) -> float:
+    return float(chi_square.isf(p, redundancy) / redundancy)
 
 
 def _apart_deg(pose: ObjPose) -> float:
-    """Angle between the pose and its twin; 0 where there is none."""
-    if pose.twin is None:
+    """Angle between the pose and its second solution; 0 where there is none."""
+    if pose.second is None:
         return 0.0
-    away = Poses.of([pose.twin]).difference(Poses.of([pose.camera_from_obj]))[0]
+    away = Poses.of([pose.second]).difference(Poses.of([pose.camera_from_obj]))[0]
     return float(np.degrees(np.linalg.norm(away[:3])))

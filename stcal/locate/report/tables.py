@@ -76,7 +76,7 @@ def poses_csv(results: Sequence[Located], chain: Chain | None = None) -> str:
     for each in accepted(results):
         own = uncertain(each)
         cells = pose_cells(own.rigid, own.covariance if full else None)
-        fit = [f"{each.pose.rms_px():.4f}", f"{each.pose.chi2_per_dof():.4f}"] if full else ["", ""]
+        fit = [f"{each.pose.rms_px():.4f}", f"{each.pose.chi2_per_redundancy():.4f}"] if full else ["", ""]
         row = [each.name, len(each.merged.seen), len(each.tags.readable()), *cells, *fit]
         if chain:
             goal = chain.base_from_goal(each.name, own)
@@ -127,7 +127,7 @@ def _scene_json(each: Located, layout: TargetLayout, chain: Chain | None) -> dic
     content["camera_from_obj"] = None if pose is None else pose.matrix().tolist()
     if each.patent is not None:
         content |= {
-            "twin": each.patent.twin.matrix().tolist(),
+            "twin": each.patent.second.matrix().tolist(),
             "errors_px": [_finite(error) for error in each.patent.errors_px],
         }
     if each.pose is not None:
@@ -143,11 +143,11 @@ def _pose_json(each: Located, layout: TargetLayout) -> dict:
     names = [f"{layout.tags[row][1]}:{corner}" for row in pose.rows for corner in range(4)]
     return {
         "covariance": pose.covariance.tolist(),
-        "twin": None if pose.twin is None else pose.twin.matrix().tolist(),
+        "twin": None if pose.second is None else pose.second.matrix().tolist(),
         "delta_chi2": _finite(pose.delta_chi2),
         "rms_px": pose.rms_px(),
         "chi2": pose.chi2,
-        "dof": pose.dof,
+        "dof": pose.redundancy,
         "p_value": pose.p_value(),
         "outliers": [layout.tags[row][1] for row in pose.outliers],
         "corners": [

@@ -184,10 +184,10 @@ def _measured(image: ImageObservations, camera, target: TargetCircles, options, 
 def resolved(pose: TargetPose, previous: Rigid) -> TargetPose:
     """The pose with its two-fold ambiguity decided by another one that is near, camera_from_target of the image before;
     the same where it is certain, or where that one is near to neither."""
-    if pose.status == "certain" or pose.alternative is None:
+    if pose.status == "certain" or pose.second is None:
         return pose
     own, other = (
-        Rigid(each.camera_from_target.rotation @ previous.rotation.T).angle_rad() for each in (pose, pose.alternative)
+        Rigid(each.camera_from_target.rotation @ previous.rotation.T).angle_rad() for each in (pose, pose.second)
     )
     if own <= NEAR_PREVIOUS * other:
         return replace(pose, status="resolved")
@@ -218,7 +218,7 @@ def poses_csv(result: MeasureResult, joints: Table | None = None) -> tuple[str, 
         writer.writerow(
             [each.name, "+".join(pose.faces), len(pose.labels), pose.status]
             + pose_cells(pose.camera_from_target, pose.covariance)
-            + [f"{pose.rms_px():.5f}", f"{pose.chi2_per_dof():.4f}"]
+            + [f"{pose.rms_px():.5f}", f"{pose.chi2_per_redundancy():.4f}"]
             + (rows[each.name] if rows is not None else [])
             + [f"{v:.7g}" for v in felt.T.ravel()]
         )
@@ -267,7 +267,7 @@ def measure_json(result: MeasureResult) -> dict:
 
 def _image_json(each: MeasuredImage) -> dict:
     pose = each.pose
-    other = pose.alternative
+    other = pose.second
     return {
         "image": each.name,
         "faces": list(pose.faces),
@@ -284,7 +284,7 @@ def _image_json(each: MeasuredImage) -> dict:
         "delta_chi2_needed": pose.needed_chi2,
         "rms_px": pose.rms_px(),
         "chi2": pose.chi2,
-        "dof": pose.dof,
+        "dof": pose.redundancy,
         "p_value": pose.p_value(),
         "fit": fit_verdict(pose),
         "circles": [
@@ -312,7 +312,7 @@ def measure_text(result: MeasureResult) -> str:
         verdict = fit_verdict(pose)
         lines.append(
             f"{each.name:{wide}}  {'+'.join(pose.faces):7} {len(pose.labels):7}  {pose.status:9} {place}      "
-            f"{position} {turn} {pose.rms_px():7.4f} {pose.chi2_per_dof():7.2f}"
+            f"{position} {turn} {pose.rms_px():7.4f} {pose.chi2_per_redundancy():7.2f}"
             + ("" if verdict == "passed" else f"  {verdict}")
         )
         lines += [

@@ -5,10 +5,10 @@ Such a face says little on how it is tilted to first order, and more to second o
 
 import numpy as np
 
+from stcal.geometry.plane_poses import mirrored, step_between
 from stcal.geometry.pose_descent import PoseStack
 from stcal.geometry.rigid import Rigid
-from stcal.sfm.measure.minima import mirrored
-from stcal.sfm.measure.problem import PoseProblem, step_between
+from stcal.sfm.measure.problem import PoseProblem
 
 CURVED = 0.2
 """χ² two σ away that differs from its parabola by more than this share: the covariance is then taken from samples."""
@@ -28,7 +28,7 @@ def spread(
     full: np.ndarray,
     least: float,
     covariance: np.ndarray,
-    other: PoseStack | None,
+    second: PoseStack | None,
     plane: Rigid | None,
     plausible: float,
 ) -> tuple[np.ndarray, float]:
@@ -36,14 +36,14 @@ def spread(
 
     The covariance is the given one where the likelihood is Gaussian. Else it is the second moment about the pose of all
     poses by their likelihood: importance sampling with fixed numbers (Bishop 2006, Pattern Recognition and Machine
-    Learning, sec. 11.1.4); poses nearer to the ``other`` minimum are that one's.
+    Learning, sec. 11.1.4); poses nearer to the ``second`` solution are that one's.
 
     Parameters
     ----------
     full : (2n, 2n) covariance of the centres
     least : χ² of the pose
     covariance : (6, 6) of the linearised problem
-    other : second minimum, or None
+    second : the second solution, or None
     plane : target_from_plane of a face seen alone and without a second minimum, else None. The two may have grown
         together: a valley of which the linearised problem sees one side. The mirror image matters where it is
         ``plausible``, some σ off, and far more probable than these say.
@@ -61,13 +61,13 @@ def spread(
     curved = np.abs((excess(2 * np.vstack([axes, -axes])) - least) / 4 - 1).max() >= CURVED
     other_side, first = np.inf, covariance
     if plane is not None:
-        twin = mirrored(pose, plane)
-        away = step_between(pose, twin)
+        image_pose = mirrored(pose, plane)
+        away = step_between(pose, image_pose)
         square = float(away @ np.linalg.solve(covariance, away))
-        worse = _best_of_tilt(problem, twin, plane, whiten) - least
+        worse = _best_of_tilt(problem, image_pose, plane, whiten) - least
         if worse < min(plausible, square / 2) and square > OTHER_SIDE**2:
             other_side, first, curved = float(worse), covariance + np.outer(away, away) / 4, True
-    return (_sampled(excess, least, pose, first, other) if curved else covariance), other_side
+    return (_sampled(excess, least, pose, first, second) if curved else covariance), other_side
 
 
 def _best_of_tilt(problem: PoseProblem, pose: PoseStack, plane: Rigid, whiten: np.ndarray) -> float:
@@ -81,15 +81,15 @@ def _best_of_tilt(problem: PoseProblem, pose: PoseStack, plane: Rigid, whiten: n
     return float(rest @ rest)
 
 
-def _sampled(excess, least: float, pose: PoseStack, covariance: np.ndarray, other: PoseStack | None) -> np.ndarray:
+def _sampled(excess, least: float, pose: PoseStack, covariance: np.ndarray, second: PoseStack | None) -> np.ndarray:
     """Second moment (6, 6) of exp(−(excess − least)/2) about the pose; ``covariance`` : about what it will be."""
     normal = np.random.default_rng(0).standard_normal((SAMPLES, 6))
     precision = np.linalg.inv(covariance)
     for _ in range(SAMPLE_ROUNDS):
         step = SAMPLED_WIDER * normal @ _principal(covariance)
         log = (normal**2).sum(1) / 2 - (excess(step) - least) / 2
-        if other is not None:
-            away = step_between(pose, other)
+        if second is not None:
+            away = step_between(pose, second)
             log[(step - away / 2) @ precision @ away > 0] = -np.inf
         weight = np.exp(log - log.max())
         weight /= weight.sum()

@@ -15,6 +15,7 @@ from scipy.stats import chi2 as chi_square
 from stcal.errors import DegenerateError, InputError
 from stcal.geometry.arrays import frozen
 from stcal.geometry.camera import Camera
+from stcal.geometry.plane_poses import MAX_SIGMA_RAD, deciding_delta, distinct, huber_weights, weigh
 from stcal.geometry.pose_descent import Minima, PoseStack, block_diagonal
 from stcal.geometry.rigid import Rigid
 from stcal.io.camera import CameraPrior, intrinsic_basis
@@ -22,12 +23,9 @@ from stcal.labels import CircleLabel, parse_labels
 from stcal.sfm.data.model import Outlier
 from stcal.sfm.data.projection import CircleImages
 from stcal.sfm.measure.likelihood import spread
-from stcal.sfm.measure.minima import HUBER, MIN_CIRCLES, distinct, minima_without_outliers, start_pose
-from stcal.sfm.measure.problem import HOPELESS, PoseProblem, covariance_of_centres, rigid_of
+from stcal.sfm.measure.minima import MIN_CIRCLES, minima_without_outliers, start_pose
+from stcal.sfm.measure.problem import HOPELESS, PoseProblem, covariance_of_centres
 from stcal.sfm.measure.target import TargetCircles
-
-MAX_SIGMA_RAD = 0.5
-"""A rotation whose σ is larger is none: linear propagation says nothing any more."""
 
 Status = Literal["certain", "resolved", "ambiguous"]
 
@@ -36,9 +34,9 @@ Status = Literal["certain", "resolved", "ambiguous"]
 class PoseOptions:
     """How to measure.
 
-    ``flip_odds`` : at most these odds of the other pose for one to be certain, for Gaussian errors; ``sigma_margin`` :
-    by which σ may be too small without that becoming untrue; ``sigma_factor`` : factor on the centres' own σ, that of
-    the target's run where None.
+    ``flip_odds`` : at most these odds of the second solution for a pose to be certain, for Gaussian errors;
+    ``sigma_margin`` : by which σ may be too small without that becoming untrue; ``sigma_factor`` : factor on the
+    centres' own σ, that of the target's run where None.
     """
 
     flip_odds: float = 1e-6
@@ -54,8 +52,8 @@ class PoseOptions:
             )
 
     def needed(self, chi2_per_dof: float) -> float:
-        """Δχ² that makes a pose certain: −2 ln of the odds, times the variance factor that is to be allowed for."""
-        return -2 * float(np.log(self.flip_odds)) * max(self.sigma_margin**2, chi2_per_dof)
+        """Δχ² that makes a pose certain."""
+        return deciding_delta(self.flip_odds, self.sigma_margin, chi2_per_dof)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -69,10 +67,10 @@ class TargetPose:
     : (6, q) derivatives, but for the sign, by errors of the circles (target frame, mm) and intrinsics; ``status`` : see
     ``delta_chi2``; ``faces`` and ``labels`` used; ``residuals_px`` : (n, 2) measured minus projected ellipse centres;
     ``weights`` : (n,) Huber's;
-    ``outliers`` left out; ``chi2``, ``dof`` : of all residuals against their covariance; ``delta_chi2`` : by which the
-    other minimum is worse, or, where both are one wide valley, the other side of it (infinite where there is neither);
-    ``needed_chi2`` : the least of it for the pose to be certain; ``alternative`` : the other minimum where that is not
-    reached.
+    ``outliers`` left out; ``chi2``, ``redundancy`` : of all residuals against their covariance; ``delta_chi2`` : by
+    which the second solution is worse, or, where both are one wide valley, the other side of it (infinite where there
+    is neither); ``needed_chi2`` : the least of it for the pose to be certain; ``second`` : the second solution, where
+    that is not reached.
     """
 
     camera_from_target: Rigid
@@ -87,10 +85,10 @@ class TargetPose:
     weights: np.ndarray
     outliers: tuple[Outlier, ...]
     chi2: float
-    dof: int
+    redundancy: int
     delta_chi2: float
     needed_chi2: float
-    alternative: "TargetPose | None" = None
+    second: "TargetPose | None" = None
 
     def __post_init__(self):
         n = len(self.labels)
@@ -101,21 +99,22 @@ class TargetPose:
         object.__setattr__(self, "weights", frozen(self.weights, (n,), "weights"))
 
     def swapped(self) -> "TargetPose":
-        """The alternative in its place, as ``resolved``."""
-        own = replace(self, alternative=None)
-        return replace(self.alternative, status="resolved", alternative=own)
+        """The second solution in its place, as ``resolved``; this one where there is none."""
+        if self.second is None:
+            return self
+        return replace(self.second, status="resolved", second=replace(self, second=None))
 
     def rms_px(self) -> float:
         """Of the residuals, per coordinate."""
         return float(np.sqrt((self.residuals_px**2).mean()))
 
-    def chi2_per_dof(self) -> float:
+    def chi2_per_redundancy(self) -> float:
         """About 1 where the σ of centres, target and intrinsics are true."""
-        return self.chi2 / self.dof
+        return self.chi2 / self.redundancy
 
     def p_value(self) -> float:
         """Probability of residuals as large, with those σ."""
-        return float(chi_square.sf(self.chi2, self.dof))
+        return float(chi_square.sf(self.chi2, self.redundancy))
 
 
 def pose_from_circles(
@@ -131,7 +130,7 @@ def pose_from_circles(
     """Pose of a calibrated target from the ellipse centres of its circles in one image.
 
     The first step minimises the residuals of the single centres with Huber's loss, from the homography of the face with
-    the most circles and from its twin, mirrored at the line of sight. The second weighs them by their whole covariance
+    the most circles and from its mirror image at the line of sight. The second weighs them by their whole covariance
     (generalised least squares), to which the image's noise, the target's and the intrinsics' uncertainty add up, so
     that the covariance of the pose contains all three. Dots of the board are passed over.
 
@@ -159,15 +158,12 @@ def pose_from_circles(
     start, plane = start_pose(names, problem, target, where)
     found, keep, outliers = minima_without_outliers(problem, start, plane, names, where)
     problem, names = problem.select(keep), [names[i] for i in keep]
-    dof = 2 * len(names) - 6
-    if dof <= 0:
+    if len(names) < MIN_CIRCLES:
         raise DegenerateError(f"{where}: {len(names)} circles left, {MIN_CIRCLES} needed; show more of a face")
-    pose = _answer(problem, found, names, plane, dof, options)
+    pose = _answer(problem, found, names, outliers, plane, options)
     if np.sqrt(np.diag(pose.covariance)[:3].max()) > MAX_SIGMA_RAD:
         raise DegenerateError(f"{where}: its circles leave the rotation open; show more of a face, off one line")
-    return replace(
-        pose, outliers=outliers, alternative=pose.alternative and replace(pose.alternative, outliers=outliers)
-    )
+    return pose
 
 
 def _problem(labels, centre_px, covariance_px2, target: TargetCircles, camera, options, prior, where):
@@ -187,39 +183,15 @@ def _problem(labels, centre_px, covariance_px2, target: TargetCircles, camera, o
     rows = (3 * place[:, None] + np.arange(3)).ravel()
     factor = target.sigma_factor if options.sigma_factor is None else options.sigma_factor
     ideal = camera.normalised_from_pixel(centre[used])
-    slope = camera.distort_jacobian(ideal)[1] * camera.focal[:, None]
-    back = np.linalg.inv(slope)
+    px_by_centre = camera.distort_jacobian(ideal)[1] * camera.focal[:, None]
+    back = np.linalg.inv(px_by_centre)
     by_camera, known = np.zeros((len(used), 2, 0)), np.zeros((0, 0))
     if prior is not None:
         by_camera = back @ (camera.parameter_jacobian(ideal) @ intrinsic_basis(prior.colmap_model))
         known = prior.covariance
-    own = target.xyz[place], target.normal[place], target.radius[place], ideal, slope
+    own = target.xyz[place], target.normal[place], target.radius[place], ideal, px_by_centre
     spread = factor**2 * back @ noise[used] @ np.swapaxes(back, 1, 2)
     return used, PoseProblem(*own, spread, by_camera, known, target.covariance[np.ix_(rows, rows)])
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class _Weighed:
-    """One step of generalised least squares from h poses: the poses after it, ``residual`` (h, n, 2) that it leaves to
-    first order, ``normal`` (h, 6, 6), ``chi2`` (h,)."""
-
-    poses: PoseStack
-    residual: np.ndarray
-    normal: np.ndarray
-    chi2: np.ndarray
-
-
-def _weigh(residual: np.ndarray, by_pose: np.ndarray, full: np.ndarray, poses: PoseStack) -> _Weighed:
-    """The step with residuals (h, n, 2), their derivative (h, n, 2, 6) and their covariance (h, 2n, 2n)."""
-    h = len(residual)
-    r, a = residual.reshape(h, -1, 1), by_pose.reshape(h, -1, 6)
-    solved = np.linalg.solve(full, np.concatenate([a, r], axis=2))
-    back = np.swapaxes(a, 1, 2) @ solved
-    normal, right = back[..., :6], back[..., 6:]
-    step = np.linalg.solve(normal, right)[..., 0]
-    square = (np.swapaxes(r, 1, 2) @ solved[..., 6:])[:, 0, 0]
-    left = residual - (a @ step[..., None]).reshape(residual.shape)
-    return _Weighed(poses.moved(step), left, normal, square - (step * right[..., 0]).sum(1))
 
 
 def _gain(image: CircleImages, full: np.ndarray) -> np.ndarray:
@@ -230,23 +202,34 @@ def _gain(image: CircleImages, full: np.ndarray) -> np.ndarray:
 
 
 def _answer(
-    problem: PoseProblem, found: Minima, names: list[CircleLabel], plane: Rigid, dof: int, options: PoseOptions
+    problem: PoseProblem,
+    found: Minima,
+    names: list[CircleLabel],
+    outliers: tuple[Outlier, ...],
+    plane: Rigid,
+    options: PoseOptions,
 ) -> TargetPose:
     """Decide between the minima, or what there is of a second one, and collect."""
-    delta, rival = _rivalry(problem, found, dof)
-    alone = rival is None and len({name.face for name in names}) == 1
-    pose = _weighed(problem, found, 0, rival, names, dof, plane if alone else None, options)
-    needed = options.needed(pose.chi2_per_dof())
-    pose = replace(pose, delta_chi2=min(delta, pose.delta_chi2), needed_chi2=needed)
-    if pose.delta_chi2 > needed:
-        return replace(pose, status="certain")
-    if rival is None:
-        return pose
-    other = _weighed(problem, found, 1, found.poses[[0]], names, dof, None, options)
-    return replace(pose, alternative=replace(other, delta_chi2=-delta, needed_chi2=needed))
+    redundancy = 2 * len(names) - 6
+    seen = {
+        "faces": tuple(dict.fromkeys(name.face for name in names)),
+        "labels": tuple(names),
+        "outliers": outliers,
+        "redundancy": redundancy,
+    }
+    delta, second = _second_solution(problem, found, redundancy)
+    alone = second is None and len(seen["faces"]) == 1
+    first = _solution(problem, found.rows([0]), second, plane if alone else None, options)
+    seen["needed_chi2"] = options.needed(first.chi2 / redundancy)
+    if min(delta, first.other_side) > seen["needed_chi2"]:
+        return first.pose("certain", min(delta, first.other_side), seen)
+    if second is None:
+        return first.pose("ambiguous", first.other_side, seen)
+    rest = _solution(problem, found.rows([1]), found.poses[[0]], None, options)
+    return first.pose("ambiguous", min(delta, first.other_side), seen, rest.pose("ambiguous", -delta, seen))
 
 
-def _rivalry(problem: PoseProblem, found: Minima, dof: int) -> tuple[float, PoseStack | None]:
+def _second_solution(problem: PoseProblem, found: Minima, redundancy: int) -> tuple[float, PoseStack | None]:
     """By how much χ² the second minimum is worse than the first, and its pose; infinite where there is none.
 
     Both weigh the circles alike, as the stricter of the two does, or an outlier of one of them could decide.
@@ -254,40 +237,51 @@ def _rivalry(problem: PoseProblem, found: Minima, dof: int) -> tuple[float, Pose
     if len(found.cost) == 1:
         return np.inf, None
     behind = float(found.cost[1] - found.cost[0])
-    if behind > HOPELESS * max(1.0, found.cost[0] / dof):  # whatever the weights
+    if behind > HOPELESS * max(1.0, found.cost[0] / redundancy):  # whatever the weights
         return behind, found.poses[[1]]
     residual, image = problem.seen(found.poses)
-    common = np.tile(problem.noise / _huber(found.length).min(0)[:, None, None], (2, 1, 1, 1))
-    rivals = _weigh(residual, image.by_pose, covariance_of_centres(problem, image, common), found.poses)
-    if not distinct(rivals.poses, rivals.normal[0]):
+    common = np.tile(problem.noise / huber_weights(found.length).min(0)[:, None, None], (2, 1, 1, 1))
+    both = weigh(residual, image.by_pose, covariance_of_centres(problem, image, common), found.poses)
+    if not distinct(both.poses, both.normal[0]):
         return np.inf, None
-    return float(rivals.chi2[1] - rivals.chi2[0]), rivals.poses[[1]]
+    return float(both.chi2[1] - both.chi2[0]), both.poses[[1]]
 
 
-def _huber(length: np.ndarray) -> np.ndarray:
-    return np.minimum(1.0, HUBER / np.maximum(length, HUBER))
+@dataclass(frozen=True, slots=True, eq=False)
+class _Solution:
+    """One minimum by the whole covariance of its centres; fields as in :class:`TargetPose`. ``other_side`` : by how
+    much χ² the other side of a wide valley is worse, infinite where the minimum is none."""
+
+    camera_from_target: Rigid
+    covariance: np.ndarray
+    parts: dict[str, np.ndarray]
+    by_circles: np.ndarray
+    by_intrinsics: np.ndarray
+    residuals_px: np.ndarray
+    weights: np.ndarray
+    chi2: float
+    other_side: float
+
+    def pose(self, status: Status, delta_chi2: float, seen: dict, second: TargetPose | None = None) -> TargetPose:
+        """With the decision, and what does not depend on the minimum."""
+        own = {name: getattr(self, name) for name in _Solution.__slots__ if name != "other_side"}
+        return TargetPose(**own, **seen, status=status, delta_chi2=delta_chi2, second=second)
 
 
-def _weighed(
-    problem: PoseProblem,
-    found: Minima,
-    row: int,
-    other: PoseStack | None,
-    names: list[CircleLabel],
-    dof: int,
-    plane: Rigid | None,
-    options: PoseOptions,
-) -> TargetPose:
-    """One minimum by the whole covariance of its centres, undecided; ``other``, ``plane`` : see
-    :func:`stcal.sfm.measure.likelihood.spread`. Two steps: what the first leaves is of second order."""
-    weights = _huber(found.length[row])
+def _solution(
+    problem: PoseProblem, minimum: Minima, second: PoseStack | None, plane: Rigid | None, options: PoseOptions
+) -> _Solution:
+    """One minimum weighed; ``second``, ``plane`` : see :func:`stcal.sfm.measure.likelihood.spread`.
+
+    Two steps: what the first leaves is of second order.
+    """
+    weights = huber_weights(minimum.length[0])
     noise = problem.noise / weights[:, None, None]
-    start = found.poses[[row]]
-    residual, image = problem.seen(start)
+    residual, image = problem.seen(minimum.poses)
     full = covariance_of_centres(problem, image, noise[None])
-    poses = _weigh(residual, image.by_pose, full, start).poses
+    poses = weigh(residual, image.by_pose, full, minimum.poses).poses
     residual, image = problem.seen(poses)
-    last = _weigh(residual, image.by_pose, full, poses)
+    last = weigh(residual, image.by_pose, full, poses)
     gain = _gain(image, full[0])
     by_circles = gain @ block_diagonal(image.by_circle)[0]
     by_intrinsics = gain @ problem.by_camera.reshape(len(full[0]), -1)
@@ -296,26 +290,20 @@ def _weighed(
         "target": by_circles @ problem.shape @ by_circles.T,
         "intrinsics": by_intrinsics @ problem.prior @ by_intrinsics.T,
     }
-    gaussian = sum(parts.values())
+    gaussian = parts["image"] + parts["target"] + parts["intrinsics"]
     chi2 = float(last.chi2[0])
     # The samples span a valley from side to side: the margin for wrong σ is for what they do not show.
-    plausible = options.needed(chi2 / dof) / options.sigma_margin**2
-    covariance, other_side = spread(problem, last.poses, full[0], chi2, gaussian, other, plane, plausible)
+    plausible = options.needed(chi2 / (2 * len(weights) - 6)) / options.sigma_margin**2
+    covariance, other_side = spread(problem, last.poses, full[0], chi2, gaussian, second, plane, plausible)
     parts["curvature"] = covariance - gaussian
-    return TargetPose(
-        rigid_of(last.poses, 0),
-        (covariance + covariance.T) / 2,
-        parts,
-        by_circles,
-        by_intrinsics,
-        "ambiguous",
-        tuple(dict.fromkeys(name.face for name in names)),
-        tuple(names),
-        problem.in_px(last.residual[0]),
-        weights,
-        (),
-        chi2,
-        dof,
-        other_side,
-        0.0,
+    return _Solution(
+        camera_from_target=last.poses.rigid(0),
+        covariance=(covariance + covariance.T) / 2,
+        parts=parts,
+        by_circles=by_circles,
+        by_intrinsics=by_intrinsics,
+        residuals_px=problem.in_px(last.residual[0]),
+        weights=weights,
+        chi2=chi2,
+        other_side=other_side,
     )

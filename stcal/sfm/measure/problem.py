@@ -1,18 +1,18 @@
 """What one image says of a target's pose, and the descent to the poses that fit it best, several at once."""
 
 from dataclasses import dataclass
+from functools import partial
 
 import numpy as np
-from scipy.spatial.transform import Rotation
 
 from stcal.geometry import pose_descent
+from stcal.geometry.plane_poses import Descend
 from stcal.geometry.pose_descent import Minima, Normal, PoseStack, block_diagonal
-from stcal.geometry.rigid import Rigid
 from stcal.sfm.data.projection import CircleImages, project_circles
 
 SETTLED = 1e-4
 """A step that lowers χ² by less moves the pose by less than a hundredth of its σ, and the two steps that weigh the
-centres anew are still to come; a rival with a large χ² need not be better known than that, relatively."""
+centres anew are still to come; a second solution with a large χ² need not be better known than that, relatively."""
 HOPELESS = 500.0
 """In χ²: what whatever weights cannot make up for."""
 
@@ -22,16 +22,16 @@ class PoseProblem:
     """n circles, what was measured of them, and what is known of everything else; the lens taken out.
 
     ``xyz``, ``normal`` : (n, 3) target frame; ``radius`` : (n,); ``centre`` : (n, 2) of the ellipses, normalised
-    coordinates; ``slope`` : (n, 2, 2) px by those; ``noise`` : (n, 2, 2) covariance of ``centre``; ``by_camera`` :
-    (n, 2, q) derivative of ``centre`` by the intrinsics, q = 0 where they are held, ``prior`` : (q, q) their
-    covariance; ``shape`` : (3n, 3n) mm² covariance of the circles.
+    coordinates; ``px_by_centre`` : (n, 2, 2) jacobian of the lens; ``noise`` : (n, 2, 2) covariance of ``centre``;
+    ``by_camera`` : (n, 2, q) derivative of ``centre`` by the intrinsics, q = 0 where they are held, ``prior`` : (q, q)
+    their covariance; ``shape`` : (3n, 3n) mm² covariance of the circles.
     """
 
     xyz: np.ndarray
     normal: np.ndarray
     radius: np.ndarray
     centre: np.ndarray
-    slope: np.ndarray
+    px_by_centre: np.ndarray
     noise: np.ndarray
     by_camera: np.ndarray
     prior: np.ndarray
@@ -44,24 +44,13 @@ class PoseProblem:
 
     def in_px(self, residual: np.ndarray) -> np.ndarray:
         """Residuals (n, 2) in the image as it is, px."""
-        return (self.slope @ residual[..., None])[..., 0]
+        return (self.px_by_centre @ residual[..., None])[..., 0]
 
     def select(self, keep: np.ndarray) -> "PoseProblem":
         """Those circles only."""
         rows = (3 * keep[:, None] + np.arange(3)).ravel()
-        own = (self.xyz, self.normal, self.radius, self.centre, self.slope, self.noise, self.by_camera)
+        own = (self.xyz, self.normal, self.radius, self.centre, self.px_by_centre, self.noise, self.by_camera)
         return PoseProblem(*(a[keep] for a in own), self.prior, self.shape[np.ix_(rows, rows)])
-
-
-def rigid_of(poses: PoseStack, row: int) -> Rigid:
-    """camera_from_target of one of them."""
-    return Rigid(poses.rotation[row], poses.translation[row])
-
-
-def step_between(pose: PoseStack, other: PoseStack) -> np.ndarray:
-    """(6,) left perturbation that leads from the one pose to the other, stacks of one each."""
-    turn = Rotation.from_matrix(other.rotation[0] @ pose.rotation[0].T).as_rotvec()
-    return np.concatenate([turn, other.translation[0] - pose.translation[0]])
 
 
 def covariance_of_centres(problem: PoseProblem, image: CircleImages, noise: np.ndarray) -> np.ndarray:
@@ -72,16 +61,16 @@ def covariance_of_centres(problem: PoseProblem, image: CircleImages, noise: np.n
     return full + by_camera @ problem.prior @ by_camera.T
 
 
-def whitening_by_centre(problem: PoseProblem, poses: PoseStack) -> np.ndarray:
-    """(h, 2n, 2n) that make each centre's residual one of σ 1, the others apart: noise and its own circle's σ."""
-    by_circle = problem.seen(poses)[1].by_circle
+def descent_near(problem: PoseProblem, pose: PoseStack) -> Descend:
+    """The descent with each centre's residual, near a pose, one of σ 1: noise and its own circle's σ."""
+    by_circle = problem.seen(pose)[1].by_circle
     n = len(problem.xyz)
     own = problem.shape.reshape(n, 3, n, 3)[np.arange(n), :, np.arange(n)]
     root = np.linalg.inv(np.linalg.cholesky(problem.noise + by_circle @ own @ np.swapaxes(by_circle, -1, -2)))
-    return block_diagonal(root)
+    return partial(_descend, problem, block_diagonal(root))
 
 
-def descend(problem: PoseProblem, poses: PoseStack, whiten: np.ndarray, huber: float) -> Minima:
+def _descend(problem: PoseProblem, whiten: np.ndarray, poses: PoseStack, huber: float) -> Minima:
     """The minima next to h poses, Huber's loss on the residuals whitened by (h or 1, 2n, 2n)."""
     h, n = len(poses), len(problem.xyz)
 

@@ -127,6 +127,6 @@ def _row(each: MeasuredImage, verdicts: bool) -> list[str]:
         + [number(v, 3) for v in pose.camera_from_target.translation]
         + [number(1e3 * v, 1) for v in sigma[3:]]
         + [number(1e3 * np.degrees(v), 2) for v in sigma[:3]]
-        + [number(pose.rms_px(), 4), number(pose.chi2_per_dof(), 2)]
+        + [number(pose.rms_px(), 4), number(pose.chi2_per_redundancy(), 2)]
         + ([fit_verdict(pose)] if verdicts else [])
     )

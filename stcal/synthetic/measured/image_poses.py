@@ -7,6 +7,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 from scipy.stats import chi2
 
+from stcal.geometry.plane_poses import mirrored
 from stcal.geometry.pose_descent import PoseStack
 from stcal.geometry.rigid import Rigid
 from stcal.labels import CircleLabel
@@ -14,7 +15,6 @@ from stcal.sfm.adjust.chain import CalibratedTarget
 from stcal.sfm.adjust.joint import covariance_of
 from stcal.sfm.adjust.uncertainty import derivatives
 from stcal.sfm.data.observations import ImageObservations
-from stcal.sfm.measure.minima import mirrored
 from stcal.sfm.measure.pose import TargetPose
 from stcal.sfm.measure.target import TargetCircles
 from stcal.sfm.plan.simulated import observe, true_models
@@ -98,11 +98,11 @@ def pose_error(estimate: Rigid, truth: Rigid) -> np.ndarray:
 
 
 def is_flipped(pose: TargetPose, truth: Rigid, towards: Rigid) -> bool:
-    """Whether the pose is the truth's twin, mirrored at the line of sight to ``towards``: nearer to it in rotation than
-    to the truth, and off the truth by more than its own covariance explains but once in 10⁶."""
+    """Whether the pose is the truth's second solution, mirrored at the line of sight to ``towards``: nearer to it in
+    rotation than to the truth, and off the truth by more than its own covariance explains but once in 10⁶."""
     error = pose_error(pose.camera_from_target, truth)
     if error @ np.linalg.solve(pose.covariance, error) < chi2.isf(1e-6, 6):
         return False
-    twin = mirrored(PoseStack(truth.rotation[None], truth.translation[None]), towards).rotation[0]
-    off = Rigid(pose.camera_from_target.rotation @ twin.T).angle_rad()
+    second = mirrored(PoseStack.of(truth), towards).rotation[0]
+    off = Rigid(pose.camera_from_target.rotation @ second.T).angle_rad()
     return off < float(np.linalg.norm(error[:3]))

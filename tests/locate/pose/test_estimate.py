@@ -40,7 +40,7 @@ def test_the_covariance_is_true(shown, layout, shared):
         pose = locate(seen, layout, CAMERA)
         error = error_of(pose, truth)
         squares.append(error @ np.linalg.solve(pose.covariance, error) / 6)
-        fits.append(pose.chi2_per_dof())
+        fits.append(pose.chi2_per_redundancy())
     assert 0.9 < np.mean(squares) < 1.1
     assert 0.9 < np.mean(fits) < 1.1
 
@@ -88,7 +88,7 @@ def test_both_minima_are_refined():
     layout = example_layout(0.03, 0.2)
     seen = merge(simulated_exposures(layout, truth, np.random.default_rng(0), shown=((0,),)), layout).seen
     pose = locate(seen, layout, CAMERA)
-    tilts = sorted(p.rotation[1, 2] for p in (pose.camera_from_obj, pose.twin))
+    tilts = sorted(p.rotation[1, 2] for p in (pose.camera_from_obj, pose.second))
     assert tilts[0] < -0.2
     assert tilts[1] > 0.2
     assert 0 <= pose.delta_chi2 < 60
@@ -100,7 +100,7 @@ def test_two_poses_that_are_one_are_covered_by_one_covariance():
     seen = merge(simulated_exposures(layout, truth, np.random.default_rng(0), shown=((0,),)), layout).seen
     pose = locate(seen, layout, CAMERA)
     assert judge(pose, VerdictOptions(max_sigma_deg=90.0))[1].decision == "ambiguous"
-    away = Poses.of([pose.twin]).difference(Poses.of([pose.camera_from_obj]))[0]
+    away = Poses.of([pose.second]).difference(Poses.of([pose.camera_from_obj]))[0]
     wide = covering_both(pose)
     gain = wide.covariance - pose.covariance
     odds = np.exp(-pose.delta_chi2 / 2)

@@ -66,7 +66,7 @@ def squared_errors(scene, known, count, faces, noise_px, tilt_deg, distance_mm=(
         if pose.status == "certain":
             error = pose_error(pose.camera_from_target, truth)
             square.append(error @ np.linalg.solve(pose.covariance, error) / 6)
-            fit.append(pose.chi2_per_dof())
+            fit.append(pose.chi2_per_redundancy())
             flipped += is_flipped(pose, truth, towards)
     return np.array(square), np.array(fit), 1 - len(square) / count, flipped
 
@@ -132,9 +132,9 @@ def test_flipped_poses_would_be_returned_without_the_ambiguity(scene, known):
         if is_flipped(pose, truth, towards):
             flipped += 1
             assert pose.status == "ambiguous"
-        if pose.status == "ambiguous" and pose.alternative is not None:
+        if pose.status == "ambiguous" and pose.second is not None:
             ambiguous += 1
-            assert pose.alternative.alternative is None
+            assert pose.second.second is None
     assert flipped > 5
     assert ambiguous > 50
 
@@ -154,7 +154,7 @@ def test_a_second_face_or_the_previous_image_resolves_it(scene, known):
     assert chosen.status == "resolved"
     assert np.linalg.norm(pose_error(chosen.camera_from_target, truth)[:3]) < 0.1
     # The twin's neighbour chooses the twin, and a view from elsewhere none.
-    other = next(p for p in (pose, pose.alternative) if p.camera_from_target is not chosen.camera_from_target)
+    other = next(p for p in (pose, pose.second) if p.camera_from_target is not chosen.camera_from_target)
     assert resolved(pose, other.camera_from_target).camera_from_target is other.camera_from_target
     far = Rigid(Rigid.exp([0, 1.5, 0, 0, 0, 0]).rotation @ truth.rotation, truth.translation)
     assert resolved(pose, far).status == "ambiguous"
