@@ -20,7 +20,7 @@ from stcal.report.text import number
 from stcal.robot.identify.solve import Identified, IdentifyOptions, identify
 from stcal.robot.kinematics.file import load_robot
 from stcal.robot.kinematics.forward import forward
-from stcal.robot.kinematics.measurements import Measurements, joint_values
+from stcal.robot.kinematics.measurements import Measurements, joint_values, targets_of
 from stcal.robot.kinematics.model import Robot
 
 FIRST_NAMES = 6
@@ -128,8 +128,7 @@ def _measurements(pairs: Pairs, file: Path, robot: Robot) -> Measurements:
         q = joint_values(table, robot)
     except InputError as error:
         raise InputError(f"{error} (--robot needs the joint values of each point)") from error
-    targets = tuple(table.text("target")) if "target" in table else ("",) * len(table)
-    return Measurements(pairs.where, pairs.lines, q, targets, pairs.xyz_b)
+    return Measurements(pairs.where, pairs.lines, q, targets_of(table), pairs.xyz_b)
 
 
 def grown(robot: Robot, data: Measurements, good: np.ndarray, settings: IdentifyOptions):

@@ -166,7 +166,7 @@ def fit_axes(data: Measurements, robot: Robot, arcs: list[Arc]) -> tuple[list[Ax
     The covariance counts a row once, however many sweeps it belongs to.
     """
     kinematic = data.q @ robot.coupling.T
-    points, m = np.array(data.positions), len(data)
+    points, m = np.array(data.points()), len(data)
     turned = np.broadcast_to(np.eye(3), (m, 3, 3))  # what unwinding has turned the noise by
     fits, response, inherited = [], [], []
     for j, sliding in enumerate(robot.prismatic):
@@ -331,7 +331,7 @@ def _lengths(angle: float, value: np.ndarray, sigma: np.ndarray, size: float) ->
 def _leave_one_out(data: Measurements, fits: list[AxisFit], nominal: Robot) -> LeaveOneOut:
     """All axes again without each row; what comes after a changed axis is unwound and fitted again."""
     kinematic = data.q @ nominal.coupling.T
-    start = [np.array(data.positions)]
+    start = [np.array(data.points())]
     for j, fit in enumerate(fits):
         start.append(_unwound(fit.world_from_axis, start[-1], kinematic[:, j], bool(nominal.prismatic[j]))[1])
     lines, values = [], []

@@ -60,7 +60,7 @@ def find_arcs(data: Measurements, robot: Robot, still_rad: float = STILL_RAD) ->
             places = values if robot.prismatic[j] else np.mod(values + STILL_RAD, 2 * np.pi)
             distinct = len(set(_clusters(places, still[j])))
             if distinct >= DISTINCT[joint.type]:
-                arcs.append(Arc(j, target, rows))
+                arcs.append(Arc(j, target, np.array(rows)))
                 found += 1
             elif distinct > 1:
                 notes.append(
@@ -86,7 +86,7 @@ def called(target: str) -> str:
 def _require_motion(data: Measurements) -> None:
     names = np.array(data.targets)
     for target in dict.fromkeys(data.targets):
-        points = data.positions[names == target]
+        points = data.points()[names == target]
         moved = np.linalg.norm(points - np.median(points, axis=0), axis=1)
         if len(points) > 1 and np.quantile(moved, 0.9) < NOT_MOVED_MM:
             raise InputError(

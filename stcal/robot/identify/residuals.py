@@ -76,8 +76,9 @@ def observed(data: Measurements, kind: Kind | None = None) -> Observed:
     if kind != "distance":
         return Observed(kind, data, rows, rows, none)
     if held == "distance":
-        real = rows[data.from_row != rows]
-        return Observed(kind, data, real, data.from_row[real], data.distances[real])
+        distances, from_row = data.lengths()
+        real = rows[from_row != rows]
+        return Observed(kind, data, real, from_row[real], distances[real])
     return Observed("position", data, rows, rows, none, frameless=True)
 
 
@@ -102,7 +103,7 @@ def residuals(state: State, seen: Observed) -> np.ndarray:
     if seen.kind == "pose":
         return seen.data.poses().difference(tip)
     if seen.kind == "position":
-        return seen.data.positions - tip.translation
+        return seen.data.points() - tip.translation
     apart = tip.translation[seen.first] - tip.translation[seen.second]
     return (seen.values - np.linalg.norm(apart, axis=1))[:, None]
 
@@ -124,16 +125,16 @@ def tip_jacobian(state: State, q: np.ndarray, targets: Sequence[str], kind: Kind
     over translation (mm), in the world's axes."""
     tip = tips(state, q, targets)
     width = tool_width(kind)
-    by_axes = chain_jacobian(state.chain, q, tip)
-    by_tools = np.zeros((len(tip), 6, width * len(state.tools)))
-    targets = np.array(targets)
+    axes_part = chain_jacobian(state.chain, q, tip)
+    tools_part = np.zeros((len(tip), 6, width * len(state.tools)))
+    names = np.array(targets)
     for t, name in enumerate(state.tools):
-        rows, place = targets == name, width * t
+        rows, place = names == name, width * t
         if width == 6:
-            by_tools[rows, :3, place : place + 3] = tip.rotation[rows]
+            tools_part[rows, :3, place : place + 3] = tip.rotation[rows]
             place += 3
-        by_tools[rows, 3:, place : place + 3] = tip.rotation[rows]
-    return tip, np.concatenate([by_axes, by_tools], axis=2)
+        tools_part[rows, 3:, place : place + 3] = tip.rotation[rows]
+    return tip, np.concatenate([axes_part, tools_part], axis=2)
 
 
 def moved(state: State, step: np.ndarray, kind: Kind) -> State:

@@ -1,6 +1,7 @@
 """Identification of a robot's kinematics from poses, positions or distances: parameters, σ and held-out error."""
 
 from dataclasses import dataclass, replace
+from typing import get_args
 
 import numpy as np
 
@@ -286,7 +287,7 @@ def _ranks(state: State, data: Measurements) -> dict[str, int]:
     tip = tips(state, data.q, data.targets)
     exact = Measurements(data.where, data.lines, data.q, data.targets, tip.translation, tip.rotation)
     ranks, weighting = {}, Weighting(TYPICAL_MM, TYPICAL_RAD)
-    for kind in WIDTH:
+    for kind in get_args(Kind):
         seen = observed(exact, kind)
         ranks[kind] = normal_rank(state, seen, weighting) - _place(seen)
     return ranks
@@ -296,7 +297,7 @@ def _observability(robot: Robot, adjusted: _Adjusted, seen: Observed, rank: int)
     state, weighting = adjusted.solution.state, adjusted.weighting
     rows = weighting.whiten(jacobian(state, seen), seen) * parameter_scale(robot, seen.kind, state.tools)
     if seen.frameless:  # without what a motion of all points makes
-        at = seen.data.positions - seen.data.positions.mean(0)
+        at = seen.data.points() - seen.data.points().mean(0)
         motions = np.concatenate([-skew(at) / np.linalg.norm(at), np.tile(np.eye(3), (len(at), 1, 1))], axis=2)
         u, s, _ = np.linalg.svd(weighting.whiten(motions, seen).reshape(-1, 6), full_matrices=False)
         u, flat = u[:, s > 1e-9 * s[0]], rows.reshape(-1, rows.shape[2])
@@ -308,7 +309,7 @@ def _place(seen: Observed) -> int:
     """Directions in which positions that count by their distances can be moved together: 6 (5 of points on a line)."""
     if not seen.frameless:
         return 0
-    at = seen.data.positions - seen.data.positions.mean(0)
+    at = seen.data.points() - seen.data.points().mean(0)
     turns = np.linalg.matrix_rank(skew(at).reshape(-1, 3), tol=STILL_MM)
     return 3 + int(turns)
 

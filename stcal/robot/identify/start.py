@@ -48,13 +48,13 @@ def start(robot: Robot, data: Measurements) -> State:
 def _spread(data: Measurements) -> float:
     """RMS about the mean of what was measured, mm."""
     if data.positions is None:
-        return float(np.sqrt((data.distances**2).mean()))
+        return float(np.sqrt((data.lengths()[0] ** 2).mean()))
     return float(np.sqrt(((data.positions - data.positions.mean(0)) ** 2).sum(1).mean()))
 
 
 def _moves(data: Measurements) -> None:
     if data.positions is None:
-        if np.ptp(data.distances) < STILL_MM:
+        if np.ptp(data.lengths()[0]) < STILL_MM:
             raise DegenerateError(f"{data.where}: all distances are equal; positions apart from one another needed")
         return
     for name in sorted(set(data.targets)):
@@ -92,7 +92,7 @@ def _placed(robot: Robot, data: Measurements, tools: dict[str, Rigid]) -> tuple[
 
 
 def _off_a_line(data: Measurements) -> None:
-    extent = np.linalg.svd(data.positions - data.positions.mean(0), compute_uv=False)
+    extent = np.linalg.svd(data.points() - data.points().mean(0), compute_uv=False)
     if len(extent) < 2 or extent[1] <= STILL_MM:
         raise DegenerateError(
             f"{data.where}: all positions lie on one line (within {STILL_MM} mm), so that it is not seen where the "

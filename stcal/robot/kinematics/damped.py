@@ -62,9 +62,9 @@ class Problem:
 
     def jacobian(self, q: np.ndarray) -> np.ndarray:
         """(m, 6, n) without unit."""
-        by_joint = jacobian(self.robot, q * self.unit, self.tool) * self.unit
-        by_joint[:, 3:] /= self.reach
-        return by_joint
+        found = jacobian(self.robot, q * self.unit, self.tool) * self.unit
+        found[:, 3:] /= self.reach
+        return found
 
 
 def reach_mm(robot: Robot, tool: str = "") -> float:
@@ -88,8 +88,7 @@ def solve(problem: Problem, poses: Poses, q: np.ndarray, bounds: np.ndarray | No
     weight[3:] = 1 / problem.reach
     if problem.under_actuated:
         weight[:3] = ORIENTATION_WEIGHT
-    at = np.arange(len(q))
-    goal = poses
+    at, goal = np.arange(len(q)), poses
     off = problem.errors(goal, q)
     damping = np.full(len(q), 1e-2)
     for _ in range(ROUNDS):
@@ -105,8 +104,7 @@ def solve(problem: Problem, poses: Poses, q: np.ndarray, bounds: np.ndarray | No
         better = np.linalg.norm(new * weight, axis=1) < np.linalg.norm(off * weight, axis=1)
         q[at[better]] = trial[better]
         off = np.where(better[:, None], new, off)
-        damping = np.where(better, damping / 5, damping * 5)
-        damping = np.clip(damping, 1e-12, 1e12)
+        damping = np.clip(np.where(better, damping / 5, damping * 5), 1e-12, 1e12)
         stuck = (np.abs(trial - q[at]).max(axis=1) < 1e-15) & ~better | (gain < 1e-15)
         keep = ~stuck
         at, goal, off, damping = at[keep], goal[keep], off[keep], damping[keep]
@@ -117,37 +115,44 @@ def _done(off: np.ndarray) -> np.ndarray:
     return (np.abs(off[:, :3]).max(axis=1) <= DONE_RAD) & (np.abs(off[:, 3:]).max(axis=1) <= DONE_MM)
 
 
-def _step(problem, q, off, weight, damping, bounds) -> tuple[np.ndarray, np.ndarray]:
+def _step(
+    problem: Problem,
+    q: np.ndarray,
+    off: np.ndarray,
+    weight: np.ndarray,
+    damping: np.ndarray,
+    bounds: np.ndarray | None,
+) -> tuple[np.ndarray, np.ndarray]:
     """Damped step (m, n), and (m,) how much of the error the joints can act on."""
     weighted = off * weight
     row = np.where(weight == 1 / problem.reach, 1.0, weight)  # the Jacobian's translation is in shares of the reach
-    by_joint = problem.jacobian(q) * row[:, None]
-    slope = np.einsum("mij,mi->mj", by_joint, weighted)
+    derivative = problem.jacobian(q) * row[:, None]
+    pull = np.einsum("mij,mi->mj", derivative, weighted)
     if bounds is not None:  # a joint at its limit that would go beyond stays
         low, high = bounds.T
-        held = ((q <= low) & (slope < 0)) | ((q >= high) & (slope > 0))
-        by_joint = np.where(held[:, None], 0.0, by_joint)
-        slope = np.where(held, 0.0, slope)
+        held = ((q <= low) & (pull < 0)) | ((q >= high) & (pull > 0))
+        derivative = np.where(held[:, None], 0.0, derivative)
+        pull = np.where(held, 0.0, pull)
     size = np.einsum("mi,mi->m", weighted, weighted)
-    normal = np.einsum("mij,mik->mjk", by_joint, by_joint)
+    normal = np.einsum("mij,mik->mjk", derivative, derivative)
     diagonal = np.arange(normal.shape[1])
     normal[:, diagonal, diagonal] += (np.maximum(damping * size, LEAST_DAMPING))[:, None]
-    step = np.linalg.solve(normal, slope[..., None])[..., 0]
+    step = np.linalg.solve(normal, pull[..., None])[..., 0]
     longest = np.abs(step).max(axis=1, keepdims=True)
-    gain = np.linalg.norm(slope, axis=1)
+    gain = np.linalg.norm(pull, axis=1)
     return step * np.minimum(1, LONGEST / np.maximum(longest, 1e-300)), gain
 
 
-def _position_exact(problem, poses, q, bounds) -> np.ndarray:
+def _position_exact(problem: Problem, poses: Poses, q: np.ndarray, bounds: np.ndarray | None) -> np.ndarray:
     """Shortest steps that take the rest of the position error away; of joints within bounds only, as far as it goes."""
     for _ in range(4):
         off = problem.errors(poses, q)[:, 3:] / problem.reach
-        by_joint = problem.jacobian(q)[:, 3:]
+        derivative = problem.jacobian(q)[:, 3:]
         near = np.linalg.norm(off, axis=1) < ORIENTATION_WEIGHT  # farther ones are out of reach, and stay as they are
         if bounds is not None:
             low, high = bounds.T
-            by_joint = np.where(((q <= low) | (q >= high))[:, None], 0.0, by_joint)
-        step = np.einsum("mji,mi->mj", np.linalg.pinv(by_joint, rcond=1e-9), off)
+            derivative = np.where(((q <= low) | (q >= high))[:, None], 0.0, derivative)
+        step = np.einsum("mji,mi->mj", np.linalg.pinv(derivative, rcond=1e-9), off)
         q = np.where(near[:, None], q + step, q)
         if bounds is not None:
             q = np.clip(q, *bounds.T)

@@ -25,8 +25,7 @@ def robot_from_chain(chain: Chain, tools: Mapping[str, Rigid], nominal: Robot) -
     rows = list(nominal.rows)
     standard = nominal.convention == "standard"
     first = Rigid()
-    passed = Rigid()
-    """What a joint lets through to the next: turn about and slide along its axis (any shift, if prismatic)."""
+    passed = Rigid()  # what a joint lets through to the next: a turn and a slide about its axis (any, if prismatic)
     for i in range(1, n):
         gap = passed @ chain.gap(i)
         before = rows[i - 1]

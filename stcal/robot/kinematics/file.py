@@ -15,8 +15,6 @@ from stcal.robot.kinematics.model import Convention, DHRow, Joint, JointType, Ro
 WHAT = "robot file"
 REMEDY = "`stcal robot init FILE` writes one to edit"
 POSE_KEYS = ("x_mm", "y_mm", "z_mm", "qw", "qx", "qy", "qz")
-
-
 LIMIT_DIGITS = 9
 """Decimals of joint limits, degrees or mm: 125°, not 125.00000000000001."""
 
@@ -35,7 +33,7 @@ class _PoseFile(Strict):
         length = float(np.linalg.norm(wxyz))
         if abs(length - 1) > UNIT_WITHIN:
             raise InputError(f"{where}: quaternion of length {length:.4g}, 1 needed; normalise qw, qx, qy, qz")
-        return Poses.from_quaternions(wxyz[None], [[self.x_mm, self.y_mm, self.z_mm]])[0]
+        return Poses.from_quaternions([wxyz], [[self.x_mm, self.y_mm, self.z_mm]])[0]
 
 
 class _ToolFile(_PoseFile):
@@ -66,7 +64,17 @@ class _RobotFile(Strict):
 
 
 def load_robot(path: str | Path) -> Robot:
-    """Read ``robot.toml`` (form: ``data_layout.md``).
+    """Read a robot file.
+
+    Parameters
+    ----------
+    path : str or Path
+        ``robot.toml``, lengths in mm and angles in degrees (form: ``data_layout.md``).
+
+    Returns
+    -------
+    Robot
+        Lengths in mm, angles in rad.
 
     Raises
     ------
@@ -78,10 +86,12 @@ def load_robot(path: str | Path) -> Robot:
     where = f"{WHAT} {path}"
     rows, joints = [], []
     for i, j in enumerate(data.joint, 1):
-        rows.append(DHRow(j.a_mm, *_radians(j.alpha_deg), j.d_mm, *_radians(j.theta_deg, j.beta_deg)))
+        alpha, theta, beta = np.radians([j.alpha_deg, j.theta_deg, j.beta_deg]).tolist()
+        rows.append(DHRow(j.a_mm, alpha, j.d_mm, theta, beta))
         joints.append(_joint(j, f"{where}: joint {i}"))
     n = len(rows)
-    if data.coupling is not None and (len(data.coupling) != n or any(len(row) != n for row in data.coupling)):
+    coupling = np.eye(n).tolist() if data.coupling is None else data.coupling
+    if len(coupling) != n or any(len(row) != n for row in coupling):
         raise InputError(f"{where}: coupling: {n} rows of {n} numbers needed for {n} joints")
     names = [t.name for t in data.target]
     for name in names:
@@ -90,7 +100,7 @@ def load_robot(path: str | Path) -> Robot:
     tools = {"": data.tool.rigid(f"{where}: tool")}
     tools |= {t.name: t.rigid(f"{where}: target {t.name}") for t in data.target}
     base = data.base.rigid(f"{where}: base")
-    return Robot(data.name, data.convention, tuple(rows), tuple(joints), data.coupling, base, tools)
+    return Robot(data.name, data.convention, tuple(rows), tuple(joints), np.array(coupling), base, tools)
 
 
 def _joint(j: _JointFile, where: str) -> Joint:
@@ -108,7 +118,20 @@ def _joint(j: _JointFile, where: str) -> Joint:
 
 
 def robot_toml(robot: Robot, comments: Sequence[str] = ()) -> str:
-    """The text of a robot file; every number reads back to the same double but for the last bit of the angles."""
+    """The text of a robot file; every number reads back to the same double but for the last bit of the angles.
+
+    Parameters
+    ----------
+    robot : Robot
+        What to write.
+    comments : sequence of str
+        Lines to stand at the top.
+
+    Returns
+    -------
+    str
+        TOML, lengths in mm and angles in degrees (form: ``data_layout.md``).
+    """
     lines = [f"# {comment}" for comment in comments]
     lines += [
         f"name = {_text(robot.name)}",
@@ -140,6 +163,15 @@ def robot_toml(robot: Robot, comments: Sequence[str] = ()) -> str:
 def save_robot(path: str | Path, robot: Robot, comments: Sequence[str] = ()) -> None:
     """Write a robot file, complete or not at all.
 
+    Parameters
+    ----------
+    path : str or Path
+        File to write; an existing one is replaced.
+    robot : Robot
+        What to write.
+    comments : sequence of str
+        Lines to stand at the top.
+
     Raises
     ------
     InputError
@@ -166,7 +198,3 @@ def _number(value: float) -> str:
 def _text(value: str) -> str:
     escaped = value.replace("\\", "\\\\").replace('"', '\\"').replace("\n", " ")
     return f'"{escaped}"'
-
-
-def _radians(*degrees: float) -> list[float]:
-    return np.radians(degrees).tolist()

@@ -3,6 +3,7 @@
 from dataclasses import replace
 
 import numpy as np
+from numpy.typing import ArrayLike
 from scipy.spatial.transform import Rotation
 
 from stcal.errors import InputError
@@ -10,14 +11,16 @@ from stcal.geometry.rigid import Poses, Rigid
 from stcal.robot.kinematics.model import Chain, Robot
 
 CHUNK = 8192
-"""Joint vectors at a time: their frames stay in the cache."""
+"""Joint vectors at a time: their frames, 96 bytes each, stay in a processor's cache of a megabyte."""
 
 
-def forward(robot: Robot, q: np.ndarray, tool: str = "") -> Poses:
+def forward(robot: Robot, q: ArrayLike, tool: str = "") -> Poses:
     """base_from_tool of each joint vector.
 
     Parameters
     ----------
+    robot : Robot
+        An arm of n joints; where its base stands does not matter.
     q : (m, n) or (n,) array
         Values of the controller, rad or mm.
     tool : str
@@ -27,23 +30,46 @@ def forward(robot: Robot, q: np.ndarray, tool: str = "") -> Poses:
     -------
     Poses
         m transforms, mm.
+
+    Raises
+    ------
+    InputError
+        Joint values of another shape or not finite; an unknown tool.
     """
     return flange_poses(_from_base_to_tool(robot, tool), _joint_vectors(q, len(robot.rows)))
 
 
-def jacobian(robot: Robot, q: np.ndarray, tool: str = "") -> np.ndarray:
-    """Derivative of base_from_tool by the controller's values, (m, 6, n).
+def jacobian(robot: Robot, q: ArrayLike, tool: str = "") -> np.ndarray:
+    """Geometric Jacobian: derivative of base_from_tool by the controller's values.
 
-    Rotation vector (rad) over translation (mm) of the tool's origin, both in the axes of the base (left perturbation).
+    Parameters
+    ----------
+    robot : Robot
+        An arm of n joints; where its base stands does not matter.
+    q : (m, n) or (n,) array
+        Values of the controller, rad or mm.
+    tool : str
+        Name of the tool.
+
+    Returns
+    -------
+    (m, 6, n) array
+        Rotation vector (rad) over translation (mm) of the tool's origin, both in the axes of the base (left
+        perturbation), by rad or mm of each joint.
+
+    Raises
+    ------
+    InputError
+        Joint values of another shape or not finite; an unknown tool.
     """
-    q = _joint_vectors(q, len(robot.rows))
+    values = _joint_vectors(q, len(robot.rows))
     chain = _from_base_to_tool(robot, tool)
-    axes, origins = joint_frames(chain, q)
+    axes, origins = joint_frames(chain, values)
     z = axes[..., 2]  # (n, m, 3)
-    swept = np.cross(z, flange_poses(chain, q).translation - origins)
+    swept = np.cross(z, flange_poses(chain, values).translation - origins)
     sliding = chain.prismatic[:, None, None]
-    by_joint = np.concatenate([np.where(sliding, 0.0, z), np.where(sliding, z, swept)], axis=2)
-    return np.moveaxis(by_joint, 0, 2) @ chain.coupling
+    columns = np.concatenate([np.where(sliding, 0.0, z), np.where(sliding, z, swept)], axis=2)
+    return np.moveaxis(columns, 0, 2) @ chain.coupling
 
 
 def flange_poses(chain: Chain, q: np.ndarray) -> Poses:
@@ -135,10 +161,10 @@ def _from_base_to_tool(robot: Robot, tool: str) -> Chain:
     return replace(chain, last_from_flange=chain.last_from_flange @ robot.tool(tool))
 
 
-def _joint_vectors(q: np.ndarray, n: int) -> np.ndarray:
-    q = np.atleast_2d(np.asarray(q, float))
-    if q.ndim != 2 or q.shape[1] != n:
-        raise InputError(f"joint values: shape {q.shape}, (m, {n}) needed for {n} joints")
-    if not np.isfinite(q).all():
+def _joint_vectors(q: ArrayLike, n: int) -> np.ndarray:
+    values = np.atleast_2d(np.asarray(q, float))
+    if values.ndim != 2 or values.shape[1] != n:
+        raise InputError(f"joint values: shape {values.shape}, (m, {n}) needed for {n} joints")
+    if not np.isfinite(values).all():
         raise InputError("joint values: hold values that are not finite")
-    return q
+    return values

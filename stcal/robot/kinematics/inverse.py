@@ -8,6 +8,7 @@ without unit: lengths, also the values of prismatic joints, are divided by the a
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import ArrayLike
 from scipy.spatial import KDTree
 from scipy.stats import qmc
 
@@ -78,8 +79,8 @@ class Inverse:
         return np.array([s in (REACHED, SINGULAR_POSE, ORIENTATION) for s in self.status], bool)
 
 
-def inverse(robot: Robot, poses: Poses, near: np.ndarray | None = None, tool: str = "") -> Inverse:
-    """Joint vectors that bring the tool to ``poses`` (base_from_tool).
+def inverse(robot: Robot, poses: Poses, near: ArrayLike | None = None, tool: str = "") -> Inverse:
+    """Joint vectors q that bring the tool to ``poses``: forward(robot, q) = base_from_tool.
 
     Of all branches and turns within the joint limits, the one nearest to ``near`` (Euclidean distance, rad, prismatic
     joints in shares of the reach). Where the step from ``near`` is so short that no other branch can be
@@ -89,18 +90,30 @@ def inverse(robot: Robot, poses: Poses, near: np.ndarray | None = None, tool: st
 
     Parameters
     ----------
+    robot : Robot
+        An arm of n joints; where its base stands does not matter.
     poses : Poses
         m transforms base_from_tool, mm.
-    near : (m, n) or (n,) array
+    near : (m, n) or (n,) array, optional
         Reference values of the controller, rad or mm. Without it the first pose gets the branch nearest to the middle
         of the limits (0 where unlimited), and every other the one nearest to that of the pose before.
     tool : str
         Name of the tool.
 
+    Returns
+    -------
+    Inverse
+        Joint vectors (m, n), and for each whether it reaches its pose; no pose raises an error.
+
     Raises
     ------
     InputError
-        ``near`` of another shape; a robot of more than six joints without ``near``.
+        ``near`` of another shape or not finite; a robot of more than six joints without ``near``; an unknown tool.
+
+    References
+    ----------
+    J. Fan, Y. Yuan, "On the quadratic convergence of the Levenberg–Marquardt method without nonsingularity
+    assumption", Computing 74, 2005.
     """
     m, n = len(poses), len(robot.rows)
     problem = Problem.of(robot, tool)
@@ -112,15 +125,7 @@ def inverse(robot: Robot, poses: Poses, near: np.ndarray | None = None, tool: st
     near = np.broadcast_to(near, (m, n)) / problem.unit
     if not np.isfinite(near).all():
         raise InputError("reference joint values: hold values that are not finite")
-    bounds = problem.bounds if n > 6 else None
-    q = solve(problem, poses, problem.clipped(near) if n > 6 else near, bounds)
-    q, inside = _turned(problem, q, near)
-    found = _judge(problem, poses, q)
-    ok = inside & found.usable
-    if n <= 6:
-        doubtful = ok & ~_is_nearest(problem, q, near)
-        q[doubtful] = _nearest_around(problem, poses[doubtful], q[doubtful], near[doubtful])
-        ok &= ~doubtful | (np.linalg.norm(q - near, axis=1) <= SHORT)
+    q, ok = _from_near(problem, poses, near)
     beyond = np.zeros(m, bool)
     rest = np.flatnonzero(~ok)
     for start in range(0, len(rest), GROUP):
@@ -134,16 +139,29 @@ def inverse(robot: Robot, poses: Poses, near: np.ndarray | None = None, tool: st
 
 
 def branches(robot: Robot, pose: Rigid, tool: str = "") -> Inverse:
-    """All joint vectors within the limits that bring the tool to ``pose`` (base_from_tool), one for each branch.
+    """All joint vectors within the limits that bring the tool to ``pose``, one for each branch.
 
     Turns by 2π are one branch: the value nearest to the middle of the limits stands for them. At a singular pose, where
-    there is a continuum of solutions, some of them. Found by many starts, the same ones every time; empty where the
-    pose is not reached.
+    there is a continuum of solutions, some of them. Found by many starts, the same ones every time.
+
+    Parameters
+    ----------
+    robot : Robot
+        An arm of n joints, at most six; where its base stands does not matter.
+    pose : Rigid
+        base_from_tool, mm.
+    tool : str
+        Name of the tool.
+
+    Returns
+    -------
+    Inverse
+        Joint vectors (k, n), the nearest to the middle of the limits first; k is 0 where the pose is not reached.
 
     Raises
     ------
     InputError
-        More than six joints: there are endlessly many.
+        More than six joints, of which there are endlessly many solutions; an unknown tool.
     """
     problem = Problem.of(robot, tool)
     _refuse_redundant(problem)
@@ -155,6 +173,20 @@ def branches(robot: Robot, pose: Rigid, tool: str = "") -> Inverse:
     keep = np.flatnonzero(found.usable & _as_good(found.error_rad))
     order = keep[np.argsort(np.linalg.norm(solutions[keep] - problem.middle, axis=1), kind="stable")]
     return Inverse(found.q[order], tuple(found.status[i] for i in order), found.error_mm[order], found.error_rad[order])
+
+
+def _from_near(problem: Problem, poses: Poses, near: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Joint vectors (m, n) by descent from ``near`` (m, n), and which (m,) are sure to be the nearest solutions."""
+    isolated = len(problem.unit) <= 6
+    bounds = None if isolated else problem.bounds
+    q = solve(problem, poses, near if isolated else problem.clipped(near), bounds)
+    q, inside = _turned(problem, q, near)
+    ok = inside & _judge(problem, poses, q).usable
+    if isolated:
+        doubtful = ok & ~_is_nearest(problem, q, near)
+        q[doubtful] = _nearest_around(problem, poses[doubtful], q[doubtful], near[doubtful])
+        ok &= ~doubtful | (np.linalg.norm(q - near, axis=1) <= SHORT)
+    return q, ok
 
 
 def _in_sequence(problem: Problem, poses: Poses) -> Inverse:
@@ -272,8 +304,7 @@ def _nearest_around(problem: Problem, poses: Poses, q: np.ndarray, near: np.ndar
     if not len(q):
         return q
     weakest = np.linalg.svd(problem.jacobian(q))[2][:, q.shape[1] - 1]
-    best = q.copy()
-    distance = np.linalg.norm(q - near, axis=1)
+    best, distance = q.copy(), np.linalg.norm(q - near, axis=1)
     for side in (-2, -1, 1, 2):
         start = q + side * distance[:, None] * weakest
         other, inside = _turned(problem, solve(problem, poses, start), near)

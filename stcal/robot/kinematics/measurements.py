@@ -19,20 +19,45 @@ STATUS, AMBIGUOUS = "status", "ambiguous"
 MAX_TURNS = 4
 """Joint values beyond so many turns are degrees in a column of radians."""
 LONGEST_TOOL_MM = 10_000.0
+"""What a target may be from the flange, beyond all that the arm reaches: no tool is as long."""
 FARTHEST = {"mm": 1e7, "rad": 100 * 2 * np.pi}
 """10 km and a hundred turns: what is beyond is no length and no joint value."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Measurements:
-    """What an instrument saw at m joint vectors.
+    """What an instrument saw at m joint vectors: poses, positions, or distances between positions.
 
-    ``where`` : the file; ``lines`` : (m,) its lines; ``q`` : (m, n) values of the controller, rad or mm; ``targets`` :
-    (m,) names of the reflector or target seen; ``positions`` : (m, 3) mm in the instrument's frame; ``rotations`` :
-    (m, 3, 3) where poses were measured; ``covariance`` : (m, 6, 6) of the poses where known; ``common`` : (m, 6, r)
-    their common errors, in it: pose i errs by ``common[i] @ z`` with the same r normal numbers z of σ 1 for all, and by
-    itself; ``distances`` : (m,) mm, where only these were measured, from the position at row
-    ``from_row``, (m,), from 0. What was not measured is None. ``notes`` : on rows of the file that are not here.
+    Parameters
+    ----------
+    where : str
+        The file, for messages.
+    lines : sequence of int
+        (m,) its lines.
+    q : (m, n) array
+        Values of the controller, rad or mm.
+    targets : tuple of str
+        (m,) names of the reflector or target seen.
+    positions : (m, 3) array, optional
+        Of the targets in the instrument's frame, mm; None where only distances were measured.
+    rotations : (m, 3, 3) array, optional
+        instrument_from_target, where poses were measured.
+    covariance : (m, 6, 6) array, optional
+        Of the poses, rad and mm, left perturbation.
+    common : (m, 6, r) array, optional
+        Common errors, contained in ``covariance``: pose i errs by ``common[i] @ z`` with the same r normal numbers z of
+        σ 1 for all, and by itself.
+    distances : (m,) array, optional
+        Where only these were measured, mm.
+    from_row : (m,) array of int, optional
+        Row, from 0, at whose position each distance starts.
+    notes : tuple of str
+        On rows of the file that are not here.
+
+    Raises
+    ------
+    InputError
+        Arrays of other shapes, or with values that are not finite.
     """
 
     where: str
@@ -66,33 +91,59 @@ class Measurements:
         if self.distances is not None:
             raise InputError(f"{self.where}: distances refer to other rows, so that rows cannot be taken out")
         rows = np.arange(len(self))[index]
-        return Measurements(
-            self.where,
-            [self.lines[i] for i in rows],
-            self.q[rows],
-            tuple(self.targets[i] for i in rows),
-            *(None if a is None else a[rows] for a in (self.positions, self.rotations, self.covariance, self.common)),
-            notes=self.notes,
+        optional = {name: getattr(self, name) for name in ("positions", "rotations", "covariance", "common")}
+        return replace(
+            self,
+            lines=[self.lines[i] for i in rows],
+            q=self.q[rows],
+            targets=tuple(self.targets[i] for i in rows),
+            **{name: None if values is None else values[rows] for name, values in optional.items()},
         )
 
     def own_covariance(self) -> np.ndarray:
         """(m, 6, 6) of what each pose errs by itself."""
+        if self.covariance is None:
+            raise InputError(f"{self.where}: poses without covariance; columns of it needed")
         if self.common is None:
             return self.covariance
         return self.covariance - self.common @ np.swapaxes(self.common, 1, 2)
+
+    def points(self) -> np.ndarray:
+        """(m, 3) positions as measured, mm."""
+        if self.positions is None:
+            raise InputError(f"{self.where}: distances only; columns x_mm, y_mm, z_mm needed")
+        return self.positions
 
     def poses(self) -> Poses:
         """world_from_tool as measured."""
         if self.rotations is None:
             raise InputError(f"{self.where}: positions without orientation; columns qw, qx, qy, qz needed")
-        return Poses(self.rotations, self.positions)
+        return Poses(self.rotations, self.points())
+
+    def lengths(self) -> tuple[np.ndarray, np.ndarray]:
+        """(m,) distances as measured, mm, and (m,) the rows that they start from."""
+        if self.distances is None or self.from_row is None:
+            raise InputError(f"{self.where}: positions, not distances; column distance_mm needed")
+        return self.distances, self.from_row
 
 
 def read_measurements(path: str | Path, robot: Robot) -> Measurements:
-    """Read joint values with positions, poses or distances (form: ``data_layout.md``).
+    """Read joint values with positions, poses or distances.
 
     Poses of which their ``status`` says that another one fits the image as well, and copies of a row, are left out with
     a note.
+
+    Parameters
+    ----------
+    path : str or Path
+        Table (CSV; form: ``data_layout.md``).
+    robot : Robot
+        Whose joints moved: their number and types, and the reach that positions are checked against.
+
+    Returns
+    -------
+    Measurements
+        In the instrument's frame; mm, rad.
 
     Raises
     ------
@@ -101,16 +152,15 @@ def read_measurements(path: str | Path, robot: Robot) -> Measurements:
     """
     table = read_table(path, WHAT)
     q = joint_values(table, robot)
-    targets = tuple(table.text("target")) if "target" in table else ("",) * len(table)
-    rows = (table.where, table.lines, q, targets)
+    targets = targets_of(table)
     if table.has("x", LENGTHS):
+        data = Measurements(table.where, table.lines, q, targets, table.points())
         if table.has_rotation():
-            poses = table.poses()
-            covariance = table.pose_covariances()
-            data = Measurements(*rows, poses.translation, poses.rotation, covariance, table.common_errors(covariance))
-        else:
-            data = Measurements(*rows, table.points())
-        within(table, "position", data.positions, "mm")
+            poses, covariance = table.poses(), table.pose_covariances()
+            data = replace(
+                data, rotations=poses.rotation, covariance=covariance, common=table.common_errors(covariance)
+            )
+        within(table, "position", data.points(), "mm")
         _in_reach(data, robot)
         return _usable(data, table)
     if not table.has("distance", LENGTHS):
@@ -120,7 +170,12 @@ def read_measurements(path: str | Path, robot: Robot) -> Measurements:
         )
     distances = table.quantity("distance", LENGTHS)
     within(table, "distance", distances, "mm")
-    return Measurements(*rows, distances=distances, from_row=_from_rows(table, distances))
+    return Measurements(table.where, table.lines, q, targets, distances=distances, from_row=_from_rows(table))
+
+
+def targets_of(table: Table) -> tuple[str, ...]:
+    """(m,) names of column ``target``; where there is none, that of the robot's only one."""
+    return tuple(table.text("target")) if "target" in table else ("",) * len(table)
 
 
 def within(table: Table, name: str, values: np.ndarray, unit: str) -> None:
@@ -135,7 +190,7 @@ def within(table: Table, name: str, values: np.ndarray, unit: str) -> None:
 
 def _in_reach(data: Measurements, robot: Robot) -> None:
     """No position farther from the middle one than the arm can put it."""
-    away = np.linalg.norm(data.positions - np.median(data.positions, axis=0), axis=1)
+    away = np.linalg.norm(data.points() - np.median(data.points(), axis=0), axis=1)
     reach = max(reach_mm(robot, tool) for tool in robot.tools)
     worst = int(away.argmax())
     if away[worst] > 2 * reach + LONGEST_TOOL_MM:
@@ -152,7 +207,7 @@ def _usable(data: Measurements, table: Table) -> Measurements:
         undecided = np.array([status == AMBIGUOUS for status in table.text(STATUS)])
     rotations = np.zeros((len(data), 0)) if data.rotations is None else data.rotations.reshape(len(data), -1)
     names = np.unique(data.targets, return_inverse=True)[1]
-    every = np.column_stack([data.q, names, data.positions, rotations])
+    every = np.column_stack([data.q, names, data.points(), rotations])
     copies = np.ones(len(data), bool)
     copies[np.unique(every, axis=0, return_index=True)[1]] = False
     reasons = {
@@ -193,7 +248,7 @@ def joint_values(table: Table, robot: Robot) -> np.ndarray:
     return np.column_stack(columns)
 
 
-def _from_rows(table: Table, distances: np.ndarray) -> np.ndarray:
+def _from_rows(table: Table) -> np.ndarray:
     """Row that each distance starts from: column ``from_row``, counted from 1 as the rows stand; else the first."""
     if "from_row" not in table:
         return np.zeros(len(table), int)

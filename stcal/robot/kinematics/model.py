@@ -20,11 +20,29 @@ JointType = Literal["revolute", "prismatic"]
 
 @dataclass(frozen=True, slots=True)
 class DHRow:
-    """One row: ``a``, ``d`` in mm, ``alpha``, ``theta``, Hayati's ``beta`` in rad.
+    """One row of Denavit–Hartenberg parameters, with Hayati's β for nearly parallel axes.
 
-    Standard (Denavit & Hartenberg 1955, Hayati 1983): Rz(θ+q) Tz(d) Tx(a) Rx(α) Ry(β).
-    Modified (Craig 1986): Rx(α) Tx(a) Ry(β) Rz(θ+q) Tz(d), α and a being those before the joint.
-    A prismatic joint adds its value to d.
+    Standard: Rz(θ+q) Tz(d) Tx(a) Rx(α) Ry(β). Modified: Rx(α) Tx(a) Ry(β) Rz(θ+q) Tz(d), α and a being those before the
+    joint. A prismatic joint adds its value to d in place of θ.
+
+    Parameters
+    ----------
+    a : float
+        Length of the common normal, mm.
+    alpha : float
+        Twist about it, rad.
+    d : float
+        Offset along the joint's axis, mm.
+    theta : float
+        Angle about the joint's axis where the joint's value is 0, rad.
+    beta : float
+        Second twist, about y, rad; 0 in rows of Denavit and Hartenberg proper.
+
+    References
+    ----------
+    J. Denavit, R. S. Hartenberg, "A kinematic notation for lower-pair mechanisms based on matrices", J. Appl. Mech. 22,
+    1955. J. J. Craig, "Introduction to Robotics", 1986 (modified). S. A. Hayati, "Robot arm geometric link parameter
+    estimation", IEEE CDC 1983 (β).
     """
 
     a: float
@@ -36,7 +54,15 @@ class DHRow:
 
 @dataclass(frozen=True, slots=True)
 class Joint:
-    """Type and range of the controller's value, rad or mm; unlimited where none is given."""
+    """Type of a joint, and the range of its value.
+
+    Parameters
+    ----------
+    type : {"revolute", "prismatic"}
+        Whether it turns about its axis or slides along it.
+    lower, upper : float
+        Limits of the controller's value, rad or mm; unlimited where not given.
+    """
 
     type: JointType = "revolute"
     lower: float = -np.inf
@@ -45,18 +71,36 @@ class Joint:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Robot:
-    """A serial arm.
+    """A serial arm of n joints.
 
-    ``rows``, ``joints`` : one for each joint; ``coupling`` : (n, n), kinematic joint values from the controller's;
-    ``world_from_base`` : base in the frame of the measuring instrument; ``tools`` : flange_from_tool by name, ``""``
-    being the one meant where none is named.
+    Parameters
+    ----------
+    name : str
+        For messages and reports.
+    convention : {"standard", "modified"}
+        Of all rows; see :class:`DHRow`.
+    rows : tuple of DHRow
+        One for each joint, from the base; mm, rad.
+    joints : tuple of Joint
+        One for each row: type and range.
+    coupling : (n, n) array, optional
+        Kinematic joint values from the controller's, a regular matrix; the identity if not given.
+    world_from_base : Rigid
+        Base in the frame of the measuring instrument, mm.
+    tools : mapping of str to Rigid
+        flange_from_tool by name, mm; ``""`` is the one meant where none is named.
+
+    Raises
+    ------
+    InputError
+        Rows and joints differ in number, or there are none; a coupling matrix of another shape, or a singular one.
     """
 
     name: str
     convention: Convention
     rows: tuple[DHRow, ...]
     joints: tuple[Joint, ...]
-    coupling: np.ndarray | None = None
+    coupling: np.ndarray = None  # pyright: ignore[reportAssignmentType]  # made below: its size is that of the rows
     world_from_base: Rigid = field(default_factory=Rigid)
     tools: Mapping[str, Rigid] = field(default_factory=lambda: {"": Rigid()})
 
@@ -66,7 +110,7 @@ class Robot:
             raise InputError(
                 f"robot {self.name}: {n} rows and {len(self.joints)} joints, one row for each joint needed"
             )
-        coupling = np.eye(n) if self.coupling is None else self.coupling
+        coupling = np.eye(n) if self.coupling is None else self.coupling  # None: not given
         object.__setattr__(self, "coupling", frozen(coupling, (n, n), f"robot {self.name}: coupling"))
         if np.linalg.cond(self.coupling) > 1e6:
             raise InputError(f"robot {self.name}: the coupling matrix cannot be inverted; a regular matrix needed")
@@ -81,7 +125,7 @@ class Robot:
         return np.array([[joint.lower, joint.upper] for joint in self.joints])
 
     def tool(self, name: str = "") -> Rigid:
-        """flange_from_tool by name."""
+        """flange_from_tool of the tool ``name``; InputError where there is none."""
         if name not in self.tools:
             known = ", ".join(repr(t) for t in self.tools)
             raise InputError(f"robot {self.name}: no tool {name!r}; there are {known}")

@@ -15,7 +15,7 @@ from stcal.io.table import LENGTHS, read_table
 from stcal.parallel import one_thread
 from stcal.robot.kinematics.forward import forward
 from stcal.robot.kinematics.inverse import LIMIT, ORIENTATION, SINGULAR_POSE, UNREACHABLE, Inverse, inverse
-from stcal.robot.kinematics.measurements import joint_values, within
+from stcal.robot.kinematics.measurements import joint_values, targets_of, within
 from stcal.robot.kinematics.model import Robot
 
 WHAT = "targets"
@@ -147,7 +147,7 @@ def read_targets(path: str | Path, robot: Robot) -> Targets:
         )
     if has_poses and not table.has_rotation():
         raise InputError(f"{table.where}: positions without orientation; columns qw, qx, qy, qz needed")
-    tools = tuple(table.text("target")) if "target" in table else ("",) * len(table)
+    tools = targets_of(table)
     for line, tool in zip(table.lines, tools, strict=True):
         if tool not in robot.tools:
             known = ", ".join(repr(name) for name in robot.tools)
