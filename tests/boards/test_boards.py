@@ -25,7 +25,7 @@ def turn(degrees: float) -> np.ndarray:
 
 
 @pytest.mark.parametrize(("rows", "columns"), [(5, 8), (6, 7), (7, 7), (6, 6), (6, 8)])
-@pytest.mark.parametrize("degrees", [0, 90, 170, -100])
+@pytest.mark.parametrize("degrees", [0, 170, *(pytest.param(d, marks=pytest.mark.slow) for d in (90, -100))])
 def test_chessboard_corners_are_numbered(rows, columns, degrees):
     board = ChessboardDesign(rows, columns, 20.0)
     sheet, first = chessboard_mm(rows, columns, 20.0)

@@ -34,6 +34,7 @@ def calibration(trials: int, n: int, share=0.0, given=False, **options) -> float
 
 
 # χ²₆/6 has a standard deviation of 0.58; the mean of 60 trials one of 0.075, and 0.28 is nearly 4 of these.
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("share", "options"),
     [

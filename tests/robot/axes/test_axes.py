@@ -119,6 +119,7 @@ def axis_error(frame: Rigid, z: np.ndarray, origin: np.ndarray, sliding: bool) -
     return np.array([-direction[1], direction[0], *place[:2]])[: 2 if sliding else 4]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("name", "rests"), [("MH80", 1), ("coupled", 2), ("SCARA", 1)])
 def test_errors_of_the_axes_are_as_large_as_their_covariance(name, rests):
     nominal = NOMINALS[name]()
@@ -142,6 +143,7 @@ def test_errors_of_the_axes_are_as_large_as_their_covariance(name, rests):
     assert np.mean(np.square(coordinates)) == pytest.approx(1, abs=0.03)  # 100 draws × 4 axes × dof ≥ 30
 
 
+@pytest.mark.slow
 def test_errors_of_pairs_are_as_large_as_their_sigma():
     nominal = mh80()
     true = arm(nominal)

@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 from stcal.errors import InputError
 from stcal.geometry.rigid import Poses, Rigid
 from stcal.robot.kinematics.example import mh80
-from stcal.robot.kinematics.forward import forward
+from stcal.robot.kinematics.forward import forward, jacobian
 from stcal.robot.kinematics.inverse import branches, inverse
 from stcal.robot.kinematics.model import DHRow, Joint, Robot
 from stcal.synthetic.measured.arms import joint_vectors, made
@@ -102,6 +102,7 @@ def test_the_pose_is_reached_from_a_near_start(name):
     assert np.median(np.abs(found.q - q)) < 1e-9
 
 
+@pytest.mark.slow
 @settings(max_examples=20, deadline=None)
 @given(st.sampled_from(sorted(ARMS)), st.integers(0, 2**31))
 def test_the_pose_is_reached_from_any_start_and_no_branch_is_nearer(name, seed):
@@ -121,6 +122,7 @@ def test_the_pose_is_reached_from_any_start_and_no_branch_is_nearer(name, seed):
     assert np.linalg.norm((found.q - near) / unit) <= np.linalg.norm((q - near) / unit) + 1e-6
 
 
+@pytest.mark.slow
 def test_nearest_of_all_branches_and_turns():
     robot = ARMS["made"]
     rng = np.random.default_rng(8)
@@ -305,15 +307,20 @@ def test_bad_reference_is_named():
     assert len(inverse(mh80(), pose[:0], np.zeros(6))) == 0
 
 
-def test_ten_thousand_poses_in_about_a_second():
+def test_ten_thousand_poses_are_solved_together():
+    """Processor time over that of one evaluation of all Jacobians in the same run: 21 measured, of four steps with
+    their solutions; a loop of Python over the poses would be above 300."""
     robot = ARMS["made"]
     rng = np.random.default_rng(0)
     q = joint_vectors(robot, 10_000, rng, 0.8)
     poses = forward(robot, q)
     near = q + rng.normal(0, 1e-3, q.shape)
-    start = time.perf_counter()
+    jacobian(robot, q[:10])
+    start = time.process_time()
+    for _ in range(3):
+        jacobian(robot, q)
+    middle = time.process_time()
     found = inverse(robot, poses, near)
-    # About 0.5 s on an idle core; others may be at work beside it.
-    assert time.perf_counter() - start < 5
+    assert time.process_time() - middle < 100 * (middle - start) / 3
     assert found.usable.all()
     assert off(robot, poses, found.q)[0] <= 1e-9

@@ -1,0 +1,136 @@
+"""The main chain on photographs of another program, with truth: run, compare, measure, report. Needs nothing beside the
+repository.
+
+Faces and poses come with covariances C; a squared error eᵀC⁻¹e of six numbers is χ²(6) if C is true. Bounds leave out
+what happens once in a thousand sets, on either side: larger errors are wrong, smaller ones are too good to be had.
+"""
+
+import copy
+import csv
+import json
+import subprocess
+import sys
+from html.parser import HTMLParser
+
+import numpy as np
+import pytest
+from scipy.stats import chi2
+
+from stcal.geometry.rigid import Rigid
+from stcal.sfm.report.compare import compare
+from stcal.synthetic.measured.image_poses import pose_error
+from tests.sfm.truth import true_poses
+
+ONCE_IN = 1000
+FACES = ("2", "3", "4", "5")
+
+
+def bounds(count: int) -> tuple[float, float]:
+    """Of χ²(6), such that one of ``count`` lies outside once in a thousand sets (Bonferroni)."""
+    share = 1 / ONCE_IN / count / 2
+    return float(chi2.ppf(share, 6)), float(chi2.isf(share, 6))
+
+
+def printed(*arguments) -> str:
+    """By ``stcal-sfm``, as it is called."""
+    call = [sys.executable, "-c", "from stcal.cli.main import main_sfm; main_sfm()", *map(str, arguments)]
+    done = subprocess.run(call, capture_output=True, text=True, encoding="utf-8")
+    assert done.returncode == 0, done.stderr
+    return done.stdout
+
+
+@pytest.fixture(scope="module")
+def calibrated(sample, tmp_path_factory):
+    """The run's folder, and what the command printed."""
+    out = tmp_path_factory.mktemp("sample") / "run"
+    return out, printed("run", sample / "images", "--camera", sample / "cameras.txt", "--out", out, "--workers", 1)
+
+
+@pytest.fixture(scope="module")
+def truth(sample):
+    return json.loads((sample / "truth.json").read_text())
+
+
+def test_faces_are_as_far_off_as_they_say(calibrated, sample):
+    found = compare(calibrated[0], sample / "truth.json")
+    assert found["missing"] == []
+    least, most = bounds(len(FACES))
+    for face_id in FACES:
+        row = found["faces"][face_id]
+        assert least < 6 * row["normalised_error"] ** 2 < most, face_id
+        assert row["circles"] == 10
+
+
+def test_a_face_that_is_off_would_be_seen(calibrated, truth, tmp_path):
+    """Thirty µm: ten of its σ."""
+    truth = copy.deepcopy(truth)
+    truth["target_from_face"]["2"][0][3] += 0.03
+    (tmp_path / "truth.json").write_text(json.dumps(truth))
+    found = compare(calibrated[0], tmp_path / "truth.json")["faces"]["2"]
+    assert 6 * found["normalised_error"] ** 2 > bounds(len(FACES))[1]
+
+
+def test_all_visible_circles_are_found_and_none_is_wrong(calibrated, sample, truth):
+    labels = compare(calibrated[0], sample / "truth.json")["labels"]
+    visible = [c for g in truth["groups"].values() for i in g["images"].values() for c in i["circles"].values()]
+    assert labels == {"wrong": 0, "found": labels["visible"], "visible": sum(c["must_find"] for c in visible)}
+    assert labels["visible"] > 900
+
+
+def test_poses_of_the_target_are_as_far_off_as_they_say(calibrated, sample, truth, tmp_path):
+    """Measured in the same photographs with the faces just found; board dots are told apart by the board's file."""
+    out, _ = calibrated
+    printed(
+        *("measure", sample / "images", "--camera", sample / "cameras.txt", "--faces", out / "faces.json"),
+        *("--board", out / "board.toml", "--out", tmp_path / "poses.csv", "--json", tmp_path / "poses.json"),
+        *("--workers", 1),
+    )
+    poses = true_poses(truth)
+    measured = {each["image"]: each for each in json.loads((tmp_path / "poses.json").read_text())["images"]}
+    assert set(measured) == set(poses)
+    least, most = bounds(len(poses))
+    for name, each in measured.items():
+        error = pose_error(Rigid.from_matrix(each["camera_from_target"]), poses[name])
+        assert each["status"] == "certain", name
+        assert least < error @ np.linalg.solve(np.array(each["covariance"]), error) < most, name
+
+
+class Page(HTMLParser):
+    """Ids of a page's parts, and every address it refers to."""
+
+    def __init__(self):
+        super().__init__()
+        self.ids, self.addresses = set(), []
+
+    def handle_starttag(self, tag, attributes):
+        values = dict(attributes)
+        self.ids.add(values.get("id"))
+        self.addresses += [values[name] for name in ("src", "href") if name in values]
+
+
+def test_the_report_says_what_the_files_say(calibrated):
+    """The page stands alone, and its table has the faces' positions."""
+    out, text = calibrated
+    html = (out / "report.html").read_text(encoding="utf-8")
+    page = Page()
+    page.feed(html)
+    assert {"result", "checks", "trust", "faces", "scale", "residuals", "overlays"} <= page.ids
+    assert [a for a in page.addresses if not a.startswith(("#", "data:"))] == []
+    faces = json.loads((out / "faces.json").read_text())["target_from_face"]
+    for face_id in FACES:
+        for value in np.array(faces[face_id])[:3, 3]:
+            assert f"{value:.4f}" in text
+            assert f"{value:.4f}" in html.replace("−", "-")
+
+
+def test_detections_are_where_the_truth_has_them(calibrated, truth):
+    """Ellipse centres against images of circle centres: eccentricity makes r²cosθ/D of difference, 0.1 px at most here
+    (r = 7.5 mm, 1 m, f = 1678 px), noise a hundredth."""
+    with open(calibrated[0] / "detections.csv", newline="", encoding="utf-8") as stream:
+        rows = [row for row in csv.DictReader(stream) if not row["label"].startswith("board")]
+    images = {name: each for g in truth["groups"].values() for name, each in g["images"].items()}
+    true = np.array([images[row["image"]]["circles"][row["label"]]["centre_px"] for row in rows])
+    away = np.linalg.norm(np.array([[float(row["x_px"]), float(row["y_px"])] for row in rows]) - true, axis=1)
+    assert len(rows) > 200
+    assert np.median(away) > 0.001
+    assert away.max() < 0.2

@@ -1,0 +1,242 @@
+"""Public names have numpydoc docstrings: every argument or field, what is returned, and what is raised.
+
+``numpydoc.validate`` would bring Sphinx along and argue about full stops; what is asked here needs forty lines.
+"""
+
+import ast
+import dataclasses
+import importlib
+import inspect
+import re
+import textwrap
+
+import pytest
+
+import stcal
+from stcal import errors
+from stcal.errors import InputError
+
+SYSTEMS = ("sfm", "robot", "register", "handeye", "locate")
+UNDOCUMENTED: set[str] = {
+    "stcal.handeye.Compared",
+    "stcal.handeye.Views",
+    "stcal.handeye.compare",
+    "stcal.handeye.cross_validate",
+    "stcal.handeye.handeye",
+    "stcal.handeye.pairs_of_views",
+    "stcal.handeye.read_poses",
+    "stcal.handeye.splits",
+    "stcal.register.Alternative",
+    "stcal.register.HeldOut",
+    "stcal.register.Liu2017Options",
+    "stcal.register.Pairs",
+    "stcal.register.read_pairs",
+    "stcal.register.register",
+    "stcal.robot.DHRow",
+    "stcal.robot.DesignOptions",
+    "stcal.robot.Identified",
+    "stcal.robot.IdentifyOptions",
+    "stcal.robot.Joint",
+    "stcal.robot.Measurements",
+    "stcal.robot.Robot",
+    "stcal.robot.compensate",
+    "stcal.robot.design",
+    "stcal.robot.forward",
+    "stcal.robot.identify",
+    "stcal.robot.inverse",
+    "stcal.robot.jacobian",
+    "stcal.robot.load_robot",
+    "stcal.robot.read_measured",
+    "stcal.robot.read_measurements",
+    "stcal.robot.read_targets",
+    "stcal.robot.robot_from_sweeps",
+    "stcal.robot.robot_toml",
+    "stcal.robot.save_robot",
+    "stcal.robot.verify",
+    "stcal.sfm.MeasureOptions",
+    "stcal.sfm.PlanOptions",
+    "stcal.sfm.RunOptions",
+    "stcal.sfm.RunResult",
+    "stcal.sfm.advise",
+    "stcal.sfm.calibrate_camera",
+    "stcal.sfm.load_run",
+    "stcal.sfm.measure",
+    "stcal.sfm.plan",
+    "stcal.sfm.read_target",
+    "stcal.sfm.run",
+}
+"""Names whose docstrings lack something. It only shrinks: whoever completes a docstring takes its name off, and no new
+name comes on."""
+
+
+def public() -> dict[str, object]:
+    """Functions and classes of every ``__all__``, by dotted name; constants carry no docstring."""
+    modules = [stcal, *(importlib.import_module(f"stcal.{system}") for system in SYSTEMS)]
+    found = {f"{m.__name__}.{name}": getattr(m, name) for m in modules for name in getattr(m, "__all__", ())}
+    return {name: value for name, value in found.items() if inspect.isclass(value) or inspect.isroutine(value)}
+
+
+def sections(doc: str) -> dict[str, str]:
+    """Text by title; what stands above the first title has none."""
+    parts = re.split(r"^(\w[\w ]*)\n-{3,}$", inspect.cleandoc(doc), flags=re.MULTILINE)
+    return {"": parts[0]} | dict(zip(parts[1::2], parts[2::2], strict=True))
+
+
+def entries(text: str) -> set[str]:
+    """Names that a section has a line for: ``a``, ``a : type`` and ``a, b : type`` at its margin."""
+    heads = [line.split(" : ")[0] for line in text.splitlines() if line and not line.startswith(" ")]
+    return {name.strip().lstrip("*") for head in heads for name in head.split(",")}
+
+
+def arguments(value: object) -> set[str]:
+    if dataclasses.is_dataclass(value):
+        return {field.name for field in dataclasses.fields(value) if field.init and not field.name.startswith("_")}
+    if inspect.isclass(value) and issubclass(value, tuple | BaseException):
+        return set(getattr(value, "_fields", ()))
+    try:
+        return {name for name in inspect.signature(value).parameters if name not in ("self", "cls")}
+    except ValueError:  # of a class without a signature
+        return set()
+
+
+def raised(function: object) -> set[str]:
+    """Names of the package's errors that the function raises itself; those of what it calls are for readers to know."""
+    tree = ast.parse(textwrap.dedent(inspect.getsource(function)))
+    calls = [node.exc for node in ast.walk(tree) if isinstance(node, ast.Raise) and isinstance(node.exc, ast.Call)]
+    return {call.func.id for call in calls if isinstance(call.func, ast.Name) and hasattr(errors, call.func.id)}
+
+
+def covered(name: str, stated: set[str]) -> bool:
+    """Whether an error, or what it is a kind of, is stated."""
+    return any(base.__name__ in stated for base in getattr(errors, name).__mro__)
+
+
+def lacks(value: object) -> list[str]:
+    """What the docstring of a public function or class lacks, in words."""
+    own = vars(value).get("__doc__") if inspect.isclass(value) else value.__doc__
+    if not own or (dataclasses.is_dataclass(value) and own.startswith(f"{value.__name__}(")):
+        return ["a docstring"]
+    found = sections(own)
+    missing = [] if found[""].strip() else ["a summary"]
+    titles = ("Parameters", "Other Parameters") + (("Attributes",) if inspect.isclass(value) else ())
+    named = set().union(*(entries(found.get(title, "")) for title in titles))
+    wanted = arguments(value)
+    missing += [f"the argument {name}" for name in sorted(wanted - named)]
+    if not inspect.isclass(value):
+        missing += [f"no argument is called {name}" for name in sorted(named - wanted)]
+        annotation = inspect.signature(value).return_annotation
+        if annotation not in (None, "None") and not found.keys() & {"Returns", "Yields"}:
+            missing.append("Returns")
+        stated = set(re.findall(r"\w+", found.get("Raises", "")))
+        missing += [f"Raises {name}" for name in sorted(raised(value)) if not covered(name, stated)]
+    else:
+        methods = {n: m for n, m in vars(value).items() if not n.startswith("_") and not dataclass_field(value, n)}
+        missing += [
+            f"a docstring of {name}"
+            for name, method in methods.items()
+            if (inspect.isroutine(method) or isinstance(method, property | classmethod | staticmethod))
+            and not method.__doc__
+        ]
+    return missing
+
+
+def dataclass_field(value: object, name: str) -> bool:
+    return name in getattr(value, "__dataclass_fields__", {})
+
+
+PUBLIC = public()
+
+
+def test_every_system_shows_its_names():
+    """Sixty at this writing; an empty ``__all__`` would let everything below pass."""
+    assert len(PUBLIC) > 40
+    assert {"stcal.sfm.run", "stcal.robot.identify", "stcal.register.register", "stcal.handeye.handeye"} <= set(PUBLIC)
+
+
+def test_the_list_of_the_undocumented_is_of_public_names():
+    assert set(PUBLIC) >= UNDOCUMENTED
+
+
+@pytest.mark.parametrize(
+    "name",
+    [
+        pytest.param(n, marks=pytest.mark.xfail(reason="incomplete docstring", strict=True)) if n in UNDOCUMENTED else n
+        for n in sorted(PUBLIC)
+    ],
+)
+def test_public_names_are_documented(name):
+    assert lacks(PUBLIC[name]) == []
+
+
+# --- the checker itself ---
+
+
+def complete(a, b, *more) -> int:
+    """Sum.
+
+    Parameters
+    ----------
+    a, b : int
+        Two numbers.
+    *more : int
+        And more.
+
+    Returns
+    -------
+    int
+
+    Raises
+    ------
+    StcalError
+        If a is not positive.
+    """
+    if a < 0:
+        raise InputError("negative")
+    return a + b + sum(more)
+
+
+def bare(a, b) -> int:
+    """Sum.
+
+    Parameters
+    ----------
+    a : int
+    c : int
+    """
+    if a < 0:
+        raise InputError("negative")
+    return a + b
+
+
+@dataclasses.dataclass
+class Fields:
+    """Two.
+
+    Parameters
+    ----------
+    a : int
+    """
+
+    a: int
+    b: int
+
+    def method(self):
+        return self.a
+
+
+@dataclasses.dataclass
+class Nothing:
+    a: int
+
+
+def test_the_checker_sees_what_is_missing():
+    assert lacks(complete) == []
+    assert lacks(bare) == ["the argument b", "no argument is called c", "Returns", "Raises InputError"]
+    assert lacks(Fields) == ["the argument b", "a docstring of method"]
+    assert lacks(Nothing) == ["a docstring"]
+
+
+def test_an_error_is_covered_by_what_it_is_a_kind_of():
+    assert covered("InputError", {"StcalError"})
+    assert covered("InputError", {"InputError"})
+    assert not covered("InputError", {"DegenerateError"})
