@@ -27,68 +27,12 @@ def test_every_option_is_documented(name, command):
     assert [option for option in options if option != "--help" and option not in text] == []
 
 
-VERBS = frozenset(
-    [
-        "Accept",
-        "Add",
-        "Adjust",
-        "Advise",
-        "Allow",
-        "Also",
-        "Answer",
-        "Assume",
-        "Blur",
-        "Calibrate",
-        "Call",
-        "Choose",
-        "Compare",
-        "Compute",
-        "Copy",
-        "Correct",
-        "Cross-validate",
-        "Decide",
-        "Detect",
-        "Divide",
-        "Draw",
-        "Explain",
-        "Find",
-        "Fit",
-        "Forecast",
-        "Give",
-        "Hold",
-        "Identify",
-        "Ignore",
-        "Keep",
-        "Lay",
-        "Match",
-        "Map",
-        "Measure",
-        "Multiply",
-        "Name",
-        "Photograph",
-        "Place",
-        "Plan",
-        "Print",
-        "Rank",
-        "Read",
-        "Reject",
-        "Render",
-        "Run",
-        "Set",
-        "Show",
-        "Solve",
-        "Spread",
-        "Start",
-        "End",
-        "Stop",
-        "Take",
-        "Tell",
-        "Treat",
-        "Use",
-        "Write",
-        "Count",
-    ]  # noqa: SIM905: one a cell would be sixty lines
-)
+VERBS = """
+Accept Add Adjust Advise Allow Also Answer Assume Blur Calibrate Call Choose Compare Compute Copy Correct Count
+Cross-validate Decide Detect Divide Draw End Explain Find Fit Forecast Give Hold Identify Ignore Keep Lay Map
+Match Measure Multiply Name Photograph Place Plan Print Rank Read Reject Render Run Set Show Solve Spread Start
+Stop Take Tell Treat Use Write
+"""
 """With which a help text may begin; *Also* goes before one of the others."""
 
 
@@ -100,6 +44,6 @@ def test_every_help_is_a_sentence_with_a_verb(name, command):
         first = (text or "").split("\n\n")[0].strip()
         words = first.split()
         assert words, f"{name} {what}: no help"
-        assert words[0] in VERBS, f"{name} {what}: {first}"
+        assert words[0] in VERBS.split(), f"{name} {what}: {first}"
         assert words[0] != "Also" or words[1] == "write", f"{name} {what}: {first}"
         assert first.endswith((".", "….")), f"{name} {what}: {first}"

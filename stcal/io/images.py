@@ -4,6 +4,7 @@ import contextlib
 import os
 import re
 import tempfile
+import threading
 import zlib
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -29,6 +30,9 @@ _DAMAGE = re.compile(
     rb"(Corrupt JPEG data(?!: \d+ extraneous bytes before marker 0xd9)|Premature end|TIFF_Error)[^\n]*"
 )
 """What decoders write to standard error and then go on; stray bytes before the end of a JPEG do no harm."""
+
+_STANDARD_ERROR = threading.Lock()
+"""Held while it is led elsewhere."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -117,7 +121,7 @@ def decode(data: bytes, name: str) -> np.ndarray:
     if _is_png(data) and not _png_intact(data):
         raise InputError(f"{name}: damaged (a checksum is wrong); copy it again")
     flags = cv2.IMREAD_GRAYSCALE | cv2.IMREAD_ANYDEPTH | cv2.IMREAD_IGNORE_ORIENTATION
-    with _decoder_messages() as messages:
+    with _STANDARD_ERROR, _decoder_messages() as messages:
         try:
             image = cv2.imdecode(np.frombuffer(data, np.uint8), flags)
         except cv2.error:
@@ -160,7 +164,10 @@ def _bright_end(image: np.ndarray) -> float:
 
 @contextlib.contextmanager
 def _decoder_messages() -> Iterator[bytearray]:
-    """What libraries in C write to standard error meanwhile: the only sign that a decoder made something up."""
+    """What libraries in C write to standard error meanwhile: the only sign that a decoder made something up.
+
+    One thread at a time: a second one would keep the first one's file as the standard error to put back.
+    """
     messages = bytearray()
     try:
         kept = os.dup(2)

@@ -1,5 +1,9 @@
 """Files found group by group, and decoded as the sensor gave them."""
 
+import subprocess
+import sys
+from concurrent.futures import ThreadPoolExecutor
+
 import cv2
 import numpy as np
 import pytest
@@ -59,3 +63,45 @@ def test_exif_orientation_is_ignored():
 def test_what_is_no_image_says_so(data, reason):
     with pytest.raises(InputError, match=reason):
         decode(data, "x")
+
+
+def test_threads_leave_standard_error_as_it_was():
+    code = """
+import os
+from concurrent.futures import ThreadPoolExecutor
+import cv2, numpy as np
+from stcal.io.images import decode
+before = os.fstat(2)
+jpeg = cv2.imencode(".jpg", np.tile(np.arange(256, dtype=np.uint8), (200, 1)))[1].tobytes()
+with ThreadPoolExecutor(4) as pool:
+    list(pool.map(lambda k: decode(jpeg, str(k)), range(200)))
+assert os.path.samestat(before, os.fstat(2))
+os.write(2, b"still heard")
+"""
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, timeout=60)
+    assert (done.returncode, done.stderr) == (0, b"still heard")
+
+
+def damaged_jpeg() -> bytes:
+    """Whole to its end marker, but its scan is not what an encoder would write."""
+    picture = cv2.GaussianBlur(np.random.default_rng(0).integers(0, 256, (200, 300), np.uint8), (0, 0), 3)
+    data = bytearray(encoded(".jpg", picture))
+    middle = len(data) // 2
+    data[middle : middle + 300] = bytes(300)
+    return bytes(data)
+
+
+def test_a_damaged_image_is_told_from_whole_ones_in_other_threads():
+    whole, damaged = encoded(".jpg"), damaged_jpeg()
+
+    def fault(k: int) -> str:
+        try:
+            decode(damaged if k % 5 == 0 else whole, str(k))
+        except InputError as error:
+            return str(error)
+        return ""
+
+    with ThreadPoolExecutor(4) as pool:
+        faults = list(pool.map(fault, range(100)))
+    assert [k for k, text in enumerate(faults) if text] == list(range(0, 100, 5))
+    assert all("damaged (Corrupt JPEG data" in text for text in faults if text)
