@@ -6,6 +6,7 @@ import pytest
 from typer.main import get_command
 
 from stcal.cli.main import app
+from tests.scripts import load_script
 
 ROOT = Path(__file__).resolve().parents[1]
 DOCUMENTS = ("README.md", "data_layout.md")
@@ -47,3 +48,19 @@ def test_every_help_is_a_sentence_with_a_verb(name, command):
         assert words[0] in VERBS.split(), f"{name} {what}: {first}"
         assert words[0] != "Also" or words[1] == "write", f"{name} {what}: {first}"
         assert first.endswith((".", "….")), f"{name} {what}: {first}"
+
+
+def test_the_tables_of_result_files_are_those_of_the_models():
+    layout = load_script("data_layout")
+    text = layout.DOCUMENT.read_text(encoding="utf-8")
+    assert "made by scripts/data_layout.py: FacesFile" in text
+    assert layout.made_anew(text)[1] == []
+
+
+def test_a_table_that_differs_is_named():
+    layout = load_script("data_layout")
+    text = layout.DOCUMENT.read_text(encoding="utf-8")
+    changed = text.replace("| `eccentricity` | true or false |", "| `eccentricity` | number |")
+    assert changed != text
+    again, differing = layout.made_anew(changed)
+    assert (again, differing) == (text, ["FacesFile"])

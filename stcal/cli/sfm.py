@@ -150,7 +150,7 @@ def detect(
     """Detect circles alone: detections.csv and an overlay picture of every image."""
     from stcal.io.images import find_images
     from stcal.sfm import pipeline
-    from stcal.sfm.run.saved import marker_json
+    from stcal.sfm.run.marker import MarkerFile
     from stcal.sfm.run.text import detection_text
 
     model = read_camera(camera)
@@ -160,7 +160,7 @@ def detect(
     if (out / "faces.json").exists():
         raise InputError(f"output folder {out}: holds a finished calibration; give another folder with --out")
     find_images(images)
-    folder = pipeline.claim_folder(out, marker_json(images, None))
+    folder = pipeline.claim_folder(out, MarkerFile.of(images, None))
     with StageProgress() as progress:
         detection, labelled = pipeline.detect(images, model, folder, target_design, board_design, options, progress)
     print(detection_text(detection, labelled))

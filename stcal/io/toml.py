@@ -7,6 +7,7 @@ from typing import Annotated, TypeVar
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
 from stcal.errors import InputError
+from stcal.io.mistakes import first_mistake
 
 M = TypeVar("M", bound=BaseModel)
 
@@ -36,20 +37,6 @@ def load_toml(path: str | Path, model: type[M], what: str, remedy: str) -> M:
     except OSError as error:
         raise InputError(f"{what} {path}: {error.strerror or error}; {remedy}") from error
     except ValidationError as error:
-        first = error.errors()[0]
-        place = ".".join(str(part + 1 if isinstance(part, int) else part) for part in first["loc"])
-        place = " ".join(place.split())  # a quoted TOML key may hold a line break
-        if first["type"] == "extra_forbidden":
-            reason = "unknown key; remove it or correct its spelling"
-        elif first["type"] == "missing":
-            reason = "key missing; add it"
-        elif first["type"] == "string_pattern_mismatch":
-            reason = f"{first['input'][:80]!r}: spaces, colons, commas, slashes and line breaks are not allowed"
-        else:
-            shown = repr(first["input"])
-            shown = shown if len(shown) <= 80 else shown[:79] + "…"
-            reason = f"{shown}: {first['msg'][0].lower()}{first['msg'][1:]}"
-        more = f" (and {error.error_count() - 1} more)" if error.error_count() > 1 else ""
-        raise InputError(f"{what} {path}: {place}: {reason}{more}") from error
+        raise InputError(f"{what} {path}: {first_mistake(error)}") from error
     except (ValueError, RecursionError) as error:  # TOMLDecodeError, UnicodeDecodeError, numbers of 5000 digits
         raise InputError(f"{what} {path}: not valid TOML: {error}") from error

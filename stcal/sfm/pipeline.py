@@ -9,7 +9,6 @@ from pathlib import Path
 
 import numpy as np
 
-import stcal
 from stcal.design import BoardDesign, TargetDesign, reference_board, reference_target
 from stcal.errors import InputError
 from stcal.geometry.camera import Camera
@@ -20,6 +19,7 @@ from stcal.io.saving import json_text, save
 from stcal.parallel import one_thread
 from stcal.sfm.adjust.calibration import Calibration, calibrate
 from stcal.sfm.adjust.chain import measure_chains
+from stcal.sfm.adjust.file import FacesFile
 from stcal.sfm.checks.suite import Evidence, run_checks
 from stcal.sfm.data.model import GroupModel
 from stcal.sfm.data.observations import ImageObservations, by_group, detections_csv
@@ -32,10 +32,11 @@ from stcal.sfm.mapping.database import image_ids, labels_csv, remove_database, w
 from stcal.sfm.mapping.graph import ImageGraph, image_graph
 from stcal.sfm.mapping.models import find_models, read_model, write_model
 from stcal.sfm.report.page import report_html, shown_overlays
+from stcal.sfm.run.marker import MarkerFile
 from stcal.sfm.run.options import RunOptions
-from stcal.sfm.run.output import faces_json, report_json
+from stcal.sfm.run.output import report_json
 from stcal.sfm.run.result import RunResult
-from stcal.sfm.run.saved import BOARD, CAMERA, TARGET, SavedRun, marker_json
+from stcal.sfm.run.saved import BOARD, CAMERA, TARGET, SavedRun
 from stcal.sfm.run.solve import GroupSolution, require_groups, solve_group, unseen_board
 
 RESULTS = ("faces.json", "report.json", "report.html", "labels.csv", "detections.csv", "compare.json")
@@ -76,7 +77,7 @@ def run(
     options = (options or RunOptions()).settled(target)
     model = refinable(model) if options.refine_camera else model
     find_images(images)  # before anything of an earlier run is removed
-    out = claim_folder(out, marker_json(images, options))
+    out = claim_folder(out, MarkerFile.of(images, options))
 
     detection, labelled = detect(images, model, out, target, board, options, tell)
     require_single(detection.images)
@@ -187,7 +188,8 @@ def calibrate_models(model: Path, saved: SavedRun) -> Calibration:
 def write_faces(path: Path, calibration: Calibration, saved: SavedRun) -> None:
     """``faces.json`` of models that were chained."""
     options = replace(saved.options, solve="chain").adjustment(saved.target)
-    save(path, json_text(faces_json(calibration.target, saved.target, options, calibration.sigma_factor)))
+    faces = FacesFile.of(calibration.target, saved.target, options, calibration.sigma_factor)
+    save(path, json_text(faces.content()))
 
 
 def load_design(given, default: Callable, load: Callable):
@@ -197,8 +199,8 @@ def load_design(given, default: Callable, load: Callable):
     return load(given) if isinstance(given, (str, Path)) else given
 
 
-def claim_folder(out: str | Path, contents: dict) -> Path:
-    """Make the run's folder, mark it as ours with ``contents``, and remove results that will be made anew.
+def claim_folder(out: str | Path, content: MarkerFile) -> Path:
+    """Make the run's folder, mark it as ours with ``content``, and remove results that will be made anew.
 
     Raises
     ------
@@ -213,7 +215,7 @@ def claim_folder(out: str | Path, contents: dict) -> Path:
         if out.is_dir() and not marker.exists() and any(not p.name.startswith(RUN_MARKER) for p in out.iterdir()):
             raise InputError(f"output folder {out}: not empty and not of an earlier run; give a new folder with --out")
         out.mkdir(parents=True, exist_ok=True)
-        save(marker, json_text({"program": "stcal-sfm", "version": stcal.__version__} | contents))
+        save(marker, json_text(content.content()))
         for name in RESULTS:
             (out / name).unlink(missing_ok=True)
         for name in RESULT_FOLDERS:
@@ -323,13 +325,13 @@ def _write(result: RunResult, tell: Progress) -> None:
     save(out / TARGET, target_toml(result.target_design))
     save(out / BOARD, board_toml(result.board_design))
     report = report_json(result)
-    faces = faces_json(
+    faces = FacesFile.of(
         result.target,
         result.target_design,
         result.options.adjustment(result.target_design),
         result.calibration.sigma_factor,
     )
-    save(out / "faces.json", json_text(faces))
+    save(out / "faces.json", json_text(faces.content()))
     write_report(out, report)
     tell("report", 1, 1)
 

@@ -54,7 +54,7 @@ def diagnose(
     mapped = {name for model in models for name in model.images}
     try:
         findings = [*_files(run), *_images(run, mapped), *_circles(run), *_faces(run)]
-        files, circles = run.report["summary"]["files"], {k: np.array(v) for k, v in run.faces["circles"].items()}
+        files, circles = run.report["summary"]["files"], run.faces.circles
     except (KeyError, TypeError) as error:
         raise InputError(f"run {run.folder}: of another version ({error}); run it again") from error
     jobs = _jobs(run, images or run.images, models, circles)

@@ -194,7 +194,7 @@ def _comparison(run, native, schema, foreign: Calibration, own: Calibration, aga
         },
         "result": {
             "faces": face_differences(again.target, run),
-            "circles_um": _circles(again.target.circles, run.faces["circles"]),
+            "circles_um": _circles(again.target.circles, run.faces.circles),
         },
         "plain": {"faces": face_differences(foreign.target, run)},
         "notes": list(foreign.notes),
@@ -204,8 +204,7 @@ def _comparison(run, native, schema, foreign: Calibration, own: Calibration, aga
 
 def face_differences(target: CalibratedTarget, run: SavedRun) -> dict:
     """Differences of a target's faces from those of ``RUN/faces.json`` by face; None for what only one has."""
-    known = {face: Rigid.from_matrix(np.array(m)) for face, m in run.faces["target_from_face"].items()}
-    return _faces(target.target_from_face, known)
+    return _faces(target.target_from_face, run.faces.poses())
 
 
 def _faces(a: dict[str, Rigid], b: dict[str, Rigid]) -> dict:

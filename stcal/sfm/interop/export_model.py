@@ -15,6 +15,7 @@ import pycolmap
 from stcal.design import TargetDesign
 from stcal.errors import InputError
 from stcal.labels import DotLabel, Label
+from stcal.sfm.adjust.file import FacesFile
 from stcal.sfm.mapping.database import colmap_camera, from_colmap_px
 from stcal.sfm.mapping.models import open_model, rigid_from_colmap
 from stcal.sfm.run.saved import SavedRun, load_run
@@ -164,9 +165,9 @@ def _colours(target: TargetDesign) -> dict[str, tuple[int, int, int]]:
     return {face.id: FACES_RGB[i % len(FACES_RGB)] for i, face in enumerate(target.faces)}
 
 
-def _labels_csv(points: Sequence[_Point], faces: dict, kind: str) -> str:
+def _labels_csv(points: Sequence[_Point], faces: FacesFile, kind: str) -> str:
     """``labels.csv``: COLMAP's files name points by id, the others by their place, from 0."""
-    covariance = faces.get("circle_covariance_mm2", {})
+    covariance = faces.circle_covariance_mm2
     stream = io.StringIO()
     writer = csv.writer(stream, lineterminator="\n")
     writer.writerow(LABEL_COLUMNS)

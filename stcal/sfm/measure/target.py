@@ -1,6 +1,5 @@
 """A calibrated target as one image of it is measured by: its circles in the target frame with their covariance."""
 
-import json
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -12,8 +11,10 @@ from stcal.geometry.align import align_rigid
 from stcal.geometry.arrays import frozen
 from stcal.geometry.plane import fit_plane
 from stcal.geometry.rigid import Rigid
+from stcal.io.json import checked, read_json
 from stcal.labels import CircleLabel, circle_labels
 from stcal.sfm.adjust.chain import CalibratedTarget
+from stcal.sfm.adjust.file import FacesFile
 
 SAME_DESIGN_MM = 0.5
 """RMS by which a face's circles may differ from the design: made to a tenth of that, and drawn to far more."""
@@ -94,21 +95,16 @@ def read_target(path: str | Path, design: TargetDesign) -> TargetCircles:
         Not a ``faces.json``, or one of another design.
     """
     path = Path(path)
+    content = read_json(path, "faces", "give RUN/faces.json")
     try:
-        content = json.loads(path.read_text(encoding="utf-8"))
-    except OSError as error:
-        raise InputError(f"faces {path}: {error.strerror or error}; give RUN/faces.json") from error
-    except ValueError as error:
-        raise InputError(f"faces {path}: not JSON ({str(error)[:100]}); give RUN/faces.json") from error
-    try:
-        labels = circle_labels(content["circles"])
-        xyz = frozen([content["circles"][label] for label in labels], (None, 3), "circles")
-        radius = frozen([content["radius_mm"][label] for label in labels], (len(labels),), "radii")
-        single = {k: frozen(c, (3, 3), k) for k, c in content.get("circle_covariance_mm2", {}).items()}
-        covariance, notes = _covariance(labels, _joint(content, labels), single)
-        if "centre_sigma_factor" not in content:
+        faces = checked(content, FacesFile)
+        labels = circle_labels(faces.circles)
+        xyz = np.array(list(faces.circles.values())).reshape(-1, 3)
+        radius = np.array([faces.radius_mm[label] for label in labels])
+        covariance, notes = _covariance(labels, _joint(faces, labels), faces.circle_covariance_mm2)
+        if faces.centre_sigma_factor is None:
             notes += ("faces.json states no centre_sigma_factor: the centres' own σ are used; run it again",)
-        factor = float(content.get("centre_sigma_factor", 1.0))
+        factor = 1.0 if faces.centre_sigma_factor is None else faces.centre_sigma_factor
         target = TargetCircles(labels, xyz, radius, covariance, factor, notes)
     except (InputError, DegenerateError, LookupError, TypeError, ValueError, AttributeError) as error:
         reason = f"no {error}" if isinstance(error, KeyError) else str(error)[:150]
@@ -117,20 +113,15 @@ def read_target(path: str | Path, design: TargetDesign) -> TargetCircles:
     return target
 
 
-def _joint(content: dict, labels: tuple[CircleLabel, ...]) -> np.ndarray | None:
+def _joint(faces: FacesFile, labels: tuple[CircleLabel, ...]) -> np.ndarray | None:
     """(3c, 3c) in the order of ``labels``; None where the file has none."""
-    if "circles_joint_covariance_mm2" not in content:
+    joint = faces.circles_joint_covariance_mm2
+    if joint is None:
         return None
-    joint = content["circles_joint_covariance_mm2"]
-    if sorted(joint["labels"]) != sorted(labels):
+    if sorted(joint.labels) != sorted(labels):
         raise InputError("its joint covariance is not of its circles")
-    size = 3 * len(labels)
-    full = np.zeros((size, size))
-    i, j = np.triu_indices(size)
-    full[i, j] = full[j, i] = frozen(joint["upper_triangle"], (len(i),), "joint covariance")
-    order = [joint["labels"].index(label) for label in labels]
-    rows = (3 * np.array(order)[:, None] + np.arange(3)).ravel()
-    return full[np.ix_(rows, rows)]
+    rows = (3 * np.array([joint.labels.index(label) for label in labels])[:, None] + np.arange(3)).ravel()
+    return joint.matrix()[np.ix_(rows, rows)]
 
 
 def _covariance(labels, joint: np.ndarray | None, single: dict[str, np.ndarray]) -> tuple[np.ndarray, tuple[str, ...]]:

@@ -93,9 +93,9 @@ def known_of(run: SavedRun) -> Known:
     read = read_model(run.folder / "target_model", run.observations, image_ids(run.observations), run.corrected_px)
     models = [with_sigma(model, run.report["summary"]["sigma_factor"]) for model in read.groups]
     start = CalibratedTarget(
-        run.faces["reference_face"],
-        {face: Rigid.from_matrix(m) for face, m in run.faces["target_from_face"].items()},
-        dict(zip(circle_labels(run.faces["circles"]), map(np.array, run.faces["circles"].values()), strict=True)),
+        run.faces.reference_face,
+        run.faces.poses(),
+        dict(zip(circle_labels(run.faces.circles), run.faces.circles.values(), strict=True)),
         {model.group: Rigid() for model in models},
     )
     prior = camera_prior(read_camera(run.folder / CAMERA), run.camera) if run.options.refine_camera else None
@@ -105,7 +105,7 @@ def known_of(run: SavedRun) -> Known:
         run.board,
         joint.camera,
         start,
-        run.faces["frame"],
+        run.faces.frame,
         run.options.flatness_mm,
         prior,
         joint.board_common,

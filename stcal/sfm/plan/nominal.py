@@ -1,6 +1,5 @@
 """Where the faces of a target are before it is photographed: of the reference design, or from an earlier run."""
 
-import json
 from pathlib import Path
 
 import numpy as np
@@ -8,6 +7,8 @@ import numpy as np
 from stcal.design import TargetDesign, reference_target
 from stcal.errors import InputError
 from stcal.geometry.rigid import Rigid
+from stcal.io.json import read_result
+from stcal.sfm.adjust.file import FacePoses
 from stcal.synthetic.scene import nominal_target_from_face
 
 
@@ -26,11 +27,7 @@ def nominal_poses(target: TargetDesign, faces: Path | None) -> dict[str, Rigid]:
                 "an earlier run, be it a rough one"
             )
         return nominal_target_from_face()
-    try:
-        content = json.loads(faces.read_text(encoding="utf-8"))
-        poses = {face: Rigid.from_matrix(np.array(m, float)) for face, m in content["target_from_face"].items()}
-    except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:
-        raise InputError(f"{faces}: not the faces.json of a run ({error}); give RUN/faces.json") from error
+    poses = read_result(faces, FacePoses, "faces", "give RUN/faces.json, the faces.json of a run").poses()
     missing = [face.id for face in target.faces if face.id not in poses]
     if missing:
         raise InputError(

@@ -1,21 +1,36 @@
 """Errors of a run against a known truth, in the format of ``truth.json`` (``data_layout.md``)."""
 
 import csv
-import json
 from pathlib import Path
+from typing import Any, Literal
 
 import numpy as np
+from pydantic import Field
 
 from stcal.errors import DegenerateError, InputError
 from stcal.geometry.align import align_rigid
-from stcal.geometry.arrays import frozen
 from stcal.geometry.rigid import Rigid
+from stcal.io.json import Matrix6, Part, Pose, Vector3, read_result
 from stcal.labels import BOARD, CircleLabel, DotLabel, parse_label, parse_labels
 
 FACES = "faces.json"
 DETECTIONS = "detections.csv"
 NEAR_PX = 1.5
 """A label is right when its ellipse centre is this near to the image of the circle's centre; eccentricity makes 0.2."""
+
+REMEDY = "give a finished run, and truth.json, as data_layout.md has them"
+
+
+class Answer(Part):
+    """What the two files have in common: ``faces.json``, and a truth, of which ``groups`` are looked at in passing."""
+
+    format: Literal["stcal faces 1"] = "stcal faces 1"
+    unit: Literal["mm"]
+    reference_face: str
+    target_from_face: dict[str, Pose]
+    circles: dict[str, Vector3]
+    target_from_face_covariance: dict[str, Matrix6] = Field({})
+    groups: Any = None
 
 
 def compare(run: str | Path, truth: str | Path) -> dict:
@@ -37,32 +52,30 @@ def compare(run: str | Path, truth: str | Path) -> dict:
         A file is missing or has another form, or the reference faces differ.
     """
     run = Path(run)
-    found = _read(run / FACES if run.is_dir() else run, "run")
-    known = _read(Path(truth), "truth")
-    if found["reference_face"] != known["reference_face"]:
+    found = read_result(run / FACES if run.is_dir() else run, Answer, "run", REMEDY)
+    known = read_result(truth, Answer, "truth", REMEDY)
+    if found.reference_face != known.reference_face:
         raise InputError(
-            f"reference face {found['reference_face']} in the run, {known['reference_face']} in the truth; "
-            f"run again with --reference-face {known['reference_face']}"
+            f"reference face {found.reference_face} in the run, {known.reference_face} in the truth; "
+            f"run again with --reference-face {known.reference_face}"
         )
-    if not set(known["target_from_face"]) & set(found["target_from_face"]):
+    if not known.target_from_face.keys() & found.target_from_face.keys():
         raise InputError(f"run {run}, truth {truth}: no face in common; give the truth of the same target")
     faces = {
-        face_id: _face(face_id, found, known)
-        for face_id in known["target_from_face"]
-        if face_id in found["target_from_face"]
+        face_id: _face(face_id, found, known) for face_id in known.target_from_face if face_id in found.target_from_face
     }
-    labels = _labels(run / DETECTIONS, known) if run.is_dir() and _is(known, "groups", dict) else None
+    labels = _labels(run / DETECTIONS, known) if run.is_dir() and isinstance(known.groups, dict) else None
     measures = ("translation_um", "rotation_mdeg", "circles_mean_um")
     return {
-        "reference_face": known["reference_face"],
+        "reference_face": known.reference_face,
         "faces": faces,
-        "missing": [face_id for face_id in known["target_from_face"] if face_id not in faces],
+        "missing": [face_id for face_id in known.target_from_face if face_id not in faces],
         "worst": {m: max((f[m] for f in faces.values() if f[m] is not None), default=None) for m in measures},
         **({"labels": labels} if labels else {}),
     }
 
 
-def _labels(path: Path, known: dict) -> dict | None:
+def _labels(path: Path, known: Answer) -> dict | None:
     """Labels of ``detections.csv`` against the truth; a board's numbers are known up to its own symmetry, but for a
     whole group at once."""
     try:
@@ -72,10 +85,10 @@ def _labels(path: Path, known: dict) -> dict | None:
         for row in rows:
             measured.setdefault(row["image"], {})[parse_label(row["label"])] = (float(row["x_px"]), float(row["y_px"]))
         for labels in measured.values():  # circles that the truth does not know are neither right nor wrong
-            for label in [x for x in labels if isinstance(x, CircleLabel) and x not in known["circles"]]:
+            for label in [x for x in labels if isinstance(x, CircleLabel) and x not in known.circles]:
                 del labels[label]
         total = np.zeros(3, int)
-        for group in known["groups"].values():
+        for group in known.groups.values():
             count = len(group["board_circles_target"])
             grid = np.arange(count).reshape(-1, _columns(group["board_circles_target"]))
             turns = [grid, np.rot90(grid, 2)]
@@ -114,37 +127,10 @@ def _count(measured: dict, images: dict, numbers: np.ndarray) -> tuple[int, int,
     return wrong, found, visible
 
 
-def _read(path: Path, what: str) -> dict:
-    try:
-        content = json.loads(path.read_text(encoding="utf-8"))
-    except OSError as error:
-        raise InputError(f"{what} {path}: {error.strerror or error}; give a finished run, and truth.json") from error
-    except ValueError as error:
-        raise InputError(f"{what} {path}: not JSON ({error}); give faces.json of a run, and truth.json") from error
-    wanted = {"unit": str, "reference_face": str, "target_from_face": dict, "circles": dict}
-    missing = [key for key, kind in wanted.items() if not (isinstance(content, dict) and _is(content, key, kind))]
-    if missing:
-        raise InputError(f"{what} {path}: no {', '.join(missing)} as data_layout.md has it; give the right file")
-    if content["unit"] != "mm":
-        raise InputError(f"{what} {path}: unit {content['unit']}, mm needed; convert it")
-    return content
-
-
-def _is(content: dict, key: str, kind: type) -> bool:
-    return isinstance(content.get(key), kind)
-
-
-def _face(face_id: str, found: dict, known: dict) -> dict:
-    try:
-        estimate = Rigid.from_matrix(found["target_from_face"][face_id])
-        true = Rigid.from_matrix(known["target_from_face"][face_id])
-        labels = [
-            label for label in parse_labels(known["circles"]) if label.plane == face_id and label in found["circles"]
-        ]
-        a, b = (frozen([each["circles"][k] for k in labels], what="circles").reshape(-1, 3) for each in (known, found))
-    except (ValueError, TypeError, InputError) as error:
-        reason = str(error)[:120]
-        raise InputError(f"face {face_id}: {reason}; a 4×4 matrix and circles of three numbers needed") from error
+def _face(face_id: str, found: Answer, known: Answer) -> dict:
+    estimate, true = (Rigid.from_matrix(each.target_from_face[face_id]) for each in (found, known))
+    labels = [label for label in parse_labels(known.circles) if label.plane == face_id and label in found.circles]
+    a, b = (np.array([each.circles[label] for label in labels]).reshape(-1, 3) for each in (known, found))
     shift = estimate.translation - true.translation
     turn = Rigid(estimate.rotation @ true.rotation.T)
     row = {
@@ -159,15 +145,14 @@ def _face(face_id: str, found: dict, known: dict) -> dict:
         row |= {"circles_mean_um": float(error.mean()), "circles_max_um": float(error.max())}
     except DegenerateError:
         pass  # fewer than three circles in common: there is no rigid fit, and the row says how many there were
-    covariance = found.get("target_from_face_covariance", {}).get(face_id)
-    if covariance is not None:
-        c = np.array(covariance, float)
+    c = found.target_from_face_covariance.get(face_id)
+    if c is not None:
         sigma = np.sqrt(np.maximum(np.diag(c), 0))
         row |= {
             "translation_sigma_um": (1e3 * sigma[3:]).tolist(),
             "rotation_sigma_mdeg": (1e3 * np.degrees(sigma[:3])).tolist(),
         }
-        if np.linalg.eigvalsh(c)[0] > 0 and face_id != known["reference_face"]:
+        if np.linalg.eigvalsh(c)[0] > 0 and face_id != known.reference_face:
             e = np.concatenate([turn.log()[:3], shift])
             row["normalised_error"] = float(np.sqrt(e @ np.linalg.solve(c, e) / 6))
     return row

@@ -1,4 +1,4 @@
-"""``faces.json`` and ``report.json``: the result and everything that tells how far to trust it, as plain values."""
+"""``report.json``: everything that tells how far to trust the result."""
 
 from dataclasses import asdict
 from itertools import combinations
@@ -6,11 +6,8 @@ from itertools import combinations
 import numpy as np
 
 import stcal
-from stcal.design import TargetDesign
 from stcal.geometry.plane import fit_plane
 from stcal.labels import DotLabel
-from stcal.sfm.adjust.chain import CalibratedTarget
-from stcal.sfm.adjust.options import AdjustOptions
 from stcal.sfm.checks.verdict import Check
 from stcal.sfm.data.model import MIN_POINTS, GroupModel
 from stcal.sfm.data.observations import ImageObservations
@@ -18,35 +15,6 @@ from stcal.sfm.mapping.resect import MIN_RAY_ANGLE_RAD
 from stcal.sfm.run.result import RunResult
 
 MICRO = 1e3
-
-
-def faces_json(
-    target: CalibratedTarget, design: TargetDesign, options: AdjustOptions, centre_sigma_factor: float
-) -> dict:
-    """The content of ``faces.json``: mm and rad, target frame, 4×4 row-major."""
-    radius = design.radius_of()
-    content = {
-        "format": "stcal faces 1",
-        "unit": "mm",
-        "reference_face": target.reference_face,
-        "frame": options.frame,
-        "solve": options.solve,
-        "eccentricity": options.eccentricity,
-        "target_from_face": {face: pose.matrix().tolist() for face, pose in target.target_from_face.items()},
-        "circles": {label: xyz.tolist() for label, xyz in target.circles.items()},
-        "radius_mm": {label: radius[label] for label in target.circles},
-        "centre_sigma_factor": centre_sigma_factor,
-    }
-    if target.face_covariance:
-        content["target_from_face_covariance"] = {f: c.tolist() for f, c in target.face_covariance.items()}
-        content["distance_sigma_mm"] = {f"{a} {b}": sigma for (a, b), sigma in target.distance_sigma_mm.items()}
-        content["scale_sigma_ppm"] = 1e6 * target.scale_sigma
-        content["circle_covariance_mm2"] = {label: c.tolist() for label, c in target.circle_covariance.items()}
-        content["circles_joint_covariance_mm2"] = {
-            "labels": list(target.circles),
-            "upper_triangle": target.covariance_mm2[np.triu_indices(3 * len(target.circles))].tolist(),
-        }
-    return content
 
 
 def report_json(result: RunResult) -> dict:

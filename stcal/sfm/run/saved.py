@@ -1,10 +1,9 @@
 """A finished run read back from its folder, for every command that goes on from it."""
 
 import csv
-import json
 from collections.abc import Collection, Iterator
 from contextlib import contextmanager
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -13,19 +12,20 @@ from stcal.design import BoardDesign, TargetDesign
 from stcal.errors import InputError, StcalError
 from stcal.geometry.arrays import frozen
 from stcal.geometry.camera import Camera
-from stcal.geometry.rigid import Rigid
 from stcal.io.camera import read_camera
 from stcal.io.design import load_board, load_target
 from stcal.io.images import RUN_MARKER
+from stcal.io.json import checked, read_json
+from stcal.sfm.adjust.file import FacesFile
 from stcal.sfm.data.observations import ImageObservations, by_group
 from stcal.sfm.detect.ellipses import EllipseOptions
 from stcal.sfm.mapping.pairs import PairOptions
+from stcal.sfm.run.marker import MarkerFile
 from stcal.sfm.run.options import RunOptions
 
 CAMERA, TARGET, BOARD = "cameras.txt", "target.toml", "board.toml"
 """Copies of what the run was given."""
-
-
+AGAIN = "run it again"
 COVARIANCE = ("var_x_px2", "cov_xy_px2", "var_y_px2")
 
 
@@ -35,7 +35,7 @@ class SavedRun:
 
     ``images`` : the folder of photographs as the run was given it; ``observations`` : of all images, in the database's
     order, without the shapes of the ellipses (zero); ``corrected_px`` : by image, (n, 2), what the database holds;
-    ``faces``, ``report`` : content of ``faces.json`` and ``report.json``.
+    ``faces``, ``report`` : ``faces.json``, and the content of ``report.json``.
     """
 
     folder: Path
@@ -47,7 +47,7 @@ class SavedRun:
     board: BoardDesign
     observations: tuple[ImageObservations, ...]
     corrected_px: tuple[np.ndarray, ...]
-    faces: dict
+    faces: FacesFile
     report: dict
 
     @property
@@ -58,11 +58,6 @@ class SavedRun:
     def groups(self) -> dict[str, list[ImageObservations]]:
         """Observations by group, in order."""
         return by_group(self.observations)
-
-
-def marker_json(images: str | Path, options: RunOptions | None) -> dict:
-    """What ``stcal-run.json`` says of a run besides program and version."""
-    return {"images": str(Path(images).absolute()), "options": None if options is None else asdict(options)}
 
 
 def load_run(folder: str | Path) -> SavedRun:
@@ -80,21 +75,22 @@ def load_run(folder: str | Path) -> SavedRun:
     missing = [name for name in needed if not (folder / name).is_file()]
     if missing:
         raise InputError(f"run {folder}: unfinished, or of another version: no {', '.join(missing)}; run it again")
-    marker, faces, report = (_json(folder / name) for name in (RUN_MARKER, "faces.json", "report.json"))
+    marker, faces, report = (read_json(folder / n, "", AGAIN) for n in (RUN_MARKER, "faces.json", "report.json"))
     model = read_camera(folder / CAMERA)
     camera = model.sized(0, 0)
     target, board = load_target(folder / TARGET), load_board(folder / BOARD)
     with _as_written(folder / RUN_MARKER):
-        options, images = _options(marker["options"]).settled(target), Path(marker["images"])
+        own = checked(marker, MarkerFile)
+        options, images = _options(own.options).settled(target), Path(own.images)
     with _as_written(folder / "report.json"):
         names = _require_report(report)
     with _as_written(folder / "faces.json"):
-        _require_faces(faces)
+        result = checked(faces, FacesFile)
     with _as_written(folder / "labels.csv"):
         known = {*target.radius_of(), *board.radius_of()}
         observations, corrected = _labels(folder / "labels.csv", names, camera, known)
     return SavedRun(
-        folder, images, options, camera, model.colmap_model, target, board, observations, corrected, faces, report
+        folder, images, options, camera, model.colmap_model, target, board, observations, corrected, result, report
     )
 
 
@@ -113,16 +109,6 @@ def _as_written(path: Path) -> Iterator[None]:
         raise InputError(f"{path}: damaged, or of another version ({reason}); run it again") from error
 
 
-def _json(path: Path) -> dict:
-    try:
-        content = json.loads(path.read_text(encoding="utf-8"))
-    except (OSError, ValueError, RecursionError) as error:
-        raise InputError(f"{path}: cannot be read ({error}); run it again") from error
-    if not isinstance(content, dict):
-        raise InputError(f"{path}: not a JSON object; run it again")
-    return content
-
-
 def _require_report(report: dict) -> list[tuple[str, str, int]]:
     """(name, group, circles) of the images in the database's order; what later commands read is there."""
     names = [(each["name"], each["group"], each["circles"]) for each in report["images"]]
@@ -133,13 +119,6 @@ def _require_report(report: dict) -> list[tuple[str, str, int]]:
             raise ValueError(f"group {group}: its initial pair is not of its images")
     float(report["summary"]["residual_rms_px"])
     return names
-
-
-def _require_faces(faces: dict) -> None:
-    for matrix in faces["target_from_face"].values():
-        Rigid.from_matrix(matrix)
-    for label, xyz in faces["circles"].items():
-        frozen(xyz, (3,), f"circle {label}")
 
 
 def _labels(path: Path, names: list[tuple[str, str, int]], camera: Camera, known: Collection[str]):

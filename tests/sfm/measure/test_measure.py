@@ -451,6 +451,8 @@ def not_definite(content):
         (moved_circle, r"face 2 is 1\.\d+ mm RMS off that of target"),
         (other_radius, r"circle 2:7 has radius 7\.5 mm, 8 mm in target"),
         (not_definite, r"not positive semi-definite"),
+        (lambda content: content.update(unit="m"), r"unit: 'm'"),
+        (lambda content: content.update(format="stcal faces 2"), r"format: 'stcal faces 2'"),
         (lambda content: content.pop("circles"), r"no 'circles'"),
         (lambda content: content["circles"].update({"1:1": [0, 0, None]}), r"not the faces.json of a run"),
     ],

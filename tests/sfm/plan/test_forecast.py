@@ -365,7 +365,8 @@ def test_plan_out_of_reach(stcal_sfm):
     ("faces", "message"),
     [
         (None, "does not say where its faces are; give --faces"),
-        ("nothing", "not the faces.json of a run"),
+        ("nothing", "not JSON"),
+        ('{"unit": "m", "target_from_face": {}}', "unit: 'm'"),
         ('{"target_from_face": {}}', "no face top of target"),
     ],
 )

@@ -474,17 +474,22 @@ def with_circle(xyz):
 
 TRUTHS = {
     "missing": (None, ("No such file", "give a finished run, and truth.json")),
-    "empty": (lambda truth: "", ("not JSON", "give faces.json of a run, and truth.json")),
-    "a list": (lambda truth: "[1, 2]", ("no unit, reference_face, target_from_face, circles", "data_layout.md")),
-    "inches": (changed(unit="in"), ("unit in, mm needed",)),
-    "faces null": (changed(target_from_face=None), ("no target_from_face", "data_layout.md")),
-    "circles a list": (changed(circles=[1]), ("no circles", "data_layout.md")),
+    "empty": (lambda truth: "", ("not JSON", "give a finished run, and truth.json")),
+    "a list": (lambda truth: "[1, 2]", ("a list, an object with named keys needed", "data_layout.md")),
+    "no unit": (lambda truth: json.dumps({k: v for k, v in truth.items() if k != "unit"}), ("no 'unit'",)),
+    "inches": (changed(unit="in"), ("unit: 'in': ", "'mm'")),
+    "another format": (changed(format="stcal faces 2"), ("format: 'stcal faces 2': ", "'stcal faces 1'")),
+    "faces null": (changed(target_from_face=None), ("target_from_face: None: ", "data_layout.md")),
+    "circles a list": (changed(circles=[1]), ("circles: [1]: ", "data_layout.md")),
     "another reference": (changed(reference_face="2"), ("reference face 1 in the run, 2 in", "--reference-face 2")),
-    "another target": (changed(target_from_face={"x": []}), ("no face in common; give the truth of the same target",)),
-    "matrix of words": (with_matrix("abc"), ("face 2", "a 4×4 matrix and circles of three numbers needed")),
-    "matrix scaled": (with_matrix((2 * np.eye(4)).tolist()), ("face 2", "4×4 matrix")),
-    "circle of two numbers": (with_circle([1, 2]), ("face 2", "circles of three numbers needed")),
-    "circle NaN": (with_circle([np.nan] * 3), ("face 2", "not finite", "circles of three numbers needed")),
+    "another target": (
+        changed(target_from_face={"x": np.eye(4).tolist()}),
+        ("no face in common; give the truth of the same target",),
+    ),
+    "matrix of words": (with_matrix("abc"), ("target_from_face.2: ", "abc")),
+    "matrix scaled": (with_matrix((2 * np.eye(4)).tolist()), ("target_from_face.2: ", "0 0 0 1 needed")),
+    "circle of two numbers": (with_circle([1, 2]), ("circles.2:1: [1, 2]: shape (2,), (3,) needed",)),
+    "circle NaN": (with_circle([np.nan] * 3), ("circles.2:1: ", "not finite")),
 }
 
 

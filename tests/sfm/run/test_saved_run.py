@@ -14,8 +14,9 @@ from stcal.sfm import run
 from stcal.sfm.detect.ellipses import EllipseOptions
 from stcal.sfm.mapping.pairs import PairOptions
 from stcal.sfm.pipeline import claim_folder
+from stcal.sfm.run.marker import MarkerFile
 from stcal.sfm.run.options import RunOptions
-from stcal.sfm.run.saved import load_run, marker_json
+from stcal.sfm.run.saved import load_run
 from tests.outcome import INPUT, assert_error
 
 FRAME = ("id", "ids", "origin", "x", "y")
@@ -103,10 +104,10 @@ def test_camera_and_designs_are_the_same(written):
 def test_options_answers_and_places_are_the_same(written):
     result, saved = written
     assert saved.options == result.options
-    assert saved.options.reference_face == saved.faces["reference_face"] == "2"
+    assert saved.options.reference_face == saved.faces.reference_face == "2"
     assert saved.images == result.out.parent / "data" / "images"
     assert saved.database == result.out / "database.db"
-    found = {face: np.array(matrix) for face, matrix in saved.faces["target_from_face"].items()}
+    found = {face: np.array(matrix) for face, matrix in saved.faces.target_from_face.items()}
     assert found.keys() == result.target.target_from_face.keys()
     assert all(np.array_equal(found[face], pose.matrix()) for face, pose in result.target.target_from_face.items())
 
@@ -119,7 +120,7 @@ def test_options_that_are_all_other_than_the_defaults(small_run, tmp_path, monke
     )
     assert all(getattr(OTHER.ellipses, n) != getattr(default.ellipses, n) for n in EllipseOptions.__slots__)
     monkeypatch.chdir(tmp_path)
-    claim_folder("new", marker_json("some images", OTHER))
+    claim_folder("new", MarkerFile.of("some images", OTHER))
     own = shutil.copytree(small_run, tmp_path / "run")
     shutil.copy(tmp_path / "new" / "stcal-run.json", own)
     saved = load_run(own)
@@ -191,7 +192,7 @@ def test_a_file_that_is_no_json_object(own_run, stcal_sfm, name, content):
 )
 def test_a_run_of_before_a_key_was_written(own_run, stcal_sfm, name, key):
     edit(own_run / name, lambda content: content.pop(key))
-    parts = (str(own_run / name), "of another version", f"(no '{key}')", "run it again")
+    parts = (str(own_run / name), "of another version", f"no '{key}'", "run it again")
     assert_error(stcal_sfm(*faces_of(own_run)), INPUT, *parts)
 
 
@@ -201,7 +202,7 @@ WRONG = {
     "an option missing": ("stcal-run.json", lambda c: c["options"].pop("ellipses"), "no 'ellipses'"),
     "no such choice": ("stcal-run.json", lambda c: c["options"].update(solve="guess"), "solve 'guess'"),
     "no such face": ("stcal-run.json", lambda c: c["options"].update(reference_face="9"), "no face 9"),
-    "images a number": ("stcal-run.json", lambda c: c.update(images=3), "int"),
+    "images a number": ("stcal-run.json", lambda c: c.update(images=3), "images: 3: "),
     "report's images a list of names": ("report.json", lambda c: c.update(images=["a", "b"]), "indices"),
     "a group without pairs": ("report.json", lambda c: c["groups"][0].update(pairs=[]), "index out of range"),
     "a group missing": ("report.json", lambda c: c["groups"].pop(), "no '14'"),
@@ -211,15 +212,21 @@ WRONG = {
         "group 12: its initial pair is not of its images",
     ),
     "the residual a word": ("report.json", lambda c: c["summary"].update(residual_rms_px="small"), "'small'"),
-    "faces a list": ("faces.json", lambda c: c.update(target_from_face=[1]), "list"),
+    "another format": ("faces.json", lambda c: c.update(format="stcal faces 2"), "'stcal faces 1'"),
+    "metres": ("faces.json", lambda c: c.update(unit="m"), "'mm'"),
+    "faces a list": ("faces.json", lambda c: c.update(target_from_face=[1]), "target_from_face: [1]: "),
     "a face of words": ("faces.json", lambda c: c["target_from_face"].update({"2": "abc"}), "abc"),
     "a face scaled": (
         "faces.json",
         lambda c: c["target_from_face"].update({"2": np.diag([2.0, 2, 2, 1]).tolist()}),
         "scaled",
     ),
-    "a circle of two": ("faces.json", lambda c: c["circles"].update({"2:1": [1, 2]}), "circle 2:1: shape (2,)"),
-    "a circle not finite": ("faces.json", lambda c: c["circles"].update({"2:1": [1, 2, np.nan]}), "circle 2:1"),
+    "a circle of two": (
+        "faces.json",
+        lambda c: c["circles"].update({"2:1": [1, 2]}),
+        "circles.2:1: [1, 2]: shape (2,)",
+    ),
+    "a circle not finite": ("faces.json", lambda c: c["circles"].update({"2:1": [1, 2, np.nan]}), "circles.2:1: "),
 }
 
 

@@ -1,0 +1,144 @@
+"""Result files: pydantic models that say every key, its type and its meaning, written and read as JSON.
+
+A model is written with the keys that it was given, in the order of its fields: a key that does not apply is left out by
+not giving it, and is null where it is given as None. Arrays and poses are lists of numbers in the file.
+"""
+
+import json
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated, Any, TypeVar
+
+import numpy as np
+from pydantic import BaseModel, ConfigDict, GetCoreSchemaHandler, ValidationError
+from pydantic_core import PydanticCustomError, core_schema
+
+from stcal.errors import InputError
+from stcal.geometry.arrays import frozen
+from stcal.geometry.rigid import Rigid
+from stcal.io.mistakes import first_mistake
+
+
+class Part(BaseModel):
+    """An object inside a result file; ``from_attributes``: a dataclass with these fields will do."""
+
+    model_config = ConfigDict(
+        frozen=True,
+        extra="forbid",
+        allow_inf_nan=False,
+        from_attributes=True,
+        validate_by_name=True,
+        serialize_by_alias=True,
+        arbitrary_types_allowed=True,
+    )
+
+
+class ResultFile(Part):
+    """A result file as a whole; ``format`` of a model is the name of its format and its version."""
+
+    def content(self) -> dict[str, Any]:
+        """Plain values: the keys given, in the order of the fields."""
+        return self.model_dump(exclude_unset=True, warnings=False)
+
+
+F = TypeVar("F", bound=Part)
+
+
+@dataclass(frozen=True, slots=True)
+class Shape:
+    """An array of this shape, None for any length: a list of lists in the file, (…) float64 in Python."""
+
+    sides: tuple[int | None, ...]
+
+    def __get_pydantic_core_schema__(self, source: Any, handler: GetCoreSchemaHandler) -> core_schema.CoreSchema:
+        plain = core_schema.plain_serializer_function_ser_schema(np.ndarray.tolist)
+        return core_schema.no_info_plain_validator_function(self.checked, serialization=plain)
+
+    def checked(self, value: Any) -> np.ndarray:
+        try:
+            return frozen(value, self.sides, "array")
+        except (InputError, ValueError, TypeError) as error:
+            reason = str(error).removeprefix("array: ")
+            raise PydanticCustomError("array", "{reason}", {"reason": reason}) from error
+
+    def words(self) -> str:
+        """For the tables of the documents."""
+        if len(self.sides) == 1:
+            return "list of numbers" if self.sides[0] is None else f"{self.sides[0]} numbers"
+        return "×".join("n" if n is None else str(n) for n in self.sides)
+
+
+@dataclass(frozen=True, slots=True)
+class PoseShape(Shape):
+    """A rigid transform: 4×4 in the file; a :class:`Rigid` will do."""
+
+    def checked(self, value: Any) -> np.ndarray:
+        if isinstance(value, Rigid):
+            return value.matrix()
+        try:
+            Rigid.from_matrix(value)
+        except (InputError, ValueError, TypeError) as error:
+            raise PydanticCustomError("pose", "{reason}", {"reason": str(error)}) from error
+        return Shape.checked(self, value)
+
+
+Pose = Annotated[np.ndarray, PoseShape((4, 4))]
+Matrix3 = Annotated[np.ndarray, Shape((3, 3))]
+Matrix4 = Annotated[np.ndarray, Shape((4, 4))]
+Matrix6 = Annotated[np.ndarray, Shape((6, 6))]
+Matrix = Annotated[np.ndarray, Shape((None, None))]
+Points = Annotated[np.ndarray, Shape((None, 3))]
+Vector = Annotated[np.ndarray, Shape((None,))]
+Vector3 = Annotated[np.ndarray, Shape((3,))]
+Pair = Annotated[np.ndarray, Shape((2,))]
+
+ByFace = Annotated[str, "face"]
+ByLabel = Annotated[str, "label"]
+ByGroup = Annotated[str, "group"]
+ByImage = Annotated[str, "image"]
+ByName = Annotated[str, "name"]
+"""Keys of objects; the word stands in the documents: ``faces.<face>``."""
+
+
+def read_json(path: str | Path, what: str, remedy: str) -> dict[str, Any]:
+    """The object in a JSON file; ``what`` names the kind of file, ``remedy`` what to do about a file that is none.
+
+    Raises
+    ------
+    InputError
+        Unreadable, not JSON, or not an object with named keys.
+    """
+    where = f"{what} {path}".lstrip()
+    try:
+        content = json.loads(Path(path).read_bytes().decode("utf-8-sig"))  # Windows editors put a byte-order mark first
+    except OSError as error:
+        raise InputError(f"{where}: {error.strerror or error}; {remedy}") from error
+    except (ValueError, RecursionError) as error:  # not UTF-8, a NUL in the name, a number of 5000 digits, deep nesting
+        raise InputError(f"{where}: not JSON ({' '.join(str(error).split())[:100]}); {remedy}") from error
+    if not isinstance(content, dict):
+        raise InputError(f"{where}: a {type(content).__name__}, an object with named keys needed; {remedy}")
+    return content
+
+
+def checked(content: dict[str, Any], model: type[F]) -> F:
+    """What a file holds as ``model`` has it; keys that the model does not know are passed over.
+
+    Raises
+    ------
+    InputError
+        Another format, a key missing or a value that is not as needed; the message names place and reason.
+    """
+    try:
+        return model.model_validate(content, extra="ignore")
+    except ValidationError as error:
+        key = error.errors()[0]["loc"][-1:]
+        raise InputError(first_mistake(error, f"no {str(*key)!r}")) from error
+
+
+def read_result(path: str | Path, model: type[F], what: str, remedy: str) -> F:
+    """Read a result file; see :func:`read_json` and :func:`checked`, which raise."""
+    content = read_json(path, what, remedy)
+    try:
+        return checked(content, model)
+    except InputError as error:
+        raise InputError(f"{what} {path}: {error}; {remedy}") from error

@@ -1,0 +1,119 @@
+"""``faces.json``: the calibrated target as a file."""
+
+from typing import Any, Literal
+
+import numpy as np
+from pydantic import Field
+
+from stcal.design import TargetDesign
+from stcal.geometry.rigid import Rigid
+from stcal.io.json import ByFace, ByLabel, ByName, Matrix3, Matrix6, Part, Pose, ResultFile, Vector, Vector3
+from stcal.sfm.adjust.chain import CalibratedTarget
+from stcal.sfm.adjust.faces import FrameKind
+from stcal.sfm.adjust.options import AdjustOptions, Solve
+
+
+class FacePoses(Part):
+    """What of ``faces.json`` a plan needs."""
+
+    format: Literal["stcal faces 1"] = "stcal faces 1"
+    unit: Literal["mm"] = "mm"
+    target_from_face: dict[str, Pose]
+
+    def poses(self) -> dict[str, Rigid]:
+        """target_from_face by face."""
+        return {face: Rigid.from_matrix(matrix) for face, matrix in self.target_from_face.items()}
+
+
+class JointCovariance(Part):
+    """That of all circles together."""
+
+    labels: list[str]
+    upper_triangle: Vector
+
+    def matrix(self) -> np.ndarray:
+        """(3c, 3c) in the order of ``labels``.
+
+        Raises
+        ------
+        ValueError
+            The triangle is not of so many circles.
+        """
+        size = 3 * len(self.labels)
+        i, j = np.triu_indices(size)
+        full = np.zeros((size, size))
+        full[i, j] = full[j, i] = self.upper_triangle
+        return full
+
+
+class FacesFile(ResultFile):
+    """The result of a run: mm and rad, target frame."""
+
+    format: Literal["stcal faces 1"] = Field("stcal faces 1", description="the file's form and its version")
+    unit: Literal["mm"] = Field("mm", description="of all lengths")
+    reference_face: str = Field(description="id of the face whose frame is the target frame")
+    frame: FrameKind = Field(description="of a face, see the table of frames")
+    solve: Solve = Field(description="one adjustment over all groups (`joint`), or group by group (`chain`)")
+    eccentricity: bool = Field(
+        description="whether it was corrected; without it `solve` is `chain` and `frame` is `three-point`, as "
+        "published, unless they are given"
+    )
+    target_from_face: dict[ByFace, Pose] = Field(description="frame of each face")
+    circles: dict[ByLabel, Vector3] = Field(description="`face:circle` → centre, target frame, mm")
+    radius_mm: dict[ByLabel, float] = Field(description="`face:circle` → radius of the design, mm")
+    centre_sigma_factor: float | None = Field(
+        None,
+        description="by which residuals of the run's groups exceed the centres' own σ; `measure` multiplies σ by it",
+    )
+    target_from_face_covariance: dict[ByFace, Matrix6] = Field(
+        {},
+        description="only with `joint`: rad and mm, see conventions; that of the reference face is 0 up to rounding",
+    )
+    distance_sigma_mm: dict[ByName, float] = Field(
+        {}, description='only with `joint`: `"a b"` → σ of the distance between the origins of two faces, mm'
+    )
+    scale_sigma_ppm: float | None = Field(None, description="only with `joint`: σ of the target's size")
+    circle_covariance_mm2: dict[ByLabel, Matrix3] = Field(
+        {}, description="only with `joint`: `face:circle` → covariance, target frame, mm²"
+    )
+    circles_joint_covariance_mm2: JointCovariance | None = Field(
+        None,
+        description="only with `joint`: `labels` of the c circles in order, and `upper_triangle` of the 3c×3c "
+        "covariance of their x, y, z in the target frame, row by row, mm². Singular, since the circles carry the frame",
+    )
+
+    @classmethod
+    def of(
+        cls, target: CalibratedTarget, design: TargetDesign, options: AdjustOptions, centre_sigma_factor: float
+    ) -> "FacesFile":
+        """The file of a calibrated target; its covariances where it states them."""
+        radius = design.radius_of()
+        content: dict[str, Any] = {
+            "format": "stcal faces 1",
+            "unit": "mm",
+            "reference_face": target.reference_face,
+            "frame": options.frame,
+            "solve": options.solve,
+            "eccentricity": options.eccentricity,
+            "target_from_face": target.target_from_face,
+            "circles": target.circles,
+            "radius_mm": {label: radius[label] for label in target.circles},
+            "centre_sigma_factor": centre_sigma_factor,
+        }
+        if target.face_covariance:
+            upper = np.triu_indices(3 * len(target.circles))
+            content |= {
+                "target_from_face_covariance": target.face_covariance,
+                "distance_sigma_mm": {f"{a} {b}": sigma for (a, b), sigma in target.distance_sigma_mm.items()},
+                "scale_sigma_ppm": 1e6 * target.scale_sigma,
+                "circle_covariance_mm2": target.circle_covariance,
+                "circles_joint_covariance_mm2": {
+                    "labels": list(target.circles),
+                    "upper_triangle": target.covariance_mm2[upper],
+                },
+            }
+        return cls.model_validate(content)
+
+    def poses(self) -> dict[str, Rigid]:
+        """target_from_face by face."""
+        return {face: Rigid.from_matrix(matrix) for face, matrix in self.target_from_face.items()}

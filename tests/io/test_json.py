@@ -1,0 +1,113 @@
+"""JSON files: any content is a value or one line of error; result files say what is wrong where."""
+
+import json
+from typing import Literal
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from pydantic import ValidationError
+
+from stcal.errors import InputError
+from stcal.geometry.rigid import Rigid
+from stcal.io.json import ByFace, Part, Pose, ResultFile, Vector3, checked, read_json, read_result
+from stcal.io.saving import json_text
+
+
+class Row(Part):
+    name: str
+    value: int | float | None
+
+
+class Example(ResultFile):
+    format: Literal["stcal example 1"]
+    rows: list[Row]
+    poses: dict[ByFace, Pose]
+    middle: Vector3
+    later: float | None = None
+
+
+POSE = Rigid.exp([0.1, -0.2, 0.3, 4, 5, 6])
+WHOLE = {
+    "format": "stcal example 1",
+    "rows": [{"name": "ä", "value": 1}, {"name": "b", "value": 1.0}, {"name": "c", "value": None}],
+    "poses": {"1": POSE},
+    "middle": np.array([0.1, 0.2, 0.3]),
+}
+
+
+def test_written_as_given_and_read_back(tmp_path):
+    text = json_text(Example.model_validate(WHOLE).content())
+    plain = WHOLE | {"poses": {"1": POSE.matrix().tolist()}, "middle": [0.1, 0.2, 0.3]}
+    assert text == json.dumps(plain, indent=1, ensure_ascii=False) + "\n"  # 1 stays 1, and later is not there
+    path = tmp_path / "example.json"
+    path.write_bytes(b"\xef\xbb\xbf" + text.encode())
+    found = read_result(path, Example, "example", "make one")
+    assert np.array_equal(found.poses["1"], POSE.matrix())
+    assert found.later is None
+    assert found.content() == json.loads(text)
+
+
+def test_a_key_that_is_no_part_of_the_file_is_not_written():
+    with pytest.raises(ValidationError, match="other"):
+        Example.model_validate(WHOLE | {"other": 1})
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"format": "stcal example 2"}, r"^format: 'stcal example 2': .*'stcal example 1'"),
+        ({"rows": [{"name": "a", "value": float("nan")}]}, r"^rows\.1\.value\..*: nan: "),
+        ({"rows": [{"name": "a"}]}, r"^rows\.1\.value: no 'value'$"),
+        ({"rows": [{"name": 3, "value": 1}]}, r"^rows\.1\.name: 3: "),
+        ({"poses": {"1": np.diag([2.0, 1, 1, 1])}}, r"^poses\.1: .*not a rotation"),
+        ({"poses": {"1": "abc"}}, r"^poses\.1: 'abc': "),
+        ({"middle": [1, 2]}, r"^middle: \[1, 2\]: shape \(2,\), \(3,\) needed$"),
+        ({"middle": [1, 2, float("inf")]}, r"^middle: .*not finite"),
+    ],
+)
+def test_the_place_and_the_reason_are_named(change, message):
+    with pytest.raises(InputError, match=message):
+        checked(WHOLE | change, Example)
+
+
+def test_keys_of_later_versions_are_passed_over():
+    assert "newer" not in checked(WHOLE | {"newer": 1}, Example).content()
+
+
+@pytest.mark.parametrize(
+    ("content", "reason"),
+    [
+        (b"", "not JSON"),
+        (b"\xff\xfe\x00", "not JSON"),
+        (b"[" * 100_000, "not JSON"),
+        (b'{"a": ' + b"9" * 5000 + b"}", "not JSON"),
+        (b"[1]", "a list, an object with named keys needed"),
+        (b"NaN", "a float, an object"),
+    ],
+)
+def test_a_file_that_is_no_object(tmp_path, content, reason):
+    path = tmp_path / "some.json"
+    path.write_bytes(content)
+    with pytest.raises(InputError, match=reason) as caught:
+        read_json(path, "file", "make one")
+    assert str(caught.value).startswith(f"file {path}: ")
+    assert str(caught.value).endswith("; make one")
+    assert "\n" not in str(caught.value)
+
+
+def test_a_file_that_is_not_there(tmp_path):
+    with pytest.raises(InputError, match=r"some\.json: No such file or directory; make one"):
+        read_json(tmp_path / "some.json", "file", "make one")
+
+
+@given(st.binary(max_size=60) | st.text(max_size=60).map(str.encode))
+def test_any_bytes_are_a_value_or_one_line(tmp_path_factory, content):
+    path = tmp_path_factory.getbasetemp() / "any.json"
+    path.write_bytes(content)
+    try:
+        message = str(read_json(path, "file", "make one"))
+    except InputError as error:
+        message = str(error)
+    assert "\n" not in message
