@@ -34,7 +34,7 @@ from stcal.sfm.mapping.models import find_models, read_model, write_model
 from stcal.sfm.report.page import report_html, shown_overlays
 from stcal.sfm.run.marker import MarkerFile
 from stcal.sfm.run.options import RunOptions
-from stcal.sfm.run.output import report_json
+from stcal.sfm.run.output import report_of
 from stcal.sfm.run.result import RunResult
 from stcal.sfm.run.saved import BOARD, CAMERA, TARGET, SavedRun
 from stcal.sfm.run.solve import GroupSolution, require_groups, solve_group, unseen_board
@@ -324,7 +324,7 @@ def _write(result: RunResult, tell: Progress) -> None:
     write_cameras_txt(out / CAMERA, result.camera, result.colmap_model, result.camera_covariance)
     save(out / TARGET, target_toml(result.target_design))
     save(out / BOARD, board_toml(result.board_design))
-    report = report_json(result)
+    report = report_of(result).content()
     faces = FacesFile.of(
         result.target,
         result.target_design,

@@ -22,7 +22,7 @@ def report_html(report: dict, overlays: dict[str, bytes]) -> str:
 
     Parameters
     ----------
-    report : what :func:`stcal.sfm.run.output.report_json` made
+    report : what :func:`stcal.sfm.run.output.report_of` made
     overlays : JPEG by image name
     """
     colours = figures.group_colours([group["name"] for group in report["groups"]])

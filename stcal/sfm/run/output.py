@@ -1,6 +1,5 @@
 """``report.json``: everything that tells how far to trust the result."""
 
-from dataclasses import asdict
 from itertools import combinations
 
 import numpy as np
@@ -8,86 +7,86 @@ import numpy as np
 import stcal
 from stcal.geometry.plane import fit_plane
 from stcal.labels import DotLabel
-from stcal.sfm.checks.verdict import Check
 from stcal.sfm.data.model import MIN_POINTS, GroupModel
 from stcal.sfm.data.observations import ImageObservations
 from stcal.sfm.mapping.resect import MIN_RAY_ANGLE_RAD
+from stcal.sfm.run.report import ReportFile
 from stcal.sfm.run.result import RunResult
 
 MICRO = 1e3
 
 
-def report_json(result: RunResult) -> dict:
-    """The content of ``report.json``."""
+def report_of(result: RunResult) -> ReportFile:
+    """The report of a run."""
     models = _final_models(result)
     residual = {name: model.residuals_px(result.calibration.camera) for name, model in models.items()}
     everything = np.concatenate(list(residual.values()))
-    return {
-        "format": "stcal report 1",
-        "version": stcal.__version__,
-        "target": result.target_design.name,
-        "reference_face": result.target.reference_face,
-        "options": {
-            "solve": result.options.solve,
-            "frame": result.options.frame,
-            "eccentricity": result.options.eccentricity,
-            "max_pair_angle_deg": round(float(np.degrees(result.options.pairs.limit_rad())), 9),
-        },
-        "camera": {
-            "model": result.colmap_model,
-            "size_px": [result.camera.width, result.camera.height],
-            "focal_px": result.calibration.camera.focal.tolist(),
-            "centre_px": result.calibration.camera.centre.tolist(),
-            "distortion": result.calibration.camera.distortion.tolist(),
-        },
-        "summary": {
-            "files": len(result.detection.images) + len(result.detection.skipped),
-            "images": len(result.labelled),
-            "images_mapped": sum(len(model.images) for model in models.values()),
-            "groups": len(models),
-            "faces": len(result.target.target_from_face),
-            "faces_not_seen": [f.id for f in result.target_design.faces if f.id not in result.target.target_from_face],
-            "observations": len(everything),
-            "residual_rms_px": float(np.sqrt((everything**2).mean())),
-            "centre_sigma_rms_px": float(np.sqrt(np.concatenate([m.sigma_px() ** 2 for m in models.values()]).mean())),
-            "sigma_factor": result.calibration.sigma_factor,
-            "scale_sigma_ppm": None if result.target.scale_sigma is None else 1e6 * result.target.scale_sigma,
-            "sigma0": result.calibration.joint.sigma0 if result.calibration.joint else None,
-            "redundancy": result.calibration.joint.redundancy if result.calibration.joint else None,
-            "last_move_px": result.calibration.joint.last_move_px if result.calibration.joint else None,
-        },
-        "faces": {face: _face(result, face) for face in result.target.target_from_face},
-        "between_faces": _between(result),
-        "chains": {
-            face: [
-                {
-                    "faces": list(chain.faces),
-                    "groups": list(chain.groups),
-                    "translation_um": MICRO * chain.translation_mm,
-                    "rotation_mdeg": MICRO * float(np.degrees(chain.rotation_rad)),
-                }
-                for chain in chains
-            ]
-            for face, chains in result.chains.items()
-        },
-        "checks": [_check(check) for check in result.checks],
-        "groups": [_group(result, solution) for solution in result.solutions],
-        "residuals_by_image": _by_image(models, residual),
-        "residuals_by_label": _by_label(models, residual),
-        "left_out": _left_out(result),
-        "notes": list(result.notes),
-        "images": [
-            {"image_id": i, "name": image.name, "group": image.group, "circles": len(image)}
-            for i, image in enumerate(result.observations(), start=1)
-        ],
-        "scene": _scene(result),
-    }
-
-
-def _check(check: Check) -> dict:
-    """A check as plain values."""
-    content = asdict(check)
-    return content | {"measured": list(content["measured"]), "names": list(check.names)}
+    return ReportFile.model_validate(
+        {
+            "format": "stcal report 1",
+            "version": stcal.__version__,
+            "target": result.target_design.name,
+            "reference_face": result.target.reference_face,
+            "options": {
+                "solve": result.options.solve,
+                "frame": result.options.frame,
+                "eccentricity": result.options.eccentricity,
+                "max_pair_angle_deg": round(float(np.degrees(result.options.pairs.limit_rad())), 9),
+            },
+            "camera": {
+                "model": result.colmap_model,
+                "size_px": [result.camera.width, result.camera.height],
+                "focal_px": result.calibration.camera.focal,
+                "centre_px": result.calibration.camera.centre,
+                "distortion": result.calibration.camera.distortion,
+            },
+            "summary": {
+                "files": len(result.detection.images) + len(result.detection.skipped),
+                "images": len(result.labelled),
+                "images_mapped": sum(len(model.images) for model in models.values()),
+                "groups": len(models),
+                "faces": len(result.target.target_from_face),
+                "faces_not_seen": [
+                    f.id for f in result.target_design.faces if f.id not in result.target.target_from_face
+                ],
+                "observations": len(everything),
+                "residual_rms_px": float(np.sqrt((everything**2).mean())),
+                "centre_sigma_rms_px": float(
+                    np.sqrt(np.concatenate([m.sigma_px() ** 2 for m in models.values()]).mean())
+                ),
+                "sigma_factor": result.calibration.sigma_factor,
+                "scale_sigma_ppm": None if result.target.scale_sigma is None else 1e6 * result.target.scale_sigma,
+                "sigma0": result.calibration.joint.sigma0 if result.calibration.joint else None,
+                "redundancy": result.calibration.joint.redundancy if result.calibration.joint else None,
+                "last_move_px": result.calibration.joint.last_move_px if result.calibration.joint else None,
+            },
+            "faces": {face: _face(result, face) for face in result.target.target_from_face},
+            "between_faces": _between(result),
+            "chains": {
+                face: [
+                    {
+                        "faces": list(chain.faces),
+                        "groups": list(chain.groups),
+                        "translation_um": MICRO * chain.translation_mm,
+                        "rotation_mdeg": MICRO * float(np.degrees(chain.rotation_rad)),
+                    }
+                    for chain in chains
+                ]
+                for face, chains in result.chains.items()
+            },
+            "checks": result.checks,
+            "groups": [_group(result, solution) for solution in result.solutions],
+            "residuals_by_image": _by_image(models, residual),
+            "residuals_by_label": _by_label(models, residual),
+            "left_out": _left_out(result),
+            "notes": list(result.notes),
+            "images": [
+                {"image_id": i, "name": image.name, "group": image.group, "circles": len(image)}
+                for i, image in enumerate(result.observations(), start=1)
+            ],
+            "scene": _scene(result),
+        }
+    )
 
 
 def _final_models(result: RunResult) -> dict[str, GroupModel]:
@@ -104,11 +103,11 @@ def _face(result: RunResult, face_id: str) -> dict:
     covariance = result.target.face_covariance.get(face_id)
     sigma = None if covariance is None else np.sqrt(np.maximum(np.diag(covariance), 0))
     return {
-        "target_from_face": pose.matrix().tolist(),
-        "translation_mm": pose.translation.tolist(),
+        "target_from_face": pose,
+        "translation_mm": pose.translation,
         "angle_to_reference_deg": float(np.degrees(np.arccos(np.clip(pose.rotation[2, 2], -1, 1)))),
-        "translation_sigma_um": None if sigma is None else (MICRO * sigma[3:]).tolist(),
-        "rotation_sigma_mdeg": None if sigma is None else (MICRO * np.degrees(sigma[:3])).tolist(),
+        "translation_sigma_um": None if sigma is None else MICRO * sigma[3:],
+        "rotation_sigma_mdeg": None if sigma is None else MICRO * np.degrees(sigma[:3]),
         "circles": len(labels),
         "circles_of_design": len(result.target_design.face(face_id).ids),
         "plane_rms_um": MICRO * fit_plane(np.array([result.target.circles[label] for label in labels])).rms,
@@ -166,8 +165,7 @@ def _group(result: RunResult, solution) -> dict:
             "board_mean_um": MICRO * scale.mean_mm(),
             "board_rms_um": MICRO * scale.rms_mm(),
             "board_residuals_um": {
-                label: (MICRO * residual).tolist()
-                for label, residual in zip(scale.labels, scale.residuals_mm, strict=True)
+                label: MICRO * residual for label, residual in zip(scale.labels, scale.residuals_mm, strict=True)
             },
         },
     }
@@ -244,7 +242,7 @@ def _left_out(result: RunResult) -> dict:
         own = [observed[name].observations for name in solution.model.images]
         circles += _without_point(solution.model, own, {(o.image, o.label) for o in solution.outliers})
     return {
-        "files": [asdict(skipped) for skipped in result.detection.skipped],
+        "files": result.detection.skipped,
         "images": images,
         "circles": circles,
         "notes": [{"image": name, "note": note} for name, each in observed.items() for note in each.notes],
@@ -284,14 +282,14 @@ def _scene(result: RunResult) -> dict:
                 {
                     "image": image,
                     "group": model.group,
-                    "position_mm": target_from_camera.translation.tolist(),
-                    "axes": target_from_camera.rotation.T.tolist(),
+                    "position_mm": target_from_camera.translation,
+                    "axes": target_from_camera.rotation.T,
                 }
             )
         dots = [i for i, label in enumerate(model.labels) if isinstance(label, DotLabel)]
-        boards[model.group] = model.xyz_world[dots].tolist()
+        boards[model.group] = model.xyz_world[dots]
     return {
         "cameras": cameras,
         "boards": boards,
-        "circles": {label: xyz.tolist() for label, xyz in result.target.circles.items()},
+        "circles": result.target.circles,
     }

@@ -22,6 +22,7 @@ from stcal.sfm.detect.ellipses import EllipseOptions
 from stcal.sfm.mapping.pairs import PairOptions
 from stcal.sfm.run.marker import MarkerFile
 from stcal.sfm.run.options import RunOptions
+from stcal.sfm.run.report import ReportRead
 
 CAMERA, TARGET, BOARD = "cameras.txt", "target.toml", "board.toml"
 """Copies of what the run was given."""
@@ -83,7 +84,7 @@ def load_run(folder: str | Path) -> SavedRun:
         own = checked(marker, MarkerFile)
         options, images = _options(own.options).settled(target), Path(own.images)
     with _as_written(folder / "report.json"):
-        names = _require_report(report)
+        names = checked(report, ReportRead).names()
     with _as_written(folder / "faces.json"):
         result = checked(faces, FacesFile)
     with _as_written(folder / "labels.csv"):
@@ -107,18 +108,6 @@ def _as_written(path: Path) -> Iterator[None]:
     except (OSError, LookupError, TypeError, ValueError, AttributeError, csv.Error, StcalError) as error:
         reason = f"no {error}" if isinstance(error, KeyError) else error
         raise InputError(f"{path}: damaged, or of another version ({reason}); run it again") from error
-
-
-def _require_report(report: dict) -> list[tuple[str, str, int]]:
-    """(name, group, circles) of the images in the database's order; what later commands read is there."""
-    names = [(each["name"], each["group"], each["circles"]) for each in report["images"]]
-    pairs = {each["name"]: each["pairs"][0] for each in report["groups"]}
-    for group in {group for _, group, _ in names}:
-        own = {name for name, of, _ in names if of == group}
-        if not {pairs[group]["first"], pairs[group]["second"]} <= own:
-            raise ValueError(f"group {group}: its initial pair is not of its images")
-    float(report["summary"]["residual_rms_px"])
-    return names
 
 
 def _labels(path: Path, names: list[tuple[str, str, int]], camera: Camera, known: Collection[str]):

@@ -203,8 +203,8 @@ WRONG = {
     "no such choice": ("stcal-run.json", lambda c: c["options"].update(solve="guess"), "solve 'guess'"),
     "no such face": ("stcal-run.json", lambda c: c["options"].update(reference_face="9"), "no face 9"),
     "images a number": ("stcal-run.json", lambda c: c.update(images=3), "images: 3: "),
-    "report's images a list of names": ("report.json", lambda c: c.update(images=["a", "b"]), "indices"),
-    "a group without pairs": ("report.json", lambda c: c["groups"][0].update(pairs=[]), "index out of range"),
+    "report's images a list of names": ("report.json", lambda c: c.update(images=["a", "b"]), "images.1: 'a': "),
+    "a group without pairs": ("report.json", lambda c: c["groups"][0].update(pairs=[]), "groups.1.pairs: []: "),
     "a group missing": ("report.json", lambda c: c["groups"].pop(), "no '14'"),
     "another group's pair": (
         "report.json",
