@@ -47,7 +47,7 @@ def is_silently_wrong(found: Registration, truth: Rigid) -> bool:
     error = parameter_error(found.b_from_a, truth)
     size = error @ np.linalg.solve(found.covariance, error) / len(error)
     told = found.ambiguous or found.alternative is not None or any("bent" in note for note in found.notes)
-    return bool(size > fisher.isf(ONE_IN, len(error), found.dof)) and not told
+    return bool(size > fisher.isf(ONE_IN, len(error), found.redundancy)) and not told
 
 
 def trials_of(count: int, n: int, share: float, kind: str) -> str:
@@ -173,7 +173,7 @@ def _calibrated(title, count, model, n, share, threshold=None, given=False, unde
             stated = root @ np.swapaxes(root, 1, 2) / understated
         found = register(s.xyz_a, xyz_b, model=model, covariances=stated, threshold_mm=threshold, folds=0, seed=trial)
         error = parameter_error(found.b_from_a, truth)
-        spread = (found.dof - 2) / found.dof if np.isfinite(found.dof) else 1.0
+        spread = (found.redundancy - 2) / found.redundancy if np.isfinite(found.redundancy) else 1.0
         sizes.append(error @ np.linalg.solve(found.covariance, error) / len(error) * spread)
         # about the points' middle, where rotation and translation are independent
         shift = _about(found, np.array(CENTRE_MM))

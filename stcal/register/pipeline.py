@@ -1,6 +1,6 @@
 """Registration of two instruments from corresponding points: the calls in order; read this first."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from functools import partial
 
@@ -8,9 +8,10 @@ import numpy as np
 
 from stcal.errors import DegenerateError, InputError
 from stcal.parallel import one_thread
-from stcal.register.core.covariance import Noise, covariance_of, noise_of, sigma_within
+from stcal.register.core.covariance import covariance_of, sigma_within
 from stcal.register.core.liu2017 import Liu2017Options, liu2017
-from stcal.register.core.models import MODELS, Model, fit, parts, squares
+from stcal.register.core.models import MODELS, parts, squares
+from stcal.register.core.problem import Problem, noise_of
 from stcal.register.core.result import Alternative, Registration
 from stcal.register.core.robust import (
     AS_GOOD,
@@ -32,7 +33,8 @@ from stcal.register.judge.notes import Subject, notes_of
 METHODS = ("robust", "least-squares", "liu2017")
 SUSPICIOUS_SHARE = 0.5
 SUSPICIOUS_SIGMA = 0.05
-"""Fewer inliers, or a σ above this share of the points' spread: a mirrored frame is tried."""
+"""With fewer inliers, or a σ above this share of the points' RMS distance from their middle, a mirrored frame is
+tried. Both are met long before a mirrored frame is found; the trial costs time only."""
 
 
 @one_thread()
@@ -88,6 +90,10 @@ def register(
     lines : sequence of int, optional
         Lines of a file that messages name the points by; else rows, from 1.
 
+    Returns
+    -------
+    Registration
+
     Raises
     ------
     InputError
@@ -97,51 +103,50 @@ def register(
     ConvergenceError
         A fit with covariances did not settle.
     """
-    a, b, chosen, noise = _checked(xyz_a, xyz_b, model, method, threshold_mm, weights, covariances)
-    if chosen.name == "rigid":
-        check_units(a, b, seed)
+    problem = _checked(xyz_a, xyz_b, model, method, threshold_mm, weights, covariances)
+    if problem.model.name == "rigid":
+        check_units(problem.xyz_a, problem.xyz_b, seed)
     if method == "robust":
-        fit_rows = partial(_robust_rows, chosen, a, b, noise, threshold_mm, seed)
-        fitted, other = _robust(chosen, a, b, noise, threshold_mm, seed)
+        again: Callable[[Problem], Fitted] = partial(robust_fit, threshold=threshold_mm, seed=seed)
+        fitted, other = _robust(problem, threshold_mm, seed)
     else:
-        if method == "least-squares":
-            fit_rows = partial(_least_squares, chosen, a, b, noise)
-        else:
-            fit_rows = partial(_liu2017, a, b, _liu2017_options(liu2017_options, threshold_mm), seed)
-        fitted, other = fit_rows(np.arange(len(a))), None
-    _check_geometry(chosen, method, a, b, fitted, lines)
-    inliers = fitted.inliers
-    alternative = None if other is None else _alternative(fitted, other, a)
-    ambiguous = alternative is not None and len(alternative.rows) >= AS_GOOD * inliers.sum()
-    if ambiguous and not allow_ambiguous:
+        published = partial(_liu2017, options=_liu2017_options(liu2017_options, threshold_mm), seed=seed)
+        again = _least_squares if method == "least-squares" else published
+        fitted, other = again(problem), None
+    _check_geometry(problem, method, fitted, lines)
+    alternative = None if other is None else _alternative(fitted, other, problem.xyz_a)
+    ambiguous = alternative is not None and len(alternative.rows) >= AS_GOOD * fitted.inliers.sum()
+    if alternative is not None and ambiguous and not allow_ambiguous:
         raise DegenerateError(
-            f"registration: {inliers.sum()} point pairs agree on one transform and {len(alternative.rows)} others on "
-            f"another, {alternative.apart_mm:.4g} mm from it; register one group of rows alone, or allow ambiguous "
-            "answers"
+            f"registration: {fitted.inliers.sum()} point pairs agree on one transform and {len(alternative.rows)} "
+            f"others on another, {alternative.apart_mm:.4g} mm from it; register one group of rows alone, or allow "
+            "ambiguous answers"
         )
-    covariance, scaled, dof = covariance_of(
-        chosen, fitted.transform, a[inliers], noise[inliers], fitted.sigma, fitted.threshold
+    covariance = covariance_of(problem[fitted.inliers], fitted.transform, fitted.sigma, fitted.threshold)
+    given = problem.noise.sigma_mm
+    subject = Subject(
+        problem=problem,
+        method=method,
+        fitted=fitted,
+        alternative=alternative,
+        ambiguous=ambiguous,
+        covariance=covariance,
+        factor=None if given is None else fitted.sigma / given,
+        lines=lines,
     )
-    residuals = b - fitted.transform @ a
-    length = np.linalg.norm(residuals[inliers], axis=1)
-    factor = None if noise.sigma_mm is None else fitted.sigma / noise.sigma_mm
-    subject = Subject(chosen, method, a, b, fitted, alternative, ambiguous, factor if scaled else None, dof, lines)
     return Registration(
-        model=chosen.name,
+        model=problem.model.name,
         method=method,
         b_from_a=fitted.transform,
-        covariance=covariance,
-        inliers=inliers,
-        residuals=residuals,
+        covariance=covariance.matrix,
+        inliers=fitted.inliers,
+        residuals=problem.residuals(fitted.transform),
         sigma_mm=fitted.sigma,
-        dof=dof,
-        threshold_mm=fitted.threshold,
-        mean_mm=float(length.mean()),
-        rms_mm=float(np.sqrt((length**2).mean())),
-        max_mm=float(length.max()),
-        sigma_factor=factor,
-        scaled=scaled,
-        held_out=held_out(lambda rows: fit_rows(rows).transform, a, b, inliers, folds, chosen.sample + 1, seed),
+        redundancy=covariance.redundancy,
+        threshold_mm=fitted.threshold if np.isfinite(fitted.threshold) else None,
+        sigma_factor=subject.factor,
+        scaled=covariance.scaled,
+        held_out=_held_out(problem, again, fitted.inliers, folds, seed),
         ambiguous=ambiguous,
         alternative=alternative,
         notes=tuple(notes_of(subject)),
@@ -150,9 +155,7 @@ def register(
     )
 
 
-def _checked(
-    xyz_a, xyz_b, model: str, method: str, threshold_mm, weights, covariances
-) -> tuple[np.ndarray, np.ndarray, Model, Noise]:
+def _checked(xyz_a, xyz_b, model: str, method: str, threshold_mm: float | None, weights, covariances) -> Problem:
     a, b = np.asarray(xyz_a, float), np.asarray(xyz_b, float)
     if a.ndim != 2 or a.shape[1:] != (3,) or a.shape != b.shape:
         raise InputError(f"registration: points of shapes {a.shape} and {b.shape}; (n, 3) twice needed")
@@ -169,29 +172,39 @@ def _checked(
     if method == "liu2017" and (weights is not None or covariances is not None):
         raise InputError("registration: method liu2017 knows no weights or covariances; leave them out")
     chosen = MODELS["affine" if method == "liu2017" else model]
-    if len(a) < chosen.sample or chosen.freedom(len(a)) <= 0:
-        needed = max(chosen.sample, chosen.parameters // 3 + 1)
-        raise DegenerateError(f"registration: {len(a)} point pairs, {needed} needed for the {chosen.name} model")
-    return a, b, chosen, noise_of(len(a), weights, covariances)
+    if len(a) < chosen.needed:
+        raise DegenerateError(f"registration: {len(a)} point pairs, {chosen.needed} needed for the {chosen.name} model")
+    return Problem(chosen, a, b, noise_of(len(a), weights, covariances))
 
 
-def _check_geometry(model: Model, method: str, a, b, fitted: Fitted, lines: Sequence[int] | None) -> None:
+def _held_out(problem: Problem, again: Callable[[Problem], Fitted], inliers: np.ndarray, folds: int, seed: int):
+    return held_out(
+        lambda rows: again(problem[rows]).transform,
+        problem.xyz_a,
+        problem.xyz_b,
+        inliers,
+        folds,
+        problem.model.sample + 1,
+        seed,
+    )
+
+
+def _check_geometry(problem: Problem, method: str, fitted: Fitted, lines: Sequence[int] | None) -> None:
     """Refuse mirrored frames, and points that do not determine the model; the baseline runs as it was published."""
     if method == "liu2017":
         return
-    inliers = fitted.inliers
-    check_mirrored(model, a[inliers], b[inliers])
-    check_extent(model, a[inliers], fitted.sigma)
-    if method == "robust" and not inliers.all():
-        check_supports(model, a, inliers, fitted.sigma, lambda row: row_name(row, lines))
+    inside = problem[fitted.inliers]
+    check_mirrored(problem.model, inside.xyz_a, inside.xyz_b)
+    check_extent(problem.model, inside.xyz_a, fitted.sigma)
+    if method == "robust" and not fitted.inliers.all():
+        check_supports(problem.model, problem.xyz_a, fitted.inliers, fitted.sigma, lambda row: row_name(row, lines))
 
 
-def _least_squares(model: Model, a: np.ndarray, b: np.ndarray, noise: Noise, rows: np.ndarray) -> Fitted:
-    a, b, noise = a[rows], b[rows], noise[rows]
-    transform = fit(model, a, b, noise.precision)
-    total = squares(b - transform @ a, noise.precision).sum()
-    sigma = sigma_within(float(total), model, len(a), None)
-    return Fitted(transform, np.ones(len(a), bool), sigma, None)
+def _least_squares(problem: Problem) -> Fitted:
+    transform = problem.fit()
+    total = problem.squares(transform).sum()
+    sigma = sigma_within(float(total), problem.model, len(problem), np.inf)
+    return Fitted(transform, np.ones(len(problem), bool), sigma, np.inf)
 
 
 def _liu2017_options(options: Liu2017Options | None, threshold_mm: float | None) -> Liu2017Options:
@@ -199,80 +212,76 @@ def _liu2017_options(options: Liu2017Options | None, threshold_mm: float | None)
     return options if threshold_mm is None else replace(options, limit_mm=threshold_mm)
 
 
-def _liu2017(a: np.ndarray, b: np.ndarray, options: Liu2017Options, seed: int, rows: np.ndarray) -> Fitted:
-    a, b = a[rows], b[rows]
-    found = liu2017(a, b, options, seed)
+def _liu2017(problem: Problem, options: Liu2017Options, seed: int) -> Fitted:
+    found = liu2017(problem.xyz_a, problem.xyz_b, options, seed)
     near = found.inliers
-    total = squares((b - found.b_from_a @ a)[near]).sum()
+    total = squares(problem.residuals(found.b_from_a)[near]).sum()
     sigma = float(np.sqrt(total / (3 * near.sum())))
     return Fitted(found.b_from_a, near, sigma, options.limit_mm, options.tries)
 
 
-def _robust_rows(model: Model, a, b, noise: Noise, threshold: float | None, seed: int, rows: np.ndarray) -> Fitted:
-    return robust_fit(model, a[rows], b[rows], noise[rows], threshold, seed)
-
-
-def _robust(
-    model: Model, a: np.ndarray, b: np.ndarray, noise: Noise, threshold: float | None, seed: int
-) -> tuple[Fitted, Fitted | None]:
+def _robust(problem: Problem, threshold: float | None, seed: int) -> tuple[Fitted, Fitted | None]:
     """The fit, and another one that other points agree on."""
     try:
-        fitted = robust_fit(model, a, b, noise, threshold, seed)
-        _beyond_chance(model, fitted, a, b)
+        fitted = robust_fit(problem, threshold, seed)
+        _check_chance(problem, fitted)
     except DegenerateError:
-        _check_mirrored_with_outliers(model, None, a, b, noise, threshold, seed)
+        _check_mirrored_with_outliers(problem, None, threshold, seed)
         raise
-    spread = np.sqrt(np.var(a[fitted.inliers], axis=0).sum())
-    if fitted.inliers.mean() < SUSPICIOUS_SHARE or fitted.sigma > SUSPICIOUS_SIGMA * spread:
-        _check_mirrored_with_outliers(model, fitted, a, b, noise, threshold, seed)
+    size = np.sqrt(np.var(problem.xyz_a[fitted.inliers], axis=0).sum())
+    if fitted.inliers.mean() < SUSPICIOUS_SHARE or fitted.sigma > SUSPICIOUS_SIGMA * size:
+        _check_mirrored_with_outliers(problem, fitted, threshold, seed)
     inside = np.flatnonzero(fitted.inliers)
-    groups = two_groups(model, a[inside], b[inside], noise[inside], np.random.default_rng([seed, 4]))
+    groups = two_groups(problem[inside], np.random.default_rng([seed, 4]))
     if groups is None or groups.in_space:
-        return fitted, alternative_fit(model, fitted, a, b, noise, seed)
-    apart = [squares(b[inside] - t @ a[inside], noise[inside].precision) for t in groups.transforms]
-    first = np.zeros(len(a), bool)
+        return fitted, alternative_fit(problem, fitted, seed)
+    apart = [problem[inside].squares(t) for t in groups.transforms]
+    first = np.zeros(len(problem), bool)
     first[inside[apart[0] <= apart[1]]] = True
     second = fitted.inliers & ~first
-    one = settled(model, a, b, noise, first, threshold)
+    one = settled(problem, first, threshold)
     if (one.inliers & second).sum() < second.sum() / 2:
-        return one, alternative_fit(model, one, a, b, noise, seed)
-    return _as_assigned(model, a, b, noise, first, threshold), _as_assigned(model, a, b, noise, second, threshold)
+        return one, alternative_fit(problem, one, seed)
+    return _as_assigned(problem, first, threshold), _as_assigned(problem, second, threshold)
 
 
-def _as_assigned(model: Model, a, b, noise: Noise, group: np.ndarray, threshold: float | None) -> Fitted:
+def _as_assigned(problem: Problem, group: np.ndarray, threshold: float | None) -> Fitted:
     """The fit to a group too near the other one for a threshold between them: that of its own σ reaches into it."""
-    transform = fit(model, a[group], b[group], noise[group].precision)
-    square = squares(b[group] - transform @ a[group], noise[group].precision)
-    sigma = sigma_within(float(square.sum()), model, int(group.sum()), threshold)
+    part = problem[group]
+    transform = part.fit()
+    square = part.squares(transform)
+    sigma = sigma_within(float(square.sum()), part.model, len(part), threshold or np.inf)
     return Fitted(transform, group, sigma, threshold or float(np.sqrt(square.max())))
 
 
-def _beyond_chance(model: Model, fitted: Fitted, a: np.ndarray, b: np.ndarray) -> None:
-    if len(a) > model.sample and chance(model, fitted, a, b) > np.log(BY_CHANCE):
+def _check_chance(problem: Problem, fitted: Fitted) -> None:
+    if len(problem) > problem.model.sample and chance(problem, fitted) > np.log(BY_CHANCE):
         raise DegenerateError(
-            f"registration: {fitted.inliers.sum()} of {len(a)} point pairs agree to {fitted.sigma:.4g} mm, no better "
-            "than chance; check that row i of both is the same point"
+            f"registration: {fitted.inliers.sum()} of {len(problem)} point pairs agree to {fitted.sigma:.4g} mm, no "
+            "better than chance; check that row i of both is the same point"
         )
 
 
-def _check_mirrored_with_outliers(model: Model, fitted: Fitted | None, a, b, noise, threshold, seed) -> None:
+def _check_mirrored_with_outliers(problem: Problem, fitted: Fitted | None, threshold: float | None, seed: int) -> None:
     """Refuse points of which far more agree, or far better, when a is mirrored."""
-    if model.name == "affine":
+    if problem.model.name == "affine":
         return
     flip = np.array([1, 1, -1.0])
+    image = replace(problem, xyz_a=problem.xyz_a * flip)
     try:
-        mirrored = robust_fit(model, a * flip, b, noise, threshold, seed)
+        mirrored = robust_fit(image, threshold, seed)
     except DegenerateError:
         return
     if mirrored.inliers.mean() < LEAST_SHARE:  # points near any one plane fit
         return
-    usual = 0.0 if fitted is None else chance(model, fitted, a, b)
-    if chance(model, mirrored, a * flip, b) < 2 * usual + np.log(BY_CHANCE) and (
+    usual = 0.0 if fitted is None else chance(problem, fitted)
+    if chance(image, mirrored) < 2 * usual + np.log(BY_CHANCE) and (
         fitted is None or mirrored.inliers.sum() > fitted.inliers.sum() or mirrored.sigma < fitted.sigma / 2
     ):
-        scale = 1 if fitted is None else fitted.sigma / mirrored.sigma
+        times = 1 if fitted is None else fitted.sigma / mirrored.sigma
         linear = parts(mirrored.transform)[0]
-        raise mirrored_error(linear / np.cbrt(np.linalg.det(linear)) * flip, mirrored.inliers.sum(), len(a), scale)
+        rotation = linear / np.cbrt(np.linalg.det(linear))
+        raise mirrored_error(rotation * flip, mirrored.inliers.sum(), len(problem), times)
 
 
 def _alternative(fitted: Fitted, other: Fitted, a: np.ndarray) -> Alternative:

@@ -4,6 +4,7 @@ Residuals are b − b_from_a a in frame b. What noise they have is given by ``pr
 (n,) for weights 1/σ², (n, 3, 3) for inverse covariances.
 """
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
@@ -26,14 +27,29 @@ CHUNK = 100_000
 
 @dataclass(frozen=True, slots=True)
 class Model:
-    """``parameters`` : how many; ``sample`` : the fewest point pairs that determine them."""
+    """A kind of transform.
+
+    Parameters
+    ----------
+    name : str
+        ``rigid``, ``similarity`` or ``affine``.
+    parameters : int
+        How many it has.
+    sample : int
+        The fewest point pairs that determine them.
+    """
 
     name: str
     parameters: int
     sample: int
 
-    def freedom(self, n: int) -> int:
-        """Degrees of freedom of a fit to n point pairs."""
+    @property
+    def needed(self) -> int:
+        """The fewest point pairs of a fit with redundancy."""
+        return max(self.sample, self.parameters // 3 + 1)
+
+    def redundancy(self, n: int) -> int:
+        """Of a fit to n point pairs."""
         return 3 * n - self.parameters
 
 
@@ -56,8 +72,15 @@ def fit(model: Model, xyz_a: np.ndarray, xyz_b: np.ndarray, precision: np.ndarra
 
     Parameters
     ----------
-    xyz_a, xyz_b : (n, 3) arrays, mm
+    model : Model
+    xyz_a, xyz_b : (n, 3) arrays
+        mm; row i of both is the same point.
     precision : (n,) or (n, 3, 3) array, optional
+        Weights, or inverse covariances in frame b.
+
+    Returns
+    -------
+    Rigid, Similarity or Affine
 
     Raises
     ------
@@ -77,7 +100,7 @@ def fit(model: Model, xyz_a: np.ndarray, xyz_b: np.ndarray, precision: np.ndarra
     for _ in range(MAX_STEPS):
         origin, normal, right = _normal_equations(model, transform, xyz_a, precision, xyz_b)
         step = np.linalg.solve(normal, right)
-        transform = _moved(model, transform, origin, step)
+        transform = _moved(transform, origin, step)
         if (np.abs(step) * np.sqrt(np.diag(normal)) <= SETTLED * (1 + np.sqrt(len(xyz_a)))).all():
             return transform
     raise ConvergenceError(
@@ -101,10 +124,24 @@ def rounding_mm(xyz_a: np.ndarray, xyz_b: np.ndarray) -> float:
 def unit_covariance(
     model: Model, transform: Transform, xyz_a: np.ndarray, precision: np.ndarray | None = None
 ) -> np.ndarray:
-    """Covariance (p, p) of a fit's parameters at unit noise (1 mm, or the covariances that ``precision`` inverts).
+    """Covariance of a fit's parameters at unit noise (1 mm, or the covariances that ``precision`` inverts).
 
     Parameters of a left perturbation in frame b: rotation vector (rad) and translation (mm), R' = exp(w) R and
     t' = t + dt; then for a similarity its relative scale, s' = s (1 + ds). Affine: rows of the 3×4 matrix.
+
+    Parameters
+    ----------
+    model : Model
+    transform : Rigid, Similarity or Affine
+        b_from_a.
+    xyz_a : (n, 3) array
+        The points fitted, mm.
+    precision : (n,) or (n, 3, 3) array, optional
+        As of :func:`fit`.
+
+    Returns
+    -------
+    (p, p) array
     """
     origin, normal, _ = _normal_equations(model, transform, xyz_a, precision)
     to_origin = _to_origin(model, transform, origin)
@@ -116,21 +153,35 @@ def unit_covariance(
 def leverages(
     model: Model, transform: Transform, xyz_a: np.ndarray, used: np.ndarray, precision: np.ndarray | None = None
 ) -> np.ndarray:
-    """What the uncertainty of the fit to the points ``used`` (mask) adds to every point's residual, (n, 3, 3).
+    """What the uncertainty of the fit adds to every point's residual.
 
     H = Lᵀ J N⁻¹ Jᵀ L with P = L Lᵀ: whitened residuals Lᵀ r have covariance 1 − H for points that were used and 1 + H
     for others. An eigenvalue of 1 is a direction in which no other point checks this one.
+
+    Parameters
+    ----------
+    model, transform, precision :
+        As of :func:`unit_covariance`.
+    xyz_a : (n, 3) array
+        All points, mm.
+    used : (n,) bool array
+        Those that were fitted.
+
+    Returns
+    -------
+    (n, 3, 3) array
+        H of each point.
     """
     p = None if precision is None else precision[used]
     origin, normal, _ = _normal_equations(model, transform, xyz_a[used], p)
-    slope = jacobian(model, transform, xyz_a - origin)
-    spread = slope @ np.linalg.inv(normal) @ np.swapaxes(slope, 1, 2)
+    by_step = jacobian(model, transform, xyz_a - origin)
+    covariance = by_step @ np.linalg.inv(normal) @ np.swapaxes(by_step, 1, 2)
     if precision is None:
-        return spread
+        return covariance
     if precision.ndim == 1:
-        return spread * precision[:, None, None]
+        return covariance * precision[:, None, None]
     root = np.linalg.cholesky(precision)
-    return np.swapaxes(root, 1, 2) @ spread @ root
+    return np.swapaxes(root, 1, 2) @ covariance @ root
 
 
 def whitened(residuals: np.ndarray, precision: np.ndarray | None = None) -> np.ndarray:
@@ -143,9 +194,19 @@ def whitened(residuals: np.ndarray, precision: np.ndarray | None = None) -> np.n
 
 
 def hypotheses(model: Model, xyz_a: np.ndarray, xyz_b: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Fits to many minimal samples at once: linear parts (s, 3, 3) and translations (s, 3) of b_from_a.
+    """Fits to many minimal samples at once. What degenerate samples give is finite and wrong.
 
-    ``xyz_a``, ``xyz_b`` : (s, m, 3). What degenerate samples give is finite and wrong.
+    Parameters
+    ----------
+    model : Model
+    xyz_a, xyz_b : (s, m, 3) arrays
+        m points of each of s samples, mm.
+
+    Returns
+    -------
+    linear : (s, 3, 3) array
+    translation : (s, 3) array
+        Of b_from_a, mm.
     """
     mean_a, mean_b = xyz_a.mean(1), xyz_b.mean(1)
     a, b = xyz_a - mean_a[:, None], xyz_b - mean_b[:, None]
@@ -160,23 +221,33 @@ def hypotheses(model: Model, xyz_a: np.ndarray, xyz_b: np.ndarray) -> tuple[np.n
 
 
 def jacobian(model: Model, transform: Transform, from_origin: np.ndarray) -> np.ndarray:
-    """Derivative (n, 3, p) of b_from_a a by the parameters (see :func:`unit_covariance`) about a point of a.
+    """Derivative of b_from_a a by the parameters (see :func:`unit_covariance`) about a point of a.
 
-    ``from_origin`` : (n, 3), a minus that point.
+    Parameters
+    ----------
+    model : Model
+    transform : Rigid, Similarity or Affine
+        b_from_a.
+    from_origin : (n, 3) array
+        Points of a minus that point, mm.
+
+    Returns
+    -------
+    (n, 3, p) array
     """
     n = len(from_origin)
-    slope = np.zeros((n, 3, model.parameters))
+    by_step = np.zeros((n, 3, model.parameters))
     if model.name == "affine":
         for row in range(3):
-            slope[:, row, 4 * row : 4 * row + 3] = from_origin
-            slope[:, row, 4 * row + 3] = 1
-        return slope
+            by_step[:, row, 4 * row : 4 * row + 3] = from_origin
+            by_step[:, row, 4 * row + 3] = 1
+        return by_step
     turned = from_origin @ parts(transform)[0].T
-    slope[:, :, :3] = -skew(turned)
-    slope[:, :, 3:6] = np.eye(3)
+    by_step[:, :, :3] = -skew(turned)
+    by_step[:, :, 3:6] = np.eye(3)
     if model.name == "similarity":
-        slope[:, :, 6] = turned
-    return slope
+        by_step[:, :, 6] = turned
+    return by_step
 
 
 def _normal_equations(
@@ -196,9 +267,9 @@ def _normal_equations(
         return origin, _isotropic_normal(model, transform, xyz_a - origin, weights), np.zeros(model.parameters)
     normal, right = np.zeros((model.parameters,) * 2), np.zeros(model.parameters)
     for rows in _chunks(len(xyz_a)):
-        slope = jacobian(model, transform, xyz_a[rows] - origin)
-        weighted = np.swapaxes(slope, 1, 2) @ precision[rows]
-        normal += (weighted @ slope).sum(0)
+        by_step = jacobian(model, transform, xyz_a[rows] - origin)
+        weighted = np.swapaxes(by_step, 1, 2) @ precision[rows]
+        normal += (weighted @ by_step).sum(0)
         if xyz_b is not None:
             residual = xyz_b[rows] - transform @ xyz_a[rows]
             right += (weighted @ residual[:, :, None]).sum((0, 2))
@@ -237,15 +308,15 @@ def _to_origin(model: Model, transform: Transform, origin: np.ndarray) -> np.nda
     return change
 
 
-def _moved(model: Model, transform: Transform, origin: np.ndarray, step: np.ndarray) -> Transform:
+def _moved(transform: Transform, origin: np.ndarray, step: np.ndarray) -> Transform:
     """The transform after a step of the parameters about ``origin``."""
-    if model.name == "affine":
+    if isinstance(transform, Affine):
         rows = step.reshape(3, 4)
         linear = transform.linear + rows[:, :3]
         return Affine(linear, transform @ origin + rows[:, 3] - linear @ origin)
     turn = Rigid.exp([*step[:3], 0, 0, 0]).rotation
     there = transform @ origin + step[3:6]
-    if model.name == "rigid":
+    if isinstance(transform, Rigid):
         rotation = turn @ transform.rotation
         return Rigid(rotation, there - rotation @ origin)
     scale, rotation = transform.scale * (1 + step[6]), turn @ transform.rigid.rotation
@@ -254,5 +325,5 @@ def _moved(model: Model, transform: Transform, origin: np.ndarray, step: np.ndar
     return Similarity(scale, Rigid(rotation, there - scale * rotation @ origin))
 
 
-def _chunks(n: int):
+def _chunks(n: int) -> Iterator[slice]:
     return (slice(i, i + CHUNK) for i in range(0, n, CHUNK))

@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 
 from stcal.errors import InputError
-from stcal.geometry.arrays import frozen
+from stcal.geometry.arrays import Array, freeze
 from stcal.io.table import LENGTHS, Table, read_table
 
 WHAT = "point pairs"
@@ -24,20 +24,20 @@ class Pairs:
 
     where: str
     lines: Sequence[int]
-    xyz_a: np.ndarray
-    xyz_b: np.ndarray
+    xyz_a: Array
+    xyz_b: Array
     weights: np.ndarray | None = None
     covariances: np.ndarray | None = None
 
     def __post_init__(self):
         n = len(self.lines)
-        object.__setattr__(self, "xyz_a", frozen(self.xyz_a, (n, 3), "points of a"))
-        object.__setattr__(self, "xyz_b", frozen(self.xyz_b, (n, 3), "points of b"))
+        freeze(self, "xyz_a", (n, 3), "points of a")
+        freeze(self, "xyz_b", (n, 3), "points of b")
         if self.weights is not None:
-            object.__setattr__(self, "weights", frozen(self.weights, (n,), "weights"))
+            freeze(self, "weights", (n,), "weights")
         if self.covariances is not None:
             shape = (n,) if np.ndim(self.covariances) == 1 else (n, 3, 3)
-            object.__setattr__(self, "covariances", frozen(self.covariances, shape, "covariances"))
+            freeze(self, "covariances", shape, "covariances")
 
     def __len__(self) -> int:
         return len(self.lines)
@@ -83,7 +83,7 @@ def _no_pair_twice(table: Table, rows: np.ndarray) -> None:
     near = np.flatnonzero(np.diff(key[order]) == 0)
     same = near[(rows[order[near]] == rows[order[near + 1]]).all(1)]
     if len(same):
-        first, again = sorted((order[same[0]], order[same[0] + 1]))
+        first, again = sorted((int(order[same[0]]), int(order[same[0] + 1])))
         more = f" (and {len(same) - 1} more)" if len(same) > 1 else ""
         raise InputError(
             f"{table.where}: line {table.lines[again]}: the same pair as on line {table.lines[first]}{more}; remove "

@@ -4,47 +4,84 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from stcal.geometry.arrays import frozen
+from stcal.geometry.arrays import Array, freeze
 from stcal.register.core.models import Transform
+
+
+@dataclass(frozen=True, slots=True)
+class ErrorFigures:
+    """Figures of the lengths |b − b_from_a a| of some points' errors; NaN where there are no points.
+
+    Parameters
+    ----------
+    points : int
+    mean_mm, rms_mm, max_mm : float
+    """
+
+    points: int
+    mean_mm: float
+    rms_mm: float
+    max_mm: float
+
+    @classmethod
+    def of(cls, lengths: np.ndarray) -> "ErrorFigures":
+        """Of lengths (n,), mm."""
+        if not len(lengths):
+            return cls(0, np.nan, np.nan, np.nan)
+        return cls(len(lengths), float(lengths.mean()), float(np.sqrt((lengths**2).mean())), float(lengths.max()))
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class HeldOut:
     """Errors |b − b_from_a a| of points that were left out of the fit, by cross-validation.
 
-    ``folds`` : parts, each left out once; ``rows`` : (m,) indices of the points tried (a sample where there are very
-    many); ``error_mm`` : (m,) of each; ``of_inliers`` and ``of_all`` : (mean, RMS, maximum), mm.
+    Parameters
+    ----------
+    folds : int
+        Parts, each left out once.
+    rows : (m,) int array
+        Indices of the points tried (a sample where there are very many).
+    error_mm : (m,) array
+    of_inliers, of_all : ErrorFigures
     """
 
     folds: int
-    rows: np.ndarray
-    error_mm: np.ndarray
-    of_inliers: tuple[float, float, float]
-    of_all: tuple[float, float, float]
+    rows: Array
+    error_mm: Array
+    of_inliers: ErrorFigures
+    of_all: ErrorFigures
 
     def __post_init__(self):
-        object.__setattr__(self, "rows", frozen(self.rows, (None,), "rows", int))
-        object.__setattr__(self, "error_mm", frozen(self.error_mm, (len(self.rows),), "held-out errors"))
+        freeze(self, "rows", (None,), "rows", int)
+        freeze(self, "error_mm", (len(self.rows),), "held-out errors")
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Alternative:
     """Another transform, which fits other points as well as the one found fits its own.
 
-    ``b_from_a`` : as of :class:`Registration`; ``rows`` : (m,) indices of its points; ``apart_mm`` : RMS distance
-    between the two transforms over all points; ``turn_rad`` : angle between them (0 for affine ones).
+    Parameters
+    ----------
+    b_from_a : Rigid, Similarity or Affine
+        As of :class:`Registration`.
+    rows : (m,) int array
+        Indices of its points.
+    apart_mm : float
+        RMS distance between the two transforms over all points.
+    turn_rad : float
+        Angle between their rotations.
     """
 
     b_from_a: Transform
-    rows: np.ndarray
+    rows: Array
     apart_mm: float
     turn_rad: float
 
     def __post_init__(self):
-        object.__setattr__(self, "rows", frozen(self.rows, (None,), "rows", int))
+        freeze(self, "rows", (None,), "rows", int)
 
 
-@dataclass(frozen=True, slots=True, eq=False)
+@dataclass(frozen=True, slots=True, eq=False, kw_only=True)
 class Registration:
     """The transform between two instruments' frames.
 
@@ -55,8 +92,8 @@ class Registration:
     b_from_a : Rigid, Similarity or Affine
     covariance : (6, 6), (7, 7) or (12, 12) array
         Of a left perturbation in frame b: rotation vector (rad), translation (mm), and a similarity's relative scale;
-        affine: the rows of the 3×4 matrix. σ is estimated with ``dof`` degrees of freedom: a region of confidence
-        takes its bound from F(p, dof), not from χ².
+        affine: the rows of the 3×4 matrix. σ is estimated with ``redundancy`` degrees of freedom: a region of
+        confidence takes its bound from F(p, redundancy), not from χ².
     inliers : (n,) bool array
         The points that the transform is fitted to.
     residuals : (n, 3) array
@@ -68,12 +105,10 @@ class Registration:
         is scaled by it only where the data contradict the σ given (``scaled``).
     scaled : bool
         Whether the covariance rests on the residuals; False where it rests on the σ given.
-    dof : float
+    redundancy : float
         Degrees of freedom of the σ that the covariance rests on; infinite where that was given.
     threshold_mm : float or None
         Inliers are nearer than this (a point of the σ above; at the points' middle); None without a threshold.
-    mean_mm, rms_mm, max_mm : float
-        Of the inliers' residual lengths.
     held_out : HeldOut or None
         None where not asked for, or with too few points.
     ambiguous : bool
@@ -88,15 +123,12 @@ class Registration:
     model: str
     method: str
     b_from_a: Transform
-    covariance: np.ndarray
-    inliers: np.ndarray
-    residuals: np.ndarray
+    covariance: Array
+    inliers: Array
+    residuals: Array
     sigma_mm: float
-    dof: float
+    redundancy: float
     threshold_mm: float | None
-    mean_mm: float
-    rms_mm: float
-    max_mm: float
     sigma_factor: float | None = None
     scaled: bool = True
     held_out: HeldOut | None = None
@@ -107,13 +139,18 @@ class Registration:
     samples: int = 0
 
     def __post_init__(self):
-        object.__setattr__(self, "residuals", frozen(self.residuals, (None, 3), "residuals"))
-        object.__setattr__(self, "inliers", frozen(self.inliers, (len(self.residuals),), "inliers", bool))
+        freeze(self, "residuals", (None, 3), "residuals")
+        freeze(self, "inliers", (len(self.residuals),), "inliers", bool)
         p = len(self.covariance)
-        object.__setattr__(self, "covariance", frozen(self.covariance, (p, p), "covariance"))
+        freeze(self, "covariance", (p, p), "covariance")
 
     def __len__(self) -> int:
         return len(self.residuals)
+
+    @property
+    def inlier_errors(self) -> ErrorFigures:
+        """Of the inliers' residuals."""
+        return ErrorFigures.of(np.linalg.norm(self.residuals[self.inliers], axis=1))
 
     @property
     def outliers(self) -> np.ndarray:

@@ -17,17 +17,21 @@ from scipy.stats import chi2
 from scipy.stats import f as fisher
 
 from stcal.errors import DegenerateError
-from stcal.register.core.covariance import Noise, sigma_within
-from stcal.register.core.models import Model, Transform, fit, leverages, parts, rounding_mm, squares, whitened
-from stcal.register.core.search import FALSE_ALARMS, LEAST_FREEDOM, Consensus, Score, by_scale, by_threshold, search
+from stcal.register.core.covariance import sigma_within
+from stcal.register.core.models import Model, Transform, leverages, parts
+from stcal.register.core.problem import Problem
+from stcal.register.core.search import FALSE_ALARMS, LEAST_REDUNDANCY, Consensus, by_scale, by_threshold, search
 
 SUBSET = 500
 """Samples are scored on so many points: σ is then known to 2 %, shares to 2 %."""
 CLEAN_SETS_WITH_OUTLIER = 0.001
+"""Sets without outliers in which one point or more is called one."""
 LEVERAGE_UP_TO = 10_000
 """With more points the fit's own uncertainty adds under 0.02 % to a residual."""
 MAX_ROUNDS = 50
+"""Of fit, σ and inliers; a set that comes again ends them earlier."""
 NESTED = 6
+"""Consensus within a consensus: gross errors hide smaller ones."""
 BY_CHANCE = 0.01
 """Sets that random points would give and that are taken for a transform: so many in one file."""
 DISTINCT = 5.0
@@ -35,13 +39,26 @@ DISTINCT = 5.0
 MOST_OF_REST = 0.5
 """Of many outliers some always lie near some transform; half of them do for a reason."""
 AS_GOOD = 0.5
-"""Another transform with this share of the points of the one found makes the answer ambiguous: with up to 60 % wrong
+"""A second transform with this share of the points of the one found makes the answer ambiguous: with up to 60 % wrong
 points, all in one other motion, the true ones are 40 : 60 of the wrong."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Fitted:
-    """``inliers`` : (n,) mask; ``sigma``, ``threshold`` : mm of a point of mean σ."""
+    """A transform and the points that agree on it.
+
+    Parameters
+    ----------
+    transform : Rigid, Similarity or Affine
+        b_from_a.
+    inliers : (n,) bool array
+    sigma : float
+        Per axis, mm of a point of mean σ.
+    threshold : float
+        Inliers are nearer, mm of a point of mean σ; infinite where nothing was cut off.
+    samples : int
+        Random samples drawn; 0 when none, or all there are.
+    """
 
     transform: Transform
     inliers: np.ndarray
@@ -50,162 +67,203 @@ class Fitted:
     samples: int = 0
 
 
-def robust_fit(
-    model: Model, xyz_a: np.ndarray, xyz_b: np.ndarray, noise: Noise, threshold: float | None, seed: int
-) -> Fitted:
+def robust_fit(problem: Problem, threshold: float | None = None, seed: int = 0) -> Fitted:
     """Transform, inliers and σ.
+
+    Parameters
+    ----------
+    problem : Problem
+    threshold : float, optional
+        Inliers are nearer, mm of a point of mean σ; estimated where not given.
+    seed : int
+        Of the random samples.
+
+    Returns
+    -------
+    Fitted
 
     Raises
     ------
     DegenerateError
         Too few points agree, or none that could not by chance.
+    ConvergenceError
+        A fit with covariances did not settle.
     """
     rng = np.random.default_rng(seed)
-    count = len(xyz_a)
-    rows = np.arange(count) if count <= SUBSET else np.sort(rng.choice(count, SUBSET, replace=False))
-    a, b, own = xyz_a[rows], xyz_b[rows], noise[rows]
+    count = len(problem)
+    part = problem if count <= SUBSET else problem[np.sort(rng.choice(count, SUBSET, replace=False))]
     if threshold is None:
-        inliers, samples = _consensus(model, a, b, own, rng)
+        inliers, samples = _consensus(part, rng)
     else:
-        found = search(model, a, b, own, by_threshold(threshold), rng)
-        _enough(model, found.inliers if found is not None else np.zeros(count, bool), threshold)
+        found = search(part, by_threshold(threshold), rng)
+        if found is None:
+            raise _too_few_agree(problem.model, count, threshold)
         inliers, samples = found.inliers, found.samples
-    start = settled(model, a, b, own, inliers, threshold)
+    start = settled(part, inliers, threshold, samples)
     if count > SUBSET:
-        near = squares(xyz_b - start.transform @ xyz_a, noise.precision) <= start.threshold**2
-        start = settled(model, xyz_a, xyz_b, noise, near, threshold)
-    return Fitted(start.transform, start.inliers, start.sigma, start.threshold, samples)
+        near = problem.squares(start.transform) <= start.threshold**2
+        start = settled(problem, near, threshold, samples)
+    return start
 
 
-def _consensus(model: Model, a, b, noise: Noise, rng) -> tuple[np.ndarray, int]:
+def _consensus(problem: Problem, rng: np.random.Generator) -> tuple[np.ndarray, int]:
     """Mask of the points that agree, and samples drawn."""
-    rows, samples = np.arange(len(a)), 0
+    rows, samples = np.arange(len(problem)), 0
+    model = problem.model
     for _ in range(NESTED):
-        if len(rows) <= model.sample or model.freedom(len(rows) - 1) <= 0:
+        if len(rows) <= model.sample or model.redundancy(len(rows) - 1) <= 0:
             break
-        x, y, own = a[rows], b[rows], noise[rows]
-        total = squares(y - fit(model, x, y, own.precision) @ x, own.precision).sum()
-        if total <= len(rows) * rounding_mm(x, y) ** 2:
+        part = problem[rows]
+        total = part.squares(part.fit()).sum()
+        if total <= len(rows) * part.rounding_mm() ** 2:
             break
-        found = search(model, x, y, own, by_scale(model, len(rows), total), rng)
+        found = search(part, by_scale(model, len(rows), total), rng)
         samples += found.samples if found is not None else 0
         if found is None or found.value > np.log(FALSE_ALARMS):
             break
-        _can_be_trusted(model, found, rows)
+        _check_trust(model, found)
         rows = rows[found.inliers]
-    mask = np.zeros(len(a), bool)
+    mask = np.zeros(len(problem), bool)
     mask[rows] = True
     return mask, samples
 
 
-def _can_be_trusted(model: Model, found: Consensus, rows: np.ndarray) -> None:
+def _check_trust(model: Model, found: Consensus) -> None:
     agree = int(found.inliers.sum())
-    if model.freedom(agree) < LEAST_FREEDOM:
+    if model.redundancy(agree) < LEAST_REDUNDANCY:
         raise DegenerateError(
-            f"registration: only {agree} of {len(rows)} point pairs agree on one {model.name} transform, at least "
-            f"{-(-(LEAST_FREEDOM + model.parameters) // 3)} needed to tell which are wrong; measure more points"
+            f"registration: only {agree} of {len(found.inliers)} point pairs agree on one {model.name} transform, at "
+            f"least {-(-(LEAST_REDUNDANCY + model.parameters) // 3)} needed to tell which are wrong; measure more "
+            "points"
         )
 
 
-def _enough(model: Model, inliers: np.ndarray, threshold: float | None) -> None:
-    agree = int(inliers.sum())
-    if agree >= model.sample and model.freedom(agree) > 0:
-        return
-    needed = max(model.sample, model.parameters // 3 + 1)
+def _too_few_agree(model: Model, count: int, threshold: float | None) -> DegenerateError:
     within = "" if threshold is None else f" within {threshold:.4g} mm"
     larger = "" if threshold is None else ", or give a larger threshold"
-    raise DegenerateError(
-        f"registration: fewer than {needed} of {len(inliers)} point pairs agree on one {model.name} transform{within}; "
+    return DegenerateError(
+        f"registration: fewer than {model.needed} of {count} point pairs agree on one {model.name} transform{within}; "
         f"check the order of the rows and the units{larger}"
     )
 
 
-def settled(
-    model: Model,
-    xyz_a: np.ndarray,
-    xyz_b: np.ndarray,
-    noise: Noise,
-    inliers: np.ndarray,
-    threshold: float | None,
-) -> Fitted:
-    """Fit, σ and inliers in turn until the set stays, or comes again: then the larger of those in the cycle."""
+def settled(problem: Problem, inliers: np.ndarray, threshold: float | None, samples: int = 0) -> Fitted:
+    """Fit, σ and inliers in turn until the set stays, or comes again: then the larger of those in the cycle.
+
+    Parameters
+    ----------
+    problem : Problem
+    inliers : (n,) bool array
+        To begin with.
+    threshold, samples :
+        As of :func:`robust_fit` and :class:`Fitted`.
+
+    Returns
+    -------
+    Fitted
+
+    Raises
+    ------
+    DegenerateError
+        Too few points agree.
+    """
+    model = problem.model
     seen: dict[bytes, Fitted] = {}
-    floor = rounding_mm(xyz_a, xyz_b)
+    floor = problem.rounding_mm()
     for _ in range(MAX_ROUNDS):
         count = int(inliers.sum())
-        _enough(model, inliers, threshold)
-        transform = fit(model, xyz_a[inliers], xyz_b[inliers], noise[inliers].precision)
-        residuals = xyz_b - transform @ xyz_a
-        square = squares(residuals, noise.precision)
-        sigma = max(sigma_within(square[inliers].sum(), model, count, threshold), floor)
+        if count < model.needed:
+            raise _too_few_agree(model, len(inliers), threshold)
+        transform = problem[inliers].fit()
+        square = problem.squares(transform)
+        sigma = max(sigma_within(square[inliers].sum(), model, count, threshold or np.inf), floor)
         if threshold is not None:
             cut, chosen = threshold, square <= threshold**2
         else:
-            cut, chosen = _chosen(model, transform, xyz_a, residuals, square, noise, inliers, sigma)
+            cut, chosen = _chosen(problem, transform, square, inliers, sigma)
         key = np.packbits(inliers).tobytes()
         if key in seen:
-            break
-        seen[key] = Fitted(transform, inliers, sigma, cut)
+            cycle = list(seen)
+            return max((seen[k] for k in cycle[cycle.index(key) :]), key=lambda f: f.inliers.sum())
+        seen[key] = Fitted(transform, inliers, sigma, cut, samples)
         # no test that leaves too few to judge by
-        too_few = threshold is None and model.freedom(int(chosen.sum())) < min(LEAST_FREEDOM, model.freedom(count))
+        enough = min(LEAST_REDUNDANCY, model.redundancy(count))
+        too_few = threshold is None and model.redundancy(int(chosen.sum())) < enough
         if too_few or (chosen == inliers).all():
             return seen[key]
         inliers = chosen
-    names = list(seen)
-    return max((seen[k] for k in names[names.index(key) if key in names else 0 :]), key=lambda f: f.inliers.sum())
+    return max(seen.values(), key=lambda f: f.inliers.sum())
 
 
-def _chosen(model, transform, xyz_a, residuals, square, noise: Noise, used, sigma) -> tuple[float, np.ndarray]:
+def _chosen(
+    problem: Problem, transform: Transform, square: np.ndarray, used: np.ndarray, sigma: float
+) -> tuple[float, np.ndarray]:
     """The threshold at the middle of the points, mm, and who passes the test."""
-    total, freedom = len(square), model.freedom(int(used.sum()))
+    total, redundancy = len(problem), problem.model.redundancy(int(used.sum()))
     beyond = CLEAN_SETS_WITH_OUTLIER / total
-    outside = 3 * sigma**2 * fisher.isf(beyond, 3, freedom)
+    outside = 3 * sigma**2 * fisher.isf(beyond, 3, redundancy)
     if total > LEVERAGE_UP_TO:
         return float(np.sqrt(outside)), square <= outside
-    deletion = deletion_squares(model, transform, xyz_a, residuals, noise, used)
+    deletion = deletion_squares(problem, transform, used)
     passed = deletion <= outside
-    if freedom > 3:  # a point that was used is tested against the σ of the others
-        rest = np.maximum(freedom * sigma**2 - deletion[used], 0) / (freedom - 3)
-        passed[used] = deletion[used] <= 3 * fisher.isf(beyond, 3, freedom - 3) * np.maximum(rest, 1e-300)
+    if redundancy > 3:  # a point that was used is tested against the σ of the others
+        rest = np.maximum(redundancy * sigma**2 - deletion[used], 0) / (redundancy - 3)
+        passed[used] = deletion[used] <= 3 * fisher.isf(beyond, 3, redundancy - 3) * np.maximum(rest, 1e-300)
     return float(np.sqrt(outside)), passed
 
 
-def deletion_squares(
-    model: Model,
-    transform: Transform,
-    xyz_a: np.ndarray,
-    residuals: np.ndarray,
-    noise: Noise,
-    used: np.ndarray,
-) -> np.ndarray:
-    """(n,) rᵀ C⁻¹ r of each point's residual from a fit without it, C its covariance at unit noise.
+def deletion_squares(problem: Problem, transform: Transform, used: np.ndarray) -> np.ndarray:
+    """Squares of each point's residual from a fit without it.
 
-    ``residuals`` : (n, 3) of the fit to the points ``used``; for these r (1 − H)⁻¹ r, for others r (1 + H)⁻¹ r.
+    r (1 − H)⁻¹ r for points that were used, r (1 + H)⁻¹ r for others, with whitened residuals r and H of
+    :func:`~stcal.register.core.models.leverages` (Cook & Weisberg 1982, Residuals and Influence in Regression).
+
+    Parameters
+    ----------
+    problem : Problem
+    transform : Rigid, Similarity or Affine
+        The fit to the points used.
+    used : (n,) bool array
+
+    Returns
+    -------
+    (n,) array
+        rᵀ C⁻¹ r, C the residual's covariance at unit noise.
     """
-    spread = leverages(model, transform, xyz_a, used, noise.precision)
+    added = leverages(problem.model, transform, problem.xyz_a, used, problem.noise.precision)
     own = np.where(used, -1.0, 1.0)[:, None, None]
-    value, vector = np.linalg.eigh(np.eye(3) + own * spread)
-    turned = np.einsum("nij,ni->nj", vector, whitened(residuals, noise.precision))
+    value, vector = np.linalg.eigh(np.eye(3) + own * added)
+    turned = np.einsum("nij,ni->nj", vector, problem.whitened(transform))
     return (turned**2 / np.maximum(value, 1e-9)).sum(1)
 
 
-def chance(
-    model: Model, fitted: Fitted, xyz_a: np.ndarray, xyz_b: np.ndarray, extent: np.ndarray | None = None
-) -> float:
-    """Logarithm of the number of sets that would agree so well were the points anywhere among the others.
+def chance(problem: Problem, fitted: Fitted, extent: np.ndarray | None = None) -> float:
+    """How many sets would agree so well were the points anywhere among the others.
 
-    Moisan & Stival's number of false alarms, (n − m) C(n, k) C(k, m) αᵏ⁻ᵐ, least over k; α(r) is the share of a box
-    that a cube of half side r takes, at most 1 along each axis. ``extent`` : (3,) sides of that box, mm; else those of
-    the inliers along their principal axes (thin where they are coplanar).
+    Moisan & Stival's (2004) number of false alarms, (n − m) C(n, k) C(k, m) αᵏ⁻ᵐ, least over k; α(r) is the share of a
+    box that a cube of half side r takes, at most 1 along each axis.
+
+    Parameters
+    ----------
+    problem : Problem
+    fitted : Fitted
+    extent : (3,) array, optional
+        Sides of that box, mm; else those of the inliers along their principal axes (thin where they are coplanar).
+
+    Returns
+    -------
+    float
+        Its logarithm.
     """
-    rows = np.arange(len(xyz_a))[:: max(1, len(xyz_a) // LEVERAGE_UP_TO)]
+    model, every = problem.model, len(problem)
+    rows = np.arange(every)[:: max(1, every // LEVERAGE_UP_TO)]
+    part = problem[rows]
     count, k = len(rows), np.arange(model.sample + 1, len(rows) + 1)
     if not len(k):
         return 0.0
-    order = np.sort(np.linalg.norm(xyz_b[rows] - fitted.transform @ xyz_a[rows], axis=1))
-    if extent is None:
-        extent = np.ptp(_along_axes(xyz_b[rows][fitted.inliers[rows]]), axis=0)
-    alpha = np.minimum(1, 2 * order[k - 1, None] / np.maximum(extent, 1e-300)).prod(1)
+    order = np.sort(np.linalg.norm(part.residuals(fitted.transform), axis=1))
+    sides = np.ptp(_along_axes(part.xyz_b[fitted.inliers[rows]]), axis=0) if extent is None else extent
+    alpha = np.minimum(1, 2 * order[k - 1, None] / np.maximum(sides, 1e-300)).prod(1)
     choices = gammaln(count + 1) - gammaln(count - k + 1) - gammaln(model.sample + 1) - gammaln(k - model.sample + 1)
     value = np.log(count - model.sample) + choices + (k - model.sample) * np.log(np.maximum(alpha, 1e-300))
     return float(value.min())
@@ -217,37 +275,50 @@ def _along_axes(points: np.ndarray) -> np.ndarray:
     return centred @ np.linalg.eigh(centred.T @ centred)[1]
 
 
-def alternative_fit(
-    model: Model, fitted: Fitted, xyz_a: np.ndarray, xyz_b: np.ndarray, noise: Noise, seed: int
-) -> Fitted | None:
-    """What the outliers agree on, within the same threshold; None where they do not beyond chance."""
-    rest = np.flatnonzero(~fitted.inliers)
-    if len(rest) <= model.sample or model.freedom(len(rest)) <= 0:
+def alternative_fit(problem: Problem, fitted: Fitted, seed: int) -> Fitted | None:
+    """What the outliers agree on, within the same threshold.
+
+    Parameters
+    ----------
+    problem : Problem
+    fitted : Fitted
+        The transform found.
+    seed : int
+        As of :func:`robust_fit`.
+
+    Returns
+    -------
+    Fitted or None
+        None where they agree on nothing beyond chance.
+    """
+    model = problem.model
+    outside = np.flatnonzero(~fitted.inliers)
+    if len(outside) <= model.sample or model.redundancy(len(outside)) <= 0:
         return None
     rng = np.random.default_rng(seed + 1)
-    tried = rest if len(rest) <= SUBSET else np.sort(rng.choice(rest, SUBSET, replace=False))
-    freedom = model.freedom(int(fitted.inliers.sum()))
-    threshold = fitted.threshold * float(np.sqrt(freedom / chi2.isf(1 - FALSE_ALARMS, freedom)))  # σ may be so large
-    score: Score = by_threshold(threshold)
-    found = search(model, xyz_a[tried], xyz_b[tried], noise[tried], score, rng)
+    tried = outside if len(outside) <= SUBSET else np.sort(rng.choice(outside, SUBSET, replace=False))
+    redundancy = model.redundancy(int(fitted.inliers.sum()))
+    # σ may be so large
+    threshold = fitted.threshold * float(np.sqrt(redundancy / chi2.isf(1 - FALSE_ALARMS, redundancy)))
+    found = search(problem[tried], by_threshold(threshold), rng)
     if found is None or found.inliers.sum() <= model.sample:
         return None
-    inside = tried[found.inliers]
-    transform = fit(model, xyz_a[inside], xyz_b[inside], noise[inside].precision)
-    near = squares(xyz_b[rest] - transform @ xyz_a[rest], noise[rest].precision) <= threshold**2
+    transform = problem[tried[found.inliers]].fit()
+    rest = problem[outside]
+    near = rest.squares(transform) <= threshold**2
     if near.sum() <= model.sample or near.sum() < min(MOST_OF_REST * len(rest), AS_GOOD * fitted.inliers.sum()):
         return None
-    own = xyz_a[rest[near]]
+    own = rest.xyz_a[near]
     if np.sqrt(((transform @ own - fitted.transform @ own) ** 2).sum(1).mean()) < DISTINCT * fitted.sigma:
         return None  # good points that a tight threshold cut off
-    mask = np.zeros(len(xyz_a), bool)
-    mask[rest[near]] = True
-    other = Fitted(transform, mask, fitted.sigma, threshold, found.samples)
-    alone = Fitted(transform, near, fitted.sigma, threshold)
     # wrong points lie anywhere as far off the transform found as the farthest of them
-    off = np.linalg.norm(xyz_b[rest] - fitted.transform @ xyz_a[rest], axis=1).max()
-    is_chance = chance(model, alone, xyz_a[rest], xyz_b[rest], np.full(3, 2 * off)) > np.log(BY_CHANCE)
-    return None if is_chance else other
+    off = np.linalg.norm(rest.residuals(fitted.transform), axis=1).max()
+    alone = Fitted(transform, near, fitted.sigma, threshold)
+    if chance(rest, alone, np.full(3, 2 * off)) > np.log(BY_CHANCE):
+        return None
+    mask = np.zeros(len(problem), bool)
+    mask[outside[near]] = True
+    return Fitted(transform, mask, fitted.sigma, threshold, found.samples)
 
 
 def turn_between(one: Transform, two: Transform) -> float:

@@ -19,27 +19,30 @@ import numpy as np
 from scipy.special import gammaln
 
 from stcal.errors import ConvergenceError, DegenerateError
-from stcal.register.core.covariance import Noise
-from stcal.register.core.models import Model, fit, hypotheses, squares
+from stcal.register.core.models import Model, hypotheses
+from stcal.register.core.problem import Problem
 
 FALSE_ALARMS = 1e-4
 """Expected number of sets declared in data without outliers. So few, because a chance set of few points claims a
 σ far too small. Real ones are far below: ten of 20 points that agree to 0.15 mm, the others off by 5 mm, have 1e-14."""
-LEAST_FREEDOM = 6
-"""Degrees of freedom of the smallest consensus: four points rigidly, five in similarity, six affinely."""
+LEAST_REDUNDANCY = 6
+"""Redundancy of the smallest consensus: four points rigidly, five in similarity, six affinely."""
 MISSED = 1e-9
-"""Chance that no sample is free of outliers."""
+"""Chance that no sample is free of outliers, for which the number of samples is chosen."""
 LEAST_SHARE = 0.25
 """Samples are drawn until a consensus of this share cannot have been missed; below it may be."""
-SPARE = 3
+CLEAN_PER_WIDE = 3
 """Of clean samples one in so many is wide enough to lead to the optimum; measured: every second one does."""
 EXHAUSTIVE = 2000
 """Up to so many samples are all tried (23 points rigidly)."""
 BATCH = 500
+"""Samples scored at once."""
 MOST_SAMPLES = 20_000
+"""Above what is ever needed: at the least share 3900 samples of three points, 15 900 of four."""
 REFINED = 6
 """So many of the best samples of a batch are refined."""
 MAX_STEPS = 30
+"""Of concentration, which ends by itself after a few: the score falls in each, and there are finitely many sets."""
 TINY = 1e-24
 """Square sums below this share of the points' own are rounding."""
 
@@ -49,7 +52,16 @@ Score = Callable[[np.ndarray], tuple[np.ndarray, np.ndarray]]
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Consensus:
-    """``inliers`` : (n,) mask; ``value`` : its score; ``samples`` : drawn, 0 when all there are were tried."""
+    """A set of points that agree.
+
+    Parameters
+    ----------
+    inliers : (n,) bool array
+    value : float
+        Its score, less is better.
+    samples : int
+        How many were drawn; 0 when all there are were tried.
+    """
 
     inliers: np.ndarray
     value: float
@@ -59,8 +71,8 @@ class Consensus:
 def by_scale(model: Model, count: int, total: float) -> Score:
     """Logarithm of the number of false alarms; ``total`` : square sum of the least-squares fit to all points."""
     k = np.arange(model.sample, count)
-    k = k[model.freedom(k) > 0]  # smaller sets than can be trusted are looked for too: then nothing is
-    a, b = model.freedom(k) / 2, 3 * (count - k) / 2
+    k = k[3 * k > model.parameters]  # smaller sets than can be trusted are looked for too: then nothing is
+    a, b = (3 * k - model.parameters) / 2, 3 * (count - k) / 2
     tests = np.log(len(k)) + gammaln(count + 1) - gammaln(k + 1) - gammaln(count - k + 1)
 
     def score(square: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -74,7 +86,7 @@ def by_scale(model: Model, count: int, total: float) -> Score:
     return score
 
 
-def chernoff(share: np.ndarray, a: np.ndarray, b: np.ndarray) -> np.ndarray:
+def chernoff(share: float | np.ndarray, a: float | np.ndarray, b: float | np.ndarray) -> np.ndarray:
     """Chernoff's bound of log P(Beta(a, b) ≤ share): (x (a + b)/a)ᵃ ((1 − x)(a + b)/b)ᵇ below a/(a + b), else 1."""
     limit = a / (a + b)
     share = np.clip(share, TINY, limit)
@@ -101,50 +113,61 @@ def by_threshold(threshold: float) -> Score:
     return score
 
 
-def search(
-    model: Model, xyz_a: np.ndarray, xyz_b: np.ndarray, noise: Noise, score: Score, rng: np.random.Generator
-) -> Consensus | None:
-    """The best set that random samples lead to; None where no sample gives one of enough points."""
-    count = len(xyz_a)
-    drawn, needed, best = 0, 1, None
-    batches = _all_samples(count, model.sample) if comb(count, model.sample) <= EXHAUSTIVE else None
+def search(problem: Problem, score: Score, rng: np.random.Generator) -> Consensus | None:
+    """The best set that random samples lead to.
+
+    Parameters
+    ----------
+    problem : Problem
+    score : Score
+        See :func:`by_scale`, :func:`by_share` and :func:`by_threshold`.
+    rng : numpy.random.Generator
+
+    Returns
+    -------
+    Consensus or None
+        None where no sample gives one of enough points.
+    """
+    count, size = len(problem), problem.model.sample
+    drawn, needed, best = 0, 1.0, None
+    every = _all_samples(count, size) if comb(count, size) <= EXHAUSTIVE else None
     while drawn < needed:
-        samples = batches if batches is not None else _random_samples(count, model.sample, rng)
+        samples = every if every is not None else _random_samples(count, size, rng)
         drawn += len(samples)
-        found = _best_of(model, xyz_a, xyz_b, noise, score, samples)
+        found = _best_of(problem, score, samples)
         if found is not None and (best is None or found.value < best.value):
             best = found
-        if batches is not None:
+        if every is not None:
             break
         share = max(best.inliers.mean() if best is not None else 0, LEAST_SHARE)
-        clean = min(share, 1 - 1e-9) ** model.sample
-        needed = min(SPARE * np.log(MISSED) / np.log1p(-clean), MOST_SAMPLES)
-    return None if best is None else Consensus(best.inliers, best.value, 0 if batches is not None else drawn)
+        clean = min(share, 1 - 1e-9) ** size
+        needed = min(CLEAN_PER_WIDE * np.log(MISSED) / np.log1p(-clean), MOST_SAMPLES)
+    return None if best is None else Consensus(best.inliers, best.value, 0 if every is not None else drawn)
 
 
-def _best_of(model, xyz_a, xyz_b, noise, score, samples) -> Consensus | None:
-    linear, translation = hypotheses(model, xyz_a[samples], xyz_b[samples])
-    square = _squares_of_many(linear, translation, xyz_a, xyz_b, noise.precision)
+def _best_of(problem: Problem, score: Score, samples: np.ndarray) -> Consensus | None:
+    linear, translation = hypotheses(problem.model, problem.xyz_a[samples], problem.xyz_b[samples])
+    square = _squares_of_many(linear, translation, problem)
     value, cut = score(square)
     best = None
     for i in np.argsort(value, kind="stable")[:REFINED]:
-        found = _concentrated(model, xyz_a, xyz_b, noise, score, square[i] <= cut[i])
+        found = _concentrated(problem, score, square[i] <= cut[i])
         if found is not None and (best is None or found.value < best.value):
             best = found
     return best
 
 
-def _concentrated(model, xyz_a, xyz_b, noise, score, inliers: np.ndarray) -> Consensus | None:
+def _concentrated(problem: Problem, score: Score, inliers: np.ndarray) -> Consensus | None:
     """Fit and choose anew until the score falls no more."""
     best = None
     for _ in range(MAX_STEPS):
-        if inliers.sum() < model.sample:
+        if inliers.sum() < problem.model.sample:
             break
         try:
-            transform = fit(model, xyz_a[inliers], xyz_b[inliers], noise[inliers].precision)
+            transform = problem[inliers].fit()
         except (DegenerateError, ConvergenceError):
             break
-        square = squares(xyz_b - transform @ xyz_a, noise.precision)
+        square = problem.squares(transform)
         value, cut = score(square[None])
         if best is not None and value[0] >= best.value:
             break
@@ -153,9 +176,11 @@ def _concentrated(model, xyz_a, xyz_b, noise, score, inliers: np.ndarray) -> Con
     return best
 
 
-def _squares_of_many(linear, translation, xyz_a, xyz_b, precision) -> np.ndarray:
+def _squares_of_many(linear: np.ndarray, translation: np.ndarray, problem: Problem) -> np.ndarray:
     """Squared distances (s, n) under s transforms."""
-    residual = xyz_b.T - translation[:, :, None] - (linear.reshape(-1, 3) @ xyz_a.T).reshape(len(linear), 3, -1)
+    turned = (linear.reshape(-1, 3) @ problem.xyz_a.T).reshape(len(linear), 3, -1)
+    residual = problem.xyz_b.T - translation[:, :, None] - turned
+    precision = problem.noise.precision
     if precision is not None and precision.ndim == 3:
         weighted = np.einsum("nij,sjn->sin", precision, residual, optimize=True)
         return np.maximum(np.einsum("sin,sin->sn", residual, weighted), 0)

@@ -6,7 +6,7 @@ import numpy as np
 
 from stcal.errors import StcalError
 from stcal.register.core.models import Transform
-from stcal.register.core.result import HeldOut
+from stcal.register.core.result import ErrorFigures, HeldOut
 
 TRIED = 20_000
 """Of more points a sample is cross-validated: its errors are then known to 1 %."""
@@ -21,10 +21,27 @@ def held_out(
     least: int,
     seed: int,
 ) -> HeldOut | None:
-    """Errors of points (n, 3) left out in turn, mm; None with too few points for a fit to the others.
+    """Errors of points left out of the fit in turn.
 
-    ``fit_rows`` : the fit to the rows given; a fold whose fit fails is left out of the figures.
-    ``inliers`` : (n,) mask of the fit to all; ``least`` : the fewest points to fit.
+    Parameters
+    ----------
+    fit_rows : callable
+        The fit to the rows given, b_from_a; a fold whose fit fails is left out of the figures.
+    xyz_a, xyz_b : (n, 3) arrays
+        mm; row i of both is the same point.
+    inliers : (n,) bool array
+        Of the fit to all.
+    folds : int
+        Parts to leave out, one at a time.
+    least : int
+        The fewest points to fit.
+    seed : int
+        Of the division into parts.
+
+    Returns
+    -------
+    HeldOut or None
+        None with too few points for a fit to the others, or where every fold's fit fails.
     """
     rows = np.random.default_rng([seed, 2]).permutation(len(xyz_a))[:TRIED]
     folds = min(folds, len(rows))
@@ -44,10 +61,4 @@ def held_out(
     order = np.argsort(tried)
     tried, error = tried[order], error[order]
     own = error[inliers[tried]]
-    return HeldOut(len(done), tried, error, _figures(own), _figures(error))
-
-
-def _figures(error: np.ndarray) -> tuple[float, float, float]:
-    if not len(error):
-        return (np.nan, np.nan, np.nan)
-    return float(error.mean()), float(np.sqrt((error**2).mean())), float(error.max())
+    return HeldOut(len(done), tried, error, ErrorFigures.of(own), ErrorFigures.of(error))

@@ -17,6 +17,7 @@ WIDER_THAN = 10.0
 SYMMETRY_UP_TO = 200
 """Points; larger sets are clouds, not layouts with labels."""
 SHOWN = 6
+"""Points of a cycle that a note names."""
 
 Namer = Callable[[int], str]
 
@@ -73,9 +74,9 @@ def check_supports(model: Model, xyz_a: np.ndarray, inliers: np.ndarray, sigma_m
     rows = np.flatnonzero(inliers)
     alone = single_supports(model, xyz_a[rows], sigma_mm)
     if len(alone):
-        kind = "plane" if model.name == "affine" else "line"
+        kind, first = "plane" if model.name == "affine" else "line", name(int(rows[alone[0]]))
         raise DegenerateError(
-            f"registration: only {name(rows[alone[0]])} keeps the {len(rows)} points that agree off a {kind}, and any "
+            f"registration: only {first} keeps the {len(rows)} points that agree off a {kind}, and any "
             f"wrong point would fit there as well; measure more points off the {kind}"
         )
 
@@ -108,7 +109,7 @@ def symmetry(xyz: np.ndarray, tolerance_mm: float) -> tuple[float, np.ndarray] |
         & (np.abs(apart - apart[first, second]) < 2 * tolerance_mm)
     )
     tree = KDTree(centred)
-    best = None
+    least, best = np.inf, None
     for i, j in np.argwhere(fits):
         if (i, j) == (first, second):
             continue
@@ -118,12 +119,12 @@ def symmetry(xyz: np.ndarray, tolerance_mm: float) -> tuple[float, np.ndarray] |
             turn = best_rotations(centred[to].T @ centred)[0]
         misfit = np.linalg.norm(centred @ turn.T - centred[to], axis=1).max()
         is_one = len(np.unique(to)) == n and (to != np.arange(n)).any()
-        if is_one and misfit <= 2 * tolerance_mm and (best is None or misfit < best[0]):
-            best = (misfit, float(Rotation.from_matrix(turn).magnitude()), to)
-    return None if best is None else best[1:]
+        if is_one and misfit <= 2 * tolerance_mm and misfit < least:
+            least, best = misfit, (float(Rotation.from_matrix(turn).magnitude()), to)
+    return best
 
 
-def symmetry_note(found: tuple[float, np.ndarray], rows: Sequence[int], name: Namer) -> str:
+def symmetry_note(found: tuple[float, np.ndarray], rows: np.ndarray, name: Namer) -> str:
     """One line: the turn and what it exchanges."""
     angle, to = found
     start = int(np.flatnonzero(to != np.arange(len(to)))[0])
@@ -131,7 +132,7 @@ def symmetry_note(found: tuple[float, np.ndarray], rows: Sequence[int], name: Na
     while at != start:
         cycle.append(at)
         at = int(to[at])
-    steps = ", ".join(f"{name(rows[i])} → {name(rows[j])}" for i, j in pairwise([*cycle, start][: SHOWN + 1]))
+    steps = ", ".join(f"{name(int(rows[i]))} → {name(int(rows[j]))}" for i, j in pairwise([*cycle, start][: SHOWN + 1]))
     return (
         f"the layout is symmetric: a turn by {np.degrees(angle):.1f}° maps it onto itself ({steps}"
         f"{', …' if len(cycle) > SHOWN or (to != np.arange(len(to))).sum() > len(cycle) else ''}); labels exchanged "

@@ -18,14 +18,16 @@ from scipy.special import gammaln
 from scipy.stats import binom, chi2
 
 from stcal.errors import ConvergenceError, DegenerateError
-from stcal.register.core.covariance import Noise
-from stcal.register.core.models import Model, Transform, fit, rounding_mm, squares, whitened
+from stcal.register.core.models import Model, Transform
+from stcal.register.core.problem import Problem
 from stcal.register.core.search import FALSE_ALARMS, by_share, chernoff, search
 
 TRIED = 200
 """Points that are looked at: a shift of 4 σ of half of them is seen then."""
 MAX_ROUNDS = 30
+"""Of assigning and fitting, which ends by itself: the square sum falls in each."""
 FEW = 16
+"""Points up to which square sums take the place of determinants (see above)."""
 SPHERICAL = 0.1
 """Of 16 points with noise three times as large along one axis half are told so; the others are too few to mislead."""
 TOGETHER = 0.01
@@ -34,39 +36,61 @@ TOGETHER = 0.01
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Groups:
-    """``transforms`` : of the larger group and of the other; ``in_space`` : whether place tells the group, which speaks
-    for a bent frame and not for two motions."""
+    """Two groups of points with a transform each.
+
+    Parameters
+    ----------
+    transforms : two Rigid, Similarity or Affine
+        Of the larger group and of the other.
+    in_space : bool
+        Whether place tells the group, which speaks for a bent frame and not for two motions.
+    """
 
     transforms: tuple[Transform, Transform]
     in_space: bool
 
 
-def two_groups(
-    model: Model, xyz_a: np.ndarray, xyz_b: np.ndarray, noise: Noise, rng: np.random.Generator
-) -> Groups | None:
-    """The two transforms; None where one explains the points as well."""
-    rows = np.arange(len(xyz_a))
-    if len(rows) > TRIED:
-        rows = np.sort(rng.choice(rows, TRIED, replace=False))
-    a, b, own = xyz_a[rows], xyz_b[rows], noise[rows]
-    n = len(rows)
-    least = model.sample + 1
-    if n < 2 * least:
+@dataclass(frozen=True, slots=True, eq=False)
+class _Assignment:
+    """``first`` : (n,) mask of the first group; the transforms of both; ``total`` : their square sum."""
+
+    first: np.ndarray
+    transforms: tuple[Transform, Transform]
+    total: float
+
+
+def two_groups(problem: Problem, rng: np.random.Generator) -> Groups | None:
+    """The two transforms of points that fall into two groups.
+
+    Parameters
+    ----------
+    problem : Problem
+    rng : numpy.random.Generator
+
+    Returns
+    -------
+    Groups or None
+        None where one transform explains the points as well.
+    """
+    n, model = len(problem), problem.model
+    part = problem if n <= TRIED else problem[np.sort(rng.choice(np.arange(n), TRIED, replace=False))]
+    n = len(part)
+    if n < 2 * (model.sample + 1):
         return None
     try:
-        whole = whitened(b - fit(model, a, b, own.precision) @ a, own.precision)
-        found = _assigned(model, a, b, own, rng)
+        whole = part.whitened(part.fit())
+        found = _assigned(part, rng)
     except (DegenerateError, ConvergenceError):
         return None
-    if found is None or np.abs(whole).max() <= rounding_mm(a, b):
+    if found is None or np.abs(whole).max() <= part.rounding_mm():
         return None
-    first, transforms = found
-    parted = np.where(first[:, None], *(whitened(b - t @ a, own.precision) for t in transforms))
+    first, (one, two) = found.first, found.transforms
+    parted = np.where(first[:, None], part.whitened(one), part.whitened(two))
     if (n - 1) * np.log(2) + _log_chance(model, whole, parted) > np.log(FALSE_ALARMS):
         return None
     if first.sum() < n / 2:
-        first, transforms = ~first, transforms[::-1]
-    return Groups(transforms, lies_together(a, first))
+        return Groups((two, one), lies_together(part.xyz_a, ~first))
+    return Groups((one, two), lies_together(part.xyz_a, first))
 
 
 def _log_chance(model: Model, whole: np.ndarray, parted: np.ndarray) -> float:
@@ -87,10 +111,10 @@ def _log_chance(model: Model, whole: np.ndarray, parted: np.ndarray) -> float:
     return bound
 
 
-def sphericity(scatter: np.ndarray, freedom: float) -> float:
+def sphericity(scatter: np.ndarray, redundancy: float) -> float:
     """p-value of equal noise along all axes (Mauchly 1940, with Bartlett's factor)."""
     w = np.linalg.slogdet(scatter)[1] - 3 * np.log(np.trace(scatter) / 3)
-    return float(chi2.sf(-(freedom - 23 / 18) * w, 5))
+    return float(chi2.sf(-(redundancy - 23 / 18) * w, 5))
 
 
 def wilks_bound(log_ratio: float, of_error: float, of_hypothesis: float) -> float:
@@ -113,28 +137,29 @@ def lies_together(xyz_a: np.ndarray, group: np.ndarray) -> bool:
     return bool(binom.sf(same - 1, len(group), share**2 + (1 - share) ** 2) < TOGETHER)
 
 
-def _assigned(model: Model, a, b, noise: Noise, rng):
-    """Mask of the first group, and both transforms; None where a group becomes too small."""
-    core = search(model, a, b, noise, by_share(model, len(a)), rng)
+def _assigned(problem: Problem, rng: np.random.Generator) -> _Assignment | None:
+    """Both groups; None where one becomes too small."""
+    model, n = problem.model, len(problem)
+    core = search(problem, by_share(model, n), rng)
     if core is None:
         return None
     rest = np.flatnonzero(~core.inliers)
     if len(rest) <= model.sample:
         return None
-    inner = search(model, a[rest], b[rest], noise[rest], by_share(model, len(rest)), rng)
+    inner = search(problem[rest], by_share(model, len(rest)), rng)
     if inner is None:
         return None
-    first, second = core.inliers, np.isin(np.arange(len(a)), rest[inner.inliers])
+    first, second = core.inliers, np.isin(np.arange(n), rest[inner.inliers])
     best = None
     for _ in range(MAX_ROUNDS):
         if min(first.sum(), second.sum()) <= model.sample:
             break
-        pair = tuple(fit(model, a[g], b[g], noise[g].precision) for g in (first, second))
-        apart = np.array([squares(b - t @ a, noise.precision) for t in pair])
+        transforms = problem[first].fit(), problem[second].fit()
+        apart = np.array([problem.squares(t) for t in transforms])
         total = apart.min(0).sum()
-        if best is not None and total >= best[2]:
+        if best is not None and total >= best.total:
             break
         first = apart[0] <= apart[1]
         second = ~first
-        best = (first, pair, total)
-    return None if best is None else best[:2]
+        best = _Assignment(first, transforms, total)
+    return best

@@ -10,7 +10,8 @@ from scipy.stats import f as fisher
 
 from stcal.errors import InputError
 from stcal.geometry.align import best_rotations
-from stcal.register.core.models import Model, Transform, parts
+from stcal.register.core.models import Model, parts
+from stcal.register.core.problem import Problem
 from stcal.register.core.robust import BY_CHANCE, Fitted
 
 Namer = Callable[[int], str]
@@ -20,12 +21,15 @@ UNITS = {1000.0: ("m", "m"), 25.4: ("inches", "in"), 10.0: ("cm", "cm")}
 UNIT_WITHIN = 0.08
 """Outliers move the median ratio of distances by a few per cent; the factors are far apart."""
 PAIRS = 4000
+"""Of points, whose distances are compared."""
 MIRROR_RATIO = 4.0
 """Mirrored points fit a mirrored frame to noise, a right one to their thickness; bent frames never gain so much."""
 MIRROR_CHANCE = 1e-4
+"""Right frames called mirrored, were their points thick only by noise: so many."""
 NAMED_BELOW_RAD = np.radians(15)
 """A sign or an exchange of axes is named when it leaves the frames turned by less: then it is what was meant."""
 SHOWN = 5
+"""Rows that a note names."""
 LOOKED_AT = 10_000
 """Outliers; what slips they show, the others show too."""
 
@@ -76,8 +80,8 @@ def check_mirrored(model: Model, xyz_a: np.ndarray, xyz_b: np.ndarray) -> None:
     if model.name == "affine" or len(xyz_a) <= model.sample:
         return
     ratio, reflection = mirrored_ratio(xyz_a, xyz_b)
-    freedom = model.freedom(len(xyz_a))
-    if ratio > max(MIRROR_RATIO, fisher.isf(MIRROR_CHANCE, freedom, freedom)):
+    redundancy = model.redundancy(len(xyz_a))
+    if ratio > max(MIRROR_RATIO, fisher.isf(MIRROR_CHANCE, redundancy, redundancy)):
         raise mirrored_error(reflection, len(xyz_a), len(xyz_a), np.sqrt(ratio))
 
 
@@ -90,7 +94,7 @@ def mirrored_error(reflection: np.ndarray, agree: int, count: int, times: float)
         swap[[i, j]] = swap[[j, i]]
         mends[f"a{axes[i]} and a{axes[j]} with each other"] = swap
     turns = {mend: Rotation.from_matrix(reflection @ m).magnitude() for mend, m in mends.items()}
-    least = min(turns, key=turns.get)
+    least = min(turns, key=turns.__getitem__)
     advice = "change the sign of one axis of a or of b"
     if turns[least] < NAMED_BELOW_RAD:
         advice = f"change {least}: the frames are then turned by only {np.degrees(turns[least]):.1f}°"
@@ -100,12 +104,12 @@ def mirrored_error(reflection: np.ndarray, agree: int, count: int, times: float)
     )
 
 
-def outlier_notes(transform: Transform, fitted: Fitted, xyz_a: np.ndarray, xyz_b: np.ndarray, name: Namer) -> list[str]:
+def outlier_notes(problem: Problem, fitted: Fitted, name: Namer) -> list[str]:
     """Outliers that a slip explains: exchanged rows, or another unit."""
     rows = np.flatnonzero(~fitted.inliers)[:LOOKED_AT]
-    if not len(rows) or fitted.threshold is None:
+    if not len(rows):
         return []
-    reach = fitted.threshold
+    xyz_a, xyz_b, transform, reach = problem.xyz_a, problem.xyz_b, fitted.transform, fitted.threshold
     notes = []
     mapped = transform @ xyz_a[rows]
     distance, nearest = KDTree(mapped).query(xyz_b[rows])
@@ -113,7 +117,8 @@ def outlier_notes(transform: Transform, fitted: Fitted, xyz_a: np.ndarray, xyz_b
     taken = np.minimum(1, 2 * reach / np.maximum(np.ptp(mapped, axis=0), 1e-300)).prod()
     by_chance = binom.sf(len(swapped) - 1, len(rows), 1 - (1 - taken) ** (len(rows) - 1))
     if len(swapped) and by_chance < BY_CHANCE:
-        shown = ", ".join(f"{name(rows[i])} is the point of {name(rows[nearest[i]])}" for i in swapped[:SHOWN])
+        exchanged = [(int(rows[i]), int(rows[nearest[i]])) for i in swapped[:SHOWN]]
+        shown = ", ".join(f"{name(i)} is the point of {name(j)}" for i, j in exchanged)
         notes.append(f"rows exchanged: b of {shown}{_more(len(swapped))}; correct the order")
     linear, translation = parts(transform)
     back = np.linalg.inv(linear)
@@ -125,7 +130,7 @@ def outlier_notes(transform: Transform, fitted: Fitted, xyz_a: np.ndarray, xyz_b
         for side, residual in tries.items():
             fits = np.flatnonzero(np.linalg.norm(residual, axis=1) <= reach)
             if len(fits):
-                shown = ", ".join(name(rows[i]) for i in fits[:SHOWN])
+                shown = ", ".join(name(int(rows[i])) for i in fits[:SHOWN])
                 shown += _more(len(fits))
                 notes.append(f"another unit: {side} of {shown} fits when multiplied by {factor:.6g}; correct it")
     return notes

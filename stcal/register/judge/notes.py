@@ -8,36 +8,56 @@ from scipy.spatial import KDTree
 from scipy.stats import f as fisher
 from scipy.stats import norm
 
-from stcal.register.core.models import Model, squares
+from stcal.geometry.affine import Affine
+from stcal.geometry.rigid import Similarity
+from stcal.register.core.covariance import Covariance
+from stcal.register.core.models import squares
+from stcal.register.core.problem import Problem
 from stcal.register.core.result import Alternative
 from stcal.register.core.robust import CLEAN_SETS_WITH_OUTLIER, LEVERAGE_UP_TO, Fitted
 from stcal.register.judge.degeneracy import WIDER_THAN, row_name, single_supports, spreads, symmetry, symmetry_note
 from stcal.register.judge.mistakes import SHOWN, UNIT_WITHIN, UNITS, outlier_notes
 
-FEW_FREEDOMS = 6
+LOW_REDUNDANCY = 6
 """Below so many degrees of freedom σ is uncertain by more than 30 %."""
 MAJORITY = 0.5
+"""Of the point pairs; where fewer agree, a note says so."""
 NEIGHBOURS = 2000
+"""Of so many points residuals are compared with the nearest neighbour's …"""
 FEWEST_NEIGHBOURS = 20
+"""… and of no fewer: the sum of fewer products is not normal."""
 BY_NEIGHBOURS = 1e-4
-"""Of so many points; clean data called bent: so many."""
+"""Clean data called bent: so many."""
 TIGHT = 2.5
 """A threshold of 2.5 σ cuts off a tenth of the good points; below it the covariance of few points is too small."""
 
 
-@dataclass(frozen=True, slots=True, eq=False)
+@dataclass(frozen=True, slots=True, eq=False, kw_only=True)
 class Subject:
-    """What there is to judge. ``factor`` : by which residuals exceed the σ given, where the data contradict it."""
+    """What there is to judge.
 
-    model: Model
+    Parameters
+    ----------
+    problem : Problem
+    method : str
+    fitted : Fitted
+    alternative : Alternative or None
+    ambiguous : bool
+        The alternative is about as good.
+    covariance : Covariance
+    factor : float or None
+        By which residuals exceed the σ given; None where none was given.
+    lines : sequence of int, optional
+        Lines of the file that name the points.
+    """
+
+    problem: Problem
     method: str
-    xyz_a: np.ndarray
-    xyz_b: np.ndarray
     fitted: Fitted
     alternative: Alternative | None
     ambiguous: bool
+    covariance: Covariance
     factor: float | None
-    dof: float
     lines: Sequence[int] | None
 
     def name(self, row: int) -> str:
@@ -48,8 +68,7 @@ class Subject:
 def notes_of(subject: Subject) -> list[str]:
     """The lines."""
     notes = [*_agreement(subject), *_noise(subject), *_layout(subject)]
-    fitted = subject.fitted
-    return notes + outlier_notes(fitted.transform, fitted, subject.xyz_a, subject.xyz_b, subject.name)
+    return notes + outlier_notes(subject.problem, subject.fitted, subject.name)
 
 
 def _agreement(subject: Subject) -> list[str]:
@@ -73,14 +92,14 @@ def _agreement(subject: Subject) -> list[str]:
 
 def _far_rows(subject: Subject) -> list[str]:
     """Rows that the robust method would look at."""
-    fitted, n = subject.fitted, len(subject.xyz_a)
-    freedom = subject.model.freedom(n)
-    square = squares(subject.xyz_b - fitted.transform @ subject.xyz_a)
-    bound = square.sum() / freedom * 3 * fisher.isf(CLEAN_SETS_WITH_OUTLIER / n, 3, freedom)
+    problem = subject.problem
+    redundancy = problem.redundancy
+    square = squares(problem.residuals(subject.fitted.transform))
+    bound = square.sum() / redundancy * 3 * fisher.isf(CLEAN_SETS_WITH_OUTLIER / len(problem), 3, redundancy)
     far = np.flatnonzero(square > bound)
     if not len(far):
         return []
-    worst = far[square[far].argmax()]
+    worst = int(far[square[far].argmax()])
     return [
         f"{len(far)} points lie farther off than noise would put them, the farthest {subject.name(worst)} at "
         f"{np.sqrt(square[worst]):.4g} mm; use the robust method"
@@ -89,22 +108,21 @@ def _far_rows(subject: Subject) -> list[str]:
 
 def _noise(subject: Subject) -> list[str]:
     fitted, notes = subject.fitted, []
-    inside = fitted.inliers
-    residuals = subject.xyz_b[inside] - fitted.transform @ subject.xyz_a[inside]
-    if neighbours_alike(subject.xyz_a[inside], residuals):
+    inside = subject.problem[fitted.inliers]
+    if neighbours_alike(inside.xyz_a, inside.residuals(fitted.transform)):
         notes.append(
             "the residuals are not noise: neighbours are off alike, so that the frames are bent against each other and "
             "a transform holds only where its points are; see the residual field"
         )
-    if subject.factor is not None:
+    if subject.factor is not None and subject.covariance.scaled:
         notes.append(
             f"residuals exceed the σ given {subject.factor:.3g} times, which chance does not explain; the covariance "
             "is scaled by it"
         )
-    if subject.dof < FEW_FREEDOMS:
-        notes.append(f"σ rests on {subject.dof:.0f} degrees of freedom and is a rough guess; measure more points")
-    is_tight = fitted.threshold is not None and fitted.threshold < TIGHT * fitted.sigma
-    if is_tight and subject.method == "robust":
+    redundancy = subject.covariance.redundancy
+    if redundancy < LOW_REDUNDANCY:
+        notes.append(f"σ rests on {redundancy:.0f} degrees of freedom and is a rough guess; measure more points")
+    if fitted.threshold < TIGHT * fitted.sigma and subject.method == "robust":
         notes.append(
             f"the threshold of {fitted.threshold:.4g} mm is only {fitted.threshold / fitted.sigma:.2g} σ and cuts off "
             "good points; leave it out to have it estimated"
@@ -129,25 +147,24 @@ def neighbours_alike(xyz_a: np.ndarray, residuals: np.ndarray) -> bool:
 
 
 def _layout(subject: Subject) -> list[str]:
-    model, fitted, notes = subject.model, subject.fitted, []
+    model, fitted, notes = subject.problem.model, subject.fitted, []
     rows = np.flatnonzero(fitted.inliers)
-    inside, sigma = subject.xyz_a[rows], fitted.sigma
+    inside, sigma, transform = subject.problem.xyz_a[rows], fitted.sigma, fitted.transform
     if len(rows) <= LEVERAGE_UP_TO and subject.method != "liu2017":
         alone = single_supports(model, inside, sigma)
         kind = "plane" if model.name == "affine" else "line"
         notes += [
-            f"only {subject.name(rows[i])} keeps the points off a {kind}, and no other checks it; measure more off it"
-            for i in alone[:SHOWN]
+            f"only {subject.name(row)} keeps the points off a {kind}, and no other checks it; measure more off it"
+            for row in rows[alone[:SHOWN]].tolist()
         ]
     if model.name != "affine" and spreads(inside)[2] < WIDER_THAN * sigma:
         notes.append("the points lie in a plane: a mirrored frame would not be noticed")
-    if model.name == "affine" and np.linalg.det(fitted.transform.linear) < 0:
+    if isinstance(transform, Affine) and np.linalg.det(transform.linear) < 0:
         notes.append("the transform mirrors: one of the frames is left-handed")
-    if model.name == "similarity":
-        scale = fitted.transform.scale
+    if isinstance(transform, Similarity):
+        scale = transform.scale
         for factor, (name, _) in UNITS.items():
             if abs(max(scale, 1 / scale) / factor - 1) < UNIT_WITHIN:
                 notes.append(f"the scale is {scale:.6g}: is {'a' if scale > 1 else 'b'} in {name}?")
-    reach = fitted.threshold if fitted.threshold is not None else 4 * sigma
-    found = symmetry(inside, reach)
+    found = symmetry(inside, fitted.threshold if np.isfinite(fitted.threshold) else 4 * sigma)
     return notes if found is None else [*notes, symmetry_note(found, rows, subject.name)]

@@ -23,7 +23,7 @@ def space_figure(found: Findings):
     place = result.b_from_a @ found.xyz_a[rows]
     residual, inlier = result.residuals[rows], result.inliers[rows]
     side = float(np.ptp(place, axis=0).max()) or 1.0
-    typical = max(result.rms_mm, 1e-12)
+    typical = max(result.inlier_errors.rms_mm, 1e-12)
     crowded = min(1.0, FEW / len(rows)) ** (1 / 3)
     scale = round_below(ARROW_SHARE * crowded * side / typical)
     length = np.linalg.norm(residual, axis=1)
@@ -109,7 +109,7 @@ def errors_figure(found: Findings):
     length, inlier = found.length_mm[rows], result.inliers[rows]
     figure = new_figure(9, 2.6)
     axes = figure.add_axes((0.07, 0.2, 0.92, 0.66))
-    top = 1.25 * result.max_mm
+    top = 1.25 * result.inlier_errors.max_mm
     for edge in found.cubes.sides_mm:
         axes.axvline(edge, color=FAINT, lw=0.8)
     for kind, colour, name in ((True, COLOURS[0], "inlier"), (False, COLOURS[1], "outlier")):

@@ -7,7 +7,7 @@ import numpy as np
 from stcal.geometry.affine import Affine
 from stcal.geometry.rigid import Rigid
 from stcal.register.core.models import Transform, parts
-from stcal.register.core.result import HeldOut
+from stcal.register.core.result import ErrorFigures, HeldOut
 from stcal.register.workspace.findings import Findings
 
 FORMAT = "stcal registration 1"
@@ -49,13 +49,11 @@ def registration_json(found: Findings) -> dict:
         },
         **_transform(result.b_from_a),
         "sigma_mm": result.sigma_mm,
-        "dof": result.dof if np.isfinite(result.dof) else None,
+        "dof": result.redundancy if np.isfinite(result.redundancy) else None,
         "sigma_factor": result.sigma_factor,
         "scaled": result.scaled,
         "threshold_mm": result.threshold_mm,
-        "mean_mm": result.mean_mm,
-        "rms_mm": result.rms_mm,
-        "max_mm": result.max_mm,
+        **_figures(result.inlier_errors),
         "held_out": None if result.held_out is None else _held_out(found, result.held_out),
         "ambiguous": bool(result.ambiguous),
         "alternative": None,
@@ -90,11 +88,10 @@ def _transform(transform: Transform) -> dict:
 
 
 def _held_out(found: Findings, held: HeldOut) -> dict:
-    keys = ("mean_mm", "rms_mm", "max_mm")
     return {
         "folds": held.folds,
-        "inliers": dict(zip(keys, map(_or_none, held.of_inliers), strict=True)),
-        "all": dict(zip(keys, map(_or_none, held.of_all), strict=True)),
+        "inliers": _figures(held.of_inliers),
+        "all": _figures(held.of_all),
         "lines": [int(found.lines[i]) for i in held.rows],
         "error_mm": held.error_mm.tolist(),
     }
@@ -122,8 +119,8 @@ def _field(found: Findings) -> dict:
         "points": len(field.rows),
         "taken_back_lines": [int(found.lines[i]) for i in field.taken_back],
         "left_out": {
-            "transform": _figures(field.plain_mm),
-            "transform_and_field": _figures(field.corrected_mm),
+            "transform": _figures(ErrorFigures.of(field.plain_mm)),
+            "transform_and_field": _figures(ErrorFigures.of(field.corrected_mm)),
             "sigma_ratio": field.sigma_ratio,
         },
         "grid": {
@@ -158,12 +155,8 @@ def _cubes(found: Findings) -> dict:
     }
 
 
-def _figures(errors: np.ndarray) -> dict:
-    return {
-        "mean_mm": float(errors.mean()),
-        "rms_mm": float(np.sqrt((errors**2).mean())),
-        "max_mm": float(errors.max()),
-    }
+def _figures(errors: ErrorFigures) -> dict:
+    return {name: _or_none(getattr(errors, name)) for name in ("mean_mm", "rms_mm", "max_mm")}
 
 
 def _or_none(value: float) -> float | None:

@@ -7,6 +7,7 @@ import numpy as np
 
 from stcal.geometry.affine import Affine
 from stcal.geometry.rigid import Similarity
+from stcal.register.core.result import ErrorFigures
 from stcal.register.report.drawings import errors_figure, field_figure, space_figure
 from stcal.register.report.file import matrix_of
 from stcal.register.workspace.findings import Findings
@@ -71,21 +72,24 @@ def _parts_lines(found: Findings) -> list[str]:
         lines.append(f"scale {result.b_from_a.scale:.8f} ± {sigma[6] * result.b_from_a.scale:.2g}")
     for place, xyz in (("the middle of the inliers", found.middle()), ("a's origin", np.zeros(3))):
         lines.append(f"σ it makes at {place}: {' '.join(f'{v:.3g}' for v in found.sigma_mm_at(xyz))} mm")
-    freedom = f", {result.dof:.0f} degrees of freedom" if np.isfinite(result.dof) else ""
+    redundancy = f", {result.redundancy:.0f} degrees of freedom" if np.isfinite(result.redundancy) else ""
     factor = "" if result.sigma_factor is None else f", {result.sigma_factor:.2f} of the σ given"
-    return [*lines, f"σ of a coordinate {result.sigma_mm:.4g} mm{factor}{freedom}"]
+    return [*lines, f"σ of a coordinate {result.sigma_mm:.4g} mm{factor}{redundancy}"]
 
 
 def _errors(found: Findings) -> list[tuple]:
     """(name, points, mean, RMS, maximum)."""
     result, held = found.registration, found.registration.held_out
-    rows = [("residuals of the inliers", int(result.inliers.sum()), result.mean_mm, result.rms_mm, result.max_mm)]
+    rows = [_figures("residuals of the inliers", result.inlier_errors)]
     if held is not None:
-        own = int(result.inliers[held.rows].sum())
-        rows.append((f"held out ({held.folds} folds), inliers", own, *held.of_inliers))
-        if own < len(held.rows):
-            rows.append((f"held out ({held.folds} folds), all", len(held.rows), *held.of_all))
+        rows.append(_figures(f"held out ({held.folds} folds), inliers", held.of_inliers))
+        if held.of_inliers.points < held.of_all.points:
+            rows.append(_figures(f"held out ({held.folds} folds), all", held.of_all))
     return rows
+
+
+def _figures(name: str, errors: ErrorFigures) -> tuple:
+    return name, errors.points, errors.mean_mm, errors.rms_mm, errors.max_mm
 
 
 def _row_lines(found: Findings) -> list[str]:
@@ -180,23 +184,24 @@ def registration_page(found: Findings, more: Sections | None = None) -> str:
 
 def _result(found: Findings) -> str:
     result = found.registration
+    errors = result.inlier_errors
     tiles = [(f"{result.inliers.sum()} / {len(result)}", "inliers of the point pairs")]
-    tiles.append((f"{result.rms_mm:.3g} mm", f"RMS residual of the inliers, at most {result.max_mm:.3g} mm"))
+    tiles.append((f"{errors.rms_mm:.3g} mm", f"RMS residual of the inliers, at most {errors.max_mm:.3g} mm"))
     if result.held_out is not None:
-        mean, _, largest = result.held_out.of_inliers
-        tiles.append((f"{mean:.3g} mm", f"mean error of inliers held out, at most {largest:.3g} mm"))
+        held = result.held_out.of_inliers
+        tiles.append((f"{held.mean_mm:.3g} mm", f"mean error of inliers held out, at most {held.max_mm:.3g} mm"))
     sigma = float(np.linalg.norm(found.sigma_mm_at(found.middle())))
     tiles.append((f"{sigma:.2g} mm", "σ of the transform at the middle of the inliers, all axes together"))
     boxes = "".join(f"<div><b>{value}</b><span>{escape(name)}</span></div>" for value, name in tiles)
     matrix = matrix_table(matrix_of(result.b_from_a), "a")
-    errors = table(
+    listed = table(
         ["<Lengths of errors", "Points", "Mean (mm)", "RMS (mm)", "Max (mm)"],
         [[name, str(count), *(number(v, 4) for v in figures)] for name, count, *figures in _errors(found)],
     )
     facts = "".join(f"<p>{escape(line)}.</p>\n" for line in _parts_lines(found))
     return (
         f'<div class="tiles">{boxes}</div>\n<div class="columns"><div><h3>b_from_a</h3>{matrix}{facts}</div>'
-        f"<div><h3>Errors</h3>{errors}</div></div>\n"
+        f"<div><h3>Errors</h3>{listed}</div></div>\n"
     )
 
 

@@ -15,9 +15,9 @@ from scipy.spatial import KDTree
 from scipy.spatial.distance import cdist
 from scipy.stats import chi2
 
-from stcal.geometry.arrays import frozen
-from stcal.register.core.covariance import noise_of
+from stcal.geometry.arrays import Array, freeze
 from stcal.register.core.models import MODELS, Model, Transform, jacobian
+from stcal.register.core.problem import noise_of
 from stcal.register.core.result import Registration
 
 MOST_POINTS = 500
@@ -46,16 +46,16 @@ class Field:
     size_mm: float
     noise_mm: float
     p_value: float
-    rows: np.ndarray
-    taken_back: np.ndarray
-    plain_mm: np.ndarray
-    corrected_mm: np.ndarray
+    rows: Array
+    taken_back: Array
+    plain_mm: Array
+    corrected_mm: Array
     sigma_ratio: float
     _solved: "_Solved"
 
     def __post_init__(self):
         for name, kind in (("rows", int), ("taken_back", int), ("plain_mm", float), ("corrected_mm", float)):
-            object.__setattr__(self, name, frozen(getattr(self, name), (None,), name, kind))
+            freeze(self, name, (None,), name, kind)
 
     @property
     def seen(self) -> bool:
@@ -107,7 +107,7 @@ def residual_field(
     taken = np.zeros(0, int)
     for _ in range(ROUNDS):
         rows = _few(np.flatnonzero(used))
-        if model.freedom(len(rows)) < 2 * model.parameters:
+        if model.redundancy(len(rows)) < 2 * model.parameters:
             return None
         found = _Likelihood.of(model, registration.b_from_a, a[rows], b[rows], variance[rows])
         field = _field(found, rows, taken)

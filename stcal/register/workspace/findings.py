@@ -5,7 +5,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from stcal.geometry.arrays import frozen
+from stcal.geometry.arrays import Array, freeze
 from stcal.register.core.models import MODELS, jacobian
 from stcal.register.core.result import Registration
 from stcal.register.workspace.cubes import Cubes, cubes
@@ -19,13 +19,13 @@ class Findings:
 
     where: str
     lines: Sequence[int]
-    xyz_a: np.ndarray
+    xyz_a: Array
     registration: Registration
     field: Field | None
     cubes: Cubes | None
 
     def __post_init__(self):
-        object.__setattr__(self, "xyz_a", frozen(self.xyz_a, (len(self.registration), 3), "points"))
+        freeze(self, "xyz_a", (len(self.registration), 3), "points")
 
     @property
     def length_mm(self) -> np.ndarray:
@@ -39,8 +39,8 @@ class Findings:
     def sigma_mm_at(self, xyz_a: np.ndarray) -> np.ndarray:
         """(3,) σ that the transform's covariance makes at a point of frame a, along b's axes."""
         found = self.registration
-        slope = jacobian(MODELS[found.model], found.b_from_a, xyz_a[None])[0]
-        return np.sqrt(np.diag(slope @ found.covariance @ slope.T).clip(0))
+        by_step = jacobian(MODELS[found.model], found.b_from_a, xyz_a[None])[0]
+        return np.sqrt(np.diag(by_step @ found.covariance @ by_step.T).clip(0))
 
 
 def findings(

@@ -6,8 +6,9 @@ from scipy.spatial.transform import Rotation
 
 from stcal.errors import InputError
 from stcal.register import register
-from stcal.register.core.covariance import covariance_of, kept_share, kept_variance, noise_of, sigma_within
+from stcal.register.core.covariance import covariance_of, kept_share, kept_variance, sigma_within
 from stcal.register.core.models import MODELS
+from stcal.register.core.problem import Noise, Problem, noise_of
 from stcal.synthetic.measured.point_pairs import SIGMA_MM, make_scene, parameter_error
 
 RIGID = MODELS["rigid"]
@@ -28,7 +29,8 @@ def calibration(trials: int, n: int, share=0.0, given=False, **options) -> float
             stated = root @ np.swapaxes(root, 1, 2)
         found = register(s.xyz_a, b, covariances=stated, folds=0, **options)
         error = parameter_error(found.b_from_a, s.b_from_a)
-        of_sigma = (found.dof - 2) / found.dof if np.isfinite(found.dof) else 1  # E[σ²/s²] = ν/(ν − 2)
+        ν = found.redundancy
+        of_sigma = (ν - 2) / ν if np.isfinite(ν) else 1  # E[σ²/s²] = ν/(ν − 2)
         sizes.append(error @ np.linalg.solve(found.covariance, error) / len(error) * of_sigma)
     return float(np.mean(sizes))
 
@@ -52,8 +54,8 @@ def test_the_covariance_is_calibrated(share, options):
 def test_a_cut_costs_what_an_estimator_with_hard_rejection_loses():
     """At 2 σ: χ²₃(4)/χ²₅(4) = 0.7385/0.4506 of the variance that as many whole points have."""
     s = make_scene(np.random.default_rng(7), 50)
-    arguments = RIGID, s.b_from_a, s.xyz_a, noise_of(50, None, None), 0.1
-    whole, cut = covariance_of(*arguments, None)[0], covariance_of(*arguments, 0.2)[0]
+    problem = Problem(RIGID, s.xyz_a, s.xyz_b, Noise())
+    whole, cut = (covariance_of(problem, s.b_from_a, 0.1, threshold).matrix for threshold in (np.inf, 0.2))
     np.testing.assert_allclose(cut, whole * 0.7385 / 0.4506, rtol=2e-4)
 
 
@@ -80,11 +82,11 @@ def test_given_sigma_stands_unless_contradicted():
     s = make_scene(np.random.default_rng(3), 50)
     true = register(s.xyz_a, s.xyz_b, covariances=np.full(50, SIGMA_MM**2), folds=0)
     assert not true.scaled
-    assert true.dof == np.inf
+    assert true.redundancy == np.inf
     assert true.sigma_factor == pytest.approx(1, abs=0.25)  # 144 degrees of freedom: ± 6 %
     low = register(s.xyz_a, s.xyz_b, covariances=np.full(50, (SIGMA_MM / 5) ** 2), folds=0)
     assert low.scaled
-    assert low.dof == 144
+    assert low.redundancy == 144
     assert low.sigma_factor == pytest.approx(5 * true.sigma_factor)
     assert any("residuals exceed the σ given" in note for note in low.notes)
     # scaled, it is what the residuals alone give

@@ -102,7 +102,7 @@ def test_a_symmetric_layout_is_told():
     # labels exchanged by such a turn fit as well
     angle, to = symmetry(SQUARE, 0.5)
     turned = register(SQUARE, seen(SQUARE)[to], folds=0)
-    assert turned.rms_mm < 4 * SIGMA
+    assert turned.inlier_errors.rms_mm < 4 * SIGMA
     assert np.degrees(angle) == pytest.approx(90, abs=1) or np.degrees(angle) == pytest.approx(180, abs=1)
 
 

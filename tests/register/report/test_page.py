@@ -67,7 +67,7 @@ def test_json_is_the_result(model):
     np.testing.assert_allclose(content["residuals"], result.residuals)
     assert content["lines"] == list(range(2, 42))
     assert [o["line"] for o in content["outliers"]] == [19, 5]
-    assert content["held_out"]["inliers"]["mean_mm"] == result.held_out.of_inliers[0]
+    assert content["held_out"]["inliers"]["mean_mm"] == result.held_out.of_inliers.mean_mm
     assert len(content["field"]["grid"]["xyz_a_mm"]) == GRID**3
     assert np.shape(content["field"]["grid"]["error_mm"]) == (GRID**3, 3)
     sides = content["cubes"]["sides_mm"]
