@@ -18,14 +18,6 @@ from stcal.errors import InputError
 
 SYSTEMS = ("sfm", "robot", "register", "handeye", "locate")
 UNDOCUMENTED: set[str] = {
-    "stcal.handeye.Compared",
-    "stcal.handeye.Views",
-    "stcal.handeye.compare",
-    "stcal.handeye.cross_validate",
-    "stcal.handeye.handeye",
-    "stcal.handeye.pairs_of_views",
-    "stcal.handeye.read_poses",
-    "stcal.handeye.splits",
     "stcal.register.Alternative",
     "stcal.register.HeldOut",
     "stcal.register.Liu2017Options",

@@ -118,6 +118,12 @@ def handeye(
     views : Views, optional
         The corners that ``pairs`` come from; only ``reprojection`` uses them.
     options : HandEyeOptions, optional
+        What is known of errors and camera, and what else to solve for; the defaults where None.
+
+    Returns
+    -------
+    HandEye
+        X and Z with covariances, residuals, outliers, and notes on what is doubtful.
 
     Raises
     ------

@@ -42,8 +42,8 @@ class HeldOut:
     rows: np.ndarray
     rotation_rad: np.ndarray
     translation_mm: np.ndarray
-    board_mm: np.ndarray | None
-    pose_mm: np.ndarray | None
+    board_mm: np.ndarray | None = None
+    pose_mm: np.ndarray | None = None
 
     def __post_init__(self):
         object.__setattr__(self, "rows", frozen(self.rows, (None, None), "held-out poses", int))
@@ -63,7 +63,19 @@ class HeldOut:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Compared:
-    """One method: its result and errors, or ``reason`` why there are none."""
+    """One method beside the others.
+
+    Parameters
+    ----------
+    method : str
+        One of :data:`~stcal.handeye.METHODS`.
+    result : HandEye or None
+        Of all poses; None where the method fails.
+    held_out : HeldOut or None
+        Errors on poses that were held out; None where the method fails, or none were.
+    reason : str
+        Why it fails; empty where it does not.
+    """
 
     method: str
     result: HandEye | None
@@ -72,9 +84,23 @@ class Compared:
 
 
 def splits(count: int, held_out: int | None = None, repeats: int = 15, seed: int = 0) -> np.ndarray:
-    """Poses to hold out, (repeats, k) of ``count``: at random, in rounds in each of which every pose comes about once.
+    """Poses to hold out: at random, in rounds in each of which every pose comes about once.
 
-    Without ``held_out`` a quarter of the poses, at least one.
+    Parameters
+    ----------
+    count : int
+        Poses there are.
+    held_out : int, optional
+        Poses to hold out at once, k; a quarter of them, at least one, where None.
+    repeats : int
+        Splits wanted.
+    seed : int
+        Of the random order.
+
+    Returns
+    -------
+    (repeats, k) int array
+        Rows held out in each split, in ascending order.
 
     Raises
     ------
@@ -105,13 +131,22 @@ def cross_validate(
     workers: int | None = 1,
     progress: Callable[[int, int], None] | None = None,
 ) -> HeldOut:
-    """Solve without some of the poses and predict these; arguments as of :func:`~stcal.handeye.handeye`.
+    """Solve without some of the poses and predict these (Stone 1974, J. R. Stat. Soc. B 36).
 
     Parameters
     ----------
-    rows : (s, k) from :func:`splits`
-    workers : processes for adjustments of corners, as many as cores where None
-    progress : called with the number of splits done, and that of all
+    pairs, setup, method, views, options
+        As of :func:`~stcal.handeye.handeye`.
+    rows : (s, k) int array, optional
+        Poses to hold out, from :func:`splits`, which is also what None means.
+    workers : int or None
+        Processes for adjustments of corners, as many as cores where None.
+    progress : callable, optional
+        Called with the number of splits done, and that of all.
+
+    Returns
+    -------
+    HeldOut
 
     Raises
     ------
@@ -124,14 +159,13 @@ def cross_validate(
         pairs, views, options = mended.pairs, mended.views, replace(options, symmetries=())
     rows = splits(len(pairs)) if rows is None else rows
     jobs = [(pairs, setup, method, views, options, out) for out in rows]
-    found: list = [None] * len(jobs)
+    found: list[dict[str, np.ndarray]] = [{}] * len(jobs)
     slow = views is not None and method in (None, "reprojection")
     for done, (i, errors) in enumerate(run_parallel(_without, jobs, workers if slow else 1), 1):
         found[i] = errors
         if progress:
             progress(done, len(jobs))
-    parts = [None if part[0] is None else np.array(part) for part in zip(*found, strict=True)]
-    return HeldOut(rows, *parts)
+    return HeldOut(rows, **{name: np.array([errors[name] for errors in found]) for name in found[0]})
 
 
 def _without(pairs: HandEyePoses, setup: Setup, method, views: Views | None, options: HandEyeOptions, out: np.ndarray):
@@ -145,12 +179,15 @@ def _without(pairs: HandEyePoses, setup: Setup, method, views: Views | None, opt
     return predicted(result, pairs[out], None if views is None else views[out])
 
 
-def predicted(result: HandEye, pairs: HandEyePoses, views: Views | None) -> tuple[np.ndarray | None, ...]:
-    """Errors of :class:`HeldOut`, (k,) each, on pairs and views that the result has not seen."""
+def predicted(result: HandEye, pairs: HandEyePoses, views: Views | None) -> dict[str, np.ndarray]:
+    """Errors of :class:`HeldOut` by name, (k,) each, on pairs and views that the result has not seen."""
     scale, loop = result.scale, Loop.of(pairs, result.setup)
     if views is None:
         off = loop.residuals(result.mount_from_camera, result.stand_from_board, scale)
-        return np.linalg.norm(off[:, :3], axis=1), np.linalg.norm(off[:, 3:], axis=1), None, None
+        return {
+            "rotation_rad": np.linalg.norm(off[:, :3], axis=1),
+            "translation_mm": np.linalg.norm(off[:, 3:], axis=1),
+        }
     board = result.reprojection
     camera = views.camera if board is None else board.camera
     seen = [
@@ -160,14 +197,12 @@ def predicted(result: HandEye, pairs: HandEyePoses, views: Views | None) -> tupl
     by_view = resect(Views(camera, tuple(seen)), pairs.names).camera_from_board
     off = replace(loop, camera_from_board=by_view).residuals(result.mount_from_camera, result.stand_from_board)
     by_robot = result.mount_from_camera.inverse() @ loop.stand_from_mount.inverse() @ result.stand_from_board
-    on_board = [_beside(view, camera, pose) for view, pose in zip(seen, by_robot, strict=True)]
-    apart = [_apart(view, *two) for view, *two in zip(seen, by_robot, by_view, strict=True)]
-    return (
-        np.linalg.norm(off[:, :3], axis=1),
-        np.linalg.norm(off[:, 3:], axis=1),
-        np.array(on_board),
-        np.array(apart),
-    )
+    return {
+        "rotation_rad": np.linalg.norm(off[:, :3], axis=1),
+        "translation_mm": np.linalg.norm(off[:, 3:], axis=1),
+        "board_mm": np.array([_beside(view, camera, pose) for view, pose in zip(seen, by_robot, strict=True)]),
+        "pose_mm": np.array([_apart(view, *two) for view, *two in zip(seen, by_robot, by_view, strict=True)]),
+    }
 
 
 @one_thread()
@@ -181,8 +216,23 @@ def compare(
     workers: int | None = 1,
     progress: Callable[[int, int], None] | None = None,
 ) -> tuple[Compared, ...]:
-    """Every method on the same poses and the same splits (none where ``rows`` is empty); ``reprojection`` only with
-    views.
+    """Every method on the same poses and the same splits.
+
+    Parameters
+    ----------
+    pairs, setup, views, options
+        As of :func:`~stcal.handeye.handeye`; without views, ``reprojection`` is passed over.
+    methods : tuple of str
+        Of :data:`~stcal.handeye.METHODS`.
+    rows, workers
+        As of :func:`cross_validate`; nothing is held out where ``rows`` is empty.
+    progress : callable, optional
+        Called with the number of methods done, and that of all.
+
+    Returns
+    -------
+    tuple of Compared
+        In the order of ``methods``; a method that fails says why.
 
     Raises
     ------

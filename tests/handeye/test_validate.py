@@ -42,10 +42,12 @@ def test_errors_at_the_board():
     truth = simulated_views(np.random.default_rng(2), 6, "eye-to-hand")
     exact = handeye(truth.pairs, "eye-to-hand", views=truth.views, options=HandEyeOptions(noise=Noise(board_mm=0)))
     seen = truth.pairs[:1], truth.views[:1]
-    assert [v.item() < 1e-3 for v in predicted(exact, *seen)] == [True] * 4
+    assert [v.item() < 1e-3 for v in predicted(exact, *seen).values()] == [True] * 4
     for shift, on_board in (([1.0, 0, 0], 1.0), ([0, 0, 1.0], 0.0)):
         moved = exact.mount_from_camera @ Rigid(np.eye(3), shift)
-        _, distance, board, pose = (v.item() for v in predicted(replace(exact, mount_from_camera=moved), *seen))
+        _, distance, board, pose = (
+            v.item() for v in predicted(replace(exact, mount_from_camera=moved), *seen).values()
+        )
         assert distance == pytest.approx(1, abs=1e-2)
         assert pose == pytest.approx(1, abs=1e-2)
         # The board is tilted by up to 29° and seen up to 20° off the axis.

@@ -85,11 +85,12 @@ class HandEyePoses:
     def __getitem__(self, index) -> "HandEyePoses":
         """Pairs by a mask, slice or list."""
         rows = np.arange(len(self))[index]
-        covariances = (self.base_from_flange_covariance, self.camera_from_board_covariance)
+        of_flange, of_board = self.base_from_flange_covariance, self.camera_from_board_covariance
         return HandEyePoses(
             self.base_from_flange[rows],
             self.camera_from_board[rows],
-            *(None if c is None else c[rows] for c in covariances),
+            None if of_flange is None else of_flange[rows],
+            None if of_board is None else of_board[rows],
             tuple(self.names[i] for i in rows),
             self.where,
         )
@@ -119,6 +120,16 @@ def read_poses(path: str | Path) -> HandEyePoses:
 
     Columns ``base_from_flange_x_mm`` … ``_qw`` … and ``camera_from_board_…`` (or ``flange_from_base_…``,
     ``board_from_camera_…``), lengths in any unit of :data:`~stcal.io.table.LENGTHS`, covariances as ``…_cov_rx_rx``.
+
+    Parameters
+    ----------
+    path : str or Path
+        The file.
+
+    Returns
+    -------
+    HandEyePoses
+        Poses in mm; pairs are named by their lines.
 
     Raises
     ------

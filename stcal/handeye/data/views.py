@@ -52,7 +52,15 @@ class View:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Views:
-    """One :class:`View` for each pose of the flange, all by one camera."""
+    """One view for each pose of the flange, all by one camera.
+
+    Parameters
+    ----------
+    camera : Camera
+        That took them.
+    views : tuple of View
+        m of them, in order of the poses.
+    """
 
     camera: Camera
     views: tuple[View, ...]
@@ -104,6 +112,21 @@ def pairs_of_views(
     base_from_flange: Poses, views: Views, names: tuple[str, ...] = (), where: str = "views"
 ) -> HandEyePoses:
     """Pose pairs of which the board's poses, with their covariances, come from the corners of each view.
+
+    Parameters
+    ----------
+    base_from_flange : Poses
+        m of them, mm, as the robot states them.
+    views : Views
+        m of them, in the same order.
+    names : tuple of str
+        What each pair is called in messages; ``pose 1`` … where none are given.
+    where : str
+        What the views were read from, for messages.
+
+    Returns
+    -------
+    HandEyePoses
 
     Raises
     ------
