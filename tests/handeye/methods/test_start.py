@@ -1,0 +1,67 @@
+"""First values: exact from exact poses, and as good as that with a third of bad ones."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from stcal.errors import DegenerateError
+from stcal.geometry.rigid import Poses, Rigid
+from stcal.handeye.data.loop import SETUPS, Loop
+from stcal.handeye.methods.start import mean_pose, robust
+from stcal.synthetic.measured.handeye import disturbed, simulated
+
+
+def apart(found: Rigid, true: Rigid) -> np.ndarray:
+    """rad and mm."""
+    error = (found @ true.inverse()).log()
+    return np.array([np.linalg.norm(error[:3]), np.linalg.norm(found.translation - true.translation)])
+
+
+@pytest.mark.parametrize("setup", SETUPS)
+@pytest.mark.parametrize("count", [3, 4, 6, 15])
+def test_exact_poses_give_the_exact_answer(setup, count):
+    truth = simulated(np.random.default_rng(count), count, setup)
+    x, z, scale = robust(Loop.of(truth.pairs, setup))
+    assert (apart(x, truth.mount_from_camera) < [1e-7, 1e-5]).all()
+    assert (apart(z, truth.stand_from_board) < [1e-7, 1e-5]).all()
+    assert scale == 1.0
+
+
+def test_the_board_s_size_comes_out_too():
+    truth = simulated(np.random.default_rng(1), 12)
+    loop = Loop.of(truth.pairs, "eye-in-hand")
+    eye = loop.camera_from_board
+    x, _, scale = robust(replace(loop, camera_from_board=Poses(eye.rotation, eye.translation / 1.05)), True)
+    assert scale == pytest.approx(1.05, rel=1e-9)
+    assert apart(x, truth.mount_from_camera)[1] < 1e-5
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_a_third_of_bad_poses_does_no_harm(seed):
+    """Five of fifteen off by 0.3 rad and 100 mm, the others by 1e-4 rad and 0.05 mm: about what ten good ones give; the
+    solution of all at once is tens of mm off."""
+    rng = np.random.default_rng(seed)
+    truth = simulated(rng, 15)
+    loop = Loop.of(truth.pairs, "eye-in-hand")
+    eye, bad = loop.camera_from_board, np.arange(15) < 5
+    good, spoilt = disturbed(rng, eye, 1e-4, 0.05), disturbed(rng, eye, 0.3, 100.0)
+    rotation = np.where(bad[:, None, None], spoilt.rotation, good.rotation)
+    translation = np.where(bad[:, None], spoilt.translation, good.translation)
+    x, z, _ = robust(replace(loop, camera_from_board=Poses(rotation, translation)))
+    assert 1e-6 < apart(x, truth.mount_from_camera)[0] < 1e-3
+    assert 1e-3 < apart(x, truth.mount_from_camera)[1] < 1.0
+    assert apart(z, truth.stand_from_board)[1] < 1.0
+
+
+def test_two_poses_are_too_few():
+    truth = simulated(np.random.default_rng(0), 2)
+    with pytest.raises(DegenerateError, match="2 poses, 3 needed"):
+        robust(Loop.of(truth.pairs, "eye-in-hand"))
+
+
+def test_mean_pose_of_two_turns_is_half_way():
+    poses = Poses.of([Rigid.exp([0, 0, a, 1, 2, 10 * a]) for a in (0.2, 0.4)])
+    mean = mean_pose(poses)
+    assert mean.log()[:3] == pytest.approx([0, 0, 0.3])
+    assert mean.translation == pytest.approx(poses.translation.mean(0))

@@ -1,0 +1,76 @@
+"""Reduced normal equations of a group against the same in full, derivatives by differences."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from stcal.geometry.rigid import Rigid
+from stcal.sfm.adjust import blocks
+from stcal.synthetic.scene import SceneOptions, make_scene
+from tests.sfm.adjust import dense
+
+
+@pytest.fixture(scope="module")
+def group(labels_only):
+    scene = make_scene(
+        SceneOptions(seed=9, width=1296, height=864, images_per_group=3, groups=(("1", "2"), ("1", "4")))
+    )
+    observed = labels_only.observations(scene, 0.01, np.random.default_rng(2))
+    return labels_only.models(scene, observed)[0], scene.camera
+
+
+@pytest.mark.parametrize("intrinsics", [0, 2])
+def test_without_cameras_it_is_the_schur_complement_of_the_full_equations(group, intrinsics):
+    """Points and the camera's parameters remain; a step of these brings the cameras' own along."""
+    model, camera = group
+    basis = np.eye(12)[:, :intrinsics]
+    normal, right, camera_step, camera_from_kept = blocks.without_cameras(model, camera, basis, np.inf)
+    jacobian = dense.jacobian(model, camera)
+    if intrinsics:
+        by = [
+            (dense.projections(model, camera.with_parameters(camera.parameters() + 1e-3 * b))
+             - dense.projections(model, camera.with_parameters(camera.parameters() - 1e-3 * b))).ravel() / 2e-3
+            for b in basis.T
+        ]  # fmt: skip
+        jacobian = np.column_stack([jacobian, *by])
+    residual = model.whiten(model.residuals_px(camera)).ravel()
+    k = 6 * len(model.images)
+    full, full_right = jacobian.T @ jacobian, jacobian.T @ residual
+    back = np.linalg.solve(full[:k, :k], full[:k, k:])
+    wanted = full[k:, k:] - full[k:, :k] @ back
+    scale = np.sqrt(np.diag(full)[k:])
+    np.testing.assert_allclose(normal / np.outer(scale, scale), wanted / np.outer(scale, scale), atol=1e-6)
+    np.testing.assert_allclose(right / scale, (full_right[k:] - back.T @ full_right[:k]) / scale, atol=1e-5)
+    step = np.random.default_rng(1).normal(size=len(normal)) / scale
+    cameras = camera_step.ravel() - np.tensordot(camera_from_kept, step, 1).ravel()
+    solved = np.linalg.solve(full[:k, :k], full_right[:k] - full[:k, k:] @ step)
+    np.testing.assert_allclose(cameras, solved, atol=1e-5 * np.abs(solved).max())
+
+
+def test_weights_are_hubers_and_the_cost_is_theirs(group):
+    """Weight 1 within the limit and limit/length beyond; the cost's derivative by a residual is 2 w r."""
+    model, camera = group
+    far = model.measured_px.copy()
+    far[5] += [1.0, 0.0]
+    model = replace(model, measured_px=far)
+    length = np.linalg.norm(blocks.normalised(model, camera), axis=1)
+    weights = blocks.robust_weights(model, camera, 4.0)
+    assert weights[5] == pytest.approx(4 / length[5])
+    assert (weights[length < 4] == 1).all()
+
+    def cost(shift: float) -> float:
+        changed = far.copy()
+        changed[5, 0] += shift
+        return blocks.image_cost(replace(model, measured_px=changed), camera, 4.0)
+
+    gradient = (cost(1e-4) - cost(-1e-4)) / 2e-4
+    by_x = model.whiten(np.tile([1.0, 0.0], (len(far), 1)))[5]
+    assert gradient == pytest.approx(2 * weights[5] * by_x @ blocks.normalised(model, camera)[5], rel=1e-5)
+
+
+def test_points_behind_a_camera_cost_everything(group):
+    model, camera = group
+    turned = tuple(Rigid.exp([np.pi, 0, 0, 0, 0, 0]) @ pose for pose in model.camera_from_world)
+    behind = replace(model, camera_from_world=turned)
+    assert blocks.image_cost(behind, camera, 4.0) == np.inf

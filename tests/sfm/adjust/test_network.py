@@ -1,0 +1,107 @@
+"""The free network against the same equations in full, and the score test against an adjustment with the fault."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from stcal.geometry.rigid import skew
+from stcal.sfm.adjust.group import adjust
+from stcal.sfm.adjust.network import free_network, solve_score
+from stcal.sfm.adjust.refine import eccentricity_px
+from stcal.synthetic.scene import SceneOptions, make_scene
+from tests.sfm.adjust import dense
+
+NOISE_PX, FACTOR = 0.01, 1.3
+
+
+@pytest.fixture(scope="module")
+def group(labels_only):
+    """An adjusted group of four images, mm, and its camera."""
+    scene = make_scene(
+        SceneOptions(seed=8, width=1296, height=864, images_per_group=4, groups=(("1", "2"), ("1", "4")))
+    )
+    observed = labels_only.observations(scene, NOISE_PX, np.random.default_rng(2))
+    start = labels_only.models(scene, observed)[0]
+    radius = scene.target.radius_of() | scene.board.radius_of()
+    start = replace(start, shift_px=eccentricity_px(start, scene.camera, radius, 1.0))
+    return adjust(start, scene.camera), scene.camera
+
+
+@pytest.fixture(scope="module")
+def network(group):
+    return free_network(*group, FACTOR)
+
+
+@pytest.fixture(scope="module")
+def full(group):
+    """Dense Jacobian over σ, and the cofactors of all unknowns with inner constraints on the points."""
+    model, camera = group
+    model = replace(model, covariance_px2=FACTOR**2 * model.covariance_px2)
+    jacobian = dense.jacobian(model, camera)
+    middle = model.xyz_world - model.xyz_world.mean(0)
+    size, p = jacobian.shape[1], len(middle)
+    free = np.zeros((size, 7))
+    free[-3 * p :] = np.concatenate(
+        [-skew(middle), np.broadcast_to(np.eye(3), (p, 3, 3)), middle[:, :, None]], axis=2
+    ).reshape(-1, 7)
+    bordered = np.block([[jacobian.T @ jacobian, free], [free.T, np.zeros((7, 7))]])
+    return jacobian, np.linalg.inv(bordered)[:size, :size]
+
+
+def test_covariance_of_the_points_is_that_of_the_full_equations(network, full, group):
+    p = 3 * len(group[0].labels)
+    scale = np.sqrt(np.diag(network.covariance_mm2))
+    np.testing.assert_allclose(
+        network.covariance_mm2 / np.outer(scale, scale), full[1][-p:, -p:] / np.outer(scale, scale), atol=1e-5
+    )
+    np.testing.assert_array_equal(network.covariance_of([3, 1])[3:, :3], network.covariance_mm2[3:6, 9:12])
+
+
+def test_redundancy_is_that_of_the_full_equations(network, full, group):
+    """Diagonal of 1 − J C Jᵀ, both coordinates of an observation; in all, what is not unknown."""
+    jacobian, cofactors = full
+    own = 1 - np.einsum("ij,jk,ik->i", jacobian, cofactors, jacobian)
+    np.testing.assert_allclose(network.redundancy, own.reshape(-1, 2).sum(1), atol=1e-6)
+    assert network.redundancy.sum() == pytest.approx(len(jacobian) - (jacobian.shape[1] - 7), abs=1e-5)
+    square, redundancy = network.square_by_image()
+    assert square.sum() == pytest.approx((network.residual**2).sum())
+    assert redundancy.sum() == pytest.approx(network.redundancy.sum())
+    assert len(square) == len(group[0].images)
+
+
+def test_score_of_a_parameter_is_its_estimate_beside_all_others(network, full, group):
+    """One more column in the full equations: its σ is the score's, and so is its estimate."""
+    model, rng = group[0], np.random.default_rng(0)
+    column = rng.normal(size=(len(model.image_index), 2, 1))
+    value, covariance, statistic, count = solve_score(*network.score(column))
+    wider = np.column_stack([full[0], column.reshape(-1)])
+    estimate = np.linalg.lstsq(wider, network.residual.reshape(-1), rcond=1e-9)[0][-1]
+    left = column.reshape(-1) - full[0] @ np.linalg.lstsq(full[0], column.reshape(-1), rcond=1e-9)[0]
+    assert covariance[0, 0] == pytest.approx(1 / (left @ left), rel=1e-4)
+    assert value[0] == pytest.approx(estimate, rel=1e-3, abs=1e-4 * np.sqrt(covariance[0, 0]))
+    assert count == 1
+    assert statistic == pytest.approx(value[0] ** 2 / covariance[0, 0])
+
+
+def test_a_fault_of_one_image_is_found_there_and_nowhere_else(group):
+    """One image's focal length 1e-4 longer: 100 times its σ there."""
+    model, camera = group
+    image = 2
+    own = model.image_index == image
+    stretched = model.measured_px.copy()
+    stretched[own] += 1e-3 * (stretched[own] - camera.centre)
+    network = free_network(adjust(replace(model, measured_px=stretched), camera), camera, 1.0)
+    columns = network.model.whiten(network.model.corrected_px() - camera.centre)[:, :, None]
+    normal, right = network.score_by_image(columns)
+    statistics = [solve_score(n, r)[2] for n, r in zip(normal, right, strict=True)]
+    assert np.argmax(statistics) == image
+    assert solve_score(normal[image], right[image])[0][0] == pytest.approx(1e-3, rel=0.05)
+
+
+def test_directions_without_information_count_for_nothing():
+    normal = np.array([[2.0, 2.0], [2.0, 2.0]])
+    value, _, statistic, count = solve_score(normal, np.array([1.0, 1.0]))
+    assert count == 1
+    assert statistic == pytest.approx(0.5)
+    assert normal @ value == pytest.approx([1.0, 1.0])
