@@ -21,7 +21,7 @@ from stcal.sfm.adjust.joint import adjust_jointly
 from stcal.sfm.adjust.refine import eccentricity_px
 from stcal.sfm.adjust.scale import find_scale
 from stcal.sfm.adjust.uncertainty import calibrated_target
-from stcal.sfm.data.model import GroupModel
+from stcal.sfm.data.model import WorldModel
 from stcal.sfm.data.observations import ImageObservations
 from stcal.sfm.plan.simulated import observe, true_models
 from stcal.synthetic.scene import Scene, SceneOptions, make_scene
@@ -61,10 +61,10 @@ class LabelsOnly:
         """Ellipse centres of everything that must be found, with noise."""
         return observe(scene, noise_px, rng)
 
-    def models(self, scene: Scene, observations: list[ImageObservations], unit_mm: float = 1.0) -> list[GroupModel]:
+    def models(self, scene: Scene, observations: list[ImageObservations], unit_mm: float = 1.0) -> list[WorldModel]:
         """Models at the true geometry, in a world turned and scaled against the target frame."""
         world_from_target = Similarity(1 / unit_mm, Rigid.exp([0.3, -0.2, 0.5, 40, -30, 900]))
-        return [model.moved(world_from_target) for model in true_models(scene, observations)]
+        return [model.in_world(world_from_target) for model in true_models(scene, observations)]
 
     def calibrate(self, scene: Scene, noise_px: float, seed: int, solve: str = "joint"):
         """Chain or joint calibration from labels; returns (CalibratedTarget, JointResult or None)."""
@@ -76,13 +76,13 @@ class LabelsOnly:
             model = replace(start, shift_px=eccentricity_px(start, camera, radius, 1.0))
             model = adjust(model, camera)
             scales[model.group] = find_scale(model, board).mm_per_unit
-            faces += faces_of_group(model, scales[model.group], camera, target, "plane")[0]
+            faces += faces_of_group(model.metric(Similarity(scales[model.group], Rigid())), camera, target, "plane")[0]
             models.append(model)
         chained = chain_faces(faces, target, target.faces[0].id)
         if solve == "chain":
             return chained, None
         metric = [
-            m.moved(Similarity(1.0, chained.target_from_group[m.group]) @ Similarity(scales[m.group], Rigid()))
+            m.metric(Similarity(1.0, chained.target_from_group[m.group]) @ Similarity(scales[m.group], Rigid()))
             for m in models
         ]
         joint = adjust_jointly(metric, board, camera)

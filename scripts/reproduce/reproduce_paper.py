@@ -24,14 +24,14 @@ import matplotlib as mpl
 import numpy as np
 
 from stcal.geometry.align import align_rigid
-from stcal.geometry.rigid import Rigid
+from stcal.geometry.rigid import Rigid, Similarity
 from stcal.labels import dot_cells
 from stcal.parallel import one_thread
 from stcal.report.figure import save
 from stcal.sfm import run
 from stcal.sfm.adjust.faces import faces_of_group
 from stcal.sfm.adjust.scale import find_scale
-from stcal.sfm.data.model import GroupModel
+from stcal.sfm.data.model import WorldModel
 from stcal.sfm.data.observations import ImageObservations
 from stcal.sfm.mapping.graph import image_graph
 from stcal.sfm.pipeline import solve_groups
@@ -102,7 +102,7 @@ def by_the_paper(observations: list[ImageObservations], scene: Scene, out: Path)
     frames, boards = {}, []
     for model in (s.model for s in solutions):
         scale = find_scale(model, scene.board).rows_mm_per_unit
-        faces, _ = faces_of_group(model, scale, scene.camera, scene.target, options.frame)
+        faces, _ = faces_of_group(model.metric(Similarity(scale, Rigid())), scene.camera, scene.target, options.frame)
         frames[model.group] = {each.face: each.group_from_face for each in faces}
         boards.append(board_errors(model, scale, scene))
     return errors(chained(frames, scene), boards, scene)
@@ -126,7 +126,7 @@ def by_us(data: Path, scene: Scene, out: Path) -> tuple[Errors, list[ImageObserv
     return errors(calibration.target.target_from_face, boards, scene, sigma), result.observations()
 
 
-def board_errors(model: GroupModel, mm_per_unit: float, scene: Scene) -> tuple[float, float]:
+def board_errors(model: WorldModel, mm_per_unit: float, scene: Scene) -> tuple[float, float]:
     """Mean length of the scaled board's residuals against the design and against the true dots, µm."""
     rows, columns = scene.board.rows, scene.board.columns
     members = model.points_by_face()["board"]

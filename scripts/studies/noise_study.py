@@ -19,7 +19,7 @@ import matplotlib as mpl
 import numpy as np
 
 from stcal.design import BoardDesign, TargetDesign, reference_board, reference_target
-from stcal.geometry.rigid import Rigid
+from stcal.geometry.rigid import Rigid, Similarity
 from stcal.parallel import one_thread
 from stcal.report.figure import save
 from stcal.sfm.adjust.calibration import Calibration, calibrate
@@ -66,11 +66,17 @@ def one_run(seed: int, point: Point) -> np.ndarray:
     scene = make_scene(scene_options, target, board, nominal_target_from_face())
     noise_px = point.noise_px / np.sqrt(point.radius)
     observations = observe(scene, noise_px, np.random.default_rng([seed, 41]))
-    measured = true_models(scene, observations)
+    measured = [m.in_world(Similarity(1.0, Rigid())) for m in true_models(scene, observations)]
     radius = target.radius_of() | board.radius_of()
     corrected = [replace(m, shift_px=eccentricity_px(m, scene.camera, radius, 1.0)) for m in measured]
     ours, control = (
-        calibrate([adjust(m, scene.camera) for m in models], scene.camera, target, board, options.adjustment(target))
+        calibrate(
+            [adjust(m, scene.camera) for m in models],
+            scene.camera,
+            target,
+            board,
+            options.adjustment(target),
+        )
         for models, options in ((corrected, RunOptions()), (measured, RunOptions(eccentricity=False)))
     )
     scale = (ours.sigma_factor * ours.joint.sigma0) ** 2

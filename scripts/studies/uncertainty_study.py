@@ -14,7 +14,7 @@ from dataclasses import replace
 import numpy as np
 
 from stcal.design import reference_board
-from stcal.geometry.rigid import Rigid
+from stcal.geometry.rigid import Rigid, Similarity
 from stcal.io.camera import CameraPrior, intrinsic_basis
 from stcal.parallel import one_thread
 from stcal.sfm.adjust.calibration import calibrate
@@ -42,7 +42,7 @@ def one_run(seed: int, board_sigma_mm: float, refine: bool) -> list[tuple[float,
         camera = camera.with_parameters(camera.parameters() + away)
     radius = scene.target.radius_of() | board.radius_of()
     models = [
-        adjust(replace(m, shift_px=eccentricity_px(m, camera, radius, 1.0)), camera)
+        adjust(replace(m, shift_px=eccentricity_px(m, camera, radius, 1.0)), camera).in_world(Similarity(1.0, Rigid()))
         for m in true_models(scene, observations)
     ]
     options = RunOptions(refine_camera=refine).adjustment(scene.target)

@@ -12,7 +12,7 @@ from scipy.spatial.transform import Rotation
 from stcal.geometry.camera import Camera
 from stcal.geometry.rigid import Rigid, skew
 from stcal.sfm.adjust.group import projection_jacobians
-from stcal.sfm.data.model import GroupModel
+from stcal.sfm.data.model import GroupModel, MetricModel
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -39,7 +39,7 @@ class Block:
     common shape, empty where each group has its own; ``circle_place`` : of each circle among all.
     """
 
-    model: GroupModel
+    model: MetricModel
     world_from_board: Rigid
     design: np.ndarray
     sigma_mm: float

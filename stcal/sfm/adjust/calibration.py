@@ -8,7 +8,6 @@ import numpy as np
 from stcal.design import BoardDesign, TargetDesign
 from stcal.errors import MappingError
 from stcal.geometry.camera import Camera
-from stcal.geometry.rigid import Rigid, Similarity
 from stcal.io.camera import CameraPrior
 from stcal.sfm.adjust.chain import CalibratedTarget, chain_faces
 from stcal.sfm.adjust.faces import FaceInGroup, faces_of_group
@@ -18,7 +17,7 @@ from stcal.sfm.adjust.options import AdjustOptions
 from stcal.sfm.adjust.refine import eccentricity_px
 from stcal.sfm.adjust.scale import Scale, find_scale
 from stcal.sfm.adjust.uncertainty import calibrated_target
-from stcal.sfm.data.model import GroupModel
+from stcal.sfm.data.model import GroupModel, M, MetricModel, WorldModel
 
 JOINT_ROUNDS = 2
 """Eccentricity moves by nanometres between the first and the second joint adjustment."""
@@ -36,13 +35,13 @@ class Calibration:
     faces: tuple[FaceInGroup, ...]
     joint: JointResult | None
     sigma_factor: float
-    models: tuple[GroupModel, ...]
+    models: tuple[MetricModel, ...]
     camera: Camera
     notes: tuple[str, ...]
 
 
 def calibrate(
-    models: Sequence[GroupModel],
+    models: Sequence[WorldModel],
     camera: Camera,
     target: TargetDesign,
     board: BoardDesign,
@@ -65,7 +64,9 @@ def calibrate(
     scales = {model.group: find_scale(model, board) for model in models}
     faces, notes = [], []
     for model in models:
-        found, missing = faces_of_group(model, scales[model.group].mm_per_unit, camera, target, options.frame)
+        found, missing = faces_of_group(
+            model.metric(scales[model.group].group_from_world()), camera, target, options.frame
+        )
         faces += found
         notes += missing
     try:
@@ -78,15 +79,15 @@ def calibrate(
     if options.solve == "joint":
         joint, factor = _adjust_all(metric, factor, camera, target, board, options, prior)
         calibrated = calibrated_target(joint, calibrated, target, options.frame)
-        metric = [m.moved(Similarity(1.0, calibrated.target_from_group[m.group])) for m in joint.models]
+        metric = [m.moved(calibrated.target_from_group[m.group]) for m in joint.models]
         camera = joint.camera
         notes += _unsettled(joint)
     return Calibration(calibrated, scales, tuple(faces), joint, factor, tuple(metric), camera, tuple(notes))
 
 
-def _placed(model: GroupModel, scale: Scale, start: CalibratedTarget) -> GroupModel:
+def _placed(model: WorldModel, scale: Scale, start: CalibratedTarget) -> MetricModel:
     """The model in mm in the target frame, by its chain."""
-    return model.moved(Similarity(1.0, start.target_from_group[model.group]) @ Similarity(scale.mm_per_unit, Rigid()))
+    return model.metric(start.target_from_group[model.group] @ scale.group_from_world())
 
 
 def _unsettled(joint: JointResult) -> list[str]:
@@ -100,7 +101,7 @@ def _unsettled(joint: JointResult) -> list[str]:
 
 
 def _adjust_all(
-    models: list[GroupModel], factor: float, camera: Camera, target, board, options: AdjustOptions, prior
+    models: list[MetricModel], factor: float, camera: Camera, target, board, options: AdjustOptions, prior
 ) -> tuple[JointResult, float]:
     """The joint adjustment from the chained result, and the factor on the centres' σ; eccentricity follows, and with
     refined intrinsics that factor too: a wrong camera makes residuals of its own."""
@@ -127,6 +128,6 @@ def image_sigma_factor(models: Sequence[GroupModel], camera: Camera) -> float:
     return float(np.sqrt(square / redundancy)) if redundancy > 0 else 1.0
 
 
-def with_sigma(model: GroupModel, factor: float) -> GroupModel:
+def with_sigma(model: M, factor: float) -> M:
     """The model with its observations' σ scaled."""
     return replace(model, covariance_px2=factor**2 * model.covariance_px2)

@@ -13,7 +13,7 @@ from stcal.geometry.plane import fit_plane
 from stcal.geometry.rigid import Rigid
 from stcal.labels import CircleLabel
 from stcal.sfm.adjust.group import projection_jacobians
-from stcal.sfm.data.model import GroupModel
+from stcal.sfm.data.model import MetricModel
 
 FrameKind = Literal["plane", "three-point"]
 
@@ -71,12 +71,12 @@ def face_frame(face: FaceDesign, xyz: dict[str, np.ndarray], kind: FrameKind, to
 
 
 def faces_of_group(
-    model: GroupModel, mm_per_unit: float, camera: Camera, target: TargetDesign, kind: FrameKind
+    model: MetricModel, camera: Camera, target: TargetDesign, kind: FrameKind
 ) -> tuple[list[FaceInGroup], list[str]]:
     """Frames of all faces of one group, and why a face has none."""
-    xyz = mm_per_unit * model.xyz_world
-    information = _point_information(model, camera) / mm_per_unit**2
-    cameras = np.stack([pose.inverse().translation for pose in model.camera_from_world]) * mm_per_unit
+    xyz = model.xyz_world
+    information = _point_information(model, camera)
+    cameras = np.stack([pose.inverse().translation for pose in model.camera_from_world])
     faces, notes = [], []
     for face in target.faces:
         members = model.points_by_face().get(face.id, np.zeros(0, int))
@@ -109,8 +109,8 @@ def faces_of_group(
     return faces, notes
 
 
-def _point_information(model: GroupModel, camera: Camera) -> np.ndarray:
-    """Inverse covariance (p, 3, 3) of each point, given the cameras, world units."""
+def _point_information(model: MetricModel, camera: Camera) -> np.ndarray:
+    """Inverse covariance (p, 3, 3) of each point, given the cameras, mm⁻²."""
     jacobian = model.whiten(projection_jacobians(model, camera)[1])
     information = np.zeros((len(model.labels), 3, 3))
     np.add.at(information, model.point_index, np.swapaxes(jacobian, 1, 2) @ jacobian)

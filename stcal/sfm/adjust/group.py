@@ -15,7 +15,7 @@ from scipy.spatial.transform import Rotation
 from stcal.errors import ConvergenceError
 from stcal.geometry.camera import Camera
 from stcal.geometry.rigid import Rigid, skew
-from stcal.sfm.data.model import GroupModel
+from stcal.sfm.data.model import GroupModel, M
 
 MAX_STEPS = 50
 SETTLED_PX = 1e-8
@@ -24,7 +24,7 @@ DAMPING = 1e-10
 MAX_DAMPING = 1e8
 
 
-def adjust(model: GroupModel, camera: Camera) -> GroupModel:
+def adjust(model: M, camera: Camera) -> M:
     """Minimise the weighted reprojection error of the corrected centres over poses and points.
 
     Raises
@@ -74,7 +74,7 @@ def projection_jacobians(model: GroupModel, camera: Camera) -> tuple[np.ndarray,
     return by_pose, by_camera @ rotation
 
 
-def _step(model: GroupModel, camera: Camera, damping: float) -> tuple[GroupModel, float]:
+def _step(model: M, camera: Camera, damping: float) -> tuple[M, float]:
     """One step, and the largest move of a projection in px."""
     m, p, n = len(model.images), len(model.labels), len(model.image_index)
     by_pose, by_point = projection_jacobians(model, camera)

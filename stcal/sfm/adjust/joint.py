@@ -21,7 +21,7 @@ from stcal.io.camera import CameraPrior, intrinsic_basis
 from stcal.labels import CircleLabel, DotLabel, dot_cells
 from stcal.sfm.adjust.blocks import Block, Shared, condense, moved, normalised, robust_weights
 from stcal.sfm.adjust.scale import MIN_DOTS
-from stcal.sfm.data.model import GroupModel
+from stcal.sfm.data.model import GroupModel, MetricModel
 
 MAX_STEPS = 100
 MAX_MOVE_PX = 0.02
@@ -52,7 +52,7 @@ class JointResult:
     projection at most.
     """
 
-    models: tuple[GroupModel, ...]
+    models: tuple[MetricModel, ...]
     world_from_board: dict[str, Rigid]
     labels: tuple[CircleLabel, ...]
     xyz_world: np.ndarray
@@ -97,7 +97,7 @@ class _Setting:
 
 
 def adjust_jointly(
-    models: Sequence[GroupModel],
+    models: Sequence[MetricModel],
     board: BoardDesign,
     camera: Camera,
     flatness_mm: float | None = None,
@@ -128,7 +128,7 @@ def adjust_jointly(
 
 
 def covariance_of(
-    models: Sequence[GroupModel],
+    models: Sequence[MetricModel],
     board: BoardDesign,
     camera: Camera,
     flatness_mm: float | None = None,
@@ -195,7 +195,7 @@ def _minimise(blocks: list[Block], shared: Shared, setting: _Setting) -> tuple[l
     return blocks, shared, float(move)
 
 
-def _block(model: GroupModel, board: BoardDesign, labels: tuple[CircleLabel, ...]) -> Block:
+def _block(model: MetricModel, board: BoardDesign, labels: tuple[CircleLabel, ...]) -> Block:
     place = {label: i for i, label in enumerate(labels)}
     dots = np.array([i for i, label in enumerate(model.labels) if isinstance(label, DotLabel)])
     circles = np.array([i for i, label in enumerate(model.labels) if isinstance(label, CircleLabel)], int)
@@ -255,7 +255,7 @@ def _shared_circles(blocks: list[Block], count: int) -> np.ndarray:
     return total / seen[:, None]
 
 
-def _with_circles(block: Block, xyz: np.ndarray) -> GroupModel:
+def _with_circles(block: Block, xyz: np.ndarray) -> MetricModel:
     points = block.model.xyz_world.copy()
     points[block.circles] = xyz[block.circle_place]
     return replace(block.model, xyz_world=points)

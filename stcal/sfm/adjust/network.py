@@ -13,7 +13,7 @@ from stcal.geometry.arrays import frozen
 from stcal.geometry.camera import Camera
 from stcal.geometry.rigid import skew
 from stcal.sfm.adjust.group import projection_jacobians
-from stcal.sfm.data.model import GroupModel
+from stcal.sfm.data.model import GroupModel, MetricModel
 
 MIN_SHARE = 1e-6
 """Of a parameter's information that poses and points leave to it; below, it cannot be told from them."""
@@ -30,7 +30,7 @@ class Network:
     ``redundancy`` : (n,) of each observation, between 0 and 2.
     """
 
-    model: GroupModel
+    model: MetricModel
     residual: np.ndarray
     by_pose: np.ndarray
     by_point: np.ndarray
@@ -90,7 +90,7 @@ class Network:
         )
 
 
-def free_network(model: GroupModel, camera: Camera, factor: float) -> Network:
+def free_network(model: MetricModel, camera: Camera, factor: float) -> Network:
     """Of an adjusted metric model; ``factor`` : on the centres' own σ."""
     model = replace(model, covariance_px2=factor**2 * model.covariance_px2)
     by_pose, by_point = projection_jacobians(model, camera)

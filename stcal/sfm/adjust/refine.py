@@ -12,7 +12,7 @@ from stcal.geometry.plane import fit_plane
 from stcal.labels import Label
 from stcal.sfm.adjust.group import adjust
 from stcal.sfm.adjust.scale import find_scale
-from stcal.sfm.data.model import GroupModel, Outlier
+from stcal.sfm.data.model import GroupModel, Outlier, WorldModel
 
 MAX_ROUNDS = 20
 SETTLED_PX = 1e-5
@@ -28,13 +28,13 @@ MAX_OUTLIER_SHARE = 0.1
 class Refined:
     """``model`` with settled corrections; ``rounds`` it took; ``outliers`` left out on the way."""
 
-    model: GroupModel
+    model: WorldModel
     rounds: int
     outliers: tuple[Outlier, ...]
 
 
 def refine(
-    model: GroupModel,
+    model: WorldModel,
     camera: Camera,
     target: TargetDesign,
     board: BoardDesign,

@@ -8,9 +8,9 @@ from stcal.design import BoardDesign
 from stcal.errors import DegenerateError, ScaleError
 from stcal.geometry.align import align_similarity
 from stcal.geometry.arrays import frozen
-from stcal.geometry.rigid import Similarity
+from stcal.geometry.rigid import Rigid, Similarity
 from stcal.labels import DotLabel, dot_cells
-from stcal.sfm.data.model import GroupModel
+from stcal.sfm.data.model import WorldModel
 
 MIN_DOTS = 4
 
@@ -40,6 +40,10 @@ class Scale:
         """λ by least squares."""
         return self.board_from_world.scale
 
+    def group_from_world(self) -> Similarity:
+        """To the group's metric frame: the world's, in mm."""
+        return Similarity(self.mm_per_unit, Rigid())
+
     def rms_mm(self) -> float:
         """RMS of the residuals' lengths."""
         return float(np.sqrt((self.residuals_mm**2).sum(1).mean()))
@@ -49,7 +53,7 @@ class Scale:
         return float(np.linalg.norm(self.residuals_mm, axis=1).mean())
 
 
-def find_scale(model: GroupModel, board: BoardDesign) -> Scale:
+def find_scale(model: WorldModel, board: BoardDesign) -> Scale:
     """Scale of a model from the dots of the board.
 
     Raises

@@ -20,7 +20,7 @@ from stcal.labels import DotLabel
 from stcal.sfm.adjust.blocks import image_cost, normalised, robust_weights, without_cameras
 from stcal.sfm.adjust.refine import eccentricity_px
 from stcal.sfm.camera.views import start_pose
-from stcal.sfm.data.model import GroupModel
+from stcal.sfm.data.model import MetricModel
 from stcal.sfm.data.observations import ImageObservations, by_group
 
 HUBER = 3.0
@@ -58,7 +58,7 @@ class Intrinsics:
     cameras: tuple[Camera, ...]
     colmap_model: str
     covariance: np.ndarray
-    models: tuple[GroupModel, ...]
+    models: tuple[MetricModel, ...]
     camera_of: tuple[int, ...]
     factors: SigmaFactors
     huber: float
@@ -89,7 +89,7 @@ class Intrinsics:
 class _State:
     """Unknowns. ``folder`` : of each model; models of one folder share their points."""
 
-    models: tuple[GroupModel, ...]
+    models: tuple[MetricModel, ...]
     folder: tuple[str, ...]
     camera_of: tuple[int, ...]
     cameras: tuple[Camera, ...]
@@ -198,23 +198,23 @@ def _start_state(views, camera_of_view, board: BoardDesign, start: Camera) -> _S
     return _State(tuple(models), tuple(folders), tuple(which), (start,) * (max(which) + 1))
 
 
-def _model(folder: str, labels: tuple[DotLabel, ...], views, board: BoardDesign, camera: Camera) -> GroupModel:
+def _model(folder: str, labels: tuple[DotLabel, ...], views, board: BoardDesign, camera: Camera) -> MetricModel:
     """The views of a folder around its board, which stands still in the world."""
     place = {label: i for i, label in enumerate(labels)}
     rows = [(i, place[label], k) for i, v in enumerate(views) for k, label in enumerate(v.labels)]
     image_index, point_index, keypoint = np.array(rows).T
-    return GroupModel(
-        folder,
-        tuple(v.name for v in views),
-        tuple(start_pose(v, board, camera) for v in views),
-        labels,
-        board.places_mm(labels),
-        image_index,
-        point_index,
-        keypoint,
-        np.concatenate([v.centre_px for v in views]),
-        np.zeros((len(rows), 2)),
-        np.concatenate([v.covariance_px2 for v in views]),
+    return MetricModel(
+        group=folder,
+        images=tuple(v.name for v in views),
+        camera_from_world=tuple(start_pose(v, board, camera) for v in views),
+        labels=labels,
+        xyz_world=board.places_mm(labels),
+        image_index=image_index,
+        point_index=point_index,
+        keypoint=keypoint,
+        measured_px=np.concatenate([v.centre_px for v in views]),
+        shift_px=np.zeros((len(rows), 2)),
+        covariance_px2=np.concatenate([v.covariance_px2 for v in views]),
     )
 
 
@@ -357,7 +357,7 @@ def _moved(state: _State, setting: _Setting, step: np.ndarray, back) -> _State |
     return replace(state, models=tuple(models), cameras=cameras)
 
 
-def _with_steps(model: GroupModel, dots: np.ndarray, poses: np.ndarray) -> GroupModel:
+def _with_steps(model: MetricModel, dots: np.ndarray, poses: np.ndarray) -> MetricModel:
     turned = Rotation.from_rotvec(poses[:, :3]).as_matrix()
     cameras = tuple(
         Rigid(turn @ pose.rotation, pose.translation + step[3:])

@@ -19,7 +19,7 @@ from stcal.sfm.adjust.network import Network
 from stcal.sfm.adjust.options import AdjustOptions
 from stcal.sfm.adjust.uncertainty import calibrated_target
 from stcal.sfm.checks.verdict import Check, Measured, Trial, impossible, judge
-from stcal.sfm.data.model import GroupModel
+from stcal.sfm.data.model import MetricModel
 
 MIN_HALF = 2
 """Images of a group in each half."""
@@ -37,7 +37,7 @@ class Again:
     board: BoardDesign
     options: AdjustOptions
 
-    def adjust(self, models: Sequence[GroupModel], faces: Sequence[str]) -> tuple[CalibratedTarget, JointResult]:
+    def adjust(self, models: Sequence[MetricModel], faces: Sequence[str]) -> tuple[CalibratedTarget, JointResult]:
         """The same adjustment of some models; poses of ``faces``, in the frame of the first.
 
         Raises

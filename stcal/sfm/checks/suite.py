@@ -7,7 +7,6 @@ import numpy as np
 from stcal.design import BoardDesign, TargetDesign
 from stcal.errors import StcalError
 from stcal.geometry.camera import Camera
-from stcal.geometry.rigid import Rigid, Similarity
 from stcal.io.camera import CameraPrior
 from stcal.sfm.adjust.calibration import Calibration, calibrate, image_sigma_factor
 from stcal.sfm.adjust.group import adjust
@@ -33,7 +32,7 @@ from stcal.sfm.checks.images import (
 from stcal.sfm.checks.labels import labels_check
 from stcal.sfm.checks.radii import measure_radii, radius_checks
 from stcal.sfm.checks.verdict import Check, Measured, Trial, impossible, judge
-from stcal.sfm.data.model import GroupModel, Outlier
+from stcal.sfm.data.model import Outlier, WorldModel
 from stcal.sfm.data.observations import ImageObservations
 
 JOINT = (
@@ -56,7 +55,7 @@ class Evidence:
     edges, by image, may be empty.
     """
 
-    models: tuple[GroupModel, ...]
+    models: tuple[WorldModel, ...]
     outliers: tuple[Outlier, ...]
     images: tuple[ImageObservations, ...]
     camera: Camera
@@ -76,7 +75,7 @@ class Evidence:
             models = tuple(adjust(model, camera) for model in models)
         factor = image_sigma_factor(models, camera)
         scales = self.calibration.scales
-        return [free_network(m.moved(Similarity(scales[m.group].mm_per_unit, Rigid())), camera, factor) for m in models]
+        return [free_network(m.metric(scales[m.group].group_from_world()), camera, factor) for m in models]
 
 
 def run_checks(evidence: Evidence) -> tuple[Check, ...]:

@@ -1,6 +1,8 @@
-"""The model of one group: cameras and labelled points in a world without unit, and the observations they explain."""
+"""The model of one group: cameras and labelled points, and the observations they explain. The mapper's world has no
+unit, so that its models and those in millimetres are two types: whoever forgets the scale passes the wrong one."""
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
+from typing import TypeVar
 
 import numpy as np
 
@@ -27,9 +29,10 @@ class Outlier:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class GroupModel:
-    """m images, p points, n observations of one group.
+    """m images, p points, n observations of one group; what models with and without unit have in common.
 
-    ``images`` : (m,) names; ``camera_from_world`` : (m,) poses; ``labels`` : (p,); ``xyz_world`` : (p, 3), no unit;
+    ``images`` : (m,) names; ``camera_from_world`` : (m,) poses; ``labels`` : (p,); ``xyz_world`` : (p, 3), in the unit
+    and the frame that :class:`WorldModel` and :class:`MetricModel` say;
     ``image_index``, ``point_index`` : (n,); ``keypoint`` : (n,) place among the image's observations;
     ``measured_px`` : (n, 2) ellipse centres; ``shift_px`` : (n, 2) what eccentricity adds to the image of a circle's
     centre, zero until it is known; ``covariance_px2`` : (n, 2, 2) of the measured centres.
@@ -95,8 +98,8 @@ class GroupModel:
         """Corrected minus projected, (n, 2)."""
         return self.corrected_px() - camera.project(self.xyz_camera())
 
-    def moved(self, a_from_world: Similarity) -> "GroupModel":
-        """The same model in another world, its unit included."""
+    def _placed(self, kind: type["M"], a_from_world: Similarity) -> "M":
+        """The same model in another frame, its unit included."""
         rotation, scale = a_from_world.rigid.rotation, a_from_world.scale
         poses = tuple(
             Rigid(
@@ -105,7 +108,8 @@ class GroupModel:
             )
             for pose in self.camera_from_world
         )
-        return replace(self, camera_from_world=poses, xyz_world=a_from_world @ self.xyz_world)
+        same = {f.name: getattr(self, f.name) for f in fields(self)}
+        return kind(**same | {"camera_from_world": poses, "xyz_world": a_from_world @ self.xyz_world})
 
     def points_by_face(self) -> dict[str, np.ndarray]:
         """Indices of the points of every face, and of the board under ``board``."""
@@ -114,7 +118,7 @@ class GroupModel:
             members.setdefault(label.plane, []).append(i)
         return {key: np.array(indices) for key, indices in members.items()}
 
-    def without(self, drop: np.ndarray) -> "GroupModel":
+    def without(self: "M", drop: np.ndarray) -> "M":
         """The model without the observations of mask ``drop``, and then without points that fewer than two images
         see and images that see fewer than six points."""
         keep = ~drop
@@ -137,3 +141,34 @@ class GroupModel:
             xyz_world=self.xyz_world[kept_points],
             **arrays,
         )
+
+
+M = TypeVar("M", bound=GroupModel)
+"""Models of either kind: what keeps the unit keeps the type."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class WorldModel(GroupModel):
+    """A model as the mapper makes it: its world has no unit and its frame is by chance."""
+
+    def moved(self, a_from_world: Similarity) -> "WorldModel":
+        """The same model in another world, its unit included."""
+        return self._placed(WorldModel, a_from_world)
+
+    def metric(self, a_from_world: Similarity) -> "MetricModel":
+        """The model in mm, in frame a."""
+        return self._placed(MetricModel, a_from_world)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class MetricModel(GroupModel):
+    """A model in mm. Its frame is the target's where the group is chained to it, else the group's or the board's own:
+    ``world`` in the names of the fields stands for that frame."""
+
+    def moved(self, a_from_world: Rigid) -> "MetricModel":
+        """The same model in another frame."""
+        return self._placed(MetricModel, Similarity(1.0, a_from_world))
+
+    def in_world(self, world_from_a: Similarity) -> "WorldModel":
+        """The model as the mapper might have made it, for simulations."""
+        return self._placed(WorldModel, world_from_a)

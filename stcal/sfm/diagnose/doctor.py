@@ -16,7 +16,7 @@ from stcal.errors import InputError
 from stcal.geometry.camera import Camera
 from stcal.io.images import decode
 from stcal.parallel import run_parallel
-from stcal.sfm.data.model import MIN_POINTS, GroupModel
+from stcal.sfm.data.model import MIN_POINTS, MetricModel
 from stcal.sfm.detect.ellipses import EllipseOptions
 from stcal.sfm.diagnose.examine import Expected, Trial, Verdict, by_geometry, examine, labels_found, trials
 from stcal.sfm.diagnose.findings import Diagnosis, Finding, advice, in_order
@@ -50,7 +50,7 @@ def diagnose(
     if images is not None and not images.is_dir():
         raise InputError(f"image folder {images}: not a folder; give the folder of the run's images with --images")
     ids = image_ids(run.observations)
-    models = read_model(run.folder / "target_model", run.observations, ids, run.corrected_px).groups
+    models = read_model(run.folder / "target_model", run.observations, ids, run.corrected_px).in_mm()
     mapped = {name for model in models for name in model.images}
     try:
         findings = [*_files(run), *_images(run, mapped), *_circles(run), *_faces(run)]
@@ -157,7 +157,7 @@ class _Job:
     known: frozenset[str]
 
 
-def _jobs(run: SavedRun, images: Path, models: Sequence[GroupModel], circles: dict[str, np.ndarray]) -> list[_Job]:
+def _jobs(run: SavedRun, images: Path, models: Sequence[MetricModel], circles: dict[str, np.ndarray]) -> list[_Job]:
     """Mapped images that lack circles in view, and images without a pose; not those of groups without a model."""
     given = run.camera, run.target, run.board, run.options.ellipses
     observations = {image.name: image for image in run.observations}

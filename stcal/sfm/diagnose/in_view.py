@@ -8,7 +8,7 @@ from stcal.geometry.align import align_rigid
 from stcal.geometry.camera import Camera
 from stcal.geometry.rigid import Rigid
 from stcal.labels import BOARD
-from stcal.sfm.data.model import GroupModel
+from stcal.sfm.data.model import MetricModel
 from stcal.sfm.data.observations import ImageObservations
 from stcal.sfm.diagnose.examine import Expected
 
@@ -21,7 +21,7 @@ BORDER_POINTS = 33
 
 
 def missing_circles(
-    model: GroupModel,
+    model: MetricModel,
     circles: dict[str, np.ndarray],
     observations: dict[str, ImageObservations],
     camera: Camera,

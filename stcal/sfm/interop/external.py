@@ -8,7 +8,7 @@ import numpy as np
 from stcal.errors import InputError, MappingError
 from stcal.geometry.camera import Camera
 from stcal.sfm.adjust.calibration import Calibration, calibrate
-from stcal.sfm.data.model import GroupModel
+from stcal.sfm.data.model import WorldModel
 from stcal.sfm.mapping.models import ReadModel
 from stcal.sfm.run.saved import SavedRun
 
@@ -25,7 +25,7 @@ def faces_from_models(read: Sequence[ReadModel], run: SavedRun) -> Calibration:
     MappingError
         The reference face is in none of the models, or a face is not linked to it.
     """
-    models: dict[str, GroupModel] = {}
+    models: dict[str, WorldModel] = {}
     notes = []
     for source in read:
         if not source.camera.same_as(read[0].camera):

@@ -10,7 +10,7 @@ import pycolmap
 
 from stcal.errors import MappingError
 from stcal.geometry.camera import Camera
-from stcal.sfm.data.model import MIN_POINTS, GroupModel, Outlier
+from stcal.sfm.data.model import MIN_POINTS, Outlier, WorldModel
 from stcal.sfm.data.observations import ImageObservations
 from stcal.sfm.mapping.database import CAMERA_ID
 from stcal.sfm.mapping.models import rigid_from_colmap
@@ -30,7 +30,7 @@ class Mapping:
     """``model`` of a group; ``left_out`` : image name → reason; ``seeded`` : how the initial pair was registered;
     ``outliers`` : observations far off their label's point."""
 
-    model: GroupModel
+    model: WorldModel
     outliers: tuple[Outlier, ...]
     left_out: dict[str, str]
     seeded: str
@@ -70,7 +70,7 @@ def map_group(
     return Mapping(model, outliers, left_out(group, model), seeded)
 
 
-def left_out(group: list[ImageObservations], model: GroupModel) -> dict[str, str]:
+def left_out(group: list[ImageObservations], model: WorldModel) -> dict[str, str]:
     """Reason by name of every image that the model does not have."""
     reasons = {}
     for image in group:
@@ -85,7 +85,7 @@ def left_out(group: list[ImageObservations], model: GroupModel) -> dict[str, str
     return reasons
 
 
-def _require_agreement(model: GroupModel, group: list[ImageObservations]) -> None:
+def _require_agreement(model: WorldModel, group: list[ImageObservations]) -> None:
     count: dict[str, int] = {}
     for image in group:
         for label in image.labels:
@@ -172,7 +172,7 @@ def _own_mapping(database: Path, names, ids, pair: PairScore) -> pycolmap.Recons
 
 def labelled_model(
     reconstruction: pycolmap.Reconstruction, group: list[ImageObservations], ids: dict[str, int], camera: Camera
-) -> tuple[GroupModel, tuple[Outlier, ...]]:
+) -> tuple[WorldModel, tuple[Outlier, ...]]:
     """One point for each label, with every observation of the label that agrees with it; and those that do not.
 
     Images of the group that the reconstruction lacks are resected by their labels.
@@ -187,7 +187,7 @@ def labelled_model(
                 votes = places.setdefault(image.labels[k], {})
                 votes[point.point3D_id] = votes.get(point.point3D_id, 0) + 1
     xyz = {label: reconstruction.point3D(max(votes, key=votes.get)).xyz for label, votes in places.items()}
-    model = assemble(group[0].group, registered, poses, xyz)
+    model = assemble(WorldModel, group[0].group, registered, poses, xyz)
     if len(registered) < len(group):
         model = complete(model, group, camera, MAX_REPROJECTION_PX)
     residual = np.linalg.norm(model.residuals_px(camera), axis=1)

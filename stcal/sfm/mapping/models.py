@@ -11,10 +11,10 @@ import pycolmap
 
 from stcal.errors import InputError
 from stcal.geometry.camera import Camera
-from stcal.geometry.rigid import Rigid
+from stcal.geometry.rigid import Rigid, Similarity
 from stcal.io.camera import camera_from_colmap
 from stcal.labels import DotLabel
-from stcal.sfm.data.model import GroupModel
+from stcal.sfm.data.model import GroupModel, MetricModel, WorldModel
 from stcal.sfm.data.observations import ImageObservations
 from stcal.sfm.mapping.database import CAMERA_ID, colmap_camera, from_colmap_px, to_colmap_px
 
@@ -87,7 +87,7 @@ def write_model(
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ReadModel:
-    """A COLMAP model with labels: one :class:`GroupModel` for each group that it has images of, all in its world.
+    """A COLMAP model with labels: one :class:`WorldModel` for each group that it has images of, all in its world.
 
     ``camera`` : the model's own, refined perhaps; ``unlabelled`` : points whose keypoints name no label, or several;
     ``split`` : labels that more than one point stands for, the longest track was taken; ``absent`` : points that
@@ -96,10 +96,14 @@ class ReadModel:
 
     path: Path
     camera: Camera
-    groups: tuple[GroupModel, ...]
+    groups: tuple[WorldModel, ...]
     unlabelled: int
     split: int
     absent: int
+
+    def in_mm(self) -> tuple[MetricModel, ...]:
+        """The groups of a model that was written in mm, as a run's ``target_model`` is."""
+        return tuple(group.metric(Similarity(1.0, Rigid())) for group in self.groups)
 
 
 def find_models(folder: str | Path) -> list[Path]:
@@ -333,7 +337,7 @@ def _labels_of_points(reconstruction, place, observations) -> tuple[dict[int, tu
     return found, unlabelled
 
 
-def _group_model(path: Path, group: str, images, reconstruction, point_label) -> tuple[GroupModel | None, int]:
+def _group_model(path: Path, group: str, images, reconstruction, point_label) -> tuple[WorldModel | None, int]:
     """One group of the model, and how many labels had several points."""
     rows = []  # image, keypoint, point id
     for i, (_, _, image) in enumerate(images):
@@ -357,17 +361,17 @@ def _group_model(path: Path, group: str, images, reconstruction, point_label) ->
     if not np.isfinite(xyz).all():
         lost = labels[int(np.argmin(np.isfinite(xyz).all(axis=1)))]
         raise InputError(f"model {path}: point {chosen[lost]} ({lost}) is not finite; write or copy it again")
-    model = GroupModel(
-        group,
-        tuple(o.name for o, _, _ in images),
-        tuple(_pose(path, image) for _, _, image in images),
-        tuple(labels),
-        xyz,
-        image_index,
-        np.array([index[p] for p in point_id.tolist()]),
-        keypoint,
-        measured,
-        measured - corrected,
-        np.array([o.covariance_px2[k] for o, k in zip(observed, keypoint, strict=True)]),
+    model = WorldModel(
+        group=group,
+        images=tuple(o.name for o, _, _ in images),
+        camera_from_world=tuple(_pose(path, image) for _, _, image in images),
+        labels=tuple(labels),
+        xyz_world=xyz,
+        image_index=image_index,
+        point_index=np.array([index[p] for p in point_id.tolist()]),
+        keypoint=keypoint,
+        measured_px=measured,
+        shift_px=measured - corrected,
+        covariance_px2=np.array([o.covariance_px2[k] for o, k in zip(observed, keypoint, strict=True)]),
     )
     return model, sum(len(votes) > 1 for votes in length.values())

@@ -6,7 +6,7 @@ import pycolmap
 from stcal.geometry.camera import Camera
 from stcal.geometry.rigid import Rigid
 from stcal.labels import Label
-from stcal.sfm.data.model import MIN_POINTS, GroupModel
+from stcal.sfm.data.model import MIN_POINTS, M, WorldModel
 from stcal.sfm.data.observations import ImageObservations
 from stcal.sfm.mapping.models import rigid_from_colmap
 
@@ -17,7 +17,7 @@ MIN_RAY_ANGLE_RAD = np.radians(0.5)
 """Between some two rays of a new point, or its depth is a guess."""
 
 
-def complete(model: GroupModel, group: list[ImageObservations], camera: Camera, max_error_px: float) -> GroupModel:
+def complete(model: WorldModel, group: list[ImageObservations], camera: Camera, max_error_px: float) -> WorldModel:
     """The model with every further image of the group that its points place, and with the circles that these add.
 
     An image is placed by six or more labelled points, and a quarter of those that it shows, within ``max_error_px``
@@ -33,12 +33,12 @@ def complete(model: GroupModel, group: list[ImageObservations], camera: Camera, 
                 poses[image.name] = pose
     placed = [image for image in group if image.name in poses]
     xyz |= _triangulated(placed, poses, xyz.keys())
-    return assemble(model.group, placed, [poses[image.name] for image in placed], xyz)
+    return assemble(WorldModel, model.group, placed, [poses[image.name] for image in placed], xyz)
 
 
 def assemble(
-    group: str, images: list[ImageObservations], poses: list[Rigid], xyz: dict[Label, np.ndarray]
-) -> GroupModel:
+    kind: type[M], group: str, images: list[ImageObservations], poses: list[Rigid], xyz: dict[Label, np.ndarray]
+) -> M:
     """The model of placed images and labelled points with all observations that they have of one another."""
     labels = sorted(xyz)
     index = {label: i for i, label in enumerate(labels)}
@@ -47,18 +47,18 @@ def assemble(
     ]
     image_index, point_index, keypoint = np.array(rows, int).reshape(-1, 3).T
     first = np.cumsum([0, *(len(image) for image in images)])[image_index] + keypoint
-    return GroupModel(
-        group,
-        tuple(image.name for image in images),
-        tuple(poses),
-        tuple(labels),
-        np.array([xyz[label] for label in labels]).reshape(-1, 3),
-        image_index,
-        point_index,
-        keypoint,
-        np.concatenate([image.centre_px for image in images])[first],
-        np.zeros((len(rows), 2)),
-        np.concatenate([image.covariance_px2 for image in images])[first],
+    return kind(
+        group=group,
+        images=tuple(image.name for image in images),
+        camera_from_world=tuple(poses),
+        labels=tuple(labels),
+        xyz_world=np.array([xyz[label] for label in labels]).reshape(-1, 3),
+        image_index=image_index,
+        point_index=point_index,
+        keypoint=keypoint,
+        measured_px=np.concatenate([image.centre_px for image in images])[first],
+        shift_px=np.zeros((len(rows), 2)),
+        covariance_px2=np.concatenate([image.covariance_px2 for image in images])[first],
     )
 
 

@@ -14,7 +14,7 @@ from stcal.parallel import one_thread
 from stcal.sfm.adjust.calibration import with_sigma
 from stcal.sfm.adjust.chain import CalibratedTarget
 from stcal.sfm.adjust.joint import JointResult, adjust_jointly
-from stcal.sfm.data.model import GroupModel
+from stcal.sfm.data.model import MetricModel
 from stcal.sfm.mapping.database import image_ids
 from stcal.sfm.mapping.models import read_model
 from stcal.sfm.plan.forecast import CentreNoise, Forecast, Setup, forecast, variance_shares, without_sources
@@ -75,7 +75,7 @@ class Advice:
 class Known:
     """A run as the forecast sees it: models in mm in the target frame, σ as in the run's adjustment."""
 
-    models: tuple[GroupModel, ...]
+    models: tuple[MetricModel, ...]
     joint: JointResult
     setup: Setup
     noise: CentreNoise
@@ -91,7 +91,7 @@ def known_of(run: SavedRun) -> Known:
         The run's ``target_model`` is missing or damaged.
     """
     read = read_model(run.folder / "target_model", run.observations, image_ids(run.observations), run.corrected_px)
-    models = [with_sigma(model, run.report["summary"]["sigma_factor"]) for model in read.groups]
+    models = [with_sigma(model, run.report["summary"]["sigma_factor"]) for model in read.in_mm()]
     start = CalibratedTarget(
         run.faces.reference_face,
         run.faces.poses(),
@@ -195,7 +195,7 @@ def _new_groups(known: Known, now: Forecast, images: int) -> list[NewGroup]:
     return sorted(found, key=lambda each: each.sigma_mm)
 
 
-def _new_model(known: Known, pair: tuple[str, str], images: int) -> GroupModel:
+def _new_model(known: Known, pair: tuple[str, str], images: int) -> MetricModel:
     """A group of two faces with the board beside them, photographed from the distance of the present ones."""
     scene = known.scene
     name = f"new {group_name(pair)}"

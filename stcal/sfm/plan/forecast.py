@@ -16,7 +16,7 @@ from stcal.sfm.adjust.chain import CalibratedTarget
 from stcal.sfm.adjust.faces import FrameKind
 from stcal.sfm.adjust.joint import covariance_of
 from stcal.sfm.adjust.uncertainty import Derivatives, derivatives, scale_sigma
-from stcal.sfm.data.model import GroupModel
+from stcal.sfm.data.model import MetricModel
 from stcal.synthetic.observe import rim_points
 
 IMAGE_NOISE = 0.01
@@ -58,7 +58,7 @@ class CentreNoise:
         return cls(PRACTICE * IMAGE_NOISE / CONTRAST * float(np.sqrt(2 * np.sqrt(np.pi) * BLUR_PX)))
 
     @classmethod
-    def measured(cls, models: Sequence[GroupModel], camera: Camera, radius_mm: dict[Label, float]) -> "CentreNoise":
+    def measured(cls, models: Sequence[MetricModel], camera: Camera, radius_mm: dict[Label, float]) -> "CentreNoise":
         """Fitted to the covariances that the observations of metric models carry."""
         rims = [_Rims.of(model, camera, radius_mm) for model in models]
         ratio = np.concatenate(
@@ -78,7 +78,7 @@ class CentreNoise:
         """The same with all σ multiplied."""
         return replace(self, edge=factor * self.edge, floor_px=factor * self.floor_px)
 
-    def applied(self, model: GroupModel, camera: Camera, radius_mm: dict[Label, float]) -> GroupModel:
+    def applied(self, model: MetricModel, camera: Camera, radius_mm: dict[Label, float]) -> MetricModel:
         """The metric model with the covariances that its observations are to have."""
         rims = _Rims.of(model, camera, radius_mm)
         size = self.edge**2 * (1 + (self.narrow_px / rims.minor_px) ** 2)
@@ -94,7 +94,7 @@ class _Rims:
     minor_px: np.ndarray
 
     @classmethod
-    def of(cls, model: GroupModel, camera: Camera, radius_mm: dict[Label, float]) -> "_Rims":
+    def of(cls, model: MetricModel, camera: Camera, radius_mm: dict[Label, float]) -> "_Rims":
         normal = np.zeros((len(model.labels), 3))
         for members in model.points_by_face().values():
             normal[members] = fit_plane(model.xyz_world[members]).normal
@@ -166,7 +166,7 @@ class Forecast:
         return face, sigma[face]
 
 
-def forecast(models: Sequence[GroupModel], setup: Setup, known: Derivatives | None = None) -> Forecast:
+def forecast(models: Sequence[MetricModel], setup: Setup, known: Derivatives | None = None) -> Forecast:
     """σ of the target from metric models, mm, target frame, as the joint adjustment would state them.
 
     ``known`` : derivatives of an earlier forecast of the same circles.
@@ -184,7 +184,7 @@ def forecast(models: Sequence[GroupModel], setup: Setup, known: Derivatives | No
     )
 
 
-def without_sources(models: Sequence[GroupModel], setup: Setup, known: Derivatives) -> dict[str, Forecast]:
+def without_sources(models: Sequence[MetricModel], setup: Setup, known: Derivatives) -> dict[str, Forecast]:
     """The forecast with each source of error in turn switched off: images, board, intrinsics where they are refined."""
     quiet = [replace(m, covariance_px2=OFF**2 * m.covariance_px2) for m in models]
     found = {

@@ -12,7 +12,7 @@ from stcal.geometry.rigid import Rigid
 from stcal.io.camera import CameraModel, camera_prior, refinable
 from stcal.parallel import one_thread
 from stcal.sfm.adjust.chain import CalibratedTarget
-from stcal.sfm.data.model import GroupModel
+from stcal.sfm.data.model import MetricModel
 from stcal.sfm.plan.forecast import ONE_PLATE, CentreNoise, Forecast, Setup, forecast, variance_shares, without_sources
 from stcal.sfm.plan.simulated import observe, true_models
 from stcal.sfm.run.options import RunOptions
@@ -204,7 +204,7 @@ def _stated(camera: Camera, colmap_model: str) -> CameraModel:
     )
 
 
-def _models(scene: Scene, options: PlanOptions) -> list[GroupModel]:
+def _models(scene: Scene, options: PlanOptions) -> list[MetricModel]:
     radius = scene.target.radius_of() | scene.board.radius_of()
     exact = true_models(scene, observe(scene, 0.0, np.random.default_rng(0)))
     return [options.noise.applied(model, scene.camera, radius) for model in exact]

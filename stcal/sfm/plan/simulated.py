@@ -5,7 +5,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from stcal.geometry.conic import circle_image_offset
-from stcal.sfm.data.model import GroupModel
+from stcal.sfm.data.model import MetricModel
 from stcal.sfm.data.observations import ImageObservations, by_group
 from stcal.sfm.mapping.resect import assemble
 from stcal.synthetic.observe import image_circles
@@ -41,7 +41,7 @@ def observe(scene: Scene, noise_px: float, rng: np.random.Generator, missing: fl
     return images
 
 
-def true_models(scene: Scene, observations: Sequence[ImageObservations]) -> list[GroupModel]:
+def true_models(scene: Scene, observations: Sequence[ImageObservations]) -> list[MetricModel]:
     """Models of the groups at the true geometry, mm, target frame, with these observations; no eccentricity yet."""
     models = []
     for name, images in by_group(observations).items():
@@ -49,5 +49,5 @@ def true_models(scene: Scene, observations: Sequence[ImageObservations]) -> list
         place = scene.circles_target | dict(zip(scene.board.labels(), group.board_circles_target, strict=True))
         seen = {label for image in images for label in image.labels}
         poses = [group.camera_from_target[int(image.name.rpartition("/")[2])] for image in images]
-        models.append(assemble(name, images, poses, {label: place[label] for label in seen}))
+        models.append(assemble(MetricModel, name, images, poses, {label: place[label] for label in seen}))
     return models

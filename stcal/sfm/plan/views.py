@@ -10,7 +10,7 @@ from stcal.geometry.camera import Camera
 from stcal.geometry.rigid import Rigid
 from stcal.labels import CircleLabel, DotLabel, Label
 from stcal.sfm.adjust.joint import JointResult
-from stcal.sfm.data.model import GroupModel
+from stcal.sfm.data.model import MetricModel
 from stcal.sfm.plan.forecast import CentreNoise, Setup
 from stcal.synthetic.observe import MAX_FOUND_TILT_RAD, image_circles
 from stcal.synthetic.scene import Group, Scene
@@ -34,7 +34,7 @@ class View:
     """
 
     group: str
-    model: GroupModel
+    model: MetricModel
     azimuth_deg: float
     elevation_deg: float
     roll_deg: float
@@ -61,7 +61,7 @@ class _Stand:
             object.__setattr__(self, name, frozen(getattr(self, name), shape, name))
 
     @classmethod
-    def of(cls, model: GroupModel) -> "_Stand":
+    def of(cls, model: MetricModel) -> "_Stand":
         centre = (model.xyz_world.min(0) + model.xyz_world.max(0)) / 2
         away = np.array([pose.inverse().translation for pose in model.camera_from_world]) - centre
         distance = np.linalg.norm(away, axis=1)
@@ -87,7 +87,7 @@ class _Stand:
         return Rigid(rotation, -rotation @ (self.centre - self.distance_mm * forward))
 
 
-def known_scene(models: tuple[GroupModel, ...], joint: JointResult, setup: Setup, colmap_model: str) -> Scene:
+def known_scene(models: tuple[MetricModel, ...], joint: JointResult, setup: Setup, colmap_model: str) -> Scene:
     """What a run knows, as a scene: calibrated faces and circles, its boards, no views yet; target frame."""
     circles = dict(zip(joint.labels, joint.xyz_world, strict=True))
     groups = {}
@@ -112,7 +112,7 @@ def _calibrated_part(target: TargetDesign, target_from_face: dict[str, Rigid], c
     return replace(target, faces=tuple(faces))
 
 
-def candidates(scene: Scene, model: GroupModel, setup: Setup, noise: CentreNoise) -> list[View]:
+def candidates(scene: Scene, model: MetricModel, setup: Setup, noise: CentreNoise) -> list[View]:
     """Views of a group on a grid about its present ones that show the whole board and at least one whole face."""
     stand = _Stand.of(model)
     steps = np.arange(-REACH_DEG, REACH_DEG + 1e-9, GRID_DEG)
@@ -149,7 +149,7 @@ def candidates(scene: Scene, model: GroupModel, setup: Setup, noise: CentreNoise
     return views
 
 
-def _largest_tilt(scene: Scene, model: GroupModel) -> float:
+def _largest_tilt(scene: Scene, model: MetricModel) -> float:
     """Of the circles that the run found in this group, rad; no more than a simulation believes in."""
     normal = {face.id: scene.target_from_face[face.id].rotation[:, 2] for face in scene.target.faces}
     board = -scene.groups[model.group].target_from_board.rotation[:, 2]
@@ -183,7 +183,7 @@ def _behind(xyz_camera: np.ndarray, corners_camera: np.ndarray) -> np.ndarray:
         return (part > 0) & (part < 1 - 1e-3) & (u > 0) & (u < 1) & (v > 0) & (v < 1)
 
 
-def _worth_it(seen: set[Label], model: GroupModel) -> bool:
+def _worth_it(seen: set[Label], model: MetricModel) -> bool:
     members = {key: {model.labels[i] for i in rows} for key, rows in model.points_by_face().items()}
     return members["board"] <= seen and any(own <= seen for key, own in members.items() if key != "board")
 
@@ -200,7 +200,7 @@ def _tilts_deg(scene: Scene, group: str, position: np.ndarray, seen: set[Label])
     }
 
 
-def _single(model: GroupModel, name: str, pose: Rigid, labels: list[Label], camera: Camera) -> GroupModel:
+def _single(model: MetricModel, name: str, pose: Rigid, labels: list[Label], camera: Camera) -> MetricModel:
     """The model of one image of the group that sees these points."""
     place = {label: i for i, label in enumerate(model.labels)}
     points = np.array([place[label] for label in labels])
@@ -218,7 +218,7 @@ def _single(model: GroupModel, name: str, pose: Rigid, labels: list[Label], came
     )
 
 
-def with_view(model: GroupModel, view: View) -> GroupModel:
+def with_view(model: MetricModel, view: View) -> MetricModel:
     """The group's model with one more image."""
     new = view.model
     joined = {

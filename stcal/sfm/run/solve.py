@@ -19,7 +19,7 @@ from stcal.io.images import SUFFIXES, TOP_GROUP, Skipped
 from stcal.io.saving import save
 from stcal.labels import DotLabel, dot_cells, parse_labels
 from stcal.sfm.adjust.refine import refine
-from stcal.sfm.data.model import GroupModel, Outlier
+from stcal.sfm.data.model import Outlier, WorldModel
 from stcal.sfm.data.observations import ImageObservations
 from stcal.sfm.mapping.incremental import left_out, map_group
 from stcal.sfm.mapping.pairs import PairOptions, PairScore, rank_pairs
@@ -37,7 +37,7 @@ class GroupSolution:
     """
 
     pairs: tuple[PairScore, ...]
-    model: GroupModel
+    model: WorldModel
     seeded: str
     rounds: int
     left_out: dict[str, str]
@@ -181,7 +181,7 @@ def _load(path: Path) -> GroupSolution | None:
     try:
         with np.load(io.BytesIO(path.read_bytes())) as stored:
             meta = json.loads(stored["meta"].tobytes())
-            model = GroupModel(
+            model = WorldModel(
                 meta["group"],
                 tuple(meta["images"]),
                 tuple(Rigid(m[:3, :3], m[:3, 3]) for m in stored["poses"]),

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from stcal.errors import InputError
+from stcal.geometry.rigid import Rigid, Similarity
 from stcal.io.camera import CameraModel, camera_prior
 from stcal.sfm.adjust.calibration import calibrate
 from stcal.sfm.adjust.refine import refine
@@ -19,7 +20,10 @@ NOISE_PX = 0.01
 def position_error_um(scene, observations, camera, refine_camera: bool) -> float:
     """RMS over the faces but the reference."""
     seen = [replace(image, centre=camera.normalised_from_pixel(image.centre_px)) for image in observations]
-    models = [refine(m, camera, scene.target, scene.board).model for m in true_models(scene, seen)]
+    models = [
+        refine(m.in_world(Similarity(1.0, Rigid())), camera, scene.target, scene.board).model
+        for m in true_models(scene, seen)
+    ]
     given = CameraModel(camera.focal, camera.centre, camera.distortion, scene.colmap_model, 0, 0, "given")
     options = RunOptions(refine_camera=refine_camera).adjustment(scene.target)
     result = calibrate(models, camera, scene.target, scene.board, options, camera_prior(given, camera))

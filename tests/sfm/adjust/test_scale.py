@@ -7,7 +7,7 @@ from stcal.design import reference_board
 from stcal.errors import ScaleError
 from stcal.geometry.rigid import Rigid
 from stcal.sfm.adjust.scale import find_scale
-from stcal.sfm.data.model import GroupModel
+from stcal.sfm.data.model import WorldModel
 
 BOARD = reference_board()
 WORLD_FROM_BOARD = Rigid.exp([0.4, -0.2, 0.9, 3.0, 1.0, 20.0])
@@ -16,7 +16,7 @@ WORLD_FROM_BOARD = Rigid.exp([0.4, -0.2, 0.9, 3.0, 1.0, 20.0])
 def model_of(xyz_board, labels, mm_per_unit=25.0):
     xyz = (WORLD_FROM_BOARD @ xyz_board) / mm_per_unit
     none = np.zeros(0)
-    return GroupModel(
+    return WorldModel(
         "g", (), (), tuple(labels), xyz, none, none, none, np.zeros((0, 2)), np.zeros((0, 2)), np.zeros((0, 2, 2))
     )
 

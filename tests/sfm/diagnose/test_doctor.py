@@ -136,7 +136,7 @@ def test_in_view_is_what_the_simulation_wants_found(small_run, small_dataset):
     """With all labels taken away what is missing is what the truth wants found: faces of the group, tilt to 70°."""
     saved = load_run(small_run)
     ids = image_ids(saved.observations)
-    models = read_model(small_run / "target_model", saved.observations, ids, saved.corrected_px).groups
+    models = read_model(small_run / "target_model", saved.observations, ids, saved.corrected_px).in_mm()
     truth = json.loads((small_dataset / "truth.json").read_text())["groups"]
     blind = {image.name: image.select([]) for image in saved.observations}
     circles = {label: np.array(xyz) for label, xyz in saved.faces["circles"].items()}

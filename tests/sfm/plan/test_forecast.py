@@ -17,7 +17,7 @@ from stcal.io.camera import CameraModel
 from stcal.sfm.adjust.chain import CalibratedTarget
 from stcal.sfm.adjust.joint import adjust_jointly, covariance_of
 from stcal.sfm.adjust.uncertainty import derivatives
-from stcal.sfm.data.model import GroupModel
+from stcal.sfm.data.model import MetricModel
 from stcal.sfm.plan import views
 from stcal.sfm.plan.advise import Known, advise, after, known_of
 from stcal.sfm.plan.forecast import BLUR_PX, CONTRAST, IMAGE_NOISE, PRACTICE, CentreNoise, Forecast, Setup, forecast
@@ -52,13 +52,13 @@ def setup_of(scene: Scene, board_sigma_mm: float = 0.02, common: float = 0.0) ->
     return Setup(scene.target, board, scene.camera, start, "plane", None, None, common)
 
 
-def models_of(scene: Scene, noise: CentreNoise = NOISE) -> list[GroupModel]:
+def models_of(scene: Scene, noise: CentreNoise = NOISE) -> list[MetricModel]:
     radius = scene.target.radius_of() | scene.board.radius_of()
     models = true_models(scene, observe(scene, 0.0, np.random.default_rng(0)))
     return [noise.applied(model, scene.camera, radius) for model in models]
 
 
-def drawn(models: list[GroupModel], setup: Setup, rng: np.random.Generator) -> list[GroupModel]:
+def drawn(models: list[MetricModel], setup: Setup, rng: np.random.Generator) -> list[MetricModel]:
     """The models with dots displaced by the board's σ, one plate or one for each group, and noisy centres."""
     world_from_board = covariance_of(models, setup.board, setup.camera).world_from_board
     labels = setup.board.labels()
@@ -75,7 +75,7 @@ def drawn(models: list[GroupModel], setup: Setup, rng: np.random.Generator) -> l
     return noisy
 
 
-def errors_of(models: list[GroupModel], setup: Setup, expected: Forecast, draws: int, seed: int):
+def errors_of(models: list[MetricModel], setup: Setup, expected: Forecast, draws: int, seed: int):
     """Pose errors by face, (draws, 6), of adjusted simulations, and the last adjustment."""
     rng = np.random.default_rng(seed)
     truth = covariance_of(models, setup.board, setup.camera).xyz_world
@@ -114,7 +114,7 @@ def test_forecast_is_what_the_adjustment_states(exact):
         assert np.sqrt(np.diag(stated[face])) == pytest.approx(np.sqrt(np.diag(covariance)), rel=0.08)
 
 
-def doubled(model: GroupModel) -> GroupModel:
+def doubled(model: MetricModel) -> MetricModel:
     """Every image taken twice."""
     names = ("point_index", "keypoint", "measured_px", "shift_px", "covariance_px2")
     return replace(
