@@ -18,12 +18,6 @@ from stcal.errors import InputError
 
 SYSTEMS = ("sfm", "robot", "register", "handeye", "locate")
 UNDOCUMENTED: set[str] = {
-    "stcal.register.Alternative",
-    "stcal.register.HeldOut",
-    "stcal.register.Liu2017Options",
-    "stcal.register.Pairs",
-    "stcal.register.read_pairs",
-    "stcal.register.register",
     "stcal.robot.DesignOptions",
     "stcal.robot.Identified",
     "stcal.robot.IdentifyOptions",

@@ -87,6 +87,7 @@ def register(
     allow_ambiguous : bool
         Give the transform of the more points where another one is about as good, instead of an error.
     liu2017_options : Liu2017Options, optional
+        For the method ``liu2017`` only.
     lines : sequence of int, optional
         Lines of a file that messages name the points by; else rows, from 1.
 

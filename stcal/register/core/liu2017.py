@@ -18,8 +18,26 @@ from stcal.geometry.affine import Affine
 
 @dataclass(frozen=True, slots=True)
 class Liu2017Options:
-    """``sample`` : N, 4 … 40 in the paper, best 30–36; ``limit_mm`` : 0.18–0.23; ``share`` : of the points outside the
-    sample; ``orthogonal_within`` : largest entry of |RᵀR − 1|; ``tries`` : samples drawn."""
+    """What the method of Liu et al. (2017) leaves to choose; the defaults are of the paper's best range.
+
+    Parameters
+    ----------
+    sample : int
+        N, the points of a sample; 4 … 40 in the paper, best 30–36.
+    limit_mm : float
+        Inliers are nearer; 0.18 … 0.23 in the paper.
+    share : float
+        Of inliers among the points outside the sample, above which a sample is acceptable.
+    orthogonal_within : float
+        Largest entry of |RᵀR − 1| that passes; not stated in the paper.
+    tries : int
+        Samples drawn; not stated in the paper.
+
+    Raises
+    ------
+    InputError
+        A sample of fewer than four points, or a number that is not positive.
+    """
 
     sample: int = 30
     limit_mm: float = 0.2
@@ -39,9 +57,19 @@ class Liu2017Options:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Liu2017Result:
-    """``sample`` : (N,) rows of the winner; ``inliers`` : (n,) mask of points within the limit, of the sample too;
-    ``acceptable`` : how many samples were; ``shares`` : (tries,) of inliers outside each sample, NaN where screened
-    out.
+    """What the method gives.
+
+    Parameters
+    ----------
+    b_from_a : Affine
+    sample : (N,) int array
+        Rows of the winner.
+    inliers : (n,) bool array
+        Points within the limit, of the sample too.
+    acceptable : int
+        How many samples were.
+    shares : (tries,) array
+        Of inliers outside each sample, NaN where screened out.
     """
 
     b_from_a: Affine
@@ -54,7 +82,16 @@ class Liu2017Result:
 def affine_least_squares(xyz_a: np.ndarray, xyz_b: np.ndarray) -> Affine:
     """b_from_a of twelve parameters as in the paper's eqs. 5–6; coplanar points are not refused.
 
-    Between them, coplanar points leave it free off their plane: there it may be wrong by metres.
+    Coplanar points leave it free off their plane: there it may be wrong by metres.
+
+    Parameters
+    ----------
+    xyz_a, xyz_b : (n, 3) arrays
+        mm; row i of both is the same point.
+
+    Returns
+    -------
+    Affine
     """
     design = np.column_stack([xyz_a, np.ones(len(xyz_a))])
     solution = np.linalg.lstsq(design, np.asarray(xyz_b, float), rcond=None)[0]
@@ -62,7 +99,19 @@ def affine_least_squares(xyz_a: np.ndarray, xyz_b: np.ndarray) -> Affine:
 
 
 def liu2017(xyz_a: np.ndarray, xyz_b: np.ndarray, options: Liu2017Options, seed: int = 0) -> Liu2017Result:
-    """b_from_a by the paper's method from points (n, 3), mm.
+    """b_from_a by the paper's method.
+
+    Parameters
+    ----------
+    xyz_a, xyz_b : (n, 3) arrays
+        mm; row i of both is the same point.
+    options : Liu2017Options
+    seed : int
+        Of the random samples.
+
+    Returns
+    -------
+    Liu2017Result
 
     Raises
     ------
@@ -73,7 +122,7 @@ def liu2017(xyz_a: np.ndarray, xyz_b: np.ndarray, options: Liu2017Options, seed:
     if count <= size:
         raise DegenerateError(f"liu2017: {count} point pairs, more than the {size} of a sample needed; lower its size")
     rng = np.random.default_rng(seed)
-    best, acceptable = None, 0
+    best, least, acceptable = None, np.inf, 0
     shares = np.full(options.tries, np.nan)
     for i in range(options.tries):
         sample = rng.choice(count, size, replace=False)
@@ -89,8 +138,8 @@ def liu2017(xyz_a: np.ndarray, xyz_b: np.ndarray, options: Liu2017Options, seed:
             continue
         acceptable += 1
         variance = float(error[outside & near].var())
-        if best is None or variance < best[0]:
-            best = (variance, b_from_a, np.sort(sample), near)
+        if variance < least:
+            least, best = variance, (b_from_a, np.sort(sample), near)
     if best is None:
         tried = shares[np.isfinite(shares)]
         most = f"at most {100 * tried.max():.0f} %" if len(tried) else "none had an orthogonal 3×3 part"
@@ -99,4 +148,4 @@ def liu2017(xyz_a: np.ndarray, xyz_b: np.ndarray, options: Liu2017Options, seed:
             f"{options.limit_mm:g} mm in {options.tries} tries ({most}); a larger limit (--threshold), or the robust "
             "method needed"
         )
-    return Liu2017Result(best[1], best[2], best[3], acceptable, shares)
+    return Liu2017Result(*best, acceptable, shares)

@@ -19,8 +19,26 @@ KINDS = "weight, sigma_mm, or cov_x_x … cov_z_z"
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Pairs:
-    """``where`` : the file; ``lines`` : (n,) its lines; ``xyz_a``, ``xyz_b`` : (n, 3) mm, row i of both the same point;
-    ``weights`` : (n,) ~ 1/σ², or ``covariances`` : (n, 3, 3), or (n,) variances per axis, mm², or neither."""
+    """Corresponding points of two frames as a file states them; weights, or covariances, or neither.
+
+    Parameters
+    ----------
+    where : str
+        The file.
+    lines : sequence of n int
+        Its lines.
+    xyz_a, xyz_b : (n, 3) arrays
+        mm, each in its own frame; row i of both is the same point.
+    weights : (n,) array or None
+        ~ 1/σ².
+    covariances : (n, 3, 3) or (n,) array, or None
+        Covariances, or variances per axis, of b − b_from_a a in frame b, mm².
+
+    Raises
+    ------
+    InputError
+        Shapes that do not fit, or values that are not finite.
+    """
 
     where: str
     lines: Sequence[int]
@@ -45,6 +63,15 @@ class Pairs:
 
 def read_pairs(path: str | Path) -> Pairs:
     """Read ``ax_mm, ay_mm, az_mm, bx_mm, by_mm, bz_mm`` and what noise they have (form: ``data_layout.md``).
+
+    Parameters
+    ----------
+    path : str or Path
+        A table.
+
+    Returns
+    -------
+    Pairs
 
     Raises
     ------

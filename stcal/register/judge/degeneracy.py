@@ -114,14 +114,20 @@ def symmetry(xyz: np.ndarray, tolerance_mm: float) -> tuple[float, np.ndarray] |
         if (i, j) == (first, second):
             continue
         turn = best_rotations(centred[[i, j]].T @ centred[[first, second]])[0]
-        for _ in range(2):  # from two points, then from all: the first two carry their own noise
-            _, to = tree.query(centred @ turn.T)
-            turn = best_rotations(centred[to].T @ centred)[0]
+        # from two points, then from all: the first two carry their own noise
+        turn = best_rotations(centred[_nearest(tree, centred @ turn.T)].T @ centred)[0]
+        to = _nearest(tree, centred @ turn.T)
+        turn = best_rotations(centred[to].T @ centred)[0]
         misfit = np.linalg.norm(centred @ turn.T - centred[to], axis=1).max()
         is_one = len(np.unique(to)) == n and (to != np.arange(n)).any()
         if is_one and misfit <= 2 * tolerance_mm and misfit < least:
             least, best = misfit, (float(Rotation.from_matrix(turn).magnitude()), to)
     return best
+
+
+def _nearest(tree: KDTree, xyz: np.ndarray) -> np.ndarray:
+    """(n,) indices of the tree's points nearest to points (n, 3)."""
+    return np.asarray(tree.query(xyz)[1])
 
 
 def symmetry_note(found: tuple[float, np.ndarray], rows: np.ndarray, name: Namer) -> str:

@@ -131,7 +131,7 @@ def wilks_bound(log_ratio: float, of_error: float, of_hypothesis: float) -> floa
 
 def lies_together(xyz_a: np.ndarray, group: np.ndarray) -> bool:
     """Whether neighbours are in the same group more often than chance would have it."""
-    nearest = KDTree(xyz_a).query(xyz_a, k=2)[1][:, 1]
+    nearest = np.asarray(KDTree(xyz_a).query(xyz_a, k=2)[1])[:, 1]
     same = int((group[nearest] == group).sum())
     share = group.mean()
     return bool(binom.sf(same - 1, len(group), share**2 + (1 - share) ** 2) < TOGETHER)

@@ -112,7 +112,7 @@ def outlier_notes(problem: Problem, fitted: Fitted, name: Namer) -> list[str]:
     xyz_a, xyz_b, transform, reach = problem.xyz_a, problem.xyz_b, fitted.transform, fitted.threshold
     notes = []
     mapped = transform @ xyz_a[rows]
-    distance, nearest = KDTree(mapped).query(xyz_b[rows])
+    distance, nearest = (np.asarray(each) for each in KDTree(mapped).query(xyz_b[rows]))
     swapped = np.flatnonzero((distance <= reach) & (nearest != np.arange(len(rows))))
     taken = np.minimum(1, 2 * reach / np.maximum(np.ptp(mapped, axis=0), 1e-300)).prod()
     by_chance = binom.sf(len(swapped) - 1, len(rows), 1 - (1 - taken) ** (len(rows) - 1))

@@ -140,7 +140,8 @@ def neighbours_alike(xyz_a: np.ndarray, residuals: np.ndarray) -> bool:
     xyz, r = xyz_a[rows], residuals[rows]
     if len(xyz) < FEWEST_NEIGHBOURS:
         return False
-    pairs = np.column_stack([np.arange(len(xyz)), KDTree(xyz).query(xyz, k=2)[1][:, 1]])
+    nearest = np.asarray(KDTree(xyz).query(xyz, k=2)[1])[:, 1]
+    pairs = np.column_stack([np.arange(len(xyz)), nearest])
     one, two = np.unique(np.sort(pairs, axis=1), axis=0).T
     product = np.einsum("ni,ni->n", r[one], r[two])
     return bool(norm.sf(product.sum() / max(np.sqrt((product**2).sum()), 1e-300)) < BY_NEIGHBOURS)
