@@ -1,13 +1,11 @@
 """The axis method's result for the terminal, for programs, and as a page."""
 
-from html import escape
-
 import numpy as np
 
 import stcal
 from stcal.report.figure import AXIS_COLOURS, FAINT, INK, SMALL, calm, new_figure, uri
-from stcal.report.page import page, plot, swatch, table
-from stcal.report.text import number
+from stcal.report.page import render
+from stcal.report.text import number, text_table
 from stcal.robot.axes.fit import AxisFit
 from stcal.robot.axes.model import ROW_VALUES, AxesResult, Pair
 from stcal.robot.axes.sweeps import called
@@ -22,14 +20,14 @@ SPREAD_HEADS = ("joints", "distance mm", "D-H a mm")
 def axes_text(result: AxesResult) -> str:
     """Tables for the terminal."""
     lines = ["Axes: residuals as RMS of a coordinate, and as mean and RMS length of the points' vectors"]
-    lines += _aligned(AXIS_HEADS, [_axis_cells(fit) for fit in result.fits])
+    lines += text_table([AXIS_HEADS, *[_axis_cells(fit) for fit in result.fits]])
     lines += ["", "Pairs of axes: robust distance, and the common normal of Denavit and Hartenberg"]
-    lines += _aligned(PAIR_HEADS, [_pair_cells(pair) for pair in result.pairs])
+    lines += text_table([PAIR_HEADS, *[_pair_cells(pair) for pair in result.pairs]])
     lines += [f"refused D-H value of joints {_names(p)}: {p.refused}" for p in result.pairs if p.refused]
     lines += ["", f"Leave-one-out: largest less smallest over {len(result.without_one.lines)} rows"]
-    lines += _aligned(SPREAD_HEADS, _spread_cells(result))
+    lines += text_table([SPREAD_HEADS, *_spread_cells(result)])
     lines += ["", f"Rows ({result.robot.convention}), ± σ where the axes determine them"]
-    lines += _aligned(ROW_HEADS, _row_cells(result))
+    lines += text_table([ROW_HEADS, *_row_cells(result)])
     for name, tool in result.robot.tools.items():
         x, y, z = tool.translation
         lines.append(
@@ -37,11 +35,6 @@ def axes_text(result: AxesResult) -> str:
             "all rows"
         )
     return "\n".join(lines)
-
-
-def _aligned(heads: tuple[str, ...], rows: list[list[str]]) -> list[str]:
-    width = [max(len(row[k]) for row in [heads, *rows]) for k in range(len(heads))]
-    return ["  ".join(cell.rjust(w) for cell, w in zip(row, width, strict=True)) for row in [heads, *rows]]
 
 
 def _axis_cells(fit: AxisFit) -> list[str]:
@@ -185,50 +178,25 @@ def _pair_json(pair: Pair) -> dict:
 
 def axes_page(result: AxesResult, where: str) -> str:
     """The report of ``axes``."""
-    banner = f'<h1>Axes of {escape(result.robot.name)}</h1><p class="counts">{escape(where)}</p>\n'
-    refused = "".join(
-        f'<p class="alarm">D-H value of joints {_names(p)} refused: {escape(p.refused)}.</p>\n'
-        for p in result.pairs
-        if p.refused
+    return render(
+        "robot/axes/page.html.jinja",
+        robot=result.robot.name,
+        where=where,
+        heads={"axes": AXIS_HEADS, "pairs": PAIR_HEADS, "without_one": SPREAD_HEADS, "rows": ROW_HEADS},
+        axes=[_axis_cells(fit) for fit in result.fits],
+        residuals=_residuals(result),
+        colours=AXIS_COLOURS,
+        refused=[(_names(pair), pair.refused) for pair in result.pairs if pair.refused],
+        pairs=[_pair_cells(pair) for pair in result.pairs],
+        left_out=len(result.without_one.lines),
+        without_one=_spread_cells(result),
+        rows=_row_cells(result),
+        tools=[
+            [called(name), *(number(v, 4) for v in tool.translation), number(result.tool_spread_mm[name], 3)]
+            for name, tool in result.robot.tools.items()
+        ],
+        notes=result.notes,
     )
-    tools = [
-        [called(name), *(number(v, 4) for v in tool.translation), number(result.tool_spread_mm[name], 3)]
-        for name, tool in result.robot.tools.items()
-    ]
-    heads = list(AXIS_HEADS)
-    axes = table(heads, [_axis_cells(f) for f in result.fits], [("", 4), ("residuals", 3), ("uncertainty", 2)])
-    over = [("", 3), ("robust", 2), ("common normal", 4), ("", 1)]
-    pairs = table(list(PAIR_HEADS), [_pair_cells(p) for p in result.pairs], over)
-    without = (
-        f"<p>Largest less smallest value when each of {len(result.without_one.lines)} rows (with its reflectors) is "
-        "left out.</p>\n" + table(list(SPREAD_HEADS), _spread_cells(result))
-    )
-    robot = (
-        table(list(ROW_HEADS), _row_cells(result))
-        + "<p>σ where the axes determine the value; the others are kept from the robot file.</p>\n"
-        + table(["<on the flange", "x mm", "y mm", "z mm", "RMS over all rows mm"], tools)
-    )
-    sections = [
-        ("axes", "Axes", AXIS_TEXT + axes + _residuals(result)),
-        ("pairs", "Pairs of axes", refused + pairs + PAIR_TEXT),
-        ("leave-one-out", "Leave-one-out", without),
-        ("robot", "Robot", robot),
-    ]
-    notes = "".join(f"<li>{escape(note)}</li>" for note in result.notes)
-    if notes:
-        sections.append(("notes", "Left out", f"<ul>{notes}</ul>\n"))
-    return page(f"Axes of {result.robot.name}", banner, sections)
-
-
-AXIS_TEXT = (
-    "<p>One fit for each joint over all arcs of all reflectors. Residuals: RMS of a coordinate (radial, axial), mean "
-    "and RMS length of the points' vectors.</p>\n"
-)
-PAIR_TEXT = (
-    "<p>Distance: of nearly parallel axes in the plane across the first that its row in the robot has (Hayati), of "
-    "others along their common normal. Foot: of the common normal, along the first axis from where that was measured."
-    "</p>\n"
-)
 
 
 def _residuals(result: AxesResult) -> str:
@@ -246,5 +214,4 @@ def _residuals(result: AxesResult) -> str:
     axes.set_axisbelow(True)
     axes.set_xlabel("joint", fontsize=SMALL + 1, color=INK)
     axes.set_ylabel("residual, mm", fontsize=SMALL + 1, color=INK)
-    caption = f"{swatch('radial', AXIS_COLOURS[0])} {swatch('axial', AXIS_COLOURS[2])} (both across, if prismatic)"
-    return plot(uri(figure), "residuals of each joint's points", caption + ", reflector by reflector", "wide")
+    return uri(figure)

@@ -1,11 +1,9 @@
 """What an identification found, as text, JSON and page."""
 
-from html import escape
-
 import numpy as np
 
 from stcal.report.figure import COLOURS, calm, new_figure, uri
-from stcal.report.page import fold, page, plot, table
+from stcal.report.page import render
 from stcal.report.text import NONE, number
 from stcal.robot.identify.nominal import dh_values
 from stcal.robot.identify.observability import MEANING
@@ -107,29 +105,26 @@ def identified_json(result: Identified, nominal: Robot) -> dict:
 
 def identified_page(result: Identified, nominal: Robot) -> str:
     """The report page."""
-    title = f"{nominal.name}: identified"
-    seen = result.seen
-    counts = f"{_observations(result)} from {seen.data.where}, {result.rank} parameters determined"
-    banner = f'<h1>{escape(title)}</h1>\n<p class="counts">{escape(counts)}</p>\n'
-    banner += "".join(f"<p>{escape(note)}</p>\n" for note in result.notes)
-    errors = [[name, *(number(v, 4) for v in _statistics(e))] for name, e in _errors(result).items()]
-    facts = [[name, f"{value:.4g}", MEANING[name]] for name, value in result.observability.values().items()]
-    accuracy = (
-        table(["<Error", "Mean (mm)", "RMS (mm)", "Max (mm)"], errors)
-        + f"<p>{escape(_noise(result))}. Held out: rows that took no part in the fit that they judge.</p>\n"
-        + plot(uri(_figure(result)), "Errors by row", "Error by observation; held out: mean over the divisions", "wide")
+    return render(
+        "robot/identify/page.html.jinja",
+        robot=nominal.name,
+        result=result,
+        observations=_observations(result),
+        errors=[[name, *(number(v, 4) for v in _statistics(e))] for name, e in _errors(result).items()],
+        noise=_noise(result),
+        errors_by_row=uri(_figure(result)),
+        dh=_rows(result, nominal),
+        placed=[[name, *(number(v, 4) for v in pose)] for name, pose in _placed(result.robot).items()],
+        kinds=", ".join(f"{kind}s {rank}" for kind, rank in result.ranks.items()),
+        sigma=[
+            [name, f"{1000 * np.degrees(s):.3f} mdeg" if " r" in name else f"{1000 * s:.1f} µm"]
+            for name, s in zip(result.names, np.sqrt(np.diag(result.covariance)), strict=True)
+        ],
+        indices=[[name, f"{value:.4g}", MEANING[name]] for name, value in result.observability.values().items()],
+        outliers=[
+            [_place(result, i), number(error, 3), number(result.weights[i], 2)] for i, error in result.outliers()
+        ],
     )
-    sections = [
-        ("accuracy", "Accuracy", accuracy),
-        ("rows", "Denavit–Hartenberg rows", _rows(result, nominal) + _places(result.robot)),
-        (
-            "determined",
-            "What the data determine",
-            _determined(result) + table(["<Index", "Value (1/mm, O2: none)", "<"], facts),
-        ),
-        ("outliers", "Outliers", _outliers(result)),
-    ]
-    return page(title, banner, sections)
 
 
 def _placed(robot: Robot) -> dict[str, np.ndarray]:
@@ -139,15 +134,10 @@ def _placed(robot: Robot) -> dict[str, np.ndarray]:
     return {name: np.append(pose.translation, np.degrees(pose.log()[:3])) for name, pose in poses.items()}
 
 
-def _places(robot: Robot) -> str:
-    rows = [[name, *(number(v, 4) for v in pose)] for name, pose in _placed(robot).items()]
-    heads = ["<", "x mm", "y mm", "z mm", "rotation vector x °", "y °", "z °"]
-    return "<h3>Base and tools</h3>\n" + table(heads, rows)
-
-
-def _rows(result: Identified, nominal: Robot) -> str:
+def _rows(result: Identified, nominal: Robot) -> list[tuple[list, list]]:
+    """Of each unit: the values that have it, each with the columns that it spans, and rows of joints."""
     values, before, sigma = dh_values(result.robot) * SHOWN, dh_values(nominal) * SHOWN, result.dh_sigma * SHOWN
-    text = f"<p>Convention {result.robot.convention}. β (Hayati) where axes are nearly parallel; d is then kept.</p>\n"
+    tables = []
     for unit in dict.fromkeys(UNITS):
         kinds = [k for k in range(5) if UNITS[k] == unit]
         lines = []
@@ -157,27 +147,8 @@ def _rows(result: Identified, nominal: Robot) -> str:
                 change = NONE if sigma[i, k] == 0 else number(values[i, k] - before[i, k], 4)
                 cells += [number(values[i, k], 4), change, _sigma(sigma[i, k])]
             lines.append([str(i + 1), *cells])
-        heads = ["<Joint", *["value", "change", "σ"] * len(kinds)]
-        text += table(heads, lines, [("", 1), *[(f"{DH[k]} ({unit})", 3) for k in kinds]])
-    return text
-
-
-def _determined(result: Identified) -> str:
-    kinds = ", ".join(f"{kind}s {rank}" for kind, rank in result.ranks.items())
-    text = f"<p>{result.rank} of {len(result.names)} parameters. These joint values determine: {escape(kinds)}.</p>\n"
-    if result.undetermined:
-        text += f"<p>Kept nominal, as the data leave it open: {escape(', '.join(result.undetermined))}.</p>\n"
-    sigma = np.sqrt(np.diag(result.covariance))
-    rows = [
-        [name, f"{1000 * np.degrees(s):.3f} mdeg" if " r" in name else f"{1000 * s:.1f} µm"]
-        for name, s in zip(result.names, sigma, strict=True)
-    ]
-    return text + fold("σ of the minimal parameters", table(["<Parameter", "σ"], rows))
-
-
-def _outliers(result: Identified) -> str:
-    rows = [[_place(result, i), number(error, 3), number(result.weights[i], 2)] for i, error in result.outliers()]
-    return table(["<Where", "Error (mm)", "Weight"], rows) if rows else "<p>None.</p>\n"
+        tables.append(([(f"{DH[k]} ({unit})", 3) for k in kinds], lines))
+    return tables
 
 
 def _figure(result: Identified):

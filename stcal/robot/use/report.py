@@ -1,12 +1,11 @@
 """Pages and plots of compensation and verification."""
 
 import io
-from html import escape
 
 import numpy as np
 
 from stcal.report.figure import COLOURS, FAINT, INK, SMALL, calm, locator, new_figure, uri
-from stcal.report.page import page, plot, table
+from stcal.report.page import render
 from stcal.report.text import NONE, number
 from stcal.robot.kinematics.inverse import Inverse
 from stcal.robot.kinematics.model import Robot
@@ -55,47 +54,39 @@ def figure_bytes(figure, kind: str) -> bytes:
 
 def verification_page(result: Verification) -> str:
     """The report of ``verify``."""
-    banner = f'<h1>Distances, measured against commanded</h1><p class="counts">{escape(result.where)}</p>\n'
     rows = []
     for k, each in enumerate(result.sets):
         reduced = result.reduction(k) if k else {}
         cells = [[number(v, 4), number(reduced.get(key), 1)] for key, v in each.figures().items()]
         rows.append([each.name, *(c for pair in cells for c in pair)])
-    heads = [word for _ in range(4) for word in ("mm", "less by %")]
-    over = [("", 1), *((name, 2) for name in ("mean", "std", "max", "RMS of all pairs"))]
-    text = (
-        f"<p>Of the {len(result.poses)} poses that all sets have, the distance of each from the first (pose "
-        f"{escape(result.poses[0])}) as measured, less that commanded. Mean, standard deviation and maximum are of its "
-        "absolute value and all carry the error of the first position; the RMS over all pairs depends less on any one."
-        "</p>\n"
+    return render(
+        "robot/use/verification.html.jinja",
+        result=result,
+        figures=rows,
+        drawn=uri(verification_figure(result)),
+        names=[f"{each.name}: error mm" for each in result.sets],
+        every=[
+            [result.poses[i + 1], number(result.distance_mm[i], 3), *(number(s.error_mm[i], 4) for s in result.sets)]
+            for i in range(min(MOST_ROWS, len(result.distance_mm)))
+        ],
     )
-    notes = "".join(f'<p class="alarm">{escape(note)}</p>\n' for note in result.warnings())
-    drawn = uri(verification_figure(result))
-    figure = plot(drawn, "distance error of each pose", "Dashed: mean of the set of the same colour", "wide")
-    every = [
-        [result.poses[i + 1], number(result.distance_mm[i], 3), *(number(s.error_mm[i], 4) for s in result.sets)]
-        for i in range(min(MOST_ROWS, len(result.distance_mm)))
-    ]
-    names = ["pose", "commanded distance mm", *(f"{s.name}: error mm" for s in result.sets)]
-    sections = [
-        ("result", "Result", notes + table(["<set", *heads], rows, over) + text + figure),
-        ("poses", "Poses", table(names, every)),
-    ]
-    return page("Verification", banner, sections)
 
 
 def compensation_page(result: Compensated, robot: Robot) -> str:
     """The report of ``compensate``."""
-    counts = ", ".join(f"{s} {result.found.status.count(s)}" for s in dict.fromkeys(result.found.status))
-    banner = f'<h1>Compensation of {escape(robot.name)}</h1><p class="counts">{len(result)} poses: {counts}</p>\n'
-    summary = "".join(f"<p>{escape(line)}.</p>\n" for line in compensated_summary(result))
-    notes = result.notes()
-    listed = "".join(f"<li>{escape(note)}</li>" for note in notes[:MOST_ROWS])
-    sections = [("result", "Result", summary + (_before_plot(result) if result.compared().any() else ""))]
-    if notes:
-        sections.append(("notes", "Poses to look at", f"<ul>{listed}</ul>\n"))
-    sections.append(("joints", "Joint values", _joint_table(result, robot)))
-    return page(f"Compensation of {robot.name}", banner, sections)
+    return render(
+        "robot/use/compensation.html.jinja",
+        robot=robot.name,
+        count=len(result),
+        counts=", ".join(f"{s} {result.found.status.count(s)}" for s in dict.fromkeys(result.found.status)),
+        summary=compensated_summary(result),
+        before=_before_plot(result) if result.compared().any() else "",
+        notes=result.notes(),
+        most_rows=MOST_ROWS,
+        named=any(result.targets.tools),
+        joints=[name.replace("_", " ") for name in joint_columns(robot)],
+        rows=_joint_rows(result, robot),
+    )
 
 
 def _before_plot(result: Compensated) -> str:
@@ -111,14 +102,12 @@ def _before_plot(result: Compensated) -> str:
     axes.xaxis.set_major_locator(locator(integer=True))
     axes.set_xlabel("pose, in order of the file", fontsize=SMALL + 1, color=INK)
     axes.set_ylabel("position error, mm", fontsize=SMALL + 1, color=INK)
-    caption = "Position error of the nominal joint values by the identified robot: what compensation takes away"
-    return plot(uri(figure), "error of the nominal joint values", caption, "wide")
+    return uri(figure)
 
 
-def _joint_table(result: Compensated, robot: Robot) -> str:
-    columns = joint_columns(robot)
+def _joint_rows(result: Compensated, robot: Robot) -> list[list[str]]:
     unit = np.where(robot.prismatic, 1.0, np.degrees(1.0))
-    n, named = len(columns), any(result.targets.tools)
+    n, named = len(robot.prismatic), any(result.targets.tools)
 
     def values(found: Inverse, i: int) -> list[str]:
         return [number(v, 5) for v in found.q[i] * unit] if found.usable[i] else [NONE] * n
@@ -134,16 +123,7 @@ def _joint_table(result: Compensated, robot: Robot) -> str:
         if result.nominal:
             error = number(result.before_mm[i], 4) if result.nominal.usable[i] else NONE
             rows.append([*[""] * len(name), "nominal", *values(result.nominal, i), error])
-    more = f"<p>The first {MOST_ROWS} of {len(result)} poses.</p>\n" if len(result) > MOST_ROWS else ""
-    heads = [
-        "line",
-        *(["<target"] if named else []),
-        "<status",
-        "<",
-        *(c.replace("_", " ") for c in columns),
-        "error mm",
-    ]
-    return more + table(heads, rows)
+    return rows
 
 
 def _colours(count: int) -> list[str]:
