@@ -4,6 +4,7 @@ A template's name is its path below ``stcal/``. All have the macros of ``templat
 ``number``, ``cells`` and ``listed`` (``join``) of :mod:`stcal.report.text`.
 """
 
+from collections.abc import Sequence
 from functools import cache
 
 from jinja2 import Environment, PackageLoader, StrictUndefined, UndefinedError
@@ -11,6 +12,8 @@ from markupsafe import Markup
 
 from stcal.report.text import cells, join, number
 
+Sections = Sequence[tuple[str, str, Markup]]
+"""(anchor, heading, markup)."""
 MACROS = "report/templates/macros.html.jinja"
 
 

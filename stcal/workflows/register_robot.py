@@ -2,10 +2,10 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from html import escape
 from pathlib import Path
 
 import numpy as np
+from markupsafe import Markup
 from scipy.stats import chi2
 
 from stcal.errors import InputError, StcalError
@@ -13,9 +13,9 @@ from stcal.geometry.align import align_rigid
 from stcal.io.table import read_table
 from stcal.register import register
 from stcal.register.core.pairs import WHAT, Pairs
-from stcal.register.report.page import matrix_lines, matrix_table
+from stcal.register.report.page import matrix_lines, matrix_rows
 from stcal.register.workspace.findings import Findings
-from stcal.report.page import table
+from stcal.report.page import render
 from stcal.report.text import number
 from stcal.robot.identify.solve import Identified, IdentifyOptions, identify
 from stcal.robot.kinematics.file import load_robot
@@ -192,18 +192,16 @@ def comparison_json(beside: Comparison) -> dict:
     }
 
 
-def comparison_section(beside: Comparison) -> tuple[str, str, str]:
+def comparison_section(beside: Comparison) -> tuple[str, str, Markup]:
     """For the page."""
-    rows = [[name, *cells] for name, cells in _rows(beside)]
-    text = (
-        f"<p>{escape(_title(beside))}. The robot's axes, its base and its tool are solved together from the joint "
-        "values and the positions in b; the same rows are held out of both ways.</p>\n"
-        + table(["<Held out", "Points", "Mean (mm)", "RMS (mm)", "Max (mm)"], rows)
-        + "<h3>b_from_base of the identified robot</h3>"
-        + matrix_table(_b_from_base(beside), "base")
-        + "".join(f"<p>{escape(note)}.</p>\n" for note in _notes(beside))
+    content = render(
+        "workflows/register_robot.html.jinja",
+        title=_title(beside),
+        rows=[[name, *cells] for name, cells in _rows(beside)],
+        matrix=matrix_rows(_b_from_base(beside)),
+        notes=_notes(beside),
     )
-    return "robot", "Base and kinematics together", text
+    return "robot", "Base and kinematics together", Markup(content)
 
 
 def _title(beside: Comparison) -> str:

@@ -1,6 +1,5 @@
 """What a registration found, as text and as a page."""
 
-from html import escape
 from itertools import pairwise
 
 import numpy as np
@@ -12,8 +11,8 @@ from stcal.register.report.drawings import errors_figure, field_figure, space_fi
 from stcal.register.report.file import matrix_of
 from stcal.register.workspace.findings import Findings
 from stcal.report.figure import COLOURS, uri
-from stcal.report.page import fold, page, plot, swatch, table
-from stcal.report.text import number
+from stcal.report.page import Sections, render
+from stcal.report.text import NONE, number
 
 FEW_ROWS = 24
 """Up to so many every row is listed, else the outliers and …"""
@@ -21,9 +20,6 @@ WORST = 5
 """… so many of the inliers, those with the largest residuals."""
 MOST_OUTLIERS = 30
 ROWS_ON_PAGE = 2000
-
-Sections = list[tuple[str, str, str]]
-"""(anchor, title, markup)."""
 
 
 def registration_text(found: Findings) -> str:
@@ -43,12 +39,9 @@ def matrix_lines(matrix: np.ndarray) -> list[str]:
     return ["  " + "".join(f"{v:14.9f}" for v in row[:3]) + f"{row[3]:16.4f}" for row in matrix]
 
 
-def matrix_table(matrix: np.ndarray, frame: str) -> str:
-    """The same as markup: what becomes of the axes and the origin of ``frame``."""
-    rows = [
-        [axis] + [f"{v:.9f}" for v in row[:3]] + [f"{row[3]:.4f}"] for axis, row in zip("xyz ", matrix, strict=True)
-    ]
-    return table(["", f"x of {frame}", "y", "z", "origin (mm)"], rows)
+def matrix_rows(matrix: np.ndarray) -> list[list[str]]:
+    """The same for a page: what becomes of the axes and the origin."""
+    return [[axis, *(f"{v:.9f}" for v in row[:3]), f"{row[3]:.4f}"] for axis, row in zip("xyz ", matrix, strict=True)]
 
 
 def _heading(found: Findings) -> str:
@@ -167,98 +160,62 @@ def holds(found: Findings) -> list[str]:
     return [text]
 
 
-def registration_page(found: Findings, more: Sections | None = None) -> str:
+def registration_page(found: Findings, more: Sections = ()) -> str:
     """The report page; ``more`` sections stand before the rows."""
     result = found.registration
-    alarms = "".join(f'<p class="alarm">{escape(note)}</p>\n' for note in result.notes)
-    banner = f'<h1>Registration</h1>\n<p class="counts">{escape(_heading(found))}</p>\n{alarms}'
-    sections = [
-        ("result", "Result", _result(found)),
-        ("space", "Residuals in space", _space(found)),
-        ("holds", "Where it holds", _holds(found)),
-        *(more or []),
-        ("rows", "Rows", _rows(found)),
-    ]
-    return page("Registration", banner, sections)
+    space, enlarged = space_figure(found)
+    field = None if found.field is None else field_figure(found)
+    return render(
+        "register/report/page.html.jinja",
+        more=list(more),
+        counts=_heading(found),
+        alarming=result.notes,
+        headline=_headline(found),
+        matrix=matrix_rows(matrix_of(result.b_from_a)),
+        parts=_parts_lines(found),
+        errors=[[name, str(count), *(number(v, 4) for v in figures)] for name, count, *figures in _errors(found)],
+        colours=COLOURS,
+        space=uri(space),
+        enlarged=enlarged,
+        systematic="" if found.field is None else field_sentence(found),
+        field=field and uri(field),
+        cubes=found.cubes and _cubes(found),
+        outliers=[_row(found, row) for row in result.outliers[:ROWS_ON_PAGE]],
+        rows=[_row(found, row) for row in range(min(len(result), ROWS_ON_PAGE))],
+        count=len(result),
+    )
 
 
-def _result(found: Findings) -> str:
-    result = found.registration
-    errors = result.inlier_errors
-    tiles = [(f"{result.inliers.sum()} / {len(result)}", "inliers of the point pairs")]
-    tiles.append((f"{errors.rms_mm:.3g} mm", f"RMS residual of the inliers, at most {errors.max_mm:.3g} mm"))
+def _headline(found: Findings) -> list[tuple[str, str, str]]:
+    """(value, unit, what it is) of the tiles."""
+    result, errors = found.registration, found.registration.inlier_errors
+    tiles = [(f"{result.inliers.sum()} / {len(result)}", "", "inliers of the point pairs")]
+    tiles.append((f"{errors.rms_mm:.3g} mm", "", f"RMS residual of the inliers, at most {errors.max_mm:.3g} mm"))
     if result.held_out is not None:
         held = result.held_out.of_inliers
-        tiles.append((f"{held.mean_mm:.3g} mm", f"mean error of inliers held out, at most {held.max_mm:.3g} mm"))
+        tiles.append((f"{held.mean_mm:.3g} mm", "", f"mean error of inliers held out, at most {held.max_mm:.3g} mm"))
     sigma = float(np.linalg.norm(found.sigma_mm_at(found.middle())))
-    tiles.append((f"{sigma:.2g} mm", "σ of the transform at the middle of the inliers, all axes together"))
-    boxes = "".join(f"<div><b>{value}</b><span>{escape(name)}</span></div>" for value, name in tiles)
-    matrix = matrix_table(matrix_of(result.b_from_a), "a")
-    listed = table(
-        ["<Lengths of errors", "Points", "Mean (mm)", "RMS (mm)", "Max (mm)"],
-        [[name, str(count), *(number(v, 4) for v in figures)] for name, count, *figures in _errors(found)],
-    )
-    facts = "".join(f"<p>{escape(line)}.</p>\n" for line in _parts_lines(found))
-    return (
-        f'<div class="tiles">{boxes}</div>\n<div class="columns"><div><h3>b_from_a</h3>{matrix}{facts}</div>'
-        f"<div><h3>Errors</h3>{listed}</div></div>\n"
-    )
+    tiles.append((f"{sigma:.2g} mm", "", "σ of the transform at the middle of the inliers, all axes together"))
+    return tiles
 
 
-def _space(found: Findings) -> str:
-    figure, scale = space_figure(found)
-    outliers = bool(len(found.registration.outliers))
-    legend = swatch("inlier", COLOURS[0]) + (swatch("outlier", COLOURS[1]) if outliers else "")
-    legend = f'<p class="legend">{legend}</p>'
-    caption = f"Points in frame b and their residuals b − b_from_a a, drawn {scale:,g} times larger"
-    if outliers:
-        caption += "; arrows of outliers that would leave the picture end in a ring, their length in mm beside them"
-    return legend + plot(uri(figure), "residuals in three views", caption, "wide")
-
-
-def _holds(found: Findings) -> str:
-    text = ""
-    if found.field is not None:
-        sentence = field_sentence(found)
-        text += f"<p>{escape(sentence[0].upper() + sentence[1:])}.</p>\n"
-        figure = field_figure(found)
-        if figure is not None:
-            caption = (
-                "Systematic error to expect of the transform (RMS: of what the residuals show and of what they leave "
-                "open), in planes through the middle of the points, frame a. Dots: the points within an eighth of the "
-                "plane; dashed: the box of all. Beyond it the model knows less and says more"
-            )
-            text += plot(uri(figure), "systematic error over the workspace", caption, "wide")
-    if found.cubes is None:
-        return text + ("" if text else "<p>Too few points to tell.</p>\n")
-    reach = found.cubes
-    middle = " ".join(f"{v:.1f}" for v in reach.middle)
-    text += (
-        f"<p>Cubes about ({middle}) mm, along the axes of a. The transform is fitted again to the points in one cube "
-        "and tried on those of all; the points that it is fitted to are held out in turn. Nothing is assumed about "
-        f"where errors come from. {escape(' '.join(s[0].upper() + s[1:] + '.' for s in holds(found)))}</p>\n"
-    )
-    names = shells(found)
-    heads = ["<Fitted in the cube of", *(word for _ in names for word in ("points", "mean", "max"))]
-    rows = []
+def _cubes(found: Findings) -> dict:
+    """Errors in cubes as the template shows them."""
+    reach, rows = found.cubes, []
     for side, row in zip(reach.sides_mm, reach.errors, strict=True):
-        cells = [[str(e.points), number(e.mean_mm, 4), number(e.max_mm, 4)] if e else ["0", "–", "–"] for e in row]
-        rows.append([f"{side:g} mm", *(c for cell in cells for c in cell)])
-    text += table(heads, rows, [("errors (mm)", 1), *((name, 3) for name in names)])
-    return text + plot(uri(errors_figure(found)), "errors by place", "Lengths of the residuals by place", "wide")
+        errors = [[str(e.points), number(e.mean_mm, 4), number(e.max_mm, 4)] if e else ["0", NONE, NONE] for e in row]
+        rows.append([f"{side:g} mm", *(cell for error in errors for cell in error)])
+    return {
+        "middle": " ".join(f"{v:.1f}" for v in reach.middle),
+        "holds": holds(found),
+        "shells": shells(found),
+        "rows": rows,
+        "figure": uri(errors_figure(found)),
+    }
 
 
-def _rows(found: Findings) -> str:
-    result, length = found.registration, found.length_mm
-    heads = ["line", "<", "x (mm)", "y (mm)", "z (mm)", "length (mm)"]
-
-    def cells(row: int) -> list[str]:
-        kind = "inlier" if result.inliers[row] else "outlier"
-        values = [number(v, 4) for v in (*result.residuals[row], length[row])]
-        return [str(found.lines[row]), kind, *values]
-
-    outliers = [cells(row) for row in result.outliers[:ROWS_ON_PAGE]]
-    text = f"<h3>Outliers</h3>{table(heads, outliers)}" if outliers else "<p>No outliers.</p>\n"
-    shown = range(min(len(result), ROWS_ON_PAGE))
-    name = "All rows" if len(result) <= ROWS_ON_PAGE else f"The first {ROWS_ON_PAGE} of {len(result)} rows"
-    return text + fold(name, table(heads, [cells(row) for row in shown]))
+def _row(found: Findings, row: int) -> list[str]:
+    result = found.registration
+    kind = "inlier" if result.inliers[row] else "outlier"
+    values = [number(v, 4) for v in (*result.residuals[row], found.length_mm[row])]
+    return [str(found.lines[row]), kind, *values]

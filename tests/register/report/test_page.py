@@ -5,6 +5,7 @@ import re
 
 import numpy as np
 import pytest
+from markupsafe import Markup
 
 from stcal.geometry.rigid import Rigid, Similarity
 from stcal.register import register
@@ -90,7 +91,7 @@ def test_units_of_the_affine_covariance():
 
 
 def test_page_shows_outliers_and_escapes_names():
-    page = registration_page(found_of(), [("more", "One <more>", "<p>section</p>")])
+    page = registration_page(found_of(), [("more", "One <more>", Markup("<p>section</p>"))])
     assert "pairs &lt;a&amp;b&gt;.csv" in page
     assert "<a&b>" not in page
     assert page.count("data:image/svg+xml;base64,") == 3
