@@ -1,7 +1,7 @@
 """From exposures to poses with verdicts: the stages in order."""
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Literal
 
 from stcal.boards.tags import other_dictionaries
@@ -16,13 +16,27 @@ from stcal.locate.pose.patent import PatentOptions, PatentPose, locate_as_patent
 from stcal.locate.pose.verdict import Verdict, VerdictOptions, judge
 
 Method = Literal["joint", "patent"]
+MOVED_SIGMAS = 5.0
+"""Of a shift between exposures: by chance once in 10⁵ (Rayleigh)."""
 
 
 @dataclass(frozen=True, slots=True)
 class LocateOptions:
-    """``method`` : ``joint`` over all exposures, or ``patent``; ``verdict``, ``patent`` : their limits; ``moved_px`` :
-    a scene whose tags shift by more between exposures, and by more than five σ, has moved; ``workers`` : threads that
-    search for tags, as many as there are cores where None."""
+    """How to locate a target.
+
+    Parameters
+    ----------
+    method : {"joint", "patent"}
+        By all exposures together, or as the patent has it.
+    verdict : VerdictOptions
+        Limits of the joint method.
+    patent : PatentOptions
+        Limits of the patent's.
+    moved_px : float
+        A scene whose tags shift by more between exposures, and by more than :data:`MOVED_SIGMAS`, has moved.
+    workers : int or None
+        Threads that search for tags, as many as there are cores where None.
+    """
 
     method: Method = "joint"
     verdict: VerdictOptions = field(default_factory=VerdictOptions)
@@ -37,13 +51,25 @@ class LocateOptions:
             raise InputError(f"moved_px {self.moved_px:g}: a positive number needed")
 
 
-MOVED_SIGMAS = 5.0
-
-
 @dataclass(frozen=True, slots=True, eq=False)
 class Located:
-    """One scene: ``pose`` is None where none was found or the images contradict one another; ``patent`` : what the
-    patent's method says of it, where it was asked for."""
+    """One scene.
+
+    Parameters
+    ----------
+    tags : SceneTags
+        What its exposures show.
+    merged : Merged or None
+        Corners of all exposures together; None where these do not belong together.
+    pose : ObjPose or None
+        None where none was found, or another method was asked for.
+    verdict : Verdict
+        Whether the pose may be used.
+    notes : tuple of str
+        What was left out, and what else there is to know.
+    patent : PatentPose or None
+        What the patent's method says of it, where it was asked for.
+    """
 
     tags: SceneTags
     merged: Merged | None
@@ -63,13 +89,28 @@ def run(
 ) -> Iterator[Located]:
     """The target's pose in each scene, with its verdict.
 
-    Trouble with one scene rejects that scene, with the reason, and never ends the run.
+    Parameters
+    ----------
+    scenes : sequence of SceneFiles
+        From :func:`~stcal.locate.find_scenes`.
+    layout : TargetLayout
+        The target.
+    camera : CameraModel
+        That took the exposures.
+    options : LocateOptions, optional
+        The defaults where None.
+
+    Yields
+    ------
+    Located
+        One for each scene, in their order. Trouble with one scene rejects that scene, with the reason, and never ends
+        the run.
     """
     options = options or LocateOptions()
     for files, tags in zip(scenes, read_scenes(scenes, layout, options.workers), strict=True):
         located = locate_scene(tags, layout, camera, options)
         if located.merged is not None and not sum(located.merged.counts):
-            located = _explained(located, files, layout)
+            located = replace(located, verdict=_rejected([_why_no_tag(located.tags, located.merged, files, layout)]))
         yield located
 
 
@@ -78,7 +119,7 @@ def locate_scene(
 ) -> Located:
     """The verdict on one scene."""
     options = options or LocateOptions()
-    notes = [f"left out: {exposure.trouble}" for exposure in scene.exposures if exposure.trouble]
+    notes = [f"left out: {exposure.trouble}" for exposure in scene.unreadable()]
     used = scene.readable()
     troubles = _size_troubles(scene, camera)
     if troubles:
@@ -156,16 +197,16 @@ def _rejected(reasons: Sequence[str]) -> Verdict:
     return Verdict("reject", (), tuple(reasons))
 
 
-def _explained(located: Located, files: SceneFiles, layout: TargetLayout) -> Located:
+def _why_no_tag(tags: SceneTags, merged: Merged, files: SceneFiles, layout: TargetLayout) -> str:
     """Why no tag is seen: perhaps those in view are of another dictionary."""
     known = layout.dictionaries()
-    used = {exposure.name for exposure in located.tags.readable()}
+    used = {exposure.name for exposure in tags.readable()}
     file = next(file for file in files.files if file.name in used)
     others = other_dictionaries(decode(file.path.read_bytes(), file.name), known)
+    if merged.unknown:
+        names = ", ".join(str(tag) for _, tag in merged.unknown[:5])
+        return f"no tag of the layout, but others of its dictionaries ({names}); is it the layout of this target?"
     reason = f"no tag of {', '.join(known)}; 1 of the layout needed"
-    if located.merged.unknown:
-        names = ", ".join(str(tag) for _, tag in located.merged.unknown[:5])
-        reason = f"no tag of the layout, but others of its dictionaries ({names}); is it the layout of this target?"
-    elif others:
+    if others:
         reason += f", and {file.name} shows {others[0][1]} of {others[0][0]}; correct dictionary in the layout file"
-    return Located(located.tags, located.merged, None, _rejected([reason]), located.notes)
+    return reason

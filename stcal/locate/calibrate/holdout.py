@@ -7,7 +7,7 @@ from itertools import combinations
 import numpy as np
 
 from stcal.boards.tags import Tags
-from stcal.errors import StcalError
+from stcal.errors import DegenerateError, StcalError
 from stcal.geometry.plane import camera_from_plane, fit_homography, refine_planar_pose
 from stcal.geometry.plane_poses import mirrored
 from stcal.geometry.pose_descent import PoseStack
@@ -38,14 +38,20 @@ class Trial:
 
 def half_calibrated(images: CalibrationImages, plan: LayoutPlan, chosen: Sequence[int]) -> CalibratedLayout:
     """The layout from the chosen images only."""
-    parts = ([values[i] for i in chosen] for values in (images.views, images.tags, images.names))
-    views, tags, names = parts
-    return calibrate(plan, views, tags, names, images.camera)
+    return calibrate(
+        plan,
+        [images.views[i] for i in chosen],
+        [images.tags[i] for i in chosen],
+        [images.names[i] for i in chosen],
+        images.camera,
+    )
 
 
 def true_pose(images: CalibrationImages, i: int, calibrated: CalibratedLayout) -> Rigid:
     """camera_from_obj of image i, by its board."""
     view = images.views[i]
+    if view is None:
+        raise DegenerateError(f"{images.names[i]}: the board is not seen; a pose to compare with needs it")
     seen = images.camera.normalised_from_pixel(view.xy_px)
     xy = view.xyz_board[:, :2]
     pose = refine_planar_pose(camera_from_plane(fit_homography(xy, seen)), xy, seen)

@@ -30,16 +30,25 @@ class CalibratedLayout:
 
     Parameters
     ----------
-    layout : with σ and covariance of all corners
-    published : (n, 4, 2) mm, corners in {obj} as the patent leaves them, before the adjustment
-    board_from_obj : where {obj} lies on the board
-    adjusted : poses and residuals
-    images : those used
-    counts : (n,) images that show each tag
-    unseen : rows of the plan without a corner, which the layout lacks
-    deviation_mm : (n,) largest distance of a corner from its nominal place, the nominal target laid over this one; NaN
-        where the plan has no place
-    left_out : images that were not used, and why
+    layout : TargetLayout
+        With σ and covariance of all corners.
+    published : (n, 4, 2) array
+        mm, corners in {obj} as the patent leaves them, before the adjustment.
+    board_from_obj : Rigid
+        Where {obj} lies on the board.
+    adjusted : Adjusted
+        Poses and residuals.
+    images : tuple of str
+        Those used.
+    counts : (n,) int array
+        Images that show each tag.
+    unseen : tuple of int
+        Rows of the plan without a corner, which the layout lacks.
+    deviation_mm : (n,) array
+        Largest distance of a corner from its nominal place, the nominal target laid over this one; NaN where the plan
+        has no place.
+    left_out : tuple of str
+        Images that were not used, and why.
     """
 
     layout: TargetLayout
@@ -62,9 +71,27 @@ def calibrate(
     camera: Camera,
     symmetries: Sequence[Rigid] = (),
 ) -> CalibratedLayout:
-    """Corners of the plan's tags from m images, each with the view of the board, None where it is not seen, and tags.
+    """Corners of a target's tags in {obj}, from photographs with a board in the same plane.
 
-    ``symmetries`` : turns after which the board looks the same; the tags then tell how it lies in each image.
+    Parameters
+    ----------
+    plan : LayoutPlan
+        Which tags, and which of them holds the origin of {obj}.
+    views : sequence of BoardView or None
+        Of the board in m images; None where it is not seen.
+    tags : sequence of Tags
+        m of them.
+    names : sequence of str
+        Of the images.
+    camera : Camera
+        That took them, at their size.
+    symmetries : sequence of Rigid
+        board_from_board after which the board looks the same; the tags then tell how it lies in each image.
+
+    Returns
+    -------
+    CalibratedLayout
+        Corners in mm, with their covariance.
 
     Raises
     ------

@@ -1,6 +1,6 @@
 """Scenes: one target in one place, photographed at several exposures; and the tags that each of these shows."""
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
@@ -15,7 +15,17 @@ from stcal.locate.data.layout import TargetLayout
 
 @dataclass(frozen=True, slots=True)
 class SceneFiles:
-    """The exposures of one scene; ``skipped`` : what lies beside them and is none."""
+    """The exposures of one scene, not yet read.
+
+    Parameters
+    ----------
+    name : str
+        Of the scene.
+    files : tuple of ImageFile
+        The exposures.
+    skipped : tuple of str
+        What lies beside them and is none, with reasons.
+    """
 
     name: str
     files: tuple[ImageFile, ...]
@@ -24,13 +34,19 @@ class SceneFiles:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Exposure:
-    """What one image shows: ``tags``, None where it cannot be read and ``trouble`` says why; ``size`` : width and
-    height, px."""
+    """What one image shows: ``tags``; ``size`` : width and height, px."""
 
     name: str
-    tags: Tags | None
-    size: tuple[int, int] | None = None
-    trouble: str | None = None
+    tags: Tags
+    size: tuple[int, int]
+
+
+@dataclass(frozen=True, slots=True)
+class Unreadable:
+    """An image that cannot be read; ``trouble`` says why."""
+
+    name: str
+    trouble: str
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -38,11 +54,15 @@ class SceneTags:
     """The exposures of one scene."""
 
     name: str
-    exposures: tuple[Exposure, ...]
+    exposures: tuple[Exposure | Unreadable, ...]
 
     def readable(self) -> list[Exposure]:
         """Those with an image."""
-        return [exposure for exposure in self.exposures if exposure.tags is not None]
+        return [exposure for exposure in self.exposures if isinstance(exposure, Exposure)]
+
+    def unreadable(self) -> list[Unreadable]:
+        """Those without."""
+        return [exposure for exposure in self.exposures if isinstance(exposure, Unreadable)]
 
 
 def exposure_times(shortest: float, longest: float, count: int) -> np.ndarray:
@@ -62,7 +82,16 @@ def exposure_times(shortest: float, longest: float, count: int) -> np.ndarray:
 
 
 def find_scenes(path: str | Path) -> list[SceneFiles]:
-    """Scenes in ``path``: one image; a folder of exposures; or a folder of such folders, each a scene.
+    """Scenes in a folder.
+
+    Parameters
+    ----------
+    path : str or Path
+        One image; a folder of exposures; or a folder of such folders, each a scene.
+
+    Returns
+    -------
+    list of SceneFiles
 
     Raises
     ------
@@ -98,10 +127,13 @@ def detect(image: np.ndarray, name: str, dictionaries: Sequence[str]) -> Exposur
     return Exposure(name, find_tags(image, dictionaries), (image.shape[1], image.shape[0]))
 
 
-def _begin(file: ImageFile, dictionaries: Sequence[str], pool: ThreadPoolExecutor):
+def _begin(
+    file: ImageFile, dictionaries: Sequence[str], pool: ThreadPoolExecutor
+) -> Callable[[], Exposure | Unreadable]:
+    """Begin the search for tags; the result is waited for when it is called."""
     try:
         image = grey_8bit(decode(file.path.read_bytes(), file.name))
     except (InputError, OSError) as error:
-        trouble = Exposure(file.name, None, trouble=" ".join(str(error).split()))
+        trouble = Unreadable(file.name, " ".join(str(error).split()))
         return lambda: trouble
     return pool.submit(detect, image, file.name, dictionaries).result

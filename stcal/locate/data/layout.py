@@ -18,8 +18,18 @@ WHAT = "layout file"
 class LayoutPlan:
     """A target as it is meant to be, for its calibration.
 
-    ``tags`` : (n,) dictionary and id; ``size_mm`` : (n,) sides, NaN where not given; ``origin`` : row of the tag in
-    whose middle {obj} lies; ``corners_mm`` : (n, 4, 2), NaN where a place is not given.
+    Parameters
+    ----------
+    name : str
+        Of the target.
+    tags : tuple of (str, int)
+        n of them, dictionary and id.
+    size_mm : (n,) array
+        Sides, NaN where not given.
+    origin : int
+        Row of the tag in whose middle {obj} lies.
+    corners_mm : (n, 4, 2) array
+        In the plane of the target, NaN where a place is not given.
     """
 
     name: str
@@ -37,12 +47,19 @@ class TargetLayout:
 
     Parameters
     ----------
-    tags : (n,) dictionary and id; the ids differ
-    corners_mm : (n, 4, 2) top left, top right, bottom right, bottom left as printed, in {obj}
-    covariance_mm2 : (8n, 8n) of all their coordinates, tag by tag, corner by corner, x before y
-    origin : row of the tag that holds the origin
-    sigma_px, tag_sigma_px : what print, lens and flatness add to the measured σ of a corner, for each by itself and for
-        the four of a tag together, as the calibration's residuals say
+    name : str
+        Of the target.
+    tags : tuple of (str, int)
+        n of them, dictionary and id; the ids differ.
+    corners_mm : (n, 4, 2) array
+        Top left, top right, bottom right, bottom left as printed, in {obj}.
+    covariance_mm2 : (8n, 8n) array
+        Of all their coordinates, mm², tag by tag, corner by corner, x before y.
+    origin : int
+        Row of the tag that holds the origin.
+    sigma_px, tag_sigma_px : float
+        What print, lens and flatness add to the measured σ of a corner, for each by itself and for the four of a tag
+        together, as the calibration's residuals say.
     """
 
     name: str
@@ -74,6 +91,15 @@ class TargetLayout:
 def load_plan(path: str | Path) -> LayoutPlan:
     """Read a layout file whose tags may be without a place.
 
+    Parameters
+    ----------
+    path : str or Path
+        The TOML file.
+
+    Returns
+    -------
+    LayoutPlan
+
     Raises
     ------
     InputError
@@ -84,6 +110,16 @@ def load_plan(path: str | Path) -> LayoutPlan:
 
 def load_layout(path: str | Path) -> TargetLayout:
     """Read a layout file: a calibrated one, or one whose tags have nominal places.
+
+    Parameters
+    ----------
+    path : str or Path
+        The TOML file.
+
+    Returns
+    -------
+    TargetLayout
+        Corners in {obj}, mm, with their covariance.
 
     Raises
     ------

@@ -38,8 +38,16 @@ START_PX = 2.0
 class SeenTags:
     """Tags of a layout in one scene.
 
-    ``rows`` : (k,) of the layout; ``corners_px`` : (k, 4, 2); ``covariance_px2`` : (k, 4, 2, 2), what the
-    layout adds to single corners included; ``edge_sigma_px`` : (k,) of a shift that all edges of a tag share.
+    Parameters
+    ----------
+    rows : (k,) int array
+        Of the layout.
+    corners_px : (k, 4, 2) array
+        In the image as it is.
+    covariance_px2 : (k, 4, 2, 2) array
+        Of the corners, what the layout adds to single ones included.
+    edge_sigma_px : (k,) array
+        σ of a shift that all edges of a tag share.
     """
 
     rows: np.ndarray
@@ -66,12 +74,32 @@ class SeenTags:
 class ObjPose:
     """Where the target is in one scene.
 
-    ``camera_from_obj``; ``covariance`` : (6, 6) rad and mm, left perturbation in the camera frame; ``rows`` : (k,) of
-    the layout's tags used, ``outliers`` : of those left out because they contradict the others; ``residuals_px`` :
-    (4k, 2) measured minus projected; ``weights`` : (4k,) Huber's; ``chi2`` against the whole covariance,
-    ``redundancy``; ``foreshortening`` : cosine between the target's normal and the line of sight to the middle of its
-    corners; ``extent_px`` : of the corners in the image across their longer direction; ``delta_chi2`` : by which the
-    second solution is worse, infinite where there is none; ``second`` : that solution's pose.
+    Parameters
+    ----------
+    camera_from_obj : Rigid
+        mm.
+    covariance : (6, 6) array
+        rad and mm, left perturbation in the camera frame.
+    rows : (k,) int array
+        Of the layout's tags used.
+    outliers : tuple of int
+        Rows of those left out because they contradict the others.
+    residuals_px : (4k, 2) array
+        Measured minus projected corners.
+    weights : (4k,) array
+        Huber's.
+    chi2 : float
+        Of the residuals against their whole covariance.
+    redundancy : int
+        Coordinates measured, less the six of the pose.
+    foreshortening : float
+        Cosine between the target's normal and the line of sight to the middle of its corners.
+    extent_px : float
+        Of the corners in the image across their longer direction.
+    delta_chi2 : float
+        By which the second solution is worse; infinite where there is none.
+    second : Rigid or None
+        The second solution, camera_from_obj.
     """
 
     camera_from_obj: Rigid
@@ -111,10 +139,28 @@ class ObjPose:
 def locate(
     seen: SeenTags, layout: TargetLayout, camera: Camera, prior: CameraPrior | None = None, where: str = "scene"
 ) -> ObjPose:
-    """The target's pose from the corners of its tags in one scene.
+    """The target's pose from the corners of its tags in one scene: camera_from_obj.
 
     The first step minimises the corners' residuals with Huber's loss, from the best of all poses that single tags and
     all of them together leave, and from its mirror image. The second weighs them by their whole covariance.
+
+    Parameters
+    ----------
+    seen : SeenTags
+        Corners of the layout's tags, px.
+    layout : TargetLayout
+        The target, with the covariance of its corners.
+    camera : Camera
+        At the size of the image.
+    prior : CameraPrior, optional
+        Covariance of the intrinsics, which are exact where None.
+    where : str
+        Name of the scene, for messages.
+
+    Returns
+    -------
+    ObjPose
+        The better of the minima, with the second solution where there is one.
 
     Raises
     ------

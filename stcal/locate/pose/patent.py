@@ -25,8 +25,16 @@ TINY_PX = 1e-9
 class PatentOptions:
     """The patent's thresholds, which it names and gives no values for.
 
-    ``area_share`` : S_dis; ``min_det_j`` : J_lim, 1/mm² (a target of any size seen straight from 10 m has 10⁻⁸);
-    ``max_error_px`` : E_lim; ``min_error_ratio`` : E_ratio.
+    Parameters
+    ----------
+    area_share : float
+        S_dis, of the largest area that an exposure's tags span.
+    min_det_j : float
+        J_lim, 1/mm²; a target of any size seen straight from 10 m has 10⁻⁸.
+    max_error_px : float
+        E_lim, RMS.
+    min_error_ratio : float
+        E_ratio, of the second solution's error to the first's.
     """
 
     area_share: float = 0.8
@@ -44,9 +52,27 @@ class PatentOptions:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class PatentPose:
-    """``exposure`` : index of the one that was kept, of ``candidates``; ``errors_px`` : RMS of both poses there, the
-    smaller first; ``camera_from_obj`` : the better pose, ``second`` the other; ``det_j`` : of the homography's
-    derivative at the normalised centre, 1/mm²; ``tags`` used."""
+    """What the patent's method says of a scene.
+
+    Parameters
+    ----------
+    exposure : int
+        Index of the one that was kept.
+    candidates : tuple of int
+        Those it was chosen from.
+    camera_from_obj : Rigid
+        The better pose.
+    second : Rigid
+        The second solution.
+    errors_px : (float, float)
+        RMS of both there, the smaller first.
+    det_j : float
+        Determinant of the homography's derivative at the normalised centre, 1/mm².
+    tags : int
+        Number of tags used.
+    verdict : Verdict
+        Of the patent's gate.
+    """
 
     exposure: int
     candidates: tuple[int, ...]

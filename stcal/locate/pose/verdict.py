@@ -18,12 +18,24 @@ Decision = Literal["accept", "ambiguous", "reject"]
 class VerdictOptions:
     """The limits.
 
-    ``min_tags`` : tags used; ``min_spread_px`` : the corners' extent across their longer direction;
-    ``min_foreshortening`` : cosine between the target's normal and the line of sight, which is det J of a target of any
-    size and distance; ``max_p`` : odds of residuals as large as a pose is rejected for; ``flip_odds`` : at most these
-    odds of the other pose, for Gaussian errors; ``sigma_margin`` : by which all σ may be too small without that
-    becoming untrue; ``equal_deg`` : two poses nearer than this are one, and its covariance covers both;
-    ``max_sigma_deg``, ``max_sigma_mm`` : of rotation and position in their worst direction.
+    Parameters
+    ----------
+    min_tags : int
+        Tags used.
+    min_spread_px : float
+        The corners' extent across their longer direction.
+    min_foreshortening : float
+        Cosine between the target's normal and the line of sight, which is det J of a target of any size and distance.
+    max_p : float
+        Odds of residuals as large as a pose is rejected for.
+    flip_odds : float
+        At most these odds of the second solution, for Gaussian errors.
+    sigma_margin : float
+        By which all σ may be too small without that becoming untrue.
+    equal_deg : float
+        Two solutions nearer than this are one, and its covariance covers both.
+    max_sigma_deg, max_sigma_mm : float
+        Of rotation and position in their worst direction; no limit where None.
     """
 
     min_tags: int = 1
@@ -69,7 +81,17 @@ class Check:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Verdict:
-    """``decision``, with ``checks``; ``reasons`` : those that are not passed, in words."""
+    """Whether a pose may be used.
+
+    Parameters
+    ----------
+    decision : {"accept", "ambiguous", "reject"}
+        Ambiguous: the second solution is not worse by enough.
+    checks : tuple of Check
+        Each value beside its limit.
+    reasons : tuple of str
+        Checks that are not passed, in words.
+    """
 
     decision: Decision
     checks: tuple[Check, ...]

@@ -153,6 +153,6 @@ def _axes(pose, layout: TargetLayout, camera: Camera, width: float) -> list[str]
     start, *tips = camera.project(ends)
     return [
         f'<line x1="{start[0]:.1f}" y1="{start[1]:.1f}" x2="{tip[0]:.1f}" y2="{tip[1]:.1f}" stroke="{colour}" '
-        f'stroke-width="{2 * width:.1f}"/>{_text(*tip, name, 9 * width, colour)}'
+        f'stroke-width="{2 * width:.1f}"/>{_text(tip[0], tip[1], name, 9 * width, colour)}'
         for tip, colour, name in zip(tips, AXIS_COLOURS, "XYZ", strict=True)
     ]

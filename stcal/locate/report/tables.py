@@ -6,11 +6,14 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from stcal.errors import InputError
 from stcal.geometry.rigid import Rigid
 from stcal.geometry.uncertain import UncertainRigid
 from stcal.io.table import COVARIANCE, POSE, pose_cells
+from stcal.locate.data.exposures import Exposure
 from stcal.locate.data.layout import TargetLayout
 from stcal.locate.pipeline import Located
+from stcal.locate.pose.estimate import ObjPose
 from stcal.locate.report.chain import Chain
 
 BASE = "base_from_goal_"
@@ -53,7 +56,10 @@ def camera_from_obj(each: Located) -> Rigid | None:
 def uncertain(each: Located) -> UncertainRigid:
     """camera_from_obj with its covariance; the patent's method states none."""
     if each.pose is None:
-        return UncertainRigid.exact(camera_from_obj(each))
+        pose = camera_from_obj(each)
+        if pose is None:
+            raise InputError(f"{each.name}: no pose; {each.verdict.decision}")
+        return UncertainRigid.exact(pose)
     return UncertainRigid(each.pose.camera_from_obj, each.pose.covariance)
 
 
@@ -76,8 +82,8 @@ def poses_csv(results: Sequence[Located], chain: Chain | None = None) -> str:
     for each in accepted(results):
         own = uncertain(each)
         cells = pose_cells(own.rigid, own.covariance if full else None)
-        fit = [f"{each.pose.rms_px():.4f}", f"{each.pose.chi2_per_redundancy():.4f}"] if full else ["", ""]
-        row = [each.name, len(each.merged.seen), len(each.tags.readable()), *cells, *fit]
+        fit = ["", ""] if each.pose is None else [f"{each.pose.rms_px():.4f}", f"{each.pose.chi2_per_redundancy():.4f}"]
+        row = [each.name, len(each.merged.seen) if each.merged else 0, len(each.tags.readable()), *cells, *fit]
         if chain:
             goal = chain.base_from_goal(each.name, own)
             row += pose_cells(goal.rigid, goal.covariance if full else None)
@@ -114,7 +120,9 @@ def _scene_json(each: Located, layout: TargetLayout, chain: Chain | None) -> dic
             for check in verdict.checks
         ],
         "exposures": [
-            {"image": e.name, "tags": None if e.tags is None else len(e.tags), "trouble": e.trouble}
+            {"image": e.name, "tags": len(e.tags), "trouble": None}
+            if isinstance(e, Exposure)
+            else {"image": e.name, "tags": None, "trouble": e.trouble}
             for e in each.tags.exposures
         ],
         "tags": [] if merged is None else [layout.tags[row][1] for row in merged.seen.rows],
@@ -131,15 +139,14 @@ def _scene_json(each: Located, layout: TargetLayout, chain: Chain | None) -> dic
             "errors_px": [_finite(error) for error in each.patent.errors_px],
         }
     if each.pose is not None:
-        content |= _pose_json(each, layout)
+        content |= _pose_json(each.pose, layout)
     if chain and pose is not None and not chain.without_pose([each.name]):
         goal = chain.base_from_goal(each.name, uncertain(each))
         content |= {"base_from_goal": goal.rigid.matrix().tolist(), "base_covariance": goal.covariance.tolist()}
     return content
 
 
-def _pose_json(each: Located, layout: TargetLayout) -> dict:
-    pose = each.pose
+def _pose_json(pose: ObjPose, layout: TargetLayout) -> dict:
     names = [f"{layout.tags[row][1]}:{corner}" for row in pose.rows for corner in range(4)]
     return {
         "covariance": pose.covariance.tolist(),
