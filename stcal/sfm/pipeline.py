@@ -97,20 +97,20 @@ def run(
     )
     tell("faces", 1, 1)
     result = RunResult(
-        out,
-        detection.camera,
-        model.colmap_model,
-        model.covariance,
-        target,
-        board,
-        options,
-        detection,
-        tuple(labelled),
-        graph,
-        tuple(solutions),
-        calibration,
-        measure_chains(calibration.faces, calibration.target),
-        (*calibration.notes, *unseen_board(solutions, board)),
+        out=out,
+        camera=detection.camera,
+        colmap_model=model.colmap_model,
+        camera_covariance=model.covariance,
+        target_design=target,
+        board_design=board,
+        options=options,
+        detection=detection,
+        labelled=tuple(labelled),
+        graph=graph,
+        solutions=tuple(solutions),
+        calibration=calibration,
+        chains=measure_chains(calibration.faces, calibration.target),
+        notes=(*calibration.notes, *unseen_board(solutions, board)),
     )
     tell("check", 0, 1)
     result = replace(result, checks=run_checks(_evidence(result, prior)))
@@ -123,17 +123,17 @@ def _evidence(result: RunResult, prior: CameraPrior) -> Evidence:
     """What the checks look at."""
     blur = {i.file.name: i.detection.centres.blur_px for i in result.detection.images}
     return Evidence(
-        tuple(s.model for s in result.solutions),
-        tuple(o for s in result.solutions for o in s.outliers),
-        tuple(result.observations()),
-        result.camera,
-        result.colmap_model,
-        result.target_design,
-        result.board_design,
-        result.options.adjustment(result.target_design),
-        result.calibration,
-        prior if result.options.refine_camera else None,
-        {name: float(np.median(each)) for name, each in blur.items() if len(each)},
+        models=tuple(s.model for s in result.solutions),
+        outliers=tuple(o for s in result.solutions for o in s.outliers),
+        images=tuple(result.observations()),
+        camera=result.camera,
+        colmap_model=result.colmap_model,
+        target=result.target_design,
+        board=result.board_design,
+        options=result.options.adjustment(result.target_design),
+        calibration=result.calibration,
+        prior=prior if result.options.refine_camera else None,
+        blur_px={name: float(np.median(each)) for name, each in blur.items() if len(each)},
     )
 
 

@@ -82,7 +82,16 @@ def calibrate(
         metric = [m.moved(calibrated.target_from_group[m.group]) for m in joint.models]
         camera = joint.camera
         notes += _unsettled(joint)
-    return Calibration(calibrated, scales, tuple(faces), joint, factor, tuple(metric), camera, tuple(notes))
+    return Calibration(
+        target=calibrated,
+        scales=scales,
+        faces=tuple(faces),
+        joint=joint,
+        sigma_factor=factor,
+        models=tuple(metric),
+        camera=camera,
+        notes=tuple(notes),
+    )
 
 
 def _placed(model: WorldModel, scale: Scale, start: CalibratedTarget) -> MetricModel:

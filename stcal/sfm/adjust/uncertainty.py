@@ -59,15 +59,15 @@ def calibrated_target(
     """
     own = derivatives(result, start, target, kind)
     return CalibratedTarget(
-        start.reference_face,
-        own.target_from_face,
-        dict(zip(result.labels, own.xyz_target, strict=True)),
-        dict.fromkeys(start.target_from_group, own.target_from_world),
-        own.face_covariance(result.covariance_mm2),
-        dict(zip(result.labels, own.circle_covariance(result.covariance_mm2), strict=True)),
-        own.distance_sigma_mm(result.covariance_mm2),
-        scale_sigma(result.xyz_world, result.covariance_mm2),
-        own.all_circles_covariance(result.covariance_mm2),
+        reference_face=start.reference_face,
+        target_from_face=own.target_from_face,
+        circles=dict(zip(result.labels, own.xyz_target, strict=True)),
+        target_from_group=dict.fromkeys(start.target_from_group, own.target_from_world),
+        face_covariance=own.face_covariance(result.covariance_mm2),
+        circle_covariance=dict(zip(result.labels, own.circle_covariance(result.covariance_mm2), strict=True)),
+        distance_sigma_mm=own.distance_sigma_mm(result.covariance_mm2),
+        scale_sigma=scale_sigma(result.xyz_world, result.covariance_mm2),
+        covariance_mm2=own.all_circles_covariance(result.covariance_mm2),
     )
 
 

@@ -175,14 +175,14 @@ def adjust_intrinsics(
             break
     covariance = np.linalg.inv(reduced)
     return Intrinsics(
-        state.cameras,
-        colmap_model,
-        (covariance + covariance.T) / 2,
-        state.models,
-        state.camera_of,
-        factors,
-        setting.huber,
-        _image_redundancy(state, basis.shape[1]),
+        cameras=state.cameras,
+        colmap_model=colmap_model,
+        covariance=(covariance + covariance.T) / 2,
+        models=state.models,
+        camera_of=state.camera_of,
+        factors=factors,
+        huber=setting.huber,
+        redundancy=_image_redundancy(state, basis.shape[1]),
     )
 
 

@@ -78,13 +78,13 @@ def board_views(images: Sequence[DetectedImage], board: BoardDesign, camera: Cam
             labels = tuple(DotLabel(0, i) for i in range(count))
             views.append(
                 ImageObservations(
-                    image.file.name,
-                    image.file.group,
-                    labels,
-                    dots.centre_px,
-                    dots.centre,
-                    dots.shape,
-                    dots.covariance_px2,
+                    name=image.file.name,
+                    group=image.file.group,
+                    labels=labels,
+                    centre_px=dots.centre_px,
+                    centre=dots.centre,
+                    shape=dots.shape,
+                    covariance_px2=dots.covariance_px2,
                 )
             )
     numberings = {i.file.name: i.detection.numberings for i in images}

@@ -121,14 +121,14 @@ def measure_centres(image: np.ndarray, camera: Camera, ellipses: Ellipses, neigh
     distorted, jacobian = camera.distort_jacobian(centre)
     jacobian = jacobian * camera.focal[:, None]
     return Centres(
-        distorted * camera.focal + camera.centre,
-        centre,
-        shape,
-        jacobian @ covariance @ np.swapaxes(jacobian, 1, 2),
-        blur,
-        contrast,
-        rim,
-        ok,
+        centre_px=distorted * camera.focal + camera.centre,
+        centre=centre,
+        shape=shape,
+        covariance_px2=jacobian @ covariance @ np.swapaxes(jacobian, 1, 2),
+        blur_px=blur,
+        contrast=contrast,
+        rim=rim,
+        ok=ok,
     )
 
 

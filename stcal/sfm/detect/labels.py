@@ -50,7 +50,13 @@ def label_group(
             )
         centres = detection.centres.select(keep)
         observations = ImageObservations(
-            name, group, tuple(labels), centres.centre_px, centres.centre, centres.shape, centres.covariance_px2
+            name=name,
+            group=group,
+            labels=tuple(labels),
+            centre_px=centres.centre_px,
+            centre=centres.centre,
+            shape=centres.shape,
+            covariance_px2=centres.covariance_px2,
         )
         labelled.append(LabelledImage(observations, tuple(notes)))
     return labelled

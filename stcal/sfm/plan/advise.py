@@ -101,15 +101,15 @@ def known_of(run: SavedRun) -> Known:
     prior = camera_prior(read_camera(run.folder / CAMERA), run.camera) if run.options.refine_camera else None
     joint = adjust_jointly(models, run.board, run.camera, run.options.flatness_mm, prior, read.camera)
     setup = Setup(
-        run.target,
-        run.board,
-        joint.camera,
-        start,
-        run.faces.frame,
-        run.options.flatness_mm,
-        prior,
-        joint.board_common,
-        joint.sigma0,
+        target=run.target,
+        board=run.board,
+        camera=joint.camera,
+        start=start,
+        frame=run.faces.frame,
+        flatness_mm=run.options.flatness_mm,
+        prior=prior,
+        common=joint.board_common,
+        sigma0=joint.sigma0,
     )
     noise = CentreNoise.measured(joint.models, joint.camera, setup.radius_mm())
     return Known(joint.models, joint, setup, noise, known_scene(joint.models, joint, setup, run.colmap_model))

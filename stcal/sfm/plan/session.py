@@ -167,14 +167,14 @@ def _setup(scene: Scene, options: PlanOptions, board: BoardDesign) -> Setup:
     )
     own = options.camera or _stated(scene.camera, scene.colmap_model)
     return Setup(
-        scene.target,
-        board,
-        scene.camera,
-        start,
-        run.frame,
-        run.flatness_mm,
-        camera_prior(refinable(own), scene.camera) if run.refine_camera else None,
-        ONE_PLATE if options.one_board else 0.0,
+        target=scene.target,
+        board=board,
+        camera=scene.camera,
+        start=start,
+        frame=run.frame,
+        flatness_mm=run.flatness_mm,
+        prior=camera_prior(refinable(own), scene.camera) if run.refine_camera else None,
+        common=ONE_PLATE if options.one_board else 0.0,
     )
 
 

@@ -29,13 +29,13 @@ def observe(scene: Scene, noise_px: float, rng: np.random.Generator, missing: fl
             centre_px = scene.camera.project(ideal) + noise_px * rng.standard_normal((len(keep), 2))
             images.append(
                 ImageObservations(
-                    f"{name}/{i:04d}",
-                    name,
-                    tuple(seen.labels[k] for k in keep),
-                    centre_px,
-                    scene.camera.normalised_from_pixel(centre_px),
-                    np.zeros((len(keep), 2, 2)),
-                    np.tile((noise_px or EXACT_SIGMA_PX) ** 2 * np.eye(2), (len(keep), 1, 1)),
+                    name=f"{name}/{i:04d}",
+                    group=name,
+                    labels=tuple(seen.labels[k] for k in keep),
+                    centre_px=centre_px,
+                    centre=scene.camera.normalised_from_pixel(centre_px),
+                    shape=np.zeros((len(keep), 2, 2)),
+                    covariance_px2=np.tile((noise_px or EXACT_SIGMA_PX) ** 2 * np.eye(2), (len(keep), 1, 1)),
                 )
             )
     return images

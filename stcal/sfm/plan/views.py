@@ -99,7 +99,16 @@ def known_scene(models: tuple[MetricModel, ...], joint: JointResult, setup: Setu
             model.group, faces, _Stand.of(model).axes, target_from_board, target_from_board @ dots, ()
         )
     target = _calibrated_part(setup.target, setup.start.target_from_face, circles)
-    return Scene(target, setup.board, setup.camera, colmap_model, setup.start.target_from_face, circles, groups, 0)
+    return Scene(
+        target=target,
+        board=setup.board,
+        camera=setup.camera,
+        colmap_model=colmap_model,
+        target_from_face=setup.start.target_from_face,
+        circles_target=circles,
+        groups=groups,
+        seed=0,
+    )
 
 
 def _calibrated_part(target: TargetDesign, target_from_face: dict[str, Rigid], circles) -> TargetDesign:

@@ -91,7 +91,17 @@ def load_run(folder: str | Path) -> SavedRun:
         known = {*target.radius_of(), *board.radius_of()}
         observations, corrected = _labels(folder / "labels.csv", names, camera, known)
     return SavedRun(
-        folder, images, options, camera, model.colmap_model, target, board, observations, corrected, result, report
+        folder=folder,
+        images=images,
+        options=options,
+        camera=camera,
+        colmap_model=model.colmap_model,
+        target=target,
+        board=board,
+        observations=observations,
+        corrected_px=corrected,
+        faces=result,
+        report=report,
     )
 
 
@@ -132,13 +142,13 @@ def _labels(path: Path, names: list[tuple[str, str, int]], camera: Camera, known
             raise ValueError(f"image {name}: a σ that is not positive")
         observations.append(
             ImageObservations(
-                name,
-                group,
-                labels,
-                values[:, :2],
-                camera.normalised_from_pixel(values[:, :2]),
-                np.zeros((len(own), 2, 2)),
-                covariance,
+                name=name,
+                group=group,
+                labels=labels,
+                centre_px=values[:, :2],
+                centre=camera.normalised_from_pixel(values[:, :2]),
+                shape=np.zeros((len(own), 2, 2)),
+                covariance_px2=covariance,
             )
         )
         corrected.append(values[:, 2:4])
