@@ -18,6 +18,7 @@ def script():
     return load_script("handeye_shared")
 
 
+@pytest.mark.slow
 def test_charuco_photographs(script, shared_data, tmp_path):
     data = shared_data("charuco_handeye").parent
     ours, text = script.charuco(data, tmp_path / "a", "--workers", "1", *script.SPLITS)
@@ -32,6 +33,7 @@ def test_charuco_photographs(script, shared_data, tmp_path):
     assert ours["sigma"]["corner_px"] < 0.1
 
 
+@pytest.mark.slow
 def test_the_pitch_of_the_dots_is_found(script, shared_data, tmp_path):
     found, text = script.dots(shared_data("dotgrid_handeye").parent, tmp_path, "--workers", "1", "--splits", "0")
     board = found["board"]

@@ -10,6 +10,7 @@ def study():
     return load_script("handeye_study")
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("method", ["pose, σ stated", "pose, σ estimated", "reprojection, σ estimated"])
 def test_a_trial(study, method):
     """Squares of six numbers of σ 1, by the bound and by the stated covariance: below 34 but once in 10⁵."""

@@ -18,6 +18,7 @@ def means(script):
     return {name: [float(e.mean()) for e in errors] for name, errors in script.trial(1, script.SHOWN).items()}
 
 
+@pytest.mark.slow
 def test_the_simulation_is_what_it_says(script):
     rng = np.random.default_rng(0)
     cell = script.Cell.of(rng)
@@ -34,17 +35,20 @@ def test_the_simulation_is_what_it_says(script):
     assert off.max() < script.OFF_MM[1] + 0.3
 
 
+@pytest.mark.slow
 def test_their_method_beats_their_least_squares(script, means):
     """The paper says three times; one robot of ours: at least 1.5 and at most 6."""
     assert 1.5 < means[script.USUAL][0] / means[script.PAPER][0] < 6
 
 
+@pytest.mark.slow
 def test_ours_beats_theirs(script, means):
     assert means[script.AFFINE][0] < means[script.PAPER][0] / 1.5
     assert means[script.TOGETHER][0] < means[script.PAPER][0] / 1.5
     assert means[script.FIELD][0] < means[script.RIGID][0]
 
 
+@pytest.mark.slow
 def test_only_the_kinematics_hold_outside(script, means):
     """In the 400 mm cube every transform is worse; base and kinematics are the best there."""
     for name in (script.USUAL, script.PAPER, script.RIGID, script.AFFINE):
@@ -53,6 +57,7 @@ def test_only_the_kinematics_hold_outside(script, means):
     assert means[script.TOGETHER][1] == min(found[1] for found in means.values())
 
 
+@pytest.mark.slow
 def test_their_samples_find_no_clean_draw_among_thirty_per_cent(script):
     rng = np.random.default_rng(2)
     cell = script.Cell.of(rng)

@@ -21,6 +21,7 @@ def calibrated(tmp_path_factory):
     return scene, data, folder / "run", result
 
 
+@pytest.mark.slow
 def test_the_design_differs_in_everything(calibrated):
     _, data, _, _ = calibrated
     target, board = load_target(data / "target.toml"), load_board(data / "board.toml")
@@ -30,6 +31,7 @@ def test_the_design_differs_in_everything(calibrated):
     assert not {"1", "2", "3"} & {face.id for face in target.faces}
 
 
+@pytest.mark.slow
 def test_every_label_is_right(calibrated):
     from stcal.synthetic.observe import image_circles
 
@@ -42,6 +44,7 @@ def test_every_label_is_right(calibrated):
             assert np.linalg.norm(centre - truth[label]) < 1.5, f"{image.name} {label}"
 
 
+@pytest.mark.slow
 def test_faces_are_right_within_their_own_sigma(calibrated):
     _, data, out, result = calibrated
     comparison = compare(out, data / "truth.json")

@@ -32,6 +32,7 @@ def rendered(request, shared_data, tmp_path_factory):
     return request.param, folder, out, result, truth
 
 
+@pytest.mark.slow
 def test_no_label_is_wrong_and_the_visible_circles_are_found(rendered):
     name, folder, out, _, _ = rendered
     labels = compare(out, folder / "truth.json")["labels"]
@@ -40,6 +41,7 @@ def test_no_label_is_wrong_and_the_visible_circles_are_found(rendered):
     assert labels["found"] / labels["visible"] >= BOUNDS[name][5]
 
 
+@pytest.mark.slow
 def test_a_wrong_label_would_be_seen(rendered, tmp_path):
     """Two circles of one image swapped in a copy of the run: both are counted."""
     _, folder, out, _, _ = rendered
@@ -52,12 +54,14 @@ def test_a_wrong_label_would_be_seen(rendered, tmp_path):
     assert compare(tmp_path, folder / "truth.json")["labels"]["wrong"] == 2
 
 
+@pytest.mark.slow
 def test_every_image_is_registered(rendered):
     _, _, _, result, truth = rendered
     mapped = {name for s in result.solutions for name in s.model.images}
     assert mapped == {name for g in truth["groups"].values() for name in g["images"]}
 
 
+@pytest.mark.slow
 def test_faces_and_circles_are_right(rendered):
     name, folder, out, _, _ = rendered
     near_um, far_um, near_mdeg, far_mdeg, circles_um, _ = BOUNDS[name]
@@ -70,6 +74,7 @@ def test_faces_and_circles_are_right(rendered):
         assert 0.05 < row["circles_mean_um"] < circles_um, face_id
 
 
+@pytest.mark.slow
 def test_centring_reaches_the_level_of_good_edges(rendered):
     """Against the exact ellipse centres: 0.005 px on clean images is what the field's notes call good."""
     name, _, _, result, _ = rendered
@@ -78,6 +83,7 @@ def test_centring_reaches_the_level_of_good_edges(rendered):
     assert 0.001 < rms < (0.005 if name == "clean" else 0.008)
 
 
+@pytest.mark.slow
 def test_the_native_program_agrees(rendered):
     """On the clean set within the issue's 2 µm and 1 mdeg on every face; our database is not touched."""
     name, _, out, _, _ = rendered
@@ -99,6 +105,7 @@ def test_the_native_program_agrees(rendered):
     assert hashlib.sha256((out / "database.db").read_bytes()).hexdigest() == before
 
 
+@pytest.mark.slow
 def test_the_uncorrected_control_shows_the_bias_that_residuals_hide(shared_data, tmp_path):
     """The bias r²cosθ/D is 40–64 µm for the big circles at 0–50° and 1 m; a face is one circle against another's."""
     folder = shared_data("stereo_target/clean")
@@ -120,6 +127,7 @@ def dotgrid_images(shared_data):
     return [(path.stem, cv2.imread(str(path), cv2.IMREAD_GRAYSCALE)) for path in sorted(folder.glob("*.png"))]
 
 
+@pytest.mark.slow
 def test_all_photographed_boards_are_found_and_oriented(shared_data):
     camera = Camera(640, 480, [542.324, 543.515], [320.474, 226.039], np.zeros(8))
     images = dotgrid_images(shared_data)
@@ -147,6 +155,7 @@ def _check_orientation(name, found):
         assert size[corner][0] > 1.25 * np.median(size), name
 
 
+@pytest.mark.slow
 def test_camera_files_of_the_data_sets_are_read(shared_data):
     for name in ("clean", "clutter"):
         model = read_camera(shared_data(f"stereo_target/{name}") / "cameras.txt")

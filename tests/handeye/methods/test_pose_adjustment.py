@@ -37,6 +37,7 @@ def bound(truth, noise):
     return np.linalg.inv(np.einsum("mai,maj->ij", slope, np.linalg.solve(spread, slope)))[:6, :6]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("setup", SETUPS)
 @pytest.mark.parametrize("stated", [True, False])
 def test_pose_error_reaches_the_bound_and_knows_it(setup, stated):
@@ -54,6 +55,7 @@ def test_pose_error_reaches_the_bound_and_knows_it(setup, stated):
     assert 0.8 < normalised(errors, covariances) < 1.25
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("robot", [(3e-4, 0.1), (1e-3, 0.02)])
 def test_sigma_are_estimated(robot):
     """Mean of 30 estimates from 30 poses each: 180 − 12 redundancies, 3 each of 4 kinds, so 1/√(2·30·90) = 1.4 % and
@@ -75,6 +77,7 @@ def test_the_robot_is_estimated_where_the_camera_is_known():
     assert found.sigma["camera_mm"] == 0.3
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("count", "low", "high"), [(3, 0.7, 1.3), (4, 0.7, 1.15)])
 def test_few_poses_state_what_they_can_know(count, low, high):
     """All σ estimated from 6 or 12 redundancies: heavy tails, so 200 draws tell their RMS to some 10 %; caution may
@@ -135,6 +138,7 @@ def test_bad_poses_are_named_and_left_out(bad):
     assert found.mount_from_camera.translation == pytest.approx(without.mount_from_camera.translation, abs=1e-3)
 
 
+@pytest.mark.slow
 def test_good_poses_are_rarely_called_bad():
     """1 % of the data sets may hold one: of 40, more than 3 have a chance of 1 in 1500."""
     named = 0

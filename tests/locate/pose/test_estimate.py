@@ -66,6 +66,7 @@ def test_intrinsics_with_sigma_make_the_pose_as_uncertain():
     assert np.mean(held) > 3
 
 
+@pytest.mark.slow
 def test_no_flipped_pose_is_accepted():
     """A single tag far away, and noisy: hundreds of poses cannot be told from their mirror image, and are not."""
     rng = np.random.default_rng(3)

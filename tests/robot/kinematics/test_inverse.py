@@ -156,6 +156,7 @@ def test_nearest_where_two_branches_almost_meet():
     np.testing.assert_allclose(inverse(free, many, near).q[clear], expected[clear], atol=1e-6)
 
 
+@pytest.mark.slow
 def test_eight_branches_of_an_arm_with_a_spherical_wrist():
     """Shoulder, elbow and wrist: 2³ (Pieper 1968), where nothing limits them."""
     robot = replace(mh80(), joints=(Joint(),) * 6)

@@ -358,6 +358,7 @@ def test_rendered_images_are_measured_as_predicted(measured, small_dataset):
     assert 0.2 < mean_squared_error(measured, json.loads((small_dataset / "truth.json").read_text())) < 2.8
 
 
+@pytest.mark.slow
 def test_the_shared_rendered_set(shared_data, tmp_path):
     """The whole chain on images of another program: calibrated, then measured. Its README says that one face in eight
     is 2 of its own σ off, and this is in the poses: 2² = 4."""

@@ -1,0 +1,74 @@
+"""Detections are kept by content and settings; what was damaged is detected again."""
+
+import shutil
+
+import numpy as np
+import pytest
+
+from stcal.design import reference_board, reference_target
+from stcal.errors import InputError
+from stcal.io.camera import read_camera
+from stcal.io.images import find_images
+from stcal.sfm.detect.ellipses import EllipseOptions
+from stcal.sfm.detect.files import detect_files
+
+IMAGE = "12/IMG_1000.jpg"
+
+
+@pytest.fixture
+def detected(sample, tmp_path):
+    """Function that detects in a folder of one photograph: (result, names of files that were reported done)."""
+    folder = tmp_path / "images"
+    (folder / "12").mkdir(parents=True)
+    shutil.copy(sample / "images" / IMAGE, folder / IMAGE)
+    camera = read_camera(sample / "cameras.txt")
+
+    def detect(options: EllipseOptions | None = None):
+        done = []
+        found = detect_files(
+            find_images(folder)[0],
+            camera,
+            reference_target(),
+            reference_board(),
+            options or EllipseOptions(),
+            tmp_path / "cache",
+            1,
+            done.append,
+        )
+        return found, done
+
+    return detect, folder, tmp_path / "cache"
+
+
+def test_a_detection_is_kept_and_a_damaged_one_made_again(detected):
+    detect, _, cache = detected
+    (first,) = detect()[0].images
+    (again,), done = detect()[0].images, detect()[1]
+    assert (first.reused, again.reused) == (False, True)
+    assert done == [IMAGE]
+    np.testing.assert_array_equal(first.detection.centres.centre_px, again.detection.centres.centre_px)
+    (file,) = cache.glob("*.npz")
+    for spoilt in (b"", file.read_bytes()[: file.stat().st_size // 2]):
+        file.write_bytes(spoilt)
+        (repaired,) = detect()[0].images
+        assert not repaired.reused
+        assert repaired.detection.target_labels == first.detection.target_labels
+        np.testing.assert_array_equal(repaired.detection.centres.centre_px, first.detection.centres.centre_px)
+
+
+def test_a_copy_and_a_file_that_is_no_image_are_named(detected):
+    detect, folder, _ = detected
+    shutil.copy(folder / IMAGE, folder / "12" / "copy.jpg")
+    (folder / "12" / "no.jpg").write_bytes(b"not an image")
+    found, _ = detect()
+    assert [image.file.name for image in found.images] == [IMAGE]
+    reasons = {each.name: each.reason for each in found.skipped}
+    assert set(reasons) == {"12/copy.jpg", "12/no.jpg"}
+    assert reasons["12/copy.jpg"] == f"the same image as {IMAGE}"
+
+
+def test_no_usable_file_is_an_error(detected):
+    detect, folder, _ = detected
+    (folder / IMAGE).write_bytes(b"not an image")
+    with pytest.raises(InputError, match=f"no usable image among 1: {IMAGE}: "):
+        detect()

@@ -1,0 +1,73 @@
+"""What is drawn on an overlay is where it should be."""
+
+import cv2
+import numpy as np
+import pytest
+
+from stcal.sfm.data.observations import ImageObservations
+from stcal.sfm.detect.overlay import draw_overlay
+
+FOCAL = np.array([2000.0, 2000.0])
+GREY = 90
+
+
+def overlay(labels, centres, shapes, scale: float, width: int = 1600, notes: int = 0) -> np.ndarray:
+    """Drawn on a plain image of ``width`` px, its thumbnail ``scale`` of that."""
+    n = len(labels)
+    size = (round(width * 0.75 * scale), round(width * scale))
+    _, jpeg = cv2.imencode(".jpg", np.full((*size, 3), GREY, np.uint8))
+    image = ImageObservations(
+        "12/a.jpg",
+        "12",
+        tuple(labels),
+        centres,
+        np.zeros((n, 2)),
+        np.array(shapes) / FOCAL[:, None],
+        np.tile(np.eye(2), (n, 1, 1)),
+    )
+    drawn = draw_overlay(jpeg.tobytes(), scale, image, ["1", "2"], FOCAL, notes)
+    return cv2.imdecode(np.frombuffer(drawn, np.uint8), cv2.IMREAD_COLOR).astype(float)
+
+
+def coloured(picture: np.ndarray) -> np.ndarray:
+    """Pixels that are not grey, (n, 2) as x, y."""
+    return np.argwhere(np.ptp(picture, axis=2) > 60)[:, ::-1]
+
+
+@pytest.mark.parametrize("scale", [1.0, 0.75])
+def test_the_rim_is_drawn_where_the_ellipse_is(scale):
+    """Every sixteenth of the rim has colour within 1.5 px, and nothing inside it but the cross is coloured."""
+    centre, shape = np.array([800.0, 600.0]), np.array([[100.0, 20.0], [0.0, 60.0]])
+    found = coloured(overlay(["1:3"], [centre], [shape], scale))
+    at = (centre + 0.5) * scale - 0.5
+    angle = np.linspace(0, 2 * np.pi, 16, endpoint=False)
+    rim = at + scale * np.column_stack([np.cos(angle), np.sin(angle)]) @ shape.T
+    away = np.linalg.norm(rim[:, None] - found, axis=2).min(1)
+    assert away.max() < 1.5
+    radius = np.linalg.norm(np.linalg.solve(scale * shape, (found - at).T), axis=0)
+    inside = found[(radius < 0.9) & (found[:, 1] > at[1] - 8)]  # the face's name stands above
+    assert np.abs(inside - at).max() < 5
+    assert np.linalg.norm(inside - at, axis=1).min() < 1
+
+
+def test_a_small_thumbnail_is_enlarged_and_the_drawing_with_it():
+    picture = overlay(["1:3"], [[400.0, 300.0]], [60 * np.eye(2)], 1.0, width=800)
+    assert picture.shape == (1200, 1600, 3)
+    found = coloured(picture)
+    away = np.abs(np.linalg.norm(found - 2 * np.array([400.25, 300.25]), axis=1) - 120)
+    assert np.percentile(away, 20) < 1.5
+
+
+def test_faces_have_colours_of_their_own():
+    one = overlay(["1:3"], [[800.0, 600.0]], [60 * np.eye(2)], 1.0)
+    two = overlay(["2:3"], [[800.0, 600.0]], [60 * np.eye(2)], 1.0)
+    x, y = 860, 600
+    near = np.s_[y - 3 : y + 4, x - 2 : x + 3]
+    assert np.abs(one[near].mean((0, 1)) - two[near].mean((0, 1))).max() > 20
+
+
+def test_the_caption_grows_with_the_notes():
+    plain, noted = (overlay(["1:3"], [[800.0, 600.0]], [60 * np.eye(2)], 1.0, notes=n) for n in (0, 2))
+    caption = np.s_[-60:, :]
+    assert (np.abs(noted - plain)[caption].max(2) > 60).sum() > 100
+    assert np.abs(noted - plain)[:-80].max() < 20
