@@ -1,7 +1,5 @@
 """A hand-eye calibration for the terminal, and as a page."""
 
-from html import escape
-
 import numpy as np
 from scipy.spatial.transform import Rotation
 
@@ -14,8 +12,8 @@ from stcal.handeye.solve import FACTORS
 from stcal.handeye.validate import Compared
 from stcal.io.camera import PARAMETER_NAMES, parameter_names
 from stcal.report.figure import COLOURS, FAINT, INK, SMALL, calm, new_figure, uri
-from stcal.report.page import fold, page, plot, swatch, table
-from stcal.report.text import NONE, number
+from stcal.report.page import render
+from stcal.report.text import NONE, number, text_table
 
 HEADS = ("", "mm", "± σ", "rotation vector °", "± σ")
 ERRORS = {
@@ -43,7 +41,7 @@ def outcome_text(outcome: Outcome) -> str:
     result, frames = outcome.result, FRAMES[outcome.result.setup]
     lines = [_headline(outcome)]
     for name, pose, covariance in _transforms(result):
-        lines += ["", *_aligned([name, *HEADS[1:]], _transform_rows(pose, covariance))]
+        lines += ["", *text_table([["<" + name, *HEADS[1:]], *_transform_rows(pose, covariance)])]
     turn, shift = result.rms()
     lines += ["", f"residuals (RMS): {np.degrees(turn):.4f}°, {shift:.3f} mm at the board's origin"]
     if outcome.held_out is not None:
@@ -56,7 +54,7 @@ def outcome_text(outcome: Outcome) -> str:
         lines.append(_turns_text(result.observability))
     if outcome.compared:
         lines += ["", f"Methods, on the same {_splits_text(outcome)} held out; off: from {frames.camera} above"]
-        lines += _aligned(*_compared_cells(outcome), left=True)
+        lines += text_table(_compared_cells(outcome))
     return "\n".join(lines)
 
 
@@ -129,7 +127,7 @@ def _turns_text(seen: Observability) -> str:
     return f"the flange turns between poses by {turns} (RMS) about its principal axes"
 
 
-def _compared_cells(outcome: Outcome) -> tuple[list[str], list[list[str]]]:
+def _compared_cells(outcome: Outcome) -> list[list[str]]:
     """Heads, and a row for each method: means on poses held out, and how far from the result."""
     known = [name for name in ERRORS if any(c.held_out and name in c.held_out.means() for c in outcome.compared)]
     rows = []
@@ -137,8 +135,8 @@ def _compared_cells(outcome: Outcome) -> tuple[list[str], list[list[str]]]:
         means = each.held_out.means() if each.held_out else {}
         cells = [number(means.get(n, np.nan) * ERRORS[n][1], ERRORS[n][2]) for n in known]
         rows.append([each.method, *cells, *_off(each, outcome.result), each.reason])
-    heads = ["method", *(ERRORS[name][0] for name in known), "off mm", "off °", ""]
-    return (heads, rows) if any(row[-1] for row in rows) else (heads[:-1], [row[:-1] for row in rows])
+    rows.insert(0, ["<method", *(ERRORS[name][0] for name in known), "off mm", "off °", "<"])
+    return rows if any(row[-1] for row in rows[1:]) else [row[:-1] for row in rows]
 
 
 def _off(each: Compared, result: HandEye) -> list[str]:
@@ -148,137 +146,91 @@ def _off(each: Compared, result: HandEye) -> list[str]:
     return [number(np.linalg.norm(off.translation), 3), number(np.degrees(off.angle_rad()), 4)]
 
 
-def _aligned(heads: list[str], rows: list[list[str]], left: bool = False) -> list[str]:
-    """Columns to the right, the first to the left, and the last with ``left`` as it is."""
-    every = [heads, *rows]
-    width = [max(len(row[k]) for row in every) for k in range(len(heads))]
-    lines = []
-    for row in every:
-        cells = [row[0].ljust(width[0]), *(cell.rjust(w) for cell, w in zip(row[1:], width[1:], strict=True))]
-        if left and heads[-1] == "":
-            cells[-1] = row[-1]
-        lines.append("  ".join(cells).rstrip())
-    return lines
-
-
 def outcome_page(outcome: Outcome) -> str:
     """The report."""
     result = outcome.result
-    banner = f'<h1>{FRAMES[result.setup].camera}</h1><p class="counts">{escape(outcome.where)}: '
-    banner += f"{escape(_headline(outcome))}</p>\n"
-    notes = "".join(f"<li>{escape(note)}</li>\n" for note in outcome.all_notes())
-    notes = f"<h3>To know</h3>\n<ul>\n{notes}</ul>\n" if notes else ""
-    sections = [("result", "Result", _tiles(outcome) + notes + _transform_tables(result) + _sigma_table(outcome))]
-    if outcome.compared:
-        sections.append(("methods", "Methods", _methods(outcome)))
-    sections.append(("poses", "Poses", _poses(outcome)))
-    if result.observability is not None:
-        sections.append(("motions", "What the motions tell", _motions(result)))
-    if outcome.left_out:
-        sections.append(("left-out", "Left out", table(["<image", "<reason"], [list(r) for r in outcome.left_out])))
-    return page(f"Hand-eye calibration: {FRAMES[result.setup].camera}", banner, sections)
+    compared = _compared_cells(outcome)
+    seen = result.observability
+    return render(
+        "handeye/report/page.html.jinja",
+        outcome=outcome,
+        camera=FRAMES[result.setup].camera,
+        counts=_headline(outcome),
+        headline=_tiles(outcome),
+        agreeing=_agreeing_text(outcome) if outcome.held_out is not None else [],
+        notes=list(outcome.all_notes()),
+        heads=HEADS,
+        transforms=[
+            (name, _transform_rows(pose, covariance), _matrix_text(pose))
+            for name, pose, covariance in _transforms(result)
+        ],
+        sigmas=_sigma_rows(outcome),
+        adjusted=_adjusted(outcome),
+        compared=compared,
+        splits=_splits_text(outcome),
+        board_seen=ERRORS["board_mm"][0] in compared[0],
+        good=GOOD,
+        bad=BAD,
+        residuals=uri(_residual_figure(result)),
+        corners=result.reprojection and (uri(_corner_figure(result)), uri(_corner_rms_figure(result))),
+        poses=_pose_rows(result),
+        motions=seen and _motion_rows(seen),
+        sigma_deg=seen and np.degrees(seen.sigma_rad),
+    )
 
 
-def _tiles(outcome: Outcome) -> str:
+def _matrix_text(pose: Rigid) -> str:
+    return "\n".join(" ".join(f"{v:14.9f}" for v in row) for row in pose.matrix())
+
+
+def _tiles(outcome: Outcome) -> list[tuple[str, str, str]]:
+    """(value, unit, what it is)."""
     result, tiles = outcome.result, []
     if outcome.held_out is not None:
         means = outcome.held_out.means()
         name = "board_mm" if "board_mm" in means else "translation_mm"
         where = "3-D error at the board" if name == "board_mm" else "error of the board's origin"
-        tiles.append((f"{means[name]:.3f} mm", f"{where}, on poses held out ({_splits_text(outcome)})"))
+        tiles.append((f"{means[name]:.3f} mm", "", f"{where}, on poses held out ({_splits_text(outcome)})"))
         turn = np.degrees(means["rotation_rad"])
-        tiles.append((f"{turn:.3f}°", "error of rotation, on poses held out"))
+        tiles.append((f"{turn:.3f}°", "", "error of rotation, on poses held out"))
     if result.covariance is not None:
         sigma = np.sqrt(np.linalg.eigvalsh(result.covariance[3:, 3:])[-1])
-        tiles.append((f"{sigma:.3f} mm", "σ of the camera's place, in its worst direction"))
+        tiles.append((f"{sigma:.3f} mm", "", "σ of the camera's place, in its worst direction"))
     turn, shift = result.rms()
-    tiles.append((f"{shift:.3f} mm", f"RMS residual at the board's origin, and {np.degrees(turn):.3f}°"))
+    tiles.append((f"{shift:.3f} mm", "", f"RMS residual at the board's origin, and {np.degrees(turn):.3f}°"))
     if result.sigma_scale is not None:
         found = "" if outcome.pitch_mm is None else f": pitch {outcome.pitch_mm * result.scale:.3f} mm"
-        tiles.append((f"{result.scale:.4f}", f"times its stated size is the board, ± {result.sigma_scale:.4f}{found}"))
-    shown = "".join(f"<div><b>{value}</b><span>{escape(text)}</span></div>" for value, text in tiles)
-    more = "".join(f"<p>Held out, {escape(text)}.</p>\n" for text in _agreeing_text(outcome))
-    return f'<div class="tiles">{shown}</div>\n{more}'
-
-
-def _transform_tables(result: HandEye) -> str:
-    parts = []
-    for name, pose, covariance in _transforms(result):
-        matrix = "\n".join(" ".join(f"{v:14.9f}" for v in row) for row in pose.matrix())
-        parts.append(
-            f"<div><h3>{name}</h3>\n"
-            + table(list(HEADS), _transform_rows(pose, covariance))
-            + fold("4×4 matrix, mm", f'<div class="scroll"><pre>{matrix}</pre></div>')
-            + "</div>"
+        tiles.append(
+            (f"{result.scale:.4f}", "", f"times its stated size is the board, ± {result.sigma_scale:.4f}{found}")
         )
-    text = (
-        "<p>The rotation vector is axis times angle, no roll, pitch and yaw. σ are of turns about the axes, and of "
-        "shifts along the axes, of the frame named first.</p>\n"
-    )
-    return '<div class="columns">' + "\n".join(parts) + "</div>\n" + text
+    return tiles
 
 
-def _sigma_table(outcome: Outcome) -> str:
-    result = outcome.result
-    if not result.sigma:
-        return ""
-    found = result.reprojection
-    extra = ""
-    if found is not None and found.camera_covariance is not None:
-        sigma = dict(zip(parameter_names(outcome.colmap_model), np.sqrt(np.diag(found.camera_covariance)), strict=True))
-        shown = []
-        for name, value in zip(PARAMETER_NAMES, found.camera.parameters(), strict=True):
-            known = sigma.get(name, sigma.get("f") if name in ("fx", "fy") else None)
-            if value or known:
-                digits, unit = (3, "px") if name[0] in "fc" else (6, "")
-                shown.append([name, number(value, digits), number(known, digits), unit])
-        head = "<div><h3>Camera, as adjusted (first pixel's centre at 0, 0)</h3>\n"
-        extra = head + table(["<", "value", "± σ", "<unit"], shown) + "</div>"
-    weights = "<div><h3>What errs, and by how much</h3>\n" + table(["<", "σ", "<"], _sigma_rows(outcome)) + "</div>"
-    return f'<div class="columns">{weights}{extra}</div>\n'
+def _adjusted(outcome: Outcome) -> list[list[str]] | None:
+    """Rows of the camera's parameters where they were adjusted."""
+    found = outcome.result.reprojection
+    if found is None or found.camera_covariance is None:
+        return None
+    sigma = dict(zip(parameter_names(outcome.colmap_model), np.sqrt(np.diag(found.camera_covariance)), strict=True))
+    shown = []
+    for name, value in zip(PARAMETER_NAMES, found.camera.parameters(), strict=True):
+        known = sigma.get(name, sigma.get("f") if name in ("fx", "fy") else None)
+        if value or known:
+            digits, unit = (3, "px") if name[0] in "fc" else (6, "")
+            shown.append([name, number(value, digits), number(known, digits), unit])
+    return shown
 
 
-def _methods(outcome: Outcome) -> str:
-    heads, rows = _compared_cells(outcome)
-    heads = [f"<{heads[0]}", *heads[1:-1], f"<{heads[-1]}" if heads[-1] == "" else heads[-1]]
-    seen = (
-        " 3-D at the board: how far from each corner the ray on which the camera saw it meets the board where the "
-        "robot has put it; by pose: distance from the corners by the pose that the image gives alone."
-    )
-    text = (
-        f"<p>Means over the same {_splits_text(outcome)} held out: each time all methods solve with the others and "
-        f"predict where the board is.{seen if ERRORS['board_mm'][0] in heads else ''} Off: how far a method's result "
-        "from all poses is from the one above.</p>\n"
-    )
-    return table(heads, rows, css="text") + text
-
-
-def _poses(outcome: Outcome) -> str:
-    result = outcome.result
-    bad = ", ".join(outcome.outliers())
-    text = f"{swatch('used', GOOD)} {swatch('left out, contradicting the others', BAD)}" if bad else ""
-    caption = "By how much the chain through each pose misses the board"
-    figures = plot(uri(_residual_figure(result)), "residual of each pose", caption, "wide")
-    if result.reprojection is not None:
-        cloud = plot(uri(_corner_figure(result)), "residuals of corners", "Corners: projected minus seen; circle: 95 %")
-        bars = plot(uri(_corner_rms_figure(result)), "corners of each pose", "Corners of each pose: RMS length")
-        figures += f'<div class="plots">{cloud}{bars}</div>\n'
+def _pose_rows(result: HandEye) -> list[list[str]]:
     turn, shift = (np.linalg.norm(part, axis=1) for part in (result.residuals[:, :3], result.residuals[:, 3:]))
     rows = []
     for i, name in enumerate(result.names):
-        row = [
-            name,
-            number(np.degrees(turn[i]), 4),
-            number(shift[i], 3),
-            *(number(v, 3) for v in result.residuals[i, 3:]),
-        ]
+        row = [name, number(np.degrees(turn[i]), 4), number(shift[i], 3)]
+        row += [number(v, 3) for v in result.residuals[i, 3:]]
         if result.reprojection is not None:
             row.append(number(result.reprojection.rms_px(i), 3))
         rows.append([*row, "left out" if result.outliers[i] else ""])
-    heads = ["<pose", "rotation °", "mm", "x mm", "y mm", "z mm"]
-    heads += ["corners px"] if result.reprojection is not None else []
-    legend = f'<p class="legend">{text}</p>\n' if text else ""
-    return legend + figures + fold(f"{len(rows)} poses", table([*heads, "<"], rows))
+    return rows
 
 
 def _residual_figure(result: HandEye):
@@ -344,16 +296,8 @@ def _finish(axes, x: str, y: str) -> None:
     axes.set_ylabel(y, fontsize=SMALL + 1, color=INK)
 
 
-def _motions(result: HandEye) -> str:
-    seen = result.observability
-    rows = [
+def _motion_rows(seen: Observability) -> list[list[str]]:
+    return [
         [str(i + 1), *(number(v, 3) for v in axis), number(np.degrees(turn), 2)]
         for i, (axis, turn) in enumerate(zip(seen.axes, seen.turns_rad, strict=True))
     ]
-    text = (
-        "<p>The principal axes of all rotations between poses, in the flange's frame, and the RMS turn about each. "
-        "The transform is known well where the second turn is large; where it is 0, the camera's place slides along "
-        f"the first axis. From poses of a common camera (1 mrad, 0.5 mm) these motions give σ of "
-        f"{number(np.degrees(seen.sigma_rad), 3)}° and {number(seen.sigma_mm, 2)} mm in the worst direction.</p>\n"
-    )
-    return table(["axis", "x", "y", "z", "turn ° (RMS)"], rows) + text
