@@ -8,7 +8,9 @@ import sys
 import threading
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor, as_completed
+from typing import TypeVar
 
+R = TypeVar("R")
 ONE_THREAD = ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS", "OPENCV_FOR_THREADS_NUM")
 """Libraries take their number of threads from these when they are loaded; processes side by side need one each."""
 _limited = threading.Lock()
@@ -36,7 +38,9 @@ def one_thread() -> Iterator[None]:
         _limited.release()
 
 
-def run_parallel(function: Callable, jobs: Sequence[tuple], workers: int | None = None) -> Iterator[tuple[int, object]]:
+def run_parallel(
+    function: Callable[..., R], jobs: Sequence[tuple], workers: int | None = None
+) -> Iterator[tuple[int, R]]:
     """Yield (index of the job, result of ``function(*job)``) as results come in, in any order.
 
     Processes are started afresh (forking a process with threads can hang) and do not import the caller's main

@@ -1,4 +1,4 @@
-"""Hand-eye calibration of two real data sets, through the command line: the figures of the README.
+"""Hand-eye calibration of two real data sets, as `stcal handeye` does it: the figures of the README.
 
 .venv/bin/python scripts/studies/handeye_shared.py [../shared/data]
 
@@ -7,18 +7,19 @@ of the 16 held out, with the camera and the board as their files have them, and 
 dotgrid_handeye: 15 photographs of a dot board by a camera on a robot; the pitch of the dots from the robot's motion.
 """
 
-import contextlib
-import io
-import json
 import sys
 import tempfile
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 
-from stcal.cli.main import app
 from stcal.geometry.camera import Camera
+from stcal.handeye import HandEyeOptions
+from stcal.handeye.report.file import outcome_json
+from stcal.handeye.report.page import outcome_text
 from stcal.io.camera import read_camera, write_cameras_txt
+from stcal.workflows.handeye import ALL, Splits, calibrate, read_input
 
 CHARUCO = """type = "charuco"
 rows = 7
@@ -42,33 +43,33 @@ radius_mm = 10.0
 """
 # The two camera files of the data set differ by 8 and 14 px, and have no distortion.
 DOTS_CAMERA_SIGMA = (10.0, 10.0, 15.0, 15.0, 0.1, 0.1, 0.01, 0.01)
-SPLITS = ("--held-out", "5", "--splits", "15")
+SPLITS, DEFAULT = Splits(15, held_out=5), Splits()
 
 
-def charuco(data: Path, scratch: Path, *options: str, adjusted: dict | None = None) -> tuple[dict, str]:
-    """Output of ``stcal handeye`` on charuco_handeye, and what it prints.
+def charuco(
+    data: Path, scratch: Path, splits: Splits = SPLITS, method: str | None = None, adjusted: dict | None = None
+) -> tuple[dict, str]:
+    """What ``stcal handeye`` writes of charuco_handeye, and what it prints.
 
     The camera file of the data set has no distortion, which the lens has: it is adjusted; or camera and board are those
     of an output, ``adjusted``.
     """
     folder = data / "charuco_handeye" / "test_set_charuco"
     file, board = folder / "cal_data.yaml", CHARUCO
-    if adjusted is None:
-        options = ("--refine-camera", "--with-scale", *options)
-    else:
+    if adjusted is not None:
         camera = Camera(1600, 1200, np.ones(2), np.zeros(2), np.zeros(8))
         camera = camera.with_parameters(np.array(list(adjusted["camera"]["parameters"].values())))
         file = _camera_file(scratch, camera)
         board = board.replace("36.195", repr(adjusted["board"]["pitch_mm"]))
-    return _handeye(folder, scratch, file, board, "--setup", "eye-to-hand", *options)
+    return _handeye(folder, scratch, file, board, "eye-to-hand", method, splits, adjusted is None)
 
 
-def dots(data: Path, scratch: Path, *options: str) -> tuple[dict, str]:
+def dots(data: Path, scratch: Path, splits: Splits = DEFAULT) -> tuple[dict, str]:
     """The same on dotgrid_handeye."""
     folder = data / "dotgrid_handeye"
     camera = read_camera(folder / "camera_intr_calibrated.yaml").sized(640, 480)
     file = _camera_file(scratch, camera, np.diag(np.square(DOTS_CAMERA_SIGMA)))
-    return _handeye(folder, scratch, file, DOTS, "--refine-camera", "--with-scale", *options)
+    return _handeye(folder, scratch, file, DOTS, "eye-in-hand", None, splits, True)
 
 
 def _camera_file(scratch: Path, camera: Camera, covariance: np.ndarray | None = None) -> Path:
@@ -77,18 +78,23 @@ def _camera_file(scratch: Path, camera: Camera, covariance: np.ndarray | None = 
     return scratch / "cameras.txt"
 
 
-def _handeye(folder: Path, scratch: Path, camera: Path, board: str, *options: str) -> tuple[dict, str]:
-    """The command on one data set, as it is."""
+def _handeye(
+    folder: Path,
+    scratch: Path,
+    camera: Path,
+    board: str,
+    setup: str,
+    method: str | None,
+    splits: Splits,
+    adjust: bool,
+) -> tuple[dict, str]:
+    """One data set; ``adjust`` : camera and size of the board too."""
     scratch.mkdir(parents=True, exist_ok=True)
     (scratch / "board.toml").write_text(board)
-    files = {"--poses": folder / "poses", "--camera": camera, "--board": scratch / "board.toml"}
-    given = [str(word) for pair in files.items() for word in pair]
-    out = scratch / "all.json"
-    printed = io.StringIO()
-    with contextlib.redirect_stdout(printed):
-        arguments = ["handeye", str(folder / "images"), *given, *options, "--json", str(out)]
-        app(arguments, standalone_mode=False)
-    return json.loads(out.read_text()), printed.getvalue()
+    given = read_input(folder / "images", folder / "poses", camera, scratch / "board.toml", splits.workers)
+    options = HandEyeOptions(intrinsics=given.prior if adjust else None, with_scale=adjust, symmetries=given.symmetries)
+    outcome = calibrate(given, setup, method, options, splits)
+    return outcome_json(outcome), outcome_text(outcome)
 
 
 def by_split(data: dict) -> np.ndarray:
@@ -110,13 +116,13 @@ def main() -> None:
         if not (data / name).is_dir():
             sys.exit(f"error: {data / name} is missing; give the folder that holds it")
     with tempfile.TemporaryDirectory() as scratch:
-        found, text = charuco(data, Path(scratch) / "charuco", "--method", "all", *SPLITS)
+        found, text = charuco(data, Path(scratch) / "charuco", method=ALL)
         print(f"charuco_handeye\n\n{text}")
         _compare(found)
-        found, text = charuco(data, Path(scratch) / "adjusted", "--method", "all", *SPLITS, adjusted=found)
+        found, text = charuco(data, Path(scratch) / "adjusted", method=ALL, adjusted=found)
         print(f"\ncharuco_handeye, camera and board as adjusted\n\n{text[text.index('Methods') :]}")
         _compare(found)
-        many, _ = charuco(data, Path(scratch) / "many", *SPLITS[:2], "--splits", "60")
+        many, _ = charuco(data, Path(scratch) / "many", replace(SPLITS, repeats=60))
         print(f"reprojection over 60 splits, all adjusted: mean {by_split(many).mean():.3f} mm")
         found, text = dots(data, Path(scratch) / "dots")
         print(f"\ndotgrid_handeye\n\n{text}")

@@ -122,7 +122,7 @@ def _profiles(grey: np.ndarray, frame: _Frame) -> tuple[np.ndarray, np.ndarray]:
     level = (
         cv2.remap(grey, flat[..., 0], flat[..., 1], cv2.INTER_LINEAR).reshape(n, 4, POINTS, SAMPLES).astype(np.float32)
     )
-    inside = ((xy >= 0) & (xy <= [grey.shape[1] - 1, grey.shape[0] - 1])).all((2, 3, 4))
+    inside = np.all((xy >= 0) & (xy <= [grey.shape[1] - 1, grey.shape[0] - 1]), axis=(2, 3, 4))
     rise = np.diff(level, axis=3).clip(0)
     rise[rise < MIN_RISE * rise.max(3, keepdims=True)] = 0
     total = rise.sum(3)

@@ -53,7 +53,7 @@ class Tags:
 
     def edge_sigma_px(self) -> np.ndarray:
         """σ (n,) of a shift that all edges of a tag share, outwards or inwards, which no residual of theirs shows."""
-        return np.hypot(EDGE_PX, SATURATED_EDGE_PX * self.saturated)
+        return np.hypot(EDGE_PX, SATURATED_EDGE_PX * np.asarray(self.saturated))
 
 
 def find_tags(image: np.ndarray, dictionaries: Sequence[str]) -> Tags:

@@ -1,7 +1,8 @@
 """``stcal``, the umbrella command, and ``stcal-sfm``, its shortcut: errors become one line and an exit code."""
 
 import sys
-from typing import NoReturn
+from io import TextIOWrapper
+from typing import Any, NoReturn
 
 import typer
 
@@ -13,7 +14,7 @@ INTERRUPTED = 130
 RESUMED = {"run", "detect"}
 """Commands that keep what they have done when they are interrupted."""
 # Of Click, which newer versions of Typer carry inside.
-UsageError = next(c for c in typer.BadParameter.__mro__ if c.__name__ == "ClickException")
+UsageError: Any = next(c for c in typer.BadParameter.__mro__ if c.__name__ == "ClickException")
 
 app = typer.Typer(
     name="stcal",
@@ -58,7 +59,7 @@ def _guarded(application: typer.Typer) -> None:
     debug = "--debug" in sys.argv
     arguments = [a for a in sys.argv[1:] if a != "--debug"]
     for stream in (sys.stdout, sys.stderr):
-        if hasattr(stream, "reconfigure"):  # a terminal that has no µ must not end a run
+        if isinstance(stream, TextIOWrapper):  # a terminal that has no µ must not end a run
             stream.reconfigure(errors="replace")
     try:
         # Not standalone: Typer hands its errors on in place of drawing a box of several lines.

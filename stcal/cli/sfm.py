@@ -118,13 +118,13 @@ def run(
     from stcal.sfm.run.text import run_text
 
     options = pipeline.RunOptions(
-        solve=solve and solve.value,
-        frame=frame and frame.value,
+        solve=solve.value if solve is not None else None,
+        frame=frame.value if frame is not None else None,
         eccentricity=eccentricity,
         reference_face=reference_face,
         flatness_mm=_flatness(flatness),
         refine_camera=refine_camera,
-        graph=pairs and pairs.value,
+        graph=pairs.value if pairs is not None else None,
         pairs=PairOptions(None if max_angle is None else float(np.radians(max_angle))),
         ellipses=ellipse_options(min_diameter, max_diameter),
         workers=workers,

@@ -62,7 +62,7 @@ def simulate(
         spread_deg=spread,
         images_per_group=images,
     )
-    scene = make_scene(options, *(other() if second_design else ()))
+    scene = make_scene(options, *other()) if second_design else make_scene(options)
     rendering = RenderOptions(noise=noise, blur_px=blur, clutter=clutter, bit_depth=16 if sixteen_bit else 8, seed=seed)
     kind = "png" if png or sixteen_bit else "jpg"
     with StageProgress() as progress:

@@ -208,7 +208,7 @@ def _from_colmap(rows: list[list[str]], path: Path) -> CameraModel:
         numbers = [float(value) for value in (width, height, *params)]
     except ValueError as error:
         raise InputError(f"camera file {path}: {' '.join(str(error).split())[:150]}; numbers needed") from error
-    return camera_from_colmap(name, *numbers[:2], numbers[2:], path)
+    return camera_from_colmap(name, numbers[0], numbers[1], numbers[2:], path)
 
 
 def camera_from_colmap(colmap_model: str, width: float, height: float, params, source: str | Path) -> CameraModel:
@@ -263,9 +263,9 @@ def _from_opencv(values: dict, path: Path) -> CameraModel:
     distortion[: min(len(given), 8)] = given[:8]
     kind = "FULL_OPENCV" if distortion[4:].any() else "OPENCV" if distortion.any() else "PINHOLE"
     # A missing size, or 0, is one the file does not state.
-    size = [float(values.get(f"image_{side}") or 0) or None for side in ("width", "height")]
+    width, height = (float(values.get(f"image_{side}") or 0) or None for side in ("width", "height"))
     flat = np.concatenate([[matrix[0, 0], matrix[1, 1], matrix[0, 2], matrix[1, 2]], distortion])
-    return _model(flat, kind, *size, path)
+    return _model(flat, kind, width, height, path)
 
 
 def _from_industrial(values: dict, path: Path) -> CameraModel:
@@ -281,9 +281,11 @@ class _OpencvLoader(yaml.SafeLoader):
     """YAML with OpenCV's matrix tag."""
 
 
-_OpencvLoader.add_constructor(
-    "tag:yaml.org,2002:opencv-matrix", lambda loader, node: loader.construct_mapping(node, deep=True)
-)
+def _matrix(loader: yaml.SafeLoader, node: yaml.MappingNode) -> dict:
+    return loader.construct_mapping(node, deep=True)
+
+
+_OpencvLoader.add_constructor("tag:yaml.org,2002:opencv-matrix", _matrix)
 
 
 def _yaml_values(text: str) -> dict:

@@ -9,7 +9,7 @@ import numpy as np
 from stcal.errors import InputError
 from stcal.io.camera import write_cameras_txt
 from stcal.io.design import board_toml, target_toml
-from stcal.labels import BOARD
+from stcal.labels import BOARD, Label
 from stcal.parallel import run_parallel
 from stcal.synthetic.observe import image_circles
 from stcal.synthetic.render import RenderOptions, encode, render
@@ -115,7 +115,7 @@ def truth(scene: Scene, image_format: str = "jpg") -> dict:
 
 def _image_truth(scene: Scene, group: str, image: int) -> dict:
     seen = image_circles(scene, group, image)
-    number = {label: f"{BOARD}:{i}" for i, label in enumerate(scene.board.labels())}
+    number: dict[Label, str] = {label: f"{BOARD}:{i}" for i, label in enumerate(scene.board.labels())}
     return {
         number.get(label, label): {
             "centre_px": [round(float(x), 5) for x in centre],

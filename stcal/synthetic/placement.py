@@ -105,6 +105,7 @@ def place_group(
             best = target_from_board, views, valid
         if len(valid) >= max(count, GOOD_SHARE * faces_seen.sum()):
             break
+    assert best is not None  # PLACES is more than none
     target_from_board, views, valid = best
     if len(valid) < count:
         raise DegenerateError(

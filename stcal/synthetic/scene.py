@@ -226,7 +226,7 @@ def _made_group(pair, target, board, camera, target_from_face, circles, options,
     name = group_name(pair)
     labels = [target.face(face).labels() for face in pair]
     normals = [target_from_face[face].rotation[:, 2] for face in pair]
-    axes = viewing_axes(*normals, f"group {name}")
+    axes = viewing_axes(normals[0], normals[1], f"group {name}")
     dots = np.column_stack([board.xy_mm(), np.zeros(board.rows * board.columns)])
     shape = GroupShape(
         f"group {name}",
@@ -246,14 +246,14 @@ def _made_group(pair, target, board, camera, target_from_face, circles, options,
 
 def _rectangle(xy: np.ndarray, radius: np.ndarray, margin: float) -> np.ndarray:
     """Corners, (4, 3), of the smallest rectangle (to 3°) about circles, in their plane z = 0."""
-    best = None
+    found = []
     for angle in np.radians(np.arange(0, 90, 3)):
         turned_from_plane = np.array([[np.cos(angle), np.sin(angle)], [-np.sin(angle), np.cos(angle)]])
         turned = xy @ turned_from_plane.T
         (x0, y0), (x1, y1) = (turned - radius[:, None]).min(0) - margin, (turned + radius[:, None]).max(0) + margin
-        if best is None or (x1 - x0) * (y1 - y0) < best[0]:
-            best = (x1 - x0) * (y1 - y0), np.array([[x0, y0], [x1, y0], [x1, y1], [x0, y1]]) @ turned_from_plane
-    return np.column_stack([best[1], np.zeros(4)])
+        corners = np.array([[x0, y0], [x1, y0], [x1, y1], [x0, y1]])
+        found.append(((x1 - x0) * (y1 - y0), corners @ turned_from_plane))
+    return np.column_stack([min(found, key=lambda each: each[0])[1], np.zeros(4)])
 
 
 def _face_rectangle(face: FaceDesign) -> np.ndarray:

@@ -77,14 +77,16 @@ def detect_boards(
     if not files:
         raise InputError("no image; images of the board needed")
     jobs = [(file, model, board, tuple(dictionaries)) for file in files]
-    found: list[BoardDetection | Skipped | None] = [None] * len(jobs)
-    for done, (i, detection) in enumerate(run_parallel(_detect_board, jobs, workers), 1):
-        found[i] = detection
+    by_job: dict[int, BoardDetection | Skipped] = {}
+    for i, detection in run_parallel(_detect_board, jobs, workers):
+        by_job[i] = detection
         if progress:
-            progress(done, len(jobs))
+            progress(len(by_job), len(jobs))
+    found = [by_job[i] for i in range(len(jobs))]
     detections = [each for each in found if isinstance(each, BoardDetection)]
     if not detections:
-        raise InputError(f"no usable image among {len(files)}: {found[0].name}: {found[0].reason}")
+        first = next(each for each in found if isinstance(each, Skipped))
+        raise InputError(f"no usable image among {len(files)}: {first.name}: {first.reason}")
     size = detections[0].size
     _require_inside(model, detections[0])
     found = [_of_size(each, size, detections[0].name) for each in found]

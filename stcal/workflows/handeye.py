@@ -5,10 +5,13 @@ from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 
+import numpy as np
+
 from stcal.boards.file import load_flat_board
 from stcal.errors import DegenerateError, InputError, StcalError
 from stcal.geometry.rigid import Rigid
 from stcal.handeye import HandEyeOptions, HandEyePoses, View, Views, handeye, pairs_of_views, read_poses
+from stcal.handeye.data.loop import Setup
 from stcal.handeye.data.robot_poses import RobotPoses, read_robot_poses
 from stcal.handeye.report.file import Outcome
 from stcal.handeye.validate import LEAST_LEFT, compare, cross_validate, splits
@@ -117,7 +120,7 @@ def _rows_of_images(robot: RobotPoses, files: list[ImageFile], source: Path):
 
 def calibrate(
     given: HandEyeInput,
-    setup: str,
+    setup: Setup,
     method: str | None,
     options: HandEyeOptions,
     validation: Splits,
@@ -141,7 +144,7 @@ def calibrate(
 
 def _outcome(
     given: HandEyeInput,
-    setup: str,
+    setup: Setup,
     method: str | None,
     options: HandEyeOptions,
     validation: Splits,
@@ -150,7 +153,7 @@ def _outcome(
     pairs, views = given.pairs, given.views
     chosen = None if method == ALL else method
     result = handeye(pairs, setup, chosen, views, options)
-    compared, held_out, notes, rows = (), None, (), ()
+    compared, held_out, notes, rows = (), None, (), np.zeros((0, 0), int)
     if validation.repeats and (validation.held_out or len(pairs) > LEAST_LEFT):
         rows = splits(len(pairs), validation.held_out, validation.repeats, validation.seed)
     if method == ALL:

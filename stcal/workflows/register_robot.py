@@ -96,11 +96,11 @@ def compared(pairs: Pairs, file: Path, robot_file: Path, found: Findings, option
     def by_kinematics(train: np.ndarray, test: np.ndarray) -> np.ndarray:
         return positions(grown(robot, data[train], good[train], settings)[0].robot, data[test])
 
-    done, rows, errors = held_out([by_transform, by_kinematics], pairs.xyz_b, folds, options["seed"])
+    done, rows, (by_one, by_both) = held_out([by_transform, by_kinematics], pairs.xyz_b, folds, options["seed"])
     wild = ~(found.registration.inliers | used)[rows]
     nominal = positions(robot, data)
     off = float(np.sqrt(((pairs.xyz_a - align_rigid(pairs.xyz_a, nominal) @ nominal) ** 2).sum(1).mean()))
-    return Comparison(robot, identified, found.registration.model, pairs.lines, done, rows, *errors, wild, off)
+    return Comparison(robot, identified, found.registration.model, pairs.lines, done, rows, by_one, by_both, wild, off)
 
 
 def held_out(ways, xyz_b: np.ndarray, folds: int, seed: int) -> tuple[int, np.ndarray, np.ndarray]:

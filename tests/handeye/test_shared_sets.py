@@ -1,8 +1,11 @@
-"""Two real data sets through the command line, from photographs: the acceptance figures."""
+"""Two real data sets, from photographs: the acceptance figures."""
+
+from dataclasses import replace
 
 import numpy as np
 import pytest
 
+from stcal.workflows.handeye import Splits
 from tests.scripts import load_script
 
 MEAN_MM = 0.85
@@ -21,8 +24,9 @@ def script():
 @pytest.mark.slow
 def test_charuco_photographs(script, shared_data, tmp_path):
     data = shared_data("charuco_handeye").parent
-    ours, text = script.charuco(data, tmp_path / "a", "--workers", "1", *script.SPLITS)
-    park, _ = script.charuco(data, tmp_path / "b", "--workers", "1", *script.SPLITS, "--method", "park-martin")
+    splits = replace(script.SPLITS, workers=1)
+    ours, text = script.charuco(data, tmp_path / "a", splits)
+    park, _ = script.charuco(data, tmp_path / "b", splits, "park-martin")
     errors, others = script.by_split(ours), script.by_split(park)
     assert (len(ours["poses"]), ours["outliers"], ours["left_out"]) == (16, [], [])
     assert len(errors) == 15
@@ -35,7 +39,7 @@ def test_charuco_photographs(script, shared_data, tmp_path):
 
 @pytest.mark.slow
 def test_the_pitch_of_the_dots_is_found(script, shared_data, tmp_path):
-    found, text = script.dots(shared_data("dotgrid_handeye").parent, tmp_path, "--workers", "1", "--splits", "0")
+    found, text = script.dots(shared_data("dotgrid_handeye").parent, tmp_path, Splits(0, workers=1))
     board = found["board"]
     sigma_mm = 20 * board["scale_sigma"]
     assert len(found["poses"]) == 15

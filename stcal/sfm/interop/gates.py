@@ -6,7 +6,7 @@ itself here, pair by pair, from the centres that the mapping had.
 """
 
 import tempfile
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from itertools import combinations
 from pathlib import Path
@@ -360,7 +360,7 @@ def _number(name: str, value: float) -> str:
     return f"{np.degrees(value):.4g}°" if name.endswith("angle") else f"{value:.4g}"
 
 
-def pairs_json(groups: dict[str, Sequence[PairGates]]) -> dict:
+def pairs_json(groups: Mapping[str, Sequence[PairGates]]) -> dict:
     """Everything of the table as plain values, angles in degrees."""
     return {
         "format": "stcal pairs 1",

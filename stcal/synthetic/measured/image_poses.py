@@ -84,7 +84,7 @@ def face_view(scene: Scene, face: str) -> Rigid:
 
 def faces_view(scene: Scene, faces: Sequence[str]) -> Rigid:
     """target_from_any amid several faces, Z the mean of their normals: for :func:`view`."""
-    axis = sum(scene.target_from_face[face].rotation[:, 2] for face in faces)
+    axis = np.sum([scene.target_from_face[face].rotation[:, 2] for face in faces], axis=0)
     axis = axis / np.linalg.norm(axis)
     across = np.linalg.svd(axis[None])[2][1]
     rotation = np.column_stack([across, np.cross(axis, across), axis])

@@ -46,7 +46,9 @@ def cube(rng: np.random.Generator, n: int, half_mm: float = HALF_MM) -> np.ndarr
 
 def random_rigid(rng: np.random.Generator) -> Rigid:
     """Any rotation, and a translation within 3 m along each axis."""
-    return Rigid(Rotation.random(random_state=rng.integers(2**31)).as_matrix(), rng.uniform(-3000, 3000, 3))
+    seed = rng.integers(2**31)
+    turn = Rotation.random(random_state=seed)  # pyright: ignore[reportCallIssue]  the seeded stream of earlier figures
+    return Rigid(turn.as_matrix(), rng.uniform(-3000, 3000, 3))
 
 
 def _random(rng, xyz, off):
@@ -69,7 +71,7 @@ def _other_motion(rng, xyz, off):
 
 
 def _drift(rng, xyz, off):
-    return xyz + directions(rng, 1) * np.linspace(*off, len(xyz))[:, None]
+    return xyz + directions(rng, 1) * np.linspace(off[0], off[1], len(xyz))[:, None]
 
 
 def _one_place(rng, xyz, off):
