@@ -61,6 +61,21 @@ class CameraModel:
         """The camera; a size that the file does not state is taken from the arguments."""
         return Camera(self.width or width, self.height or height, self.focal, self.centre, self.distortion)
 
+    def require_inside(self, width: int, height: int, image: str) -> None:
+        """Refuse an image that the principal point is outside of: a file that states no size may be another camera's.
+
+        Raises
+        ------
+        InputError
+            The camera file and the image do not belong together.
+        """
+        x, y = self.centre
+        if not (0 < x < width and 0 < y < height):
+            raise InputError(
+                f"camera file {self.source}: principal point ({x:.0f}, {y:.0f}) px is outside of {image} "
+                f"({width}×{height} px); use the camera file that belongs to the images"
+            )
+
 
 def colmap_params(camera: Camera, colmap_model: str) -> list[float]:
     """Parameters of ``camera`` in COLMAP's order and pixel origin for ``colmap_model``."""

@@ -88,7 +88,7 @@ def detect_boards(
         first = next(each for each in found if isinstance(each, Skipped))
         raise InputError(f"no usable image among {len(files)}: {first.name}: {first.reason}")
     size = detections[0].size
-    _require_inside(model, detections[0])
+    model.require_inside(*detections[0].size, detections[0].name)
     found = [_of_size(each, size, detections[0].name) for each in found]
     detections = tuple(each for each in found if isinstance(each, BoardDetection))
     without = (Skipped(s.name, s.why, "board") for s in detections if s.view is None)
@@ -195,16 +195,6 @@ def images_of_centres(
         ellipse = circle_image_offset(centre, pose.rotation[:, 2], radius_mm)
         seen = centre_px - (camera.project(ellipse) - camera.project(centre))
     return seen
-
-
-def _require_inside(model: CameraModel, first: BoardDetection) -> None:
-    """A file that states no size may be another camera's."""
-    x, y = model.centre
-    if not (0 < x < first.size[0] and 0 < y < first.size[1]):
-        raise InputError(
-            f"camera file {model.source}: principal point ({x:.0f}, {y:.0f}) px is outside of {first.name} "
-            f"({first.size[0]}×{first.size[1]} px); use the camera file that belongs to the images"
-        )
 
 
 def _of_size(each: BoardDetection | Skipped, size: tuple[int, int], first: str) -> BoardDetection | Skipped:

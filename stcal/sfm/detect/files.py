@@ -112,12 +112,7 @@ def _sized(camera_model: CameraModel, files: list[ImageFile]) -> Camera:
             height, width = decode(file.path.read_bytes(), file.name).shape
         except (InputError, OSError):
             continue
-        if not ((camera_model.centre > 0) & (camera_model.centre < [width, height])).all():
-            x, y = camera_model.centre
-            raise InputError(
-                f"camera file {camera_model.source}: principal point ({x:.0f}, {y:.0f}) px is outside of {file.name} "
-                f"({width}×{height} px); use the camera file that belongs to the images"
-            )
+        camera_model.require_inside(width, height, file.name)
         return camera_model.sized(width, height)
     raise InputError(f"no readable image among {len(files)}, first {files[0].name}; check the files")
 
