@@ -1,19 +1,18 @@
 """Levenberg–Marquardt from several poses at once, with Huber's loss: for problems with several minima."""
 
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields
 
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from stcal.geometry.least_squares import NormalEquations, minimise
 from stcal.geometry.rigid import Poses, Rigid
+from stcal.geometry.robust import huber_cost, huber_weights
 
 MAX_STEPS = 60
 ACCEPTED = 1e-2
 """What is still settled after all steps: a tenth of σ. In a flat valley steps are many, and short."""
-SLOW = 0.01
-"""A minimum worse by ``hopeless`` in χ², which a step promises to improve by less than this share, is not followed
-further: with large residuals the last steps are many, and short."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -50,13 +49,9 @@ class PoseStack:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Normal:
-    """h poses' ``cost`` (h,), ``normal`` matrices (h, 6, 6), ``right``-hand sides (h, 6), and ``length`` (h, n) of the
-    residuals in σ."""
+class Normal(NormalEquations):
+    """Normal equations of h poses, and ``length`` (h, n) of the residuals in σ."""
 
-    cost: np.ndarray
-    normal: np.ndarray
-    right: np.ndarray
     length: np.ndarray
 
     @classmethod
@@ -64,22 +59,12 @@ class Normal:
         """Huber's loss on the lengths of whitened residuals (h, n, 2), with minus their derivative (h, n, 2, 6); of
         infinite cost where the pose is not ``possible``, (h,)."""
         length = np.sqrt((residual**2).sum(2))
-        short = np.minimum(length, huber)
-        cost = np.where(possible, (short * (2 * length - short)).sum(1), np.inf)
+        cost = np.where(possible, huber_cost(length, huber).sum(1), np.inf)
         h = len(residual)
         flat = by_pose.reshape(h, -1, 6)
-        weight = np.repeat(short / np.maximum(length, 1e-12), 2, axis=1)[..., None]
+        weight = np.repeat(huber_weights(length, huber), 2, axis=1)[..., None]
         back = np.swapaxes(weight * flat, 1, 2)
-        return cls(cost, back @ flat, (back @ residual.reshape(h, -1, 1))[..., 0], length)
-
-    def where(self, take: np.ndarray, other: "Normal") -> "Normal":
-        """The other's rows where ``take``, (h,)."""
-        return Normal(
-            np.where(take, other.cost, self.cost),
-            np.where(take[:, None, None], other.normal, self.normal),
-            np.where(take[:, None], other.right, self.right),
-            np.where(take[:, None], other.length, self.length),
-        )
+        return cls(cost, back @ flat, -(back @ residual.reshape(h, -1, 1))[..., 0], length)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -112,32 +97,39 @@ def descend(
 
     Parameters
     ----------
-    settled : a step that lowers χ² by less, or by less than that share, is the last
-    hopeless : by how much χ² a minimum may be worse and still be followed to its end; see :data:`SLOW`
+    evaluate
+        Normal equations at h poses.
+    poses
+        The starts.
+    settled
+        A step that lowers χ² by less, or by less than that share, is the last.
+    hopeless
+        By how much χ² of a pose may be worse than of the best and still be followed to its end.
     """
-    now = evaluate(poses)
-    damping, done = np.full(len(poses), 1e-6), np.zeros(len(poses), bool)
-    for _ in range(MAX_STEPS):
-        # Millimetres and radians: damped by the diagonal (Marquardt), not by its mean.
-        scale = np.einsum("hii->hi", now.normal)
-        damped = now.normal + (damping[:, None] * scale)[:, :, None] * np.eye(6)
-        step = np.linalg.solve(damped, now.right[..., None])[..., 0]
-        gain, behind = (step * now.right).sum(1), now.cost - now.cost.min()
-        done |= (gain < settled * np.maximum(now.cost, 1)) | ((behind > hopeless) & (gain < SLOW * behind))
-        if done.all():
-            break
-        step[done] = 0
-        trial = poses.moved(step)
-        new = evaluate(trial)
-        better = (new.cost <= now.cost) & ~done
-        poses = replace(
-            poses,
-            rotation=np.where(better[:, None, None], trial.rotation, poses.rotation),
-            translation=np.where(better[:, None], trial.translation, poses.translation),
-        )
-        now = now.where(better, new)
-        damping = np.where(better, damping / 10, np.minimum(np.maximum(10 * damping, 1e-3), 1e8))
-    return Minima(poses, now.cost, now.normal, now.length, done | (gain < ACCEPTED))
+    found = minimise(
+        poses,
+        evaluate,
+        lambda stack, step: stack.moved(step),
+        select=_select,
+        damping=1e-6,
+        settled=settled,
+        least_gain=settled,
+        max_steps=MAX_STEPS,
+        hopeless=hopeless,
+    )
+    last = found.linear
+    ended = found.converged | (found.promised < ACCEPTED) | (last.cost - last.cost.min() > hopeless)
+    return Minima(found.state, last.cost, last.normal, last.length, ended)
+
+
+def _select(take: np.ndarray, new, old):
+    """Rows of the new poses, or normal equations, where ``take`` (h,), else of the old ones."""
+
+    def rows(name: str) -> np.ndarray:
+        a, b = getattr(new, name), getattr(old, name)
+        return np.where(take.reshape(-1, *[1] * (a.ndim - 1)), a, b)
+
+    return type(new)(*(rows(field.name) for field in fields(new)))
 
 
 def block_diagonal(blocks: np.ndarray) -> np.ndarray:

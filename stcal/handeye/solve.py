@@ -5,7 +5,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from stcal.errors import DegenerateError, InputError
-from stcal.geometry.least_squares import generalised_inverse
+from stcal.geometry.normal_equations import generalised_inverse
 from stcal.geometry.rigid import Rigid
 from stcal.handeye.data.loop import FRAMES, Loop, Setup
 from stcal.handeye.data.motions import Motions, poses_with_log

@@ -52,9 +52,9 @@ def test_hopeless_rivals_are_left():
         away = poses.translation[:, 0] - [0.0, 10.0]
         cost = 0.05 * away**2 + [0.0, 1000.0]
         normal = np.tile(np.eye(6), (2, 1, 1))  # twenty times the curvature
-        right = np.zeros((2, 6))
-        right[:, 3] = -0.05 * away
-        return Normal(cost, normal, right, np.zeros((2, 1)))
+        gradient = np.zeros((2, 6))
+        gradient[:, 3] = 0.05 * away
+        return Normal(cost, normal, gradient, np.zeros((2, 1)))
 
     start = PoseStack(np.tile(np.eye(3), (2, 1, 1)), np.zeros((2, 3)))
     followed = descend(evaluate, start, 1e-9).poses.translation[:, 0]
@@ -72,7 +72,7 @@ def test_gradient_is_that_of_hubers_loss():
         step = np.zeros((1, 6))
         step[0, k] = 1e-6
         slope = (evaluate(poses.moved(step)).cost - evaluate(poses.moved(-step)).cost) / 2e-6
-        assert slope == pytest.approx(-2 * now.right[:, k], rel=1e-4)
+        assert slope == pytest.approx(2 * now.gradient[:, k], rel=1e-4)
 
 
 def test_a_pose_with_points_behind_the_camera_is_no_minimum():

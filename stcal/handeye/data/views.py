@@ -7,7 +7,7 @@ import numpy as np
 from stcal.errors import DegenerateError, InputError
 from stcal.geometry.arrays import frozen
 from stcal.geometry.camera import Camera
-from stcal.geometry.least_squares import Linear, minimise, perturbed
+from stcal.geometry.least_squares import Minimum, NormalEquations, minimise, perturbed
 from stcal.geometry.plane import camera_from_plane, fit_homography
 from stcal.geometry.rigid import Poses, Rigid, skew
 from stcal.handeye.data.pairs import HandEyePoses
@@ -97,10 +97,10 @@ def resect(views: Views, names: tuple[str, ...], scale: float = 1.0) -> Resectio
     """
     poses, normals, cost = [], [], 0.0
     for view, name in zip(views.views, names, strict=True):
-        pose, linear = _pose_of(view, views.camera, name)
-        poses.append(Rigid(pose.rotation, scale * pose.translation))
-        normals.append(linear.normal)
-        cost += linear.cost
+        found = _pose_of(view, views.camera, name)
+        poses.append(Rigid(found.state.rotation, scale * found.state.translation))
+        normals.append(found.linear.normal)
+        cost += found.linear.cost
     spare = 2 * views.corners() - 6 * len(views)
     variance = cost / spare if spare else 1.0
     covariance = variance * np.linalg.inv(np.array(normals))
@@ -153,7 +153,7 @@ def project_jacobian(camera: Camera, xyz_camera: np.ndarray) -> tuple[np.ndarray
     return distorted * camera.focal + camera.centre, camera.focal[:, None] * (by_ideal @ by_point)
 
 
-def _pose_of(view: View, camera: Camera, name: str) -> tuple[Rigid, Linear]:
+def _pose_of(view: View, camera: Camera, name: str) -> Minimum[Rigid]:
     if len(view) < LEAST_CORNERS:
         raise DegenerateError(f"{name}: {len(view)} corners of the board, {LEAST_CORNERS} needed; take the image out")
     try:
@@ -162,15 +162,15 @@ def _pose_of(view: View, camera: Camera, name: str) -> tuple[Rigid, Linear]:
         raise DegenerateError(f"{name}: the corners seen lie on a line; take the image out") from error
     weight = view.whitening()
 
-    def linear(pose: Rigid) -> Linear:
+    def linearise(pose: Rigid) -> NormalEquations:
         rotated = view.xyz_board @ pose.rotation.T
         point = rotated + pose.translation
         if (point[:, 2] <= 0).any():
-            return Linear(np.inf, np.eye(6), np.zeros(6))
+            return NormalEquations.impossible(6)
         px, by_point = project_jacobian(camera, point)
         by = np.concatenate([-by_point @ skew(rotated), by_point], axis=2)
         white = np.einsum("kab,kb->ka", weight, px - view.xy_px).ravel()
-        slope = (weight @ by).reshape(-1, 6)
-        return Linear(float(white @ white), slope.T @ slope, slope.T @ white)
+        return NormalEquations.of(white, (weight @ by).reshape(-1, 6))
 
-    return minimise(camera_from_plane(homography), linear, perturbed, name)
+    found = minimise(camera_from_plane(homography), linearise, perturbed)
+    return found.required(name, "take the image out")

@@ -4,7 +4,7 @@ import numpy as np
 from scipy.stats import chi2
 
 from stcal.errors import StcalError
-from stcal.geometry.least_squares import generalised_inverse
+from stcal.geometry.normal_equations import generalised_inverse
 from stcal.handeye.data.loop import Loop
 from stcal.handeye.judge.observability import scale_is_seen, unit_of
 from stcal.handeye.methods.noise import Noise

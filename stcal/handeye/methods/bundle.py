@@ -10,7 +10,7 @@ from scipy.spatial.transform import Rotation
 from scipy.stats import chi2
 
 from stcal.geometry.camera import Camera
-from stcal.geometry.least_squares import Linear, minimise, perturbed
+from stcal.geometry.least_squares import NormalEquations, minimise, perturbed
 from stcal.geometry.rigid import Poses, Rigid, skew
 from stcal.handeye.data.views import project_jacobian
 from stcal.handeye.methods.noise import CAUTION
@@ -26,6 +26,7 @@ SETTLED = 1e-3
 """Relative change of σ from round to round that moves nothing any more."""
 HELD = 1e-10
 """Share of each unknown's information that is added: what nothing determines must not be singular."""
+WORST = "check the poses that fit worst"
 FARTHEST = 14.0
 """A round changes a σ by e⁷, a thousand times, at most."""
 
@@ -175,14 +176,14 @@ class Corners:
             found.append(Group(names, off, slope, POSE))
         return found
 
-    def linear(self, state: Bundle) -> Linear:
+    def linear(self, state: Bundle) -> NormalEquations:
         """Cost and normal equations; infinite cost where a corner lies behind the camera."""
         poses = state.camera_from_board(self.inverted)
         depth = (poses.rotation[self.view, 2] * (state.scale * state.corners[self.corner])).sum(1)
         if (depth + poses.translation[self.view, 2] <= 0).any():
-            return Linear(np.inf, np.eye(self.count()), np.zeros(self.count()))
-        parts = [group.linear() for group in self.groups(state)]
-        return Linear(*(sum(values) for values in zip(*((p.cost, p.normal, p.gradient) for p in parts), strict=True)))
+            return NormalEquations.impossible(self.count())
+        first, *others = (group.linear() for group in self.groups(state))
+        return sum(others, first)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -202,7 +203,7 @@ class Group:
         """(g,) Huber's weights."""
         return np.minimum(1, self.limit / np.maximum(np.linalg.norm(self.white, axis=1), 1e-300))
 
-    def linear(self) -> Linear:
+    def linear(self) -> NormalEquations:
         """Its part of the cost and of the normal equations."""
         length = np.linalg.norm(self.white, axis=1)
         inside = np.minimum(length, self.limit)
@@ -210,9 +211,9 @@ class Group:
         if (length > inside).any():
             cost += float(2 * self.limit * (length - inside).sum())
         pulled = self.slope.multiply(np.repeat(self.weight(), self.white.shape[1])[:, None]).tocsr().T
-        return Linear(cost, (pulled @ self.slope).toarray(), pulled @ self.white.ravel())
+        return NormalEquations(cost, (pulled @ self.slope).toarray(), pulled @ self.white.ravel())
 
-    def by_name(self) -> dict[str, tuple[int, Linear]]:
+    def by_name(self) -> dict[str, tuple[int, NormalEquations]]:
         """By each of ``names``, or by none: number of residuals, and its quadratic part of the cost."""
         g, d = self.white.shape
         width = d // max(len(self.names), 1)
@@ -222,7 +223,7 @@ class Group:
             rows = np.flatnonzero(np.arange(g * d) % d // width == i)
             slope, white = self.slope[rows], self.white.ravel()[rows]
             pulled = slope.multiply(weight[rows, None]).tocsr().T
-            linear = Linear(float(weight[rows] @ white**2), (pulled @ slope).toarray(), pulled @ white)
+            linear = NormalEquations(float(weight[rows] @ white**2), (pulled @ slope).toarray(), pulled @ white)
             found[name] = len(rows), linear
         return found
 
@@ -238,27 +239,26 @@ def adjust(corners: Corners, start: Bundle, free: tuple[str, ...]) -> tuple[Corn
     """
     state = start
     for _ in range(ROUNDS if free else 0):
-        state, _ = minimise(state, corners.linear, corners.moved, "hand-eye", ROUGHLY)
+        state = minimise(state, corners.linear, corners.moved, settled=ROUGHLY).required("hand-eye", WORST).state
         sigma = corners.sigma | estimated(corners, state, free)
         change = max(abs(np.log(sigma[name] / corners.sigma[name])) for name in free)
         corners = replace(corners, sigma=sigma)
         if change < SETTLED:
             break
-    state, last = minimise(state, corners.linear, corners.moved, "hand-eye")
-    return corners, state, last.normal
+    found = minimise(state, corners.linear, corners.moved).required("hand-eye", WORST)
+    return corners, found.state, found.linear.normal
 
 
 def estimated(corners: Corners, state: Bundle, free: tuple[str, ...]) -> dict[str, float]:
     """Restricted maximum-likelihood σ of the ``free`` groups, all else linear about a state (as
     :func:`~stcal.handeye.methods.noise.variance_components`)."""
-    parts: dict[str, tuple[int, Linear]] = {}
+    parts: dict[str, tuple[int, NormalEquations]] = {}
     for group in corners.groups(state):
         for name, (count, linear) in group.by_name().items():
             key = name if name in free else ""
-            old_count, old = parts.get(key, (0, Linear(0.0, 0.0, 0.0)))
-            sums = old.cost + linear.cost, old.normal + linear.normal, old.gradient + linear.gradient
-            parts[key] = old_count + count, Linear(*sums)
-    fixed = parts.pop("", (0, Linear(0.0, 0.0, 0.0)))[1]
+            old_count, old = parts.get(key, (0, NormalEquations(0.0, 0.0, 0.0)))
+            parts[key] = old_count + count, old + linear
+    fixed = parts.pop("", (0, NormalEquations(0.0, 0.0, 0.0)))[1]
     names = tuple(parts)
 
     def cost(logs: np.ndarray) -> tuple[float, np.ndarray]:

@@ -6,9 +6,12 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from stcal.errors import InputError
-from stcal.geometry.least_squares import Linear, minimise, perturbed
+from stcal.geometry.least_squares import NormalEquations, minimise, perturbed
 from stcal.geometry.rigid import Rigid, skew
 from stcal.handeye.data.motions import Motions
+
+EXACT = 1e-24
+"""What a step at the minimum may promise, rad²: the objective is in no σ."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -59,7 +62,7 @@ class Objective:
         rotation, translation = self._parts(turn, x[:, 3:])
         return (rotation**2).sum((1, 2)) + self.weight * (translation**2).sum((1, 2))
 
-    def linear(self, x: Rigid) -> Linear:
+    def linear(self, x: Rigid) -> NormalEquations:
         """About X, translation in mm."""
         rotation, translation = self._parts(x.rotation[None], x.translation[None] / self.unit_mm)
         root = np.sqrt(self.weight)
@@ -68,8 +71,7 @@ class Objective:
         slope[0, :, :, :3] = skew(self.motions.beta @ x.rotation.T)
         slope[1, :, :, :3] = root / self.unit_mm * skew(self.motions.camera.translation @ x.rotation.T)
         slope[1, :, :, 3:] = root / self.unit_mm * (self.motions.mount.rotation - np.eye(3))
-        slope = slope.reshape(-1, 6)
-        return Linear(float(white @ white), slope.T @ slope, slope.T @ white)
+        return NormalEquations.of(white, slope.reshape(-1, 6))
 
     def _parts(self, turn: np.ndarray, shift: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Errors (p, k, 3) of rotation and translation."""
@@ -111,4 +113,5 @@ def polish(objective: Objective, x: Rigid) -> Rigid:
     ConvergenceError
         None is reached.
     """
-    return minimise(x, objective.linear, perturbed, "differential evolution")[0]
+    found = minimise(x, objective.linear, perturbed, least_gain=EXACT)
+    return found.required("differential evolution", "check the poses that fit worst").state

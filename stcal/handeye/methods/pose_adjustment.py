@@ -5,7 +5,8 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.stats import chi2, f
 
-from stcal.geometry.least_squares import Linear, generalised_inverse, minimise, perturbed
+from stcal.geometry.least_squares import NormalEquations, minimise, perturbed
+from stcal.geometry.normal_equations import generalised_inverse
 from stcal.geometry.rigid import Rigid
 from stcal.handeye.data.loop import Loop
 from stcal.handeye.methods.noise import Noise, components, variance_components
@@ -117,13 +118,12 @@ def _solved(loop: Loop, start: State, spread: np.ndarray, count: int) -> tuple[S
     """State of least squares and its normal matrix."""
     weight = np.linalg.inv(np.linalg.cholesky(spread))
 
-    def linear(state: State) -> Linear:
+    def linearise(state: State) -> NormalEquations:
         white = np.einsum("mab,mb->ma", weight, _residuals(loop, state)).ravel()
-        slope = (weight @ _slope(loop, state, count)).reshape(-1, count)
-        return Linear(float(white @ white), slope.T @ slope, slope.T @ white)
+        return NormalEquations.of(white, (weight @ _slope(loop, state, count)).reshape(-1, count))
 
-    state, last = minimise(start, linear, State.moved, "hand-eye")
-    return state, last.normal
+    found = minimise(start, linearise, State.moved).required("hand-eye", "check the poses that fit worst")
+    return found.state, found.linear.normal
 
 
 def _squared(residuals: np.ndarray, spread: np.ndarray) -> np.ndarray:

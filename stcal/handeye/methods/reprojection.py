@@ -9,7 +9,7 @@ from scipy.stats import f
 from stcal.errors import DegenerateError
 from stcal.geometry.arrays import frozen
 from stcal.geometry.camera import Camera
-from stcal.geometry.least_squares import generalised_inverse
+from stcal.geometry.normal_equations import generalised_inverse
 from stcal.geometry.rigid import Poses, Rigid
 from stcal.handeye.data.loop import Loop
 from stcal.handeye.data.views import View, Views, resect

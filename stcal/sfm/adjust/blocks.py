@@ -1,4 +1,4 @@
-"""Normal equations of one group in the joint adjustment, condensed to what all groups share (Helmert blocking).
+"""Normal equations of one group in the joint adjustment, reduced to what all groups share (Helmert blocking).
 
 Unknowns of a group: cameras, dots, the board's pose. Shared: the target's circles, the board's shape, the intrinsics.
 Cameras are eliminated image by image, then dots and pose at once, so that what remains does not grow with the images.
@@ -7,11 +7,13 @@ Cameras are eliminated image by image, then dots and pose at once, so that what 
 from dataclasses import dataclass, replace
 
 import numpy as np
-from scipy.spatial.transform import Rotation
 
 from stcal.geometry.camera import Camera
+from stcal.geometry.least_squares import perturbed
+from stcal.geometry.normal_equations import Reduction, blocks_of, reduce
 from stcal.geometry.rigid import Rigid, skew
-from stcal.sfm.adjust.group import projection_jacobians
+from stcal.geometry.robust import huber_cost, huber_weights
+from stcal.sfm.adjust.group import moved_poses, projection_jacobians
 from stcal.sfm.data.model import GroupModel, MetricModel
 
 
@@ -63,16 +65,19 @@ class Block:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Condensed:
-    """``normal``, ``right`` over the group's outer unknowns (its circles, dots of the common shape, intrinsics), and
-    what brings a step of those back to the others."""
+class Reduced:
+    """``normal``, ``right`` over the group's outer unknowns (its circles, dots of the common shape, intrinsics); what
+    brings a step of those back to dots and board (``inner``) and then to the ``cameras``."""
 
     normal: np.ndarray
     right: np.ndarray
-    inner_step: np.ndarray
-    inner_from_outer: np.ndarray
-    camera_step: np.ndarray
-    camera_from_kept: np.ndarray
+    inner: Reduction
+    cameras: Reduction
+
+    @property
+    def gain(self) -> float:
+        """By how much the unknowns that are reduced away lower the cost alone."""
+        return self.inner.gain + self.cameras.gain
 
 
 def normalised(model: GroupModel, camera: Camera) -> np.ndarray:
@@ -84,35 +89,25 @@ def image_cost(model: GroupModel, camera: Camera, huber: float) -> float:
     """Squared residuals over σ², Huber's beyond ``huber``; infinite behind a camera."""
     if (model.xyz_camera()[:, 2] <= 0).any():
         return np.inf
-    length = np.linalg.norm(normalised(model, camera), axis=1)
-    short = np.minimum(length, huber)
-    return float((short * (2 * length - short)).sum())
+    return float(huber_cost(np.linalg.norm(normalised(model, camera), axis=1), huber).sum())
 
 
 def robust_weights(model: GroupModel, camera: Camera, huber: float) -> np.ndarray:
     """Huber's weights, (n,), of the lengths of the residuals over σ."""
-    length = np.linalg.norm(normalised(model, camera), axis=1)
-    return np.minimum(1.0, huber / np.maximum(length, 1e-12))
+    return huber_weights(np.linalg.norm(normalised(model, camera), axis=1), huber)
 
 
-def condense(block: Block, shared: Shared, huber: float) -> Condensed:
-    """Eliminate cameras, dots and the board's pose."""
-    normal, right, camera_step, camera_from_kept = without_cameras(block.model, shared.camera, shared.basis, huber)
+def reduced(block: Block, shared: Shared, huber: float) -> Reduced:
+    """Cameras, dots and the board's pose reduced away."""
+    normal, right, cameras = without_cameras(block.model, shared.camera, shared.basis, huber)
     full, full_right, inner, outer = _with_board(block, shared, normal, right)
-    inverse = np.linalg.inv(full[np.ix_(inner, inner)])
-    coupling = full[np.ix_(inner, outer)]
-    back = inverse @ coupling
-    return Condensed(
-        full[np.ix_(outer, outer)] - coupling.T @ back,
-        full_right[outer] - back.T @ full_right[inner],
-        inverse @ full_right[inner],
-        back,
-        camera_step,
-        camera_from_kept,
-    )
+    away = reduce(full[np.ix_(inner, inner)][None], full_right[None, inner], full[np.ix_(inner, outer)][None])
+    return Reduced(full[np.ix_(outer, outer)] - away.normal, full_right[outer] - away.right, away, cameras)
 
 
-def without_cameras(model: GroupModel, camera: Camera, basis: np.ndarray, huber: float):
+def without_cameras(
+    model: GroupModel, camera: Camera, basis: np.ndarray, huber: float
+) -> tuple[np.ndarray, np.ndarray, Reduction]:
     """Normal equations over points (3p) and intrinsics (q), and the way back to the cameras."""
     m, p, q = len(model.images), len(model.labels), basis.shape[1]
     by_pose, by_point = projection_jacobians(model, camera)
@@ -120,16 +115,11 @@ def without_cameras(model: GroupModel, camera: Camera, basis: np.ndarray, huber:
     a, c = model.whiten(by_pose) * root[..., None], model.whiten(by_point) * root[..., None]
     residual = normalised(model, camera) * root
     at = np.swapaxes(a, 1, 2)
-    camera_block, camera_right = np.zeros((m, 6, 6)), np.zeros((m, 6))
-    np.add.at(camera_block, model.image_index, at @ a)
-    np.add.at(camera_right, model.image_index, np.einsum("nki,nk->ni", a, residual))
     cross = np.zeros((m, 6, 3 * p + q))
     columns = 3 * model.point_index[:, None] + np.arange(3)
     cross[model.image_index[:, None, None], np.arange(6)[:, None], columns[:, None]] = at @ c
     normal, right = np.zeros((3 * p + q, 3 * p + q)), np.zeros(3 * p + q)
-    blocks, rights = np.zeros((p, 3, 3)), np.zeros((p, 3))
-    np.add.at(blocks, model.point_index, np.swapaxes(c, 1, 2) @ c)
-    np.add.at(rights, model.point_index, np.einsum("nki,nk->ni", c, residual))
+    blocks, rights = blocks_of(c, residual, model.point_index, p)
     place = 3 * np.arange(p)[:, None] + np.arange(3)
     normal[place[:, :, None], place[:, None]] = blocks
     right[: 3 * p] = rights.ravel()
@@ -144,12 +134,8 @@ def without_cameras(model: GroupModel, camera: Camera, basis: np.ndarray, huber:
         normal[3 * p :, : 3 * p] = normal[: 3 * p, 3 * p :].T
         normal[3 * p :, 3 * p :] = np.einsum("nki,nkj->ij", e, e)
         right[3 * p :] = np.einsum("nki,nk->i", e, residual)
-    inverse = np.linalg.inv(camera_block)
-    eliminated = inverse @ cross
-    flat, weighted = cross.reshape(6 * m, -1), eliminated.reshape(6 * m, -1)
-    normal -= flat.T @ weighted
-    right -= weighted.T @ camera_right.ravel()
-    return normal, right, np.einsum("mij,mj->mi", inverse, camera_right), eliminated
+    cameras = reduce(*blocks_of(a, residual, model.image_index, m), cross)
+    return normal - cameras.normal, right - cameras.right, cameras
 
 
 def _with_board(block: Block, shared: Shared, normal: np.ndarray, right: np.ndarray):
@@ -179,25 +165,20 @@ def _with_board(block: Block, shared: Shared, normal: np.ndarray, right: np.ndar
     return full, full_right, inner, outer
 
 
-def moved(block: Block, condensed: Condensed, outer_step: np.ndarray, intrinsics_step: np.ndarray, factor: float):
-    """The group after a step of its outer unknowns, everything else following."""
-    model = block.model
-    p, d = len(model.labels), len(block.dots)
-    inner_step = condensed.inner_step - condensed.inner_from_outer @ outer_step
-    points = np.zeros((p, 3))
-    points[block.circles] = outer_step[: 3 * len(block.circles)].reshape(-1, 3)
-    points[block.dots] = inner_step[: 3 * d].reshape(-1, 3)
-    kept = np.concatenate([points.ravel(), intrinsics_step])
-    poses = factor * (condensed.camera_step - condensed.camera_from_kept @ kept)
-    turned = Rotation.from_rotvec(poses[:, :3]).as_matrix()
-    cameras = tuple(
-        Rigid(turn @ pose.rotation, pose.translation + step[3:])
-        for turn, pose, step in zip(turned, model.camera_from_world, poses, strict=True)
-    )
-    board_step = factor * inner_step[3 * d :]
-    board = Rigid(
-        Rotation.from_rotvec(board_step[:3]).as_matrix() @ block.world_from_board.rotation,
-        block.world_from_board.translation + board_step[3:],
-    )
-    changed = replace(model, camera_from_world=cameras, xyz_world=model.xyz_world + factor * points)
-    return replace(block, model=changed, world_from_board=board)
+def step_of(block: Block, reduced: Reduced, outer: np.ndarray, intrinsics: np.ndarray) -> np.ndarray:
+    """Step (3p + 6m + 6,) of the group's points, cameras and board beside one of its outer unknowns."""
+    points, d = np.zeros((len(block.model.labels), 3)), len(block.dots)
+    (inner,) = reduced.inner.back(outer)
+    points[block.circles] = outer[: 3 * len(block.circles)].reshape(-1, 3)
+    points[block.dots] = inner[: 3 * d].reshape(-1, 3)
+    cameras = reduced.cameras.back(np.concatenate([points.ravel(), intrinsics]))
+    return np.concatenate([points.ravel(), cameras.ravel(), inner[3 * d :]])
+
+
+def moved(block: Block, step: np.ndarray) -> Block:
+    """The group after a step of :func:`step_of`."""
+    model, p = block.model, 3 * len(block.model.labels)
+    cameras = moved_poses(model.camera_from_world, step[p:-6].reshape(-1, 6))
+    points = model.xyz_world + step[:p].reshape(-1, 3)
+    changed = replace(model, camera_from_world=cameras, xyz_world=points)
+    return replace(block, model=changed, world_from_board=perturbed(block.world_from_board, step[-6:]))

@@ -6,15 +6,13 @@ import numpy as np
 
 from stcal.design import TargetDesign
 from stcal.errors import MappingError
+from stcal.geometry.least_squares import NormalEquations, minimise
 from stcal.geometry.rigid import Rigid, skew
 from stcal.labels import CircleLabel
 from stcal.sfm.adjust.faces import FaceInGroup
 
 MAX_CHAIN_STEPS = 4
 MAX_CHAINS = 12
-MAX_STEPS = 20
-SETTLED = 1e-9
-"""Of a step in rad and mm."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -139,7 +137,7 @@ def _pose_information(each: FaceInGroup) -> np.ndarray:
 
 
 def _adjust(faces: list[FaceInGroup], chains, reference: str) -> tuple[dict[str, Rigid], dict[str, Rigid]]:
-    """Poses of faces and groups in the target frame by weighted Gauss–Newton over all (group, face).
+    """Poses of faces and groups in the target frame by weighted least squares over all (group, face).
 
     Poses are perturbed on the right, so that a face's own step is minus its residual.
     """
@@ -151,28 +149,27 @@ def _adjust(faces: list[FaceInGroup], chains, reference: str) -> tuple[dict[str,
     free = [face_id for face_id in start if face_id != reference]
     roots = [np.linalg.cholesky(_pose_information(each) + 1e-12 * np.eye(6)).T for each in faces]
 
-    face = {face_id: start[face_id] for face_id in (reference, *free)}
-    group = dict(start_group)
-    column = {("face", f): 6 * i for i, f in enumerate(free)}
-    column |= {("group", g): 6 * (len(free) + i) for i, g in enumerate(groups)}
-    for _ in range(MAX_STEPS):
+    names = [("face", f) for f in free] + [("group", g) for g in groups]
+    column = {name: slice(6 * i, 6 * i + 6) for i, name in enumerate(names)}
+    begin = {("face", f): start[f] for f in (reference, *free)} | {("group", g): start_group[g] for g in groups}
+
+    def linearise(poses: dict[tuple[str, str], Rigid]) -> NormalEquations:
         jacobian, residual = np.zeros((6 * len(faces), 6 * len(column))), np.zeros(6 * len(faces))
         for k, (each, root) in enumerate(zip(faces, roots, strict=True)):
-            rows = slice(6 * k, 6 * k + 6)
-            residual[rows] = root @ (face[each.face].inverse() @ group[each.group] @ each.group_from_face).log()
+            rows, group, face = slice(6 * k, 6 * k + 6), ("group", each.group), ("face", each.face)
+            residual[rows] = root @ (poses[face].inverse() @ poses[group] @ each.group_from_face).log()
             r, t = each.group_from_face.rotation.T, each.group_from_face.translation
-            at = column["group", each.group]
-            jacobian[rows, at : at + 6] = root @ np.block([[r, np.zeros((3, 3))], [-r @ skew(t), r]])
+            jacobian[rows, column[group]] = root @ np.block([[r, np.zeros((3, 3))], [-r @ skew(t), r]])
             if each.face != reference:
-                at = column["face", each.face]
-                jacobian[rows, at : at + 6] = -root
-        step = -np.linalg.lstsq(jacobian, residual, rcond=1e-13)[0]
-        for (kind, name), at in column.items():
-            poses = face if kind == "face" else group
-            poses[name] = poses[name] @ Rigid.exp(step[at : at + 6])
-        if np.abs(step).max() < SETTLED:
-            break
-    return face, group
+                jacobian[rows, column[face]] = -root
+        return NormalEquations.of(residual, jacobian)
+
+    def moved(poses: dict[tuple[str, str], Rigid], step: np.ndarray) -> dict[tuple[str, str], Rigid]:
+        return poses | {name: poses[name] @ Rigid.exp(step[at]) for name, at in column.items()}
+
+    found = minimise(begin, linearise, moved).required("faces", "check that nothing but the camera moved in a group")
+    poses = found.state
+    return {f: poses["face", f] for f in (reference, *free)}, {g: poses["group", g] for g in groups}
 
 
 def _circles(faces: list[FaceInGroup], target_from_face: dict[str, Rigid], target: TargetDesign) -> dict:

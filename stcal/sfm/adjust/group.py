@@ -5,23 +5,24 @@ of two in the faces. Intrinsics are fixed. The seven free directions of the worl
 a vanishing damping, so that the model stays where it is.
 """
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.linalg import LinAlgError
 from scipy.linalg import cho_factor, cho_solve
 from scipy.spatial.transform import Rotation
 
-from stcal.errors import ConvergenceError
 from stcal.geometry.camera import Camera
+from stcal.geometry.least_squares import minimise
+from stcal.geometry.normal_equations import blocks_of, reduce
 from stcal.geometry.rigid import Rigid, skew
 from stcal.sfm.data.model import GroupModel, M
 
+EXACTLY = 1e-15
+"""Share of χ² that the last step may promise: corrections of nanometres are to be seen."""
 MAX_STEPS = 50
-SETTLED_PX = 1e-8
-"""The largest move of any projection in the last step: far below what a correction may change."""
 DAMPING = 1e-10
-MAX_DAMPING = 1e8
+"""What holds the seven free directions of the world."""
 
 
 def adjust(model: M, camera: Camera) -> M:
@@ -32,27 +33,17 @@ def adjust(model: M, camera: Camera) -> M:
     ConvergenceError
         No minimum after ``MAX_STEPS`` steps.
     """
-    damping = DAMPING
-    cost = _cost(model, camera)
-    for _ in range(MAX_STEPS):
-        while True:
-            trial, move = _step(model, camera, damping)
-            trial_cost = _cost(trial, camera)
-            if trial_cost <= cost * (1 + 1e-12) or move < SETTLED_PX:
-                break
-            damping = max(damping, 1e-8) * 100
-            if damping > MAX_DAMPING:
-                raise ConvergenceError(
-                    f"group {model.group}: bundle adjustment finds no better model; check the camera file"
-                )
-        damping = max(damping / 100, DAMPING)
-        model, cost = trial, min(cost, trial_cost)
-        if move < SETTLED_PX:
-            return model
-    raise ConvergenceError(
-        f"group {model.group}: bundle adjustment still moves projections by {move:.1g} px after {MAX_STEPS} steps, "
-        f"{SETTLED_PX:g} needed; check the camera file"
+    found = minimise(
+        model,
+        lambda state: _Normal.of(state, camera),
+        _moved,
+        cost=lambda state: _cost(state, camera),
+        damping=DAMPING,
+        least_damping=DAMPING,
+        settled=EXACTLY,
+        max_steps=MAX_STEPS,
     )
+    return found.required(f"group {model.group}: bundle adjustment", "check the camera file").state
 
 
 def _cost(model: GroupModel, camera: Camera) -> float:
@@ -74,53 +65,69 @@ def projection_jacobians(model: GroupModel, camera: Camera) -> tuple[np.ndarray,
     return by_pose, by_camera @ rotation
 
 
-def _step(model: M, camera: Camera, damping: float) -> tuple[M, float]:
-    """One step, and the largest move of a projection in px."""
-    m, p, n = len(model.images), len(model.labels), len(model.image_index)
-    by_pose, by_point = projection_jacobians(model, camera)
-    a, b = model.whiten(by_pose), model.whiten(by_point)
-    residual = model.whiten(model.residuals_px(camera))
-    poses = _normal_blocks(a, residual, model.image_index, m, damping)
-    points = _normal_blocks(b, residual, model.point_index, p, damping)
-    cross = np.zeros((m, p, 6, 3))
-    cross[model.image_index, model.point_index] = np.swapaxes(a, 1, 2) @ b
-    if 6 * m <= 3 * p:
-        pose_step, point_step = _solve(*poses, *points, cross)
-    else:
-        point_step, pose_step = _solve(*points, *poses, cross.transpose(1, 0, 3, 2))
-    move = np.einsum("nij,nj->ni", by_pose, pose_step[model.image_index])
-    move += np.einsum("nij,nj->ni", by_point, point_step[model.point_index])
-    turned = Rotation.from_rotvec(pose_step[:, :3]).as_matrix()
-    moved_poses = tuple(
-        Rigid(turn @ pose.rotation, pose.translation + step[3:])
-        for turn, pose, step in zip(turned, model.camera_from_world, pose_step, strict=True)
+@dataclass(frozen=True, slots=True, eq=False)
+class _Normal:
+    """Normal equations of m poses and p points: their blocks (m, 6, 6), (p, 3, 3) and right-hand sides (m, 6), (p, 3),
+    and ``cross`` (m, p, 6, 3) between them."""
+
+    cost: float
+    poses: np.ndarray
+    pose_right: np.ndarray
+    points: np.ndarray
+    point_right: np.ndarray
+    cross: np.ndarray
+
+    @classmethod
+    def of(cls, model: GroupModel, camera: Camera) -> "_Normal":
+        by_pose, by_point = (model.whiten(each) for each in projection_jacobians(model, camera))
+        residual = model.whiten(model.residuals_px(camera))
+        m, p = len(model.images), len(model.labels)
+        cross = np.zeros((m, p, 6, 3))
+        cross[model.image_index, model.point_index] = np.swapaxes(by_pose, 1, 2) @ by_point
+        return cls(
+            _cost(model, camera),
+            *blocks_of(by_pose, residual, model.image_index, m),
+            *blocks_of(by_point, residual, model.point_index, p),
+            cross,
+        )
+
+    def step(self, damping: float | np.ndarray) -> tuple[np.ndarray, float]:
+        """(6m + 3p,) of poses, then points; of the two the more numerous are reduced away."""
+        poses, points = (block + damping * block * np.eye(block.shape[1]) for block in (self.poses, self.points))
+        if self.poses.size // 6 <= self.points.size // 3:
+            pose_step, point_step = _solve(poses, self.pose_right, points, self.point_right, self.cross)
+        else:
+            cross = self.cross.transpose(1, 0, 3, 2)
+            point_step, pose_step = _solve(points, self.point_right, poses, self.pose_right, cross)
+        gain = float((pose_step * self.pose_right).sum() + (point_step * self.point_right).sum())
+        return np.concatenate([pose_step.ravel(), point_step.ravel()]), gain
+
+
+def _moved(model: M, step: np.ndarray) -> M:
+    """The model after steps of its poses and points."""
+    poses, points = step[: 6 * len(model.images)].reshape(-1, 6), step[6 * len(model.images) :].reshape(-1, 3)
+    return replace(
+        model, camera_from_world=moved_poses(model.camera_from_world, poses), xyz_world=model.xyz_world + points
     )
-    moved = replace(model, camera_from_world=moved_poses, xyz_world=model.xyz_world + point_step)
-    return moved, float(np.abs(move).max()) if n else 0.0
 
 
-def _normal_blocks(jacobian, residual, index, count: int, damping: float) -> tuple[np.ndarray, np.ndarray]:
-    """Diagonal blocks (count, k, k) of the normal matrix, damped, and right-hand side (count, k)."""
-    k = jacobian.shape[2]
-    block, right = np.zeros((count, k, k)), np.zeros((count, k))
-    np.add.at(block, index, np.swapaxes(jacobian, 1, 2) @ jacobian)
-    np.add.at(right, index, np.einsum("nki,nk->ni", jacobian, residual))
-    return block + damping * block * np.eye(k), right
+def moved_poses(poses: tuple[Rigid, ...], step: np.ndarray) -> tuple[Rigid, ...]:
+    """Poses after left perturbations (m, 6)."""
+    turned = Rotation.from_rotvec(step[:, :3]).as_matrix()
+    return tuple(
+        Rigid(turn @ pose.rotation, pose.translation + shift)
+        for turn, pose, shift in zip(turned, poses, step[:, 3:], strict=True)
+    )
 
 
 def _solve(kept, kept_right, dropped, dropped_right, cross) -> tuple[np.ndarray, np.ndarray]:
-    """Steps of the kept blocks (a, i) and the dropped ones (b, j), the latter eliminated; ``cross`` : (a, b, i, j)."""
+    """Steps of the kept blocks (a, i) and of the reduced ones (b, j); ``cross`` : (a, b, i, j)."""
     a, b, i, j = cross.shape
-    inverse = np.linalg.inv(dropped)
-    flat = cross.transpose(0, 2, 1, 3).reshape(a * i, b * j)
-    weighted = (cross @ inverse).transpose(0, 2, 1, 3).reshape(a * i, b * j)
-    reduced = -weighted @ flat.T
-    blocks = reduced.reshape(a, i, a, i)
-    blocks[np.arange(a), :, np.arange(a)] += kept
-    right = kept_right.ravel() - weighted @ dropped_right.ravel()
-    step = _solve_symmetric(reduced, right)
-    back = np.einsum("bij,bj->bi", inverse, dropped_right - (flat.T @ step).reshape(b, j))
-    return step.reshape(a, i), back
+    away = reduce(dropped, dropped_right, cross.transpose(1, 3, 0, 2).reshape(b, j, a * i))
+    normal = -away.normal
+    normal.reshape(a, i, a, i)[np.arange(a), :, np.arange(a)] += kept
+    step = _solve_symmetric(normal, kept_right.ravel() - away.right)
+    return step.reshape(a, i), away.back(step)
 
 
 def _solve_symmetric(matrix: np.ndarray, right: np.ndarray) -> np.ndarray:

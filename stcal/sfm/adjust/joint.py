@@ -1,7 +1,7 @@
 """One adjustment over all groups: one target, one board with a pose for each group, all cameras, intrinsics if asked.
 
 Board positions are observations with their stated σ, so scale is part of the estimate. The circles of a face are
-coplanar within a stated σ. Residuals far beyond their σ weigh less (Huber). The inverse of the condensed normal matrix
+coplanar within a stated σ. Residuals far beyond their σ weigh less (Huber). The inverse of the reduced normal matrix
 is the marginal covariance of the circles, everything else accounted for.
 """
 
@@ -15,24 +15,28 @@ from stcal.errors import ConvergenceError, ScaleError
 from stcal.geometry.align import align_rigid
 from stcal.geometry.arrays import frozen
 from stcal.geometry.camera import Camera
+from stcal.geometry.least_squares import minimise
+from stcal.geometry.normal_equations import constrained_inverse, free_motions
 from stcal.geometry.plane import fit_plane
-from stcal.geometry.rigid import Rigid, skew
+from stcal.geometry.rigid import Rigid
+from stcal.geometry.robust import HUBER, robust_sigma
 from stcal.io.camera import CameraPrior, intrinsic_basis
 from stcal.labels import CircleLabel, DotLabel, dot_cells
-from stcal.sfm.adjust.blocks import Block, Shared, condense, moved, normalised, robust_weights
+from stcal.sfm.adjust.blocks import Block, Reduced, Shared, moved, normalised, reduced, robust_weights, step_of
 from stcal.sfm.adjust.scale import MIN_DOTS
 from stcal.sfm.data.model import GroupModel, MetricModel
 
+EXACTLY = 1e-15
+"""Share of χ² that the last step may promise: corrections of nanometres are to be seen."""
 MAX_STEPS = 100
 MAX_MOVE_PX = 0.02
 """Contradictory observations make the last steps slow; what still moves less than this has an answer for the checks."""
-MAX_HALVINGS = 8
+DAMPING = 1e-12
+"""Nothing that the datum leaves open is determined by less."""
 SETTLED_PX = 1e-7
 """What moves less has settled; what stops between the two limits is returned, and marked."""
 FREE_DIRECTIONS = 6
 """The world may be anywhere: a rigid motion of everything changes nothing."""
-HUBER = 3.0
-"""In units of the residuals' robust spread: one honest residual in ninety is longer, and loses hardly anything."""
 MIN_COMMON = 0.1
 MAX_COMMON = 0.99
 """Share of the board's variance that is common to all groups: below the first it is taken as none, above the second
@@ -77,6 +81,16 @@ class JointResult:
         return self.last_move_px < SETTLED_PX
 
 
+@dataclass(frozen=True, slots=True)
+class _Places:
+    """Of circles, common shape and intrinsics among the unknowns that the groups share, and how many those are."""
+
+    circles: slice
+    shape: slice
+    intrinsics: slice
+    count: int
+
+
 @dataclass(frozen=True, slots=True, eq=False)
 class _Setting:
     """What stays the same in one minimisation."""
@@ -88,6 +102,13 @@ class _Setting:
     given: Camera
     prior: np.ndarray
     huber: float
+
+    def places(self, shared: Shared) -> "_Places":
+        """Where the shared unknowns stand."""
+        c = 3 * len(self.labels)
+        s = c + (3 * len(shared.shape_mm) if self.common else 0)
+        count = s + shared.basis.shape[1]
+        return _Places(slice(0, c), slice(c, s), slice(s, count), count)
 
     def own_sigma_mm(self) -> float:
         return self.board.sigma_mm * float(np.sqrt(1 - self.common))
@@ -118,7 +139,7 @@ def adjust_jointly(
         No minimum is reached.
     """
     blocks, shared, setting = _start(models, board, camera, flatness_mm, prior, start or camera)
-    setting = replace(setting, huber=HUBER * _spread(blocks, shared.camera))
+    setting = replace(setting, huber=HUBER * _robust_sigma(blocks, shared.camera))
     blocks, shared, move = _minimise(blocks, shared, setting)
     common = _common_share(blocks, board)
     if common > 0:
@@ -165,34 +186,82 @@ def _with_common(blocks: list[Block], setting: _Setting, common: float) -> tuple
 
 
 def _minimise(blocks: list[Block], shared: Shared, setting: _Setting) -> tuple[list[Block], Shared, float]:
-    """Gauss–Newton with step halving; and by how much the last whole step moves a projection at most, px."""
-    cost = _cost(blocks, shared, setting)
-    move = np.inf
-    for _ in range(MAX_STEPS):
-        normal, right, condensed = _normal_equations(blocks, shared, setting)
-        step = _inverse(normal, shared, setting) @ right
-        for factor in 0.5 ** np.arange(MAX_HALVINGS):
-            trial, trial_shared = _step(blocks, shared, condensed, step, factor, setting)
-            trial_cost = _cost(trial, trial_shared, setting)
-            lower = trial_cost <= cost * (1 + 1e-9)
-            if lower:
-                break
-        # A shortened step moves little wherever it is: whether this is the minimum, only the whole step tells. That
-        # holds too where no length lowers the cost: at a minimum to rounding the whole step is rounding as well, and
-        # where it is not, the derivatives do not describe the cost, and nothing has settled.
-        move = max(_largest_move(old, shared, new, trial_shared) for old, new in zip(blocks, trial, strict=True))
-        move /= factor
-        if not lower:
-            break
-        blocks, shared, cost = trial, trial_shared, trial_cost
-        if move < SETTLED_PX:
-            break
+    """The state of least cost; and by how much the next whole step would still move a projection at most, px."""
+    found = minimise(
+        _State(tuple(blocks), shared),
+        lambda state: _Normal.of(state, setting),
+        lambda state, step: state.moved(step, setting),
+        cost=lambda state: _cost(state.blocks, state.shared, setting),
+        damping=DAMPING,
+        least_damping=DAMPING,
+        settled=EXACTLY,
+        max_steps=MAX_STEPS,
+    )
+    last, beyond = found.state, found.state.moved(found.linear.step(DAMPING)[0], setting)
+    move = max(_largest_move(a, last.shared, b, beyond.shared) for a, b in zip(last.blocks, beyond.blocks, strict=True))
     if not move <= MAX_MOVE_PX:  # not a number either
         raise ConvergenceError(
             f"joint adjustment: projections still move by {move:.1g} px in the last of at most {MAX_STEPS} steps; "
             "compare with --solve chain and look at the outliers"
         )
-    return blocks, shared, float(move)
+    return list(last.blocks), last.shared, float(move)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _State:
+    """All unknowns."""
+
+    blocks: tuple[Block, ...]
+    shared: Shared
+
+    def moved(self, step: np.ndarray, setting: _Setting) -> "_State":
+        """After a step of what the groups share, then of each group's own."""
+        shared, places = self.shared, setting.places(self.shared)
+        ends = places.count + np.cumsum([0, *(_size(b) for b in self.blocks)])
+        blocks = tuple(moved(b, step[i:j]) for b, i, j in zip(self.blocks, ends[:-1], ends[1:], strict=True))
+        shape = shared.shape_mm + step[places.shape].reshape(-1, 3) if setting.common else shared.shape_mm
+        camera = shared.camera
+        if shared.basis.shape[1]:
+            camera = camera.with_parameters(camera.parameters() + shared.basis @ step[places.intrinsics])
+        xyz = shared.xyz_world + step[places.circles].reshape(-1, 3)
+        return _State(blocks, Shared(xyz, shape, camera, shared.basis))
+
+
+def _size(block: Block) -> int:
+    """Number of a group's own unknowns, points that it shares included."""
+    return 3 * len(block.model.labels) + 6 * len(block.model.images) + 6
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Normal:
+    """Normal equations over what the groups share, each group's own unknowns reduced away."""
+
+    cost: float
+    state: _State
+    setting: _Setting
+    normal: np.ndarray
+    right: np.ndarray
+    groups: tuple[Reduced, ...]
+
+    @classmethod
+    def of(cls, state: _State, setting: _Setting) -> "_Normal":
+        cost = _cost(state.blocks, state.shared, setting)
+        return cls(cost, state, setting, *_normal_equations(state.blocks, state.shared, setting))
+
+    def step(self, damping: float | np.ndarray) -> tuple[np.ndarray, float]:
+        """Of what the groups share, then of each group's own."""
+        setting, shared = self.setting, self.state.shared
+        free = _free(len(self.normal), shared)
+        held = self.normal + damping * np.diag(np.diag(self.normal))
+        held += np.median(np.diag(self.normal)[: shared.xyz_world.size]) * free @ free.T
+        outer = np.linalg.solve(held, self.right)
+        gain = 2 * float(outer @ self.right) - float(outer @ self.normal @ outer) + sum(g.gain for g in self.groups)
+        intrinsics = outer[setting.places(shared).intrinsics]
+        own = [
+            step_of(b, g, outer[_outer(b, setting, shared)], intrinsics)
+            for b, g in zip(self.state.blocks, self.groups, strict=True)
+        ]
+        return np.concatenate([outer, *own]), gain
 
 
 def _block(model: MetricModel, board: BoardDesign, labels: tuple[CircleLabel, ...]) -> Block:
@@ -222,10 +291,10 @@ def _dot_place(model: GroupModel, dots: np.ndarray, board: BoardDesign) -> np.nd
     return cells[:, 0] * board.columns + cells[:, 1]
 
 
-def _spread(blocks: list[Block], camera: Camera) -> float:
-    """Robust σ of the normalised residuals per axis, from the median of their lengths (Rayleigh)."""
+def _robust_sigma(blocks: list[Block], camera: Camera) -> float:
+    """Robust σ of the normalised residuals per axis."""
     length = np.concatenate([np.linalg.norm(normalised(b.model, camera), axis=1) for b in blocks])
-    return max(float(np.median(length) / np.sqrt(2 * np.log(2))), 1e-6)
+    return max(robust_sigma(length, 2), 1e-6)
 
 
 def _common_share(blocks: list[Block], board: BoardDesign) -> float:
@@ -261,35 +330,30 @@ def _with_circles(block: Block, xyz: np.ndarray) -> MetricModel:
     return replace(block.model, xyz_world=points)
 
 
-def _outer(block: Block, setting: _Setting, q: int) -> np.ndarray:
+def _outer(block: Block, setting: _Setting, shared: Shared) -> np.ndarray:
     """Places of a group's outer unknowns among all: circles, shape, intrinsics."""
-    c = 3 * len(setting.labels)
-    s = 3 * setting.board.rows * setting.board.columns if setting.common else 0
+    places = setting.places(shared)
     circles = (3 * block.circle_place[:, None] + np.arange(3)).ravel()
-    shape = c + (3 * block.dot_place[:, None] + np.arange(3)).ravel()
-    return np.concatenate([circles, shape, c + s + np.arange(q)]).astype(int)
+    shape = places.shape.start + (3 * block.dot_place[:, None] + np.arange(3)).ravel()
+    intrinsics = np.arange(places.intrinsics.start, places.intrinsics.stop)
+    return np.concatenate([circles, shape, intrinsics]).astype(int)
 
 
-def _normal_equations(blocks: list[Block], shared: Shared, setting: _Setting):
-    """Over circles, common shape and intrinsics; everything else condensed."""
-    q = shared.basis.shape[1]
-    c = 3 * len(setting.labels)
-    s = 3 * len(shared.shape_mm) if setting.common else 0
-    normal, right = np.zeros((c + s + q, c + s + q)), np.zeros(c + s + q)
-    condensed = []
-    for b in blocks:
-        each = condense(b, shared, setting.huber)
-        place = _outer(b, setting, q)
+def _normal_equations(blocks: Sequence[Block], shared: Shared, setting: _Setting):
+    """Over circles, common shape and intrinsics: matrix and right-hand side; and the groups, reduced."""
+    places = setting.places(shared)
+    normal, right = np.zeros((places.count, places.count)), np.zeros(places.count)
+    groups = tuple(reduced(b, shared, setting.huber) for b in blocks)
+    for b, each in zip(blocks, groups, strict=True):
+        place = _outer(b, setting, shared)
         normal[np.ix_(place, place)] += each.normal
         right[place] += each.right
-        condensed.append(each)
-    if s:
-        shape = np.arange(c, c + s)
+    if setting.common:
+        shape = np.arange(places.shape.start, places.shape.stop)
         normal[shape, shape] += 1 / setting.shape_sigma_mm() ** 2
         right[shape] -= shared.shape_mm.ravel() / setting.shape_sigma_mm() ** 2
-    if q:
-        normal[c + s :, c + s :] += setting.prior
-        right[c + s :] -= setting.prior @ _away(shared, setting)
+    normal[places.intrinsics, places.intrinsics] += setting.prior
+    right[places.intrinsics] -= setting.prior @ _away(shared, setting)
     for members, across, normal_world in _planes(shared, setting):
         jacobian = across[:, :, None] * normal_world  # distances from the plane by the circles
         flat = jacobian.reshape(len(members), -1)
@@ -297,7 +361,7 @@ def _normal_equations(blocks: list[Block], shared: Shared, setting: _Setting):
         distance = across @ (shared.xyz_world[members] @ normal_world)
         normal[np.ix_(place, place)] += flat.T @ flat / setting.flatness_mm**2
         right[place] -= flat.T @ distance / setting.flatness_mm**2
-    return normal, right, condensed
+    return normal, right, groups
 
 
 def _planes(shared: Shared, setting: _Setting):
@@ -322,7 +386,7 @@ def _away(shared: Shared, setting: _Setting) -> np.ndarray:
     return np.linalg.pinv(shared.basis) @ (shared.camera.parameters() - setting.given.parameters())
 
 
-def _cost(blocks: list[Block], shared: Shared, setting: _Setting) -> float:
+def _cost(blocks: Sequence[Block], shared: Shared, setting: _Setting) -> float:
     cost = sum(b.cost(shared, setting.huber) for b in blocks)
     if setting.common:
         cost += float(((shared.shape_mm / setting.shape_sigma_mm()) ** 2).sum())
@@ -334,32 +398,11 @@ def _cost(blocks: list[Block], shared: Shared, setting: _Setting) -> float:
     return cost
 
 
-def _inverse(normal: np.ndarray, shared: Shared, setting: _Setting) -> np.ndarray:
-    """Inverse with inner constraints on the circles: of all datums that of smallest trace (S-transformation)."""
-    middle = shared.xyz_world - shared.xyz_world.mean(0)
-    free = np.zeros((len(normal), FREE_DIRECTIONS))
-    rows = 3 * len(middle)
-    free[:rows] = np.concatenate([-skew(middle), np.broadcast_to(np.eye(3), (len(middle), 3, 3))], axis=2).reshape(
-        rows, 6
-    )
-    free[:rows] = np.linalg.qr(free[:rows])[0]
-    scale = float(np.median(np.diag(normal)[:rows]))
-    return np.linalg.inv(normal + scale * free @ free.T) - free @ free.T / scale
-
-
-def _step(blocks, shared: Shared, condensed, step: np.ndarray, factor: float, setting: _Setting):
-    q, c = shared.basis.shape[1], 3 * len(setting.labels)
-    s = 3 * len(shared.shape_mm) if setting.common else 0
-    intrinsics = step[c + s :]
-    new = [
-        moved(b, each, step[_outer(b, setting, q)], intrinsics, factor)
-        for b, each in zip(blocks, condensed, strict=True)
-    ]
-    shape = shared.shape_mm + factor * step[c : c + s].reshape(-1, 3) if s else shared.shape_mm
-    camera = shared.camera
-    if q:
-        camera = camera.with_parameters(camera.parameters() + factor * shared.basis @ intrinsics)
-    return new, Shared(shared.xyz_world + factor * step[:c].reshape(-1, 3), shape, camera, shared.basis)
+def _free(count: int, shared: Shared) -> np.ndarray:
+    """Directions (count, 6) in which all circles move as one: the datum is that of smallest trace over them."""
+    free = np.zeros((count, FREE_DIRECTIONS))
+    free[: shared.xyz_world.size] = free_motions(shared.xyz_world, scale=False)
+    return free
 
 
 def _largest_move(old: Block, shared: Shared, new: Block, new_shared: Shared) -> float:
@@ -372,8 +415,9 @@ def _result(
 ) -> JointResult:
     """``move_px`` : of the last step; ``sigma0`` : estimated from the residuals where None."""
     normal, _, _ = _normal_equations(blocks, shared, setting)
-    inverse = _inverse(normal, shared, setting)
-    q, c = shared.basis.shape[1], 3 * len(setting.labels)
+    inverse = constrained_inverse(normal, _free(len(normal), shared))
+    places = setting.places(shared)
+    c = places.circles.stop
     flat = sum(len(members) - 3 for members, _, _ in _planes(shared, setting))
     observations = sum(2 * len(b.model.image_index) + 3 * len(b.dots) for b in blocks) + flat
     unknowns = c + sum(6 * len(b.model.images) + 3 * len(b.dots) + 6 for b in blocks)
@@ -391,7 +435,7 @@ def _result(
         {b.model.group: b.board_residual() for b in blocks},
         setting.common,
         shared.camera,
-        covariance[len(inverse) - q :, len(inverse) - q :],
+        covariance[places.intrinsics, places.intrinsics],
         {b.model.group: robust_weights(b.model, shared.camera, setting.huber) for b in blocks},
         redundancy,
         move_px,

@@ -11,7 +11,7 @@ import numpy as np
 
 from stcal.geometry.arrays import frozen
 from stcal.geometry.camera import Camera
-from stcal.geometry.rigid import skew
+from stcal.geometry.normal_equations import blocks_of, constrained_inverse, free_motions, reduce
 from stcal.sfm.adjust.group import projection_jacobians
 from stcal.sfm.data.model import GroupModel, MetricModel
 
@@ -96,37 +96,20 @@ def free_network(model: MetricModel, camera: Camera, factor: float) -> Network:
     by_pose, by_point = projection_jacobians(model, camera)
     a, b = model.whiten(by_pose), model.whiten(by_point)
     m, p = len(model.images), len(model.labels)
-    at = np.swapaxes(a, 1, 2)
-    poses, points = np.zeros((m, 6, 6)), np.zeros((p, 3, 3))
-    np.add.at(poses, model.image_index, at @ a)
-    np.add.at(points, model.point_index, np.swapaxes(b, 1, 2) @ b)
+    residual = model.whiten(model.residuals_px(camera))
     coupling = np.zeros((m, p, 6, 3))
-    coupling[model.image_index, model.point_index] = at @ b
+    coupling[model.image_index, model.point_index] = np.swapaxes(a, 1, 2) @ b
     coupling = coupling.transpose(0, 2, 1, 3).reshape(m, 6, 3 * p)
-    inverse = np.linalg.inv(poses)
-    eliminated = inverse @ coupling
-    normal = -coupling.reshape(6 * m, -1).T @ eliminated.reshape(6 * m, -1)
+    poses, pose_right = blocks_of(a, residual, model.image_index, m)
+    points, point_right = blocks_of(b, residual, model.point_index, p)
+    away = reduce(poses, pose_right, coupling)
+    normal = -away.normal
     place = 3 * np.arange(p)[:, None] + np.arange(3)
     normal[place[:, :, None], place[:, None]] += points
-    covariance = _inverse(normal, model.xyz_world)
-    residual = model.whiten(model.residuals_px(camera))
-    redundancy = 2 - _leverage(model, a, b, inverse, eliminated, covariance)
-    pose_right, point_right = np.zeros((m, 6)), np.zeros((p, 3))
-    np.add.at(pose_right, model.image_index, np.einsum("nki,nk->ni", a, residual))
-    np.add.at(point_right, model.point_index, np.einsum("nki,nk->ni", b, residual))
-    left = point_right.ravel() - np.einsum("mip,mi->p", eliminated, pose_right)
-    return Network(model, residual, a, b, inverse, coupling, pose_right, left, covariance, redundancy)
-
-
-def _inverse(normal: np.ndarray, xyz: np.ndarray) -> np.ndarray:
-    """Inverse with inner constraints over the seven free directions of the world."""
-    middle = xyz - xyz.mean(0)
-    free = np.concatenate(
-        [-skew(middle), np.broadcast_to(np.eye(3), (len(xyz), 3, 3)), middle[:, :, None]], axis=2
-    ).reshape(-1, 7)
-    free = np.linalg.qr(free)[0]
-    scale = float(np.median(np.diag(normal)))
-    return np.linalg.inv(normal + scale * free @ free.T) - free @ free.T / scale
+    covariance = constrained_inverse(normal, free_motions(model.xyz_world, scale=True))
+    redundancy = 2 - _leverage(model, a, b, away.inverse, away.from_kept, covariance)
+    left = point_right.ravel() - away.right
+    return Network(model, residual, a, b, away.inverse, coupling, pose_right, left, covariance, redundancy)
 
 
 def _leverage(model: GroupModel, a, b, inverse, eliminated, covariance) -> np.ndarray:

@@ -1,0 +1,42 @@
+"""Robust weights and scales: Huber's loss of lengths, and σ from medians.
+
+A length is that of d coordinates over their σ; of normal errors its square is χ² distributed with d degrees of freedom.
+"""
+
+import numpy as np
+from scipy.special import chdtri
+
+HUBER = 3.0
+"""Limit of a length of two coordinates over their robust σ: one honest residual in ninety is longer, and loses hardly
+anything."""
+
+
+def length_limit(coordinates: int, beyond: float) -> float:
+    """Length that normal errors of so many ``coordinates`` exceed with probability ``beyond``."""
+    return float(np.sqrt(chdtri(coordinates, beyond)))
+
+
+def huber_weights(length: np.ndarray, limit: float) -> np.ndarray:
+    """Weights of lengths, same shape: 1 up to ``limit``, then falling with the inverse of the length (Huber 1964)."""
+    return limit / np.maximum(length, limit) if np.isfinite(limit) else np.ones_like(length)
+
+
+def huber_cost(length: np.ndarray, limit: float) -> np.ndarray:
+    """Loss of lengths, same shape: the square up to ``limit``, then linear; its derivative is 2 · weight · length."""
+    short = np.minimum(length, limit)
+    return short * (2 * length - short)
+
+
+def robust_sigma(length: np.ndarray, coordinates: int = 1, redundancy: float = 1.0) -> float:
+    """σ of one coordinate from the median of lengths (n,); half of them may be anything.
+
+    Parameters
+    ----------
+    length
+        (n,) Absolute values, or lengths of so many ``coordinates``.
+    coordinates
+        Behind each length.
+    redundancy
+        Share of the observations that parameters have not taken up: residuals are shorter than errors by its root.
+    """
+    return float(np.median(length)) / np.sqrt(chdtri(coordinates, 0.5) * redundancy)
