@@ -1,0 +1,51 @@
+"""What cannot be solved is refused before anything is mapped, and says what to add."""
+
+import numpy as np
+import pytest
+
+from stcal.errors import MappingError
+from stcal.io.images import Skipped
+from stcal.sfm.run.solve import require_groups, require_usable
+
+
+@pytest.fixture(scope="module")
+def group(scene, labels_only):
+    found = labels_only.observations(scene, 0.01, np.random.default_rng(0))
+    return [image for image in found if image.group == found[0].group]
+
+
+def only(group, board: bool):
+    """Every image with its dots alone, or with its circles alone."""
+    return [
+        image.select([i for i, label in enumerate(image.labels) if str(label).startswith("board") == board])
+        for image in group
+    ]
+
+
+def test_two_images_with_board_and_face_will_do(group):
+    require_usable(group[:2])
+    require_groups({group[0].group: group[:2]}, [])
+
+
+def test_what_is_missing_is_named(group):
+    with pytest.raises(MappingError, match=r"1 usable image \(.*\), 2 needed"):
+        require_usable(group[:1])
+    with pytest.raises(MappingError, match="no face of the target recognised in 5 images"):
+        require_usable(only(group, board=True))
+    with pytest.raises(MappingError, match="no board recognised in 5 images"):
+        require_usable(only(group, board=False))
+
+
+def test_a_group_of_which_every_file_was_skipped_is_not_forgotten(group):
+    """Its folder is one of the session: without it the answer would lack a face and not say so."""
+    lost = [Skipped("99/a.jpg", "cannot be read")]
+    with pytest.raises(MappingError, match=r"group 99: 0 usable images, 2 needed, not 99/a.jpg: cannot be read"):
+        require_groups({group[0].group: group}, lost)
+
+
+def test_a_folder_of_copies_or_of_notes_is_no_group(group):
+    skipped = [
+        Skipped("copies/a.jpg", "the same image as 12/b.jpg", "copy"),
+        Skipped("99/notes.txt", "not an image file"),
+    ]
+    require_groups({group[0].group: group}, skipped)
