@@ -5,9 +5,14 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from stcal.errors import DegenerateError
+from stcal.errors import ConvergenceError, DegenerateError
 from stcal.geometry.arrays import Array, freeze
 from stcal.geometry.rigid import Rigid, skew
+
+MAX_STEPS = 50
+"""Of Gauss–Newton; a board that is seen well needs about five."""
+SETTLED = 1e-10
+"""Last step of a pose: rad, and share of the distance."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -116,10 +121,32 @@ def camera_from_plane(normalised_from_plane: np.ndarray) -> Rigid:
 
 
 def refine_planar_pose(camera_from_plane: Rigid, xy_plane: np.ndarray, xy_normalised: np.ndarray) -> Rigid:
-    """Gauss–Newton on the reprojection error of plane points (n, 2) in normalised coordinates, from a start value."""
+    """Gauss–Newton on the reprojection error of a plane's points.
+
+    Parameters
+    ----------
+    camera_from_plane : Rigid
+        To start from, mm.
+    xy_plane : (n, 2) array
+        Points in the plane's frame, mm.
+    xy_normalised : (n, 2) array
+        Their ideal normalised image coordinates.
+
+    Returns
+    -------
+    Rigid
+        camera_from_plane.
+
+    Raises
+    ------
+    DegenerateError
+        The plane comes to lie behind the camera.
+    ConvergenceError
+        The steps do not die away.
+    """
     xyz = np.column_stack([xy_plane, np.zeros(len(xy_plane))])
     pose = camera_from_plane
-    for _ in range(10):
+    for _ in range(MAX_STEPS):
         rotated = xyz @ pose.rotation.T
         p = rotated + pose.translation
         if (p[:, 2] <= 0).any():
@@ -131,6 +158,8 @@ def refine_planar_pose(camera_from_plane: Rigid, xy_plane: np.ndarray, xy_normal
         residual = (p[:, :2] / p[:, 2:] - xy_normalised).ravel()
         step = -np.linalg.lstsq(jac, residual, rcond=None)[0]
         pose = Rigid(Rotation.from_rotvec(step[:3]).as_matrix() @ pose.rotation, pose.translation + step[3:])
-        if np.abs(step[:3]).max() < 1e-10 and np.abs(step[3:]).max() < 1e-10 * pose.translation[2]:
-            break
-    return pose
+        if np.abs(step[:3]).max() < SETTLED and np.abs(step[3:]).max() < SETTLED * pose.translation[2]:
+            return pose
+    raise ConvergenceError(
+        f"planar pose: {MAX_STEPS} Gauss–Newton steps did not settle; check that the points are numbered rightly"
+    )

@@ -6,7 +6,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from stcal.errors import DegenerateError
+from stcal.errors import ConvergenceError, DegenerateError
 from stcal.geometry.plane import (
     Plane,
     apply_homography,
@@ -167,3 +167,9 @@ def test_refinement_agrees_with_opencv_on_noisy_points():
 def test_refinement_refuses_points_behind_the_camera():
     with pytest.raises(DegenerateError, match="behind the camera"):
         refine_planar_pose(Rigid(translation=[0, 0, -500]), GRID, GRID / 1000)
+
+
+def test_a_pose_that_does_not_settle_is_an_error(monkeypatch):
+    monkeypatch.setattr("stcal.geometry.plane.MAX_STEPS", 1)
+    with pytest.raises(ConvergenceError, match="1 Gauss–Newton steps did not settle"):
+        refine_planar_pose(Rigid(translation=[0, 0, 600]), GRID, GRID / 500)

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from stcal.design import BoardDesign, FaceDesign, TargetDesign
-from stcal.errors import DegenerateError
+from stcal.errors import ConvergenceError, DegenerateError
 from stcal.geometry.plane import camera_from_plane, fit_homography, refine_planar_pose
 from stcal.geometry.rigid import Rigid
 from stcal.labels import DotLabel, Label
@@ -137,5 +137,5 @@ def _planar_pose(xy_mm: np.ndarray, xy_normalised: np.ndarray) -> Rigid | None:
     try:
         start = camera_from_plane(fit_homography(xy_mm, xy_normalised))
         return refine_planar_pose(start, xy_mm, xy_normalised)
-    except DegenerateError:
+    except (ConvergenceError, DegenerateError):
         return None
