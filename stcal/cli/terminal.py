@@ -45,9 +45,9 @@ class StageProgress:
             print(f"{stage}: {done} of {total}", file=sys.stderr, flush=True)
 
 
-def write(path: Path, content: str | bytes | dict, said: str = "written") -> None:
-    """Save a file, of a dict as JSON, and say so."""
-    saving.save(path, saving.json_text(content) if isinstance(content, dict) else content)
+def write(path: Path, content, said: str = "written") -> None:
+    """Save text, bytes, or a dict or result file as JSON, and say so."""
+    saving.save(path, content if isinstance(content, str | bytes) else saving.json_text(content))
     print(f"{said}: {path}")
 
 

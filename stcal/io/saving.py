@@ -34,9 +34,10 @@ def save(path: Path, content: str | bytes) -> None:
             partial.unlink(missing_ok=True)
 
 
-def json_text(content: dict) -> str:
-    """As all JSON files of the package are written."""
-    return json.dumps(content, indent=1, ensure_ascii=False, allow_nan=False) + "\n"
+def json_text(content) -> str:
+    """As all JSON files of the package are written: of a dict, or of a result file (``stcal.io.json.ResultFile``)."""
+    plain = content if isinstance(content, dict) else content.content()
+    return json.dumps(plain, indent=1, ensure_ascii=False, allow_nan=False) + "\n"
 
 
 def keep_apart(outputs: dict[str, Path | None], inputs: Sequence[Path | None]) -> None:

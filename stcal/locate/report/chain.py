@@ -1,19 +1,35 @@
 """From the camera to the robot: base_from_obj = base_from_flange · flange_from_camera · camera_from_obj · offset."""
 
-import json
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Literal
 
 import numpy as np
 
 from stcal.errors import InputError
 from stcal.geometry.rigid import Rigid
 from stcal.geometry.uncertain import UncertainRigid
+from stcal.io.json import Matrix6, Part, Pose, read_result
 from stcal.io.table import read_table
 
 MOVING, FIXED = "flange_from_camera", "base_from_camera"
 ROBOT = "base_from_flange_"
+
+
+class HandEyeRead(Part):
+    """What of the file of ``stcal handeye`` is needed here."""
+
+    format: Literal["stcal handeye 1"] = "stcal handeye 1"
+    flange_from_camera: Pose | None = None
+    base_from_camera: Pose | None = None
+    covariance: Matrix6 | None = None
+
+
+class OffsetFile(Part):
+    """Where to go in the target's frame, exact."""
+
+    obj_from_goal: Pose
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -54,13 +70,14 @@ def read_chain(hand_eye: str | Path, robot_poses: str | Path | None, offset: str
     InputError
         A file that is not as ``data_layout.md`` has it, or robot poses that are missing, or given for a fixed camera.
     """
-    data = _json(hand_eye, "hand-eye file")
+    mounted = read_result(hand_eye, HandEyeRead, "hand-eye file", "give the file of stcal handeye")
     where = f"hand-eye file {hand_eye}"
-    names = [name for name in (MOVING, FIXED) if name in data]
+    found = {MOVING: mounted.flange_from_camera, FIXED: mounted.base_from_camera}
+    names = [name for name, matrix in found.items() if matrix is not None]
     if len(names) != 1:
         raise InputError(f"{where}: {' and '.join(names) or 'neither'}; {MOVING} or {FIXED} needed")
-    covariance = np.zeros((6, 6)) if data.get("covariance") is None else data["covariance"]
-    mount = UncertainRigid(_matrix(data[names[0]], f"{where}: {names[0]}"), _numbers(covariance, where))
+    covariance = np.zeros((6, 6)) if mounted.covariance is None else mounted.covariance
+    mount = UncertainRigid(Rigid.from_matrix(found[names[0]]), covariance)
     moving = names[0] == MOVING
     if moving and robot_poses is None:
         raise InputError(f"{where}: the camera is on the flange; robot poses of the scenes (--robot-poses) needed")
@@ -68,10 +85,8 @@ def read_chain(hand_eye: str | Path, robot_poses: str | Path | None, offset: str
         raise InputError(f"{where}: the camera is fixed; it needs no robot poses, leave --robot-poses away")
     shift = Rigid()
     if offset is not None:
-        content = _json(offset, "offset file")
-        if "obj_from_goal" not in content:
-            raise InputError(f"offset file {offset}: no obj_from_goal; a 4×4 matrix under this key needed")
-        shift = _matrix(content["obj_from_goal"], f"offset file {offset}")
+        read = read_result(offset, OffsetFile, "offset file", "a 4×4 matrix under the key obj_from_goal needed")
+        shift = Rigid.from_matrix(read.obj_from_goal)
     return Chain(mount, moving, read_robot_poses(robot_poses) if robot_poses else {}, shift)
 
 
@@ -86,29 +101,3 @@ def read_robot_poses(path: str | Path) -> dict[str, UncertainRigid]:
             raise InputError(f"{table.where}: line {table.lines[row]}: scene {name} again; every scene once needed")
         found[name] = UncertainRigid(pose, np.zeros((6, 6)) if covariances is None else covariances[row])
     return found
-
-
-def _json(path: str | Path, what: str) -> dict:
-    try:
-        data = json.loads(Path(path).read_text(encoding="utf-8-sig"))
-    except OSError as error:
-        raise InputError(f"{what} {path}: {error.strerror or error}; check the path") from error
-    except (ValueError, RecursionError) as error:
-        raise InputError(f"{what} {path}: not JSON ({' '.join(str(error).split())[:100]})") from error
-    if not isinstance(data, dict):
-        raise InputError(f"{what} {path}: a {type(data).__name__}; an object with named keys needed")
-    return data
-
-
-def _matrix(value, where: str) -> Rigid:
-    try:
-        return Rigid.from_matrix(_numbers(value, where))
-    except InputError as error:
-        raise InputError(f"{where}: {str(error).removeprefix(f'{where}: ')}") from error
-
-
-def _numbers(value, where: str) -> np.ndarray:
-    try:
-        return np.array(value, float)
-    except (ValueError, TypeError) as error:
-        raise InputError(f"{where}: not a matrix of numbers; correct it") from error

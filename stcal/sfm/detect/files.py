@@ -1,10 +1,7 @@
 """Detection over all files: in parallel, each result kept by the content of its image and the options."""
 
 import hashlib
-import io
 import json
-import zipfile
-import zlib
 from collections.abc import Callable
 from concurrent.futures.process import BrokenProcessPool
 from dataclasses import asdict, dataclass, fields
@@ -15,9 +12,9 @@ import numpy as np
 from stcal.design import BoardDesign, TargetDesign
 from stcal.errors import ConvergenceError, DetectionError, InputError
 from stcal.geometry.camera import Camera
+from stcal.io.cache import keep, kept
 from stcal.io.camera import CameraModel
 from stcal.io.images import ImageFile, Skipped, decode, grey_8bit, thumbnail
-from stcal.io.saving import save
 from stcal.labels import parse_labels
 from stcal.parallel import run_parallel
 from stcal.sfm.detect.centres import Centres
@@ -89,6 +86,8 @@ def detect_files(
         for k, outcome in run_parallel(_detect_file, [jobs[i] for i in pending], workers):
             i, skipped = pending[k], isinstance(outcome, Skipped)
             found[i] = outcome if skipped else _load(files[i], cache / f"{outcome}.npz", reused=False)
+            if found[i] is None:
+                raise InputError(f"{cache / f'{outcome}.npz'}: written, and cannot be read again; check the disk")
             if progress:
                 progress(files[i].name)
     except BrokenProcessPool as error:
@@ -191,36 +190,25 @@ def _save(path: Path, detection: ImageDetection, digest: str, image: np.ndarray)
         "repeated": detection.repeated,
         "candidates": detection.candidates,
     }
-    stream = io.BytesIO()
     arrays = {f.name: getattr(detection.centres, f.name) for f in fields(Centres)}
-    np.savez(
-        stream,
-        numberings=detection.numberings,
-        thumbnail=jpeg,
-        meta=np.frombuffer(json.dumps(meta).encode(), np.uint8),
-        **arrays,
-    )
-    save(path, stream.getvalue())
+    keep(path, {"numberings": detection.numberings, "thumbnail": jpeg, **arrays}, meta)
 
 
 def _load(file: ImageFile, path: Path, reused: bool) -> DetectedImage | None:
     """Read what was kept; None where the file is damaged."""
-    try:
-        with np.load(io.BytesIO(path.read_bytes())) as stored:
-            meta = json.loads(stored["meta"].tobytes())
-            detection = ImageDetection(
-                Centres(*(stored[f.name] for f in fields(Centres))),
-                parse_labels(meta["target_labels"]),
-                stored["numberings"],
-                tuple(meta["notes"]),
-                tuple(meta["repeated"]),
-                meta["candidates"],
-            )
-            return DetectedImage(file, detection, meta["digest"], stored["thumbnail"].tobytes(), meta["scale"], reused)
-    except (OSError, InputError, ValueError, KeyError, EOFError, TypeError, zipfile.BadZipFile, zlib.error):
-        if not reused:
-            raise
-        return None
+
+    def make(stored, meta) -> DetectedImage:
+        detection = ImageDetection(
+            Centres(*(stored[f.name] for f in fields(Centres))),
+            parse_labels(meta["target_labels"]),
+            stored["numberings"],
+            tuple(meta["notes"]),
+            tuple(meta["repeated"]),
+            meta["candidates"],
+        )
+        return DetectedImage(file, detection, meta["digest"], stored["thumbnail"].tobytes(), meta["scale"], reused)
+
+    return kept(path, make)
 
 
 def _without_copies(found: list[DetectedImage | Skipped]) -> tuple[list[DetectedImage], list[Skipped]]:

@@ -1,10 +1,7 @@
 """One group from labels to a corrected model: pairs, mapping, refinement; kept by its inputs."""
 
 import hashlib
-import io
 import json
-import zipfile
-import zlib
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, fields
 from pathlib import Path
@@ -12,11 +9,11 @@ from pathlib import Path
 import numpy as np
 
 from stcal.design import BoardDesign, TargetDesign
-from stcal.errors import InputError, MappingError
+from stcal.errors import MappingError
 from stcal.geometry.camera import Camera
 from stcal.geometry.rigid import Rigid
+from stcal.io.cache import keep, kept
 from stcal.io.images import SUFFIXES, TOP_GROUP, Skipped
-from stcal.io.saving import save
 from stcal.labels import DotLabel, dot_cells, parse_labels
 from stcal.sfm.adjust.refine import refine
 from stcal.sfm.data.model import Outlier, WorldModel
@@ -113,9 +110,9 @@ def solve_group(
     """
     key = _key(group, skeleton, ids, camera, target, board, pair_options, eccentricity)
     path = cache / f"group-{key}.npz"
-    kept = _load(path)
-    if kept is not None:
-        return kept
+    known = kept(path, _stored)
+    if known is not None:
+        return known
     pairs = rank_pairs([image for image in group if image.name in skeleton], camera, pair_options)
     mapping = map_group(database, scratch, group, skeleton, ids, pairs, camera)
     refined = refine(mapping.model, camera, target, board, eccentricity)
@@ -169,33 +166,25 @@ def _save(path: Path, solution: GroupSolution) -> None:
             None if p.second_from_first is None else p.second_from_first.matrix().tolist() for p in solution.pairs
         ],
     }
-    stream = io.BytesIO()
-    poses = np.stack([pose.matrix() for pose in model.camera_from_world])
     arrays = {name: getattr(model, name) for name in _ARRAYS}
-    np.savez(stream, poses=poses, meta=np.frombuffer(json.dumps(meta).encode(), np.uint8), **arrays)
-    save(path, stream.getvalue())
+    keep(path, {"poses": np.stack([pose.matrix() for pose in model.camera_from_world]), **arrays}, meta)
 
 
-def _load(path: Path) -> GroupSolution | None:
-    """What was kept; None where there is nothing, or it is damaged."""
-    try:
-        with np.load(io.BytesIO(path.read_bytes())) as stored:
-            meta = json.loads(stored["meta"].tobytes())
-            model = WorldModel(
-                meta["group"],
-                tuple(meta["images"]),
-                tuple(Rigid(m[:3, :3], m[:3, 3]) for m in stored["poses"]),
-                parse_labels(meta["labels"]),
-                **{name: stored[name] for name in _ARRAYS},
-            )
-            pairs = tuple(
-                PairScore(**p, second_from_first=None if m is None else Rigid.from_matrix(m))
-                for p, m in zip(meta["pairs"], meta["pair_poses"], strict=True)
-            )
-            outliers = tuple(Outlier(**o) for o in meta["outliers"])
-            return GroupSolution(pairs, model, meta["seeded"], meta["rounds"], meta["left_out"], outliers)
-    except (OSError, InputError, ValueError, KeyError, EOFError, TypeError, zipfile.BadZipFile, zlib.error):
-        return None
+def _stored(stored, meta) -> GroupSolution:
+    """Of what was kept."""
+    model = WorldModel(
+        meta["group"],
+        tuple(meta["images"]),
+        tuple(Rigid(m[:3, :3], m[:3, 3]) for m in stored["poses"]),
+        parse_labels(meta["labels"]),
+        **{name: stored[name] for name in _ARRAYS},
+    )
+    pairs = tuple(
+        PairScore(**p, second_from_first=None if m is None else Rigid.from_matrix(m))
+        for p, m in zip(meta["pairs"], meta["pair_poses"], strict=True)
+    )
+    outliers = tuple(Outlier(**o) for o in meta["outliers"])
+    return GroupSolution(pairs, model, meta["seeded"], meta["rounds"], meta["left_out"], outliers)
 
 
 def unseen_board(solutions: list[GroupSolution], board: BoardDesign) -> list[str]:

@@ -70,13 +70,14 @@ def test_what_is_wrong_is_named(files, tmp_path):
         ("{", "not JSON"),
         ("[]", "an object"),
         ("{}", "neither; flange_from_camera or base_from_camera"),
-        (json.dumps({"flange_from_camera": [[1, 2], [3, 4]]}), "flange_from_camera: .*4×4 needed"),
-        (json.dumps({"flange_from_camera": "x"}), "not a matrix of numbers"),
+        (json.dumps({"flange_from_camera": [[1, 2], [3, 4]]}), "flange_from_camera.*4×4 needed"),
+        (json.dumps({"flange_from_camera": "x"}), "flange_from_camera.*'x'"),
+        (json.dumps({"format": "stcal handeye 2", "base_from_camera": MOUNT.matrix().tolist()}), "'stcal handeye 1'"),
     ]:
         hand_eye.write_text(content)
         with pytest.raises(InputError, match=reason):
             read_chain(hand_eye, poses)
     offset.write_text("{}")
     hand_eye.write_text(json.dumps({"base_from_camera": np.eye(4).tolist()}))
-    with pytest.raises(InputError, match="no obj_from_goal"):
+    with pytest.raises(InputError, match="no 'obj_from_goal'"):
         read_chain(hand_eye, None, offset)

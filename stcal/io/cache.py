@@ -1,0 +1,35 @@
+"""Results kept between runs: arrays and plain values in one file; what is damaged is made anew."""
+
+import io
+import json
+import zipfile
+import zlib
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import Any, TypeVar
+
+import numpy as np
+
+from stcal.errors import StcalError
+from stcal.io.saving import save
+
+R = TypeVar("R")
+META = "meta"
+DAMAGE = (OSError, ValueError, LookupError, EOFError, TypeError, zipfile.BadZipFile, zlib.error, StcalError)
+"""What reading, or making the result anew, raises where a file is absent, cut or of another form."""
+
+
+def keep(path: Path, arrays: Mapping[str, Any], meta: dict[str, Any]) -> None:
+    """Save arrays by name, and plain values."""
+    stream = io.BytesIO()
+    np.savez(stream, **{**arrays, META: np.frombuffer(json.dumps(meta).encode(), np.uint8)})
+    save(path, stream.getvalue())
+
+
+def kept(path: Path, make: Callable[[Mapping[str, np.ndarray], dict[str, Any]], R]) -> R | None:
+    """What ``make`` makes of the arrays and values of a file; None where there is none, or a damaged one."""
+    try:
+        with np.load(io.BytesIO(path.read_bytes())) as stored:
+            return make(stored, json.loads(stored[META].tobytes()))
+    except DAMAGE:
+        return None

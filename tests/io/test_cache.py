@@ -1,0 +1,36 @@
+"""What is kept is read back bit by bit; what is damaged counts as absent."""
+
+import numpy as np
+import pytest
+
+from stcal.io.cache import keep, kept
+
+ARRAYS = {"xyz": np.array([[0.1, 0.2, 0.3]]), "index": np.array([3, 1])}
+META = {"name": "ä", "count": 2}
+
+
+def together(arrays, meta):
+    return {name: arrays[name] for name in ARRAYS}, meta
+
+
+def test_kept_and_read_back(tmp_path):
+    path = tmp_path / "cache" / "key.npz"
+    keep(path, ARRAYS, META)
+    arrays, meta = kept(path, together)
+    assert meta == META
+    assert all(np.array_equal(arrays[name], ARRAYS[name]) for name in ARRAYS)
+
+
+@pytest.mark.parametrize("end", [0, 10, 200, -1])
+def test_a_damaged_or_absent_file_is_none(tmp_path, end):
+    path = tmp_path / "key.npz"
+    assert kept(path, together) is None
+    keep(path, ARRAYS, META)
+    path.write_bytes(path.read_bytes()[:end])
+    assert kept(path, together) is None
+
+
+def test_a_file_of_another_form_is_none(tmp_path):
+    path = tmp_path / "key.npz"
+    keep(path, {"xyz": ARRAYS["xyz"]}, META)
+    assert kept(path, together) is None
