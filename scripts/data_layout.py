@@ -21,7 +21,14 @@ from stcal.io.json import Part, Shape
 
 DOCUMENT = Path(__file__).resolve().parents[1] / "data_layout.md"
 BLOCK = re.compile(r"(<!-- made by scripts/data_layout\.py: (\w+) -->\n)(.*?)(<!-- end -->)", re.DOTALL)
-MODULES = ("stcal.sfm.adjust.file", "stcal.sfm.run.marker", "stcal.sfm.run.report")
+MODULES = (
+    "stcal.sfm.adjust.file",
+    "stcal.sfm.run.marker",
+    "stcal.sfm.run.report",
+    "stcal.robot.axes.files",
+    "stcal.robot.identify.files",
+    "stcal.robot.use.files",
+)
 """Where the models are."""
 WORDS = {str: "string", int: "integer", float: "number", bool: "true or false", type(None): "null", Any: "any"}
 

@@ -57,7 +57,7 @@ def axes(
 ) -> None:
     """Find each joint's axis from sweeps of that joint alone, and the robot that follows (the axis method)."""
     from stcal.robot.axes.model import robot_from_sweeps
-    from stcal.robot.axes.report import axes_json, axes_page, axes_text
+    from stcal.robot.axes.report import axes_file, axes_page, axes_text
     from stcal.robot.kinematics.file import load_robot, robot_toml
     from stcal.robot.kinematics.measurements import read_measurements
 
@@ -70,7 +70,7 @@ def axes(
     if out:
         write(out, robot_toml(result.robot, [f"Identified by the axis method from {sweeps.name}."]))
     if json_file:
-        write(json_file, axes_json(result))
+        write(json_file, axes_file(result))
     if report:
         write(report, axes_page(result, data.where))
 
@@ -119,7 +119,7 @@ def identify(
     report: ReportFile = None,
 ) -> None:
     """Identify the kinematics from poses, positions or distances; σ not given are estimated."""
-    from stcal.robot.identify.report import identified_json, identified_page, identified_text
+    from stcal.robot.identify.report import identified_file, identified_page, identified_text
     from stcal.robot.identify.solve import IdentifyOptions
     from stcal.robot.identify.solve import identify as identified_from
     from stcal.robot.kinematics.file import load_robot, robot_toml
@@ -135,7 +135,7 @@ def identify(
     if out:
         write(out, robot_toml(result.robot, [f"Identified from {data_file.name}: {result.rank} parameters."]))
     if json_file:
-        write(json_file, identified_json(result, nominal))
+        write(json_file, identified_file(result, nominal))
     if report:
         write(report, identified_page(result, nominal))
 
@@ -169,7 +169,7 @@ def compensate(
     if out:
         write(out, stage.compensated_csv(result, identified))
     if json_file:
-        write(json_file, stage.compensated_json(result, identified))
+        write(json_file, stage.compensation_file(result, identified))
     if report:
         from stcal.robot.use.report import compensation_page
 
@@ -204,7 +204,7 @@ def verify(
 
         write(plot, figure_bytes(verification_figure(result), plot.suffix.lower()[1:]))
     if json_file:
-        write(json_file, stage.verified_json(result))
+        write(json_file, stage.verification_file(result))
     if report:
         from stcal.robot.use.report import verification_page
 
@@ -255,7 +255,7 @@ def design(
     if out:
         write(out, stage.design_csv(result, robot))
     if json_file:
-        write(json_file, stage.design_json(result))
+        write(json_file, stage.design_file(result))
     if report:
         from stcal.robot.use.design_report import design_page
 

@@ -6,6 +6,7 @@ import stcal
 from stcal.report.figure import AXIS_COLOURS, FAINT, INK, SMALL, calm, new_figure, uri
 from stcal.report.page import render
 from stcal.report.text import number, text_table
+from stcal.robot.axes.files import AxesFile
 from stcal.robot.axes.fit import AxisFit
 from stcal.robot.axes.model import ROW_VALUES, AxesResult, Pair
 from stcal.robot.axes.sweeps import called
@@ -96,39 +97,41 @@ def _row_cells(result: AxesResult) -> list[list[str]]:
     return rows
 
 
-def axes_json(result: AxesResult) -> dict:
+def axes_file(result: AxesResult) -> AxesFile:
     """Everything as plain values: mm, rad; None where there is no value."""
     distance, normal = (result.without_one.spread(name) for name in ("distance", "normal"))
-    return {
-        "format": "stcal axes 1",
-        "version": stcal.__version__,
-        "robot": robot_toml(result.robot),
-        "axes": [_axis_json(fit) for fit in result.fits],
-        "covariance": result.covariance.tolist(),
-        "rows": [
-            {f"{key}{_unit(key)}": getattr(row, key) for key in ROW_VALUES}
-            | {f"{key}_sigma{_unit(key)}": float(s) for key, s in zip(ROW_VALUES, sigma, strict=True)}
-            for row, sigma in zip(result.robot.rows, result.row_sigma, strict=True)
-        ],
-        "targets": {
-            name: {"xyz_flange_mm": tool.translation.tolist(), "rms_mm": result.tool_spread_mm[name]}
-            for name, tool in result.robot.tools.items()
-        },
-        "pairs": [
-            _pair_json(pair)
-            | {
-                "leave_one_out_distance_spread_mm": _known(distance[pair.joint]),
-                "leave_one_out_normal_spread_mm": _known(normal[pair.joint]),
-            }
-            for pair in result.pairs
-        ],
-        "leave_one_out": {
-            "lines": list(result.without_one.lines),
-            "distance_mm": [[_known(v) for v in row] for row in result.without_one.distance],
-            "normal_mm": [[_known(v) for v in row] for row in result.without_one.normal],
-        },
-        "notes": list(result.notes),
-    }
+    return AxesFile.model_validate(
+        {
+            "format": "stcal axes 1",
+            "version": stcal.__version__,
+            "robot": robot_toml(result.robot),
+            "axes": [_axis_json(fit) for fit in result.fits],
+            "covariance": result.covariance,
+            "rows": [
+                {f"{key}{_unit(key)}": getattr(row, key) for key in ROW_VALUES}
+                | {f"{key}_sigma{_unit(key)}": float(s) for key, s in zip(ROW_VALUES, sigma, strict=True)}
+                for row, sigma in zip(result.robot.rows, result.row_sigma, strict=True)
+            ],
+            "targets": {
+                name: {"xyz_flange_mm": tool.translation, "rms_mm": result.tool_spread_mm[name]}
+                for name, tool in result.robot.tools.items()
+            },
+            "pairs": [
+                _pair_json(pair)
+                | {
+                    "leave_one_out_distance_spread_mm": _known(distance[pair.joint]),
+                    "leave_one_out_normal_spread_mm": _known(normal[pair.joint]),
+                }
+                for pair in result.pairs
+            ],
+            "leave_one_out": {
+                "lines": list(result.without_one.lines),
+                "distance_mm": [[_known(v) for v in row] for row in result.without_one.distance],
+                "normal_mm": [[_known(v) for v in row] for row in result.without_one.normal],
+            },
+            "notes": list(result.notes),
+        }
+    )
 
 
 def _unit(key: str) -> str:

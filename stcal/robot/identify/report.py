@@ -5,6 +5,7 @@ import numpy as np
 from stcal.report.figure import COLOURS, calm, new_figure, uri
 from stcal.report.page import render
 from stcal.report.text import NONE, number
+from stcal.robot.identify.files import IdentifiedFile
 from stcal.robot.identify.nominal import dh_values
 from stcal.robot.identify.observability import MEANING
 from stcal.robot.identify.solve import Identified
@@ -52,7 +53,7 @@ def identified_text(result: Identified, nominal: Robot) -> str:
     return "\n".join(lines)
 
 
-def identified_json(result: Identified, nominal: Robot) -> dict:
+def identified_file(result: Identified, nominal: Robot) -> IdentifiedFile:
     """Everything, for programs (keys: ``data_layout.md``)."""
     values, before = dh_values(result.robot), dh_values(nominal)
     held = result.held_out
@@ -81,7 +82,7 @@ def identified_json(result: Identified, nominal: Robot) -> dict:
             for each in zip(before.tolist(), values.tolist(), result.dh_sigma.tolist(), strict=True)
         ],
         "parameter_names": list(result.names),
-        "covariance": result.covariance.tolist(),
+        "covariance": result.covariance,
         "residuals": [
             {"line": _line(result, i), "error_mm": float(e), "weight": float(w)}
             for i, (e, w) in enumerate(zip(result.fitted_mm, result.weights, strict=True))
@@ -100,7 +101,7 @@ def identified_json(result: Identified, nominal: Robot) -> dict:
             "max_mm": largest,
             "mean_deg": float(np.degrees(np.nanmean(held.rotation_rad))) if result.seen.kind == "pose" else None,
         }
-    return content
+    return IdentifiedFile.model_validate(content)
 
 
 def identified_page(result: Identified, nominal: Robot) -> str:

@@ -17,6 +17,7 @@ from stcal.robot.kinematics.forward import forward
 from stcal.robot.kinematics.inverse import LIMIT, ORIENTATION, SINGULAR_POSE, UNREACHABLE, Inverse, inverse
 from stcal.robot.kinematics.measurements import joint_values, targets_of, within
 from stcal.robot.kinematics.model import Robot
+from stcal.robot.use.files import CompensationFile
 
 WHAT = "targets"
 FAR_RAD = np.radians(1.0)
@@ -265,7 +266,7 @@ def compensated_csv(result: Compensated, robot: Robot) -> str:
     return stream.getvalue()
 
 
-def compensated_json(result: Compensated, robot: Robot) -> dict:
+def compensation_file(result: Compensated, robot: Robot) -> CompensationFile:
     """Everything, for programs."""
     columns = joint_columns(robot)
     unit = np.where(robot.prismatic, 1.0, np.degrees(1.0))
@@ -279,8 +280,8 @@ def compensated_json(result: Compensated, robot: Robot) -> dict:
         row = {
             "line": int(line),
             "target": result.targets.tools[i],
-            "commanded_mm": result.poses.translation[i].tolist(),
-            "commanded_quaternion": quaternions[i].tolist(),
+            "commanded_mm": result.poses.translation[i],
+            "commanded_quaternion": quaternions[i],
             "status": result.found.status[i],
             "joints": joints(result.found, i),
             "error_mm": float(result.found.error_mm[i]),
@@ -296,7 +297,9 @@ def compensated_json(result: Compensated, robot: Robot) -> dict:
             }
         rows.append(row)
     counts = {status: result.found.status.count(status) for status in dict.fromkeys(result.found.status)}
-    return {"format": "stcal compensation 1", "robot": robot.name, "counts": counts, "poses": rows}
+    return CompensationFile.model_validate(
+        {"format": "stcal compensation 1", "robot": robot.name, "counts": counts, "poses": rows}
+    )
 
 
 def compensated_text(result: Compensated, robot: Robot, most: int = 60) -> str:

@@ -20,6 +20,7 @@ from stcal.robot.identify.observability import SEEN, Observability, identificati
 from stcal.robot.kinematics.forward import forward
 from stcal.robot.kinematics.model import Robot
 from stcal.robot.use.compensation import joint_cells, joint_columns
+from stcal.robot.use.files import DesignFile
 
 RANDOM_SETS = 20
 DRAWS = 200
@@ -253,20 +254,22 @@ def design_csv(result: PoseDesign, robot: Robot) -> str:
     return stream.getvalue()
 
 
-def design_json(result: PoseDesign) -> dict:
+def design_file(result: PoseDesign) -> DesignFile:
     """Everything but the poses themselves, for programs."""
-    return {
-        "format": "stcal pose design 1",
-        "count": len(result.q),
-        "parameters": result.parameters,
-        "seen": result.seen,
-        "exchanges": result.exchanges,
-        "chosen": result.chosen.values(),
-        "random_median": result.median(),
-        "random": [each.values() for each in result.random],
-        "predicted_sigma_mm": result.sigma_mm,
-        "random_predicted_sigma_mm": result.random_sigma_mm if np.isfinite(result.random_sigma_mm) else None,
-    }
+    return DesignFile.model_validate(
+        {
+            "format": "stcal pose design 1",
+            "count": len(result.q),
+            "parameters": result.parameters,
+            "seen": result.seen,
+            "exchanges": result.exchanges,
+            "chosen": result.chosen.values(),
+            "random_median": result.median(),
+            "random": [each.values() for each in result.random],
+            "predicted_sigma_mm": result.sigma_mm,
+            "random_predicted_sigma_mm": result.random_sigma_mm if np.isfinite(result.random_sigma_mm) else None,
+        }
+    )
 
 
 def design_text(result: PoseDesign) -> str:

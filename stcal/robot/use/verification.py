@@ -14,6 +14,7 @@ from stcal.errors import InputError
 from stcal.geometry.arrays import frozen
 from stcal.io.table import Table, read_table
 from stcal.robot.kinematics.measurements import within
+from stcal.robot.use.files import VerificationFile
 
 WHAT = "measured positions"
 SAME_MM = 1e-6
@@ -214,7 +215,7 @@ def verified_text(result: Verification) -> str:
     return "\n".join(lines)
 
 
-def verified_json(result: Verification) -> dict:
+def verification_file(result: Verification) -> VerificationFile:
     """Everything, for programs."""
     sets = []
     for k, each in enumerate(result.sets):
@@ -223,17 +224,17 @@ def verified_json(result: Verification) -> dict:
         reduced = reduced and {
             key.replace("_mm", "_percent"): v if np.isfinite(v) else None for key, v in reduced.items()
         }
-        sets.append(
-            {"set": each.name, **figures, "scale": each.scale, "reduced": reduced, "error_mm": each.error_mm.tolist()}
-        )
-    return {
-        "format": "stcal verification 1",
-        "poses": list(result.poses),
-        "distance_mm": result.distance_mm.tolist(),
-        "sets": sets,
-        "missing": {name: list(poses) for name, poses in result.missing.items()},
-        "warnings": result.warnings(),
-    }
+        sets.append({"set": each.name, **figures, "scale": each.scale, "reduced": reduced, "error_mm": each.error_mm})
+    return VerificationFile.model_validate(
+        {
+            "format": "stcal verification 1",
+            "poses": result.poses,
+            "distance_mm": result.distance_mm,
+            "sets": sets,
+            "missing": {name: list(poses) for name, poses in result.missing.items()},
+            "warnings": result.warnings(),
+        }
+    )
 
 
 def _few(names: Sequence[str], most: int = 12) -> str:

@@ -13,7 +13,7 @@ from scipy.spatial.transform import Rotation
 from stcal.errors import DegenerateError, InputError
 from stcal.geometry.rigid import Rigid
 from stcal.robot.identify.nominal import dh_values
-from stcal.robot.identify.report import identified_json, identified_page, identified_text
+from stcal.robot.identify.report import identified_file, identified_page, identified_text
 from stcal.robot.identify.residuals import jacobian, moved, observed, residuals, tips
 from stcal.robot.identify.solve import IdentifyOptions, identify
 from stcal.robot.kinematics.example import mh80
@@ -238,7 +238,7 @@ def test_many_outliers_do_not_pass_for_noise():
 def test_report_and_json_hold_the_result():
     _, data = simulated(7, 40)
     found = identify(mh80(), data, IdentifyOptions(folds=3, repeats=1))
-    content = json.loads(json.dumps(identified_json(found, mh80()), allow_nan=False))
+    content = json.loads(json.dumps(identified_file(found, mh80()).content(), allow_nan=False))
     assert content["rank"] == 30
     assert len(content["covariance"]) == 30
     assert content["held_out"]["mean_mm"] == pytest.approx(float(found.held_out.position_mm.mean()))

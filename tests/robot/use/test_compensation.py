@@ -17,7 +17,7 @@ from stcal.robot.kinematics.example import mh80
 from stcal.robot.kinematics.file import load_robot, robot_toml
 from stcal.robot.kinematics.forward import forward
 from stcal.robot.kinematics.model import Joint
-from stcal.robot.use.compensation import compensate, compensated_csv, compensated_json, read_targets
+from stcal.robot.use.compensation import compensate, compensated_csv, compensation_file, read_targets
 from stcal.synthetic.measured.arms import joint_vectors, made
 
 JOINTS = [f"q{i}_deg" for i in range(1, 7)]
@@ -140,7 +140,7 @@ def test_what_is_not_reached_keeps_its_row_without_joint_values(case):
     kept = np.arange(20) != 4
     # Nine decimals of a degree at 2 m: 2 m · 1.7e-11 · some joints.
     np.testing.assert_allclose(forward(case.real, back).translation, case.poses.translation[kept], atol=1e-6)
-    content = compensated_json(result, case.real)
+    content = compensation_file(result, case.real).content()
     assert content["counts"] == {"reached": 19, "unreachable": 1}
     assert content["poses"][4]["joints"] is None
 

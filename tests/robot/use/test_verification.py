@@ -9,7 +9,7 @@ import pytest
 from stcal.cli.main import main
 from stcal.errors import InputError
 from stcal.geometry.rigid import Rigid
-from stcal.robot.use.verification import read_measured, verified_json, verified_text, verify
+from stcal.robot.use.verification import read_measured, verification_file, verified_text, verify
 
 HEAD = "set,commanded_x_mm,commanded_y_mm,commanded_z_mm,x_mm,y_mm,z_mm"
 COMMANDED = np.array([[0, 0, 0], [30, 0, 0], [0, 40, 0], [0, 0, 50], [60, 80, 0]], float)
@@ -118,7 +118,7 @@ def test_too_few_and_other_units_are_named(tmp_path):
 
 def test_no_error_at_all_gives_no_reduction(tmp_path):
     rows = [f"{s},{','.join(f'{v:g}' for v in (*c, *c))}" for s in ("a", "b") for c in COMMANDED]
-    content = verified_json(verify(read_measured(written(tmp_path, rows))))
+    content = verification_file(verify(read_measured(written(tmp_path, rows)))).content()
     assert content["sets"][1]["reduced"]["mean_percent"] is None
     json.dumps(content, allow_nan=False)
 

@@ -1,0 +1,89 @@
+"""What ``identify`` writes with ``--json``."""
+
+from typing import Literal
+
+from pydantic import Field
+
+from stcal.io.json import Matrix, Part, ResultFile
+
+
+class Errors(Part):
+    mean_mm: float
+    rms_mm: float
+    max_mm: float
+
+
+class BothErrors(Part):
+    nominal: Errors
+    identified: Errors
+
+
+class HeldOutErrors(Part):
+    folds: int
+    repeats: int
+    mean_mm: float
+    rms_mm: float
+    max_mm: float
+    mean_deg: float | None
+
+
+class Element(Part):
+    nominal: float
+    identified: float
+    sigma: float
+
+
+class RowErrors(Part):
+    line: int
+    error_mm: float
+    weight: float
+
+
+class OutlierRow(Part):
+    line: int
+    place: str
+    error_mm: float
+
+
+class IdentifiedFile(ResultFile):
+    """Of ``identify``."""
+
+    format: Literal["stcal identified 1"] = Field(description="the file's form and its version")
+    robot: str = Field(description="name")
+    observed: str = Field(description="kind of observation used")
+    observations: int = Field(description="how many")
+    rank: int = Field(description="parameters determined by the data used")
+    parameters: int = Field(description="of how many")
+    ranks: dict[str, int] = Field(description="`rank` by kind of observation at the same joint values")
+    undetermined: list[str] = Field(description="parameters kept nominal (`--partial`)")
+    notes: list[str] = Field(description="rows left out; what is to be known of the rows found")
+    sigma_mm: float | None = Field(
+        description="of one coordinate, given or estimated (null where each row has its own)"
+    )
+    sigma_rad: float | None = Field(description="the same of one component of a rotation")
+    sigma0: float = Field(description="σ₀ by which what was given is multiplied, else 1")
+    deviations: dict[str, float | None] = Field(
+        description="`length_mm`, `twist_rad`, `zero_rad`: σ of this robot's dimensions about nominal, as estimated; "
+        "null where it has none"
+    )
+    errors: BothErrors = Field(
+        description="`nominal` (with base and tools fitted) and `identified`: `mean_mm`, `rms_mm`, `max_mm`"
+    )
+    held_out: HeldOutErrors | None = Field(
+        description="`folds`, `repeats`, `mean_mm`, `rms_mm`, `max_mm`, `mean_deg`; null where rows are too few"
+    )
+    observability: dict[str, float] = Field(
+        description="`O1` … `O5` (Borm & Menq; Driels & Pathre; Nahvi, Hollerbach & Hayward; Nahvi & Hollerbach; Sun & "
+        "Hollerbach) of the Jacobian over σ, all parameters in mm, an angle being the arc that it makes at the arm's "
+        "whole length; 1/mm, `O2` without unit; 1/`O3` is the σ in mm of the combination of parameters that is seen "
+        "worst"
+    )
+    rows: list[dict[str, Element]] = Field(
+        description="for each joint `a`, `d` (mm), `alpha`, `theta`, `beta` (rad): `nominal`, `identified`, `sigma`"
+    )
+    parameter_names: list[str] = Field(
+        description="small motions of each joint's frame (`J2 rx`: rad, `J2 x`: mm) and of the tools"
+    )
+    covariance: Matrix = Field(description="of these; of distances singular: 0 along what they never show")
+    residuals: list[RowErrors] = Field(description="`line`, `error_mm`, `weight`")
+    outliers: list[OutlierRow] = Field(description="those of less than half weight: `line`, `place`, `error_mm`")

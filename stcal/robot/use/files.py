@@ -1,0 +1,95 @@
+"""What ``compensate``, ``verify`` and ``design`` write with ``--json``."""
+
+from typing import Annotated, Literal
+
+from pydantic import Field
+
+from stcal.io.json import Part, ResultFile, Vector, Vector3
+
+ByStatus = Annotated[str, "status"]
+BySet = Annotated[str, "set"]
+
+
+class CompensatedPose(Part):
+    line: int
+    target: str
+    commanded_mm: Vector3
+    commanded_quaternion: Vector
+    status: str
+    joints: dict[str, float] | None
+    error_mm: float
+    error_rad: float
+    nominal_status: str = ""
+    nominal_joints: dict[str, float] | None = None
+    nominal_error_mm: float | None = None
+    nominal_error_rad: float | None = None
+
+
+class CompensationFile(ResultFile):
+    """Of ``compensate``."""
+
+    format: Literal["stcal compensation 1"] = Field(description="the file's form and its version")
+    robot: str = Field(description="name")
+    counts: dict[ByStatus, int] = Field(description="number of poses")
+    poses: list[CompensatedPose] = Field(
+        description="the columns above: `line`, `target`, `commanded_mm`, `commanded_quaternion` (w first), `status`, "
+        "`joints` (by column name, null where not reached), `error_mm`, `error_rad`, and with `--nominal` "
+        "`nominal_status`, `nominal_joints`, `nominal_error_mm`, `nominal_error_rad`"
+    )
+
+
+class Reduced(Part):
+    mean_percent: float | None
+    std_percent: float | None
+    max_percent: float | None
+    all_pairs_rms_percent: float | None
+
+
+class MeasuredSet(Part):
+    set: str
+    mean_mm: float
+    std_mm: float
+    max_mm: float
+    all_pairs_rms_mm: float
+    scale: float
+    reduced: Reduced | None = Field(
+        description="each figure's reduction from the first set: `mean_percent`, `std_percent`, `max_percent`, "
+        "`all_pairs_rms_percent`; null for the first"
+    )
+    error_mm: Vector
+
+
+class VerificationFile(ResultFile):
+    """Of ``verify``."""
+
+    format: Literal["stcal verification 1"] = Field(description="the file's form and its version")
+    poses: list[str] = Field(description="names, the first being the one that distances start from")
+    distance_mm: Vector = Field(description="commanded distances of the others from it")
+    sets: list[MeasuredSet] = Field(
+        description="`set`; `mean_mm`, `std_mm` (sample), `max_mm` of the absolute errors of those distances, "
+        "`error_mm` measured minus commanded; `all_pairs_rms_mm` of the distance errors of all pairs; `scale` measured "
+        "over commanded distances of all pairs by least squares; `reduced`"
+    )
+    missing: dict[BySet, list[str]] = Field(description="poses that a set lacks")
+    warnings: list[str] = Field(description="what to look at")
+
+
+class DesignFile(ResultFile):
+    """Of ``design``."""
+
+    format: Literal["stcal pose design 1"] = Field(description="the file's form and its version")
+    count: int = Field(description="number of poses")
+    parameters: int = Field(description="of the robot and its tool")
+    seen: int = Field(description="how many combinations of them any pose shows; the indices are of these")
+    exchanges: int = Field(description="single poses exchanged after the greedy choice")
+    chosen: dict[str, float] = Field(
+        description="`O1` … `O5` of the chosen poses; defined and in units as `identify --json` has them"
+    )
+    random_median: dict[str, float] = Field(description="medians of `random`")
+    random: list[dict[str, float]] = Field(description="`O1` … `O5` of 20 random sets of as many poses")
+    predicted_sigma_mm: float = Field(
+        description="σ per axis of the position that the identified robot predicts, RMS over random poses"
+    )
+    random_predicted_sigma_mm: float | None = Field(
+        description="the same, median of the random sets (null where they leave parameters open)"
+    )
