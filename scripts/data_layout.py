@@ -25,6 +25,8 @@ MODULES = (
     "stcal.sfm.adjust.file",
     "stcal.sfm.run.marker",
     "stcal.sfm.run.report",
+    "stcal.sfm.measure.files",
+    "stcal.locate.report.files",
     "stcal.robot.axes.files",
     "stcal.robot.identify.files",
     "stcal.robot.use.files",

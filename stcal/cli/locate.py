@@ -60,7 +60,7 @@ def calibrate(
     from stcal.io.camera import read_camera
     from stcal.locate.calibrate.solve import calibrate as calibrated
     from stcal.locate.data.layout import layout_toml, load_plan
-    from stcal.locate.report.calibration import calibrated_json, calibrated_text, warnings
+    from stcal.locate.report.calibration import calibrated_file, calibrated_text, warnings
     from stcal.workflows.locate import calibration_images
 
     keep_apart({"--out": out, "--json": json_file}, (layout, board, camera))
@@ -74,7 +74,7 @@ def calibrate(
     print_each("warning", warnings(result, plan.tags))
     write(out, layout_toml(result.layout, [f"Calibrated by stcal locate from {len(result.images)} images."]))
     if json_file:
-        write(json_file, calibrated_json(result))
+        write(json_file, calibrated_file(result))
 
 
 @app.command()

@@ -85,7 +85,7 @@ def measure(
     print_each("not joined", apart)
     write(out, text, "poses")
     if json_file:
-        write(json_file, work.measure_json(result), "as JSON")
+        write(json_file, work.poses_file(result), "as JSON")
     if report:
         from stcal.sfm.measure.report import measure_page
 

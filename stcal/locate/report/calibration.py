@@ -3,6 +3,7 @@
 import numpy as np
 
 from stcal.locate.calibrate.solve import CalibratedLayout
+from stcal.locate.report.files import CalibratedLayoutFile
 
 FEW_IMAGES = 3
 
@@ -50,40 +51,42 @@ def warnings(result: CalibratedLayout, names: tuple[tuple[str, int], ...]) -> li
     return found
 
 
-def calibrated_json(result: CalibratedLayout) -> dict:
+def calibrated_file(result: CalibratedLayout) -> CalibratedLayoutFile:
     """Everything but the covariance, which the layout file holds."""
     layout, adjusted = result.layout, result.adjusted
-    return {
-        "format": "stcal layout calibration 1",
-        "unit": "mm",
-        "images": [
-            {"image": name, "camera_from_board": pose.matrix().tolist(), "tags_rms_px": float(rms)}
-            for name, pose, rms in zip(result.images, adjusted.poses, adjusted.image_rms_px, strict=True)
-        ],
-        "left_out": list(result.left_out),
-        "board_from_obj": result.board_from_obj.matrix().tolist(),
-        "board_rms_px": adjusted.board_rms_px,
-        "tag_rms_px": adjusted.tag_rms_px,
-        "sigma_px": adjusted.sigma_px,
-        "tag_sigma_px": adjusted.tag_sigma_px,
-        "tags": [
-            {
-                "dictionary": dictionary,
-                "id": tag,
-                "images": int(count),
-                "corners_mm": corners.tolist(),
-                "sigma_mm": sigma.tolist(),
-                "published_mm": published.tolist(),
-                "from_nominal_mm": float(nominal) if np.isfinite(nominal) else None,
-            }
-            for (dictionary, tag), count, corners, sigma, published, nominal in zip(
-                layout.tags,
-                result.counts,
-                layout.corners_mm,
-                layout.sigma_mm(),
-                result.published,
-                result.deviation_mm,
-                strict=True,
-            )
-        ],
-    }
+    return CalibratedLayoutFile.model_validate(
+        {
+            "format": "stcal layout calibration 1",
+            "unit": "mm",
+            "images": [
+                {"image": name, "camera_from_board": pose, "tags_rms_px": float(rms)}
+                for name, pose, rms in zip(result.images, adjusted.poses, adjusted.image_rms_px, strict=True)
+            ],
+            "left_out": list(result.left_out),
+            "board_from_obj": result.board_from_obj,
+            "board_rms_px": adjusted.board_rms_px,
+            "tag_rms_px": adjusted.tag_rms_px,
+            "sigma_px": adjusted.sigma_px,
+            "tag_sigma_px": adjusted.tag_sigma_px,
+            "tags": [
+                {
+                    "dictionary": dictionary,
+                    "id": tag,
+                    "images": int(count),
+                    "corners_mm": corners,
+                    "sigma_mm": sigma,
+                    "published_mm": published,
+                    "from_nominal_mm": float(nominal) if np.isfinite(nominal) else None,
+                }
+                for (dictionary, tag), count, corners, sigma, published, nominal in zip(
+                    layout.tags,
+                    result.counts,
+                    layout.corners_mm,
+                    layout.sigma_mm(),
+                    result.published,
+                    result.deviation_mm,
+                    strict=True,
+                )
+            ],
+        }
+    )

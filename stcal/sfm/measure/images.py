@@ -4,7 +4,7 @@ import csv
 import io
 import tempfile
 from collections.abc import Callable, Sequence
-from dataclasses import asdict, dataclass, field, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import numpy as np
@@ -23,6 +23,7 @@ from stcal.sfm.detect.ellipses import EllipseOptions
 from stcal.sfm.detect.files import DetectedImage, detect_files
 from stcal.sfm.detect.labels import label_group
 from stcal.sfm.measure.common_errors import common_errors
+from stcal.sfm.measure.files import PosesFile
 from stcal.sfm.measure.pose import PoseOptions, TargetPose, pose_from_circles
 from stcal.sfm.measure.target import TargetCircles
 
@@ -252,17 +253,19 @@ def fit_verdict(pose: TargetPose) -> str:
     return "failed" if p < FAILED else "suspicious" if p < SUSPICIOUS else "passed"
 
 
-def measure_json(result: MeasureResult) -> dict:
+def poses_file(result: MeasureResult) -> PosesFile:
     """The content of ``--json``."""
-    return {
-        "format": "stcal poses 1",
-        "unit": "mm",
-        "sigma_factor": result.sigma_factor,
-        "intrinsics_held": result.intrinsics_held,
-        "notes": list(result.notes),
-        "images": [_image_json(each) for each in result.images],
-        "left_out": [{"name": each.name, "reason": each.reason} for each in result.left_out],
-    }
+    return PosesFile.model_validate(
+        {
+            "format": "stcal poses 1",
+            "unit": "mm",
+            "sigma_factor": result.sigma_factor,
+            "intrinsics_held": result.intrinsics_held,
+            "notes": list(result.notes),
+            "images": [_image_json(each) for each in result.images],
+            "left_out": result.left_out,
+        }
+    )
 
 
 def _image_json(each: MeasuredImage) -> dict:
@@ -272,14 +275,10 @@ def _image_json(each: MeasuredImage) -> dict:
         "image": each.name,
         "faces": list(pose.faces),
         "status": pose.status,
-        "camera_from_target": pose.camera_from_target.matrix().tolist(),
-        "covariance": pose.covariance.tolist(),
-        "covariance_parts": {source: part.tolist() for source, part in pose.parts.items()},
-        "alternative": other
-        and {
-            "camera_from_target": other.camera_from_target.matrix().tolist(),
-            "covariance": other.covariance.tolist(),
-        },
+        "camera_from_target": pose.camera_from_target,
+        "covariance": pose.covariance,
+        "covariance_parts": pose.parts,
+        "alternative": other,
         "delta_chi2": pose.delta_chi2 if np.isfinite(pose.delta_chi2) else None,
         "delta_chi2_needed": pose.needed_chi2,
         "rms_px": pose.rms_px(),
@@ -288,10 +287,10 @@ def _image_json(each: MeasuredImage) -> dict:
         "p_value": pose.p_value(),
         "fit": fit_verdict(pose),
         "circles": [
-            {"label": label, "residual_px": residual.tolist(), "weight": float(weight)}
+            {"label": label, "residual_px": residual, "weight": float(weight)}
             for label, residual, weight in zip(pose.labels, pose.residuals_px, pose.weights, strict=True)
         ],
-        "outliers": [{k: v for k, v in asdict(o).items() if k != "image"} for o in pose.outliers],
+        "outliers": pose.outliers,
         "notes": list(each.notes),
     }
 

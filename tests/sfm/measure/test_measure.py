@@ -20,7 +20,7 @@ from stcal.io.table import read_table
 from stcal.sfm import RunOptions, run
 from stcal.sfm.data.observations import ImageObservations
 from stcal.sfm.data.projection import project_circles
-from stcal.sfm.measure.images import NO_FACE, MeasureOptions, measure, measure_json, measure_labelled, resolved
+from stcal.sfm.measure.images import NO_FACE, MeasureOptions, measure, measure_labelled, poses_file, resolved
 from stcal.sfm.measure.pose import PoseOptions, pose_from_circles
 from stcal.sfm.measure.report import measure_page
 from stcal.sfm.measure.target import TargetCircles, read_target
@@ -177,7 +177,7 @@ def test_images_are_resolved_in_order_of_their_names(scene, known):
         assert np.linalg.norm(pose_error(each.pose.camera_from_target, truth)[:3]) < 0.1
     plain = measure_labelled(images, scene.camera, known.truth)
     assert [i.pose.status for i in plain.images] == ["certain", "ambiguous", "ambiguous"]
-    content = measure_json(plain)
+    content = poses_file(plain).content()
     assert content["images"][0]["alternative"] is None
     assert np.shape(content["images"][1]["alternative"]["camera_from_target"]) == (4, 4)
     json.dumps(content, allow_nan=False)
