@@ -55,36 +55,3 @@ def swatch(name: str, colour: str) -> Markup:
 def verdict(text: str, colour: str) -> Markup:
     """A word in its colour, for a table's cell."""
     return environment().globals["verdict"](text, colour)
-
-
-# Of pages that still build their own markup.
-
-
-class Html(str):
-    """Text that is markup already; everything else is escaped."""
-
-    __slots__ = ()
-
-    def __html__(self) -> str:
-        return str(self)
-
-
-def page(title: str, banner: str, sections) -> str:
-    """The page: ``banner`` is markup above the contents; each section is (anchor, title, markup)."""
-    found = [(key, Markup(text), Markup(content)) for key, text, content in sections]
-    heads = [each[:2] for each in found]
-    return render(
-        "report/templates/given.html.jinja", title=title, given=Markup(banner), found=found, given_sections=heads
-    )
-
-
-def table(*args, **options) -> Html:
-    return Html(environment().globals["table"](*args, **options))
-
-
-def fold(summary: str, content: str) -> str:
-    return str(environment().globals["fold"](summary, Markup(content)))
-
-
-def plot(uri: str, alt: str, caption: str = "", css: str = "") -> str:
-    return str(environment().globals["plot"](uri, alt, Markup(caption), css))
