@@ -18,16 +18,6 @@ from stcal.errors import InputError
 
 SYSTEMS = ("sfm", "robot", "register", "handeye", "locate")
 UNDOCUMENTED: set[str] = {
-    "stcal.robot.DesignOptions",
-    "stcal.robot.Identified",
-    "stcal.robot.IdentifyOptions",
-    "stcal.robot.compensate",
-    "stcal.robot.design",
-    "stcal.robot.identify",
-    "stcal.robot.read_measured",
-    "stcal.robot.read_targets",
-    "stcal.robot.robot_from_sweeps",
-    "stcal.robot.verify",
     "stcal.sfm.MeasureOptions",
     "stcal.sfm.PlanOptions",
     "stcal.sfm.RunOptions",

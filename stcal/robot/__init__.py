@@ -12,9 +12,10 @@ Lengths in mm, angles in rad, joint values (m, n) as the controller has them::
     robot.save_robot("identified.toml", found.robot)
 
     base_from_tool = robot.forward(found.robot, data.q)  # m poses at once
-    slope = robot.jacobian(found.robot, data.q)  # (m, 6, n)
+    jacobian = robot.jacobian(found.robot, data.q)  # (m, 6, n)
     solved = robot.inverse(found.robot, base_from_tool, data.q)  # solved.q, solved.status
-    told = robot.compensate(found.robot, robot.read_targets("targets.csv", nominal), nominal)  # told.found.q
+    targets = robot.read_targets("targets.csv", nominal)
+    compensated = robot.compensate(found.robot, targets, nominal)  # compensated.found.q
     check = robot.verify(robot.read_measured("verified.csv"))  # check.sets[0].mean_mm, .max_mm
     axes = robot.robot_from_sweeps(robot.read_measurements("sweeps.csv", nominal), nominal)  # axes.robot
 """

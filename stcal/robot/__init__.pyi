@@ -7,6 +7,7 @@ from .kinematics.file import robot_toml as robot_toml
 from .kinematics.file import save_robot as save_robot
 from .kinematics.forward import forward as forward
 from .kinematics.forward import jacobian as jacobian
+from .kinematics.inverse import branches as branches
 from .kinematics.inverse import inverse as inverse
 from .kinematics.measurements import Measurements as Measurements
 from .kinematics.measurements import read_measurements as read_measurements

@@ -60,10 +60,10 @@ def test_the_example_of_the_docstring_runs(files, monkeypatch, capsys):
     again = robot.load_robot(files / "identified.toml")
     apart = robot.forward(again, data.q).difference(names["base_from_tool"])
     assert np.abs(apart).max() < 1e-9
-    assert names["slope"].shape == (40, 6, 6)
+    assert names["jacobian"].shape == (40, 6, 6)
     assert names["solved"].q == pytest.approx(np.array(data.q), abs=1e-7)
     assert names["plan"].q.shape == (40, 6)
-    assert set(names["told"].found.status) == {"reached"}
+    assert set(names["compensated"].found.status) == {"reached"}
     assert names["check"].sets[0].max_mm < 0.5
     assert names["axes"].robot.rows[1].a == pytest.approx(870, abs=2)
 

@@ -58,7 +58,7 @@ def require_like_nominal(where: str, frames: list[Rigid], nominal: Robot) -> Non
     for flipped in chain.from_iterable(combinations(range(len(frames)), k) for k in range(1, MANY)):
         sign = np.where(np.isin(np.arange(len(frames)), flipped), -1.0, 1.0)
         reversed_[flipped] = float(np.linalg.norm(_shape(found * sign[:, None], places, nominal.prismatic)[0] - shape))
-    best = min(reversed_, key=reversed_.get)
+    best = min(reversed_, key=lambda flipped: reversed_[flipped])
     if mirrored < as_it_is / 2 and mirrored <= LIKELY * reversed_[best]:
         raise InputError(
             f"{where}: the axes are the mirror image of robot {nominal.name}'s: positions of a left-handed frame (or "

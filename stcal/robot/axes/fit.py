@@ -29,12 +29,15 @@ LONGER = "sweep further, or with reflectors farther apart"
 QUIET = 1e-3
 """Share of the largest arc below which no residual can hide a gross error that bent the first axis."""
 ITERATIONS, HALVINGS, STARTS, REWEIGHTINGS = 100, 12, 60, 30
+WEIGHTS_SETTLED = 1e-3
+"""A weight that changes by less moves an axis by less than a thousandth of its σ."""
 SINGULAR, TINY = 1e-10, 1e-300
+"""Ratio of singular values below which arcs do not determine an axis; and what keeps a division by 0 off."""
 FIRST_SIZE = 0.05
 """Arcs of this share of the largest one give the first axis and σ, by which the smaller are judged."""
 
 
-@dataclass(frozen=True, slots=True, eq=False)
+@dataclass(frozen=True, slots=True, eq=False, kw_only=True)
 class AxisFit:
     """The axis of one joint.
 
@@ -44,7 +47,8 @@ class AxisFit:
     one for each point of each arc; ``residuals`` : (k, 2) mm, radial and axial (across the line, for a prismatic
     joint); ``weights`` : (k,), 0 for what is grossly wrong; ``gain`` : (p, k, 3) derivative of the axis by the points,
     p being 4 (rx, ry rad, tx, ty mm in the axis's own frame) or 2 (rx, ry); ``sigma_mm`` : of one coordinate;
-    ``dof`` : redundancy; ``span`` : what the joint moved, rad or mm.
+    ``redundancy`` : numbers measured beyond those needed; ``span`` : what the joint moved, rad or mm; ``settled`` :
+    whether the robust weights had come to rest.
     """
 
     joint: int
@@ -58,8 +62,9 @@ class AxisFit:
     weights: np.ndarray
     gain: np.ndarray
     sigma_mm: float
-    dof: int
+    redundancy: int
     span: float
+    settled: bool
 
     @property
     def covariance(self) -> np.ndarray:
@@ -106,14 +111,14 @@ def fit_axis(points: np.ndarray, moved: np.ndarray, arcs: list[Arc], prismatic: 
     if size.max() <= ROUNDING * max(np.abs(points).max(), 1.0) * 1e3:
         raise DegenerateError(_on_axis(where, size.max()))
     use = list(np.flatnonzero(size >= FIRST_SIZE * size.max()))
-    fit = _Fit(points, [arcs[i] for i in use], prismatic, where)
+    fit = _AxisFitting(points, [arcs[i] for i in use], prismatic, where)
     fit.solve()
     if not prismatic:
         small = [i for i in range(len(arcs)) if i not in use]
         more = [i for i in small if fit.radius_of(points[arcs[i].rows]) > NEAR_AXIS * fit.sigma()]
         if more:
             use = sorted(use + more)
-            fit = _Fit(points, [arcs[i] for i in use], prismatic, where, fit.frame)
+            fit = _AxisFitting(points, [arcs[i] for i in use], prismatic, where, fit.frame)
             fit.solve()
     fit.orient(moved)
     return fit.result(moved, tuple(arc for i, arc in enumerate(arcs) if i not in use))
@@ -121,7 +126,7 @@ def fit_axis(points: np.ndarray, moved: np.ndarray, arcs: list[Arc], prismatic: 
 
 def refit_axis(fit: AxisFit, points: np.ndarray, left_out: np.ndarray) -> Rigid:
     """world_from_axis without some rows, from moved points; the weights of the fit are kept."""
-    again = _Fit(points, list(fit.arcs), fit.gain.shape[0] == 2, f"joint {fit.joint + 1}", fit.world_from_axis)
+    again = _AxisFitting(points, list(fit.arcs), fit.gain.shape[0] == 2, f"joint {fit.joint + 1}", fit.world_from_axis)
     again.weights = np.where(np.isin(fit.rows, left_out), 0.0, fit.weights)
     again.descend()
     return again.frame
@@ -138,11 +143,12 @@ def _on_axis(where: str, spread: float) -> str:
     )
 
 
-class _Fit:
+class _AxisFitting:
     """A fit under way: frame of the axis and weights change, the points stay."""
 
-    def __init__(self, points, arcs: list[Arc], prismatic: bool, where: str, frame: Rigid | None = None):
-        self.arcs, self.prismatic, self.where, self.frame = arcs, prismatic, where, frame
+    def __init__(self, points: np.ndarray, arcs: list[Arc], prismatic: bool, where: str, frame: Rigid | None = None):
+        self.arcs, self.prismatic, self.where = arcs, prismatic, where
+        self.frame, self.started, self.settled = frame or Rigid(), frame is not None, False
         self.rows = np.concatenate([arc.rows for arc in arcs])
         self.points = points[self.rows]
         self.member = np.zeros((len(self.rows), len(arcs)))  # (k, a) one-hot
@@ -153,12 +159,12 @@ class _Fit:
 
     def solve(self) -> None:
         """Start, Huber's iteration, gross points out, until nothing changes."""
-        if self.dof() < 1:
+        if self.redundancy() < 1:
             raise DegenerateError(
                 f"{self.where}: {len(self.rows)} positions on {len(self.arcs)} arcs leave no redundancy; another "
                 "position or a second reflector needed"
             )
-        if self.frame is None:
+        if not self.started:
             self.start()
             self.weights = self.huber()  # before the first step, which a gross error would lead astray
         for gross in (np.inf, GROSS):
@@ -166,10 +172,11 @@ class _Fit:
                 self.descend()
                 length = np.linalg.norm(self.residuals(), axis=1)
                 new = np.where(length > gross * self.robust_sigma(length), 0.0, self.huber())
-                new = new if self.dof(new) > 0 else self.huber()
+                new = new if self.redundancy(new) > 0 else self.huber()
                 changed = np.abs(new - self.weights).max()
                 self.weights = new
-                if changed < 1e-3:
+                self.settled = bool(changed < WEIGHTS_SETTLED)
+                if self.settled:
                     break
         self.descend()
         self.require_known()
@@ -237,13 +244,13 @@ class _Fit:
         local = (points - self.frame.translation) @ self.frame.rotation
         return float(np.hypot(local[:, 0], local[:, 1]).mean())
 
-    def dof(self, weights: np.ndarray | None = None) -> int:
+    def redundancy(self, weights: np.ndarray | None = None) -> int:
         kept = (self.weights if weights is None else weights) > 0
         return int(2 * kept.sum() - (2 if self.prismatic else 4) - 2 * (self.member[kept].any(axis=0)).sum())
 
     def sigma(self) -> float:
         """Of one coordinate, mm."""
-        return float(np.sqrt((self.weights[:, None] * self.residuals() ** 2).sum() / max(self.dof(), 1)))
+        return float(np.sqrt((self.weights[:, None] * self.residuals() ** 2).sum() / max(self.redundancy(), 1)))
 
     def huber(self) -> np.ndarray:
         """(k,) weights by the lengths of the residuals."""
@@ -253,10 +260,10 @@ class _Fit:
 
     def robust_sigma(self, length: np.ndarray) -> float:
         """From the median length of two normal coordinates, σ √(2 ln 2)."""
-        redundancy = self.dof(np.ones(len(length))) / (2 * len(length))
+        redundancy = self.redundancy(np.ones(len(length))) / (2 * len(length))
         return max(float(np.median(length)) / np.sqrt(2 * np.log(2) * redundancy), self.floor)
 
-    def by_points(self) -> np.ndarray:
+    def points_jacobian(self) -> np.ndarray:
         """(k, 2, 3) derivative of the values by the points."""
         local, axes = self.local(), self.frame.rotation
         if self.prismatic:
@@ -264,7 +271,7 @@ class _Fit:
         outward = local[:, :2] / np.maximum(np.hypot(local[:, 0], local[:, 1]), TINY)[:, None]
         return np.stack([outward @ axes[:, :2].T, np.broadcast_to(axes[:, 2], (len(local), 3))], axis=1)
 
-    def by_axis(self) -> np.ndarray:
+    def jacobian(self) -> np.ndarray:
         """(k, 2, p) derivative of the residuals by rx, ry, tx, ty of the axis in its own frame."""
         u, v, w = self.local().T
         zero = np.zeros_like(u)
@@ -278,11 +285,11 @@ class _Fit:
 
     def inverse(self) -> np.ndarray:
         """(p, k, 2) : the step of Gauss and Newton from the residuals."""
-        slope = self.by_axis()
-        k, _, p = slope.shape
+        jacobian = self.jacobian()
+        k, _, p = jacobian.shape
         root = np.repeat(np.sqrt(self.weights), 2)
         unit = np.array([1 / self.size, 1 / self.size, 1.0, 1.0])[:p]
-        u, s, vt = np.linalg.svd(root[:, None] * slope.reshape(2 * k, p) * unit, full_matrices=False)
+        u, s, vt = np.linalg.svd(root[:, None] * jacobian.reshape(2 * k, p) * unit, full_matrices=False)
         if s[-1] <= SINGULAR * s[0]:
             raise DegenerateError(f"{self.where}: its arcs do not determine an axis; {LONGER}")
         return -(unit[:, None] * (vt.T / s) @ u.T * root).reshape(p, k, 2)
@@ -316,7 +323,8 @@ class _Fit:
         self.frame = Rigid(self.frame.rotation, self.frame.translation + self.frame.rotation @ shift)
 
     def gain(self) -> np.ndarray:
-        return np.einsum("pkv,kvc->pkc", self.inverse(), self.by_points())
+        """(p, k, 3) derivative of the axis by the points."""
+        return np.einsum("pkv,kvc->pkc", self.inverse(), self.points_jacobian())
 
     def require_known(self) -> None:
         """Refuse an axis whose σ is beyond what its linear covariance can say."""
@@ -357,23 +365,25 @@ class _Fit:
             self.frame = Rigid(self.frame.rotation * [1, -1, -1], self.frame.translation)
 
     def result(self, moved: np.ndarray, near: tuple[Arc, ...]) -> AxisFit:
+        """What was found, for joint values ``moved`` (m,)."""
         radii, heights = self.means()
         if self.prismatic:
             radii, heights = np.full((2, len(self.arcs)), np.nan)
         return AxisFit(
-            self.arcs[0].joint,
-            self.frame,
-            tuple(self.arcs),
-            radii,
-            heights,
-            near,
-            self.rows,
-            self.residuals(),
-            self.weights,
-            self.gain(),
-            self.sigma(),
-            self.dof(),
-            float(np.ptp(moved[self.rows])),
+            joint=self.arcs[0].joint,
+            world_from_axis=self.frame,
+            arcs=tuple(self.arcs),
+            radii=radii,
+            heights=heights,
+            near=near,
+            rows=self.rows,
+            residuals=self.residuals(),
+            weights=self.weights,
+            gain=self.gain(),
+            sigma_mm=self.sigma(),
+            redundancy=self.redundancy(),
+            span=float(np.ptp(moved[self.rows])),
+            settled=self.settled,
         )
 
 

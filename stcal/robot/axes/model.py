@@ -7,11 +7,11 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from stcal.errors import ConvergenceError, DegenerateError
-from stcal.geometry.arrays import frozen
+from stcal.geometry.arrays import Array, freeze
 from stcal.geometry.rigid import Rigid
 from stcal.parallel import one_thread
 from stcal.robot.axes.checks import AGREES_RAD, require_like_nominal
-from stcal.robot.axes.fit import GROSS, TINY, AxisFit, fit_axis, refit_axis
+from stcal.robot.axes.fit import GROSS, REWEIGHTINGS, TINY, AxisFit, fit_axis, refit_axis
 from stcal.robot.axes.sweeps import STILL_RAD, Arc, called, find_arcs
 from stcal.robot.kinematics.dh import PARALLEL_RAD, robot_from_chain
 from stcal.robot.kinematics.measurements import Measurements
@@ -30,7 +30,7 @@ TOOL_GROSS = 6.0
 ROW_VALUES = ("a", "alpha", "d", "theta", "beta")
 
 
-@dataclass(frozen=True, slots=True, eq=False)
+@dataclass(frozen=True, slots=True, eq=False, kw_only=True)
 class Pair:
     """Two consecutive axes, ``joint`` (from 0) and the next; mm, rad; None along prismatic joints.
 
@@ -79,7 +79,7 @@ class LeaveOneOut:
         return np.where(known.any(axis=0), high - low, np.nan)
 
 
-@dataclass(frozen=True, slots=True, eq=False)
+@dataclass(frozen=True, slots=True, eq=False, kw_only=True)
 class AxesResult:
     """A robot by the axis method.
 
@@ -91,18 +91,18 @@ class AxesResult:
     """
 
     fits: tuple[AxisFit, ...]
-    covariance: np.ndarray
+    covariance: Array
     chain: Chain
     robot: Robot
-    row_sigma: np.ndarray
+    row_sigma: Array
     tool_spread_mm: dict[str, float]
     pairs: tuple[Pair, ...]
     without_one: LeaveOneOut
     notes: tuple[str, ...]
 
     def __post_init__(self):
-        object.__setattr__(self, "covariance", frozen(self.covariance, (None, None), "covariance"))
-        object.__setattr__(self, "row_sigma", frozen(self.row_sigma, (None, 5), "σ of the rows"))
+        freeze(self, "covariance", (None, None), "covariance")
+        freeze(self, "row_sigma", (None, 5), "σ of the rows")
 
 
 @one_thread()
@@ -121,12 +121,25 @@ def robot_from_sweeps(data: Measurements, nominal: Robot, still_rad: float = STI
     still_rad : float
         Revolute joints stand still within this.
 
+    Returns
+    -------
+    AxesResult
+        Axes in the instrument's frame with their covariance, and the robot that they make; mm, rad.
+
     Raises
     ------
+    ConvergenceError
+        The fit of an axis reaches no minimum.
     InputError
         A joint never swept, a reflector that does not move, mirrored positions, a robot of another build.
     DegenerateError
         Axes that their arcs do not determine.
+
+    References
+    ----------
+    H. W. Stone, "Kinematic Modeling, Identification, and Control of Robotic Manipulators", 1987. J. Santolaria, M.
+    Ginés, "Uncertainty estimation in robot kinematic calibration", Robotics and Computer-Integrated Manufacturing 29,
+    2013.
     """
     arcs, notes = find_arcs(data, nominal, still_rad)
     notes = [*data.notes, *notes]
@@ -138,7 +151,7 @@ def robot_from_sweeps(data: Measurements, nominal: Robot, still_rad: float = STI
     robot = robot_from_chain(axes, tools, nominal)
     kept = {name: nominal.tools[name].rotation if name in nominal.tools else np.eye(3) for name in tools}
     robot = replace(robot, tools={n: Rigid(kept[n], t.translation) for n, t in robot.tools.items()})
-    row_sigma = _sigma(_slopes(lambda f: _row_values(f, nominal), frames, nominal), covariance).reshape(-1, 5)
+    row_sigma = _sigma(_jacobian(lambda f: _row_values(f, nominal), frames, nominal), covariance).reshape(-1, 5)
     pairs = pairs_of(frames, covariance, robot)
     notes += _notes(data, fits, robot, nominal)
     notes += [
@@ -148,15 +161,15 @@ def robot_from_sweeps(data: Measurements, nominal: Robot, still_rad: float = STI
         if p.refused and not p.parallel
     ]
     return AxesResult(
-        tuple(fits),
-        covariance,
-        axes,
-        robot,
-        row_sigma,
-        spread,
-        pairs,
-        _leave_one_out(data, fits, nominal),
-        tuple(notes),
+        fits=tuple(fits),
+        covariance=covariance,
+        chain=axes,
+        robot=robot,
+        row_sigma=row_sigma,
+        tool_spread_mm=spread,
+        pairs=pairs,
+        without_one=_leave_one_out(data, fits, nominal),
+        notes=tuple(notes),
     )
 
 
@@ -174,14 +187,13 @@ def fit_axes(data: Measurements, robot: Robot, arcs: list[Arc]) -> tuple[list[Ax
         fit = fit_axis(points, kinematic[:, j], own, bool(sliding), f"{data.where}: joint {j + 1}")
         # derivative of this axis by σ-scaled noise of every row: its own, and through the axes before it
         to_noise = np.zeros((len(fit.gain), m, 3))
-        np.add.at(
-            to_noise, (slice(None), fit.rows), fit.sigma_mm * np.einsum("pkc,kcd->pkd", fit.gain, turned[fit.rows])
-        )
-        for before, by_axis in zip(response, inherited, strict=True):
-            to_noise += np.einsum("pq,qmc->pmc", np.einsum("pkc,kcq->pq", fit.gain, by_axis[fit.rows]), before)
+        own_noise = fit.sigma_mm * np.einsum("pkc,kcd->kpd", fit.gain, turned[fit.rows])
+        np.add.at(to_noise.swapaxes(0, 1), fit.rows, own_noise)  # a row may belong to several arcs
+        for before, jacobian in zip(response, inherited, strict=True):
+            to_noise += np.einsum("pq,qmc->pmc", np.einsum("pkc,kcq->pq", fit.gain, jacobian[fit.rows]), before)
         turn, after = _unwound(fit.world_from_axis, points, kinematic[:, j], bool(sliding))
-        inherited = [turn @ by_axis for by_axis in inherited]
-        inherited.append(_by_axis(fit.world_from_axis, points, after, turn, len(fit.gain)))
+        inherited = [turn @ jacobian for jacobian in inherited]
+        inherited.append(_unwinding_jacobian(fit.world_from_axis, points, after, turn, len(fit.gain)))
         fits.append(fit)
         response.append(to_noise)
         points, turned = after, turn @ turned
@@ -198,7 +210,7 @@ def _unwound(axis: Rigid, points: np.ndarray, value: np.ndarray, sliding: bool) 
     return turn, np.einsum("mij,mj->mi", turn, points - origin) + origin
 
 
-def _by_axis(axis: Rigid, before: np.ndarray, after: np.ndarray, turn: np.ndarray, count: int) -> np.ndarray:
+def _unwinding_jacobian(axis: Rigid, before: np.ndarray, after: np.ndarray, turn: np.ndarray, count: int) -> np.ndarray:
     """(m, 3, p) derivative of the unwound points by rx, ry, tx, ty of the axis in its frame.
 
     Moving the axis by a small motion D makes of its unwinding U the motion D U D⁻¹: δ = D(U x) − U(D x).
@@ -241,7 +253,7 @@ def _row_values(frames: list[Rigid], nominal: Robot) -> np.ndarray:
     return np.array([[getattr(row, key) for key in ROW_VALUES] for row in robot.rows]).ravel()
 
 
-def _slopes(function, frames: list[Rigid], robot: Robot) -> np.ndarray:
+def _jacobian(function, frames: list[Rigid], robot: Robot) -> np.ndarray:
     """(v, p) central differences of a function of the axes by their parameters, each in its own frame."""
     columns = []
     for i, sliding in enumerate(robot.prismatic):
@@ -255,8 +267,9 @@ def _slopes(function, frames: list[Rigid], robot: Robot) -> np.ndarray:
     return np.column_stack(columns)
 
 
-def _sigma(slopes: np.ndarray, covariance: np.ndarray) -> np.ndarray:
-    return np.sqrt(np.maximum(np.einsum("vp,pq,vq->v", slopes, covariance, slopes), 0))
+def _sigma(jacobian: np.ndarray, covariance: np.ndarray) -> np.ndarray:
+    """(v,) σ of values from the covariance (p, p) of what their ``jacobian`` (v, p) is by."""
+    return np.sqrt(np.maximum(np.einsum("vp,pq,vq->v", jacobian, covariance, jacobian), 0))
 
 
 def _pair_values(frames: list[Rigid], nominal: Robot) -> np.ndarray:
@@ -284,20 +297,22 @@ def pairs_of(frames: list[Rigid], covariance: np.ndarray, robot: Robot) -> tuple
     if len(frames) < 2:
         return ()
     values = _pair_values(frames, robot).reshape(-1, 6)
-    slopes = _slopes(lambda f: _pair_values(f, robot), frames, robot).reshape(len(values), 6, -1)
+    jacobians = _jacobian(lambda f: _pair_values(f, robot), frames, robot).reshape(len(values), 6, -1)
     size = sum(abs(row.a) + abs(row.d) for row in robot.rows)
     pairs = []
-    for i, (value, slope) in enumerate(zip(values, slopes, strict=True)):
+    for i, (value, jacobian) in enumerate(zip(values, jacobians, strict=True)):
         acute = float(np.linalg.norm(value[:3]))
         opposed = frames[i].rotation[:, 2] @ frames[i + 1].rotation[:, 2] < 0
-        pair = Pair(
-            i,
-            np.pi - acute if opposed else acute,
-            _angle_sigma(value[:3], slope[:3] @ covariance @ slope[:3].T),
-            bool(np.sin(acute) < np.sin(PARALLEL_RAD)),
-        )
+        lengths = {}
         if np.isfinite(value[3]):
-            pair = replace(pair, **_lengths(acute, value[3:], _sigma(slope[3:], covariance), size))
+            lengths = _lengths(acute, value[3:], _sigma(jacobian[3:], covariance), size)
+        pair = Pair(
+            joint=i,
+            angle=np.pi - acute if opposed else acute,
+            angle_sigma=_angle_sigma(value[:3], jacobian[:3] @ covariance @ jacobian[:3].T),
+            parallel=bool(np.sin(acute) < np.sin(PARALLEL_RAD)),
+            **lengths,
+        )
         pairs.append(pair)
     return tuple(pairs)
 
@@ -342,7 +357,7 @@ def _leave_one_out(data: Measurements, fits: list[AxisFit], nominal: Robot) -> L
         frames, points = [fit.world_from_axis for fit in fits[:first]], start[first]
         try:
             for j in range(first, len(fits)):
-                frames.append(refit_axis(fits[j], points, rows))
+                frames.append(refit_axis(fits[j], points, np.array(rows)))
                 points = _unwound(frames[j], points, kinematic[:, j], bool(nominal.prismatic[j]))[1]
             found = _pair_values(frames, nominal).reshape(-1, 6)
         except (DegenerateError, ConvergenceError):
@@ -364,7 +379,11 @@ def _instants(data: Measurements) -> list[list[int]]:
 
 
 def _notes(data: Measurements, fits: list[AxisFit], robot: Robot, nominal: Robot) -> list[str]:
-    notes = []
+    notes = [
+        f"joint {fit.joint + 1}: the weights of its points still change after {REWEIGHTINGS} rounds; look at them"
+        for fit in fits
+        if not fit.settled
+    ]
     for fit in fits:
         for row in fit.outliers:
             here = (fit.rows == row) & (fit.weights == 0)

@@ -154,7 +154,7 @@ def _axis_json(fit: AxisFit) -> dict:
         "residual_length_mean_mm": float(length.mean()),
         "residual_length_rms_mm": _rms(length),
         "sigma_mm": fit.sigma_mm,
-        "dof": fit.dof,
+        "dof": fit.redundancy,
         "span_mm" if len(fit.gain) == 2 else "span_rad": fit.span,
         "arcs": [
             {"target": arc.target, "points": len(arc.rows), "radius_mm": _known(r), "height_mm": _known(h)}

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from stcal.errors import InputError
-from stcal.geometry.arrays import frozen
+from stcal.geometry.arrays import Array, freeze
 from stcal.robot.kinematics.measurements import Measurements
 from stcal.robot.kinematics.model import Robot
 
@@ -25,10 +25,10 @@ class Arc:
 
     joint: int
     target: str
-    rows: np.ndarray
+    rows: Array
 
     def __post_init__(self):
-        object.__setattr__(self, "rows", frozen(self.rows, (None,), "rows", int))
+        freeze(self, "rows", (None,), "rows", int)
 
 
 def find_arcs(data: Measurements, robot: Robot, still_rad: float = STILL_RAD) -> tuple[list[Arc], list[str]]:
@@ -60,7 +60,7 @@ def find_arcs(data: Measurements, robot: Robot, still_rad: float = STILL_RAD) ->
             places = values if robot.prismatic[j] else np.mod(values + STILL_RAD, 2 * np.pi)
             distinct = len(set(_clusters(places, still[j])))
             if distinct >= DISTINCT[joint.type]:
-                arcs.append(Arc(j, target, np.array(rows)))
+                arcs.append(Arc(j, target, rows))
                 found += 1
             elif distinct > 1:
                 notes.append(

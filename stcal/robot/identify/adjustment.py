@@ -81,19 +81,19 @@ def _decorrelated(values: np.ndarray, common: np.ndarray) -> np.ndarray:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Held:
-    """Knowledge from elsewhere, linear about a state: ``value + slope @ step``, (p,), is 0 with σ ``sigma``, (p,)."""
+    """Knowledge from elsewhere, linear about a state: ``value + jacobian @ step``, (p,), is 0 with σ ``sigma``."""
 
     value: np.ndarray
-    slope: np.ndarray
+    jacobian: np.ndarray
     sigma: np.ndarray
 
     def normal(self) -> np.ndarray:
         """(k, k)"""
-        return (self.slope.T / self.sigma**2) @ self.slope
+        return (self.jacobian.T / self.sigma**2) @ self.jacobian
 
     def pull(self) -> np.ndarray:
         """(k,) half the gradient of the squares."""
-        return (self.slope.T / self.sigma**2) @ self.value
+        return (self.jacobian.T / self.sigma**2) @ self.value
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -145,15 +145,15 @@ def solve(
         hold, pull = hold + held.normal(), held.pull()
     away, damping = np.zeros(len(hold)), 1e-3
     for _ in range(MAX_STEPS):
-        normal, slope = solution.normal + hold, gradient - hold @ away - pull
+        normal, right = solution.normal + hold, gradient - hold @ away - pull
         cost = solution.cost + away @ (hold @ away + 2 * pull)
         scale = np.diag(normal)
         while True:
-            step = np.linalg.solve(normal + damping * np.diag(scale), slope)
+            step = np.linalg.solve(normal + damping * np.diag(scale), right)
             trial = moved(solution.state, step, seen.kind)
             there = away + step
             trial_cost = _cost(residuals(trial, seen), seen, weighting, limit) + there @ (hold @ there + 2 * pull)
-            gain, predicted = cost - trial_cost, 2 * slope @ step - step @ normal @ step
+            gain, predicted = cost - trial_cost, 2 * right @ step - step @ normal @ step
             if gain >= 0.1 * predicted or predicted <= SETTLED * abs(cost) + LEAST_GAIN or damping > 1e12:
                 break
             damping *= 10
@@ -196,9 +196,9 @@ def _linearised(state: State, seen: Observed, weighting: Weighting, limit: float
     """State with its normal matrix, and the gradient (k,)."""
     found, derivative = residuals(state, seen), jacobian(state, seen)
     units = parameter_units(derivative)
-    white, slope = weighting.whiten(found, seen), weighting.whiten(derivative, seen)
+    white, whitened = weighting.whiten(found, seen), weighting.whiten(derivative, seen)
     weights = np.minimum(1.0, limit / np.maximum(np.linalg.norm(white, axis=1), 1e-300))
-    flat = slope.reshape(-1, slope.shape[2])
+    flat = whitened.reshape(-1, whitened.shape[2])
     weighted = flat * np.repeat(weights, white.shape[1])[:, None]
     cost = _cost(found, seen, weighting, limit)
     normal = weighted.T @ flat

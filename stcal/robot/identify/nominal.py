@@ -45,14 +45,14 @@ class NominalRows:
     """The nominal dimensions as observations of the parameters.
 
     Dimensions are the rows' a, alpha, d, theta, beta, but of coaxial joints the offset along and across the nominal x
-    in place of a and theta (its polar form). ``coaxial`` : rows of theta, and of the a that follows it; ``slope`` :
+    in place of a and theta (its polar form). ``coaxial`` : rows of theta, and of the a that follows it; ``jacobian`` :
     (n, 5, k) by the parameters of the axes (tools move no row), taken once, as it hardly changes over what a factory
     does; ``free`` : (n, 5) dimensions that parameters move at all; ``group`` : (n, 5) whose σ.
     """
 
     nominal: Robot
     coaxial: tuple[tuple[int, int], ...]
-    slope: np.ndarray
+    jacobian: np.ndarray
     free: np.ndarray
     group: np.ndarray
 
@@ -66,24 +66,24 @@ class NominalRows:
             return _dimensions(found, nominal, coaxial)
 
         units = units[: len(chain_parameters(state.chain))]
-        slope, here = np.zeros((len(nominal.rows), 5, len(units))), values(np.zeros(len(units)))
+        jacobian, here = np.zeros((len(nominal.rows), 5, len(units))), values(np.zeros(len(units)))
         for k in range(len(units)):
             step = np.zeros(len(units))
             step[k] = DIFFERENCE_MM * units[k]
-            slope[:, :, k] = (values(step) - here) / step[k]
-        group = np.tile([LENGTH, TWIST, LENGTH, ZERO, TWIST], (len(slope), 1))
+            jacobian[:, :, k] = (values(step) - here) / step[k]
+        group = np.tile([LENGTH, TWIST, LENGTH, ZERO, TWIST], (len(jacobian), 1))
         group[nominal.prismatic, 3] = TWIST  # the zero of these is d
         group[[turn for turn, _ in coaxial], 3] = LENGTH
-        return cls(nominal, coaxial, slope, np.abs(slope * units).max(axis=2) > 1e-9, group)
+        return cls(nominal, coaxial, jacobian, np.abs(jacobian * units).max(axis=2) > 1e-9, group)
 
     def held(self, state: State, deviations: Deviations, kind: Kind) -> Held:
         """Linear about ``state``, with the σ of ``deviations``, by all parameters of this kind of observation."""
         robot = robot_from_chain(state.chain, state.tools, self.nominal)
         away = _dimensions(robot, self.nominal, self.coaxial) - _dimensions(self.nominal, self.nominal, self.coaxial)
-        slope = self.slope[self.free]
-        tools = unknowns(state.chain, len(state.tools), kind) - slope.shape[1]
-        slope = np.pad(slope, ((0, 0), (0, tools)))
-        return Held(away[self.free], slope, np.array(astuple(deviations))[self.group[self.free]])
+        jacobian = self.jacobian[self.free]
+        tools = unknowns(state.chain, len(state.tools), kind) - jacobian.shape[1]
+        jacobian = np.pad(jacobian, ((0, 0), (0, tools)))
+        return Held(away[self.free], jacobian, np.array(astuple(deviations))[self.group[self.free]])
 
     def notes(self, robot: Robot) -> tuple[str, ...]:
         """What is to be known of the rows of ``robot``."""
@@ -95,15 +95,15 @@ class NominalRows:
 
     def sigma(self, robot: Robot, covariance: np.ndarray) -> np.ndarray:
         """(n, 5) σ of the rows of ``robot`` (a, alpha, d, theta, beta) from the parameters' covariance (k, k)."""
-        slope, k = self.slope.copy(), self.slope.shape[2]
+        jacobian, k = self.jacobian.copy(), self.jacobian.shape[2]
         covariance = covariance[:k, :k]
         for turn, reach in self.coaxial:
             angle = robot.rows[turn].theta - self.nominal.rows[turn].theta
-            along, across = self.slope[reach, 0], self.slope[turn, 3]
-            slope[reach, 0] = np.cos(angle) * along + np.sin(angle) * across
+            along, across = self.jacobian[reach, 0], self.jacobian[turn, 3]
+            jacobian[reach, 0] = np.cos(angle) * along + np.sin(angle) * across
             offset = max(abs(robot.rows[reach].a), 1e-9)
-            slope[turn, 3] = (np.cos(angle) * across - np.sin(angle) * along) / offset
-        return np.sqrt(np.einsum("njk,kl,njl->nj", slope, covariance, slope).clip(0))
+            jacobian[turn, 3] = (np.cos(angle) * across - np.sin(angle) * along) / offset
+        return np.sqrt(np.einsum("njk,kl,njl->nj", jacobian, covariance, jacobian).clip(0))
 
 
 def _dimensions(robot: Robot, nominal: Robot, coaxial: tuple[tuple[int, int], ...]) -> np.ndarray:

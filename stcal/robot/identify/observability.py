@@ -106,9 +106,9 @@ def identification_jacobian(
         Values of the controller, rad or mm.
     """
     state = State(robot.chain(), {tool: robot.tool(tool)})
-    slope = tip_jacobian(state, q, (tool,) * len(q), observe)[1]
+    derivative = tip_jacobian(state, q, (tool,) * len(q), observe)[1]
     sigma = np.repeat([sigma_rad, sigma_mm], 3)
-    return (slope / sigma[:, None])[:, -WIDTH[observe] :]
+    return (derivative / sigma[:, None])[:, -WIDTH[observe] :]
 
 
 def parameter_scale(robot: Robot, observe: Kind = "position", tools: Iterable[str] = ("",)) -> np.ndarray:

@@ -195,8 +195,8 @@ def _noise(result: Identified) -> str:
         noise = f"σ of a coordinate {weighting.sigma_mm:.3g} mm{rotation}, σ₀ {result.sigma0:.2f}"
     degrees = np.degrees(1.0)
     kinds = ((" mm in lengths", 1.0), ("° in twists", degrees), ("° in zero positions", degrees))
-    found = [(s, *kind) for s, kind in zip(result.deviations.values(), kinds, strict=True) if s is not None]
-    shown = ", ".join(f"{sigma * unit:.2g}{what}" for sigma, what, unit in found)
+    found = zip(result.deviations.values(), kinds, strict=True)
+    shown = ", ".join(f"{sigma * unit:.2g}{what}" for sigma, (what, unit) in found if sigma is not None)
     return f"{noise}; the robot differs from nominal by σ of {shown}" if shown else noise
 
 

@@ -6,7 +6,7 @@ from typing import get_args
 import numpy as np
 
 from stcal.errors import DegenerateError, InputError
-from stcal.geometry.arrays import frozen
+from stcal.geometry.arrays import Array, freeze
 from stcal.geometry.rigid import skew
 from stcal.parallel import one_thread
 from stcal.robot.identify.adjustment import (
@@ -44,13 +44,17 @@ LEAST_MM, LEAST_RAD = 1e-3, 1e-6
 TYPICAL_MM, TYPICAL_RAD = 0.1, 5e-4
 """Of instruments: what joint values determine is told for these."""
 VARIANCE_ROUNDS = 10
+"""Two to four do for most data; a robot without noise needs the most."""
 VARIANCE_SETTLED = 1e-3
+"""Of the logarithm of a σ: a thousandth of it is far below what any data tell of one."""
 FALLS = 0.5
 """Medians of residuals that fall by less are near enough for the estimates proper."""
 STILL_RAD, STILL_MM = 1e-5, 1e-2
 """A joint that moves less than this did not move."""
 OUTLIER_WEIGHT = 0.5
+"""Observations of less are named: their residual is over twice Huber's limit."""
 OUTLIER_ROUNDS = 5
+"""Of leaving errors out; after 1 to 3 the same ones are left out again."""
 MOSTLY_GOOD = 0.5
 """Share of the observations below which nothing is called an error."""
 REPEATS, FEW_ROWS = 5, 300
@@ -59,9 +63,30 @@ REPEATS, FEW_ROWS = 5, 300
 
 @dataclass(frozen=True, slots=True)
 class IdentifyOptions:
-    """``observe`` : kind of observation, None for the most that was measured; ``sigma_mm``, ``sigma_rad`` : of one
-    coordinate, estimated where None; ``folds`` of the cross-validation, 0 for none, each row held out once in each of
-    ``repeats`` divisions drawn with ``seed``; ``partial`` : keep nominal what the data do not determine."""
+    """How :func:`identify` works.
+
+    Parameters
+    ----------
+    observe : {"pose", "position", "distance"}, optional
+        What of the measurements to use; the most that was measured if not given.
+    sigma_mm, sigma_rad : float, optional
+        σ of one coordinate of a position, mm, and of an orientation, rad; estimated where not given.
+    robust : bool
+        Whether outliers weigh less (Huber), and what are errors and no noise nothing at all.
+    folds : int
+        Of the cross-validation; 0 for none.
+    repeats : int, optional
+        Divisions into folds, in each of which every row is held out once; 5 of few rows, 1 of many, if not given.
+    seed : int
+        Of the divisions.
+    partial : bool
+        Keep nominal what the data do not determine, in place of refusing them.
+
+    Raises
+    ------
+    InputError
+        A σ that is not positive, or beyond 1 m or 1 rad.
+    """
 
     observe: Kind | None = None
     sigma_mm: float | None = None
@@ -80,7 +105,8 @@ class IdentifyOptions:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class HeldOut:
-    """Errors of rows that a fit had not seen: ``position_mm`` : (repeats, r); ``rotation_rad`` : the same, or empty."""
+    """Errors of rows that a fit had not seen: ``position_mm``, ``rotation_rad`` : (repeats, r), nan where there is
+    none, as of rotations where positions were measured."""
 
     folds: int
     position_mm: np.ndarray
@@ -88,33 +114,63 @@ class HeldOut:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Identified:
-    """The identified robot, and how far to trust it.
+class Adjustment:
+    """A solution with the σ that go with it; ``notes`` : on what had not come to rest."""
 
-    ``robot`` : base where the instrument stands, tools by target; ``names`` : (k,) of the parameters, small motions of
-    each joint's frame and of the tools (J2 ry: axis of joint 2 about its y, rad; tool x: mm); ``covariance`` : (k, k);
-    ``rank`` of the data used, ``ranks`` by kind of observation of the same joint values;
-    ``undetermined`` : names of parameters along directions that were kept nominal; ``weights`` : (r,) Huber's;
-    ``nominal_mm``, ``fitted_mm`` : (r,) errors with nominal axes (base and tools fitted) and identified ones;
-    ``dh_sigma`` : (n, 5) of a, alpha, d, theta, beta, mm and rad; ``observability`` : of the parameters that are
-    determined; ``deviations`` : σ of this robot's dimensions about nominal, as the data show them, by name; ``notes`` :
-    rows left out, and what is to be known of the result.
+    solution: Solution
+    weighting: Weighting
+    deviations: Deviations
+    rows: NominalRows
+    parts: Components
+    notes: tuple[str, ...] = ()
+
+
+@dataclass(frozen=True, slots=True, eq=False, kw_only=True)
+class Identified:
+    """The identified robot, and how far to trust it; r observations, k parameters, n joints.
+
+    Parameters
+    ----------
+    robot : Robot
+        Base where the instrument stands, tools by target; mm, rad.
+    seen : Observed
+        The r observations.
+    adjustment : Adjustment
+        Solution, weights and σ; what is wanted of it is at hand as properties.
+    names : tuple of str
+        (k,) of the parameters, small motions of each joint's frame and of the tools (J2 ry: axis of joint 2 about its
+        y, rad; tool x: mm).
+    covariance : (k, k) array
+        Of the parameters, rad and mm.
+    rank : int
+        Parameters that the data used determine.
+    ranks : dict of str to int
+        Parameters that these joint values determine, by kind of observation.
+    undetermined : tuple of str
+        Names of parameters along directions that were kept nominal.
+    nominal_mm : (r,) array
+        Errors with nominal axes, base and tools fitted.
+    held_out : HeldOut or None
+        Errors of the cross-validation.
+    dh_sigma : (n, 5) array
+        σ of a, alpha, d, theta, beta; mm, rad.
+    observability : Observability
+        Of the parameters that are determined.
+    deviations : dict of str to float or None
+        σ of this robot's dimensions about nominal, as the data show them, by name; mm, rad.
+    notes : tuple of str
+        Rows left out, and what is to be known of the result.
     """
 
     robot: Robot
-    state: State
     seen: Observed
-    weighting: Weighting
-    sigma0: float
+    adjustment: Adjustment
     names: tuple[str, ...]
-    covariance: np.ndarray
+    covariance: Array
     rank: int
     ranks: dict[str, int]
     undetermined: tuple[str, ...]
-    weights: np.ndarray
-    residuals: np.ndarray
     nominal_mm: np.ndarray
-    fitted_mm: np.ndarray
     held_out: HeldOut | None
     dh_sigma: np.ndarray
     observability: Observability
@@ -123,7 +179,37 @@ class Identified:
 
     def __post_init__(self):
         k = len(self.names)
-        object.__setattr__(self, "covariance", frozen(self.covariance, (k, k), "covariance"))
+        freeze(self, "covariance", (k, k), "covariance")
+
+    @property
+    def state(self) -> State:
+        """Chain and tools as identified."""
+        return self.adjustment.solution.state
+
+    @property
+    def weighting(self) -> Weighting:
+        """σ of the observations."""
+        return self.adjustment.weighting
+
+    @property
+    def sigma0(self) -> float:
+        """By how much the σ that were given have to be multiplied; 1 where they were estimated."""
+        return self.weighting.factor
+
+    @property
+    def weights(self) -> np.ndarray:
+        """(r,) Huber's weights."""
+        return self.adjustment.solution.weights
+
+    @property
+    def residuals(self) -> np.ndarray:
+        """(r, 6), (r, 3) or (r, 1) measured minus modelled, rad and mm, in the instrument's axes."""
+        return self.adjustment.solution.residuals
+
+    @property
+    def fitted_mm(self) -> np.ndarray:
+        """(r,) errors with identified axes."""
+        return _lengths(self.residuals)
 
     def outliers(self) -> list[tuple[int, float]]:
         """(row of the observations, error in mm) of those that weigh less than half."""
@@ -135,15 +221,39 @@ def identify(robot: Robot, data: Measurements, options: IdentifyOptions | None =
     """Identify the axes, base and tools of ``robot`` from ``data``.
 
     Complete, minimal and continuous parameters (:func:`stcal.robot.kinematics.forward.chain_parameters`), trust region,
-    Huber weights, covariance, and the way back to D-H rows with Hayati's β (Hayati 1983) for nearly parallel axes.
+    Huber weights, covariance, and the way back to D-H rows with Hayati's β for nearly parallel axes.
+
+    Parameters
+    ----------
+    robot : Robot
+        The nominal robot: mm, rad; it is where the search starts, and what dimensions are expected to be near to.
+    data : Measurements
+        Joint values with what was measured there, in the instrument's frame.
+    options : IdentifyOptions, optional
+        σ, robustness, cross-validation.
+
+    Returns
+    -------
+    Identified
+        The robot with ``world_from_base`` in the instrument's frame, its covariance and errors. Iterations of the σ
+        that had not come to rest are among its notes.
 
     Raises
     ------
+    ConvergenceError
+        The adjustment reaches no minimum.
     DegenerateError
         A joint or a target never moved, too few observations, or directions that the data do not determine (kept
         nominal with ``partial``).
     InputError
         The nominal robot does not fit the data.
+
+    References
+    ----------
+    S. A. Hayati, "Robot arm geometric link parameter estimation", IEEE CDC 1983. H. Zhuang, Z. S. Roth, F. Hamano, "A
+    complete and parametrically continuous kinematic model for robot manipulators", IEEE Trans. Robotics and Automation
+    8, 1992. K. Okamura, F. C. Park, "Kinematic calibration using the product of exponentials formula", Robotica 14,
+    1996.
     """
     options = options or IdentifyOptions()
     seen = observed(data, options.observe)
@@ -151,31 +261,26 @@ def identify(robot: Robot, data: Measurements, options: IdentifyOptions | None =
     first = start(robot, data)
     _enough(robot, seen, first)
     adjusted = _adjusted(robot, first, seen, options)
-    solution, weighting = adjusted.solution, adjusted.weighting
+    solution = adjusted.solution
     names = parameter_names(solution.state, seen.kind)
     undetermined = _undetermined(solution, names, seen, options.partial)
     covariance, rank = _covariance(adjusted, seen), solution.rank() - _place(seen)
     identified = robot_from_chain(solution.state.chain, solution.state.tools, robot)
     return Identified(
-        identified,
-        solution.state,
-        seen,
-        weighting,
-        weighting.factor,
-        tuple(names),
-        covariance,
-        rank,
-        _ranks(solution.state, data),
-        undetermined,
-        solution.weights,
-        solution.residuals,
-        _lengths(residuals(first, seen)),
-        _lengths(solution.residuals),
-        _cross_validated(robot, seen, adjusted, options),
-        adjusted.rows.sigma(identified, covariance),
-        _observability(identified, adjusted, seen, rank),
-        adjusted.deviations.of(adjusted.rows.group[adjusted.rows.free]),
-        data.notes + adjusted.rows.notes(identified),
+        robot=identified,
+        seen=seen,
+        adjustment=adjusted,
+        names=tuple(names),
+        covariance=covariance,
+        rank=rank,
+        ranks=_ranks(solution.state, data),
+        undetermined=undetermined,
+        nominal_mm=_lengths(residuals(first, seen)),
+        held_out=_cross_validated(robot, seen, adjusted, options),
+        dh_sigma=adjusted.rows.sigma(identified, covariance),
+        observability=_observability(identified, adjusted, seen, rank),
+        deviations=adjusted.deviations.of(adjusted.rows.group[adjusted.rows.free]),
+        notes=data.notes + adjusted.rows.notes(identified) + adjusted.notes,
     )
 
 
@@ -215,38 +320,35 @@ def _weighting(state: State, seen: Observed, options: IdentifyOptions) -> Weight
     return weighting.with_values({n: weighting.value(n) * max(misfit[n], 1.0) for n in estimated})
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class _Adjusted:
-    """A solution with the σ that go with it."""
-
-    solution: Solution
-    weighting: Weighting
-    deviations: Deviations
-    rows: NominalRows
-    parts: Components
-
-
 def _adjusted(
     nominal: Robot, state: State, seen: Observed, options: IdentifyOptions, rows: NominalRows | None = None
-) -> _Adjusted:
+) -> Adjustment:
     """Solve, and estimate σ; once more without what are errors and no noise: Huber's weights bound their pull, but let
     each pull as hard as the worst honest observation, which no covariance knows of."""
     rows = rows or NominalRows.about(state, parameter_units(jacobian(state, seen)), nominal)
     found, good = _settled(state, seen, options, rows), np.ones(len(seen), bool)
     for _ in range(OUTLIER_ROUNDS):
-        weights = found.solution.weights
-        if (good == (weights >= GROSS)).all() or (weights >= GROSS).mean() < MOSTLY_GOOD:
-            break
-        good = weights >= GROSS
+        if not _errors_change(found, good):
+            return found
+        good = found.solution.weights >= GROSS
         found = _settled(found.solution.state, only_of(seen, good), options, rows)
         left = residuals(found.solution.state, seen)
         length = np.linalg.norm(found.weighting.whiten(left, seen), axis=1)
         weights = np.minimum(1.0, huber_limit(seen.kind) / np.maximum(length, 1e-300))
         found = replace(found, solution=replace(found.solution, residuals=left, weights=weights))
+    if _errors_change(found, good):
+        note = f"which observations are errors still changes after {OUTLIER_ROUNDS} rounds; look at the outliers"
+        found = replace(found, notes=(*found.notes, note))
     return found
 
 
-def _settled(state: State, seen: Observed, options: IdentifyOptions, rows: NominalRows) -> _Adjusted:
+def _errors_change(found: Adjustment, good: np.ndarray) -> bool:
+    """Whether other observations than before, (r,), are errors; never where most would be."""
+    now = found.solution.weights >= GROSS
+    return bool((now != good).any() and now.mean() >= MOSTLY_GOOD)
+
+
+def _settled(state: State, seen: Observed, options: IdentifyOptions, rows: NominalRows) -> Adjustment:
     """Solve, and estimate σ, in turns."""
     weighting, deviations = _weighting(state, seen, options), Deviations()
     for _ in range(VARIANCE_ROUNDS):  # by medians, which outliers do not move, until they stay
@@ -259,9 +361,10 @@ def _settled(state: State, seen: Observed, options: IdentifyOptions, rows: Nomin
         parts = components(solution, seen, weighting, options.robust, rows, deviations)
         new_weighting, new_deviations, change = estimated(parts, rows, weighting, deviations)
         if change < VARIANCE_SETTLED:
-            break
+            return Adjustment(solution, weighting, deviations, rows, parts)
         state, weighting, deviations = solution.state, new_weighting, new_deviations
-    return _Adjusted(solution, weighting, deviations, rows, parts)
+    note = f"the σ still change by {np.expm1(change):.2%} after {VARIANCE_ROUNDS} rounds of estimating them"
+    return Adjustment(solution, weighting, deviations, rows, parts, (note,))
 
 
 def _undetermined(solution: Solution, names: list[str], seen: Observed, partial: bool) -> tuple[str, ...]:
@@ -293,7 +396,7 @@ def _ranks(state: State, data: Measurements) -> dict[str, int]:
     return ranks
 
 
-def _observability(robot: Robot, adjusted: _Adjusted, seen: Observed, rank: int) -> Observability:
+def _observability(robot: Robot, adjusted: Adjustment, seen: Observed, rank: int) -> Observability:
     state, weighting = adjusted.solution.state, adjusted.weighting
     rows = weighting.whiten(jacobian(state, seen), seen) * parameter_scale(robot, seen.kind, state.tools)
     if seen.frameless:  # without what a motion of all points makes
@@ -314,7 +417,7 @@ def _place(seen: Observed) -> int:
     return 3 + int(turns)
 
 
-def _covariance(adjusted: _Adjusted, seen: Observed) -> np.ndarray:
+def _covariance(adjusted: Adjustment, seen: Observed) -> np.ndarray:
     """(k, k) of the parameters; none along the directions that distances never see, which stay where they were."""
     covariance = adjusted.parts.covariance(np.zeros(len(adjusted.parts.count)))
     if seen.kind != "distance":
@@ -325,7 +428,7 @@ def _covariance(adjusted: _Adjusted, seen: Observed) -> np.ndarray:
     return kept @ covariance @ kept.T
 
 
-def _cross_validated(robot: Robot, seen: Observed, whole: _Adjusted, options: IdentifyOptions) -> HeldOut | None:
+def _cross_validated(robot: Robot, seen: Observed, whole: Adjustment, options: IdentifyOptions) -> HeldOut | None:
     """Errors of rows that took no part: of neither the parameters nor (where rows are few) the σ."""
     rows = len(seen)
     folds = min(options.folds, rows)

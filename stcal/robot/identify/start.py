@@ -6,7 +6,7 @@ from dataclasses import replace
 import numpy as np
 from scipy.optimize import least_squares
 
-from stcal.errors import DegenerateError, InputError
+from stcal.errors import ConvergenceError, DegenerateError, InputError
 from stcal.geometry.align import align_rigid
 from stcal.geometry.rigid import Poses, Rigid, skew
 from stcal.robot.identify.residuals import State, observed, residuals
@@ -39,13 +39,13 @@ def start(robot: Robot, data: Measurements) -> State:
     _moves(data)
     tools = {name: robot.tools.get(name, robot.tools.get("", Rigid())) for name in sorted(set(data.targets))}
     state, misfit = _placed(robot, data, tools)
-    spread = _spread(data)
-    if misfit > FITS * spread:
-        _explain(robot, data, tools, misfit, spread)
+    extent = _extent(data)
+    if misfit > FITS * extent:
+        _explain(robot, data, tools, misfit, extent)
     return state
 
 
-def _spread(data: Measurements) -> float:
+def _extent(data: Measurements) -> float:
     """RMS about the mean of what was measured, mm."""
     if data.positions is None:
         return float(np.sqrt((data.lengths()[0] ** 2).mean()))
@@ -92,8 +92,8 @@ def _placed(robot: Robot, data: Measurements, tools: dict[str, Rigid]) -> tuple[
 
 
 def _off_a_line(data: Measurements) -> None:
-    extent = np.linalg.svd(data.points() - data.points().mean(0), compute_uv=False)
-    if len(extent) < 2 or extent[1] <= STILL_MM:
+    extents = np.linalg.svd(data.points() - data.points().mean(0), compute_uv=False)
+    if len(extents) < 2 or extents[1] <= STILL_MM:
         raise DegenerateError(
             f"{data.where}: all positions lie on one line (within {STILL_MM} mm), so that it is not seen where the "
             "instrument stands; move joints that take the target off it"
@@ -116,14 +116,19 @@ def _base_and_points(where: str, flange: Poses, positions: np.ndarray, rows: np.
         before, misfit = misfit, float(np.sqrt((error**2).sum(1).mean()))
         if before - misfit < SETTLED_MM:
             break
-        slope = np.zeros((len(rows), 3, 6 + 3 * len(points)))
-        slope[:, :, :3] = -skew(seen @ base.rotation.T)
-        slope[:, :, 3:6] = np.eye(3)
+        jacobian = np.zeros((len(rows), 3, 6 + 3 * len(points)))
+        jacobian[:, :, :3] = -skew(seen @ base.rotation.T)
+        jacobian[:, :, 3:6] = np.eye(3)
         for k in range(len(points)):
-            slope[rows == k, :, 6 + 3 * k : 9 + 3 * k] = base.rotation @ flange.rotation[rows == k]
-        step = np.linalg.lstsq(slope.reshape(-1, slope.shape[2]), error.ravel(), rcond=1e-9)[0]
+            jacobian[rows == k, :, 6 + 3 * k : 9 + 3 * k] = base.rotation @ flange.rotation[rows == k]
+        step = np.linalg.lstsq(jacobian.reshape(-1, jacobian.shape[2]), error.ravel(), rcond=1e-9)[0]
         base = Rigid(Rigid.exp(step[:6]).rotation @ base.rotation, base.translation + step[3:6])
         points = points + step[6:].reshape(-1, 3)
+    else:
+        raise ConvergenceError(
+            f"{where}: base and tools still come nearer to the measurements after {ROUNDS} steps, {misfit:.3g} mm RMS "
+            "off; check the D-H rows and the joint values"
+        )
     return base, points, misfit
 
 
@@ -132,27 +137,29 @@ def _points_of_distances(robot: Robot, flange: Poses, data: Measurements, rows: 
 
     def errors(moved: np.ndarray) -> np.ndarray:
         tip = flange @ moved.reshape(-1, 3)[rows]
-        return data.distances - np.linalg.norm(tip - tip[data.from_row], axis=1)
+        return distances - np.linalg.norm(tip - tip[from_row], axis=1)
 
+    distances, from_row = data.lengths()
     reach = max(reach_mm(robot, tool) for tool in robot.tools)
     around = AROUND * reach * np.vstack([np.zeros((1, 3)), np.eye(3), -np.eye(3)])
+    # A start, settled or not: the adjustment goes on from here, and says when it does not converge.
     fits = [least_squares(errors, (points + shift).ravel(), max_nfev=ROUNDS) for shift in around]
     best = min(fits, key=lambda fit: fit.cost)
     return best.x.reshape(-1, 3), float(np.sqrt(2 * best.cost / len(data)))
 
 
-def _explain(robot: Robot, data: Measurements, tools: dict[str, Rigid], misfit: float, spread: float) -> None:
+def _explain(robot: Robot, data: Measurements, tools: dict[str, Rigid], misfit: float, extent: float) -> None:
     """Say what is wrong with the data, or with the robot file."""
     found = {}
     for reason, other, guess in _guesses(robot, data, tools):
         try:
-            found[reason] = _placed(other, guess, tools)[1] / _spread(guess)
-        except DegenerateError:  # a guess that leaves too little
+            found[reason] = _placed(other, guess, tools)[1] / _extent(guess)
+        except (DegenerateError, ConvergenceError):  # a guess that leaves too little, or explains nothing
             continue
     says = f"{data.where}: robot {robot.name} misses the measurements by {misfit:.3g} mm RMS, "
-    says += f"{FITS:.0%} of their spread of {spread:.3g} mm allowed; "
-    reason = min(found, key=found.get)
-    if found[reason] < min(EXPLAINS * misfit / spread, FITS):
+    says += f"{FITS:.0%} of their spread of {extent:.3g} mm allowed; "
+    reason = min(found, key=lambda guess: found[guess])
+    if found[reason] < min(EXPLAINS * misfit / extent, FITS):
         raise InputError(f"{says}it would fit if {reason}")
     raise InputError(f"{says}check D-H rows and convention, the order and zero of joints, coupling, and units")
 

@@ -82,10 +82,11 @@ class Components:
 
     def covariance(self, best: np.ndarray) -> np.ndarray:
         """(k, k) covariance of the parameters about the estimate at ``best`` (p,)."""
-        spread = self._spread(best)
-        index = np.indices((len(NODES),) * spread.shape[1]).reshape(spread.shape[1], len(NODES) ** spread.shape[1]).T
+        root = self._root(best)
+        width = root.shape[1]
+        index = np.indices((len(NODES),) * width).reshape(width, len(NODES) ** width).T
         z = NODES[index]
-        log_density, _, step, inverse = self.at(best + z @ spread.T)
+        log_density, _, step, inverse = self.at(best + z @ root.T)
         middle = self.at(best[None])
         log_weight = np.log(NODE_WEIGHTS[index]).sum(1) + log_density - middle[0] + 0.5 * (z**2).sum(1)
         weight = np.exp(log_weight - log_weight.max())
@@ -94,19 +95,19 @@ class Components:
         mean = np.einsum("m,mkl->kl", weight, inverse) + (shift.T * weight) @ shift
         return mean * self.units[:, None] * self.units
 
-    def _spread(self, best: np.ndarray) -> np.ndarray:
+    def _root(self, best: np.ndarray) -> np.ndarray:
         """(p, f) square root of the covariance of log σ, of the f that are not at their least value."""
         free = np.flatnonzero(best > np.maximum(self.least, -FARTHEST) + STEP)
         moves = STEP * np.eye(len(best))[free]
         gradient = self.at(np.concatenate([best + moves, best - moves]))[1]
-        slope = (gradient[: len(free)] - gradient[len(free) :])[:, free] / (2 * STEP)
-        values, directions = np.linalg.eigh(-(slope + slope.T) / 2)
+        hessian = (gradient[: len(free)] - gradient[len(free) :])[:, free] / (2 * STEP)
+        values, directions = np.linalg.eigh(-(hessian + hessian.T) / 2)
         # a flat or rising direction: as wide as what is known beforehand, at the most
         least = np.full(len(free), np.min(self.doubt, initial=1.0) ** -2.0)
         values = np.maximum(values, least)
-        spread = np.zeros((len(best), len(free)))
-        spread[free] = directions / np.sqrt(values)
-        return spread
+        root = np.zeros((len(best), len(free)))
+        root[free] = directions / np.sqrt(values)
+        return root
 
 
 def components(
@@ -115,7 +116,7 @@ def components(
     """The parts of an adjustment: of the data those whose σ is estimated, then the groups of the robot's dimensions."""
     units = solution.units
     white = weighting.whiten(solution.residuals, seen)
-    slope = weighting.whiten(jacobian(solution.state, seen), seen) * units
+    derivative = weighting.whiten(jacobian(solution.state, seen), seen) * units
     kept = _kept(seen.kind) if robust else 1.0
     honest = solution.weights >= GROSS
     honest |= honest.mean() < 0.5
@@ -125,25 +126,28 @@ def components(
     parts, fixed, fixed_pull = [], np.eye(len(units)) / USELESS_MM**2, np.zeros(len(units))
     for name, columns in weighting.columns(white.shape[1]).items():
         if name in weighting.estimated:
-            square, count = _normal(white, slope, columns, scaled), kept * white[honest, columns].size
+            square, count = _normal(white, derivative, columns, scaled), kept * white[honest, columns].size
             parts.append((*square, count, 0.0, np.inf, np.log(LEAST / weighting.value(name))))
-            normal, pull, _ = _normal(white, slope, columns, weight - scaled)
+            normal, pull, _ = _normal(white, derivative, columns, weight - scaled)
         else:
-            normal, pull, _ = _normal(white, slope, columns, weight)
+            normal, pull, _ = _normal(white, derivative, columns, weight)
         fixed, fixed_pull = fixed + normal, fixed_pull + pull
     held, group = rows.held(solution.state, deviations, seen.kind), rows.group[rows.free]
     for g, (sigma, expected) in enumerate(zip(astuple(deviations), astuple(Deviations()), strict=True)):
         mine = group == g
-        e, j = held.value[mine] / sigma, held.slope[mine] * units / sigma
+        e, j = held.value[mine] / sigma, held.jacobian[mine] * units / sigma
         if mine.any():
             parts.append((j.T @ j, -j.T @ e, e @ e, mine.sum(), np.log(expected / sigma), DOUBT, -np.inf))
-    return Components(*(np.array(each, float) for each in zip(*parts, strict=True)), fixed, fixed_pull, units)
+    normal, pull, square, count, expected, doubt, least = (np.array(each, float) for each in zip(*parts, strict=True))
+    return Components(normal, pull, square, count, expected, doubt, least, fixed, fixed_pull, units)
 
 
-def _normal(white: np.ndarray, slope: np.ndarray, columns: slice, weight: np.ndarray):
+def _normal(
+    white: np.ndarray, derivative: np.ndarray, columns: slice, weight: np.ndarray
+) -> tuple[np.ndarray, np.ndarray, float]:
     """JᵀWJ, JᵀWe and eᵀWe of some coordinates, with weights (r, 1, 1)."""
-    k = slope.shape[2]
-    e, j = white[:, columns].ravel(), slope[:, columns]
+    k = derivative.shape[2]
+    e, j = white[:, columns].ravel(), derivative[:, columns]
     weighted = (weight * j).reshape(-1, k).T
     return weighted @ j.reshape(-1, k), weighted @ e, float((weight[:, :, 0] * white[:, columns] ** 2).sum())
 

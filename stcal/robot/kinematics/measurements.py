@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 
 from stcal.errors import InputError
-from stcal.geometry.arrays import frozen
+from stcal.geometry.arrays import Array, freeze
 from stcal.geometry.rigid import Poses
 from stcal.io.table import ANGLES, LENGTHS, Table, read_table
 from stcal.robot.kinematics.damped import reach_mm
@@ -62,7 +62,7 @@ class Measurements:
 
     where: str
     lines: Sequence[int]
-    q: np.ndarray
+    q: Array
     targets: tuple[str, ...]
     positions: np.ndarray | None = None
     rotations: np.ndarray | None = None
@@ -74,14 +74,14 @@ class Measurements:
 
     def __post_init__(self):
         m = len(self.q)
-        object.__setattr__(self, "q", frozen(self.q, (m, None), "joint values"))
+        freeze(self, "q", (m, None), "joint values")
         shapes = {"positions": (3,), "rotations": (3, 3), "covariance": (6, 6), "common": (6, None)}
         for name, shape in shapes.items():
             if getattr(self, name) is not None:
-                object.__setattr__(self, name, frozen(getattr(self, name), (m, *shape), name))
+                freeze(self, name, (m, *shape), name)
         if self.distances is not None:
-            object.__setattr__(self, "distances", frozen(self.distances, (m,), "distances"))
-            object.__setattr__(self, "from_row", frozen(self.from_row, (m,), "rows", int))
+            freeze(self, "distances", (m,), "distances")
+            freeze(self, "from_row", (m,), "rows", int)
 
     def __len__(self) -> int:
         return len(self.q)

@@ -101,7 +101,7 @@ class Robot:
     rows: tuple[DHRow, ...]
     joints: tuple[Joint, ...]
     coupling: np.ndarray = None  # pyright: ignore[reportAssignmentType]  # made below: its size is that of the rows
-    world_from_base: Rigid = field(default_factory=Rigid)
+    world_from_base: Rigid = field(default_factory=lambda: Rigid())
     tools: Mapping[str, Rigid] = field(default_factory=lambda: {"": Rigid()})
 
     def __post_init__(self):

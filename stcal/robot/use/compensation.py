@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from stcal.errors import InputError
-from stcal.geometry.arrays import frozen
+from stcal.geometry.arrays import freeze
 from stcal.geometry.rigid import Poses
 from stcal.io.table import LENGTHS, read_table
 from stcal.parallel import one_thread
@@ -34,10 +34,20 @@ MEANING = {
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Targets:
-    """Commanded poses base_from_tool, one for each row of a file.
+    """Commanded poses, one for each row of a file; by joint values where no poses are given.
 
-    ``lines`` : (m,) of the file; ``tools`` : (m,) names; ``poses`` : None where joint values command; ``q`` : (m, n)
-    commanded joint values, or those whose branch is wanted, rad or mm; None where there are none.
+    Parameters
+    ----------
+    where : str
+        The file, for messages.
+    lines : sequence of int
+        (m,) its lines.
+    tools : tuple of str
+        (m,) names.
+    poses : Poses or None
+        base_from_tool, mm; None where joint values command.
+    q : (m, n) array or None
+        Commanded joint values, or those whose branch is wanted, rad or mm.
     """
 
     where: str
@@ -48,13 +58,19 @@ class Targets:
 
     def __post_init__(self):
         if self.q is not None:
-            object.__setattr__(self, "q", frozen(self.q, (len(self), None), "joint values"))
+            freeze(self, "q", (len(self), None), "joint values")
 
     def __len__(self) -> int:
         return len(self.lines)
 
+    def joints(self) -> np.ndarray:
+        """(m, n) commanded joint values, rad or mm; refused where there are none."""
+        if self.q is None:
+            raise InputError(f"{self.where}: poses without joint values; columns q1_deg … needed")
+        return self.q
 
-@dataclass(frozen=True, slots=True, eq=False)
+
+@dataclass(frozen=True, slots=True, eq=False, kw_only=True)
 class Compensated:
     """Commanded poses with what the controller must be told.
 
@@ -66,9 +82,10 @@ class Compensated:
     found : Inverse
         By the identified robot.
     nominal : Inverse or None
-        By the nominal robot: what would be told without calibration.
-    before_mm, before_rad : (m,) arrays or None
-        Error, by the identified robot, of the nominal joint values: what compensation takes away.
+        By the nominal robot: what would be commanded without calibration.
+    before_mm, before_rad : (m,) arrays
+        Error, by the identified robot, of the nominal joint values: what compensation takes away; empty without a
+        nominal robot.
     sliding : (n,) array
         Which joints are prismatic.
     other_tools : tuple of str
@@ -79,8 +96,8 @@ class Compensated:
     poses: Poses
     found: Inverse
     nominal: Inverse | None
-    before_mm: np.ndarray | None
-    before_rad: np.ndarray | None
+    before_mm: np.ndarray
+    before_rad: np.ndarray
     sliding: np.ndarray
     other_tools: tuple[str, ...] = ()
 
@@ -102,7 +119,7 @@ class Compensated:
         moved = np.abs(self.found.q - self.nominal.q)[:, ~self.sliding].max(axis=1, initial=0.0)
         return [
             f"line {self.targets.lines[i]}: a joint moves by {np.degrees(moved[i]):.1f}°: near a singular pose"
-            for i in np.flatnonzero(self.compared() & (moved > FAR_RAD))
+            for i in np.flatnonzero(self.compared() & (moved > FAR_RAD)).tolist()
         ]
 
     def _not_simply_reached(self) -> list[str]:
@@ -115,10 +132,10 @@ class Compensated:
         ]
 
 
-def _other_tools(identified: Robot, nominal: Robot | None, used: Sequence[str]) -> tuple[str, ...]:
+def _other_tools(identified: Robot, nominal: Robot, used: Sequence[str]) -> tuple[str, ...]:
     """Where a tool is not nearly the same in both files: commanded poses are of one of them only."""
     notes = []
-    for name in dict.fromkeys(used) if nominal else ():
+    for name in dict.fromkeys(used):
         own, other = identified.tool(name), nominal.tool(name)
         mm, rad = np.linalg.norm(own.translation - other.translation), (own.inverse() @ other).angle_rad()
         if mm > SAME_TOOL_MM or rad > SAME_TOOL_RAD:
@@ -131,7 +148,19 @@ def _other_tools(identified: Robot, nominal: Robot | None, used: Sequence[str]) 
 
 
 def read_targets(path: str | Path, robot: Robot) -> Targets:
-    """Read commanded poses (form: ``data_layout.md``).
+    """Read commanded poses, or joint values that command them.
+
+    Parameters
+    ----------
+    path : str or Path
+        Table (CSV; form: ``data_layout.md``).
+    robot : Robot
+        Whose tools they are of; its joints, where joint values are given.
+
+    Returns
+    -------
+    Targets
+        base_from_tool, mm; joint values, rad or mm.
 
     Raises
     ------
@@ -175,6 +204,21 @@ def compensate(identified: Robot, targets: Targets, nominal: Robot | None = None
     Where neither is known the first pose gets the one nearest to the middle of the joint limits and every other the one
     nearest to the pose before.
 
+    Parameters
+    ----------
+    identified : Robot
+        As it is; mm, rad.
+    targets : Targets
+        m commanded poses base_from_tool.
+    nominal : Robot, optional
+        As its controller believes it to be.
+
+    Returns
+    -------
+    Compensated
+        Joint vectors (m, n) to command, rad or mm, and for each whether it reaches its pose; poses out of reach raise
+        no error.
+
     Raises
     ------
     InputError
@@ -187,24 +231,39 @@ def compensate(identified: Robot, targets: Targets, nominal: Robot | None = None
             f"nominal robot {nominal.name} and identified robot {identified.name}: joints of different number or type; "
             "files of the same robot needed"
         )
-    if targets.poses is None and nominal is None:
+    if nominal is None:
+        return _without_nominal(identified, targets)
+    poses = _by_tool(nominal, targets, targets.joints()) if targets.poses is None else targets.poses
+    before = _inverse_by_tool(nominal, targets, poses, targets.q)
+    off = poses.difference(_by_tool(identified, targets, before.q))
+    return Compensated(
+        targets=targets,
+        poses=poses,
+        found=_inverse_by_tool(identified, targets, poses, before.q),
+        nominal=before,
+        before_mm=np.linalg.norm(off[:, 3:], axis=1),
+        before_rad=np.linalg.norm(off[:, :3], axis=1),
+        sliding=identified.prismatic,
+        other_tools=_other_tools(identified, nominal, targets.tools),
+    )
+
+
+def _without_nominal(identified: Robot, targets: Targets) -> Compensated:
+    if targets.poses is None:
         raise InputError(
             f"{targets.where}: joint values without poses; only the nominal robot knows which poses they command, "
             "give its file with --nominal"
         )
-    poses = targets.poses if targets.poses is not None else _by_tool(nominal, targets)
-    before = None
-    near = targets.q
-    if nominal is not None:
-        before = _inverse_by_tool(nominal, targets, poses, targets.q)
-        near = before.q
-    found = _inverse_by_tool(identified, targets, poses, near)
-    if before is None:
-        return Compensated(targets, poses, found, None, None, None, identified.prismatic)
-    off = poses.difference(_by_tool(identified, targets, before.q))
-    error_mm, error_rad = np.linalg.norm(off[:, 3:], axis=1), np.linalg.norm(off[:, :3], axis=1)
-    tools = _other_tools(identified, nominal, targets.tools)
-    return Compensated(targets, poses, found, before, error_mm, error_rad, identified.prismatic, tools)
+    found, none = _inverse_by_tool(identified, targets, targets.poses, targets.q), np.zeros(0)
+    return Compensated(
+        targets=targets,
+        poses=targets.poses,
+        found=found,
+        nominal=None,
+        before_mm=none,
+        before_rad=none,
+        sliding=identified.prismatic,
+    )
 
 
 def _rows_by_tool(targets: Targets) -> list[tuple[str, np.ndarray]]:
@@ -212,9 +271,8 @@ def _rows_by_tool(targets: Targets) -> list[tuple[str, np.ndarray]]:
     return [(name, np.flatnonzero(names == name)) for name in dict.fromkeys(targets.tools)]
 
 
-def _by_tool(robot: Robot, targets: Targets, q: np.ndarray | None = None) -> Poses:
-    """base_from_tool of each row's joint values and tool."""
-    q = targets.q if q is None else q
+def _by_tool(robot: Robot, targets: Targets, q: np.ndarray) -> Poses:
+    """base_from_tool of joint values (m, n), with each row's tool."""
     rotation, translation = np.empty((len(q), 3, 3)), np.empty((len(q), 3))
     for name, rows in _rows_by_tool(targets):
         part = forward(robot, q[rows], name)

@@ -41,13 +41,13 @@ class Measured:
         object.__setattr__(self, "measured", frozen(self.measured, (m, 3), "measured positions"))
 
 
-@dataclass(frozen=True, slots=True, eq=False)
+@dataclass(frozen=True, slots=True, eq=False, kw_only=True)
 class SetResult:
     """Distance errors of one set, mm.
 
     ``error_mm`` : (m − 1,) measured minus commanded distance from the first position; ``mean_mm``, ``std_mm``,
-    ``max_mm`` : of their absolute values, the standard deviation with m − 2 degrees of freedom; ``pairs_rms_mm`` : of
-    the errors of all pairs; ``scale`` : measured over commanded distances of all pairs, by least squares.
+    ``max_mm`` : of their absolute values, the standard deviation with m − 2 in the denominator; ``pairs_rms_mm`` :
+    of the errors of all pairs; ``scale`` : measured over commanded distances of all pairs, by least squares.
     """
 
     name: str
@@ -98,7 +98,17 @@ class Verification:
 
 
 def read_measured(path: str | Path) -> Measured:
-    """Read commanded and measured positions (form: ``data_layout.md``).
+    """Read commanded and measured positions.
+
+    Parameters
+    ----------
+    path : str or Path
+        Table (CSV; form: ``data_layout.md``).
+
+    Returns
+    -------
+    Measured
+        Positions, mm, commanded ones in the robot's base and measured ones in the instrument's frame.
 
     Raises
     ------
@@ -126,18 +136,31 @@ def _names(table: Table, sets: tuple[str, ...], commanded: np.ndarray) -> tuple[
                 )
             seen[key] = line
         return names
-    places: dict[tuple, list[int]] = {}
-    names, times = [], {}
+    places: dict[tuple, int] = {}
+    numbers: list[int] = []
+    times: dict[tuple, int] = {}
     for name, xyz in zip(sets, np.round(commanded / SAME_MM).astype(np.int64).tolist(), strict=True):
         place = tuple(xyz)
         times[name, place] = times.get((name, place), 0) + 1
         key = (place, times[name, place])
-        names.append(places.setdefault(key, len(places) + 1))
-    return tuple(str(name) for name in names)
+        numbers.append(places.setdefault(key, len(places) + 1))
+    return tuple(map(str, numbers))
 
 
 def verify(data: Measured) -> Verification:
     """Distance errors of each set, over the poses that all sets have.
+
+    Distances from the first position need no common frame of robot and instrument (Zhang & Wei 2017, section 4.3).
+
+    Parameters
+    ----------
+    data : Measured
+        Commanded and measured positions of one or more sets, mm.
+
+    Returns
+    -------
+    Verification
+        Of each set mean, standard deviation and maximum of the errors of distances, mm.
 
     Raises
     ------
@@ -185,13 +208,13 @@ def _set_result(data: Measured, name: str, rows: np.ndarray) -> SetResult:
     if wanted_squares == 0:
         raise InputError(f"{data.where}: set {name}: all commanded positions are the same; different ones needed")
     return SetResult(
-        name,
-        error,
-        float(size.mean()),
-        float(size.std(ddof=1)),
-        float(size.max()),
-        float(np.sqrt(squares / pairs)),
-        product / wanted_squares,
+        name=name,
+        error_mm=error,
+        mean_mm=float(size.mean()),
+        std_mm=float(size.std(ddof=1)),
+        max_mm=float(size.max()),
+        pairs_rms_mm=float(np.sqrt(squares / pairs)),
+        scale=product / wanted_squares,
     )
 
 
