@@ -136,11 +136,11 @@ def test_errors_of_the_axes_are_as_large_as_their_covariance(name, rests):
         squares.append(error @ np.linalg.solve(covariance, error))
         freedom = len(error)
         coordinates.append([fit.sigma_mm / SIGMA for fit in fits])
-    dof = min(fit.dof for fit in fits)
-    # normal errors over an estimated σ: the mean of their squares is dof / (dof − 2); 100 draws of 14 to 24
-    # coordinates scatter by √(2 / 1400) = 4 % at most
-    assert 0.9 < np.mean(squares) / freedom < 1.1 * dof / (dof - 2)
-    assert np.mean(np.square(coordinates)) == pytest.approx(1, abs=0.03)  # 100 draws × 4 axes × dof ≥ 30
+    redundancy = min(fit.redundancy for fit in fits)
+    # normal errors over an estimated σ: the mean of their squares is redundancy / (redundancy − 2); 100 draws of 14
+    # to 24 coordinates scatter by √(2 / 1400) = 4 % at most
+    assert 0.9 < np.mean(squares) / freedom < 1.1 * redundancy / (redundancy - 2)
+    assert np.mean(np.square(coordinates)) == pytest.approx(1, abs=0.03)  # 100 draws × 4 axes × 30 or more
 
 
 @pytest.mark.slow
