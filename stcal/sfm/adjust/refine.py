@@ -9,6 +9,7 @@ from stcal.errors import ConvergenceError, DegenerateError, MappingError
 from stcal.geometry.camera import Camera
 from stcal.geometry.conic import circle_image_offset
 from stcal.geometry.plane import fit_plane
+from stcal.geometry.robust import robust_sigma
 from stcal.labels import Label
 from stcal.sfm.adjust.group import adjust
 from stcal.sfm.adjust.scale import find_scale
@@ -18,7 +19,8 @@ MAX_ROUNDS = 20
 SETTLED_PX = 1e-5
 """The corrections have settled when none moves by more than this: far below any centring noise."""
 OUTLIER_RMS = 6.0
-"""Observations beyond this multiple of the residuals' robust spread (and of their own σ) are named and left out."""
+"""Observations longer than this multiple of the residuals' robust RMS length, √2 σ, and than twice this multiple of their
+own σ are named and left out."""
 MIN_OUTLIER_PX = 0.1
 WORST_SHARE = 0.5
 MAX_OUTLIER_SHARE = 0.1
@@ -119,8 +121,8 @@ def _outliers(model: GroupModel, camera: Camera) -> tuple[np.ndarray, list[Outli
     """The worst observation of every image that is beyond the limit, and not much better than the worst of all: one
     bad observation pulls on all that share a point or a camera with it."""
     residual = np.linalg.norm(model.residuals_px(camera), axis=1)
-    spread = 1.4826 * np.median(residual) / np.sqrt(2 * np.log(2)) * np.sqrt(2)
-    limit = np.maximum(np.maximum(OUTLIER_RMS * spread, 2 * OUTLIER_RMS * model.sigma_px()), MIN_OUTLIER_PX)
+    rms = np.sqrt(2) * robust_sigma(residual, 2)
+    limit = np.maximum(np.maximum(OUTLIER_RMS * rms, 2 * OUTLIER_RMS * model.sigma_px()), MIN_OUTLIER_PX)
     least = max(1.0, WORST_SHARE * float((residual / limit).max(initial=0.0)))
     off = np.zeros(len(residual), bool)
     named = []

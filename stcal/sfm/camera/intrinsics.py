@@ -9,28 +9,30 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from scipy.spatial.transform import Rotation
 
 from stcal.design import BoardDesign
 from stcal.errors import ConvergenceError
 from stcal.geometry.camera import Camera
-from stcal.geometry.rigid import Rigid
+from stcal.geometry.least_squares import minimise
+from stcal.geometry.normal_equations import Reduction, reduce
+from stcal.geometry.robust import HUBER, robust_sigma
 from stcal.io.camera import intrinsic_basis
 from stcal.labels import DotLabel
 from stcal.sfm.adjust.blocks import image_cost, normalised, robust_weights, without_cameras
+from stcal.sfm.adjust.group import moved_poses
 from stcal.sfm.adjust.refine import eccentricity_px
 from stcal.sfm.camera.views import start_pose
 from stcal.sfm.data.model import MetricModel
 from stcal.sfm.data.observations import ImageObservations, by_group
 
-HUBER = 3.0
-"""In units of the residuals' robust spread: one honest residual in ninety is longer, and loses hardly anything."""
-MAX_STEPS = 60
-SETTLED_PX = 1e-6
+MAX_STEPS = 100
+EXACTLY = 1e-15
+"""Share of χ² that the last step may promise."""
+TINY_PX = 1e-3
+"""Focal length of no lens."""
 CREEPING_PX = 1e-3
 """Moves below this after all steps are along a direction that hardly changes the images: its σ says so."""
 START_DAMPING = 1e-3
-MAX_DAMPING = 1e12
 MAX_ROUNDS = 20
 SETTLED_FACTOR = 0.005
 """Rounds end when no variance component moves by more than this …"""
@@ -165,15 +167,15 @@ def adjust_intrinsics(
         state = _weighted(state, own, factors, board)
         shifted = max(np.abs(a.shift_px - b.shift_px).max() for a, b in zip(state.models, before.models, strict=True))
         setting = replace(setting, sigma_mm=factors.dots * board.sigma_mm)
-        state = _minimise(state, setting)
-        setting = replace(setting, huber=HUBER * _spread(state))
-        reduced, _, _, dots_left = _normal_equations(state, setting)
-        updated = known or _updated_factors(state, setting, dots_left, factors)
+        state = _minimise(state, setting).state
+        setting = replace(setting, huber=HUBER * _robust_sigma(state))
+        last = _Normal.of(state, setting)
+        updated = known or _updated_factors(state, setting, last.dots_left, factors)
         change = max(abs(updated.centres / factors.centres - 1), abs(updated.dots / factors.dots - 1))
         factors = updated
         if change < SETTLED_FACTOR and shifted < SETTLED_SHIFT_PX:
             break
-    covariance = np.linalg.inv(reduced)
+    covariance = np.linalg.inv(last.normal)
     return Intrinsics(
         cameras=state.cameras,
         colmap_model=colmap_model,
@@ -232,11 +234,11 @@ def _weighted(state: _State, own: list[np.ndarray], factors: SigmaFactors, board
     return replace(state, models=models)
 
 
-def _spread(state: _State) -> float:
-    """Robust σ of the normalised residuals per axis, from the median of their lengths (Rayleigh)."""
+def _robust_sigma(state: _State) -> float:
+    """Robust σ of the normalised residuals per axis."""
     parts = [normalised(m, state.cameras[k]) for m, k in zip(state.models, state.camera_of, strict=True)]
     length = np.linalg.norm(np.concatenate(parts), axis=1)
-    return max(float(np.median(length) / np.sqrt(2 * np.log(2))), 1e-6)
+    return max(robust_sigma(length, 2), 1e-6)
 
 
 def _image_redundancy(state: _State, q: int) -> int:
@@ -280,90 +282,110 @@ def _cost(state: _State, setting: _Setting) -> float:
     )
 
 
-def _normal_equations(state: _State, setting: _Setting):
-    """Normal matrix and right-hand side over the intrinsics of all cameras; the way back to dots and poses; and the
-    redundancy of the observations of the dots."""
-    q, c = setting.basis.shape[1], len(state.cameras)
-    reduced = np.kron(np.eye(c), setting.weight)
-    right = -np.concatenate([setting.weight @ setting.away(camera) for camera in state.cameras])
-    back, own = [], []
-    for folder, rows in _boards(state).items():
-        p = 3 * len(setting.design[folder])
-        full, full_right, poses = np.zeros((p + c * q, p + c * q)), np.zeros(p + c * q), []
-        for i in rows:
-            k = state.camera_of[i]
-            part, part_right, *pose = without_cameras(state.models[i], state.cameras[k], setting.basis, setting.huber)
-            place = np.concatenate([np.arange(p), p + k * q + np.arange(q)])
-            full[np.ix_(place, place)] += part
-            full_right[place] += part_right
-            poses.append((i, *pose))
-        gap = state.models[rows[0]].xyz_world - setting.design[folder]
-        full[np.arange(p), np.arange(p)] += 1 / setting.sigma_mm**2
-        full_right[:p] -= gap.ravel() / setting.sigma_mm**2
-        inverse = np.linalg.inv(full[:p, :p])
-        from_intrinsics = inverse @ full[:p, p:]
-        reduced += full[p:, p:] - full[p:, :p] @ from_intrinsics
-        right += full_right[p:] - from_intrinsics.T @ full_right[:p]
-        back.append((inverse @ full_right[:p], from_intrinsics, poses))
-        own.append((p, np.trace(inverse), from_intrinsics))
-    covariance = np.linalg.inv(reduced)
-    left = sum(p - (trace + np.sum((b @ covariance) * b)) / setting.sigma_mm**2 for p, trace, b in own)
-    return reduced, right, back, float(left)
+@dataclass(frozen=True, slots=True, eq=False)
+class _Normal:
+    """Normal equations over the intrinsics of all cameras; the dots of each board are reduced away, the poses of each
+    model before them. ``dots_left`` : redundancy of the observations of the dots."""
 
+    cost: float
+    state: _State
+    normal: np.ndarray
+    right: np.ndarray
+    boards: tuple[Reduction, ...]
+    poses: tuple[Reduction, ...]
+    dots_left: float
 
-def _minimise(state: _State, setting: _Setting) -> _State:
-    """Levenberg–Marquardt: intrinsics damped, dots and poses at their best for each step of them."""
-    damping, cost = START_DAMPING, _cost(state, setting)
-    for _ in range(MAX_STEPS):
-        reduced, right, back, _ = _normal_equations(state, setting)
-        while True:
-            step = np.linalg.solve(reduced + damping * np.diag(np.diag(reduced)), right)
-            trial = _moved(state, setting, step, back)
-            move = _largest_move(state, trial) if trial else np.inf
-            if move < SETTLED_PX:
-                return state
-            trial_cost = _cost(trial, setting) if trial else np.inf
-            if trial_cost <= cost * (1 + 1e-12):
-                break
-            damping *= 10
-            if damping > MAX_DAMPING:
-                raise ConvergenceError(
-                    "camera: the adjustment finds no better intrinsics; look at the images, leave out the worst, "
-                    "or choose a simpler --model"
+    @classmethod
+    def of(cls, state: _State, setting: _Setting) -> "_Normal":
+        q, c = setting.basis.shape[1], len(state.cameras)
+        normal = np.kron(np.eye(c), setting.weight)
+        right = -np.concatenate([setting.weight @ setting.away(camera) for camera in state.cameras])
+        boards, poses = [], []
+        for folder, rows in _boards(state).items():
+            p = 3 * len(setting.design[folder])
+            full, full_right = np.zeros((p + c * q, p + c * q)), np.zeros(p + c * q)
+            for i in rows:
+                k = state.camera_of[i]
+                part, part_right, away = without_cameras(
+                    state.models[i], state.cameras[k], setting.basis, setting.huber
                 )
-        state, cost, damping = trial, trial_cost, damping / 10
-    if move < CREEPING_PX:
-        return state
-    raise ConvergenceError(
-        f"camera: projections still move by {move:.1g} px after {MAX_STEPS} steps, {CREEPING_PX:g} px needed; "
-        "add views that fill the image and are tilted, or choose a simpler --model"
+                place = np.concatenate([np.arange(p), p + k * q + np.arange(q)])
+                full[np.ix_(place, place)] += part
+                full_right[place] += part_right
+                poses.append(away)
+            gap = state.models[rows[0]].xyz_world - setting.design[folder]
+            full[np.arange(p), np.arange(p)] += 1 / setting.sigma_mm**2
+            full_right[:p] -= gap.ravel() / setting.sigma_mm**2
+            dots = reduce(full[None, :p, :p], full_right[None, :p], full[None, :p, p:])
+            normal += full[p:, p:] - dots.normal
+            right += full_right[p:] - dots.right
+            boards.append(dots)
+        covariance = np.linalg.inv(normal)
+        taken = [np.trace(b.inverse[0]) + np.sum((b.from_kept[0] @ covariance) * b.from_kept[0]) for b in boards]
+        dots_left = sum(b.step.size - t / setting.sigma_mm**2 for b, t in zip(boards, taken, strict=True))
+        return cls(_cost(state, setting), state, normal, right, tuple(boards), tuple(poses), float(dots_left))
+
+    def step(self, damping: float | np.ndarray) -> tuple[np.ndarray, float]:
+        """Of the intrinsics, then of the dots of each board, then of the poses of each model."""
+        own = np.linalg.solve(self.normal + damping * np.diag(np.diag(self.normal)), self.right)
+        gain = 2 * float(own @ self.right) - float(own @ self.normal @ own)
+        gain += sum(each.gain for each in (*self.boards, *self.poses))
+        each_camera = own.reshape(len(self.state.cameras), -1)
+        dots = [board.back(own).ravel() for board in self.boards]
+        poses, models = [], iter(self.poses)
+        for rows, moved in zip(_boards(self.state).values(), dots, strict=True):
+            poses += [next(models).back(np.concatenate([moved, each_camera[self.state.camera_of[i]]])) for i in rows]
+        return np.concatenate([own, *dots, *(each.ravel() for each in poses)]), gain
+
+
+def _minimise(state: _State, setting: _Setting) -> _Normal:
+    """Normal equations at the minimum: intrinsics are damped, dots and poses at their best for each step of them."""
+    found = minimise(
+        state,
+        lambda at: _Normal.of(at, setting),
+        lambda at, step: _moved(at, setting, step),
+        cost=lambda at: _cost(at, setting),
+        damping=START_DAMPING,
+        settled=EXACTLY,
+        max_steps=MAX_STEPS,
     )
+    last = found.linear
+    if not found.converged:  # along a direction that hardly changes the images: its σ says so
+        move = _largest_move(found.state, _moved(found.state, setting, last.step(0.0)[0]))
+        if not move < CREEPING_PX:
+            raise ConvergenceError(
+                f"camera: projections still move by {move:.1g} px after {found.steps} steps, {CREEPING_PX:g} px "
+                "needed; look at the images, add views that fill the image and are tilted, or choose a simpler --model"
+            )
+    return last
 
 
-def _moved(state: _State, setting: _Setting, step: np.ndarray, back) -> _State | None:
-    """The state after a step of the intrinsics; None where that leaves no camera."""
-    q = setting.basis.shape[1]
-    steps = step.reshape(len(state.cameras), q)
-    models = list(state.models)
-    for dots_step, from_intrinsics, poses in back:
-        dots = dots_step - from_intrinsics @ step
-        for i, pose_step, from_kept in poses:
-            kept = np.concatenate([dots, steps[state.camera_of[i]]])
-            models[i] = _with_steps(models[i], dots, pose_step - from_kept @ kept)
-    parameters = [c.parameters() + setting.basis @ s for c, s in zip(state.cameras, steps, strict=True)]
-    if any((p[:2] <= 0).any() or not np.isfinite(p).all() for p in parameters):
-        return None
-    cameras = tuple(c.with_parameters(p) for c, p in zip(state.cameras, parameters, strict=True))
+def _moved(state: _State, setting: _Setting, step: np.ndarray) -> _State:
+    """The state after a step of :meth:`_Normal.step`."""
+    q, models = setting.basis.shape[1], list(state.models)
+    own, rest = np.split(step, [q * len(state.cameras)])
+    boards = _boards(state)
+    sizes = [3 * len(setting.design[folder]) for folder in boards]
+    *dots, rest = np.split(rest, np.cumsum(sizes))
+    order = [i for rows in boards.values() for i in rows]
+    poses = dict(zip(order, np.split(rest, np.cumsum([6 * len(models[i].images) for i in order])[:-1]), strict=True))
+    for rows, moved in zip(boards.values(), dots, strict=True):
+        for i in rows:
+            cameras = moved_poses(models[i].camera_from_world, poses[i].reshape(-1, 6))
+            xyz = models[i].xyz_world + moved.reshape(-1, 3)
+            models[i] = replace(models[i], camera_from_world=cameras, xyz_world=xyz)
+    cameras = tuple(
+        camera.with_parameters(_positive(camera.parameters() + setting.basis @ s))
+        for camera, s in zip(state.cameras, own.reshape(len(state.cameras), q), strict=True)
+    )
     return replace(state, models=tuple(models), cameras=cameras)
 
 
-def _with_steps(model: MetricModel, dots: np.ndarray, poses: np.ndarray) -> MetricModel:
-    turned = Rotation.from_rotvec(poses[:, :3]).as_matrix()
-    cameras = tuple(
-        Rigid(turn @ pose.rotation, pose.translation + step[3:])
-        for turn, pose, step in zip(turned, model.camera_from_world, poses, strict=True)
-    )
-    return replace(model, camera_from_world=cameras, xyz_world=model.xyz_world + dots.reshape(-1, 3))
+def _positive(parameters: np.ndarray) -> np.ndarray:
+    """Parameters of a camera; where a step leaves none, such as no image agrees with."""
+    if (parameters[:2] > 0).all() and np.isfinite(parameters).all():
+        return parameters
+    return np.concatenate([[TINY_PX, TINY_PX], np.zeros(len(parameters) - 2)])
 
 
 def _largest_move(old: _State, new: _State) -> float:

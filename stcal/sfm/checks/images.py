@@ -7,6 +7,7 @@ from scipy.stats import f as fisher
 
 from stcal.geometry.camera import Camera
 from stcal.geometry.rigid import skew
+from stcal.geometry.robust import robust_sigma
 from stcal.io.camera import CameraPrior, intrinsic_basis
 from stcal.labels import CircleLabel
 from stcal.sfm.adjust.calibration import Calibration
@@ -169,9 +170,9 @@ def _dull(values: dict[str, float], unit: str) -> list[Trial]:
     own = np.array(list(values.values()))
     freedom = max(MAD_EFFICIENCY * len(own) - 1, 2.0)
     least = np.log(DULL) / np.sqrt(fisher.isf(SUSPICIOUS / len(own), 1, freedom))
-    spread = max(1.4826 * float(np.median(np.abs(own - np.median(own)))), least)
+    sigma = max(robust_sigma(np.abs(own - np.median(own))), least)
     return [
-        Trial(name, float(np.exp(value)), unit, max(value / spread, 0.0) ** 2, 1, freedom, True)
+        Trial(name, float(np.exp(value)), unit, max(value / sigma, 0.0) ** 2, 1, freedom, True)
         for name, value in values.items()
     ]
 

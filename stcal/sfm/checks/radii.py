@@ -8,6 +8,7 @@ import numpy as np
 from stcal.geometry.arrays import frozen
 from stcal.geometry.camera import Camera
 from stcal.geometry.plane import fit_plane
+from stcal.geometry.robust import robust_sigma
 from stcal.labels import CircleLabel, DotLabel, Label
 from stcal.sfm.adjust.network import Network
 from stcal.sfm.checks.verdict import Check, Trial, judge
@@ -116,12 +117,12 @@ def radius_checks(radii: Radii) -> list[Check]:
         whole.append(Trial(name, bias_px, "px", (bias_px / EDGE_BIAS_PX) ** 2, 1))
         if len(members) < MIN_PEERS:
             continue
-        spread = float(np.hypot(1.4826 * np.median(np.abs(ratio - usual)), RADIUS_TOLERANCE))
+        sigma = float(np.hypot(robust_sigma(np.abs(ratio - usual)), RADIUS_TOLERANCE))
         freedom = max(MAD_EFFICIENCY * len(members) - 1, 2.0)
         for i in members:
             away = radii.ratio[i] - usual
             single.append(
-                Trial(radii.labels[i], 1e3 * away * radii.design_mm[i], "µm", (away / spread) ** 2, 1, freedom)
+                Trial(radii.labels[i], 1e3 * away * radii.design_mm[i], "µm", (away / sigma) ** 2, 1, freedom)
             )
     odd = (
         "a damaged or dirty circle, a wrong label, or another radius than the design's: look at it in the overlays, "

@@ -15,6 +15,7 @@ from scipy.special import ndtr
 
 from stcal.geometry.arrays import frozen
 from stcal.geometry.camera import Camera
+from stcal.geometry.robust import robust_sigma
 from stcal.sfm.detect.ellipses import Ellipses
 
 BAND_PX = 4.0
@@ -43,7 +44,7 @@ MAX_SHIFT = 0.35
 MAX_RIM_RESIDUAL = 0.15
 """RMS residual of a sector that follows the model, as a fraction of the contrast."""
 RIM_CLEARANCE_PX = 1.5
-MIN_SPREAD = 0.4
+MIN_SIGMA = 0.4
 """Grey values: what quantisation leaves of noise, and a little more."""
 
 
@@ -290,10 +291,10 @@ class _Fit:
         """
         edge = (inside > 0.08) & (inside < 0.92)
         size = np.abs(self.residual[edge]) if edge.any() else np.abs(self.residual)
-        spread = max(1.4826 * float(np.median(size)), MIN_SPREAD)
+        sigma = max(robust_sigma(size), MIN_SIGMA)
         self.weight = np.ones(len(self.residual), np.float32)
         if robust:
-            self.weight = 1 / (1 + (self.residual * np.float32(1 / (ROBUST_WIDTH * spread))) ** 2) ** 2
+            self.weight = 1 / (1 + (self.residual * np.float32(1 / (ROBUST_WIDTH * sigma))) ** 2) ** 2
 
     def _covariance(self) -> np.ndarray:
         """Of the centre: errors sit on the edge more than beside it, and the sandwich form (White 1980) weighs them
@@ -312,7 +313,7 @@ class _Fit:
         sector = (angle * (SECTORS / (2 * np.pi))).astype(int) % SECTORS
         total = np.bincount(sector, minlength=SECTORS)
         square = np.bincount(sector, self.residual[near] ** 2, minlength=SECTORS)
-        noise = 1.4826 * np.median(np.abs(self.residual))
+        noise = robust_sigma(np.abs(self.residual))
         allowed = (MAX_RIM_RESIDUAL * self.contrast) ** 2 + (2 * noise) ** 2
         rim = float((square <= allowed * total).mean())
         shape = np.linalg.inv(self.inverse_shape)
