@@ -19,8 +19,8 @@ MAX_ROUNDS = 20
 SETTLED_PX = 1e-5
 """The corrections have settled when none moves by more than this: far below any centring noise."""
 OUTLIER_RMS = 6.0
-"""Observations longer than this multiple of the residuals' robust RMS length, √2 σ, and than twice this multiple of their
-own σ are named and left out."""
+"""Observations longer than this multiple of the residuals' robust RMS length, √2 σ, and than twice this multiple of
+their own σ are named and left out."""
 MIN_OUTLIER_PX = 0.1
 WORST_SHARE = 0.5
 MAX_OUTLIER_SHARE = 0.1
