@@ -1,6 +1,7 @@
 """One call for every method."""
 
 from dataclasses import dataclass, field, replace
+from functools import partial
 
 import numpy as np
 
@@ -91,9 +92,14 @@ class _Task:
 
     def guess(self, loop: Loop, with_scale: bool) -> tuple[Rigid, Rigid, float]:
         """First X, Z and scale."""
-        if self.options.four_dof:
-            return start.about_one_axis(loop, self.seen.mount_axis, with_scale)
-        return start.robust(loop, with_scale)
+        return _guess(self.options, self.seen, loop, with_scale)
+
+
+def _guess(options: HandEyeOptions, seen: Observability, loop: Loop, with_scale: bool) -> tuple[Rigid, Rigid, float]:
+    """First X, Z and scale."""
+    if options.four_dof:
+        return start.about_one_axis(loop, seen.mount_axis, with_scale)
+    return start.robust(loop, with_scale)
 
 
 @one_thread()
@@ -164,10 +170,9 @@ def _task(pairs: HandEyePoses, setup: Setup, views: Views | None, options: HandE
     if options.symmetries:
         mended = repair(pairs, setup, options.symmetries, views)
         pairs, views, notes = mended.pairs, mended.views, mended.notes()
-    task = _Task(pairs, Loop.of(pairs, setup), setup, views, options, seen, notes)
-    return replace(
-        task, notes=notes + check_conventions(pairs, setup, task.guess, options.with_scale, views is not None)
-    )
+    guess = partial(_guess, options, seen)
+    notes += check_conventions(pairs, setup, guess, options.with_scale, views is not None)
+    return _Task(pairs, Loop.of(pairs, setup), setup, views, options, seen, notes)
 
 
 def _by_equations(task: _Task, method: str) -> HandEye:
@@ -192,7 +197,17 @@ def _by_equations(task: _Task, method: str) -> HandEye:
         z = start.mean_pose(task.loop.chain(x))
     none = np.zeros(len(task.loop), bool)
     residuals = task.loop.residuals(x, z)
-    return HandEye(method, task.setup, x, z, residuals, task.pairs.names, none, observability=task.seen, notes=notes)
+    return HandEye(
+        method=method,
+        setup=task.setup,
+        mount_from_camera=x,
+        stand_from_board=z,
+        residuals=residuals,
+        names=task.pairs.names,
+        outliers=none,
+        observability=task.seen,
+        notes=notes,
+    )
 
 
 def _by_motions(loop: Loop, method: str, unit_mm: float, options: EvolutionOptions) -> Rigid:
@@ -223,24 +238,24 @@ def _by_poses(task: _Task) -> HandEye:
     if (factor := solution.sigma.get("camera_factor", 1.0)) > WIDENED:
         notes += (f"the board's poses err {factor:.2g} times what their σ say: check the intrinsics",)
     if not solution.sigma or options.noise.robot_rad is not None or options.noise.camera_rad is not None:
-        notes += remarks.of_variance(solution.variance_factor, solution.spare)
+        notes += remarks.of_variance(solution.variance_factor, solution.redundancy)
     stated = {name: getattr(options.noise, name) for name in ("robot_rad", "robot_mm", "camera_rad", "camera_mm")}
     return HandEye(
-        "pose",
-        task.setup,
-        x,
-        z,
-        solution.residuals,
-        task.pairs.names,
-        solution.outliers,
-        covariance[:6, :6],
-        covariance[6:12, 6:12],
-        state.scale,
-        sigma_scale,
-        {name: value for name, value in stated.items() if value} | solution.sigma,
-        tuple(solution.sigma),
+        method="pose",
+        setup=task.setup,
+        mount_from_camera=x,
+        stand_from_board=z,
+        residuals=solution.residuals,
+        names=task.pairs.names,
+        outliers=solution.outliers,
+        covariance=covariance[:6, :6],
+        stand_covariance=covariance[6:12, 6:12],
+        scale=state.scale,
+        sigma_scale=sigma_scale,
+        sigma={name: value for name, value in stated.items() if value} | solution.sigma,
+        estimated=tuple(solution.sigma),
         observability=task.seen,
-        notes=notes,
+        notes=notes + remarks.of_rounds(solution.settled),
     )
 
 
@@ -273,22 +288,22 @@ def _by_views(task: _Task) -> HandEye:
         which = ", ".join(f"{FACTORS[name]} {factor:.2g} times" for name, factor in doubted.items())
         notes += (f"the corners contradict the camera file: its σ were widened ({which}); calibrate the camera",)
     return HandEye(
-        "reprojection",
-        task.setup,
-        x,
-        z,
-        residuals,
-        names,
-        solution.outliers,
-        covariance[:6, :6],
-        covariance[6:12, 6:12],
-        solution.state.scale,
-        solution.sigma_scale,
-        solution.sigma,
-        solution.estimated,
-        solution.found,
-        task.seen,
-        notes,
+        method="reprojection",
+        setup=task.setup,
+        mount_from_camera=x,
+        stand_from_board=z,
+        residuals=residuals,
+        names=names,
+        outliers=solution.outliers,
+        covariance=covariance[:6, :6],
+        stand_covariance=covariance[6:12, 6:12],
+        scale=solution.state.scale,
+        sigma_scale=solution.sigma_scale,
+        sigma=solution.sigma,
+        estimated=solution.estimated,
+        reprojection=solution.found,
+        observability=task.seen,
+        notes=notes + remarks.of_rounds(solution.settled),
     )
 
 

@@ -88,10 +88,17 @@ def of_distance(loop: Loop) -> tuple[str, ...]:
     return (f"the board is {away:.2g} mm from the camera (median): if lengths are in metres, name the columns _m",)
 
 
-def of_variance(factor: float, spare: int) -> tuple[str, ...]:
-    """Where the residuals are not what stated σ make expect: ``factor`` is the mean square in units of σ of ``spare``
-    degrees of freedom."""
-    low, high = chi2.ppf([0.0005, 0.9995], spare) / spare
+def of_rounds(settled: bool) -> tuple[str, ...]:
+    """Where the σ that are estimated from the residuals, or the poses taken to be good, still change at the end."""
+    if settled:
+        return ()
+    return ("the estimated σ, or the set of outliers, did not settle: state those σ that are known, or add poses",)
+
+
+def of_variance(factor: float, redundancy: int) -> tuple[str, ...]:
+    """Where the residuals are not what stated σ make expect: ``factor`` is the mean square in units of σ, over
+    this ``redundancy``."""
+    low, high = chi2.ppf([0.0005, 0.9995], redundancy) / redundancy
     if low <= factor <= high:
         return ()
     return (

@@ -228,25 +228,36 @@ class Group:
         return found
 
 
-def adjust(corners: Corners, start: Bundle, free: tuple[str, ...]) -> tuple[Corners, Bundle, np.ndarray]:
-    """Solve, and estimate the σ of the ``free`` groups in rounds. Returns the corners with these σ, the state, and the
-    normal matrix.
+@dataclass(frozen=True, slots=True, eq=False)
+class BundleSolution:
+    """``corners`` : with the σ that were estimated; ``state``; ``normal`` : matrix about it; ``settled`` : whether the
+    σ did within :data:`ROUNDS`."""
+
+    corners: Corners
+    state: Bundle
+    normal: np.ndarray
+    settled: bool
+
+
+def adjust(corners: Corners, start: Bundle, free: tuple[str, ...]) -> BundleSolution:
+    """Solve, and estimate the σ of the ``free`` groups in rounds.
 
     Raises
     ------
     ConvergenceError
         No minimum is reached.
     """
-    state = start
+    state, settled = start, not free
     for _ in range(ROUNDS if free else 0):
         state = minimise(state, corners.linear, corners.moved, settled=ROUGHLY).required("hand-eye", WORST).state
         sigma = corners.sigma | estimated(corners, state, free)
         change = max(abs(np.log(sigma[name] / corners.sigma[name])) for name in free)
         corners = replace(corners, sigma=sigma)
-        if change < SETTLED:
+        settled = bool(change < SETTLED)
+        if settled:
             break
     found = minimise(state, corners.linear, corners.moved).required("hand-eye", WORST)
-    return corners, found.state, found.linear.normal
+    return BundleSolution(corners, found.state, found.linear.normal, settled)
 
 
 def estimated(corners: Corners, state: Bundle, free: tuple[str, ...]) -> dict[str, float]:

@@ -40,20 +40,21 @@ class State:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class PoseSolution:
-    """``normal`` : (k, k) of X, Z (and the scale); ``residuals`` : (m, 6); ``spread`` : (m, 6, 6) their covariances;
+    """``normal`` : (k, k) of X, Z (and the scale); ``residuals`` : (m, 6); ``covariance`` : (m, 6, 6) theirs;
     ``outliers`` : (m,); ``sigma`` : what was estimated, by name; ``variance_factor`` : mean squared residual in
-    units of σ, per degree of freedom; ``spare`` : these; ``scale_hint`` : what the scale would become if it were solved
-    for, and its σ."""
+    units of σ, over the ``redundancy``; ``scale_hint`` : what the scale would become if it were solved for, and its σ;
+    ``settled`` : whether σ and outliers did within :data:`ROUNDS`."""
 
     state: State
     normal: np.ndarray
     residuals: np.ndarray
-    spread: np.ndarray
+    covariance: np.ndarray
     outliers: np.ndarray
     sigma: dict[str, float]
     variance_factor: float
-    spare: int
+    redundancy: int
     scale_hint: tuple[float, float]
+    settled: bool
 
 
 def adjust_poses(loop: Loop, start: State, noise: Noise, with_scale: bool = False, robust: bool = True) -> PoseSolution:
@@ -82,19 +83,29 @@ def adjust_poses(loop: Loop, start: State, noise: Noise, with_scale: bool = Fals
         if parts.names:
             old = variances
             variances = variance_components(parts.of(used), residuals[used], slope[used], first)
-            settled = np.abs(np.log(variances / old)).max() < SETTLED
+            settled = bool(np.abs(np.log(variances / old)).max() < SETTLED)
         if robust and round_ < ROUNDS // 2:  # later they stay: a set that swings would never settle
             used = _agreeing(residuals, slope, parts.total(variances), used, estimated=bool(parts.names))
-        if settled and (used == before).all():
+        settled &= bool((used == before).all())
+        if settled:
             break
     spread = parts.total(variances)
     state, normal = _solved(loop[used], state, spread[used], count)
     residuals = _residuals(loop, state)
     sigma = {name: float(v) for name, v in zip(parts.names, np.sqrt(variances), strict=True)}
-    spare = max(6 * int(used.sum()) - count, 1)
-    factor = float(_squared(residuals, spread)[used].sum() / spare)
-    hint = _scale_hint(loop[used], state, residuals[used], spread[used])
-    return PoseSolution(state, normal, residuals, spread, ~used, sigma, factor, spare, hint)
+    redundancy = max(6 * int(used.sum()) - count, 1)
+    return PoseSolution(
+        state=state,
+        normal=normal,
+        residuals=residuals,
+        covariance=spread,
+        outliers=~used,
+        sigma=sigma,
+        variance_factor=float(_squared(residuals, spread)[used].sum() / redundancy),
+        redundancy=redundancy,
+        scale_hint=_scale_hint(loop[used], state, residuals[used], spread[used]),
+        settled=settled,
+    )
 
 
 def _scale_hint(loop: Loop, state: State, residuals: np.ndarray, spread: np.ndarray) -> tuple[float, float]:
@@ -143,11 +154,11 @@ def _agreeing(
 ) -> np.ndarray:
     """Which poses, (m,), agree with the solution of all others."""
     m, count = len(used), slope.shape[2]
-    spare = 6 * int(used.sum()) - count - 6
-    if spare < 6:
+    redundancy = 6 * int(used.sum()) - count - 6
+    if redundancy < 6:
         return used
     level = 1 - FALSE_ALARM / m
-    limit = 6 * f.ppf(level, 6, spare) if estimated else chi2.ppf(level, 6)
+    limit = 6 * f.ppf(level, 6, redundancy) if estimated else chi2.ppf(level, 6)
     agrees = against_others(residuals, slope, spread, used) <= limit
     return agrees if agrees.sum() >= LEAST_POSES else used
 

@@ -86,7 +86,8 @@ class Adjusted:
     """``state`` : of the poses used; ``outliers`` : (m,); ``normal`` : (12, 12) of X and Z, all else eliminated;
     ``covariance`` : its inverse; ``sigma_scale``; ``sigma`` : by group; ``estimated`` : which of them;
     ``scale_hint`` : what the scale would become if it were solved for, and its σ;
-    ``camera_gain`` : by how much the cost would fall, per parameter, if intrinsics were; ``found``."""
+    ``camera_gain`` : by how much the cost would fall, per parameter, if intrinsics were; ``found``; ``settled`` :
+    whether the estimated σ did."""
 
     state: Bundle
     outliers: np.ndarray
@@ -98,6 +99,7 @@ class Adjusted:
     scale_hint: tuple[float, float]
     camera_gain: float
     found: Reprojection
+    settled: bool
 
 
 def adjust_views(
@@ -135,7 +137,8 @@ def adjust_views(
         rows = np.flatnonzero(used)
         corners, free = problem(loop[rows], base_from_flange[rows], views[rows], noise, intrinsics, with_scale)
         begin = Bundle(x, z, corners.base_from_flange, corners.xyz_board, views.camera, scale)
-        corners, state, normal = adjust(corners, begin, free)
+        solution = adjust(corners, begin, free)
+        corners, state, normal = solution.corners, solution.state, solution.normal
         inverse = generalised_inverse(normal)
         bad = _contradicting(corners, state, inverse)
         if not bad.any() or used.sum() - bad.sum() < LEAST_POSES:
@@ -148,16 +151,17 @@ def adjust_views(
     rest = generalised_inverse(normal[12:, 12:])
     own = normal[:12, :12] - normal[:12, 12:] @ rest @ normal[12:, :12]
     return Adjusted(
-        state,
-        ~used,
-        own,
-        inverse[:12, :12],
-        sigma_scale,
-        sigma,
-        free,
-        _scale_hint(corners, state),
-        _camera_gain(corners, state),
-        found,
+        state=state,
+        outliers=~used,
+        normal=own,
+        covariance=inverse[:12, :12],
+        sigma_scale=sigma_scale,
+        sigma=sigma,
+        estimated=free,
+        scale_hint=_scale_hint(corners, state),
+        camera_gain=_camera_gain(corners, state),
+        found=found,
+        settled=solution.settled,
     )
 
 
@@ -226,8 +230,8 @@ def _contradicting(corners: Corners, state: Bundle, inverse: np.ndarray) -> np.n
     value, vector = np.linalg.eigh(np.eye(6) - weight @ own @ np.swapaxes(weight, 1, 2))
     turned = np.einsum("mab,ma->mb", vector, white)
     squared = np.where(value > SEEN, turned**2 / np.maximum(value, SEEN), 0).sum(1)
-    spare = max(6 * (m - 1) - corners.places()["board"].start, 6)
-    return squared > 6 * f.ppf(1 - FALSE_ALARM / m, 6, spare)
+    redundancy = max(6 * (m - 1) - corners.places()["board"].start, 6)
+    return squared > 6 * f.ppf(1 - FALSE_ALARM / m, 6, redundancy)
 
 
 def _scale_hint(corners: Corners, state: Bundle) -> tuple[float, float]:

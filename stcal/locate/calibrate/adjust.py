@@ -63,7 +63,8 @@ class Adjusted:
     ``board_factor`` : by which the stated σ of the board's points are too small, as the residuals say; ``sigma_px``,
     ``tag_sigma_px`` : what print, lens and flatness add to the σ of a corner, and to the four of a tag together;
     ``board_rms_px``, ``tag_rms_px`` : per coordinate; ``image_rms_px`` : (m,) of the tags in each image;
-    ``downweighted`` : share of the tags that are damped as outliers."""
+    ``downweighted`` : share of the tags that are damped as outliers; ``settled`` : whether the σ did within
+    :data:`VARIANCE_ROUNDS`."""
 
     corners_mm: np.ndarray
     covariance_mm2: np.ndarray
@@ -75,6 +76,7 @@ class Adjusted:
     tag_rms_px: float
     image_rms_px: np.ndarray
     downweighted: float
+    settled: bool
 
 
 @dataclass(frozen=True, slots=True)
@@ -113,26 +115,29 @@ def adjust(images: Sequence[ImageCorners], start: np.ndarray) -> Adjusted:
     corners = start.reshape(-1, 2).copy()
     poses = Poses.of([image.pose for image in images])
     noise = _first_noise(images, poses, corners)
+    settled = False
     for round_ in range(VARIANCE_ROUNDS):
         poses, corners = _settled(images, poses, corners, noise)
         blocks = [_blocks(image, poses[[i]], corners, noise) for i, image in enumerate(images)]
         covariance = np.linalg.inv(_reduced(images, blocks, len(corners))[0])
         before, noise = noise, _variances(images, blocks, covariance, noise)
         change = max(abs(noise.corner_px - before.corner_px), abs(noise.tag_px - before.tag_px))
-        if round_ and abs(noise.board / before.board - 1) < 0.01 and change < NEAR_PX:
+        settled = round_ > 0 and abs(noise.board / before.board - 1) < 0.01 and change < NEAR_PX
+        if settled:
             break
     board, tags = ([block[side] for block in blocks] for side in (0, 1))
     return Adjusted(
-        corners.reshape(-1, 4, 2),
-        covariance,
-        poses,
-        noise.board,
-        noise.corner_px,
-        noise.tag_px,
-        _rms(np.concatenate([g.px.ravel() for g in board])),
-        _rms(np.concatenate([g.px.ravel() for g in tags])),
-        np.array([_rms(g.px) for g in tags]),
-        float((np.concatenate([g.weight for g in tags]) < 1).mean()),
+        corners_mm=corners.reshape(-1, 4, 2),
+        covariance_mm2=covariance,
+        poses=poses,
+        board_factor=noise.board,
+        sigma_px=noise.corner_px,
+        tag_sigma_px=noise.tag_px,
+        board_rms_px=_rms(np.concatenate([g.px.ravel() for g in board])),
+        tag_rms_px=_rms(np.concatenate([g.px.ravel() for g in tags])),
+        image_rms_px=np.array([_rms(g.px) for g in tags]),
+        downweighted=float((np.concatenate([g.weight for g in tags]) < 1).mean()),
+        settled=settled,
     )
 
 

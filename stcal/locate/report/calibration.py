@@ -48,6 +48,8 @@ def warnings(result: CalibratedLayout, names: tuple[tuple[str, int], ...]) -> li
         found.append(
             f"{result.adjusted.downweighted:.0%} of the tags seen are outliers; is target and board one plane?"
         )
+    if not result.adjusted.settled:
+        found.append("the σ of board and tags still change at the end of the adjustment; add images")
     return found
 
 
