@@ -15,11 +15,10 @@ from scipy.spatial.transform import Rotation
 from stcal.errors import ConvergenceError
 from stcal.geometry.pose_descent import Minima, PoseStack
 from stcal.geometry.rigid import Rigid
+from stcal.geometry.robust import HUBER, huber_weights, robust_sigma
 
-HUBER = 3.0
-"""In σ of a point, or in the residuals' robust σ if that is larger: one honest point in ninety is beyond (Rayleigh)."""
 OUTLIER = 6.0
-"""In the same unit: by chance one point in 6·10⁷ (Rayleigh)."""
+"""In σ, or the residuals' robust σ if that is larger: by chance one point in 6·10⁷ (Rayleigh)."""
 MAX_OUTLIER_SHARE = 1 / 3
 """Of what was seen: beyond it, the rest is no majority that could be believed."""
 SAME = 1.0
@@ -28,8 +27,6 @@ WIDER = 1.1
 """Residuals whose robust σ is larger by this factor change what Huber's loss damps: the descent is repeated."""
 MAX_SIGMA_RAD = 0.5
 """A rotation whose σ is larger is none: linear propagation says nothing any more."""
-RAYLEIGH_MEDIAN = float(np.sqrt(2 * np.log(2)))
-
 Descend = Callable[[PoseStack, float], Minima]
 """From h poses and the limit of Huber's loss, in σ, to the h minima next to them."""
 
@@ -111,7 +108,7 @@ def two_minima(
         descend = descend_near(poses[[0]])
         found = _ordered(descend(poses, HUBER * sigma))
         poses = found.poses
-        wider = float(np.median(found.length[0])) / RAYLEIGH_MEDIAN
+        wider = robust_sigma(found.length[0], 2)
         if wider <= WIDER * sigma:
             break
         sigma = wider
@@ -129,9 +126,9 @@ def _ordered(found: Minima) -> Minima:
     return found.rows(np.argsort(found.cost, kind="stable"))
 
 
-def huber_weights(length: np.ndarray) -> np.ndarray:
-    """Of residuals, of any shape, whose length is in σ."""
-    return np.minimum(1.0, HUBER / np.maximum(length, HUBER))
+def weights_of(length: np.ndarray) -> np.ndarray:
+    """Huber's weights of points, same shape, whose residuals have these lengths in σ."""
+    return huber_weights(length, HUBER)
 
 
 def deciding_delta(flip_odds: float, sigma_margin: float, variance_factor: float) -> float:

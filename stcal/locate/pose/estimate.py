@@ -20,9 +20,9 @@ from stcal.geometry.plane_poses import (
     MAX_SIGMA_RAD,
     Weighed,
     covariance_of_both,
-    huber_weights,
     step_between,
     two_minima,
+    weights_of,
 )
 from stcal.geometry.pose_descent import Minima, PoseStack
 from stcal.geometry.rigid import Poses, Rigid
@@ -261,7 +261,7 @@ def _poses(problem: PlanarProblem, sets: list[slice]) -> Poses | None:
 
 def _answer(problem: PlanarProblem, found: Minima, rows: np.ndarray, outliers: tuple[int, ...]) -> ObjPose:
     """Decide between the minima, and collect."""
-    own = huber_weights(found.length)
+    own = weights_of(found.length)
     if len(own) == 1:
         return _collected(problem, weighed(problem, found.poses, own[0]), own[0], rows, outliers)
     # Both minima weigh the corners alike, as the stricter of the two does, or an outlier of one of them could decide.

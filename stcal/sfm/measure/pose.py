@@ -15,7 +15,7 @@ from scipy.stats import chi2 as chi_square
 from stcal.errors import DegenerateError, InputError
 from stcal.geometry.arrays import frozen
 from stcal.geometry.camera import Camera
-from stcal.geometry.plane_poses import MAX_SIGMA_RAD, deciding_delta, distinct, huber_weights, weigh
+from stcal.geometry.plane_poses import MAX_SIGMA_RAD, deciding_delta, distinct, weigh, weights_of
 from stcal.geometry.pose_descent import Minima, PoseStack, block_diagonal
 from stcal.geometry.rigid import Rigid
 from stcal.io.camera import CameraPrior, intrinsic_basis
@@ -240,7 +240,7 @@ def _second_solution(problem: PoseProblem, found: Minima, redundancy: int) -> tu
     if behind > HOPELESS * max(1.0, found.cost[0] / redundancy):  # whatever the weights
         return behind, found.poses[[1]]
     residual, image = problem.seen(found.poses)
-    common = np.tile(problem.noise / huber_weights(found.length).min(0)[:, None, None], (2, 1, 1, 1))
+    common = np.tile(problem.noise / weights_of(found.length).min(0)[:, None, None], (2, 1, 1, 1))
     both = weigh(residual, image.by_pose, covariance_of_centres(problem, image, common), found.poses)
     if not distinct(both.poses, both.normal[0]):
         return np.inf, None
@@ -275,7 +275,7 @@ def _solution(
 
     Two steps: what the first leaves is of second order.
     """
-    weights = huber_weights(minimum.length[0])
+    weights = weights_of(minimum.length[0])
     noise = problem.noise / weights[:, None, None]
     residual, image = problem.seen(minimum.poses)
     full = covariance_of_centres(problem, image, noise[None])
