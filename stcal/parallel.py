@@ -11,6 +11,8 @@ from concurrent.futures import ProcessPoolExecutor, as_completed
 from typing import TypeVar
 
 R = TypeVar("R")
+Progress = Callable[[str, int, int], None]
+"""Called with (stage, done, total)."""
 ONE_THREAD = ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS", "OPENCV_FOR_THREADS_NUM")
 """Libraries take their number of threads from these when they are loaded; processes side by side need one each."""
 _limited = threading.Lock()

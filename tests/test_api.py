@@ -28,7 +28,6 @@ UNDOCUMENTED: set[str] = {
     "stcal.sfm.measure",
     "stcal.sfm.plan",
     "stcal.sfm.read_target",
-    "stcal.sfm.run",
 }
 """Names whose docstrings lack something. It only shrinks: whoever completes a docstring takes its name off, and no new
 name comes on."""

@@ -34,8 +34,8 @@ from stcal.sfm.adjust.scale import find_scale
 from stcal.sfm.data.model import WorldModel
 from stcal.sfm.data.observations import ImageObservations
 from stcal.sfm.mapping.graph import image_graph
-from stcal.sfm.pipeline import solve_groups
 from stcal.sfm.run.options import RunOptions
+from stcal.sfm.run.solve import solve_groups
 from stcal.synthetic.dataset import write_dataset
 from stcal.synthetic.scene import Scene, SceneOptions, make_scene
 

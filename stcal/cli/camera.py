@@ -7,10 +7,9 @@ import typer
 
 from stcal.cli.options import BoardFile, TargetFile, Workers
 from stcal.cli.terminal import StageProgress
-from stcal.design import reference_board, reference_target
 from stcal.errors import InputError
 from stcal.io.camera import write_cameras_txt
-from stcal.io.design import load_board, load_target
+from stcal.io.design import board_of, target_of
 from stcal.io.saving import json_text, save
 
 app = typer.Typer()
@@ -43,12 +42,11 @@ def calibrate_camera(
     from stcal.sfm.camera.calibrate import calibrate_camera as calibrate
     from stcal.sfm.camera.calibrate import calibration_json
     from stcal.sfm.camera.text import calibration_text
-    from stcal.sfm.pipeline import load_design
 
     if out.exists():
         raise InputError(f"{out}: exists; give a new file with --out")
-    target_design = load_design(target, reference_target, load_target)
-    board_design = load_design(board, reference_board, load_board)
+    target_design = target_of(target)
+    board_design = board_of(board)
     with StageProgress() as progress:
         result = calibrate(images, target_design, board_design, model, workers=workers, progress=progress)
     write_cameras_txt(out, result.intrinsics.camera, model, result.intrinsics.covariance)

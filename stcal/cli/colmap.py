@@ -81,14 +81,13 @@ def crosscheck(
     ] = 600.0,
 ) -> None:
     """Map the same database with the native COLMAP and compare faces, circles and cameras, into the report."""
-    from stcal.sfm import pipeline
-    from stcal.sfm.interop.crosscheck import Tolerances, comparison_text
+    from stcal.sfm.interop.crosscheck import Tolerances, comparison_text, crosscheck_run
     from stcal.sfm.run.saved import load_run
 
     tolerances = Tolerances(tolerance_um, tolerance_mdeg, tolerance_um, camera_tolerance_um, camera_tolerance_mdeg)
     saved = load_run(run)
     with StageProgress() as progress:
-        check = pipeline.crosscheck_run(saved, colmap, tolerances, timeout, progress)
+        check = crosscheck_run(saved, colmap, tolerances, timeout, progress)
     print(comparison_text(check))
     print(f"report: {run / 'report.html'}")
     if check["differences"]:
@@ -111,7 +110,7 @@ def faces(
     ] = None,
 ) -> None:
     """Find scale and faces from a COLMAP model made or edited elsewhere; labels come by (image, keypoint)."""
-    from stcal.sfm import pipeline
+    from stcal.sfm.interop.external import calibrate_models, write_faces
     from stcal.sfm.interop.text import faces_text
     from stcal.sfm.run.saved import load_run
 
@@ -120,10 +119,10 @@ def faces(
     if out is not None and not out.parent.is_dir():
         raise InputError(f"{out}: no folder {out.parent}; make it, or give another place with --out")
     saved = load_run(run)
-    calibration = pipeline.calibrate_models(model, saved)
+    calibration = calibrate_models(model, saved)
     print(faces_text(calibration, saved))
     if out is not None:
-        pipeline.write_faces(out, calibration, saved)
+        write_faces(out, calibration, saved)
         print(f"faces: {out}")
 
 

@@ -7,10 +7,9 @@ import typer
 
 from stcal.cli.options import CameraFile, MaxDiameter, MinDiameter, ReportFile, TargetFile, Workers, ellipse_options
 from stcal.cli.terminal import StageProgress, print_each, write
-from stcal.design import reference_target
 from stcal.errors import InputError
 from stcal.io.camera import read_camera
-from stcal.io.design import load_board, load_target
+from stcal.io.design import load_board, target_of
 from stcal.io.saving import keep_apart
 
 app = typer.Typer()
@@ -64,13 +63,12 @@ def measure(
     from stcal.sfm.measure import images as work
     from stcal.sfm.measure.pose import PoseOptions
     from stcal.sfm.measure.target import read_target
-    from stcal.sfm.pipeline import load_design
 
     keep_apart({"--out": out, "--json": json_file, "--report": report}, (camera, faces, target, board, joints))
     for path in (out, json_file, report):
         if path is not None and not path.parent.is_dir():
             raise InputError(f"{path}: no folder {path.parent}; make it, or give another place")
-    design = load_design(target, reference_target, load_target)
+    design = target_of(target)
     known = read_target(faces, design)
     table = read_table(joints, "joints") if joints else None
     options = work.MeasureOptions(

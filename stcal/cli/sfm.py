@@ -18,10 +18,9 @@ from stcal.cli.options import (
     ellipse_options,
 )
 from stcal.cli.terminal import StageProgress
-from stcal.design import reference_board, reference_target
 from stcal.errors import InputError
 from stcal.io.camera import read_camera
-from stcal.io.design import load_board, load_target
+from stcal.io.design import board_of, target_of
 
 app = typer.Typer(
     name="stcal-sfm",
@@ -115,9 +114,10 @@ def run(
     """Calibrate the target: detect, map, scale, chain and adjust; writes faces.json and report.html."""
     from stcal.sfm import pipeline
     from stcal.sfm.mapping.pairs import PairOptions
+    from stcal.sfm.run.options import RunOptions
     from stcal.sfm.run.text import run_text
 
-    options = pipeline.RunOptions(
+    options = RunOptions(
         solve=solve.value if solve is not None else None,
         frame=frame.value if frame is not None else None,
         eccentricity=eccentricity,
@@ -150,17 +150,19 @@ def detect(
     """Detect circles alone: detections.csv and an overlay picture of every image."""
     from stcal.io.images import find_images
     from stcal.sfm import pipeline
+    from stcal.sfm.run.folder import claim_folder
     from stcal.sfm.run.marker import MarkerFile
+    from stcal.sfm.run.options import RunOptions
     from stcal.sfm.run.text import detection_text
 
     model = read_camera(camera)
-    target_design = pipeline.load_design(target, reference_target, load_target)
-    board_design = pipeline.load_design(board, reference_board, load_board)
-    options = pipeline.RunOptions(ellipses=ellipse_options(min_diameter, max_diameter), workers=workers)
+    target_design = target_of(target)
+    board_design = board_of(board)
+    options = RunOptions(ellipses=ellipse_options(min_diameter, max_diameter), workers=workers)
     if (out / "faces.json").exists():
         raise InputError(f"output folder {out}: holds a finished calibration; give another folder with --out")
     find_images(images)
-    folder = pipeline.claim_folder(out, MarkerFile.of(images, None))
+    folder = claim_folder(out, MarkerFile.of(images, None))
     with StageProgress() as progress:
         detection, labelled = pipeline.detect(images, model, folder, target_design, board_design, options, progress)
     print(detection_text(detection, labelled))

@@ -7,7 +7,7 @@ from typing import Annotated
 import numpy as np
 from pydantic import AfterValidator, BeforeValidator, Field
 
-from stcal.design import BoardDesign, FaceDesign, Polarity, TargetDesign
+from stcal.design import BoardDesign, FaceDesign, Polarity, TargetDesign, reference_board, reference_target
 from stcal.errors import InputError
 from stcal.io.toml import Finite, Positive, Strict, load_toml
 from stcal.labels import BOARD
@@ -107,6 +107,16 @@ def load_board(path: str | Path) -> BoardDesign:
         corner,
         data.corner.radius_mm if data.corner else None,
     )
+
+
+def target_of(given: str | Path | TargetDesign | None) -> TargetDesign:
+    """The target that is given, or that a file holds; the reference design where None."""
+    return reference_target() if given is None else given if isinstance(given, TargetDesign) else load_target(given)
+
+
+def board_of(given: str | Path | BoardDesign | None) -> BoardDesign:
+    """The board that is given, or that a file holds; the reference board where None."""
+    return reference_board() if given is None else given if isinstance(given, BoardDesign) else load_board(given)
 
 
 def _no_duplicates(ids: list[str], what: str) -> None:

@@ -1,6 +1,5 @@
 """Hand-eye calibration from a file of poses or from images of any board: ``stcal handeye`` composes three systems."""
 
-from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
@@ -17,12 +16,11 @@ from stcal.handeye.report.file import Outcome
 from stcal.handeye.validate import LEAST_LEFT, compare, cross_validate, splits
 from stcal.io.camera import CameraPrior, camera_prior, read_camera, refinable
 from stcal.io.images import ImageFile, find_images
+from stcal.parallel import Progress
 from stcal.workflows.board_views import detect_boards
 
 ALL = "all"
 """In place of a method's name: all of them, compared."""
-Progress = Callable[[str, int, int], None]
-"""Called with (stage, done, total)."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -17,6 +17,7 @@ import pycolmap
 
 from stcal.errors import InputError, MappingError
 from stcal.geometry.rigid import Rigid
+from stcal.parallel import Progress
 from stcal.sfm.adjust.calibration import Calibration, calibrate
 from stcal.sfm.adjust.chain import CalibratedTarget
 from stcal.sfm.adjust.refine import refine
@@ -27,6 +28,7 @@ from stcal.sfm.interop.schema import schema_of_version
 from stcal.sfm.mapping.database import from_colmap_px, image_ids
 from stcal.sfm.mapping.incremental import labelled_model, pipeline_options, seeded_mapping
 from stcal.sfm.mapping.models import KEYPOINT_TOLERANCE_PX, ReadModel, find_models, open_model, read_model
+from stcal.sfm.run.folder import require_report, write_report
 from stcal.sfm.run.saved import SavedRun
 
 MICRO = 1e3
@@ -52,6 +54,16 @@ class Tolerances:
         for name, value in asdict(self).items():
             if not 0 <= value < np.inf:
                 raise InputError(f"tolerance {name} {value:g}: a number of 0 or more needed; give another")
+
+
+def crosscheck_run(
+    saved: SavedRun, colmap: Path | None, tolerances: Tolerances, timeout_s: float, progress: Progress | None = None
+) -> dict:
+    """Cross-check a finished run with the native COLMAP; the comparison is added to its report."""
+    require_report(saved)  # before minutes of mapping
+    check = crosscheck(saved, colmap, tolerances, timeout_s, progress)
+    write_report(saved.folder, saved.report | {"crosscheck": check})
+    return check
 
 
 def crosscheck(

@@ -2,14 +2,19 @@
 
 from collections.abc import Sequence
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 
 from stcal.errors import InputError, MappingError
 from stcal.geometry.camera import Camera
+from stcal.io.saving import json_text, save
+from stcal.parallel import one_thread
 from stcal.sfm.adjust.calibration import Calibration, calibrate
+from stcal.sfm.adjust.file import FacesFile
 from stcal.sfm.data.model import WorldModel
-from stcal.sfm.mapping.models import ReadModel
+from stcal.sfm.mapping.database import image_ids
+from stcal.sfm.mapping.models import ReadModel, find_models, read_model
 from stcal.sfm.run.saved import SavedRun
 
 
@@ -63,6 +68,21 @@ def faces_from_models(read: Sequence[ReadModel], run: SavedRun) -> Calibration:
     except MappingError as error:
         raise MappingError("; ".join([str(error), *notes])) from error
     return replace(calibration, notes=(*notes, *calibration.notes))
+
+
+@one_thread()
+def calibrate_models(model: Path, run: SavedRun) -> Calibration:
+    """Scale and faces from a COLMAP model, or the models in a folder, that rest on the run's database."""
+    ids = image_ids(run.observations)
+    read = [read_model(path, run.observations, ids, run.corrected_px) for path in find_models(model)]
+    return faces_from_models(read, run)
+
+
+def write_faces(path: Path, calibration: Calibration, run: SavedRun) -> None:
+    """``faces.json`` of models that were chained."""
+    options = replace(run.options, solve="chain").adjustment(run.target)
+    faces = FacesFile.of(calibration.target, run.target, options, calibration.sigma_factor)
+    save(path, json_text(faces.content()))
 
 
 def _camera_change_px(camera: Camera, run: SavedRun) -> float:

@@ -7,8 +7,10 @@ import numpy as np
 
 from stcal.design import BoardDesign, TargetDesign
 from stcal.geometry.camera import Camera
+from stcal.io.camera import CameraPrior
 from stcal.sfm.adjust.calibration import Calibration
 from stcal.sfm.adjust.chain import Chain
+from stcal.sfm.checks.suite import Evidence
 from stcal.sfm.checks.verdict import Check
 from stcal.sfm.data.observations import ImageObservations
 from stcal.sfm.detect.files import DetectionResult
@@ -46,3 +48,20 @@ class RunResult:
     def observations(self) -> list[ImageObservations]:
         """Labelled centres of all images, in the database's order."""
         return [each.observations for each in self.labelled]
+
+    def evidence(self, prior: CameraPrior) -> Evidence:
+        """What the checks look at; ``prior`` : of the intrinsics, where they were refined."""
+        blur = {i.file.name: i.detection.centres.blur_px for i in self.detection.images}
+        return Evidence(
+            models=tuple(s.model for s in self.solutions),
+            outliers=tuple(o for s in self.solutions for o in s.outliers),
+            images=tuple(self.observations()),
+            camera=self.camera,
+            colmap_model=self.colmap_model,
+            target=self.target_design,
+            board=self.board_design,
+            options=self.options.adjustment(self.target_design),
+            calibration=self.calibration,
+            prior=prior if self.options.refine_camera else None,
+            blur_px={name: float(np.median(each)) for name, each in blur.items() if len(each)},
+        )

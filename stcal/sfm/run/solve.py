@@ -2,6 +2,7 @@
 
 import hashlib
 import json
+import shutil
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, fields
 from pathlib import Path
@@ -15,11 +16,15 @@ from stcal.geometry.rigid import Rigid
 from stcal.io.cache import keep, kept
 from stcal.io.images import SUFFIXES, TOP_GROUP, Skipped
 from stcal.labels import DotLabel, dot_cells, parse_labels
+from stcal.parallel import Progress
 from stcal.sfm.adjust.refine import refine
 from stcal.sfm.data.model import Outlier, WorldModel
-from stcal.sfm.data.observations import ImageObservations
+from stcal.sfm.data.observations import ImageObservations, by_group
+from stcal.sfm.mapping.database import image_ids, write_database
+from stcal.sfm.mapping.graph import ImageGraph
 from stcal.sfm.mapping.incremental import left_out, map_group
 from stcal.sfm.mapping.pairs import PairOptions, PairScore, rank_pairs
+from stcal.sfm.run.options import RunOptions
 
 CACHE_VERSION = 4
 _ARRAYS = ("xyz_world", "image_index", "point_index", "keypoint", "measured_px", "shift_px", "covariance_px2")
@@ -196,3 +201,46 @@ def unseen_board(solutions: list[GroupSolution], board: BoardDesign) -> list[str
         if missing:
             notes.append(f"board {what} {', '.join(missing)}: not seen in any image; check {what}s in the board file")
     return notes
+
+
+def solve_groups(
+    observations: Sequence[ImageObservations],
+    graph: ImageGraph,
+    out: Path,
+    camera: Camera,
+    colmap_model: str,
+    target: TargetDesign,
+    board: BoardDesign,
+    options: RunOptions,
+    progress: Progress,
+) -> list[GroupSolution]:
+    """Map and refine group by group, in ``out/scratch``, which is removed again."""
+    scratch = out / "scratch"
+    shutil.rmtree(scratch, ignore_errors=True)
+    scratch.mkdir()
+    ids = image_ids(observations)
+    database = scratch / "mapping.db"
+    groups = by_group(observations)
+    solutions = []
+    try:
+        write_database(database, camera, colmap_model, observations, graph.pairs)
+        for name, group in groups.items():
+            solutions.append(
+                solve_group(
+                    group,
+                    [observations[i].name for i in graph.skeleton[name]],
+                    database,
+                    scratch / "models",
+                    ids,
+                    camera,
+                    target,
+                    board,
+                    options.pairs,
+                    options.eccentricity,
+                    out / "cache",
+                )
+            )
+            progress("map", len(solutions), len(groups))
+    finally:
+        shutil.rmtree(scratch, ignore_errors=True)
+    return solutions

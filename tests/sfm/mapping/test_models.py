@@ -16,11 +16,10 @@ import pytest
 
 from stcal.errors import InputError, MappingError, ScaleError
 from stcal.sfm.interop.export_database import export_database
-from stcal.sfm.interop.external import faces_from_models
+from stcal.sfm.interop.external import calibrate_models, faces_from_models
 from stcal.sfm.mapping.database import image_ids
 from stcal.sfm.mapping.incremental import seeded_mapping
 from stcal.sfm.mapping.models import find_models, open_model, read_model, write_model
-from stcal.sfm.pipeline import calibrate_models
 from stcal.sfm.run.saved import load_run
 from tests.outcome import COMPUTATION, INPUT, assert_error
 

@@ -22,7 +22,8 @@ from stcal.sfm.mapping.graph import (
     track_parts,
 )
 from stcal.sfm.mapping.resect import complete
-from stcal.sfm.pipeline import RunOptions, solve_groups
+from stcal.sfm.run.options import RunOptions
+from stcal.sfm.run.solve import solve_groups
 from stcal.synthetic.scene import SceneOptions, make_scene
 from tests.scripts import script_path
 

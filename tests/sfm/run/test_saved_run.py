@@ -13,7 +13,7 @@ from stcal.errors import InputError
 from stcal.sfm import run
 from stcal.sfm.detect.ellipses import EllipseOptions
 from stcal.sfm.mapping.pairs import PairOptions
-from stcal.sfm.pipeline import claim_folder
+from stcal.sfm.run.folder import claim_folder
 from stcal.sfm.run.marker import MarkerFile
 from stcal.sfm.run.options import RunOptions
 from stcal.sfm.run.saved import load_run

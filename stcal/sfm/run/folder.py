@@ -1,0 +1,164 @@
+"""The folder of a run: claimed, its overlays, its results, its report."""
+
+import os
+import shutil
+from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
+
+import numpy as np
+
+from stcal.design import TargetDesign
+from stcal.errors import InputError
+from stcal.io.camera import write_cameras_txt
+from stcal.io.design import board_toml, target_toml
+from stcal.io.images import RUN_MARKER
+from stcal.io.saving import json_text, save
+from stcal.parallel import Progress
+from stcal.sfm.adjust.file import FacesFile
+from stcal.sfm.data.model import GroupModel
+from stcal.sfm.data.observations import ImageObservations
+from stcal.sfm.detect.files import DetectionResult
+from stcal.sfm.detect.labels import LabelledImage
+from stcal.sfm.detect.overlay import draw_overlay
+from stcal.sfm.mapping.database import image_ids, labels_csv, remove_database, write_database
+from stcal.sfm.mapping.models import write_model
+from stcal.sfm.report.page import report_html, shown_overlays
+from stcal.sfm.run.marker import MarkerFile
+from stcal.sfm.run.output import report_of
+from stcal.sfm.run.result import RunResult
+from stcal.sfm.run.saved import BOARD, CAMERA, TARGET, SavedRun
+
+RESULTS = ("faces.json", "report.json", "report.html", "labels.csv", "detections.csv", "compare.json")
+RESULTS += (CAMERA, TARGET, BOARD)
+RESULT_FOLDERS = ("models", "target_model", "overlays", "scratch")
+
+
+def claim_folder(out: str | Path, content: MarkerFile) -> Path:
+    """Make the run's folder, mark it as ours with ``content``, and remove results that will be made anew.
+
+    Raises
+    ------
+    InputError
+        The folder holds something else.
+    """
+    out = Path(out)
+    marker = out / RUN_MARKER
+    try:
+        if out.exists() and not out.is_dir():
+            raise InputError(f"output {out}: not a folder; give a new folder with --out")
+        if out.is_dir() and not marker.exists() and any(not p.name.startswith(RUN_MARKER) for p in out.iterdir()):
+            raise InputError(f"output folder {out}: not empty and not of an earlier run; give a new folder with --out")
+        out.mkdir(parents=True, exist_ok=True)
+        save(marker, json_text(content.content()))
+        for name in RESULTS:
+            (out / name).unlink(missing_ok=True)
+        for name in RESULT_FOLDERS:
+            shutil.rmtree(out / name, ignore_errors=True)
+        remove_database(out / "database.db")
+    except OSError as error:
+        raise InputError(f"output folder {out}: {error.strerror or error}; give a writable folder") from error
+    return out
+
+
+def write_overlays(
+    detection: DetectionResult, labelled: list[LabelledImage], target: TargetDesign, out: Path, progress: Progress
+) -> None:
+    """Of every image, what was found in it."""
+    face_ids = [face.id for face in target.faces]
+
+    def draw(image, each: LabelledImage) -> None:
+        path = overlay_path(out, image.file.name)
+        path.parent.mkdir(parents=True, exist_ok=True)
+        picture = draw_overlay(
+            image.thumbnail,
+            image.thumbnail_scale,
+            each.observations,
+            face_ids,
+            detection.camera.focal,
+            len(each.notes),
+        )
+        save(path, picture)
+
+    with ThreadPoolExecutor() as pool:  # drawing and JPEG release the interpreter
+        for i, _ in enumerate(pool.map(draw, _in_order(detection, labelled), labelled)):
+            progress("overlays", i + 1, len(labelled))
+
+
+def _in_order(detection: DetectionResult, labelled: list[LabelledImage]):
+    by_name = {image.file.name: image for image in detection.images}
+    return [by_name[each.observations.name] for each in labelled]
+
+
+def overlay_path(out: Path, name: str) -> Path:
+    """The overlay of an image."""
+    return out / "overlays" / f"{name}.jpg"
+
+
+def write_run(result: RunResult, progress: Progress) -> None:
+    """The database with corrected centres, models, faces and report; ``faces.json`` comes last but for the report."""
+    out = result.out
+    observations = result.observations()
+    ids = image_ids(observations)
+    models = {s.model.group: s.model for s in result.solutions}
+    corrected = _corrected_px(models, observations)
+    write_database(out / "database.db", result.camera, result.colmap_model, observations, result.graph.pairs, corrected)
+    save(out / "labels.csv", labels_csv(observations, corrected))
+    shutil.rmtree(out / "models", ignore_errors=True)
+    for name, model in models.items():
+        folder = out / "models" / name  # "models/." where the images lie directly in their folder
+        write_model(folder, [model], observations, ids, result.camera, result.colmap_model)
+    write_model(
+        out / "target_model",
+        result.calibration.models,
+        observations,
+        ids,
+        result.calibration.camera,
+        result.colmap_model,
+    )
+    write_cameras_txt(out / CAMERA, result.camera, result.colmap_model, result.camera_covariance)
+    save(out / TARGET, target_toml(result.target_design))
+    save(out / BOARD, board_toml(result.board_design))
+    report = report_of(result).content()
+    faces = FacesFile.of(
+        result.target,
+        result.target_design,
+        result.options.adjustment(result.target_design),
+        result.calibration.sigma_factor,
+    )
+    save(out / "faces.json", json_text(faces.content()))
+    write_report(out, report)
+    progress("report", 1, 1)
+
+
+def write_report(out: Path, report: dict) -> None:
+    """``report.json`` and ``report.html`` of a run's folder."""
+    page = _report_page(out, report)
+    save(out / "report.json", json_text(report))
+    save(out / "report.html", page)
+
+
+def _report_page(out: Path, report: dict) -> bytes:
+    overlays = {name: overlay_path(out, name).read_bytes() for name in shown_overlays(report)}
+    return report_html(report, overlays).encode()
+
+
+def require_report(saved: SavedRun) -> None:
+    """Refuse a run whose report cannot be added to: of another version, without its overlays, or read-only."""
+    try:
+        _report_page(saved.folder, {key: value for key, value in saved.report.items() if key != "crosscheck"})
+    except OSError as error:
+        raise InputError(f"{error.filename}: {error.strerror or error}; the report needs it, run it again") from error
+    except (LookupError, TypeError, ValueError, AttributeError) as error:
+        reason = f"no {error}" if isinstance(error, KeyError) else error
+        raise InputError(
+            f"{saved.folder / 'report.json'}: damaged, or of another version ({reason}); run it again"
+        ) from error
+    if not os.access(saved.folder, os.W_OK):
+        raise InputError(f"run {saved.folder}: cannot be written to, and the comparison goes into its report; copy it")
+
+
+def _corrected_px(models: dict[str, GroupModel], observations: list[ImageObservations]) -> list[np.ndarray]:
+    """All keypoints of every image as the models of the groups correct them."""
+    rows = {name: rows for m in models.values() for name, rows in zip(m.images, m.rows_by_image(), strict=True)}
+    none = np.zeros(0, int)
+    return [models[image.group].keypoints_px(image, rows.get(image.name, none)) for image in observations]
