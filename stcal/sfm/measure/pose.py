@@ -15,7 +15,7 @@ from scipy.stats import chi2 as chi_square
 from stcal.errors import DegenerateError, InputError
 from stcal.geometry.arrays import frozen
 from stcal.geometry.camera import Camera
-from stcal.geometry.plane_poses import MAX_SIGMA_RAD, deciding_delta, distinct, weigh, weights_of
+from stcal.geometry.plane_poses import MAX_SIGMA_RAD, OUTLIER, deciding_delta, distinct, weigh, weights_of
 from stcal.geometry.pose_descent import Minima, PoseStack, block_diagonal
 from stcal.geometry.rigid import Rigid
 from stcal.io.camera import CameraPrior, intrinsic_basis
@@ -147,7 +147,7 @@ def pose_from_circles(
     InputError
         A circle that the target does not have, a label twice, or arrays of a wrong shape.
     DegenerateError
-        No face has four circles in general position, or too many circles contradict the others.
+        No face has four circles in general position, or too many circles contradict each other.
     ConvergenceError
         No minimum is reached.
     """
@@ -162,6 +162,11 @@ def pose_from_circles(
         raise DegenerateError(f"{where}: {len(names)} circles left, {MIN_CIRCLES} needed; show more of a face")
     pose = _answer(problem, found, names, outliers, plane, options)
     if np.sqrt(np.diag(pose.covariance)[:3].max()) > MAX_SIGMA_RAD:
+        if pose.chi2_per_redundancy() > OUTLIER**2:  # what leaves the rotation open are the residuals
+            raise DegenerateError(
+                f"{where}: its circles contradict each other, χ²/dof {pose.chi2_per_redundancy():.2g}; check their "
+                "labels, and that camera file, faces.json and images belong together"
+            )
         raise DegenerateError(f"{where}: its circles leave the rotation open; show more of a face, off one line")
     return pose
 
