@@ -26,6 +26,8 @@ MODULES = (
     "stcal.sfm.run.marker",
     "stcal.sfm.run.report",
     "stcal.sfm.measure.files",
+    "stcal.sfm.camera.file",
+    "stcal.handeye.report.file",
     "stcal.locate.report.files",
     "stcal.robot.axes.files",
     "stcal.robot.identify.files",

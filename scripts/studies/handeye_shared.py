@@ -16,7 +16,7 @@ import numpy as np
 
 from stcal.geometry.camera import Camera
 from stcal.handeye import HandEyeOptions
-from stcal.handeye.report.file import outcome_json
+from stcal.handeye.report.file import HandEyeFile
 from stcal.handeye.report.page import outcome_text
 from stcal.io.camera import read_camera, write_cameras_txt
 from stcal.workflows.handeye import ALL, Splits, calibrate, read_input
@@ -94,7 +94,7 @@ def _handeye(
     given = read_input(folder / "images", folder / "poses", camera, scratch / "board.toml", splits.workers)
     options = HandEyeOptions(intrinsics=given.prior if adjust else None, with_scale=adjust, symmetries=given.symmetries)
     outcome = calibrate(given, setup, method, options, splits)
-    return outcome_json(outcome), outcome_text(outcome)
+    return HandEyeFile.of(outcome, whole=True).content(), outcome_text(outcome)
 
 
 def by_split(data: dict) -> np.ndarray:

@@ -40,7 +40,7 @@ def calibrate_camera(
 ) -> None:
     """Calibrate the camera from views of the board, without any start: cameras.txt with σ and correlations, for run."""
     from stcal.sfm.camera.calibrate import calibrate_camera as calibrate
-    from stcal.sfm.camera.calibrate import calibration_json
+    from stcal.sfm.camera.file import CalibrationFile
     from stcal.sfm.camera.text import calibration_text
 
     if out.exists():
@@ -50,7 +50,7 @@ def calibrate_camera(
     with StageProgress() as progress:
         result = calibrate(images, target_design, board_design, model, workers=workers, progress=progress)
     write_cameras_txt(out, result.intrinsics.camera, model, result.intrinsics.covariance)
-    summary = calibration_json(result)
+    summary = CalibrationFile.of(result)
     json_file = json_file or out.with_suffix(".json")
     save(json_file, json_text(summary))
     print(calibration_text(result, summary))

@@ -118,7 +118,7 @@ def handeye(
     """Find where a camera sits on a robot's flange, or in its base, and how well that is known."""
     from stcal.handeye import HandEyeOptions, Noise
     from stcal.handeye.report.export import opencv_yaml, ros_yaml, urdf_joint
-    from stcal.handeye.report.file import calibration_json, outcome_json
+    from stcal.handeye.report.file import HandEyeFile
     from stcal.handeye.report.page import outcome_page, outcome_text
     from stcal.workflows.handeye import Splits, calibrate, read_input
 
@@ -149,7 +149,7 @@ def handeye(
         print(f"left out {name}: {reason}")
     print_each("note", outcome.all_notes())
     for path, content in (
-        (out, lambda: calibration_json(outcome)),
+        (out, lambda: HandEyeFile.of(outcome)),
         (ros, lambda: ros_yaml(result, parent, child)),
         (urdf, lambda: urdf_joint(result, parent, child)),
         (opencv, lambda: opencv_yaml(result)),
@@ -160,7 +160,7 @@ def handeye(
     if camera_out:
         _save_camera(camera_out, outcome)
     if json_file:
-        write(json_file, outcome_json(outcome))
+        write(json_file, HandEyeFile.of(outcome, whole=True))
 
 
 def _require_fitting(source: Path, method: str | None, refine_camera: bool, camera_out: Path | None) -> None:

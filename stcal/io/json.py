@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Annotated, Any, TypeVar
 
 import numpy as np
-from pydantic import BaseModel, ConfigDict, GetCoreSchemaHandler, ValidationError
+from pydantic import BaseModel, BeforeValidator, ConfigDict, GetCoreSchemaHandler, ValidationError
 from pydantic_core import PydanticCustomError, core_schema
 
 from stcal.errors import InputError
@@ -39,6 +39,13 @@ class ResultFile(Part):
     def content(self) -> dict[str, Any]:
         """Plain values: the keys given, in the order of the fields."""
         return self.model_dump(exclude_unset=True, warnings=False)
+
+
+class NamedReason(Part):
+    """What was left out, and why."""
+
+    name: str
+    reason: str
 
 
 F = TypeVar("F", bound=Part)
@@ -82,6 +89,10 @@ class PoseShape(Shape):
         return Shape.checked(self, value)
 
 
+Finite = Annotated[
+    float | None, BeforeValidator(lambda value: None if value is None or not np.isfinite(value) else value)
+]
+"""JSON knows no infinity: null in its place, and in that of what is no number."""
 Pose = Annotated[np.ndarray, PoseShape((4, 4))]
 Matrix3 = Annotated[np.ndarray, Shape((3, 3))]
 Matrix4 = Annotated[np.ndarray, Shape((4, 4))]

@@ -1,15 +1,18 @@
 """All that a hand-eye calibration found, and its file."""
 
 from dataclasses import dataclass
+from typing import Literal
 
 import numpy as np
+from pydantic import Field
 
 import stcal
-from stcal.handeye.data.loop import FRAMES
+from stcal.handeye.data.loop import FRAMES, Setup
 from stcal.handeye.judge.observability import Observability
 from stcal.handeye.result import HandEye
 from stcal.handeye.validate import Compared, HeldOut
 from stcal.io.camera import PARAMETER_NAMES, parameter_names
+from stcal.io.json import Finite, Matrix3, Matrix6, NamedReason, Part, Pose, ResultFile, Vector, Vector3
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -56,112 +59,221 @@ class Outcome:
         return tuple(name for name, bad in zip(self.result.names, self.result.outliers, strict=True) if bad)
 
 
-def outcome_json(outcome: Outcome) -> dict:
-    """:func:`calibration_json`, with every split, and every method where they were compared."""
-    names = outcome.result.names
-    more = {"splits": _splits(outcome.held_out, names), "methods": [_method(each, names) for each in outcome.compared]}
-    return calibration_json(outcome) | more
+class BoardSize(Part):
+    scale: float
+    scale_sigma: Finite
+    pitch_mm: float | None
 
 
-def calibration_json(outcome: Outcome) -> dict:
-    """The result as plain values (form: ``data_layout.md``): mm, rad, px; None where there is no value."""
-    result, frames = outcome.result, FRAMES[outcome.result.setup]
-    return {
-        "format": "stcal handeye 1",
-        "version": stcal.__version__,
-        "from": outcome.where,
-        "setup": result.setup,
-        "method": result.method,
-        frames.camera: result.mount_from_camera.matrix().tolist(),
-        "covariance": _listed(result.covariance),
-        frames.board: result.stand_from_board.matrix().tolist(),
-        f"{frames.board}_covariance": _listed(result.stand_covariance),
-        "board": {
-            "scale": float(result.scale),
-            "scale_sigma": _plain(result.sigma_scale),
-            "pitch_mm": None if outcome.pitch_mm is None else float(outcome.pitch_mm * result.scale),
-        },
-        "camera": _camera(outcome),
-        "sigma": {name: float(value) for name, value in result.sigma.items()},
-        "estimated": list(result.estimated),
-        "corner_px_is_factor": outcome.own_sigmas,
-        "rms": dict(zip(("rotation_rad", "translation_mm"), result.rms(), strict=True)),
-        "poses": _poses(result),
-        "outliers": list(outcome.outliers()),
-        "left_out": [{"name": name, "reason": reason} for name, reason in outcome.left_out],
-        "held_out": _held_out(outcome.held_out, outcome.result.outliers),
-        "observability": _observability(result.observability),
-        "notes": list(outcome.all_notes()),
-    }
+class AdjustedCamera(Part):
+    model: str
+    parameters: dict[str, float]
+    sigma: dict[str, float]
 
 
-def _listed(values: np.ndarray | None) -> list | None:
-    return None if values is None else np.asarray(values).tolist()
+class RmsResidual(Part):
+    rotation_rad: float
+    translation_mm: float
 
 
-def _plain(value: float | None) -> float | None:
-    return None if value is None or not np.isfinite(value) else float(value)
+class PoseRow(Part):
+    name: str
+    used: bool
+    rotation_rad: Vector3
+    translation_mm: Vector3
+    corner_rms_px: Finite = None
 
 
-def _camera(outcome: Outcome) -> dict | None:
+class HeldOutMeans(Part):
+    splits: int
+    poses: int
+    rotation_rad: float
+    translation_mm: float
+    board_mm: float | None = None
+    pose_mm: float | None = None
+    agreeing: dict[str, float] | None
+
+
+class SeenTurns(Part):
+    turns_rad: Vector3
+    axes_flange: Matrix3
+    sigma_rad: Finite
+    sigma_mm: Finite
+
+
+class SplitErrors(Part):
+    poses: list[str]
+    rotation_rad: Vector
+    translation_mm: Vector
+    board_mm: Vector | None = None
+    pose_mm: Vector | None = None
+
+
+class MethodRow(Part):
+    method: str
+    reason: str | None
+    held_out: HeldOutMeans | None
+    flange_from_camera: Pose | None = None
+    base_from_camera: Pose | None = None
+    base_from_board: Pose | None = None
+    flange_from_board: Pose | None = None
+    splits: list[SplitErrors]
+
+
+class HandEyeFile(ResultFile):
+    """Of ``handeye``: mm, rad, px; null where there is no value."""
+
+    format: Literal["stcal handeye 1"] = Field(description="the file's form and its version")
+    version: str = Field(description="of stcal")
+    where: str = Field(alias="from", description="names of the files")
+    setup: Setup = Field(description="what carries the camera")
+    method: str = Field(description="that found the result")
+    flange_from_camera: Pose | None = Field(None, description="`X` of eye-in-hand")
+    base_from_camera: Pose | None = Field(None, description="`X` of eye-to-hand")
+    covariance: Matrix6 | None = Field(description="of `X`, null for methods that give none")
+    base_from_board: Pose | None = Field(None, description="`Z` of eye-in-hand")
+    base_from_board_covariance: Matrix6 | None = Field(None, description="its covariance, likewise")
+    flange_from_board: Pose | None = Field(None, description="`Z` of eye-to-hand")
+    flange_from_board_covariance: Matrix6 | None = Field(None, description="its covariance, likewise")
+    board: BoardSize = Field(
+        description="`scale`: true size over stated size, 1 where it was not solved for; `scale_sigma`; `pitch_mm` of "
+        "dots or squares, times `scale`; null for tags and poses"
+    )
+    camera: AdjustedCamera | None = Field(
+        description="with `--refine-camera`: COLMAP `model`; `parameters` fx, fy, cx, cy, k1, k2, p1, p2, k3 … k6, "
+        "OpenCV pixel origin; `sigma` of those of the model"
+    )
+    sigma: dict[str, float] = Field(
+        description="`robot_rad`, `robot_mm`, `camera_rad`, `camera_mm`, `corner_px`, `board_mm` as far as the method "
+        "weights by them; `camera_factor`: by which the σ of given covariances of `camera_from_board` were multiplied; "
+        "`camera_focal`, `camera_centre`, `camera_radial`, `camera_tangential` (`camera_all` where their covariance is "
+        "stated): factors, 1 or more, by which the σ of the camera file were widened"
+    )
+    estimated: list[str] = Field(description="which of them were estimated")
+    corner_px_is_factor: bool = Field(description="whether `corner_px` is the factor of the corners' own σ")
+    rms: RmsResidual = Field(description="`rotation_rad`, `translation_mm` of the residuals of the poses used")
+    poses: list[PoseRow] = Field(
+        description="`name` (`line 7`, or the image), `used`, residual `rotation_rad` (rotation vector) and "
+        "`translation_mm` at the board's origin, by which the chain through this pose misses `Z`; with method "
+        "`reprojection` `corner_rms_px`"
+    )
+    outliers: list[str] = Field(
+        description="names of poses that contradict the others and were left out of the solution"
+    )
+    left_out: list[NamedReason] = Field(description="`name`, `reason` of images and rows that did not take part")
+    held_out: HeldOutMeans | None = Field(
+        description="`splits`, `poses` in each, and means: `rotation_rad`, `translation_mm` of the board's origin; "
+        "with images `board_mm`: how far from each corner the ray on which the camera saw it meets the board where the "
+        "robot has put it, mean over the corners, and `pose_mm`: distance of the corners by the robot from those by "
+        "the pose that the image gives alone; `agreeing`: the same means without `outliers`, null where there are none"
+    )
+    observability: SeenTurns | None = Field(
+        description="`turns_rad` RMS between poses about the principal `axes_flange`; `sigma_rad`, `sigma_mm` of the "
+        "worst direction from poses of a common camera (1 mrad, 0.5 mm)"
+    )
+    notes: list[str] = Field(description="what should be known about the result")
+    splits: list[SplitErrors] = Field(
+        [],
+        description="only in `--json`: names of the `poses` held out, and the errors of each: `rotation_rad`, "
+        "`translation_mm`, `board_mm`, `pose_mm`",
+    )
+    methods: list[MethodRow] = Field(
+        [],
+        description="only in `--json`, with `--method all`: `method`, `X` and `Z` (`flange_from_camera`, "
+        "`base_from_board`, or `base_from_camera`, `flange_from_board`); `held_out` and `splits` with `poses`, "
+        "`rotation_rad`, `translation_mm`, `board_mm`, `pose_mm`, `agreeing` as above; `reason` where it fails",
+    )
+
+    @classmethod
+    def of(cls, outcome: Outcome, whole: bool = False) -> "HandEyeFile":
+        """What ``--out`` holds; ``whole`` : what ``--json`` does, every split and every method too."""
+        result, names, board = outcome.result, outcome.result.names, FRAMES[outcome.result.setup].board
+        poses = {name: pose.matrix() for name, pose in result.transforms.items()}
+        compared = [_method(each, names) for each in outcome.compared]
+        more = {"splits": _splits(outcome.held_out, names), "methods": compared} if whole else {}
+        return cls.model_validate(
+            {
+                "format": "stcal handeye 1",
+                "version": stcal.__version__,
+                "where": outcome.where,
+                "setup": result.setup,
+                "method": result.method,
+                **poses,
+                "covariance": result.covariance,
+                f"{board}_covariance": result.stand_covariance,
+                "board": BoardSize(
+                    scale=result.scale,
+                    scale_sigma=result.sigma_scale,
+                    pitch_mm=None if outcome.pitch_mm is None else outcome.pitch_mm * result.scale,
+                ),
+                "camera": _camera(outcome),
+                "sigma": result.sigma,
+                "estimated": result.estimated,
+                "corner_px_is_factor": outcome.own_sigmas,
+                "rms": dict(zip(RmsResidual.model_fields, result.rms(), strict=True)),
+                "poses": _poses(result),
+                "outliers": outcome.outliers(),
+                "left_out": [NamedReason(name=name, reason=reason) for name, reason in outcome.left_out],
+                "held_out": _held_out(outcome.held_out, result.outliers),
+                "observability": _observability(result.observability),
+                "notes": outcome.all_notes(),
+                **more,
+            }
+        )
+
+
+def _camera(outcome: Outcome) -> AdjustedCamera | None:
     found = outcome.result.reprojection
     if found is None or found.camera_covariance is None:
         return None
     names, sigma = parameter_names(outcome.colmap_model), np.sqrt(np.diag(found.camera_covariance))
-    return {
-        "model": outcome.colmap_model,
-        "parameters": dict(zip(PARAMETER_NAMES, found.camera.parameters().tolist(), strict=True)),
-        "sigma": dict(zip(names, sigma.tolist(), strict=True)),
-    }
+    return AdjustedCamera(
+        model=outcome.colmap_model,
+        parameters=dict(zip(PARAMETER_NAMES, found.camera.parameters(), strict=True)),
+        sigma=dict(zip(names, sigma, strict=True)),
+    )
 
 
-def _poses(result: HandEye) -> list[dict]:
+def _poses(result: HandEye) -> list[PoseRow]:
     rows = []
     for i, (name, off) in enumerate(zip(result.names, result.residuals, strict=True)):
-        row = {
-            "name": name,
-            "used": not bool(result.outliers[i]),
-            "rotation_rad": off[:3].tolist(),
-            "translation_mm": off[3:].tolist(),
-        }
-        if result.reprojection is not None:
-            row["corner_rms_px"] = _plain(result.reprojection.rms_px(i))
-        rows.append(row)
+        rms = {} if result.reprojection is None else {"corner_rms_px": result.reprojection.rms_px(i)}
+        row = {"name": name, "used": not result.outliers[i], "rotation_rad": off[:3], "translation_mm": off[3:]}
+        rows.append(PoseRow.model_validate(row | rms))
     return rows
 
 
-def _held_out(found: HeldOut | None, outliers: np.ndarray) -> dict | None:
+def _held_out(found: HeldOut | None, outliers: np.ndarray) -> HeldOutMeans | None:
     if found is None:
         return None
-    whole = {"splits": found.rows.shape[0], "poses": found.rows.shape[1], **found.means()}
-    return whole | {"agreeing": (found.means(~outliers) or None) if outliers.any() else None}
+    splits, poses = found.rows.shape
+    agreeing = (found.means(~outliers) or None) if outliers.any() else None
+    return HeldOutMeans(splits=splits, poses=poses, **found.means(), agreeing=agreeing)
 
 
-def _splits(found: HeldOut | None, names: tuple[str, ...]) -> list[dict]:
+def _splits(found: HeldOut | None, names: tuple[str, ...]) -> list[SplitErrors]:
     """Of each split the poses held out, and the errors on each."""
     if found is None:
         return []
-    kinds = found.means()
     return [
-        {"poses": [names[i] for i in row], **{kind: getattr(found, kind)[k].tolist() for kind in kinds}}
+        SplitErrors(poses=[names[i] for i in row], **{kind: getattr(found, kind)[k] for kind in found.means()})
         for k, row in enumerate(found.rows)
     ]
 
 
-def _method(each: Compared, names: tuple[str, ...]) -> dict:
+def _method(each: Compared, names: tuple[str, ...]) -> MethodRow:
     bad = np.zeros(len(names), bool) if each.result is None else each.result.outliers
-    row = {"method": each.method, "reason": each.reason or None, "held_out": _held_out(each.held_out, bad)}
-    if each.result is not None:
-        row |= {name: pose.matrix().tolist() for name, pose in each.result.transforms.items()}
-    return row | {"splits": _splits(each.held_out, names)}
+    transforms = {} if each.result is None else each.result.transforms
+    return MethodRow(
+        method=each.method,
+        reason=each.reason or None,
+        held_out=_held_out(each.held_out, bad),
+        **{name: pose.matrix() for name, pose in transforms.items()},
+        splits=_splits(each.held_out, names),
+    )
 
 
-def _observability(seen: Observability | None) -> dict | None:
-    if seen is None:
-        return None
-    return {
-        "turns_rad": seen.turns_rad.tolist(),
-        "axes_flange": seen.axes.tolist(),
-        "sigma_rad": _plain(seen.sigma_rad),
-        "sigma_mm": _plain(seen.sigma_mm),
-    }
+def _observability(seen: Observability | None) -> SeenTurns | None:
+    return seen and SeenTurns(
+        turns_rad=seen.turns_rad, axes_flange=seen.axes, sigma_rad=seen.sigma_rad, sigma_mm=seen.sigma_mm
+    )

@@ -10,7 +10,7 @@ import numpy as np
 from stcal.design import BoardDesign, TargetDesign
 from stcal.errors import DegenerateError, DetectionError, InputError
 from stcal.geometry.camera import Camera
-from stcal.io.camera import COLMAP_MODELS, CameraModel, parameter_names
+from stcal.io.camera import COLMAP_MODELS, CameraModel
 from stcal.io.images import ImageFile, Skipped, decode, find_images
 from stcal.parallel import one_thread
 from stcal.sfm.camera.intrinsics import Intrinsics, adjust_intrinsics, model_parameters
@@ -240,72 +240,3 @@ def _warnings(
             "keep focus and zoom fixed, look at the outliers, or choose a --model with more parameters"
         )
     return warnings
-
-
-def calibration_json(calibration: CameraCalibration) -> dict:
-    """Content of the file that ``--json`` names; pixels from the centre of the top-left pixel."""
-    result, projection, split = calibration.intrinsics, calibration.projection, calibration.split
-    camera, sigma = result.camera, result.sigma()
-    names = parameter_names(result.colmap_model)
-    values = model_parameters(camera, result.colmap_model)
-    return {
-        "format": "stcal camera 1",
-        "model": result.colmap_model,
-        "size_px": [camera.width, camera.height],
-        "parameters": {
-            name: {"value": float(v), "sigma": float(s)} for name, v, s in zip(names, values, sigma, strict=True)
-        },
-        "correlation": (result.covariance / np.outer(sigma, sigma)).tolist(),
-        "residual_rms_px": residual_rms_px(result),
-        "centre_sigma_factor": result.factors.centres,
-        "dot_sigma_factor": result.factors.dots,
-        "redundancy": result.redundancy,
-        "rounds": calibration.rounds,
-        "projection": {
-            "median_sigma_px": float(np.median(projection.sigma_px)),
-            "corners": {
-                corner: {"reach": float(reach), "sigma_px": float(s)}
-                for corner, reach, s in zip(CORNERS, projection.reach, projection.corner_sigma_px, strict=True)
-            },
-        },
-        "split_half": None
-        if split is None
-        else {
-            "verdict": split.verdict,
-            "p_value": split.p_value,
-            "difference": dict(zip(names, split.difference.tolist(), strict=True)),
-            "sigma": dict(zip(names, split.sigma.tolist(), strict=True)),
-            "largest_px": split.largest_px,
-            "largest_sigma_px": split.largest_sigma_px,
-        },
-        "images": _image_rows(result),
-        "outliers": _outlier_rows(result),
-        "left_out": [{"name": s.name, "reason": s.reason} for s in calibration.skipped],
-        "warnings": list(calibration.warnings),
-    }
-
-
-def _image_rows(result: Intrinsics) -> list[dict]:
-    rows = []
-    for model in result.models:
-        residual = model.residuals_px(result.camera)
-        for i, own in enumerate(model.rows_by_image()):
-            rows.append(
-                {
-                    "image": model.images[i],
-                    "dots": len(own),
-                    "tilt_deg": float(np.degrees(np.arccos(abs(model.camera_from_world[i].rotation[2, 2])))),
-                    "rms_px": float(np.sqrt((residual[own] ** 2).mean())),
-                }
-            )
-    return rows
-
-
-def _outlier_rows(result: Intrinsics) -> list[dict]:
-    rows = []
-    for model, weights in zip(result.models, result.weights(), strict=True):
-        length = np.linalg.norm(model.residuals_px(result.camera), axis=1)
-        for i in np.flatnonzero(weights < OUTLIER_WEIGHT):
-            image, label = model.images[model.image_index[i]], model.labels[model.point_index[i]]
-            rows.append({"image": image, "label": label, "residual_px": float(length[i]), "weight": float(weights[i])})
-    return rows

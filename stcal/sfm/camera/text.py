@@ -3,24 +3,22 @@
 import numpy as np
 
 from stcal.sfm.camera.calibrate import CameraCalibration
+from stcal.sfm.camera.file import CalibrationFile
 
 
-def calibration_text(result: CameraCalibration, summary: dict) -> str:
-    """Parameters with σ, and what to look at; ``summary`` : :func:`~stcal.sfm.camera.calibrate.calibration_json`."""
+def calibration_text(result: CameraCalibration, summary: CalibrationFile) -> str:
+    """Parameters with σ, and what to look at."""
     lines = [f"skipped {each.name}: {each.reason}" for each in result.skipped]
-    lines += [
-        f"outlier {each['image']} {each['label']}: residual {each['residual_px']:.3f} px"
-        for each in summary["outliers"]
-    ]
-    width, height = summary["size_px"]
+    lines += [f"outlier {each.image} {each.label}: residual {each.residual_px:.3f} px" for each in summary.outliers]
+    width, height = summary.size_px
     lines.append(
-        f"{summary['model']}, {width}×{height} px: {len(result.views)} views of the board, "
-        f"{sum(len(v) for v in result.views)} dots, residual RMS {summary['residual_rms_px']:.4f} px, "
+        f"{summary.model}, {width}×{height} px: {len(result.views)} views of the board, "
+        f"{sum(len(v) for v in result.views)} dots, residual RMS {summary.residual_rms_px:.4f} px, "
         f"{result.rounds} rounds of detection"
     )
     lines += [
-        f"{name:>4} {each['value']:14.6f} ± {each['sigma']:.6f}{' px' if name[0] in 'fc' else ''}"
-        for name, each in summary["parameters"].items()
+        f"{name:>4} {each.value:14.6f} ± {each.sigma:.6f}{' px' if name[0] in 'fc' else ''}"
+        for name, each in summary.parameters.items()
     ]
     lines.append(
         f"σ of a projection: {np.median(result.projection.sigma_px):.4f} px median over the image, "

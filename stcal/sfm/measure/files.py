@@ -4,7 +4,7 @@ from typing import Literal
 
 from pydantic import Field
 
-from stcal.io.json import Matrix6, Pair, Part, Pose, ResultFile
+from stcal.io.json import Finite, Matrix6, NamedReason, Pair, Part, Pose, ResultFile
 
 
 class OtherPose(Part):
@@ -37,7 +37,7 @@ class ImagePose(Part):
     alternative: OtherPose | None = Field(
         description="`camera_from_target` and `covariance` of the other pose that fits, null where there is none"
     )
-    delta_chi2: float | None = Field(
+    delta_chi2: Finite = Field(
         description="by which the other pose fits worse (null: there is no other; below 0: this one does, and "
         "`--previous` chose it)"
     )
@@ -56,11 +56,6 @@ class ImagePose(Part):
     notes: list[str] = Field(description="what detection saw and left out")
 
 
-class FileWithoutPose(Part):
-    name: str
-    reason: str
-
-
 class PosesFile(ResultFile):
     """Of ``measure``."""
 
@@ -74,4 +69,4 @@ class PosesFile(ResultFile):
     images: list[ImagePose] = Field(
         description="`image`, `faces`, `status`, `camera_from_target` 4×4, `covariance` 6×6, and"
     )
-    left_out: list[FileWithoutPose] = Field(description="`name`, `reason` of files and images without a pose")
+    left_out: list[NamedReason] = Field(description="`name`, `reason` of files and images without a pose")

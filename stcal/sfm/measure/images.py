@@ -279,7 +279,7 @@ def _image_json(each: MeasuredImage) -> dict:
         "covariance": pose.covariance,
         "covariance_parts": pose.parts,
         "alternative": other,
-        "delta_chi2": pose.delta_chi2 if np.isfinite(pose.delta_chi2) else None,
+        "delta_chi2": pose.delta_chi2,
         "delta_chi2_needed": pose.needed_chi2,
         "rms_px": pose.rms_px(),
         "chi2": pose.chi2,

@@ -9,11 +9,12 @@ import numpy as np
 import pytest
 
 from stcal.handeye import HandEyeOptions, handeye
-from stcal.handeye.report.file import Outcome, calibration_json, outcome_json
+from stcal.handeye.report.file import HandEyeFile, Outcome
 from stcal.handeye.report.page import outcome_page, outcome_text
 from stcal.handeye.solve import FACTORS
 from stcal.handeye.validate import Compared, compare, cross_validate, splits
 from stcal.io.camera import CameraModel, camera_prior
+from stcal.io.saving import json_text
 from stcal.synthetic.measured.handeye import simulated, simulated_views
 
 VOID = {"meta", "img", "br"}
@@ -91,7 +92,7 @@ def test_every_sigma_that_there_is_has_a_name():
     outcome = Outcome("images", result, colmap_model="PINHOLE")
     assert "σ of camera file, focal length: " in outcome_text(outcome)
     assert "Camera, as adjusted" in outcome_page(outcome)
-    assert max(v for k, v in calibration_json(outcome)["sigma"].items() if k in FACTORS) > 1.5
+    assert max(v for k, v in HandEyeFile.of(outcome).sigma.items() if k in FACTORS) > 1.5
 
 
 def test_corners_with_sigmas_of_their_own_have_a_factor(of_views):
@@ -119,20 +120,20 @@ def test_an_outlier_is_marked_in_text_page_and_file(of_methods):
     outcome = replace(of_methods, result=replace(of_methods.result, outliers=bad))
     assert "9 poses, without 1 that contradicts them: pose 5" in outcome_text(outcome)
     assert "left out, contradicting the others" in " ".join(read(outcome_page(outcome)).text)
-    assert calibration_json(outcome)["outliers"] == ["pose 5"]
+    assert HandEyeFile.of(outcome).outliers == ["pose 5"]
 
 
 def test_the_file_is_plain_json_and_gives_the_transform_back(of_views, of_methods):
-    data = json.loads(json.dumps(outcome_json(of_views), allow_nan=False))
+    data = json.loads(json_text(HandEyeFile.of(of_views, whole=True)))
     assert data["base_from_camera"] == of_views.result.base_from_camera.matrix().tolist()
     assert np.array(data["covariance"]) == pytest.approx(of_views.result.covariance, rel=1e-15)
     assert data["board"]["pitch_mm"] == pytest.approx(25 * of_views.result.scale)
     assert [len(split["board_mm"]) for split in data["splits"]] == [2, 2]
     mean = np.mean([split["board_mm"] for split in data["splits"]])
     assert data["held_out"]["board_mm"] == pytest.approx(mean)
-    data = json.loads(json.dumps(outcome_json(of_methods), allow_nan=False))
+    data = json.loads(json_text(HandEyeFile.of(of_methods, whole=True)))
     assert [row["reason"] for row in data["methods"]] == [None, None, "hand-eye: zhao finds no rotation"]
-    assert "methods" not in calibration_json(of_methods)
+    assert "methods" not in HandEyeFile.of(of_methods).content()
 
 
 def test_methods_of_which_none_could_be_validated_are_listed(of_methods):

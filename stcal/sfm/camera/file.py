@@ -1,0 +1,151 @@
+"""What ``calibrate-camera`` writes beside the camera file."""
+
+from collections.abc import Iterator
+from typing import Annotated, Literal
+
+import numpy as np
+from pydantic import Field
+
+from stcal.io.camera import parameter_names
+from stcal.io.json import ByName, Matrix, NamedReason, Part, ResultFile
+from stcal.sfm.camera.calibrate import CORNERS, OUTLIER_WEIGHT, CameraCalibration, residual_rms_px
+from stcal.sfm.camera.intrinsics import Intrinsics, model_parameters
+from stcal.sfm.camera.trust import Verdict
+
+ByCorner = Annotated[str, "corner"]
+
+
+class Parameter(Part):
+    value: float
+    sigma: float
+
+
+class Corner(Part):
+    reach: float
+    sigma_px: float
+
+
+class Projection(Part):
+    median_sigma_px: float
+    corners: dict[ByCorner, Corner] = Field(
+        description="`reach` of the dots towards it, 1 at the corner, and `sigma_px` there"
+    )
+
+
+class Halves(Part):
+    verdict: Verdict
+    p_value: float
+    difference: dict[str, float]
+    sigma: dict[str, float]
+    largest_px: float
+    largest_sigma_px: float
+
+
+class ViewRow(Part):
+    image: str
+    dots: int
+    tilt_deg: float
+    rms_px: float
+
+
+class OutlierRow(Part):
+    image: str
+    label: str
+    residual_px: float
+    weight: float
+
+
+class CalibrationFile(ResultFile):
+    """Of ``calibrate-camera``; pixels from the centre of the top-left pixel."""
+
+    format: Literal["stcal camera 1"] = Field(description="the file's form and its version")
+    model: str = Field(description="COLMAP model")
+    size_px: tuple[int, int] = Field(description="width and height")
+    parameters: dict[ByName, Parameter] = Field(
+        description="`value`, `sigma`, in the model's order; px and OpenCV pixel origin, distortion coefficients "
+        "without unit"
+    )
+    correlation: Matrix = Field(description="in the order of `parameters`")
+    residual_rms_px: float = Field(description="per coordinate")
+    centre_sigma_factor: float = Field(
+        description="by which residuals exceed the centres' own σ (not below 1); σ are scaled by it"
+    )
+    dot_sigma_factor: float = Field(
+        description="by which dots exceed the `sigma_mm` of the board file (not below 1); σ are scaled by it"
+    )
+    redundancy: int = Field(description="degrees of freedom")
+    rounds: int = Field(description="of detection")
+    projection: Projection = Field(
+        description="σ per axis of where a known direction is seen, up to a rotation of the camera: `median_sigma_px` "
+        "over the image, and in the corners"
+    )
+    split_half: Halves | None = Field(
+        description="every second view against the others: `verdict` `passed`, `suspicious` (p < 0.01) or `failed` "
+        "(p < 0.0001), `p_value`, `difference` and its `sigma` by parameter, `largest_px` difference of a projection "
+        "over the image, `largest_sigma_px` per axis there; null with fewer than six views"
+    )
+    images: list[ViewRow] = Field(
+        description="`image`, `dots`, `tilt_deg` of the board against the image plane, `rms_px`"
+    )
+    outliers: list[OutlierRow] = Field(
+        description="dots that weigh less than half: `image`, `label`, `residual_px`, `weight`"
+    )
+    left_out: list[NamedReason] = Field(description="`name`, `reason`")
+    warnings: list[str] = Field(description="what to look at, and do")
+
+    @classmethod
+    def of(cls, calibration: CameraCalibration) -> "CalibrationFile":
+        """The file of a calibrated camera."""
+        result, projection, split = calibration.intrinsics, calibration.projection, calibration.split
+        camera, sigma, names = result.camera, result.sigma(), parameter_names(result.colmap_model)
+        values = zip(names, model_parameters(camera, result.colmap_model), sigma, strict=True)
+        corners = zip(CORNERS, projection.reach, projection.corner_sigma_px, strict=True)
+        return cls(
+            format="stcal camera 1",
+            model=result.colmap_model,
+            size_px=(camera.width, camera.height),
+            parameters={name: Parameter(value=value, sigma=own) for name, value, own in values},
+            correlation=result.covariance / np.outer(sigma, sigma),
+            residual_rms_px=residual_rms_px(result),
+            centre_sigma_factor=result.factors.centres,
+            dot_sigma_factor=result.factors.dots,
+            redundancy=result.redundancy,
+            rounds=calibration.rounds,
+            projection=Projection(
+                median_sigma_px=float(np.median(projection.sigma_px)),
+                corners={corner: Corner(reach=reach, sigma_px=own) for corner, reach, own in corners},
+            ),
+            split_half=split
+            and Halves(
+                verdict=split.verdict,
+                p_value=split.p_value,
+                difference=dict(zip(names, split.difference, strict=True)),
+                sigma=dict(zip(names, split.sigma, strict=True)),
+                largest_px=split.largest_px,
+                largest_sigma_px=split.largest_sigma_px,
+            ),
+            images=list(_views(result)),
+            outliers=list(_outliers(result)),
+            left_out=[NamedReason(name=each.name, reason=each.reason) for each in calibration.skipped],
+            warnings=list(calibration.warnings),
+        )
+
+
+def _views(result: Intrinsics) -> Iterator[ViewRow]:
+    for model in result.models:
+        residual = model.residuals_px(result.camera)
+        for image, pose, own in zip(model.images, model.camera_from_world, model.rows_by_image(), strict=True):
+            yield ViewRow(
+                image=image,
+                dots=len(own),
+                tilt_deg=float(np.degrees(np.arccos(abs(pose.rotation[2, 2])))),
+                rms_px=float(np.sqrt((residual[own] ** 2).mean())),
+            )
+
+
+def _outliers(result: Intrinsics) -> Iterator[OutlierRow]:
+    for model, weights in zip(result.models, result.weights(), strict=True):
+        length = np.linalg.norm(model.residuals_px(result.camera), axis=1)
+        for i in np.flatnonzero(weights < OUTLIER_WEIGHT):
+            image, label = model.images[model.image_index[i]], model.labels[model.point_index[i]]
+            yield OutlierRow(image=image, label=label, residual_px=length[i], weight=weights[i])
