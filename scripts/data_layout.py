@@ -27,6 +27,7 @@ MODULES = (
     "stcal.sfm.run.report",
     "stcal.sfm.measure.files",
     "stcal.sfm.camera.file",
+    "stcal.sfm.plan.file",
     "stcal.handeye.report.file",
     "stcal.locate.report.files",
     "stcal.robot.axes.files",

@@ -47,11 +47,12 @@ def plan(
     out: JsonFile = None,
 ) -> None:
     """Forecast the σ before any photograph is taken, and what would help most; no Monte Carlo."""
+    from stcal.sfm.plan.file import PlanFile
     from stcal.sfm.plan.noise import expected_noise, noise_of_run, stated_noise
     from stcal.sfm.plan.nominal import nominal_poses
     from stcal.sfm.plan.session import PlanOptions, pairs_of_faces
     from stcal.sfm.plan.session import plan as planned
-    from stcal.sfm.plan.tables import plan_json, plan_text
+    from stcal.sfm.plan.tables import plan_text
     from stcal.sfm.run.options import RunOptions
     from stcal.sfm.run.saved import load_run
 
@@ -77,7 +78,7 @@ def plan(
     result = planned(options, design, load_board(board) if board else reference_board(), nominal_poses(design, faces))
     print(plan_text(result, source))
     if out:
-        write(out, plan_json(result), "as JSON")
+        write(out, PlanFile.of_plan(result), "as JSON")
 
 
 @app.command()
@@ -89,7 +90,8 @@ def advise(
     """Compute from a run's own geometry which further photographs would lower the σ of its worst face most."""
     from stcal.sfm.plan.advise import advise as advice_for
     from stcal.sfm.plan.advise import doubts, known_of
-    from stcal.sfm.plan.tables import advice_json, advice_text
+    from stcal.sfm.plan.file import AdviceFile
+    from stcal.sfm.plan.tables import advice_text
     from stcal.sfm.run.saved import load_run
 
     saved = load_run(run)
@@ -100,4 +102,4 @@ def advise(
         advice = advice_for(known, count, progress)
     print(advice_text(advice))
     if out:
-        write(out, advice_json(advice), "as JSON")
+        write(out, AdviceFile.of_advice(advice), "as JSON")

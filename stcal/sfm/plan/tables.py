@@ -1,41 +1,10 @@
-"""What ``plan`` and ``advise`` answer, as text for people and as the content of their JSON files."""
+"""What ``plan`` and ``advise`` answer, as text for people."""
 
-import numpy as np
-
-from stcal.labels import CircleLabel
-from stcal.sfm.plan.advise import Advice, Choice
+from stcal.sfm.plan.advise import Advice
+from stcal.sfm.plan.file import MICRO, PPM, ForecastPart
 from stcal.sfm.plan.forecast import Forecast
 from stcal.sfm.plan.session import Plan
 from stcal.sfm.plan.views import View
-
-MICRO = 1e3
-PPM = 1e6
-
-
-def forecast_json(forecast: Forecast, shares: dict[str, dict[str, float]]) -> dict:
-    """Faces, worst face and scale of a forecast."""
-    worst, sigma = forecast.worst()
-    return {
-        "worst_face": worst,
-        "worst_sigma_um": MICRO * sigma,
-        "scale_sigma_ppm": PPM * forecast.scale_sigma,
-        "faces": {
-            face: {
-                "translation_sigma_um": (MICRO * np.sqrt(np.diag(covariance)[3:])).tolist(),
-                "rotation_sigma_mdeg": (MICRO * np.degrees(np.sqrt(np.diag(covariance)[:3]))).tolist(),
-                "position_sigma_um": MICRO * forecast.position_sigma_mm()[face],
-                "worst_circle": _worst_circle(forecast, face)[0],
-                "worst_circle_sigma_um": MICRO * _worst_circle(forecast, face)[1],
-                "variance_shares": shares[face],
-            }
-            for face, covariance in forecast.face_covariance.items()
-        },
-    }
-
-
-def _worst_circle(forecast: Forecast, face: str) -> tuple[CircleLabel, float]:
-    own = {label: sigma for label, sigma in forecast.circle_sigma_mm.items() if label.face == face}
-    return max(own.items(), key=lambda each: each[1])
 
 
 def forecast_table(forecast: Forecast, shares: dict[str, dict[str, float]]) -> list[str]:
@@ -44,11 +13,11 @@ def forecast_table(forecast: Forecast, shares: dict[str, dict[str, float]]) -> l
         f"{'face':>6} {'σ position µm':^23} {'σ rotation mdeg':^17}  {'worst circle µm':<16} of the variance",
         f"{'':>6} {'x':>5} {'y':>5} {'z':>5} {'all':>5} {'x':>5} {'y':>5} {'z':>5}",
     ]
-    for face, row in forecast_json(forecast, shares)["faces"].items():
-        position = " ".join(f"{s:5.2f}" for s in [*row["translation_sigma_um"], row["position_sigma_um"]])
-        rotation = " ".join(f"{s:5.2f}" for s in row["rotation_sigma_mdeg"])
-        circle = f"{row['worst_circle']} {row['worst_circle_sigma_um']:.2f}"
-        lines.append(f"{face:>6} {position} {rotation}  {circle:<16} {_shares_text(row['variance_shares'])}")
+    for face, row in ForecastPart.of(forecast, shares).faces.items():
+        position = " ".join(f"{s:5.2f}" for s in [*row.translation_sigma_um, row.position_sigma_um])
+        rotation = " ".join(f"{s:5.2f}" for s in row.rotation_sigma_mdeg)
+        circle = f"{row.worst_circle} {row.worst_circle_sigma_um:.2f}"
+        lines.append(f"{face:>6} {position} {rotation}  {circle:<16} {_shares_text(row.variance_shares)}")
     return lines
 
 
@@ -56,35 +25,6 @@ def _shares_text(shares: dict[str, float]) -> str:
     """The largest first."""
     ordered = sorted(shares.items(), key=lambda each: -each[1])
     return ", ".join(f"{source} {100 * max(share, 0.0):.0f} %" for source, share in ordered)
-
-
-def plan_json(plan: Plan) -> dict:
-    """The content of ``plan --json``."""
-    options = plan.options
-    return {
-        "format": "stcal plan 1",
-        "images_per_group": options.images,
-        "groups": list(plan.groups),
-        "spread_deg": options.spread_deg,
-        "distance_mm": options.distance_mm,
-        "size_px": [plan.setup.camera.width, plan.setup.camera.height],
-        "focal_px": plan.setup.camera.focal.tolist(),
-        "refine_camera": options.run.refine_camera,
-        "one_board": options.one_board,
-        "board_sigma_um": MICRO * plan.setup.board.sigma_mm,
-        "reference_face": plan.setup.start.reference_face,
-        "observations": plan.observations,
-        "centre_sigma_rms_px": plan.centre_sigma_px,
-        **forecast_json(plan.forecast, plan.shares),
-        "remedies": [
-            {
-                "what": remedy.what,
-                "worst_sigma_um": None if remedy.sigma_mm is None else MICRO * remedy.sigma_mm,
-                "reason": remedy.reason,
-            }
-            for remedy in plan.remedies
-        ],
-    }
 
 
 def plan_text(plan: Plan, noise: str) -> str:
@@ -110,46 +50,6 @@ def plan_text(plan: Plan, noise: str) -> str:
     lines += [f"{r.what:<28}      –   {r.reason}" for r in plan.remedies if r.sigma_mm is None]
     lines.append("where board and cameras happen to stand (--seed) makes about ±3 %")
     return "\n".join(lines)
-
-
-def advice_json(advice: Advice) -> dict:
-    """The content of ``advise --json``."""
-    return {
-        "format": "stcal advice 1",
-        **forecast_json(advice.now, advice.shares),
-        "views": [_choice_json(choice) for choice in advice.choices],
-        "new_groups": [
-            {
-                "faces": list(each.faces),
-                "images": each.images,
-                "worst_face": each.face,
-                "worst_sigma_um": MICRO * each.sigma_mm,
-            }
-            for each in advice.new_groups
-        ],
-        "board_dominates": advice.board_dominates,
-        "half_board_sigma_um": MICRO * advice.better_board.worst()[1],
-        "candidates": advice.tried,
-    }
-
-
-def _choice_json(choice: Choice) -> dict:
-    view = choice.view
-    return {
-        "group": view.group,
-        "from_image": view.middle,
-        "right_deg": view.azimuth_deg,
-        "up_deg": view.elevation_deg,
-        "roll_deg": view.roll_deg,
-        "distance_mm": view.distance_mm,
-        "tilts_deg": view.tilts_deg,
-        "nearest_image": view.nearest,
-        "nearest_deg": view.nearest_deg,
-        "camera_from_target": view.model.camera_from_world[0].matrix().tolist(),
-        "labels": [view.model.labels[i] for i in view.model.point_index],
-        "worst_face": choice.face,
-        "worst_sigma_um": MICRO * choice.sigma_mm,
-    }
 
 
 def advice_text(advice: Advice) -> str:
