@@ -1,6 +1,17 @@
 """stcal: calibration of stereo targets from photographs of a single camera, and the use of them.
 
-See :func:`stcal.sfm.run` for the main job and ``README.md`` for conventions.
+See :func:`stcal.sfm.run` for the main job and ``README.md`` for conventions. Each system is a package, loaded when it
+is first used.
 """
 
+from importlib import import_module
+
 __version__ = "0.1.0"
+__all__ = ["handeye", "locate", "register", "robot", "sfm"]
+
+
+def __getattr__(name: str):
+    """A system."""
+    if name not in __all__:
+        raise AttributeError(f"module stcal has no attribute {name}")
+    return import_module(f"stcal.{name}")
