@@ -12,7 +12,7 @@ import re
 import sys
 import types
 from collections.abc import Iterator
-from dataclasses import is_dataclass
+from dataclasses import fields, is_dataclass
 from importlib import import_module
 from pathlib import Path
 from typing import Annotated, Any, Literal, Union, get_args, get_origin
@@ -28,6 +28,8 @@ MODULES = (
     "stcal.sfm.measure.files",
     "stcal.sfm.camera.file",
     "stcal.sfm.plan.file",
+    "stcal.sfm.interop.file",
+    "stcal.sfm.diagnose.file",
     "stcal.handeye.report.file",
     "stcal.locate.report.files",
     "stcal.robot.axes.files",
@@ -67,14 +69,17 @@ def rows_of(model: type[Part], above: str = "", said: str | None = None) -> Iter
             yield f"{key}{suffix}" if within else key, kind, field.description
         elif said is None or f"`{field.alias or name}`" not in said:
             raise SystemExit(f"{model.__name__}.{name}: neither a description, nor named by the object that holds it")
-        if within:
-            yield from rows_of(within, f"{key}{suffix}.", field.description or said)
+        holder = field.description or said
+        if within and issubclass(within, Part):
+            yield from rows_of(within, f"{key}{suffix}.", holder)
+        elif within and not all(f"`{each.name}`" in holder for each in fields(within)):
+            raise SystemExit(f"{model.__name__}.{name}: does not name every field of {within.__name__}")
 
 
-def inner(annotation: Any) -> tuple[type[Part] | None, str]:
-    """The model of the objects in a field, if any, and how their place is written: ``[]`` or ``.<face>``."""
+def inner(annotation: Any) -> tuple[type | None, str]:
+    """Model or dataclass of the objects in a field, if any, and how their place is written: ``[]`` or ``.<face>``."""
     origin, own = get_origin(annotation), get_args(annotation)
-    if isinstance(annotation, type) and issubclass(annotation, Part):
+    if isinstance(annotation, type) and (issubclass(annotation, Part) or is_dataclass(annotation)):
         return annotation, ""
     if origin is Annotated:
         return inner(own[0])
@@ -104,7 +109,7 @@ def words(annotation: Any) -> str:
         return "objects" if inner(own[0])[0] else f"list of {words(own[0])}"
     if origin is dict:
         return "object" if inner(own[1])[0] or own[1] is Any else f"{words(own[0])} → {words(own[1])}"
-    if is_dataclass(annotation) or (isinstance(annotation, type) and issubclass(annotation, Part)):
+    if inner(annotation)[0]:
         return "object"
     return WORDS[annotation]
 

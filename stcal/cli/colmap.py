@@ -134,7 +134,8 @@ def pairs(
     out: JsonFile = None,
 ) -> None:
     """Rank the initial pairs, and show how each fares at every gate: ours, and COLMAP's as set and at its defaults."""
-    from stcal.sfm.interop.gates import limits_text, pairs_json, pairs_table, run_gates
+    from stcal.sfm.interop.file import PairsFile
+    from stcal.sfm.interop.gates import limits_text, pairs_table, run_gates
     from stcal.sfm.run.saved import load_run
 
     saved = load_run(run)
@@ -144,7 +145,7 @@ def pairs(
         print(pairs_table(name, images, rows, len(rows) if everything else SHOWN_PAIRS), end="\n\n")
     print(limits_text(saved.options.pairs))
     if out:
-        write(out, pairs_json(found), "as JSON")
+        write(out, PairsFile.of(found), "as JSON")
 
 
 @app.command()
@@ -163,6 +164,7 @@ def doctor(
     """Explain every image and circle left out: the threshold that stopped it, its value, and what would let it in."""
     from stcal.sfm.diagnose import findings
     from stcal.sfm.diagnose.doctor import diagnose
+    from stcal.sfm.diagnose.file import DoctorFile
     from stcal.sfm.run.saved import load_run
 
     saved = load_run(run)
@@ -170,4 +172,4 @@ def doctor(
         diagnosis = diagnose(saved, images, workers, progress)
     print(findings.table(diagnosis, None if everything else findings.MAX_LINES))
     if out:
-        write(out, findings.to_json(diagnosis), "as JSON")
+        write(out, DoctorFile.of(diagnosis), "as JSON")

@@ -1,8 +1,8 @@
-"""What the doctor finds, in words: the advice at every gate, the order of findings, table and JSON."""
+"""What the doctor finds, in words: the advice at every gate, the order of findings, and the table."""
 
 import math
 from collections.abc import Iterable
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from itertools import groupby
 
 from stcal.labels import BOARD, DotLabel, parse_label, parse_labels
@@ -68,6 +68,15 @@ class Finding:
 
 
 @dataclass(frozen=True, slots=True)
+class GateCount:
+    """What a gate stopped: ``circles`` of ``images``, of which an option lets in ``by_option`` circles."""
+
+    circles: int
+    images: int
+    by_option: int
+
+
+@dataclass(frozen=True, slots=True)
 class Diagnosis:
     """``files`` given, ``images`` of them that could be used, ``mapped`` images, ``circles`` : observations in the
     model; ``findings`` : what was left out, the most useful to know first."""
@@ -108,29 +117,20 @@ def _rank(finding: Finding) -> int:
     return 1 if finding.options else 2
 
 
-def to_json(diagnosis: Diagnosis) -> dict:
-    """Plain values; see ``data_layout.md``."""
-    return {
-        "format": "stcal doctor 1",
-        "summary": {name: getattr(diagnosis, name) for name in ("files", "images", "mapped", "circles")},
-        "gates": _by_gate(diagnosis.findings),
-        "findings": [asdict(finding) for finding in diagnosis.findings],
-    }
-
-
-def _by_gate(findings: tuple[Finding, ...]) -> dict[str, dict[str, int]]:
-    counts: dict[str, dict[str, int]] = {}
-    images: dict[str, set[str]] = {}
+def by_gate(findings: Iterable[Finding]) -> dict[str, GateCount]:
+    """What each gate stopped in images; what is said of the whole run is no circle of an image."""
+    together: dict[str, list[Finding]] = {}
     for finding in findings:
-        if not finding.image:  # what is said of the whole run is no circle of an image
-            continue
-        own = counts.setdefault(finding.gate, {"circles": 0, "images": 0, "by_option": 0})
-        own["circles"] += len(finding.labels)
-        own["by_option"] += len(finding.labels) if finding.options else 0
-        images.setdefault(finding.gate, set()).add(finding.image)
-    for gate, names in images.items():
-        counts[gate]["images"] = len(names)
-    return counts
+        if finding.image:
+            together.setdefault(finding.gate, []).append(finding)
+    return {
+        gate: GateCount(
+            sum(len(each.labels) for each in own),
+            len({each.image for each in own}),
+            sum(len(each.labels) for each in own if each.options),
+        )
+        for gate, own in together.items()
+    }
 
 
 def table(diagnosis: Diagnosis, lines: int | None = MAX_LINES) -> str:
@@ -142,9 +142,9 @@ def table(diagnosis: Diagnosis, lines: int | None = MAX_LINES) -> str:
     files = _number(diagnosis.files - diagnosis.images, "file")
     images = _number(diagnosis.images - diagnosis.mapped, "image")
     text = [f"{heading}; left out: {files}, {images}, {_circles(found)}"]
-    for gate, count in sorted(_by_gate(found).items(), key=lambda item: (-item[1]["circles"], -item[1]["images"])):
-        circles = f"{_number(count['circles'], 'circle')} of " if count["circles"] else ""
-        text.append(f"  {gate:<18}{circles}{_number(count['images'], 'image')}")
+    for gate, count in sorted(by_gate(found).items(), key=lambda item: (-item[1].circles, -item[1].images)):
+        circles = f"{_number(count.circles, 'circle')} of " if count.circles else ""
+        text.append(f"  {gate:<18}{circles}{_number(count.images, 'image')}")
     helping: dict[str, list[Finding]] = {}
     for finding in found:
         for option in finding.options:

@@ -6,7 +6,7 @@ itself here, pair by pair, from the centres that the mapping had.
 """
 
 import tempfile
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import combinations
 from pathlib import Path
@@ -358,40 +358,3 @@ def _in_words(verdict: Verdict) -> str:
 
 def _number(name: str, value: float) -> str:
     return f"{np.degrees(value):.4g}°" if name.endswith("angle") else f"{value:.4g}"
-
-
-def pairs_json(groups: Mapping[str, Sequence[PairGates]]) -> dict:
-    """Everything of the table as plain values, angles in degrees."""
-    return {
-        "format": "stcal pairs 1",
-        "groups": [{"name": name, "pairs": [_pair_json(row) for row in rows]} for name, rows in groups.items()],
-    }
-
-
-def _pair_json(row: PairGates) -> dict:
-    score = row.score
-    return {
-        "first": score.first,
-        "second": score.second,
-        "shared": score.shared,
-        "median_angle_deg": _degrees(score.median_angle_rad),
-        "in_front": score.in_front,
-        "forward": score.forward,
-        "verdict": score.verdict,
-        "ranking": [_gate_json(gate) for gate in row.own],
-        **{
-            name: {"relaxations": verdict.relaxations, "gates": [_gate_json(gate) for gate in verdict.gates]}
-            for name, verdict in (("as_set", row.as_set), ("defaults", row.defaults))
-        },
-    }
-
-
-def _gate_json(gate: Gate) -> dict:
-    angle = gate.name.endswith("angle")
-    value, limit = (_degrees(v) if angle else v for v in (gate.value, gate.limit))
-    return {"gate": f"{gate.name}_deg" if angle else gate.name, "value": value, "limit": limit, "passed": gate.passed}
-
-
-def _degrees(angle_rad: float) -> float:
-    """Without the last digits of the conversion, so that a limit reads as it was given."""
-    return round(float(np.degrees(angle_rad)), 9)

@@ -16,7 +16,7 @@ from stcal.sfm import RunOptions, pipeline, run
 from stcal.sfm.detect.ellipses import EllipseOptions, find_ellipses
 from stcal.sfm.diagnose.doctor import diagnose
 from stcal.sfm.diagnose.examine import LEAST_MIN_DIAMETER_PX
-from stcal.sfm.diagnose.findings import Diagnosis, Finding, in_order, table, to_json
+from stcal.sfm.diagnose.findings import Diagnosis, Finding, GateCount, by_gate, in_order, table
 from stcal.sfm.diagnose.in_view import ideal_border, in_view, missing_circles
 from stcal.sfm.diagnose.trace import trace_outlines
 from stcal.sfm.mapping.database import image_ids
@@ -427,7 +427,7 @@ def test_the_table():
         "b  2:1  hidden 0, 0.08 needed: uncover it",
     ]
     assert table(diagnosis, lines=1).splitlines()[-1] == "… 4 more lines with --all"
-    assert to_json(diagnosis)["gates"]["min_diameter"] == {"circles": 3, "images": 2, "by_option": 2}
+    assert by_gate(findings)["min_diameter"] == GateCount(circles=3, images=2, by_option=2)
 
 
 def outline(draw, centre=(300.0, 200.0), diameter=30.0, **options):
