@@ -22,5 +22,6 @@ def front(package: str, file: str) -> None:
     package, file : the package's ``__name__`` and ``__file__``
     """
     module = sys.modules[package]
-    module.__getattr__, module.__dir__, module.__all__ = lazy_loader.attach_stub(package, file)
+    names = ("__getattr__", "__dir__", "__all__")
+    vars(module).update(zip(names, lazy_loader.attach_stub(package, file), strict=True))
     module.__class__ = _Front

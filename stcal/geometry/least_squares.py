@@ -8,7 +8,7 @@ rounding hides.
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Generic, Protocol, TypeVar
+from typing import Any, Generic, Protocol, TypeVar
 
 import numpy as np
 
@@ -37,7 +37,6 @@ SLOW = 0.01
 """A problem behind the best one by ``hopeless``, of which a step promises less than this share of that distance, is
 not followed further: with large residuals the last steps are many, and short."""
 TINY = 1e-300
-S = TypeVar("S")
 
 
 class Linear(Protocol):
@@ -51,6 +50,10 @@ class Linear(Protocol):
     def step(self, damping: float | np.ndarray) -> tuple[np.ndarray, float | np.ndarray]:
         """The damped step, (k,) or (h, k), and by how much it promises to lower the cost."""
         ...
+
+
+S = TypeVar("S")
+L = TypeVar("L", bound=Linear)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -86,7 +89,7 @@ class NormalEquations:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Minimum(Generic[S]):
+class Minimum(Generic[S, L]):
     """Where a descent ended.
 
     ``linear`` : the problem about ``state``; ``converged`` : whether it is a minimum, (h,) for h problems; ``promised``
@@ -94,12 +97,12 @@ class Minimum(Generic[S]):
     """
 
     state: S
-    linear: Linear
+    linear: L
     converged: np.ndarray
     promised: np.ndarray
     steps: int
 
-    def required(self, what: str, remedy: str, accepted: float = 0.0) -> "Minimum[S]":
+    def required(self, what: str, remedy: str, accepted: float = 0.0) -> "Minimum[S, L]":
         """This, if it is a minimum, or if no step promises more than ``accepted``, in units of σ².
 
         Raises
@@ -122,17 +125,17 @@ def _one(take: np.ndarray, new, old):
 
 def minimise(
     state: S,
-    linearise: Callable[[S], Linear],
+    linearise: Callable[[S], L],
     moved: Callable[[S, np.ndarray], S],
     cost: Callable[[S], float] | None = None,
-    select: Callable[[np.ndarray, S, S], S] = _one,
+    select: Callable[[np.ndarray, Any, Any], Any] = _one,
     damping: float = 1e-4,
     least_damping: float = 1e-12,
     settled: float = SETTLED,
     least_gain: float = LEAST_GAIN,
     max_steps: int = MAX_STEPS,
     hopeless: float = np.inf,
-) -> Minimum[S]:
+) -> Minimum[S, L]:
     """State of least cost, from a start.
 
     Parameters
@@ -181,8 +184,11 @@ def minimise(
         done |= (behind > hopeless) & (gain < SLOW * behind)
         last = done | small | (damp > MAX_DAMPING)
         trial = moved(state, np.where(done[..., None], 0.0, step))
-        there = None if cost else linearise(trial)
-        reached = cost(trial) if there is None else there.cost
+        if cost:
+            there, reached = None, cost(trial)
+        else:
+            there = linearise(trial)
+            reached = there.cost
         better = (reached <= np.asarray(here.cost) * (1 + ROUNDING)) & ~done
         with np.errstate(invalid="ignore"):
             fall = here.cost - reached

@@ -7,7 +7,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from stcal.geometry.least_squares import NormalEquations, minimise
-from stcal.geometry.rigid import Poses, Rigid
+from stcal.geometry.rigid import Rigid
 from stcal.geometry.robust import huber_cost, huber_weights
 
 MAX_STEPS = 60
@@ -52,6 +52,7 @@ class PoseStack:
 class Normal(NormalEquations):
     """Normal equations of h poses, and ``length`` (h, n) of the residuals in σ."""
 
+    cost: np.ndarray
     length: np.ndarray
 
     @classmethod
@@ -71,7 +72,7 @@ class Normal(NormalEquations):
 class Minima:
     """h poses at their minima: ``cost`` (h,), ``normal`` (h, 6, 6), ``length`` (h, n) residuals in σ, ``settled``."""
 
-    poses: PoseStack | Poses
+    poses: PoseStack
     cost: np.ndarray
     normal: np.ndarray
     length: np.ndarray
@@ -79,17 +80,18 @@ class Minima:
 
     def rows(self, index) -> "Minima":
         """Those of a list, a mask or a slice."""
-        return Minima(*(getattr(self, name)[index] for name in Minima.__slots__))
+        return Minima(self.poses[index], self.cost[index], self.normal[index], self.length[index], self.settled[index])
 
     def plus(self, other: "Minima") -> "Minima":
         """These, and the other's after them."""
-        rest = [np.concatenate([getattr(self, name), getattr(other, name)]) for name in Minima.__slots__[1:]]
-        return Minima(self.poses.plus(other.poses), *rest)
+        rest = ("cost", "normal", "length", "settled")
+        both = (np.concatenate([getattr(self, name), getattr(other, name)]) for name in rest)
+        return Minima(self.poses.plus(other.poses), *both)
 
 
 def descend(
-    evaluate: Callable[[PoseStack | Poses], Normal],
-    poses: PoseStack | Poses,
+    evaluate: Callable[[PoseStack], Normal],
+    poses: PoseStack,
     settled: float,
     hopeless: float = np.inf,
 ) -> Minima:

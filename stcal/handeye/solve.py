@@ -154,8 +154,8 @@ def handeye(
     task = _task(pairs, setup, views, options or HandEyeOptions())
     if method == "pose":
         return _by_poses(task)
-    if method == "reprojection":
-        return _by_views(task)
+    if method == "reprojection" and task.views is not None:
+        return _by_views(task, task.views)
     return _by_equations(task, method)
 
 
@@ -259,12 +259,12 @@ def _by_poses(task: _Task) -> HandEye:
     )
 
 
-def _by_views(task: _Task) -> HandEye:
+def _by_views(task: _Task, views: Views) -> HandEye:
     options, names = task.options, task.pairs.names
     solution = adjust_views(
         task.loop,
         task.pairs.base_from_flange,
-        task.views,
+        views,
         task.guess(task.loop, options.with_scale),
         options.noise,
         options.intrinsics,
@@ -276,7 +276,7 @@ def _by_views(task: _Task) -> HandEye:
     notes, covariance = task.notes, solution.covariance
     if options.four_dof:
         x, z, covariance, notes = _without_slide(task, x, z, solution.normal)
-    seen = replace(task.loop, camera_from_board=resected(names, task.views, solution))
+    seen = replace(task.loop, camera_from_board=resected(names, views, solution))
     residuals = seen.residuals(x, z)
     notes += _remarks(task, solution.outliers, residuals, solution.scale_hint)
     if solution.camera_gain > CAMERA_GAIN:

@@ -70,8 +70,7 @@ def uri(figure) -> str:
     import matplotlib
 
     stream = io.BytesIO()
-    settings = {"svg.fonttype": "path", "svg.hashsalt": "stcal"}
-    with warnings.catch_warnings(), matplotlib.rc_context(settings):
+    with warnings.catch_warnings(), matplotlib.rc_context({"svg.fonttype": "path", "svg.hashsalt": "stcal"}):
         warnings.filterwarnings("ignore", "Glyph")  # a face may be named in any script
         figure.savefig(stream, format="svg", metadata={"Date": None, "Creator": None, "Format": None, "Type": None})
     return "data:image/svg+xml;base64," + base64.b64encode(stream.getvalue()).decode()

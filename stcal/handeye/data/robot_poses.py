@@ -108,7 +108,7 @@ def _from_yaml(files: list[tuple[str, Path]], where: str) -> RobotPoses:
         for key, value in zip(keys, row, strict=True):
             if isinstance(value, bool) or not isinstance(value, int | float) or not np.isfinite(value):
                 raise InputError(f"{where}: {file.name}: {key} is {value!r}, a finite number needed")
-        length = float(np.linalg.norm(row[3:]))
+        length = float(np.linalg.norm(np.array(row[3:], float)))
         if abs(length - 1) > UNIT_WITHIN:
             raise InputError(f"{where}: {file.name}: quaternion of length {length:.4g}, 1 ± {UNIT_WITHIN:g} needed")
         values.append(row)

@@ -153,7 +153,7 @@ def project_jacobian(camera: Camera, xyz_camera: np.ndarray) -> tuple[np.ndarray
     return distorted * camera.focal + camera.centre, camera.focal[:, None] * (by_ideal @ by_point)
 
 
-def _pose_of(view: View, camera: Camera, name: str) -> Minimum[Rigid]:
+def _pose_of(view: View, camera: Camera, name: str) -> Minimum[Rigid, NormalEquations]:
     if len(view) < LEAST_CORNERS:
         raise DegenerateError(f"{name}: {len(view)} corners of the board, {LEAST_CORNERS} needed; take the image out")
     try:

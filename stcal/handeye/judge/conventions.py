@@ -58,7 +58,7 @@ def check_conventions(
         gain = {
             what: given[0] / max(turn, 1e-12) * given[1] / max(shift, 1e-12) for what, (turn, shift) in found.items()
         }
-        what = max(gain, key=gain.get)
+        what = max(gain, key=gain.__getitem__)
         if gain[what] > FAR_BETTER and given[1] > BETTER * found[what][1]:
             turn, shift = found[what]
             raise InputError(f"{contradict}, but by {np.degrees(turn):.2g}° and {shift:.2g} mm {what}")

@@ -263,13 +263,15 @@ def adjust(corners: Corners, start: Bundle, free: tuple[str, ...]) -> BundleSolu
 def estimated(corners: Corners, state: Bundle, free: tuple[str, ...]) -> dict[str, float]:
     """Restricted maximum-likelihood σ of the ``free`` groups, all else linear about a state (as
     :func:`~stcal.handeye.methods.noise.variance_components`)."""
+    unknowns = corners.count()
+    nothing = NormalEquations(0.0, np.zeros((unknowns, unknowns)), np.zeros(unknowns))
     parts: dict[str, tuple[int, NormalEquations]] = {}
     for group in corners.groups(state):
         for name, (count, linear) in group.by_name().items():
             key = name if name in free else ""
-            old_count, old = parts.get(key, (0, NormalEquations(0.0, 0.0, 0.0)))
+            old_count, old = parts.get(key, (0, nothing))
             parts[key] = old_count + count, old + linear
-    fixed = parts.pop("", (0, NormalEquations(0.0, 0.0, 0.0)))[1]
+    fixed = parts.pop("", (0, nothing))[1]
     names = tuple(parts)
 
     def cost(logs: np.ndarray) -> tuple[float, np.ndarray]:

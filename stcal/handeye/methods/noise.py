@@ -143,7 +143,7 @@ def _stated(m: int, covariance: np.ndarray | None, rad: float | None, mm: float 
     """The covariances of the poses where they have any, else of one σ for all."""
     if covariance is not None:
         return covariance
-    if rad is None:
+    if rad is None or mm is None:
         return None
     return np.tile(np.diag([rad**2] * 3 + [mm**2] * 3), (m, 1, 1))
 

@@ -62,7 +62,7 @@ def about_one_axis(loop: Loop, mount_axis: np.ndarray, with_scale: bool = False)
     motions = Motions.all(loop)
     motions = motions[motions.has_log()]
     camera_axis = (motions.alpha @ mount_axis) @ motions.beta
-    turn, _ = Rotation.align_vectors(mount_axis[None], camera_axis[None])
+    turn = Rotation.align_vectors(mount_axis[None], camera_axis[None])[0]
     board = eye.translation @ turn.as_matrix().T
     along = (board @ mount_axis)[:, None] * mount_axis
     across = np.stack([board - along, np.cross(mount_axis, board)], axis=2)

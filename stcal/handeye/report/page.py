@@ -6,6 +6,7 @@ from scipy.spatial.transform import Rotation
 from stcal.geometry.rigid import Rigid
 from stcal.handeye.data.loop import FRAMES
 from stcal.handeye.judge.observability import Observability
+from stcal.handeye.methods.reprojection import Reprojection
 from stcal.handeye.report.file import Outcome
 from stcal.handeye.result import HandEye
 from stcal.handeye.solve import FACTORS
@@ -49,7 +50,7 @@ def outcome_text(outcome: Outcome) -> str:
         lines += [f"held out, {text}" for text in _agreeing_text(outcome)]
     lines += [f"σ of {text}: {value} ({how})" for text, value, how in _sigma_rows(outcome)]
     if result.sigma_scale is not None:
-        lines.append(scale_text(outcome))
+        lines.append(scale_text(outcome, result.sigma_scale))
     if result.observability is not None:
         lines.append(_turns_text(result.observability))
     if outcome.compared:
@@ -58,13 +59,13 @@ def outcome_text(outcome: Outcome) -> str:
     return "\n".join(lines)
 
 
-def scale_text(outcome: Outcome) -> str:
-    """The board's true size, as found."""
+def scale_text(outcome: Outcome, sigma_scale: float) -> str:
+    """The board's true size, as found, and its σ."""
     result = outcome.result
-    text = f"board: {result.scale:.5f} ± {result.sigma_scale:.5f} times its stated size"
+    text = f"board: {result.scale:.5f} ± {sigma_scale:.5f} times its stated size"
     if outcome.pitch_mm is None:
         return text
-    found, sigma = outcome.pitch_mm * result.scale, outcome.pitch_mm * result.sigma_scale
+    found, sigma = outcome.pitch_mm * result.scale, outcome.pitch_mm * sigma_scale
     return f"{text}: pitch {found:.4f} ± {sigma:.4f} mm, stated {outcome.pitch_mm:g} mm"
 
 
@@ -143,7 +144,7 @@ def _off(each: Compared, result: HandEye) -> list[str]:
     if each.result is None:
         return [NONE, NONE]
     off = result.mount_from_camera.inverse() @ each.result.mount_from_camera
-    return [number(np.linalg.norm(off.translation), 3), number(np.degrees(off.angle_rad()), 4)]
+    return [number(float(np.linalg.norm(off.translation)), 3), number(np.degrees(off.angle_rad()), 4)]
 
 
 def outcome_page(outcome: Outcome) -> str:
@@ -172,7 +173,7 @@ def outcome_page(outcome: Outcome) -> str:
         good=GOOD,
         bad=BAD,
         residuals=uri(_residual_figure(result)),
-        corners=result.reprojection and (uri(_corner_figure(result)), uri(_corner_rms_figure(result))),
+        corners=[uri(figure) for figure in _corner_figures(result)],
         poses=_pose_rows(result),
         motions=seen and _motion_rows(seen),
         sigma_deg=seen and np.degrees(seen.sigma_rad),
@@ -256,8 +257,13 @@ def _residual_figure(result: HandEye):
     return figure
 
 
-def _corner_figure(result: HandEye):
+def _corner_figures(result: HandEye) -> list:
+    """Residuals of all corners, and their RMS by pose; none where no corners were adjusted."""
     found = result.reprojection
+    return [] if found is None else [_corner_figure(found), _corner_rms_figure(found, len(result.names))]
+
+
+def _corner_figure(found: Reprojection):
     figure = new_figure(4.4, 4.0)
     axes = figure.add_axes((0.15, 0.12, 0.8, 0.86))
     off = found.residuals_px
@@ -271,10 +277,10 @@ def _corner_figure(result: HandEye):
     return figure
 
 
-def _corner_rms_figure(result: HandEye):
+def _corner_rms_figure(found: Reprojection, count: int):
     figure = new_figure(4.4, 4.0)
     axes = figure.add_axes((0.15, 0.12, 0.8, 0.86))
-    rms = np.array([result.reprojection.rms_px(i) for i in range(len(result.names))])
+    rms = np.array([found.rms_px(i) for i in range(count)])
     axes.vlines(
         np.arange(1, len(rms) + 1), 0, np.nan_to_num(rms), color=GOOD, lw=float(np.clip(150 / len(rms), 0.8, 6))
     )

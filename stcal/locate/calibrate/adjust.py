@@ -5,7 +5,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy.linalg import null_space
-from scipy.optimize import brentq
+from scipy.optimize import root_scalar
 from scipy.stats import chi2 as chi_square
 
 from stcal.errors import ConvergenceError
@@ -267,4 +267,5 @@ def _added(own: np.ndarray, px: np.ndarray, weight: np.ndarray, part: np.ndarray
 
     if excess(0.0) <= 0:
         return 0.0
-    return float(brentq(excess, 0.0, float(np.sqrt((seen**2).sum() / free)) + 1e-9))
+    most = float(np.sqrt((seen**2).sum() / free)) + 1e-9
+    return float(root_scalar(excess, method="brentq", bracket=(0.0, most)).root)

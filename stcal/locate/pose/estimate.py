@@ -210,7 +210,8 @@ def problem_of(seen: SeenTags, layout: TargetLayout, camera: Camera, prior: Came
     known = np.diag(np.append(seen.edge_sigma_px**2, np.full(2 * len(seen), layout.tag_sigma_px**2)))
     if prior is not None:
         by_camera = back @ (camera.parameter_jacobian(ideal) @ intrinsic_basis(prior.colmap_model))
-        common, known = np.concatenate([common, by_camera], axis=2), block_diag(known, prior.covariance)
+        common = np.concatenate([common, by_camera], axis=2)
+        known = np.asarray(block_diag(known, prior.covariance))
     noise = back @ seen.covariance_px2.reshape(-1, 2, 2) @ np.swapaxes(back, 1, 2)
     xy = layout.corners_mm[seen.rows].reshape(-1, 2)
     return PlanarProblem(xy, ideal, noise, px_by_seen, layout.covariance_mm2[np.ix_(rows, rows)], common, known)

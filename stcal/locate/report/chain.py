@@ -72,13 +72,14 @@ def read_chain(hand_eye: str | Path, robot_poses: str | Path | None, offset: str
     """
     mounted = read_result(hand_eye, HandEyeRead, "hand-eye file", "give the file of stcal handeye")
     where = f"hand-eye file {hand_eye}"
-    found = {MOVING: mounted.flange_from_camera, FIXED: mounted.base_from_camera}
-    names = [name for name, matrix in found.items() if matrix is not None]
-    if len(names) != 1:
-        raise InputError(f"{where}: {' and '.join(names) or 'neither'}; {MOVING} or {FIXED} needed")
+    either = {MOVING: mounted.flange_from_camera, FIXED: mounted.base_from_camera}
+    found = {name: matrix for name, matrix in either.items() if matrix is not None}
+    if len(found) != 1:
+        raise InputError(f"{where}: {' and '.join(found) or 'neither'}; {MOVING} or {FIXED} needed")
+    [(name, matrix)] = found.items()
     covariance = np.zeros((6, 6)) if mounted.covariance is None else mounted.covariance
-    mount = UncertainRigid(Rigid.from_matrix(found[names[0]]), covariance)
-    moving = names[0] == MOVING
+    mount = UncertainRigid(Rigid.from_matrix(matrix), covariance)
+    moving = name == MOVING
     if moving and robot_poses is None:
         raise InputError(f"{where}: the camera is on the flange; robot poses of the scenes (--robot-poses) needed")
     if not moving and robot_poses is not None:

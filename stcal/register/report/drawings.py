@@ -2,6 +2,8 @@
 
 import numpy as np
 
+from stcal.register.workspace.cubes import Cubes
+from stcal.register.workspace.field import Field
 from stcal.register.workspace.findings import Findings
 from stcal.report.figure import COLOURS, FAINT, INK, SMALL, calm, locator, new_figure, round_below
 
@@ -62,9 +64,8 @@ def space_figure(found: Findings):
     return figure, scale
 
 
-def field_figure(found: Findings):
+def field_figure(found: Findings, field: Field):
     """Planes through the middle of the points with the error to expect; None where the points have no width."""
-    field = found.field
     own = found.xyz_a[field.rows]
     low, high = own.min(0), own.max(0)
     if (high - low).min() < 1e-3 * (high - low).max():
@@ -82,11 +83,10 @@ def field_figure(found: Findings):
     most = max(float(size.max()) for _, _, size in planes)
     step = round_below(most / 10)
     levels = np.arange(np.ceil(most / step * (1 - 1e-9)) + 1) * step
-    figure = new_figure(10.2, 3.5)
-    shown = None
+    figure, shown = new_figure(10.2, 3.5), []
     for k, ((i, j), (u, v, size)) in enumerate(zip(VIEWS, planes, strict=True)):
         axes = figure.add_axes((0.055 + k * 0.298, 0.15, 0.24, 0.8))
-        shown = axes.contourf(u, v, size, levels=levels, cmap="YlOrRd")
+        shown.append(axes.contourf(u, v, size, levels=levels, cmap="YlOrRd"))
         axes.contour(u, v, size, levels=levels[1:-1:2], colors=INK, linewidths=0.4, alpha=0.5)
         third = 3 - i - j
         near = np.abs(own[:, third] - middle[third]) < (high - low)[third] / 8
@@ -94,23 +94,23 @@ def field_figure(found: Findings):
         box = np.array([[low[i], low[j]], [high[i], low[j]], [high[i], high[j]], [low[i], high[j]], [low[i], low[j]]])
         axes.plot(*box.T, color=INK, lw=0.7, ls=(0, (4, 3)))
         _frame(axes, "a", i, j, middle, reach)
-    bar = figure.colorbar(shown, cax=figure.add_axes((0.918, 0.15, 0.012, 0.8)))
+    bar = figure.colorbar(shown[-1], cax=figure.add_axes((0.918, 0.15, 0.012, 0.8)))
     bar.set_ticks(levels[:: -(-len(levels) // 8)])
     bar.ax.tick_params(labelsize=SMALL, length=2)
     bar.set_label("mm", fontsize=SMALL + 1)
     return figure
 
 
-def errors_figure(found: Findings):
+def errors_figure(found: Findings, reach: Cubes):
     """Lengths of residuals against the side of the cube about the middle that a point lies on."""
     result = found.registration
     rows = _shown(found)
-    side = 2 * np.abs(found.xyz_a[rows] - found.cubes.middle).max(1)
+    side = 2 * np.abs(found.xyz_a[rows] - reach.middle).max(1)
     length, inlier = found.length_mm[rows], result.inliers[rows]
     figure = new_figure(9, 2.6)
     axes = figure.add_axes((0.07, 0.2, 0.92, 0.66))
     top = 1.25 * result.inlier_errors.max_mm
-    for edge in found.cubes.sides_mm:
+    for edge in reach.sides_mm:
         axes.axvline(edge, color=FAINT, lw=0.8)
     for kind, colour, name in ((True, COLOURS[0], "inlier"), (False, COLOURS[1], "outlier")):
         own = inlier == kind

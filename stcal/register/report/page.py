@@ -9,10 +9,12 @@ from stcal.geometry.rigid import Similarity
 from stcal.register.core.result import ErrorFigures
 from stcal.register.report.drawings import errors_figure, field_figure, space_figure
 from stcal.register.report.file import matrix_of
+from stcal.register.workspace.cubes import Cubes
+from stcal.register.workspace.field import Field
 from stcal.register.workspace.findings import Findings
 from stcal.report.figure import COLOURS, uri
 from stcal.report.page import Sections, render
-from stcal.report.text import NONE, number
+from stcal.report.text import NONE, number, text_table
 
 FEW_ROWS = 24
 """Up to so many every row is listed, else the outliers and …"""
@@ -26,9 +28,8 @@ def registration_text(found: Findings) -> str:
     """Tables for the terminal."""
     result = found.registration
     lines = [_heading(found), "", "b_from_a, mm", *matrix_lines(matrix_of(result.b_from_a)), *_parts_lines(found), ""]
-    lines += [f"{'mm':<28}{'points':>8}{'mean':>10}{'RMS':>10}{'max':>10}"]
-    for name, count, *figures in _errors(found):
-        lines.append(f"{name:<28}{count:>8}" + "".join(f"{number(v, 4):>10}" for v in figures))
+    heads = ["<mm", "points", "mean", "RMS", "max"]
+    lines += text_table([heads, *_error_cells(found)], least=(28, 8, 10, 10, 10), gap=0)
     lines += ["", *_row_lines(found)]
     reach = _field_lines(found) + _cube_lines(found)
     return "\n".join(lines + (["", *reach] if reach else []))
@@ -70,8 +71,8 @@ def _parts_lines(found: Findings) -> list[str]:
     return [*lines, f"σ of a coordinate {result.sigma_mm:.4g} mm{factor}{redundancy}"]
 
 
-def _errors(found: Findings) -> list[tuple]:
-    """(name, points, mean, RMS, maximum)."""
+def _error_cells(found: Findings) -> list[list[str]]:
+    """Name, points, mean, RMS, maximum."""
     result, held = found.registration, found.registration.held_out
     rows = [_figures("residuals of the inliers", result.inlier_errors)]
     if held is not None:
@@ -81,8 +82,8 @@ def _errors(found: Findings) -> list[tuple]:
     return rows
 
 
-def _figures(name: str, errors: ErrorFigures) -> tuple:
-    return name, errors.points, errors.mean_mm, errors.rms_mm, errors.max_mm
+def _figures(name: str, errors: ErrorFigures) -> list[str]:
+    return [name, str(errors.points), *(number(v, 4) for v in (errors.mean_mm, errors.rms_mm, errors.max_mm))]
 
 
 def _row_lines(found: Findings) -> list[str]:
@@ -95,7 +96,7 @@ def _row_lines(found: Findings) -> list[str]:
         rows = np.concatenate([result.outliers[:MOST_OUTLIERS], worst])
         title = f"residuals b − b_from_a a of the outliers and of the {len(worst)} largest inliers, mm"
     lines = [f"{title:<60}{'x':>10}{'y':>10}{'z':>10}{'length':>10}"] if len(rows) else []
-    for row in rows:
+    for row in rows.tolist():
         kind = "inlier" if result.inliers[row] else "OUTLIER"
         values = [*result.residuals[row], length[row]]
         lines.append(f"  {f'line {found.lines[row]}':<16}{kind:<42}" + "".join(f"{v:10.3f}" for v in values))
@@ -104,9 +105,8 @@ def _row_lines(found: Findings) -> list[str]:
     return lines
 
 
-def field_sentence(found: Findings) -> str:
+def field_sentence(field: Field) -> str:
     """Whether residuals are more than noise, in a sentence."""
-    field = found.field
     if not field.seen:
         return (
             f"no systematic residuals seen: they look like noise of σ {field.noise_mm:.3g} mm "
@@ -123,12 +123,12 @@ def field_sentence(found: Findings) -> str:
 
 
 def _field_lines(found: Findings) -> list[str]:
-    return [] if found.field is None else [field_sentence(found)]
+    return [] if found.field is None else [field_sentence(found.field)]
 
 
-def shells(found: Findings) -> list[str]:
+def shells(reach: Cubes) -> list[str]:
     """``inner 200 mm``, ``200 … 300 mm`` …."""
-    sides = [f"{side:g}" for side in found.cubes.sides_mm]
+    sides = [f"{side:g}" for side in reach.sides_mm]
     return [f"inner {sides[0]} mm"] + [f"{a} … {b} mm" for a, b in pairwise(sides)]
 
 
@@ -138,17 +138,16 @@ def _cube_lines(found: Findings) -> list[str]:
         return []
     middle = " ".join(f"{v:.0f}" for v in reach.middle)
     rows = [[f"{e.mean_mm:.3f} / {e.max_mm:.3f}" if e else "–" for e in row] for row in reach.errors]
-    width = max(16, 2 + max(len(cell) for row in [shells(found), *rows] for cell in row))
+    width = max(16, 2 + max(len(cell) for row in [shells(reach), *rows] for cell in row))
     title = f"errors in cubes about {middle} of a, mean / max, mm"
-    lines = [f"{title:<52}" + "".join(f"{s:>{width}}" for s in shells(found))]
+    lines = [f"{title:<52}" + "".join(f"{s:>{width}}" for s in shells(reach))]
     for side, cells in zip(reach.sides_mm, rows, strict=True):
         lines.append(f"{f'  fitted in the cube of {side:g} mm':<52}" + "".join(f"{c:>{width}}" for c in cells))
-    return [*lines, *holds(found)]
+    return [*lines, *holds(reach)]
 
 
-def holds(found: Findings) -> list[str]:
+def holds(reach: Cubes) -> list[str]:
     """Of a fit to the inner cube: how far it errs there, and farther out."""
-    reach = found.cubes
     first = reach.errors[0]
     outside = [(side, e) for side, e in zip(reach.sides_mm[1:], first[1:], strict=True) if e]
     if first[0] is None or not outside:
@@ -164,7 +163,7 @@ def registration_page(found: Findings, more: Sections = ()) -> str:
     """The report page; ``more`` sections stand before the rows."""
     result = found.registration
     space, enlarged = space_figure(found)
-    field = None if found.field is None else field_figure(found)
+    field = None if found.field is None else field_figure(found, found.field)
     return render(
         "register/report/page.html.jinja",
         more=list(more),
@@ -173,13 +172,13 @@ def registration_page(found: Findings, more: Sections = ()) -> str:
         headline=_headline(found),
         matrix=matrix_rows(matrix_of(result.b_from_a)),
         parts=_parts_lines(found),
-        errors=[[name, str(count), *(number(v, 4) for v in figures)] for name, count, *figures in _errors(found)],
+        errors=_error_cells(found),
         colours=COLOURS,
         space=uri(space),
         enlarged=enlarged,
-        systematic="" if found.field is None else field_sentence(found),
+        systematic="" if found.field is None else field_sentence(found.field),
         field=field and uri(field),
-        cubes=found.cubes and _cubes(found),
+        cubes=found.cubes and _cubes(found, found.cubes),
         outliers=[_row(found, row) for row in result.outliers[:ROWS_ON_PAGE]],
         rows=[_row(found, row) for row in range(min(len(result), ROWS_ON_PAGE))],
         count=len(result),
@@ -199,18 +198,18 @@ def _headline(found: Findings) -> list[tuple[str, str, str]]:
     return tiles
 
 
-def _cubes(found: Findings) -> dict:
+def _cubes(found: Findings, reach: Cubes) -> dict:
     """Errors in cubes as the template shows them."""
-    reach, rows = found.cubes, []
+    rows = []
     for side, row in zip(reach.sides_mm, reach.errors, strict=True):
         errors = [[str(e.points), number(e.mean_mm, 4), number(e.max_mm, 4)] if e else ["0", NONE, NONE] for e in row]
         rows.append([f"{side:g} mm", *(cell for error in errors for cell in error)])
     return {
         "middle": " ".join(f"{v:.1f}" for v in reach.middle),
-        "holds": holds(found),
-        "shells": shells(found),
+        "holds": holds(reach),
+        "shells": shells(reach),
         "rows": rows,
-        "figure": uri(errors_figure(found)),
+        "figure": uri(errors_figure(found, reach)),
     }
 
 
