@@ -25,9 +25,11 @@ from stcal.sfm.camera.views import start_pose
 from stcal.sfm.data.model import MetricModel
 from stcal.sfm.data.observations import ImageObservations, by_group
 
-MAX_STEPS = 100
+MAX_STEPS = 200
 EXACTLY = 1e-15
-"""Share of χ² that the last step may promise."""
+"""Share of χ² that the last step may promise …"""
+SETTLED_PX = 1e-6
+"""… or by less than this it moves every projection: along a valley there is always more to gain, and nothing to see."""
 TINY_PX = 1e-3
 """Focal length of no lens."""
 CREEPING_PX = 1e-3
@@ -289,6 +291,7 @@ class _Normal:
 
     cost: float
     state: _State
+    setting: _Setting
     normal: np.ndarray
     right: np.ndarray
     boards: tuple[Reduction, ...]
@@ -323,7 +326,7 @@ class _Normal:
         covariance = np.linalg.inv(normal)
         taken = [np.trace(b.inverse[0]) + np.sum((b.from_kept[0] @ covariance) * b.from_kept[0]) for b in boards]
         dots_left = sum(b.step.size - t / setting.sigma_mm**2 for b, t in zip(boards, taken, strict=True))
-        return cls(_cost(state, setting), state, normal, right, tuple(boards), tuple(poses), float(dots_left))
+        return cls(_cost(state, setting), state, setting, normal, right, tuple(boards), tuple(poses), float(dots_left))
 
     def step(self, damping: float | np.ndarray) -> tuple[np.ndarray, float]:
         """Of the intrinsics, then of the dots of each board, then of the poses of each model."""
@@ -335,7 +338,17 @@ class _Normal:
         poses, models = [], iter(self.poses)
         for rows, moved in zip(_boards(self.state).values(), dots, strict=True):
             poses += [next(models).back(np.concatenate([moved, each_camera[self.state.camera_of[i]]])) for i in rows]
-        return np.concatenate([own, *dots, *(each.ravel() for each in poses)]), gain
+        step = np.concatenate([own, *dots, *(each.ravel() for each in poses)])
+        return step, gain if self.largest_move(step) > SETTLED_PX else 0.0
+
+    def largest_move(self, step: np.ndarray) -> float:
+        """By which a step moves any projection, px."""
+        new = _moved(self.state, self.setting, step)
+        moves = [
+            np.abs(b.residuals_px(new.cameras[k]) - a.residuals_px(self.state.cameras[k])).max()
+            for a, b, k in zip(self.state.models, new.models, self.state.camera_of, strict=True)
+        ]
+        return float(max(moves))
 
 
 def _minimise(state: _State, setting: _Setting) -> _Normal:
@@ -351,7 +364,7 @@ def _minimise(state: _State, setting: _Setting) -> _Normal:
     )
     last = found.linear
     if not found.converged:  # along a direction that hardly changes the images: its σ says so
-        move = _largest_move(found.state, _moved(found.state, setting, last.step(0.0)[0]))
+        move = last.largest_move(last.step(START_DAMPING)[0])
         if not move < CREEPING_PX:
             raise ConvergenceError(
                 f"camera: projections still move by {move:.1g} px after {found.steps} steps, {CREEPING_PX:g} px "
@@ -386,11 +399,3 @@ def _positive(parameters: np.ndarray) -> np.ndarray:
     if (parameters[:2] > 0).all() and np.isfinite(parameters).all():
         return parameters
     return np.concatenate([[TINY_PX, TINY_PX], np.zeros(len(parameters) - 2)])
-
-
-def _largest_move(old: _State, new: _State) -> float:
-    moves = [
-        np.abs(b.residuals_px(new.cameras[k]) - a.residuals_px(old.cameras[k])).max()
-        for a, b, k in zip(old.models, new.models, old.camera_of, strict=True)
-    ]
-    return float(max(moves))

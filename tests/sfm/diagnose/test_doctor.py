@@ -139,7 +139,7 @@ def test_in_view_is_what_the_simulation_wants_found(small_run, small_dataset):
     models = read_model(small_run / "target_model", saved.observations, ids, saved.corrected_px).in_mm()
     truth = json.loads((small_dataset / "truth.json").read_text())["groups"]
     blind = {image.name: image.select([]) for image in saved.observations}
-    circles = {label: np.array(xyz) for label, xyz in saved.faces["circles"].items()}
+    circles = {label: np.array(xyz) for label, xyz in saved.faces.circles.items()}
     assert len(models) == 2
     for model in models:
         expected = missing_circles(model, circles, blind, saved.camera, saved.target, saved.board)

@@ -322,7 +322,7 @@ def test_the_models_of_all_groups(saved):
     found = calibrate_models(saved.folder / "models", saved)
     assert [m.group for m in found.models] == ["12", "14"]
     assert found.notes == ()
-    assert found.target.target_from_face.keys() == saved.faces["target_from_face"].keys()
+    assert found.target.target_from_face.keys() == saved.faces.target_from_face.keys()
 
 
 def test_all_groups_in_one_world(saved, tmp_path):
