@@ -79,12 +79,12 @@ class SceneOptions:
 class Group:
     """Photographs between which only the camera moves.
 
-    ``faces`` : the two faces the group is for; ``axes`` : (3, 3) rows right, up, towards the camera of the middle
-    view, target frame; ``board_circles_target`` : (n, 3) mm, row-major; ``camera_from_target`` : one per image.
+    ``faces`` : the group is for, two in a made scene; ``axes`` : (3, 3) rows right, up, towards the camera of the
+    middle view, target frame; ``board_circles_target`` : (n, 3) mm, row-major; ``camera_from_target`` : one per image.
     """
 
     name: str
-    faces: tuple[str, str]
+    faces: tuple[str, ...]
     axes: np.ndarray
     target_from_board: Rigid
     board_circles_target: np.ndarray

@@ -1,5 +1,6 @@
 """Chain the faces of all groups into the target frame, and say how far the ways to a face disagree."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -47,7 +48,7 @@ class CalibratedTarget:
     covariance_mm2: np.ndarray | None = None
 
 
-def chain_faces(faces: list[FaceInGroup], target: TargetDesign, reference: str) -> CalibratedTarget:
+def chain_faces(faces: Sequence[FaceInGroup], target: TargetDesign, reference: str) -> CalibratedTarget:
     """Combine the faces of all groups into the target frame, that of the reference face.
 
     Every group states the pose of its faces against one another; a least-squares adjustment over all groups, weighted
@@ -79,7 +80,7 @@ def chain_faces(faces: list[FaceInGroup], target: TargetDesign, reference: str) 
     return CalibratedTarget(reference, target_from_face, circles, target_from_group)
 
 
-def measure_chains(faces: list[FaceInGroup], calibrated: CalibratedTarget) -> dict[str, tuple[Chain, ...]]:
+def measure_chains(faces: Sequence[FaceInGroup], calibrated: CalibratedTarget) -> dict[str, tuple[Chain, ...]]:
     """All ways to every face but the reference, with their distance from the calibrated pose."""
     return {
         face_id: tuple(_measure(way, faces, pose) for way in _chains(faces, calibrated.reference_face, face_id))
@@ -88,7 +89,7 @@ def measure_chains(faces: list[FaceInGroup], calibrated: CalibratedTarget) -> di
     }
 
 
-def _chains(faces: list[FaceInGroup], start: str, goal: str) -> list[tuple[tuple[str, ...], tuple[str, ...]]]:
+def _chains(faces: Sequence[FaceInGroup], start: str, goal: str) -> list[tuple[tuple[str, ...], tuple[str, ...]]]:
     """Simple ways from one face to another, the shortest first: (faces, groups)."""
     by_group: dict[str, list[str]] = {}
     for each in faces:
@@ -113,14 +114,14 @@ def _chains(faces: list[FaceInGroup], start: str, goal: str) -> list[tuple[tuple
     return found
 
 
-def _measure(chain, faces: list[FaceInGroup], combined: Rigid) -> Chain:
+def _measure(chain, faces: Sequence[FaceInGroup], combined: Rigid) -> Chain:
     way, groups = chain
     difference = _along(chain, faces) @ combined.inverse()
     shift = _along(chain, faces).translation - combined.translation
     return Chain(way, groups, float(np.linalg.norm(shift)), difference.angle_rad())
 
 
-def _along(chain, faces: list[FaceInGroup]) -> Rigid:
+def _along(chain, faces: Sequence[FaceInGroup]) -> Rigid:
     """reference_from_face along one chain."""
     pose = {(each.group, each.face): each.group_from_face for each in faces}
     way, groups = chain
@@ -136,7 +137,7 @@ def _pose_information(each: FaceInGroup) -> np.ndarray:
     return np.einsum("nki,nkl,nlj->ij", jacobian, each.information, jacobian)
 
 
-def _adjust(faces: list[FaceInGroup], chains, reference: str) -> tuple[dict[str, Rigid], dict[str, Rigid]]:
+def _adjust(faces: Sequence[FaceInGroup], chains, reference: str) -> tuple[dict[str, Rigid], dict[str, Rigid]]:
     """Poses of faces and groups in the target frame by weighted least squares over all (group, face).
 
     Poses are perturbed on the right, so that a face's own step is minus its residual.
@@ -172,7 +173,7 @@ def _adjust(faces: list[FaceInGroup], chains, reference: str) -> tuple[dict[str,
     return {f: poses["face", f] for f in (reference, *free)}, {g: poses["group", g] for g in groups}
 
 
-def _circles(faces: list[FaceInGroup], target_from_face: dict[str, Rigid], target: TargetDesign) -> dict:
+def _circles(faces: Sequence[FaceInGroup], target_from_face: dict[str, Rigid], target: TargetDesign) -> dict:
     """Circle centres in the target frame: weighted means over the groups, in the face frame."""
     weight: dict[CircleLabel, np.ndarray] = {}
     total: dict[CircleLabel, np.ndarray] = {}

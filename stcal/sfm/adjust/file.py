@@ -100,7 +100,7 @@ class FacesFile(ResultFile):
             "radius_mm": {label: radius[label] for label in target.circles},
             "centre_sigma_factor": centre_sigma_factor,
         }
-        if target.face_covariance:
+        if target.covariance_mm2 is not None and target.scale_sigma is not None:
             upper = np.triu_indices(3 * len(target.circles))
             content |= {
                 "target_from_face_covariance": target.face_covariance,

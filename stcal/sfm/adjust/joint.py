@@ -93,12 +93,12 @@ class _Places:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Setting:
-    """What stays the same in one minimisation."""
+    """What stays the same in one minimisation; ``flatness_mm`` is infinite where nothing is known of it."""
 
     labels: tuple[CircleLabel, ...]
     board: BoardDesign
     common: float
-    flatness_mm: float | None
+    flatness_mm: float
     given: Camera
     prior: np.ndarray
     huber: float
@@ -175,6 +175,7 @@ def _start(models, board: BoardDesign, camera: Camera, flatness_mm, prior: Camer
     xyz = _shared_circles(blocks, len(labels))
     shared = Shared(xyz, np.zeros((board.rows * board.columns, 3)), start, basis)
     blocks = [replace(b, model=_with_circles(b, xyz)) for b in blocks]
+    flatness_mm = np.inf if flatness_mm is None else flatness_mm
     return blocks, shared, _Setting(labels, board, 0.0, flatness_mm, camera, weight, np.inf)
 
 
@@ -366,7 +367,7 @@ def _normal_equations(blocks: Sequence[Block], shared: Shared, setting: _Setting
 
 def _planes(shared: Shared, setting: _Setting):
     """For every face: its circles, the projector that takes heights to distances from the best plane, its normal."""
-    if setting.flatness_mm is None:
+    if not np.isfinite(setting.flatness_mm):
         return
     faces: dict[str, list[int]] = {}
     for i, label in enumerate(setting.labels):

@@ -81,7 +81,7 @@ def calibrate_camera(
     tell = progress or (lambda *_: None)
     files, other = find_images(images)
     camera = start_camera(*_first_size(files))
-    result = None
+    before: Intrinsics | None = None
     with tempfile.TemporaryDirectory(prefix="stcal-camera-") as cache:
         for rounds in range(1, MAX_ROUNDS + 1):
             detection = _detect(
@@ -90,13 +90,13 @@ def calibrate_camera(
             views = board_views(detection.images, board, camera)
             skipped = (*other, *detection.skipped, *_without_board(detection, views))
             require_views(views, len(files), skipped)
-            before = result
             start = camera if before else closed_form(views, board, camera)
             result = adjust_intrinsics(views, board, start, colmap_model)
             require_determined(result, views)
             camera = result.camera
             if before and _next_move(before, result) < SETTLED_SIGMAS:
                 break
+            before = result
     projection = projection_sigma(result)
     split = split_half(result, views, board)
     warnings = _warnings(result, projection, split, board)

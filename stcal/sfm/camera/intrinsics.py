@@ -17,7 +17,7 @@ from stcal.geometry.least_squares import minimise
 from stcal.geometry.normal_equations import Reduction, reduce
 from stcal.geometry.robust import HUBER, robust_sigma
 from stcal.io.camera import intrinsic_basis
-from stcal.labels import DotLabel
+from stcal.labels import Label
 from stcal.sfm.adjust.blocks import image_cost, normalised, robust_weights, without_cameras
 from stcal.sfm.adjust.group import moved_poses
 from stcal.sfm.adjust.refine import eccentricity_px
@@ -202,7 +202,7 @@ def _start_state(views, camera_of_view, board: BoardDesign, start: Camera) -> _S
     return _State(tuple(models), tuple(folders), tuple(which), (start,) * (max(which) + 1))
 
 
-def _model(folder: str, labels: tuple[DotLabel, ...], views, board: BoardDesign, camera: Camera) -> MetricModel:
+def _model(folder: str, labels: tuple[Label, ...], views, board: BoardDesign, camera: Camera) -> MetricModel:
     """The views of a folder around its board, which stands still in the world."""
     place = {label: i for i, label in enumerate(labels)}
     rows = [(i, place[label], k) for i, v in enumerate(views) for k, label in enumerate(v.labels)]
@@ -224,7 +224,7 @@ def _model(folder: str, labels: tuple[DotLabel, ...], views, board: BoardDesign,
 
 def _weighted(state: _State, own: list[np.ndarray], factors: SigmaFactors, board: BoardDesign) -> _State:
     """The state with the centres' σ scaled, and the eccentricity as it is now."""
-    radius = board.radius_of()
+    radius: dict[Label, float] = {**board.radius_of()}
     models = tuple(
         replace(
             m,

@@ -30,9 +30,10 @@ MICRO = 1e3
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Again:
-    """What it takes to adjust parts of a run again, from the joint result, at its intrinsics."""
+    """What it takes to adjust parts of a run again, from its ``joint`` result, at its intrinsics."""
 
     calibration: Calibration
+    joint: JointResult
     target: TargetDesign
     board: BoardDesign
     options: AdjustOptions
@@ -63,7 +64,7 @@ def halves_check(again: Again) -> Check:
     """Two results from two halves of the images of every group, taken in turn. Their difference against the sum of
     their covariances; the board's own deviations are common to both, which makes the test a little milder."""
     key, title = "halves", "Two halves of the images against each other"
-    models, reference = again.calibration.joint.models, again.calibration.target.reference_face
+    models, reference = again.joint.models, again.calibration.target.reference_face
     fewest = min(models, key=lambda model: len(model.images))
     if len(fewest.images) < 2 * MIN_HALF:
         reason = f"group {fewest.group} has {len(fewest.images)} images, {2 * MIN_HALF} needed"
@@ -97,7 +98,7 @@ def groups_check(again: Again) -> Check:
     change is the difference of the two covariances, as that of a nested adjustment."""
     key, title = "groups", "The result without each group"
     calibration = again.calibration
-    models, whole = calibration.joint.models, calibration.target
+    models, whole = again.joint.models, calibration.target
     reference = whole.reference_face
     faces = [reference, *(f for f in whole.target_from_face if f != reference)]
     members = {m.group: {f.face for f in calibration.faces if f.group == m.group} for m in models}
@@ -112,7 +113,7 @@ def groups_check(again: Again) -> Check:
             without, joint = again.adjust([m for m in models if m.group != group], faces)
         except StcalError:
             continue
-        scale = (calibration.joint.sigma0 / joint.sigma0) ** 2
+        scale = (again.joint.sigma0 / joint.sigma0) ** 2
         for face in faces[1:]:
             change = _difference(without.target_from_face[face], whole.target_from_face[face])
             larger = scale * without.face_covariance[face]
@@ -152,8 +153,8 @@ def loops_check(again: Again) -> Check:
     calibration = again.calibration
     trials = []
     steps: dict[tuple[str, str, str], tuple[Rigid, np.ndarray]] = {}
-    redundancy = sum(2 * len(m.image_index) for m in calibration.joint.models)
-    for face, found in measure_chains(list(calibration.faces), calibration.target).items():
+    redundancy = sum(2 * len(m.image_index) for m in again.joint.models)
+    for face, found in measure_chains(calibration.faces, calibration.target).items():
         for one, two in combinations(found, 2):
             if set(one.groups) & set(two.groups):
                 continue
@@ -176,7 +177,7 @@ def _along(again: Again, way: Chain, steps) -> tuple[Rigid, np.ndarray]:
     pose, covariance = Rigid(), np.zeros((6, 6))
     for group, a, b in zip(way.groups, way.faces[:-1], way.faces[1:], strict=True):
         if (group, a, b) not in steps:
-            models = [m for m in again.calibration.joint.models if m.group == group]
+            models = [m for m in again.joint.models if m.group == group]
             single, _ = again.adjust(models, (a, b))
             steps[group, a, b] = single.target_from_face[b], single.face_covariance[b]
         step, own = steps[group, a, b]
@@ -188,12 +189,11 @@ def _along(again: Again, way: Chain, steps) -> tuple[Rigid, np.ndarray]:
     return pose, covariance
 
 
-def agreement_check(calibration: Calibration, networks: Sequence[Network]) -> Check:
+def agreement_check(joint: JointResult, networks: Sequence[Network]) -> Check:
     """σ₀ of the joint adjustment: what one target, the board's σ and flat faces add to the residuals of the free
     networks, against what they should (F test of nested models). Suspicious at least where that adjustment has not
     settled, which is no matter of chance: contradictory observations make its last steps slow."""
     key, title = "agreement", "Groups, board and faces against one another (σ₀)"
-    joint = calibration.joint
     free = float(sum(n.redundancy.sum() for n in networks))
     square = float(sum((n.residual**2).sum() for n in networks))
     extra = max(joint.sigma0**2 * joint.redundancy - square, 0.0)

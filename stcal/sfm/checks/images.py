@@ -1,6 +1,6 @@
 """Checks of images, labels and camera, from the residuals of the free networks: no board, no design is believed."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 
 import numpy as np
 from scipy.stats import f as fisher
@@ -42,7 +42,7 @@ def camera_check(
         "the camera file does not belong to these images (other focus, zoom, lens or size), or is too coarse: run with "
         "--refine-camera, or calibrate the camera anew"
     )
-    if prior is not None:
+    if prior is not None and calibration.joint is not None:  # which the options of a run see to
         away = np.linalg.pinv(intrinsic_basis(prior.colmap_model))
         away = away @ (calibration.camera.parameters() - camera.parameters())
         gained = prior.covariance - calibration.joint.camera_covariance
@@ -51,7 +51,7 @@ def camera_check(
         names = _names(prior.colmap_model)
     else:
         tested = "FULL_OPENCV" if colmap_model == "FULL_OPENCV" else "OPENCV"
-        normal, right = _summed(networks, lambda n: _by_intrinsics(n, calibration.camera, tested))
+        normal, right = summed(networks, lambda n: _by_intrinsics(n, calibration.camera, tested))
         estimate, covariance, statistic, freedom = solve_score(normal, right)
         sigma, names = np.sqrt(np.diag(covariance)), _names(tested)
     redundancy = sum(n.redundancy.sum() for n in networks)
@@ -77,9 +77,10 @@ def _by_intrinsics(network: Network, camera: Camera, colmap_model: str) -> np.nd
     return network.model.whiten(by_intrinsics)
 
 
-def _summed(networks: Sequence[Network], columns) -> tuple[np.ndarray, np.ndarray]:
-    scores = [n.score(columns(n)) for n in networks]
-    return sum(s[0] for s in scores), sum(s[1] for s in scores)
+def summed(networks: Sequence[Network], columns: Callable[[Network], np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
+    """:meth:`~stcal.sfm.adjust.network.Network.score` of parameters that all groups have in common."""
+    normal, right = zip(*(n.score(columns(n)) for n in networks), strict=True)
+    return np.sum(normal, axis=0), np.sum(right, axis=0)
 
 
 def field_check(networks: Sequence[Network], camera: Camera) -> Check:
@@ -96,7 +97,7 @@ def field_check(networks: Sequence[Network], camera: Camera) -> Check:
         field = np.stack([np.hstack([terms, none]), np.hstack([none, terms])], axis=1)
         return network.model.whiten(field)
 
-    _, _, statistic, freedom = solve_score(*_summed(networks, columns))
+    _, _, statistic, freedom = solve_score(*summed(networks, columns))
     count = sum(n.residual.size for n in networks)
     redundancy = sum(n.redundancy.sum() for n in networks)
     sigma = np.sqrt(np.mean(np.concatenate([n.model.sigma_px() ** 2 for n in networks])))

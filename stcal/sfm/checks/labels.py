@@ -8,6 +8,7 @@ from itertools import combinations
 import numpy as np
 
 from stcal.geometry.camera import Camera
+from stcal.labels import Label
 from stcal.sfm.adjust.network import Network
 from stcal.sfm.checks.verdict import SHOWN, Check, Measured, Trial, judge
 from stcal.sfm.data.model import Outlier
@@ -74,7 +75,7 @@ def _exchanged(
     networks: Sequence[Network], outliers: Sequence[Outlier], images: Sequence[ImageObservations], camera: Camera
 ) -> tuple[str, ...]:
     """``image: label and label`` of every pair of outliers that stand at each other's places."""
-    by_image: dict[str, list[str]] = {}
+    by_image: dict[str, list[Label]] = {}
     for each in outliers:
         by_image.setdefault(each.image, []).append(each.label)
     observed = {image.name: image for image in images}

@@ -67,8 +67,8 @@ def measure_radii(
 ) -> Radii:
     """Radii from the ellipses' areas and the circles' places and planes."""
     shapes = {image.name: image.shape for image in images}
-    ratio: dict[str, list[np.ndarray]] = {}
-    size: dict[str, list[np.ndarray]] = {}
+    ratio: dict[Label, list[np.ndarray]] = {}
+    size: dict[Label, list[np.ndarray]] = {}
     focal = float(np.sqrt(camera.focal.prod()))
     for network in networks:
         model = network.model
@@ -120,9 +120,9 @@ def radius_checks(radii: Radii) -> list[Check]:
         sigma = float(np.hypot(robust_sigma(np.abs(ratio - usual)), RADIUS_TOLERANCE))
         freedom = max(MAD_EFFICIENCY * len(members) - 1, 2.0)
         for i in members:
-            away = radii.ratio[i] - usual
+            away = float(radii.ratio[i]) - usual
             single.append(
-                Trial(radii.labels[i], 1e3 * away * radii.design_mm[i], "µm", (away / sigma) ** 2, 1, freedom)
+                Trial(radii.labels[i], 1e3 * away * float(radii.design_mm[i]), "µm", (away / sigma) ** 2, 1, freedom)
             )
     odd = (
         "a damaged or dirty circle, a wrong label, or another radius than the design's: look at it in the overlays, "

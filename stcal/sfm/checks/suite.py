@@ -28,6 +28,7 @@ from stcal.sfm.checks.images import (
     moved_check,
     sharpness_check,
     sigma_check,
+    summed,
 )
 from stcal.sfm.checks.labels import labels_check
 from stcal.sfm.checks.radii import measure_radii, radius_checks
@@ -101,14 +102,15 @@ def run_checks(evidence: Evidence) -> tuple[Check, ...]:
 
 
 def _joint_checks(evidence: Evidence, networks: list[Network]) -> list[Check]:
-    if evidence.calibration.joint is None:
+    joint = evidence.calibration.joint
+    if joint is None:
         reason = "needs the covariances of the joint adjustment"
         return [impossible(key, title, reason, "run with --solve joint") for key, title in JOINT]
-    again = Again(evidence.calibration, evidence.target, evidence.board, evidence.options)
-    linked = {model.group for model in evidence.calibration.joint.models}
+    again = Again(evidence.calibration, joint, evidence.target, evidence.board, evidence.options)
+    linked = {model.group for model in joint.models}
     own = [n for n in networks if n.model.group in linked]
     return [
-        agreement_check(evidence.calibration, own),
+        agreement_check(joint, own),
         halves_check(again),
         groups_check(again),
         loops_check(again),
@@ -122,8 +124,9 @@ def control_check(evidence: Evidence, networks: list[Network]) -> Check:
     key = "control"
     if not evidence.options.eccentricity:
         return impossible(key, CONTROL, "this run is the control", "run with eccentricity")
-    scores = [n.score(n.model.whiten(n.model.shift_px[:, :, None])) for n in networks]
-    more, covariance, statistic, freedom = solve_score(sum(s[0] for s in scores), sum(s[1] for s in scores))
+    more, covariance, statistic, freedom = solve_score(
+        *summed(networks, lambda n: n.model.whiten(n.model.shift_px[:, :, None]))
+    )
     redundancy = sum(n.redundancy.sum() for n in networks)
     remedy = (
         "the measured centres do not move as those of ellipses: check radii, polarity and exposure; centroids of grey "

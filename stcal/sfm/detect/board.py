@@ -249,7 +249,7 @@ def _place(candidates: Candidates, uv, index, turn: int, board: BoardDesign, hom
 
 def _large_dots(candidates: Candidates, uv, index, board: BoardDesign, homography) -> np.ndarray:
     """Mask of the dots that are larger than the others, as the larger corner dot is."""
-    if board.corner is None:
+    if board.corner is None or board.corner_radius_mm is None:
         return np.zeros(len(uv), bool)
     local = np.sqrt(np.abs(np.linalg.det(homography_jacobian(homography, uv))))
     size = candidates.radius[index] / local

@@ -211,19 +211,20 @@ def masks(
         mean = cv2.blur(smooth, (window, window), borderType=cv2.BORDER_REFLECT)
         difference = cv2.subtract(smooth, mean) if polarity == "bright" else cv2.subtract(mean, smooth)
         # An outline at half the blob's own height neither grows with blur nor runs into a neighbour.
-        height = cv2.dilate(difference, np.ones((REACH_PX, REACH_PX), np.uint8))
+        peak = cv2.dilate(difference, np.ones((REACH_PX, REACH_PX), np.uint8))
         mask = cv2.bitwise_and(
-            cv2.compare(difference, threshold, cv2.CMP_GT),
-            cv2.compare(difference, cv2.convertScaleAbs(height, alpha=OUTLINE_LEVEL), cv2.CMP_GT),
+            cv2.threshold(difference, threshold, 255, cv2.THRESH_BINARY)[1],
+            cv2.compare(difference, cv2.convertScaleAbs(peak, alpha=OUTLINE_LEVEL), cv2.CMP_GT),
         )
         shortest, longest = max(6.0, 2 * level.lowest), 4 * highest / np.sqrt(options.min_axis_ratio)
-        yield mask, OutlineGates(*mask.shape[::-1], level.lowest, highest, options.min_axis_ratio, shortest, longest)
+        height, width = mask.shape
+        yield mask, OutlineGates(width, height, level.lowest, highest, options.min_axis_ratio, shortest, longest)
 
 
 def outlines(mask: np.ndarray) -> list[np.ndarray]:
     """Outer outlines in a mask; the rims of holes are none."""
     contours, hierarchy = cv2.findContours(mask, cv2.RETR_CCOMP, cv2.CHAIN_APPROX_NONE)
-    return [contours[i] for i in np.flatnonzero(hierarchy[0, :, 3] < 0)] if contours else []
+    return [contours[i] for i in np.flatnonzero(hierarchy[0, :, 3] < 0).tolist()] if contours else []
 
 
 def outline_area(contour: np.ndarray) -> float:

@@ -15,7 +15,7 @@ from stcal.geometry.camera import Camera
 from stcal.io.cache import keep, kept
 from stcal.io.camera import CameraModel
 from stcal.io.images import ImageFile, Skipped, decode, grey_8bit, thumbnail
-from stcal.labels import parse_labels
+from stcal.labels import circle_labels
 from stcal.parallel import run_parallel
 from stcal.sfm.detect.centres import Centres
 from stcal.sfm.detect.ellipses import EllipseOptions
@@ -84,8 +84,10 @@ def detect_files(
             progress(file.name)
     try:
         for k, outcome in run_parallel(_detect_file, [jobs[i] for i in pending], workers):
-            i, skipped = pending[k], isinstance(outcome, Skipped)
-            found[i] = outcome if skipped else _load(files[i], cache / f"{outcome}.npz", reused=False)
+            i = pending[k]
+            found[i] = (
+                outcome if isinstance(outcome, Skipped) else _load(files[i], cache / f"{outcome}.npz", reused=False)
+            )
             if found[i] is None:
                 raise InputError(f"{cache / f'{outcome}.npz'}: written, and cannot be read again; check the disk")
             if progress:
@@ -200,7 +202,7 @@ def _load(file: ImageFile, path: Path, reused: bool) -> DetectedImage | None:
     def make(stored, meta) -> DetectedImage:
         detection = ImageDetection(
             Centres(*(stored[f.name] for f in fields(Centres))),
-            parse_labels(meta["target_labels"]),
+            circle_labels(meta["target_labels"]),
             stored["numberings"],
             tuple(meta["notes"]),
             tuple(meta["repeated"]),

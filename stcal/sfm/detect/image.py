@@ -60,9 +60,8 @@ def read_image(
     grey: np.ndarray, camera: Camera, target: TargetDesign, board: BoardDesign | None, options: EllipseOptions
 ) -> ImageReading:
     """Find the outlines of one polarity or both in an 8-bit image, and the board and the faces among them."""
-    found = {
-        p: find_ellipses(grey, p, options) for p in {target.polarity, board.polarity if board else target.polarity}
-    }
+    polarities: set[Polarity] = {target.polarity, board.polarity if board else target.polarity}
+    found: dict[Polarity, Ellipses] = {p: find_ellipses(grey, p, options) for p in polarities}
     repeated: list[str] = []
     reading = None
     free = {p: np.ones(len(e), bool) for p, e in found.items()}
@@ -85,7 +84,7 @@ def read_image(
             free[board.polarity][each.candidates] = False
     ellipses = found[target.polarity].select(free[target.polarity])
     bright = 0.0
-    if reading is not None and board.polarity == target.polarity:
+    if board is not None and reading is not None and board.polarity == target.polarity:
         bright = float(np.median(found[board.polarity].contrast[reading.candidates]))
     faces = FaceFinder(target).find(Candidates.of(ellipses, camera), bright)
     repeated += [f"face {face_id}" for face_id in faces.repeated]
@@ -107,7 +106,7 @@ def detect_image(
     kept = np.flatnonzero(target_centres.ok)
     parts = [target_centres.select(kept)]
     numberings = np.zeros((0, 0, 2), int)
-    if reading.board is not None:
+    if board is not None and reading.board is not None:
         found = reading.found[board.polarity]
         dots = measure_centres(scaled, camera, found.select(reading.board.candidates), found)
         notes += [_rim_note("a board dot", rim) for _, rim, ok in _rows(range(len(dots)), dots) if not ok]
@@ -127,7 +126,7 @@ def _rows(labels, centres: Centres):
     return zip(labels, centres.rim, centres.ok, strict=True)
 
 
-def _rim_note(label: CircleLabel, rim: float) -> str:
+def _rim_note(label: str, rim: float) -> str:
     return (
         f"{label}: {100 * rim:.0f} % of its rim follows an ellipse, 80 % needed; partly hidden or disturbed, left out"
     )
@@ -136,4 +135,4 @@ def _rim_note(label: CircleLabel, rim: float) -> str:
 def _corners(camera: Camera) -> np.ndarray:
     """Corners of the image, around it, in normalised ideal coordinates."""
     right, bottom = camera.width - 0.5, camera.height - 0.5
-    return camera.normalised_from_pixel([[-0.5, -0.5], [right, -0.5], [right, bottom], [-0.5, bottom]])
+    return camera.normalised_from_pixel(np.array([[-0.5, -0.5], [right, -0.5], [right, bottom], [-0.5, bottom]]))

@@ -128,7 +128,8 @@ def _board_poses(detection: ImageDetection, board: BoardDesign) -> list[Rigid]:
     """camera_from_board by numbering; none where the dots do not fix it."""
     dots = detection.centres.centre[len(detection.target_labels) :]
     poses = [_planar_pose(board.pitch_mm * n[:, ::-1].astype(float), dots) for n in detection.numberings]
-    return [] if any(pose is None for pose in poses) else poses
+    found = [pose for pose in poses if pose is not None]
+    return found if len(found) == len(poses) else []
 
 
 def _planar_pose(xy_mm: np.ndarray, xy_normalised: np.ndarray) -> Rigid | None:

@@ -211,7 +211,9 @@ def _try_options(run: SavedRun, jobs, examined, workers, progress) -> dict[str, 
 
 def _try(job: _Job, tried: list[Trial]) -> dict[str, set[str]]:
     """Labels that each option finds; for an image without a pose those known, if they are enough to place it."""
-    image, _ = _decoded(job)
+    image, problem = _decoded(job)
+    if image is None:
+        raise InputError(problem)
     found = {}
     for trial in tried:
         labels = labels_found(image, job.camera, job.target, job.board, trial.options, job.expected)

@@ -131,11 +131,11 @@ class _Examination:
     def verdicts(self) -> list[Verdict]:
         """Of all missing circles."""
         verdicts, lost = [], []
-        for i in np.flatnonzero(self.plane.missing):
+        for i in np.flatnonzero(self.plane.missing).tolist():
             if self.fit is not None and self.fit.fits()[i]:
-                verdicts.append(self._recognised(i) or self._rim(i))
+                verdicts.append(self._recognised(i, self.fit) or self._rim(i, self.fit))
             elif self.fit is not None and self.fit.distance[i] < self.fit.radius[i]:
-                verdicts.append(self._pattern(i))
+                verdicts.append(self._pattern(i, self.fit))
             else:
                 lost.append(i)
         if lost:
@@ -147,10 +147,10 @@ class _Examination:
                 verdicts.append(Verdict(self.plane.labels[i], end.gate, end.value, end.limit, end.unit, end.cause))
         return verdicts
 
-    def _recognised(self, i: int) -> Verdict | None:
+    def _recognised(self, i: int, fit: PatternFit) -> Verdict | None:
         """The gate between outline and rim that stopped a circle, if one did: its face or the board."""
-        label, reading, candidate = self.plane.labels[i], self.reading, self.fit.index[i]
-        count = int(self.fit.fits().sum())
+        label, reading, candidate = self.plane.labels[i], self.reading, fit.index[i]
+        count = int(fit.fits().sum())
         if self.is_board:
             if reading.board is not None:
                 return None if candidate in reading.board.candidates else Verdict(label, "board_grid")
@@ -160,23 +160,23 @@ class _Examination:
         if named:
             return None if candidate in named[0].used() else Verdict(label, "pattern")
         for refused in reading.faces.refused:
-            if set(refused.used) & set(self.fit.index[self.fit.fits()]):
+            if set(refused.used) & set(fit.index[fit.fits()]):
                 unit = "other readings" if refused.gate == "face_readings" else "grey values"
                 return Verdict(label, refused.gate, refused.value, refused.limit, unit)
         needed = needed_circles(self.target.face(self.plane.plane))
         return Verdict(label, "face_circles" if count < needed else "face_pattern", count, needed, "circles")
 
-    def _rim(self, i: int) -> Verdict:
+    def _rim(self, i: int, fit: PatternFit) -> Verdict:
         """The last gate of an image."""
-        ellipse = self.ellipses.select(self.fit.index[i : i + 1])
+        ellipse = self.ellipses.select(fit.index[i : i + 1])
         measured = measure_centres(grey_fine(self.image), self.camera, ellipse, self.reading.found[self.polarity])
         if not measured.ok[0]:
             return Verdict(self.plane.labels[i], "rim", float(measured.rim[0]), MIN_RIM, "of the rim")
         return Verdict(self.plane.labels[i], "board_numbering" if self.is_board else "found_now")
 
-    def _pattern(self, i: int) -> Verdict:
+    def _pattern(self, i: int, fit: PatternFit) -> Verdict:
         """Something elliptic is at the place of a circle, but not just there, or of another size or shape."""
-        fit, label = self.fit, self.plane.labels[i]
+        label = self.plane.labels[i]
         if not fit.in_place()[i]:
             off, allowed = fit.distance[i] / fit.radius[i], fit.max_distance[i] / fit.radius[i]
             return Verdict(label, "position", float(off), float(allowed), "radii")
@@ -204,13 +204,14 @@ def trials(verdicts: Sequence[Verdict], pixels: int, options: EllipseOptions) ->
     """Options that could let circles in, loosened as far as these ask for, and to the end; gentle ones first."""
     found = []
     smallest, _ = diameter_limits_px(pixels, options)
-    small = [v.value for v in verdicts if v.gate == "min_diameter" and v.value >= LEAST_MIN_DIAMETER_PX and not v.cause]
+    stopped = [(v.gate, v.value) for v in verdicts if v.value is not None and not v.cause]
+    small = [value for gate, value in stopped if gate == "min_diameter" and value >= LEAST_MIN_DIAMETER_PX]
     half_px = np.floor(2 * min(small, default=LEAST_MIN_DIAMETER_PX)) / 2
     for diameter in dict.fromkeys((half_px, LEAST_MIN_DIAMETER_PX)):
         if diameter < smallest:
             looser = replace(options, min_diameter_px=float(diameter))
             found.append(Trial("min_diameter", f"--min-diameter {diameter:g}", looser))
-    if large := [v.value for v in verdicts if v.gate == "max_diameter" and not v.cause]:
+    if large := [value for gate, value in stopped if gate == "max_diameter"]:
         for diameter in dict.fromkeys(10 * np.ceil(factor * max(large) / 10) for factor in LARGER):
             looser = replace(options, max_diameter_px=float(diameter))
             found.append(Trial("max_diameter", f"--max-diameter {diameter:g}", looser))
@@ -234,7 +235,7 @@ def labels_found(
     detection = detect_image(image, camera, target, board, options)
     if detection.repeated:  # a run would end there
         return set()
-    found = set(detection.target_labels)
+    found: set[str] = set(detection.target_labels)
     dots = detection.centres.centre_px[len(detection.target_labels) :]
     for plane in planes:
         if plane.plane == BOARD and len(dots):

@@ -90,7 +90,7 @@ class Diagnosis:
 
 def advice(gate: str, value: float | None = None, limit: float | None = None, cause: str = "") -> str:
     """What to do with the scene for a circle that a gate stopped; ``cause`` as of the examination."""
-    closer = math.ceil(100 * (1 - value / limit)) if gate == "min_diameter" else 0
+    closer = 0 if gate != "min_diameter" or value is None or limit is None else math.ceil(100 * (1 - value / limit))
     return CAUSES.get(cause) or ADVICE[gate].format(closer=closer)
 
 

@@ -59,7 +59,7 @@ class OutlineEnd:
 
     def closeness(self) -> float:
         """How close the value came to the limit; comparable for one gate."""
-        if self.value is None:
+        if self.value is None or self.limit is None:
             return 0.0
         return self.value / self.limit if self.gate in NEEDED else -self.value / self.limit
 
@@ -94,8 +94,8 @@ def trace_outlines(
         furthest = max((end for end in own if end.rank >= 0), key=lambda end: (end.rank, end.closeness()), default=None)
         if furthest is None:
             found.append(_nothing(contrast[k], threshold, grey_range, predicted[k], limits))
-        elif not furthest.gate:
-            found.append(_passed(image, polarity, furthest, threshold, grey_range, centre[k], predicted[k]))
+        elif furthest.ellipse is not None:
+            found.append(_passed(image, polarity, furthest.ellipse, threshold, grey_range, centre[k], predicted[k]))
         else:
             found.append(furthest)
     return found
@@ -143,9 +143,9 @@ def _end(gates: OutlineGates, contour, level: Level, limits: tuple[float, float]
     return OutlineEnd(gate, float(value), float(limit), unit, cause, rank)
 
 
-def _passed(image, polarity, end: OutlineEnd, threshold, grey_range, centre, predicted) -> OutlineEnd:
+def _passed(image, polarity, row: np.ndarray, threshold, grey_range, centre, predicted) -> OutlineEnd:
     """An outline that is an ellipse: too faint, or not the circle's own."""
-    at, shape = distinct(end.ellipse)
+    at, shape = distinct(row)
     contrast = contrast_of(image, polarity, at, shape)[0]
     if contrast <= threshold:
         return _faint(contrast, threshold, grey_range)

@@ -141,8 +141,8 @@ def _require_keypoints(run: SavedRun, copy: Path, ids: dict[str, int]) -> None:
         found = {name: opened.read_keypoints(i)[:, :2] for name, i in names.items()} if names == ids else {}
     for image, expected in zip(run.observations, run.corrected_px, strict=True):
         xy = found.get(image.name)
-        same = xy is not None and len(xy) == len(expected)
-        if not same or np.abs(from_colmap_px(xy) - expected).max(initial=0.0) > KEYPOINT_TOLERANCE_PX:
+        off = np.inf if xy is None or len(xy) != len(expected) else np.abs(from_colmap_px(xy) - expected).max(initial=0)
+        if off > KEYPOINT_TOLERANCE_PX:
             raise InputError(
                 f"{run.database}: its keypoints of {image.name} are not those of {run.folder / 'labels.csv'}; run again"
             )

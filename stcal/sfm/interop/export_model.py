@@ -90,7 +90,7 @@ def export_model(run: str | Path, out: str | Path, kind: str) -> ExportedModel:
     reconstruction, points = _labelled_points(saved)
     ideal = kind in ("nvm", "bundler")
     camera = saved.camera
-    focal_px = float(camera.focal.mean()) if ideal else None
+    focal_px = float(camera.focal.mean())
     with tempfile.TemporaryDirectory(prefix=f".{out.name}.partial-", dir=out.parent) as scratch:
         partial = Path(scratch) / out.name
         beside = partial / labels.name if kind in FOLDERS else Path(scratch) / labels.name
@@ -115,8 +115,8 @@ def export_model(run: str | Path, out: str | Path, kind: str) -> ExportedModel:
         elif out.exists():
             out.rmdir()  # empty; not every system lets a folder take its place
         os.replace(partial, out)
-    centre_px = ((camera.width - 1) / 2, (camera.height - 1) / 2) if ideal else None
-    return ExportedModel(out, labels, reconstruction.num_reg_images(), len(points), focal_px, centre_px)
+    optics = (focal_px, ((camera.width - 1) / 2, (camera.height - 1) / 2)) if ideal else (None, None)
+    return ExportedModel(out, labels, reconstruction.num_reg_images(), len(points), *optics)
 
 
 def _require_free(out: Path, labels: Path, kind: str) -> None:

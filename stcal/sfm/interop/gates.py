@@ -224,9 +224,9 @@ class _Mapping:
         found = pycolmap.estimate_two_view_geometry_pose(*views, geometry)
         name = pycolmap.TwoViewGeometryConfiguration(geometry.config).name
         inliers = len(geometry.inlier_matches)
-        if not found:
+        pose = geometry.cam2_from_cam1 if found else None
+        if pose is None:
             return _TwoViews(len(matches), inliers, name, None, 0.0, 0.0)
-        pose = geometry.cam2_from_cam1
         return _TwoViews(len(matches), inliers, name, pose, float(abs(pose.translation[2])), float(geometry.tri_angle))
 
     def verdict(self, pair: tuple[int, int], views: _TwoViews) -> Verdict:
@@ -292,7 +292,7 @@ def pairs_table(group: str, images: int, rows: Sequence[PairGates], shown: int) 
     heading = f"group {group}: {len(rows)} pairs of {images} images"
     if shown < len(rows):
         heading += f", the first {shown} (--all for the other {len(rows) - shown})"
-    cells = [HEAD]
+    cells = [list(HEAD)]
     for row in rows[:shown]:
         score, points = row.score, [gate.value for gate in row.as_set.gates if gate.name == "points"]
         cells.append(
@@ -346,7 +346,7 @@ def limits_text(options: PairOptions) -> str:
 def _in_words(verdict: Verdict) -> str:
     failed = ", ".join(
         f"no pose ({gate.value})"
-        if gate.limit is None
+        if gate.limit is None or isinstance(gate.value, str)
         else f"{gate.name} {_number(gate.name, gate.value)} {BROKEN[KEPT[gate.name]]} {_number(gate.name, gate.limit)}"
         for gate in verdict.gates
         if not gate.passed

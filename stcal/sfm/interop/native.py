@@ -10,6 +10,7 @@ import subprocess
 import time
 from dataclasses import dataclass
 from pathlib import Path
+from typing import IO
 
 from stcal.errors import InputError, MappingError
 
@@ -132,26 +133,28 @@ def _run(command: list[str], timeout_s: float, **environment: str) -> tuple[int 
         )
     except OSError as error:
         raise InputError(f"native COLMAP: {command[0]} cannot be started ({error.strerror}); {INSTALL}") from error
+    pipe = process.stdout
+    assert pipe is not None  # it was asked for
     try:
-        output = _listen(process, time.monotonic() + timeout_s)
+        output = _listen(process, pipe, time.monotonic() + timeout_s)
         code = process.poll()
     finally:
         with contextlib.suppress(ProcessLookupError, PermissionError):  # macOS: not permitted on what has ended
             os.killpg(process.pid, signal.SIGKILL)
         process.wait()
-        process.stdout.close()
+        pipe.close()
     return code, output.decode(errors="replace")
 
 
-def _listen(process: subprocess.Popen, until: float) -> bytes:
+def _listen(process: subprocess.Popen, pipe: IO[bytes], until: float) -> bytes:
     """The last that a process prints, till it ends or the time is over; a child of it may keep the pipe open."""
     kept = b""
     with selectors.DefaultSelector() as selector:
-        selector.register(process.stdout, selectors.EVENT_READ)
+        selector.register(pipe, selectors.EVENT_READ)
         while (left := until - time.monotonic()) > 0:
             ended = process.poll() is not None
             if selector.select(0 if ended else min(left, LOOK_SECONDS)):
-                chunk = os.read(process.stdout.fileno(), 1 << 16)
+                chunk = os.read(pipe.fileno(), 1 << 16)
                 if not chunk:
                     with contextlib.suppress(subprocess.TimeoutExpired):
                         process.wait(left)

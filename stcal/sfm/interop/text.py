@@ -22,7 +22,7 @@ def model_text(written: ExportedModel, kind: str) -> str:
         f"{written.images} images and {written.points} points, mm, target frame: {written.path}",
         f"labels: {written.labels}",
     ]
-    if written.focal_px is not None:
+    if written.focal_px is not None and written.centre_px is not None:
         x, y = written.centre_px
         lines.append(
             f"{kind} knows one focal length and a principal point at the centre: the keypoints are those of an ideal "

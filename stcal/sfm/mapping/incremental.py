@@ -10,6 +10,7 @@ import pycolmap
 
 from stcal.errors import MappingError
 from stcal.geometry.camera import Camera
+from stcal.labels import Label
 from stcal.sfm.data.model import MIN_POINTS, Outlier, WorldModel
 from stcal.sfm.data.observations import ImageObservations
 from stcal.sfm.mapping.database import CAMERA_ID
@@ -149,7 +150,8 @@ def _own_mapping(database: Path, names, ids, pair: PairScore) -> pycolmap.Recons
     mapper = pycolmap.IncrementalMapper(cache)
     mapper.begin_reconstruction(reconstruction)
     mapper_options, triangulation = options.get_mapper(), options.get_triangulation()
-    pose = pycolmap.Rigid3d(pycolmap.Rotation3d(pair.second_from_first.rotation), pair.second_from_first.translation)
+    start = pair.pose()
+    pose = pycolmap.Rigid3d(pycolmap.Rotation3d(start.rotation), start.translation)
     first, second = ids[pair.first], ids[pair.second]
     mapper.register_initial_image_pair(mapper_options, first, second, pose)
     for image_id in (first, second):
@@ -180,13 +182,13 @@ def labelled_model(
     known = reconstruction.images  # COLMAP forgets images that share nothing with the others
     registered = [image for image in group if ids[image.name] in known and known[ids[image.name]].has_pose]
     poses = [rigid_from_colmap(known[ids[image.name]].cam_from_world()) for image in registered]
-    places: dict[str, dict[int, int]] = {}
+    places: dict[Label, dict[int, int]] = {}
     for image in registered:
         for k, point in enumerate(known[ids[image.name]].points2D):
             if point.has_point3D():
                 votes = places.setdefault(image.labels[k], {})
                 votes[point.point3D_id] = votes.get(point.point3D_id, 0) + 1
-    xyz = {label: reconstruction.point3D(max(votes, key=votes.get)).xyz for label, votes in places.items()}
+    xyz = {label: reconstruction.point3D(max(votes, key=votes.__getitem__)).xyz for label, votes in places.items()}
     model = assemble(WorldModel, group[0].group, registered, poses, xyz)
     if len(registered) < len(group):
         model = complete(model, group, camera, MAX_REPROJECTION_PX)

@@ -13,7 +13,7 @@ from stcal.errors import InputError
 from stcal.geometry.camera import Camera
 from stcal.geometry.rigid import Rigid, Similarity
 from stcal.io.camera import camera_from_colmap
-from stcal.labels import DotLabel
+from stcal.labels import DotLabel, Label
 from stcal.sfm.data.model import GroupModel, MetricModel, WorldModel
 from stcal.sfm.data.observations import ImageObservations
 from stcal.sfm.mapping.database import CAMERA_ID, colmap_camera, from_colmap_px, to_colmap_px
@@ -58,7 +58,7 @@ def to_reconstruction(
         for name, pose, rows in zip(model.images, model.camera_from_world, model.rows_by_image(), strict=True):
             image = pycolmap.Image(name=name, camera_id=CAMERA_ID, image_id=ids[name])
             keypoints = to_colmap_px(model.keypoints_px(by_name[name], rows))
-            image.points2D = [pycolmap.Point2D(each) for each in keypoints]
+            image.points2D = pycolmap.Point2DList([pycolmap.Point2D(each) for each in keypoints])
             reconstruction.add_image_with_trivial_frame(
                 image, pycolmap.Rigid3d(pycolmap.Rotation3d(pose.rotation), pose.translation)
             )
@@ -346,11 +346,11 @@ def _group_model(path: Path, group: str, images, reconstruction, point_label) ->
                 rows.append((i, k, point.point3D_id))
     if not rows:
         return None, 0
-    length: dict[str, dict[int, int]] = {}
+    length: dict[Label, dict[int, int]] = {}
     for _, _, point_id in rows:
         votes = length.setdefault(point_label[point_id][1], {})
         votes[point_id] = votes.get(point_id, 0) + 1
-    chosen = {label: max(sorted(votes), key=votes.get) for label, votes in length.items()}
+    chosen = {label: max(sorted(votes), key=votes.__getitem__) for label, votes in length.items()}
     labels = sorted(chosen)
     index = {chosen[label]: i for i, label in enumerate(labels)}
     image_index, keypoint, point_id = np.array([row for row in rows if row[2] in index]).T

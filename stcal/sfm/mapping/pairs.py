@@ -51,6 +51,18 @@ class PairScore:
     second_from_first: Rigid | None
     verdict: str
 
+    def pose(self) -> Rigid:
+        """``second_from_first``.
+
+        Raises
+        ------
+        MappingError
+            None was found.
+        """
+        if self.second_from_first is None:
+            raise MappingError(f"pair {self.first}, {self.second}: no relative pose; take another pair")
+        return self.second_from_first
+
 
 def rank_pairs(group: list[ImageObservations], camera: Camera, options: PairOptions) -> list[PairScore]:
     """All pairs of a group, the chosen one first, then the usable by angle, then the rest.

@@ -206,14 +206,16 @@ def poses_csv(result: MeasureResult, joints: Table | None = None) -> tuple[str, 
     """
     header = [IMAGE, FACES, CIRCLES, STATUS, *POSE, *COVARIANCE, *QUALITY]
     common = common_columns(result.common.shape[2])
-    more, rows = ([], None) if joints is None else _joint_cells(joints, header + common)
+    where, more, rows = "", [], None
+    if joints is not None:
+        where, (more, rows) = joints.where, _joint_cells(joints, header + common)
     stream = io.StringIO()
     writer = csv.writer(stream, lineterminator="\n")
     writer.writerow(header + more + common)
     missing = []
     for each, felt in zip(result.images, result.common, strict=True):
         if rows is not None and each.name not in rows:
-            missing.append(f"{each.name}: measured, but not in {joints.where}")
+            missing.append(f"{each.name}: measured, but not in {where}")
             continue
         pose = each.pose
         writer.writerow(
@@ -225,9 +227,9 @@ def poses_csv(result: MeasureResult, joints: Table | None = None) -> tuple[str, 
         )
     if rows is not None:
         names = {each.name for each in result.images}
-        missing += [f"{name}: in {joints.where}, but without a pose" for name in rows if name not in names]
+        missing += [f"{name}: in {where}, but without a pose" for name in rows if name not in names]
         if len(rows.keys() & names) == 0:
-            raise InputError(f"{joints.where}: none of its images was measured; names are like {result.images[0].name}")
+            raise InputError(f"{where}: none of its images was measured; names are like {result.images[0].name}")
     return stream.getvalue(), tuple(missing)
 
 

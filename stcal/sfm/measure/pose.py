@@ -19,7 +19,7 @@ from stcal.geometry.plane_poses import MAX_SIGMA_RAD, OUTLIER, deciding_delta, d
 from stcal.geometry.pose_descent import Minima, PoseStack, block_diagonal
 from stcal.geometry.rigid import Rigid
 from stcal.io.camera import CameraPrior, intrinsic_basis
-from stcal.labels import CircleLabel, parse_labels
+from stcal.labels import CircleLabel, circle_labels, parse_labels
 from stcal.sfm.data.model import Outlier
 from stcal.sfm.data.projection import CircleImages
 from stcal.sfm.measure.likelihood import spread
@@ -154,7 +154,7 @@ def pose_from_circles(
     options = options or PoseOptions()
     labels = parse_labels(labels)
     used, problem = _problem(labels, centre_px, covariance_px2, target, camera, options, prior, where)
-    names = [labels[i] for i in used]
+    names = list(circle_labels(labels[i] for i in used))
     start, plane = start_pose(names, problem, target, where)
     found, keep, outliers = minima_without_outliers(problem, start, plane, names, where)
     problem, names = problem.select(keep), [names[i] for i in keep]

@@ -1,6 +1,6 @@
 """What one image says of a target's pose, and the descent to the poses that fit it best, several at once."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 
 import numpy as np
@@ -49,8 +49,8 @@ class PoseProblem:
     def select(self, keep: np.ndarray) -> "PoseProblem":
         """Those circles only."""
         rows = (3 * keep[:, None] + np.arange(3)).ravel()
-        own = (self.xyz, self.normal, self.radius, self.centre, self.px_by_centre, self.noise, self.by_camera)
-        return PoseProblem(*(a[keep] for a in own), self.prior, self.shape[np.ix_(rows, rows)])
+        own = ("xyz", "normal", "radius", "centre", "px_by_centre", "noise", "by_camera")
+        return replace(self, **{name: getattr(self, name)[keep] for name in own}, shape=self.shape[np.ix_(rows, rows)])
 
 
 def covariance_of_centres(problem: PoseProblem, image: CircleImages, noise: np.ndarray) -> np.ndarray:
@@ -77,6 +77,6 @@ def _descend(problem: PoseProblem, whiten: np.ndarray, poses: PoseStack, huber: 
     def evaluate(poses: PoseStack) -> Normal:
         residual, image = problem.seen(poses)
         r = (whiten @ residual.reshape(h, 2 * n, 1)).reshape(h, n, 2)
-        return Normal.of(r, whiten @ image.by_pose.reshape(h, 2 * n, 6), (image.depth > 0).all(1), huber)
+        return Normal.of(r, whiten @ image.by_pose.reshape(h, 2 * n, 6), np.all(image.depth > 0, axis=1), huber)
 
     return pose_descent.descend(evaluate, poses, SETTLED, HOPELESS)

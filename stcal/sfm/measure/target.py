@@ -1,7 +1,9 @@
 """A calibrated target as one image of it is measured by: its circles in the target frame with their covariance."""
 
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -124,7 +126,9 @@ def _joint(faces: FacesFile, labels: tuple[CircleLabel, ...]) -> np.ndarray | No
     return joint.matrix()[np.ix_(rows, rows)]
 
 
-def _covariance(labels, joint: np.ndarray | None, single: dict[str, np.ndarray]) -> tuple[np.ndarray, tuple[str, ...]]:
+def _covariance(
+    labels, joint: np.ndarray | None, single: Mapping[Any, np.ndarray]
+) -> tuple[np.ndarray, tuple[str, ...]]:
     """The best covariance (3c, 3c) that there is, and what it lacks."""
     notes: tuple[str, ...] = ()
     if joint is None:

@@ -200,7 +200,7 @@ def _new_model(known: Known, pair: tuple[str, str], images: int) -> MetricModel:
     scene = known.scene
     name = f"new {group_name(pair)}"
     normals = [scene.target_from_face[face].rotation[:, 2] for face in pair]
-    axes = viewing_axes(*normals, name)
+    axes = viewing_axes(normals[0], normals[1], name)
     present = next(iter(scene.groups))
     dots = np.column_stack([scene.board.xy_mm(), np.zeros(scene.board.rows * scene.board.columns)])
     shape = GroupShape(

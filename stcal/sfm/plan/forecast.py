@@ -162,7 +162,7 @@ class Forecast:
     def worst(self) -> tuple[str, float]:
         """The face whose position is known worst, and its σ in mm."""
         sigma = self.position_sigma_mm()
-        face = max(sigma, key=sigma.get)
+        face = max(sigma, key=sigma.__getitem__)
         return face, sigma[face]
 
 

@@ -132,14 +132,6 @@ def _scene(options: PlanOptions, target: TargetDesign, board: BoardDesign, nomin
     """The nominal geometry: nothing is misplaced."""
     file = options.camera
     height = round(options.width * 2 / 3)
-    optics = {"width": options.width, "height": height}
-    if file is not None:
-        optics = {
-            "width": file.width,
-            "height": file.height,
-            "focal_px": float(np.sqrt(file.focal.prod())),
-            "distortion": tuple(file.distortion),
-        }
     shape = SceneOptions(
         seed=options.seed,
         centre_sigma=0.0,
@@ -150,14 +142,18 @@ def _scene(options: PlanOptions, target: TargetDesign, board: BoardDesign, nomin
         circle_sigma_mm=0.0,
         face_shift_mm=0.0,
         face_turn_deg=0.0,
-        **optics,
+        width=options.width,
+        height=height,
     )
+    if file is not None:
+        focal_px, distortion = float(np.sqrt(file.focal.prod())), tuple(file.distortion)
+        shape = replace(shape, width=file.width, height=file.height, focal_px=focal_px, distortion=distortion)
     scene = make_scene(shape, target, replace(board, sigma_mm=0.0), nominal)
     return scene if file is None else replace(scene, camera=file.sized(0, 0), colmap_model=file.colmap_model)
 
 
 def _setup(scene: Scene, options: PlanOptions, board: BoardDesign) -> Setup:
-    run = options.run.settled(scene.target)
+    run = options.run.adjustment(scene.target)
     linked = _linked(run.reference_face, [group.faces for group in scene.groups.values()])
     start = CalibratedTarget(
         run.reference_face,
@@ -178,7 +174,7 @@ def _setup(scene: Scene, options: PlanOptions, board: BoardDesign) -> Setup:
     )
 
 
-def _linked(reference: str, pairs: list[tuple[str, str]]) -> set[str]:
+def _linked(reference: str, pairs: list[tuple[str, ...]]) -> set[str]:
     """The faces of all groups, each linked to the reference face.
 
     Raises

@@ -43,10 +43,9 @@ def plan_text(plan: Plan, noise: str) -> str:
         "",
         f"{'what would help':<28} worst face µm",
     ]
-    reachable = [remedy for remedy in plan.remedies if remedy.sigma_mm is not None]
-    for remedy in sorted(reachable, key=lambda each: each.sigma_mm):
-        change = 100 * (remedy.sigma_mm / sigma - 1)
-        lines.append(f"{remedy.what:<28} {MICRO * remedy.sigma_mm:6.2f}   {change:+.0f} %")
+    reachable = [(r.sigma_mm, r.what) for r in plan.remedies if r.sigma_mm is not None]
+    for worst_mm, what in sorted(reachable, key=lambda each: each[0]):
+        lines.append(f"{what:<28} {MICRO * worst_mm:6.2f}   {100 * (worst_mm / sigma - 1):+.0f} %")
     lines += [f"{r.what:<28}      –   {r.reason}" for r in plan.remedies if r.sigma_mm is None]
     lines.append("where board and cameras happen to stand (--seed) makes about ±3 %")
     return "\n".join(lines)

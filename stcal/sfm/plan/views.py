@@ -137,7 +137,7 @@ def candidates(scene: Scene, model: MetricModel, setup: Setup, noise: CentreNois
     limit = _largest_tilt(scene, model)
     views = []
     for i, place in enumerate(places):
-        seen = shown(scene, model.group, i, limit) & set(model.labels)
+        seen = set(model.labels) & shown(scene, model.group, i, limit)
         if not _worth_it(seen, model):
             continue
         single = _single(model, f"{model.group}/view {place}", poses[i], sorted(seen), setup.camera)

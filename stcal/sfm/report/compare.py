@@ -121,7 +121,7 @@ def _count(measured: dict, images: dict, numbers: np.ndarray) -> tuple[int, int,
                 row, column = label.row, label.column
                 inside = 0 <= row < numbers.shape[0] and 0 <= column < numbers.shape[1]
                 key = f"{BOARD}:{numbers[row, column]}" if inside else label
-            near = key in circles and np.linalg.norm(np.subtract(centre, circles[key]["centre_px"])) < NEAR_PX
+            near = key in circles and bool(np.linalg.norm(np.subtract(centre, circles[key]["centre_px"])) < NEAR_PX)
             wrong += not near
             found += near and bool(circles[key]["must_find"])
     return wrong, found, visible

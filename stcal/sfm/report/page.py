@@ -110,9 +110,10 @@ def _settings(report: dict) -> list[list[str]]:
     summary, options, camera = report["summary"], report["options"], report["camera"]
     left, last = report["left_out"], summary["last_move_px"]
     sizes = " × ".join(str(size) for size in camera["size_px"])
+    solve, frame = str(options["solve"]), str(options["frame"])
     return [
-        ["Solve", SOLVES.get(options["solve"], options["solve"])],
-        ["Face frames", FRAMES.get(options["frame"], options["frame"])],
+        ["Solve", SOLVES.get(solve, solve)],
+        ["Face frames", FRAMES.get(frame, frame)],
         ["Eccentricity", "corrected" if options["eccentricity"] else "off (uncorrected control)"],
         ["Reference face", report["reference_face"]],
         ["Faces not seen", join(summary["faces_not_seen"]) if summary["faces_not_seen"] else "none"],

@@ -82,7 +82,7 @@ def load_run(folder: str | Path) -> SavedRun:
     target, board = load_target(folder / TARGET), load_board(folder / BOARD)
     with _as_written(folder / RUN_MARKER):
         own = checked(marker, MarkerFile)
-        options, images = _options(own.options).settled(target), Path(own.images)
+        options, images = _options(own.options or {}).settled(target), Path(own.images)
     with _as_written(folder / "report.json"):
         names = checked(report, ReportRead).names()
     with _as_written(folder / "faces.json"):
