@@ -1,5 +1,7 @@
 """Plots of the report of a run."""
 
+from typing import Any
+
 import numpy as np
 
 from stcal.labels import dot_cells, parse_label, parse_labels
@@ -109,7 +111,7 @@ def target_view(circles: dict[str, list[float]], faces: dict[str, dict], azimuth
     axes.scatter(*xyz.T, s=9, color=INK, depthshade=False)
     axes.add_collection3d(Line3DCollection(lines, colors=ink, linewidths=1.6), autolim=False)
     for name, at in names:
-        axes.text(at[0], at[1], at[2], name, fontsize=11, weight="bold", ha="center", va="center", parse_math=False)
+        axes.text(*at, name, fontsize=11, weight="bold", ha="center", va="center", parse_math=False)
     return uri(figure)
 
 
@@ -141,14 +143,12 @@ def _space(xyz: np.ndarray, width: float, height: float, elevation: float, azimu
     margin = 0.03 * max(float((high - low).max()), 1e-6)
     low, high = low - margin, high + margin
     figure = new_figure(width, height)
-    axes = Axes3D(figure, rect=(0.0, 0.03, 0.95, 0.94))
-    figure.add_axes(axes)
+    axes: Any = figure.add_axes(Axes3D(figure, rect=(0.0, 0.03, 0.95, 0.94)))  # has no types of its own
     axes.set(xlim=(low[0], high[0]), ylim=(low[1], high[1]), zlim=(low[2], high[2]))
     axes.set_box_aspect(high - low, zoom=1.08)
     axes.set_proj_type("ortho")
     axes.view_init(elevation, azimuth)
-    for name in "XYZ":
-        axis = getattr(axes, f"{name.lower()}axis")  # matplotlib types X and Y as those of a plane
+    for axis, name in ((axes.xaxis, "X"), (axes.yaxis, "Y"), (axes.zaxis, "Z")):
         axis.set_pane_color((0.955, 0.965, 0.975, 1))
         axis.set_label_text(f"{name}, mm", fontsize=SMALL + 0.5)
         axis.line.set_color("#9aa0a8")

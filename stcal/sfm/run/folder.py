@@ -2,6 +2,7 @@
 
 import os
 import shutil
+from collections.abc import Mapping
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
@@ -157,7 +158,7 @@ def require_report(saved: SavedRun) -> None:
         raise InputError(f"run {saved.folder}: cannot be written to, and the comparison goes into its report; copy it")
 
 
-def _corrected_px(models: dict[str, GroupModel], observations: list[ImageObservations]) -> list[np.ndarray]:
+def _corrected_px(models: Mapping[str, GroupModel], observations: list[ImageObservations]) -> list[np.ndarray]:
     """All keypoints of every image as the models of the groups correct them."""
     rows = {name: rows for m in models.values() for name, rows in zip(m.images, m.rows_by_image(), strict=True)}
     none = np.zeros(0, int)
