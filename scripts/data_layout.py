@@ -31,6 +31,7 @@ MODULES = (
     "stcal.sfm.interop.file",
     "stcal.sfm.diagnose.file",
     "stcal.handeye.report.file",
+    "stcal.register.report.file",
     "stcal.locate.report.files",
     "stcal.robot.axes.files",
     "stcal.robot.identify.files",

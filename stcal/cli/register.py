@@ -61,7 +61,7 @@ def register(
     """Find b_from_a from points measured in two frames, some of them wrong; with σ, outliers and where it holds."""
     from stcal.register import register as registered
     from stcal.register.core.pairs import read_pairs
-    from stcal.register.report.file import registration_json
+    from stcal.register.report.file import RegistrationFile
     from stcal.register.report.page import registration_page, registration_text
     from stcal.register.workspace.findings import findings
 
@@ -84,15 +84,15 @@ def register(
     found = findings(pairs.where, pairs.lines, pairs.xyz_a, pairs.xyz_b, result, pairs.weights, pairs.covariances)
     print(registration_text(found))
     print_each(f"warning: {pairs.where}", result.notes)
-    content, sections, failed = registration_json(found), [], None
+    content, sections, failed = RegistrationFile.of(found), [], None
     if robot_file:
         from stcal.robot.kinematics.file import robot_toml
-        from stcal.workflows.register_robot import compared, comparison_json, comparison_section, comparison_text
+        from stcal.workflows.register_robot import compared, comparison_section, comparison_text, robot_part
 
         try:
             beside = compared(pairs, pairs_file, robot_file, found, options, folds)
             print("", comparison_text(beside), sep="\n")
-            content["robot"] = comparison_json(beside)
+            content = content.model_copy(update={"robot": robot_part(beside)})
             sections.append(comparison_section(beside))
             if identified:
                 comments = [f"Identified from {pairs_file.name}: {beside.identified.rank} parameters."]

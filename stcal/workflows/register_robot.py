@@ -13,6 +13,8 @@ from stcal.geometry.align import align_rigid
 from stcal.io.table import read_table
 from stcal.register import register
 from stcal.register.core.pairs import WHAT, Pairs
+from stcal.register.core.result import ErrorFigures
+from stcal.register.report.file import FiguresRow, HeldOutBoth, MeanRmsMax, RobotPart
 from stcal.register.report.page import matrix_lines, matrix_rows
 from stcal.register.workspace.findings import Findings
 from stcal.report.page import render
@@ -28,7 +30,6 @@ ROUNDS, CLEAN_SETS = 3, 0.01
 """Rows are taken in that lie within the bound that a clean set exceeds anywhere in one case of a hundred."""
 SAME_MM = 0.01
 """Positions of a and of the robot file agree, or a is of another base or tool."""
-FIGURES = ("mean_mm", "rms_mm", "max_mm")
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -165,31 +166,31 @@ def comparison_text(beside: Comparison) -> str:
     return "\n".join(lines + [f"{note}" for note in _notes(beside)])
 
 
-def comparison_json(beside: Comparison) -> dict:
-    """For programs (keys: ``data_layout.md``)."""
-    result = beside.identified
-    return {
-        "name": beside.robot.name,
-        "b_from_base": _b_from_base(beside).tolist(),
-        "rank": result.rank,
-        "parameters": len(result.names),
-        "undetermined": list(result.undetermined),
-        "sigma_mm": result.weighting.sigma_mm,
-        "a_off_robot_file_mm": beside.off_mm,
-        "better": beside.better,
-        "held_out": {
-            "folds": beside.folds,
-            "lines": [int(beside.lines[i]) for i in beside.rows],
-            "transform_mm": beside.transform_mm.tolist(),
-            "kinematics_mm": beside.kinematics_mm.tolist(),
-            "outliers_of_both": [int(beside.lines[i]) for i in beside.rows[beside.wild]],
-            "figures": [
-                {"rows": name, "points": len(t), "transform": _figures(t), "kinematics": _figures(k)}
+def robot_part(beside: Comparison) -> RobotPart:
+    """For the file of the registration."""
+    result, lines = beside.identified, beside.lines
+    return RobotPart(
+        name=beside.robot.name,
+        b_from_base=_b_from_base(beside),
+        rank=result.rank,
+        parameters=len(result.names),
+        undetermined=list(result.undetermined),
+        sigma_mm=result.weighting.sigma_mm,
+        a_off_robot_file_mm=beside.off_mm,
+        better=beside.better,
+        held_out=HeldOutBoth(
+            folds=beside.folds,
+            lines=[lines[i] for i in beside.rows],
+            transform_mm=beside.transform_mm,
+            kinematics_mm=beside.kinematics_mm,
+            outliers_of_both=[lines[i] for i in beside.rows[beside.wild]],
+            figures=[
+                FiguresRow(rows=name, points=len(t), transform=_figures(t), kinematics=_figures(k))
                 for name, t, k in beside.errors()
                 if len(t)
             ],
-        },
-    }
+        ),
+    )
 
 
 def comparison_section(beside: Comparison) -> tuple[str, str, Markup]:
@@ -216,7 +217,7 @@ def _rows(beside: Comparison) -> list[tuple[str, list[str]]]:
     for name, transform, kinematics in beside.errors():
         for way, errors in ((f"{beside.model} transform", transform), ("base and kinematics together", kinematics)):
             if len(errors):
-                cells = [str(len(errors)), *(number(v, 4) for v in _figures(errors).values())]
+                cells = [str(len(errors)), *(number(v, 4) for _, v in _figures(errors))]
                 found.append((f"{name}: {way}", cells))
     return found
 
@@ -243,6 +244,5 @@ def _b_from_base(beside: Comparison) -> np.ndarray:
     return beside.identified.robot.world_from_base.matrix()
 
 
-def _figures(errors: np.ndarray) -> dict:
-    values = float(errors.mean()), float(np.sqrt((errors**2).mean())), float(errors.max())
-    return dict(zip(FIGURES, values, strict=True))
+def _figures(errors: np.ndarray) -> MeanRmsMax:
+    return MeanRmsMax.model_validate(ErrorFigures.of(errors))

@@ -1,16 +1,20 @@
 """What a registration found, for programs: the keys of ``data_layout.md``."""
 
-from dataclasses import asdict
+from collections.abc import Sequence
+from typing import Any, Literal
 
 import numpy as np
+from pydantic import Field
 
 from stcal.geometry.affine import Affine
 from stcal.geometry.rigid import Rigid
+from stcal.io.json import Finite, Matrix, Matrix4, Part, Points, Pose, ResultFile, Vector, Vector3
 from stcal.register.core.models import Transform, parts
-from stcal.register.core.result import ErrorFigures, HeldOut
+from stcal.register.core.result import Alternative, ErrorFigures, HeldOut
+from stcal.register.workspace.cubes import Cubes
+from stcal.register.workspace.field import Field as ResidualField
 from stcal.register.workspace.findings import Findings
 
-FORMAT = "stcal registration 1"
 NAMES = {
     6: ("rx", "ry", "rz", "x", "y", "z"),
     7: ("rx", "ry", "rz", "x", "y", "z", "scale"),
@@ -30,105 +34,255 @@ def matrix_of(transform: Transform) -> np.ndarray:
     return whole
 
 
-def registration_json(found: Findings) -> dict:
-    """Everything; lengths in mm, angles in rad."""
-    result = found.registration
-    names = NAMES[len(result.covariance)]
-    content = {
-        "format": FORMAT,
-        "pairs": found.where,
-        "model": result.model,
-        "method": result.method,
-        "b_from_a": matrix_of(result.b_from_a).tolist(),
-        "covariance": result.covariance.tolist(),
-        "covariance_of": list(names),
-        "units": {
-            "b_from_a": "mm",
-            "residuals": "mm",
-            "covariance": ["mm" if n in "xyz" or n.endswith("4") else UNIT[n[0]] for n in names],
-        },
-        **_transform(result.b_from_a),
-        "sigma_mm": result.sigma_mm,
-        "dof": result.redundancy if np.isfinite(result.redundancy) else None,
-        "sigma_factor": result.sigma_factor,
-        "scaled": result.scaled,
-        "threshold_mm": result.threshold_mm,
-        **_figures(result.inlier_errors),
-        "held_out": None if result.held_out is None else _held_out(found, result.held_out),
-        "ambiguous": bool(result.ambiguous),
-        "alternative": None,
-        "notes": list(result.notes),
-        "seed": result.seed,
-        "samples": result.samples,
-        "lines": [int(line) for line in found.lines],
-        "inliers": result.inliers.tolist(),
-        "residuals": result.residuals.tolist(),
-        "outliers": [_outlier(found, row) for row in result.outliers],
-        "field": None if found.field is None else _field(found),
-        "cubes": None if found.cubes is None else _cubes(found),
-    }
-    other = result.alternative
-    if other is not None:
-        content["alternative"] = {
-            "b_from_a": matrix_of(other.b_from_a).tolist(),
-            "lines": [int(found.lines[i]) for i in other.rows],
-            "apart_mm": other.apart_mm,
-            "turn_rad": other.turn_rad,
-        }
-    return content
+class Units(Part):
+    b_from_a: Literal["mm"] = "mm"
+    residuals: Literal["mm"] = "mm"
+    covariance: list[str]
 
 
-def _transform(transform: Transform) -> dict:
+class MeanRmsMax(Part):
+    """Of lengths, null where there are none."""
+
+    mean_mm: Finite
+    rms_mm: Finite
+    max_mm: Finite
+
+
+class HeldOutRows(Part):
+    folds: int
+    inliers: MeanRmsMax
+    all: MeanRmsMax
+    lines: list[int]
+    error_mm: Vector
+
+
+class OtherTransform(Part):
+    b_from_a: Matrix4
+    lines: list[int]
+    apart_mm: float
+    turn_rad: float
+
+
+class OutlierRow(Part):
+    line: int
+    residual_mm: Vector3
+    length_mm: float
+
+
+class LeftOutErrors(Part):
+    transform: MeanRmsMax
+    transform_and_field: MeanRmsMax
+    sigma_ratio: float
+
+
+class GridErrors(Part):
+    xyz_a_mm: Points
+    error_mm: Points
+    sigma_mm: Vector
+
+
+class FieldPart(Part):
+    seen: bool
+    p_value: float
+    length_mm: float
+    size_mm: float
+    noise_mm: float
+    points: int
+    taken_back_lines: list[int]
+    left_out: LeftOutErrors
+    grid: GridErrors
+
+
+class CubeRow(Part):
+    side_mm: float
+    errors: list[ErrorFigures | None]
+
+
+class CubesPart(Part):
+    middle_a_mm: Vector3
+    sides_mm: Vector
+    fitted_in: list[CubeRow]
+
+
+class FiguresRow(Part):
+    rows: str
+    points: int
+    transform: MeanRmsMax
+    kinematics: MeanRmsMax
+
+
+class HeldOutBoth(Part):
+    folds: int
+    lines: list[int]
+    transform_mm: Vector
+    kinematics_mm: Vector
+    outliers_of_both: list[int]
+    figures: list[FiguresRow]
+
+
+class RobotPart(Part):
+    """Base and kinematics solved beside the transform."""
+
+    name: str
+    b_from_base: Pose
+    rank: int
+    parameters: int
+    undetermined: list[str]
+    sigma_mm: float | None
+    a_off_robot_file_mm: float
+    better: bool
+    held_out: HeldOutBoth
+
+
+class RegistrationFile(ResultFile):
+    """Of ``register``; lengths in mm, angles in rad."""
+
+    format: Literal["stcal registration 1"] = Field(description="the file's form and its version")
+    pairs: str = Field(description="the file of the points")
+    model: str = Field(description="as asked for (`liu2017` is always affine)")
+    method: str = Field(description="as asked for")
+    b_from_a: Matrix4 = Field(description="row-major: `xyz_b = b_from_a @ xyz_a`")
+    covariance: Matrix = Field(
+        description="of a left perturbation in frame b (rotation vector, translation, then the relative scale of a "
+        "similarity), or of the rows of the 3×4 matrix of an affine transform"
+    )
+    covariance_of: list[str] = Field(description="names of its rows: `rx … z`, `scale`, `m11 … m34`")
+    units: Units = Field(description="of `b_from_a`, of `residuals`, and of each row of `covariance`")
+    scale: float | None = Field(None, description="of a similarity")
+    scales: Vector3 | None = Field(None, description="singular values of an affine transform's 3×3 part")
+    sigma_mm: float = Field(description="σ per axis of a residual, estimated")
+    dof: Finite = Field(
+        description="degrees of freedom of the σ that the covariance rests on (null: given)",
+    )
+    sigma_factor: float | None = Field(description="by how much residuals exceed the σ given with the data")
+    scaled: bool = Field(description="whether the covariance rests on the residuals")
+    threshold_mm: float | None = Field(description="inliers are nearer than this; null by least squares")
+    mean_mm: Finite = Field(description="mean length of the inliers' residuals")
+    rms_mm: Finite = Field(description="RMS length")
+    max_mm: Finite = Field(description="largest length")
+    held_out: HeldOutRows | None = Field(
+        description="`folds`; `inliers` and `all` with `mean_mm`, `rms_mm`, `max_mm`; `lines` and `error_mm` of each "
+        "point tried"
+    )
+    ambiguous: bool = Field(description="whether `alternative` is about as good")
+    alternative: OtherTransform | None = Field(
+        description="another transform that other points agree on: `b_from_a`, `lines`, `apart_mm` (RMS), `turn_rad`"
+    )
+    notes: list[str] = Field(description="what to look at")
+    seed: int = Field(description="of the random samples")
+    samples: int = Field(description="how many were drawn, 0: all there are")
+    lines: list[int] = Field(description="for each row of the file its line")
+    inliers: list[bool] = Field(description="whether it is an inlier")
+    residuals: Points = Field(description="b − b_from_a a, frame b")
+    outliers: list[OutlierRow] = Field(description="`line`, `residual_mm`, `length_mm`, the farthest first")
+    field: FieldPart | None = Field(
+        description="systematic residuals over the workspace, null with too few points: `seen` (chance below 1 %), "
+        "`p_value`; `size_mm` RMS length, `length_mm` over which they change, `noise_mm` σ per axis beside them; "
+        "`points` used (at most 500), `taken_back_lines` of outliers that follow the field of the others; `left_out`: "
+        "errors (`mean_mm`, `rms_mm`, `max_mm`) of points by the `transform`, and by `transform_and_field`, fitted to "
+        "the others, and `sigma_ratio`, RMS of the latter over their σ; `grid`: `xyz_a_mm` in frame a (7³ places over "
+        "the box of the points and a quarter beyond), `error_mm` to expect of b − b_from_a a there, frame b, and its "
+        "`sigma_mm` per axis"
+    )
+    cubes: CubesPart | None = Field(
+        description="null with too few points: `middle_a_mm`, `sides_mm` of cubes along the axes of a; `fitted_in` for "
+        "each cube (`side_mm`) the `errors` of the points within the first cube, between the first and the second, …: "
+        "`points`, `mean_mm`, `rms_mm`, `max_mm`; those that the fit used are held out in turn"
+    )
+    robot: RobotPart | None = Field(
+        None,
+        description="with `--robot`: `name`; `b_from_base` of the identified robot; `rank`, `parameters`, "
+        "`undetermined`, `sigma_mm` as of `identify`; `a_off_robot_file_mm`: RMS of a off the robot file's positions "
+        "after a rigid fit; `better` than the transform, held out; `held_out`: `folds`, `lines`, `transform_mm`, "
+        "`kinematics_mm` of each row, `outliers_of_both` (lines), `figures`: `rows`, `points`, and `transform` and "
+        "`kinematics` with `mean_mm`, `rms_mm`, `max_mm`",
+    )
+
+    @classmethod
+    def of(cls, found: Findings) -> "RegistrationFile":
+        """The file of a registration."""
+        result, lines = found.registration, found.lines
+        names = NAMES[len(result.covariance)]
+        same = ("model", "method", "covariance", "sigma_mm", "sigma_factor", "scaled", "threshold_mm", "ambiguous")
+        same += ("notes", "seed", "samples", "residuals")
+        return cls.model_validate(
+            {name: getattr(result, name) for name in same}
+            | {
+                "format": "stcal registration 1",
+                "pairs": found.where,
+                "b_from_a": matrix_of(result.b_from_a),
+                "covariance_of": names,
+                "units": {
+                    "b_from_a": "mm",
+                    "residuals": "mm",
+                    "covariance": ["mm" if n in "xyz" or n.endswith("4") else UNIT[n[0]] for n in names],
+                },
+                **_scale(result.b_from_a),
+                "dof": result.redundancy,
+                **dict(MeanRmsMax.model_validate(result.inlier_errors)),
+                "held_out": result.held_out and _held_out(result.held_out, lines),
+                "alternative": result.alternative and _alternative(result.alternative, lines),
+                "lines": lines,
+                "inliers": result.inliers.tolist(),
+                "outliers": [_outlier(found, row) for row in result.outliers],
+                "field": found.field and _field(found.field, found),
+                "cubes": found.cubes and _cubes(found.cubes),
+            }
+        )
+
+
+def _scale(transform: Transform) -> dict[str, Any]:
     """What the matrix hides: scale of a similarity, shear and scales of an affine transform."""
     if isinstance(transform, Rigid):
         return {}
     if isinstance(transform, Affine):
-        return {"scales": np.linalg.svd(transform.linear, compute_uv=False).tolist()}
+        return {"scales": np.linalg.svd(transform.linear, compute_uv=False)}
     return {"scale": transform.scale}
 
 
-def _held_out(found: Findings, held: HeldOut) -> dict:
-    return {
-        "folds": held.folds,
-        "inliers": _figures(held.of_inliers),
-        "all": _figures(held.of_all),
-        "lines": [int(found.lines[i]) for i in held.rows],
-        "error_mm": held.error_mm.tolist(),
-    }
+def _held_out(held: HeldOut, lines: Sequence[int]) -> HeldOutRows:
+    return HeldOutRows(
+        folds=held.folds,
+        inliers=MeanRmsMax.model_validate(held.of_inliers),
+        all=MeanRmsMax.model_validate(held.of_all),
+        lines=[lines[i] for i in held.rows],
+        error_mm=held.error_mm,
+    )
 
 
-def _outlier(found: Findings, row: int) -> dict:
+def _alternative(other: Alternative, lines: Sequence[int]) -> OtherTransform:
+    return OtherTransform(
+        b_from_a=matrix_of(other.b_from_a),
+        lines=[lines[i] for i in other.rows],
+        apart_mm=other.apart_mm,
+        turn_rad=other.turn_rad,
+    )
+
+
+def _outlier(found: Findings, row: int) -> OutlierRow:
     residual = found.registration.residuals[row]
-    return {
-        "line": int(found.lines[row]),
-        "residual_mm": residual.tolist(),
-        "length_mm": float(np.linalg.norm(residual)),
-    }
+    return OutlierRow(line=found.lines[row], residual_mm=residual, length_mm=float(np.linalg.norm(residual)))
 
 
-def _field(found: Findings) -> dict:
-    field = found.field
+def _field(field: ResidualField, found: Findings) -> FieldPart:
     grid = grid_of(found)
     error, covariance = field.at(grid)
-    return {
-        "seen": field.seen,
-        "p_value": field.p_value,
-        "length_mm": field.length_mm,
-        "size_mm": field.size_mm,
-        "noise_mm": field.noise_mm,
-        "points": len(field.rows),
-        "taken_back_lines": [int(found.lines[i]) for i in field.taken_back],
-        "left_out": {
-            "transform": _figures(ErrorFigures.of(field.plain_mm)),
-            "transform_and_field": _figures(ErrorFigures.of(field.corrected_mm)),
-            "sigma_ratio": field.sigma_ratio,
-        },
-        "grid": {
-            "xyz_a_mm": grid.tolist(),
-            "error_mm": error.tolist(),
-            "sigma_mm": np.sqrt(np.trace(covariance, axis1=1, axis2=2) / 3).tolist(),
-        },
-    }
+    plain, corrected = (ErrorFigures.of(lengths) for lengths in (field.plain_mm, field.corrected_mm))
+    return FieldPart(
+        seen=field.seen,
+        p_value=field.p_value,
+        length_mm=field.length_mm,
+        size_mm=field.size_mm,
+        noise_mm=field.noise_mm,
+        points=len(field.rows),
+        taken_back_lines=[found.lines[i] for i in field.taken_back],
+        left_out=LeftOutErrors(
+            transform=MeanRmsMax.model_validate(plain),
+            transform_and_field=MeanRmsMax.model_validate(corrected),
+            sigma_ratio=field.sigma_ratio,
+        ),
+        grid=GridErrors(xyz_a_mm=grid, error_mm=error, sigma_mm=np.sqrt(np.trace(covariance, axis1=1, axis2=2) / 3)),
+    )
 
 
 def grid_of(found: Findings) -> np.ndarray:
@@ -140,24 +294,10 @@ def grid_of(found: Findings) -> np.ndarray:
     return np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 3)
 
 
-def _cubes(found: Findings) -> dict:
-    reach = found.cubes
-    return {
-        "middle_a_mm": reach.middle.tolist(),
-        "sides_mm": reach.sides_mm.tolist(),
-        "fitted_in": [
-            {
-                "side_mm": float(side),
-                "errors": [None if e is None else asdict(e) for e in row],
-            }
-            for side, row in zip(reach.sides_mm, reach.errors, strict=True)
-        ],
-    }
-
-
-def _figures(errors: ErrorFigures) -> dict:
-    return {name: _or_none(getattr(errors, name)) for name in ("mean_mm", "rms_mm", "max_mm")}
-
-
-def _or_none(value: float) -> float | None:
-    return float(value) if np.isfinite(value) else None
+def _cubes(cubes: Cubes) -> CubesPart:
+    rows = zip(cubes.sides_mm, cubes.errors, strict=True)
+    return CubesPart(
+        middle_a_mm=cubes.middle,
+        sides_mm=cubes.sides_mm,
+        fitted_in=[CubeRow(side_mm=side, errors=list(errors)) for side, errors in rows],
+    )

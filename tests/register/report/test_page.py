@@ -8,8 +8,9 @@ import pytest
 from markupsafe import Markup
 
 from stcal.geometry.rigid import Rigid, Similarity
+from stcal.io.saving import json_text
 from stcal.register import register
-from stcal.register.report.file import FORMAT, GRID, registration_json
+from stcal.register.report.file import GRID, RegistrationFile
 from stcal.register.report.page import FEW_ROWS, registration_page, registration_text
 from stcal.register.workspace.findings import findings
 
@@ -56,8 +57,8 @@ def test_a_bent_frame_is_said():
 def test_json_is_the_result(model):
     found = found_of(model=model)
     result = found.registration
-    content = json.loads(json.dumps(registration_json(found), allow_nan=False))
-    assert content["format"] == FORMAT
+    content = json.loads(json_text(RegistrationFile.of(found)))
+    assert content["format"] == "stcal registration 1"
     matrix = np.array(content["b_from_a"])
     a = found.xyz_a
     np.testing.assert_allclose(a @ matrix[:3, :3].T + matrix[:3, 3], result.b_from_a @ a, atol=1e-9)
@@ -82,9 +83,9 @@ def test_json_is_the_result(model):
 
 def test_units_of_the_affine_covariance():
     """σ of the entry m14 (mm) is far above that of m11 (no unit): the origin is 1 m away."""
-    content = registration_json(found_of(model="affine"))
-    sigma = np.sqrt(np.diag(content["covariance"]))
-    units = dict(zip(content["covariance_of"], content["units"]["covariance"], strict=True))
+    content = RegistrationFile.of(found_of(model="affine"))
+    sigma = np.sqrt(np.diag(content.covariance))
+    units = dict(zip(content.covariance_of, content.units.covariance, strict=True))
     assert units["m14"] == "mm"
     assert units["m11"] == "1"
     assert sigma[3] > 300 * sigma[0]

@@ -4,6 +4,7 @@ import csv
 import json
 import shutil
 from collections import defaultdict
+from importlib import import_module
 from pathlib import Path
 
 import cv2
@@ -12,7 +13,7 @@ import pytest
 
 from stcal.errors import InputError
 from stcal.geometry.rigid import Rigid
-from stcal.sfm import RunOptions, pipeline, run
+from stcal.sfm import RunOptions, run
 from stcal.sfm.detect.ellipses import EllipseOptions, find_ellipses
 from stcal.sfm.diagnose.doctor import diagnose
 from stcal.sfm.diagnose.examine import LEAST_MIN_DIAMETER_PX
@@ -94,7 +95,7 @@ def rows(folder: Path) -> list[list[str]]:
 @pytest.fixture(autouse=True)
 def no_figures(monkeypatch):
     """The doctor does not read the report's page, which takes half of a small run's time."""
-    monkeypatch.setattr(pipeline, "report_html", lambda *_: "")
+    monkeypatch.setattr(import_module("stcal.sfm.run.folder"), "report_html", lambda *_: "")
 
 
 @pytest.fixture
