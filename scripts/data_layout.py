@@ -33,6 +33,7 @@ MODULES = (
     "stcal.handeye.report.file",
     "stcal.register.report.file",
     "stcal.locate.report.files",
+    "stcal.locate.report.located",
     "stcal.robot.axes.files",
     "stcal.robot.identify.files",
     "stcal.robot.use.files",

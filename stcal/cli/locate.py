@@ -163,7 +163,8 @@ def run(
     from stcal.locate.pose.patent import PatentOptions
     from stcal.locate.pose.verdict import VerdictOptions
     from stcal.locate.report.chain import read_chain
-    from stcal.locate.report.tables import accepted, poses_csv, run_json, run_text
+    from stcal.locate.report.located import LocatedFile
+    from stcal.locate.report.tables import accepted, poses_csv, run_text
 
     inputs = (layout, camera, hand_eye, robot_poses, offset)
     keep_apart({"--out": out, "--json": json_file, "--report": report}, inputs)
@@ -193,7 +194,7 @@ def run(
     if out:
         write(out, poses_csv(results, chain))
     if json_file:
-        write(json_file, run_json(results, target, chain))
+        write(json_file, LocatedFile.of(results, target, chain))
     if report:
         from stcal.locate.report.page import run_page
 

@@ -1,4 +1,4 @@
-"""What ``locate run`` found, as text, CSV and JSON."""
+"""What ``locate run`` found, as text and CSV."""
 
 import csv
 import io
@@ -10,10 +10,7 @@ from stcal.errors import InputError
 from stcal.geometry.rigid import Rigid
 from stcal.geometry.uncertain import UncertainRigid
 from stcal.io.table import COVARIANCE, POSE, pose_cells
-from stcal.locate.data.exposures import Exposure
-from stcal.locate.data.layout import TargetLayout
 from stcal.locate.pipeline import Located
-from stcal.locate.pose.estimate import ObjPose
 from stcal.locate.report.chain import Chain
 
 BASE = "base_from_goal_"
@@ -89,81 +86,3 @@ def poses_csv(results: Sequence[Located], chain: Chain | None = None) -> str:
             row += pose_cells(goal.rigid, goal.covariance if full else None)
         write.writerow(row)
     return out.getvalue()
-
-
-def run_json(results: Sequence[Located], layout: TargetLayout, chain: Chain | None = None) -> dict:
-    """Everything, rejected and ambiguous poses too."""
-    return {
-        "format": "stcal located 1",
-        "unit": "mm",
-        "layout": layout.name,
-        "scenes": [_scene_json(each, layout, chain) for each in results],
-    }
-
-
-def _scene_json(each: Located, layout: TargetLayout, chain: Chain | None) -> dict:
-    verdict, merged = each.verdict, each.merged
-    content = {
-        "scene": each.name,
-        "verdict": verdict.decision,
-        "reasons": list(verdict.reasons),
-        "notes": list(each.notes),
-        "checks": [
-            {
-                "name": check.name,
-                "value": _finite(check.value),
-                "at_least": check.at_least,
-                "at_most": check.at_most,
-                "unit": check.unit.strip(),
-                "passed": check.passed,
-            }
-            for check in verdict.checks
-        ],
-        "exposures": [
-            {"image": e.name, "tags": len(e.tags), "trouble": None}
-            if isinstance(e, Exposure)
-            else {"image": e.name, "tags": None, "trouble": e.trouble}
-            for e in each.tags.exposures
-        ],
-        "tags": [] if merged is None else [layout.tags[row][1] for row in merged.seen.rows],
-        "differing_share": None if merged is None else merged.share,
-        "shifts": []
-        if merged is None
-        else [{"between": list(s.exposures), "tags": s.tags, "shift_px": s.shift_px} for s in merged.shifts],
-    }
-    pose = camera_from_obj(each)
-    content["camera_from_obj"] = None if pose is None else pose.matrix().tolist()
-    if each.patent is not None:
-        content |= {
-            "twin": each.patent.second.matrix().tolist(),
-            "errors_px": [_finite(error) for error in each.patent.errors_px],
-        }
-    if each.pose is not None:
-        content |= _pose_json(each.pose, layout)
-    if chain and pose is not None and not chain.without_pose([each.name]):
-        goal = chain.base_from_goal(each.name, uncertain(each))
-        content |= {"base_from_goal": goal.rigid.matrix().tolist(), "base_covariance": goal.covariance.tolist()}
-    return content
-
-
-def _pose_json(pose: ObjPose, layout: TargetLayout) -> dict:
-    names = [f"{layout.tags[row][1]}:{corner}" for row in pose.rows for corner in range(4)]
-    return {
-        "covariance": pose.covariance.tolist(),
-        "twin": None if pose.second is None else pose.second.matrix().tolist(),
-        "delta_chi2": _finite(pose.delta_chi2),
-        "rms_px": pose.rms_px(),
-        "chi2": pose.chi2,
-        "dof": pose.redundancy,
-        "p_value": pose.p_value(),
-        "outliers": [layout.tags[row][1] for row in pose.outliers],
-        "corners": [
-            {"corner": name, "residual_px": residual.tolist(), "weight": float(weight)}
-            for name, residual, weight in zip(names, pose.residuals_px, pose.weights, strict=True)
-        ],
-    }
-
-
-def _finite(value: float) -> float | None:
-    """JSON knows no infinity: null, where there is no other pose."""
-    return float(value) if np.isfinite(value) else None

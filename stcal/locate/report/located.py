@@ -1,0 +1,139 @@
+"""What ``locate run`` writes with ``--json``."""
+
+from collections.abc import Sequence
+from typing import Annotated, Any, Literal
+
+from pydantic import Field, StringConstraints
+
+from stcal.io.json import Finite, Matrix6, Pair, Part, Pose, ResultFile
+from stcal.locate.data.exposures import Exposure, Unreadable
+from stcal.locate.data.layout import TargetLayout
+from stcal.locate.pipeline import Located
+from stcal.locate.pose.estimate import ObjPose
+from stcal.locate.pose.merge import Shift
+from stcal.locate.report.chain import Chain
+from stcal.locate.report.tables import camera_from_obj, uncertain
+
+
+class CheckRow(Part):
+    name: str
+    value: Finite
+    at_least: float | None
+    at_most: float | None
+    unit: Annotated[str, StringConstraints(strip_whitespace=True)]
+    passed: bool
+
+
+class ExposureRow(Part):
+    image: str
+    tags: int | None
+    trouble: str | None
+
+
+class ShiftRow(Part):
+    between: tuple[str, str]
+    tags: int
+    shift_px: float
+
+
+class CornerRow(Part):
+    corner: str
+    residual_px: Pair
+    weight: float
+
+
+class SceneRow(Part):
+    scene: str
+    verdict: str
+    reasons: list[str]
+    notes: list[str]
+    checks: list[CheckRow] = Field(
+        description="`name`, `value`, `at_least`, `at_most`, `unit`, `passed`; value null: no other pose"
+    )
+    exposures: list[ExposureRow] = Field(description="`image`, `tags`, `trouble`")
+    tags: list[int] = Field(description="seen")
+    differing_share: float | None = Field(
+        description="of the corners' stated variance, how much differs between exposures"
+    )
+    shifts: list[ShiftRow] = Field(
+        description="`between` two exposures, `tags` in common, `shift_px` the median shift of their middles"
+    )
+    camera_from_obj: Pose | None = Field(description="pose, rejected and ambiguous ones too")
+    covariance: Matrix6 | None = Field(None, description="its covariance; not with `--method patent`")
+    twin: Pose | None = Field(None, description="the other pose that fits, null where there is none")
+    errors_px: list[Finite] | None = Field(None, description="only with `--method patent`: of the two poses")
+    delta_chi2: Finite = Field(None, description="this and all below as in [measure](#out-what-measure-writes)")
+    rms_px: float | None = Field(None, description="of the residuals, per coordinate")
+    chi2: float | None = Field(None, description="of the residuals")
+    dof: int | None = Field(None, description="their degrees of freedom")
+    p_value: float | None = Field(None, description="of as much by chance")
+    outliers: list[int] = Field([], description="ids of tags that contradict the others")
+    corners: list[CornerRow] = Field([], description="`corner` as `id:0` … `id:3`, `residual_px`, `weight`")
+    base_from_goal: Pose | None = Field(None, description="with `--hand-eye`")
+    base_covariance: Matrix6 | None = Field(None, description="its covariance")
+
+
+class LocatedFile(ResultFile):
+    """Of ``locate run``: everything, rejected and ambiguous poses too."""
+
+    format: Literal["stcal located 1"] = Field(description="the file's form and its version")
+    unit: Literal["mm"] = Field(description="of all lengths")
+    layout: str = Field(description="the layout's name")
+    scenes: list[SceneRow] = Field(description="`scene`, `verdict`, `reasons`, `notes`, and")
+
+    @classmethod
+    def of(cls, results: Sequence[Located], layout: TargetLayout, chain: Chain | None = None) -> "LocatedFile":
+        """The file of all scenes; ``chain`` : to the robot's base."""
+        scenes = [_scene(each, layout, chain) for each in results]
+        return cls(format="stcal located 1", unit="mm", layout=layout.name, scenes=scenes)
+
+
+def _scene(each: Located, layout: TargetLayout, chain: Chain | None) -> SceneRow:
+    verdict, merged, pose = each.verdict, each.merged, camera_from_obj(each)
+    content: dict[str, Any] = {
+        "scene": each.name,
+        "verdict": verdict.decision,
+        "reasons": verdict.reasons,
+        "notes": each.notes,
+        "checks": verdict.checks,
+        "exposures": [_exposure(own) for own in each.tags.exposures],
+        "tags": [layout.tags[row][1] for row in merged.seen.rows] if merged else [],
+        "differing_share": None if merged is None else merged.share,
+        "shifts": [_shift(own) for own in merged.shifts] if merged else [],
+        "camera_from_obj": pose,
+    }
+    if each.patent is not None:
+        content |= {"twin": each.patent.second, "errors_px": each.patent.errors_px}
+    if each.pose is not None:
+        content |= _fit(each.pose, layout)
+    if chain and pose is not None and not chain.without_pose([each.name]):
+        goal = chain.base_from_goal(each.name, uncertain(each))
+        content |= {"base_from_goal": goal.rigid, "base_covariance": goal.covariance}
+    return SceneRow.model_validate(content)
+
+
+def _exposure(own: Exposure | Unreadable) -> ExposureRow:
+    read = isinstance(own, Exposure)
+    return ExposureRow(image=own.name, tags=len(own.tags) if read else None, trouble=None if read else own.trouble)
+
+
+def _shift(own: Shift) -> ShiftRow:
+    return ShiftRow(between=own.exposures, tags=own.tags, shift_px=own.shift_px)
+
+
+def _fit(pose: ObjPose, layout: TargetLayout) -> dict[str, Any]:
+    names = [f"{layout.tags[row][1]}:{corner}" for row in pose.rows for corner in range(4)]
+    return {
+        "covariance": pose.covariance,
+        "twin": pose.second,
+        "delta_chi2": pose.delta_chi2,
+        "rms_px": pose.rms_px(),
+        "chi2": pose.chi2,
+        "dof": pose.redundancy,
+        "p_value": pose.p_value(),
+        "outliers": [layout.tags[row][1] for row in pose.outliers],
+        "corners": [
+            CornerRow(corner=name, residual_px=residual, weight=weight)
+            for name, residual, weight in zip(names, pose.residuals_px, pose.weights, strict=True)
+        ],
+    }
