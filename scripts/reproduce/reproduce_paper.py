@@ -137,7 +137,7 @@ def board_errors(model: WorldModel, mm_per_unit: float, scene: Scene) -> tuple[f
     for dots in (design, scene.groups[model.group].board_circles_target):
         means = []
         for chosen in (dots[numbers], dots[::-1][numbers]):  # a plain board may be numbered from either end
-            found = mm_per_unit * model.xyz_world[members]
+            found = mm_per_unit * model.xyz_model[members]
             means.append(np.linalg.norm(align_rigid(chosen, found) @ found - chosen, axis=1).mean())
         answers.append(1e3 * float(min(means)))
     return answers[0], answers[1]

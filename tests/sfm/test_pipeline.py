@@ -106,7 +106,7 @@ def test_any_colmap_makes_an_unbiased_model_of_the_database(calibrated, tmp_path
     distances = []
     for each in (ours, theirs):
         scale = find_scale(each, result.board_design).mm_per_unit
-        place = {label: scale * xyz for label, xyz in zip(each.labels, each.xyz_world, strict=True)}
+        place = {label: scale * xyz for label, xyz in zip(each.labels, each.xyz_model, strict=True)}
         distances.append(np.linalg.norm(place["1:1"] - place["2:1"]))
     assert distances[0] == pytest.approx(distances[1], abs=2e-4)  # float32 keypoints; the bias would be 0.05 mm
 

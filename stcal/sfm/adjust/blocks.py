@@ -21,12 +21,12 @@ from stcal.sfm.data.model import GroupModel, MetricModel
 class Shared:
     """What all groups share.
 
-    ``xyz_world`` : (c, 3) circles, mm; ``shape_mm`` : (d, 3) deviation of the dots from the design that all groups
+    ``xyz_model`` : (c, 3) circles, mm; ``shape_mm`` : (d, 3) deviation of the dots from the design that all groups
     have in common, board frame; ``camera`` ; ``basis`` : (12, q) derivative of the camera's parameters by those that
     are adjusted.
     """
 
-    xyz_world: np.ndarray
+    xyz_model: np.ndarray
     shape_mm: np.ndarray
     camera: Camera
     basis: np.ndarray
@@ -36,13 +36,13 @@ class Shared:
 class Block:
     """One group.
 
-    ``world_from_board`` ; ``design`` : (e, 3) its dots, board frame; ``sigma_mm`` of a dot about the common shape;
+    ``model_from_board`` ; ``design`` : (e, 3) its dots, board frame; ``sigma_mm`` of a dot about the common shape;
     ``dots``, ``circles`` : points of the model that are dots and circles; ``dot_place`` : (e,) of each dot in the
     common shape, empty where each group has its own; ``circle_place`` : of each circle among all.
     """
 
     model: MetricModel
-    world_from_board: Rigid
+    model_from_board: Rigid
     design: np.ndarray
     sigma_mm: float
     dots: np.ndarray
@@ -56,7 +56,7 @@ class Block:
 
     def board_residual(self) -> np.ndarray:
         """Adjusted minus design, (e, 3), board frame, mm."""
-        return self.world_from_board.inverse() @ self.model.xyz_world[self.dots] - self.design
+        return self.model_from_board.inverse() @ self.model.xyz_model[self.dots] - self.design
 
     def cost(self, shared: Shared, huber: float) -> float:
         """Squared residuals over σ², Huber's beyond ``huber``; infinite behind a camera."""
@@ -146,9 +146,9 @@ def _with_board(block: Block, shared: Shared, normal: np.ndarray, right: np.ndar
     size = 3 * p + q
     full, full_right = np.zeros((size + 6 + s, size + 6 + s)), np.zeros(size + 6 + s)
     full[:size, :size], full_right[:size] = normal, right
-    rotation = block.world_from_board.rotation
+    rotation = block.model_from_board.rotation
     turned = block.expected_dots(shared) @ rotation.T
-    gap = block.model.xyz_world[block.dots] - (turned + block.world_from_board.translation)
+    gap = block.model.xyz_model[block.dots] - (turned + block.model_from_board.translation)
     jacobian = np.zeros((3 * d, size + 6 + s))
     rows = np.arange(3 * d).reshape(d, 3)
     jacobian[rows, 3 * block.dots[:, None] + np.arange(3)] = 1
@@ -178,7 +178,7 @@ def step_of(block: Block, reduced: Reduced, outer: np.ndarray, intrinsics: np.nd
 def moved(block: Block, step: np.ndarray) -> Block:
     """The group after a step of :func:`step_of`."""
     model, p = block.model, 3 * len(block.model.labels)
-    cameras = moved_poses(model.camera_from_world, step[p:-6].reshape(-1, 6))
-    points = model.xyz_world + step[:p].reshape(-1, 3)
-    changed = replace(model, camera_from_world=cameras, xyz_world=points)
-    return replace(block, model=changed, world_from_board=perturbed(block.world_from_board, step[-6:]))
+    cameras = moved_poses(model.camera_from_model, step[p:-6].reshape(-1, 6))
+    points = model.xyz_model + step[:p].reshape(-1, 3)
+    changed = replace(model, camera_from_model=cameras, xyz_model=points)
+    return replace(block, model=changed, model_from_board=perturbed(block.model_from_board, step[-6:]))

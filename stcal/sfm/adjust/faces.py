@@ -41,7 +41,7 @@ class FaceInGroup:
 
 
 def face_frame(face: FaceDesign, xyz: dict[str, np.ndarray], kind: FrameKind, towards: np.ndarray) -> Rigid:
-    """world_from_face from circle centres, by Zhang & Wei's Gram–Schmidt (eqs. 8–10).
+    """model_from_face from circle centres, by Zhang & Wei's Gram–Schmidt (eqs. 8–10).
 
     Parameters
     ----------
@@ -74,9 +74,9 @@ def faces_of_group(
     model: MetricModel, camera: Camera, target: TargetDesign, kind: FrameKind
 ) -> tuple[list[FaceInGroup], list[str]]:
     """Frames of all faces of one group, and why a face has none."""
-    xyz = model.xyz_world
+    xyz = model.xyz_model
     information = _point_information(model, camera)
-    cameras = np.stack([pose.inverse().translation for pose in model.camera_from_world])
+    cameras = np.stack([pose.inverse().translation for pose in model.camera_from_model])
     faces, notes = [], []
     for face in target.faces:
         members = model.points_by_face().get(face.id, np.zeros(0, int))

@@ -59,9 +59,9 @@ def projection_jacobians(model: GroupModel, camera: Camera) -> tuple[np.ndarray,
     ideal = xyz[:, :2] / xyz[:, 2:]
     by_ideal = camera.distort_jacobian(ideal)[1] * camera.focal[:, None]
     by_camera = np.concatenate([by_ideal, -by_ideal @ ideal[..., None]], axis=2) / xyz[:, 2, None, None]
-    translation = np.stack([pose.translation for pose in model.camera_from_world])[model.image_index]
+    translation = np.stack([pose.translation for pose in model.camera_from_model])[model.image_index]
     by_pose = np.concatenate([-by_camera @ skew(xyz - translation), by_camera], axis=2)
-    rotation = np.stack([pose.rotation for pose in model.camera_from_world])[model.image_index]
+    rotation = np.stack([pose.rotation for pose in model.camera_from_model])[model.image_index]
     return by_pose, by_camera @ rotation
 
 
@@ -107,7 +107,7 @@ def _moved(model: M, step: np.ndarray) -> M:
     """The model after steps of its poses and points."""
     poses, points = step[: 6 * len(model.images)].reshape(-1, 6), step[6 * len(model.images) :].reshape(-1, 3)
     return replace(
-        model, camera_from_world=moved_poses(model.camera_from_world, poses), xyz_world=model.xyz_world + points
+        model, camera_from_model=moved_poses(model.camera_from_model, poses), xyz_model=model.xyz_model + points
     )
 
 

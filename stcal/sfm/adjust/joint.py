@@ -36,7 +36,7 @@ DAMPING = 1e-12
 SETTLED_PX = 1e-7
 """What moves less has settled; what stops between the two limits is returned, and marked."""
 FREE_DIRECTIONS = 6
-"""The world may be anywhere: a rigid motion of everything changes nothing."""
+"""The models' frame may be anywhere: a rigid motion of everything changes nothing."""
 MIN_COMMON = 0.1
 MAX_COMMON = 0.99
 """Share of the board's variance that is common to all groups: below the first it is taken as none, above the second
@@ -45,10 +45,10 @@ what is left to a single group would be smaller than anything a board does."""
 
 @dataclass(frozen=True, slots=True, eq=False)
 class JointResult:
-    """The adjusted models, in one metric world.
+    """The adjusted models, in one frame, mm.
 
-    ``models`` : one for each group, mm; ``world_from_board`` by group; ``labels`` : (c,) of the target's circles;
-    ``xyz_world`` : (c, 3) mm; ``covariance_mm2`` : (3c, 3c) marginal, in the datum of smallest trace, scaled by
+    ``models`` : one for each group, mm; ``model_from_board`` by group; ``labels`` : (c,) of the target's circles;
+    ``xyz_model`` : (c, 3) mm; ``covariance_mm2`` : (3c, 3c) marginal, in the datum of smallest trace, scaled by
     ``sigma0``²; ``sigma0`` : residuals against the centres' own σ; ``board_residuals_mm`` by group: (n, 3), board
     frame; ``board_common`` : share of the board's variance that all groups have in common; ``camera`` : adjusted where
     asked, with ``camera_covariance`` (q, q) of the parameters of its COLMAP model, else empty; ``weights`` by group:
@@ -57,9 +57,9 @@ class JointResult:
     """
 
     models: tuple[MetricModel, ...]
-    world_from_board: dict[str, Rigid]
+    model_from_board: dict[str, Rigid]
     labels: tuple[CircleLabel, ...]
-    xyz_world: np.ndarray
+    xyz_model: np.ndarray
     covariance_mm2: np.ndarray
     sigma0: float
     board_residuals_mm: dict[str, np.ndarray]
@@ -72,7 +72,7 @@ class JointResult:
 
     def __post_init__(self):
         c = len(self.labels)
-        object.__setattr__(self, "xyz_world", frozen(self.xyz_world, (c, 3), "circles"))
+        object.__setattr__(self, "xyz_model", frozen(self.xyz_model, (c, 3), "circles"))
         object.__setattr__(self, "covariance_mm2", frozen(self.covariance_mm2, (3 * c, 3 * c), "covariance"))
 
     @property
@@ -125,7 +125,7 @@ def adjust_jointly(
     prior: CameraPrior | None = None,
     start: Camera | None = None,
 ) -> JointResult:
-    """Adjust metric models that share one world (mm), all observations weighted by their σ.
+    """Adjust metric models that share one frame, all observations weighted by their σ.
 
     ``flatness_mm`` : σ of a circle's distance from the plane of its face, None for no such knowledge; ``prior`` : the
     intrinsics of ``camera`` are observations with this covariance and are adjusted, from ``start``; fixed where None.
@@ -224,7 +224,7 @@ class _State:
         camera = shared.camera
         if shared.basis.shape[1]:
             camera = camera.with_parameters(camera.parameters() + shared.basis @ step[places.intrinsics])
-        xyz = shared.xyz_world + step[places.circles].reshape(-1, 3)
+        xyz = shared.xyz_model + step[places.circles].reshape(-1, 3)
         return _State(blocks, Shared(xyz, shape, camera, shared.basis))
 
 
@@ -254,7 +254,7 @@ class _Normal:
         setting, shared = self.setting, self.state.shared
         free = _free(len(self.normal), shared)
         held = self.normal + damping * np.diag(np.diag(self.normal))
-        held += np.median(np.diag(self.normal)[: shared.xyz_world.size]) * free @ free.T
+        held += np.median(np.diag(self.normal)[: shared.xyz_model.size]) * free @ free.T
         outer = np.linalg.solve(held, self.right)
         gain = 2 * float(outer @ self.right) - float(outer @ self.normal @ outer) + sum(g.gain for g in self.groups)
         intrinsics = outer[setting.places(shared).intrinsics]
@@ -277,7 +277,7 @@ def _block(model: MetricModel, board: BoardDesign, labels: tuple[CircleLabel, ..
     design = board.places_mm(model.labels[i] for i in dots)
     return Block(
         model,
-        align_rigid(model.xyz_world[dots], design),
+        align_rigid(model.xyz_model[dots], design),
         design,
         board.sigma_mm,
         dots,
@@ -320,15 +320,15 @@ def _shared_circles(blocks: list[Block], count: int) -> np.ndarray:
     """Start values: the mean over the groups."""
     total, seen = np.zeros((count, 3)), np.zeros(count)
     for b in blocks:
-        np.add.at(total, b.circle_place, b.model.xyz_world[b.circles])
+        np.add.at(total, b.circle_place, b.model.xyz_model[b.circles])
         np.add.at(seen, b.circle_place, 1)
     return total / seen[:, None]
 
 
 def _with_circles(block: Block, xyz: np.ndarray) -> MetricModel:
-    points = block.model.xyz_world.copy()
+    points = block.model.xyz_model.copy()
     points[block.circles] = xyz[block.circle_place]
-    return replace(block.model, xyz_world=points)
+    return replace(block.model, xyz_model=points)
 
 
 def _outer(block: Block, setting: _Setting, shared: Shared) -> np.ndarray:
@@ -355,11 +355,11 @@ def _normal_equations(blocks: Sequence[Block], shared: Shared, setting: _Setting
         right[shape] -= shared.shape_mm.ravel() / setting.shape_sigma_mm() ** 2
     normal[places.intrinsics, places.intrinsics] += setting.prior
     right[places.intrinsics] -= setting.prior @ _away(shared, setting)
-    for members, across, normal_world in _planes(shared, setting):
-        jacobian = across[:, :, None] * normal_world  # distances from the plane by the circles
+    for members, across, normal_model in _planes(shared, setting):
+        jacobian = across[:, :, None] * normal_model  # distances from the plane by the circles
         flat = jacobian.reshape(len(members), -1)
         place = (3 * members[:, None] + np.arange(3)).ravel()
-        distance = across @ (shared.xyz_world[members] @ normal_world)
+        distance = across @ (shared.xyz_model[members] @ normal_model)
         normal[np.ix_(place, place)] += flat.T @ flat / setting.flatness_mm**2
         right[place] -= flat.T @ distance / setting.flatness_mm**2
     return normal, right, groups
@@ -375,7 +375,7 @@ def _planes(shared: Shared, setting: _Setting):
     for own in faces.values():
         if len(own) > 3:
             members = np.array(own)
-            xyz = shared.xyz_world[members]
+            xyz = shared.xyz_model[members]
             normal = fit_plane(xyz).normal
             base = np.linalg.svd(np.eye(3) - np.outer(normal, normal))[0][:, :2]
             design = np.column_stack([np.ones(len(own)), (xyz - xyz.mean(0)) @ base])
@@ -395,14 +395,14 @@ def _cost(blocks: Sequence[Block], shared: Shared, setting: _Setting) -> float:
         away = _away(shared, setting)
         cost += float(away @ setting.prior @ away)
     for members, across, normal in _planes(shared, setting):
-        cost += float(((across @ (shared.xyz_world[members] @ normal)) ** 2).sum()) / setting.flatness_mm**2
+        cost += float(((across @ (shared.xyz_model[members] @ normal)) ** 2).sum()) / setting.flatness_mm**2
     return cost
 
 
 def _free(count: int, shared: Shared) -> np.ndarray:
     """Directions (count, 6) in which all circles move as one: the datum is that of smallest trace over them."""
     free = np.zeros((count, FREE_DIRECTIONS))
-    free[: shared.xyz_world.size] = free_motions(shared.xyz_world, scale=False)
+    free[: shared.xyz_model.size] = free_motions(shared.xyz_model, scale=False)
     return free
 
 
@@ -428,9 +428,9 @@ def _result(
     covariance = sigma0**2 * inverse
     return JointResult(
         tuple(b.model for b in blocks),
-        {b.model.group: b.world_from_board for b in blocks},
+        {b.model.group: b.model_from_board for b in blocks},
         setting.labels,
-        shared.xyz_world,
+        shared.xyz_model,
         covariance[:c, :c],
         sigma0,
         {b.model.group: b.board_residual() for b in blocks},

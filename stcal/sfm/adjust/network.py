@@ -106,7 +106,7 @@ def free_network(model: MetricModel, camera: Camera, factor: float) -> Network:
     normal = -away.normal
     place = 3 * np.arange(p)[:, None] + np.arange(3)
     normal[place[:, :, None], place[:, None]] += points
-    covariance = constrained_inverse(normal, free_motions(model.xyz_world, scale=True))
+    covariance = constrained_inverse(normal, free_motions(model.xyz_model, scale=True))
     redundancy = 2 - _leverage(model, a, b, away.inverse, away.from_kept, covariance)
     left = point_right.ravel() - away.right
     return Network(model, residual, a, b, away.inverse, coupling, pose_right, left, covariance, redundancy)

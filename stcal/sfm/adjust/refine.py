@@ -102,7 +102,7 @@ def eccentricity_px(model: GroupModel, camera: Camera, radius_mm: dict[Label, fl
     normal = np.zeros((len(model.labels), 3))
     for key, members in model.points_by_face().items():
         try:
-            normal[members] = fit_plane(model.xyz_world[members]).normal
+            normal[members] = fit_plane(model.xyz_model[members]).normal
         except DegenerateError as error:
             what = "the board" if key == "board" else f"face {key}"
             raise MappingError(
@@ -110,7 +110,7 @@ def eccentricity_px(model: GroupModel, camera: Camera, radius_mm: dict[Label, fl
                 f"add views that show {what}"
             ) from error
     radius = np.array([radius_mm[label] for label in model.labels]) / mm_per_unit
-    rotation = np.stack([pose.rotation for pose in model.camera_from_world])[model.image_index]
+    rotation = np.stack([pose.rotation for pose in model.camera_from_model])[model.image_index]
     xyz = model.xyz_camera()
     normal_camera = np.einsum("nij,nj->ni", rotation, normal[model.point_index])
     ellipse = circle_image_offset(xyz, normal_camera, radius[model.point_index])

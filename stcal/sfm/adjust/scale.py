@@ -71,7 +71,7 @@ def find_scale(model: WorldModel, board: BoardDesign) -> Scale:
     labels = [model.labels[i] for i in members]
     cells = dot_cells(labels)
     xyz_board = board.places_mm(labels)
-    xyz_world = model.xyz_world[members]
+    xyz_world = model.xyz_model[members]
     try:
         board_from_world = align_similarity(xyz_board, xyz_world)
     except DegenerateError as error:

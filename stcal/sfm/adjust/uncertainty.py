@@ -15,15 +15,15 @@ from stcal.sfm.adjust.joint import JointResult
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Derivatives:
-    """The target in its own frame, and what moves it: derivatives by the circles in the world, mm.
+    """The target in its own frame, and what moves it: derivatives by the circles in the models' frame, mm.
 
-    ``target_from_face`` by face; ``xyz_target`` : (c, 3); ``target_from_world`` ; ``faces`` by face: (6, 3c) rotation
+    ``target_from_face`` by face; ``xyz_target`` : (c, 3); ``target_from_model`` ; ``faces`` by face: (6, 3c) rotation
     (rad) and translation (mm), perturbation in the target frame; ``circles`` : (c, 3, 3c).
     """
 
     target_from_face: dict[str, Rigid]
     xyz_target: np.ndarray
-    target_from_world: Rigid
+    target_from_model: Rigid
     faces: dict[str, np.ndarray]
     circles: np.ndarray
 
@@ -62,18 +62,18 @@ def calibrated_target(
         reference_face=start.reference_face,
         target_from_face=own.target_from_face,
         circles=dict(zip(result.labels, own.xyz_target, strict=True)),
-        target_from_group=dict.fromkeys(start.target_from_group, own.target_from_world),
+        target_from_group=dict.fromkeys(start.target_from_group, own.target_from_model),
         face_covariance=own.face_covariance(result.covariance_mm2),
         circle_covariance=dict(zip(result.labels, own.circle_covariance(result.covariance_mm2), strict=True)),
         distance_sigma_mm=own.distance_sigma_mm(result.covariance_mm2),
-        scale_sigma=scale_sigma(result.xyz_world, result.covariance_mm2),
+        scale_sigma=scale_sigma(result.xyz_model, result.covariance_mm2),
         covariance_mm2=own.all_circles_covariance(result.covariance_mm2),
     )
 
 
-def scale_sigma(xyz_world: np.ndarray, covariance_mm2: np.ndarray) -> float:
+def scale_sigma(xyz_model: np.ndarray, covariance_mm2: np.ndarray) -> float:
     """Relative σ of the scale of the circles: of the similarity's scale between them as adjusted and as they are."""
-    middle = xyz_world - xyz_world.mean(0)
+    middle = xyz_model - xyz_model.mean(0)
     gradient = (middle / (middle**2).sum()).ravel()
     return float(np.sqrt(gradient @ covariance_mm2 @ gradient))
 
@@ -81,14 +81,14 @@ def scale_sigma(xyz_world: np.ndarray, covariance_mm2: np.ndarray) -> float:
 def derivatives(result: JointResult, start: CalibratedTarget, target: TargetDesign, kind: FrameKind) -> Derivatives:
     """Poses and circles in the target frame are functions of all circles; derivatives by central differences."""
     step = 1e-3
-    own = _frames(result, result.xyz_world, start, target, kind)
-    origin = _in_target_frame(own, result.xyz_world, start)
+    own = _frames(result, result.xyz_model, start, target, kind)
+    origin = _in_target_frame(own, result.xyz_model, start)
     twists, circles = [], []
     for i, label in enumerate(result.labels):
         for axis in range(3):
             ends = []
             for sign in (1, -1):
-                xyz = result.xyz_world.copy()
+                xyz = result.xyz_model.copy()
                 xyz[i, axis] += sign * step
                 moved = _frames(result, xyz, start, target, kind, only=label.face)
                 ends.append(_in_target_frame(own | moved, xyz, start))
@@ -106,24 +106,24 @@ def _perturbation(ahead: Rigid, behind: Rigid) -> np.ndarray:
 
 
 def _frames(
-    result: JointResult, xyz_world, start: CalibratedTarget, target: TargetDesign, kind: FrameKind, only=None
+    result: JointResult, xyz_model, start: CalibratedTarget, target: TargetDesign, kind: FrameKind, only=None
 ) -> dict[str, Rigid]:
-    """world_from_face of all faces, or of one."""
+    """model_from_face of all faces, or of one."""
     frames = {}
     for face in target.faces:
         if face.id in start.target_from_face and only in (None, face.id):
             own = {
-                label.circle: xyz for label, xyz in zip(result.labels, xyz_world, strict=True) if label.face == face.id
+                label.circle: xyz for label, xyz in zip(result.labels, xyz_model, strict=True) if label.face == face.id
             }
             frames[face.id] = face_frame(face, own, kind, start.target_from_face[face.id].rotation[:, 2])
     return frames
 
 
-def _in_target_frame(world_from_face: dict[str, Rigid], xyz_world: np.ndarray, start: CalibratedTarget):
-    """target_from_face, circles (c, 3) in the target frame, and target_from_world."""
-    target_from_world = world_from_face[start.reference_face].inverse()
+def _in_target_frame(model_from_face: dict[str, Rigid], xyz_model: np.ndarray, start: CalibratedTarget):
+    """target_from_face, circles (c, 3) in the target frame, and target_from_model."""
+    target_from_model = model_from_face[start.reference_face].inverse()
     return (
-        {face_id: target_from_world @ pose for face_id, pose in world_from_face.items()},
-        target_from_world @ xyz_world,
-        target_from_world,
+        {face_id: target_from_model @ pose for face_id, pose in model_from_face.items()},
+        target_from_model @ xyz_model,
+        target_from_model,
     )

@@ -195,7 +195,7 @@ def residual_rms_px(result: Intrinsics) -> float:
 
 def _spread_deg(result: Intrinsics) -> float:
     """Largest angle between the normals of two boards as the camera sees them."""
-    normals = np.array([pose.rotation[:, 2] for model in result.models for pose in model.camera_from_world])
+    normals = np.array([pose.rotation[:, 2] for model in result.models for pose in model.camera_from_model])
     return float(np.degrees(np.arccos(np.clip((normals @ normals.T).min(), -1, 1))))
 
 

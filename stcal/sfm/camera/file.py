@@ -134,7 +134,7 @@ class CalibrationFile(ResultFile):
 def _views(result: Intrinsics) -> Iterator[ViewRow]:
     for model in result.models:
         residual = model.residuals_px(result.camera)
-        for image, pose, own in zip(model.images, model.camera_from_world, model.rows_by_image(), strict=True):
+        for image, pose, own in zip(model.images, model.camera_from_model, model.rows_by_image(), strict=True):
             yield ViewRow(
                 image=image,
                 dots=len(own),

@@ -203,16 +203,16 @@ def _start_state(views, camera_of_view, board: BoardDesign, start: Camera) -> _S
 
 
 def _model(folder: str, labels: tuple[Label, ...], views, board: BoardDesign, camera: Camera) -> MetricModel:
-    """The views of a folder around its board, which stands still in the world."""
+    """The views of a folder around its board, which stands still."""
     place = {label: i for i, label in enumerate(labels)}
     rows = [(i, place[label], k) for i, v in enumerate(views) for k, label in enumerate(v.labels)]
     image_index, point_index, keypoint = np.array(rows).T
     return MetricModel(
         group=folder,
         images=tuple(v.name for v in views),
-        camera_from_world=tuple(start_pose(v, board, camera) for v in views),
+        camera_from_model=tuple(start_pose(v, board, camera) for v in views),
         labels=labels,
-        xyz_world=board.places_mm(labels),
+        xyz_model=board.places_mm(labels),
         image_index=image_index,
         point_index=point_index,
         keypoint=keypoint,
@@ -270,7 +270,7 @@ def _boards(state: _State) -> dict[str, list[int]]:
 
 
 def _dots_cost(state: _State, setting: _Setting) -> float:
-    gaps = [state.models[rows[0]].xyz_world - setting.design[folder] for folder, rows in _boards(state).items()]
+    gaps = [state.models[rows[0]].xyz_model - setting.design[folder] for folder, rows in _boards(state).items()]
     return sum(float((gap**2).sum()) for gap in gaps) / setting.sigma_mm**2
 
 
@@ -316,7 +316,7 @@ class _Normal:
                 full[np.ix_(place, place)] += part
                 full_right[place] += part_right
                 poses.append(away)
-            gap = state.models[rows[0]].xyz_world - setting.design[folder]
+            gap = state.models[rows[0]].xyz_model - setting.design[folder]
             full[np.arange(p), np.arange(p)] += 1 / setting.sigma_mm**2
             full_right[:p] -= gap.ravel() / setting.sigma_mm**2
             dots = reduce(full[None, :p, :p], full_right[None, :p], full[None, :p, p:])
@@ -384,9 +384,9 @@ def _moved(state: _State, setting: _Setting, step: np.ndarray) -> _State:
     poses = dict(zip(order, np.split(rest, np.cumsum([6 * len(models[i].images) for i in order])[:-1]), strict=True))
     for rows, moved in zip(boards.values(), dots, strict=True):
         for i in rows:
-            cameras = moved_poses(models[i].camera_from_world, poses[i].reshape(-1, 6))
-            xyz = models[i].xyz_world + moved.reshape(-1, 3)
-            models[i] = replace(models[i], camera_from_world=cameras, xyz_world=xyz)
+            cameras = moved_poses(models[i].camera_from_model, poses[i].reshape(-1, 6))
+            xyz = models[i].xyz_model + moved.reshape(-1, 3)
+            models[i] = replace(models[i], camera_from_model=cameras, xyz_model=xyz)
     cameras = tuple(
         camera.with_parameters(_positive(camera.parameters() + setting.basis @ s))
         for camera, s in zip(state.cameras, own.reshape(len(state.cameras), q), strict=True)

@@ -50,9 +50,9 @@ def _board_gap(network: Network, dots: np.ndarray, board: BoardDesign):
     labels = [network.model.labels[i] for i in dots]
     cells = dot_cells(labels)
     design = board.places_mm(labels)
-    xyz = network.model.xyz_world[dots]
-    board_from_world = align_similarity(design, xyz)
-    turn = np.kron(np.eye(len(dots)), board_from_world.scale * board_from_world.rigid.rotation)
+    xyz = network.model.xyz_model[dots]
+    board_from_model = align_similarity(design, xyz)
+    turn = np.kron(np.eye(len(dots)), board_from_model.scale * board_from_model.rigid.rotation)
     covariance = turn @ network.covariance_of(dots) @ turn.T + board.sigma_mm**2 * np.eye(3 * len(dots))
     middle = design - design.mean(0)
     free = np.concatenate(
@@ -62,7 +62,7 @@ def _board_gap(network: Network, dots: np.ndarray, board: BoardDesign):
     inverse = np.linalg.inv(covariance)
     along = inverse @ free
     weight = inverse - along @ np.linalg.solve(free.T @ along, along.T)
-    return (board_from_world @ xyz - design).ravel(), weight, cells
+    return (board_from_model @ xyz - design).ravel(), weight, cells
 
 
 def _lines(name, gap, weight, cells, board: BoardDesign, inflation: float, redundancy: float) -> list[Trial]:

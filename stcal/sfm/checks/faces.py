@@ -250,8 +250,8 @@ def flatness_check(networks: Sequence[Network], flatness_mm: float | None) -> Ch
 def _heights(network: Network, members: np.ndarray) -> tuple[tuple[str, ...], np.ndarray, np.ndarray]:
     """Labels, heights over any plane (k,), mm, seen from outside, and their weight matrix, that no plane touches."""
     model = network.model
-    xyz = model.xyz_world[members]
-    towards = np.mean([pose.inverse().translation for pose in model.camera_from_world], axis=0) - xyz.mean(0)
+    xyz = model.xyz_model[members]
+    towards = np.mean([pose.inverse().translation for pose in model.camera_from_model], axis=0) - xyz.mean(0)
     plane = fit_plane(xyz, towards)
     across = np.kron(np.eye(len(members)), plane.normal)
     covariance = across @ network.covariance_of(members) @ across.T

@@ -187,8 +187,8 @@ def moved_check(networks: Sequence[Network]) -> Check:
         on_face = np.array([isinstance(label, CircleLabel) for label in model.labels])
         if on_face.all() or not on_face.any():
             continue
-        middle = model.xyz_world[on_face].mean(0)
-        arm = model.xyz_world[model.point_index] - middle
+        middle = model.xyz_model[on_face].mean(0)
+        arm = model.xyz_model[model.point_index] - middle
         motion = np.concatenate([-skew(arm), np.broadcast_to(np.eye(3), (len(arm), 3, 3))], axis=2)
         motion = motion * on_face[model.point_index][:, None, None]
         normal, right = network.score_by_image(network.by_point @ motion)

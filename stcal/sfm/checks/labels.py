@@ -83,9 +83,9 @@ def _exchanged(
     for network in networks:
         model = network.model
         for name in set(model.images) & set(by_image):
-            pose = model.camera_from_world[model.images.index(name)]
+            pose = model.camera_from_model[model.images.index(name)]
             labels = [label for label in by_image[name] if label in model.labels]
-            place = {x: camera.project((pose @ model.xyz_world[model.labels.index(x)])[None])[0] for x in labels}
+            place = {x: camera.project((pose @ model.xyz_model[model.labels.index(x)])[None])[0] for x in labels}
             measured = dict(zip(observed[name].labels, observed[name].centre_px, strict=True))
             for a, b in combinations(labels, 2):
                 apart = np.linalg.norm(place[a] - place[b])

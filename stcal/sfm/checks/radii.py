@@ -96,8 +96,8 @@ def _areas(network: Network, radius_mm: np.ndarray) -> np.ndarray:
     model = network.model
     normal = np.zeros((len(model.labels), 3))
     for members in model.points_by_face().values():
-        normal[members] = fit_plane(model.xyz_world[members]).normal
-    rotation = np.stack([pose.rotation for pose in model.camera_from_world])[model.image_index]
+        normal[members] = fit_plane(model.xyz_model[members]).normal
+    rotation = np.stack([pose.rotation for pose in model.camera_from_model])[model.image_index]
     n = np.einsum("nij,nj->ni", rotation, normal[model.point_index])
     c = model.xyz_camera()
     square = radius_mm[model.point_index, None, None] ** 2

@@ -31,8 +31,8 @@ class Outlier:
 class GroupModel:
     """m images, p points, n observations of one group; what models with and without unit have in common.
 
-    ``images`` : (m,) names; ``camera_from_world`` : (m,) poses; ``labels`` : (p,); ``xyz_world`` : (p, 3), in the unit
-    and the frame that :class:`WorldModel` and :class:`MetricModel` say;
+    ``images`` : (m,) names; ``camera_from_model`` : (m,) poses; ``labels`` : (p,); ``xyz_model`` : (p, 3): the model's
+    frame, and its unit, are what :class:`WorldModel` and :class:`MetricModel` say;
     ``image_index``, ``point_index`` : (n,); ``keypoint`` : (n,) place among the image's observations;
     ``measured_px`` : (n, 2) ellipse centres; ``shift_px`` : (n, 2) what eccentricity adds to the image of a circle's
     centre, zero until it is known; ``covariance_px2`` : (n, 2, 2) of the measured centres.
@@ -40,9 +40,9 @@ class GroupModel:
 
     group: str
     images: tuple[str, ...]
-    camera_from_world: tuple[Rigid, ...]
+    camera_from_model: tuple[Rigid, ...]
     labels: tuple[Label, ...]
-    xyz_world: np.ndarray
+    xyz_model: np.ndarray
     image_index: np.ndarray
     point_index: np.ndarray
     keypoint: np.ndarray
@@ -53,7 +53,7 @@ class GroupModel:
     def __post_init__(self):
         object.__setattr__(self, "labels", parse_labels(self.labels))
         n = len(self.image_index)
-        object.__setattr__(self, "xyz_world", frozen(self.xyz_world, (len(self.labels), 3), "points"))
+        object.__setattr__(self, "xyz_model", frozen(self.xyz_model, (len(self.labels), 3), "points"))
         for name, shape in (("measured_px", (n, 2)), ("shift_px", (n, 2)), ("covariance_px2", (n, 2, 2))):
             object.__setattr__(self, name, frozen(getattr(self, name), shape, name))
         for name in ("image_index", "point_index", "keypoint"):
@@ -89,27 +89,27 @@ class GroupModel:
 
     def xyz_camera(self) -> np.ndarray:
         """The observed points in the frames of the cameras that observe them, (n, 3)."""
-        rotation = np.stack([pose.rotation for pose in self.camera_from_world])
-        translation = np.stack([pose.translation for pose in self.camera_from_world])
-        xyz = self.xyz_world[self.point_index]
+        rotation = np.stack([pose.rotation for pose in self.camera_from_model])
+        translation = np.stack([pose.translation for pose in self.camera_from_model])
+        xyz = self.xyz_model[self.point_index]
         return np.einsum("nij,nj->ni", rotation[self.image_index], xyz) + translation[self.image_index]
 
     def residuals_px(self, camera: Camera) -> np.ndarray:
         """Corrected minus projected, (n, 2)."""
         return self.corrected_px() - camera.project(self.xyz_camera())
 
-    def _placed(self, kind: type["M"], a_from_world: Similarity) -> "M":
+    def _placed(self, kind: type["M"], a_from_model: Similarity) -> "M":
         """The same model in another frame, its unit included."""
-        rotation, scale = a_from_world.rigid.rotation, a_from_world.scale
+        rotation, scale = a_from_model.rigid.rotation, a_from_model.scale
         poses = tuple(
             Rigid(
                 pose.rotation @ rotation.T,
-                scale * pose.translation - pose.rotation @ rotation.T @ a_from_world.rigid.translation,
+                scale * pose.translation - pose.rotation @ rotation.T @ a_from_model.rigid.translation,
             )
-            for pose in self.camera_from_world
+            for pose in self.camera_from_model
         )
         same = {f.name: getattr(self, f.name) for f in fields(self)}
-        return kind(**same | {"camera_from_world": poses, "xyz_world": a_from_world @ self.xyz_world})
+        return kind(**same | {"camera_from_model": poses, "xyz_model": a_from_model @ self.xyz_model})
 
     def points_by_face(self) -> dict[str, np.ndarray]:
         """Indices of the points of every face, and of the board under ``board``."""
@@ -136,9 +136,9 @@ class GroupModel:
         return replace(
             self,
             images=tuple(self.images[i] for i in kept_images),
-            camera_from_world=tuple(self.camera_from_world[i] for i in kept_images),
+            camera_from_model=tuple(self.camera_from_model[i] for i in kept_images),
             labels=tuple(self.labels[i] for i in kept_points),
-            xyz_world=self.xyz_world[kept_points],
+            xyz_model=self.xyz_model[kept_points],
             **arrays,
         )
 
@@ -149,7 +149,7 @@ M = TypeVar("M", bound=GroupModel)
 
 @dataclass(frozen=True, slots=True, eq=False)
 class WorldModel(GroupModel):
-    """A model as the mapper makes it: its world has no unit and its frame is by chance."""
+    """A model as the mapper makes it: its frame is a world without unit, and lies by chance."""
 
     def moved(self, a_from_world: Similarity) -> "WorldModel":
         """The same model in another world, its unit included."""
@@ -162,13 +162,12 @@ class WorldModel(GroupModel):
 
 @dataclass(frozen=True, slots=True, eq=False)
 class MetricModel(GroupModel):
-    """A model in mm. Its frame is the target's where the group is chained to it, else the group's or the board's own:
-    ``world`` in the names of the fields stands for that frame."""
+    """A model in mm. Its frame is the target's where the group is chained to it, else the group's or the board's."""
 
-    def moved(self, a_from_world: Rigid) -> "MetricModel":
+    def moved(self, a_from_model: Rigid) -> "MetricModel":
         """The same model in another frame."""
-        return self._placed(MetricModel, Similarity(1.0, a_from_world))
+        return self._placed(MetricModel, Similarity(1.0, a_from_model))
 
-    def in_world(self, world_from_a: Similarity) -> "WorldModel":
+    def in_world(self, world_from_model: Similarity) -> "WorldModel":
         """The model as the mapper might have made it, for simulations."""
-        return self._placed(WorldModel, world_from_a)
+        return self._placed(WorldModel, world_from_model)

@@ -61,13 +61,13 @@ def missing_circles(
     circles : centres of the target's circles, (3,) by label, target frame, mm; the model's own go first
     observations : by image
     """
-    xyz = circles | dict(zip(model.labels, model.xyz_world, strict=True))
+    xyz = circles | dict(zip(model.labels, model.xyz_model, strict=True))
     designs = [_Plane(f.id, f.labels(), f.xy_mm, f.radius_mm, 1) for f in target.faces]
     designs.append(_Plane(BOARD, board.labels(), board.xy_mm(), board.radii_mm(), -1))  # Z points into the board
     placed = [(plane, pose) for plane in designs if (pose := plane.placed(xyz)) is not None]
     border = ideal_border(camera)
     found = {}
-    for name, camera_from_target in zip(model.images, model.camera_from_world, strict=True):
+    for name, camera_from_target in zip(model.images, model.camera_from_model, strict=True):
         seen = set(observations[name].labels)
         planes = []
         for plane, target_from_plane in placed:

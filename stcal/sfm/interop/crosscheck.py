@@ -241,7 +241,7 @@ def _circles(a: dict, b: dict) -> dict[str, float]:
 
 def _cameras(a: Calibration, b: Calibration) -> list[dict]:
     """Differences of camera positions and attitudes against the target."""
-    poses = [{n: p for m in each.models for n, p in zip(m.images, m.camera_from_world, strict=True)} for each in (a, b)]
+    poses = [{n: p for m in each.models for n, p in zip(m.images, m.camera_from_model, strict=True)} for each in (a, b)]
     rows = []
     for name in poses[0].keys() & poses[1].keys():
         one, other = poses[0][name].inverse(), poses[1][name].inverse()

@@ -51,11 +51,11 @@ def to_reconstruction(
     tracks: dict[tuple[str, tuple[float, ...]], pycolmap.Track] = {}
     groups: dict[tuple[str, tuple[float, ...]], set[str]] = {}
     for model in models:
-        places = [(label, tuple(xyz)) for label, xyz in zip(model.labels, model.xyz_world.tolist(), strict=True)]
+        places = [(label, tuple(xyz)) for label, xyz in zip(model.labels, model.xyz_model.tolist(), strict=True)]
         for place in places:
             tracks.setdefault(place, pycolmap.Track())
             groups.setdefault(place, set()).add(model.group)
-        for name, pose, rows in zip(model.images, model.camera_from_world, model.rows_by_image(), strict=True):
+        for name, pose, rows in zip(model.images, model.camera_from_model, model.rows_by_image(), strict=True):
             image = pycolmap.Image(name=name, camera_id=CAMERA_ID, image_id=ids[name])
             keypoints = to_colmap_px(model.keypoints_px(by_name[name], rows))
             image.points2D = pycolmap.Point2DList([pycolmap.Point2D(each) for each in keypoints])
@@ -309,7 +309,7 @@ def _require_fit(path: Path, model: GroupModel, camera: Camera) -> None:
 
 
 def _pose(path: Path, image) -> Rigid:
-    """camera_from_world of an image of the model."""
+    """camera_from_model of an image of the model."""
     pose = image.cam_from_world()
     length = float(np.linalg.norm(pose.rotation.quat))
     if not (abs(length - 1) <= MAX_LENGTH_ERROR and np.isfinite(pose.translation).all()):
@@ -364,9 +364,9 @@ def _group_model(path: Path, group: str, images, reconstruction, point_label) ->
     model = WorldModel(
         group=group,
         images=tuple(o.name for o, _, _ in images),
-        camera_from_world=tuple(_pose(path, image) for _, _, image in images),
+        camera_from_model=tuple(_pose(path, image) for _, _, image in images),
         labels=tuple(labels),
-        xyz_world=xyz,
+        xyz_model=xyz,
         image_index=image_index,
         point_index=np.array([index[p] for p in point_id.tolist()]),
         keypoint=keypoint,

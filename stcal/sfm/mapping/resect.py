@@ -24,8 +24,8 @@ def complete(model: WorldModel, group: list[ImageObservations], camera: Camera, 
     (RANSAC and refinement of pycolmap on ideal coordinates); circles that the model lacks are triangulated from all
     images then placed. Observations are all of each placed image.
     """
-    xyz = dict(zip(model.labels, model.xyz_world, strict=True))
-    poses = dict(zip(model.images, model.camera_from_world, strict=True))
+    xyz = dict(zip(model.labels, model.xyz_model, strict=True))
+    poses = dict(zip(model.images, model.camera_from_model, strict=True))
     for image in group:
         if image.name not in poses:
             pose = _resect(image, xyz, camera, max_error_px)
@@ -50,9 +50,9 @@ def assemble(
     return kind(
         group=group,
         images=tuple(image.name for image in images),
-        camera_from_world=tuple(poses),
+        camera_from_model=tuple(poses),
         labels=tuple(labels),
-        xyz_world=np.array([xyz[label] for label in labels]).reshape(-1, 3),
+        xyz_model=np.array([xyz[label] for label in labels]).reshape(-1, 3),
         image_index=image_index,
         point_index=point_index,
         keypoint=keypoint,

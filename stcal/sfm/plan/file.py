@@ -146,7 +146,7 @@ class ViewRow(Part):
             tilts_deg=view.tilts_deg,
             nearest_image=view.nearest,
             nearest_deg=view.nearest_deg,
-            camera_from_target=view.model.camera_from_world[0].matrix(),
+            camera_from_target=view.model.camera_from_model[0].matrix(),
             labels=[view.model.labels[i] for i in view.model.point_index],
             worst_face=choice.face,
             worst_sigma_um=MICRO * choice.sigma_mm,

@@ -97,8 +97,8 @@ class _Rims:
     def of(cls, model: MetricModel, camera: Camera, radius_mm: dict[Label, float]) -> "_Rims":
         normal = np.zeros((len(model.labels), 3))
         for members in model.points_by_face().values():
-            normal[members] = fit_plane(model.xyz_world[members]).normal
-        rotation = np.stack([pose.rotation for pose in model.camera_from_world])[model.image_index]
+            normal[members] = fit_plane(model.xyz_model[members]).normal
+        rotation = np.stack([pose.rotation for pose in model.camera_from_model])[model.image_index]
         normal_camera = np.einsum("nij,nj->ni", rotation, normal[model.point_index])
         radius = np.array([radius_mm[label] for label in model.labels])[model.point_index]
         rim = camera.project(rim_points(model.xyz_camera(), normal_camera, radius))
@@ -179,7 +179,7 @@ def forecast(models: Sequence[MetricModel], setup: Setup, known: Derivatives | N
     return Forecast(
         {face: c for face, c in own.face_covariance(covariance).items() if face != reference},
         dict(zip(joint.labels, circles.tolist(), strict=True)),
-        scale_sigma(joint.xyz_world, covariance),
+        scale_sigma(joint.xyz_model, covariance),
         own,
     )
 

@@ -62,13 +62,13 @@ class _Stand:
 
     @classmethod
     def of(cls, model: MetricModel) -> "_Stand":
-        centre = (model.xyz_world.min(0) + model.xyz_world.max(0)) / 2
-        away = np.array([pose.inverse().translation for pose in model.camera_from_world]) - centre
+        centre = (model.xyz_model.min(0) + model.xyz_model.max(0)) / 2
+        away = np.array([pose.inverse().translation for pose in model.camera_from_model]) - centre
         distance = np.linalg.norm(away, axis=1)
         directions = away / distance[:, None]
         towards = directions.mean(0) / np.linalg.norm(directions.mean(0))
         middle = int(np.argmax(directions @ towards))
-        up = -model.camera_from_world[middle].rotation[1]
+        up = -model.camera_from_model[middle].rotation[1]
         right = np.cross(up, towards)
         right /= np.linalg.norm(right)
         axes = np.array([right, np.cross(towards, right), towards])
@@ -89,11 +89,11 @@ class _Stand:
 
 def known_scene(models: tuple[MetricModel, ...], joint: JointResult, setup: Setup, colmap_model: str) -> Scene:
     """What a run knows, as a scene: calibrated faces and circles, its boards, no views yet; target frame."""
-    circles = dict(zip(joint.labels, joint.xyz_world, strict=True))
+    circles = dict(zip(joint.labels, joint.xyz_model, strict=True))
     groups = {}
     for model in models:
         faces = tuple(sorted({label.face for label in model.labels if isinstance(label, CircleLabel)}))
-        target_from_board = joint.world_from_board[model.group]
+        target_from_board = joint.model_from_board[model.group]
         dots = np.column_stack([setup.board.xy_mm(), np.zeros(setup.board.rows * setup.board.columns)])
         groups[model.group] = Group(
             model.group, faces, _Stand.of(model).axes, target_from_board, target_from_board @ dots, ()
@@ -163,8 +163,8 @@ def _largest_tilt(scene: Scene, model: MetricModel) -> float:
     normal = {face.id: scene.target_from_face[face.id].rotation[:, 2] for face in scene.target.faces}
     board = -scene.groups[model.group].target_from_board.rotation[:, 2]
     normals = np.array([board if isinstance(x, DotLabel) else normal.get(x.face, board) for x in model.labels])
-    centres = np.array([pose.inverse().translation for pose in model.camera_from_world])[model.image_index]
-    ray = centres - model.xyz_world[model.point_index]
+    centres = np.array([pose.inverse().translation for pose in model.camera_from_model])[model.image_index]
+    ray = centres - model.xyz_model[model.point_index]
     cosine = (ray * normals[model.point_index]).sum(1) / np.linalg.norm(ray, axis=1)
     return min(float(np.arccos(np.clip(cosine.min(), -1, 1))), MAX_FOUND_TILT_RAD)
 
@@ -217,11 +217,11 @@ def _single(model: MetricModel, name: str, pose: Rigid, labels: list[Label], cam
     return replace(
         model,
         images=(name,),
-        camera_from_world=(pose,),
+        camera_from_model=(pose,),
         image_index=np.zeros(n, int),
         point_index=points,
         keypoint=np.arange(n),
-        measured_px=camera.project(pose @ model.xyz_world[points]),
+        measured_px=camera.project(pose @ model.xyz_model[points]),
         shift_px=np.zeros((n, 2)),
         covariance_px2=np.tile(np.eye(2), (n, 1, 1)),
     )
@@ -237,7 +237,7 @@ def with_view(model: MetricModel, view: View) -> MetricModel:
     return replace(
         model,
         images=(*model.images, *new.images),
-        camera_from_world=(*model.camera_from_world, *new.camera_from_world),
+        camera_from_model=(*model.camera_from_model, *new.camera_from_model),
         image_index=np.concatenate([model.image_index, new.image_index + len(model.images)]),
         **joined,
     )

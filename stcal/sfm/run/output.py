@@ -252,7 +252,7 @@ def _left_out(result: RunResult) -> dict:
 def _without_point(model: GroupModel, images: list[ImageObservations], outliers: set[tuple[str, str]]) -> list[dict]:
     """Circles labelled in mapped images that are no points of the model: seen once, or from one direction."""
     rays: dict[str, list[tuple[str, np.ndarray]]] = {}
-    for image, pose in zip(images, model.camera_from_world, strict=True):
+    for image, pose in zip(images, model.camera_from_model, strict=True):
         for k in range(len(image)):
             if image.labels[k] not in model.labels and (image.name, image.labels[k]) not in outliers:
                 ray = pose.rotation.T @ np.append(image.centre[k], 1.0)
@@ -276,7 +276,7 @@ def _scene(result: RunResult) -> dict:
     """Cameras, board outlines and circles in the target frame, for the picture in space."""
     cameras, boards = [], {}
     for model in result.calibration.models:
-        for image, pose in zip(model.images, model.camera_from_world, strict=True):
+        for image, pose in zip(model.images, model.camera_from_model, strict=True):
             target_from_camera = pose.inverse()
             cameras.append(
                 {
@@ -287,7 +287,7 @@ def _scene(result: RunResult) -> dict:
                 }
             )
         dots = [i for i, label in enumerate(model.labels) if isinstance(label, DotLabel)]
-        boards[model.group] = model.xyz_world[dots]
+        boards[model.group] = model.xyz_model[dots]
     return {
         "cameras": cameras,
         "boards": boards,

@@ -26,8 +26,8 @@ from stcal.sfm.mapping.incremental import left_out, map_group
 from stcal.sfm.mapping.pairs import PairOptions, PairScore, rank_pairs
 from stcal.sfm.run.options import RunOptions
 
-CACHE_VERSION = 4
-_ARRAYS = ("xyz_world", "image_index", "point_index", "keypoint", "measured_px", "shift_px", "covariance_px2")
+CACHE_VERSION = 5
+_ARRAYS = ("xyz_model", "image_index", "point_index", "keypoint", "measured_px", "shift_px", "covariance_px2")
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -172,7 +172,7 @@ def _save(path: Path, solution: GroupSolution) -> None:
         ],
     }
     arrays = {name: getattr(model, name) for name in _ARRAYS}
-    keep(path, {"poses": np.stack([pose.matrix() for pose in model.camera_from_world]), **arrays}, meta)
+    keep(path, {"poses": np.stack([pose.matrix() for pose in model.camera_from_model]), **arrays}, meta)
 
 
 def _stored(stored, meta) -> GroupSolution:

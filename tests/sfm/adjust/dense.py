@@ -17,9 +17,9 @@ def moved(model: GroupModel, step: np.ndarray) -> GroupModel:
     m = len(model.images)
     poses = tuple(
         Rigid(Rigid.exp([*s[:3], 0, 0, 0]).rotation @ pose.rotation, pose.translation + s[3:])
-        for s, pose in zip(step[: 6 * m].reshape(m, 6), model.camera_from_world, strict=True)
+        for s, pose in zip(step[: 6 * m].reshape(m, 6), model.camera_from_model, strict=True)
     )
-    return replace(model, camera_from_world=poses, xyz_world=model.xyz_world + step[6 * m :].reshape(-1, 3))
+    return replace(model, camera_from_model=poses, xyz_model=model.xyz_model + step[6 * m :].reshape(-1, 3))
 
 
 def derivative(function: Callable[[np.ndarray], np.ndarray], size: int) -> np.ndarray:

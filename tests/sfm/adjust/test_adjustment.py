@@ -49,8 +49,8 @@ def test_refinement_from_scratch_finds_the_eccentricity(scene, labels_only):
         dots = dict(zip(board.labels(), group.board_circles_target, strict=True))
         true = np.array([scene.circles_target[k] if k in scene.circles_target else dots[k] for k in start.labels])
         for model, low, high in ((refined.model, 0.0, 1e-3), (uncorrected, 0.005, 0.1)):
-            fit = align_similarity(true, model.xyz_world)
-            error = np.linalg.norm(fit @ model.xyz_world - true, axis=1)
+            fit = align_similarity(true, model.xyz_model)
+            error = np.linalg.norm(fit @ model.xyz_model - true, axis=1)
             assert low <= error.mean() < high  # … while the points are tens of µm off
 
 
@@ -83,14 +83,14 @@ def test_adjustment_does_not_depend_on_the_world_or_the_order_of_images(scene, l
     shuffled = replace(
         start,
         images=tuple(start.images[i] for i in order),
-        camera_from_world=tuple(start.camera_from_world[i] for i in order),
+        camera_from_model=tuple(start.camera_from_model[i] for i in order),
         image_index=order[start.image_index],
     )
     a = adjust(start, scene.camera)
     for other in (moved, shuffled):
         b = adjust(other, scene.camera)
-        fit = align_similarity(a.xyz_world, b.xyz_world)
-        assert np.abs(fit @ b.xyz_world - a.xyz_world).max() < 1e-6
+        fit = align_similarity(a.xyz_model, b.xyz_model)
+        assert np.abs(fit @ b.xyz_model - a.xyz_model).max() < 1e-6
 
 
 def test_the_joint_adjustment_is_exact_without_noise(labels_only):

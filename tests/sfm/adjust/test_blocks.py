@@ -71,6 +71,6 @@ def test_weights_are_hubers_and_the_cost_is_theirs(group):
 
 def test_points_behind_a_camera_cost_everything(group):
     model, camera = group
-    turned = tuple(Rigid.exp([np.pi, 0, 0, 0, 0, 0]) @ pose for pose in model.camera_from_world)
-    behind = replace(model, camera_from_world=turned)
+    turned = tuple(Rigid.exp([np.pi, 0, 0, 0, 0, 0]) @ pose for pose in model.camera_from_model)
+    behind = replace(model, camera_from_model=turned)
     assert blocks.image_cost(behind, camera, 4.0) == np.inf

@@ -39,7 +39,7 @@ def full(group):
     model, camera = group
     model = replace(model, covariance_px2=FACTOR**2 * model.covariance_px2)
     jacobian = dense.jacobian(model, camera)
-    middle = model.xyz_world - model.xyz_world.mean(0)
+    middle = model.xyz_model - model.xyz_model.mean(0)
     size, p = jacobian.shape[1], len(middle)
     free = np.zeros((size, 7))
     free[-3 * p :] = np.concatenate(

@@ -183,7 +183,7 @@ def test_points_have_the_label_of_their_keypoints(saved):
     assert group.group == "14"
     assert list(group.labels) == sorted(expected)
     assert len(expected) >= 80
-    assert np.array_equal(group.xyz_world, [expected[label] for label in group.labels])
+    assert np.array_equal(group.xyz_model, [expected[label] for label in group.labels])
 
 
 def test_text_is_as_good_as_binary(saved, model, plain):
@@ -201,12 +201,12 @@ def test_a_text_with_fewer_digits(saved, model, plain):
     found = calibrate_models(path.parent, saved)
     assert_same_faces(found, plain)  # a frame is made of points
     (group,) = read(path.parent, saved).groups
-    assert 1e-6 < np.abs(group.camera_from_world[0].rotation - plain_rotation(saved)).max() < 4e-4
+    assert 1e-6 < np.abs(group.camera_from_model[0].rotation - plain_rotation(saved)).max() < 4e-4
 
 
 def plain_rotation(saved) -> np.ndarray:
     (group,) = read(saved.folder / "models" / "12", saved).groups
-    return group.camera_from_world[0].rotation
+    return group.camera_from_model[0].rotation
 
 
 # --- edited models ---
@@ -343,7 +343,7 @@ def test_circles_that_are_one_point_in_all_groups(saved):
     """The run's final model: the circles of face 1 are seen by both groups, the board of each is its own."""
     path = saved.folder / "target_model"
     groups = {group.group: group for group in read(path, saved).groups}
-    place = {g: dict(zip(m.labels, m.xyz_world.tolist(), strict=True)) for g, m in groups.items()}
+    place = {g: dict(zip(m.labels, m.xyz_model.tolist(), strict=True)) for g, m in groups.items()}
     shared = [label for label in place["12"] if label in place["14"]]
     assert {label for label in shared if label.startswith("1:")} == {f"1:{c}" for c in saved.target.face("1").ids}
     for label in shared:

@@ -60,15 +60,15 @@ def models_of(scene: Scene, noise: CentreNoise = NOISE) -> list[MetricModel]:
 
 def drawn(models: list[MetricModel], setup: Setup, rng: np.random.Generator) -> list[MetricModel]:
     """The models with dots displaced by the board's σ, one plate or one for each group, and noisy centres."""
-    world_from_board = covariance_of(models, setup.board, setup.camera).world_from_board
+    model_from_board = covariance_of(models, setup.board, setup.camera).model_from_board
     labels = setup.board.labels()
     plate = rng.normal(0, setup.board.sigma_mm, (len(labels), 3))
     noisy = []
     for model in models:
         own = plate if setup.common else rng.normal(0, setup.board.sigma_mm, plate.shape)
-        moved = dict(zip(labels, own @ world_from_board[model.group].rotation.T, strict=True))
+        moved = dict(zip(labels, own @ model_from_board[model.group].rotation.T, strict=True))
         shift = np.array([moved.get(label, np.zeros(3)) for label in model.labels])
-        true = replace(model, xyz_world=model.xyz_world + shift)
+        true = replace(model, xyz_model=model.xyz_model + shift)
         root = np.linalg.cholesky(model.covariance_px2)
         noise = np.einsum("nij,nj->ni", root, rng.standard_normal(model.measured_px.shape))
         noisy.append(replace(true, measured_px=setup.camera.project(true.xyz_camera()) + noise, shift_px=0 * noise))
@@ -78,11 +78,11 @@ def drawn(models: list[MetricModel], setup: Setup, rng: np.random.Generator) -> 
 def errors_of(models: list[MetricModel], setup: Setup, expected: Forecast, draws: int, seed: int):
     """Pose errors by face, (draws, 6), of adjusted simulations, and the last adjustment."""
     rng = np.random.default_rng(seed)
-    truth = covariance_of(models, setup.board, setup.camera).xyz_world
+    truth = covariance_of(models, setup.board, setup.camera).xyz_model
     rows = []
     for _ in range(draws):
         joint = adjust_jointly(drawn(models, setup, rng), setup.board, setup.camera)
-        rows.append((joint.xyz_world - truth).ravel())
+        rows.append((joint.xyz_model - truth).ravel())
     return {face: np.array(rows) @ expected.derivatives.faces[face].T for face in expected.face_covariance}, joint
 
 
@@ -120,7 +120,7 @@ def doubled(model: MetricModel) -> MetricModel:
     return replace(
         model,
         images=(*model.images, *(f"{name} again" for name in model.images)),
-        camera_from_world=model.camera_from_world * 2,
+        camera_from_model=model.camera_from_model * 2,
         image_index=np.concatenate([model.image_index, model.image_index + len(model.images)]),
         **{name: np.concatenate([getattr(model, name)] * 2) for name in names},
     )

@@ -175,7 +175,7 @@ def test_resection_places_the_other_images(placed):
     rms = np.sqrt((model.residuals_px(scene.camera) ** 2).mean())
     # Ellipse centres against images of the centres: eccentricity is up to 0.2 px here, noise 0.02.
     assert NOISE_PX < rms < 0.15
-    for ours, theirs in zip(model.camera_from_world, true.camera_from_world, strict=True):
+    for ours, theirs in zip(model.camera_from_model, true.camera_from_model, strict=True):
         assert np.linalg.norm(ours.inverse().translation - theirs.inverse().translation) < 2  # mm at 1 m
 
 
@@ -186,7 +186,7 @@ def test_resection_adds_the_circles_that_the_model_lacks(placed):
     without = start.without(start.point_index == lost)
     assert "1:3" not in without.labels
     model = complete(without, group, scene.camera, 4.0)
-    error = model.xyz_world[model.labels.index("1:3")] - true.xyz_world[true.labels.index("1:3")]
+    error = model.xyz_model[model.labels.index("1:3")] - true.xyz_model[true.labels.index("1:3")]
     assert np.linalg.norm(error) < 0.2  # mm: eccentricity moves a circle by about 0.06
 
 
