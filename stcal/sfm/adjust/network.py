@@ -124,13 +124,23 @@ def _leverage(model: GroupModel, a, b, inverse, eliminated, covariance) -> np.nd
     return own + np.einsum("nki,nij,nkj->n", b, blocks[model.point_index], b, optimize=True)
 
 
-def solve_score(normal: np.ndarray, right: np.ndarray) -> tuple[np.ndarray, np.ndarray, float, int]:
-    """Estimate (q,), covariance (q, q), statistic (χ² distributed where no parameter is needed) and its degrees of
-    freedom: directions that the normal matrix does not hold count for nothing."""
+@dataclass(frozen=True, slots=True, eq=False)
+class ScoreTest:
+    """``estimate`` : (q,) of the further parameters, with ``covariance`` (q, q); ``statistic`` : χ² distributed with
+    ``freedom`` degrees of freedom where no parameter is needed."""
+
+    estimate: np.ndarray
+    covariance: np.ndarray
+    statistic: float
+    freedom: int
+
+
+def solve_score(normal: np.ndarray, right: np.ndarray) -> ScoreTest:
+    """The test of :meth:`Network.score`; directions that the normal matrix does not hold count for nothing."""
     scale = np.sqrt(np.maximum(np.diag(normal), 1e-300))
     value, vector = np.linalg.eigh(normal / np.outer(scale, scale))
     held = value > MIN_SHARE
     half = vector[:, held] / np.sqrt(value[held])
     half = half / scale[:, None]
     along = half.T @ right
-    return half @ along, half @ half.T, float(along @ along), int(held.sum())
+    return ScoreTest(half @ along, half @ half.T, float(along @ along), int(held.sum()))

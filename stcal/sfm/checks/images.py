@@ -47,16 +47,16 @@ def camera_check(
         away = away @ (calibration.camera.parameters() - camera.parameters())
         gained = prior.covariance - calibration.joint.camera_covariance
         estimate, sigma = away, np.sqrt(np.diag(prior.covariance))
-        _, _, statistic, freedom = solve_score(np.linalg.pinv(gained, hermitian=True), np.linalg.pinv(gained) @ away)
+        test = solve_score(np.linalg.pinv(gained, hermitian=True), np.linalg.pinv(gained) @ away)
         names = _names(prior.colmap_model)
     else:
         tested = "FULL_OPENCV" if colmap_model == "FULL_OPENCV" else "OPENCV"
         normal, right = summed(networks, lambda n: _by_intrinsics(n, calibration.camera, tested))
-        estimate, covariance, statistic, freedom = solve_score(normal, right)
-        sigma, names = np.sqrt(np.diag(covariance)), _names(tested)
+        test = solve_score(normal, right)
+        estimate, sigma, names = test.estimate, np.sqrt(np.diag(test.covariance)), _names(tested)
     redundancy = sum(n.redundancy.sum() for n in networks)
-    rms = float(np.sqrt(max(statistic, 0) / max(freedom, 1)))
-    check = judge(key, title, [Trial("camera", rms, "σ", statistic, freedom, redundancy)], "cameras", remedy)
+    rms = float(np.sqrt(max(test.statistic, 0) / max(test.freedom, 1)))
+    check = judge(key, title, [Trial("camera", rms, "σ", test.statistic, test.freedom, redundancy)], "cameras", remedy)
     single = tuple(
         Measured(name, float(value), float(3.29 * s), "px" if name[0] in "fc" else "", None)
         for name, value, s in zip(names, estimate, sigma, strict=True)
@@ -97,13 +97,13 @@ def field_check(networks: Sequence[Network], camera: Camera) -> Check:
         field = np.stack([np.hstack([terms, none]), np.hstack([none, terms])], axis=1)
         return network.model.whiten(field)
 
-    _, _, statistic, freedom = solve_score(*summed(networks, columns))
+    test = solve_score(*summed(networks, columns))
     count = sum(n.residual.size for n in networks)
     redundancy = sum(n.redundancy.sum() for n in networks)
     sigma = np.sqrt(np.mean(np.concatenate([n.model.sigma_px() ** 2 for n in networks])))
-    value = float(sigma * np.sqrt(max(statistic, 0) / count))
-    allowed = 1 + count * (FIELD_FLOOR_PX / sigma) ** 2 / max(freedom, 1)
-    trial = Trial("camera", value, "px RMS", statistic / allowed, freedom, redundancy)
+    value = float(sigma * np.sqrt(max(test.statistic, 0) / count))
+    allowed = 1 + count * (FIELD_FLOOR_PX / sigma) ** 2 / max(test.freedom, 1)
+    trial = Trial("camera", value, "px RMS", test.statistic / allowed, test.freedom, redundancy)
     remedy = (
         "a distortion that the camera model cannot follow, or wrong intrinsics: calibrate with a richer model "
         "(FULL_OPENCV), and keep focus and aperture as they were then"
@@ -197,11 +197,10 @@ def moved_check(networks: Sequence[Network]) -> Check:
             faces = on_face[model.point_index[rows]].sum()
             if min(faces, len(rows) - faces) < MIN_CIRCLES:
                 continue
-            shift, _, statistic, freedom = solve_score(normal[i], right[i])
-            if freedom:
-                trials.append(
-                    Trial(name, 1e3 * float(np.linalg.norm(shift[3:])), "µm", statistic, freedom, redundancy - freedom)
-                )
+            test = solve_score(normal[i], right[i])
+            if test.freedom:
+                shift_um = 1e3 * float(np.linalg.norm(test.estimate[3:]))
+                trials.append(Trial(name, shift_um, "µm", test.statistic, test.freedom, redundancy - test.freedom))
     remedy = (
         "in these images the target stood elsewhere against the board than in the others of the group: sort the images "
         "into groups between which nothing moved, or take the group again"

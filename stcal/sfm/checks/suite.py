@@ -124,21 +124,21 @@ def control_check(evidence: Evidence, networks: list[Network]) -> Check:
     key = "control"
     if not evidence.options.eccentricity:
         return impossible(key, CONTROL, "this run is the control", "run with eccentricity")
-    more, covariance, statistic, freedom = solve_score(
-        *summed(networks, lambda n: n.model.whiten(n.model.shift_px[:, :, None]))
-    )
+    test = solve_score(*summed(networks, lambda n: n.model.whiten(n.model.shift_px[:, :, None])))
     redundancy = sum(n.redundancy.sum() for n in networks)
     remedy = (
         "the measured centres do not move as those of ellipses: check radii, polarity and exposure; centroids of grey "
         "values or of contours need another correction"
     )
-    trial = Trial("share of the eccentricity found, less 1", float(more[0]), "", statistic, freedom, redundancy)
+    trial = Trial(
+        "share of the eccentricity found, less 1", float(test.estimate[0]), "", test.statistic, test.freedom, redundancy
+    )
     check = judge(key, CONTROL, [trial], "corrections", remedy)
     try:
         told, measured = _control(evidence)
     except StcalError as error:
         told, measured = f"no uncorrected result ({error})", ()
-    reason = f"{1 + more[0]:.3f} ± {np.sqrt(covariance[0, 0]):.3f} of the eccentricity found; {told}"
+    reason = f"{1 + test.estimate[0]:.3f} ± {np.sqrt(test.covariance[0, 0]):.3f} of the eccentricity found; {told}"
     return replace(check, reason=reason, measured=check.measured + measured)
 
 

@@ -185,11 +185,11 @@ def _number(candidates: Candidates, cells, board: BoardDesign, image_corners) ->
     if len(uv) < needed_dots(board):
         return None
     readings = [_place(candidates, uv, index, turn, board, homography, image_corners) for turn in range(4)]
-    placements = sorted((p for reading in readings for p in reading), key=lambda p: (p[0], -len(p[1])))
+    placements = sorted((p for reading in readings for p in reading), key=lambda p: (p.unexplained, -len(p.inside)))
     if not placements:
         return None
-    fewest = placements[0][0]
-    placements = [p for p in placements if p[0] <= fewest + MAX_UNEXPLAINED]
+    most = placements[0].unexplained + MAX_UNEXPLAINED
+    placements = [p for p in placements if p.unexplained <= most]
     return _reading(placements, candidates, board)
 
 
@@ -218,8 +218,21 @@ def _robust_homography(uv, candidates: Candidates, index) -> np.ndarray | None:
     return homography
 
 
-def _place(candidates: Candidates, uv, index, turn: int, board: BoardDesign, homography, image_corners) -> list[tuple]:
-    """Placements (unexplained, inside mask, row and column) of the grid turned by ``turn`` quarters."""
+@dataclass(frozen=True, slots=True, eq=False)
+class _Placement:
+    """One way to lay the board over n dots: ``unexplained`` dots, seen outside of it or expected and not seen;
+    ``inside`` : (n,) those on it; ``cells`` : (n, 2) their row and column; ``index`` : (n,) of the candidates."""
+
+    unexplained: int
+    inside: np.ndarray
+    cells: np.ndarray
+    index: np.ndarray
+
+
+def _place(
+    candidates: Candidates, uv, index, turn: int, board: BoardDesign, homography, image_corners
+) -> list[_Placement]:
+    """Placements of the grid turned by ``turn`` quarters."""
     rotation = np.array([[1, 0], [0, 1]])
     for _ in range(turn):
         rotation = rotation @ np.array([[0, -1], [1, 0]])
@@ -243,7 +256,8 @@ def _place(candidates: Candidates, uv, index, turn: int, board: BoardDesign, hom
         missing = np.ones(len(all_cells), bool)
         missing[column_row[inside[k]] @ [1, board.columns]] = False
         expected = _inside_image(apply_homography(homography, back[missing]), homography, back[missing], image_corners)
-        placements.append((int(expected.sum() + outside_count[k]), inside[k], column_row[:, ::-1], index))
+        unexplained = int(expected.sum() + outside_count[k])
+        placements.append(_Placement(unexplained, inside[k], column_row[:, ::-1], index))
     return placements
 
 
@@ -266,10 +280,10 @@ def _inside_image(xy: np.ndarray, homography, uv, image_corners) -> np.ndarray:
     return (distance > margin[:, None]).all(1)
 
 
-def _reading(placements: list[tuple], candidates: Candidates, board: BoardDesign) -> BoardReading:
+def _reading(placements: list[_Placement], candidates: Candidates, board: BoardDesign) -> BoardReading:
     """The dots that all placements number, with their numberings and homographies."""
-    common = np.logical_and.reduce([p[1] for p in placements])
-    index = placements[0][3][common]
-    numberings = np.stack([p[2][common] for p in placements])
+    common = np.logical_and.reduce([p.inside for p in placements])
+    index = placements[0].index[common]
+    numberings = np.stack([p.cells[common] for p in placements])
     homographies = [fit_homography(board.pitch_mm * n[:, ::-1].astype(float), candidates.xy[index]) for n in numberings]
     return BoardReading(index, numberings, np.stack(homographies))

@@ -115,10 +115,9 @@ def measure_centres(image: np.ndarray, camera: Camera, ellipses: Ellipses, neigh
         _Fit(image, ellipses.centre_px[i], ellipses.shape_px[i], half[i], to_ideal[i], masks[i]).result()
         for i in range(len(ellipses))
     ]
-    centre = np.array([r[0] for r in rows]).reshape(-1, 2) / focal
-    shape = np.array([r[1] for r in rows]).reshape(-1, 2, 2) / focal
-    covariance = np.array([r[2] for r in rows]).reshape(-1, 2, 2) / focal**2
-    blur, contrast, rim, ok = (np.array([r[k] for r in rows], float) for k in (3, 4, 5, 6))
+    centre = np.array([fit.centre for fit in rows]).reshape(-1, 2) / focal
+    shape = np.array([fit.shape for fit in rows]).reshape(-1, 2, 2) / focal
+    covariance = np.array([fit.covariance for fit in rows]).reshape(-1, 2, 2) / focal**2
     distorted, jacobian = camera.distort_jacobian(centre)
     jacobian = jacobian * camera.focal[:, None]
     return Centres(
@@ -126,10 +125,10 @@ def measure_centres(image: np.ndarray, camera: Camera, ellipses: Ellipses, neigh
         centre=centre,
         shape=shape,
         covariance_px2=jacobian @ covariance @ np.swapaxes(jacobian, 1, 2),
-        blur_px=blur,
-        contrast=contrast,
-        rim=rim,
-        ok=ok,
+        blur_px=np.array([fit.blur for fit in rows], float),
+        contrast=np.array([fit.contrast for fit in rows], float),
+        rim=np.array([fit.rim for fit in rows], float),
+        ok=np.array([fit.rim >= MIN_RIM for fit in rows], bool),
     )
 
 
@@ -167,6 +166,18 @@ def _intruders(ellipses: Ellipses, neighbours: Ellipses, half: np.ndarray) -> li
                 found.append((neighbours.centre_px[j], np.linalg.inv(wider)))
         lists.append(found)
     return lists
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Ellipse:
+    """One ellipse, ideal px: ``centre`` (2,), ``shape`` and ``covariance`` (2, 2), and what :class:`Centres` says."""
+
+    centre: np.ndarray
+    shape: np.ndarray
+    covariance: np.ndarray
+    blur: float
+    contrast: float
+    rim: float
 
 
 class _Fit:
@@ -304,10 +315,10 @@ class _Fit:
         n = len(self.residual)
         return half @ half.T * (n / (n - PARAMETERS))
 
-    def result(self):
-        """(centre, shape, covariance, blur, contrast, rim share, ok), ideal px."""
+    def result(self) -> _Ellipse:
+        """The fit; of no contrast and no rim where it failed."""
         if self.failed:
-            return self.start, np.eye(2) * self.radius, np.eye(2), 0.0, 0.0, 0.0, False
+            return _Ellipse(self.start, np.eye(2) * self.radius, np.eye(2), 0.0, 0.0, 0.0)
         near = np.abs(self.reduced) * self.blur < max(1.5, self.blur)
         angle = np.arctan2(self.rim_angle[1][near], self.rim_angle[0][near])
         sector = (angle * (SECTORS / (2 * np.pi))).astype(int) % SECTORS
@@ -317,4 +328,4 @@ class _Fit:
         allowed = (MAX_RIM_RESIDUAL * self.contrast) ** 2 + (2 * noise) ** 2
         rim = float((square <= allowed * total).mean())
         shape = np.linalg.inv(self.inverse_shape)
-        return self.centre, shape, self._covariance(), self.blur, self.contrast, rim, rim >= MIN_RIM
+        return _Ellipse(self.centre, shape, self._covariance(), self.blur, self.contrast, rim)

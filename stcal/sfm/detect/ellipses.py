@@ -102,6 +102,17 @@ class Level:
 
 
 @dataclass(frozen=True, slots=True)
+class OutlineVerdict:
+    """The first ``gate`` that an outline fails, with its ``value`` and ``limit``, empty where it passes all;
+    ``ellipse`` : (x, y, full axis 1, full axis 2, angle of axis 1 in degrees), fitted after the first three gates."""
+
+    gate: str
+    value: float
+    limit: float
+    ellipse: tuple[float, ...] = ()
+
+
+@dataclass(frozen=True, slots=True)
 class OutlineGates:
     """What an outline in one mask must keep to; px of the level, ``shortest`` and ``longest`` in points."""
 
@@ -113,36 +124,35 @@ class OutlineGates:
     shortest: float
     longest: float
 
-    def check(self, contour: np.ndarray) -> tuple[str, float, float, tuple[float, ...]]:
-        """(gate, value, limit, ellipse): the first gate that the outline fails, none where it passes all; the ellipse
-        (x, y, full axis 1, full axis 2, angle of axis 1 in degrees) is fitted after the first three."""
+    def check(self, contour: np.ndarray) -> OutlineVerdict:
+        """Fit the ellipse, and pass the outline through the gates."""
         if len(contour) < self.shortest:
-            return "short", len(contour), self.shortest, ()
+            return OutlineVerdict("short", len(contour), self.shortest)
         if len(contour) > self.longest:
-            return "long", len(contour), self.longest, ()
+            return OutlineVerdict("long", len(contour), self.longest)
         x, y, w, h = cv2.boundingRect(contour)
         if x == 0 or y == 0 or x + w == self.width or y + h == self.height:
-            return "border", 0.0, 1.0, ()
+            return OutlineVerdict("border", 0.0, 1.0)
         (cx, cy), (d1, d2), angle = cv2.fitEllipseDirect(contour)
         if not np.isfinite(d1 + d2 + cx + cy):
-            return "ellipse", np.nan, np.nan, ()
+            return OutlineVerdict("ellipse", np.nan, np.nan)
         # The outline runs through the centres of the outermost pixels, half a pixel inside the edge.
         d1, d2 = d1 + 1, d2 + 1
         row = (cx, cy, d1, d2, angle)
         if min(d1, d2) < self.min_axis_ratio * max(d1, d2):
-            return "min_axis_ratio", min(d1, d2) / max(d1, d2), self.min_axis_ratio, row
+            return OutlineVerdict("min_axis_ratio", min(d1, d2) / max(d1, d2), self.min_axis_ratio, row)
         diameter = np.sqrt(d1 * d2)
         if not diameter >= self.lowest:
-            return "min_diameter", diameter, self.lowest, row
+            return OutlineVerdict("min_diameter", diameter, self.lowest, row)
         if not diameter <= self.highest:
-            return "max_diameter", diameter, self.highest, row
+            return OutlineVerdict("max_diameter", diameter, self.highest, row)
         error = abs(outline_area(contour) / (np.pi / 4 * d1 * d2) - 1)
         if error > MAX_AREA_ERROR:
-            return "outline_area", error, MAX_AREA_ERROR, row
+            return OutlineVerdict("outline_area", error, MAX_AREA_ERROR, row)
         deviation = _outline_deviation(contour[:, 0, :], cx, cy, d1 - 1, d2 - 1, angle)
         if deviation > 1:
-            return "outline_deviation", deviation, 1.0, row
-        return "", 0.0, 0.0, row
+            return OutlineVerdict("outline_deviation", deviation, 1.0, row)
+        return OutlineVerdict("", 0.0, 0.0, row)
 
 
 def find_ellipses(image: np.ndarray, polarity: Polarity, options: EllipseOptions) -> Ellipses:
@@ -237,9 +247,9 @@ def _rows(level: Level, polarity: Polarity, threshold: float, options: EllipseOp
     rows = []
     for mask, gates in masks(level, polarity, threshold, options):
         for contour in outlines(mask):
-            gate, _, _, row = gates.check(contour)
-            if not gate:
-                rows.append(row)
+            verdict = gates.check(contour)
+            if not verdict.gate:
+                rows.append(verdict.ellipse)
     return level.in_full(rows)
 
 

@@ -125,7 +125,8 @@ def _covering(mask, contours, boxes, centre, shape) -> np.ndarray | None:
 
 def _end(gates: OutlineGates, contour, level: Level, limits: tuple[float, float], predicted: float) -> OutlineEnd:
     """Where one outline in one mask ends; what only another level or window can judge has rank −1."""
-    gate, value, limit, row = gates.check(contour)
+    verdict = gates.check(contour)
+    gate, value, limit = verdict.gate, verdict.value, verdict.limit
     rank, unit = PROGRESS.index(gate), ""
     diameter = float(np.sqrt(outline_area(contour) * 4 / np.pi))
     if gate == "short":
@@ -139,7 +140,7 @@ def _end(gates: OutlineGates, contour, level: Level, limits: tuple[float, float]
     size = diameter * level.scale / predicted
     cause = "merged" if size > MERGED else "cut" if size < CUT else ""
     if not gate or gate == "ellipse":  # nothing that has a value
-        return OutlineEnd(gate, rank=rank, cause=cause, ellipse=None if gate else level.in_full([row]))
+        return OutlineEnd(gate, rank=rank, cause=cause, ellipse=None if gate else level.in_full([verdict.ellipse]))
     return OutlineEnd(gate, float(value), float(limit), unit, cause, rank)
 
 

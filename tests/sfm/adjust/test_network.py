@@ -74,14 +74,14 @@ def test_score_of_a_parameter_is_its_estimate_beside_all_others(network, full, g
     """One more column in the full equations: its σ is the score's, and so is its estimate."""
     model, rng = group[0], np.random.default_rng(0)
     column = rng.normal(size=(len(model.image_index), 2, 1))
-    value, covariance, statistic, count = solve_score(*network.score(column))
+    test = solve_score(*network.score(column))
     wider = np.column_stack([full[0], column.reshape(-1)])
     estimate = np.linalg.lstsq(wider, network.residual.reshape(-1), rcond=1e-9)[0][-1]
     left = column.reshape(-1) - full[0] @ np.linalg.lstsq(full[0], column.reshape(-1), rcond=1e-9)[0]
-    assert covariance[0, 0] == pytest.approx(1 / (left @ left), rel=1e-4)
-    assert value[0] == pytest.approx(estimate, rel=1e-3, abs=1e-4 * np.sqrt(covariance[0, 0]))
-    assert count == 1
-    assert statistic == pytest.approx(value[0] ** 2 / covariance[0, 0])
+    assert test.covariance[0, 0] == pytest.approx(1 / (left @ left), rel=1e-4)
+    assert test.estimate[0] == pytest.approx(estimate, rel=1e-3, abs=1e-4 * np.sqrt(test.covariance[0, 0]))
+    assert test.freedom == 1
+    assert test.statistic == pytest.approx(test.estimate[0] ** 2 / test.covariance[0, 0])
 
 
 def test_a_fault_of_one_image_is_found_there_and_nowhere_else(group):
@@ -94,14 +94,14 @@ def test_a_fault_of_one_image_is_found_there_and_nowhere_else(group):
     network = free_network(adjust(replace(model, measured_px=stretched), camera), camera, 1.0)
     columns = network.model.whiten(network.model.corrected_px() - camera.centre)[:, :, None]
     normal, right = network.score_by_image(columns)
-    statistics = [solve_score(n, r)[2] for n, r in zip(normal, right, strict=True)]
+    statistics = [solve_score(n, r).statistic for n, r in zip(normal, right, strict=True)]
     assert np.argmax(statistics) == image
-    assert solve_score(normal[image], right[image])[0][0] == pytest.approx(1e-3, rel=0.05)
+    assert solve_score(normal[image], right[image]).estimate[0] == pytest.approx(1e-3, rel=0.05)
 
 
 def test_directions_without_information_count_for_nothing():
     normal = np.array([[2.0, 2.0], [2.0, 2.0]])
-    value, _, statistic, count = solve_score(normal, np.array([1.0, 1.0]))
-    assert count == 1
-    assert statistic == pytest.approx(0.5)
-    assert normal @ value == pytest.approx([1.0, 1.0])
+    test = solve_score(normal, np.array([1.0, 1.0]))
+    assert test.freedom == 1
+    assert test.statistic == pytest.approx(0.5)
+    assert normal @ test.estimate == pytest.approx([1.0, 1.0])
