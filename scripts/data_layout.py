@@ -26,6 +26,7 @@ MODULES = (
     "stcal.sfm.run.marker",
     "stcal.sfm.run.report",
     "stcal.sfm.measure.files",
+    "stcal.sfm.report.compare",
     "stcal.sfm.camera.file",
     "stcal.sfm.plan.file",
     "stcal.sfm.interop.file",

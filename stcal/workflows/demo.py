@@ -5,7 +5,7 @@ from functools import partial
 from pathlib import Path
 
 from stcal.sfm.pipeline import run
-from stcal.sfm.report.compare import compare
+from stcal.sfm.report.compare import CompareFile, compare
 from stcal.sfm.run.options import RunOptions
 from stcal.sfm.run.result import RunResult
 from stcal.synthetic.dataset import write_dataset
@@ -15,7 +15,7 @@ OPTIONS = SceneOptions(seed=1, width=1728, height=1152, images_per_group=5)
 WHAT = "simulated photographs of the reference target: 4 groups of 5 images, 1728×1152 px, at 1 m"
 
 
-def demo(folder: Path, workers: int | None, progress: Callable[[str, int, int], None]) -> tuple[RunResult, dict]:
+def demo(folder: Path, workers: int | None, progress: Callable[[str, int, int], None]) -> tuple[RunResult, CompareFile]:
     """The run in ``folder/run`` of the data set in ``folder/data``, and its errors against the truth."""
     data = folder / "data"
     write_dataset(data, make_scene(OPTIONS), workers=workers, progress=partial(progress, "render"))

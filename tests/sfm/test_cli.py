@@ -79,6 +79,6 @@ def test_the_demo_ends_within_its_own_sigma(command, tmp_path):
     assert "simulated" in text
     from stcal.sfm.report.compare import compare
 
-    comparison = compare(tmp_path / "demo" / "run", tmp_path / "demo" / "data" / "truth.json")
+    comparison = compare(tmp_path / "demo" / "run", tmp_path / "demo" / "data" / "truth.json").content()
     for face_id in ("2", "3", "4", "5"):
         assert 0.1 < comparison["faces"][face_id]["normalised_error"] < 2.0

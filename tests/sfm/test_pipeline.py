@@ -33,14 +33,14 @@ def calibrated(tmp_path_factory):
 
 def test_cluttered_photographs_are_labelled_without_a_mistake(calibrated):
     _, data, result = calibrated
-    labels = compare(result.out, data / "truth.json")["labels"]
+    labels = compare(result.out, data / "truth.json").content()["labels"]
     assert labels["wrong"] == 0
     assert labels["found"] / labels["visible"] >= 0.97
 
 
 def test_errors_are_those_that_sigma_predicts(calibrated):
     _, data, result = calibrated
-    faces = compare(result.out, data / "truth.json")["faces"]
+    faces = compare(result.out, data / "truth.json").content()["faces"]
     assert set(faces) == {"1", "2", "3", "4", "5"}
     for face_id in ("2", "3", "4", "5"):
         # χ²₆/6 of a true covariance exceeds 4 once in 2000 draws.

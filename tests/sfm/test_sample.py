@@ -52,7 +52,7 @@ def truth(sample):
 
 
 def test_faces_are_as_far_off_as_they_say(calibrated, sample):
-    found = compare(calibrated[0], sample / "truth.json")
+    found = compare(calibrated[0], sample / "truth.json").content()
     assert found["missing"] == []
     least, most = bounds(len(FACES))
     for face_id in FACES:
@@ -66,12 +66,12 @@ def test_a_face_that_is_off_would_be_seen(calibrated, truth, tmp_path):
     truth = copy.deepcopy(truth)
     truth["target_from_face"]["2"][0][3] += 0.03
     (tmp_path / "truth.json").write_text(json.dumps(truth))
-    found = compare(calibrated[0], tmp_path / "truth.json")["faces"]["2"]
+    found = compare(calibrated[0], tmp_path / "truth.json").content()["faces"]["2"]
     assert 6 * found["normalised_error"] ** 2 > bounds(len(FACES))[1]
 
 
 def test_all_visible_circles_are_found_and_none_is_wrong(calibrated, sample, truth):
-    labels = compare(calibrated[0], sample / "truth.json")["labels"]
+    labels = compare(calibrated[0], sample / "truth.json").content()["labels"]
     visible = [c for g in truth["groups"].values() for i in g["images"].values() for c in i["circles"].values()]
     assert labels == {"wrong": 0, "found": labels["visible"], "visible": sum(c["must_find"] for c in visible)}
     assert labels["visible"] > 900

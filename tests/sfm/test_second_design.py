@@ -47,7 +47,7 @@ def test_every_label_is_right(calibrated):
 @pytest.mark.slow
 def test_faces_are_right_within_their_own_sigma(calibrated):
     _, data, out, result = calibrated
-    comparison = compare(out, data / "truth.json")
+    comparison = compare(out, data / "truth.json").content()
     assert not comparison["missing"]
     for face_id, row in comparison["faces"].items():
         if face_id == comparison["reference_face"]:

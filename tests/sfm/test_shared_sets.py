@@ -35,7 +35,7 @@ def rendered(request, shared_data, tmp_path_factory):
 @pytest.mark.slow
 def test_no_label_is_wrong_and_the_visible_circles_are_found(rendered):
     name, folder, out, _, _ = rendered
-    labels = compare(out, folder / "truth.json")["labels"]
+    labels = compare(out, folder / "truth.json").content()["labels"]
     assert labels["wrong"] == 0
     assert labels["visible"] > 1000
     assert labels["found"] / labels["visible"] >= BOUNDS[name][5]
@@ -51,7 +51,7 @@ def test_a_wrong_label_would_be_seen(rendered, tmp_path):
     a, b = rows[1].split(","), rows[2].split(",")
     rows[1], rows[2] = ",".join([a[0], b[1], *a[2:]]), ",".join([b[0], a[1], *b[2:]])
     (tmp_path / "detections.csv").write_text("\n".join(rows))
-    assert compare(tmp_path, folder / "truth.json")["labels"]["wrong"] == 2
+    assert compare(tmp_path, folder / "truth.json").content()["labels"]["wrong"] == 2
 
 
 @pytest.mark.slow
@@ -65,7 +65,7 @@ def test_every_image_is_registered(rendered):
 def test_faces_and_circles_are_right(rendered):
     name, folder, out, _, _ = rendered
     near_um, far_um, near_mdeg, far_mdeg, circles_um, _ = BOUNDS[name]
-    faces = compare(out, folder / "truth.json")["faces"]
+    faces = compare(out, folder / "truth.json").content()["faces"]
     assert set(faces) == {"1", "2", "3", "4", "5"}
     for face_id, row in faces.items():
         assert row["translation_um"] < (far_um if face_id == "3" else near_um), face_id
@@ -110,7 +110,7 @@ def test_the_uncorrected_control_shows_the_bias_that_residuals_hide(shared_data,
     """The bias r²cosθ/D is 40–64 µm for the big circles at 0–50° and 1 m; a face is one circle against another's."""
     folder = shared_data("stereo_target/clean")
     result = run(folder / "images", folder / "cameras.txt", tmp_path / "run", options=RunOptions(eccentricity=False))
-    faces = compare(tmp_path / "run", folder / "truth.json")["faces"]
+    faces = compare(tmp_path / "run", folder / "truth.json").content()["faces"]
     for face_id in ("2", "4", "5"):
         assert 40 < faces[face_id]["translation_um"] < 70
     assert faces["3"]["translation_um"] > 65

@@ -1,4 +1,4 @@
-"""Errors of a run against a known truth, in the format of ``truth.json`` (``data_layout.md``)."""
+"""Errors of a run against a known truth: ``truth.json`` and ``compare.json`` (``data_layout.md``)."""
 
 import csv
 from pathlib import Path
@@ -10,7 +10,7 @@ from pydantic import Field
 from stcal.errors import DegenerateError, InputError
 from stcal.geometry.align import align_rigid
 from stcal.geometry.rigid import Rigid
-from stcal.io.json import Matrix6, Part, Pose, Vector3, read_result
+from stcal.io.json import ByFace, Matrix6, Part, Pose, ResultFile, Vector3, read_result
 from stcal.labels import BOARD, CircleLabel, DotLabel, parse_label, parse_labels
 
 FACES = "faces.json"
@@ -33,18 +33,52 @@ class Answer(Part):
     groups: Any = None
 
 
-def compare(run: str | Path, truth: str | Path) -> dict:
-    """Errors of ``RUN/faces.json`` (or of the file itself) against a truth file.
+class FaceErrors(Part):
+    translation_um: float
+    rotation_mdeg: float
+    circles: int
+    circles_mean_um: float | None
+    circles_max_um: float | None
+    translation_sigma_um: Vector3 | None = None
+    rotation_sigma_mdeg: Vector3 | None = None
+    normalised_error: float | None = None
 
-    Returns
-    -------
-    dict
-        ``faces`` : by face ``translation_um`` and ``rotation_mdeg`` of target_from_face, ``circles_mean_um`` and
-        ``circles_max_um`` after a rigid fit of the face, ``circles`` compared, and where the run states σ,
-        ``translation_sigma_um``, ``rotation_sigma_mdeg`` and ``normalised_error`` (√(eᵀC⁻¹e/6), about 1 when σ is
-        true); ``missing`` faces of the truth; ``worst`` over all faces; and, where the truth lists images and the run
-        is a folder, ``labels`` : ``wrong``, and ``found`` of the ``visible`` circles (those the truth calls
-        must_find) in the images that both have.
+
+class LargestErrors(Part):
+    translation_um: float | None
+    rotation_mdeg: float | None
+    circles_mean_um: float | None
+
+
+class LabelCounts(Part):
+    wrong: int
+    found: int
+    visible: int
+
+
+class CompareFile(ResultFile):
+    """Of ``compare``."""
+
+    reference_face: str = Field(description="face id, the same in both")
+    faces: dict[ByFace, FaceErrors] = Field(
+        description="`translation_um`, `rotation_mdeg` of `target_from_face` against the truth; after a rigid fit of "
+        "the face's `circles` (number in common) `circles_mean_um`, `circles_max_um`, null with fewer than three; with "
+        "covariances in the run also `translation_sigma_um`, `rotation_sigma_mdeg` and, but for the reference face, "
+        "`normalised_error` √(eᵀC⁻¹e/6), about 1 when σ is true"
+    )
+    missing: list[str] = Field(description="faces of the truth that the run lacks")
+    worst: LargestErrors = Field(
+        description="largest `translation_um`, `rotation_mdeg`, `circles_mean_um` of all faces"
+    )
+    labels: LabelCounts | None = Field(
+        None,
+        description="where the truth lists images that the run has: `wrong` labels (of circles that the truth knows; "
+        "the board's numbers up to its symmetry), and `found` of the `visible` circles (`must_find`)",
+    )
+
+
+def compare(run: str | Path, truth: str | Path) -> CompareFile:
+    """Errors of ``RUN/faces.json`` (or of the file itself) against a truth file.
 
     Raises
     ------
@@ -65,17 +99,20 @@ def compare(run: str | Path, truth: str | Path) -> dict:
         face_id: _face(face_id, found, known) for face_id in known.target_from_face if face_id in found.target_from_face
     }
     labels = _labels(run / DETECTIONS, known) if run.is_dir() and isinstance(known.groups, dict) else None
-    measures = ("translation_um", "rotation_mdeg", "circles_mean_um")
-    return {
-        "reference_face": known.reference_face,
-        "faces": faces,
-        "missing": [face_id for face_id in known.target_from_face if face_id not in faces],
-        "worst": {m: max((f[m] for f in faces.values() if f[m] is not None), default=None) for m in measures},
-        **({"labels": labels} if labels else {}),
+    worst = {
+        name: max((value for each in faces.values() if (value := getattr(each, name)) is not None), default=None)
+        for name in LargestErrors.model_fields
     }
+    return CompareFile(
+        reference_face=known.reference_face,
+        faces=faces,
+        missing=[face_id for face_id in known.target_from_face if face_id not in faces],
+        worst=LargestErrors(**worst),
+        **({"labels": labels} if labels else {}),
+    )
 
 
-def _labels(path: Path, known: Answer) -> dict | None:
+def _labels(path: Path, known: Answer) -> LabelCounts | None:
     """Labels of ``detections.csv`` against the truth; a board's numbers are known up to its own symmetry, but for a
     whole group at once."""
     try:
@@ -99,7 +136,7 @@ def _labels(path: Path, known: Answer) -> dict | None:
         return None
     if not total.any():
         return None
-    return dict(zip(("wrong", "found", "visible"), total.tolist(), strict=True))
+    return LabelCounts(**dict(zip(LabelCounts.model_fields, total.tolist(), strict=True)))
 
 
 def _columns(dots: list) -> int:
@@ -127,13 +164,13 @@ def _count(measured: dict, images: dict, numbers: np.ndarray) -> tuple[int, int,
     return wrong, found, visible
 
 
-def _face(face_id: str, found: Answer, known: Answer) -> dict:
+def _face(face_id: str, found: Answer, known: Answer) -> FaceErrors:
     estimate, true = (Rigid.from_matrix(each.target_from_face[face_id]) for each in (found, known))
     labels = [label for label in parse_labels(known.circles) if label.plane == face_id and label in found.circles]
     a, b = (np.array([each.circles[label] for label in labels]).reshape(-1, 3) for each in (known, found))
     shift = estimate.translation - true.translation
     turn = Rigid(estimate.rotation @ true.rotation.T)
-    row = {
+    row: dict[str, Any] = {
         "translation_um": 1e3 * float(np.linalg.norm(shift)),
         "rotation_mdeg": 1e3 * float(np.degrees(turn.angle_rad())),
         "circles": len(labels),
@@ -149,30 +186,29 @@ def _face(face_id: str, found: Answer, known: Answer) -> dict:
     if c is not None:
         sigma = np.sqrt(np.maximum(np.diag(c), 0))
         row |= {
-            "translation_sigma_um": (1e3 * sigma[3:]).tolist(),
-            "rotation_sigma_mdeg": (1e3 * np.degrees(sigma[:3])).tolist(),
+            "translation_sigma_um": 1e3 * sigma[3:],
+            "rotation_sigma_mdeg": 1e3 * np.degrees(sigma[:3]),
         }
         if np.linalg.eigvalsh(c)[0] > 0 and face_id != known.reference_face:
             e = np.concatenate([turn.log()[:3], shift])
             row["normalised_error"] = float(np.sqrt(e @ np.linalg.solve(c, e) / 6))
-    return row
+    return FaceErrors.model_validate(row)
 
 
-def comparison_table(comparison: dict) -> str:
+def comparison_table(comparison: CompareFile) -> str:
     """The comparison as a text table."""
     lines = [
         f"{'face':>6} {'position':>10} {'rotation':>10} {'circles':>10} {'worst':>8} {'of':>4}  error / σ",
         f"{'':>6} {'µm':>10} {'mdeg':>10} {'mean µm':>10} {'µm':>8}",
     ]
-    for face_id, row in comparison["faces"].items():
-        mean, worst = (f"{row[k]:.2f}" if row[k] is not None else "–" for k in ("circles_mean_um", "circles_max_um"))
-        ratio = f"{row['normalised_error']:.2f}" if "normalised_error" in row else "–"
-        place = "reference" if face_id == comparison["reference_face"] else f"{row['translation_um']:.1f}"
-        turn = "" if face_id == comparison["reference_face"] else f"{row['rotation_mdeg']:.2f}"
-        lines.append(f"{face_id:>6} {place:>10} {turn:>10} {mean:>10} {worst:>8} {row['circles']:>4}  {ratio:>9}")
-    if "labels" in comparison:
-        n = comparison["labels"]
-        lines.append(f"labels: {n['wrong']} wrong; {n['found']} of {n['visible']} visible circles found")
-    if comparison["missing"]:
-        lines.append(f"not in the run: face {', '.join(comparison['missing'])}")
+    for face_id, row in comparison.faces.items():
+        figures = row.circles_mean_um, row.circles_max_um, row.normalised_error
+        mean, worst, ratio = ("–" if value is None else f"{value:.2f}" for value in figures)
+        place = "reference" if face_id == comparison.reference_face else f"{row.translation_um:.1f}"
+        turn = "" if face_id == comparison.reference_face else f"{row.rotation_mdeg:.2f}"
+        lines.append(f"{face_id:>6} {place:>10} {turn:>10} {mean:>10} {worst:>8} {row.circles:>4}  {ratio:>9}")
+    if n := comparison.labels:
+        lines.append(f"labels: {n.wrong} wrong; {n.found} of {n.visible} visible circles found")
+    if comparison.missing:
+        lines.append(f"not in the run: face {', '.join(comparison.missing)}")
     return "\n".join(lines)

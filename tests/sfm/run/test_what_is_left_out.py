@@ -104,10 +104,10 @@ def test_a_missing_column_and_a_label_off_the_board_are_counted_rightly(small_da
     for file in ("faces.json", "detections.csv"):
         (tmp_path / file).write_bytes((small_run / file).read_bytes())
     rows = (small_run / "detections.csv").read_text().splitlines()
-    before = compare(small_run, small_dataset / "truth.json")["labels"]
+    before = compare(small_run, small_dataset / "truth.json").content()["labels"]
     some = [r for r in rows if not (r.split(",")[1].startswith("board:") and r.split(",")[1].endswith(":8"))]
     (tmp_path / "detections.csv").write_text("\n".join(some))
-    assert compare(tmp_path, small_dataset / "truth.json")["labels"]["wrong"] == before["wrong"] == 0
+    assert compare(tmp_path, small_dataset / "truth.json").content()["labels"]["wrong"] == before["wrong"] == 0
     image = rows[1].split(",")[0]
     (tmp_path / "detections.csv").write_text("\n".join([*rows, f"{image},board:7:0,5,5,0.01"]))
-    assert compare(tmp_path, small_dataset / "truth.json")["labels"]["wrong"] == 1
+    assert compare(tmp_path, small_dataset / "truth.json").content()["labels"]["wrong"] == 1
