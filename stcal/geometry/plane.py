@@ -3,16 +3,15 @@
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.spatial.transform import Rotation
 
-from stcal.errors import ConvergenceError, DegenerateError
+from stcal.errors import DegenerateError
 from stcal.geometry.arrays import Array, freeze
+from stcal.geometry.least_squares import NormalEquations, minimise, perturbed
 from stcal.geometry.rigid import Rigid, skew
 
-MAX_STEPS = 50
-"""Of Gauss–Newton; a board that is seen well needs about five."""
-SETTLED = 1e-10
-"""Last step of a pose: rad, and share of the distance."""
+MAX_STEPS = 100
+EXACT = 1e-22
+"""What the last step of a pose may promise, in squared normalised coordinates: a hundred-billionth of the distance."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -121,7 +120,7 @@ def camera_from_plane(normalised_from_plane: np.ndarray) -> Rigid:
 
 
 def refine_planar_pose(camera_from_plane: Rigid, xy_plane: np.ndarray, xy_normalised: np.ndarray) -> Rigid:
-    """Gauss–Newton on the reprojection error of a plane's points.
+    """Pose of least reprojection error of a plane's points.
 
     Parameters
     ----------
@@ -140,26 +139,24 @@ def refine_planar_pose(camera_from_plane: Rigid, xy_plane: np.ndarray, xy_normal
     Raises
     ------
     DegenerateError
-        The plane comes to lie behind the camera.
+        At the start, points lie behind the camera.
     ConvergenceError
-        The steps do not die away.
+        No minimum is reached.
     """
     xyz = np.column_stack([xy_plane, np.zeros(len(xy_plane))])
-    pose = camera_from_plane
-    for _ in range(MAX_STEPS):
+
+    def linearise(pose: Rigid) -> NormalEquations:
         rotated = xyz @ pose.rotation.T
         p = rotated + pose.translation
         if (p[:, 2] <= 0).any():
-            raise DegenerateError("planar pose: points behind the camera")
-        jac_point = np.zeros((len(p), 2, 3))
-        jac_point[:, 0, 0] = jac_point[:, 1, 1] = 1 / p[:, 2]
-        jac_point[:, :, 2] = -p[:, :2] / p[:, 2:] ** 2
-        jac = np.concatenate([-jac_point @ skew(rotated), jac_point], axis=2).reshape(-1, 6)
-        residual = (p[:, :2] / p[:, 2:] - xy_normalised).ravel()
-        step = -np.linalg.lstsq(jac, residual, rcond=None)[0]
-        pose = Rigid(Rotation.from_rotvec(step[:3]).as_matrix() @ pose.rotation, pose.translation + step[3:])
-        if np.abs(step[:3]).max() < SETTLED and np.abs(step[3:]).max() < SETTLED * pose.translation[2]:
-            return pose
-    raise ConvergenceError(
-        f"planar pose: {MAX_STEPS} Gauss–Newton steps did not settle; check that the points are numbered rightly"
-    )
+            return NormalEquations.impossible(6)
+        by_point = np.zeros((len(p), 2, 3))
+        by_point[:, 0, 0] = by_point[:, 1, 1] = 1 / p[:, 2]
+        by_point[:, :, 2] = -p[:, :2] / p[:, 2:] ** 2
+        by_pose = np.concatenate([-by_point @ skew(rotated), by_point], axis=2)
+        return NormalEquations.of((p[:, :2] / p[:, 2:] - xy_normalised).ravel(), by_pose.reshape(-1, 6))
+
+    if not np.isfinite(linearise(camera_from_plane).cost):
+        raise DegenerateError("planar pose: points behind the camera")
+    found = minimise(camera_from_plane, linearise, perturbed, least_gain=EXACT, max_steps=MAX_STEPS)
+    return found.required("planar pose", "check that the points are numbered rightly").state

@@ -6,15 +6,14 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy.linalg import null_space
 from scipy.optimize import root_scalar
-from scipy.stats import chi2 as chi_square
 
-from stcal.errors import ConvergenceError
+from stcal.geometry.least_squares import minimise
+from stcal.geometry.normal_equations import Reduction, reduce
 from stcal.geometry.rigid import Poses, Rigid
+from stcal.geometry.robust import huber_cost, huber_weights, length_limit, robust_sigma
 from stcal.locate.pose.problem import PlanarProblem, project
 
 MAX_STEPS = 60
-SETTLED = 1e-4
-"""A step that moves nothing by more than this, in mm or milliradians, is the last."""
 HUBER_TAIL = 0.011
 """Share of honest points, or tags, whose residuals Huber's loss damps: 3 σ in the plane."""
 GROSS = 4.0
@@ -25,7 +24,6 @@ TOGETHER = np.tile(np.eye(2), (4, 1))
 APART = null_space(TOGETHER.T)
 """(8, 6): what its corners do beside that."""
 NEAR_PX = 0.005
-RAYLEIGH_MEDIAN = float(np.sqrt(2 * np.log(2)))
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -92,13 +90,15 @@ class _Noise:
 @dataclass(frozen=True, slots=True, eq=False)
 class _Group:
     """p points of the board (d = 2) or tags (d = 8). Whitened residuals (p, d), their derivatives by the pose (p, d, 6)
-    and by the points (p, d, d); Huber's ``weight`` (p,); ``px`` : (p, d) residuals in pixels."""
+    and by the points (p, d, d); Huber's ``weight`` (p,); ``px`` : (p, d) residuals in pixels; ``cost`` : of Huber's
+    loss, which rises no further where a residual is gross."""
 
     residual: np.ndarray
     by_pose: np.ndarray
     by_point: np.ndarray
     weight: np.ndarray
     px: np.ndarray
+    cost: float
 
 
 def adjust(images: Sequence[ImageCorners], start: np.ndarray) -> Adjusted:
@@ -118,14 +118,14 @@ def adjust(images: Sequence[ImageCorners], start: np.ndarray) -> Adjusted:
     settled = False
     for round_ in range(VARIANCE_ROUNDS):
         poses, corners = _settled(images, poses, corners, noise)
-        blocks = [_blocks(image, poses[[i]], corners, noise) for i, image in enumerate(images)]
-        covariance = np.linalg.inv(_reduced(images, blocks, len(corners))[0])
-        before, noise = noise, _variances(images, blocks, covariance, noise)
+        linear = _Linear.of(images, poses, corners, noise)
+        covariance = np.linalg.inv(linear.normal)
+        before, noise = noise, _variances(images, linear, covariance, noise)
         change = max(abs(noise.corner_px - before.corner_px), abs(noise.tag_px - before.tag_px))
         settled = round_ > 0 and abs(noise.board / before.board - 1) < 0.01 and change < NEAR_PX
         if settled:
             break
-    board, tags = ([block[side] for block in blocks] for side in (0, 1))
+    board, tags = ([block[side] for block in linear.blocks] for side in (0, 1))
     return Adjusted(
         corners_mm=corners.reshape(-1, 4, 2),
         covariance_mm2=covariance,
@@ -144,9 +144,9 @@ def adjust(images: Sequence[ImageCorners], start: np.ndarray) -> Adjusted:
 def _first_noise(images, poses: Poses, corners: np.ndarray) -> "_Noise":
     """By the medians of the residuals."""
     blocks = [_blocks(image, poses[[i]], corners, _Noise(1.0, 0.0, 0.0)) for i, image in enumerate(images)]
-    board = np.median(np.concatenate([np.linalg.norm(b[0].residual, axis=1) for b in blocks]))
-    tags = np.median(np.concatenate([np.linalg.norm(b[1].px.reshape(-1, 2), axis=1) for b in blocks]))
-    return _Noise(max(float(board) / RAYLEIGH_MEDIAN, 1e-3), float(tags) / RAYLEIGH_MEDIAN, 0.0)
+    board = np.concatenate([np.linalg.norm(b[0].residual, axis=1) for b in blocks])
+    tags = np.concatenate([np.linalg.norm(b[1].px.reshape(-1, 2), axis=1) for b in blocks])
+    return _Noise(max(robust_sigma(board, 2), 1e-3), robust_sigma(tags, 2), 0.0)
 
 
 def _rms(values: np.ndarray) -> float:
@@ -154,23 +154,12 @@ def _rms(values: np.ndarray) -> float:
 
 
 def _settled(images, poses: Poses, corners: np.ndarray, noise: _Noise) -> tuple[Poses, np.ndarray]:
-    for _ in range(MAX_STEPS):
-        blocks = [_blocks(image, poses[[i]], corners, noise) for i, image in enumerate(images)]
-        eliminated, right = _reduced(images, blocks, len(corners))
-        by_corner = np.linalg.solve(eliminated, right)
-        steps = np.array(
-            [
-                np.linalg.solve(own, g - cross @ by_corner[where])
-                for own, g, cross, where in (_normal(image, block) for image, block in zip(images, blocks, strict=True))
-            ]
-        )
-        poses, corners = poses.moved(steps), corners + by_corner.reshape(-1, 2)
-        if max(np.abs(by_corner).max(), np.abs(steps * [1e3, 1e3, 1e3, 1, 1, 1]).max()) < SETTLED:
-            return poses, corners
-    raise ConvergenceError(
-        f"layout: the adjustment does not settle in {MAX_STEPS} steps (last {np.abs(by_corner).max():.2g} mm); "
-        "check board file and camera file"
-    )
+    def moved(at: tuple[Poses, np.ndarray], step: np.ndarray) -> tuple[Poses, np.ndarray]:
+        by_corner, by_pose = np.split(step, [corners.size])
+        return at[0].moved(by_pose.reshape(-1, 6)), at[1] + by_corner.reshape(-1, 2)
+
+    found = minimise((poses, corners), lambda at: _Linear.of(images, *at, noise), moved, max_steps=MAX_STEPS)
+    return found.required("layout", "check board file and camera file").state
 
 
 def _blocks(image: ImageCorners, pose: Poses, corners: np.ndarray, noise: _Noise) -> tuple[_Group, _Group]:
@@ -191,54 +180,68 @@ def _group(image: ImageCorners, pose: Poses, xy: np.ndarray, seen: np.ndarray, n
     by_point[:, each, :, each] = np.moveaxis(view.by_corner[0].reshape(p, d // 2, 2, 2), 1, 0)
     root = np.linalg.inv(np.linalg.cholesky(noise))
     residual = (root @ raw[..., None])[..., 0]
-    limit = float(np.sqrt(chi_square.isf(HUBER_TAIL, d)))
+    limit = length_limit(d, HUBER_TAIL)
     length = np.linalg.norm(residual, axis=1)
-    weight = np.where(length > GROSS * limit, 0.0, np.minimum(1.0, limit / np.maximum(length, limit)))
     return _Group(
-        residual,
-        root @ view.by_pose[0].reshape(p, d, 6),
-        root @ by_point.reshape(p, d, d),
-        weight,
-        image.focal_px * raw,
+        residual=residual,
+        by_pose=root @ view.by_pose[0].reshape(p, d, 6),
+        by_point=root @ by_point.reshape(p, d, d),
+        weight=np.where(length > GROSS * limit, 0.0, huber_weights(length, limit)),
+        px=image.focal_px * raw,
+        cost=float(huber_cost(np.minimum(length, GROSS * limit), limit).sum()),
     )
 
 
-def _normal(image: ImageCorners, block: tuple[_Group, _Group]):
-    """Normal matrix (6, 6) and right side of a pose, its cross block with the corners, and their columns."""
-    own, g = np.zeros((6, 6)), np.zeros(6)
-    for group in block:
-        weighted = group.weight[:, None, None] * group.by_pose
-        own += np.einsum("pij,pik->jk", weighted, group.by_pose)
-        g += np.einsum("pij,pi->j", weighted, group.residual)
-    tags = block[1]
-    cross = np.einsum("p,pij,pik->jpk", tags.weight, tags.by_pose, tags.by_point).reshape(6, -1)
-    return own, g, cross, (8 * image.rows[:, None] + np.arange(8)).ravel()
+@dataclass(frozen=True, slots=True, eq=False)
+class _Linear:
+    """About a state: ``cost``; ``blocks`` : board and tags by image; ``normal`` (8n, 8n) and ``right`` (8n,) of the
+    corners, the ``poses`` reduced away."""
+
+    cost: float
+    blocks: list[tuple[_Group, _Group]]
+    normal: np.ndarray
+    right: np.ndarray
+    poses: Reduction
+
+    @classmethod
+    def of(cls, images, poses: Poses, corners: np.ndarray, noise: _Noise) -> "_Linear":
+        blocks = [_blocks(image, poses[[i]], corners, noise) for i, image in enumerate(images)]
+        m, k = len(blocks), corners.size
+        own, own_right, cross = np.zeros((m, 6, 6)), np.zeros((m, 6)), np.zeros((m, 6, k))
+        normal, right = np.zeros((k, k)), np.zeros(k)
+        for i, (image, block) in enumerate(zip(images, blocks, strict=True)):
+            for group in block:
+                weighted = group.weight[:, None, None] * group.by_pose
+                own[i] += np.einsum("pij,pik->jk", weighted, group.by_pose)
+                own_right[i] += np.einsum("pij,pi->j", weighted, group.residual)
+            tags, place = block[1], _place(image)
+            weighted = tags.weight[:, None, None] * tags.by_point
+            cross[i][:, place.ravel()] = np.einsum("pij,pik->jpk", tags.by_pose, weighted).reshape(6, -1)
+            normal[place[:, :, None], place[:, None, :]] += np.einsum("pij,pik->pjk", weighted, tags.by_point)
+            right[place] += np.einsum("pij,pi->pj", weighted, tags.residual)
+        away = reduce(own, own_right, cross)
+        cost = sum(group.cost for block in blocks for group in block)
+        return cls(cost, blocks, normal - away.normal, right - away.right, away)
+
+    def step(self, damping: float | np.ndarray) -> tuple[np.ndarray, float]:
+        """Of the corners, which is damped, then of the poses, at their best for it."""
+        own = np.linalg.solve(self.normal + damping * np.diag(np.diag(self.normal)), self.right)
+        gain = 2 * float(own @ self.right) - float(own @ self.normal @ own) + self.poses.gain
+        return np.concatenate([own, self.poses.back(own).ravel()]), gain
 
 
-def _reduced(images, blocks, points: int) -> tuple[np.ndarray, np.ndarray]:
-    """Normal matrix and right side of the corners, the poses eliminated (Schur complement)."""
-    normal, right = np.zeros((2 * points, 2 * points)), np.zeros(2 * points)
-    for image, block in zip(images, blocks, strict=True):
-        own, g, cross, where = _normal(image, block)
-        tags = block[1]
-        each = np.einsum("p,pij,pik->pjk", tags.weight, tags.by_point, tags.by_point)
-        place = where.reshape(-1, 8)
-        normal[place[:, :, None], place[:, None, :]] += each
-        right[where] += np.einsum("p,pij,pi->pj", tags.weight, tags.by_point, tags.residual).ravel()
-        gain = np.linalg.solve(own, np.column_stack([cross, g]))
-        normal[np.ix_(where, where)] -= cross.T @ gain[:, :-1]
-        right[where] -= cross.T @ gain[:, -1]
-    return normal, right
+def _place(image: ImageCorners) -> np.ndarray:
+    """(k, 8) where the coordinates of each tag stand among the unknowns."""
+    return 8 * image.rows[:, None] + np.arange(8)
 
 
-def _variances(images, blocks, covariance: np.ndarray, noise: _Noise) -> _Noise:
+def _variances(images, linear: _Linear, covariance: np.ndarray, noise: _Noise) -> _Noise:
     """The noise with which the squared residuals of either kind are as many as their redundancy."""
-    square, free, taken = 0.0, np.zeros(2), 0.0
-    for image, block in zip(images, blocks, strict=True):
-        own, _, cross, where = _normal(image, block)
-        inverse = np.linalg.inv(own)
-        gain = inverse @ cross
-        of_pose = inverse + gain @ covariance[np.ix_(where, where)] @ gain.T
+    square, free, taken, blocks = 0.0, np.zeros(2), 0.0, linear.blocks
+    for i, (image, block) in enumerate(zip(images, blocks, strict=True)):
+        where = _place(image).ravel()
+        by_corners = linear.poses.from_kept[i][:, where]
+        of_pose = linear.poses.inverse[i] + by_corners @ covariance[np.ix_(where, where)] @ by_corners.T
         board = block[0]
         by_board = np.einsum("p,pij,pik->jk", board.weight, board.by_pose, board.by_pose)
         taken += float(np.trace(of_pose @ by_board))

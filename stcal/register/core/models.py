@@ -9,16 +9,14 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from stcal.errors import ConvergenceError, DegenerateError
+from stcal.errors import DegenerateError
 from stcal.geometry.affine import Affine
 from stcal.geometry.align import align_affine, align_rigid, align_similarity, best_rotations
+from stcal.geometry.least_squares import NormalEquations, minimise
 from stcal.geometry.rigid import Rigid, Similarity, skew
 
 Transform = Rigid | Similarity | Affine
 
-MAX_STEPS = 50
-SETTLED = 1e-8
-"""Gauss–Newton ends when a step moves no parameter by more than this share of its own σ at unit noise."""
 EXACT = 1e-11
 """σ below this share of the coordinates' size is rounding of numbers."""
 CHUNK = 100_000
@@ -68,7 +66,7 @@ def parts(transform: Transform) -> tuple[np.ndarray, np.ndarray]:
 def fit(model: Model, xyz_a: np.ndarray, xyz_b: np.ndarray, precision: np.ndarray | None = None) -> Transform:
     """b_from_a that minimises Σ rᵢᵀ Pᵢ rᵢ.
 
-    In closed form where noise is isotropic; with inverse covariances by Gauss–Newton from there.
+    In closed form where noise is isotropic; with inverse covariances by descent from there.
 
     Parameters
     ----------
@@ -87,7 +85,7 @@ def fit(model: Model, xyz_a: np.ndarray, xyz_b: np.ndarray, precision: np.ndarra
     DegenerateError
         Too few points, collinear ones, or coplanar ones for the affine model.
     ConvergenceError
-        Gauss–Newton did not settle.
+        No minimum is reached.
     """
     weights = precision
     if precision is not None and precision.ndim == 3:
@@ -96,16 +94,13 @@ def fit(model: Model, xyz_a: np.ndarray, xyz_b: np.ndarray, precision: np.ndarra
     start = closed(xyz_b, xyz_a, weights)
     if precision is None or precision.ndim == 1:
         return start
-    transform = start
-    for _ in range(MAX_STEPS):
-        origin, normal, right = _normal_equations(model, transform, xyz_a, precision, xyz_b)
-        step = np.linalg.solve(normal, right)
-        transform = _moved(transform, origin, step)
-        if (np.abs(step) * np.sqrt(np.diag(normal)) <= SETTLED * (1 + np.sqrt(len(xyz_a)))).all():
-            return transform
-    raise ConvergenceError(
-        f"registration: {MAX_STEPS} Gauss–Newton steps did not settle; are the covariances true, or some of them huge?"
+    origin = weights @ xyz_a / weights.sum()
+    found = minimise(
+        start,
+        lambda transform: _about(model, transform, origin, xyz_a, precision, xyz_b),
+        lambda transform, step: _moved(transform, origin, step),
     )
+    return found.required("registration", "are the covariances true, or some of them huge?").state
 
 
 def squares(residuals: np.ndarray, precision: np.ndarray | None = None) -> np.ndarray:
@@ -143,7 +138,7 @@ def unit_covariance(
     -------
     (p, p) array
     """
-    origin, normal, _ = _normal_equations(model, transform, xyz_a, precision)
+    origin, normal = _normal(model, transform, xyz_a, precision)
     to_origin = _to_origin(model, transform, origin)
     scale = 1 / np.sqrt(np.diag(normal))
     covariance = np.linalg.inv(normal * scale[:, None] * scale) * scale[:, None] * scale
@@ -173,7 +168,7 @@ def leverages(
         H of each point.
     """
     p = None if precision is None else precision[used]
-    origin, normal, _ = _normal_equations(model, transform, xyz_a[used], p)
+    origin, normal = _normal(model, transform, xyz_a[used], p)
     by_step = jacobian(model, transform, xyz_a - origin)
     covariance = by_step @ np.linalg.inv(normal) @ np.swapaxes(by_step, 1, 2)
     if precision is None:
@@ -250,30 +245,32 @@ def jacobian(model: Model, transform: Transform, from_origin: np.ndarray) -> np.
     return by_step
 
 
-def _normal_equations(
-    model: Model,
-    transform: Transform,
-    xyz_a: np.ndarray,
-    precision: np.ndarray | None,
-    xyz_b: np.ndarray | None = None,
-) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Origin in a (the points' weighted mean), normal matrix (p, p) about it, and right side (p,) where b is given."""
+def _normal(
+    model: Model, transform: Transform, xyz_a: np.ndarray, precision: np.ndarray | None
+) -> tuple[np.ndarray, np.ndarray]:
+    """Origin in a (the points' weighted mean), and the normal matrix (p, p) about it."""
     if precision is None or precision.ndim == 1:
         weights = np.ones(len(xyz_a)) if precision is None else precision
-    else:
-        weights = np.trace(precision, axis1=1, axis2=2)
+        origin = weights @ xyz_a / weights.sum()
+        return origin, _isotropic_normal(model, transform, xyz_a - origin, weights)
+    weights = np.trace(precision, axis1=1, axis2=2)
     origin = weights @ xyz_a / weights.sum()
-    if precision is None or precision.ndim == 1:
-        return origin, _isotropic_normal(model, transform, xyz_a - origin, weights), np.zeros(model.parameters)
-    normal, right = np.zeros((model.parameters,) * 2), np.zeros(model.parameters)
+    return origin, _about(model, transform, origin, xyz_a, precision, transform @ xyz_a).normal
+
+
+def _about(
+    model: Model, transform: Transform, origin: np.ndarray, xyz_a: np.ndarray, precision: np.ndarray, xyz_b: np.ndarray
+) -> NormalEquations:
+    """Over the parameters about a point ``origin`` of a, with inverse covariances."""
+    cost, normal, gradient = 0.0, np.zeros((model.parameters,) * 2), np.zeros(model.parameters)
     for rows in _chunks(len(xyz_a)):
         by_step = jacobian(model, transform, xyz_a[rows] - origin)
         weighted = np.swapaxes(by_step, 1, 2) @ precision[rows]
+        residual = xyz_b[rows] - transform @ xyz_a[rows]
         normal += (weighted @ by_step).sum(0)
-        if xyz_b is not None:
-            residual = xyz_b[rows] - transform @ xyz_a[rows]
-            right += (weighted @ residual[:, :, None]).sum((0, 2))
-    return origin, normal, right
+        gradient -= (weighted @ residual[:, :, None]).sum((0, 2))
+        cost += float(squares(residual, precision[rows]).sum())
+    return NormalEquations(cost, normal, gradient)
 
 
 def _isotropic_normal(model: Model, transform: Transform, from_origin: np.ndarray, weights: np.ndarray) -> np.ndarray:

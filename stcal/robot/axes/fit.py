@@ -9,12 +9,12 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from stcal.errors import ConvergenceError, DegenerateError, InputError
+from stcal.errors import DegenerateError, InputError
+from stcal.geometry.least_squares import NormalEquations, minimise
 from stcal.geometry.rigid import Rigid
+from stcal.geometry.robust import HUBER, huber_weights, robust_sigma
 from stcal.robot.axes.sweeps import Arc
 
-HUBER = 3.0
-"""σ of a point's residual from which it counts less: 1 in 90 of normal ones, so that the rest loses nothing."""
 GROSS = 6.0
 """σ from which a point is left out and named: 1 in 10⁷ of normal ones."""
 NEAR_AXIS = 10.0
@@ -28,7 +28,7 @@ MOTION = np.radians(2.0)
 LONGER = "sweep further, or with reflectors farther apart"
 QUIET = 1e-3
 """Share of the largest arc below which no residual can hide a gross error that bent the first axis."""
-ITERATIONS, HALVINGS, STARTS, REWEIGHTINGS = 100, 12, 60, 30
+STARTS, REWEIGHTINGS = 60, 30
 WEIGHTS_SETTLED = 1e-3
 """A weight that changes by less moves an axis by less than a thousandth of its σ."""
 SINGULAR, TINY = 1e-10, 1e-300
@@ -255,13 +255,12 @@ class _AxisFitting:
     def huber(self) -> np.ndarray:
         """(k,) weights by the lengths of the residuals."""
         length = np.linalg.norm(self.residuals(), axis=1)
-        limit = HUBER * self.robust_sigma(length)
-        return limit / np.maximum(length, limit)
+        return huber_weights(length, HUBER * self.robust_sigma(length))
 
     def robust_sigma(self, length: np.ndarray) -> float:
-        """From the median length of two normal coordinates, σ √(2 ln 2)."""
+        """Of one coordinate, from the median length, mm."""
         redundancy = self.redundancy(np.ones(len(length))) / (2 * len(length))
-        return max(float(np.median(length)) / np.sqrt(2 * np.log(2) * redundancy), self.floor)
+        return max(robust_sigma(length, 2, redundancy), self.floor)
 
     def points_jacobian(self) -> np.ndarray:
         """(k, 2, 3) derivative of the values by the points."""
@@ -295,32 +294,30 @@ class _AxisFitting:
         return -(unit[:, None] * (vt.T / s) @ u.T * root).reshape(p, k, 2)
 
     def descend(self) -> None:
-        """Gauss–Newton with halved steps, the weights being fixed."""
-        for _ in range(ITERATIONS):
-            residuals = self.residuals()
-            before, frame = (self.weights[:, None] * residuals**2).sum(), self.frame
-            step = np.einsum("pkc,kc->p", self.inverse(), residuals)
-            for _ in range(HALVINGS):
-                twist = np.zeros(6)
-                twist[[0, 1]] = step[:2]
-                twist[3 : 1 + len(step)] = step[2:]
-                self.frame = frame @ Rigid.exp(twist)
-                if (self.weights[:, None] * self.residuals() ** 2).sum() <= before + self.floor**2:
-                    break
-                step = step / 2
-            self.centre()
-            if np.linalg.norm(step[:2]) * self.size + np.linalg.norm(step[2:]) <= 10 * self.floor:
-                return
-        raise ConvergenceError(
-            f"{self.where}: the fit of its axis still moves after {ITERATIONS} steps; are these single-joint sweeps?"
-        )
+        """Least squares, the weights being fixed."""
+        self.inverse()  # refuses arcs that determine no axis
+        start, twists = self.frame, np.eye(6)[[0, 1] if self.prismatic else [0, 1, 3, 4]]
 
-    def centre(self) -> None:
-        """Origin to the foot of the points' centroid."""
-        shift = self.local().mean(axis=0)
+        def linearise(frame: Rigid) -> NormalEquations:
+            self.frame = frame
+            root = np.sqrt(np.repeat(self.weights, 2))
+            jacobian = self.jacobian().reshape(len(root), -1)
+            return NormalEquations.of(root * self.residuals().ravel(), root[:, None] * jacobian)
+
+        found = minimise(
+            start,
+            linearise,
+            lambda frame, step: self.centred(frame @ Rigid.exp(step @ twists)),
+            least_gain=self.floor**2,
+        )
+        self.frame = found.required(f"{self.where}: axis", "are these single-joint sweeps?").state
+
+    def centred(self, frame: Rigid) -> Rigid:
+        """With its origin at the foot of the points' centroid."""
+        shift = frame.inverse() @ self.points.mean(axis=0)
         if not self.prismatic:
             shift[:2] = 0
-        self.frame = Rigid(self.frame.rotation, self.frame.translation + self.frame.rotation @ shift)
+        return Rigid(frame.rotation, frame @ shift)
 
     def gain(self) -> np.ndarray:
         """(p, k, 3) derivative of the axis by the points."""

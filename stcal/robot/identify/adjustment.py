@@ -1,12 +1,12 @@
-"""Trust-region least squares over the minimal parameters of a robot, robust; what the data determine told apart."""
+"""Least squares over the minimal parameters of a robot, robust; what the data determine told apart."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 
 import numpy as np
-from scipy.special import chdtri
 
-from stcal.errors import ConvergenceError
+from stcal.geometry.least_squares import NormalEquations, minimise
+from stcal.geometry.robust import huber_cost, huber_weights, length_limit
 from stcal.robot.identify.residuals import WIDTH, Kind, Observed, State, jacobian, moved, residuals
 
 MAX_STEPS = 100
@@ -18,8 +18,8 @@ USELESS_MM = 50.0
 """A direction (1 mm, or the turn that moves the tool by 1 mm) with a larger σ is not determined: the nominal is better.
 All parameters are held to where they start by this σ, which nothing feels that is determined."""
 ACCEPTED = 1e-4
-"""In units of σ²: what a step may still gain when there have been enough. Along a flat direction, where Huber's weights
-make every step half as long as it should be, they are many and short."""
+"""In units of σ²: what a step may still promise when there have been enough. Along a flat direction, where Huber's
+weights make every step half as long as it should be, they are many and short."""
 STAYS_MM = 1e-3
 """σ of a movement that the observations never show."""
 LEAST_GAIN = 1e-9
@@ -130,8 +130,7 @@ def solve(
 ) -> Solution:
     """Minimise the observations' whitened residuals from ``state``, where ``held`` is linear.
 
-    Levenberg's damping by the ratio of actual to predicted gain (Moré 1978); parameters are small motions about the
-    present state, so that no representation is ever singular.
+    Parameters are small motions about the present state, so that no representation is ever singular.
 
     Raises
     ------
@@ -139,35 +138,36 @@ def solve(
         No minimum is reached.
     """
     limit = huber_limit(seen.kind) if robust else np.inf
-    solution, gradient = _linearised(state, seen, weighting, limit)
-    hold, pull = _fixed(solution, seen.kind), np.zeros(len(solution.units))
+    first = _linearised(state, seen, weighting, limit)[0]
+    hold, pull = _fixed(first, seen.kind), np.zeros(len(first.units))
     if held is not None:
         hold, pull = hold + held.normal(), held.pull()
-    away, damping = np.zeros(len(hold)), 1e-3
-    for _ in range(MAX_STEPS):
-        normal, right = solution.normal + hold, gradient - hold @ away - pull
-        cost = solution.cost + away @ (hold @ away + 2 * pull)
-        scale = np.diag(normal)
-        while True:
-            step = np.linalg.solve(normal + damping * np.diag(scale), right)
-            trial = moved(solution.state, step, seen.kind)
-            there = away + step
-            trial_cost = _cost(residuals(trial, seen), seen, weighting, limit) + there @ (hold @ there + 2 * pull)
-            gain, predicted = cost - trial_cost, 2 * right @ step - step @ normal @ step
-            if gain >= 0.1 * predicted or predicted <= SETTLED * abs(cost) + LEAST_GAIN or damping > 1e12:
-                break
-            damping *= 10
-        if gain <= SETTLED * abs(cost) + LEAST_GAIN:
-            last = _linearised(trial, seen, weighting, limit)[0] if gain > 0 else solution
-            return replace(last, prior=hold)
-        damping = max(damping / 10, 1e-12) if gain > 0.5 * predicted else damping
-        away = there
-        solution, gradient = _linearised(trial, seen, weighting, limit)
-    if gain < ACCEPTED:
-        return replace(solution, prior=hold)
-    raise ConvergenceError(
-        f"{seen.data.where}: identification still gains after {MAX_STEPS} steps; check the robot file and the outliers"
-    )
+
+    def kept(away: np.ndarray) -> NormalEquations:
+        return NormalEquations(float(away @ (hold @ away + 2 * pull)), hold, hold @ away + pull)
+
+    def linearise(at: _Away) -> NormalEquations:
+        found, gradient = _linearised(at.state, seen, weighting, limit)
+        return NormalEquations(found.cost, found.normal, gradient) + kept(at.away)
+
+    found = minimise(
+        _Away(state, np.zeros(len(hold))),
+        linearise,
+        lambda at, step: _Away(moved(at.state, step, seen.kind), at.away + step),
+        cost=lambda at: _cost(residuals(at.state, seen), seen, weighting, limit) + float(kept(at.away).cost),
+        settled=SETTLED,
+        least_gain=LEAST_GAIN,
+        max_steps=MAX_STEPS,
+    ).required(f"{seen.data.where}: identification", "check the robot file and the outliers", ACCEPTED)
+    return replace(_linearised(found.state.state, seen, weighting, limit)[0], prior=hold)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Away:
+    """A state, and the sum of the steps (k,) that led there."""
+
+    state: State
+    away: np.ndarray
 
 
 def unseen(kind: Kind) -> int:
@@ -184,7 +184,7 @@ def _fixed(solution: Solution, kind: Kind) -> np.ndarray:
 
 def huber_limit(kind: Kind) -> float:
     """Length of an observation's whitened residual beyond which it weighs less."""
-    return float(np.sqrt(chdtri(WIDTH[kind], 1 - HUBER_LEVEL)))
+    return length_limit(WIDTH[kind], 1 - HUBER_LEVEL)
 
 
 def normal_rank(state: State, seen: Observed, weighting: Weighting) -> int:
@@ -193,16 +193,16 @@ def normal_rank(state: State, seen: Observed, weighting: Weighting) -> int:
 
 
 def _linearised(state: State, seen: Observed, weighting: Weighting, limit: float) -> tuple[Solution, np.ndarray]:
-    """State with its normal matrix, and the gradient (k,)."""
+    """State with its normal matrix, and half the gradient (k,) of the cost."""
     found, derivative = residuals(state, seen), jacobian(state, seen)
     units = parameter_units(derivative)
     white, whitened = weighting.whiten(found, seen), weighting.whiten(derivative, seen)
-    weights = np.minimum(1.0, limit / np.maximum(np.linalg.norm(white, axis=1), 1e-300))
+    weights = huber_weights(np.linalg.norm(white, axis=1), limit)
     flat = whitened.reshape(-1, whitened.shape[2])
     weighted = flat * np.repeat(weights, white.shape[1])[:, None]
     cost = _cost(found, seen, weighting, limit)
     normal = weighted.T @ flat
-    return Solution(state, found, weights, normal, units, cost, np.zeros_like(normal)), weighted.T @ white.ravel()
+    return Solution(state, found, weights, normal, units, cost, np.zeros_like(normal)), -weighted.T @ white.ravel()
 
 
 def parameter_units(derivative: np.ndarray) -> np.ndarray:
@@ -215,7 +215,4 @@ def parameter_units(derivative: np.ndarray) -> np.ndarray:
 
 
 def _cost(found: np.ndarray, seen: Observed, weighting: Weighting, limit: float) -> float:
-    length = np.linalg.norm(weighting.whiten(found, seen), axis=1)
-    inside = np.minimum(length, limit)
-    beyond = length - inside
-    return float((inside**2).sum() + (2 * limit * beyond.sum() if beyond.any() else 0.0))
+    return float(huber_cost(np.linalg.norm(weighting.whiten(found, seen), axis=1), limit).sum())

@@ -8,6 +8,7 @@ from scipy.optimize import least_squares
 
 from stcal.errors import ConvergenceError, DegenerateError, InputError
 from stcal.geometry.align import align_rigid
+from stcal.geometry.least_squares import NormalEquations, minimise, perturbed
 from stcal.geometry.rigid import Poses, Rigid, skew
 from stcal.robot.identify.residuals import State, observed, residuals
 from stcal.robot.kinematics.damped import reach_mm
@@ -16,7 +17,8 @@ from stcal.robot.kinematics.measurements import Measurements
 from stcal.robot.kinematics.model import Robot
 
 ROUNDS = 50
-SETTLED_MM = 1e-6
+REGULAR = 1e-10
+"""Damping that keeps what these positions leave open, as of a tool that never turned, where it is."""
 FITS = 0.05
 """A nominal robot fits its data when its RMS error is below this share of their spread; factories err by under 1 %."""
 EXPLAINS = 0.2
@@ -101,7 +103,7 @@ def _off_a_line(data: Measurements) -> None:
 
 
 def _base_and_points(where: str, flange: Poses, positions: np.ndarray, rows: np.ndarray, points: np.ndarray):
-    """Gauss–Newton over the base and the tool points, from the alignment with the points given; and RMS misfit, mm."""
+    """Base and tool points by least squares, from the alignment with the points given; and RMS misfit, mm."""
     try:
         base = align_rigid(positions, flange @ points[rows])
     except DegenerateError as error:
@@ -109,27 +111,21 @@ def _base_and_points(where: str, flange: Poses, positions: np.ndarray, rows: np.
             f"{where}: by the robot file all joint values put the target on one line, so that it is not seen how the "
             "instrument stands about it; move other joints, or give the tool in the robot file if it is off the axis"
         ) from error
-    misfit = np.inf
-    for _ in range(ROUNDS):
-        seen = flange @ points[rows]
-        error = positions - base @ seen
-        before, misfit = misfit, float(np.sqrt((error**2).sum(1).mean()))
-        if before - misfit < SETTLED_MM:
-            break
-        jacobian = np.zeros((len(rows), 3, 6 + 3 * len(points)))
-        jacobian[:, :, :3] = -skew(seen @ base.rotation.T)
-        jacobian[:, :, 3:6] = np.eye(3)
-        for k in range(len(points)):
-            jacobian[rows == k, :, 6 + 3 * k : 9 + 3 * k] = base.rotation @ flange.rotation[rows == k]
-        step = np.linalg.lstsq(jacobian.reshape(-1, jacobian.shape[2]), error.ravel(), rcond=1e-9)[0]
-        base = Rigid(Rigid.exp(step[:6]).rotation @ base.rotation, base.translation + step[3:6])
-        points = points + step[6:].reshape(-1, 3)
-    else:
-        raise ConvergenceError(
-            f"{where}: base and tools still come nearer to the measurements after {ROUNDS} steps, {misfit:.3g} mm RMS "
-            "off; check the D-H rows and the joint values"
-        )
-    return base, points, misfit
+    moving = (rows[:, None] == np.arange(len(points)))[:, None, :, None]
+
+    def linearise(at: tuple[Rigid, np.ndarray]) -> NormalEquations:
+        seen = flange @ at[1][rows]
+        turned = np.where(moving, (at[0].rotation @ flange.rotation)[:, :, None], 0.0).reshape(len(rows), 3, -1)
+        by = np.concatenate([-skew(seen @ at[0].rotation.T), np.tile(np.eye(3), (len(rows), 1, 1)), turned], axis=2)
+        return NormalEquations.of((at[0] @ seen - positions).ravel(), by.reshape(-1, by.shape[2]))
+
+    found = minimise(
+        (base, points),
+        linearise,
+        lambda at, step: (perturbed(at[0], step[:6]), at[1] + step[6:].reshape(-1, 3)),
+        least_damping=REGULAR,
+    ).required(f"{where}: base and tools", "check the D-H rows and the joint values")
+    return *found.state, float(np.sqrt(found.linear.cost / len(rows)))
 
 
 def _points_of_distances(robot: Robot, flange: Poses, data: Measurements, rows: np.ndarray, points: np.ndarray):

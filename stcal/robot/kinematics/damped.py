@@ -1,4 +1,9 @@
-"""Damped least squares for joint vectors, many poses at once; without unit, lengths in shares of the arm's reach."""
+"""Damped least squares for joint vectors, many poses at once; without unit, lengths in shares of the arm's reach.
+
+This descent stands apart from :func:`stcal.geometry.least_squares.minimise`: thousands of starts, most of which end
+early, are followed in shrinking arrays, joints stop at their limits, and the damping is a share of the squared error,
+which keeps steps short where the arm folds. Callers look at what was reached, so that none passes for a solution.
+"""
 
 from dataclasses import dataclass
 

@@ -79,5 +79,5 @@ def test_no_minimum_within_the_steps_is_an_error(case, monkeypatch):
     monkeypatch.setattr(adjustment, "MAX_STEPS", 1)
     count = jacobian(state, seen).shape[2]
     far = moved(state, np.full(count, 0.05), seen.kind)
-    with pytest.raises(ConvergenceError, match="still gains after 1 steps"):
+    with pytest.raises(ConvergenceError, match="identification: no minimum after 1 steps"):
         solve(far, seen, WEIGHTING)
