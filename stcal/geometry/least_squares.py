@@ -6,7 +6,7 @@ reached when the next whole step promises to lower the cost, in units of σ², b
 rounding hides.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any, Generic, Protocol, TypeVar
 
@@ -74,6 +74,12 @@ class NormalEquations:
     def impossible(cls, count: int) -> "NormalEquations":
         """Of a state that must not be taken, with this many parameters."""
         return cls(np.inf, np.eye(count), np.zeros(count))
+
+    @classmethod
+    def stacked(cls, each: Sequence["NormalEquations"]) -> "NormalEquations":
+        """Of h problems, from those of one each."""
+        cost, normal, gradient = (np.array([getattr(one, name) for one in each]) for name in cls.__slots__)
+        return cls(cost, normal, gradient)
 
     def __add__(self, other: "NormalEquations") -> "NormalEquations":
         return NormalEquations(self.cost + other.cost, self.normal + other.normal, self.gradient + other.gradient)

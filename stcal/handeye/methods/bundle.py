@@ -3,19 +3,18 @@
 from dataclasses import dataclass, replace
 
 import numpy as np
-from scipy.linalg import cho_factor, cho_solve
-from scipy.optimize import minimize
 from scipy.sparse import csr_matrix
 from scipy.spatial.transform import Rotation
-from scipy.stats import chi2
 
 from stcal.geometry.camera import Camera
 from stcal.geometry.least_squares import NormalEquations, minimise, perturbed
 from stcal.geometry.rigid import Poses, Rigid, skew
+from stcal.geometry.robust import huber_cost, huber_weights, length_limit
+from stcal.geometry.variances import Parts
 from stcal.handeye.data.views import project_jacobian
 from stcal.handeye.methods.noise import CAUTION
 
-CORNER, POSE = (float(np.sqrt(chi2.ppf(0.999, dof))) for dof in (2, 6))
+CORNER, POSE = length_limit(2, 0.001), length_limit(6, 0.001)
 """Huber's limits: one good corner, and one good pose, in a thousand weighs less than one."""
 LEAST = {"corner_px": 1e-6, "robot_rad": 1e-8, "robot_mm": 1e-5, "board_mm": 1e-5}
 """Estimated σ stay above: exact data have none. Factors of what is stated of a camera stay above 1."""
@@ -27,7 +26,7 @@ SETTLED = 1e-3
 HELD = 1e-10
 """Share of each unknown's information that is added: what nothing determines must not be singular."""
 WORST = "check the poses that fit worst"
-FARTHEST = 14.0
+FARTHEST = 7.0
 """A round changes a σ by e⁷, a thousand times, at most."""
 
 
@@ -201,15 +200,11 @@ class Group:
 
     def weight(self) -> np.ndarray:
         """(g,) Huber's weights."""
-        return np.minimum(1, self.limit / np.maximum(np.linalg.norm(self.white, axis=1), 1e-300))
+        return huber_weights(np.linalg.norm(self.white, axis=1), self.limit)
 
     def linear(self) -> NormalEquations:
         """Its part of the cost and of the normal equations."""
-        length = np.linalg.norm(self.white, axis=1)
-        inside = np.minimum(length, self.limit)
-        cost = float((inside**2).sum())
-        if (length > inside).any():
-            cost += float(2 * self.limit * (length - inside).sum())
+        cost = float(huber_cost(np.linalg.norm(self.white, axis=1), self.limit).sum())
         pulled = self.slope.multiply(np.repeat(self.weight(), self.white.shape[1])[:, None]).tocsr().T
         return NormalEquations(cost, (pulled @ self.slope).toarray(), pulled @ self.white.ravel())
 
@@ -273,29 +268,17 @@ def estimated(corners: Corners, state: Bundle, free: tuple[str, ...]) -> dict[st
             parts[key] = old_count + count, old + linear
     fixed = parts.pop("", (0, nothing))[1]
     names = tuple(parts)
-
-    def cost(logs: np.ndarray) -> tuple[float, np.ndarray]:
-        """Minus twice the log-likelihood of (old σ / new σ)²."""
-        share = np.exp(logs)
-        linears = [linear for _, linear in parts.values()]
-        counts = np.array([count for count, _ in parts.values()])
-        normal = fixed.normal + sum(s * linear.normal for s, linear in zip(share, linears, strict=True))
-        scale = 1 / np.sqrt(np.maximum(np.diag(normal), 1e-300))
-        pull = fixed.gradient + sum(s * linear.gradient for s, linear in zip(share, linears, strict=True))
-        root = cho_factor(normal * scale[:, None] * scale + HELD * np.eye(len(scale)), lower=True)
-        inverse = cho_solve(root, np.eye(len(scale))) * scale[:, None] * scale
-        step = -inverse @ pull
-        value = fixed.cost + share @ [linear.cost for linear in linears] + pull @ step - counts @ logs
-        value += 2 * np.log(np.diag(root[0]) / scale).sum()
-        squares = [p.cost + 2 * p.gradient @ step + step @ p.normal @ step for p in linears]
-        taken = [(inverse * p.normal).sum() for p in linears]
-        return float(value + caution @ logs), share * (np.array(squares) + taken) - counts + caution
-
-    least = [2 * np.log(corners.sigma[name] / LEAST.get(name, 1.0)) for name in names]
-    caution = np.array([CAUTION if name in LEAST else 0.0 for name in names])
-    bounds = [(-FARTHEST, min(FARTHEST, highest)) for highest in least]
-    found = minimize(cost, np.zeros(len(names)), jac=True, method="L-BFGS-B", bounds=bounds)
-    return {name: float(corners.sigma[name] * np.exp(-x / 2)) for name, x in zip(names, found.x, strict=True)}
+    found = Parts(
+        each=NormalEquations.stacked([linear for _, linear in parts.values()]),
+        count=np.array([count for count, _ in parts.values()]),
+        fixed=fixed,
+        caution=np.array([CAUTION if name in LEAST else 0.0 for name in names]),
+        held=HELD,
+    )
+    least = np.log([LEAST.get(name, 1.0) / corners.sigma[name] for name in names])
+    farthest = np.full(len(names), FARTHEST)
+    best = found.best(np.maximum(least, -farthest), farthest, [np.zeros(len(names))])
+    return {name: float(corners.sigma[name] * np.exp(x)) for name, x in zip(names, best, strict=True)}
 
 
 def _sparse(by: dict, at: dict[str, slice], count: int, own: dict[str, np.ndarray]) -> csr_matrix:

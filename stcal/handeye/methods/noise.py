@@ -3,11 +3,11 @@
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.optimize import minimize
-from scipy.stats import chi2
 
 from stcal.errors import InputError
 from stcal.geometry.rigid import Rigid
+from stcal.geometry.robust import robust_sigma
+from stcal.geometry.variances import component_variances
 from stcal.handeye.data.loop import Loop
 
 LEAST = {"rad": 1e-9, "mm": 1e-6, "factor": 1e-2}
@@ -92,7 +92,8 @@ class Components:
 
     def first(self, residuals: np.ndarray) -> np.ndarray:
         """Variances (f,) to start with, from the medians of residuals (m, 6): bad poses do not count."""
-        squared = np.median((residuals.reshape(-1, 2, 3) ** 2).sum(2), axis=0) / chi2.ppf(0.5, 3)
+        lengths = np.linalg.norm(residuals.reshape(-1, 2, 3), axis=2)
+        squared = [robust_sigma(length, 3) ** 2 for length in lengths.T]
         turns = max(sum(name.endswith("_rad") for name in self.names), 1)
         by_kind = {"rad": squared[0] / turns, "mm": squared[1], "factor": 1.0}
         return np.maximum([by_kind[_kind(name)] for name in self.names], self.least())
@@ -160,32 +161,6 @@ def variance_components(parts: Components, residuals: np.ndarray, slope: np.ndar
     first : (f,) array
         The first guess, of :meth:`Components.first`.
     """
-    slope = _independent(slope)
-
-    def cost(logs: np.ndarray) -> tuple[float, np.ndarray]:
-        theta = np.exp(logs)
-        spread = parts.total(theta)
-        inverse = np.linalg.inv(spread)
-        weighted = inverse @ slope
-        normal = np.einsum("mai,maj->ij", slope, weighted)
-        covariance = np.linalg.inv(normal)
-        left = residuals - slope @ (covariance @ np.einsum("mai,ma->i", weighted, residuals))
-        fitted = np.einsum("mab,mb->ma", inverse, left)
-        value = np.linalg.slogdet(spread)[1].sum() + np.linalg.slogdet(normal)[1] + (fitted * left).sum()
-        by = np.einsum("mab,kmba->k", inverse, parts.free)
-        taken = np.einsum("kmab,mbj->kmaj", parts.free, weighted)
-        by = by - np.einsum("mai,kmaj,ij->k", weighted, taken, covariance, optimize=True)
-        by = by - np.einsum("ma,kmab,mb->k", fitted, parts.free, fitted, optimize=True)
-        return float(value - CAUTION * logs.sum()), by * theta - CAUTION
-
-    low, start = np.log(np.maximum(parts.least(), LEAST_SHARE * first)), np.log(first)
-    bounds = list(zip(low, np.maximum(start, low) + 2 * FARTHEST, strict=True))
-    found = minimize(cost, start, jac=True, method="L-BFGS-B", bounds=bounds, options={"ftol": 1e-12})
-    return np.exp(found.x)
-
-
-def _independent(slope: np.ndarray) -> np.ndarray:
-    """Directions (m, 6, r) that span the same changes of the residuals as the columns of ``slope``."""
-    flat = slope.reshape(-1, slope.shape[2])
-    u, s, _ = np.linalg.svd(flat / np.maximum(np.linalg.norm(flat, axis=0), 1e-300), full_matrices=False)
-    return u[:, s > 1e-7 * s[0]].reshape(*slope.shape[:2], -1)
+    least = np.maximum(parts.least(), LEAST_SHARE * first)
+    most = np.maximum(first, least) * np.exp(2 * FARTHEST)
+    return component_variances(residuals, slope, parts.known, parts.free, first, (least, most), CAUTION)

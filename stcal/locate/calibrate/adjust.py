@@ -11,6 +11,7 @@ from stcal.geometry.least_squares import minimise
 from stcal.geometry.normal_equations import Reduction, reduce
 from stcal.geometry.rigid import Poses, Rigid
 from stcal.geometry.robust import huber_cost, huber_weights, length_limit, robust_sigma
+from stcal.geometry.variances import sigma_factor
 from stcal.locate.pose.problem import PlanarProblem, project
 
 MAX_STEPS = 60
@@ -19,6 +20,8 @@ HUBER_TAIL = 0.011
 GROSS = 4.0
 """Times that limit: another tag than it is read as, or a corner that is hidden. It has no weight at all."""
 VARIANCE_ROUNDS = 6
+LEAST_FACTOR = 1e-3
+"""Of the stated σ of the board's points: exact data have none, and rounding would count."""
 TOGETHER = np.tile(np.eye(2), (4, 1))
 """(8, 2): the corners of a tag that moves as a whole."""
 APART = null_space(TOGETHER.T)
@@ -146,7 +149,7 @@ def _first_noise(images, poses: Poses, corners: np.ndarray) -> "_Noise":
     blocks = [_blocks(image, poses[[i]], corners, _Noise(1.0, 0.0, 0.0)) for i, image in enumerate(images)]
     board = np.concatenate([np.linalg.norm(b[0].residual, axis=1) for b in blocks])
     tags = np.concatenate([np.linalg.norm(b[1].px.reshape(-1, 2), axis=1) for b in blocks])
-    return _Noise(max(robust_sigma(board, 2), 1e-3), robust_sigma(tags, 2), 0.0)
+    return _Noise(max(robust_sigma(board, 2), LEAST_FACTOR), robust_sigma(tags, 2), 0.0)
 
 
 def _rms(values: np.ndarray) -> float:
@@ -257,7 +260,7 @@ def _variances(images, linear: _Linear, covariance: np.ndarray, noise: _Noise) -
     both = _added(own, px, weight, TOGETHER / 2, 2 / 8 * free[1])
     # The mean of four corners, times two: a tag's shift counts four times, the corners' own once.
     tag = np.sqrt(max(both**2 - corner**2, 0.0) / 4)
-    return _Noise(noise.board * float(np.sqrt(square / free[0])), corner, float(tag))
+    return _Noise(max(noise.board * sigma_factor(square, free[0]), LEAST_FACTOR), corner, float(tag))
 
 
 def _added(own: np.ndarray, px: np.ndarray, weight: np.ndarray, part: np.ndarray, free: float) -> float:

@@ -8,6 +8,7 @@ import numpy as np
 from stcal.errors import DegenerateError, InputError
 from stcal.geometry.arrays import Array, freeze
 from stcal.geometry.rigid import skew
+from stcal.geometry.robust import huber_weights
 from stcal.parallel import one_thread
 from stcal.robot.identify.adjustment import (
     Solution,
@@ -334,7 +335,7 @@ def _adjusted(
         found = _settled(found.solution.state, only_of(seen, good), options, rows)
         left = residuals(found.solution.state, seen)
         length = np.linalg.norm(found.weighting.whiten(left, seen), axis=1)
-        weights = np.minimum(1.0, huber_limit(seen.kind) / np.maximum(length, 1e-300))
+        weights = huber_weights(length, huber_limit(seen.kind))
         found = replace(found, solution=replace(found.solution, residuals=left, weights=weights))
     if _errors_change(found, good):
         note = f"which observations are errors still changes after {OUTLIER_ROUNDS} rounds; look at the outliers"
@@ -419,7 +420,7 @@ def _place(seen: Observed) -> int:
 
 def _covariance(adjusted: Adjustment, seen: Observed) -> np.ndarray:
     """(k, k) of the parameters; none along the directions that distances never see, which stay where they were."""
-    covariance = adjusted.parts.covariance(np.zeros(len(adjusted.parts.count)))
+    covariance = adjusted.parts.covariance(np.zeros(len(adjusted.parts.least)))
     if seen.kind != "distance":
         return covariance
     units = adjusted.solution.units

@@ -19,6 +19,9 @@ from stcal.robot.kinematics.model import Robot
 ROUNDS = 50
 REGULAR = 1e-10
 """Damping that keeps what these positions leave open, as of a tool that never turned, where it is."""
+NEARLY = 1e-3
+"""Share of the squared misfit that a start may still promise to lose: where the robot file is not that of the data the
+valley is flat, and the misfit says so."""
 FITS = 0.05
 """A nominal robot fits its data when its RMS error is below this share of their spread; factories err by under 1 %."""
 EXPLAINS = 0.2
@@ -124,7 +127,9 @@ def _base_and_points(where: str, flange: Poses, positions: np.ndarray, rows: np.
         linearise,
         lambda at, step: (perturbed(at[0], step[:6]), at[1] + step[6:].reshape(-1, 3)),
         least_damping=REGULAR,
-    ).required(f"{where}: base and tools", "check the D-H rows and the joint values")
+        max_steps=ROUNDS,
+    )
+    found.required(f"{where}: base and tools", "check the D-H rows and the joint values", NEARLY * found.linear.cost)
     return *found.state, float(np.sqrt(found.linear.cost / len(rows)))
 
 

@@ -10,9 +10,10 @@ about the maximum: in place of σ taken as known it is wider by what a t distrib
 from dataclasses import astuple, dataclass
 
 import numpy as np
-from scipy.optimize import minimize
 from scipy.special import chdtr, chdtrc
 
+from stcal.geometry.least_squares import NormalEquations
+from stcal.geometry.variances import Parts
 from stcal.robot.identify.adjustment import USELESS_MM, Solution, Weighting, huber_limit
 from stcal.robot.identify.nominal import DOUBT, Deviations, NominalRows
 from stcal.robot.identify.residuals import WIDTH, Kind, Observed, jacobian
@@ -33,52 +34,18 @@ STEP = 1e-4
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Components:
-    """An adjustment, linear about its solution, in p parts of which each has a σ.
+    """Parts of an adjustment, linear about its solution, in ``units`` (k,) of its parameters; those of the data first,
+    then the groups of the robot's dimensions. ``least`` : (p,) of log (σ / present σ)."""
 
-    ``normal`` : (p, k, k), ``pull`` : (p, k), ``square`` : (p,) of each part's residuals e - J δ over its present σ:
-    JᵀJ, Jᵀe and eᵀe. ``count`` : (p,) of numbers. ``expected``, ``doubt`` : (p,) mean and σ of what is known of
-    log (σ / present σ) beforehand, ``doubt`` infinite where nothing is. ``least`` : (p,) of that logarithm.
-    ``fixed``, ``fixed_pull`` : (k, k), (k,) of what has no σ to be estimated; ``units`` : (k,) of the parameters.
-    """
-
-    normal: np.ndarray
-    pull: np.ndarray
-    square: np.ndarray
-    count: np.ndarray
-    expected: np.ndarray
-    doubt: np.ndarray
+    parts: Parts
     least: np.ndarray
-    fixed: np.ndarray
-    fixed_pull: np.ndarray
     units: np.ndarray
-
-    def at(self, x: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-        """At log (σ / present σ) x (m, p): log posterior density (m,), its gradient (m, p), parameters (m, k) beyond
-        the solution and their covariance (m, k, k), both in ``units``."""
-        share = np.exp(-2 * x)
-        normal = np.einsum("mp,pkl->mkl", share, self.normal) + self.fixed
-        pull = share @ self.pull + self.fixed_pull
-        inverse = np.linalg.inv(normal)
-        step = np.einsum("mkl,ml->mk", inverse, pull)
-        away = (x - self.expected) / self.doubt
-        square = self.square - 2 * step @ self.pull.T + np.einsum("mk,pkl,ml->mp", step, self.normal, step)
-        taken = np.einsum("mkl,plk->mp", inverse, self.normal)
-        fixed = np.einsum("mk,kl,ml->m", step, self.fixed, step) - 2 * step @ self.fixed_pull
-        value = -(x @ self.count) - 0.5 * ((share * square).sum(1) + fixed + np.linalg.slogdet(normal)[1])
-        return value - 0.5 * (away**2).sum(1), share * (square + taken) - self.count - away / self.doubt, step, inverse
 
     def best(self) -> np.ndarray:
         """(p,) log (σ / present σ) of highest density."""
-        bounds = np.column_stack([np.maximum(self.least, -FARTHEST), np.full(len(self.least), FARTHEST)])
-
-        def downhill(x: np.ndarray) -> tuple[float, np.ndarray]:
-            value, gradient, _, _ = self.at(x[None])
-            return -float(value[0]), -gradient[0]
-
-        data = np.isinf(self.doubt)
-        starts = (np.zeros(len(data)), np.where(data, QUIETER, self.expected))
-        fits = [minimize(downhill, np.clip(x, *bounds.T), jac=True, method="L-BFGS-B", bounds=bounds) for x in starts]
-        return min(fits, key=lambda fit: fit.fun).x
+        data = np.isinf(self.parts.doubt)
+        starts = (np.zeros(len(data)), np.where(data, QUIETER, self.parts.expected))
+        return self.parts.best(np.maximum(self.least, -FARTHEST), np.full(len(data), FARTHEST), starts)
 
     def covariance(self, best: np.ndarray) -> np.ndarray:
         """(k, k) covariance of the parameters about the estimate at ``best`` (p,)."""
@@ -86,8 +53,8 @@ class Components:
         width = root.shape[1]
         index = np.indices((len(NODES),) * width).reshape(width, len(NODES) ** width).T
         z = NODES[index]
-        log_density, _, step, inverse = self.at(best + z @ root.T)
-        middle = self.at(best[None])
+        log_density, _, step, inverse = self.parts.at(best + z @ root.T)
+        middle = self.parts.at(best[None])
         log_weight = np.log(NODE_WEIGHTS[index]).sum(1) + log_density - middle[0] + 0.5 * (z**2).sum(1)
         weight = np.exp(log_weight - log_weight.max())
         weight /= weight.sum()
@@ -99,11 +66,11 @@ class Components:
         """(p, f) square root of the covariance of log σ, of the f that are not at their least value."""
         free = np.flatnonzero(best > np.maximum(self.least, -FARTHEST) + STEP)
         moves = STEP * np.eye(len(best))[free]
-        gradient = self.at(np.concatenate([best + moves, best - moves]))[1]
+        gradient = self.parts.at(np.concatenate([best + moves, best - moves]))[1]
         hessian = (gradient[: len(free)] - gradient[len(free) :])[:, free] / (2 * STEP)
         values, directions = np.linalg.eigh(-(hessian + hessian.T) / 2)
         # a flat or rising direction: as wide as what is known beforehand, at the most
-        least = np.full(len(free), np.min(self.doubt, initial=1.0) ** -2.0)
+        least = np.full(len(free), np.min(self.parts.doubt, initial=1.0) ** -2.0)
         values = np.maximum(values, least)
         root = np.zeros((len(best), len(free)))
         root[free] = directions / np.sqrt(values)
@@ -123,33 +90,32 @@ def components(
     # What σ scales is the square of the residual cut off at Huber's limit, (w e)²; the rest of w e² stays as it is.
     weight = solution.weights[:, None, None]
     scaled = weight**2 * honest[:, None, None]
-    parts, fixed, fixed_pull = [], np.eye(len(units)) / USELESS_MM**2, np.zeros(len(units))
+    parts, fixed = [], NormalEquations(0.0, np.eye(len(units)) / USELESS_MM**2, np.zeros(len(units)))
     for name, columns in weighting.columns(white.shape[1]).items():
         if name in weighting.estimated:
-            square, count = _normal(white, derivative, columns, scaled), kept * white[honest, columns].size
-            parts.append((*square, count, 0.0, np.inf, np.log(LEAST / weighting.value(name))))
-            normal, pull, _ = _normal(white, derivative, columns, weight - scaled)
+            own, count = _linear(white, derivative, columns, scaled), kept * white[honest, columns].size
+            parts.append((own, count, 0.0, np.inf, np.log(LEAST / weighting.value(name))))
+            fixed = fixed + _linear(white, derivative, columns, weight - scaled)
         else:
-            normal, pull, _ = _normal(white, derivative, columns, weight)
-        fixed, fixed_pull = fixed + normal, fixed_pull + pull
+            fixed = fixed + _linear(white, derivative, columns, weight)
     held, group = rows.held(solution.state, deviations, seen.kind), rows.group[rows.free]
     for g, (sigma, expected) in enumerate(zip(astuple(deviations), astuple(Deviations()), strict=True)):
         mine = group == g
         e, j = held.value[mine] / sigma, held.jacobian[mine] * units / sigma
         if mine.any():
-            parts.append((j.T @ j, -j.T @ e, e @ e, mine.sum(), np.log(expected / sigma), DOUBT, -np.inf))
-    normal, pull, square, count, expected, doubt, least = (np.array(each, float) for each in zip(*parts, strict=True))
-    return Components(normal, pull, square, count, expected, doubt, least, fixed, fixed_pull, units)
+            parts.append((NormalEquations.of(e, j), mine.sum(), np.log(expected / sigma), DOUBT, -np.inf))
+    each, *known = zip(*parts, strict=True)
+    count, expected, doubt, least = (np.array(values, float) for values in known)
+    return Components(Parts(NormalEquations.stacked(each), count, fixed, expected, doubt), least, units)
 
 
-def _normal(
-    white: np.ndarray, derivative: np.ndarray, columns: slice, weight: np.ndarray
-) -> tuple[np.ndarray, np.ndarray, float]:
-    """JᵀWJ, JᵀWe and eᵀWe of some coordinates, with weights (r, 1, 1)."""
+def _linear(white: np.ndarray, derivative: np.ndarray, columns: slice, weight: np.ndarray) -> NormalEquations:
+    """Of some coordinates e - J δ, with weights (r, 1, 1)."""
     k = derivative.shape[2]
     e, j = white[:, columns].ravel(), derivative[:, columns]
     weighted = (weight * j).reshape(-1, k).T
-    return weighted @ j.reshape(-1, k), weighted @ e, float((weight[:, :, 0] * white[:, columns] ** 2).sum())
+    cost = float((weight[:, :, 0] * white[:, columns] ** 2).sum())
+    return NormalEquations(cost, weighted @ j.reshape(-1, k), -(weighted @ e))
 
 
 def estimated(parts: Components, rows: NominalRows, weighting: Weighting, deviations: Deviations):

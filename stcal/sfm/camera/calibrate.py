@@ -82,6 +82,7 @@ def calibrate_camera(
     files, other = find_images(images)
     camera = start_camera(*_first_size(files))
     before: Intrinsics | None = None
+    settled = False
     with tempfile.TemporaryDirectory(prefix="stcal-camera-") as cache:
         for rounds in range(1, MAX_ROUNDS + 1):
             detection = _detect(
@@ -94,12 +95,13 @@ def calibrate_camera(
             result = adjust_intrinsics(views, board, start, colmap_model)
             require_determined(result, views)
             camera = result.camera
-            if before and _next_move(before, result) < SETTLED_SIGMAS:
+            settled = before is not None and _next_move(before, result) < SETTLED_SIGMAS
+            if settled:
                 break
             before = result
     projection = projection_sigma(result)
     split = split_half(result, views, board)
-    warnings = _warnings(result, projection, split, board)
+    warnings = [*_of_rounds(result, settled), *_warnings(result, projection, split, board)]
     return CameraCalibration(result, tuple(views), skipped, rounds, projection, split, tuple(warnings))
 
 
@@ -210,6 +212,18 @@ def _next_move(before: Intrinsics, after: Intrinsics) -> float:
     bent_px = np.abs((before.camera.distort(ideal) - ideal) * before.camera.focal).max()
     moved_px = np.abs(projection_jacobian(before.camera, before.colmap_model) @ moved).max()
     return float(np.abs(moved / after.sigma()).max() * min(1.0, moved_px / max(bent_px, 1e-9)))
+
+
+def _of_rounds(result: Intrinsics, settled: bool) -> list[str]:
+    """What had not come to rest when the rounds were used up."""
+    found = []
+    if not settled:
+        found.append(
+            f"the camera still moves after {MAX_ROUNDS} rounds of detection; add views, or choose a simpler --model"
+        )
+    if not result.settled:
+        found.append("the σ of centres and dots still change when the rounds end; look at the outliers")
+    return found
 
 
 def _warnings(

@@ -16,6 +16,7 @@ from stcal.geometry.camera import Camera
 from stcal.geometry.least_squares import minimise
 from stcal.geometry.normal_equations import Reduction, reduce
 from stcal.geometry.robust import HUBER, robust_sigma
+from stcal.geometry.variances import sigma_factor
 from stcal.io.camera import intrinsic_basis
 from stcal.labels import Label
 from stcal.sfm.adjust.blocks import image_cost, normalised, robust_weights, without_cameras
@@ -57,7 +58,8 @@ class SigmaFactors:
 class Intrinsics:
     """``cameras`` adjusted, c of them; ``covariance`` : (cq, cq) of the parameters of ``colmap_model``, camera by
     camera; ``models`` : the boards as seen by each camera, one for each folder, mm, board frame; ``camera_of`` each;
-    ``factors`` ; ``huber`` : the length of a normalised residual beyond which it weighs less; ``redundancy`` ."""
+    ``factors`` ; ``huber`` : the length of a normalised residual beyond which it weighs less; ``redundancy`` ;
+    ``settled`` : whether σ and eccentricities did within :data:`MAX_ROUNDS`."""
 
     cameras: tuple[Camera, ...]
     colmap_model: str
@@ -67,6 +69,7 @@ class Intrinsics:
     factors: SigmaFactors
     huber: float
     redundancy: int
+    settled: bool
 
     @property
     def camera(self) -> Camera:
@@ -164,6 +167,7 @@ def adjust_intrinsics(
     weight = np.linalg.inv(vague_prior(start, colmap_model))
     setting = _Setting(basis, weight, start, design, board.sigma_mm, np.inf)
     known, factors = factors, factors or SigmaFactors()
+    settled = False
     for _ in range(MAX_ROUNDS):
         before = state
         state = _weighted(state, own, factors, board)
@@ -175,7 +179,8 @@ def adjust_intrinsics(
         updated = known or _updated_factors(state, setting, last.dots_left, factors)
         change = max(abs(updated.centres / factors.centres - 1), abs(updated.dots / factors.dots - 1))
         factors = updated
-        if change < SETTLED_FACTOR and shifted < SETTLED_SHIFT_PX:
+        settled = bool(change < SETTLED_FACTOR and shifted < SETTLED_SHIFT_PX)
+        if settled:
             break
     covariance = np.linalg.inv(last.normal)
     return Intrinsics(
@@ -187,6 +192,7 @@ def adjust_intrinsics(
         factors=factors,
         huber=setting.huber,
         redundancy=_image_redundancy(state, basis.shape[1]),
+        settled=settled,
     )
 
 
@@ -254,11 +260,11 @@ def _updated_factors(state: _State, setting: _Setting, dots_left: float, factors
     image = sum(
         image_cost(m, state.cameras[k], setting.huber) for m, k in zip(state.models, state.camera_of, strict=True)
     )
-    image_left = max(_image_redundancy(state, setting.basis.shape[1]) - dots_left, 1.0)
+    image_left = _image_redundancy(state, setting.basis.shape[1]) - dots_left
     dots = factors.dots
     if dots_left > MIN_BOARD_REDUNDANCY:
-        dots = max(1.0, dots * float(np.sqrt(_dots_cost(state, setting) / dots_left)))
-    return SigmaFactors(factors.centres * float(np.sqrt(image / image_left)), dots)
+        dots = max(1.0, dots * sigma_factor(_dots_cost(state, setting), dots_left))
+    return SigmaFactors(factors.centres * sigma_factor(image, image_left), dots)
 
 
 def _boards(state: _State) -> dict[str, list[int]]:

@@ -3,6 +3,8 @@
 import numpy as np
 import pytest
 
+from stcal.geometry.least_squares import NormalEquations
+from stcal.geometry.variances import Parts
 from stcal.robot.identify.variances import Components
 
 
@@ -13,13 +15,13 @@ def regression(
     design = rng.normal(size=(rows, width))
     drawn = rng.normal(size=width) * tau * (np.arange(width) >= width - groups)
     seen = design @ drawn + rng.normal(size=rows) * sigma
-    parts = [(design.T @ design, design.T @ seen, seen @ seen, rows, 0.0, np.inf, -np.inf)]
+    each, count, doubt = [NormalEquations.of(seen, -design)], [rows], [np.inf]
     if groups:
         mine = np.diag((np.arange(width) >= width - groups).astype(float))
-        parts.append((mine, np.zeros(width), 0.0, groups, 0.0, 1.0, -np.inf))
-    fixed, none = 1e-12 * np.eye(width), np.zeros(width)
-    parts = [np.array(each, float) for each in zip(*parts, strict=True)]
-    return Components(*parts, fixed, none, np.ones(width)), design, seen, drawn
+        each, count, doubt = [*each, NormalEquations.of(np.zeros(width), mine)], [rows, groups], [np.inf, 1.0]
+    fixed = NormalEquations(0.0, 1e-12 * np.eye(width), np.zeros(width))
+    parts = Parts(NormalEquations.stacked(each), np.array(count), fixed, np.zeros(len(count)), np.array(doubt))
+    return Components(parts, np.full(len(count), -np.inf), np.ones(width)), design, seen, drawn
 
 
 @pytest.mark.parametrize("rows", [14, 24, 104])
@@ -39,7 +41,7 @@ def test_of_several_parts_the_covariance_is_true_on_average():
     for seed in range(400):
         parts, _, _, drawn = regression(np.random.default_rng(seed), 30, 10, 6, 1.0, 0.6)
         best = parts.best()
-        step = parts.at(best[None])[2][0]
+        step = parts.parts.at(best[None])[2][0]
         away = step - drawn
         error.append(away @ np.linalg.solve(parts.covariance(best), away) / 10)
     # With the σ taken for known it is 1.18. Three standard errors of the mean of 400 draws:
@@ -49,10 +51,9 @@ def test_of_several_parts_the_covariance_is_true_on_average():
 def test_parts_without_noise_do_not_break_it():
     design = np.random.default_rng(3).normal(size=(20, 3))
     exact = design @ [1.0, 2.0, 3.0]
-    parts = [(design.T @ design, design.T @ exact, exact @ exact, 20, 0.0, np.inf, -2.0)]
-    parts = Components(
-        *(np.array(each, float) for each in zip(*parts, strict=True)), np.zeros((3, 3)), np.zeros(3), np.ones(3)
-    )
+    each = NormalEquations.stacked([NormalEquations.of(exact, -design)])
+    none = NormalEquations(0.0, np.zeros((3, 3)), np.zeros(3))
+    parts = Components(Parts(each, np.array([20]), none, np.zeros(1), np.array([np.inf])), np.array([-2.0]), np.ones(3))
     best = parts.best()
     assert best == pytest.approx([-2.0])
     assert np.isfinite(parts.covariance(best)).all()

@@ -1,0 +1,127 @@
+"""Variance components: how much each kind of observation errs, from residuals that adjusted parameters have shortened.
+
+Restricted maximum likelihood (REML, Patterson & Thompson 1971), of parts that each have a σ or of covariances that are
+sums of components; and Förstner's (1979) step towards it.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.optimize import minimize
+
+from stcal.geometry.least_squares import NormalEquations
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Parts:
+    """An adjustment, linear about a state, in p parts of which each has a σ; x is log (σ / present σ).
+
+    ``each`` : p problems, each over its present σ; ``count`` : (p,) of their numbers; ``fixed`` : what has no σ to be
+    estimated; ``expected``, ``doubt`` : (p,) mean and σ of what is known of x beforehand, ``doubt`` infinite where
+    nothing is; ``caution`` : (p,) redundancies that are not counted; ``held`` : share of each parameter's information
+    that is added, so that what nothing determines is not singular.
+    """
+
+    each: NormalEquations
+    count: np.ndarray
+    fixed: NormalEquations
+    expected: np.ndarray | float = 0.0
+    doubt: np.ndarray | float = np.inf
+    caution: np.ndarray | float = 0.0
+    held: float = 0.0
+
+    def at(self, x: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+        """At x (m, p): log posterior density (m,), its gradient (m, p), parameters (m, k) beyond the state and their
+        covariance (m, k, k)."""
+        share, normals = np.exp(-2 * x), self.each.normal
+        p, k = self.each.gradient.shape
+        normal = (share @ normals.reshape(p, -1)).reshape(-1, k, k) + self.fixed.normal
+        scale = np.sqrt(np.maximum(np.einsum("mkk->mk", normal), 1e-300))
+        unit = normal / scale[:, :, None] / scale[:, None, :] + self.held * np.eye(k)
+        inverse = np.linalg.inv(unit) / scale[:, :, None] / scale[:, None, :]
+        step = -np.einsum("mkl,ml->mk", inverse, share @ self.each.gradient + self.fixed.gradient)
+        away = (x - self.expected) / self.doubt
+        bent = np.einsum("pmk,mk->mp", step @ normals, step)
+        square = self.each.cost + 2 * step @ self.each.gradient.T + bent
+        taken = inverse.reshape(-1, k * k) @ normals.reshape(p, -1).T
+        fixed = self.fixed.cost + 2 * step @ self.fixed.gradient + ((step @ self.fixed.normal) * step).sum(1)
+        size = np.linalg.slogdet(unit)[1] + 2 * np.log(scale).sum(1)
+        counted = self.count - self.caution
+        value = -(x @ counted) - 0.5 * ((share * square).sum(1) + fixed + size + (away**2).sum(1))
+        return value, share * (square + taken) - counted - away / self.doubt, step, inverse
+
+    def best(self, low: np.ndarray, high: np.ndarray, starts: Sequence[np.ndarray]) -> np.ndarray:
+        """(p,) x of highest density within bounds (p,), looked for from ``starts`` (p,)."""
+
+        def downhill(x: np.ndarray) -> tuple[float, np.ndarray]:
+            value, gradient, _, _ = self.at(x[None])
+            return -float(value[0]), -gradient[0]
+
+        bounds = np.column_stack([low, high])
+        fits = [minimize(downhill, np.clip(x, low, high), jac=True, method="L-BFGS-B", bounds=bounds) for x in starts]
+        return min(fits, key=lambda fit: fit.fun).x
+
+
+def component_variances(
+    residuals: np.ndarray,
+    jacobian: np.ndarray,
+    known: np.ndarray,
+    free: np.ndarray,
+    first: np.ndarray,
+    bounds: tuple[np.ndarray, np.ndarray],
+    caution: float = 0.0,
+) -> np.ndarray:
+    """Restricted maximum-likelihood variances (f,) of covariances that are sums of components.
+
+    Parameters
+    ----------
+    residuals
+        (m, a) near a solution.
+    jacobian
+        (m, a, k) their derivative by the parameters solved for; dependent columns do no harm.
+    known
+        (m, a, a) the part of their covariances that is known.
+    free
+        (f, m, a, a) what is multiplied by each variance.
+    first
+        (f,) first guess.
+    bounds
+        (f,) least and greatest variances.
+    caution
+        Redundancies of each variance that are not counted.
+    """
+    jacobian = _independent(jacobian)
+
+    def cost(logs: np.ndarray) -> tuple[float, np.ndarray]:
+        theta = np.exp(logs)
+        spread = known + np.tensordot(theta, free, 1)
+        inverse = np.linalg.inv(spread)
+        weighted = inverse @ jacobian
+        normal = np.einsum("mai,maj->ij", jacobian, weighted)
+        covariance = np.linalg.inv(normal)
+        left = residuals - jacobian @ (covariance @ np.einsum("mai,ma->i", weighted, residuals))
+        fitted = np.einsum("mab,mb->ma", inverse, left)
+        value = np.linalg.slogdet(spread)[1].sum() + np.linalg.slogdet(normal)[1] + (fitted * left).sum()
+        by = np.einsum("mab,kmba->k", inverse, free)
+        taken = np.einsum("kmab,mbj->kmaj", free, weighted)
+        by = by - np.einsum("mai,kmaj,ij->k", weighted, taken, covariance, optimize=True)
+        by = by - np.einsum("ma,kmab,mb->k", fitted, free, fitted, optimize=True)
+        return float(value - caution * logs.sum()), by * theta - caution
+
+    limits = np.log(np.column_stack(bounds))
+    found = minimize(cost, np.log(first), jac=True, method="L-BFGS-B", bounds=limits, options={"ftol": 1e-12})
+    return np.exp(found.x)
+
+
+def _independent(jacobian: np.ndarray) -> np.ndarray:
+    """Directions (m, a, r) that span the same changes of the residuals as the columns of ``jacobian``."""
+    flat = jacobian.reshape(-1, jacobian.shape[2])
+    u, s, _ = np.linalg.svd(flat / np.maximum(np.linalg.norm(flat, axis=0), 1e-300), full_matrices=False)
+    return u[:, s > 1e-7 * s[0]].reshape(*jacobian.shape[:2], -1)
+
+
+def sigma_factor(square: float, redundancy: float) -> float:
+    """Factor on a σ with which the squares of residuals over it, ``square``, are as many as their redundancy (Förstner
+    1979); it is a step of an iteration where there are other σ."""
+    return float(np.sqrt(square / max(redundancy, 1.0)))
