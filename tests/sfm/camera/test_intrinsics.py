@@ -62,16 +62,18 @@ def error(result, truth=TRUE) -> np.ndarray:
     return model_parameters(result.camera, result.colmap_model) - model_parameters(truth, result.colmap_model)
 
 
-def test_truth_within_predicted_sigma():
-    # 40 calibrations from nothing; the normalised squared error of 8 parameters scatters by 8 % about 1.
+@pytest.mark.parametrize("count", [6, pytest.param(40, marks=pytest.mark.slow)])
+def test_truth_within_predicted_sigma(count):
+    # Of 40 calibrations from nothing the normalised squared error of 8 parameters scatters by 8 % about 1.
     squares, factors = [], []
-    for seed in range(40):
+    for seed in range(count):
         result = calibrated(views_of(np.random.default_rng(seed)))
         e = error(result)
         squares.append(e @ np.linalg.solve(result.covariance, e) / 8)
         factors.append(result.factors.centres)
-    assert 0.8 < np.mean(squares) < 1.2
-    assert 0.98 < np.mean(factors) < 1.02
+    wider = np.sqrt(40 / count)
+    assert abs(np.mean(squares) - 1) < 0.2 * wider
+    assert abs(np.mean(factors) - 1) < 0.02 * wider
     # Of a 24 mm lens on a 22 mm sensor, 1 px is 4e-4: σ of 0.02 px centres must be far below.
     assert 0.05 < result.sigma()[0] < 0.2
 
@@ -146,12 +148,12 @@ def test_a_model_that_does_not_fit_is_refused():
 
 def test_split_half_passes_honest_views_and_fails_a_changed_focus():
     p = []
-    for seed in range(8):
+    for seed in range(4):
         rng = np.random.default_rng(seed)
         views = views_of(rng)
         p.append(split_half(calibrated(views), views, BOARD).p_value)
     assert min(p) > 1e-3
-    assert np.mean(p) == pytest.approx(0.5, abs=0.3)  # uniform: σ of the mean 0.1
+    assert np.mean(p) == pytest.approx(0.5, abs=0.43)  # uniform: σ of the mean 0.14
 
     made = np.column_stack([BOARD.xy_mm(), np.zeros(63)])
     refocused = replace(TRUE, focal=1.002 * TRUE.focal)

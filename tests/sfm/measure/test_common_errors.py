@@ -11,7 +11,7 @@ from stcal.sfm.measure.pose import pose_from_circles
 from stcal.synthetic.measured.image_poses import faces_view, known_target, pose_error, see, view
 from stcal.synthetic.scene import SceneOptions, make_scene
 
-NOISE_PX, DRAWS = 0.02, 60
+NOISE_PX, DRAWS = 0.02, 20
 SIGMA = np.array([0.3, 0.3, 0.3, 0.3, 1e-4, 3e-4, 1e-5, 1e-5])
 """Of intrinsics: fx, fy, cx, cy, k1, k2, p1, p2."""
 
