@@ -5,6 +5,10 @@ is first used.
 """
 
 from importlib import import_module
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from stcal import handeye, locate, register, robot, sfm
 
 __version__ = "0.1.0"
 __all__ = ["handeye", "locate", "register", "robot", "sfm"]

@@ -265,7 +265,7 @@ def _outlier(found: Findings, row: int) -> OutlierRow:
 
 
 def _field(field: ResidualField, found: Findings) -> FieldPart:
-    grid = grid_of(found)
+    grid = grid_of(found.xyz_a[field.rows])
     error, covariance = field.at(grid)
     plain, corrected = (ErrorFigures.of(lengths) for lengths in (field.plain_mm, field.corrected_mm))
     return FieldPart(
@@ -285,9 +285,8 @@ def _field(field: ResidualField, found: Findings) -> FieldPart:
     )
 
 
-def grid_of(found: Findings) -> np.ndarray:
-    """(g, 3) places in and around the points used, frame a, mm."""
-    own = found.xyz_a[found.field.rows]
+def grid_of(own: np.ndarray) -> np.ndarray:
+    """(g, 3) places in and around the points used (n, 3), frame a, mm."""
     low, high = own.min(0), own.max(0)
     side = MARGIN * (high - low)
     axes = [np.linspace(a, b, GRID) if b > a else [a] for a, b in zip(low - side, high + side, strict=True)]

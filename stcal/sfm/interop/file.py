@@ -80,7 +80,7 @@ def _gates(verdict: Verdict) -> GatesRow:
 
 
 def _gate(gate: Gate) -> GateRow:
-    if not gate.name.endswith("angle"):
+    if not gate.name.endswith("angle") or isinstance(gate.value, str) or gate.limit is None:
         return GateRow(gate=gate.name, value=gate.value, limit=gate.limit, passed=gate.passed)
     value, limit = _degrees(gate.value), _degrees(gate.limit)
     return GateRow(gate=f"{gate.name}_deg", value=value, limit=limit, passed=gate.passed)
