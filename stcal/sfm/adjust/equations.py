@@ -1,0 +1,184 @@
+"""The equations of the joint adjustment over what all groups share, each group's own unknowns reduced away."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from stcal.design import BoardDesign
+from stcal.geometry.camera import Camera
+from stcal.geometry.normal_equations import free_motions
+from stcal.geometry.plane import fit_plane
+from stcal.labels import CircleLabel
+from stcal.sfm.adjust.blocks import Block, Reduced, Shared, moved, reduced, step_of
+
+FREE_DIRECTIONS = 6
+"""The world may be anywhere: a rigid motion of everything changes nothing."""
+
+
+@dataclass(frozen=True, slots=True)
+class Places:
+    """Of circles, common shape and intrinsics among the unknowns that the groups share, and how many those are."""
+
+    circles: slice
+    shape: slice
+    intrinsics: slice
+    count: int
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Setting:
+    """What stays the same in one minimisation; ``flatness_mm`` is infinite where nothing is known of it."""
+
+    labels: tuple[CircleLabel, ...]
+    board: BoardDesign
+    common: float
+    flatness_mm: float
+    given: Camera
+    prior: np.ndarray
+    huber: float
+
+    def places(self, shared: Shared) -> "Places":
+        """Where the shared unknowns stand."""
+        c = 3 * len(self.labels)
+        s = c + (3 * len(shared.shape_mm) if self.common else 0)
+        count = s + shared.basis.shape[1]
+        return Places(slice(0, c), slice(c, s), slice(s, count), count)
+
+    def own_sigma_mm(self) -> float:
+        return self.board.sigma_mm * float(np.sqrt(1 - self.common))
+
+    def shape_sigma_mm(self) -> float:
+        return self.board.sigma_mm * float(np.sqrt(self.common))
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class State:
+    """All unknowns."""
+
+    blocks: tuple[Block, ...]
+    shared: Shared
+
+    def moved(self, step: np.ndarray, setting: Setting) -> "State":
+        """After a step of what the groups share, then of each group's own."""
+        shared, places = self.shared, setting.places(self.shared)
+        ends = places.count + np.cumsum([0, *(_size(b) for b in self.blocks)])
+        blocks = tuple(moved(b, step[i:j]) for b, i, j in zip(self.blocks, ends[:-1], ends[1:], strict=True))
+        shape = shared.shape_mm + step[places.shape].reshape(-1, 3) if setting.common else shared.shape_mm
+        camera = shared.camera
+        if shared.basis.shape[1]:
+            camera = camera.with_parameters(camera.parameters() + shared.basis @ step[places.intrinsics])
+        xyz = shared.xyz_model + step[places.circles].reshape(-1, 3)
+        return State(blocks, Shared(xyz, shape, camera, shared.basis))
+
+
+def _size(block: Block) -> int:
+    """Number of a group's own unknowns, points that it shares included."""
+    return 3 * len(block.model.labels) + 6 * len(block.model.images) + 6
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Normal:
+    """Normal equations over what the groups share, each group's own unknowns reduced away."""
+
+    cost: float
+    state: State
+    setting: Setting
+    normal: np.ndarray
+    right: np.ndarray
+    groups: tuple[Reduced, ...]
+
+    @classmethod
+    def of(cls, state: State, setting: Setting) -> "Normal":
+        cost = cost_of(state.blocks, state.shared, setting)
+        return cls(cost, state, setting, *_normal_equations(state.blocks, state.shared, setting))
+
+    def step(self, damping: float | np.ndarray) -> tuple[np.ndarray, float]:
+        """Of what the groups share, then of each group's own."""
+        setting, shared = self.setting, self.state.shared
+        free = free_directions(len(self.normal), shared)
+        held = self.normal + damping * np.diag(np.diag(self.normal))
+        held += np.median(np.diag(self.normal)[: shared.xyz_model.size]) * free @ free.T
+        outer = np.linalg.solve(held, self.right)
+        gain = 2 * float(outer @ self.right) - float(outer @ self.normal @ outer) + sum(g.gain for g in self.groups)
+        intrinsics = outer[setting.places(shared).intrinsics]
+        own = [
+            step_of(b, g, outer[_outer(b, setting, shared)], intrinsics)
+            for b, g in zip(self.state.blocks, self.groups, strict=True)
+        ]
+        return np.concatenate([outer, *own]), gain
+
+
+def _outer(block: Block, setting: Setting, shared: Shared) -> np.ndarray:
+    """Places of a group's outer unknowns among all: circles, shape, intrinsics."""
+    places = setting.places(shared)
+    circles = (3 * block.circle_place[:, None] + np.arange(3)).ravel()
+    shape = places.shape.start + (3 * block.dot_place[:, None] + np.arange(3)).ravel()
+    intrinsics = np.arange(places.intrinsics.start, places.intrinsics.stop)
+    return np.concatenate([circles, shape, intrinsics]).astype(int)
+
+
+def _normal_equations(blocks: Sequence[Block], shared: Shared, setting: Setting):
+    """Over circles, common shape and intrinsics: matrix and right-hand side; and the groups, reduced."""
+    places = setting.places(shared)
+    normal, right = np.zeros((places.count, places.count)), np.zeros(places.count)
+    groups = tuple(reduced(b, shared, setting.huber) for b in blocks)
+    for b, each in zip(blocks, groups, strict=True):
+        place = _outer(b, setting, shared)
+        normal[np.ix_(place, place)] += each.normal
+        right[place] += each.right
+    if setting.common:
+        shape = np.arange(places.shape.start, places.shape.stop)
+        normal[shape, shape] += 1 / setting.shape_sigma_mm() ** 2
+        right[shape] -= shared.shape_mm.ravel() / setting.shape_sigma_mm() ** 2
+    normal[places.intrinsics, places.intrinsics] += setting.prior
+    right[places.intrinsics] -= setting.prior @ _away(shared, setting)
+    for members, across, normal_model in planes(shared, setting):
+        jacobian = across[:, :, None] * normal_model  # distances from the plane by the circles
+        flat = jacobian.reshape(len(members), -1)
+        place = (3 * members[:, None] + np.arange(3)).ravel()
+        distance = across @ (shared.xyz_model[members] @ normal_model)
+        normal[np.ix_(place, place)] += flat.T @ flat / setting.flatness_mm**2
+        right[place] -= flat.T @ distance / setting.flatness_mm**2
+    return normal, right, groups
+
+
+def planes(shared: Shared, setting: Setting):
+    """For every face: its circles, the projector that takes heights to distances from the best plane, its normal."""
+    if not np.isfinite(setting.flatness_mm):
+        return
+    faces: dict[str, list[int]] = {}
+    for i, label in enumerate(setting.labels):
+        faces.setdefault(label.face, []).append(i)
+    for own in faces.values():
+        if len(own) > 3:
+            members = np.array(own)
+            xyz = shared.xyz_model[members]
+            normal = fit_plane(xyz).normal
+            base = np.linalg.svd(np.eye(3) - np.outer(normal, normal))[0][:, :2]
+            design = np.column_stack([np.ones(len(own)), (xyz - xyz.mean(0)) @ base])
+            yield members, np.eye(len(own)) - design @ np.linalg.pinv(design), normal
+
+
+def _away(shared: Shared, setting: Setting) -> np.ndarray:
+    """Adjusted minus given intrinsics, (q,)."""
+    return np.linalg.pinv(shared.basis) @ (shared.camera.parameters() - setting.given.parameters())
+
+
+def cost_of(blocks: Sequence[Block], shared: Shared, setting: Setting) -> float:
+    cost = sum(b.cost(shared, setting.huber) for b in blocks)
+    if setting.common:
+        cost += float(((shared.shape_mm / setting.shape_sigma_mm()) ** 2).sum())
+    if shared.basis.shape[1]:
+        away = _away(shared, setting)
+        cost += float(away @ setting.prior @ away)
+    for members, across, normal in planes(shared, setting):
+        cost += float(((across @ (shared.xyz_model[members] @ normal)) ** 2).sum()) / setting.flatness_mm**2
+    return cost
+
+
+def free_directions(count: int, shared: Shared) -> np.ndarray:
+    """Directions (count, 6) in which all circles move as one: the datum is that of smallest trace over them."""
+    free = np.zeros((count, FREE_DIRECTIONS))
+    free[: shared.xyz_model.size] = free_motions(shared.xyz_model, scale=False)
+    return free
