@@ -1,10 +1,13 @@
 """What tests share: the data sets beside the repository, and a calibration without pixels."""
 
 import os
+import signal
 
 from stcal.parallel import ONE_THREAD
 
 os.environ.update(dict.fromkeys(ONE_THREAD, "1"))  # before numpy is loaded; for the commands that tests start, too
+if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:  # of a suite in the background: its commands could not be stopped
+    signal.signal(signal.SIGINT, signal.default_int_handler)
 
 from collections.abc import Callable
 from dataclasses import replace

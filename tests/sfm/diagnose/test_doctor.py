@@ -174,6 +174,7 @@ def test_in_view_faces_the_camera_whole_and_in_front(small_run):
     assert seen(xyz=(226, 0, 500)) == [True, False, False]
 
 
+@pytest.mark.slow
 def test_too_small_circles(patient, stcal_sfm):
     """9 px asked for: an option finds those circles that it is said to let in and no others, and places the image."""
     diagnosis = patient.run(ellipses=EllipseOptions(min_diameter_px=9.0))
@@ -292,6 +293,7 @@ def test_another_view_lets_in_a_circle_seen_once(patient):
     assert "2:7" in patient.mapped()[1]
 
 
+@pytest.mark.slow
 def test_spoiled_faces_and_boards(patient):
     """Faces with 7 of 10 circles, 8 needed, and as faint as a reflection; a board of 20 of 63 dots, 23 needed."""
     hidden = {"2:2", "2:6", "2:7"}

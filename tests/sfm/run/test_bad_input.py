@@ -531,7 +531,7 @@ def test_debug_shows_the_traceback(small_set):
     assert "stcal.errors.InputError: image folder" in done.stderr
 
 
-@pytest.mark.parametrize("how", [signal.SIGKILL, signal.SIGINT])
+@pytest.mark.parametrize("how", [pytest.param(signal.SIGKILL, marks=pytest.mark.slow), signal.SIGINT])
 def test_an_interrupted_run_leaves_nothing_that_looks_complete(small_set, stcal_sfm, how):
     small = small_set("12", "14", detected=False)
     running = subprocess.Popen(
