@@ -10,6 +10,8 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 
+from stcal.geometry.robust import median_length
+
 SAMPLES = 25
 """Of a profile across an edge."""
 POINTS = 32
@@ -140,8 +142,8 @@ def _fit(place: np.ndarray, offset: np.ndarray, good: np.ndarray) -> _Lines:
         off = np.abs(offset - value[..., :1] - value[..., 1:] * place)
         sorted_off = np.sort(np.where(keep, off, np.inf), axis=2)
         middle = np.maximum(keep.sum(2, keepdims=True) - 1, 0) // 2
-        typical = 1.4826 * np.take_along_axis(sorted_off, middle, axis=2)
-        new = good & (off < CUT * np.maximum(typical, MIN_SIGMA_PX))
+        sigma = np.take_along_axis(sorted_off, middle, axis=2) / median_length(1)
+        new = good & (off < CUT * np.maximum(sigma, MIN_SIGMA_PX))
         if (new == keep).all():
             break
         keep = new

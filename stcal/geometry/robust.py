@@ -16,6 +16,11 @@ def length_limit(coordinates: int, beyond: float) -> float:
     return float(np.sqrt(chdtri(coordinates, beyond)))
 
 
+def median_length(coordinates: int) -> float:
+    """Length that half of the normal errors of so many ``coordinates`` exceed, in σ."""
+    return length_limit(coordinates, 0.5)
+
+
 def huber_weights(length: np.ndarray, limit: float) -> np.ndarray:
     """Weights of lengths, same shape: 1 up to ``limit``, then falling with the inverse of the length (Huber 1964)."""
     return limit / np.maximum(length, limit) if np.isfinite(limit) else np.ones_like(length)
@@ -39,4 +44,4 @@ def robust_sigma(length: np.ndarray, coordinates: int = 1, redundancy: float = 1
     redundancy
         Share of the observations that parameters have not taken up: residuals are shorter than errors by its root.
     """
-    return float(np.median(length)) / np.sqrt(chdtri(coordinates, 0.5) * redundancy)
+    return float(np.median(length)) / (median_length(coordinates) * np.sqrt(redundancy))

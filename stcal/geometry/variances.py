@@ -54,13 +54,14 @@ class Parts:
     def best(self, low: np.ndarray, high: np.ndarray, starts: Sequence[np.ndarray]) -> np.ndarray:
         """(p,) x of highest density within bounds (p,), looked for from ``starts`` (p,)."""
 
-        def downhill(x: np.ndarray) -> tuple[float, np.ndarray]:
-            value, gradient, _, _ = self.at(x[None])
-            return -float(value[0]), -gradient[0]
+        def downhill(logs: np.ndarray) -> tuple[float, np.ndarray]:
+            """Of the logarithms of the weights, -2x: minus twice the log density."""
+            value, gradient, _, _ = self.at(-logs[None] / 2)
+            return -2 * float(value[0]), gradient[0]
 
-        bounds = np.column_stack([low, high])
-        fits = [minimize(downhill, np.clip(x, low, high), jac=True, method="L-BFGS-B", bounds=bounds) for x in starts]
-        return min(fits, key=lambda fit: fit.fun).x
+        bounds, begin = -2 * np.column_stack([high, low]), [-2 * np.clip(x, low, high) for x in starts]
+        fits = [minimize(downhill, logs, jac=True, method="L-BFGS-B", bounds=bounds) for logs in begin]
+        return -min(fits, key=lambda fit: fit.fun).x / 2
 
 
 def component_variances(
