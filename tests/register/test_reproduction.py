@@ -18,7 +18,6 @@ def means(script):
     return {name: [float(e.mean()) for e in errors] for name, errors in script.trial(1, script.SHOWN).items()}
 
 
-@pytest.mark.slow
 def test_the_simulation_is_what_it_says(script):
     rng = np.random.default_rng(0)
     cell = script.Cell.of(rng)
