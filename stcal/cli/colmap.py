@@ -81,7 +81,8 @@ def crosscheck(
     ] = 600.0,
 ) -> None:
     """Map the same database with the native COLMAP and compare faces, circles and cameras, into the report."""
-    from stcal.sfm.interop.crosscheck import Tolerances, comparison_text, crosscheck_run
+    from stcal.sfm.interop.crosscheck import comparison_text, crosscheck_run
+    from stcal.sfm.run.crosscheck import Tolerances
     from stcal.sfm.run.saved import load_run
 
     tolerances = Tolerances(tolerance_um, tolerance_mdeg, tolerance_um, camera_tolerance_um, camera_tolerance_mdeg)
@@ -90,9 +91,9 @@ def crosscheck(
         check = crosscheck_run(saved, colmap, tolerances, timeout, progress)
     print(comparison_text(check))
     print(f"report: {run / 'report.html'}")
-    if check["differences"]:
+    if check.differences:
         raise MappingError(
-            f"cross-check: native COLMAP {check['native']} and stcal differ: {'; '.join(check['differences'])}"
+            f"cross-check: native COLMAP {check.native} and stcal differ: {'; '.join(check.differences)}"
         )
 
 

@@ -92,7 +92,7 @@ def test_the_native_program_agrees(rendered):
     if name != "clean":
         pytest.skip("asked of the clean set")
     before = hashlib.sha256((out / "database.db").read_bytes()).hexdigest()
-    check = crosscheck(load_run(out))
+    check = crosscheck(load_run(out)).model_dump()
     for key in ("mapping", "result"):
         assert check[key]["faces"].keys() == {"1", "2", "3", "4", "5"}
         for face_id, row in check[key]["faces"].items():

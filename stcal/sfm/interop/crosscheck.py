@@ -9,7 +9,6 @@ weights and the joint adjustment are worth; no tolerance applies to it.
 
 import tempfile
 from collections.abc import Callable
-from dataclasses import asdict, dataclass
 from pathlib import Path
 
 import numpy as np
@@ -28,10 +27,22 @@ from stcal.sfm.interop.schema import schema_of_version
 from stcal.sfm.mapping.database import from_colmap_px, image_ids
 from stcal.sfm.mapping.incremental import labelled_model, pipeline_options, seeded_mapping
 from stcal.sfm.mapping.models import KEYPOINT_TOLERANCE_PX, ReadModel, find_models, open_model, read_model
+from stcal.sfm.run.crosscheck import (
+    CameraDifference,
+    Crosscheck,
+    FaceDifference,
+    FacesCompared,
+    ImagesRegistered,
+    MappingCompared,
+    ResidualRms,
+    ResultCompared,
+    Tolerances,
+)
 from stcal.sfm.run.folder import require_report, write_report
 from stcal.sfm.run.saved import SavedRun
 
 MICRO = 1e3
+TOLERANCES = Tolerances()
 RENAMED = {
     "ba_global_images_freq": "ba_global_frames_freq",
     "ba_global_images_ratio": "ba_global_frames_ratio",
@@ -40,40 +51,24 @@ RENAMED = {
 """Thresholds that older versions know by other names than pycolmap."""
 
 
-@dataclass(frozen=True, slots=True)
-class Tolerances:
-    """Largest differences allowed: faces and circles in the target frame, cameras against the target."""
-
-    face_um: float = 2.0
-    face_mdeg: float = 1.0
-    circle_um: float = 2.0
-    camera_um: float = 20.0
-    camera_mdeg: float = 2.0
-
-    def __post_init__(self):
-        for name, value in asdict(self).items():
-            if not 0 <= value < np.inf:
-                raise InputError(f"tolerance {name} {value:g}: a number of 0 or more needed; give another")
-
-
 def crosscheck_run(
     saved: SavedRun, colmap: Path | None, tolerances: Tolerances, timeout_s: float, progress: Progress | None = None
-) -> dict:
+) -> Crosscheck:
     """Cross-check a finished run with the native COLMAP; the comparison is added to its report."""
     require_report(saved)  # before minutes of mapping
     check = crosscheck(saved, colmap, tolerances, timeout_s, progress)
-    write_report(saved.folder, saved.report | {"crosscheck": check})
+    write_report(saved.folder, saved.report | {"crosscheck": check.model_dump()})
     return check
 
 
 def crosscheck(
     run: SavedRun,
     colmap: Path | None = None,
-    tolerances: Tolerances = Tolerances(),
+    tolerances: Tolerances = TOLERANCES,
     timeout_s: float = 600.0,
     progress: Callable[[str, int, int], None] | None = None,
-) -> dict:
-    """Map the run's database with the native program and compare; the content of ``report.json``'s ``crosscheck``.
+) -> Crosscheck:
+    """Map the run's database with the native program and compare: the content of ``report.json``'s ``crosscheck``.
 
     Raises
     ------
@@ -185,53 +180,62 @@ def _own(folder: Path, place: Path, names, pair, group: str, run: SavedRun, ids)
     return read_model(written, run.observations, ids, run.corrected_px)
 
 
-def _comparison(run, native, schema, foreign: Calibration, own: Calibration, again: Calibration, tolerances) -> dict:
-    content = {
-        "native": native.version,
-        "pycolmap": pycolmap.__version__,
-        "schema": schema,
-        "tolerances": asdict(tolerances),
-        "images": {
-            "native": len(_images(foreign)),
-            "pycolmap": len(_images(own)),
-            "run": len(run.observations),
-            "only_native": sorted(_images(foreign) - _images(own)),
-            "only_pycolmap": sorted(_images(own) - _images(foreign)),
-        },
-        "residual_rms_px": {"native": _rms_px(foreign, run), "pycolmap": _rms_px(own, run), "run": _run_rms(run)},
-        "mapping": {
-            "faces": _faces(foreign.target.target_from_face, own.target.target_from_face),
-            "circles_um": _circles(foreign.target.circles, own.target.circles),
-            "cameras": _cameras(foreign, own),
-        },
-        "result": {
-            "faces": face_differences(again.target, run),
-            "circles_um": _circles(again.target.circles, run.faces.circles),
-        },
-        "plain": {"faces": face_differences(foreign.target, run)},
-        "notes": list(foreign.notes),
-    }
-    return content | {"differences": _differences(content, tolerances)}
+def _comparison(
+    run: SavedRun,
+    native: NativeColmap,
+    schema: str,
+    external: Calibration,
+    own: Calibration,
+    again: Calibration,
+    tolerances: Tolerances,
+) -> Crosscheck:
+    theirs, ours = _images(external), _images(own)
+    images = ImagesRegistered(
+        native=len(theirs),
+        pycolmap=len(ours),
+        run=len(run.observations),
+        only_native=sorted(theirs - ours),
+        only_pycolmap=sorted(ours - theirs),
+    )
+    mapping = MappingCompared(
+        faces=_faces(external.target.target_from_face, own.target.target_from_face),
+        circles_um=_circles(external.target.circles, own.target.circles),
+        cameras=_cameras(external, own),
+    )
+    result = ResultCompared(
+        faces=face_differences(again.target, run), circles_um=_circles(again.target.circles, run.faces.circles)
+    )
+    return Crosscheck(
+        native=native.version,
+        pycolmap=pycolmap.__version__,
+        schema=schema,
+        tolerances=tolerances,
+        images=images,
+        residual_rms_px=ResidualRms(native=_rms_px(external, run), pycolmap=_rms_px(own, run), run=_run_rms(run)),
+        mapping=mapping,
+        result=result,
+        plain=FacesCompared(faces=face_differences(external.target, run)),
+        notes=list(external.notes),
+        differences=_differences(images, mapping, result, tolerances),
+    )
 
 
-def face_differences(target: CalibratedTarget, run: SavedRun) -> dict:
+def face_differences(target: CalibratedTarget, run: SavedRun) -> dict[str, FaceDifference | None]:
     """Differences of a target's faces from those of ``RUN/faces.json`` by face; None for what only one has."""
     return _faces(target.target_from_face, run.faces.poses())
 
 
-def _faces(a: dict[str, Rigid], b: dict[str, Rigid]) -> dict:
+def _faces(a: dict[str, Rigid], b: dict[str, Rigid]) -> dict[str, FaceDifference | None]:
     """Differences by face, for those that both have; None for the others."""
-    rows = {}
+    rows: dict[str, FaceDifference | None] = {}
     for face in sorted(a.keys() | b.keys()):
+        rows[face] = None
         if face in a and face in b:
             turn = Rigid(a[face].rotation @ b[face].rotation.T)
             shift = np.linalg.norm(a[face].translation - b[face].translation)
-            rows[face] = {
-                "translation_um": MICRO * float(shift),
-                "rotation_mdeg": MICRO * float(np.degrees(turn.angle_rad())),
-            }
-        else:
-            rows[face] = None
+            rows[face] = FaceDifference(
+                translation_um=MICRO * float(shift), rotation_mdeg=MICRO * float(np.degrees(turn.angle_rad()))
+            )
     return rows
 
 
@@ -239,21 +243,21 @@ def _circles(a: dict, b: dict) -> dict[str, float]:
     return {label: MICRO * float(np.linalg.norm(np.subtract(a[label], b[label]))) for label in a if label in b}
 
 
-def _cameras(a: Calibration, b: Calibration) -> list[dict]:
+def _cameras(a: Calibration, b: Calibration) -> list[CameraDifference]:
     """Differences of camera positions and attitudes against the target."""
     poses = [{n: p for m in each.models for n, p in zip(m.images, m.camera_from_model, strict=True)} for each in (a, b)]
     rows = []
-    for name in poses[0].keys() & poses[1].keys():
+    for name in sorted(poses[0].keys() & poses[1].keys()):
         one, other = poses[0][name].inverse(), poses[1][name].inverse()
         turn = Rigid(one.rotation @ other.rotation.T)
         rows.append(
-            {
-                "image": name,
-                "position_um": MICRO * float(np.linalg.norm(one.translation - other.translation)),
-                "rotation_mdeg": MICRO * float(np.degrees(turn.angle_rad())),
-            }
+            CameraDifference(
+                image=name,
+                position_um=MICRO * float(np.linalg.norm(one.translation - other.translation)),
+                rotation_mdeg=MICRO * float(np.degrees(turn.angle_rad())),
+            )
         )
-    return sorted(rows, key=lambda row: row["image"])
+    return rows
 
 
 def _images(calibration: Calibration) -> set[str]:
@@ -269,64 +273,64 @@ def _run_rms(run: SavedRun) -> float:
     return run.report["summary"]["residual_rms_px"]
 
 
-def comparison_text(check: dict) -> str:
+def comparison_text(check: Crosscheck) -> str:
     """The comparison as a text table."""
-    limits, residual, images = check["tolerances"], check["residual_rms_px"], check["images"]
+    limits, residual, images, cameras = check.tolerances, check.residual_rms_px, check.images, check.mapping.cameras
     lines = [
-        f"COLMAP {check['native']} (schema {check['schema']}): {images['native']} of {images['run']} images, residual "
-        f"{residual['native']:.4f} px RMS",
-        f"pycolmap {check['pycolmap']}: {images['pycolmap']} of {images['run']} images, residual "
-        f"{residual['pycolmap']:.4f} px RMS; the run: {residual['run']:.4f} px",
+        f"COLMAP {check.native} (schema {check.schema_}): {images.native} of {images.run} images, residual "
+        f"{residual.native:.4f} px RMS",
+        f"pycolmap {check.pycolmap}: {images.pycolmap} of {images.run} images, residual "
+        f"{residual.pycolmap:.4f} px RMS; the run: {residual.run:.4f} px",
         f"{'':6} {'native – pycolmap':>19} {'adjusted – faces.json':>23} {'as it is – faces.json':>23}",
         f"{'face':>6} {'µm':>10} {'mdeg':>8} {'µm':>14} {'mdeg':>8} {'µm':>14} {'mdeg':>8}",
     ]
-    for face in check["mapping"]["faces"]:
+    for face in check.mapping.faces:
         parts = []
-        for key, width in (("mapping", 10), ("result", 14), ("plain", 14)):
-            row = check[key]["faces"].get(face)
+        for compared, width in ((check.mapping, 10), (check.result, 14), (check.plain, 14)):
+            row = compared.faces.get(face)
             parts.append(
-                f"{row['translation_um']:{width}.3f} {row['rotation_mdeg']:8.3f}" if row else f"{'–':>{width}} {'–':>8}"
+                f"{row.translation_um:{width}.3f} {row.rotation_mdeg:8.3f}" if row else f"{'–':>{width}} {'–':>8}"
             )
         lines.append(f"{face:>6} {' '.join(parts)}")
-    circles, cameras = check["mapping"]["circles_um"], check["mapping"]["cameras"]
     lines.append(
-        f"largest between the two programs: circles {max(circles.values(), default=0.0):.3f} µm, cameras "
-        f"{max((c['position_um'] for c in cameras), default=0.0):.2f} µm and "
-        f"{max((c['rotation_mdeg'] for c in cameras), default=0.0):.3f} mdeg"
+        f"largest between the two programs: circles {max(check.mapping.circles_um.values(), default=0.0):.3f} µm, "
+        f"cameras {max((c.position_um for c in cameras), default=0.0):.2f} µm and "
+        f"{max((c.rotation_mdeg for c in cameras), default=0.0):.3f} mdeg"
     )
     lines.append(
-        f"allowed: faces {limits['face_um']:g} µm and {limits['face_mdeg']:g} mdeg, circles {limits['circle_um']:g} "
-        f"µm, cameras {limits['camera_um']:g} µm and {limits['camera_mdeg']:g} mdeg: "
-        f"{'exceeded' if check['differences'] else 'they agree'}"
+        f"allowed: faces {limits.face_um:g} µm and {limits.face_mdeg:g} mdeg, circles {limits.circle_um:g} "
+        f"µm, cameras {limits.camera_um:g} µm and {limits.camera_mdeg:g} mdeg: "
+        f"{'exceeded' if check.differences else 'they agree'}"
     )
-    return "\n".join([*check["notes"], *lines])
+    return "\n".join([*check.notes, *lines])
 
 
-def _differences(content: dict, tolerances: Tolerances) -> list[str]:
+def _differences(
+    images: ImagesRegistered, mapping: MappingCompared, result: ResultCompared, tolerances: Tolerances
+) -> list[str]:
     """Where the two differ by more than is allowed, one clause each."""
     found = []
-    images = content["images"]
-    for key, who in (("only_native", "native COLMAP"), ("only_pycolmap", "pycolmap")):
-        if images[key]:
-            more = f" and {len(images[key]) - 1} more" if len(images[key]) > 1 else ""
-            found.append(f"image {images[key][0]}{more}: registered by {who} only")
-    for key, what in (("mapping", "mapped by both"), ("result", "from the native model against faces.json")):
-        for face, row in content[key]["faces"].items():
+    for names, who in ((images.only_native, "native COLMAP"), (images.only_pycolmap, "pycolmap")):
+        if names:
+            more = f" and {len(names) - 1} more" if len(names) > 1 else ""
+            found.append(f"image {names[0]}{more}: registered by {who} only")
+    for compared, what in ((mapping, "mapped by both"), (result, "from the native model against faces.json")):
+        for face, row in compared.faces.items():
             if row is None:
                 found.append(f"face {face} ({what}): only one of the two has it")
-            elif row["translation_um"] > tolerances.face_um or row["rotation_mdeg"] > tolerances.face_mdeg:
+            elif row.translation_um > tolerances.face_um or row.rotation_mdeg > tolerances.face_mdeg:
                 found.append(
-                    f"face {face} ({what}) {row['translation_um']:.1f} µm, {row['rotation_mdeg']:.2f} mdeg; "
+                    f"face {face} ({what}) {row.translation_um:.1f} µm, {row.rotation_mdeg:.2f} mdeg; "
                     f"{tolerances.face_um:g} µm, {tolerances.face_mdeg:g} mdeg allowed"
                 )
-        label, worst = max(content[key]["circles_um"].items(), key=lambda each: each[1], default=("", 0.0))
+        label, worst = max(compared.circles_um.items(), key=lambda each: each[1], default=("", 0.0))
         if worst > tolerances.circle_um:
             found.append(f"circle {label} ({what}) {worst:.1f} µm; {tolerances.circle_um:g} µm allowed")
     for what, key, limit, unit in (
         ("position", "position_um", tolerances.camera_um, "µm"),
         ("attitude", "rotation_mdeg", tolerances.camera_mdeg, "mdeg"),
     ):
-        worst = max(content["mapping"]["cameras"], key=lambda row: row[key], default=None)
-        if worst and worst[key] > limit:
-            found.append(f"camera {worst['image']}: {what} {worst[key]:.1f} {unit}; {limit:g} {unit} allowed")
+        image, worst = max(((c.image, getattr(c, key)) for c in mapping.cameras), key=lambda c: c[1], default=("", 0.0))
+        if worst > limit:
+            found.append(f"camera {image}: {what} {worst:.1f} {unit}; {limit:g} {unit} allowed")
     return found

@@ -46,6 +46,6 @@ def faces_text(calibration: Calibration, run: SavedRun) -> str:
     for face_id, pose in calibration.target.target_from_face.items():
         x, y, z = pose.translation
         row = difference.get(face_id)
-        beside = f"{row['translation_um']:22.2f} {row['rotation_mdeg']:8.3f}" if row else f"{'not in the run':>31}"
+        beside = f"{row.translation_um:22.2f} {row.rotation_mdeg:8.3f}" if row else f"{'not in the run':>31}"
         lines.append(f"{face_id:>6} {x:11.4f} {y:11.4f} {z:11.4f}   {beside}")
     return "\n".join(lines)

@@ -1,6 +1,6 @@
 """What ``report.json`` holds. Fields without a description are named in that of the object that holds them."""
 
-from typing import Any, Literal
+from typing import Literal
 
 from pydantic import Field
 
@@ -8,6 +8,7 @@ from stcal.io.json import ByFace, ByGroup, ByLabel, Matrix3, Pair, Part, Points,
 from stcal.sfm.adjust.faces import FrameKind
 from stcal.sfm.adjust.options import Solve
 from stcal.sfm.checks.verdict import Verdict
+from stcal.sfm.run.crosscheck import Crosscheck
 
 Number = int | float
 """An integer stays one."""
@@ -265,9 +266,7 @@ class ReportFile(ResultFile):
         description="target frame, mm: `cameras`: `image`, `group`, `position_mm`, `axes` (rows X, Y, Z of the "
         "camera); `boards` group → mapped dots; `circles` label → `[x, y, z]`"
     )
-    crosscheck: dict[str, Any] | None = Field(
-        None, description="only after `crosscheck`, [below](#crosscheck-in-reportjson)"
-    )
+    crosscheck: Crosscheck | None = Field(None, description="only after `crosscheck`, with")
 
 
 class InitialPair(Part):

@@ -20,10 +20,11 @@ import pytest
 
 from stcal.errors import InputError, MappingError
 from stcal.sfm.interop import native
-from stcal.sfm.interop.crosscheck import Tolerances, crosscheck, mapper_options
+from stcal.sfm.interop.crosscheck import crosscheck, mapper_options
 from stcal.sfm.interop.native import NativeColmap, find_colmap, map_natively, require_listable
 from stcal.sfm.mapping.database import image_ids
 from stcal.sfm.mapping.incremental import pipeline_options
+from stcal.sfm.run.crosscheck import Tolerances
 from stcal.sfm.run.folder import write_report
 from stcal.sfm.run.saved import load_run
 from tests.outcome import COMPUTATION, INPUT, INTERRUPTED, assert_error, lines_of
