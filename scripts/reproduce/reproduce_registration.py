@@ -31,7 +31,7 @@ from stcal.register.core.liu2017 import Liu2017Options, affine_least_squares, li
 from stcal.register.workspace.field import residual_field
 from stcal.report.figure import save
 from stcal.robot.identify.solve import IdentifyOptions
-from stcal.robot.kinematics.damped import Problem, solve
+from stcal.robot.kinematics.damped import InverseProblem, solve
 from stcal.robot.kinematics.example import mh80
 from stcal.robot.kinematics.forward import forward
 from stcal.robot.kinematics.measurements import Measurements
@@ -95,7 +95,7 @@ class Cell:
         """Random places in the cube, without noise."""
         a = MIDDLE + rng.uniform(-side / 2, side / 2, (count, 3))
         poses = Poses(Rotation.from_rotvec(rng.uniform(-tilt, tilt, (count, 3))).as_matrix() @ DOWN, a)
-        q = solve(Problem.of(self.drawn), poses, np.tile(NEAR, (count, 1)))
+        q = solve(InverseProblem.of(self.drawn), poses, np.tile(NEAR, (count, 1)))
         off = np.abs(forward(self.drawn, q).translation - a).max()
         if off > 1e-6:
             raise DegenerateError(f"inverse kinematics: {off:.2g} mm from a place of the cube")

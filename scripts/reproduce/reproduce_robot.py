@@ -35,7 +35,7 @@ from stcal.robot.kinematics.inverse import inverse
 from stcal.robot.kinematics.measurements import Measurements
 from stcal.robot.kinematics.model import Joint, Robot
 from stcal.robot.use.compensation import Targets, compensate
-from stcal.robot.use.verification import Measured, SetResult, verify
+from stcal.robot.use.verification import MeasuredPoses, SetResult, verify
 from stcal.sfm.measure.common_errors import common_errors
 from stcal.sfm.measure.pose import pose_from_circles
 from stcal.sfm.measure.target import TargetCircles
@@ -312,7 +312,9 @@ def verified(targets: Targets, reached: dict[str, tuple[np.ndarray, np.ndarray]]
     rows = np.concatenate([rows for rows, _ in reached.values()])
     sets = tuple(name for name, (own, _) in reached.items() for _ in own)
     xyz = np.concatenate([xyz for _, xyz in reached.values()])
-    data = Measured("commanded", range(len(rows)), sets, tuple(map(str, rows)), targets.poses.translation[rows], xyz)
+    data = MeasuredPoses(
+        "commanded", range(len(rows)), sets, tuple(map(str, rows)), targets.poses.translation[rows], xyz
+    )
     return {each.name: each for each in verify(data).sets}
 
 

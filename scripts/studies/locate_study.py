@@ -22,7 +22,7 @@ from stcal.boards.tags import Tags, find_tags
 from stcal.geometry.rigid import Poses
 from stcal.io.camera import CameraModel, read_camera
 from stcal.io.images import decode, find_images
-from stcal.locate.calibrate.holdout import Trial, half_calibrated, subset_trials
+from stcal.locate.calibrate.holdout import PoseTrial, half_calibrated, subset_trials
 from stcal.locate.data.exposures import find_scenes
 from stcal.locate.data.layout import LayoutPlan, TargetLayout
 from stcal.locate.data.views import CalibrationImages
@@ -83,14 +83,14 @@ def subsets(images: CalibrationImages, most: int | None) -> None:
     gates["the patent's gate"] = PatentOptions()
     for name, options in gates.items():
         for size in (1, 2, 3, 4):
-            trials: list[Trial] = []
+            trials: list[PoseTrial] = []
             for chosen, held_out in halves(images):
                 calibrated = half_calibrated(images, charuco_plan(), chosen)
                 trials += subset_trials(images, held_out, calibrated, size, options, most)
             print(f"  {name:<24} {size} tags  {_line(trials)}")
 
 
-def _line(trials: Sequence[Trial]) -> str:
+def _line(trials: Sequence[PoseTrial]) -> str:
     count = len(trials)
     used = [t for t in trials if t.decision == "accept"]
     ambiguous = sum(t.decision == "ambiguous" for t in trials)

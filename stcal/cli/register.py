@@ -12,7 +12,7 @@ from stcal.errors import ConvergenceError, DegenerateError, InputError
 from stcal.io.saving import keep_apart
 
 
-class Model(StrEnum):
+class ModelName(StrEnum):
     """Of the transform."""
 
     rigid = "rigid"
@@ -35,7 +35,7 @@ def register(
             metavar="PAIRS", help="Read ax_mm,ay_mm,az_mm,bx_mm,by_mm,bz_mm of the same points from this file (CSV)."
         ),
     ],
-    model: Annotated[Model, typer.Option(help="Fit a transform of this kind.")] = Model.rigid,
+    model: Annotated[ModelName, typer.Option(help="Fit a transform of this kind.")] = ModelName.rigid,
     method: Annotated[
         Method, typer.Option(help="Fit it with this method; liu2017 is a published one, always affine.")
     ] = Method.robust,

@@ -211,7 +211,7 @@ def verify(
         write(report, verification_page(result))
 
 
-class Observed(StrEnum):
+class ObservedKind(StrEnum):
     """What the instrument measures."""
 
     pose = "pose"
@@ -224,7 +224,9 @@ def design(
     count: Annotated[int, typer.Option(min=1, max=2000, help="Choose this many poses.")] = 40,
     seed: Annotated[int, typer.Option(min=0, help="Draw the candidates with this seed.")] = 0,
     out: Annotated[Path | None, typer.Option("--out", help="Write the poses to this file (CSV).")] = None,
-    observe: Annotated[Observed, typer.Option(help="Plan for an instrument that measures this.")] = Observed.position,
+    observe: Annotated[
+        ObservedKind, typer.Option(help="Plan for an instrument that measures this.")
+    ] = ObservedKind.position,
     candidates: Annotated[int, typer.Option(min=2, max=100_000, help="Choose from this many random poses.")] = 1000,
     sigma_mm: Annotated[
         float, typer.Option("--sigma-mm", help="Assume this σ of measured positions, mm per axis.")
@@ -250,7 +252,7 @@ def design(
     robot = load_robot(robot_file)
     result = stage.design(robot, options)
     print(stage.design_text(result))
-    also = f" and {sigma_rad:g} rad" if observe is Observed.pose else ""
+    also = f" and {sigma_rad:g} rad" if observe is ObservedKind.pose else ""
     print(f"for an instrument whose {observe.value}s have σ {sigma_mm:g} mm{also} per axis (--sigma-mm, --sigma-rad)")
     if out:
         write(out, stage.design_csv(result, robot))

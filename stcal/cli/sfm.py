@@ -38,7 +38,7 @@ class Frame(StrEnum):
     three_point = "three-point"
 
 
-class Pairs(StrEnum):
+class PairsChoice(StrEnum):
     """Which pairs of images are matched."""
 
     all = "all"
@@ -101,7 +101,7 @@ def run(
         typer.Option("--refine-camera", help="Adjust the intrinsics too, from the given ones with their σ."),
     ] = False,
     pairs: Annotated[
-        Pairs | None,
+        PairsChoice | None,
         typer.Option(
             help="Match all pairs of images, or sparse, as many as hold every circle together; "
             "sparse above 80 images if not given."

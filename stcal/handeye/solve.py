@@ -21,7 +21,7 @@ from stcal.handeye.methods.closed_form import AX_XB, AX_ZB, closed_form
 from stcal.handeye.methods.convex import convex
 from stcal.handeye.methods.evolution import EvolutionOptions, Objective, evolve, polish
 from stcal.handeye.methods.noise import Noise
-from stcal.handeye.methods.pose_adjustment import State, adjust_poses
+from stcal.handeye.methods.pose_adjustment import LoopState, adjust_poses
 from stcal.handeye.methods.reprojection import adjust_views, resected
 from stcal.handeye.result import HandEye
 from stcal.io.camera import CameraPrior
@@ -224,7 +224,7 @@ def _by_motions(loop: Loop, method: str, unit_mm: float, options: EvolutionOptio
 def _by_poses(task: _Task) -> HandEye:
     options = task.options
     solution = adjust_poses(
-        task.loop, State(*task.guess(task.loop, options.with_scale)), options.noise, options.with_scale
+        task.loop, LoopState(*task.guess(task.loop, options.with_scale)), options.noise, options.with_scale
     )
     state, normal = solution.state, solution.normal
     x, z = state.mount_from_camera, state.stand_from_board

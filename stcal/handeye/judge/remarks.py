@@ -8,7 +8,7 @@ from stcal.geometry.normal_equations import generalised_inverse
 from stcal.handeye.data.loop import Loop
 from stcal.handeye.judge.observability import scale_is_seen, unit_of
 from stcal.handeye.methods.noise import Noise
-from stcal.handeye.methods.pose_adjustment import State, adjust_poses
+from stcal.handeye.methods.pose_adjustment import LoopState, adjust_poses
 from stcal.handeye.methods.start import robust
 
 SIZE_SIGMAS, SIZE_SHARE = 4.0, 1e-3
@@ -64,7 +64,7 @@ def of_size(loop: Loop, hint: tuple[float, float], noise: Noise) -> tuple[str, .
     if not _is_other(*hint):
         return ()
     try:  # the step is a large one, and its σ are those of residuals that a wrong size makes
-        found = adjust_poses(loop, State(*robust(loop, with_scale=True)), noise, with_scale=True)
+        found = adjust_poses(loop, LoopState(*robust(loop, with_scale=True)), noise, with_scale=True)
     except StcalError:
         return ()
     scale, sigma = found.state.scale, float(np.sqrt(generalised_inverse(found.normal)[12, 12]))

@@ -147,12 +147,12 @@ class Corners:
         }
         return np.einsum("nab,nb->na", self.weight, px - self.xy_px) / self.sigma["corner_px"], by
 
-    def groups(self, state: Bundle) -> list["Group"]:
+    def groups(self, state: Bundle) -> list["Knowledge"]:
         """Everything that is known: the corners seen, and what was known before."""
         at, count = self.places(), self.count()
         white, by = self.seen(state)
         found = [
-            Group(("corner_px",), white, _sparse(by, at, count, {"board": self.corner, "robot": self.view}), CORNER)
+            Knowledge(("corner_px",), white, _sparse(by, at, count, {"board": self.corner, "robot": self.view}), CORNER)
         ]
         if self.basis.shape[1]:
             off = np.linalg.pinv(self.basis) @ (state.camera.parameters() - self.camera.parameters())
@@ -161,18 +161,18 @@ class Corners:
                 whole = np.zeros((len(rows), len(off)))
                 whole[:, rows] = root
                 slope = _sparse({"camera": whole[None]}, at, count, {})
-                found.append(Group((name,), (whole @ off)[None], slope, np.inf))
+                found.append(Knowledge((name,), (whole @ off)[None], slope, np.inf))
         if at["board"].stop > at["board"].start:
             off = (state.corners - self.xyz_board) / self.sigma["board_mm"]
             slope = np.tile(np.eye(3) / self.sigma["board_mm"], (len(off), 1, 1))
             slope = _sparse({"board": slope}, at, count, {"board": np.arange(len(off))})
-            found.append(Group(("board_mm",), off, slope, np.inf))
+            found.append(Knowledge(("board_mm",), off, slope, np.inf))
         if at["robot"].stop > at["robot"].start:
             weight = self.robot_weight()
             off = np.einsum("mab,mb->ma", weight, state.base_from_flange.difference(self.base_from_flange))
             slope = _sparse({"robot": weight}, at, count, {"robot": np.arange(len(off))})
             names = ("robot_rad", "robot_mm") if self.robot is None else ()
-            found.append(Group(names, off, slope, POSE))
+            found.append(Knowledge(names, off, slope, POSE))
         return found
 
     def linear(self, state: Bundle) -> NormalEquations:
@@ -186,7 +186,7 @@ class Corners:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Group:
+class Knowledge:
     """Knowledge of one kind.
 
     ``names`` : of the σ that its columns have, each an equal share; ``white`` : (g, d) residuals in units of σ;

@@ -25,17 +25,17 @@ SETTLED = 1e-4
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class State:
+class LoopState:
     """Unknowns: X, Z and the board's scale."""
 
     mount_from_camera: Rigid
     stand_from_board: Rigid
     scale: float = 1.0
 
-    def moved(self, step: np.ndarray) -> "State":
+    def moved(self, step: np.ndarray) -> "LoopState":
         """By left perturbations (12,) or (13,) of X, Z and the scale."""
         x, z = (perturbed(a, s) for a, s in ((self.mount_from_camera, step[:6]), (self.stand_from_board, step[6:12])))
-        return State(x, z, self.scale + (step[12] if len(step) > 12 else 0.0))
+        return LoopState(x, z, self.scale + (step[12] if len(step) > 12 else 0.0))
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -45,7 +45,7 @@ class PoseSolution:
     units of σ, over the ``redundancy``; ``scale_hint`` : what the scale would become if it were solved for, and its σ;
     ``settled`` : whether σ and outliers did within :data:`ROUNDS`."""
 
-    state: State
+    state: LoopState
     normal: np.ndarray
     residuals: np.ndarray
     covariance: np.ndarray
@@ -57,7 +57,9 @@ class PoseSolution:
     settled: bool
 
 
-def adjust_poses(loop: Loop, start: State, noise: Noise, with_scale: bool = False, robust: bool = True) -> PoseSolution:
+def adjust_poses(
+    loop: Loop, start: LoopState, noise: Noise, with_scale: bool = False, robust: bool = True
+) -> PoseSolution:
     """Least squares of the loop's residuals, each in units of its σ, from a start.
 
     This is the maximum-likelihood solution for Gaussian errors of robot and camera (Strobl & Hirzinger 2006 without
@@ -108,7 +110,7 @@ def adjust_poses(loop: Loop, start: State, noise: Noise, with_scale: bool = Fals
     )
 
 
-def _scale_hint(loop: Loop, state: State, residuals: np.ndarray, spread: np.ndarray) -> tuple[float, float]:
+def _scale_hint(loop: Loop, state: LoopState, residuals: np.ndarray, spread: np.ndarray) -> tuple[float, float]:
     """What the scale would become, and its σ: one step from the solution with the scale among the unknowns."""
     slope = _slope(loop, state, 13)
     weighted = np.linalg.solve(spread, slope)
@@ -117,23 +119,23 @@ def _scale_hint(loop: Loop, state: State, residuals: np.ndarray, spread: np.ndar
     return state.scale + float(step), float(np.sqrt(inverse[12, 12]))
 
 
-def _residuals(loop: Loop, state: State) -> np.ndarray:
+def _residuals(loop: Loop, state: LoopState) -> np.ndarray:
     return loop.residuals(state.mount_from_camera, state.stand_from_board, state.scale)
 
 
-def _slope(loop: Loop, state: State, count: int) -> np.ndarray:
+def _slope(loop: Loop, state: LoopState, count: int) -> np.ndarray:
     return loop.jacobian(state.mount_from_camera, state.scale)[:, :, :count]
 
 
-def _solved(loop: Loop, start: State, spread: np.ndarray, count: int) -> tuple[State, np.ndarray]:
+def _solved(loop: Loop, start: LoopState, spread: np.ndarray, count: int) -> tuple[LoopState, np.ndarray]:
     """State of least squares and its normal matrix."""
     weight = np.linalg.inv(np.linalg.cholesky(spread))
 
-    def linearise(state: State) -> NormalEquations:
+    def linearise(state: LoopState) -> NormalEquations:
         white = np.einsum("mab,mb->ma", weight, _residuals(loop, state)).ravel()
         return NormalEquations.of(white, (weight @ _slope(loop, state, count)).reshape(-1, count))
 
-    found = minimise(start, linearise, State.moved).required("hand-eye", "check the poses that fit worst")
+    found = minimise(start, linearise, LoopState.moved).required("hand-eye", "check the poses that fit worst")
     return found.state, found.linear.normal
 
 

@@ -82,7 +82,7 @@ class Reprojection:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Adjusted:
+class AdjustedViews:
     """``state`` : of the poses used; ``outliers`` : (m,); ``normal`` : (12, 12) of X and Z, all else eliminated;
     ``covariance`` : its inverse; ``sigma_scale``; ``sigma`` : by group; ``estimated`` : which of them;
     ``scale_hint`` : what the scale would become if it were solved for, and its σ;
@@ -110,7 +110,7 @@ def adjust_views(
     noise: Noise,
     intrinsics: CameraPrior | None = None,
     with_scale: bool = False,
-) -> Adjusted:
+) -> AdjustedViews:
     """Least squares of all corners from ``first`` X, Z, scale; ``loop`` holds the same poses, the board's by them.
 
     Unknowns: X, Z, and by their σ where the robot really was and where the board's corners really are; intrinsics about
@@ -150,7 +150,7 @@ def adjust_views(
     found = _found(corners, state, inverse, base_from_flange, rows, intrinsics is not None)
     rest = generalised_inverse(normal[12:, 12:])
     own = normal[:12, :12] - normal[:12, 12:] @ rest @ normal[12:, :12]
-    return Adjusted(
+    return AdjustedViews(
         state=state,
         outliers=~used,
         normal=own,
@@ -165,7 +165,7 @@ def adjust_views(
     )
 
 
-def resected(pairs_names: tuple[str, ...], views: Views, adjusted: Adjusted) -> Poses:
+def resected(pairs_names: tuple[str, ...], views: Views, adjusted: AdjustedViews) -> Poses:
     """camera_from_board of all views by the adjusted camera and board."""
     board = adjusted.found
     seen = tuple(View(board.board(view.xyz_board), view.xy_px, view.covariance) for view in views.views)

@@ -59,7 +59,7 @@ class ImageCorners:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Adjusted:
+class AdjustedLayout:
     """``corners_mm`` : (n, 4, 2) on the board, ``covariance_mm2`` : (8n, 8n); ``poses`` camera_from_board;
     ``board_factor`` : by which the stated σ of the board's points are too small, as the residuals say; ``sigma_px``,
     ``tag_sigma_px`` : what print, lens and flatness add to the σ of a corner, and to the four of a tag together;
@@ -104,7 +104,7 @@ class _Group:
     cost: float
 
 
-def adjust(images: Sequence[ImageCorners], start: np.ndarray) -> Adjusted:
+def adjust(images: Sequence[ImageCorners], start: np.ndarray) -> AdjustedLayout:
     """Least squares with Huber's loss over 6m + 8n unknowns; the poses are eliminated image by image.
 
     The board is the reference and exact. The σ of the board's points have a factor, and those of the tags' corners a
@@ -129,7 +129,7 @@ def adjust(images: Sequence[ImageCorners], start: np.ndarray) -> Adjusted:
         if settled:
             break
     board, tags = ([block[side] for block in linear.blocks] for side in (0, 1))
-    return Adjusted(
+    return AdjustedLayout(
         corners_mm=corners.reshape(-1, 4, 2),
         covariance_mm2=covariance,
         poses=poses,

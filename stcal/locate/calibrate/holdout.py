@@ -22,7 +22,7 @@ from stcal.locate.pose.verdict import Decision, VerdictOptions, judge
 
 
 @dataclass(frozen=True, slots=True)
-class Trial:
+class PoseTrial:
     """One pose against the board's: ``decision``, ``error_rad``, ``error_mm`` at the origin of {obj}, ``sigmas`` : the
     rotation's error over its σ; ``flipped`` : nearer to the true pose's mirror image than to the true pose. Without a
     pose the errors are infinite."""
@@ -66,7 +66,7 @@ def subset_trials(
     options: VerdictOptions | PatentOptions | None = None,
     most: int | None = None,
     seed: int = 0,
-) -> Iterator[Trial]:
+) -> Iterator[PoseTrial]:
     """Poses from all subsets of ``size`` tags of each held-out image, or of ``most`` random ones; from all tags where
     None. With :class:`PatentOptions` by the patent's method and gate."""
     rng = np.random.default_rng(seed)
@@ -80,7 +80,7 @@ def subset_trials(
             yield _trial(images, i, seen.select(list(subset)), calibrated.layout, truth, options)
 
 
-def _trial(images: CalibrationImages, i: int, part: SeenTags, layout: TargetLayout, truth: Rigid, options) -> Trial:
+def _trial(images: CalibrationImages, i: int, part: SeenTags, layout: TargetLayout, truth: Rigid, options) -> PoseTrial:
     name, rows, sigma = images.names[i], tuple(int(row) for row in part.rows), np.inf
     try:
         if isinstance(options, PatentOptions):
@@ -91,11 +91,11 @@ def _trial(images: CalibrationImages, i: int, part: SeenTags, layout: TargetLayo
             located, verdict = judge(locate(part, layout, images.camera), options)
             pose, sigma = located.camera_from_obj, located.sigma_rad()
     except StcalError:
-        return Trial(name, rows, "reject")
+        return PoseTrial(name, rows, "reject")
     error = (pose @ truth.inverse()).angle_rad()
     middle = Rigid(np.eye(3), np.append(layout.corners_mm[part.rows].reshape(-1, 2).mean(0), 0.0))
     second = mirrored(PoseStack.of(truth), middle).rigid(0)
     shift = float(np.linalg.norm(pose.translation - truth.translation))
-    return Trial(
+    return PoseTrial(
         name, rows, verdict.decision, error, shift, error / sigma, (pose @ second.inverse()).angle_rad() < error
     )

@@ -16,7 +16,7 @@ from stcal.errors import DegenerateError
 from stcal.geometry.camera import Camera
 from stcal.geometry.plane import apply_homography, camera_from_plane, fit_homography, refine_planar_pose
 from stcal.geometry.rigid import Rigid
-from stcal.locate.calibrate.adjust import Adjusted, ImageCorners, adjust
+from stcal.locate.calibrate.adjust import AdjustedLayout, ImageCorners, adjust
 from stcal.locate.data.layout import LayoutPlan, TargetLayout, obj_from_plane
 from stcal.parallel import one_thread
 
@@ -36,7 +36,7 @@ class CalibratedLayout:
         mm, corners in {obj} as the patent leaves them, before the adjustment.
     board_from_obj : Rigid
         Where {obj} lies on the board.
-    adjusted : Adjusted
+    adjusted : AdjustedLayout
         Poses and residuals.
     images : tuple of str
         Those used.
@@ -54,7 +54,7 @@ class CalibratedLayout:
     layout: TargetLayout
     published: np.ndarray
     board_from_obj: Rigid
-    adjusted: Adjusted
+    adjusted: AdjustedLayout
     images: tuple[str, ...]
     counts: np.ndarray
     unseen: tuple[int, ...]
@@ -203,7 +203,7 @@ def _median_corners(images: Sequence[ImageCorners], count: int) -> np.ndarray:
     return np.nanmedian(places, axis=0)
 
 
-def _collected(plan, images, seen, start, adjusted: Adjusted, left_out) -> CalibratedLayout:
+def _collected(plan, images, seen, start, adjusted: AdjustedLayout, left_out) -> CalibratedLayout:
     """Corners in {obj}: a frame that rests on the corners of one tag, and so on their errors."""
     origin = int(np.flatnonzero(seen == plan.origin)[0])
     turn, shift = obj_from_plane(adjusted.corners_mm[origin])

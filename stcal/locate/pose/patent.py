@@ -13,7 +13,7 @@ from stcal.geometry.camera import Camera
 from stcal.geometry.ippe import PlanePoses, poses_of_plane
 from stcal.geometry.rigid import Rigid
 from stcal.locate.data.layout import TargetLayout
-from stcal.locate.pose.verdict import Check, Verdict
+from stcal.locate.pose.verdict import PoseCheck, Verdict
 
 SAME_RAD, SAME_SHARE = 1e-3, 1e-3
 """T_a and T_b are the same pose when they differ by less: turned, and shifted in shares of the distance."""
@@ -169,10 +169,10 @@ def locate_as_patent(
 def gate(det_j: float, error_px: float, error_ratio: float, same: bool, options: PatentOptions) -> Verdict:
     """S9: reject unless det J, the error, and (for two different poses) the ratio of the errors keep their limits."""
     checks = [
-        Check("det J", det_j, at_least=options.min_det_j, unit="/mm²"),
-        Check("error", error_px, at_most=options.max_error_px, unit=" px"),
+        PoseCheck("det J", det_j, at_least=options.min_det_j, unit="/mm²"),
+        PoseCheck("error", error_px, at_most=options.max_error_px, unit=" px"),
     ]
     if not same:
-        checks.append(Check("error ratio", error_ratio, at_least=options.min_error_ratio))
+        checks.append(PoseCheck("error ratio", error_ratio, at_least=options.min_error_ratio))
     failed = tuple(check.text() for check in checks if not check.passed)
     return Verdict("reject" if failed else "accept", tuple(checks), failed)

@@ -47,7 +47,7 @@ class PlanarProblem:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Views:
+class ProjectedCorners:
     """h poses and what they show: ``residual`` (h, n, 2) measured minus projected; its negative derivatives ``by_pose``
     (h, n, 2, 6) and ``by_corner`` (h, n, 2, 2); ``before`` : (h,) whether all corners lie before the camera."""
 
@@ -58,7 +58,7 @@ class Views:
     before: np.ndarray
 
 
-def project(problem: PlanarProblem, poses: Poses | PoseStack) -> Views:
+def project(problem: PlanarProblem, poses: Poses | PoseStack) -> ProjectedCorners:
     """Residuals of h poses, and their derivatives."""
     turned = np.einsum("hij,nj->hni", poses.rotation[:, :, :2], problem.xy)
     at = turned + poses.translation[:, None]
@@ -70,7 +70,7 @@ def project(problem: PlanarProblem, poses: Poses | PoseStack) -> Views:
     by_point[..., 0, 0] = by_point[..., 1, 1] = 1 / depth
     by_point[..., 2] = -uv / depth[..., None]
     by_pose = np.concatenate([-by_point @ skew(turned), by_point], axis=-1)
-    return Views(poses, problem.seen - uv, by_pose, by_point @ poses.rotation[:, None, :, :2], before)
+    return ProjectedCorners(poses, problem.seen - uv, by_pose, by_point @ poses.rotation[:, None, :, :2], before)
 
 
 def descent_near(problem: PlanarProblem, pose: PoseStack) -> Descend:

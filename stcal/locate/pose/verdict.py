@@ -58,7 +58,7 @@ class VerdictOptions:
 
 
 @dataclass(frozen=True, slots=True)
-class Check:
+class PoseCheck:
     """One value beside its limit: ``value`` must be ``at_least`` or ``at_most`` what stands there."""
 
     name: str
@@ -87,14 +87,14 @@ class Verdict:
     ----------
     decision : {"accept", "ambiguous", "reject"}
         Ambiguous: the second solution is not worse by enough.
-    checks : tuple of Check
+    checks : tuple of PoseCheck
         Each value beside its limit.
     reasons : tuple of str
         Checks that are not passed, in words.
     """
 
     decision: Decision
-    checks: tuple[Check, ...]
+    checks: tuple[PoseCheck, ...]
     reasons: tuple[str, ...]
 
 
@@ -106,18 +106,18 @@ def judge(pose: ObjPose, options: VerdictOptions | None = None) -> tuple[ObjPose
         pose = covering_both(pose)
     margin2 = options.sigma_margin**2
     checks = [
-        Check("tags", len(pose.rows), at_least=options.min_tags),
-        Check("spread", pose.extent_px, at_least=options.min_spread_px, unit=" px"),
-        Check("foreshortening", pose.foreshortening, at_least=options.min_foreshortening),
-        Check(
+        PoseCheck("tags", len(pose.rows), at_least=options.min_tags),
+        PoseCheck("spread", pose.extent_px, at_least=options.min_spread_px, unit=" px"),
+        PoseCheck("foreshortening", pose.foreshortening, at_least=options.min_foreshortening),
+        PoseCheck(
             "chi2 per dof", pose.chi2_per_redundancy(), at_most=margin2 * _chi2_limit(pose.redundancy, options.max_p)
         ),
-        Check("sigma of rotation", float(np.degrees(pose.sigma_rad())), at_most=options.max_sigma_deg, unit="°"),
+        PoseCheck("sigma of rotation", float(np.degrees(pose.sigma_rad())), at_most=options.max_sigma_deg, unit="°"),
     ]
     if options.max_sigma_mm is not None:
-        checks.append(Check("sigma of position", pose.sigma_mm(), at_most=options.max_sigma_mm, unit=" mm"))
+        checks.append(PoseCheck("sigma of position", pose.sigma_mm(), at_most=options.max_sigma_mm, unit=" mm"))
     failed = [check.text() for check in checks if not check.passed]
-    ambiguity = Check("delta chi2 of the other pose", pose.delta_chi2, at_least=needed_delta(pose, options))
+    ambiguity = PoseCheck("delta chi2 of the other pose", pose.delta_chi2, at_least=needed_delta(pose, options))
     clear = ambiguity.passed or apart_deg <= options.equal_deg
     checks.append(ambiguity)
     if failed:

@@ -33,7 +33,7 @@ class OffsetFile(Part):
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Chain:
+class GoalChain:
     """``mount`` : flange_from_camera of a camera on the flange, base_from_camera of a fixed one; ``flange`` :
     base_from_flange by scene, empty for a fixed camera; ``offset`` : obj_from_goal, exact."""
 
@@ -62,7 +62,7 @@ class Chain:
         return [scene for scene in scenes if self.moving and scene not in self.flange]
 
 
-def read_chain(hand_eye: str | Path, robot_poses: str | Path | None, offset: str | Path | None = None) -> Chain:
+def read_chain(hand_eye: str | Path, robot_poses: str | Path | None, offset: str | Path | None = None) -> GoalChain:
     """Read the hand-eye file of ``stcal handeye``, the robot's poses by scene, and the offset.
 
     Raises
@@ -88,7 +88,7 @@ def read_chain(hand_eye: str | Path, robot_poses: str | Path | None, offset: str
     if offset is not None:
         read = read_result(offset, OffsetFile, "offset file", "a 4×4 matrix under the key obj_from_goal needed")
         shift = Rigid.from_matrix(read.obj_from_goal)
-    return Chain(mount, moving, read_robot_poses(robot_poses) if robot_poses else {}, shift)
+    return GoalChain(mount, moving, read_robot_poses(robot_poses) if robot_poses else {}, shift)
 
 
 def read_robot_poses(path: str | Path) -> dict[str, UncertainRigid]:

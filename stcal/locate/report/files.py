@@ -7,7 +7,7 @@ from pydantic import Field
 from stcal.io.json import Matrix, Part, Pose, ResultFile
 
 
-class ImageRow(Part):
+class BoardImageRow(Part):
     image: str
     camera_from_board: Pose
     tags_rms_px: float
@@ -28,7 +28,7 @@ class CalibratedLayoutFile(ResultFile):
 
     format: Literal["stcal layout calibration 1"] = Field(description="the file's form and its version")
     unit: Literal["mm"] = Field(description="of all lengths")
-    images: list[ImageRow] = Field(description="`image`, `camera_from_board` 4×4, `tags_rms_px`")
+    images: list[BoardImageRow] = Field(description="`image`, `camera_from_board` 4×4, `tags_rms_px`")
     left_out: list[str] = Field(description="images without board or tags, and why")
     board_from_obj: Pose = Field(description="where {obj} lies on the board")
     board_rms_px: float = Field(description="residuals of the board's points per coordinate")

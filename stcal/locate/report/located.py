@@ -11,7 +11,7 @@ from stcal.locate.data.layout import TargetLayout
 from stcal.locate.pipeline import Located
 from stcal.locate.pose.estimate import ObjPose
 from stcal.locate.pose.merge import Shift
-from stcal.locate.report.chain import Chain
+from stcal.locate.report.chain import GoalChain
 from stcal.locate.report.tables import camera_from_obj, uncertain
 
 
@@ -82,13 +82,13 @@ class LocatedFile(ResultFile):
     scenes: list[SceneRow] = Field(description="`scene`, `verdict`, `reasons`, `notes`, and")
 
     @classmethod
-    def of(cls, results: Sequence[Located], layout: TargetLayout, chain: Chain | None = None) -> "LocatedFile":
+    def of(cls, results: Sequence[Located], layout: TargetLayout, chain: GoalChain | None = None) -> "LocatedFile":
         """The file of all scenes; ``chain`` : to the robot's base."""
         scenes = [_scene(each, layout, chain) for each in results]
         return cls(format="stcal located 1", unit="mm", layout=layout.name, scenes=scenes)
 
 
-def _scene(each: Located, layout: TargetLayout, chain: Chain | None) -> SceneRow:
+def _scene(each: Located, layout: TargetLayout, chain: GoalChain | None) -> SceneRow:
     verdict, merged, pose = each.verdict, each.merged, camera_from_obj(each)
     content: dict[str, Any] = {
         "scene": each.name,

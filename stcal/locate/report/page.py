@@ -12,7 +12,7 @@ from stcal.io.images import ImageFile, decode, grey_8bit, thumbnail
 from stcal.locate.data.exposures import Exposure, SceneFiles
 from stcal.locate.data.layout import TargetLayout
 from stcal.locate.pipeline import Located
-from stcal.locate.report.chain import Chain
+from stcal.locate.report.chain import GoalChain
 from stcal.locate.report.tables import accepted, camera_from_obj, uncertain
 from stcal.report.figure import AXIS_COLOURS, COLOURS
 from stcal.report.page import render, verdict
@@ -27,7 +27,7 @@ def run_page(
     scenes: Sequence[SceneFiles],
     layout: TargetLayout,
     model: CameraModel,
-    chain: Chain | None = None,
+    chain: GoalChain | None = None,
 ) -> str:
     """The whole page, which opens off line."""
     return render(
@@ -63,7 +63,7 @@ def _overview(results: Sequence[Located]) -> list[list]:
     return rows
 
 
-def _in_base(results: Sequence[Located], chain: Chain | None) -> list[list[str]]:
+def _in_base(results: Sequence[Located], chain: GoalChain | None) -> list[list[str]]:
     """base_from_goal of the accepted scenes."""
     if chain is None:
         return []

@@ -11,12 +11,12 @@ from stcal.geometry.rigid import Rigid
 from stcal.geometry.uncertain import UncertainRigid
 from stcal.io.table import COVARIANCE, POSE, pose_cells
 from stcal.locate.pipeline import Located
-from stcal.locate.report.chain import Chain
+from stcal.locate.report.chain import GoalChain
 
 BASE = "base_from_goal_"
 
 
-def run_text(results: Sequence[Located], chain: Chain | None = None) -> str:
+def run_text(results: Sequence[Located], chain: GoalChain | None = None) -> str:
     """A line for each scene, reasons below those that are not accepted; the target in the robot's base where a chain
     leads there."""
     width = max([5, *(len(each.name) for each in results)])
@@ -65,7 +65,7 @@ def accepted(results: Sequence[Located]) -> list[Located]:
     return [each for each in results if each.verdict.decision == "accept"]
 
 
-def poses_csv(results: Sequence[Located], chain: Chain | None = None) -> str:
+def poses_csv(results: Sequence[Located], chain: GoalChain | None = None) -> str:
     """Accepted poses only, so that nobody moves a robot to a rejected one; the others as comments."""
     out = io.StringIO()
     for each in results:

@@ -9,7 +9,7 @@ from stcal.register.core.models import Model, Transform, fit, rounding_mm, squar
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Noise:
+class PointNoise:
     """What is known of the residuals' noise.
 
     Inverse covariances are scaled so that a point of mean σ (the RMS of all σ) has σ = 1: whitened residuals are
@@ -26,9 +26,9 @@ class Noise:
     precision: np.ndarray | None = None
     sigma_mm: float | None = None
 
-    def __getitem__(self, rows: np.ndarray) -> "Noise":
+    def __getitem__(self, rows: np.ndarray) -> "PointNoise":
         """Of the points chosen by a mask or by indices."""
-        return self if self.precision is None else Noise(self.precision[rows], self.sigma_mm)
+        return self if self.precision is None else PointNoise(self.precision[rows], self.sigma_mm)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -40,13 +40,13 @@ class Problem:
     model : Model
     xyz_a, xyz_b : (n, 3) arrays
         mm; row i of both is the same point.
-    noise : Noise
+    noise : PointNoise
     """
 
     model: Model
     xyz_a: np.ndarray
     xyz_b: np.ndarray
-    noise: Noise
+    noise: PointNoise
 
     def __len__(self) -> int:
         return len(self.xyz_a)
@@ -81,7 +81,7 @@ class Problem:
         return rounding_mm(self.xyz_a, self.xyz_b)
 
 
-def noise_of(n: int, weights: np.ndarray | None, covariances: np.ndarray | None) -> Noise:
+def noise_of(n: int, weights: np.ndarray | None, covariances: np.ndarray | None) -> PointNoise:
     """The noise that weights or covariances state.
 
     Parameters
@@ -95,7 +95,7 @@ def noise_of(n: int, weights: np.ndarray | None, covariances: np.ndarray | None)
 
     Returns
     -------
-    Noise
+    PointNoise
 
     Raises
     ------
@@ -105,7 +105,7 @@ def noise_of(n: int, weights: np.ndarray | None, covariances: np.ndarray | None)
     if weights is not None and covariances is not None:
         raise InputError("registration: weights and covariances given; give only one of them")
     if weights is None and covariances is None:
-        return Noise()
+        return PointNoise()
     name = "weights" if covariances is None else "covariances"
     given = np.asarray(weights if covariances is None else covariances, float)
     if given.shape != (n,) and (name == "weights" or given.shape != (n, 3, 3)):
@@ -119,6 +119,6 @@ def noise_of(n: int, weights: np.ndarray | None, covariances: np.ndarray | None)
             "leave a row out to give it no weight"
         )
     if name == "weights":
-        return Noise(given * np.mean(1 / given))
+        return PointNoise(given * np.mean(1 / given))
     variance = float(np.mean(np.trace(given, axis1=1, axis2=2) / 3 if matrices else given))
-    return Noise((np.linalg.inv(given) if matrices else 1 / given) * variance, float(np.sqrt(variance)))
+    return PointNoise((np.linalg.inv(given) if matrices else 1 / given) * variance, float(np.sqrt(variance)))

@@ -64,7 +64,7 @@ class AxisPair(Part):
     leave_one_out_normal_spread_mm: float | None
 
 
-class LeaveOneOut(Part):
+class LeaveOneOutRows(Part):
     lines: list[int]
     distance_mm: list[list[float | None]]
     normal_mm: list[list[float | None]]
@@ -101,7 +101,7 @@ class AxesFile(ResultFile):
         'axis from where that was measured; `refused`: why these must not be used, or `""`; '
         "`leave_one_out_distance_spread_mm`, `leave_one_out_normal_spread_mm`"
     )
-    leave_one_out: LeaveOneOut = Field(
+    leave_one_out: LeaveOneOutRows = Field(
         description="`lines` of the rows left out (with all reflectors), `distance_mm`, `normal_mm` of each pair "
         "without them, signed as `a`"
     )

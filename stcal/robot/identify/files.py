@@ -39,7 +39,7 @@ class RowErrors(Part):
     weight: float
 
 
-class OutlierRow(Part):
+class OutlierMeasurementRow(Part):
     line: int
     place: str
     error_mm: float
@@ -86,4 +86,6 @@ class IdentifiedFile(ResultFile):
     )
     covariance: Matrix = Field(description="of these; of distances singular: 0 along what they never show")
     residuals: list[RowErrors] = Field(description="`line`, `error_mm`, `weight`")
-    outliers: list[OutlierRow] = Field(description="those of less than half weight: `line`, `place`, `error_mm`")
+    outliers: list[OutlierMeasurementRow] = Field(
+        description="those of less than half weight: `line`, `place`, `error_mm`"
+    )

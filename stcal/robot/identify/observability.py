@@ -26,7 +26,7 @@ MEANING = {
 
 
 @dataclass(frozen=True, slots=True)
-class Observability:
+class ObservabilityIndices:
     """Indices of an identification Jacobian with singular values σ₁ ≥ … ≥ σ_L from ``count`` poses; larger is better.
 
     They depend on the unit of the parameters but for the order that O1 gives to sets of poses. Everywhere here all
@@ -55,7 +55,7 @@ class Observability:
     o5: float
 
     @classmethod
-    def of(cls, singular_values: np.ndarray, count: int) -> "Observability":
+    def of(cls, singular_values: np.ndarray, count: int) -> "ObservabilityIndices":
         """From the singular values (L,) of the Jacobian of ``count`` poses; all indices are 0 where one of them is 0.
 
         Raises
@@ -77,7 +77,7 @@ class Observability:
         )
 
     @classmethod
-    def of_jacobian(cls, rows: np.ndarray, seen: int | None = None) -> "Observability":
+    def of_jacobian(cls, rows: np.ndarray, seen: int | None = None) -> "ObservabilityIndices":
         """From the Jacobian (m, r, k) of m poses over σ, parameters in mm; of its ``seen`` largest singular values."""
         sigma = np.linalg.svd(rows.reshape(-1, rows.shape[2]), compute_uv=False)[:seen]
         return cls.of(np.where(sigma > SEEN * sigma[0], sigma, 0.0), len(rows))

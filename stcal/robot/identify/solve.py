@@ -20,7 +20,7 @@ from stcal.robot.identify.adjustment import (
     unseen,
 )
 from stcal.robot.identify.nominal import Deviations, NominalRows
-from stcal.robot.identify.observability import Observability, parameter_scale
+from stcal.robot.identify.observability import ObservabilityIndices, parameter_scale
 from stcal.robot.identify.residuals import (
     WIDTH,
     Kind,
@@ -105,7 +105,7 @@ class IdentifyOptions:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class HeldOut:
+class HeldOutRows:
     """Errors of rows that a fit had not seen: ``position_mm``, ``rotation_rad`` : (repeats, r), nan where there is
     none, as of rotations where positions were measured."""
 
@@ -151,11 +151,11 @@ class Identified:
         Names of parameters along directions that were kept nominal.
     nominal_mm : (r,) array
         Errors with nominal axes, base and tools fitted.
-    held_out : HeldOut or None
+    held_out : HeldOutRows or None
         Errors of the cross-validation.
     dh_sigma : (n, 5) array
         σ of a, alpha, d, theta, beta; mm, rad.
-    observability : Observability
+    observability : ObservabilityIndices
         Of the parameters that are determined.
     deviations : dict of str to float or None
         σ of this robot's dimensions about nominal, as the data show them, by name; mm, rad.
@@ -172,9 +172,9 @@ class Identified:
     ranks: dict[str, int]
     undetermined: tuple[str, ...]
     nominal_mm: np.ndarray
-    held_out: HeldOut | None
+    held_out: HeldOutRows | None
     dh_sigma: np.ndarray
-    observability: Observability
+    observability: ObservabilityIndices
     deviations: dict[str, float | None]
     notes: tuple[str, ...]
 
@@ -397,7 +397,7 @@ def _ranks(state: State, data: Measurements) -> dict[str, int]:
     return ranks
 
 
-def _observability(robot: Robot, adjusted: Adjustment, seen: Observed, rank: int) -> Observability:
+def _observability(robot: Robot, adjusted: Adjustment, seen: Observed, rank: int) -> ObservabilityIndices:
     state, weighting = adjusted.solution.state, adjusted.weighting
     rows = weighting.whiten(jacobian(state, seen), seen) * parameter_scale(robot, seen.kind, state.tools)
     if seen.frameless:  # without what a motion of all points makes
@@ -406,7 +406,7 @@ def _observability(robot: Robot, adjusted: Adjustment, seen: Observed, rank: int
         u, s, _ = np.linalg.svd(weighting.whiten(motions, seen).reshape(-1, 6), full_matrices=False)
         u, flat = u[:, s > 1e-9 * s[0]], rows.reshape(-1, rows.shape[2])
         rows = (flat - u @ (u.T @ flat)).reshape(rows.shape)
-    return Observability.of_jacobian(rows, rank)
+    return ObservabilityIndices.of_jacobian(rows, rank)
 
 
 def _place(seen: Observed) -> int:
@@ -429,7 +429,7 @@ def _covariance(adjusted: Adjustment, seen: Observed) -> np.ndarray:
     return kept @ covariance @ kept.T
 
 
-def _cross_validated(robot: Robot, seen: Observed, whole: Adjustment, options: IdentifyOptions) -> HeldOut | None:
+def _cross_validated(robot: Robot, seen: Observed, whole: Adjustment, options: IdentifyOptions) -> HeldOutRows | None:
     """Errors of rows that took no part: of neither the parameters nor (where rows are few) the σ."""
     rows = len(seen)
     folds = min(options.folds, rows)
@@ -462,7 +462,7 @@ def _cross_validated(robot: Robot, seen: Observed, whole: Adjustment, options: I
             position[repeat, place] = _lengths(found)
             if seen.kind == "pose":
                 rotation[repeat, place] = np.linalg.norm(found[:, :3], axis=1)
-    return HeldOut(folds, position, rotation)
+    return HeldOutRows(folds, position, rotation)
 
 
 def _lengths(found: np.ndarray) -> np.ndarray:

@@ -26,7 +26,7 @@ ORIENTATION_WEIGHT = 0.03
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Problem:
+class InverseProblem:
     """An arm with a tool, without unit.
 
     ``unit`` : (n,) rad or mm of a joint's value 1; ``reach`` : mm; ``bounds`` : (n, 2); ``middle`` : (n,) of the
@@ -42,7 +42,7 @@ class Problem:
     turns: np.ndarray
 
     @classmethod
-    def of(cls, robot: Robot, tool: str = "") -> "Problem":
+    def of(cls, robot: Robot, tool: str = "") -> "InverseProblem":
         reach = reach_mm(robot, tool)
         sliding = robot.prismatic
         unit = np.where(sliding, reach, 1.0)
@@ -81,7 +81,7 @@ def reach_mm(robot: Robot, tool: str = "") -> float:
     return float(max(links + travel[np.isfinite(travel)].sum(), 1.0))
 
 
-def solve(problem: Problem, poses: Poses, q: np.ndarray, bounds: np.ndarray | None = None) -> np.ndarray:
+def solve(problem: InverseProblem, poses: Poses, q: np.ndarray, bounds: np.ndarray | None = None) -> np.ndarray:
     """Joint vectors (m, n), without unit, from starts q to least error; within ``bounds`` (n, 2) where given.
 
     Nothing is raised where a pose cannot be reached: the result is then a local minimum of the error.
@@ -121,7 +121,7 @@ def _done(off: np.ndarray) -> np.ndarray:
 
 
 def _step(
-    problem: Problem,
+    problem: InverseProblem,
     q: np.ndarray,
     off: np.ndarray,
     weight: np.ndarray,
@@ -148,7 +148,7 @@ def _step(
     return step * np.minimum(1, LONGEST / np.maximum(longest, 1e-300)), gain
 
 
-def _position_exact(problem: Problem, poses: Poses, q: np.ndarray, bounds: np.ndarray | None) -> np.ndarray:
+def _position_exact(problem: InverseProblem, poses: Poses, q: np.ndarray, bounds: np.ndarray | None) -> np.ndarray:
     """Shortest steps that take the rest of the position error away; of joints within bounds only, as far as it goes."""
     for _ in range(4):
         off = problem.errors(poses, q)[:, 3:] / problem.reach

@@ -15,7 +15,7 @@ from scipy.stats import qmc
 from stcal.errors import InputError
 from stcal.geometry.arrays import frozen
 from stcal.geometry.rigid import Poses, Rigid
-from stcal.robot.kinematics.damped import Problem, solve
+from stcal.robot.kinematics.damped import InverseProblem, solve
 from stcal.robot.kinematics.forward import forward
 from stcal.robot.kinematics.model import Robot
 
@@ -116,7 +116,7 @@ def inverse(robot: Robot, poses: Poses, near: ArrayLike | None = None, tool: str
     assumption", Computing 74, 2005.
     """
     m, n = len(poses), len(robot.rows)
-    problem = Problem.of(robot, tool)
+    problem = InverseProblem.of(robot, tool)
     if near is None:
         return _in_sequence(problem, poses)
     near = np.asarray(near, float)
@@ -163,7 +163,7 @@ def branches(robot: Robot, pose: Rigid, tool: str = "") -> Inverse:
     InputError
         More than six joints, of which there are endlessly many solutions; an unknown tool.
     """
-    problem = Problem.of(robot, tool)
+    problem = InverseProblem.of(robot, tool)
     _refuse_redundant(problem)
     poses = Poses.of([pose])
     solutions, inside = _turned(problem, _every_solution(problem, poses)[0], problem.middle)
@@ -175,7 +175,7 @@ def branches(robot: Robot, pose: Rigid, tool: str = "") -> Inverse:
     return Inverse(found.q[order], tuple(found.status[i] for i in order), found.error_mm[order], found.error_rad[order])
 
 
-def _from_near(problem: Problem, poses: Poses, near: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def _from_near(problem: InverseProblem, poses: Poses, near: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Joint vectors (m, n) by descent from ``near`` (m, n), and which (m,) are sure to be the nearest solutions."""
     isolated = len(problem.unit) <= 6
     bounds = None if isolated else problem.bounds
@@ -189,7 +189,7 @@ def _from_near(problem: Problem, poses: Poses, near: np.ndarray) -> tuple[np.nda
     return q, ok
 
 
-def _in_sequence(problem: Problem, poses: Poses) -> Inverse:
+def _in_sequence(problem: InverseProblem, poses: Poses) -> Inverse:
     """Without reference: each pose in the branch nearest to that of the one before."""
     _refuse_redundant(problem)
     m, n = len(poses), len(problem.unit)
@@ -204,7 +204,7 @@ def _in_sequence(problem: Problem, poses: Poses) -> Inverse:
     return _finished(problem, poses, q, ok, beyond)
 
 
-def _refuse_redundant(problem: Problem) -> None:
+def _refuse_redundant(problem: InverseProblem) -> None:
     n = len(problem.unit)
     if n > 6:
         raise InputError(
@@ -213,7 +213,7 @@ def _refuse_redundant(problem: Problem) -> None:
         )
 
 
-def _every_solution(problem: Problem, poses: Poses, more: np.ndarray | None = None) -> list[np.ndarray]:
+def _every_solution(problem: InverseProblem, poses: Poses, more: np.ndarray | None = None) -> list[np.ndarray]:
     """For each pose, joint vectors (k, n) from many starts, limits not regarded, converged or not.
 
     ``more`` : (m, n) one more joint vector to look at for each pose.
@@ -238,7 +238,9 @@ def _embedded(poses: Poses, reach: float) -> np.ndarray:
     return np.hstack([poses.rotation.reshape(-1, 9) / np.sqrt(2), poses.translation / reach])
 
 
-def _nearest(problem: Problem, pose: Poses, solutions: np.ndarray, near: np.ndarray) -> tuple[np.ndarray | None, bool]:
+def _nearest(
+    problem: InverseProblem, pose: Poses, solutions: np.ndarray, near: np.ndarray
+) -> tuple[np.ndarray | None, bool]:
     """Of the solutions of one pose the one within the limits nearest to ``near``; and whether some are beyond them."""
     turned, inside = _turned(problem, solutions, near)
     count = len(turned)
@@ -259,7 +261,7 @@ def _as_good(error_rad: np.ndarray) -> np.ndarray:
     return error_rad <= AS_GOOD * error_rad.min(initial=np.inf) + WITHIN_RAD
 
 
-def _is_reached(problem: Problem, off: np.ndarray) -> np.ndarray:
+def _is_reached(problem: InverseProblem, off: np.ndarray) -> np.ndarray:
     """(m,) of errors (m, 6), rad and mm; of fewer than six joints only the position has to be."""
     position = np.linalg.norm(off[:, 3:], axis=1) <= WITHIN_MM
     return position & ((np.linalg.norm(off[:, :3], axis=1) <= WITHIN_RAD) | problem.under_actuated)
@@ -274,7 +276,7 @@ def _distinct(solutions: np.ndarray) -> np.ndarray:
     return np.array(kept).reshape(-1, solutions.shape[1])
 
 
-def _turned(problem: Problem, q: np.ndarray, near: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def _turned(problem: InverseProblem, q: np.ndarray, near: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Joint values turned by 2π as near to ``near`` as the limits allow, and whether (m,) they are within these."""
     low, high = problem.bounds.T
     turn = 2 * np.pi
@@ -286,7 +288,7 @@ def _turned(problem: Problem, q: np.ndarray, near: np.ndarray) -> tuple[np.ndarr
     return turned, ((turned >= low - LIMIT_SLACK) & (turned <= high + LIMIT_SLACK)).all(axis=1)
 
 
-def _is_nearest(problem: Problem, q: np.ndarray, near: np.ndarray) -> np.ndarray:
+def _is_nearest(problem: InverseProblem, q: np.ndarray, near: np.ndarray) -> np.ndarray:
     """(m,) whether no other solution can be as near to ``near`` as q.
 
     A solution is the only one within 2σ/K, σ being the smallest singular value of the Jacobian there and K a Lipschitz
@@ -298,7 +300,7 @@ def _is_nearest(problem: Problem, q: np.ndarray, near: np.ndarray) -> np.ndarray
     return np.linalg.norm(q - near, axis=1) <= _smallest(problem, q) / bound
 
 
-def _nearest_around(problem: Problem, poses: Poses, q: np.ndarray, near: np.ndarray) -> np.ndarray:
+def _nearest_around(problem: InverseProblem, poses: Poses, q: np.ndarray, near: np.ndarray) -> np.ndarray:
     """Of solutions q (m, n) and those beside them the nearest to ``near``: branches meet along the motion that the
     Jacobian sees least, so that another one near by is found from either side along it."""
     if not len(q):
@@ -315,14 +317,14 @@ def _nearest_around(problem: Problem, poses: Poses, q: np.ndarray, near: np.ndar
     return best
 
 
-def _smallest(problem: Problem, q: np.ndarray) -> np.ndarray:
+def _smallest(problem: InverseProblem, q: np.ndarray) -> np.ndarray:
     """(m,) smallest singular value of the Jacobian, without unit."""
     if not len(q):
         return np.zeros(0)
     return np.linalg.svd(problem.jacobian(q), compute_uv=False)[:, -1]
 
 
-def _judge(problem: Problem, poses: Poses, q: np.ndarray) -> Inverse:
+def _judge(problem: InverseProblem, poses: Poses, q: np.ndarray) -> Inverse:
     """Status of joint vectors, limits not regarded."""
     off = problem.errors(poses, q)
     error_mm, error_rad = np.linalg.norm(off[:, 3:], axis=1), np.linalg.norm(off[:, :3], axis=1)
@@ -332,7 +334,7 @@ def _judge(problem: Problem, poses: Poses, q: np.ndarray) -> Inverse:
     return Inverse(q * problem.unit, tuple(status), error_mm, error_rad)
 
 
-def _finished(problem: Problem, poses: Poses, q: np.ndarray, ok: np.ndarray, beyond: np.ndarray) -> Inverse:
+def _finished(problem: InverseProblem, poses: Poses, q: np.ndarray, ok: np.ndarray, beyond: np.ndarray) -> Inverse:
     """Where nothing reaches the pose, what comes nearest within the limits; and the status of all."""
     q = q.copy()
     rest = np.flatnonzero(~ok)

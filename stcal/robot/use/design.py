@@ -16,7 +16,7 @@ from stcal.geometry.arrays import Array, freeze
 from stcal.geometry.rigid import Poses
 from stcal.io.table import POSE, pose_cells
 from stcal.parallel import one_thread
-from stcal.robot.identify.observability import SEEN, Observability, identification_jacobian, parameter_scale
+from stcal.robot.identify.observability import SEEN, ObservabilityIndices, identification_jacobian, parameter_scale
 from stcal.robot.kinematics.forward import forward
 from stcal.robot.kinematics.model import Robot
 from stcal.robot.use.compensation import joint_cells, joint_columns
@@ -46,8 +46,8 @@ class PoseDesign:
         base_from_tool there.
     parameters, seen : int
         Parameters, and how many of them (in combination) the candidates show; the indices are of these.
-    chosen : Observability
-    random : tuple of Observability
+    chosen : ObservabilityIndices
+    random : tuple of ObservabilityIndices
         Of random sets of the same size.
     sigma_mm, random_sigma_mm : float
         σ of the position that the identified robot will predict, RMS per axis over random poses; of the chosen set, and
@@ -59,8 +59,8 @@ class PoseDesign:
     poses: Poses
     parameters: int
     seen: int
-    chosen: Observability
-    random: tuple[Observability, ...]
+    chosen: ObservabilityIndices
+    random: tuple[ObservabilityIndices, ...]
     sigma_mm: float
     random_sigma_mm: float
     exchanges: int
@@ -177,8 +177,8 @@ def design(robot: Robot, options: DesignOptions | None = None) -> PoseDesign:
         poses=forward(robot, q[chosen], options.tool),
         parameters=len(scale),
         seen=seen,
-        chosen=Observability.of_jacobian(rows[chosen]),
-        random=tuple(Observability.of_jacobian(rows[s]) for s in sets),
+        chosen=ObservabilityIndices.of_jacobian(rows[chosen]),
+        random=tuple(ObservabilityIndices.of_jacobian(rows[s]) for s in sets),
         sigma_mm=_predicted_mm(rows[chosen], predict),
         random_sigma_mm=float(np.median([_predicted_mm(rows[s], predict) for s in sets])),
         exchanges=exchanges,

@@ -38,7 +38,7 @@ class CompensationFile(ResultFile):
     )
 
 
-class Reduced(Part):
+class ErrorReduction(Part):
     mean_percent: float | None
     std_percent: float | None
     max_percent: float | None
@@ -52,7 +52,7 @@ class MeasuredSet(Part):
     max_mm: float
     all_pairs_rms_mm: float
     scale: float
-    reduced: Reduced | None = Field(
+    reduced: ErrorReduction | None = Field(
         description="each figure's reduction from the first set: `mean_percent`, `std_percent`, `max_percent`, "
         "`all_pairs_rms_percent`; null for the first"
     )

@@ -24,7 +24,7 @@ SCALE_WITHIN = 0.01
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Measured:
+class MeasuredPoses:
     """Rows of a file. ``sets``, ``names`` : (m,) set and pose of each; ``commanded``, ``measured`` : (m, 3) mm, each in
     a frame of its own."""
 
@@ -97,7 +97,7 @@ class Verification:
         ]
 
 
-def read_measured(path: str | Path) -> Measured:
+def read_measured(path: str | Path) -> MeasuredPoses:
     """Read commanded and measured positions.
 
     Parameters
@@ -107,7 +107,7 @@ def read_measured(path: str | Path) -> Measured:
 
     Returns
     -------
-    Measured
+    MeasuredPoses
         Positions, mm, commanded ones in the robot's base and measured ones in the instrument's frame.
 
     Raises
@@ -120,7 +120,7 @@ def read_measured(path: str | Path) -> Measured:
     within(table, "commanded position", commanded, "mm")
     within(table, "position", measured, "mm")
     sets = tuple(table.text("set")) if "set" in table else ("measured",) * len(table)
-    return Measured(table.where, table.lines, sets, _names(table, sets, commanded), commanded, measured)
+    return MeasuredPoses(table.where, table.lines, sets, _names(table, sets, commanded), commanded, measured)
 
 
 def _names(table: Table, sets: tuple[str, ...], commanded: np.ndarray) -> tuple[str, ...]:
@@ -147,14 +147,14 @@ def _names(table: Table, sets: tuple[str, ...], commanded: np.ndarray) -> tuple[
     return tuple(map(str, numbers))
 
 
-def verify(data: Measured) -> Verification:
+def verify(data: MeasuredPoses) -> Verification:
     """Distance errors of each set, over the poses that all sets have.
 
     Distances from the first position need no common frame of robot and instrument (Zhang & Wei 2017, section 4.3).
 
     Parameters
     ----------
-    data : Measured
+    data : MeasuredPoses
         Commanded and measured positions of one or more sets, mm.
 
     Returns
@@ -193,7 +193,7 @@ def verify(data: Measured) -> Verification:
     return Verification(data.where, tuple(common), np.linalg.norm(at[1:] - at[0], axis=1), sets, missing)
 
 
-def _set_result(data: Measured, name: str, rows: np.ndarray) -> SetResult:
+def _set_result(data: MeasuredPoses, name: str, rows: np.ndarray) -> SetResult:
     commanded, measured = data.commanded[rows], data.measured[rows]
     error = np.linalg.norm(measured[1:] - measured[0], axis=1) - np.linalg.norm(commanded[1:] - commanded[0], axis=1)
     size = np.abs(error)

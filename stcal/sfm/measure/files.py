@@ -18,7 +18,7 @@ class CircleRow(Part):
     weight: float
 
 
-class OutlierRow(Part):
+class OutlierCircleRow(Part):
     label: str
     residual_px: float
     limit_px: float
@@ -50,7 +50,7 @@ class ImagePose(Part):
     circles: list[CircleRow] = Field(
         description="`label`, `residual_px` measured minus projected ellipse centre, Huber's `weight`"
     )
-    outliers: list[OutlierRow] = Field(
+    outliers: list[OutlierCircleRow] = Field(
         description="`label`, `residual_px`, `limit_px` of circles that contradict the others and are left out"
     )
     notes: list[str] = Field(description="what detection saw and left out")

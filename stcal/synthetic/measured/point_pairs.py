@@ -18,7 +18,7 @@ OFF_MM = (2.0, 50.0)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Scene:
+class PointPairScene:
     """``xyz_a``, ``xyz_b`` : (n, 3) mm, b with noise; ``b_from_a`` : the truth; ``clean`` : (n,) mask."""
 
     xyz_a: np.ndarray
@@ -101,7 +101,7 @@ def make_scene(
     kind: str = "random",
     off_mm: tuple[float, float] = OFF_MM,
     sigma_mm: float = SIGMA_MM,
-) -> Scene:
+) -> PointPairScene:
     """n points in a cube of 200 mm, ``share`` of them wrong, by a distance within ``off_mm`` where that applies."""
     b_from_a = random_rigid(rng)
     xyz_a = cube(rng, n)
@@ -111,7 +111,7 @@ def make_scene(
         xyz_b[wrong] = WRONG[kind](rng, xyz_b[wrong], off_mm)
     clean = np.ones(n, bool)
     clean[wrong] = False
-    return Scene(xyz_a, xyz_b, b_from_a, clean)
+    return PointPairScene(xyz_a, xyz_b, b_from_a, clean)
 
 
 def parameter_error(found: Transform, truth: Transform) -> np.ndarray:

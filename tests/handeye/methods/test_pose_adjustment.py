@@ -11,7 +11,7 @@ from stcal.geometry.rigid import Poses, Rigid
 from stcal.handeye import HandEyeOptions, HandEyePoses, Noise, handeye
 from stcal.handeye.data.loop import Loop
 from stcal.handeye.methods.noise import components
-from stcal.handeye.methods.pose_adjustment import State, adjust_poses, against_others
+from stcal.handeye.methods.pose_adjustment import LoopState, adjust_poses, against_others
 from stcal.synthetic.measured.handeye import simulated, simulated_views
 
 SETUPS = ("eye-in-hand", "eye-to-hand")
@@ -166,7 +166,7 @@ def test_poses_are_judged_by_their_own_sigma():
         loop = Loop.of(truth.pairs, "eye-in-hand")
         noise = Noise(0.0, 0.0, 1e-3, 0.3)
         solved = adjust_poses(
-            loop[used], State(truth.mount_from_camera, truth.stand_from_board), noise, robust=False
+            loop[used], LoopState(truth.mount_from_camera, truth.stand_from_board), noise, robust=False
         ).state
         x, z = solved.mount_from_camera, solved.stand_from_board
         slope = loop.jacobian(x)[:, :, :12]

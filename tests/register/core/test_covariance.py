@@ -8,7 +8,7 @@ from stcal.errors import InputError
 from stcal.register import register
 from stcal.register.core.covariance import covariance_of, kept_share, kept_variance, sigma_within
 from stcal.register.core.models import MODELS
-from stcal.register.core.problem import Noise, Problem, noise_of
+from stcal.register.core.problem import PointNoise, Problem, noise_of
 from stcal.synthetic.measured.point_pairs import SIGMA_MM, make_scene, parameter_error
 
 RIGID = MODELS["rigid"]
@@ -54,7 +54,7 @@ def test_the_covariance_is_calibrated(share, options):
 def test_a_cut_costs_what_an_estimator_with_hard_rejection_loses():
     """At 2 σ: χ²₃(4)/χ²₅(4) = 0.7385/0.4506 of the variance that as many whole points have."""
     s = make_scene(np.random.default_rng(7), 50)
-    problem = Problem(RIGID, s.xyz_a, s.xyz_b, Noise())
+    problem = Problem(RIGID, s.xyz_a, s.xyz_b, PointNoise())
     whole, cut = (covariance_of(problem, s.b_from_a, 0.1, threshold).matrix for threshold in (np.inf, 0.2))
     np.testing.assert_allclose(cut, whole * 0.7385 / 0.4506, rtol=2e-4)
 

@@ -8,7 +8,7 @@ from stcal.errors import DegenerateError
 from stcal.geometry.align import align_rigid
 from stcal.register import register
 from stcal.register.core.models import MODELS, fit
-from stcal.register.core.problem import Noise, Problem
+from stcal.register.core.problem import PointNoise, Problem
 from stcal.register.core.robust import CLEAN_SETS_WITH_OUTLIER, deletion_squares
 from stcal.register.core.search import by_scale, chernoff, search
 from stcal.register.judge.groups import lies_together, sphericity, two_groups, wilks_bound
@@ -125,7 +125,7 @@ def test_noise_along_one_axis_that_the_fit_carries_into_the_others():
         rng = np.random.default_rng([trial, 12])
         s = scene([trial, 12], 100, sigma_mm=0.01)
         b = s.xyz_b + rng.normal(0, 0.3, (100, 1)) * [0, 0.8, 0.6]
-        assert two_groups(Problem(RIGID, s.xyz_a, b, Noise()), rng) is None
+        assert two_groups(Problem(RIGID, s.xyz_a, b, PointNoise()), rng) is None
 
 
 def test_wilks_bound_is_above_the_distribution():
@@ -153,7 +153,7 @@ def test_sphericity_is_a_p_value():
 def test_deletion_residuals_are_those_of_the_fit_without_the_point():
     """Exactly so of the affine model, which is linear, with σ of every point its own."""
     s, model = scene(24, 12), MODELS["affine"]
-    noise = Noise(np.random.default_rng(0).uniform(0.5, 2, 12))
+    noise = PointNoise(np.random.default_rng(0).uniform(0.5, 2, 12))
     whole = np.ones(12, bool)
     found = fit(model, s.xyz_a, s.xyz_b, noise.precision)
     problem = Problem(model, s.xyz_a, s.xyz_b, noise)
@@ -346,18 +346,18 @@ def test_false_alarms_of_the_search_are_rare():
     for trial in range(30):
         s = scene([trial, 5], 15)
         total = ((s.xyz_b - align_rigid(s.xyz_b, s.xyz_a) @ s.xyz_a) ** 2).sum()
-        problem = Problem(RIGID, s.xyz_a, s.xyz_b, Noise())
+        problem = Problem(RIGID, s.xyz_a, s.xyz_b, PointNoise())
         found = search(problem, by_scale(RIGID, 15, total), np.random.default_rng(0))
         assert found.value > np.log(1e-3)
 
 
 def test_groups():
     s = scene(22, 60, 0.4, "one shift", (1.5, 1.5))
-    groups = two_groups(Problem(RIGID, s.xyz_a, s.xyz_b, Noise()), np.random.default_rng(0))
+    groups = two_groups(Problem(RIGID, s.xyz_a, s.xyz_b, PointNoise()), np.random.default_rng(0))
     near = [((s.xyz_b - t @ s.xyz_a) ** 2).sum(1) for t in groups.transforms]
     assert ((near[0] < near[1]) == s.clean).mean() > 0.97
     assert not groups.in_space
     none = scene(23, 60)
-    assert two_groups(Problem(RIGID, none.xyz_a, none.xyz_b, Noise()), np.random.default_rng(0)) is None
+    assert two_groups(Problem(RIGID, none.xyz_a, none.xyz_b, PointNoise()), np.random.default_rng(0)) is None
     assert lies_together(s.xyz_a, s.xyz_a[:, 0] > 800)
     assert not lies_together(s.xyz_a, s.clean)

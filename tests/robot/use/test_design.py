@@ -10,7 +10,7 @@ from stcal.cli.main import main
 from stcal.errors import DegenerateError, InputError
 from stcal.geometry.rigid import Poses, Rigid
 from stcal.io.table import read_table
-from stcal.robot.identify.observability import Observability, identification_jacobian, parameter_scale
+from stcal.robot.identify.observability import ObservabilityIndices, identification_jacobian, parameter_scale
 from stcal.robot.identify.solve import IdentifyOptions, identify
 from stcal.robot.kinematics.example import mh80
 from stcal.robot.kinematics.file import robot_toml
@@ -24,25 +24,25 @@ ARM = replace(mh80(), tools={"": TOOL})
 
 
 def test_indices_by_hand():
-    found = Observability.of([2.0, 8.0, 4.0], 4)
+    found = ObservabilityIndices.of([2.0, 8.0, 4.0], 4)
     assert found.o1 == pytest.approx(64 ** (1 / 3) / 2)  # cube root of 2·4·8 over √4
     assert found.o2 == pytest.approx(0.25)
     assert found.o3 == pytest.approx(2)
     assert found.o4 == pytest.approx(0.5)  # 2² / 8
     assert found.o5 == pytest.approx(8 / 7)  # 1 / (1/2 + 1/4 + 1/8)
-    assert Observability.of([3.0, 0.0], 1).values() == dict.fromkeys(("O1", "O2", "O3", "O4", "O5"), 0.0)
+    assert ObservabilityIndices.of([3.0, 0.0], 1).values() == dict.fromkeys(("O1", "O2", "O3", "O4", "O5"), 0.0)
 
 
 def test_indices_of_many_poses_neither_overflow_nor_depend_on_order():
     sigma = np.geomspace(1e-12, 1e12, 400)
-    assert Observability.of(sigma, 1).o1 == pytest.approx(1)
-    assert Observability.of(sigma[::-1], 1).o4 == pytest.approx(1e-36)
+    assert ObservabilityIndices.of(sigma, 1).o1 == pytest.approx(1)
+    assert ObservabilityIndices.of(sigma[::-1], 1).o4 == pytest.approx(1e-36)
 
 
 @pytest.mark.parametrize(("sigma", "count"), [([], 3), ([1.0, -1.0], 3), ([1.0], 0), ([np.nan], 1)])
 def test_no_index_of_nothing(sigma, count):
     with pytest.raises(InputError, match="singular values of"):
-        Observability.of(sigma, count)
+        ObservabilityIndices.of(sigma, count)
 
 
 @pytest.mark.parametrize("observe", ["pose", "position"])
