@@ -92,7 +92,7 @@ def fit(model: Model, xyz_a: np.ndarray, xyz_b: np.ndarray, precision: np.ndarra
         weights = np.trace(precision, axis1=1, axis2=2)
     closed = {"rigid": align_rigid, "similarity": align_similarity, "affine": align_affine}[model.name]
     start = closed(xyz_b, xyz_a, weights)
-    if precision is None or precision.ndim == 1:
+    if precision is None or weights is None or precision.ndim == 1:
         return start
     origin = weights @ xyz_a / weights.sum()
     found = minimise(

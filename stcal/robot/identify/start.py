@@ -129,8 +129,9 @@ def _base_and_points(where: str, flange: Poses, positions: np.ndarray, rows: np.
         least_damping=REGULAR,
         max_steps=ROUNDS,
     )
-    found.required(f"{where}: base and tools", "check the D-H rows and the joint values", NEARLY * found.linear.cost)
-    return *found.state, float(np.sqrt(found.linear.cost / len(rows)))
+    square = float(found.linear.cost)
+    found.required(f"{where}: base and tools", "check the D-H rows and the joint values", NEARLY * square)
+    return *found.state, float(np.sqrt(square / len(rows)))
 
 
 def _points_of_distances(robot: Robot, flange: Poses, data: Measurements, rows: np.ndarray, points: np.ndarray):
