@@ -74,3 +74,27 @@ def test_points_behind_a_camera_cost_everything(group):
     turned = tuple(Rigid.exp([np.pi, 0, 0, 0, 0, 0]) @ pose for pose in model.camera_from_model)
     behind = replace(model, camera_from_model=turned)
     assert blocks.image_cost(behind, camera, 4.0) == np.inf
+
+
+def test_dots_off_their_design_cost_their_squares_over_sigma(group):
+    model, camera = group
+    dots, none = np.arange(5), np.zeros(0, int)
+    shared = blocks.Shared(
+        xyz_model=np.zeros((0, 3)), shape_mm=np.zeros((0, 3)), camera=camera, basis=np.zeros((12, 0))
+    )
+
+    def cost(off_mm: np.ndarray) -> float:
+        block = blocks.Block(
+            model=model,
+            model_from_board=Rigid(),
+            design=model.xyz_model[dots] + off_mm,
+            sigma_mm=0.02,
+            dots=dots,
+            circles=none,
+            dot_place=none,
+            circle_place=none,
+        )
+        return block.cost(shared, np.inf)
+
+    off = np.random.default_rng(0).normal(0, 0.05, (5, 3))
+    assert cost(off) - cost(0 * off) == pytest.approx((off**2).sum() / 0.02**2, rel=1e-6)
