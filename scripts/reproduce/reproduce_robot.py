@@ -28,7 +28,8 @@ from stcal.report.figure import save
 from stcal.robot.axes.model import robot_from_sweeps
 from stcal.robot.identify.residuals import jacobian as jacobian_of
 from stcal.robot.identify.residuals import observed, residuals
-from stcal.robot.identify.solve import Identified, IdentifyOptions, identify
+from stcal.robot.identify.result import Identified, IdentifyOptions
+from stcal.robot.identify.solve import identify
 from stcal.robot.kinematics.example import mh80
 from stcal.robot.kinematics.forward import forward, jacobian
 from stcal.robot.kinematics.inverse import inverse

@@ -19,7 +19,8 @@ import numpy as np
 from stcal.geometry.rigid import Rigid
 from stcal.parallel import one_thread
 from stcal.robot.identify.residuals import Observed, State, jacobian, observed, residuals, tips
-from stcal.robot.identify.solve import Identified, IdentifyOptions, identify
+from stcal.robot.identify.result import Identified, IdentifyOptions
+from stcal.robot.identify.solve import identify
 from stcal.robot.kinematics.example import mh80
 from stcal.robot.kinematics.measurements import Measurements
 from stcal.robot.kinematics.model import Robot

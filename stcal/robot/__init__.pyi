@@ -1,6 +1,6 @@
 from .axes.model import robot_from_sweeps as robot_from_sweeps
-from .identify.solve import Identified as Identified
-from .identify.solve import IdentifyOptions as IdentifyOptions
+from .identify.result import Identified as Identified
+from .identify.result import IdentifyOptions as IdentifyOptions
 from .identify.solve import identify as identify
 from .kinematics.file import load_robot as load_robot
 from .kinematics.file import robot_toml as robot_toml

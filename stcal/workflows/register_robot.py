@@ -19,7 +19,8 @@ from stcal.register.report.page import matrix_lines, matrix_rows
 from stcal.register.workspace.findings import Findings
 from stcal.report.page import render
 from stcal.report.text import number
-from stcal.robot.identify.solve import Identified, IdentifyOptions, identify
+from stcal.robot.identify.result import Identified, IdentifyOptions
+from stcal.robot.identify.solve import identify
 from stcal.robot.kinematics.file import load_robot
 from stcal.robot.kinematics.forward import forward
 from stcal.robot.kinematics.measurements import Measurements, joint_values, targets_of

@@ -8,7 +8,7 @@ from stcal.report.text import NONE, number
 from stcal.robot.identify.files import IdentifiedFile
 from stcal.robot.identify.nominal import dh_values
 from stcal.robot.identify.observability import MEANING
-from stcal.robot.identify.solve import Identified
+from stcal.robot.identify.result import Identified
 from stcal.robot.kinematics.model import Robot
 
 DH = ("a", "alpha", "d", "theta", "beta")

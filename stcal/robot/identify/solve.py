@@ -1,12 +1,11 @@
 """Identification of a robot's kinematics from poses, positions or distances: parameters, σ and held-out error."""
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import get_args
 
 import numpy as np
 
-from stcal.errors import DegenerateError, InputError
-from stcal.geometry.arrays import Array, freeze
+from stcal.errors import DegenerateError
 from stcal.geometry.rigid import skew
 from stcal.geometry.robust import huber_weights
 from stcal.parallel import one_thread
@@ -34,8 +33,9 @@ from stcal.robot.identify.residuals import (
     tips,
     unknowns,
 )
+from stcal.robot.identify.result import Adjustment, HeldOutRows, Identified, IdentifyOptions, position_errors
 from stcal.robot.identify.start import start
-from stcal.robot.identify.variances import GROSS, Components, components, estimated
+from stcal.robot.identify.variances import GROSS, components, estimated
 from stcal.robot.kinematics.dh import robot_from_chain
 from stcal.robot.kinematics.measurements import Measurements
 from stcal.robot.kinematics.model import Robot
@@ -52,169 +52,12 @@ FALLS = 0.5
 """Medians of residuals that fall by less are near enough for the estimates proper."""
 STILL_RAD, STILL_MM = 1e-5, 1e-2
 """A joint that moves less than this did not move."""
-OUTLIER_WEIGHT = 0.5
-"""Observations of less are named: their residual is over twice Huber's limit."""
 OUTLIER_ROUNDS = 5
 """Of leaving errors out; after 1 to 3 the same ones are left out again."""
 MOSTLY_GOOD = 0.5
 """Share of the observations below which nothing is called an error."""
 REPEATS, FEW_ROWS = 5, 300
 """Divisions of the cross-validation of few rows; one does for more."""
-
-
-@dataclass(frozen=True, slots=True)
-class IdentifyOptions:
-    """How :func:`identify` works.
-
-    Parameters
-    ----------
-    observe : {"pose", "position", "distance"}, optional
-        What of the measurements to use; the most that was measured if not given.
-    sigma_mm, sigma_rad : float, optional
-        σ of one coordinate of a position, mm, and of an orientation, rad; estimated where not given.
-    robust : bool
-        Whether outliers weigh less (Huber), and what are errors and no noise nothing at all.
-    folds : int
-        Of the cross-validation; 0 for none.
-    repeats : int, optional
-        Divisions into folds, in each of which every row is held out once; 5 of few rows, 1 of many, if not given.
-    seed : int
-        Of the divisions.
-    partial : bool
-        Keep nominal what the data do not determine, in place of refusing them.
-
-    Raises
-    ------
-    InputError
-        A σ that is not positive, or beyond 1 m or 1 rad.
-    """
-
-    observe: Kind | None = None
-    sigma_mm: float | None = None
-    sigma_rad: float | None = None
-    robust: bool = True
-    folds: int = 6
-    repeats: int | None = None
-    seed: int = 0
-    partial: bool = False
-
-    def __post_init__(self):
-        for name, value, most in (("sigma_mm", self.sigma_mm, 1e3), ("sigma_rad", self.sigma_rad, 1.0)):
-            if value is not None and not 1e-12 <= value <= most:
-                raise InputError(f"{name} is {value:g}; a number above 0, up to {most:g}, needed")
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class HeldOutRows:
-    """Errors of rows that a fit had not seen: ``position_mm``, ``rotation_rad`` : (repeats, r), nan where there is
-    none, as of rotations where positions were measured."""
-
-    folds: int
-    position_mm: np.ndarray
-    rotation_rad: np.ndarray
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class Adjustment:
-    """A solution with the σ that go with it; ``notes`` : on what had not come to rest."""
-
-    solution: Solution
-    weighting: Weighting
-    deviations: Deviations
-    rows: NominalRows
-    parts: Components
-    notes: tuple[str, ...] = ()
-
-
-@dataclass(frozen=True, slots=True, eq=False, kw_only=True)
-class Identified:
-    """The identified robot, and how far to trust it; r observations, k parameters, n joints.
-
-    Parameters
-    ----------
-    robot : Robot
-        Base where the instrument stands, tools by target; mm, rad.
-    seen : Observed
-        The r observations.
-    adjustment : Adjustment
-        Solution, weights and σ; what is wanted of it is at hand as properties.
-    names : tuple of str
-        (k,) of the parameters, small motions of each joint's frame and of the tools (J2 ry: axis of joint 2 about its
-        y, rad; tool x: mm).
-    covariance : (k, k) array
-        Of the parameters, rad and mm.
-    rank : int
-        Parameters that the data used determine.
-    ranks : dict of str to int
-        Parameters that these joint values determine, by kind of observation.
-    undetermined : tuple of str
-        Names of parameters along directions that were kept nominal.
-    nominal_mm : (r,) array
-        Errors with nominal axes, base and tools fitted.
-    held_out : HeldOutRows or None
-        Errors of the cross-validation.
-    dh_sigma : (n, 5) array
-        σ of a, alpha, d, theta, beta; mm, rad.
-    observability : ObservabilityIndices
-        Of the parameters that are determined.
-    deviations : dict of str to float or None
-        σ of this robot's dimensions about nominal, as the data show them, by name; mm, rad.
-    notes : tuple of str
-        Rows left out, and what is to be known of the result.
-    """
-
-    robot: Robot
-    seen: Observed
-    adjustment: Adjustment
-    names: tuple[str, ...]
-    covariance: Array
-    rank: int
-    ranks: dict[str, int]
-    undetermined: tuple[str, ...]
-    nominal_mm: np.ndarray
-    held_out: HeldOutRows | None
-    dh_sigma: np.ndarray
-    observability: ObservabilityIndices
-    deviations: dict[str, float | None]
-    notes: tuple[str, ...]
-
-    def __post_init__(self):
-        k = len(self.names)
-        freeze(self, "covariance", (k, k), "covariance")
-
-    @property
-    def state(self) -> State:
-        """Chain and tools as identified."""
-        return self.adjustment.solution.state
-
-    @property
-    def weighting(self) -> Weighting:
-        """σ of the observations."""
-        return self.adjustment.weighting
-
-    @property
-    def sigma0(self) -> float:
-        """By how much the σ that were given have to be multiplied; 1 where they were estimated."""
-        return self.weighting.factor
-
-    @property
-    def weights(self) -> np.ndarray:
-        """(r,) Huber's weights."""
-        return self.adjustment.solution.weights
-
-    @property
-    def residuals(self) -> np.ndarray:
-        """(r, 6), (r, 3) or (r, 1) measured minus modelled, rad and mm, in the instrument's axes."""
-        return self.adjustment.solution.residuals
-
-    @property
-    def fitted_mm(self) -> np.ndarray:
-        """(r,) errors with identified axes."""
-        return _lengths(self.residuals)
-
-    def outliers(self) -> list[tuple[int, float]]:
-        """(row of the observations, error in mm) of those that weigh less than half."""
-        return [(int(i), float(self.fitted_mm[i])) for i in np.flatnonzero(self.weights < OUTLIER_WEIGHT)]
 
 
 @one_thread()
@@ -276,7 +119,7 @@ def identify(robot: Robot, data: Measurements, options: IdentifyOptions | None =
         rank=rank,
         ranks=_ranks(solution.state, data),
         undetermined=undetermined,
-        nominal_mm=_lengths(residuals(first, seen)),
+        nominal_mm=position_errors(residuals(first, seen)),
         held_out=_cross_validated(robot, seen, adjusted, options),
         dh_sigma=adjusted.rows.sigma(identified, covariance),
         observability=_observability(identified, adjusted, seen, rank),
@@ -459,12 +302,7 @@ def _cross_validated(robot: Robot, seen: Observed, whole: Adjustment, options: I
             found = residuals(state, test)
             place = np.flatnonzero(fold == k)
             place = place[known] if seen.kind != "distance" else place
-            position[repeat, place] = _lengths(found)
+            position[repeat, place] = position_errors(found)
             if seen.kind == "pose":
                 rotation[repeat, place] = np.linalg.norm(found[:, :3], axis=1)
     return HeldOutRows(folds, position, rotation)
-
-
-def _lengths(found: np.ndarray) -> np.ndarray:
-    """(r,) position error, mm."""
-    return np.linalg.norm(found[:, -3:], axis=1) if found.shape[1] > 1 else np.abs(found[:, 0])

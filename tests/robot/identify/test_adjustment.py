@@ -10,7 +10,8 @@ from stcal.geometry.rigid import Rigid
 from stcal.robot.identify import adjustment
 from stcal.robot.identify.adjustment import Weighting, huber_limit, solve
 from stcal.robot.identify.residuals import jacobian, moved, observed, residuals
-from stcal.robot.identify.solve import IdentifyOptions, identify
+from stcal.robot.identify.result import IdentifyOptions
+from stcal.robot.identify.solve import identify
 from stcal.robot.kinematics.example import mh80
 from stcal.synthetic.measured.arms import joint_vectors, made, measured, placed
 

@@ -15,7 +15,8 @@ from stcal.geometry.rigid import Rigid
 from stcal.robot.identify.nominal import dh_values
 from stcal.robot.identify.report import identified_file, identified_page, identified_text
 from stcal.robot.identify.residuals import jacobian, moved, observed, residuals, tips
-from stcal.robot.identify.solve import IdentifyOptions, identify
+from stcal.robot.identify.result import IdentifyOptions
+from stcal.robot.identify.solve import identify
 from stcal.robot.kinematics.example import mh80
 from stcal.robot.kinematics.file import load_robot, robot_toml
 from stcal.robot.kinematics.forward import flange_poses

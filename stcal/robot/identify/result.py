@@ -1,0 +1,184 @@
+"""What an identification is asked for, and what it answers."""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from stcal.errors import InputError
+from stcal.geometry.arrays import Array, freeze
+from stcal.robot.identify.adjustment import (
+    Solution,
+    Weighting,
+)
+from stcal.robot.identify.nominal import Deviations, NominalRows
+from stcal.robot.identify.observability import ObservabilityIndices
+from stcal.robot.identify.residuals import (
+    Kind,
+    Observed,
+    State,
+)
+from stcal.robot.identify.variances import Components
+from stcal.robot.kinematics.model import Robot
+
+OUTLIER_WEIGHT = 0.5
+"""Observations of less are named: their residual is over twice Huber's limit."""
+
+
+@dataclass(frozen=True, slots=True)
+class IdentifyOptions:
+    """How :func:`identify` works.
+
+    Parameters
+    ----------
+    observe : {"pose", "position", "distance"}, optional
+        What of the measurements to use; the most that was measured if not given.
+    sigma_mm, sigma_rad : float, optional
+        σ of one coordinate of a position, mm, and of an orientation, rad; estimated where not given.
+    robust : bool
+        Whether outliers weigh less (Huber), and what are errors and no noise nothing at all.
+    folds : int
+        Of the cross-validation; 0 for none.
+    repeats : int, optional
+        Divisions into folds, in each of which every row is held out once; 5 of few rows, 1 of many, if not given.
+    seed : int
+        Of the divisions.
+    partial : bool
+        Keep nominal what the data do not determine, in place of refusing them.
+
+    Raises
+    ------
+    InputError
+        A σ that is not positive, or beyond 1 m or 1 rad.
+    """
+
+    observe: Kind | None = None
+    sigma_mm: float | None = None
+    sigma_rad: float | None = None
+    robust: bool = True
+    folds: int = 6
+    repeats: int | None = None
+    seed: int = 0
+    partial: bool = False
+
+    def __post_init__(self):
+        for name, value, most in (("sigma_mm", self.sigma_mm, 1e3), ("sigma_rad", self.sigma_rad, 1.0)):
+            if value is not None and not 1e-12 <= value <= most:
+                raise InputError(f"{name} is {value:g}; a number above 0, up to {most:g}, needed")
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class HeldOutRows:
+    """Errors of rows that a fit had not seen: ``position_mm``, ``rotation_rad`` : (repeats, r), nan where there is
+    none, as of rotations where positions were measured."""
+
+    folds: int
+    position_mm: np.ndarray
+    rotation_rad: np.ndarray
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Adjustment:
+    """A solution with the σ that go with it; ``notes`` : on what had not come to rest."""
+
+    solution: Solution
+    weighting: Weighting
+    deviations: Deviations
+    rows: NominalRows
+    parts: Components
+    notes: tuple[str, ...] = ()
+
+
+@dataclass(frozen=True, slots=True, eq=False, kw_only=True)
+class Identified:
+    """The identified robot, and how far to trust it; r observations, k parameters, n joints.
+
+    Parameters
+    ----------
+    robot : Robot
+        Base where the instrument stands, tools by target; mm, rad.
+    seen : Observed
+        The r observations.
+    adjustment : Adjustment
+        Solution, weights and σ; what is wanted of it is at hand as properties.
+    names : tuple of str
+        (k,) of the parameters, small motions of each joint's frame and of the tools (J2 ry: axis of joint 2 about its
+        y, rad; tool x: mm).
+    covariance : (k, k) array
+        Of the parameters, rad and mm.
+    rank : int
+        Parameters that the data used determine.
+    ranks : dict of str to int
+        Parameters that these joint values determine, by kind of observation.
+    undetermined : tuple of str
+        Names of parameters along directions that were kept nominal.
+    nominal_mm : (r,) array
+        Errors with nominal axes, base and tools fitted.
+    held_out : HeldOutRows or None
+        Errors of the cross-validation.
+    dh_sigma : (n, 5) array
+        σ of a, alpha, d, theta, beta; mm, rad.
+    observability : ObservabilityIndices
+        Of the parameters that are determined.
+    deviations : dict of str to float or None
+        σ of this robot's dimensions about nominal, as the data show them, by name; mm, rad.
+    notes : tuple of str
+        Rows left out, and what is to be known of the result.
+    """
+
+    robot: Robot
+    seen: Observed
+    adjustment: Adjustment
+    names: tuple[str, ...]
+    covariance: Array
+    rank: int
+    ranks: dict[str, int]
+    undetermined: tuple[str, ...]
+    nominal_mm: np.ndarray
+    held_out: HeldOutRows | None
+    dh_sigma: np.ndarray
+    observability: ObservabilityIndices
+    deviations: dict[str, float | None]
+    notes: tuple[str, ...]
+
+    def __post_init__(self):
+        k = len(self.names)
+        freeze(self, "covariance", (k, k), "covariance")
+
+    @property
+    def state(self) -> State:
+        """Chain and tools as identified."""
+        return self.adjustment.solution.state
+
+    @property
+    def weighting(self) -> Weighting:
+        """σ of the observations."""
+        return self.adjustment.weighting
+
+    @property
+    def sigma0(self) -> float:
+        """By how much the σ that were given have to be multiplied; 1 where they were estimated."""
+        return self.weighting.factor
+
+    @property
+    def weights(self) -> np.ndarray:
+        """(r,) Huber's weights."""
+        return self.adjustment.solution.weights
+
+    @property
+    def residuals(self) -> np.ndarray:
+        """(r, 6), (r, 3) or (r, 1) measured minus modelled, rad and mm, in the instrument's axes."""
+        return self.adjustment.solution.residuals
+
+    @property
+    def fitted_mm(self) -> np.ndarray:
+        """(r,) errors with identified axes."""
+        return position_errors(self.residuals)
+
+    def outliers(self) -> list[tuple[int, float]]:
+        """(row of the observations, error in mm) of those that weigh less than half."""
+        return [(int(i), float(self.fitted_mm[i])) for i in np.flatnonzero(self.weights < OUTLIER_WEIGHT)]
+
+
+def position_errors(found: np.ndarray) -> np.ndarray:
+    """(r,) position error, mm."""
+    return np.linalg.norm(found[:, -3:], axis=1) if found.shape[1] > 1 else np.abs(found[:, 0])
