@@ -160,19 +160,19 @@ class Corners:
                 root = np.linalg.cholesky(self.information[rows][:, rows]).T / self.sigma[name]
                 whole = np.zeros((len(rows), len(off)))
                 whole[:, rows] = root
-                slope = _sparse({"camera": whole[None]}, at, count, {})
-                found.append(Knowledge((name,), (whole @ off)[None], slope, np.inf))
+                jacobian = _sparse({"camera": whole[None]}, at, count, {})
+                found.append(Knowledge((name,), (whole @ off)[None], jacobian, np.inf))
         if at["board"].stop > at["board"].start:
             off = (state.corners - self.xyz_board) / self.sigma["board_mm"]
-            slope = np.tile(np.eye(3) / self.sigma["board_mm"], (len(off), 1, 1))
-            slope = _sparse({"board": slope}, at, count, {"board": np.arange(len(off))})
-            found.append(Knowledge(("board_mm",), off, slope, np.inf))
+            jacobian = np.tile(np.eye(3) / self.sigma["board_mm"], (len(off), 1, 1))
+            jacobian = _sparse({"board": jacobian}, at, count, {"board": np.arange(len(off))})
+            found.append(Knowledge(("board_mm",), off, jacobian, np.inf))
         if at["robot"].stop > at["robot"].start:
             weight = self.robot_weight()
             off = np.einsum("mab,mb->ma", weight, state.base_from_flange.difference(self.base_from_flange))
-            slope = _sparse({"robot": weight}, at, count, {"robot": np.arange(len(off))})
+            jacobian = _sparse({"robot": weight}, at, count, {"robot": np.arange(len(off))})
             names = ("robot_rad", "robot_mm") if self.robot is None else ()
-            found.append(Knowledge(names, off, slope, POSE))
+            found.append(Knowledge(names, off, jacobian, POSE))
         return found
 
     def linear(self, state: Bundle) -> NormalEquations:
@@ -190,12 +190,12 @@ class Knowledge:
     """Knowledge of one kind.
 
     ``names`` : of the σ that its columns have, each an equal share; ``white`` : (g, d) residuals in units of σ;
-    ``slope`` : (g d, k) their derivative; ``limit`` : Huber's, of the length of a row.
+    ``jacobian`` : (g d, k) their derivative; ``limit`` : Huber's, of the length of a row.
     """
 
     names: tuple[str, ...]
     white: np.ndarray
-    slope: csr_matrix
+    jacobian: csr_matrix
     limit: float
 
     def weight(self) -> np.ndarray:
@@ -205,8 +205,8 @@ class Knowledge:
     def linear(self) -> NormalEquations:
         """Its part of the cost and of the normal equations."""
         cost = float(huber_cost(np.linalg.norm(self.white, axis=1), self.limit).sum())
-        pulled = self.slope.multiply(np.repeat(self.weight(), self.white.shape[1])[:, None]).tocsr().T
-        return NormalEquations(cost, (pulled @ self.slope).toarray(), pulled @ self.white.ravel())
+        pulled = self.jacobian.multiply(np.repeat(self.weight(), self.white.shape[1])[:, None]).tocsr().T
+        return NormalEquations(cost, (pulled @ self.jacobian).toarray(), pulled @ self.white.ravel())
 
     def by_name(self) -> dict[str, tuple[int, NormalEquations]]:
         """By each of ``names``, or by none: number of residuals, and its quadratic part of the cost."""
@@ -216,9 +216,9 @@ class Knowledge:
         found = {}
         for i, name in enumerate(self.names or ("",)):
             rows = np.flatnonzero(np.arange(g * d) % d // width == i)
-            slope, white = self.slope[rows], self.white.ravel()[rows]
-            pulled = slope.multiply(weight[rows, None]).tocsr().T
-            linear = NormalEquations(float(weight[rows] @ white**2), (pulled @ slope).toarray(), pulled @ white)
+            jacobian, white = self.jacobian[rows], self.white.ravel()[rows]
+            pulled = jacobian.multiply(weight[rows, None]).tocsr().T
+            linear = NormalEquations(float(weight[rows] @ white**2), (pulled @ jacobian).toarray(), pulled @ white)
             found[name] = len(rows), linear
         return found
 

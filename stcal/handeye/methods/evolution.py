@@ -67,11 +67,11 @@ class Objective:
         rotation, translation = self._parts(x.rotation[None], x.translation[None] / self.unit_mm)
         root = np.sqrt(self.weight)
         white = np.concatenate([rotation[0], root * translation[0]]).ravel()
-        slope = np.zeros((2, len(self.motions), 3, 6))
-        slope[0, :, :, :3] = skew(self.motions.beta @ x.rotation.T)
-        slope[1, :, :, :3] = root / self.unit_mm * skew(self.motions.camera.translation @ x.rotation.T)
-        slope[1, :, :, 3:] = root / self.unit_mm * (self.motions.mount.rotation - np.eye(3))
-        return NormalEquations.of(white, slope.reshape(-1, 6))
+        jacobian = np.zeros((2, len(self.motions), 3, 6))
+        jacobian[0, :, :, :3] = skew(self.motions.beta @ x.rotation.T)
+        jacobian[1, :, :, :3] = root / self.unit_mm * skew(self.motions.camera.translation @ x.rotation.T)
+        jacobian[1, :, :, 3:] = root / self.unit_mm * (self.motions.mount.rotation - np.eye(3))
+        return NormalEquations.of(white, jacobian.reshape(-1, 6))
 
     def _parts(self, turn: np.ndarray, shift: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Errors (p, k, 3) of rotation and translation."""

@@ -120,16 +120,16 @@ def components(loop: Loop, noise: Noise, mount_from_camera: Rigid, scale: float 
         "camera": _stated(len(loop), loop.camera_covariance, noise.camera_rad, noise.camera_mm),
     }
     known, free = np.zeros((len(loop), 6, 6)), {}
-    for side, slope in by.items():
+    for side, jacobian in by.items():
         if stated[side] is not None:
-            spread = slope @ stated[side] @ np.swapaxes(slope, 1, 2)
+            carried = jacobian @ stated[side] @ np.swapaxes(jacobian, 1, 2)
             if side == "camera" and loop.camera_covariance is not None and stated["robot"] is None:
-                free["camera_factor"] = spread
+                free["camera_factor"] = carried
             else:
-                known = known + spread
+                known = known + carried
             continue
         for name, columns in ((f"{side}_rad", slice(0, 3)), (f"{side}_mm", slice(3, 6))):
-            free[name] = slope[:, :, columns] @ np.swapaxes(slope[:, :, columns], 1, 2)
+            free[name] = jacobian[:, :, columns] @ np.swapaxes(jacobian[:, :, columns], 1, 2)
     if len(free) == 4:  # shifts of robot and camera move the board alike
         del free["robot_mm"]
     if 6 * len(loop) - UNKNOWNS <= CAUTION * len(free):  # three poses: one less is told
@@ -149,18 +149,20 @@ def _stated(m: int, covariance: np.ndarray | None, rad: float | None, mm: float 
     return np.tile(np.diag([rad**2] * 3 + [mm**2] * 3), (m, 1, 1))
 
 
-def variance_components(parts: Components, residuals: np.ndarray, slope: np.ndarray, first: np.ndarray) -> np.ndarray:
+def variance_components(
+    parts: Components, residuals: np.ndarray, jacobian: np.ndarray, first: np.ndarray
+) -> np.ndarray:
     """Restricted maximum-likelihood variances (f,) of the free components, from residuals (m, 6) near a solution.
 
     What the parameters take up of the residuals does not count (Patterson & Thompson 1971); :data:`CAUTION` besides.
 
     Parameters
     ----------
-    slope : (m, 6, k) array
+    jacobian : (m, 6, k) array
         Derivative of the residuals by the parameters solved for; dependent columns do no harm.
     first : (f,) array
         The first guess, of :meth:`Components.first`.
     """
     least = np.maximum(parts.least(), LEAST_SHARE * first)
     most = np.maximum(first, least) * np.exp(2 * FARTHEST)
-    return component_variances(residuals, slope, parts.known, parts.free, first, (least, most), CAUTION)
+    return component_variances(residuals, jacobian, parts.known, parts.free, first, (least, most), CAUTION)

@@ -78,21 +78,21 @@ def adjust_poses(
     used = _near(residuals, parts.total(variances)) if robust else np.ones(len(loop), bool)
     for round_ in range(ROUNDS):
         parts = components(loop, noise, state.mount_from_camera, state.scale)
-        spread = parts.total(variances)
-        state, normal = _solved(loop[used], state, spread[used], count)
-        residuals, slope = _residuals(loop, state), _slope(loop, state, count)
+        covariance = parts.total(variances)
+        state, normal = _solved(loop[used], state, covariance[used], count)
+        residuals, jacobian = _residuals(loop, state), _jacobian(loop, state, count)
         before, settled = used, True
         if parts.names:
             old = variances
-            variances = variance_components(parts.of(used), residuals[used], slope[used], first)
+            variances = variance_components(parts.of(used), residuals[used], jacobian[used], first)
             settled = bool(np.abs(np.log(variances / old)).max() < SETTLED)
         if robust and round_ < ROUNDS // 2:  # later they stay: a set that swings would never settle
-            used = _agreeing(residuals, slope, parts.total(variances), used, estimated=bool(parts.names))
+            used = _agreeing(residuals, jacobian, parts.total(variances), used, estimated=bool(parts.names))
         settled &= bool((used == before).all())
         if settled:
             break
-    spread = parts.total(variances)
-    state, normal = _solved(loop[used], state, spread[used], count)
+    covariance = parts.total(variances)
+    state, normal = _solved(loop[used], state, covariance[used], count)
     residuals = _residuals(loop, state)
     sigma = {name: float(v) for name, v in zip(parts.names, np.sqrt(variances), strict=True)}
     redundancy = max(6 * int(used.sum()) - count, 1)
@@ -100,21 +100,21 @@ def adjust_poses(
         state=state,
         normal=normal,
         residuals=residuals,
-        covariance=spread,
+        covariance=covariance,
         outliers=~used,
         sigma=sigma,
-        variance_factor=float(_squared(residuals, spread)[used].sum() / redundancy),
+        variance_factor=float(_squared(residuals, covariance)[used].sum() / redundancy),
         redundancy=redundancy,
-        scale_hint=_scale_hint(loop[used], state, residuals[used], spread[used]),
+        scale_hint=_scale_hint(loop[used], state, residuals[used], covariance[used]),
         settled=settled,
     )
 
 
-def _scale_hint(loop: Loop, state: LoopState, residuals: np.ndarray, spread: np.ndarray) -> tuple[float, float]:
+def _scale_hint(loop: Loop, state: LoopState, residuals: np.ndarray, covariance: np.ndarray) -> tuple[float, float]:
     """What the scale would become, and its σ: one step from the solution with the scale among the unknowns."""
-    slope = _slope(loop, state, 13)
-    weighted = np.linalg.solve(spread, slope)
-    inverse = generalised_inverse(np.einsum("mai,maj->ij", slope, weighted))
+    jacobian = _jacobian(loop, state, 13)
+    weighted = np.linalg.solve(covariance, jacobian)
+    inverse = generalised_inverse(np.einsum("mai,maj->ij", jacobian, weighted))
     step = -inverse[12] @ np.einsum("mai,ma->i", weighted, residuals)
     return state.scale + float(step), float(np.sqrt(inverse[12, 12]))
 
@@ -123,17 +123,17 @@ def _residuals(loop: Loop, state: LoopState) -> np.ndarray:
     return loop.residuals(state.mount_from_camera, state.stand_from_board, state.scale)
 
 
-def _slope(loop: Loop, state: LoopState, count: int) -> np.ndarray:
+def _jacobian(loop: Loop, state: LoopState, count: int) -> np.ndarray:
     return loop.jacobian(state.mount_from_camera, state.scale)[:, :, :count]
 
 
-def _solved(loop: Loop, start: LoopState, spread: np.ndarray, count: int) -> tuple[LoopState, np.ndarray]:
+def _solved(loop: Loop, start: LoopState, covariance: np.ndarray, count: int) -> tuple[LoopState, np.ndarray]:
     """State of least squares and its normal matrix."""
-    weight = np.linalg.inv(np.linalg.cholesky(spread))
+    weight = np.linalg.inv(np.linalg.cholesky(covariance))
 
     def linearise(state: LoopState) -> NormalEquations:
         white = np.einsum("mab,mb->ma", weight, _residuals(loop, state)).ravel()
-        return NormalEquations.of(white, (weight @ _slope(loop, state, count)).reshape(-1, count))
+        return NormalEquations.of(white, (weight @ _jacobian(loop, state, count)).reshape(-1, count))
 
     found = minimise(start, linearise, LoopState.moved)
     # Derivatives leave out how residuals bend: of rough poses, steps end where even a damped one gains nothing.
@@ -141,40 +141,40 @@ def _solved(loop: Loop, start: LoopState, spread: np.ndarray, count: int) -> tup
     return found.state, found.linear.normal
 
 
-def _squared(residuals: np.ndarray, spread: np.ndarray) -> np.ndarray:
+def _squared(residuals: np.ndarray, covariance: np.ndarray) -> np.ndarray:
     """Squared residuals in units of σ, (m,)."""
-    return np.einsum("ma,ma->m", residuals, np.linalg.solve(spread, residuals[:, :, None])[:, :, 0])
+    return np.einsum("ma,ma->m", residuals, np.linalg.solve(covariance, residuals[:, :, None])[:, :, 0])
 
 
-def _near(residuals: np.ndarray, spread: np.ndarray) -> np.ndarray:
+def _near(residuals: np.ndarray, covariance: np.ndarray) -> np.ndarray:
     """Poses to start with, by σ of their medians: at least the better two thirds, or chance would choose among them."""
-    squared = np.sort(_squared(residuals, spread))
+    squared = np.sort(_squared(residuals, covariance))
     enough = max(int(np.ceil(MOSTLY_GOOD * len(squared))), LEAST_POSES)
-    return _squared(residuals, spread) <= max(chi2.ppf(1 - FALSE_ALARM, 6), squared[min(enough, len(squared)) - 1])
+    return _squared(residuals, covariance) <= max(chi2.ppf(1 - FALSE_ALARM, 6), squared[min(enough, len(squared)) - 1])
 
 
 def _agreeing(
-    residuals: np.ndarray, slope: np.ndarray, spread: np.ndarray, used: np.ndarray, estimated: bool
+    residuals: np.ndarray, jacobian: np.ndarray, covariance: np.ndarray, used: np.ndarray, estimated: bool
 ) -> np.ndarray:
     """Which poses, (m,), agree with the solution of all others."""
-    m, count = len(used), slope.shape[2]
+    m, count = len(used), jacobian.shape[2]
     redundancy = 6 * int(used.sum()) - count - 6
     if redundancy < 6:
         return used
     level = 1 - FALSE_ALARM / m
     limit = 6 * f.ppf(level, 6, redundancy) if estimated else chi2.ppf(level, 6)
-    agrees = against_others(residuals, slope, spread, used) <= limit
+    agrees = against_others(residuals, jacobian, covariance, used) <= limit
     return agrees if agrees.sum() >= LEAST_POSES else used
 
 
-def against_others(residuals: np.ndarray, slope: np.ndarray, spread: np.ndarray, used: np.ndarray) -> np.ndarray:
+def against_others(residuals: np.ndarray, jacobian: np.ndarray, covariance: np.ndarray, used: np.ndarray) -> np.ndarray:
     """Squared residuals (m,), each in units of its own σ: χ² of 6 degrees of freedom for good poses.
 
     A pose that took part has drawn the solution towards itself, so that its residual scatters less than the pose; one
     that did not has the solution's error besides.
     """
-    weight = np.linalg.inv(np.linalg.cholesky(spread))
-    white, by = np.einsum("mab,mb->ma", weight, residuals), weight @ slope
+    weight = np.linalg.inv(np.linalg.cholesky(covariance))
+    white, by = np.einsum("mab,mb->ma", weight, residuals), weight @ jacobian
     solved = by @ generalised_inverse(np.einsum("mai,maj->ij", by[used], by[used])) @ np.swapaxes(by, 1, 2)
     value, vector = np.linalg.eigh(np.eye(6) + np.where(used, -1, 1)[:, None, None] * solved)
     turned = np.einsum("mab,ma->mb", vector, white)

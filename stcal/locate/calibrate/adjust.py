@@ -169,8 +169,8 @@ def _blocks(image: ImageCorners, pose: Poses, corners: np.ndarray, noise: _Noise
     """Board and tags of one image."""
     own = (4 * image.rows[:, None] + np.arange(4)).ravel()
     board = _group(image, pose, image.board_xyz[:, :2], image.board_seen, noise.board**2 * image.board_noise)
-    spread = image.noise + noise.corner_px**2 * np.eye(8) + noise.tag_px**2 * TOGETHER @ TOGETHER.T
-    return board, _group(image, pose, corners[own], image.seen, spread / image.focal_px**2)
+    covariance = image.noise + noise.corner_px**2 * np.eye(8) + noise.tag_px**2 * TOGETHER @ TOGETHER.T
+    return board, _group(image, pose, corners[own], image.seen, covariance / image.focal_px**2)
 
 
 def _group(image: ImageCorners, pose: Poses, xy: np.ndarray, seen: np.ndarray, noise: np.ndarray) -> _Group:

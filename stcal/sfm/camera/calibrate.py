@@ -78,7 +78,7 @@ def calibrate_camera(
     """
     if colmap_model not in COLMAP_MODELS:
         raise InputError(f"camera model {colmap_model}: not supported; use one of {', '.join(COLMAP_MODELS)}")
-    tell = progress or (lambda *_: None)
+    progress = progress or (lambda *_: None)
     files, other = find_images(images)
     camera = start_camera(*_first_size(files))
     before: Intrinsics | None = None
@@ -86,7 +86,7 @@ def calibrate_camera(
     with tempfile.TemporaryDirectory(prefix="stcal-camera-") as cache:
         for rounds in range(1, MAX_ROUNDS + 1):
             detection = _detect(
-                files, camera, colmap_model, target, board, ellipses, Path(cache), workers, tell, rounds
+                files, camera, colmap_model, target, board, ellipses, Path(cache), workers, progress, rounds
             )
             views = board_views(detection.images, board, camera)
             skipped = (*other, *detection.skipped, *_without_board(detection, views))
@@ -117,7 +117,7 @@ def _first_size(files: list[ImageFile]) -> tuple[int, int]:
 
 
 def _detect(
-    files, camera: Camera, colmap_model: str, target, board, ellipses, cache: Path, workers, tell, rounds: int
+    files, camera: Camera, colmap_model: str, target, board, ellipses, cache: Path, workers, progress, rounds: int
 ) -> DetectionResult:
     # No size: the first readable image has it, and messages should say so.
     model = CameraModel(camera.focal, camera.centre, camera.distortion, colmap_model, None, None, "the images")
@@ -126,9 +126,9 @@ def _detect(
     def step(_name: str) -> None:
         nonlocal done
         done += 1
-        tell(stage, done, len(files))
+        progress(stage, done, len(files))
 
-    tell(stage, 0, len(files))
+    progress(stage, 0, len(files))
     return detect_files(files, model, target, board, ellipses or EllipseOptions(), cache, workers, step)
 
 

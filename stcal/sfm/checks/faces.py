@@ -102,13 +102,13 @@ def groups_check(again: Again) -> Check:
     reference = whole.reference_face
     faces = [reference, *(f for f in whole.target_from_face if f != reference)]
     members = {m.group: {f.face for f in calibration.faces if f.group == m.group} for m in models}
-    spare = [
+    removable = [
         g
         for g in members
         if len(members) > 1 and _linked([s for other, s in members.items() if other != g], reference) >= set(faces)
     ]
     trials = []
-    for group in spare:
+    for group in removable:
         try:
             without, joint = again.adjust([m for m in models if m.group != group], faces)
         except StcalError:

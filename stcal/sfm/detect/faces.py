@@ -215,7 +215,7 @@ def _decide(readings: list[FaceReading], candidates: Candidates, contrast: float
         if settled & set(reading.used()):
             continue
         settled |= set(reading.used())
-        rivals = [
+        ambiguous = [
             r
             for r in readings
             if r is not reading
@@ -223,13 +223,13 @@ def _decide(readings: list[FaceReading], candidates: Candidates, contrast: float
             and r.count() >= reading.count()
             and not (r.face is reading.face and (r.index == reading.index).all())
         ]
-        if rivals or not is_named(reading.face, reading.index >= 0, target):
-            ids = ", ".join(sorted({r.face.id for r in (reading, *rivals)}))
+        if ambiguous or not is_named(reading.face, reading.index >= 0, target):
+            ids = ", ".join(sorted({r.face.id for r in (reading, *ambiguous)}))
             note = (
                 f"a pattern of {reading.count()} circles that fits face {ids} but may be another; left out, "
                 "show the circles that tell the faces apart"
             )
-            others = max(len(rivals), 1)
+            others = max(len(ambiguous), 1)
             refused.append(RefusedReading(reading.used(), "face_readings", others, 0, note))
         else:
             named.append(reading)

@@ -70,13 +70,13 @@ def read_image(
         boards = find_boards(Candidates.of(ellipses, camera), board, _corners(camera))
         boards.sort(key=lambda r: -float(np.median(ellipses.contrast[r.candidates])))
         contrast = [float(np.median(ellipses.contrast[r.candidates])) for r in boards]
-        rivals = [
+        ambiguous = [
             r
             for r, c in zip(boards[1:], contrast[1:], strict=True)
             if len(r.candidates) >= SECOND_BOARD_SHARE * len(boards[0].candidates)
             and c * MAX_CONTRAST_RATIO > contrast[0]
         ]
-        if rivals:
+        if ambiguous:
             repeated.append("board")
         elif boards:
             reading = boards[0]

@@ -78,7 +78,7 @@ def crosscheck(
     MappingError
         The native program fails, hangs, or makes no model of a group, or none of this database.
     """
-    tell = progress or (lambda *_: None)
+    progress = progress or (lambda *_: None)
     native = find_colmap(colmap)
     schema = schema_of_version(native.version)
     require_listable([image.name for image in run.observations])
@@ -91,7 +91,7 @@ def crosscheck(
         export_database(run.database, folder / "ours.db", "4.2")
         _require_keypoints(run, folder / "ours.db", ids)
         for done, (name, group) in enumerate(groups.items()):
-            tell("crosscheck", done, len(groups))
+            progress("crosscheck", done, len(groups))
             names = [image.name for image in group]
             pair = _initial_pair(run, name, ids)
             place = folder / f"group{done}"
@@ -101,10 +101,10 @@ def crosscheck(
             theirs.append(read)
             adjusted.append(_adjusted(path, group, ids, run))
             ours.append(_own(folder, place, names, pair, name, run, ids))
-        tell("crosscheck", len(groups), len(groups))
-        foreign, own = faces_from_models(theirs, run), faces_from_models(ours, run)
+        progress("crosscheck", len(groups), len(groups))
+        external, own = faces_from_models(theirs, run), faces_from_models(ours, run)
     again = calibrate(adjusted, run.camera, run.target, run.board, run.options.adjustment(run.target))
-    return _comparison(run, native, schema, foreign, own, again, tolerances)
+    return _comparison(run, native, schema, external, own, again, tolerances)
 
 
 def mapper_options(native: NativeColmap, names: list[str], pair: tuple[int, int]) -> dict[str, str]:

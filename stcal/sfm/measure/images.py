@@ -101,16 +101,16 @@ def measure(
     DetectionError
         No image shows a face.
     """
-    options, tell = options or MeasureOptions(), progress or (lambda *_: None)
+    options, progress = options or MeasureOptions(), progress or (lambda *_: None)
     files, other = find_images(images)
     done = 0
 
     def step(_name: str) -> None:
         nonlocal done
         done += 1
-        tell("detect", done, len(files))
+        progress("detect", done, len(files))
 
-    tell("detect", 0, len(files))
+    progress("detect", 0, len(files))
     with tempfile.TemporaryDirectory(prefix="stcal-measure-") as scratch:
         detection = detect_files(files, camera, design, board, options.ellipses, Path(scratch), options.workers, step)
     observations, notes = _labelled(detection.images, design, board)

@@ -22,7 +22,7 @@ OTHER_SIDE = 3.0
 """A pose mirrored at the line of sight is another one from this distance on, in σ; nearer, the covariance covers it."""
 
 
-def spread(
+def covariance_of_likelihood(
     problem: PoseProblem,
     pose: PoseStack,
     full: np.ndarray,

@@ -22,7 +22,7 @@ from stcal.io.camera import CameraPrior, intrinsic_basis
 from stcal.labels import CircleLabel, circle_labels, parse_labels
 from stcal.sfm.data.model import Outlier
 from stcal.sfm.data.projection import CircleImages
-from stcal.sfm.measure.likelihood import spread
+from stcal.sfm.measure.likelihood import covariance_of_likelihood
 from stcal.sfm.measure.minima import MIN_CIRCLES, minima_without_outliers, start_pose
 from stcal.sfm.measure.problem import HOPELESS, PoseProblem, covariance_of_centres
 from stcal.sfm.measure.target import TargetCircles
@@ -195,8 +195,8 @@ def _problem(labels, centre_px, covariance_px2, target: TargetCircles, camera, o
         by_camera = back @ (camera.parameter_jacobian(ideal) @ intrinsic_basis(prior.colmap_model))
         known = prior.covariance
     own = target.xyz[place], target.normal[place], target.radius[place], ideal, px_by_centre
-    spread = factor**2 * back @ noise[used] @ np.swapaxes(back, 1, 2)
-    return used, PoseProblem(*own, spread, by_camera, known, target.covariance[np.ix_(rows, rows)])
+    noise_of_centres = factor**2 * back @ noise[used] @ np.swapaxes(back, 1, 2)
+    return used, PoseProblem(*own, noise_of_centres, by_camera, known, target.covariance[np.ix_(rows, rows)])
 
 
 def _gain(image: CircleImages, full: np.ndarray) -> np.ndarray:
@@ -276,7 +276,7 @@ class _Solution:
 def _solution(
     problem: PoseProblem, minimum: Minima, second: PoseStack | None, plane: Rigid | None, options: PoseOptions
 ) -> _Solution:
-    """One minimum weighed; ``second``, ``plane`` : see :func:`stcal.sfm.measure.likelihood.spread`.
+    """One minimum weighed; ``second``, ``plane`` : see :func:`stcal.sfm.measure.likelihood.covariance_of_likelihood`.
 
     Two steps: what the first leaves is of second order.
     """
@@ -299,7 +299,9 @@ def _solution(
     chi2 = float(last.chi2[0])
     # The samples span a valley from side to side: the margin for wrong σ is for what they do not show.
     plausible = options.needed(chi2 / (2 * len(weights) - 6)) / options.sigma_margin**2
-    covariance, other_side = spread(problem, last.poses, full[0], chi2, gaussian, second, plane, plausible)
+    covariance, other_side = covariance_of_likelihood(
+        problem, last.poses, full[0], chi2, gaussian, second, plane, plausible
+    )
     parts["curvature"] = covariance - gaussian
     return _Solution(
         camera_from_target=last.poses.rigid(0),

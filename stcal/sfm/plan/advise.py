@@ -152,16 +152,16 @@ def after(known: Known, views: Sequence[View], now: Forecast) -> Forecast:
     return forecast(list(models.values()), known.setup, now.derivatives)
 
 
-def _greedy(known: Known, views: list[View], now: Forecast, count: int, tell) -> list[Choice]:
+def _greedy(known: Known, views: list[View], now: Forecast, count: int, progress) -> list[Choice]:
     """Always the view that leaves the worst face best, given those chosen before."""
     chosen: list[Choice] = []
     while views and len(chosen) < count:
         have = [choice.view for choice in chosen]
         results = []
         for view in views:
-            tell(f"view {len(have) + 1}", len(results), len(views))
+            progress(f"view {len(have) + 1}", len(results), len(views))
             results.append(after(known, [*have, view], now))
-        tell(f"view {len(have) + 1}", len(views), len(views))
+        progress(f"view {len(have) + 1}", len(views), len(views))
         best = int(np.argmin([result.worst()[1] for result in results]))
         chosen.append(Choice(views[best], *results[best].worst()))
         keep = _promising(results) - {best}

@@ -65,7 +65,7 @@ def test_derivatives_of_the_corners(setup):
         step[k] = 1e-5
         ahead, behind = (corners.groups(corners.moved(state, s * step)) for s in (1, -1))
         for group, there, back in zip(groups, ahead, behind, strict=True):
-            slope, numeric = group.slope[:, k].toarray().ravel(), (there.white - back.white).ravel() / 2e-5
+            slope, numeric = group.jacobian[:, k].toarray().ravel(), (there.white - back.white).ravel() / 2e-5
             assert np.abs(slope - numeric).max() <= 1e-5 * max(np.abs(slope).max(), 1)
 
 
