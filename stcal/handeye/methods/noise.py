@@ -72,7 +72,7 @@ class Noise:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Components:
+class LoopComponents:
     """Covariances of a loop's residuals, (m, 6, 6): ``known``, and each of ``free``, (f, m, 6, 6), times a variance.
 
     ``names`` : (f,) which σ of :class:`Noise` the free ones are.
@@ -86,9 +86,9 @@ class Components:
         """(m, 6, 6)."""
         return self.known + np.tensordot(variances, self.free, 1)
 
-    def of(self, used: np.ndarray) -> "Components":
+    def of(self, used: np.ndarray) -> "LoopComponents":
         """Of some poses."""
-        return Components(self.known[used], self.free[:, used], self.names)
+        return LoopComponents(self.known[used], self.free[:, used], self.names)
 
     def first(self, residuals: np.ndarray) -> np.ndarray:
         """Variances (f,) to start with, from the medians of residuals (m, 6): bad poses do not count."""
@@ -108,7 +108,7 @@ def _kind(name: str) -> str:
     return name.rpartition("_")[2]
 
 
-def components(loop: Loop, noise: Noise, mount_from_camera: Rigid, scale: float = 1.0) -> Components:
+def components(loop: Loop, noise: Noise, mount_from_camera: Rigid, scale: float = 1.0) -> LoopComponents:
     """At an estimate of X, on which arms of levers depend.
 
     Covariances that come with the camera's poses tell the noise of the images; what intrinsics err has the same weak
@@ -137,7 +137,7 @@ def components(loop: Loop, noise: Noise, mount_from_camera: Rigid, scale: float 
             known = known + free.pop("camera_factor")
         else:
             del free["robot_rad"]
-    return Components(known, np.array(list(free.values())).reshape(-1, len(loop), 6, 6), tuple(free))
+    return LoopComponents(known, np.array(list(free.values())).reshape(-1, len(loop), 6, 6), tuple(free))
 
 
 def _stated(m: int, covariance: np.ndarray | None, rad: float | None, mm: float | None) -> np.ndarray | None:
@@ -150,7 +150,7 @@ def _stated(m: int, covariance: np.ndarray | None, rad: float | None, mm: float 
 
 
 def variance_components(
-    parts: Components, residuals: np.ndarray, jacobian: np.ndarray, first: np.ndarray
+    parts: LoopComponents, residuals: np.ndarray, jacobian: np.ndarray, first: np.ndarray
 ) -> np.ndarray:
     """Restricted maximum-likelihood variances (f,) of the free components, from residuals (m, 6) near a solution.
 
@@ -161,7 +161,7 @@ def variance_components(
     jacobian : (m, 6, k) array
         Derivative of the residuals by the parameters solved for; dependent columns do no harm.
     first : (f,) array
-        The first guess, of :meth:`Components.first`.
+        The first guess, of :meth:`LoopComponents.first`.
     """
     least = np.maximum(parts.least(), LEAST_SHARE * first)
     most = np.maximum(first, least) * np.exp(2 * FARTHEST)

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.stats import chi2, f
 
-from stcal.geometry.least_squares import LEAST_GAIN, NormalEquations, minimise, perturbed
+from stcal.geometry.least_squares import UNKEPT, NormalEquations, minimise, perturbed
 from stcal.geometry.normal_equations import generalised_inverse
 from stcal.geometry.rigid import Rigid
 from stcal.handeye.data.loop import Loop
@@ -137,7 +137,7 @@ def _solved(loop: Loop, start: LoopState, covariance: np.ndarray, count: int) ->
 
     found = minimise(start, linearise, LoopState.moved)
     # Derivatives leave out how residuals bend: of rough poses, steps end where even a damped one gains nothing.
-    found = found.required("hand-eye", "check the poses that fit worst", accepted=LEAST_GAIN)
+    found = found.required("hand-eye", "check the poses that fit worst", accepted=UNKEPT)
     return found.state, found.linear.normal
 
 

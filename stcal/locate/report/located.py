@@ -15,7 +15,7 @@ from stcal.locate.report.chain import GoalChain
 from stcal.locate.report.tables import camera_from_obj, uncertain
 
 
-class CheckRow(Part):
+class LimitRow(Part):
     name: str
     value: Finite
     at_least: float | None
@@ -47,7 +47,7 @@ class SceneRow(Part):
     verdict: str
     reasons: list[str]
     notes: list[str]
-    checks: list[CheckRow] = Field(
+    checks: list[LimitRow] = Field(
         description="`name`, `value`, `at_least`, `at_most`, `unit`, `passed`; value null: no other pose"
     )
     exposures: list[ExposureRow] = Field(description="`image`, `tags`, `trouble`")

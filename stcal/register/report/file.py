@@ -48,7 +48,7 @@ class MeanRmsMax(Part):
     max_mm: Finite
 
 
-class HeldOutRows(Part):
+class HeldOutPart(Part):
     folds: int
     inliers: MeanRmsMax
     all: MeanRmsMax
@@ -63,7 +63,7 @@ class OtherTransform(Part):
     turn_rad: float
 
 
-class OutlierRow(Part):
+class WrongPairRow(Part):
     line: int
     residual_mm: Vector3
     length_mm: float
@@ -160,7 +160,7 @@ class RegistrationFile(ResultFile):
     mean_mm: Finite = Field(description="mean length of the inliers' residuals")
     rms_mm: Finite = Field(description="RMS length")
     max_mm: Finite = Field(description="largest length")
-    held_out: HeldOutRows | None = Field(
+    held_out: HeldOutPart | None = Field(
         description="`folds`; `inliers` and `all` with `mean_mm`, `rms_mm`, `max_mm`; `lines` and `error_mm` of each "
         "point tried"
     )
@@ -174,7 +174,7 @@ class RegistrationFile(ResultFile):
     lines: list[int] = Field(description="for each row of the file its line")
     inliers: list[bool] = Field(description="whether it is an inlier")
     residuals: Points = Field(description="b − b_from_a a, frame b")
-    outliers: list[OutlierRow] = Field(description="`line`, `residual_mm`, `length_mm`, the farthest first")
+    outliers: list[WrongPairRow] = Field(description="`line`, `residual_mm`, `length_mm`, the farthest first")
     field: FieldPart | None = Field(
         description="systematic residuals over the workspace, null with too few points: `seen` (chance below 1 %), "
         "`p_value`; `size_mm` RMS length, `length_mm` over which they change, `noise_mm` σ per axis beside them; "
@@ -240,8 +240,8 @@ def _scale(transform: Transform) -> dict[str, Any]:
     return {"scale": transform.scale}
 
 
-def _held_out(held: HeldOut, lines: Sequence[int]) -> HeldOutRows:
-    return HeldOutRows(
+def _held_out(held: HeldOut, lines: Sequence[int]) -> HeldOutPart:
+    return HeldOutPart(
         folds=held.folds,
         inliers=MeanRmsMax.model_validate(held.of_inliers),
         all=MeanRmsMax.model_validate(held.of_all),
@@ -259,9 +259,9 @@ def _alternative(other: Alternative, lines: Sequence[int]) -> OtherTransform:
     )
 
 
-def _outlier(found: Findings, row: int) -> OutlierRow:
+def _outlier(found: Findings, row: int) -> WrongPairRow:
     residual = found.registration.residuals[row]
-    return OutlierRow(line=found.lines[row], residual_mm=residual, length_mm=float(np.linalg.norm(residual)))
+    return WrongPairRow(line=found.lines[row], residual_mm=residual, length_mm=float(np.linalg.norm(residual)))
 
 
 def _field(field: ResidualField, found: Findings) -> FieldPart:

@@ -17,7 +17,7 @@ MAX_CHAINS = 12
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Chain:
+class FaceChain:
     """One way from the reference face to another: faces and groups in turn, and how far it is off the combination."""
 
     faces: tuple[str, ...]
@@ -80,7 +80,7 @@ def chain_faces(faces: Sequence[FaceInGroup], target: TargetDesign, reference: s
     return CalibratedTarget(reference, target_from_face, circles, target_from_group)
 
 
-def measure_chains(faces: Sequence[FaceInGroup], calibrated: CalibratedTarget) -> dict[str, tuple[Chain, ...]]:
+def measure_chains(faces: Sequence[FaceInGroup], calibrated: CalibratedTarget) -> dict[str, tuple[FaceChain, ...]]:
     """All ways to every face but the reference, with their distance from the calibrated pose."""
     return {
         face_id: tuple(_measure(way, faces, pose) for way in _chains(faces, calibrated.reference_face, face_id))
@@ -114,11 +114,11 @@ def _chains(faces: Sequence[FaceInGroup], start: str, goal: str) -> list[tuple[t
     return found
 
 
-def _measure(chain, faces: Sequence[FaceInGroup], combined: Rigid) -> Chain:
+def _measure(chain, faces: Sequence[FaceInGroup], combined: Rigid) -> FaceChain:
     way, groups = chain
     difference = _along(chain, faces) @ combined.inverse()
     shift = _along(chain, faces).translation - combined.translation
-    return Chain(way, groups, float(np.linalg.norm(shift)), difference.angle_rad())
+    return FaceChain(way, groups, float(np.linalg.norm(shift)), difference.angle_rad())
 
 
 def _along(chain, faces: Sequence[FaceInGroup]) -> Rigid:

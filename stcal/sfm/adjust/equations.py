@@ -53,13 +53,13 @@ class Setting:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class State:
+class JointState:
     """All unknowns."""
 
     blocks: tuple[Block, ...]
     shared: Shared
 
-    def moved(self, step: np.ndarray, setting: Setting) -> "State":
+    def moved(self, step: np.ndarray, setting: Setting) -> "JointState":
         """After a step of what the groups share, then of each group's own."""
         shared, places = self.shared, setting.places(self.shared)
         ends = places.count + np.cumsum([0, *(_size(b) for b in self.blocks)])
@@ -69,7 +69,7 @@ class State:
         if shared.basis.shape[1]:
             camera = camera.with_parameters(camera.parameters() + shared.basis @ step[places.intrinsics])
         xyz = shared.xyz_model + step[places.circles].reshape(-1, 3)
-        return State(blocks, Shared(xyz, shape, camera, shared.basis))
+        return JointState(blocks, Shared(xyz, shape, camera, shared.basis))
 
 
 def _size(block: Block) -> int:
@@ -78,18 +78,18 @@ def _size(block: Block) -> int:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Normal:
+class SharedEquations:
     """Normal equations over what the groups share, each group's own unknowns reduced away."""
 
     cost: float
-    state: State
+    state: JointState
     setting: Setting
     normal: np.ndarray
     right: np.ndarray
     groups: tuple[Reduced, ...]
 
     @classmethod
-    def of(cls, state: State, setting: Setting) -> "Normal":
+    def of(cls, state: JointState, setting: Setting) -> "SharedEquations":
         cost = cost_of(state.blocks, state.shared, setting)
         return cls(cost, state, setting, *_normal_equations(state.blocks, state.shared, setting))
 

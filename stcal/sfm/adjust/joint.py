@@ -22,7 +22,15 @@ from stcal.geometry.robust import HUBER, robust_sigma
 from stcal.io.camera import CameraPrior, intrinsic_basis
 from stcal.labels import CircleLabel, DotLabel, dot_cells
 from stcal.sfm.adjust.blocks import Block, Shared, normalised, robust_weights
-from stcal.sfm.adjust.equations import FREE_DIRECTIONS, Normal, Setting, State, cost_of, free_directions, planes
+from stcal.sfm.adjust.equations import (
+    FREE_DIRECTIONS,
+    JointState,
+    Setting,
+    SharedEquations,
+    cost_of,
+    free_directions,
+    planes,
+)
 from stcal.sfm.adjust.scale import MIN_DOTS
 from stcal.sfm.data.model import GroupModel, MetricModel
 
@@ -151,8 +159,8 @@ def _with_common(blocks: list[Block], setting: Setting, common: float) -> tuple[
 def _minimise(blocks: list[Block], shared: Shared, setting: Setting) -> tuple[list[Block], Shared, float]:
     """The state of least cost; and by how much the next whole step would still move a projection at most, px."""
     found = minimise(
-        State(tuple(blocks), shared),
-        lambda state: Normal.of(state, setting),
+        JointState(tuple(blocks), shared),
+        lambda state: SharedEquations.of(state, setting),
         lambda state, step: state.moved(step, setting),
         cost=lambda state: cost_of(state.blocks, state.shared, setting),
         damping=DAMPING,
@@ -245,7 +253,7 @@ def _result(
     blocks: list[Block], shared: Shared, setting: Setting, move_px: float, sigma0: float | None = None
 ) -> JointResult:
     """``move_px`` : of the last step; ``sigma0`` : estimated from the residuals where None."""
-    normal = Normal.of(State(tuple(blocks), shared), setting).normal
+    normal = SharedEquations.of(JointState(tuple(blocks), shared), setting).normal
     inverse = constrained_inverse(normal, free_directions(len(normal), shared))
     places = setting.places(shared)
     c = places.circles.stop

@@ -41,7 +41,7 @@ class Halves(Part):
     largest_sigma_px: float
 
 
-class ViewRow(Part):
+class BoardViewRow(Part):
     image: str
     dots: int
     tilt_deg: float
@@ -84,7 +84,7 @@ class CalibrationFile(ResultFile):
         "(p < 0.0001), `p_value`, `difference` and its `sigma` by parameter, `largest_px` difference of a projection "
         "over the image, `largest_sigma_px` per axis there; null with fewer than six views"
     )
-    images: list[ViewRow] = Field(
+    images: list[BoardViewRow] = Field(
         description="`image`, `dots`, `tilt_deg` of the board against the image plane, `rms_px`"
     )
     outliers: list[OutlierRow] = Field(
@@ -131,11 +131,11 @@ class CalibrationFile(ResultFile):
         )
 
 
-def _views(result: Intrinsics) -> Iterator[ViewRow]:
+def _views(result: Intrinsics) -> Iterator[BoardViewRow]:
     for model in result.models:
         residual = model.residuals_px(result.camera)
         for image, pose, own in zip(model.images, model.camera_from_model, model.rows_by_image(), strict=True):
-            yield ViewRow(
+            yield BoardViewRow(
                 image=image,
                 dots=len(own),
                 tilt_deg=float(np.degrees(np.arccos(abs(pose.rotation[2, 2])))),

@@ -13,7 +13,7 @@ from stcal.errors import DegenerateError, StcalError
 from stcal.geometry.plane import fit_plane
 from stcal.geometry.rigid import Rigid, skew
 from stcal.sfm.adjust.calibration import Calibration
-from stcal.sfm.adjust.chain import CalibratedTarget, Chain, measure_chains
+from stcal.sfm.adjust.chain import CalibratedTarget, FaceChain, measure_chains
 from stcal.sfm.adjust.joint import SETTLED_PX, JointResult, adjust_jointly
 from stcal.sfm.adjust.network import Network
 from stcal.sfm.adjust.options import AdjustOptions
@@ -172,7 +172,7 @@ def loops_check(again: Again) -> Check:
     return judge(key, title, trials, "loops", remedy)
 
 
-def _along(again: Again, way: Chain, steps) -> tuple[Rigid, np.ndarray]:
+def _along(again: Again, way: FaceChain, steps) -> tuple[Rigid, np.ndarray]:
     """reference_from_face along a way, and its covariance (6, 6)."""
     pose, covariance = Rigid(), np.zeros((6, 6))
     for group, a, b in zip(way.groups, way.faces[:-1], way.faces[1:], strict=True):

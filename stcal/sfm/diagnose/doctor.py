@@ -18,7 +18,7 @@ from stcal.io.images import decode
 from stcal.parallel import run_parallel
 from stcal.sfm.data.model import MIN_POINTS, MetricModel
 from stcal.sfm.detect.ellipses import EllipseOptions
-from stcal.sfm.diagnose.examine import Expected, Trial, Verdict, by_geometry, examine, labels_found, trials
+from stcal.sfm.diagnose.examine import CircleVerdict, Expected, OptionTrial, by_geometry, examine, labels_found, trials
 from stcal.sfm.diagnose.findings import Diagnosis, Finding, advice, in_order
 from stcal.sfm.diagnose.in_view import missing_circles
 from stcal.sfm.mapping.database import image_ids
@@ -187,7 +187,7 @@ def _decoded(job: _Job) -> tuple[np.ndarray | None, str]:
     return image, ""
 
 
-def _examine(job: _Job) -> tuple[list[Verdict], str]:
+def _examine(job: _Job) -> tuple[list[CircleVerdict], str]:
     """Verdicts on what is expected in an image; by the geometry alone where something is wrong with the image."""
     image, problem = _decoded(job)
     if image is None:
@@ -209,7 +209,7 @@ def _try_options(run: SavedRun, jobs, examined, workers, progress) -> dict[str, 
     return {job.name: labels for (job, _), labels in zip(attempts, found, strict=True)}
 
 
-def _try(job: _Job, tried: list[Trial]) -> dict[str, set[str]]:
+def _try(job: _Job, tried: list[OptionTrial]) -> dict[str, set[str]]:
     """Labels that each option finds; for an image without a pose those known, if they are enough to place it."""
     image, problem = _decoded(job)
     if image is None:
@@ -254,7 +254,7 @@ def _with_options(finding: Finding, options, shown: dict[str, list[dict[str, set
     return replace(finding, options=tuple(helping))
 
 
-def _findings(job: _Job, verdicts: list[Verdict], problem: str, options: dict[str, set[str]]) -> list[Finding]:
+def _findings(job: _Job, verdicts: list[CircleVerdict], problem: str, options: dict[str, set[str]]) -> list[Finding]:
     """``options`` : labels that each option finds in the image."""
     findings = []
     for v in verdicts:

@@ -65,7 +65,7 @@ class Expected:
 
 
 @dataclass(frozen=True, slots=True)
-class Verdict:
+class CircleVerdict:
     """What stopped one circle: its ``value`` did not pass the ``limit`` of ``gate``.
 
     ``cause`` : ``merged`` where its outline runs into something else, ``cut`` where it misses a part.
@@ -80,7 +80,7 @@ class Verdict:
 
 
 @dataclass(frozen=True, slots=True)
-class Trial:
+class OptionTrial:
     """An option to try: ``text`` names it, ``gate`` is the one that it loosens."""
 
     gate: str
@@ -95,7 +95,7 @@ def examine(
     board: BoardDesign,
     options: EllipseOptions,
     planes: list[Expected],
-) -> list[Verdict]:
+) -> list[CircleVerdict]:
     """The first gate that each missing circle of an image fails."""
     reading = read_image(grey_8bit(image), camera, target, board, options)
     verdicts = []
@@ -128,7 +128,7 @@ class _Examination:
         off = [np.abs(apply_homography(h, self.plane.xy_mm) - expected).max() for h in own]
         return own[int(np.argmin(off))] if own else self.plane.image_from_plane
 
-    def verdicts(self) -> list[Verdict]:
+    def verdicts(self) -> list[CircleVerdict]:
         """Of all missing circles."""
         verdicts, lost = [], []
         for i in np.flatnonzero(self.plane.missing).tolist():
@@ -144,47 +144,49 @@ class _Examination:
             for i, end in zip(
                 lost, trace_outlines(grey, self.polarity, self.options, centre[lost], shape[lost]), strict=True
             ):
-                verdicts.append(Verdict(self.plane.labels[i], end.gate, end.value, end.limit, end.unit, end.cause))
+                verdicts.append(
+                    CircleVerdict(self.plane.labels[i], end.gate, end.value, end.limit, end.unit, end.cause)
+                )
         return verdicts
 
-    def _recognised(self, i: int, fit: PatternFit) -> Verdict | None:
+    def _recognised(self, i: int, fit: PatternFit) -> CircleVerdict | None:
         """The gate between outline and rim that stopped a circle, if one did: its face or the board."""
         label, reading, candidate = self.plane.labels[i], self.reading, fit.index[i]
         count = int(fit.fits().sum())
         if self.is_board:
             if reading.board is not None:
-                return None if candidate in reading.board.candidates else Verdict(label, "board_grid")
+                return None if candidate in reading.board.candidates else CircleVerdict(label, "board_grid")
             needed = int(np.ceil(needed_dots(self.board)))
-            return Verdict(label, "board_dots" if count < needed else "board_grid", count, needed, "dots")
+            return CircleVerdict(label, "board_dots" if count < needed else "board_grid", count, needed, "dots")
         named = [r for r in reading.faces.faces if r.face.id == self.plane.plane]
         if named:
-            return None if candidate in named[0].used() else Verdict(label, "pattern")
+            return None if candidate in named[0].used() else CircleVerdict(label, "pattern")
         for refused in reading.faces.refused:
             if set(refused.used) & set(fit.index[fit.fits()]):
                 unit = "other readings" if refused.gate == "face_readings" else "grey values"
-                return Verdict(label, refused.gate, refused.value, refused.limit, unit)
+                return CircleVerdict(label, refused.gate, refused.value, refused.limit, unit)
         needed = needed_circles(self.target.face(self.plane.plane))
-        return Verdict(label, "face_circles" if count < needed else "face_pattern", count, needed, "circles")
+        return CircleVerdict(label, "face_circles" if count < needed else "face_pattern", count, needed, "circles")
 
-    def _rim(self, i: int, fit: PatternFit) -> Verdict:
+    def _rim(self, i: int, fit: PatternFit) -> CircleVerdict:
         """The last gate of an image."""
         ellipse = self.ellipses.select(fit.index[i : i + 1])
         measured = measure_centres(grey_fine(self.image), self.camera, ellipse, self.reading.found[self.polarity])
         if not measured.ok[0]:
-            return Verdict(self.plane.labels[i], "rim", float(measured.rim[0]), MIN_RIM, "of the rim")
-        return Verdict(self.plane.labels[i], "board_numbering" if self.is_board else "found_now")
+            return CircleVerdict(self.plane.labels[i], "rim", float(measured.rim[0]), MIN_RIM, "of the rim")
+        return CircleVerdict(self.plane.labels[i], "board_numbering" if self.is_board else "found_now")
 
-    def _pattern(self, i: int, fit: PatternFit) -> Verdict:
+    def _pattern(self, i: int, fit: PatternFit) -> CircleVerdict:
         """Something elliptic is at the place of a circle, but not just there, or of another size or shape."""
         label = self.plane.labels[i]
         if not fit.in_place()[i]:
             off, allowed = fit.distance[i] / fit.radius[i], fit.max_distance[i] / fit.radius[i]
-            return Verdict(label, "position", float(off), float(allowed), "radii")
+            return CircleVerdict(label, "position", float(off), float(allowed), "radii")
         stretch = max(fit.widest[i], 1 / max(fit.narrowest[i], 1e-9))
-        return Verdict(label, "shape", float(stretch), float(fit.max_stretch[i]))
+        return CircleVerdict(label, "shape", float(stretch), float(fit.max_stretch[i]))
 
 
-def by_geometry(planes: list[Expected], camera: Camera, options: EllipseOptions) -> list[Verdict]:
+def by_geometry(planes: list[Expected], camera: Camera, options: EllipseOptions) -> list[CircleVerdict]:
     """What the predicted size alone says of missing circles, for want of the image."""
     smallest, largest = diameter_limits_px(camera.width * camera.height, options)
     verdicts = []
@@ -196,11 +198,11 @@ def by_geometry(planes: list[Expected], camera: Camera, options: EllipseOptions)
                 gate, limit = "min_diameter", smallest
             elif diameter[i] > largest:
                 gate, limit = "max_diameter", largest
-            verdicts.append(Verdict(plane.labels[i], gate, float(diameter[i]), limit, "px"))
+            verdicts.append(CircleVerdict(plane.labels[i], gate, float(diameter[i]), limit, "px"))
     return verdicts
 
 
-def trials(verdicts: Sequence[Verdict], pixels: int, options: EllipseOptions) -> list[Trial]:
+def trials(verdicts: Sequence[CircleVerdict], pixels: int, options: EllipseOptions) -> list[OptionTrial]:
     """Options that could let circles in, loosened as far as these ask for, and to the end; gentle ones first."""
     found = []
     smallest, _ = diameter_limits_px(pixels, options)
@@ -210,16 +212,16 @@ def trials(verdicts: Sequence[Verdict], pixels: int, options: EllipseOptions) ->
     for diameter in dict.fromkeys((half_px, LEAST_MIN_DIAMETER_PX)):
         if diameter < smallest:
             looser = replace(options, min_diameter_px=float(diameter))
-            found.append(Trial("min_diameter", f"--min-diameter {diameter:g}", looser))
+            found.append(OptionTrial("min_diameter", f"--min-diameter {diameter:g}", looser))
     if large := [value for gate, value in stopped if gate == "max_diameter"]:
         for diameter in dict.fromkeys(10 * np.ceil(factor * max(large) / 10) for factor in LARGER):
             looser = replace(options, max_diameter_px=float(diameter))
-            found.append(Trial("max_diameter", f"--max-diameter {diameter:g}", looser))
+            found.append(OptionTrial("max_diameter", f"--max-diameter {diameter:g}", looser))
     for gate in ("min_contrast", "min_axis_ratio"):
         if any(v.gate == gate and not v.cause for v in verdicts):
             for factor in LOOSER:
                 limit = float(f"{factor * getattr(options, gate):.2g}")
-                found.append(Trial(gate, f"EllipseOptions({gate}={limit:g})", replace(options, **{gate: limit})))
+                found.append(OptionTrial(gate, f"EllipseOptions({gate}={limit:g})", replace(options, **{gate: limit})))
     return found
 
 

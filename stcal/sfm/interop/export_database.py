@@ -10,7 +10,7 @@ from itertools import zip_longest
 from pathlib import Path
 
 from stcal.errors import InputError, StcalError
-from stcal.sfm.interop.schema import SCHEMAS, SOURCE, Column, Index, Reference, Schema, Table, find_schema
+from stcal.sfm.interop.schema import SCHEMAS, SOURCE, Column, Index, Reference, Schema, SchemaTable, find_schema
 
 HEADER = b"SQLite format 3\0"
 WAL_MODE = b"\2\2"
@@ -75,20 +75,20 @@ def export_database(database: Path, out: Path, schema: str) -> Exported:
         return _summary(copy, out, wanted)
 
 
-def read_tables(connection: sqlite3.Connection) -> dict[str, Table]:
+def read_tables(connection: sqlite3.Connection) -> dict[str, SchemaTable]:
     """The tables of a database as SQLite describes them."""
     listing = "SELECT name, sql FROM sqlite_master WHERE type = 'table' AND name NOT LIKE 'sqlite_%'"
     return {name: _read_table(connection, name, sql) for name, sql in connection.execute(listing).fetchall()}
 
 
-def _read_table(connection: sqlite3.Connection, name: str, sql: str) -> Table:
+def _read_table(connection: sqlite3.Connection, name: str, sql: str) -> SchemaTable:
     def pragma(what: str, columns: str, of: str = name) -> list[tuple]:
         return connection.execute(f"SELECT {columns} FROM pragma_{what}(?)", (of,)).fetchall()
 
     references = pragma("foreign_key_list", '"from", "table", on_delete')
     indices = pragma("index_list", "name, origin")
     check = re.search(r"CHECK\s*\((.*?)\)", sql)
-    return Table(
+    return SchemaTable(
         name,
         tuple(
             Column(column, kind, bool(not_null), bool(key), default)
@@ -150,13 +150,13 @@ def _damaged(path: Path, sign: str) -> InputError:
     return InputError(f"{path}: damaged ({sign}); make the run again")
 
 
-def table_differences(found: dict[str, Table], wanted: Schema) -> list[str]:
+def table_differences(found: dict[str, SchemaTable], wanted: Schema) -> list[str]:
     """What in the tables ``found`` is not as the schema has it, table by table and column by column."""
     names = [*wanted.tables, *(name for name in found if name not in wanted.tables)]
     return [line for name in names for line in _differences(name, found.get(name), wanted.tables.get(name))]
 
 
-def _differences(name: str, found: Table | None, wanted: Table | None) -> list[str]:
+def _differences(name: str, found: SchemaTable | None, wanted: SchemaTable | None) -> list[str]:
     if found is None or wanted is None:
         return [f"table {name} is {'missing' if found is None else 'not in the schema'}"]
     lines = [
@@ -230,12 +230,12 @@ def _no_place(database: Path, wanted: Schema, what: str, since: str | None = Non
     return InputError(f"{database}: {what}: schema {wanted.name} has no place for it; {remedy}")
 
 
-def _shared_columns(table: Table) -> str:
+def _shared_columns(table: SchemaTable) -> str:
     """The columns that the table has here and in our database, as SQL."""
     return ", ".join(name for name in table.column_names() if name in SOURCE.tables[table.name].column_names())
 
 
-def _rows(connection: sqlite3.Connection, table: Table) -> sqlite3.Cursor:
+def _rows(connection: sqlite3.Connection, table: SchemaTable) -> sqlite3.Cursor:
     return connection.execute(f"SELECT {_shared_columns(table)} FROM {table.name} ORDER BY rowid")
 
 

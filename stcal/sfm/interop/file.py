@@ -7,7 +7,7 @@ import numpy as np
 from pydantic import Field
 
 from stcal.io.json import Part, ResultFile
-from stcal.sfm.interop.gates import Gate, PairGates, Verdict
+from stcal.sfm.interop.gates import Gate, GateVerdict, PairGates
 from stcal.sfm.run.report import Number, PairRow
 
 
@@ -75,7 +75,7 @@ def _pair(row: PairGates) -> RankedPair:
     )
 
 
-def _gates(verdict: Verdict) -> GatesRow:
+def _gates(verdict: GateVerdict) -> GatesRow:
     return GatesRow(relaxations=verdict.relaxations, gates=[_gate(gate) for gate in verdict.gates])
 
 

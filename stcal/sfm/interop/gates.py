@@ -42,7 +42,7 @@ class Gate:
 
 
 @dataclass(frozen=True, slots=True)
-class Verdict:
+class GateVerdict:
     """COLMAP's ``gates`` in its order, at the limits as given; ``relaxations`` : how many times it halves a limit
     until the pair passes, 0 where it passes at once, None where it never does."""
 
@@ -56,8 +56,8 @@ class PairGates:
 
     score: PairScore
     own: tuple[Gate, ...]
-    as_set: Verdict
-    defaults: Verdict
+    as_set: GateVerdict
+    defaults: GateVerdict
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -229,16 +229,16 @@ class _Mapping:
             return _TwoViews(len(matches), inliers, name, None, 0.0, 0.0)
         return _TwoViews(len(matches), inliers, name, pose, float(abs(pose.translation[2])), float(geometry.tri_angle))
 
-    def verdict(self, pair: tuple[int, int], views: _TwoViews) -> Verdict:
+    def verdict(self, pair: tuple[int, int], views: _TwoViews) -> GateVerdict:
         """At the limits as set, and if they refuse the pair, at the first relaxed ones that let it pass."""
         first, *relaxed = attempts(self.options)
         gates = self.gates(pair, views, first)
         if all(gate.passed for gate in gates):
-            return Verdict(gates, 0)
+            return GateVerdict(gates, 0)
         for count, mapper in enumerate(relaxed, start=1):
             if all(gate.passed for gate in self.gates(pair, views, mapper)):
-                return Verdict(gates, count)
-        return Verdict(gates, None)
+                return GateVerdict(gates, count)
+        return GateVerdict(gates, None)
 
     def gates(
         self, pair: tuple[int, int], views: _TwoViews, mapper: pycolmap.IncrementalMapperOptions
@@ -343,7 +343,7 @@ def limits_text(options: PairOptions) -> str:
     )
 
 
-def _in_words(verdict: Verdict) -> str:
+def _in_words(verdict: GateVerdict) -> str:
     failed = ", ".join(
         f"no pose ({gate.value})"
         if gate.limit is None or isinstance(gate.value, str)

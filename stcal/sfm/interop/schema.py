@@ -54,7 +54,7 @@ class Index:
 
 
 @dataclass(frozen=True, slots=True)
-class Table:
+class SchemaTable:
     """A table: ``check`` is the condition of its CHECK constraint."""
 
     name: str
@@ -95,12 +95,12 @@ class Schema:
 
     name: str
     user_version: int
-    tables: dict[str, Table]
+    tables: dict[str, SchemaTable]
     camera_models: dict[int, str]
     pair_configurations: dict[int, str]
     descriptor_types: dict[int, str]
 
-    def following(self, name: str, *changed: Table, **others) -> "Schema":
+    def following(self, name: str, *changed: SchemaTable, **others) -> "Schema":
         """The schema of a later version: tables added or replaced, and other fields."""
         return replace(self, name=name, tables=self.tables | {table.name: table for table in changed}, **others)
 
@@ -125,7 +125,7 @@ _MATRIX = (*_integers("rows", "cols"), *_blobs("data"))
 _OF_IMAGE = frozenset({Reference("image_id", "images")})
 _OF_RIG = frozenset({Reference("rig_id", "rigs")})
 
-_CAMERAS = Table(
+_CAMERAS = SchemaTable(
     "cameras",
     (
         _key("camera_id"),
@@ -135,7 +135,7 @@ _CAMERAS = Table(
     ),
     autoincrement=True,
 )
-_IMAGES = Table(
+_IMAGES = SchemaTable(
     "images",
     (_key("image_id"), Column("name", "TEXT", not_null=True), *_integers("camera_id")),
     references=frozenset({Reference("camera_id", "cameras", cascade=False)}),
@@ -145,20 +145,20 @@ _IMAGES = Table(
 )
 _PRIORS = ("prior_qw", "prior_qx", "prior_qy", "prior_qz", "prior_tx", "prior_ty", "prior_tz")
 _IMAGES_WITH_PRIORS = replace(_IMAGES, columns=(*_IMAGES.columns, *(Column(name, "REAL") for name in _PRIORS)))
-_KEYPOINTS = Table("keypoints", (_key("image_id"), *_MATRIX), references=_OF_IMAGE)
+_KEYPOINTS = SchemaTable("keypoints", (_key("image_id"), *_MATRIX), references=_OF_IMAGE)
 _DESCRIPTORS = replace(_KEYPOINTS, name="descriptors")
 _TYPED_DESCRIPTORS = replace(_DESCRIPTORS, columns=(_key("image_id"), *_integers("type"), *_MATRIX))
-_MATCHES = Table("matches", (_key("pair_id"), *_MATRIX))
-_GEOMETRIES = Table(
+_MATCHES = SchemaTable("matches", (_key("pair_id"), *_MATRIX))
+_GEOMETRIES = SchemaTable(
     "two_view_geometries",
     (*_MATCHES.columns, *_integers("config"), *_blobs("F", "E", "H", "qvec", "tvec")),
 )
 _GEOMETRIES_WITH_CAMERAS = replace(_GEOMETRIES, columns=(*_GEOMETRIES.columns, *_blobs("camera1", "camera2")))
-_POSITION_PRIORS = Table(
+_POSITION_PRIORS = SchemaTable(
     "pose_priors", (_key("image_id"), *_blobs("position"), *_integers("coordinate_system")), references=_OF_IMAGE
 )
 _COVARIANCE_PRIORS = replace(_POSITION_PRIORS, columns=(*_POSITION_PRIORS.columns, *_blobs("position_covariance")))
-_SENSOR_PRIORS = Table(
+_SENSOR_PRIORS = SchemaTable(
     "pose_priors",
     (
         _key("pose_prior_id"),
@@ -168,20 +168,20 @@ _SENSOR_PRIORS = Table(
     ),
     indices=_unique("pose_prior_data_assignment", "corr_data_id", "corr_sensor_id", "corr_sensor_type"),
 )
-_RIGS = Table(
+_RIGS = SchemaTable(
     "rigs",
     (_key("rig_id"), *_integers("ref_sensor_id", "ref_sensor_type")),
     indices=_unique("rig_ref_sensor_assignment", "ref_sensor_id", "ref_sensor_type"),
     autoincrement=True,
 )
-_RIG_SENSORS = Table(
+_RIG_SENSORS = SchemaTable(
     "rig_sensors",
     (*_integers("rig_id", "sensor_id", "sensor_type"), *_blobs("sensor_from_rig")),
     references=_OF_RIG,
     indices=_unique("rig_sensor_assignment", "sensor_id", "sensor_type"),
 )
-_FRAMES = Table("frames", (_key("frame_id"), *_integers("rig_id")), references=_OF_RIG, autoincrement=True)
-_FRAME_DATA = Table(
+_FRAMES = SchemaTable("frames", (_key("frame_id"), *_integers("rig_id")), references=_OF_RIG, autoincrement=True)
+_FRAME_DATA = SchemaTable(
     "frame_data",
     _integers("frame_id", "data_id", "sensor_id", "sensor_type"),
     references=frozenset({Reference("frame_id", "frames")}),

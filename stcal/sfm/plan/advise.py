@@ -19,7 +19,7 @@ from stcal.sfm.mapping.database import image_ids
 from stcal.sfm.mapping.models import read_model
 from stcal.sfm.plan.forecast import CentreNoise, Forecast, Setup, forecast, variance_shares, without_sources
 from stcal.sfm.plan.simulated import observe, true_models
-from stcal.sfm.plan.views import View, candidates, known_scene, with_view
+from stcal.sfm.plan.views import PlannedView, candidates, known_scene, with_view
 from stcal.sfm.run.saved import CAMERA, SavedRun
 from stcal.synthetic.placement import GroupShape, place_group, viewing_axes
 from stcal.synthetic.scene import Group, Scene, group_name
@@ -37,7 +37,7 @@ BOARD_DOMINATES = 0.5
 class Choice:
     """A view to add, and the face that is worst after it (and those before it in the list), σ in mm."""
 
-    view: View
+    view: PlannedView
     face: str
     sigma_mm: float
 
@@ -144,7 +144,7 @@ def advise(known: Known, count: int = 5, progress: Callable[[str, int, int], Non
     )
 
 
-def after(known: Known, views: Sequence[View], now: Forecast) -> Forecast:
+def after(known: Known, views: Sequence[PlannedView], now: Forecast) -> Forecast:
     """The forecast with further views."""
     models = {model.group: model for model in known.models}
     for view in views:
@@ -152,7 +152,7 @@ def after(known: Known, views: Sequence[View], now: Forecast) -> Forecast:
     return forecast(list(models.values()), known.setup, now.derivatives)
 
 
-def _greedy(known: Known, views: list[View], now: Forecast, count: int, progress) -> list[Choice]:
+def _greedy(known: Known, views: list[PlannedView], now: Forecast, count: int, progress) -> list[Choice]:
     """Always the view that leaves the worst face best, given those chosen before."""
     chosen: list[Choice] = []
     while views and len(chosen) < count:

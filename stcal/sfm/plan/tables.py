@@ -4,7 +4,7 @@ from stcal.sfm.plan.advise import Advice
 from stcal.sfm.plan.file import MICRO, PPM, ForecastPart
 from stcal.sfm.plan.forecast import Forecast
 from stcal.sfm.plan.session import Plan
-from stcal.sfm.plan.views import View
+from stcal.sfm.plan.views import PlannedView
 
 
 def forecast_table(forecast: Forecast, shares: dict[str, dict[str, float]]) -> list[str]:
@@ -92,7 +92,7 @@ def advice_text(advice: Advice) -> str:
     return "\n".join([*lines, "", _verdict(advice)])
 
 
-def where(view: View) -> str:
+def where(view: PlannedView) -> str:
     """``25° right, 12° up``, as the photograph to go from shows them."""
     parts = []
     for angle, names in ((view.azimuth_deg, ("right", "left")), (view.elevation_deg, ("up", "down"))):

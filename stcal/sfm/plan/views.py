@@ -24,7 +24,7 @@ ROLLS_DEG = (0.0, 90.0)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class View:
+class PlannedView:
     """A photograph to take in a group.
 
     ``model`` : the group's model of this one image; ``azimuth_deg``, ``elevation_deg`` : to the right of and above the
@@ -121,7 +121,7 @@ def _calibrated_part(target: TargetDesign, target_from_face: dict[str, Rigid], c
     return replace(target, faces=tuple(faces))
 
 
-def candidates(scene: Scene, model: MetricModel, setup: Setup, noise: CentreNoise) -> list[View]:
+def candidates(scene: Scene, model: MetricModel, setup: Setup, noise: CentreNoise) -> list[PlannedView]:
     """Views of a group on a grid about its present ones that show the whole board and at least one whole face."""
     stand = _Stand.of(model)
     steps = np.arange(-REACH_DEG, REACH_DEG + 1e-9, GRID_DEG)
@@ -144,7 +144,7 @@ def candidates(scene: Scene, model: MetricModel, setup: Setup, noise: CentreNois
         position = poses[i].inverse().translation
         cosine = stand.directions @ (position - stand.centre) / stand.distance_mm
         views.append(
-            View(
+            PlannedView(
                 model.group,
                 noise.applied(single, setup.camera, setup.radius_mm()),
                 *place,
@@ -227,7 +227,7 @@ def _single(model: MetricModel, name: str, pose: Rigid, labels: list[Label], cam
     )
 
 
-def with_view(model: MetricModel, view: View) -> MetricModel:
+def with_view(model: MetricModel, view: PlannedView) -> MetricModel:
     """The group's model with one more image."""
     new = view.model
     joined = {

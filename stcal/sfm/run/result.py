@@ -9,7 +9,7 @@ from stcal.design import BoardDesign, TargetDesign
 from stcal.geometry.camera import Camera
 from stcal.io.camera import CameraPrior
 from stcal.sfm.adjust.calibration import Calibration
-from stcal.sfm.adjust.chain import Chain
+from stcal.sfm.adjust.chain import FaceChain
 from stcal.sfm.checks.suite import Evidence
 from stcal.sfm.checks.verdict import Check
 from stcal.sfm.data.observations import ImageObservations
@@ -36,7 +36,7 @@ class RunResult:
     graph: ImageGraph
     solutions: tuple[GroupSolution, ...]
     calibration: Calibration
-    chains: dict[str, tuple[Chain, ...]]
+    chains: dict[str, tuple[FaceChain, ...]]
     notes: tuple[str, ...]
     checks: tuple[Check, ...] = ()
 
