@@ -112,7 +112,7 @@ def descend(
         poses,
         evaluate,
         lambda stack, step: stack.moved(step),
-        select=_select,
+        select=select_rows,
         damping=1e-6,
         settled=settled,
         least_gain=settled,
@@ -124,7 +124,7 @@ def descend(
     return Minima(found.state, last.cost, last.normal, last.length, ended)
 
 
-def _select(take: np.ndarray, new, old):
+def select_rows(take: np.ndarray, new, old):
     """Rows of the new poses, or normal equations, where ``take`` (h,), else of the old ones."""
 
     def rows(name: str) -> np.ndarray:

@@ -6,13 +6,14 @@ from functools import partial
 import numpy as np
 
 from stcal.geometry import pose_descent
+from stcal.geometry.least_squares import NormalEquations, minimise
 from stcal.geometry.plane_poses import Descend, Weighed, weigh
-from stcal.geometry.pose_descent import Minima, Normal, PoseStack, block_diagonal
+from stcal.geometry.pose_descent import Minima, Normal, PoseStack, block_diagonal, select_rows
 from stcal.geometry.rigid import Poses, skew
 
 SETTLED = 1e-5
 """A step that lowers χ² by less moves the pose by less than a hundredth of its σ."""
-WEIGH_STEPS, WEIGHED = 10, 1e-6
+WEIGH_STEPS, WEIGHED = 60, 1e-6
 """A step of under a thousandth of σ is the last. What many corners share, the intrinsics say, can move a pose by many
 σ of its single corners."""
 
@@ -101,10 +102,18 @@ def weighed(problem: PlanarProblem, pose: PoseStack, weights: np.ndarray) -> Wei
     noise += common @ problem.prior @ common.T
     by_corner = block_diagonal(project(problem, pose).by_corner[0])
     full = (noise + by_corner @ problem.shape @ by_corner.T)[None]
-    for _ in range(WEIGH_STEPS):
-        view = project(problem, pose)
-        found = weigh(view.residual, view.by_pose, full, pose)
-        if found.moved2[0] < WEIGHED:
-            break
-        pose = found.poses
-    return found
+
+    def linearise(poses: PoseStack) -> NormalEquations:
+        view = project(problem, poses)
+        r, a = view.residual.reshape(1, -1, 1), view.by_pose.reshape(1, -1, 6)
+        solved = np.linalg.solve(full, np.concatenate([a, r], axis=2))
+        back = np.swapaxes(a, 1, 2) @ solved
+        cost = (np.swapaxes(r, 1, 2) @ solved[..., 6:])[:, 0, 0]
+        return NormalEquations(np.where(view.before, cost, np.inf), back[..., :6], -back[..., 6])
+
+    # A second solution that is far worse may end anywhere near: what it says is that the first one is better.
+    found = minimise(
+        pose, linearise, PoseStack.moved, select=select_rows, damping=1e-6, least_gain=WEIGHED, max_steps=WEIGH_STEPS
+    ).state
+    view = project(problem, found)
+    return weigh(view.residual, view.by_pose, full, found)
