@@ -197,7 +197,7 @@ def test_a_run_of_before_a_key_was_written(own_run, stcal_sfm, name, key):
 
 
 WRONG = {
-    "options null, as of detect": ("stcal-run.json", lambda c: c.update(options=None), "NoneType"),
+    "options null, as of detect": ("stcal-run.json", lambda c: c.update(options=None), "no 'pairs'"),
     "an option unknown here": ("stcal-run.json", lambda c: c["options"].update(magic=1), "magic"),
     "an option missing": ("stcal-run.json", lambda c: c["options"].pop("ellipses"), "no 'ellipses'"),
     "no such choice": ("stcal-run.json", lambda c: c["options"].update(solve="guess"), "solve 'guess'"),
