@@ -15,7 +15,7 @@ MOST_ENTRIES = 15
 """Of ``sfm/``, folders and files."""
 
 LAYERS = (
-    ("errors", "front", "parallel"),
+    ("errors", "front", "parallel", "held_out"),
     ("geometry",),
     ("design", "labels"),
     ("io",),

@@ -26,6 +26,7 @@ from scipy.spatial.transform import Rotation
 
 from stcal.errors import DegenerateError
 from stcal.geometry.rigid import Rigid
+from stcal.held_out import dealt, held_out_errors
 from stcal.register import register
 from stcal.register.core.liu2017 import affine_least_squares
 from stcal.robot.identify.result import IdentifyOptions
@@ -144,16 +145,20 @@ def everything(station: Station) -> Places:
 
 def held_out(places: Places, robot: Robot) -> tuple[np.ndarray, np.ndarray]:
     """Errors (m,) by one rigid transform, and by base and kinematics, of places in none of their fits, mm."""
-    fold = np.random.default_rng(0).permutation(np.arange(len(places.q)) % FOLDS)
     a = forward(robot, places.q).translation
-    errors = np.empty((2, len(a)))
-    for k in range(FOLDS):
-        rest, own = np.flatnonzero(fold != k), np.flatnonzero(fold == k)
-        rigid = register(a[rest], places.b[rest], method="least-squares", folds=0).b_from_a
+
+    def by_transform(rest: np.ndarray, own: np.ndarray) -> np.ndarray:
+        b_from_a = register(a[rest], places.b[rest], method="least-squares", folds=0).b_from_a
+        return np.linalg.norm(places.b[own] - b_from_a @ a[own], axis=1)
+
+    def by_kinematics(rest: np.ndarray, own: np.ndarray) -> np.ndarray:
         real = identified(robot, places, rest)
         predicted = real.world_from_base @ forward(real, places.q[own]).translation
-        errors[:, own] = [np.linalg.norm(places.b[own] - p, axis=1) for p in (rigid @ a[own], predicted)]
-    return errors[0], errors[1]
+        return np.linalg.norm(places.b[own] - predicted, axis=1)
+
+    folds = dealt(len(a), FOLDS, np.random.default_rng(0))
+    _, _, (rigid, together) = held_out_errors([by_transform, by_kinematics], folds)
+    return rigid, together
 
 
 def figures(errors: np.ndarray, unit: float = 1.0) -> str:

@@ -15,6 +15,7 @@ from stcal.handeye.data.views import View, Views, resect
 from stcal.handeye.judge.symmetry import repair
 from stcal.handeye.result import HandEye
 from stcal.handeye.solve import METHODS, HandEyeOptions, handeye
+from stcal.held_out import splits as rows_held_out
 from stcal.parallel import one_thread, run_parallel
 
 LEAST_LEFT = 3
@@ -112,12 +113,7 @@ def splits(count: int, held_out: int | None = None, repeats: int = 15, seed: int
         raise InputError(
             f"cross-validation: {k} of {count} poses held out leave {count - k}, {LEAST_LEFT} needed; take more poses"
         )
-    rng = np.random.default_rng(seed)
-    chosen: list[np.ndarray] = []
-    while len(chosen) < repeats:
-        order = rng.permutation(count)
-        chosen += [np.sort(order[i : i + k]) for i in range(0, count - k + 1, k)]
-    return np.array(chosen[:repeats])
+    return rows_held_out(count, k, repeats, np.random.default_rng(seed))
 
 
 @one_thread()
@@ -131,7 +127,7 @@ def cross_validate(
     workers: int | None = 1,
     progress: Callable[[int, int], None] | None = None,
 ) -> HeldOut:
-    """Solve without some of the poses and predict these (Stone 1974, J. R. Stat. Soc. B 36).
+    """Solve without some of the poses and predict these.
 
     Parameters
     ----------

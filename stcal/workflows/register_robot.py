@@ -8,8 +8,9 @@ import numpy as np
 from markupsafe import Markup
 from scipy.stats import chi2
 
-from stcal.errors import InputError, StcalError
+from stcal.errors import InputError
 from stcal.geometry.align import align_rigid
+from stcal.held_out import dealt, held_out_errors
 from stcal.io.table import read_table
 from stcal.register import register
 from stcal.register.core.pairs import WHAT, Pairs
@@ -93,35 +94,19 @@ def compared(pairs: Pairs, file: Path, robot_file: Path, found: Findings, option
             for name, values in (("weights", pairs.weights), ("covariances", pairs.covariances))
         }
         more = {"folds": 0, "allow_ambiguous": True}
-        return register(pairs.xyz_a[train], pairs.xyz_b[train], **options, **own, **more).b_from_a @ pairs.xyz_a[test]
+        b_from_a = register(pairs.xyz_a[train], pairs.xyz_b[train], **options, **own, **more).b_from_a
+        return np.linalg.norm(pairs.xyz_b[test] - b_from_a @ pairs.xyz_a[test], axis=1)
 
     def by_kinematics(train: np.ndarray, test: np.ndarray) -> np.ndarray:
-        return positions(grown(robot, data[train], good[train], settings)[0].robot, data[test])
+        fitted = grown(robot, data[train], good[train], settings)[0].robot
+        return np.linalg.norm(pairs.xyz_b[test] - positions(fitted, data[test]), axis=1)
 
-    done, rows, (by_one, by_both) = held_out([by_transform, by_kinematics], pairs.xyz_b, folds, options["seed"])
+    parts = dealt(len(data), folds, np.random.default_rng([options["seed"], 4]))
+    done, rows, (by_one, by_both) = held_out_errors([by_transform, by_kinematics], parts)
     wild = ~(found.registration.inliers | used)[rows]
     nominal = positions(robot, data)
     off = float(np.sqrt(((pairs.xyz_a - align_rigid(pairs.xyz_a, nominal) @ nominal) ** 2).sum(1).mean()))
     return Comparison(robot, identified, found.registration.model, pairs.lines, done, rows, by_one, by_both, wild, off)
-
-
-def held_out(ways, xyz_b: np.ndarray, folds: int, seed: int) -> tuple[int, np.ndarray, np.ndarray]:
-    """Folds done, rows (m,) and the errors (ways, m) of each way, fitted to the other folds."""
-    fold = np.random.default_rng([seed, 4]).permutation(np.arange(len(xyz_b)) % max(folds, 1))
-    tried, errors = [], []
-    for k in range(folds if folds > 1 else 0):
-        train, test = np.flatnonzero(fold != k), np.flatnonzero(fold == k)
-        try:
-            found = [np.linalg.norm(xyz_b[test] - way(train, test), axis=1) for way in ways]
-        except StcalError:  # a fold that cannot be solved tells nothing of either way
-            continue
-        tried.append(test)
-        errors.append(found)
-    if not tried:
-        return 0, np.zeros(0, int), np.zeros((len(ways), 0))
-    rows = np.concatenate(tried)
-    order = np.argsort(rows)
-    return len(tried), rows[order], np.hstack(errors)[:, order]
 
 
 def _measurements(pairs: Pairs, file: Path, robot: Robot) -> Measurements:

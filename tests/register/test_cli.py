@@ -7,13 +7,11 @@ import numpy as np
 import pytest
 
 from stcal.cli.main import main
-from stcal.errors import DegenerateError
 from stcal.geometry.rigid import Rigid
 from stcal.robot.kinematics.example import mh80
 from stcal.robot.kinematics.file import load_robot, robot_toml
 from stcal.robot.kinematics.forward import forward
 from stcal.synthetic.measured.arms import joint_vectors, made, placed
-from stcal.workflows.register_robot import held_out
 
 HEAD = "ax_mm,ay_mm,az_mm,bx_mm,by_mm,bz_mm"
 B_FROM_A = Rigid.exp([0.3, -0.4, 1.1, 2500.0, -300.0, 800.0])
@@ -320,23 +318,3 @@ def test_a_transform_stands_where_the_kinematics_do_not(run, tmp_path, robot_pai
     assert code == 3
     assert "27 parameters" in err
     assert "robot" not in json.loads(out.read_text())
-
-
-def test_rows_are_held_out_of_both_ways():
-    seen = []
-
-    def way(train, test):
-        seen.append((train, test))
-        if 5 in test:
-            raise DegenerateError("this fold cannot be solved")
-        return np.zeros((len(test), 3))
-
-    xyz = np.arange(33.0).reshape(11, 3)
-    done, rows, errors = held_out([way, way], xyz, folds=4, seed=0)
-    assert done == 3
-    assert not any(set(train) & set(test) for train, test in seen)
-    assert all(len(train) + len(test) == 11 for train, test in seen)
-    tried = np.sort(np.concatenate([test for _, test in seen if 5 not in test]))
-    np.testing.assert_array_equal(rows, np.unique(tried))
-    np.testing.assert_allclose(errors, np.tile(np.linalg.norm(xyz[rows], axis=1), (2, 1)))
-    assert held_out([way], xyz, folds=0, seed=0)[0] == 0

@@ -4,7 +4,7 @@ from collections.abc import Callable
 
 import numpy as np
 
-from stcal.errors import StcalError
+from stcal.held_out import dealt, held_out_errors
 from stcal.register.core.models import Transform
 from stcal.register.core.result import ErrorFigures, HeldOut
 
@@ -43,22 +43,16 @@ def held_out(
     HeldOut or None
         None with too few points for a fit to the others, or where every fold's fit fails.
     """
-    rows = np.random.default_rng([seed, 2]).permutation(len(xyz_a))[:TRIED]
-    folds = min(folds, len(rows))
-    if folds < 2 or len(rows) - -(-len(rows) // folds) < least:
+    rng = np.random.default_rng([seed, 2])
+    sample = np.sort(rng.permutation(len(xyz_a))[:TRIED])
+    parts = [sample[part] for part in dealt(len(sample), folds, rng)]
+
+    def errors(rest: np.ndarray, own: np.ndarray) -> np.ndarray:
+        return np.linalg.norm(xyz_b[own] - fit_rows(rest) @ xyz_a[own], axis=1)
+
+    if not parts or len(sample) - len(parts[0]) < least:
         return None
-    done, errors = [], []
-    for part in np.array_split(rows, folds):
-        try:
-            transform = fit_rows(np.sort(np.setdiff1d(rows, part)))
-        except StcalError:
-            continue
-        done.append(part)
-        errors.append(np.linalg.norm(xyz_b[part] - transform @ xyz_a[part], axis=1))
+    done, rows, (error,) = held_out_errors([errors], parts)
     if not done:
         return None
-    tried, error = np.concatenate(done), np.concatenate(errors)
-    order = np.argsort(tried)
-    tried, error = tried[order], error[order]
-    own = error[inliers[tried]]
-    return HeldOut(len(done), tried, error, ErrorFigures.of(own), ErrorFigures.of(error))
+    return HeldOut(done, rows, error, ErrorFigures.of(error[inliers[rows]]), ErrorFigures.of(error))

@@ -149,7 +149,7 @@ def moved(state: State, step: np.ndarray, kind: Kind) -> State:
 
 
 def only_of(seen: Observed, keep: np.ndarray) -> Observed:
-    """The observations of a mask (r,)."""
+    """The observations at indices, or of a mask (r,)."""
     if seen.kind == "distance":
         return replace(seen, first=seen.first[keep], second=seen.second[keep], values=seen.values[keep])
     data = seen.data[keep]

@@ -8,6 +8,7 @@ import numpy as np
 from stcal.errors import DegenerateError
 from stcal.geometry.rigid import skew
 from stcal.geometry.robust import huber_weights
+from stcal.held_out import dealt
 from stcal.parallel import one_thread
 from stcal.robot.identify.adjustment import (
     Solution,
@@ -275,16 +276,14 @@ def _covariance(adjusted: Adjustment, seen: Observed) -> np.ndarray:
 def _cross_validated(robot: Robot, seen: Observed, whole: Adjustment, options: IdentifyOptions) -> HeldOutRows | None:
     """Errors of rows that took no part: of neither the parameters nor (where rows are few) the σ."""
     rows = len(seen)
-    folds = min(options.folds, rows)
-    if folds < 2:
+    if min(options.folds, rows) < 2:
         return None
     repeats = options.repeats or (REPEATS if rows <= FEW_ROWS else 1)
     rng = np.random.default_rng(options.seed)
     position, rotation = np.full((repeats, rows), np.nan), np.full((repeats, rows), np.nan)
     for repeat in range(repeats):
-        fold = rng.permutation(np.arange(rows) % folds)
-        for k in range(folds):
-            train, test = only_of(seen, fold != k), only_of(seen, fold == k)
+        for place in dealt(rows, options.folds, rng):
+            train, test = only_of(seen, np.setdiff1d(np.arange(rows), place)), only_of(seen, place)
             seeks = unknowns(robot.chain(), len(set(train.data.targets)), seen.kind) - unseen(seen.kind)
             if WIDTH[seen.kind] * len(train) <= seeks:
                 return None
@@ -298,11 +297,9 @@ def _cross_validated(robot: Robot, seen: Observed, whole: Adjustment, options: I
                     state = solve(state, train, weighting, options.robust, held).state
             known = np.array([t in state.tools for t in test.data.targets])
             if seen.kind != "distance":
-                test = only_of(test, known)
+                test, place = only_of(test, known), place[known]
             found = residuals(state, test)
-            place = np.flatnonzero(fold == k)
-            place = place[known] if seen.kind != "distance" else place
             position[repeat, place] = position_errors(found)
             if seen.kind == "pose":
                 rotation[repeat, place] = np.linalg.norm(found[:, :3], axis=1)
-    return HeldOutRows(folds, position, rotation)
+    return HeldOutRows(min(options.folds, rows), position, rotation)
