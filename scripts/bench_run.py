@@ -130,7 +130,7 @@ def timed_calibration(out: Path) -> float:
     run = load_run(out)
     ids, px = image_ids(run.observations), run.corrected_px
     models = [m for g in run.groups() for m in read_model(out / "models" / g, run.observations, ids, px).groups]
-    prior = camera_prior(read_camera(out / "cameras.txt"), run.camera)
+    prior = camera_prior(run.camera)
     start = time.perf_counter()
     calibrate(models, run.camera, run.target, run.board, run.options.adjustment(run.target), prior)
     return time.perf_counter() - start

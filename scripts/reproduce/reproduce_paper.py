@@ -97,7 +97,7 @@ def by_the_paper(observations: list[ImageObservations], scene: Scene, out: Path)
     graph = image_graph(observations, scene.board, options.graph)
     (out / "cache").mkdir(parents=True, exist_ok=True)
     solutions = solve_groups(
-        observations, graph, out, scene.camera, scene.colmap_model, scene.target, scene.board, options, lambda *_: None
+        observations, graph, out, scene.camera, scene.target, scene.board, options, lambda *_: None
     )
     frames, boards = {}, []
     for model in (s.model for s in solutions):

@@ -18,7 +18,7 @@ from stcal.geometry.camera import Camera
 from stcal.handeye import HandEyeOptions
 from stcal.handeye.report.file import HandEyeFile
 from stcal.handeye.report.page import outcome_text
-from stcal.io.camera import read_camera, write_cameras_txt
+from stcal.io.camera import CalibratedCamera, read_camera, write_cameras_txt
 from stcal.workflows.handeye import ALL, Splits, calibrate, read_input
 
 CHARUCO = """type = "charuco"
@@ -74,7 +74,7 @@ def dots(data: Path, scratch: Path, splits: Splits = DEFAULT) -> tuple[dict, str
 
 def _camera_file(scratch: Path, camera: Camera, covariance: np.ndarray | None = None) -> Path:
     scratch.mkdir(parents=True, exist_ok=True)
-    write_cameras_txt(scratch / "cameras.txt", camera, "OPENCV", covariance)
+    write_cameras_txt(scratch / "cameras.txt", CalibratedCamera.of(camera, "OPENCV", covariance))
     return scratch / "cameras.txt"
 
 

@@ -67,8 +67,8 @@ def one_image(case: Case, i: int, scene: Scene, known: KnownTarget) -> tuple[Tar
     faces = case.faces[i % len(case.faces)]
     target, camera, prior = known.measured(rng), scene.camera, None
     if case.camera:
-        prior = CameraPrior(scene.colmap_model, np.diag(CAMERA_SIGMA**2))
-        away = intrinsic_basis(scene.colmap_model) @ (CAMERA_SIGMA * rng.standard_normal(len(CAMERA_SIGMA)))
+        prior = CameraPrior(scene.camera.colmap_model, np.diag(CAMERA_SIGMA**2))
+        away = intrinsic_basis(scene.camera.colmap_model) @ (CAMERA_SIGMA * rng.standard_normal(len(CAMERA_SIGMA)))
         camera = camera.with_parameters(camera.parameters() + away)
     towards = face_view(scene, faces[0]) if len(faces) == 1 else faces_view(scene, faces)
     image: ImageObservations | None = None

@@ -74,7 +74,6 @@ def evidence(scene: Scene, observations, options: AdjustOptions, solutions, resu
         tuple(o for s in solutions for o in s.outliers),
         tuple(observations),
         scene.camera,
-        scene.colmap_model,
         scene.target,
         scene.board,
         options,
@@ -97,7 +96,7 @@ def measure(count: int, kind: str) -> dict:
         (out / "cache").mkdir()
         graph = image_graph(observations, scene.board, kind)
         marks.append(("graph", time.perf_counter()))
-        arguments = (scene.camera, scene.colmap_model, scene.target, scene.board, options)
+        arguments = (scene.camera, scene.target, scene.board, options)
         solutions = solve_groups(observations, graph, out, *arguments, lambda *_: None)
         marks.append(("map", time.perf_counter()))
         adjustment = options.adjustment(scene.target)
@@ -106,7 +105,7 @@ def measure(count: int, kind: str) -> dict:
         checks = run_checks(evidence(scene, observations, adjustment, solutions, result))
         marks.append(("check", time.perf_counter()))
         database = out / "database.db"
-        write_database(database, scene.camera, scene.colmap_model, observations, graph.pairs)
+        write_database(database, scene.camera, observations, graph.pairs)
         marks.append(("write", time.perf_counter()))
         size = database.stat().st_size
     error = [

@@ -37,8 +37,8 @@ def one_run(seed: int, board_sigma_mm: float, refine: bool) -> list[tuple[float,
     observations = observe(scene, NOISE_PX, rng)
     camera, prior = scene.camera, None
     if refine:
-        prior = CameraPrior(scene.colmap_model, np.diag(CAMERA_SIGMA**2))
-        away = intrinsic_basis(scene.colmap_model) @ (CAMERA_SIGMA * rng.standard_normal(8))
+        prior = CameraPrior(scene.camera.colmap_model, np.diag(CAMERA_SIGMA**2))
+        away = intrinsic_basis(scene.camera.colmap_model) @ (CAMERA_SIGMA * rng.standard_normal(8))
         camera = camera.with_parameters(camera.parameters() + away)
     radius = scene.target.radius_of() | board.radius_of()
     models = [

@@ -8,7 +8,7 @@ import typer
 from stcal.cli.options import BoardFile, TargetFile, Workers
 from stcal.cli.terminal import StageProgress
 from stcal.errors import InputError
-from stcal.io.camera import write_cameras_txt
+from stcal.io.camera import CalibratedCamera, write_cameras_txt
 from stcal.io.design import board_of, target_of
 from stcal.io.saving import json_text, save
 
@@ -49,7 +49,7 @@ def calibrate_camera(
     board_design = board_of(board)
     with StageProgress() as progress:
         result = calibrate(images, target_design, board_design, model, workers=workers, progress=progress)
-    write_cameras_txt(out, result.intrinsics.camera, model, result.intrinsics.covariance)
+    write_cameras_txt(out, CalibratedCamera.of(result.intrinsics.camera, model, result.intrinsics.covariance))
     summary = CalibrationFile.of(result)
     json_file = json_file or out.with_suffix(".json")
     save(json_file, json_text(summary))

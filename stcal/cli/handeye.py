@@ -179,13 +179,13 @@ def _require_fitting(source: Path, method: str | None, refine_camera: bool, came
 
 
 def _save_camera(path: Path, outcome: "Outcome") -> None:
-    from stcal.io.camera import write_cameras_txt
+    from stcal.io.camera import CalibratedCamera, write_cameras_txt
 
     found = outcome.result.reprojection
     if found is None:
         raise InputError(f"--camera-out: {outcome.result.method} does not adjust the camera; leave --method out")
     path.parent.mkdir(parents=True, exist_ok=True)
-    write_cameras_txt(path, found.camera, outcome.colmap_model, found.camera_covariance)
+    write_cameras_txt(path, CalibratedCamera.of(found.camera, outcome.colmap_model, found.camera_covariance))
     print(f"written: {path}")
 
 

@@ -61,6 +61,10 @@ class CameraModel:
         """The camera; a size that the file does not state is taken from the arguments."""
         return Camera(self.width or width, self.height or height, self.focal, self.centre, self.distortion)
 
+    def calibrated(self, width: int, height: int) -> "CalibratedCamera":
+        """The same with its model and covariance."""
+        return CalibratedCamera.of(self.sized(width, height), self.colmap_model, self.covariance)
+
     def require_inside(self, width: int, height: int, image: str) -> None:
         """Refuse an image that the principal point is outside of: a file that states no size may be another camera's.
 
@@ -77,10 +81,29 @@ class CameraModel:
             )
 
 
-def colmap_params(camera: Camera, colmap_model: str) -> list[float]:
-    """Parameters of ``camera`` in COLMAP's order and pixel origin for ``colmap_model``."""
-    flat = np.concatenate([camera.focal, camera.centre + COLMAP_PIXEL_ORIGIN, camera.distortion])
-    return [float(flat[place[0] if isinstance(place, tuple) else place]) for place in _COLMAP_LAYOUT[colmap_model]]
+@dataclass(frozen=True, slots=True, eq=False)
+class CalibratedCamera(Camera):
+    """A camera of known size and what is stated of its parameters.
+
+    ``colmap_model`` : the COLMAP model that holds it exactly;
+    ``covariance`` : (q, q) of the parameters of ``colmap_model``, in its order, or None where none is stated.
+    """
+
+    colmap_model: str = "FULL_OPENCV"
+    covariance: np.ndarray | None = None
+
+    @classmethod
+    def of(cls, camera: Camera, colmap_model: str, covariance: np.ndarray | None = None) -> "CalibratedCamera":
+        """``camera`` with its model and covariance."""
+        return cls(
+            camera.width, camera.height, camera.focal, camera.centre, camera.distortion, colmap_model, covariance
+        )
+
+    def colmap_params(self) -> list[float]:
+        """Parameters in COLMAP's order and pixel origin."""
+        flat = self.parameters()
+        flat[2:4] += COLMAP_PIXEL_ORIGIN
+        return [float(flat[p[0] if isinstance(p, tuple) else p]) for p in _COLMAP_LAYOUT[self.colmap_model]]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -102,23 +125,23 @@ PRIOR_TANGENTIAL = 1e-3
 """… and of p1, p2: what a calibration of some weeks ago, or of another copy of the lens, is worth."""
 
 
-def camera_prior(model: "CameraModel", camera: Camera) -> CameraPrior:
+def camera_prior(camera: CalibratedCamera) -> CameraPrior:
     """The intrinsics as observations with the covariance of their file, or with that of a calibration of some age."""
-    if model.covariance is not None:
-        return CameraPrior(model.colmap_model, model.covariance)
+    if camera.covariance is not None:
+        return CameraPrior(camera.colmap_model, camera.covariance)
     radial = np.maximum(PRIOR_RADIAL, 0.1 * np.abs(camera.distortion))
     radial[2:4] = PRIOR_TANGENTIAL
     flat = np.concatenate([PRIOR_FOCAL * camera.focal, [PRIOR_CENTRE * camera.width] * 2, radial])
-    first = intrinsic_basis(model.colmap_model).argmax(0)
-    return CameraPrior(model.colmap_model, np.diag(flat[first] ** 2))
+    first = intrinsic_basis(camera.colmap_model).argmax(0)
+    return CameraPrior(camera.colmap_model, np.diag(flat[first] ** 2))
 
 
-def refinable(model: "CameraModel") -> "CameraModel":
+def refinable(camera: CalibratedCamera) -> CalibratedCamera:
     """The same for a refinement: a file without distortion, and without σ that say that there is none, leaves the
     lens's distortion out; it is refined as OPENCV, from zero."""
-    if model.covariance is None and model.colmap_model in WITHOUT_DISTORTION:
-        return replace(model, colmap_model="OPENCV")
-    return model
+    if camera.covariance is None and camera.colmap_model in WITHOUT_DISTORTION:
+        return replace(camera, colmap_model="OPENCV")
+    return camera
 
 
 def intrinsic_basis(colmap_model: str) -> np.ndarray:
@@ -168,18 +191,16 @@ def read_camera(path: str | Path) -> CameraModel:
         ) from error
 
 
-def write_cameras_txt(
-    path: str | Path, camera: Camera, colmap_model: str = "FULL_OPENCV", covariance: np.ndarray | None = None
-) -> None:
+def write_cameras_txt(path: str | Path, camera: CalibratedCamera) -> None:
     """Write ``cameras.txt`` with one camera of id 1; σ and correlations of its parameters as comments."""
-    params = " ".join(repr(p) for p in colmap_params(camera, colmap_model))
+    params, covariance = " ".join(map(repr, camera.colmap_params())), camera.covariance
     lines = ["# CAMERA_ID, MODEL, WIDTH, HEIGHT, PARAMS[] (centre of the first pixel at 0.5, 0.5)"]
     if covariance is not None:
         sigma = np.sqrt(np.diag(covariance))
         correlation = covariance / np.outer(sigma, sigma)
         lines.append(f"{SIGMA} {' '.join(repr(float(s)) for s in sigma)}")
         lines += [f"{CORRELATION} {' '.join(repr(float(c)) for c in row)}" for row in correlation]
-    lines.append(f"1 {colmap_model} {camera.width} {camera.height} {params}")
+    lines.append(f"1 {camera.colmap_model} {camera.width} {camera.height} {params}")
     save(Path(path), "\n".join(lines) + "\n")
 
 

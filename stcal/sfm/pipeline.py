@@ -64,32 +64,27 @@ def run(
     model = camera if isinstance(camera, CameraModel) else read_camera(camera)
     target, board = target_of(target), board_of(board)
     options = (options or RunOptions()).settled(target)
-    model = refinable(model) if options.refine_camera else model
     find_images(images)  # before anything of an earlier run is removed
     out = claim_folder(out, MarkerFile.of(images, options))
 
     detection, labelled = detect(images, model, out, target, board, options, progress)
     require_single(detection.images)
+    known = model.calibrated(detection.camera.width, detection.camera.height)
+    known = refinable(known) if options.refine_camera else known
     observations = [each.observations for each in labelled]
     groups = by_group(observations)
     require_groups(groups, detection.skipped)
 
     progress("map", 0, len(groups))
     graph = image_graph(observations, board, options.graph)
-    solutions = solve_groups(
-        observations, graph, out, detection.camera, model.colmap_model, target, board, options, progress
-    )
+    solutions = solve_groups(observations, graph, out, known, target, board, options, progress)
     progress("faces", 0, 1)
-    prior = camera_prior(model, detection.camera)
-    calibration = calibrate(
-        [s.model for s in solutions], detection.camera, target, board, options.adjustment(target), prior
-    )
+    prior = camera_prior(known)
+    calibration = calibrate([s.model for s in solutions], known, target, board, options.adjustment(target), prior)
     progress("faces", 1, 1)
     result = RunResult(
         out=out,
-        camera=detection.camera,
-        colmap_model=model.colmap_model,
-        camera_covariance=model.covariance,
+        camera=known,
         target_design=target,
         board_design=board,
         options=options,

@@ -63,7 +63,7 @@ def write_dataset(
     try:
         for group in scene.groups:
             (folder / "images" / group).mkdir(parents=True, exist_ok=True)
-        write_cameras_txt(folder / "cameras.txt", scene.camera, scene.colmap_model)
+        write_cameras_txt(folder / "cameras.txt", scene.camera)
         (folder / "target.toml").write_text(target_toml(scene.target), encoding="utf-8")
         (folder / "board.toml").write_text(board_toml(scene.board), encoding="utf-8")
         (folder / "truth.json").write_text(json.dumps(truth(scene, image_format)) + "\n", encoding="utf-8")

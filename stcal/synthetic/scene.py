@@ -8,8 +8,8 @@ import numpy as np
 from stcal.design import BoardDesign, FaceDesign, TargetDesign, reference_board, reference_target
 from stcal.errors import DegenerateError, InputError
 from stcal.geometry.arrays import frozen
-from stcal.geometry.camera import Camera
 from stcal.geometry.rigid import Rigid
+from stcal.io.camera import CalibratedCamera
 from stcal.labels import CircleLabel
 from stcal.synthetic.designs import REFERENCE_GROUPS, nominal_target_from_face, second_design, three_point_frame
 from stcal.synthetic.placement import GroupShape, place_group, viewing_axes
@@ -105,8 +105,7 @@ class Scene:
 
     target: TargetDesign
     board: BoardDesign
-    camera: Camera
-    colmap_model: str
+    camera: CalibratedCamera
     target_from_face: dict[str, Rigid]
     circles_target: dict[CircleLabel, np.ndarray]
     groups: dict[str, Group]
@@ -165,14 +164,14 @@ def make_scene(
     rng = np.random.default_rng(options.seed)
     target_from_face, circles = _made_target(target, nominal, options, rng)
     _check_convex(target, target_from_face)
-    camera, colmap_model = _made_camera(options, rng)
+    camera = _made_camera(options, rng)
     groups = {}
     for pair in options.groups or _default_groups(target, target_from_face):
         group = _made_group(pair, target, board, camera, target_from_face, circles, options, rng)
         if group.name in groups:
             raise InputError(f"scene: group {group.name} occurs twice; give different pairs")
         groups[group.name] = group
-    return Scene(target, board, camera, colmap_model, target_from_face, circles, groups, options.seed)
+    return Scene(target, board, camera, target_from_face, circles, groups, options.seed)
 
 
 def group_name(pair: tuple[str, str]) -> str:
@@ -203,14 +202,14 @@ def _made_target(target, nominal, options, rng) -> tuple[dict[str, Rigid], dict[
     return {face: target_from_any @ frame for face, frame in frames.items()}, circles
 
 
-def _made_camera(options: SceneOptions, rng) -> tuple[Camera, str]:
+def _made_camera(options: SceneOptions, rng) -> CalibratedCamera:
     focal = options.focal_px or FOCAL_PER_WIDTH * options.width
     centre = (np.array([options.width, options.height]) - 1) / 2
     centre = centre + options.centre_sigma * options.width * rng.standard_normal(2)
     distortion = np.zeros(8)
     distortion[: len(options.distortion)] = options.distortion
     model = "FULL_OPENCV" if distortion[4:].any() else "OPENCV" if distortion.any() else "PINHOLE"
-    return Camera(options.width, options.height, np.array([focal, focal]), centre, distortion), model
+    return CalibratedCamera(options.width, options.height, np.array([focal, focal]), centre, distortion, model)
 
 
 def _default_groups(target: TargetDesign, target_from_face: dict[str, Rigid]) -> list[tuple[str, str]]:

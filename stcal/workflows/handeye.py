@@ -101,7 +101,7 @@ def _from_images(
     if robot.covariance is not None:
         pairs = replace(pairs, base_from_flange_covariance=robot.covariance[at])
     pitch = getattr(design, "pitch_mm", getattr(design, "square_mm", None))
-    prior = camera_prior(refinable(model), found.camera)
+    prior = camera_prior(refinable(model.calibrated(found.camera.width, found.camera.height)))
     where = f"{source.name}, {poses.name}"
     return HandEyeInput(where, pairs, seen, found.symmetries, prior, pitch, tuple(left_out))
 

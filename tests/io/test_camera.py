@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 
 from stcal.errors import InputError
 from stcal.geometry.camera import Camera
-from stcal.io.camera import colmap_params, read_camera, write_cameras_txt
+from stcal.io.camera import CalibratedCamera, read_camera, write_cameras_txt
 
 K = [[1000.0, 0, 500], [0, 1100, 400], [0, 0, 1]]
 D5 = [0.1, -0.2, 0.003, -0.004, 0.05]
@@ -88,7 +88,7 @@ def test_projection_agrees_with_pycolmap(tmp_path, name):
     xyz = np.random.default_rng(0).uniform([-0.4, -0.3, 1], [0.4, 0.3, 1], (20, 3))
     theirs = pycolmap.Camera(model=name, width=1000, height=800, params=params).img_from_cam(xyz)
     np.testing.assert_allclose(camera.project(xyz), theirs - 0.5, atol=1e-9)  # rounding at 1000 px
-    np.testing.assert_allclose(colmap_params(camera, name), params, rtol=1e-15)
+    np.testing.assert_allclose(CalibratedCamera.of(camera, name).colmap_params(), params, rtol=1e-15)
 
 
 @given(
@@ -103,7 +103,7 @@ def test_cameras_txt_round_trip(tmp_path_factory, name, lengths, coefficients):
     fx, fy = lengths[0], lengths[0] if focal[0] == focal[1] else lengths[1]
     camera = Camera(6000, 4000, [fx, fy], lengths[2:], k)
     path = tmp_path_factory.mktemp("round") / "cameras.txt"
-    write_cameras_txt(path, camera, name)
+    write_cameras_txt(path, CalibratedCamera.of(camera, name))
     found = read_camera(path)
     assert (found.colmap_model, found.width, found.height) == (name, 6000, 4000)
     np.testing.assert_array_equal(found.focal, camera.focal)
@@ -113,7 +113,7 @@ def test_cameras_txt_round_trip(tmp_path_factory, name, lengths, coefficients):
 
 def test_pycolmap_reads_what_is_written(tmp_path):
     camera = Camera(1000, 800, [1000, 1100], [500, 400], COLMAP_CASES["FULL_OPENCV"][2])
-    write_cameras_txt(tmp_path / "cameras.txt", camera)
+    write_cameras_txt(tmp_path / "cameras.txt", CalibratedCamera.of(camera, "FULL_OPENCV"))
     (tmp_path / "images.txt").write_text("")
     (tmp_path / "points3D.txt").write_text("")
     reconstruction = pycolmap.Reconstruction()

@@ -8,7 +8,7 @@ from scipy.stats import f as fisher
 from stcal.geometry.camera import Camera
 from stcal.geometry.rigid import skew
 from stcal.geometry.robust import robust_sigma
-from stcal.io.camera import CameraPrior, intrinsic_basis
+from stcal.io.camera import CalibratedCamera, CameraPrior, intrinsic_basis
 from stcal.labels import CircleLabel
 from stcal.sfm.adjust.calibration import Calibration
 from stcal.sfm.adjust.network import Network, solve_score
@@ -29,7 +29,7 @@ CAMERA_PARAMETERS = ("fx", "fy", "cx", "cy", "k1", "k2", "p1", "p2", "k3", "k4",
 
 
 def camera_check(
-    networks: Sequence[Network], camera: Camera, colmap_model: str, calibration: Calibration, prior: CameraPrior | None
+    networks: Sequence[Network], camera: CalibratedCamera, calibration: Calibration, prior: CameraPrior | None
 ) -> Check:
     """Are the intrinsics those of the images? Given ones: further intrinsics are tested, all at once, in the residuals
     of all free networks (score test). Refined ones: their distance from the given ones against the stated σ.
@@ -50,7 +50,7 @@ def camera_check(
         test = solve_score(np.linalg.pinv(gained, hermitian=True), np.linalg.pinv(gained) @ away)
         names = _names(prior.colmap_model)
     else:
-        tested = "FULL_OPENCV" if colmap_model == "FULL_OPENCV" else "OPENCV"
+        tested = "FULL_OPENCV" if camera.colmap_model == "FULL_OPENCV" else "OPENCV"
         normal, right = summed(networks, lambda n: _by_intrinsics(n, calibration.camera, tested))
         test = solve_score(normal, right)
         estimate, sigma, names = test.estimate, np.sqrt(np.diag(test.covariance)), _names(tested)

@@ -6,8 +6,7 @@ import numpy as np
 
 from stcal.design import BoardDesign, TargetDesign
 from stcal.errors import StcalError
-from stcal.geometry.camera import Camera
-from stcal.io.camera import CameraPrior
+from stcal.io.camera import CalibratedCamera, CameraPrior
 from stcal.sfm.adjust.calibration import Calibration, calibrate, image_sigma_factor
 from stcal.sfm.adjust.group import adjust
 from stcal.sfm.adjust.network import Network, free_network, solve_score
@@ -59,8 +58,7 @@ class Evidence:
     models: tuple[WorldModel, ...]
     outliers: tuple[Outlier, ...]
     images: tuple[ImageObservations, ...]
-    camera: Camera
-    colmap_model: str
+    camera: CalibratedCamera
     target: TargetDesign
     board: BoardDesign
     options: AdjustOptions
@@ -85,7 +83,7 @@ def run_checks(evidence: Evidence) -> tuple[Check, ...]:
     camera, board, target = calibration.camera, evidence.board, evidence.target
     radii = measure_radii(networks, evidence.images, target.radius_of() | board.radius_of(), camera)
     return (
-        camera_check(networks, evidence.camera, evidence.colmap_model, calibration, evidence.prior),
+        camera_check(networks, evidence.camera, calibration, evidence.prior),
         field_check(networks, camera),
         sigma_check(networks, calibration.sigma_factor),
         *_joint_checks(evidence, networks),

@@ -135,7 +135,7 @@ def _labelled_points(run: SavedRun) -> tuple[pycolmap.Reconstruction, list[_Poin
     if not path.is_dir():
         raise InputError(f"run {run.folder}: of another version, no {TARGET_MODEL}; run it again")
     reconstruction = open_model(path)
-    native = colmap_camera(run.camera, run.colmap_model)
+    native = colmap_camera(run.camera)
     if [camera.params.tolist() for camera in reconstruction.cameras.values()] != [native.params.tolist()]:
         raise InputError(f"model {path}: its camera is not that of the run's cameras.txt; run it again")
     by_name = {image.name: image for image in run.observations}

@@ -15,7 +15,7 @@ import numpy as np
 import pycolmap
 
 from stcal.errors import InputError
-from stcal.geometry.camera import Camera
+from stcal.io.camera import CalibratedCamera
 from stcal.sfm.data.observations import ImageObservations
 from stcal.sfm.mapping.database import colmap_camera, image_ids, match_labels, to_colmap_px, write_database
 from stcal.sfm.mapping.incremental import LOG_ERRORS_ONLY, SEED, pipeline_options
@@ -91,7 +91,7 @@ def run_gates(run: SavedRun, group: str | None = None) -> dict[str, list[PairGat
         if len(images) < len(names):
             missing = names - {image.name for image in images}
             raise InputError(f"{run.folder / 'report.json'}: no image {min(missing)} in labels.csv; run it again")
-        found[name] = group_gates(images, ranked[name], run.camera, run.colmap_model, run.options.pairs)
+        found[name] = group_gates(images, ranked[name], run.camera, run.options.pairs)
     return found
 
 
@@ -127,8 +127,7 @@ def ranked_pairs(run: SavedRun) -> dict[str, list[PairScore]]:
 def group_gates(
     group: Sequence[ImageObservations],
     ranked: Sequence[PairScore],
-    camera: Camera,
-    colmap_model: str,
+    camera: CalibratedCamera,
     options: PairOptions,
 ) -> list[PairGates]:
     """The gates of some pairs of a group's images.
@@ -138,12 +137,12 @@ def group_gates(
     group : the images that are mapped together; more than two matter for tracks of two views, which the defaults skip
     """
     pycolmap.logging.minloglevel = LOG_ERRORS_ONLY
-    native = colmap_camera(camera, colmap_model)
+    native = colmap_camera(camera)
     ids = image_ids(group)
     by_name = {image.name: image for image in group}
     with tempfile.TemporaryDirectory(prefix="stcal-") as scratch:
         database = Path(scratch) / "pairs.db"
-        write_database(database, camera, colmap_model, group, np.array(list(combinations(range(len(group)), 2))))
+        write_database(database, camera, group, np.array(list(combinations(range(len(group)), 2))))
         as_set, defaults = (_Mapping(database, list(by_name), each) for each in (pipeline_options, _defaults))
     rows = []
     for score in ranked:

@@ -10,8 +10,7 @@ import numpy as np
 import pycolmap
 
 from stcal.errors import InputError
-from stcal.geometry.camera import Camera
-from stcal.io.camera import COLMAP_PIXEL_ORIGIN, colmap_params
+from stcal.io.camera import COLMAP_PIXEL_ORIGIN, CalibratedCamera
 from stcal.labels import CircleLabel
 from stcal.sfm.data.observations import ImageObservations
 
@@ -19,14 +18,14 @@ CAMERA_ID = 1
 RIG_ID = 1
 
 
-def colmap_camera(camera: Camera, colmap_model: str) -> pycolmap.Camera:
+def colmap_camera(camera: CalibratedCamera) -> pycolmap.Camera:
     """The camera as COLMAP has it, its pixel origin included."""
     return pycolmap.Camera(
         camera_id=CAMERA_ID,
-        model=colmap_model,
+        model=camera.colmap_model,
         width=camera.width,
         height=camera.height,
-        params=colmap_params(camera, colmap_model),
+        params=camera.colmap_params(),
         has_prior_focal_length=True,
     )
 
@@ -60,8 +59,7 @@ def match_labels(a: ImageObservations, b: ImageObservations) -> np.ndarray:
 
 def write_database(
     path: str | Path,
-    camera: Camera,
-    colmap_model: str,
+    camera: CalibratedCamera,
     observations: Sequence[ImageObservations],
     pairs: np.ndarray,
     keypoints_px: Sequence[np.ndarray] | None = None,
@@ -78,7 +76,7 @@ def write_database(
     remove_database(partial)
     try:
         with pycolmap.Database.open(str(partial)) as database:
-            _write(database, camera, colmap_model, observations, pairs, keypoints_px)
+            _write(database, camera, observations, pairs, keypoints_px)
     except RuntimeError as error:
         remove_database(partial)
         raise InputError(
@@ -95,9 +93,9 @@ def remove_database(path: Path) -> None:
         Path(f"{path}{suffix}").unlink(missing_ok=True)
 
 
-def _write(database, camera, colmap_model, observations, pairs, keypoints_px) -> None:
+def _write(database, camera, observations, pairs, keypoints_px) -> None:
     with pycolmap.DatabaseTransaction(database):
-        native = colmap_camera(camera, colmap_model)
+        native = colmap_camera(camera)
         database.write_camera(native, use_camera_id=True)
         rig = pycolmap.Rig(rig_id=RIG_ID)
         rig.add_ref_sensor(native.sensor_id)

@@ -12,7 +12,7 @@ import pycolmap
 from stcal.errors import InputError
 from stcal.geometry.camera import Camera
 from stcal.geometry.rigid import Rigid, Similarity
-from stcal.io.camera import camera_from_colmap
+from stcal.io.camera import CalibratedCamera, camera_from_colmap
 from stcal.labels import DotLabel, Label
 from stcal.sfm.data.model import GroupModel, MetricModel, WorldModel
 from stcal.sfm.data.observations import ImageObservations
@@ -37,8 +37,7 @@ def to_reconstruction(
     models: Sequence[GroupModel],
     observations: Sequence[ImageObservations],
     ids: dict[str, int],
-    camera: Camera,
-    colmap_model: str,
+    camera: CalibratedCamera,
 ) -> tuple[pycolmap.Reconstruction, dict[int, tuple[str, str]]]:
     """COLMAP's form of models that share one world, and (group, label) of every point id.
 
@@ -46,7 +45,7 @@ def to_reconstruction(
     groups have in the same place is one point; its group is then empty.
     """
     reconstruction = pycolmap.Reconstruction()
-    reconstruction.add_camera_with_trivial_rig(colmap_camera(camera, colmap_model))
+    reconstruction.add_camera_with_trivial_rig(colmap_camera(camera))
     by_name = {image.name: image for image in observations}
     tracks: dict[tuple[str, tuple[float, ...]], pycolmap.Track] = {}
     groups: dict[tuple[str, tuple[float, ...]], set[str]] = {}
@@ -77,12 +76,11 @@ def write_model(
     models: Sequence[GroupModel],
     observations: Sequence[ImageObservations],
     ids: dict[str, int],
-    camera: Camera,
-    colmap_model: str,
+    camera: CalibratedCamera,
 ) -> None:
     """Write models that share one world as COLMAP's binary files."""
     folder.mkdir(parents=True, exist_ok=True)
-    to_reconstruction(models, observations, ids, camera, colmap_model)[0].write_binary(str(folder))
+    to_reconstruction(models, observations, ids, camera)[0].write_binary(str(folder))
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -8,7 +8,7 @@ import numpy as np
 
 from stcal.errors import DegenerateError
 from stcal.geometry.rigid import Rigid
-from stcal.io.camera import camera_prior, read_camera
+from stcal.io.camera import camera_prior
 from stcal.labels import circle_labels
 from stcal.parallel import one_thread
 from stcal.sfm.adjust.calibration import with_sigma
@@ -20,7 +20,7 @@ from stcal.sfm.mapping.models import read_model
 from stcal.sfm.plan.forecast import CentreNoise, Forecast, Setup, forecast, variance_shares, without_sources
 from stcal.sfm.plan.simulated import observe, true_models
 from stcal.sfm.plan.views import PlannedView, candidates, known_scene, with_view
-from stcal.sfm.run.saved import CAMERA, SavedRun
+from stcal.sfm.run.saved import SavedRun
 from stcal.synthetic.placement import GroupShape, place_group, viewing_axes
 from stcal.synthetic.scene import Group, Scene, group_name
 
@@ -98,7 +98,7 @@ def known_of(run: SavedRun) -> Known:
         dict(zip(circle_labels(run.faces.circles), run.faces.circles.values(), strict=True)),
         {model.group: Rigid() for model in models},
     )
-    prior = camera_prior(read_camera(run.folder / CAMERA), run.camera) if run.options.refine_camera else None
+    prior = camera_prior(run.camera) if run.options.refine_camera else None
     joint = adjust_jointly(models, run.board, run.camera, run.options.flatness_mm, prior, read.camera)
     setup = Setup(
         target=run.target,
@@ -112,7 +112,7 @@ def known_of(run: SavedRun) -> Known:
         sigma0=joint.sigma0,
     )
     noise = CentreNoise.measured(joint.models, joint.camera, setup.radius_mm())
-    return Known(joint.models, joint, setup, noise, known_scene(joint.models, joint, setup, run.colmap_model))
+    return Known(joint.models, joint, setup, noise, known_scene(joint.models, joint, setup, run.camera.colmap_model))
 
 
 def doubts(run: SavedRun) -> str:

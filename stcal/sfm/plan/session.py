@@ -7,7 +7,6 @@ import numpy as np
 
 from stcal.design import BoardDesign, TargetDesign
 from stcal.errors import DegenerateError, InputError
-from stcal.geometry.camera import Camera
 from stcal.geometry.rigid import Rigid
 from stcal.io.camera import CameraModel, camera_prior, refinable
 from stcal.parallel import one_thread
@@ -149,7 +148,7 @@ def _scene(options: PlanOptions, target: TargetDesign, board: BoardDesign, nomin
         focal_px, distortion = float(np.sqrt(file.focal.prod())), tuple(file.distortion)
         shape = replace(shape, width=file.width, height=file.height, focal_px=focal_px, distortion=distortion)
     scene = make_scene(shape, target, replace(board, sigma_mm=0.0), nominal)
-    return scene if file is None else replace(scene, camera=file.sized(0, 0), colmap_model=file.colmap_model)
+    return scene if file is None else replace(scene, camera=file.calibrated(0, 0))
 
 
 def _setup(scene: Scene, options: PlanOptions, board: BoardDesign) -> Setup:
@@ -161,7 +160,6 @@ def _setup(scene: Scene, options: PlanOptions, board: BoardDesign) -> Setup:
         scene.circles_target,
         dict.fromkeys(scene.groups, Rigid()),
     )
-    own = options.camera or _stated(scene.camera, scene.colmap_model)
     return Setup(
         target=scene.target,
         board=board,
@@ -169,7 +167,7 @@ def _setup(scene: Scene, options: PlanOptions, board: BoardDesign) -> Setup:
         start=start,
         frame=run.frame,
         flatness_mm=run.flatness_mm,
-        prior=camera_prior(refinable(own), scene.camera) if run.refine_camera else None,
+        prior=camera_prior(refinable(scene.camera)) if run.refine_camera else None,
         common=ONE_PLATE if options.one_board else 0.0,
     )
 
@@ -192,12 +190,6 @@ def _linked(reference: str, pairs: list[tuple[str, ...]]) -> set[str]:
             f"plan: no group links face {apart} to reference face {reference}; add a group that shows one of each"
         )
     return linked
-
-
-def _stated(camera: Camera, colmap_model: str) -> CameraModel:
-    return CameraModel(
-        camera.focal, camera.centre, camera.distortion, colmap_model, camera.width, camera.height, "simulated"
-    )
 
 
 def _models(scene: Scene, options: PlanOptions) -> list[MetricModel]:

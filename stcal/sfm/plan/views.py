@@ -8,6 +8,7 @@ from stcal.design import TargetDesign
 from stcal.geometry.arrays import frozen
 from stcal.geometry.camera import Camera
 from stcal.geometry.rigid import Rigid
+from stcal.io.camera import CalibratedCamera
 from stcal.labels import CircleLabel, DotLabel, Label
 from stcal.sfm.adjust.joint import JointResult
 from stcal.sfm.data.model import MetricModel
@@ -102,8 +103,7 @@ def known_scene(models: tuple[MetricModel, ...], joint: JointResult, setup: Setu
     return Scene(
         target=target,
         board=setup.board,
-        camera=setup.camera,
-        colmap_model=colmap_model,
+        camera=CalibratedCamera.of(setup.camera, colmap_model),
         target_from_face=setup.start.target_from_face,
         circles_target=circles,
         groups=groups,

@@ -10,7 +10,7 @@ import numpy as np
 
 from stcal.design import TargetDesign
 from stcal.errors import InputError
-from stcal.io.camera import write_cameras_txt
+from stcal.io.camera import CalibratedCamera, write_cameras_txt
 from stcal.io.design import board_toml, target_toml
 from stcal.io.images import RUN_MARKER
 from stcal.io.saving import json_text, save
@@ -102,21 +102,15 @@ def write_run(result: RunResult, progress: Progress) -> None:
     ids = image_ids(observations)
     models = {s.model.group: s.model for s in result.solutions}
     corrected = _corrected_px(models, observations)
-    write_database(out / "database.db", result.camera, result.colmap_model, observations, result.graph.pairs, corrected)
+    write_database(out / "database.db", result.camera, observations, result.graph.pairs, corrected)
     save(out / "labels.csv", labels_csv(observations, corrected))
     shutil.rmtree(out / "models", ignore_errors=True)
     for name, model in models.items():
         folder = out / "models" / name  # "models/." where the images lie directly in their folder
-        write_model(folder, [model], observations, ids, result.camera, result.colmap_model)
-    write_model(
-        out / "target_model",
-        result.calibration.models,
-        observations,
-        ids,
-        result.calibration.camera,
-        result.colmap_model,
-    )
-    write_cameras_txt(out / CAMERA, result.camera, result.colmap_model, result.camera_covariance)
+        write_model(folder, [model], observations, ids, result.camera)
+    adjusted = CalibratedCamera.of(result.calibration.camera, result.camera.colmap_model)
+    write_model(out / "target_model", result.calibration.models, observations, ids, adjusted)
+    write_cameras_txt(out / CAMERA, result.camera)
     save(out / TARGET, target_toml(result.target_design))
     save(out / BOARD, board_toml(result.board_design))
     report = report_of(result).content()

@@ -34,7 +34,7 @@ def report_of(result: RunResult) -> ReportFile:
                 "max_pair_angle_deg": round(float(np.degrees(result.options.pairs.limit_rad())), 9),
             },
             "camera": {
-                "model": result.colmap_model,
+                "model": result.camera.colmap_model,
                 "size_px": [result.camera.width, result.camera.height],
                 "focal_px": result.calibration.camera.focal,
                 "centre_px": result.calibration.camera.centre,

@@ -6,8 +6,7 @@ from pathlib import Path
 import numpy as np
 
 from stcal.design import BoardDesign, TargetDesign
-from stcal.geometry.camera import Camera
-from stcal.io.camera import CameraPrior
+from stcal.io.camera import CalibratedCamera, CameraPrior
 from stcal.sfm.adjust.calibration import Calibration
 from stcal.sfm.adjust.chain import FaceChain
 from stcal.sfm.checks.suite import Evidence
@@ -22,12 +21,10 @@ from stcal.sfm.run.solve import GroupSolution
 
 @dataclass(frozen=True, slots=True, eq=False)
 class RunResult:
-    """Everything a run found; ``calibration.target`` is the answer, ``camera_covariance`` the camera file's."""
+    """Everything a run found; ``calibration.target`` is the answer, ``camera`` the file's."""
 
     out: Path
-    camera: Camera
-    colmap_model: str
-    camera_covariance: np.ndarray | None
+    camera: CalibratedCamera
     target_design: TargetDesign
     board_design: BoardDesign
     options: RunOptions
@@ -57,7 +54,6 @@ class RunResult:
             outliers=tuple(o for s in self.solutions for o in s.outliers),
             images=tuple(self.observations()),
             camera=self.camera,
-            colmap_model=self.colmap_model,
             target=self.target_design,
             board=self.board_design,
             options=self.options.adjustment(self.target_design),

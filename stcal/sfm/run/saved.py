@@ -12,7 +12,7 @@ from stcal.design import BoardDesign, TargetDesign
 from stcal.errors import InputError, StcalError
 from stcal.geometry.arrays import frozen
 from stcal.geometry.camera import Camera
-from stcal.io.camera import read_camera
+from stcal.io.camera import CalibratedCamera, read_camera
 from stcal.io.design import load_board, load_target
 from stcal.io.images import RUN_MARKER
 from stcal.io.json import checked, read_json
@@ -42,8 +42,7 @@ class SavedRun:
     folder: Path
     images: Path
     options: RunOptions
-    camera: Camera
-    colmap_model: str
+    camera: CalibratedCamera
     target: TargetDesign
     board: BoardDesign
     observations: tuple[ImageObservations, ...]
@@ -77,8 +76,7 @@ def load_run(folder: str | Path) -> SavedRun:
     if missing:
         raise InputError(f"run {folder}: unfinished, or of another version: no {', '.join(missing)}; run it again")
     marker, faces, report = (read_json(folder / n, "", AGAIN) for n in (RUN_MARKER, "faces.json", "report.json"))
-    model = read_camera(folder / CAMERA)
-    camera = model.sized(0, 0)
+    camera = read_camera(folder / CAMERA).calibrated(0, 0)
     target, board = load_target(folder / TARGET), load_board(folder / BOARD)
     with _as_written(folder / RUN_MARKER):
         own = checked(marker, MarkerFile)
@@ -95,7 +93,6 @@ def load_run(folder: str | Path) -> SavedRun:
         images=images,
         options=options,
         camera=camera,
-        colmap_model=model.colmap_model,
         target=target,
         board=board,
         observations=observations,

@@ -14,6 +14,7 @@ from stcal.errors import MappingError
 from stcal.geometry.camera import Camera
 from stcal.geometry.rigid import Rigid
 from stcal.io.cache import keep, kept
+from stcal.io.camera import CalibratedCamera
 from stcal.io.images import SUFFIXES, TOP_GROUP, Skipped
 from stcal.labels import DotLabel, dot_cells, parse_labels
 from stcal.parallel import Progress
@@ -143,7 +144,7 @@ def _key(
     plain = [
         CACHE_VERSION,
         list(skeleton),
-        asdict(camera),
+        [camera.width, camera.height, camera.parameters()],
         asdict(target),
         asdict(board),
         asdict(pair_options),
@@ -207,8 +208,7 @@ def solve_groups(
     observations: Sequence[ImageObservations],
     graph: ImageGraph,
     out: Path,
-    camera: Camera,
-    colmap_model: str,
+    camera: CalibratedCamera,
     target: TargetDesign,
     board: BoardDesign,
     options: RunOptions,
@@ -223,7 +223,7 @@ def solve_groups(
     groups = by_group(observations)
     solutions = []
     try:
-        write_database(database, camera, colmap_model, observations, graph.pairs)
+        write_database(database, camera, observations, graph.pairs)
         for name, group in groups.items():
             solutions.append(
                 solve_group(

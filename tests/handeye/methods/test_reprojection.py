@@ -10,7 +10,7 @@ from stcal.handeye import HandEyeOptions, Noise, View, Views, handeye, pairs_of_
 from stcal.handeye.data.loop import Loop
 from stcal.handeye.methods.bundle import Bundle
 from stcal.handeye.methods.reprojection import problem
-from stcal.io.camera import CameraModel, camera_prior, intrinsic_basis
+from stcal.io.camera import CalibratedCamera, camera_prior, intrinsic_basis
 from stcal.synthetic.measured.handeye import simulated_views
 
 SETUPS = ("eye-in-hand", "eye-to-hand")
@@ -24,7 +24,7 @@ def error(found, truth):
 
 def prior(camera, model):
     """Intrinsics of a calibration of some age."""
-    return camera_prior(CameraModel(camera.focal, camera.centre, camera.distortion, model, None, None, ""), camera)
+    return camera_prior(CalibratedCamera.of(camera, model))
 
 
 def normalised(errors, covariances):

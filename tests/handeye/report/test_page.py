@@ -13,7 +13,7 @@ from stcal.handeye.report.file import HandEyeFile, Outcome
 from stcal.handeye.report.page import outcome_page, outcome_text
 from stcal.handeye.solve import FACTORS
 from stcal.handeye.validate import Compared, compare, cross_validate, splits
-from stcal.io.camera import CameraModel, camera_prior
+from stcal.io.camera import CalibratedCamera, camera_prior
 from stcal.io.saving import json_text
 from stcal.synthetic.measured.handeye import simulated, simulated_views
 
@@ -87,7 +87,7 @@ def test_every_sigma_that_there_is_has_a_name():
     camera = truth.views.camera
     wrong = replace(camera, focal=1.02 * camera.focal)
     views = replace(truth.views, camera=wrong)
-    prior = camera_prior(CameraModel(wrong.focal, wrong.centre, wrong.distortion, "PINHOLE", None, None, ""), wrong)
+    prior = camera_prior(CalibratedCamera.of(wrong, "PINHOLE"))
     result = handeye(truth.pairs, truth.setup, None, views, HandEyeOptions(intrinsics=prior))
     outcome = Outcome("images", result, colmap_model="PINHOLE")
     assert "σ of camera file, focal length: " in outcome_text(outcome)

@@ -7,7 +7,7 @@ import pytest
 
 from stcal.errors import InputError
 from stcal.geometry.rigid import Rigid, Similarity
-from stcal.io.camera import CameraModel, camera_prior
+from stcal.io.camera import CalibratedCamera, camera_prior
 from stcal.sfm.adjust.calibration import calibrate
 from stcal.sfm.adjust.refine import refine
 from stcal.sfm.plan.simulated import observe, true_models
@@ -24,9 +24,9 @@ def position_error_um(scene, observations, camera, refine_camera: bool) -> float
         refine(m.in_world(Similarity(1.0, Rigid())), camera, scene.target, scene.board).model
         for m in true_models(scene, seen)
     ]
-    given = CameraModel(camera.focal, camera.centre, camera.distortion, scene.colmap_model, 0, 0, "given")
+    given = CalibratedCamera.of(camera, scene.camera.colmap_model)
     options = RunOptions(refine_camera=refine_camera).adjustment(scene.target)
-    result = calibrate(models, camera, scene.target, scene.board, options, camera_prior(given, camera))
+    result = calibrate(models, camera, scene.target, scene.board, options, camera_prior(given))
     poses = result.target.target_from_face
     off = [p.translation - scene.target_from_face[f].translation for f, p in poses.items() if f != "1"]
     return 1e3 * float(np.sqrt(np.mean(np.sum(np.square(off), axis=1))))

@@ -194,8 +194,8 @@ def test_photographs_give_a_camera_file_that_runs_take_as_prior(stcal_sfm, small
     assert code == 0
     assert "split-half check" in printed
     model, truth = read_camera(out), read_camera(small_dataset / "cameras.txt")
-    camera = model.sized(1296, 864)
-    prior = camera_prior(model, camera)
+    camera = model.calibrated(1296, 864)
+    prior = camera_prior(camera)
     assert prior.colmap_model == "OPENCV"
     e = model_parameters(camera, "OPENCV") - model_parameters(truth.sized(1296, 864), "OPENCV")
     assert 0.05 < e @ np.linalg.solve(prior.covariance, e) / 8 < chi2.ppf(0.999, 8) / 8

@@ -9,6 +9,7 @@ import pytest
 
 from stcal.geometry.conic import circle_conic, ellipse_of_conic
 from stcal.geometry.rigid import Rigid
+from stcal.io.camera import CalibratedCamera
 from stcal.sfm.adjust import joint
 from stcal.sfm.adjust.calibration import calibrate
 from stcal.sfm.adjust.joint import SETTLED_PX
@@ -58,9 +59,8 @@ class Lab:
         refined, calibration, options = self.calibrate(scene, images, camera, board, solve)
         models = tuple(each.model for each in refined)
         outliers = tuple(o for each in refined for o in each.outliers)
-        evidence = Evidence(
-            models, outliers, tuple(images), camera, "OPENCV", scene.target, board, options, calibration, None, {}
-        )
+        own = CalibratedCamera.of(camera, "OPENCV")
+        evidence = Evidence(models, outliers, tuple(images), own, scene.target, board, options, calibration, None, {})
         return {check.key: check for check in run_checks(evidence)}
 
     def calibrate(self, scene, images, camera=None, board=None, solve="chain"):

@@ -14,7 +14,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from stcal.errors import InputError
-from stcal.io.camera import colmap_params, read_camera, write_cameras_txt
+from stcal.io.camera import read_camera, write_cameras_txt
 from stcal.sfm.interop.export_model import export_model
 
 AGAIN_PX = 5e-5
@@ -268,11 +268,11 @@ def test_two_focal_lengths_become_one(small_run, tmp_path, keypoints):
     own = tmp_path / "run"
     shutil.copytree(small_run, own)
     model = read_camera(own / "cameras.txt")
-    camera = replace(model.sized(0, 0), focal=model.focal * [1.02, 1.0])
-    write_cameras_txt(own / "cameras.txt", camera, model.colmap_model)
+    camera = replace(model.calibrated(0, 0), focal=model.focal * [1.02, 1.0])
+    write_cameras_txt(own / "cameras.txt", camera)
     assert "its camera is not that of the run" in refusal(own, tmp_path / "refused")
     native = pycolmap.Reconstruction(str(own / "target_model"))
-    native.camera(1).params = colmap_params(camera, model.colmap_model)
+    native.camera(1).params = camera.colmap_params()
     native.write_binary(str(own / "target_model"))
     written = export_model(own, tmp_path / "model.nvm", "nvm")
     assert written.focal_px == pytest.approx(1.01 * model.focal[1], abs=1e-9)

@@ -48,7 +48,7 @@ def judged(scene, views):
     few = {f"{n} of 25": replace(views["25"].select(range(0, 2 * n, 2)), name=f"{n} of 25") for n in (5, 12, 20)}
     group = [*views.values(), *few.values()]
     scores = [PairScore("0", image.name, len(image), 0.5, 1.0, 0.1, None, "usable") for image in group[1:]]
-    rows = group_gates(group, scores, scene.camera, scene.colmap_model, PairOptions())
+    rows = group_gates(group, scores, scene.camera, PairOptions())
     return group, {row.score.second: row for row in rows}
 
 
@@ -112,9 +112,7 @@ def test_verdicts_are_what_colmap_does(scene, judged, tmp_path):
     """Started from the pair, COLMAP registers it where the verdict says so, and makes no model where it does not."""
     group, rows = judged
     database, ids = tmp_path / "pairs.db", image_ids(group)
-    write_database(
-        database, scene.camera, scene.colmap_model, group, np.array(list(combinations(range(len(group)), 2)))
-    )
+    write_database(database, scene.camera, group, np.array(list(combinations(range(len(group)), 2))))
     names = [image.name for image in group]
     for second, row in rows.items():
         pair = ids["0"], ids[second]
@@ -133,9 +131,7 @@ def test_the_first_gates_are_colmaps_own(scene, judged, tmp_path):
     """COLMAP's ``estimate_initial_two_view_geometry`` takes the pairs that the gates before the points let pass."""
     group, rows = judged
     database, ids = tmp_path / "pairs.db", image_ids(group)
-    write_database(
-        database, scene.camera, scene.colmap_model, group, np.array(list(combinations(range(len(group)), 2)))
-    )
+    write_database(database, scene.camera, group, np.array(list(combinations(range(len(group)), 2))))
     options = gates_module.pipeline_options([image.name for image in group], (1, 2))
     with pycolmap.Database.open(str(database)) as opened:
         cache = pycolmap.DatabaseCache.create(opened, pycolmap.DatabaseCacheOptions(min_num_matches=6))
@@ -164,7 +160,7 @@ def test_wrong_centres_do_not_survive(scene, views):
     wrong[[3, 20, 40], 1] += np.radians(12.0) * scene.camera.focal[1]
     spoilt = replace(b, centre_px=wrong, centre=scene.camera.normalised_from_pixel(wrong))
     score = PairScore("0", "25", len(b), 0.5, 1.0, 0.1, None, "usable")
-    (row,) = group_gates([a, spoilt], [score], scene.camera, scene.colmap_model, PairOptions())
+    (row,) = group_gates([a, spoilt], [score], scene.camera, PairOptions())
     shared = len(set(a.labels) & set(b.labels))
     assert measured(row.as_set, "points").value == measured(row.as_set, "inliers").value == shared - 3
     # At its defaults COLMAP makes no points of circles that two images of all see.

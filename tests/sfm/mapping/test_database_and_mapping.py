@@ -30,7 +30,7 @@ def observed(scene, labels_only):
 @pytest.fixture(scope="module")
 def database(scene, observed, tmp_path_factory):
     path = tmp_path_factory.mktemp("database") / "database.db"
-    write_database(path, scene.camera, scene.colmap_model, observed, image_graph(observed, scene.board, "all").pairs)
+    write_database(path, scene.camera, observed, image_graph(observed, scene.board, "all").pairs)
     return path
 
 
@@ -139,7 +139,7 @@ def test_the_same_seed_gives_the_same_model(scene, observed, database, tmp_path)
 
 def test_the_written_model_is_colmaps_and_keeps_the_keypoints(scene, observed, database, tmp_path):
     own, mapping = map_one(scene, observed, database, tmp_path, "12")
-    write_model(tmp_path / "model", [mapping.model], observed, image_ids(observed), scene.camera, scene.colmap_model)
+    write_model(tmp_path / "model", [mapping.model], observed, image_ids(observed), scene.camera)
     read = pycolmap.Reconstruction(str(tmp_path / "model"))
     assert read.num_reg_images() == len(own)
     assert read.num_points3D() == len(mapping.model.labels)

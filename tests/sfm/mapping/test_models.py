@@ -329,7 +329,7 @@ def test_all_groups_in_one_world(saved, tmp_path):
     """As two models, and brought together as one: each group keeps its own points, scale and faces."""
     apart = calibrate_models(saved.folder / "models", saved)
     ids = image_ids(saved.observations)
-    write_model(tmp_path / "one", apart.models, saved.observations, ids, saved.camera, saved.colmap_model)
+    write_model(tmp_path / "one", apart.models, saved.observations, ids, saved.camera)
     assert len(pycolmap.Reconstruction(str(tmp_path / "one")).images) == 8
     together = calibrate_models(tmp_path / "one", saved)
     assert [m.group for m in together.models] == ["12", "14"]

@@ -52,7 +52,7 @@ def test_poses_err_together_as_stated(scene, known, with_camera):
     truths = [view(faces_view(scene, f), np.radians(15), rng.uniform(700, 1200), rng) for f in faces]
     images = [see(scene, truth, f, 0.0, rng) for truth, f in zip(truths, faces, strict=True)]
     images = [replace(i, covariance_px2=np.tile(NOISE_PX**2 * np.eye(2), (len(i), 1, 1))) for i in images]
-    prior = CameraPrior(scene.colmap_model, np.diag(SIGMA**2)) if with_camera else None
+    prior = CameraPrior(scene.camera.colmap_model, np.diag(SIGMA**2)) if with_camera else None
     exact = [measured(image, known.truth, scene.camera, prior) for image in images]
     common = common_errors(exact, known.truth, prior)
     assert 6 <= common.shape[2] <= MOST
@@ -62,7 +62,7 @@ def test_poses_err_together_as_stated(scene, known, with_camera):
     for _ in range(DRAWS):
         target, camera = known.measured(rng), scene.camera
         if with_camera:
-            away = intrinsic_basis(scene.colmap_model) @ (SIGMA * rng.standard_normal(8))
+            away = intrinsic_basis(scene.camera.colmap_model) @ (SIGMA * rng.standard_normal(8))
             camera = camera.with_parameters(camera.parameters() + away)
         poses = [measured(image, target, camera, prior) for image in images]
         error = [pose_error(p.camera_from_target, t) for p, t in zip(poses, truths, strict=True)]

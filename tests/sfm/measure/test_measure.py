@@ -252,11 +252,11 @@ def test_stated_intrinsics_go_into_the_covariance(scene, known, count):
     """Cameras drawn from the σ of the file: errors as predicted with it, far beyond without."""
     rng = np.random.default_rng(7)
     sigma = np.array([1.0, 1.0, 0.7, 0.7, 3e-4, 1e-3, 3e-5, 3e-5])
-    prior = CameraPrior(scene.colmap_model, np.diag(sigma**2))
+    prior = CameraPrior(scene.camera.colmap_model, np.diag(sigma**2))
     square, held = [], []
     for i in range(count):
         truth, _, image = one_view(scene, rng, ONE[i % 5], NOISE_PX, (0, 65), (600, 1500))
-        away = intrinsic_basis(scene.colmap_model) @ (sigma * rng.standard_normal(8))
+        away = intrinsic_basis(scene.camera.colmap_model) @ (sigma * rng.standard_normal(8))
         camera = scene.camera.with_parameters(scene.camera.parameters() + away)
         target = known.measured(rng)
         for own, results in ((prior, square), (None, held)):

@@ -169,7 +169,7 @@ def test_centre_noise_is_found_again(exact):
 def known_from(scene: Scene) -> Known:
     setup, models = setup_of(scene, 0.005), tuple(models_of(scene))
     joint = covariance_of(models, setup.board, setup.camera)
-    return Known(models, joint, setup, NOISE, known_scene(models, joint, setup, scene.colmap_model))
+    return Known(models, joint, setup, NOISE, known_scene(models, joint, setup, scene.camera.colmap_model))
 
 
 @pytest.fixture(scope="module")

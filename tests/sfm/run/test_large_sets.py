@@ -47,9 +47,7 @@ def solve(scene, observations, kind, out):
     graph = image_graph(observations, scene.board, kind)
     (out / "cache").mkdir(parents=True)
     tell = lambda *_: None  # noqa: E731
-    solutions = solve_groups(
-        observations, graph, out, scene.camera, scene.colmap_model, scene.target, scene.board, options, tell
-    )
+    solutions = solve_groups(observations, graph, out, scene.camera, scene.target, scene.board, options, tell)
     return (
         graph,
         solutions,

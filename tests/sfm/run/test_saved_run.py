@@ -93,7 +93,7 @@ def test_an_image_without_a_label_keeps_its_place(written):
 def test_camera_and_designs_are_the_same(written):
     result, saved = written
     assert saved.camera.same_as(result.camera)
-    assert saved.colmap_model == result.colmap_model
+    assert saved.camera.colmap_model == result.camera.colmap_model
     assert saved.target.radius_of() == result.target_design.radius_of()
     for found, known in zip(saved.target.faces, result.target_design.faces, strict=True):
         assert [getattr(found, n) for n in FRAME] == [getattr(known, n) for n in FRAME]
