@@ -27,6 +27,7 @@ MODULES = (
     "stcal.sfm.run.report",
     "stcal.sfm.measure.files",
     "stcal.sfm.report.compare",
+    "stcal.synthetic.truth",
     "stcal.sfm.camera.file",
     "stcal.sfm.plan.file",
     "stcal.sfm.interop.file",

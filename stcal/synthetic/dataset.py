@@ -4,18 +4,14 @@ import json
 from collections.abc import Callable
 from pathlib import Path
 
-import numpy as np
-
 from stcal.errors import InputError
 from stcal.io.camera import write_cameras_txt
 from stcal.io.design import board_toml, target_toml
-from stcal.labels import BOARD, Label
 from stcal.parallel import run_parallel
-from stcal.synthetic.observe import image_circles
 from stcal.synthetic.render import RenderOptions, encode, render
 from stcal.synthetic.scene import Scene
+from stcal.synthetic.truth import Truth, image_name
 
-FIRST_IMAGE = 1000
 IMAGE_FORMATS = ("jpg", "png")
 
 
@@ -61,12 +57,13 @@ def write_dataset(
     if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
         raise InputError(f"data set folder {folder}: exists and is not empty; give a new or an empty folder")
     try:
+        truth = json.dumps(Truth.of(scene, image_format).content())
         for group in scene.groups:
             (folder / "images" / group).mkdir(parents=True, exist_ok=True)
         write_cameras_txt(folder / "cameras.txt", scene.camera)
         (folder / "target.toml").write_text(target_toml(scene.target), encoding="utf-8")
         (folder / "board.toml").write_text(board_toml(scene.board), encoding="utf-8")
-        (folder / "truth.json").write_text(json.dumps(truth(scene, image_format)) + "\n", encoding="utf-8")
+        (folder / "truth.json").write_text(truth + "\n", encoding="utf-8")
     except OSError as error:
         raise InputError(f"data set folder {folder}: {error.strerror or error}; give a writable folder") from error
     jobs = {
@@ -80,50 +77,6 @@ def write_dataset(
         if progress:
             progress(done, len(jobs))
     return list(paths.values())
-
-
-def image_name(group: str, image: int, image_format: str = "jpg") -> str:
-    """Name of an image inside ``images``: ``12/IMG_1000.jpg``."""
-    return f"{group}/IMG_{FIRST_IMAGE + image}.{image_format}"
-
-
-def truth(scene: Scene, image_format: str = "jpg") -> dict:
-    """The content of ``truth.json``: mm, target frame, pixels from the centre of the top-left pixel.
-
-    Board dots are numbered row by row here, ``board:0`` ….
-    """
-    return {
-        "unit": "mm",
-        "reference_face": scene.reference_face,
-        "target_from_face": {face: pose.matrix().tolist() for face, pose in scene.target_from_face.items()},
-        "circles": {label: xyz.tolist() for label, xyz in scene.circles_target.items()},
-        "groups": {
-            name: {
-                "board_circles_target": g.board_circles_target.tolist(),
-                "images": {
-                    image_name(name, i, image_format): {
-                        "camera_from_target": pose.matrix().tolist(),
-                        "circles": _image_truth(scene, name, i),
-                    }
-                    for i, pose in enumerate(g.camera_from_target)
-                },
-            }
-            for name, g in scene.groups.items()
-        },
-    }
-
-
-def _image_truth(scene: Scene, group: str, image: int) -> dict:
-    seen = image_circles(scene, group, image)
-    number: dict[Label, str] = {label: f"{BOARD}:{i}" for i, label in enumerate(scene.board.labels())}
-    return {
-        number.get(label, label): {
-            "centre_px": [round(float(x), 5) for x in centre],
-            "tilt_deg": round(float(np.degrees(tilt)), 2),
-            "must_find": bool(must),
-        }
-        for label, centre, tilt, must in zip(seen.labels, seen.centre_px, seen.tilt_rad, seen.must_find, strict=True)
-    }
 
 
 def _write_image(path: Path, scene: Scene, group: str, image: int, options: RenderOptions, jpeg_quality: int) -> None:

@@ -1,6 +1,7 @@
 """Errors of a run against a known truth: ``truth.json`` and ``compare.json`` (``data_layout.md``)."""
 
 import csv
+from collections.abc import Collection
 from pathlib import Path
 from typing import Any, Literal
 
@@ -12,6 +13,7 @@ from stcal.geometry.align import align_rigid
 from stcal.geometry.rigid import Rigid
 from stcal.io.json import ByFace, Matrix6, Part, Pose, ResultFile, Vector3, read_result
 from stcal.labels import BOARD, CircleLabel, DotLabel, parse_label, parse_labels
+from stcal.synthetic.truth import TrueGroup, TrueImage, Truth
 
 FACES = "faces.json"
 DETECTIONS = "detections.csv"
@@ -22,7 +24,7 @@ REMEDY = "give a finished run, and truth.json, as data_layout.md has them"
 
 
 class Answer(Part):
-    """What the two files have in common: ``faces.json``, and a truth, of which ``groups`` are looked at in passing."""
+    """What of ``faces.json`` is compared."""
 
     format: Literal["stcal faces 1"] = "stcal faces 1"
     unit: Literal["mm"]
@@ -30,7 +32,6 @@ class Answer(Part):
     target_from_face: dict[str, Pose]
     circles: dict[str, Vector3]
     target_from_face_covariance: dict[str, Matrix6] = Field({})
-    groups: Any = None
 
 
 class FaceErrors(Part):
@@ -87,7 +88,7 @@ def compare(run: str | Path, truth: str | Path) -> CompareFile:
     """
     run = Path(run)
     found = read_result(run / FACES if run.is_dir() else run, Answer, "run", REMEDY)
-    known = read_result(truth, Answer, "truth", REMEDY)
+    known = read_result(truth, Truth, "truth", REMEDY)
     if found.reference_face != known.reference_face:
         raise InputError(
             f"reference face {found.reference_face} in the run, {known.reference_face} in the truth; "
@@ -98,7 +99,7 @@ def compare(run: str | Path, truth: str | Path) -> CompareFile:
     faces = {
         face_id: _face(face_id, found, known) for face_id in known.target_from_face if face_id in found.target_from_face
     }
-    labels = _labels(run / DETECTIONS, known) if run.is_dir() and isinstance(known.groups, dict) else None
+    labels = _labels(run / DETECTIONS, known.circles, known.groups) if run.is_dir() and known.groups else None
     worst = {
         name: max((value for each in faces.values() if (value := getattr(each, name)) is not None), default=None)
         for name in LargestErrors.model_fields
@@ -112,7 +113,7 @@ def compare(run: str | Path, truth: str | Path) -> CompareFile:
     )
 
 
-def _labels(path: Path, known: Answer) -> LabelCounts | None:
+def _labels(path: Path, circles: Collection[str], groups: dict[str, TrueGroup]) -> LabelCounts | None:
     """Labels of ``detections.csv`` against the truth; a board's numbers are known up to its own symmetry, but for a
     whole group at once."""
     try:
@@ -122,15 +123,15 @@ def _labels(path: Path, known: Answer) -> LabelCounts | None:
         for row in rows:
             measured.setdefault(row["image"], {})[parse_label(row["label"])] = (float(row["x_px"]), float(row["y_px"]))
         for labels in measured.values():  # circles that the truth does not know are neither right nor wrong
-            for label in [x for x in labels if isinstance(x, CircleLabel) and x not in known.circles]:
+            for label in [x for x in labels if isinstance(x, CircleLabel) and x not in circles]:
                 del labels[label]
         total = np.zeros(3, int)
-        for group in known.groups.values():
-            count = len(group["board_circles_target"])
-            grid = np.arange(count).reshape(-1, _columns(group["board_circles_target"]))
+        for group in groups.values():
+            dots = group.board_circles_target
+            grid = np.arange(len(dots)).reshape(-1, _columns(dots))
             turns = [grid, np.rot90(grid, 2)]
             turns += [np.rot90(grid), np.rot90(grid, 3)] if grid.shape[0] == grid.shape[1] else []
-            counts = [_count(measured, group["images"], turn) for turn in turns]
+            counts = [_count(measured, group.images, turn) for turn in turns]
             total += min(counts, key=lambda c: (c[0], -c[1]))
     except (OSError, KeyError, ValueError, TypeError, IndexError, InputError):
         return None
@@ -139,32 +140,32 @@ def _labels(path: Path, known: Answer) -> LabelCounts | None:
     return LabelCounts(**dict(zip(LabelCounts.model_fields, total.tolist(), strict=True)))
 
 
-def _columns(dots: list) -> int:
+def _columns(dots: np.ndarray) -> int:
     """Columns of a board from its dots in row-major order: where the first step back to the row's begin is."""
-    steps = np.diff(np.asarray(dots, float), axis=0)
+    steps = np.diff(dots, axis=0)
     turned = np.flatnonzero(steps @ steps[0] < 0)
     return int(turned[0]) + 1 if len(turned) else len(dots)
 
 
-def _count(measured: dict, images: dict, numbers: np.ndarray) -> tuple[int, int, int]:
+def _count(measured: dict, images: dict[str, TrueImage], numbers: np.ndarray) -> tuple[int, int, int]:
     """(wrong, found, visible) with the board's dots numbered as ``numbers``, (rows, columns), has them."""
     wrong = found = visible = 0
     for name in images.keys() & measured.keys():
-        circles = images[name]["circles"]
-        visible += sum(bool(c["must_find"]) for c in circles.values())
+        circles = images[name].circles
+        visible += sum(c.must_find for c in circles.values())
         for label, centre in measured[name].items():
             key = label
             if isinstance(label, DotLabel):
                 row, column = label.row, label.column
                 inside = 0 <= row < numbers.shape[0] and 0 <= column < numbers.shape[1]
                 key = f"{BOARD}:{numbers[row, column]}" if inside else label
-            near = key in circles and bool(np.linalg.norm(np.subtract(centre, circles[key]["centre_px"])) < NEAR_PX)
+            near = key in circles and bool(np.linalg.norm(np.subtract(centre, circles[key].centre_px)) < NEAR_PX)
             wrong += not near
-            found += near and bool(circles[key]["must_find"])
+            found += near and circles[key].must_find
     return wrong, found, visible
 
 
-def _face(face_id: str, found: Answer, known: Answer) -> FaceErrors:
+def _face(face_id: str, found: Answer, known: Truth) -> FaceErrors:
     estimate, true = (Rigid.from_matrix(each.target_from_face[face_id]) for each in (found, known))
     labels = [label for label in parse_labels(known.circles) if label.plane == face_id and label in found.circles]
     a, b = (np.array([each.circles[label] for label in labels]).reshape(-1, 3) for each in (known, found))

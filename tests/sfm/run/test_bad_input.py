@@ -479,6 +479,7 @@ TRUTHS = {
     "no unit": (lambda truth: json.dumps({k: v for k, v in truth.items() if k != "unit"}), ("no 'unit'",)),
     "inches": (changed(unit="in"), ("unit: 'in': ", "'mm'")),
     "another format": (changed(format="stcal faces 2"), ("format: 'stcal faces 2': ", "'stcal faces 1'")),
+    "group without dots": (changed(groups={"12": {"images": {}}}), ("groups.12", "no 'board_circles_target'")),
     "faces null": (changed(target_from_face=None), ("target_from_face: None: ", "data_layout.md")),
     "circles a list": (changed(circles=[1]), ("circles: [1]: ", "data_layout.md")),
     "another reference": (changed(reference_face="2"), ("reference face 1 in the run, 2 in", "--reference-face 2")),
