@@ -69,7 +69,31 @@ def calibrate_camera(
     """Intrinsics from a folder of photographs that show the board.
 
     The start needs no knowledge of the lens: labels do not depend on the focal length, and the closed form finds it.
-    Ellipses are fitted in undistorted coordinates, so detection is repeated with the camera found.
+    Ellipses are fitted in undistorted coordinates, so detection is repeated with the camera found. Closed form: Zhang
+    (2000).
+
+    Parameters
+    ----------
+    images : path
+        Folder of photographs, or of folders of them.
+    target : TargetDesign
+        What else may be in view, so that its circles are not taken for dots.
+    board : BoardDesign
+        The dot board, mm, with the σ of its dots.
+    colmap_model : str
+        COLMAP's camera model to adjust, such as ``OPENCV``.
+    ellipses : EllipseOptions, optional
+        Of detection; the defaults where None.
+    workers : int, optional
+        Processes; one per core where None.
+    progress : callable, optional
+        Called with (stage, done, total).
+
+    Returns
+    -------
+    CameraCalibration
+        Intrinsics with the covariance of their parameters, px and OpenCV's pixel origin; what they rest on, and what to
+        look at.
 
     Raises
     ------

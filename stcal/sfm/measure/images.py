@@ -38,9 +38,19 @@ SUSPICIOUS, FAILED = 1e-3, 1e-5
 
 @dataclass(frozen=True, slots=True)
 class MeasureOptions:
-    """``pose`` : of the single images; ``previous`` : an image's own undecided pose is decided by that of the image
-    before it, by name and in the same folder; ``ellipses`` : of detection; ``workers`` : processes, one per core where
-    None."""
+    """What :func:`measure` does with each image.
+
+    Parameters
+    ----------
+    pose : PoseOptions
+        Of the single images.
+    previous : bool
+        An image's own undecided pose is decided by that of the image before it, by name and in the same folder.
+    ellipses : EllipseOptions
+        Of detection.
+    workers : int, optional
+        Processes; one per core where None.
+    """
 
     pose: PoseOptions = field(default_factory=PoseOptions)
     previous: bool = False
@@ -88,11 +98,31 @@ def measure(
 ) -> MeasureResult:
     """Pose of a calibrated target in each image of a folder and of its subfolders.
 
+    Two minima of a face seen alone are told apart where its circles can (Schweighofer & Pinz 2006), and stated both
+    where they cannot.
+
     Parameters
     ----------
-    camera : as :func:`stcal.io.camera.read_camera` returns it; its covariance, if it has one, goes into the poses'
-    target : its circles, see :func:`stcal.sfm.measure.target.read_target`
-    board : a dot board that may be in view, so that its dots are not taken for circles of the target
+    images : path
+        Folder of photographs; every folder in it too.
+    camera : CameraModel
+        As :func:`stcal.io.camera.read_camera` returns it; its covariance, if it has one, goes into the poses'.
+    target : TargetCircles
+        Its circles, target frame, mm; see :func:`read_target`.
+    design : TargetDesign
+        Radii and polarity, for detection and labels.
+    board : BoardDesign, optional
+        A dot board that may be in view, so that its dots are not taken for circles of the target.
+    options : MeasureOptions, optional
+        The defaults where None.
+    progress : callable, optional
+        Called with (stage, done, total).
+
+    Returns
+    -------
+    MeasureResult
+        camera_from_target of every image that has a pose, mm, with (6, 6) covariances in rad and mm, left perturbation
+        in the camera frame; and what was left out, with reasons.
 
     Raises
     ------

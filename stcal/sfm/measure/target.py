@@ -91,6 +91,18 @@ class TargetCircles:
 def read_target(path: str | Path, design: TargetDesign) -> TargetCircles:
     """Read a ``faces.json`` and check that it is of this design.
 
+    Parameters
+    ----------
+    path : path
+        ``faces.json`` of a finished run.
+    design : TargetDesign
+        Of the same target.
+
+    Returns
+    -------
+    TargetCircles
+        Centres of all circles with the covariance of all together, target frame, mm and mm².
+
     Raises
     ------
     InputError

@@ -128,8 +128,22 @@ def doubts(run: SavedRun) -> str:
 
 @one_thread()
 def advise(known: Known, count: int = 5, progress: Callable[[str, int, int], None] | None = None) -> Advice:
-    """The ``count`` views that, taken one after the other, lower the σ of the worst face most, and new groups of as
-    many images. ``progress`` is told (stage, done, total)."""
+    """The views that, taken one after the other, lower the σ of the worst face most, and new groups of as many images.
+
+    Parameters
+    ----------
+    known : Known
+        The geometry of a finished run, see :func:`stcal.sfm.plan.advise.known_of`.
+    count : int
+        Views to choose, each given those before it.
+    progress : callable, optional
+        Called with (stage, done, total).
+
+    Returns
+    -------
+    Advice
+        The views, with the worst face and its σ after each, mm; the σ now, and their sources.
+    """
     now = forecast(known.models, known.setup)
     shares = variance_shares(now, without_sources(known.models, known.setup, now.derivatives))
     views = [v for model in known.models for v in candidates(known.scene, model, known.setup, known.noise)]

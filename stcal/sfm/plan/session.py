@@ -27,10 +27,33 @@ MIN_IMAGES = 2
 class PlanOptions:
     """What is planned.
 
-    ``images`` of each group; ``spread_deg`` : ± about the view that shows both faces equally; ``width`` : px, 3:2
-    images of a 24 mm lens, where no ``camera`` is given; ``groups`` : pairs of face ids, those of the design where
-    None; ``one_board`` : the same plate in all groups, else made anew for each; ``run`` : flatness, frame, refined
-    intrinsics and reference face; ``seed`` : of where board and cameras happen to stand.
+    Parameters
+    ----------
+    images : int
+        Of each group.
+    spread_deg : float
+        ± about the view that shows both faces equally, degrees.
+    distance_mm : float
+        From the cameras to the target, mm.
+    width : int
+        px; 3:2 images of a 24 mm lens, where no ``camera`` is given.
+    camera : CameraModel, optional
+        The camera; its file must state the image size.
+    groups : tuple of pairs of str, optional
+        Pairs of face ids; those of the design where None.
+    noise : CentreNoise
+        σ of the centres.
+    one_board : bool
+        The same plate in all groups, else made anew for each.
+    run : RunOptions
+        Flatness, frame, refined intrinsics and reference face.
+    seed : int
+        Of where board and cameras happen to stand.
+
+    Raises
+    ------
+    InputError
+        Fewer than two images in each group, or a camera file without image size.
     """
 
     images: int = 10
@@ -96,7 +119,21 @@ def plan(
 ) -> Plan:
     """Forecast of a plan: nominal geometry, board and cameras where a simulated session would have them.
 
-    ``nominal`` : pose of every face in one frame.
+    Parameters
+    ----------
+    options : PlanOptions
+        Images, camera, groups and noise.
+    target : TargetDesign
+        Drawing frame of each face, mm.
+    board : BoardDesign
+        With its σ, mm.
+    nominal : dict of Rigid, optional
+        Pose of every face in one common frame, mm, by face id.
+
+    Returns
+    -------
+    Plan
+        σ to expect of every face against the reference face, mm and rad, their sources, and what would help most.
 
     Raises
     ------

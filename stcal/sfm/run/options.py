@@ -14,11 +14,30 @@ from stcal.sfm.mapping.pairs import PairOptions
 class RunOptions:
     """What to do, the defaults of which some depend on others.
 
-    ``solve``, ``frame``, ``eccentricity``, ``reference_face``, ``flatness_mm``, ``refine_camera`` : see
-    :class:`~stcal.sfm.adjust.options.AdjustOptions`; where None, ``solve`` is ``joint`` and ``frame`` is ``plane``, but
-    for the uncorrected control, which is chained with three-point frames as in Zhang & Wei (2017), and
-    ``reference_face`` is the design's first one; ``graph`` : which pairs of images are matched, see
-    :func:`stcal.sfm.mapping.graph.image_graph`; ``workers`` : processes, one per core where None.
+    Parameters
+    ----------
+    solve : {"joint", "chain"}, optional
+        One adjustment over all groups, or group by group as in Zhang & Wei (2017). Where None ``joint``, but for the
+        uncorrected control, which is chained.
+    frame : {"plane", "three-point"}, optional
+        Frame of a face: Z from the plane of all its circles, or as in Zhang & Wei (2017). Where None ``plane``, but for
+        the uncorrected control.
+    eccentricity : bool
+        Whether it is corrected; the uncorrected control where not.
+    reference_face : str, optional
+        Id of the face whose frame is the target frame; the design's first one where None.
+    graph : {"all", "sparse"}, optional
+        Which pairs of images are matched, see :func:`stcal.sfm.mapping.graph.image_graph`; by their number where None.
+    pairs : PairOptions
+        Of the initial pair.
+    ellipses : EllipseOptions
+        Of detection.
+    workers : int, optional
+        Processes; one per core where None.
+    flatness_mm : float, optional
+        σ of a circle about the plane of its face, mm; None for no such knowledge.
+    refine_camera : bool
+        Adjust the intrinsics too, the given ones being observations.
     """
 
     solve: Solve | None = None

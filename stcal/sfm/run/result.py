@@ -21,7 +21,35 @@ from stcal.sfm.run.solve import GroupSolution
 
 @dataclass(frozen=True, slots=True, eq=False)
 class RunResult:
-    """Everything a run found; ``calibration.target`` is the answer, ``camera`` the file's."""
+    """Everything a run found; :attr:`target` is the answer.
+
+    Parameters
+    ----------
+    out : Path
+        The run's folder.
+    camera : CalibratedCamera
+        As its file states it; refined intrinsics are ``calibration.camera``.
+    target_design, board_design : TargetDesign, BoardDesign
+        As given.
+    options : RunOptions
+        With every default decided.
+    detection : DetectionResult
+        What was found in each image, and the images skipped.
+    labelled : tuple of LabelledImage
+        Labelled centres of all images, px, in the database's order.
+    graph : ImageGraph
+        Which pairs of images were matched.
+    solutions : tuple of GroupSolution
+        Of the single groups, worlds without unit.
+    calibration : Calibration
+        Target and models in mm, target frame.
+    chains : dict of tuple of FaceChain
+        Ways to each face through single groups, by face id.
+    notes : tuple of str
+        What was left out or did not settle, and what to do.
+    checks : tuple of Check
+        In the order of the report.
+    """
 
     out: Path
     camera: CalibratedCamera

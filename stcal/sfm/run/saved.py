@@ -63,6 +63,16 @@ class SavedRun:
 def load_run(folder: str | Path) -> SavedRun:
     """Read a finished run.
 
+    Parameters
+    ----------
+    folder : path
+        What the run was given as ``out``.
+
+    Returns
+    -------
+    SavedRun
+        Its inputs, labelled centres and results.
+
     Raises
     ------
     InputError
