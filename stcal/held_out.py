@@ -17,7 +17,7 @@ def dealt(count: int, folds: int, rng: np.random.Generator) -> list[np.ndarray]:
     return [np.flatnonzero(fold == k) for k in range(folds)]
 
 
-def splits(count: int, size: int, repeats: int, rng: np.random.Generator) -> np.ndarray:
+def repeated_splits(count: int, size: int, repeats: int, rng: np.random.Generator) -> np.ndarray:
     """(repeats, size) rows to hold out, in ascending order: in rounds, in each of which every row comes about once."""
     chosen: list[np.ndarray] = []
     while len(chosen) < repeats:

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from stcal.errors import DegenerateError
-from stcal.held_out import dealt, held_out_errors, splits
+from stcal.held_out import dealt, held_out_errors, repeated_splits
 
 
 def rng(seed=0):
@@ -31,11 +31,11 @@ def test_rows_are_dealt_at_random():
 
 
 def test_splits_come_in_rounds():
-    rows = splits(12, 3, 8, rng())
+    rows = repeated_splits(12, 3, 8, rng())
     assert rows.shape == (8, 3)
     assert sorted(rows[:4].ravel()) == sorted(rows[4:].ravel()) == list(range(12))
     assert (np.diff(rows) > 0).all()
-    assert splits(16, 5, 15, rng()).shape == (15, 5)
+    assert repeated_splits(16, 5, 15, rng()).shape == (15, 5)
 
 
 def test_rows_are_held_out_of_all_ways():

@@ -11,7 +11,7 @@ from .solve import METHODS as METHODS
 from .solve import HandEyeOptions as HandEyeOptions
 from .solve import handeye as handeye
 from .validate import Compared as Compared
-from .validate import HeldOut as HeldOut
+from .validate import HeldOutPoses as HeldOutPoses
 from .validate import compare as compare
 from .validate import cross_validate as cross_validate
 from .validate import splits as splits

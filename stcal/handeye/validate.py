@@ -15,7 +15,7 @@ from stcal.handeye.data.views import View, Views, resect
 from stcal.handeye.judge.symmetry import repair
 from stcal.handeye.result import HandEye
 from stcal.handeye.solve import METHODS, HandEyeOptions, handeye
-from stcal.held_out import splits as rows_held_out
+from stcal.held_out import repeated_splits
 from stcal.parallel import one_thread, run_parallel
 
 LEAST_LEFT = 3
@@ -23,7 +23,7 @@ LEAST_LEFT = 3
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class HeldOut:
+class HeldOutPoses:
     """Errors on s times k poses that were held out. One row of an array is one split.
 
     Parameters
@@ -72,7 +72,7 @@ class Compared:
         One of :data:`~stcal.handeye.METHODS`.
     result : HandEye or None
         Of all poses; None where the method fails.
-    held_out : HeldOut or None
+    held_out : HeldOutPoses or None
         Errors on poses that were held out; None where the method fails, or none were.
     reason : str
         Why it fails; empty where it does not.
@@ -80,7 +80,7 @@ class Compared:
 
     method: str
     result: HandEye | None
-    held_out: HeldOut | None
+    held_out: HeldOutPoses | None
     reason: str = ""
 
 
@@ -113,7 +113,7 @@ def splits(count: int, held_out: int | None = None, repeats: int = 15, seed: int
         raise InputError(
             f"cross-validation: {k} of {count} poses held out leave {count - k}, {LEAST_LEFT} needed; take more poses"
         )
-    return rows_held_out(count, k, repeats, np.random.default_rng(seed))
+    return repeated_splits(count, k, repeats, np.random.default_rng(seed))
 
 
 @one_thread()
@@ -126,7 +126,7 @@ def cross_validate(
     rows: np.ndarray | None = None,
     workers: int | None = 1,
     progress: Callable[[int, int], None] | None = None,
-) -> HeldOut:
+) -> HeldOutPoses:
     """Solve without some of the poses and predict these.
 
     Parameters
@@ -142,7 +142,7 @@ def cross_validate(
 
     Returns
     -------
-    HeldOut
+    HeldOutPoses
 
     Raises
     ------
@@ -161,7 +161,7 @@ def cross_validate(
         found[i] = errors
         if progress:
             progress(done, len(jobs))
-    return HeldOut(rows, **{name: np.array([errors[name] for errors in found]) for name in found[0]})
+    return HeldOutPoses(rows, **{name: np.array([errors[name] for errors in found]) for name in found[0]})
 
 
 def _without(pairs: HandEyePoses, setup: Setup, method, views: Views | None, options: HandEyeOptions, out: np.ndarray):
@@ -176,7 +176,7 @@ def _without(pairs: HandEyePoses, setup: Setup, method, views: Views | None, opt
 
 
 def predicted(result: HandEye, pairs: HandEyePoses, views: Views | None) -> dict[str, np.ndarray]:
-    """Errors of :class:`HeldOut` by name, (k,) each, on pairs and views that the result has not seen."""
+    """Errors of :class:`HeldOutPoses` by name, (k,) each, on pairs and views that the result has not seen."""
     scale, loop = result.scale, Loop.of(pairs, result.setup)
     if views is None:
         off = loop.residuals(result.mount_from_camera, result.stand_from_board, scale)

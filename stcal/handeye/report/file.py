@@ -10,7 +10,7 @@ import stcal
 from stcal.handeye.data.loop import FRAMES, Setup
 from stcal.handeye.judge.observability import Observability
 from stcal.handeye.result import HandEye
-from stcal.handeye.validate import Compared, HeldOut
+from stcal.handeye.validate import Compared, HeldOutPoses
 from stcal.io.camera import PARAMETER_NAMES, parameter_names
 from stcal.io.json import Finite, Matrix3, Matrix6, NamedReason, Part, Pose, ResultFile, Vector, Vector3
 
@@ -24,7 +24,7 @@ class Outcome:
     where : str
         What it was made from.
     result : HandEye
-    held_out : HeldOut, optional
+    held_out : HeldOutPoses, optional
         Errors of its method on poses held out.
     compared : tuple of Compared
         Every method, where that was asked for.
@@ -42,7 +42,7 @@ class Outcome:
 
     where: str
     result: HandEye
-    held_out: HeldOut | None = None
+    held_out: HeldOutPoses | None = None
     compared: tuple[Compared, ...] = ()
     pitch_mm: float | None = None
     colmap_model: str = ""
@@ -243,7 +243,7 @@ def _poses(result: HandEye) -> list[PoseRow]:
     return rows
 
 
-def _held_out(found: HeldOut | None, outliers: np.ndarray) -> HeldOutMeans | None:
+def _held_out(found: HeldOutPoses | None, outliers: np.ndarray) -> HeldOutMeans | None:
     if found is None:
         return None
     splits, poses = found.rows.shape
@@ -251,7 +251,7 @@ def _held_out(found: HeldOut | None, outliers: np.ndarray) -> HeldOutMeans | Non
     return HeldOutMeans(splits=splits, poses=poses, **found.means(), agreeing=agreeing)
 
 
-def _splits(found: HeldOut | None, names: tuple[str, ...]) -> list[SplitErrors]:
+def _splits(found: HeldOutPoses | None, names: tuple[str, ...]) -> list[SplitErrors]:
     """Of each split the poses held out, and the errors on each."""
     if found is None:
         return []

@@ -32,7 +32,7 @@ class ErrorFigures:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class HeldOut:
+class HeldOutPoints:
     """Errors |b − b_from_a a| of points that were left out of the fit, by cross-validation.
 
     Parameters
@@ -109,7 +109,7 @@ class Registration:
         Degrees of freedom of the σ that the covariance rests on; infinite where that was given.
     threshold_mm : float or None
         Inliers are nearer than this (a point of the σ above; at the points' middle); None without a threshold.
-    held_out : HeldOut or None
+    held_out : HeldOutPoints or None
         None where not asked for, or with too few points.
     ambiguous : bool
         The alternative is about as good.
@@ -131,7 +131,7 @@ class Registration:
     threshold_mm: float | None
     sigma_factor: float | None = None
     scaled: bool = True
-    held_out: HeldOut | None = None
+    held_out: HeldOutPoints | None = None
     ambiguous: bool = False
     alternative: Alternative | None = None
     notes: tuple[str, ...] = ()

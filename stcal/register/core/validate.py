@@ -6,7 +6,7 @@ import numpy as np
 
 from stcal.held_out import dealt, held_out_errors
 from stcal.register.core.models import Transform
-from stcal.register.core.result import ErrorFigures, HeldOut
+from stcal.register.core.result import ErrorFigures, HeldOutPoints
 
 TRIED = 20_000
 """Of more points a sample is cross-validated: its errors are then known to 1 %."""
@@ -20,7 +20,7 @@ def held_out(
     folds: int,
     least: int,
     seed: int,
-) -> HeldOut | None:
+) -> HeldOutPoints | None:
     """Errors of points left out of the fit in turn.
 
     Parameters
@@ -40,7 +40,7 @@ def held_out(
 
     Returns
     -------
-    HeldOut or None
+    HeldOutPoints or None
         None with too few points for a fit to the others, or where every fold's fit fails.
     """
     rng = np.random.default_rng([seed, 2])
@@ -55,4 +55,4 @@ def held_out(
     done, rows, (error,) = held_out_errors([errors], parts)
     if not done:
         return None
-    return HeldOut(done, rows, error, ErrorFigures.of(error[inliers[rows]]), ErrorFigures.of(error))
+    return HeldOutPoints(done, rows, error, ErrorFigures.of(error[inliers[rows]]), ErrorFigures.of(error))

@@ -10,7 +10,7 @@ from stcal.geometry.affine import Affine
 from stcal.geometry.rigid import Rigid
 from stcal.io.json import Finite, Matrix, Matrix4, Part, Points, Pose, ResultFile, Vector, Vector3
 from stcal.register.core.models import Transform, parts
-from stcal.register.core.result import Alternative, ErrorFigures, HeldOut
+from stcal.register.core.result import Alternative, ErrorFigures, HeldOutPoints
 from stcal.register.workspace.cubes import Cubes
 from stcal.register.workspace.field import Field as ResidualField
 from stcal.register.workspace.findings import Findings
@@ -240,7 +240,7 @@ def _scale(transform: Transform) -> dict[str, Any]:
     return {"scale": transform.scale}
 
 
-def _held_out(held: HeldOut, lines: Sequence[int]) -> HeldOutPart:
+def _held_out(held: HeldOutPoints, lines: Sequence[int]) -> HeldOutPart:
     return HeldOutPart(
         folds=held.folds,
         inliers=MeanRmsMax.model_validate(held.of_inliers),
