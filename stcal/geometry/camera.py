@@ -95,13 +95,12 @@ class Camera:
 
         Parameters
         ----------
-        xy : (..., 2) array
-            Ideal normalised coordinates.
+        xy
+            As of :meth:`distort`, which returns the first.
 
         Returns
         -------
         distorted : (..., 2) array
-            Distorted normalised coordinates.
         jacobian : (..., 2, 2) array
             Their derivative by the ideal ones.
         """

@@ -1,11 +1,34 @@
-"""Poses with covariance, chained: rotation (rad) and translation (mm), left perturbation in the outer frame."""
+"""Poses with covariance, chained: rotation (rad) and translation (mm), left perturbation in the outer frame; how well
+one fits its image."""
 
 from dataclasses import dataclass
 
 import numpy as np
+from scipy.stats import chi2
 
 from stcal.geometry.arrays import Array, freeze
 from stcal.geometry.rigid import Rigid, skew
+
+
+class ImageFit:
+    """What a pose's residuals in an image say."""
+
+    __slots__ = ()
+    residuals_px: np.ndarray
+    chi2: float
+    redundancy: int
+
+    def rms_px(self) -> float:
+        """Of the residuals, per coordinate."""
+        return float(np.sqrt((self.residuals_px**2).mean()))
+
+    def chi2_per_redundancy(self) -> float:
+        """About 1 where the σ of points, target and intrinsics are true."""
+        return self.chi2 / self.redundancy
+
+    def p_value(self) -> float:
+        """Probability of residuals as large, with those σ."""
+        return float(chi2.sf(self.chi2, self.redundancy))
 
 
 @dataclass(frozen=True, slots=True, eq=False)

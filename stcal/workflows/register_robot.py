@@ -19,7 +19,7 @@ from stcal.register.report.file import FiguresRow, HeldOutBoth, MeanRmsMax, Robo
 from stcal.register.report.page import matrix_lines, matrix_rows
 from stcal.register.workspace.findings import Findings
 from stcal.report.page import render
-from stcal.report.text import number
+from stcal.report.text import number, text_table
 from stcal.robot.identify.result import Identified, IdentifyOptions
 from stcal.robot.identify.solve import identify
 from stcal.robot.kinematics.file import load_robot
@@ -145,11 +145,10 @@ def positions(robot: Robot, data: Measurements) -> np.ndarray:
 
 def comparison_text(beside: Comparison) -> str:
     """For the terminal."""
-    lines = [_title(beside), f"{'held out, mm':<52}{'points':>8}{'mean':>10}{'RMS':>10}{'max':>10}"]
-    for name, row in _rows(beside):
-        lines.append(f"{name:<52}" + "".join(f"{cell:>{8 if k == 0 else 10}}" for k, cell in enumerate(row)))
+    heads = ["<held out, mm", "points", "mean", "RMS", "max"]
+    lines = [_title(beside), *text_table([heads, *_rows(beside)], (52, 6, 8, 8, 8))]
     lines += ["b_from_base of the identified robot, mm", *matrix_lines(_b_from_base(beside))]
-    return "\n".join(lines + [f"{note}" for note in _notes(beside)])
+    return "\n".join(lines + _notes(beside))
 
 
 def robot_part(beside: Comparison) -> RobotPart:
@@ -184,7 +183,7 @@ def comparison_section(beside: Comparison) -> tuple[str, str, Markup]:
     content = render(
         "workflows/register_robot.html.jinja",
         title=_title(beside),
-        rows=[[name, *cells] for name, cells in _rows(beside)],
+        rows=_rows(beside),
         matrix=matrix_rows(_b_from_base(beside)),
         notes=_notes(beside),
     )
@@ -198,13 +197,12 @@ def _title(beside: Comparison) -> str:
     )
 
 
-def _rows(beside: Comparison) -> list[tuple[str, list[str]]]:
+def _rows(beside: Comparison) -> list[list[str]]:
     found = []
     for name, transform, kinematics in beside.errors():
         for way, errors in ((f"{beside.model} transform", transform), ("base and kinematics together", kinematics)):
             if len(errors):
-                cells = [str(len(errors)), *(number(v, 4) for _, v in _figures(errors))]
-                found.append((f"{name}: {way}", cells))
+                found.append([f"{name}: {way}", str(len(errors)), *(number(v, 4) for _, v in _figures(errors))])
     return found
 
 

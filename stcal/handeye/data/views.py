@@ -87,7 +87,7 @@ class Resection:
     sigma_px: float
 
 
-def resect(views: Views, names: tuple[str, ...], scale: float = 1.0) -> Resection:
+def resect(views: Views, names: tuple[str, ...]) -> Resection:
     """Pose of the board in each view by itself, of least reprojection error.
 
     Raises
@@ -98,14 +98,13 @@ def resect(views: Views, names: tuple[str, ...], scale: float = 1.0) -> Resectio
     poses, normals, cost = [], [], 0.0
     for view, name in zip(views.views, names, strict=True):
         found = _pose_of(view, views.camera, name)
-        poses.append(Rigid(found.state.rotation, scale * found.state.translation))
+        poses.append(found.state)
         normals.append(found.linear.normal)
         cost += found.linear.cost
-    spare = 2 * views.corners() - 6 * len(views)
-    variance = cost / spare if spare else 1.0
+    redundancy = 2 * views.corners() - 6 * len(views)
+    variance = cost / redundancy if redundancy else 1.0
     covariance = variance * np.linalg.inv(np.array(normals))
-    unit = np.repeat([1.0, scale], 3)
-    return Resection(Poses.of(poses), covariance * unit[:, None] * unit, float(np.sqrt(variance)))
+    return Resection(Poses.of(poses), covariance, float(np.sqrt(variance)))
 
 
 def pairs_of_views(

@@ -113,8 +113,8 @@ def load_layout(path: str | Path) -> TargetLayout:
 
     Parameters
     ----------
-    path : str or Path
-        The TOML file.
+    path
+        As of :func:`load_plan`.
 
     Returns
     -------

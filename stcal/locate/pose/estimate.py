@@ -8,7 +8,6 @@ from functools import partial
 
 import numpy as np
 from scipy.linalg import block_diag
-from scipy.stats import chi2 as chi_square
 
 from stcal.boards.edges import corners_by_edges
 from stcal.errors import DegenerateError
@@ -26,6 +25,7 @@ from stcal.geometry.plane_poses import (
 )
 from stcal.geometry.pose_descent import Minima, PoseStack
 from stcal.geometry.rigid import Poses, Rigid
+from stcal.geometry.uncertain import ImageFit
 from stcal.io.camera import CameraPrior, intrinsic_basis
 from stcal.locate.data.layout import TargetLayout
 from stcal.locate.pose.problem import PlanarProblem, descent_near, project, weighed
@@ -71,7 +71,7 @@ class SeenTags:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class ObjPose:
+class ObjPose(ImageFit):
     """Where the target is in one scene.
 
     Parameters
@@ -114,18 +114,6 @@ class ObjPose:
     extent_px: float
     delta_chi2: float = np.inf
     second: Rigid | None = None
-
-    def rms_px(self) -> float:
-        """Of the residuals, per coordinate."""
-        return float(np.sqrt((self.residuals_px**2).mean()))
-
-    def chi2_per_redundancy(self) -> float:
-        """About 1 where the σ of corners, layout and intrinsics are true."""
-        return self.chi2 / self.redundancy
-
-    def p_value(self) -> float:
-        """Probability of residuals as large, with those σ."""
-        return float(chi_square.sf(self.chi2, self.redundancy))
 
     def sigma_rad(self) -> float:
         """Of the rotation, about the worst axis."""

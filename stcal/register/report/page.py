@@ -95,11 +95,13 @@ def _row_lines(found: Findings) -> list[str]:
         worst = inliers[np.argsort(-length[inliers], kind="stable")][:WORST]
         rows = np.concatenate([result.outliers[:MOST_OUTLIERS], worst])
         title = f"residuals b − b_from_a a of the outliers and of the {len(worst)} largest inliers, mm"
-    lines = [f"{title:<60}{'x':>10}{'y':>10}{'z':>10}{'length':>10}"] if len(rows) else []
+    cells = []
     for row in rows.tolist():
         kind = "inlier" if result.inliers[row] else "OUTLIER"
         values = [*result.residuals[row], length[row]]
-        lines.append(f"  {f'line {found.lines[row]}':<16}{kind:<42}" + "".join(f"{v:10.3f}" for v in values))
+        cells.append([f"  {f'line {found.lines[row]}':<16}{kind}", *(number(v, 3) for v in values)])
+    heads = ["<" + title, "x", "y", "z", "length"]
+    lines = text_table([heads, *cells], (60, *[8] * 4)) if cells else []
     if len(result) > FEW_ROWS and len(result.outliers) > MOST_OUTLIERS:
         lines.append(f"  … and {len(result.outliers) - MOST_OUTLIERS} more outliers; all are in --out and --report")
     return lines
@@ -138,12 +140,9 @@ def _cube_lines(found: Findings) -> list[str]:
         return []
     middle = " ".join(f"{v:.0f}" for v in reach.middle)
     rows = [[f"{e.mean_mm:.3f} / {e.max_mm:.3f}" if e else "–" for e in row] for row in reach.errors]
-    width = max(16, 2 + max(len(cell) for row in [shells(reach), *rows] for cell in row))
-    title = f"errors in cubes about {middle} of a, mean / max, mm"
-    lines = [f"{title:<52}" + "".join(f"{s:>{width}}" for s in shells(reach))]
-    for side, cells in zip(reach.sides_mm, rows, strict=True):
-        lines.append(f"{f'  fitted in the cube of {side:g} mm':<52}" + "".join(f"{c:>{width}}" for c in cells))
-    return [*lines, *holds(reach)]
+    heads = [f"<errors in cubes about {middle} of a, mean / max, mm", *shells(reach)]
+    fits = [[f"  fitted in the cube of {s:g} mm", *row] for s, row in zip(reach.sides_mm, rows, strict=True)]
+    return [*text_table([heads, *fits], (52, *[14] * len(rows))), *holds(reach)]
 
 
 def holds(reach: Cubes) -> list[str]:

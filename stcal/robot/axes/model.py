@@ -147,7 +147,7 @@ def robot_from_sweeps(data: Measurements, nominal: Robot, still_rad: float = STI
     frames = [fit.world_from_axis for fit in fits]
     require_like_nominal(data.where, frames, nominal)
     axes = _chain(frames, nominal)
-    tools, spread = _tools(data, frames[-1], unwound, nominal)
+    tools, spread = _tools(data, frames[-1], unwound)
     robot = robot_from_chain(axes, tools, nominal)
     kept = {name: nominal.tools[name].rotation if name in nominal.tools else np.eye(3) for name in tools}
     robot = replace(robot, tools={n: Rigid(kept[n], t.translation) for n, t in robot.tools.items()})
@@ -233,7 +233,7 @@ def _chain(frames: list[Rigid], nominal: Robot) -> Chain:
     return Chain(rotation, translation, Rigid(), nominal.prismatic, nominal.coupling)
 
 
-def _tools(data: Measurements, last: Rigid, unwound: np.ndarray, nominal: Robot):
+def _tools(data: Measurements, last: Rigid, unwound: np.ndarray):
     """Places of the reflectors in the last joint's frame, from all rows (medians: some may be grossly wrong)."""
     names, tools, spread = np.array(data.targets), {}, {}
     for name in dict.fromkeys(data.targets):

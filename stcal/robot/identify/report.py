@@ -4,7 +4,7 @@ import numpy as np
 
 from stcal.report.figure import COLOURS, calm, new_figure, uri
 from stcal.report.page import render
-from stcal.report.text import NONE, number
+from stcal.report.text import NONE, number, text_table
 from stcal.robot.identify.files import IdentifiedFile
 from stcal.robot.identify.nominal import dh_values
 from stcal.robot.identify.observability import MEANING
@@ -14,6 +14,7 @@ from stcal.robot.kinematics.model import Robot
 DH = ("a", "alpha", "d", "theta", "beta")
 UNITS = ("mm", "deg", "mm", "deg", "deg")
 SHOWN = np.array([1.0, 180 / np.pi, 1.0, 180 / np.pi, 180 / np.pi])
+PLACE = ("x", "y", "z", "rx", "ry", "rz")
 FIRST_OUTLIERS = 10
 
 
@@ -24,23 +25,16 @@ def identified_text(result: Identified, nominal: Robot) -> str:
         f"robot {nominal.name}: {_observations(result)}, {result.rank} parameters determined "
         f"(what these joint values determine: {kinds})",
         _noise(result),
-        "",
-        f"{'error, mm':<34}{'mean':>9}{'RMS':>9}{'max':>9}",
     ]
-    for name, errors in _errors(result).items():
-        mean, rms, largest = _statistics(errors)
-        lines.append(f"{name:<34}{mean:9.4f}{rms:9.4f}{largest:9.4f}")
-    lines += ["", " joint" + "".join(f"{f'{n} {u}':>13}{'±':>9}" for n, u in zip(DH, UNITS, strict=True))]
+    errors = [[name, *(number(v, 4) for v in _statistics(each))] for name, each in _errors(result).items()]
+    rows = [["joint", *(head for n, u in zip(DH, UNITS, strict=True) for head in (f"{n} {u}", "±"))]]
     values, sigma = dh_values(result.robot) * SHOWN, result.dh_sigma * SHOWN
-    for i, (row, s) in enumerate(zip(values, sigma, strict=True), 1):
-        cells = "".join(f"{v:13.4f}{_sigma(e):>9}" for v, e in zip(row, s, strict=True))
-        lines.append(f"{i:>6}{cells}")
-    lines += [
-        "",
-        f"{'mm and rotation vector, deg':<34}" + "".join(f"{c:>11}" for c in ("x", "y", "z", "rx", "ry", "rz")),
-    ]
-    for name, pose in _placed(result.robot).items():
-        lines.append(f"{name:<34}" + "".join(f"{v:11.4f}" for v in pose))
+    for i, each in enumerate(zip(values, sigma, strict=True), 1):
+        rows.append([str(i), *(cell for v, s in zip(*each, strict=True) for cell in (number(v, 4), _sigma(s)))])
+    placed = [[name, *(number(v, 4) for v in pose)] for name, pose in _placed(result.robot).items()]
+    lines += ["", *text_table([["<error, mm", "mean", "RMS", "max"], *errors], (34, *[7] * 3))]
+    lines += ["", *text_table(rows, (6, *[11, 7] * 5))]
+    lines += ["", *text_table([["<mm and rotation vector, deg", *PLACE], *placed], (34, *[9] * 6))]
     indices = result.observability.values()
     lines += ["", "observability  " + "   ".join(f"{name} {value:.3g}" for name, value in indices.items())]
     outliers = result.outliers()

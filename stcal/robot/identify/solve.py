@@ -104,7 +104,7 @@ def identify(robot: Robot, data: Measurements, options: IdentifyOptions | None =
     seen = observed(data, options.observe)
     _still_joints(robot, data, options.partial)
     first = start(robot, data)
-    _enough(robot, seen, first)
+    _enough(seen, first)
     adjusted = _adjusted(robot, first, seen, options)
     solution = adjusted.solution
     names = parameter_names(solution.state, seen.kind)
@@ -140,7 +140,7 @@ def _still_joints(robot: Robot, data: Measurements, partial: bool) -> None:
             )
 
 
-def _enough(robot: Robot, seen: Observed, state: State) -> None:
+def _enough(seen: Observed, state: State) -> None:
     seeks = len(parameter_names(state, seen.kind)) - unseen(seen.kind)
     numbers = WIDTH[seen.kind] * len(seen)
     if numbers <= seeks:

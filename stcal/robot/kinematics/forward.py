@@ -44,12 +44,8 @@ def jacobian(robot: Robot, q: ArrayLike, tool: str = "") -> np.ndarray:
 
     Parameters
     ----------
-    robot : Robot
-        An arm of n joints; where its base stands does not matter.
-    q : (m, n) or (n,) array
-        Values of the controller, rad or mm.
-    tool : str
-        Name of the tool.
+    robot, q, tool
+        As of :func:`forward`.
 
     Returns
     -------

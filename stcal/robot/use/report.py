@@ -27,14 +27,7 @@ def verification_figure(result: Verification):
         size = np.abs(each.error_mm)
         axes.plot(at, size, color=colour, lw=1.1, marker="o" if few else None, ms=2.6, label=label, clip_on=False)
         axes.axhline(each.mean_mm, color=colour, lw=0.9, ls=(0, (5, 4)), alpha=0.8)
-    axes.set_xlim(1, at[-1] + 0.02 * len(at) + 0.5)
-    axes.set_ylim(0, None)
-    calm(axes)
-    axes.grid(axis="y", color=FAINT, lw=0.6)
-    axes.set_axisbelow(True)
-    axes.xaxis.set_major_locator(locator(integer=True))
-    axes.set_xlabel("pose, in order of the file", fontsize=SMALL + 1, color=INK)
-    axes.set_ylabel("|distance error|, mm", fontsize=SMALL + 1, color=INK)
+    _pose_by_pose(axes, (1, at[-1] + 0.02 * len(at) + 0.5), "|distance error|, mm")
     if len(result.sets) <= 4:
         place = {"loc": "lower left", "bbox_to_anchor": (0, 1), "ncols": 2, "borderaxespad": 0.2}
         axes.legend(fontsize=SMALL + 0.5, frameon=False, **place)
@@ -94,15 +87,20 @@ def _before_plot(result: Compensated) -> str:
     axes = figure.add_axes((0.09, 0.18, 0.89, 0.76))
     rows = np.flatnonzero(result.compared())
     axes.vlines(rows + 1, 0, result.before_mm[rows], color=COLOURS[1], lw=max(0.5, min(3, 300 / len(result))))
-    axes.set_xlim(0.2, len(result) + 0.8)
+    _pose_by_pose(axes, (0.2, len(result) + 0.8), "position error, mm")
+    return uri(figure)
+
+
+def _pose_by_pose(axes, limits: tuple[float, float], what: str) -> None:
+    """Axes of an error of each pose."""
+    axes.set_xlim(*limits)
     axes.set_ylim(0, None)
     calm(axes)
     axes.grid(axis="y", color=FAINT, lw=0.6)
     axes.set_axisbelow(True)
     axes.xaxis.set_major_locator(locator(integer=True))
     axes.set_xlabel("pose, in order of the file", fontsize=SMALL + 1, color=INK)
-    axes.set_ylabel("position error, mm", fontsize=SMALL + 1, color=INK)
-    return uri(figure)
+    axes.set_ylabel(what, fontsize=SMALL + 1, color=INK)
 
 
 def _joint_rows(result: Compensated, robot: Robot) -> list[list[str]]:

@@ -13,6 +13,7 @@ import numpy as np
 from stcal.errors import InputError
 from stcal.geometry.arrays import frozen
 from stcal.io.table import Table, read_table
+from stcal.report.text import number, text_table
 from stcal.robot.kinematics.measurements import within
 from stcal.robot.use.files import VerificationFile
 
@@ -220,21 +221,17 @@ def _set_result(data: MeasuredPoses, name: str, rows: np.ndarray) -> SetResult:
 
 def verified_text(result: Verification) -> str:
     """The table for the terminal."""
-    width = max(9, *(len(s.name) for s in result.sets))
+    rows = [["<", "mean mm", "std mm", "max mm", "all pairs RMS mm"]]
+    for k, each in enumerate(result.sets):
+        rows.append([each.name, *(number(v, 4) for v in each.figures().values())])
+        if k:
+            rows.append(["  reduced", *(f"{v:.1f} %" for v in result.reduction(k).values())])
     lines = [
         f"distances of {len(result.poses) - 1} positions from the first (pose {result.poses[0]}), measured against "
         "commanded",
-        f"{'':<{width}} {'mean mm':>10} {'std mm':>10} {'max mm':>10} {'all pairs RMS mm':>17}",
+        *text_table(rows, (9, 10, 10, 10, 17), gap=1),
+        "mean, std, max all carry the error of the first position; the RMS over all pairs depends less on any one",
     ]
-    for k, each in enumerate(result.sets):
-        mean, std, most, pairs = each.figures().values()
-        lines.append(f"{each.name:<{width}} {mean:10.4f} {std:10.4f} {most:10.4f} {pairs:17.4f}")
-        if k:
-            mean, std, most, pairs = (f"{v:.1f} %" for v in result.reduction(k).values())
-            lines.append(f"{'  reduced':<{width}} {mean:>10} {std:>10} {most:>10} {pairs:>17}")
-    lines.append(
-        "mean, std, max all carry the error of the first position; the RMS over all pairs depends less on any one"
-    )
     return "\n".join(lines)
 
 

@@ -10,7 +10,6 @@ from dataclasses import dataclass, replace
 from typing import Literal
 
 import numpy as np
-from scipy.stats import chi2 as chi_square
 
 from stcal.errors import DegenerateError, InputError
 from stcal.geometry.arrays import frozen
@@ -18,6 +17,7 @@ from stcal.geometry.camera import Camera
 from stcal.geometry.plane_poses import MAX_SIGMA_RAD, OUTLIER, deciding_delta, distinct, weigh, weights_of
 from stcal.geometry.pose_descent import Minima, PoseStack, block_diagonal
 from stcal.geometry.rigid import Rigid
+from stcal.geometry.uncertain import ImageFit
 from stcal.io.camera import CameraPrior, intrinsic_basis
 from stcal.labels import CircleLabel, circle_labels, parse_labels
 from stcal.sfm.data.model import Outlier
@@ -57,7 +57,7 @@ class PoseOptions:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class TargetPose:
+class TargetPose(ImageFit):
     """The pose of the target in one image.
 
     ``camera_from_target`` ; ``covariance`` : (6, 6), rad and mm, left perturbation in the camera frame, R' = exp(w) R,
@@ -103,18 +103,6 @@ class TargetPose:
         if self.second is None:
             return self
         return replace(self.second, status="resolved", second=replace(self, second=None))
-
-    def rms_px(self) -> float:
-        """Of the residuals, per coordinate."""
-        return float(np.sqrt((self.residuals_px**2).mean()))
-
-    def chi2_per_redundancy(self) -> float:
-        """About 1 where the σ of centres, target and intrinsics are true."""
-        return self.chi2 / self.redundancy
-
-    def p_value(self) -> float:
-        """Probability of residuals as large, with those σ."""
-        return float(chi_square.sf(self.chi2, self.redundancy))
 
 
 def pose_from_circles(
