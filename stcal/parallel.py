@@ -1,6 +1,7 @@
 """Run one function over many jobs on all cores, and BLAS on one."""
 
 import contextlib
+import itertools
 import multiprocessing
 import os
 import signal
@@ -16,6 +17,13 @@ Progress = Callable[[str, int, int], None]
 ONE_THREAD = ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS", "OPENCV_FOR_THREADS_NUM")
 """Libraries take their number of threads from these when they are loaded; processes side by side need one each."""
 _limited = threading.Lock()
+
+
+def counted(progress: Progress, stage: str, total: int) -> Callable[[object], None]:
+    """Tell ``progress`` that nothing is done, and, at each call of what is returned, that one more is."""
+    done = itertools.count(1)
+    progress(stage, 0, total)
+    return lambda _: progress(stage, next(done), total)
 
 
 @contextlib.contextmanager

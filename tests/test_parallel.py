@@ -7,7 +7,7 @@ import sys
 import numpy as np
 from threadpoolctl import threadpool_info
 
-from stcal.parallel import ONE_THREAD
+from stcal.parallel import ONE_THREAD, counted
 
 UNLIMITED = {name: value for name, value in os.environ.items() if name not in ONE_THREAD}
 
@@ -90,3 +90,11 @@ from tests.test_parallel import threads
 print(*(number for _, found in run_parallel(threads, [(), ()], 2) for number in found))
 """
     assert said_by(code) == ["1", "1"]
+
+
+def test_what_is_done_is_counted():
+    told = []
+    step = counted(lambda *state: told.append(state), "detect", 2)
+    step("a")
+    step("b")
+    assert told == [("detect", 0, 2), ("detect", 1, 2), ("detect", 2, 2)]

@@ -1,6 +1,5 @@
 """``target.toml`` and ``board.toml``: read with every mistake named, and written with comments to edit."""
 
-import json
 from pathlib import Path
 from typing import Annotated
 
@@ -9,7 +8,7 @@ from pydantic import AfterValidator, BeforeValidator, Field
 
 from stcal.design import BoardDesign, FaceDesign, Polarity, TargetDesign, reference_board, reference_target
 from stcal.errors import InputError
-from stcal.io.toml import Finite, Positive, Strict, load_toml
+from stcal.io.toml import Finite, Positive, Strict, load_toml, toml_string
 from stcal.labels import BOARD
 
 REMEDY = "`stcal-sfm init DIR` writes one"
@@ -162,22 +161,22 @@ def target_toml(target: TargetDesign) -> str:
     lines = [
         "# A stereo target: faces with circles. Positions in mm, in any right-handed drawing frame of the face,",
         "# seen from outside with y up. Circle ids are free (no spaces, colons or commas), unique within a face.",
-        f"name = {_string(target.name)}",
+        f"name = {toml_string(target.name)}",
         f'polarity = "{target.polarity}"  # circles are "bright" or "dark" against what surrounds them',
     ]
     for face in target.faces:
         lines += [
             "",
             "[[face]]",
-            f"id = {_string(face.id)}",
+            f"id = {toml_string(face.id)}",
             "# The face frame: origin at one circle, X through a second one, Y on the side of a third, Z outwards.",
-            f"origin = {_string(face.origin)}",
-            f"x = {_string(face.x)}",
-            f"y = {_string(face.y)}",
+            f"origin = {toml_string(face.origin)}",
+            f"x = {toml_string(face.x)}",
+            f"y = {toml_string(face.y)}",
             "circles = [",
         ]
         lines += [
-            f"  {{ id = {_string(circle)}, x_mm = {_number(x)}, y_mm = {_number(y)}, radius_mm = {_number(r)} }},"
+            f"  {{ id = {toml_string(circle)}, x_mm = {_number(x)}, y_mm = {_number(y)}, radius_mm = {_number(r)} }},"
             for circle, (x, y), r in zip(face.ids, face.xy_mm, face.radius_mm, strict=True)
         ]
         lines += ["]"]
@@ -210,11 +209,6 @@ def board_toml(board: BoardDesign) -> str:
         )
         + "\n"
     )
-
-
-def _string(value: str) -> str:
-    # JSON's escapes are TOML's, but JSON leaves DEL as it is.
-    return json.dumps(value, ensure_ascii=False).replace("\x7f", "\\u007f")
 
 
 def _number(value: float) -> str:

@@ -1,5 +1,6 @@
 """TOML files against a pydantic model, with every mistake named by file and place."""
 
+import json
 import tomllib
 from pathlib import Path
 from typing import Annotated, TypeVar
@@ -40,3 +41,9 @@ def load_toml(path: str | Path, model: type[M], what: str, remedy: str) -> M:
         raise InputError(f"{what} {path}: {first_mistake(error)}") from error
     except (ValueError, RecursionError) as error:  # TOMLDecodeError, UnicodeDecodeError, numbers of 5000 digits
         raise InputError(f"{what} {path}: not valid TOML: {error}") from error
+
+
+def toml_string(value: str) -> str:
+    """A text as TOML has it, quoted."""
+    # JSON's escapes are TOML's, but JSON leaves DEL as it is.
+    return json.dumps(value, ensure_ascii=False).replace("\x7f", "\\u007f")

@@ -8,7 +8,7 @@ from stcal.io.camera import CameraModel, camera_prior, read_camera, refinable
 from stcal.io.design import board_of, target_of
 from stcal.io.images import find_images
 from stcal.io.saving import save
-from stcal.parallel import Progress, one_thread
+from stcal.parallel import Progress, counted, one_thread
 from stcal.sfm.adjust.calibration import calibrate
 from stcal.sfm.adjust.chain import measure_chains
 from stcal.sfm.checks.suite import run_checks
@@ -114,14 +114,7 @@ def detect(
 ) -> tuple[DetectionResult, list[LabelledImage]]:
     """Detection, labels, ``detections.csv`` and overlays, into a claimed folder."""
     files, other = find_images(images)
-    done = 0
-
-    def step(_name: str) -> None:
-        nonlocal done
-        done += 1
-        progress("detect", done, len(files))
-
-    progress("detect", 0, len(files))
+    step = counted(progress, "detect", len(files))
     detection = detect_files(files, camera, target, board, options.ellipses, out / "cache", options.workers, step)
     detection = replace(detection, skipped=(*other, *detection.skipped))
     groups: dict[str, list] = {}

@@ -1,9 +1,9 @@
 """A data set with known truth, rendered, calibrated, and the faces against the truth: ``stcal-sfm demo``."""
 
-from collections.abc import Callable
 from functools import partial
 from pathlib import Path
 
+from stcal.parallel import Progress
 from stcal.sfm.pipeline import run
 from stcal.sfm.report.compare import CompareFile, compare
 from stcal.sfm.run.options import RunOptions
@@ -15,7 +15,7 @@ OPTIONS = SceneOptions(seed=1, width=1728, height=1152, images_per_group=5)
 WHAT = "simulated photographs of the reference target: 4 groups of 5 images, 1728×1152 px, at 1 m"
 
 
-def demo(folder: Path, workers: int | None, progress: Callable[[str, int, int], None]) -> tuple[RunResult, CompareFile]:
+def demo(folder: Path, workers: int | None, progress: Progress) -> tuple[RunResult, CompareFile]:
     """The run in ``folder/run`` of the data set in ``folder/data``, and its errors against the truth."""
     data = folder / "data"
     write_dataset(data, make_scene(OPTIONS), workers=workers, progress=partial(progress, "render"))

@@ -9,7 +9,7 @@ import numpy as np
 from stcal.boards.file import REMEDY, TagsFile
 from stcal.errors import InputError
 from stcal.geometry.arrays import frozen
-from stcal.io.toml import load_toml
+from stcal.io.toml import load_toml, toml_string
 
 WHAT = "layout file"
 
@@ -148,7 +148,7 @@ def load_layout(path: str | Path) -> TargetLayout:
 def layout_toml(layout: TargetLayout, comments: Sequence[str] = ()) -> str:
     """The file :func:`load_layout` reads."""
     lines = [f"# {comment}" for comment in comments]
-    lines += ['type = "tags"', f"name = {_quoted(layout.name)}", f"origin = {layout.tags[layout.origin][1]}"]
+    lines += ['type = "tags"', f"name = {toml_string(layout.name)}", f"origin = {layout.tags[layout.origin][1]}"]
     lines += [f"sigma_px = {layout.sigma_px:.6g}", f"tag_sigma_px = {layout.tag_sigma_px:.6g}"]
     lines.append("# Lower triangle; coordinates tag by tag, corner by corner, x before y.")
     rows = (", ".join(f"{v:.6g}" for v in row[: k + 1]) for k, row in enumerate(_finite(layout.covariance_mm2)))
@@ -221,7 +221,3 @@ def _full(lower: list[list[float]], size: int, where: str) -> np.ndarray:
 
 def _finite(matrix: np.ndarray) -> np.ndarray:
     return matrix + 0.0  # no minus before zero
-
-
-def _quoted(text: str) -> str:
-    return '"' + text.replace("\\", "\\\\").replace('"', '\\"') + '"'

@@ -9,7 +9,7 @@ from pydantic import Field
 from stcal.errors import InputError
 from stcal.geometry.rigid import UNIT_WITHIN, Poses, Rigid
 from stcal.io.saving import save
-from stcal.io.toml import Finite, Strict, load_toml
+from stcal.io.toml import Finite, Strict, load_toml, toml_string
 from stcal.robot.kinematics.model import Convention, DHRow, Joint, JointType, Robot
 
 WHAT = "robot file"
@@ -134,7 +134,7 @@ def robot_toml(robot: Robot, comments: Sequence[str] = ()) -> str:
     """
     lines = [f"# {comment}" for comment in comments]
     lines += [
-        f"name = {_text(robot.name)}",
+        f"name = {toml_string(robot.name)}",
         f'convention = "{robot.convention}"  # {_FORM[robot.convention]}; angles in degrees, lengths in mm',
     ]
     if (robot.coupling != np.eye(len(robot.rows))).any():
@@ -156,7 +156,7 @@ def robot_toml(robot: Robot, comments: Sequence[str] = ()) -> str:
     lines += ["", "[tool]  # in the frame of the flange", *_pose_lines(robot.tools.get("", Rigid()))]
     for name, tool in robot.tools.items():
         if name:
-            lines += ["", "[[target]]", f"name = {_text(name)}", *_pose_lines(tool)]
+            lines += ["", "[[target]]", f"name = {toml_string(name)}", *_pose_lines(tool)]
     return "\n".join(lines) + "\n"
 
 
@@ -193,8 +193,3 @@ def _pose_lines(pose: Rigid) -> list[str]:
 
 def _number(value: float) -> str:
     return repr(float(value))
-
-
-def _text(value: str) -> str:
-    escaped = value.replace("\\", "\\\\").replace('"', '\\"').replace("\n", " ")
-    return f'"{escaped}"'

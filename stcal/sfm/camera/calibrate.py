@@ -1,7 +1,7 @@
 """Calibrate a camera from photographs of the dot board, nothing known: the calls in order, and what they found."""
 
 import tempfile
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -12,7 +12,7 @@ from stcal.errors import DegenerateError, DetectionError, InputError
 from stcal.geometry.camera import Camera
 from stcal.io.camera import COLMAP_MODELS, CameraModel
 from stcal.io.images import ImageFile, Skipped, decode, find_images
-from stcal.parallel import one_thread
+from stcal.parallel import Progress, counted, one_thread
 from stcal.sfm.camera.intrinsics import Intrinsics, adjust_intrinsics, model_parameters
 from stcal.sfm.camera.trust import (
     MIN_REACH,
@@ -64,7 +64,7 @@ def calibrate_camera(
     colmap_model: str = "OPENCV",
     ellipses: EllipseOptions | None = None,
     workers: int | None = None,
-    progress: Callable[[str, int, int], None] | None = None,
+    progress: Progress | None = None,
 ) -> CameraCalibration:
     """Intrinsics from a folder of photographs that show the board.
 
@@ -145,14 +145,7 @@ def _detect(
 ) -> DetectionResult:
     # No size: the first readable image has it, and messages should say so.
     model = CameraModel(camera.focal, camera.centre, camera.distortion, colmap_model, None, None, "the images")
-    stage, done = f"detect {rounds}", 0
-
-    def step(_name: str) -> None:
-        nonlocal done
-        done += 1
-        progress(stage, done, len(files))
-
-    progress(stage, 0, len(files))
+    step = counted(progress, f"detect {rounds}", len(files))
     return detect_files(files, model, target, board, ellipses or EllipseOptions(), cache, workers, step)
 
 

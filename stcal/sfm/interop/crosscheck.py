@@ -17,6 +17,7 @@ import pycolmap
 from stcal.errors import InputError, MappingError
 from stcal.geometry.rigid import Rigid
 from stcal.parallel import Progress
+from stcal.report.text import NONE, number, text_table
 from stcal.sfm.adjust.calibration import Calibration, calibrate
 from stcal.sfm.adjust.chain import CalibratedTarget
 from stcal.sfm.adjust.refine import refine
@@ -276,32 +277,28 @@ def _run_rms(run: SavedRun) -> float:
 def comparison_text(check: Crosscheck) -> str:
     """The comparison as a text table."""
     limits, residual, images, cameras = check.tolerances, check.residual_rms_px, check.images, check.mapping.cameras
+    rows = [["face", *("µm", "mdeg") * 3]]
+    for face in check.mapping.faces:
+        cells = [face]
+        for compared in (check.mapping, check.result, check.plain):
+            row = compared.faces.get(face)
+            cells += [number(row.translation_um, 3), number(row.rotation_mdeg, 3)] if row else [NONE, NONE]
+        rows.append(cells)
+    width = max(6, *(len(row[0]) for row in rows))
     lines = [
         f"COLMAP {check.native} (schema {check.schema_}): {images.native} of {images.run} images, residual "
         f"{residual.native:.4f} px RMS",
         f"pycolmap {check.pycolmap}: {images.pycolmap} of {images.run} images, residual "
         f"{residual.pycolmap:.4f} px RMS; the run: {residual.run:.4f} px",
-        f"{'':6} {'native – pycolmap':>19} {'adjusted – faces.json':>23} {'as it is – faces.json':>23}",
-        f"{'face':>6} {'µm':>10} {'mdeg':>8} {'µm':>14} {'mdeg':>8} {'µm':>14} {'mdeg':>8}",
-    ]
-    for face in check.mapping.faces:
-        parts = []
-        for compared, width in ((check.mapping, 10), (check.result, 14), (check.plain, 14)):
-            row = compared.faces.get(face)
-            parts.append(
-                f"{row.translation_um:{width}.3f} {row.rotation_mdeg:8.3f}" if row else f"{'–':>{width}} {'–':>8}"
-            )
-        lines.append(f"{face:>6} {' '.join(parts)}")
-    lines.append(
+        f"{'':{width}} {'native – pycolmap':>19} {'adjusted – faces.json':>23} {'as it is – faces.json':>23}",
+        *text_table(rows, least=(6, 10, 8, 14, 8, 14, 8), gap=1),
         f"largest between the two programs: circles {max(check.mapping.circles_um.values(), default=0.0):.3f} µm, "
         f"cameras {max((c.position_um for c in cameras), default=0.0):.2f} µm and "
-        f"{max((c.rotation_mdeg for c in cameras), default=0.0):.3f} mdeg"
-    )
-    lines.append(
+        f"{max((c.rotation_mdeg for c in cameras), default=0.0):.3f} mdeg",
         f"allowed: faces {limits.face_um:g} µm and {limits.face_mdeg:g} mdeg, circles {limits.circle_um:g} "
         f"µm, cameras {limits.camera_um:g} µm and {limits.camera_mdeg:g} mdeg: "
-        f"{'exceeded' if check.differences else 'they agree'}"
-    )
+        f"{'exceeded' if check.differences else 'they agree'}",
+    ]
     return "\n".join([*check.notes, *lines])
 
 

@@ -1,5 +1,6 @@
 """What went to and came from other programs, in a few lines for the terminal."""
 
+from stcal.report.text import number, text_table
 from stcal.sfm.adjust.calibration import Calibration
 from stcal.sfm.interop.crosscheck import face_differences
 from stcal.sfm.interop.export_database import Exported
@@ -42,10 +43,9 @@ def faces_text(calibration: Calibration, run: SavedRun) -> str:
             f"per unit, board within {1e3 * scale.rms_mm():.1f} µm RMS"
         )
     difference = face_differences(calibration.target, run)
-    lines.append(f"{'face':>6} {'x':>11} {'y':>11} {'z':>11} mm   against the run: µm     mdeg")
+    rows = [["face", "x", "y", "z", "mm   against the run: µm", "mdeg"]]
     for face_id, pose in calibration.target.target_from_face.items():
-        x, y, z = pose.translation
         row = difference.get(face_id)
-        beside = f"{row.translation_um:22.2f} {row.rotation_mdeg:8.3f}" if row else f"{'not in the run':>31}"
-        lines.append(f"{face_id:>6} {x:11.4f} {y:11.4f} {z:11.4f}   {beside}")
-    return "\n".join(lines)
+        beside = [number(row.translation_um, 2), number(row.rotation_mdeg, 3)] if row else ["not in the run", ""]
+        rows.append([face_id, *(number(x, 4) for x in pose.translation), *beside])
+    return "\n".join([*lines, *text_table(rows, least=(6, 11, 11, 11, 24, 8), gap=1)])

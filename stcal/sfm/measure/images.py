@@ -3,7 +3,7 @@
 import csv
 import io
 import tempfile
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
@@ -17,7 +17,7 @@ from stcal.geometry.rigid import Rigid
 from stcal.io.camera import CameraModel, CameraPrior
 from stcal.io.images import Skipped, find_images
 from stcal.io.table import COVARIANCE, POSE, Table, common_columns, pose_cells
-from stcal.parallel import one_thread
+from stcal.parallel import Progress, counted, one_thread
 from stcal.sfm.data.observations import ImageObservations, by_group
 from stcal.sfm.detect.ellipses import EllipseOptions
 from stcal.sfm.detect.files import DetectedImage, detect_files
@@ -94,7 +94,7 @@ def measure(
     design: TargetDesign,
     board: BoardDesign | None = None,
     options: MeasureOptions | None = None,
-    progress: Callable[[str, int, int], None] | None = None,
+    progress: Progress | None = None,
 ) -> MeasureResult:
     """Pose of a calibrated target in each image of a folder and of its subfolders.
 
@@ -133,14 +133,7 @@ def measure(
     """
     options, progress = options or MeasureOptions(), progress or (lambda *_: None)
     files, other = find_images(images)
-    done = 0
-
-    def step(_name: str) -> None:
-        nonlocal done
-        done += 1
-        progress("detect", done, len(files))
-
-    progress("detect", 0, len(files))
+    step = counted(progress, "detect", len(files))
     with tempfile.TemporaryDirectory(prefix="stcal-measure-") as scratch:
         detection = detect_files(files, camera, design, board, options.ellipses, Path(scratch), options.workers, step)
     observations, notes = _labelled(detection.images, design, board)

@@ -1,6 +1,6 @@
 """After a run: which further photographs would make its worst face better, and when only a better board would."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from itertools import combinations
 
@@ -10,7 +10,7 @@ from stcal.errors import DegenerateError
 from stcal.geometry.rigid import Rigid
 from stcal.io.camera import camera_prior
 from stcal.labels import circle_labels
-from stcal.parallel import one_thread
+from stcal.parallel import Progress, one_thread
 from stcal.sfm.adjust.calibration import with_sigma
 from stcal.sfm.adjust.chain import CalibratedTarget
 from stcal.sfm.adjust.joint import JointResult, adjust_jointly
@@ -127,7 +127,7 @@ def doubts(run: SavedRun) -> str:
 
 
 @one_thread()
-def advise(known: Known, count: int = 5, progress: Callable[[str, int, int], None] | None = None) -> Advice:
+def advise(known: Known, count: int = 5, progress: Progress | None = None) -> Advice:
     """The views that, taken one after the other, lower the σ of the worst face most, and new groups of as many images.
 
     Parameters

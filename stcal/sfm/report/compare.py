@@ -13,6 +13,7 @@ from stcal.geometry.align import align_rigid
 from stcal.geometry.rigid import Rigid
 from stcal.io.json import ByFace, Matrix6, Part, Pose, ResultFile, Vector3, read_result
 from stcal.labels import BOARD, CircleLabel, DotLabel, parse_label, parse_labels
+from stcal.report.text import number, text_table
 from stcal.synthetic.truth import TrueGroup, TrueImage, Truth
 
 FACES = "faces.json"
@@ -198,16 +199,16 @@ def _face(face_id: str, found: Answer, known: Truth) -> FaceErrors:
 
 def comparison_table(comparison: CompareFile) -> str:
     """The comparison as a text table."""
-    lines = [
-        f"{'face':>6} {'position':>10} {'rotation':>10} {'circles':>10} {'worst':>8} {'of':>4}  error / σ",
-        f"{'':>6} {'µm':>10} {'mdeg':>10} {'mean µm':>10} {'µm':>8}",
+    rows = [
+        ["face", "position", "rotation", "circles", "worst", "of", "error / σ"],
+        ["", "µm", "mdeg", "mean µm", "µm", "", ""],
     ]
     for face_id, row in comparison.faces.items():
-        figures = row.circles_mean_um, row.circles_max_um, row.normalised_error
-        mean, worst, ratio = ("–" if value is None else f"{value:.2f}" for value in figures)
-        place = "reference" if face_id == comparison.reference_face else f"{row.translation_um:.1f}"
-        turn = "" if face_id == comparison.reference_face else f"{row.rotation_mdeg:.2f}"
-        lines.append(f"{face_id:>6} {place:>10} {turn:>10} {mean:>10} {worst:>8} {row.circles:>4}  {ratio:>9}")
+        pose = [number(row.translation_um, 1), number(row.rotation_mdeg, 2)]
+        circles = [number(row.circles_mean_um, 2), number(row.circles_max_um, 2), str(row.circles)]
+        pose = ["reference", ""] if face_id == comparison.reference_face else pose
+        rows.append([face_id, *pose, *circles, number(row.normalised_error, 2)])
+    lines = text_table(rows, least=(6, 10, 10, 10, 8, 4, 10), gap=1)
     if n := comparison.labels:
         lines.append(f"labels: {n.wrong} wrong; {n.found} of {n.visible} visible circles found")
     if comparison.missing:
