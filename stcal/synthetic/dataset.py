@@ -10,7 +10,7 @@ from stcal.io.design import board_toml, target_toml
 from stcal.parallel import run_parallel
 from stcal.synthetic.render import RenderOptions, encode, render
 from stcal.synthetic.scene import Scene
-from stcal.synthetic.truth import Truth, image_name
+from stcal.synthetic.truth import TruthFile, image_name
 
 IMAGE_FORMATS = ("jpg", "png")
 
@@ -57,7 +57,7 @@ def write_dataset(
     if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
         raise InputError(f"data set folder {folder}: exists and is not empty; give a new or an empty folder")
     try:
-        truth = json.dumps(Truth.of(scene, image_format).content())
+        truth = json.dumps(TruthFile.of(scene, image_format).content())
         for group in scene.groups:
             (folder / "images" / group).mkdir(parents=True, exist_ok=True)
         write_cameras_txt(folder / "cameras.txt", scene.camera)

@@ -33,7 +33,7 @@ class TrueGroup(Part):
     images: dict[ByImage, TrueImage] = Field(description="`group/file` → what it shows")
 
 
-class Truth(ResultFile):
+class TruthFile(ResultFile):
     """mm, target frame, pixels from the centre of the top-left pixel; ``faces.json`` of another run will do."""
 
     format: Literal["stcal truth 1", "stcal faces 1"] = Field(
@@ -46,7 +46,7 @@ class Truth(ResultFile):
     groups: dict[ByGroup, TrueGroup] | None = Field(None, description="by folder of `images`")
 
     @classmethod
-    def of(cls, scene: Scene, image_format: str = "jpg") -> "Truth":
+    def of(cls, scene: Scene, image_format: str = "jpg") -> "TruthFile":
         """The truth of a scene, its images named as :func:`image_name` does."""
         return cls(
             unit="mm",

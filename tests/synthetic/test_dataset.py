@@ -12,7 +12,7 @@ from stcal.io.design import load_board, load_target
 from stcal.synthetic.dataset import write_dataset
 from stcal.synthetic.render import RenderOptions, render
 from stcal.synthetic.scene import SceneOptions, make_scene, second_design
-from stcal.synthetic.truth import Truth
+from stcal.synthetic.truth import TruthFile
 
 OPTIONS = SceneOptions(seed=5, width=324, height=216, images_per_group=2)
 
@@ -36,7 +36,10 @@ def _keys(value):
 @pytest.mark.parametrize("name", ["sample", "clean", "clutter"])
 def test_truth_has_the_form_of_the_rendered_sets(scene, sample, shared_data, name):
     folder = sample if name == "sample" else shared_data(f"stereo_target/{name}")
-    shared, ours = json.loads((folder / "truth.json").read_text()), json.loads(json.dumps(Truth.of(scene).content()))
+    shared, ours = (
+        json.loads((folder / "truth.json").read_text()),
+        json.loads(json.dumps(TruthFile.of(scene).content())),
+    )
     assert _keys(ours) == _keys(shared)
     assert list(ours["circles"]) == list(shared["circles"])
     assert list(ours["target_from_face"]) == list(shared["target_from_face"])
@@ -45,7 +48,7 @@ def test_truth_has_the_form_of_the_rendered_sets(scene, sample, shared_data, nam
 
 
 def test_truth_predicts_its_own_pixels(scene):
-    data = Truth.of(scene).content()
+    data = TruthFile.of(scene).content()
     name, image = next(iter(data["groups"]["15"]["images"].items()))
     assert name == "15/IMG_1000.jpg"
     camera_from_target = np.array(image["camera_from_target"])
@@ -86,7 +89,7 @@ def test_data_set_on_disk(tmp_path):
         assert read.ids == made.ids
         np.testing.assert_allclose(read.xy_mm, made.xy_mm, atol=1e-8)
     assert (board.corner, board.corner_radius_mm, board.columns) == ((0, 7), 7.5, 8)
-    assert json.loads((folder / "truth.json").read_text()) == Truth.of(scene).content()
+    assert json.loads((folder / "truth.json").read_text()) == TruthFile.of(scene).content()
 
 
 def test_png_holds_the_image_exactly(tmp_path):

@@ -14,7 +14,7 @@ from stcal.geometry.rigid import Rigid
 from stcal.io.json import ByFace, Matrix6, Part, Pose, ResultFile, Vector3, read_result
 from stcal.labels import BOARD, CircleLabel, DotLabel, parse_label, parse_labels
 from stcal.report.text import number, text_table
-from stcal.synthetic.truth import TrueGroup, TrueImage, Truth
+from stcal.synthetic.truth import TrueGroup, TrueImage, TruthFile
 
 FACES = "faces.json"
 DETECTIONS = "detections.csv"
@@ -89,7 +89,7 @@ def compare(run: str | Path, truth: str | Path) -> CompareFile:
     """
     run = Path(run)
     found = read_result(run / FACES if run.is_dir() else run, Answer, "run", REMEDY)
-    known = read_result(truth, Truth, "truth", REMEDY)
+    known = read_result(truth, TruthFile, "truth", REMEDY)
     if found.reference_face != known.reference_face:
         raise InputError(
             f"reference face {found.reference_face} in the run, {known.reference_face} in the truth; "
@@ -166,7 +166,7 @@ def _count(measured: dict, images: dict[str, TrueImage], numbers: np.ndarray) ->
     return wrong, found, visible
 
 
-def _face(face_id: str, found: Answer, known: Truth) -> FaceErrors:
+def _face(face_id: str, found: Answer, known: TruthFile) -> FaceErrors:
     estimate, true = (Rigid.from_matrix(each.target_from_face[face_id]) for each in (found, known))
     labels = [label for label in parse_labels(known.circles) if label.plane == face_id and label in found.circles]
     a, b = (np.array([each.circles[label] for label in labels]).reshape(-1, 3) for each in (known, found))
