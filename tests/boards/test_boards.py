@@ -24,8 +24,11 @@ def turn(degrees: float) -> np.ndarray:
     return about @ np.array([[c, -s, 0], [s, c, 0], [0, 0, 1]]) @ np.linalg.inv(about) @ IMAGE_FROM_MM
 
 
-@pytest.mark.parametrize(("rows", "columns"), [(5, 8), (6, 7), (7, 7), (6, 6), (6, 8)])
-@pytest.mark.parametrize("degrees", [0, 170, *(pytest.param(d, marks=pytest.mark.slow) for d in (90, -100))])
+@pytest.mark.parametrize(
+    ("rows", "columns"),
+    [(5, 8), (6, 6), *(pytest.param(*size, marks=pytest.mark.slow) for size in ((6, 7), (7, 7), (6, 8)))],
+)
+@pytest.mark.parametrize("degrees", [170, *(pytest.param(d, marks=pytest.mark.slow) for d in (0, 90, -100))])
 def test_chessboard_corners_are_numbered(rows, columns, degrees):
     board = ChessboardDesign(rows, columns, 20.0)
     sheet, first = chessboard_mm(rows, columns, 20.0)

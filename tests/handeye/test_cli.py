@@ -62,7 +62,7 @@ CHANCE = 5.8
 """Squared, over 6: F with 6 and 70 degrees of freedom (σ come from a dozen poses) exceeds it once in 10 000 times."""
 
 
-@pytest.mark.parametrize("setup", ["eye-in-hand", "eye-to-hand"])
+@pytest.mark.parametrize("setup", ["eye-in-hand", pytest.param("eye-to-hand", marks=pytest.mark.slow)])
 def test_a_file_of_poses(command, tmp_path, setup):
     truth = simulated(np.random.default_rng(5), 20, setup, **NOISE)
     source, out = poses_file(tmp_path / "poses.csv", truth), tmp_path / "deep" / "handeye.json"
@@ -265,6 +265,7 @@ def test_images_of_a_symmetric_chessboard(command, chessboard, tmp_path):
         assert f"written: {path}" in shown
 
 
+@pytest.mark.slow
 def test_images_of_dots_whose_size_is_wrong(command, tmp_path):
     """Dots drawn with a pitch of 20 mm; the file says 25, and radii as much too large."""
     true = BoardDesign(6, 8, 20.0, 6.0, "dark", 0.0, (0, 0), 9.0)
@@ -374,6 +375,7 @@ def test_methods_without_splits_are_compared_without_errors(command, tmp_path):
     assert "held out" not in shown.split("Methods")[0]
 
 
+@pytest.mark.slow
 def test_errors_of_the_poses_that_agree_are_told_apart(command, tmp_path):
     def edit(rows):
         rows[6][0] = repr(float(rows[6][0]) + 15)

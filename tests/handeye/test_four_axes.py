@@ -38,6 +38,7 @@ def test_four_axes_give_all_but_one_number():
         handeye(pairs, "eye-to-hand", "park-martin", options=HandEyeOptions(four_dof=True))
 
 
+@pytest.mark.slow
 def test_four_axes_are_true_to_their_covariance():
     """40 trials of the 5 numbers that are found."""
     found = [

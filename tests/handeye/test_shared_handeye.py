@@ -40,6 +40,7 @@ def charuco(shared_data):
     return pairs_of_views(flange, views, tuple(f"{i}.png" for i in range(16))), views, prior
 
 
+@pytest.mark.slow
 def test_held_out_error_at_the_board(charuco):
     pairs, views, prior = charuco
     rows = splits(16, 5, 15)

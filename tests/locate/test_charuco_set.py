@@ -69,6 +69,7 @@ def test_subsets_are_right_or_not_accepted(images, held_out, size, accepted):
         assert np.mean([trial.error_mm for trial in used]) < 1.5
 
 
+@pytest.mark.slow
 def test_a_scene_takes_little_longer_than_its_decoding(folder, images, tmp_path):
     layout = half_calibrated(images, PLAN, range(16)).layout
     photograph = cv2.imread(str(folder / "images" / images.names[5]), cv2.IMREAD_GRAYSCALE)
@@ -91,6 +92,7 @@ def test_a_scene_takes_little_longer_than_its_decoding(folder, images, tmp_path)
     assert min(ratios[1:]) < 2 * 3
 
 
+@pytest.mark.slow
 def test_exposures_together_see_more(folder, images):
     """Light (simulated) that falls off by eight stops over the target, as from sun to shade, and a spot of glare."""
     layout = half_calibrated(images, PLAN, range(16)).layout

@@ -48,6 +48,7 @@ def test_rigid_registration_holds_to_a_centimetre_and_affine_to_metres(script, d
     assert min(affine.values()) > 2000
 
 
+@pytest.mark.slow
 def test_kinematics_of_one_station_serve_another(script, data):
     """Identified where the floor is flat, used where it is not: the error falls to below 70 %."""
     _, stations, robot = data

@@ -3,12 +3,13 @@
 import shutil
 import sys
 from dataclasses import dataclass, replace
+from importlib import import_module
 from pathlib import Path
 
 import pytest
 
 from stcal.cli.main import main_sfm
-from stcal.sfm.pipeline import RunOptions, run
+from stcal.sfm.pipeline import RunOptions, RunResult, run
 from stcal.synthetic.dataset import write_dataset
 from stcal.synthetic.scene import Scene, SceneOptions, make_scene
 
@@ -30,12 +31,18 @@ def small_dataset(small_scene, tmp_path_factory) -> Path:
 
 
 @pytest.fixture(scope="session")
-def small_run(small_dataset, tmp_path_factory) -> Path:
-    """A finished run of ``small_dataset``. Not to be written to."""
+def small_result(small_dataset, tmp_path_factory) -> RunResult:
+    """Of a run of ``small_dataset``; its folder is ``small_run``."""
     out = tmp_path_factory.mktemp("small_run") / "run"
     data = small_dataset
-    run(data / "images", data / "cameras.txt", out, data / "target.toml", data / "board.toml", RunOptions(workers=1))
-    return out
+    files = [data / name for name in ("target.toml", "board.toml")]
+    return run(data / "images", data / "cameras.txt", out, *files, RunOptions(workers=1))
+
+
+@pytest.fixture(scope="session")
+def small_run(small_result) -> Path:
+    """A finished run of ``small_dataset``. Not to be written to."""
+    return small_result.out
 
 
 @pytest.fixture(scope="session")
@@ -89,6 +96,12 @@ def small_set(small_dataset, small_run, tmp_path):
         return own
 
     return copy
+
+
+@pytest.fixture
+def no_page(monkeypatch):
+    """For those who do not read the report's page, which takes half of a small run's time."""
+    monkeypatch.setattr(import_module("stcal.sfm.run.folder"), "report_html", lambda *_: "")
 
 
 @pytest.fixture

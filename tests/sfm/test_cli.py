@@ -43,12 +43,25 @@ def test_the_umbrella_command_is_the_same_thing(command, tmp_path):
     assert out.strip().count(".") == 2
 
 
+def test_simulate_and_compare(command, small_dataset, small_run, tmp_path):
+    code, text, _ = command("simulate", tmp_path, "--width", 324, "--images", 2, "--second-design", "--workers", 1)
+    assert code == 0
+    assert "6 images in 3 groups" in text
+    code, text, _ = command("compare", small_run, small_dataset / "truth.json", "--json", tmp_path / "errors.json")
+    assert code == 0
+    assert "2" in text
+    assert 0 < json.loads((tmp_path / "errors.json").read_text())["worst"]["translation_um"] < 60
+
+
+@pytest.mark.slow
 def test_simulate_detect_run_compare(command, tmp_path):
-    data, out = tmp_path / "data", tmp_path / "run"
-    code, text, _ = command("simulate", data, "--width", 1296, "--images", 3, "--second-design", "--seed", 2, "--png")
+    data, out, one = tmp_path / "data", tmp_path / "run", ("--workers", 1)
+    code, text, _ = command(
+        "simulate", data, "--width", 1296, "--images", 3, "--second-design", "--seed", 2, "--png", *one
+    )
     assert code == 0
     assert "9 images in 3 groups" in text
-    files = ["--camera", data / "cameras.txt", "--target", data / "target.toml", "--board", data / "board.toml"]
+    files = [*one, "--camera", data / "cameras.txt", "--target", data / "target.toml", "--board", data / "board.toml"]
     code, text, _ = command("detect", data / "images", *files, "--out", tmp_path / "detect")
     assert code == 0
     assert (tmp_path / "detect" / "overlays" / "top-left" / "IMG_1000.png.jpg").stat().st_size > 10_000
@@ -73,6 +86,7 @@ def test_simulate_detect_run_compare(command, tmp_path):
     assert json.loads((out / "faces.json").read_text()) == faces
 
 
+@pytest.mark.slow
 def test_the_demo_ends_within_its_own_sigma(command, tmp_path):
     code, text, _ = command("demo", "--out", tmp_path / "demo")
     assert code == 0

@@ -28,18 +28,20 @@ def calibrated(tmp_path_factory):
     write_dataset(folder / "data", scene, RenderOptions(clutter=True, seed=11))
     data = folder / "data"
     result = run(data / "images", data / "cameras.txt", folder / "run", data / "target.toml", data / "board.toml")
-    return scene, data, result
+    return data, result
 
 
+@pytest.mark.slow
 def test_cluttered_photographs_are_labelled_without_a_mistake(calibrated):
-    _, data, result = calibrated
+    data, result = calibrated
     labels = compare(result.out, data / "truth.json").content()["labels"]
     assert labels["wrong"] == 0
     assert labels["found"] / labels["visible"] >= 0.97
 
 
+@pytest.mark.slow
 def test_errors_are_those_that_sigma_predicts(calibrated):
-    _, data, result = calibrated
+    data, result = calibrated
     faces = compare(result.out, data / "truth.json").content()["faces"]
     assert set(faces) == {"1", "2", "3", "4", "5"}
     for face_id in ("2", "3", "4", "5"):
@@ -49,9 +51,8 @@ def test_errors_are_those_that_sigma_predicts(calibrated):
     assert result.calibration.joint.sigma0 == pytest.approx(1.0, abs=0.15)
 
 
-def test_every_promised_file_is_there_and_agrees(calibrated):
-    _, _, result = calibrated
-    out = result.out
+def test_every_promised_file_is_there_and_agrees(small_result):
+    result, out = small_result, small_result.out
     faces = json.loads((out / "faces.json").read_text())
     for face_id, pose in result.target.target_from_face.items():
         np.testing.assert_array_equal(faces["target_from_face"][face_id], pose.matrix())
@@ -61,16 +62,16 @@ def test_every_promised_file_is_there_and_agrees(calibrated):
     assert list(rows[0]) == ["image", "label", "x_px", "y_px", "sigma_px"]
     assert len(rows) == sum(len(o) for o in result.observations())
     report = json.loads((out / "report.json").read_text())
-    assert report["summary"]["images_mapped"] == 16
+    assert report["summary"]["images_mapped"] == 8
     assert len(report["groups"][0]["pairs"]) == 6
     assert (out / "report.html").stat().st_size > 100_000
-    assert {p.name for p in (out / "models").iterdir()} == {"12", "14", "15", "23"}
+    assert {p.name for p in (out / "models").iterdir()} == {"12", "14"}
     assert not list(out.rglob("*.partial"))
     assert not (out / "scratch").exists()
 
 
-def test_the_database_holds_corrected_centres_and_the_file_beside_it_both(calibrated):
-    scene, _, result = calibrated
+def test_the_database_holds_corrected_centres_and_the_file_beside_it_both(small_result):
+    result = small_result
     with open(result.out / "labels.csv", newline="") as stream:
         rows = list(csv.DictReader(stream))
     moved = [
@@ -83,12 +84,12 @@ def test_the_database_holds_corrected_centres_and_the_file_beside_it_both(calibr
             stored = from_colmap_px(database.read_keypoints(int(r["image_id"]))[int(r["keypoint"]), :2])
             corrected = [float(r["corrected_x_px"]), float(r["corrected_y_px"])]
             assert np.abs(stored - corrected).max() < 1.3e-4  # float32 near 2000 px
-    assert scene.camera.width == 1944
+    assert result.camera.width == 1296
 
 
-def test_any_colmap_makes_an_unbiased_model_of_the_database(calibrated, tmp_path):
+def test_any_colmap_makes_an_unbiased_model_of_the_database(small_result, tmp_path):
     """Mapped again from the file alone, without any correction: the board keeps its shape and the faces their place."""
-    _, _, result = calibrated
+    result = small_result
     observations = result.observations()
     ids = image_ids(observations)
     group = [o for o in observations if o.group == "12"]
@@ -111,8 +112,8 @@ def test_any_colmap_makes_an_unbiased_model_of_the_database(calibrated, tmp_path
     assert distances[0] == pytest.approx(distances[1], abs=2e-4)  # float32 keypoints; the bias would be 0.05 mm
 
 
-def test_options_that_do_not_exist_are_refused(calibrated, tmp_path):
-    _, data, _ = calibrated
+def test_options_that_do_not_exist_are_refused(small_dataset, tmp_path):
+    data = small_dataset
     with pytest.raises(InputError, match="solve 'both': not a choice; use joint or chain"):
         run(data / "images", data / "cameras.txt", tmp_path / "x", options=RunOptions(solve="both"))
     assert not (tmp_path / "x").exists()

@@ -77,6 +77,7 @@ def test_all_visible_circles_are_found_and_none_is_wrong(calibrated, sample, tru
     assert labels["visible"] > 900
 
 
+@pytest.mark.slow
 def test_poses_of_the_target_are_as_far_off_as_they_say(calibrated, sample, truth, tmp_path):
     """Measured in the same photographs with the faces just found; board dots are told apart by the board's file."""
     out, _ = calibrated

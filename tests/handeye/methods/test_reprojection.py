@@ -32,8 +32,14 @@ def normalised(errors, covariances):
     return float(np.sqrt(np.mean([e @ np.linalg.solve(c, e) for e, c in zip(errors, covariances, strict=True)]) / 6))
 
 
-@pytest.mark.parametrize("setup", SETUPS)
-@pytest.mark.parametrize("method", ["pose", "reprojection"])
+@pytest.mark.parametrize(
+    ("method", "setup"),
+    [
+        *(("pose", setup) for setup in SETUPS),
+        ("reprojection", "eye-to-hand"),
+        pytest.param("reprojection", "eye-in-hand", marks=pytest.mark.slow),
+    ],
+)
 def test_the_size_of_the_board_is_found(setup, method):
     """A board of 0.8 of its stated size: first doubted, then solved for to within 4 σ."""
     truth = simulated_views(np.random.default_rng(4), 12, setup, (2e-4, 0.05), 0.1, 0.01, scale=0.8)
@@ -69,8 +75,10 @@ def test_derivatives_of_the_corners(setup):
             assert np.abs(slope - numeric).max() <= 1e-5 * max(np.abs(slope).max(), 1)
 
 
-@pytest.mark.parametrize("count", [5, pytest.param(20, marks=pytest.mark.slow)])
-@pytest.mark.parametrize("setup", SETUPS)
+@pytest.mark.parametrize(
+    ("setup", "count"),
+    [("eye-in-hand", 5), *(pytest.param(setup, 20, marks=pytest.mark.slow) for setup in SETUPS)],
+)
 def test_reprojection_knows_its_error(setup, count):
     """20 trials of 6 numbers scatter by 1/√240 = 6.5 %; σ of 12 robot poses by 1/√(2·20·30) = 3 %, and it is
     stated larger by 1/30 for caution."""
@@ -86,6 +94,7 @@ def test_reprojection_knows_its_error(setup, count):
     assert np.sqrt((np.array(sigma) ** 2).mean(0)) == pytest.approx([0.1, 3e-4, 0.1, 0.03], rel=0.15 * wider)
 
 
+@pytest.mark.slow
 def test_reprojection_beats_poses_where_the_board_is_rough():
     """Corners 0.3 mm off make every pose of the board wrong alike: only the joint adjustment can tell. By 5 trials."""
     squared = {"pose": [], "reprojection": []}

@@ -53,6 +53,7 @@ def squared(result: CalibratedLayout) -> float:
     return float(((vector.T @ off)[known] ** 2 / value[known]).mean())
 
 
+@pytest.mark.slow
 def test_corners_come_back_with_true_sigma():
     """Mean over 12 calibrations of 45 squares each: σ 0.06; the variances that are estimated with them add a little."""
     results = [calibrate(PLAN, *views(10, seed), CAMERA) for seed in range(12)]
@@ -63,6 +64,7 @@ def test_corners_come_back_with_true_sigma():
     assert np.mean([r.adjusted.sigma_px for r in results]) < 0.05
 
 
+@pytest.mark.slow
 def test_the_adjustment_is_better_than_the_published_way():
     ours, theirs = [], []
     for seed in range(12):

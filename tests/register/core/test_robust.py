@@ -27,7 +27,7 @@ def cost_ratio(s, found) -> float:
     return ((b - found.b_from_a @ a) ** 2).sum() / ((b - align_rigid(b, a) @ a) ** 2).sum()
 
 
-@pytest.mark.parametrize("share", [0, 0.1, 0.2, 0.3, 0.4])
+@pytest.mark.parametrize("share", [0, 0.2, 0.4, *(pytest.param(x, marks=pytest.mark.slow) for x in (0.1, 0.3))])
 @pytest.mark.parametrize("n", [20, 100])
 def test_within_one_per_cent_of_the_optimum_of_the_clean_points(n, share):
     for trial in range(6):
@@ -39,6 +39,7 @@ def test_within_one_per_cent_of_the_optimum_of_the_clean_points(n, share):
         assert (found.inliers[s.clean]).mean() > 0.9
 
 
+@pytest.mark.slow
 def test_clean_points_are_kept():
     """One set in a thousand may lose a point: of 80 more than 2 would with a chance of 1e-4."""
     lost = sum(not register(s.xyz_a, s.xyz_b, folds=0).inliers.all() for s in (scene([i, 7], 12) for i in range(80)))
@@ -73,7 +74,7 @@ def test_more_wrong_than_right_is_said():
 
 
 @pytest.mark.parametrize("kind", ["one shift", "other motion"])
-@pytest.mark.parametrize("share", [0.4, 0.5, 0.6])
+@pytest.mark.parametrize("share", [0.5, *(pytest.param(x, marks=pytest.mark.slow) for x in (0.4, 0.6))])
 def test_two_transforms_are_refused_or_told(kind, share):
     for trial in range(4):
         s = scene([trial, 11], 40, share, kind)
@@ -119,6 +120,7 @@ def test_noise_along_one_axis_is_not_two_groups():
         assert register(s.xyz_a, b, folds=0).inliers.mean() > 0.9
 
 
+@pytest.mark.slow
 def test_noise_along_one_axis_that_the_fit_carries_into_the_others():
     """30 : 1 of 100 points: what the fit errs along the one exceeds the noise along the others."""
     for trial in range(20):
@@ -198,6 +200,7 @@ def test_a_bent_frame_is_not_two_motions():
     assert away < 0.1 * plain.inlier_errors.rms_mm
 
 
+@pytest.mark.slow
 def test_noise_is_not_called_bent():
     """One case in ten thousand is."""
     for trial in range(15):

@@ -30,6 +30,7 @@ def fitted(a, b, **options):
     return found, residual_field(found, a, b, **options)
 
 
+@pytest.mark.slow
 def test_noise_is_not_taken_for_a_field():
     """One case in a hundred may be: more than two of 40 has a chance of 1 %."""
     seen = 0

@@ -46,6 +46,7 @@ def coupled() -> Robot:
 
 
 NOMINALS = {"MH80": mh80, "Craig": craig, "SCARA": scara, "coupled": coupled}
+QUICK_AND_SLOW = ["SCARA", "Craig", *(pytest.param(name, marks=pytest.mark.slow) for name in ("MH80", "coupled"))]
 
 
 def arm(nominal: Robot) -> Robot:
@@ -80,7 +81,7 @@ def moved(data: Measurements, positions: np.ndarray) -> Measurements:
     return replace(data, positions=positions)
 
 
-@pytest.mark.parametrize("name", NOMINALS)
+@pytest.mark.parametrize("name", QUICK_AND_SLOW)
 def test_without_noise_the_arm_comes_back(name):
     nominal = NOMINALS[name]()
     true = arm(nominal)
@@ -95,7 +96,7 @@ def test_without_noise_the_arm_comes_back(name):
     assert max(fit.sigma_mm for fit in result.fits) < 1e-11
 
 
-@pytest.mark.parametrize("name", NOMINALS)
+@pytest.mark.parametrize("name", QUICK_AND_SLOW)
 def test_rows_and_chain_of_axes_make_the_same_poses(name):
     nominal = NOMINALS[name]()
     true = arm(nominal)
@@ -163,11 +164,12 @@ def test_errors_of_pairs_are_as_large_as_their_sigma():
     assert np.mean(np.square(scores), axis=0) == pytest.approx([1, 1], abs=0.33)
 
 
-def test_leaving_out_a_row_is_fitting_without_it():
+@pytest.mark.parametrize("instants", [(12,), pytest.param((3, 30), marks=pytest.mark.slow)])
+def test_leaving_out_a_row_is_fitting_without_it(instants):
     nominal = mh80()
     data = measured(arm(nominal), sweep_values(nominal, 6), SIGMA, 2)
     whole = robot_from_sweeps(data, nominal)
-    for instant in (3, 12, 30):
+    for instant in instants:
         rows = np.arange(len(data)) // 3 != instant
         index = whole.without_one.lines.index(2 + 3 * instant)
         again = robot_from_sweeps(data[rows], nominal)
@@ -178,7 +180,7 @@ def test_leaving_out_a_row_is_fitting_without_it():
         assert np.abs(found - [p.distance for p in whole.pairs]).max() > 1e-4
 
 
-@pytest.mark.parametrize("off_mm", [0.5, 20.0, 300.0, 2000.0])
+@pytest.mark.parametrize("off_mm", [0.5, 2000.0, *(pytest.param(off, marks=pytest.mark.slow) for off in (20.0, 300.0))])
 def test_a_gross_error_is_named_and_left_out(off_mm):
     nominal = mh80()
     data = measured(arm(nominal), sweep_values(nominal, 6), SIGMA, 7)

@@ -194,6 +194,7 @@ def test_a_flat_direction_is_no_failure():
     assert 0.3 < parameters < 2.2  # of 21 squares
 
 
+@pytest.mark.slow
 def test_three_thousand_poses_are_no_trouble():
     """Ratio of processor time within one run, to one least-squares solution of that size: 40 to 60 measured
     (`scripts/bench_robot.py`), which are 0.3 s; linear in the number of poses."""

@@ -36,6 +36,7 @@ def test_one_sigma_is_that_of_least_squares_and_the_covariance_that_of_t(rows):
     assert parts.covariance(best) == pytest.approx(wanted, rel=3 / freedom**2 + 1e-3)
 
 
+@pytest.mark.slow
 def test_of_several_parts_the_covariance_is_true_on_average():
     error = []
     for seed in range(400):

@@ -93,17 +93,17 @@ def test_joint_values_beside_poses_choose_the_branch(case):
 def test_a_tool_that_the_nominal_file_lacks_is_said(case, capsys, monkeypatch):
     """Commanded poses are then of another point: 150 mm off, none may be reached."""
     bare = replace(case.nominal, tools={"": Rigid()})
-    targets = read_targets(case.write(POSE, case.pose_rows()), case.real)
+    targets = read_targets(case.write(POSE, case.pose_rows()[:4]), case.real)
     notes = compensate(case.real, targets, bare).notes()
     assert re.match(r"tool of the robot files differs by 151\.\d mm and 0° between", notes[0])
     assert not any("differs by" in note for note in compensate(case.real, targets, case.nominal).notes())
-    far = [pose_cells(Rigid(p.rotation, p.translation + np.array([9000, 0, 0]))) for p in case.poses[:4]]
+    far = [pose_cells(Rigid(p.rotation, p.translation + np.array([9000, 0, 0]))) for p in case.poses[:1]]
     command = ["stcal", "robot", "compensate", str(case.write(POSE, far)), "--robot", f"{case.folder}/identified.toml"]
     monkeypatch.setattr("sys.argv", command)
     with pytest.raises(SystemExit) as end:
         main()
     assert end.value.code == 3
-    assert "none of 4 poses is reached" in capsys.readouterr().err
+    assert "none of 1 poses is reached" in capsys.readouterr().err
 
 
 def test_every_tool_by_its_name(case):

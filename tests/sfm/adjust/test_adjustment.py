@@ -123,6 +123,7 @@ def draws(scenes, labels_only):
     return [(scene, *labels_only.calibrate(scene, NOISE_PX, seed)) for seed, scene in enumerate(drawn)]
 
 
+@pytest.mark.slow
 def test_predicted_covariances_are_true(draws):
     """Normalised squared error of 4 faces over 24 draws: mean of χ²₆/6, standard deviation 0.06 if independent.
 
@@ -136,6 +137,7 @@ def test_predicted_covariances_are_true(draws):
     assert np.mean([joint.sigma0 for _, _, joint in draws]) == pytest.approx(1.0, abs=0.02)
 
 
+@pytest.mark.slow
 def test_joint_beats_the_chain(draws, labels_only):
     """One target over all groups. 48 draws have an RMS face error 1.27 times smaller, and halves of them differ by
     0.01, quarters by 0.1."""

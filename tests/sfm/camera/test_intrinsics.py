@@ -134,8 +134,8 @@ def test_closed_form_finds_the_focal_length():
 
 
 def test_boards_of_one_direction_are_refused():
-    views = views_of(np.random.default_rng(1), tilt_deg=0.02)
-    with pytest.raises(DegenerateError, match=r"focal length determined to .* by 12 views, 1 % needed.*tilted"):
+    views = views_of(np.random.default_rng(1), count=6, tilt_deg=0.02)
+    with pytest.raises(DegenerateError, match=r"focal length determined to .* by 6 views, 1 % needed.*tilted"):
         require_determined(calibrated(views), views)
 
 

@@ -81,7 +81,9 @@ def not_passed(checks):
     return {key: check.verdict for key, check in checks.items() if check.verdict not in ("passed", "not possible")}
 
 
-@pytest.mark.parametrize(("noise_px", "seed"), [(0.005, 1), (0.015, 2), (0.05, 3)])
+@pytest.mark.parametrize(
+    ("noise_px", "seed"), [(0.005, 1), *(pytest.param(*p, marks=pytest.mark.slow) for p in ((0.015, 2), (0.05, 3)))]
+)
 def test_honest_runs_pass(full_scene, lab, noise_px, seed):
     checks = lab.check(full_scene, lab.observe(full_scene, noise_px, seed))
     assert not_passed(checks) == {}
@@ -145,7 +147,7 @@ def test_noise_beyond_the_centres_own_sigma_is_said(full_scene, lab, over, verdi
     assert check.measured[0].value == pytest.approx(over, rel=0.05)  # 3000 degrees of freedom: 1.3 %
 
 
-@pytest.mark.parametrize("solve", ["chain", "joint"])
+@pytest.mark.parametrize("solve", ["chain", pytest.param("joint", marks=pytest.mark.slow)])
 def test_a_moved_target_is_named(full_scene, lab, solve):
     """0.2 mm and 0.05° against the board, in half of the images of a group; the others are innocent."""
     motion = Rigid.exp([np.radians(0.05), 0, 0, 0.2, 0, 0])
@@ -233,6 +235,7 @@ def test_a_bad_row_of_the_board_is_named(full_scene, lab):
     assert {name.split(" ", 2)[2] for name in check.names} == {"row 2"}
 
 
+@pytest.mark.slow
 def test_a_run_reports_a_blurred_photograph(small_set, small_scene):
     """With pixels: one image out of focus."""
     own = small_set("12", "14")
@@ -257,6 +260,7 @@ def test_a_run_of_photographs_passes(small_run):
     assert "not possible" in checks_values(checks)["verdicts"]
 
 
+@pytest.mark.slow
 def test_verdicts_are_tests_of_significance():
     """Chance alone: as many suspicious as are promised, and fewer failures."""
     rng = np.random.default_rng(0)

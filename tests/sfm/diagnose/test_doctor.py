@@ -4,7 +4,6 @@ import csv
 import json
 import shutil
 from collections import defaultdict
-from importlib import import_module
 from pathlib import Path
 
 import cv2
@@ -24,6 +23,7 @@ from stcal.sfm.mapping.database import image_ids
 from stcal.sfm.mapping.models import read_model
 from stcal.sfm.run.saved import load_run
 
+pytestmark = pytest.mark.usefixtures("no_page")
 IMAGES = FIRST, SECOND, THIRD, FOURTH = [f"12/IMG_100{i}.jpg" for i in range(4)]
 
 
@@ -90,12 +90,6 @@ class Patient:
 def rows(folder: Path) -> list[list[str]]:
     with open(folder / "detections.csv", newline="") as stream:
         return [row[:4] for row in csv.reader(stream)][1:]
-
-
-@pytest.fixture(autouse=True)
-def no_figures(monkeypatch):
-    """The doctor does not read the report's page, which takes half of a small run's time."""
-    monkeypatch.setattr(import_module("stcal.sfm.run.folder"), "report_html", lambda *_: "")
 
 
 @pytest.fixture
@@ -206,6 +200,7 @@ def test_the_least_diameter_tried_is_what_the_command_takes(patient, stcal_sfm):
     assert stcal_sfm(*patient.arguments("detect", "--min-diameter", LEAST_MIN_DIAMETER_PX))[0] == 0
 
 
+@pytest.mark.slow
 def test_too_large_circles(patient, stcal_sfm):
     diagnosis = patient.run(ellipses=EllipseOptions(max_diameter_px=21.0))
     large = [f for f in of_images(diagnosis) if f.gate == "max_diameter"]
@@ -217,6 +212,7 @@ def test_too_large_circles(patient, stcal_sfm):
     assert numbered <= patient.detected()
 
 
+@pytest.mark.slow
 def test_spoiled_circles(patient):
     """In one set: hidden, seen once, moved, faint, and a rim without an edge; each is told from the others."""
     patient.hide(FIRST, "2:2", "board:3:4")
@@ -282,6 +278,7 @@ def test_spoiled_circles(patient):
     assert {"1:a", "2:1", "2:3", "2:7", "board:2:2", "board:3:4"} <= patient.mapped()[1]
 
 
+@pytest.mark.slow
 def test_another_view_lets_in_a_circle_seen_once(patient):
     for name in IMAGES[2:]:
         patient.hide(name, "2:7", half=16)

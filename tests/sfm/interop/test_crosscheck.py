@@ -152,6 +152,8 @@ def test_outside_the_tolerances_it_says_where(colmap, checked, stcal_sfm):
     assert "They differ: face " in (run / "report.html").read_text(encoding="utf-8")
 
 
+@pytest.mark.usefixtures("no_page")
+@pytest.mark.slow
 def test_names_and_places_with_spaces_and_beyond_ascii(colmap, small_set, stcal_sfm):
     """Images directly in their folder, too: the group is named "."."""
     small = small_set("12")
@@ -167,6 +169,7 @@ def test_names_and_places_with_spaces_and_beyond_ascii(colmap, small_set, stcal_
     assert "zwei Flächen 1.JPG" in names
 
 
+@pytest.mark.usefixtures("no_page")
 def test_a_run_with_other_options(colmap, small_set, stcal_sfm):
     """Chained, frames of three points, another reference face: the native models go through the same."""
     small = small_set("12", "14")
@@ -271,7 +274,7 @@ done
 
 
 @pytest.fixture
-def refused(own_run, stcal_sfm, tmp_path):
+def refused_page_and_all(own_run, stcal_sfm, tmp_path):
     """The cross-check with a program must end in one line, and the run stay as it is."""
 
     def check(colmap, code: int, *parts: str, more=()) -> str:
@@ -283,6 +286,13 @@ def refused(own_run, stcal_sfm, tmp_path):
     return check
 
 
+@pytest.fixture
+def refused(refused_page_and_all, no_page):
+    """The same for a report that is whole, whose page need not be drawn to see that."""
+    return refused_page_and_all
+
+
+@pytest.mark.usefixtures("no_page")
 def test_no_native_program(own_run, stcal_sfm, tmp_path, monkeypatch):
     monkeypatch.setenv("PATH", str(tmp_path))
     outcome = stcal_sfm("crosscheck", own_run)
@@ -455,6 +465,7 @@ def test_what_the_mapper_is_given(own_run, refused, tmp_path):
     assert not given["--database_path"].startswith(str(own_run))
 
 
+@pytest.mark.usefixtures("no_page")
 def test_a_model_that_lacks_an_image(own_run, stcal_sfm, colmap, tmp_path):
     """One that is not of the initial pair, taken from the list."""
     path = program(tmp_path, f'sed -i "/IMG_1002/d" "$list"; exec {colmap} "$@"', asked=answers_of(colmap))
@@ -510,6 +521,7 @@ def test_other_keypoints_are_noticed(own_run, refused, colmap, tmp_path):
     assert re.search(r"image 12/IMG_\d+.jpg: keypoint \d+ \(2:\w\) is 0\.3000 px off", line)
 
 
+@pytest.mark.usefixtures("no_page")
 def test_another_geometry_is_noticed(own_run, stcal_sfm, colmap, tmp_path):
     """The same, but the model says our keypoints: face 2 is where the others are not. At 1 m and f = 1393 px, 0.3 px
     are 0.2 mm across; the images see it from sides that differ."""
@@ -577,11 +589,11 @@ def edit(run, change) -> None:
 
 
 @pytest.mark.parametrize("case", SPOILT_REPORTS)
-def test_a_report_that_cannot_be_added_to(own_run, refused, tmp_path, case):
+def test_a_report_that_cannot_be_added_to(own_run, refused_page_and_all, tmp_path, case):
     """It is said before the mapping, which takes minutes on large sets."""
     spoil, part = SPOILT_REPORTS[case]
     spoil(own_run)
-    refused(never(tmp_path), INPUT, part, "run it again")
+    refused_page_and_all(never(tmp_path), INPUT, part, "run it again")
 
 
 def test_no_half_of_a_report(own_run):

@@ -43,7 +43,7 @@ def test_what_is_common_is_less_than_the_whole(scene, known):
         assert left[0] > 5e-4
 
 
-@pytest.mark.parametrize("with_camera", [False, True])
+@pytest.mark.parametrize("with_camera", [True, pytest.param(False, marks=pytest.mark.slow)])
 def test_poses_err_together_as_stated(scene, known, with_camera):
     """Without noise in the images all errors are common ones: z of each direction, from the errors of all poses, has
     mean square 1, to 1.4 / √(directions × draws)."""

@@ -295,6 +295,7 @@ def replace_factor(target, factor):
     return TargetCircles(target.labels, target.xyz, target.radius, target.covariance, factor)
 
 
+@pytest.mark.slow
 def test_a_pose_costs_some_steps_and_no_search(scene, known):
     """Processor time over that of one linearised distortion of its circles, the best of several rounds in the same run:
     64 measured (2 ms), of two minima with their steps and covariance; a search over starts would take thousands."""

@@ -182,6 +182,7 @@ def advice(known):
     return advise(known, 2)
 
 
+@pytest.mark.slow
 def test_advised_views_do_what_is_said(known, advice):
     """Photographed in simulation: errors as forecast, and σ falls from the run to the adjustment as forecast."""
     models = {model.group: model for model in known.models}
@@ -204,8 +205,15 @@ def test_advised_views_do_what_is_said(known, advice):
     assert stated[1] / stated[0] == pytest.approx(forecasts[1] / forecasts[0], rel=0.1)
 
 
-def test_an_advised_view_beats_a_random_one(known, advice):
-    views = [v for model in known.models for v in candidates(known.scene, model, known.setup, known.noise)]
+@pytest.fixture(scope="module")
+def offered(known):
+    """All candidates of each group."""
+    return [(model, candidates(known.scene, model, known.setup, known.noise)) for model in known.models]
+
+
+@pytest.mark.slow
+def test_an_advised_view_beats_a_random_one(known, advice, offered):
+    views = [view for _, own in offered for view in own]
     picked = np.random.default_rng(5).choice(len(views), 20, replace=False)
     random = [after(known, [views[i]], advice.now).worst()[1] for i in picked]
     now, best = advice.now.worst()[1], advice.choices[0].sigma_mm
@@ -219,6 +227,7 @@ def coarse(monkeypatch):
     monkeypatch.setattr(views, "GRID_DEG", 50.0)
 
 
+@pytest.mark.slow
 def test_the_board_dominates_where_it_is_bad(known, advice, coarse):
     found = advise(replace(known, setup=setup_of(known.scene, 0.2)), 1)
     assert found.board_dominates
@@ -241,12 +250,11 @@ def test_a_new_group_is_advised_for_faces_not_seen_together(coarse):
     assert group.sigma_mm == pytest.approx(forecast(known.models, known.setup).worst()[1], rel=0.15)
 
 
-def test_a_candidate_shows_nothing_that_is_hidden(known):
+def test_a_candidate_shows_nothing_that_is_hidden(offered):
     """Faces 2 and 4 look to opposite sides: no view shows both, and the whole board is always in it."""
-    for model in known.models:
-        views = candidates(known.scene, model, known.setup, known.noise)
-        assert len(views) > 20
-        for view in views:
+    for model, own in offered:
+        assert len(own) > 20
+        for view in own:
             assert not {"2", "4"} <= view.tilts_deg.keys()
             assert sum(model.labels[i].startswith("board:") for i in view.model.point_index) == 63
             assert max(view.tilts_deg.values()) < 75
@@ -318,7 +326,7 @@ def test_advise_without_the_final_model(stcal_sfm, small_run, tmp_path):
 
 
 def test_plan_command(stcal_sfm, tmp_path):
-    code, text, _ = stcal_sfm("plan", "--width", 2592, "--images", 4, "--json", tmp_path / "plan.json")
+    code, text, _ = stcal_sfm("plan", "--width", 2592, "--images", 2, "--json", tmp_path / "plan.json")
     content = json.loads((tmp_path / "plan.json").read_text())
     assert code == 0
     assert content["groups"] == ["12", "14", "15", "23"]
@@ -327,17 +335,18 @@ def test_plan_command(stcal_sfm, tmp_path):
     assert {row["what"] for row in content["remedies"]} >= {"twice the images", "a board of half the σ"}
 
 
-def plan(images=4, noise=NOISE):
+def plan(images=2, noise=NOISE):
     """Of faces 1, 2 and 3, the last two groups away from the first."""
     options = PlanOptions(width=2592, images=images, groups=(("1", "2"), ("2", "3")), noise=noise)
     return make_plan(options, reference_target(), reference_board(), nominal_target_from_face())
 
 
+@pytest.mark.slow
 def test_plan_remedies_are_plans_of_their_own():
     """Twice the images is what a plan with twice the images says."""
-    four, eight = plan(), plan(images=8)
-    assert four.remedies[0].sigma_mm == pytest.approx(eight.forecast.worst()[1], rel=1e-9)
-    assert 0.65 < four.remedies[0].sigma_mm / four.forecast.worst()[1] < 0.95
+    two, four = plan(), plan(images=4)
+    assert two.remedies[0].sigma_mm == pytest.approx(four.forecast.worst()[1], rel=1e-9)
+    assert 0.65 < two.remedies[0].sigma_mm / two.forecast.worst()[1] < 0.95
 
 
 def test_plan_names_what_dominates():
@@ -361,7 +370,7 @@ def test_plan_says_what_is_wrong(stcal_sfm, arguments, message):
 
 
 def test_plan_out_of_reach(stcal_sfm):
-    code, _, error = stcal_sfm("plan", "--distance", 300)
+    code, _, error = stcal_sfm("plan", "--distance", 300, "--images", 2)
     assert (code, error.count("\n")) == (3, 1)
     assert "enlarge distance_mm" in error
 

@@ -1,5 +1,6 @@
 """Images and observations that do not fit are left out by name, kept results belong to their inputs, and σ₀ counts."""
 
+import shutil
 from dataclasses import replace
 
 import cv2
@@ -14,39 +15,46 @@ from stcal.sfm.detect.ellipses import EllipseOptions
 from stcal.sfm.mapping.incremental import left_out
 from stcal.sfm.report.compare import compare
 
+pytestmark = pytest.mark.usefixtures("no_page")
+
 
 def calibrate(folder, out, **options):
     data = [folder / name for name in ("images", "cameras.txt")]
     return run(*data, out, folder / "target.toml", folder / "board.toml", RunOptions(workers=1, **options))
 
 
-def test_an_image_without_a_circle_is_reported_and_harms_nothing(small_set, tmp_path):
-    folder = small_set("12").folder
+def test_an_image_without_a_circle_is_reported_and_harms_nothing(small_set):
+    small = small_set("12")
+    folder = small.folder
     cv2.imwrite(str(folder / "images" / "12" / "black.png"), np.zeros((864, 1296), np.uint8))
-    result = calibrate(folder, tmp_path / "run")
+    result = calibrate(folder, small.out)
     reasons = {name: why for s in result.solutions for name, why in s.left_out.items()}
     assert list(reasons) == ["12/black.png"]
     assert "0 of its circles are in the model, 6 needed" in reasons["12/black.png"]
 
 
 def test_kept_results_are_not_taken_for_other_options(small_set, tmp_path):
-    folder = small_set("12").folder
+    small = small_set("12")
+    folder = small.folder
+    shutil.copytree(small.out, tmp_path / "fresh", ignore=shutil.ignore_patterns("group-*"))  # detections alone
     fresh = calibrate(folder, tmp_path / "fresh", eccentricity=False)
-    calibrate(folder, tmp_path / "run")
-    again = calibrate(folder, tmp_path / "run", eccentricity=False)
+    calibrate(folder, small.out)
+    again = calibrate(folder, small.out, eccentricity=False)
     np.testing.assert_array_equal(
         fresh.target.target_from_face["2"].matrix(), again.target.target_from_face["2"].matrix()
     )
-    coarse = calibrate(folder, tmp_path / "run", ellipses=EllipseOptions(min_diameter_px=9.0))
+    coarse = calibrate(folder, small.out, ellipses=EllipseOptions(min_diameter_px=9.0))
     assert not any(image.reused for image in coarse.detection.images)
 
 
-def test_a_damaged_cache_is_made_anew(small_set, tmp_path):
-    folder = small_set("12").folder
-    first = calibrate(folder, tmp_path / "run")
-    for path in (tmp_path / "run" / "cache").iterdir():
+def test_a_damaged_cache_is_made_anew(small_set):
+    small = small_set("12")
+    first = calibrate(small.folder, small.out)
+    assert all(image.reused for image in first.detection.images)
+    for path in (small.out / "cache").iterdir():
         path.write_bytes(path.read_bytes()[:-200])
-    again = calibrate(folder, tmp_path / "run")
+    again = calibrate(small.folder, small.out)
+    assert not any(image.reused for image in again.detection.images)
     np.testing.assert_array_equal(
         first.target.target_from_face["2"].matrix(), again.target.target_from_face["2"].matrix()
     )
