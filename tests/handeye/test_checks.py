@@ -305,6 +305,7 @@ def test_rough_poses_that_fit_another_setup_better_are_said(sets):
     assert said >= 0.8 * sets
 
 
+@pytest.mark.slow
 def test_three_hundred_poses_need_little_memory():
     """All pairs of motions are 45 000; a full singular basis of them would be 15 GB."""
     tracemalloc.start()

@@ -145,6 +145,7 @@ def test_stated_sigmas_weight(command, tmp_path):
     assert "both or none needed" in err
 
 
+@pytest.mark.slow
 def test_the_boards_size_is_found(command, tmp_path):
     """The file states a board of 0.96 times its true size."""
     truth = simulated(np.random.default_rng(8), 20, **NOISE)

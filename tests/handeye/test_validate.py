@@ -54,6 +54,7 @@ def test_errors_at_the_board():
         assert board == pytest.approx(on_board, abs=0.6)
 
 
+@pytest.mark.slow
 def test_compare_lists_every_method():
     truth = simulated_views(np.random.default_rng(3), 10, robot=(3e-4, 0.1), corner_px=0.1)
     found = compare(truth.pairs, views=truth.views, rows=splits(10, 3, 2))

@@ -131,6 +131,7 @@ def test_covariances_are_read_and_turned_over(tmp_path, truth):
     assert pairs[2:4].camera_from_board_covariance.shape == (2, 6, 6)
 
 
+@pytest.mark.slow
 def test_the_inverse_covariance_is_that_of_scattered_poses():
     """From 20 000 draws: entries agree to their own scatter, √(2 / 20 000) = 1 %, of the largest."""
     pose = Rigid.exp([0.4, -0.8, 1.1, 300.0, -200.0, 500.0])

@@ -180,7 +180,7 @@ def test_leaving_out_a_row_is_fitting_without_it(instants):
         assert np.abs(found - [p.distance for p in whole.pairs]).max() > 1e-4
 
 
-@pytest.mark.parametrize("off_mm", [0.5, 2000.0, *(pytest.param(off, marks=pytest.mark.slow) for off in (20.0, 300.0))])
+@pytest.mark.parametrize("off_mm", [2000.0, *(pytest.param(off, marks=pytest.mark.slow) for off in (0.5, 20.0, 300.0))])
 def test_a_gross_error_is_named_and_left_out(off_mm):
     nominal = mh80()
     data = measured(arm(nominal), sweep_values(nominal, 6), SIGMA, 7)

@@ -308,6 +308,7 @@ def test_bad_reference_is_named():
     assert len(inverse(mh80(), pose[:0], np.zeros(6))) == 0
 
 
+@pytest.mark.slow
 def test_ten_thousand_poses_are_solved_together():
     """Processor time over that of one evaluation of all Jacobians in the same run: 21 measured, of four steps with
     their solutions; a loop of Python over the poses would be above 300."""

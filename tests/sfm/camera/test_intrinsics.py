@@ -139,6 +139,7 @@ def test_boards_of_one_direction_are_refused():
         require_determined(calibrated(views), views)
 
 
+@pytest.mark.slow
 def test_a_model_that_does_not_fit_is_refused():
     bent = replace(TRUE, distortion=[-0.3, 0.1, 0, 0, 0, 0, 0, 0])
     views = views_of(np.random.default_rng(2), camera=bent)

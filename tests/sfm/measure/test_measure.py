@@ -99,6 +99,7 @@ def test_errors_of_several_faces_are_as_predicted(scene, known, faces, count):
     assert flipped == 0
 
 
+@pytest.mark.slow
 def test_without_the_targets_own_covariance_the_errors_would_be_too_large(scene, known):
     """A target of several µm, and centres of half a µm: the image's noise is the smaller part."""
     rng = np.random.default_rng(1)
