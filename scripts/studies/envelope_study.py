@@ -1,0 +1,818 @@
+"""Where the program's envelope ends: rendered sets degraded as photographs are, at five strengths of each kind.
+
+.venv/bin/python scripts/studies/envelope_study.py [--sets FOLDER …] [--only KIND] [--strengths 1,3,5] [--bin FOLDER]
+    [--json FILE] [--compare FILE] [--picture FILE.svg]
+
+Where circles, faces and board lie in the photographs is taken from ``truth.json`` alone. Each degraded set goes through
+`stcal-sfm run` of this or another version (`--bin`: the folder that holds its `stcal-sfm`), one after another. With
+`--json` every row is kept as it comes, and rows that the file has already are not run again: a study that was stopped
+goes on, and a finished one is printed. `--compare FILE` puts an earlier file's figures in front.
+
+recall: circles found of those that must be found; what the degradation hides, cuts or mirrors must not. wrong: labels
+farther than 1.5 px, or a quarter of the circle's radius, from the place of that circle's ellipse, or of circles that
+are not in view. The board's numbers count up to its symmetry. Rolling shutter, rotation, mirroring and scale move the
+true places with the pixels; the kernel of a motion is centred and moves nothing; halves of circles that are darker
+leave the rims where they are, so that a shift is the program's own. µm, σ: the face that is farthest off, and
+√(eᵀC⁻¹e/6), the largest of all faces, against the truth in the run's own reference face. silent: over 4 σ and no
+check failed.
+"""
+
+import argparse
+import csv
+import json
+import os
+import re
+import subprocess
+import sys
+import tempfile
+import time
+import zlib
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import cv2
+import numpy as np
+
+from stcal.geometry.camera import Camera
+from stcal.geometry.rigid import Rigid
+from stcal.io.camera import write_cameras_txt
+from stcal.labels import BOARD
+from stcal.synthetic import degrade
+from stcal.synthetic.photograph import Photograph, Plane, RenderedSet, read_set
+
+ROOT = Path(__file__).resolve().parents[2]
+SAMPLE = ROOT / "tests" / "data" / "sample"
+NEAR_PX, NEAR_RADII = 1.5, 0.25
+SILENT_SIGMA = 4.0
+LONGEST_S = 1800.0
+Place = Callable[[np.ndarray], np.ndarray]
+
+
+@dataclass
+class Picture:
+    """A degraded photograph. ``pixels`` : grey values, or a JPEG file; ``hidden`` : labels no longer in view;
+    ``waived`` : labels that may be found, and need not; ``place`` : where points of the photograph went."""
+
+    pixels: np.ndarray | bytes
+    hidden: set[str] = field(default_factory=set)
+    waived: set[str] = field(default_factory=set)
+    place: Place | None = None
+    bits: int = 8
+
+
+@dataclass
+class Case:
+    """One kind at one strength on one set; ``shared`` keeps what its photographs have in common."""
+
+    data: RenderedSet
+    kind: str
+    value: float
+    shared: dict = field(default_factory=dict)
+
+    def seed(self, *words) -> int:
+        """Of random numbers: the same in every run."""
+        return zlib.crc32(" ".join(map(str, (self.kind, self.data.folder.name, *words))).encode())
+
+    def rng(self, *words) -> np.random.Generator:
+        return np.random.default_rng(self.seed(*words))
+
+
+@dataclass(frozen=True)
+class Kind:
+    """``unit`` : of ``values``; ``make`` : degrades a photograph; ``goal`` : number of strengths within the goals;
+    ``camera`` : that of the degraded set; ``may_end`` : strengths at which no result can be wanted."""
+
+    name: str
+    unit: str
+    values: tuple
+    make: Callable[[Photograph, float, Case], Picture]
+    goal: int = 5
+    camera: Callable[[Case], Camera] | None = None
+    may_end: tuple[int, ...] = ()
+
+
+def simple(function: Callable[..., np.ndarray], *words) -> Callable[[Photograph, float, Case], Picture]:
+    """A kind that takes pixels and strength alone."""
+    return lambda photo, value, case: Picture(function(photo.grey, value, *words))
+
+
+# ---------------------------------------------------------------- kinds
+
+
+def plain(photo: Photograph, value: float, case: Case) -> Picture:
+    return Picture((case.data.folder / "images" / photo.name).read_bytes())
+
+
+def motion(photo: Photograph, value: float, case: Case) -> Picture:
+    return Picture(degrade.motion_blurred(photo.grey, value, case.rng(photo.name).uniform(0, np.pi)))
+
+
+def noise(photo: Photograph, value: float, case: Case) -> Picture:
+    return Picture(degrade.noisy(photo.grey, value, case.seed(photo.name)))
+
+
+def gradient(photo: Photograph, value: float, case: Case) -> Picture:
+    return Picture(degrade.graded(photo.grey, value, case.rng(photo.name).uniform(0, 2 * np.pi)))
+
+
+def on_sensor(function) -> Callable[[Photograph, float, Case], Picture]:
+    """The same places in all photographs."""
+    return lambda photo, value, case: Picture(function(photo.grey, value, case.seed()))
+
+
+def haze(photo: Photograph, value: float, case: Case) -> Picture:
+    return Picture(degrade.hazy(photo.grey, value, case.seed(photo.name)))
+
+
+def dim_face(photo: Photograph, value: float, case: Case) -> Picture:
+    """The face that most photographs need."""
+    if "face" not in case.shared:
+        wanted = [label.partition(":")[0] for p in case.data.photographs for label, must in p.must_find.items() if must]
+        case.shared["face"] = max((face.id for face in case.data.target.faces), key=wanted.count)
+    image = photo.grey.astype(np.float32)
+    for face in photo.faces:
+        if face.name == case.shared["face"]:
+            image = degrade.brightened(image, photo.face_region(face), value)
+    return Picture(image)
+
+
+def bright_board(photo: Photograph, value: float, case: Case) -> Picture:
+    """The exposure is such that the board does not clip: the target gets darker instead."""
+    share = photo.face_region(photo.board)
+    brightest = float(np.percentile(photo.grey[share > 0.5], 99)) * value
+    image = degrade.brightened(photo.grey, share, value)
+    return Picture(image * min(1.0, 250 / brightest))
+
+
+def glare(photo: Photograph, value: float, case: Case) -> Picture:
+    rng = case.rng(photo.name)
+    places = []
+    for plane in photo.planes:
+        outline = photo.outline_px(plane, 0.0)
+        corners = outline[rng.integers(len(outline), size=(3, 3))]
+        places += list((rng.dirichlet([1, 1, 1], 3)[..., None] * corners).sum(1))
+    radius = float(np.median([r for _, r in photo.ellipses().values()]))
+    image = degrade.glared(photo.grey, places, 1.5 * radius, value)
+    whole, part = degrade.covered_labels(photo, np.minimum(image, 255), 40.0)
+    return Picture(image, waived=whole | part)
+
+
+def chosen(photo: Photograph, case: Case, count: float, at_most: float = 1.0) -> list[str]:
+    """Random circles of every face in view; ``count`` of each, or a share."""
+    rng, found = case.rng(photo.name), []
+    for face in photo.faces:
+        n = int(count) if count >= 1 else int(np.ceil(count * len(face.labels)))
+        found += list(rng.permutation(list(face.labels))[: min(n, int(at_most * len(face.labels)))])
+    return found
+
+
+def hide(photo: Photograph, value: float, case: Case) -> Picture:
+    labels = chosen(photo, case, value)
+    return Picture(degrade.without_circles(photo, labels), hidden=set(labels))
+
+
+def cut(photo: Photograph, value: float, case: Case) -> Picture:
+    """A third of the circles of every face, and a tenth of the board's dots."""
+    dots = case.rng(photo.name, "dots").permutation(list(photo.board.labels))[: len(photo.board.labels) // 10]
+    labels = [*chosen(photo, case, 0.33), *dots]
+    return Picture(degrade.cut_circles(photo, labels, value, case.seed(photo.name)), waived=set(labels))
+
+
+def cover_board(photo: Photograph, value: float, case: Case) -> Picture:
+    image = degrade.board_covered(photo, value, case.seed(photo.name))
+    whole, part = degrade.covered_labels(photo, image)
+    return Picture(image, hidden=whole, waived=part)
+
+
+def cover_one_board(photo: Photograph, value: float, case: Case) -> Picture:
+    return cover_board(photo, value, case) if photo.number == 0 else Picture(photo.grey)
+
+
+def uneven(photo: Photograph, value: float, case: Case) -> Picture:
+    return Picture(degrade.unevenly_lit(photo, value))
+
+
+def half(photo: Photograph, value: float, case: Case) -> Picture:
+    return Picture(degrade.half_darker(photo, value))
+
+
+def file_of_quality(photo: Photograph, value: float, case: Case) -> Picture:
+    return Picture(degrade.jpeg(photo.grey, int(value)))
+
+
+def rolling(photo: Photograph, value: float, case: Case) -> Picture:
+    shift = value * case.rng(photo.name).choice([-1, 1])
+    height = photo.grey.shape[0]
+    return Picture(degrade.rolling_shutter(photo.grey, shift), place=lambda xy: degrade.rolled(xy, shift, height))
+
+
+def deep(photo: Photograph, value: float, case: Case) -> Picture:
+    """Sensors of 10 to 16 bits, their values kept as they are."""
+    return Picture(photo.grey.astype(np.float32), bits=int(value))
+
+
+def small_camera(case: Case) -> Camera:
+    """The camera with so few pixels that a small circle is ``value`` px across, in the median."""
+    camera = case.data.camera
+    if "size" not in case.shared:
+        smallest = min(case.data.target.radius_of().values())
+        small = {str(k) for k, r in case.data.target.radius_of().items() if r <= 1.01 * smallest}
+        radii = [r for p in case.data.photographs for k, (_, r) in p.ellipses().items() if k in small]
+        factor = min(1.0, case.value / (2 * float(np.median(radii))))
+        case.shared["size"] = round(camera.width * factor), round(camera.height * factor)
+    width, height = case.shared["size"]
+    factors = np.array([width / camera.width, height / camera.height])
+    return Camera(width, height, camera.focal * factors, (camera.centre + 0.5) * factors - 0.5, camera.distortion)
+
+
+def small(photo: Photograph, value: float, case: Case) -> Picture:
+    camera = small_camera(case)
+    factors = np.array([camera.width / photo.camera.width, camera.height / photo.camera.height])
+    image = degrade.shrunk(photo.grey, camera.width, camera.height)
+    return Picture(image, place=lambda xy: (np.asarray(xy) + 0.5) * factors - 0.5)
+
+
+MIRRORED = ("one image", "one in half of the groups", "one in each group", "a group", "all")
+
+
+def mirror_images(photo: Photograph, value, case: Case) -> Picture:
+    groups = list(case.data.truth["groups"])
+    at = groups.index(photo.group)
+    hit = {
+        "one image": at == photo.number == 0,
+        "one in half of the groups": photo.number == 0 and at % 2 == 0,
+        "one in each group": photo.number == 0,
+        "a group": at == len(groups) - 1,
+        "all": True,
+    }[value]
+    if not hit:
+        return Picture(photo.grey)
+    width = photo.grey.shape[1]
+    place = lambda xy: np.stack([width - 1 - np.asarray(xy)[..., 0], np.asarray(xy)[..., 1]], axis=-1)  # noqa: E731
+    return Picture(photo.grey[:, ::-1], waived=set(photo.must_find), place=place)
+
+
+ROTATED = {"all by 90°": 1, "all by 180°": 2, "all by 270°": 3, "one in a group by 90°": 1, "one in a group by 180°": 2}
+
+
+def rotated_camera(case: Case) -> Camera:
+    """The camera turned with its images; where only some are turned, the file's own."""
+    camera = case.data.camera
+    for _ in range(ROTATED[case.value] if case.value.startswith("all") else 0):
+        d = camera.distortion.copy()
+        d[2], d[3] = -d[3], d[2]  # (p2, p1) turns as a vector
+        centre = [camera.centre[1], camera.width - 1 - camera.centre[0]]
+        camera = Camera(camera.height, camera.width, camera.focal[::-1], np.array(centre), d)
+    return camera
+
+
+def rotate(photo: Photograph, value, case: Case) -> Picture:
+    if not value.startswith("all") and photo.number:
+        return Picture(photo.grey)
+    quarter, (height, width) = ROTATED[value], photo.grey.shape
+    place = {
+        1: lambda xy: np.stack([xy[..., 1], width - 1 - xy[..., 0]], axis=-1),
+        2: lambda xy: np.stack([width - 1 - xy[..., 0], height - 1 - xy[..., 1]], axis=-1),
+        3: lambda xy: np.stack([height - 1 - xy[..., 1], xy[..., 0]], axis=-1),
+    }[quarter]
+    waived = set() if value.startswith("all") else set(photo.must_find)
+    return Picture(np.rot90(photo.grey, quarter), waived=waived, place=place)
+
+
+# ---------------------------------------------------------------- kinds with something behind
+
+Motion = tuple[np.ndarray, np.ndarray]
+"""Matrix (3, 3), perhaps a reflection, and shift (3,) mm, in the target frame."""
+
+
+def in_camera(photo: Photograph, motion: Motion) -> Motion:
+    """The same motion in the camera frame."""
+    r, t = photo.camera_from_target.rotation, photo.camera_from_target.translation
+    matrix = r @ motion[0] @ r.T
+    return matrix, r @ motion[1] + t - matrix @ t
+
+
+def facing(photo: Photograph, planes: Iterable[Plane], motion: Motion) -> list[Plane]:
+    """These planes moved, those that then face the camera, the farthest first."""
+    matrix, shift = in_camera(photo, motion)
+    found = []
+    for plane in planes:
+        outward = np.cross(plane.matrix[:, 0], plane.matrix[:, 1]) * (-1 if plane.name == BOARD else 1)
+        moved = plane.moved(matrix, shift)
+        middle = moved.xyz_camera(moved.xy_mm.mean(0))
+        if (matrix @ outward) @ middle < 0 and (moved.xyz_camera(moved.outline_mm())[:, 2] > 50).all():
+            found.append((float(np.linalg.norm(middle)), moved))
+    return [plane for _, plane in sorted(found, key=lambda each: -each[0])]
+
+
+def visible_share(photo: Photograph, planes: Iterable[Plane], free: np.ndarray) -> float:
+    """Number of circles of these planes that fall on free pixels."""
+    count = 0.0
+    for plane in planes:
+        x, y = np.rint(photo.camera.project(plane.xyz_camera(plane.xy_mm))).astype(int).T
+        inside = (x >= 0) & (y >= 0) & (x < free.shape[1]) & (y < free.shape[0])
+        count += free[y[inside], x[inside]].sum() / len(plane.labels)
+    return count
+
+
+def best_motion(photo: Photograph, case: Case, planes_of: Callable, candidates: Callable, key: str = "") -> Motion:
+    """Of a group's candidates that of which its photographs show most; the same for all photographs of the group."""
+    if (name := f"{photo.group}{key}") not in case.shared:
+        group = [p for p in case.data.photographs if p.group == photo.group]
+        frees = [1 - p.foreground() for p in group]
+        scores = []
+        for motion in (found := candidates(group)):
+            shown = [facing(p, planes_of(p), motion) for p in group]
+            scores.append(
+                sum(visible_share(p, planes, free) for p, planes, free in zip(group, shown, frees, strict=True))
+            )
+        case.shared[name] = found[int(np.argmax(scores))]
+    return case.shared[name]
+
+
+def behind_motions(case: Case, own: Callable[[Photograph], np.ndarray], turn: float, *words) -> Callable:
+    """Random motions to behind the target, as the group's cameras see it; ``own`` : middle of what moves, target
+    frame; ``turn`` : about any axis, rad at most."""
+
+    def candidates(group: list[Photograph]) -> list[Motion]:
+        rng = case.rng(group[0].group, *words)
+        axes = np.mean([p.camera_from_target.rotation for p in group], axis=0)
+        middle, found = own(group[0]), []
+        target = case_middle(case)
+        for _ in range(60):
+            r = Rigid.exp([*(turn * rng.uniform(-1, 1, 3) / np.sqrt(3)), 0, 0, 0]).rotation
+            to = target + rng.uniform(-350, 350) * axes[0] + rng.uniform(-250, 250) * axes[1]
+            to = to + rng.uniform(200, 450) * axes[2]
+            found.append((r, to - r @ middle))
+        return found
+
+    return candidates
+
+
+def case_middle(case: Case) -> np.ndarray:
+    """Middle of the target's circles, target frame."""
+    return np.mean(list(case.data.truth["circles"].values()), axis=0)
+
+
+def mirrors(case: Case) -> Callable:
+    """Mirrors that stand 15 mm off the target's circles, on all sides."""
+    circles = np.array(list(case.data.truth["circles"].values()))
+
+    def candidates(group: list[Photograph]) -> list[Motion]:
+        sides = [np.array(s, float) for s in np.ndindex(3, 3, 3)]
+        found = []
+        for side in (s - 1 for s in sides if (s != 1).any()):
+            n = side / np.linalg.norm(side)
+            at = (circles @ n).min() - 15.0
+            if all((-p.camera_from_target.rotation.T @ p.camera_from_target.translation) @ n > at for p in group):
+                found.append((np.eye(3) - 2 * np.outer(n, n), 2 * at * n))
+        return found
+
+    return candidates
+
+
+def all_faces(photo: Photograph) -> tuple[Plane, ...]:
+    return (*photo.faces, *photo.hidden_faces)
+
+
+def reflection(photo: Photograph, value: float, case: Case) -> Picture:
+    motion = best_motion(photo, case, all_faces, mirrors(case))
+    planes = facing(photo, all_faces(photo), motion)
+    shown = max(photo.faces, key=lambda face: sum(photo.must_find.get(label, False) for label in face.labels))
+    circle, plate = photo.levels(shown)
+    return Picture(degrade.behind(photo, planes, [(value * circle, value * plate)] * len(planes), 15.0))
+
+
+def second_target(photo: Photograph, value: float, case: Case) -> Picture:
+    motion = best_motion(photo, case, all_faces, behind_motions(case, lambda p: case_middle(case), 1.0))
+    planes = facing(photo, all_faces(photo), motion)
+    circle, plate = photo.levels(photo.faces[0])
+    return Picture(degrade.behind(photo, planes, [(value * circle, value * plate)] * len(planes), 15.0))
+
+
+def second_board(photo: Photograph, value: float, case: Case) -> Picture:
+    def middle(p: Photograph) -> np.ndarray:
+        return p.camera_from_target.inverse() @ p.board.xyz_camera(p.board.xy_mm.mean(0))
+
+    motion = best_motion(photo, case, lambda p: [p.board], behind_motions(case, middle, 0.6))
+    planes = facing(photo, [photo.board], motion)
+    circle, plate = photo.levels(photo.board)
+    return Picture(degrade.behind(photo, planes, [(value * circle, value * plate)] * len(planes), 15.0))
+
+
+def discs(photo: Photograph, case: Case, k: int, hexagonal: bool) -> Plane:
+    """The ``k``-th plate of equal discs, at the target's place, facing the group's cameras."""
+    rng = case.rng(photo.group, k, "discs")
+    radii = sorted(set(case.data.target.radius_of().values()))
+    radius = float(rng.choice([4.0, 5.0, 6.0])) if hexagonal else float(radii[-1] if k == 0 else rng.choice(radii))
+    pitch = radius * float(rng.choice([2.6, 3.0, 3.4] if hexagonal else [2.6, 5.0, 3.5]))
+    if k == 0 and not hexagonal:
+        pitch = 5 * radius  # as the big circles of a face of the reference target
+    n = 11 if hexagonal else 6
+    column, row = np.meshgrid(np.arange(n, dtype=float), np.arange(n, dtype=float))
+    if hexagonal:
+        column, row = column + 0.5 * (row % 2), row * np.sqrt(0.75)
+    xy = pitch * np.column_stack([column.ravel(), row.ravel()])
+    group = [p for p in case.data.photographs if p.group == photo.group]
+    axes = np.mean([p.camera_from_target.rotation for p in group], axis=0)
+    u, _, v = np.linalg.svd(axes)
+    x, y, _ = u @ v
+    at = case_middle(case) - x * xy[:, 0].mean() - y * -xy[:, 1].mean()
+    r, t = photo.camera_from_target.rotation, photo.camera_from_target.translation
+    matrix = np.column_stack([r @ x, r @ -y, r @ at + t])
+    labels = tuple(f"disc:{i}" for i in range(len(xy)))
+    return Plane("discs", matrix, labels, xy, np.full(len(xy), radius))
+
+
+def plates(hexagonal: bool) -> Callable[[Photograph, float, Case], Picture]:
+    """``value`` plates of equal discs behind; every other one with the contrast turned round."""
+
+    def make(photo: Photograph, value: float, case: Case) -> Picture:
+        drawn, levels = [], []
+        circle, plate = photo.levels(photo.faces[0])
+        for k in range(int(value)):
+            motions = behind_motions(case, lambda p: case_middle(case), 0.6, k)
+            motion = best_motion(photo, case, lambda p, k=k: [discs(p, case, k, hexagonal)], motions, f" {k}")
+            found = facing(photo, [discs(photo, case, k, hexagonal)], motion)
+            drawn += found
+            levels += [(circle, plate) if (k % 2 == 0) != hexagonal else (plate, circle)] * len(found)
+        return Picture(degrade.behind(photo, drawn, levels, 15.0))
+
+    return make
+
+
+KINDS = (
+    Kind("plain", "as it is", (0,), plain),
+    Kind("defocus", "px radius", (1, 2.5, 5, 8, 12), simple(degrade.defocused), goal=3),
+    Kind("motion", "px", (2, 5, 9, 14, 20), motion),
+    Kind("noise", "grey levels", (2, 8, 15, 30, 40), noise, goal=4),
+    Kind("underexposed", "×", (0.7, 0.5, 0.35, 0.25, 0.15), simple(degrade.exposed)),
+    Kind("overexposed", "×", (1.3, 1.6, 2.0, 2.5, 3.0), simple(degrade.exposed)),
+    Kind("gamma", "exponent 1/", (1.25, 0.8, 1.6, 0.6, 2.2), simple(degrade.toned)),
+    Kind("jpeg", "quality", (95, 80, 60, 40, 20), file_of_quality),
+    Kind("vignetting", "lost in the corners", (0.3, 0.45, 0.6, 0.75, 0.85), simple(degrade.vignetted)),
+    Kind("gradient", "brightest : darkest", (1.5, 2.5, 4, 6, 8), gradient),
+    Kind("face dimmed", "×", (0.7, 0.5, 0.35, 0.2, 0.15), dim_face),
+    Kind("board brighter", "×", (1.5, 2, 3, 4, 5), bright_board),
+    Kind("unevenly lit", "brightest : darkest", (1.5, 2.5, 4, 6, 8), uneven),
+    Kind("glare", "grey levels", (40, 80, 150, 250, 400), glare),
+    Kind("haze", "share", (0.15, 0.3, 0.45, 0.6, 0.75), haze),
+    Kind("circles hidden", "per face", (1, 2, 3, 4, 6), hide),
+    Kind("circles cut", "share of area", (0.05, 0.1, 0.2, 0.3, 0.4), cut),
+    Kind("board covered", "share", (0.1, 0.2, 0.3, 0.4, 0.5), cover_board),
+    Kind("one board covered", "share, one image a group", (0.1, 0.2, 0.3, 0.4, 0.5), cover_one_board),
+    Kind("halves darker", "share", (0.05, 0.1, 0.15, 0.2, 0.3), half),
+    Kind("hot pixels", "share", (1e-4, 3e-4, 1e-3, 3e-3, 1e-2), on_sensor(degrade.hot_pixels)),
+    Kind("dust", "spots", (5, 15, 40, 80, 150), on_sensor(degrade.dusty)),
+    Kind("printed grids", "grids behind", (1, 2, 3, 4, 5), plates(False)),
+    Kind("perforated", "plates behind", (1, 2, 3, 4, 5), plates(True)),
+    Kind("second board", "× brightness", (0.4, 0.6, 0.8, 1.0, 1.3), second_board),
+    Kind("second target", "× brightness", (0.4, 0.6, 0.8, 1.0, 1.3), second_target),
+    Kind("reflection", "× brightness", (0.2, 0.35, 0.5, 0.7, 0.9), reflection),
+    Kind("mirrored", "", MIRRORED, mirror_images, may_end=(5,)),
+    Kind("small circles", "px across", (12, 9, 7.5, 6, 5), small, camera=small_camera),
+    Kind("rolling shutter", "px", (0.5, 1, 2, 4, 8), rolling),
+    Kind("rotated", "", tuple(ROTATED), rotate, camera=rotated_camera),
+    Kind("deep", "bits", (10, 12, 14, 15, 16), deep),
+)  # fmt: skip
+
+
+# ---------------------------------------------------------------- runs
+
+
+def write_case(kind: Kind, case: Case, folder: Path) -> dict[str, Picture]:
+    """The degraded set in a folder; its pictures without pixels, by name without suffix."""
+    pictures = {}
+    for photo in case.data.photographs:
+        picture = kind.make(photo, case.value, case)
+        path = folder / "images" / photo.name
+        path.parent.mkdir(parents=True, exist_ok=True)
+        if isinstance(picture.pixels, bytes):
+            path.with_suffix(".jpg").write_bytes(picture.pixels)
+        else:
+            pixels = degrade.stored(picture.pixels, picture.bits)
+            cv2.imwrite(str(path.with_suffix(".png")), pixels, [cv2.IMWRITE_PNG_COMPRESSION, 1])
+        picture.pixels = b""
+        pictures[photo.name.rpartition(".")[0]] = picture
+    camera = kind.camera(case) if kind.camera else case.data.camera
+    write_cameras_txt(folder / "cameras.txt", camera)
+    return pictures
+
+
+def run_program(program: Path, case: Case, folder: Path, workers: int) -> tuple[int, str, float]:
+    """(exit code, first line of the error, seconds) of a run on a degraded set."""
+    words = [str(program / "stcal-sfm"), "run", str(folder / "images"), "--camera", str(folder / "cameras.txt")]
+    words += ["--out", str(folder / "run"), "--workers", str(workers)]
+    for name in ("target", "board"):
+        if (path := case.data.folder / f"{name}.toml").exists():
+            words += [f"--{name}", str(path)]
+    start = time.monotonic()
+    environment = os.environ | {"OPENBLAS_NUM_THREADS": "1"}
+    try:
+        done = subprocess.run(words, capture_output=True, text=True, check=False, timeout=LONGEST_S, env=environment)
+        code, said = done.returncode, done.stderr
+    except subprocess.TimeoutExpired:
+        code, said = -1, f"error: not done after {LONGEST_S:.0f} s"
+    lines = [x for x in said.splitlines() if x.strip() and not re.fullmatch(r"[\w ]+: \d+ of \d+", x)]
+    errors = [x for x in lines if x.startswith("error")] or lines[-1:]
+    trace = "traceback: " if "Traceback" in said else ""
+    text = trace + errors[0].replace(str(folder), "…") if code and errors else ""
+    return code, text[:300], time.monotonic() - start
+
+
+# ---------------------------------------------------------------- judgement
+
+
+def read_detections(path: Path) -> dict[str, dict[str, np.ndarray]]:
+    """Measured places by image (without suffix) and label."""
+    found: dict[str, dict[str, np.ndarray]] = {}
+    if path.exists():
+        with open(path, encoding="utf-8", newline="") as stream:
+            for row in csv.DictReader(stream):
+                place = np.array([float(row["x_px"]), float(row["y_px"])])
+                found.setdefault(row["image"].rpartition(".")[0], {})[row["label"]] = place
+    return found
+
+
+def board_turns(data: RenderedSet) -> list[np.ndarray]:
+    """Numbers of the board's dots by row and column, as its own symmetry lets them be."""
+    grid = np.arange(data.board.rows * data.board.columns).reshape(data.board.rows, -1)
+    if data.board.corner is not None:
+        return [grid]
+    square = [np.rot90(grid), np.rot90(grid, 3)] if data.board.rows == data.board.columns else []
+    return [grid, np.rot90(grid, 2), *square]
+
+
+def judge_labels(data: RenderedSet, pictures: dict[str, Picture], run: Path) -> dict:
+    """Counts of circles and dots found, of those that must be, and of wrong labels, with examples."""
+    measured = read_detections(run / "detections.csv")
+    total = dict.fromkeys(("found", "must", "dots", "must_dots", "wrong"), 0)
+    examples: list[str] = []
+    for group in data.truth["groups"]:
+        tried = []
+        for turn in board_turns(data):
+            counts, bad = dict.fromkeys(total, 0), []
+            for photo in (p for p in data.photographs if p.group == group):
+                name = photo.name.rpartition(".")[0]
+                _count(photo, pictures[name], measured.get(name, {}), turn, counts, bad)
+            tried.append((counts["wrong"], -counts["dots"], len(tried), counts, bad))
+        *_, counts, bad = min(tried)
+        total = {key: total[key] + counts[key] for key in total}
+        examples += bad
+    return total | {"examples": examples[:8]}
+
+
+def _count(photo: Photograph, picture: Picture, measured: dict, turn: np.ndarray, counts: dict, bad: list) -> None:
+    ellipses = photo.ellipses()
+    must = {k for k, m in photo.must_find.items() if m} - picture.hidden - picture.waived
+    counts["must"] += sum(not k.startswith(BOARD) for k in must)
+    counts["must_dots"] += sum(k.startswith(BOARD) for k in must)
+    scale = 1.0
+    if picture.place:  # a set of other size has other radii
+        ends = picture.place(np.array([[0.0, 0.0], [1000.0, 1000.0]]))
+        scale = float(np.linalg.norm(ends[1] - ends[0]) / np.hypot(1000, 1000))
+    for label, xy in measured.items():
+        key = label
+        if label.startswith(f"{BOARD}:"):
+            row, column = map(int, label.split(":")[1:])
+            inside = row < turn.shape[0] and column < turn.shape[1]
+            key = f"{BOARD}:{turn[row, column]}" if inside else label
+        if key not in ellipses or key in picture.hidden:
+            counts["wrong"] += 1
+            bad.append(f"{photo.name} {label}: not in view")
+            continue
+        centre, radius = ellipses[key]
+        away = float(np.linalg.norm(xy - (picture.place(centre) if picture.place else centre)))
+        if away > max(NEAR_PX, NEAR_RADII * radius * scale):
+            counts["wrong"] += 1
+            bad.append(f"{photo.name} {label}: {away:.1f} px off")
+        elif key in must:
+            counts["dots" if key.startswith(BOARD) else "found"] += 1
+
+
+def judge_faces(data: RenderedSet, run: Path) -> dict:
+    """Faces found, and the largest errors: µm and in σ."""
+    known = {face: Rigid.from_matrix(matrix) for face, matrix in data.truth["target_from_face"].items()}
+    shown = {k.partition(":")[0] for p in data.photographs for k, must in p.must_find.items() if must}
+    row = {"faces": 0, "faces_of": len(shown & known.keys()), "worst_um": None, "worst_sigma": None, "worst_face": ""}
+    if not (run / "faces.json").exists():
+        return row
+    found = json.loads((run / "faces.json").read_text())
+    own = found["reference_face"]
+    row["faces"] = len(found["target_from_face"].keys() & known.keys())
+    for face, matrix in found["target_from_face"].items():
+        if face == own or face not in known or own not in known:
+            continue
+        true, estimate = known[own].inverse() @ known[face], Rigid.from_matrix(matrix)
+        shift = estimate.translation - true.translation
+        um = 1e3 * float(np.linalg.norm(shift))
+        if row["worst_um"] is None or um > row["worst_um"]:
+            row |= {"worst_um": um, "worst_face": face}
+        covariance = np.array(found.get("target_from_face_covariance", {}).get(face, np.zeros((6, 6))))
+        if np.linalg.eigvalsh(covariance)[0] > 0:
+            error = np.concatenate([Rigid(estimate.rotation @ true.rotation.T).log()[:3], shift])
+            sigma = float(np.sqrt(error @ np.linalg.solve(covariance, error) / 6))
+            row["worst_sigma"] = max(sigma, row["worst_sigma"] or 0.0)
+    return row
+
+
+def judge_checks(run: Path) -> dict:
+    """Keys of the checks that failed, and of those that are suspicious."""
+    report = run / "report.json"
+    checks = json.loads(report.read_text())["checks"] if report.exists() else []
+    return {name: [c["key"] for c in checks if c["verdict"] == name] for name in ("failed", "suspicious")}
+
+
+def run_case(kind: Kind, strength: int, data: RenderedSet, program: Path, workers: int) -> dict:
+    """The row of one case."""
+    case = Case(data, kind.name, kind.values[strength - 1])
+    with tempfile.TemporaryDirectory(prefix="envelope-") as scratch:
+        folder = Path(scratch)
+        pictures = write_case(kind, case, folder)
+        code, error, seconds = run_program(program, case, folder, workers)
+        run = folder / "run"
+        row = {"set": data.folder.name, "kind": kind.name, "strength": strength, "value": case.value}
+        row |= judge_labels(data, pictures, run) | judge_faces(data, run) | judge_checks(run)
+        return row | {"exit": code, "error": error, "seconds": round(seconds, 1)}
+
+
+# ---------------------------------------------------------------- results
+
+
+def silent(row: dict) -> bool:
+    """Wrong without a word: over 4 σ, and no check failed."""
+    return (row["worst_sigma"] or 0) > SILENT_SIGMA and not row["failed"]
+
+
+def kind_of(row: dict) -> Kind:
+    return next(kind for kind in KINDS if kind.name == row["kind"])
+
+
+def share(found: int, of: int) -> str:
+    return f"{100 * found / of:.1f}" if of else "–"
+
+
+def figures(row: dict | None) -> str:
+    """A row's figures, in columns."""
+    if row is None:
+        return f"{'–':>6} {'–':>6} {'–':>5} {'–':>4} {'–':>8} {'–':>6} {'–':>4} {'–':>4}"
+    um, sigma = (f"{row[key]:.1f}" if row[key] is not None else "–" for key in ("worst_um", "worst_sigma"))
+    faces = f"{row['faces']}/{row['faces_of']}"
+    checks = f"{len(row['failed'])}+{len(row['suspicious'])}"
+    return (
+        f"{share(row['found'], row['must']):>6} {share(row['dots'], row['must_dots']):>6} {row['wrong']:>5} "
+        f"{faces:>4} {um:>8} {sigma:>6} {checks:>4} {row['exit']:>4}"
+    )
+
+
+HEADINGS = f"{'circ %':>6} {'dots %':>6} {'wrong':>5} {'face':>4} {'µm':>8} {'σ':>6} {'f+s':>4} {'exit':>4}"
+
+
+def line_of(row: dict, before: dict | None, comparing: bool) -> str:
+    kind = kind_of(row)
+    beyond = "*" if row["strength"] > kind.goal or row["strength"] in kind.may_end else " "
+    text = f"{row['set'][:11]:<11} {row['kind']:<17} {row['value']!s:>8}{beyond} "
+    text += f"{figures(before)}  |  " if comparing else ""
+    text += figures(row)
+    text += "  SILENT" if silent(row) else ""
+    return text + (f"  {row['error'][:110]}" if row["error"] else "")
+
+
+def summary(rows: list[dict]) -> str:
+    """What the issue's goals ask for, over all rows."""
+    ended = [r for r in rows if r["exit"]]
+    inside = [r for r in ended if r["strength"] <= kind_of(r).goal and r["strength"] not in kind_of(r).may_end]
+    lost = [r for r in rows if not r["exit"] and r["faces"] < r["faces_of"]]
+    names = lambda found: "; ".join(f"{r['set']} {r['kind']} {r['value']}" for r in found[:12])  # noqa: E731
+    wrong, quiet = [r for r in rows if r["wrong"]], [r for r in rows if silent(r)]
+    return "\n".join(
+        [
+            f"cases                {len(rows)}",
+            f"wrong labels         {sum(r['wrong'] for r in rows)} in {len(wrong)} cases: {names(wrong)}",
+            f"silent (> {SILENT_SIGMA:g} σ)       {len(quiet)}: {names(quiet)}",
+            f"runs that ended      {len(ended)}, {len(inside)} of them within the goals: {names(inside)}",
+            f"faces lost           in {len(lost)} runs: {names(lost)}",
+            f"circles found        {share(sum(r['found'] for r in rows), sum(r['must'] for r in rows))} %",
+            f"dots found           {share(sum(r['dots'] for r in rows), sum(r['must_dots'] for r in rows))} %",
+        ]
+    )
+
+
+def picture(rows: list[dict], before: list[dict], path: Path) -> None:
+    """Recall of circles by kind and strength, the worst of all sets; before beside after where there is both."""
+    from matplotlib.colors import LinearSegmentedColormap
+
+    from stcal.report.figure import INK, SMALL, new_figure, save
+
+    colours = LinearSegmentedColormap.from_list("recall", ["#b5473c", "#e9b98a", "#f4efe0", "#bcd7e6", "#5b9bc4"])
+    panels = [("before", before), ("after", rows)] if before else [("", rows)]
+    names = [kind.name for kind in KINDS if any(r["kind"] == kind.name for r in rows)]
+    figure = new_figure(1.7 + 4.9 * len(panels), 0.7 + 0.27 * len(names))
+    all_axes = figure.subplots(1, len(panels), squeeze=False, sharey=True)[0]
+    for axes, (title, own) in zip(all_axes, panels, strict=True):
+        for i, name in enumerate(names):
+            for strength in range(1, 6):
+                hit = [r for r in own if r["kind"] == name and r["strength"] == strength]
+                if hit:
+                    _cell(axes, hit, i, strength, colours)
+        axes.set_xlim(0.5, 5.5)
+        axes.set_ylim(len(names) - 0.5, -0.5)
+        axes.set_xticks(range(1, 6), [f"strength {k}" for k in range(1, 6)], fontsize=SMALL, color=INK)
+        units = [f"{kind.name}, {kind.unit}" if kind.unit else kind.name for kind in KINDS if kind.name in names]
+        axes.set_yticks(range(len(names)), units, fontsize=SMALL, color=INK)
+        axes.tick_params(length=0, labelleft=axes is all_axes[0])
+        axes.xaxis.tick_top()
+        for side in axes.spines.values():
+            side.set_visible(False)
+        if title:
+            axes.set_title(title, fontsize=SMALL + 2, color=INK)
+    figure.tight_layout()
+    save(figure, path)
+
+
+def _cell(axes, hit: list[dict], i: int, strength: int, colours) -> None:
+    """One box: the strength, the recall, and what went wrong."""
+    recall = [r["found"] / r["must"] for r in hit if r["must"]]
+    least = min(recall) if recall else None
+    colour = "#eeeeee" if least is None else colours(least)
+    ended, quiet, wrong = any(r["exit"] for r in hit), any(silent(r) for r in hit), sum(r["wrong"] for r in hit)
+    axes.add_patch(_box(strength, i, colour))
+    said = [*(["ended"] if ended else []), *(["silent"] if quiet else []), *([f"{wrong} wrong"] if wrong else [])]
+    value = str(hit[0]["value"]).replace("one in half of the groups", "half of groups").replace("one in", "1 in")
+    text = f"{value}: " + ("–" if least is None else f"{100 * least:.0f} %") + (f", {', '.join(said)}" if said else "")
+    bold = "bold" if said else "normal"
+    axes.text(strength, i, text, ha="center", va="center", fontsize=5.2, color="#222222", fontweight=bold)
+
+
+def _box(x: float, y: float, colour):
+    from matplotlib.patches import Rectangle
+
+    return Rectangle((x - 0.48, y - 0.45), 0.96, 0.9, facecolor=colour, edgecolor="none")
+
+
+def rows_of(path: Path | None) -> dict[tuple, dict]:
+    """Rows of a file by set, kind and strength."""
+    rows = json.loads(path.read_text()) if path and path.exists() else []
+    return {(r["set"], r["kind"], r["strength"]): r for r in rows}
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--sets", type=Path, nargs="+", default=[SAMPLE], help="folders of rendered sets")
+    parser.add_argument("--only", default="", help="regular expression of kinds")
+    parser.add_argument("--strengths", default="1,2,3,4,5")
+    parser.add_argument("--bin", type=Path, default=Path(sys.executable).parent, help="folder of stcal-sfm")
+    parser.add_argument("--workers", type=int, default=2, help="processes of each run")
+    parser.add_argument("--json", type=Path, help="keep rows here, and take those that it has")
+    parser.add_argument("--compare", type=Path, help="an earlier file of --json")
+    parser.add_argument("--picture", type=Path, help="draw recall by kind and strength")
+    parser.add_argument("--look", type=Path, help="write the first photograph of each case here, and run nothing")
+    given = parser.parse_args()
+    strengths = [int(k) for k in given.strengths.split(",")]
+    done, before = rows_of(given.json), rows_of(given.compare)
+    rows = []
+    print(" " * 40 + (f"{HEADINGS}  |  " if before else "") + HEADINGS, flush=True)
+    for folder in given.sets:
+        data = None
+        for kind in KINDS:
+            for strength in strengths if re.search(given.only, kind.name) else []:
+                key = (folder.resolve().name, kind.name, strength)
+                if strength > len(kind.values):
+                    continue
+                if key not in done or given.look:
+                    data = data or read_set(folder.resolve())
+                    if given.look:
+                        look(kind, strength, data, given.look)
+                        continue
+                    done[key] = run_case(kind, strength, data, given.bin.resolve(), given.workers)
+                    if given.json:
+                        given.json.parent.mkdir(parents=True, exist_ok=True)
+                        given.json.write_text(json.dumps(list(done.values()), indent=1) + "\n")
+                rows.append(done[key])
+                print(line_of(rows[-1], before.get(key), bool(before)), flush=True)
+    if not rows:
+        return
+    if before:
+        print(
+            f"\nbefore\n{summary([before[k] for r in rows if (k := (r['set'], r['kind'], r['strength'])) in before])}"
+        )
+        print("\nafter", end="")
+    print(f"\n{summary(rows)}\n* beyond the goals")
+    if given.picture:
+        picture(rows, list(before.values()), given.picture)
+
+
+def look(kind: Kind, strength: int, data: RenderedSet, folder: Path) -> None:
+    """The first photograph of a case, as PNG."""
+    case = Case(data, kind.name, kind.values[strength - 1])
+    pixels = kind.make(data.photographs[0], case.value, case).pixels
+    if isinstance(pixels, bytes):
+        pixels = cv2.imdecode(np.frombuffer(pixels, np.uint8), cv2.IMREAD_GRAYSCALE)
+    folder.mkdir(parents=True, exist_ok=True)
+    name = f"{data.folder.name}-{kind.name}-{strength}".replace(" ", "-")
+    cv2.imwrite(str(folder / f"{name}.png"), degrade.stored(pixels))
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,209 @@
+"""Degraded photographs: each does what it says, and nothing else."""
+
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from stcal.errors import InputError
+from stcal.synthetic import degrade
+from stcal.synthetic.photograph import RenderedSet, read_set
+
+SAMPLE = Path(__file__).resolve().parents[1] / "data" / "sample"
+STEP = np.tile(np.where(np.arange(120) < 60, 40.0, 200.0).astype(np.float32), (80, 1))
+POINT = np.zeros((81, 81), np.float32)
+POINT[40, 40] = 1000.0
+EVEN = np.full((200, 300), 120, np.uint8)
+
+
+@pytest.fixture(scope="module")
+def sample() -> RenderedSet:
+    return read_set(SAMPLE, at_most=1)
+
+
+def centroid(image: np.ndarray) -> tuple[float, float]:
+    y, x = np.indices(image.shape)
+    return float((x * image).sum() / image.sum()), float((y * image).sum() / image.sum())
+
+
+def spread(image: np.ndarray) -> np.ndarray:
+    """Root of the second moments about the centroid, along x and y, px."""
+    y, x = np.indices(image.shape)
+    mx, my = centroid(image)
+    return np.sqrt([((x - mx) ** 2 * image).sum() / image.sum(), ((y - my) ** 2 * image).sum() / image.sum()])
+
+
+def test_defocus_spreads_a_point_over_a_disc():
+    disc = degrade.defocused(POINT, 6.0)
+    assert disc.sum() == pytest.approx(1000, rel=1e-5)
+    assert centroid(disc) == pytest.approx((40, 40), abs=1e-3)
+    assert spread(disc) == pytest.approx([3, 3], rel=0.02)  # r/2 of an even disc
+    assert np.count_nonzero(disc > 0.5 * disc.max()) == pytest.approx(np.pi * 36, rel=0.05)
+
+
+def test_motion_spreads_a_point_over_a_line_and_leaves_its_middle():
+    for angle in (0.0, 0.9, np.pi / 2):
+        line = degrade.motion_blurred(POINT, 12.0, angle)
+        assert centroid(line) == pytest.approx((40, 40), abs=1e-3)
+        # An even line of 12 px has a spread of 12/√12; sharing points among pixels adds up to 1/4 px².
+        along = np.array([abs(np.cos(angle)), abs(np.sin(angle))]) * 12 / np.sqrt(12)
+        assert spread(line) == pytest.approx(along, abs=0.1)
+
+
+def test_rolling_shutter_moves_points_where_it_says():
+    smooth = cv2.GaussianBlur(np.pad(POINT, ((0, 60), (0, 0))), (0, 0), 2.0)
+    moved = degrade.rolling_shutter(smooth, 8.0)
+    expected = degrade.rolled(np.array([40.0, 40.0]), 8.0, smooth.shape[0])
+    assert expected[0] == pytest.approx(40 + 8 * (40 / 140 - 0.5))
+    assert centroid(np.maximum(moved, 0)) == pytest.approx(tuple(expected), abs=0.02)
+
+
+def test_noise_has_its_sigma_and_seed():
+    noisy = degrade.noisy(EVEN, 12.0, 3)
+    assert (noisy - EVEN).std() == pytest.approx(12, rel=0.02)  # 60 000 pixels: 0.3 %
+    assert abs((noisy - EVEN).mean()) < 0.3
+    assert (noisy == degrade.noisy(EVEN, 12.0, 3)).all()
+    assert (noisy != degrade.noisy(EVEN, 12.0, 4)).any()
+
+
+def test_exposure_clips_and_blooms():
+    assert degrade.exposed(STEP, 0.5) == pytest.approx(STEP / 2)
+    bright = degrade.stored(degrade.exposed(STEP, 2.0)).astype(float)
+    assert (bright[:, 61:] == 255).all()
+    assert (bright[:, :30] == 80).all()
+    assert 85 < bright[40, 58] < 110  # half of 15 % of the 145 grey values lost beside it: 91
+
+
+def test_tones_keep_black_and_white():
+    levels = np.array([[0.0, 63.75, 127.5, 255.0]], np.float32)
+    assert degrade.toned(levels, 2.0)[0] == pytest.approx([0, 127.5, 180.31, 255], abs=0.01)
+
+
+def test_jpeg_of_lower_quality_is_smaller_and_farther_off():
+    image = degrade.stored(degrade.noisy(STEP, 10, 0))
+    files = [degrade.jpeg(image, quality) for quality in (95, 40)]
+    off = [np.std(cv2.imdecode(np.frombuffer(f, np.uint8), 0).astype(float) - image) for f in files]
+    assert len(files[1]) < 0.5 * len(files[0])
+    assert off[0] < 3 < off[1]
+
+
+def test_light_falls_off():
+    corners = degrade.vignetted(EVEN, 0.4)
+    assert corners[0, 0] == pytest.approx(72, abs=0.01)
+    assert corners[100, 150] == pytest.approx(120, rel=1e-3)
+    slope = degrade.graded(EVEN, 4.0, 0.0)
+    assert slope[7, 0] == pytest.approx(120)
+    assert slope[7, -1] == pytest.approx(30)
+    veiled = degrade.hazy(STEP, 0.6, 1)
+    assert np.median(veiled[:, 61] - veiled[:, 58]) == pytest.approx(0.4 * 160, abs=2)
+
+
+def test_the_sensor_has_hot_pixels_and_dust():
+    hot = degrade.hot_pixels(EVEN, 0.01, 0) != EVEN
+    assert hot.mean() == pytest.approx(0.01, rel=0.2)  # 600 of 60 000
+    dust = degrade.dusty(EVEN, 10, 0) / 120
+    assert 0.2 < dust.min() < 0.9
+    assert dust.max() <= 1
+    assert 0.5 < (dust > 0.99).mean() < 0.99
+
+
+def test_glare_adds_its_peak():
+    spots = degrade.glared(EVEN, [np.array([50.0, 60.0])], 8.0, 90.0)
+    assert spots[60, 50] == pytest.approx(210)
+    assert spots[60, 58] == pytest.approx(120 + 90 * np.exp(-0.5), rel=1e-4)
+
+
+def test_files_are_of_8_to_16_bits():
+    assert degrade.stored(np.array([[-4.0, 99.6, 300.0]])).tolist() == [[0, 100, 255]]
+    deep = degrade.stored(np.array([[0.0, 255.0]]), 12)
+    assert deep.dtype == np.uint16
+    assert deep.tolist() == [[0, 4095]]
+    with pytest.raises(InputError, match="17 bits"):
+        degrade.stored(EVEN, 17)
+
+
+def test_the_truth_says_where_circles_are(sample):
+    photo = sample.photographs[0]
+    truth = sample.truth["groups"][photo.group]["images"][photo.name]["circles"]
+    ellipses = photo.ellipses()
+    assert ellipses.keys() == truth.keys()
+    for label, (centre, radius) in ellipses.items():
+        assert np.hypot(*(centre - truth[label]["centre_px"])) < 0.3  # eccentricity
+        assert 2 < radius < 20
+    for plane in photo.planes:
+        circle, plate = photo.levels(plane)
+        assert circle > plate + 50
+
+
+def test_pixels_and_planes_belong_together(sample):
+    photo = sample.photographs[0]
+    x, y = np.meshgrid([3, 700, 1500], [5, 1030])
+    exact = photo.camera.normalised_from_pixel(np.stack([x, y], axis=-1))
+    assert photo.ideal[y, x] == pytest.approx(exact, abs=1e-8)  # 2e-5 px
+    window, unit = photo.circle(photo.board, 0, 1.5)
+    place = photo.camera.project(photo.board.xyz_camera(photo.board.xy_mm[0]))
+    corner = np.array([window[1].start, window[0].start])
+    nearest = np.unravel_index(np.argmin(np.hypot(unit[..., 0], unit[..., 1])), unit.shape[:2])
+    assert np.abs(corner + nearest[::-1] - place).max() <= 0.5
+
+
+def test_hidden_circles_are_gone_and_others_stay(sample):
+    photo = sample.photographs[0]
+    face = photo.faces[0]
+    image = degrade.without_circles(photo, face.labels[:3])
+    whole, part = degrade.covered_labels(photo, image)
+    assert whole == set(face.labels[:3])
+    assert part == set()
+    circle, plate = photo.levels(face)
+    x, y = np.rint(photo.ellipses()[face.labels[0]][0]).astype(int)
+    assert image[y, x] == pytest.approx(plate, abs=15)
+    assert photo.grey[y, x] == pytest.approx(circle, abs=40)
+
+
+def test_cut_circles_lose_their_share(sample):
+    photo = sample.photographs[0]
+    face = max(photo.faces, key=lambda f: sum(photo.must_find.get(k, False) for k in f.labels))
+    label = face.labels[0]
+    image = degrade.cut_circles(photo, [label], 0.3, 5)
+    window, _ = photo.circle(face, 0, 1.3)
+    _, plate = photo.levels(face)
+    lost = (photo.grey[window] - image[window]).sum() / (photo.grey[window] - plate).sum()
+    assert lost == pytest.approx(0.3, abs=0.04)
+    assert degrade.covered_labels(photo, image) == (set(), {label})
+
+
+def test_half_of_a_circle_is_darker(sample):
+    photo = sample.photographs[0]
+    image = degrade.half_darker(photo, 0.2)
+    window, unit = photo.circle(photo.board, 10, 1.0)
+    along = unit[..., 0] * np.cos(0.6) + unit[..., 1] * np.sin(0.6)
+    inside = np.hypot(unit[..., 0], unit[..., 1]) < 0.7
+    kept = (image / np.maximum(photo.grey, 1))[window]
+    assert kept[inside & (along < -0.3)] == pytest.approx(1, abs=0.02)
+    assert np.median(kept[inside & (along > 0.3)]) == pytest.approx(0.82, abs=0.04)  # of the contrast, not the light
+
+
+def test_a_sheet_covers_its_share_of_the_board(sample):
+    photo = sample.photographs[0]
+    whole, part = degrade.covered_labels(photo, degrade.board_covered(photo, 0.4, 2))
+    assert all(label.startswith("board") for label in whole | part)
+    assert 0.25 < len(whole | part) / len(photo.board.labels) < 0.5
+
+
+def test_what_stands_behind_covers_neither_target_nor_board(sample):
+    photo = sample.photographs[0]
+    board = photo.board.moved(np.eye(3), np.array([150.0, 200.0, 400.0]))
+    image = degrade.behind(photo, [board], [(255.0, 90.0)])
+    assert degrade.covered_labels(photo, image) == (set(), set())
+    assert 0.005 < (np.abs(image - photo.grey) > 20).mean() < 0.2
+
+
+def test_the_box_is_lit_from_one_side(sample):
+    photo = sample.photographs[0]
+    image = degrade.unevenly_lit(photo, 4.0)
+    lit = image / np.maximum(photo.grey, 1)
+    board = photo.face_region(photo.board) > 0.99
+    assert np.abs(image - photo.grey)[board].max() < 0.5
+    face = photo.face_region(photo.faces[0]) > 0.99
+    assert 0.2 < np.median(lit[face]) < 0.95
