@@ -14,7 +14,7 @@ from stcal.geometry.align import align_rigid
 from stcal.geometry.camera import Camera
 from stcal.geometry.conic import circle_image_offset
 from stcal.geometry.rigid import Rigid
-from stcal.io.camera import read_camera
+from stcal.io.camera import CalibratedCamera, read_camera
 from stcal.io.design import load_board, load_target
 from stcal.io.images import decode
 from stcal.labels import BOARD
@@ -183,7 +183,7 @@ class RenderedSet:
     folder: Path
     target: TargetDesign
     board: BoardDesign
-    camera: Camera
+    camera: CalibratedCamera
     truth: dict
     photographs: tuple[Photograph, ...]
 
@@ -201,7 +201,7 @@ def read_set(folder: str | Path, at_most: int | None = None) -> RenderedSet:
         for number, (name, image) in enumerate(list(content["images"].items())[:at_most]):
             grey = decode((folder / "images" / name).read_bytes(), name)
             if camera is None or ideal is None:
-                camera = read_camera(folder / "cameras.txt").sized(grey.shape[1], grey.shape[0])
+                camera = read_camera(folder / "cameras.txt").calibrated(grey.shape[1], grey.shape[0])
                 ideal = _ideal(camera)
             pose = Rigid.from_matrix(image["camera_from_target"])
             planes = _faces(target, truth, pose)
