@@ -59,6 +59,7 @@ class Picture:
     waived: set[str] = field(default_factory=set)
     place: Place | None = None
     bits: int = 8
+    mirrored: bool = False
 
 
 @dataclass
@@ -233,7 +234,8 @@ def small(photo: Photograph, value: float, case: Case) -> Picture:
     return Picture(image, place=lambda xy: (np.asarray(xy) + 0.5) * factors - 0.5)
 
 
-MIRRORED = ("one image", "one in half of the groups", "one in each group", "a group", "all")
+MIRRORED = ("one image", "some", "1 a group", "a group", "all")
+"""Images: one; one in every other group; one in each group; all of the last group; all."""
 
 
 def mirror_images(photo: Photograph, value, case: Case) -> Picture:
@@ -241,8 +243,8 @@ def mirror_images(photo: Photograph, value, case: Case) -> Picture:
     at = groups.index(photo.group)
     hit = {
         "one image": at == photo.number == 0,
-        "one in half of the groups": photo.number == 0 and at % 2 == 0,
-        "one in each group": photo.number == 0,
+        "some": photo.number == 0 and at % 2 == 0,
+        "1 a group": photo.number == 0,
         "a group": at == len(groups) - 1,
         "all": True,
     }[value]
@@ -250,10 +252,11 @@ def mirror_images(photo: Photograph, value, case: Case) -> Picture:
         return Picture(photo.grey)
     width = photo.grey.shape[1]
     place = lambda xy: np.stack([width - 1 - np.asarray(xy)[..., 0], np.asarray(xy)[..., 1]], axis=-1)  # noqa: E731
-    return Picture(photo.grey[:, ::-1], waived=set(photo.must_find), place=place)
+    return Picture(photo.grey[:, ::-1], waived=set(photo.must_find), place=place, mirrored=True)
 
 
-ROTATED = {"all by 90°": 1, "all by 180°": 2, "all by 270°": 3, "one in a group by 90°": 1, "one in a group by 180°": 2}
+ROTATED = {"all 90°": 1, "all 180°": 2, "all 270°": 3, "one 90°": 1, "one 180°": 2}
+"""Quarter turns; ``one`` : in each group, with the camera of the others."""
 
 
 def rotated_camera(case: Case) -> Camera:
@@ -535,9 +538,10 @@ def read_detections(path: Path) -> dict[str, dict[str, np.ndarray]]:
     return found
 
 
-def board_turns(data: RenderedSet) -> list[np.ndarray]:
-    """Numbers of the board's dots by row and column, as its own symmetry lets them be."""
+def board_turns(data: RenderedSet, mirrored: bool) -> list[np.ndarray]:
+    """Numbers of the board's dots by row and column, as its own symmetry lets them be; ``mirrored`` : in all images."""
     grid = np.arange(data.board.rows * data.board.columns).reshape(data.board.rows, -1)
+    grid = grid[:, ::-1] if mirrored else grid
     if data.board.corner is not None:
         return [grid]
     square = [np.rot90(grid), np.rot90(grid, 3)] if data.board.rows == data.board.columns else []
@@ -550,11 +554,11 @@ def judge_labels(data: RenderedSet, pictures: dict[str, Picture], run: Path) -> 
     total = dict.fromkeys(("found", "must", "dots", "must_dots", "wrong"), 0)
     examples: list[str] = []
     for group in data.truth["groups"]:
+        photos = {p.name.rpartition(".")[0]: p for p in data.photographs if p.group == group}
         tried = []
-        for turn in board_turns(data):
+        for turn in board_turns(data, all(pictures[name].mirrored for name in photos)):
             counts, bad = dict.fromkeys(total, 0), []
-            for photo in (p for p in data.photographs if p.group == group):
-                name = photo.name.rpartition(".")[0]
+            for name, photo in photos.items():
                 _count(photo, pictures[name], measured.get(name, {}), turn, counts, bad)
             tried.append((counts["wrong"], -counts["dots"], len(tried), counts, bad))
         *_, counts, bad = min(tried)
@@ -700,55 +704,51 @@ def summary(rows: list[dict]) -> str:
 
 
 def picture(rows: list[dict], before: list[dict], path: Path) -> None:
-    """Recall of circles by kind and strength, the worst of all sets; before beside after where there is both."""
-    from matplotlib.colors import LinearSegmentedColormap
-
+    """Recall, the least of circles and dots in all sets, by kind and strength; before beside after."""
     from stcal.report.figure import INK, SMALL, new_figure, save
 
-    colours = LinearSegmentedColormap.from_list("recall", ["#b5473c", "#e9b98a", "#f4efe0", "#bcd7e6", "#5b9bc4"])
     panels = [("before", before), ("after", rows)] if before else [("", rows)]
-    names = [kind.name for kind in KINDS if any(r["kind"] == kind.name for r in rows)]
-    figure = new_figure(1.7 + 4.9 * len(panels), 0.7 + 0.27 * len(names))
+    kinds = [kind for kind in KINDS if any(r["kind"] == kind.name for r in rows)]
+    strengths = sorted({r["strength"] for r in rows})
+    figure = new_figure(2.7 + 0.95 * len(strengths) * len(panels), 0.6 + 0.29 * len(kinds))
     all_axes = figure.subplots(1, len(panels), squeeze=False, sharey=True)[0]
     for axes, (title, own) in zip(all_axes, panels, strict=True):
-        for i, name in enumerate(names):
-            for strength in range(1, 6):
-                hit = [r for r in own if r["kind"] == name and r["strength"] == strength]
-                if hit:
-                    _cell(axes, hit, i, strength, colours)
-        axes.set_xlim(0.5, 5.5)
-        axes.set_ylim(len(names) - 0.5, -0.5)
-        axes.set_xticks(range(1, 6), [f"strength {k}" for k in range(1, 6)], fontsize=SMALL, color=INK)
-        units = [f"{kind.name}, {kind.unit}" if kind.unit else kind.name for kind in KINDS if kind.name in names]
-        axes.set_yticks(range(len(names)), units, fontsize=SMALL, color=INK)
+        for i, kind in enumerate(kinds):
+            for j, strength in enumerate(strengths):
+                if hit := [r for r in own if r["kind"] == kind.name and r["strength"] == strength]:
+                    _cell(axes, hit, i, j)
+        axes.set_xlim(-0.5, len(strengths) - 0.5)
+        axes.set_ylim(len(kinds) - 0.5, -0.5)
+        named = [f"{title}, {k}" if title else f"strength {k}" for k in strengths]
+        axes.set_xticks(range(len(strengths)), named, fontsize=SMALL, color=INK)
+        units = [f"{kind.name}, {kind.unit}" if kind.unit else kind.name for kind in kinds]
+        axes.set_yticks(range(len(kinds)), units, fontsize=SMALL, color=INK)
         axes.tick_params(length=0, labelleft=axes is all_axes[0])
         axes.xaxis.tick_top()
         for side in axes.spines.values():
             side.set_visible(False)
-        if title:
-            axes.set_title(title, fontsize=SMALL + 2, color=INK)
     figure.tight_layout()
     save(figure, path)
 
 
-def _cell(axes, hit: list[dict], i: int, strength: int, colours) -> None:
-    """One box: the strength, the recall, and what went wrong."""
-    recall = [r["found"] / r["must"] for r in hit if r["must"]]
-    least = min(recall) if recall else None
-    colour = "#eeeeee" if least is None else colours(least)
-    ended, quiet, wrong = any(r["exit"] for r in hit), any(silent(r) for r in hit), sum(r["wrong"] for r in hit)
-    axes.add_patch(_box(strength, i, colour))
-    said = [*(["ended"] if ended else []), *(["silent"] if quiet else []), *([f"{wrong} wrong"] if wrong else [])]
-    value = str(hit[0]["value"]).replace("one in half of the groups", "half of groups").replace("one in", "1 in")
-    text = f"{value}: " + ("–" if least is None else f"{100 * least:.0f} %") + (f", {', '.join(said)}" if said else "")
-    bold = "bold" if said else "normal"
-    axes.text(strength, i, text, ha="center", va="center", fontsize=5.2, color="#222222", fontweight=bold)
-
-
-def _box(x: float, y: float, colour):
+def _cell(axes, hit: list[dict], i: int, j: int) -> None:
+    """One box: the strength with the recall, and below what went wrong."""
+    from matplotlib.colors import LinearSegmentedColormap
     from matplotlib.patches import Rectangle
 
-    return Rectangle((x - 0.48, y - 0.45), 0.96, 0.9, facecolor=colour, edgecolor="none")
+    colours = LinearSegmentedColormap.from_list("recall", ["#b5473c", "#e9b98a", "#f4efe0", "#bcd7e6", "#6fa8cf"])
+    recall = [r[a] / r[b] for r in hit for a, b in (("found", "must"), ("dots", "must_dots")) if r[b]]
+    colour = colours(min(recall)) if recall else "#eeeeee"
+    axes.add_patch(Rectangle((j - 0.48, i - 0.45), 0.96, 0.9, facecolor=colour, edgecolor="none"))
+    ended, quiet, wrong = any(r["exit"] for r in hit), any(silent(r) for r in hit), sum(r["wrong"] for r in hit)
+    lost = any(not r["exit"] and r["faces"] < r["faces_of"] for r in hit)
+    said = [word for word, true in (("ended", ended), ("silent", quiet), ("faces lost", lost)) if true]
+    said += [f"{wrong} wrong"] if wrong else []
+    ink = "#ffffff" if recall and min(recall) < 0.2 else "#222222"
+    text = f"{hit[0]['value']}: " + (f"{100 * min(recall):.0f} %" if recall else "–")
+    style = {"ha": "center", "va": "center", "color": ink}
+    axes.text(j, i - (0.19 if said else 0), text, fontsize=6, **style)
+    axes.text(j, i + 0.21, ", ".join(said), fontsize=5.5, fontweight="bold", **style)
 
 
 def rows_of(path: Path | None) -> dict[tuple, dict]:

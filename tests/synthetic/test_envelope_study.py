@@ -28,7 +28,7 @@ def perfect(pictures: dict, skip: set[str] = frozenset()) -> list[tuple[str, str
                 name = label
                 if label.startswith("board:"):
                     row, column = divmod(62 - int(label[6:]), 9)
-                    name = f"board:{row}:{column}"
+                    name = f"board:{row}:{8 - column if picture.mirrored else column}"
                 rows.append((photo.name, name, picture.place(centre) if picture.place else centre))
     return rows
 
