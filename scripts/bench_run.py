@@ -115,8 +115,8 @@ def timed_detection(data: Path, cache: Path):
     start = time.perf_counter()
     result = detect_files(files, camera, *designs, EllipseOptions(), cache)
     seconds = time.perf_counter() - start
-    found = {i.file.name: i.detection for i in result.images if len(i.detection.numberings)}
-    return seconds, {name: d.centres.centre_px[len(d.target_labels) :] for name, d in found.items()}
+    found = {i.file.name: i.detection for i in result.images}
+    return seconds, {name: d.centres.centre_px[d.board.rows] for name, d in found.items() if d.board is not None}
 
 
 def timed_calibration(out: Path) -> float:

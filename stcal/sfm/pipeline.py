@@ -13,8 +13,9 @@ from stcal.sfm.adjust.calibration import calibrate
 from stcal.sfm.adjust.chain import measure_chains
 from stcal.sfm.checks.suite import run_checks
 from stcal.sfm.data.observations import by_group, detections_csv
-from stcal.sfm.detect.files import DetectionResult, detect_files, require_single
-from stcal.sfm.detect.labels import LabelledImage, label_group
+from stcal.sfm.detect.files import DetectionResult, detect_files, require_upright
+from stcal.sfm.detect.group import label_images
+from stcal.sfm.detect.labels import LabelledImage
 from stcal.sfm.mapping.graph import image_graph
 from stcal.sfm.run.folder import claim_folder, write_overlays, write_run
 from stcal.sfm.run.marker import MarkerFile
@@ -68,7 +69,7 @@ def run(
     out = claim_folder(out, MarkerFile.of(images, options))
 
     detection, labelled = detect(images, model, out, target, board, options, progress)
-    require_single(detection.images)
+    require_upright(detection.images)
     known = model.calibrated(detection.camera.width, detection.camera.height)
     known = refinable(known) if options.refine_camera else known
     observations = [each.observations for each in labelled]
@@ -117,10 +118,7 @@ def detect(
     step = counted(progress, "detect", len(files))
     detection = detect_files(files, camera, target, board, options.ellipses, out / "cache", options.workers, step)
     detection = replace(detection, skipped=(*other, *detection.skipped))
-    groups: dict[str, list] = {}
-    for image in detection.images:
-        groups.setdefault(image.file.group, []).append((image.file.name, image.file.group, image.detection))
-    labelled = [each for group in groups.values() for each in label_group(group, target, board)]
+    labelled = label_images(detection, target, board, out / "cache", options.workers)
     save(out / "detections.csv", detections_csv([each.observations for each in labelled]))
     write_overlays(detection, labelled, target, out, progress)
     return detection, labelled

@@ -158,12 +158,12 @@ def _find_dots(image: np.ndarray, name: str, camera: Camera, board: BoardDesign)
     found = detect_image(image, camera, TargetDesign("none", board.polarity, ()), board, EllipseOptions())
     if found.repeated:
         return None, "the board is in view more than once"
-    if not len(found.numberings):
+    if found.board is None or not len(found.board.rows):
         return None, "no board of dots recognised"
-    ids = found.numberings @ [board.columns, 1]
+    ids = found.board.numberings @ [board.columns, 1]
     if not _turned_only(ids, board):
         return None, "a strip of the board is hidden, so that its dots cannot be numbered; show more of it"
-    centres, xy = found.centres, board.xy_mm()[ids[0]]
+    centres, xy = found.centres.select(found.board.rows), board.xy_mm()[ids[0]]
     xyz = np.column_stack([xy, np.zeros(len(xy))])
     centre_px = images_of_centres(centres.centre_px, xyz, board.radii_mm()[ids[0]], camera)
     return BoardView(name, ids[0], xyz, centre_px, centres.covariance_px2), ""

@@ -134,16 +134,17 @@ def test_all_photographed_boards_are_found_and_oriented(shared_data):
     assert len(images) == 15
     for name, image in images:
         found = detect_image(image, camera, reference_target(), DOTGRID, EllipseOptions())
-        assert found.numberings.shape[0] == 1, f"{name}: not oriented"
-        assert found.numberings.shape[1] >= 97, f"{name}: {found.numberings.shape[1]} dots"
-        assert not found.target_labels, f"{name}: a face where there is none"
+        assert found.board is not None
+        assert found.board.numberings.shape[0] == 1, f"{name}: not oriented"
+        assert found.board.numberings.shape[1] >= 97, f"{name}: {found.board.numberings.shape[1]} dots"
+        assert not found.faces, f"{name}: a face where there is none"
         _check_orientation(name, found)
 
 
 def _check_orientation(name, found):
     """In all these photographs the sheet stands the same way up: columns to the right, rows downwards, and the dot
     numbered as the corner is the larger one."""
-    numbering, centre = found.numberings[0], found.centres.centre_px
+    numbering, centre = found.board.numberings[0], found.centres.centre_px[found.board.rows]
     rows, columns = numbering.T
     along_column = np.polyfit(columns, centre[:, 0], 1)[0]
     along_row = np.polyfit(rows, centre[:, 1], 1)[0]

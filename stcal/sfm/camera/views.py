@@ -72,10 +72,10 @@ def board_views(images: Sequence[DetectedImage], board: BoardDesign, camera: Cam
     """
     views = []
     for image in images:
-        count = image.detection.numberings.shape[1]
-        if count:
-            dots = image.detection.centres.select(np.arange(-count, 0))
-            labels = tuple(DotLabel(0, i) for i in range(count))
+        seen = image.detection.board
+        if seen is not None and len(seen.rows):
+            dots = image.detection.centres.select(seen.rows)
+            labels = tuple(DotLabel(0, i) for i in range(len(dots)))
             views.append(
                 ImageObservations(
                     name=image.file.name,
@@ -87,7 +87,7 @@ def board_views(images: Sequence[DetectedImage], board: BoardDesign, camera: Cam
                     covariance_px2=dots.covariance_px2,
                 )
             )
-    numberings = {i.file.name: i.detection.numberings for i in images}
+    numberings = {i.file.name: i.detection.board.numberings for i in images if i.detection.board is not None}
     settled = {}
     for members in by_group(views).values():
         fields = [_deviations(numberings[v.name], camera.normalised_from_pixel(v.centre_px), board) for v in members]

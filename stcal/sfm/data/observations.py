@@ -45,6 +45,11 @@ class ImageObservations:
         """Faces of the target that the labels name, in order."""
         return list(dict.fromkeys(label.face for label in self.labels if isinstance(label, CircleLabel)))
 
+    def plus(self, other: "ImageObservations") -> "ImageObservations":
+        """These, and the other's circles of the same image after them."""
+        arrays = [np.concatenate([getattr(self, f.name), getattr(other, f.name)]) for f in fields(self)[3:]]
+        return ImageObservations(self.name, self.group, self.labels + other.labels, *arrays)
+
     def select(self, keep) -> "ImageObservations":
         """Those of the indices ``keep``."""
         arrays = [getattr(self, f.name)[keep] for f in fields(self)[3:]]

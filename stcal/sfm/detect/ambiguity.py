@@ -80,3 +80,21 @@ def is_named(face: FaceDesign, found: np.ndarray, target: TargetDesign) -> bool:
     """Whether the circles found (mask) name the face: no other reading explains them all."""
     circles = frozenset(np.flatnonzero(found).tolist())
     return not any(circles <= rival for rival in confusable(target)[face.id])
+
+
+def mirror_images(target: TargetDesign) -> dict[str, str]:
+    """For every face whose image in a mirror passes for a face, that face."""
+    key = tuple((f.id, f.xy_mm.tobytes(), f.radius_mm.tobytes()) for f in target.faces)
+    return _mirror_images(key)
+
+
+@lru_cache(maxsize=8)
+def _mirror_images(key) -> dict[str, str]:
+    faces = [(face_id, np.frombuffer(xy).reshape(-1, 2), np.frombuffer(radius)) for face_id, xy, radius in key]
+    found = {}
+    for face_id, xy, radius in faces:
+        for other_id, other_xy, other_radius in faces:
+            most = max(map(len, _common(xy * [1, -1], radius, other_xy, other_radius, same=False)), default=0)
+            if most == len(xy) == len(other_xy):
+                found[face_id] = other_id
+    return found

@@ -43,6 +43,12 @@ class Candidates:
         radius = np.sqrt(np.abs(np.linalg.det(shape))) if len(xy) else np.zeros(0)
         return cls(xy, shape, radius, ellipses.contrast, 1 / float(np.sqrt(camera.focal.prod())), KDTree(xy))
 
+    def mirrored(self) -> "Candidates":
+        """As a mirror shows them: x turned about."""
+        flip = np.array([-1.0, 1.0])
+        xy = self.xy * flip
+        return Candidates(xy, flip[:, None] * self.shape * flip, self.radius, self.contrast, self.px, KDTree(xy))
+
     def __len__(self) -> int:
         return len(self.xy)
 

@@ -55,7 +55,8 @@ class Centres:
     ``centre_px`` : (n, 2) centre of the ideal ellipse, put into the image as it is (OpenCV pixel origin);
     ``centre`` : (n, 2) the same in normalised ideal coordinates; ``shape`` : (n, 2, 2) its shape there, rim = centre +
     shape @ unit circle; ``covariance_px2`` : (n, 2, 2) of ``centre_px``; ``blur_px`` : (n,); ``contrast`` : (n,) grey
-    values, inside minus outside; ``rim`` : (n,) share of the rim that follows the model; ``ok`` : (n,) usable.
+    values, inside minus outside; ``noise`` : (n,) robust σ of a pixel about the model, grey values; ``rim`` : (n,)
+    share of the rim that follows the model; ``ok`` : (n,) usable.
     """
 
     centre_px: np.ndarray
@@ -64,6 +65,7 @@ class Centres:
     covariance_px2: np.ndarray
     blur_px: np.ndarray
     contrast: np.ndarray
+    noise: np.ndarray
     rim: np.ndarray
     ok: np.ndarray
 
@@ -76,6 +78,7 @@ class Centres:
             ("blur_px", (n,)),
             ("covariance_px2", (n, 2, 2)),
             ("contrast", (n,)),
+            ("noise", (n,)),
             ("rim", (n,)),
         ):
             object.__setattr__(self, name, frozen(getattr(self, name), shape, name))
@@ -127,6 +130,7 @@ def measure_centres(image: np.ndarray, camera: Camera, ellipses: Ellipses, neigh
         covariance_px2=jacobian @ covariance @ np.swapaxes(jacobian, 1, 2),
         blur_px=np.array([fit.blur for fit in rows], float),
         contrast=np.array([fit.contrast for fit in rows], float),
+        noise=np.array([fit.noise for fit in rows], float),
         rim=np.array([fit.rim for fit in rows], float),
         ok=np.array([fit.rim >= MIN_RIM for fit in rows], bool),
     )
@@ -177,6 +181,7 @@ class _Ellipse:
     covariance: np.ndarray
     blur: float
     contrast: float
+    noise: float
     rim: float
 
 
@@ -318,7 +323,7 @@ class _Fit:
     def result(self) -> _Ellipse:
         """The fit; of no contrast and no rim where it failed."""
         if self.failed:
-            return _Ellipse(self.start, np.eye(2) * self.radius, np.eye(2), 0.0, 0.0, 0.0)
+            return _Ellipse(self.start, np.eye(2) * self.radius, np.eye(2), 0.0, 0.0, 0.0, 0.0)
         near = np.abs(self.reduced) * self.blur < max(1.5, self.blur)
         angle = np.arctan2(self.rim_angle[1][near], self.rim_angle[0][near])
         sector = (angle * (SECTORS / (2 * np.pi))).astype(int) % SECTORS
@@ -328,4 +333,4 @@ class _Fit:
         allowed = (MAX_RIM_RESIDUAL * self.contrast) ** 2 + (2 * noise) ** 2
         rim = float((square <= allowed * total).mean())
         shape = np.linalg.inv(self.inverse_shape)
-        return _Ellipse(self.centre, shape, self._covariance(), self.blur, self.contrast, rim)
+        return _Ellipse(self.centre, shape, self._covariance(), self.blur, self.contrast, noise, rim)

@@ -11,7 +11,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from stcal.design import FaceDesign, TargetDesign
-from stcal.sfm.detect.ambiguity import is_named
+from stcal.geometry.plane import homography_jacobian
+from stcal.sfm.detect.ambiguity import is_named, mirror_images
 from stcal.sfm.detect.candidates import MAX_AXIS_RATIO, Candidates, grow_match, singular_values
 
 NEIGHBOURS_IN_DESIGN = 3
@@ -22,12 +23,17 @@ SUPPORT = 5
 """So many nearest circles are predicted from a pair …"""
 MIN_SUPPORT = 2
 """… and so many of them must be there before the hypothesis is grown."""
-MAX_HYPOTHESES = 300
-MAX_CONTRAST_RATIO = 2.0
-"""Between circles of one target; a reflection of it is fainter."""
-MAX_HIDDEN = 2
+FIRST_HYPOTHESES = 300
+"""The best supported ones in an image are all grown, so that rivals meet; of the others …"""
+MAX_TRIES = 8
+"""… at most so many from each outline that is in no reading yet: a dim face comes after all clutter."""
+MAX_CONTRAST_RATIO = 4.0
+"""Between neighbouring circles of one face, which a shadow or a glare may cross."""
 MIN_CIRCLES = 6
 """A homography takes four circles; two more confirm it."""
+MAX_SIZE_RATIO = 1.25
+"""Between the sizes of two circles of a face, each over its design's, on top of a pixel of their diameters: the equal
+discs of a printed grid are no large and small circles."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -62,12 +68,11 @@ class RefusedReading:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class FaceFinding:
-    """``faces`` : named with certainty, at most one reading each; ``refused`` : what was seen and left out, and why;
-    ``repeated`` : ids of faces seen more than once."""
+    """``faces`` : named with certainty, a face in view twice with two readings; ``refused`` : what was seen and left
+    out, and why."""
 
     faces: tuple[FaceReading, ...]
     refused: tuple[RefusedReading, ...]
-    repeated: tuple[str, ...]
 
     @property
     def notes(self) -> tuple[str, ...]:
@@ -110,25 +115,37 @@ class FaceFinder:
     def __init__(self, target: TargetDesign):
         self.target = target
 
-    def find(self, candidates: Candidates, contrast: float = 0.0) -> FaceFinding:
-        """All faces among the candidates.
-
-        ``contrast`` : of what is certainly no reflection, the board say. The mirror image of a face can pass for
-        another face; it is told by its faintness, against ``contrast`` and against the brightest face.
-        """
+    def find(self, candidates: Candidates) -> FaceFinding:
+        """All faces among the candidates. The image of a face in a mirror can pass for another face, which only the
+        group can tell."""
         readings: list[FaceReading] = []
-        if len(candidates) >= MIN_CIRCLES:
-            for face, index in self._hypotheses(candidates):
-                matched = index >= 0
-                if any(r.face is face and (r.index == index)[matched].sum() >= 2 for r in readings):
-                    continue
-                grown = grow_match(candidates, index, face.xy_mm, face.radius_mm)
-                if grown is not None and _seen_from_outside(grown[1], face):
-                    readings.append(FaceReading(face, *grown))
-        return _decide(readings, candidates, contrast, self.target)
+        tries = np.zeros(len(candidates), int)
+        explained: set[int] = set()
+        starts = self._hypotheses(candidates) if len(candidates) >= MIN_CIRCLES else []
+        for rank, (first, face, index) in enumerate(starts):
+            if rank == FIRST_HYPOTHESES:
+                explained = {i for r in readings for i in r.used() if r.count() >= needed_circles(r.face)}
+            matched = index >= 0
+            if tries[first] == MAX_TRIES or first in explained:
+                continue
+            if any(r.face is face and (r.index == index)[matched].sum() >= 2 for r in readings):
+                continue
+            if rank >= FIRST_HYPOTHESES:
+                tries[first] += 1
+            grown = grow_match(candidates, index, face.xy_mm, face.radius_mm)
+            if grown is not None and _seen_from_outside(grown[1], face):
+                readings.append(FaceReading(face, _of_one_size(candidates, face, *grown), grown[1]))
+        return _decide(readings, self.target)
 
-    def _hypotheses(self, candidates: Candidates) -> list[tuple[FaceDesign, np.ndarray]]:
-        """Starts (face, index), the best supported first."""
+    def find_mirrored(self, candidates: Candidates, named: tuple[FaceReading, ...]) -> tuple[FaceReading, ...]:
+        """Faces that the image shows as a mirror does, if none of those ``named`` in it says that it does not."""
+        if any(reading.face.id not in mirror_images(self.target) for reading in named):
+            return ()
+        found = self.find(candidates.mirrored()).faces
+        return tuple(reading for reading in found if reading.face.id not in mirror_images(self.target))
+
+    def _hypotheses(self, candidates: Candidates) -> list[tuple[int, FaceDesign, np.ndarray]]:
+        """Starts (first candidate, face, index), the best supported first."""
         first, step, ratio = _candidate_pairs(candidates)
         length = np.linalg.norm(step, axis=1)
         found = []
@@ -140,14 +157,14 @@ class FaceFinder:
                 continue
             linear = candidates.shape[first[ok]] @ _turn(pair.offset[pair.second] * [1, -1], step[ok]) * [1, -1]
             support = _support(candidates, pair, candidates.xy[first[ok]], linear)
-            hits, contrast = (support >= 0).sum(1), candidates.contrast[first[ok]]
+            hits, contrast, origin = (support >= 0).sum(1), candidates.contrast[first[ok]], first[ok].tolist()
             for h in np.flatnonzero(hits >= 2 + MIN_SUPPORT):
                 for face, near in pair.faces:
                     index = np.full(len(face.ids), -1)
                     index[near] = support[h]
-                    found.append((hits[h], contrast[h], face, index))
+                    found.append((hits[h], contrast[h], origin[h], face, index))
         found.sort(key=lambda item: (-item[0], -item[1]))
-        return [(face, index) for _, _, face, index in found[:MAX_HYPOTHESES]]
+        return [(start, face, index) for _, _, start, face, index in found]
 
 
 def _candidate_pairs(candidates: Candidates):
@@ -190,36 +207,38 @@ def _seen_from_outside(homography: np.ndarray, face: FaceDesign) -> bool:
     return np.linalg.det(homography) * depth < 0
 
 
+def _of_one_size(candidates: Candidates, face: FaceDesign, index: np.ndarray, homography: np.ndarray) -> np.ndarray:
+    """``index`` without the circles that are larger or smaller against their design than most others."""
+    local = homography_jacobian(homography, face.xy_mm)
+    expected = face.radius_mm * np.sqrt(np.abs(np.linalg.det(local)))
+    ratio = candidates.radius[index] / expected
+    middle = np.median(ratio[index >= 0])
+    allowed = MAX_SIZE_RATIO * (1 + candidates.px / (2 * middle * expected))
+    return np.where((ratio < middle * allowed) & (ratio * allowed > middle), index, -1)
+
+
 def needed_circles(face: FaceDesign) -> int:
     """Fewest circles that make a reading of the face."""
-    return max(len(face.ids) - MAX_HIDDEN, min(MIN_CIRCLES, len(face.ids)))
+    return min(MIN_CIRCLES, len(face.ids))
 
 
-def _decide(readings: list[FaceReading], candidates: Candidates, contrast: float, target: TargetDesign) -> FaceFinding:
-    """Keep the readings that explain more than every other reading of the same candidates, and no reflections."""
+def _decide(readings: list[FaceReading], target: TargetDesign) -> FaceFinding:
+    """Keep the readings that explain more than every other reading of the same candidates."""
     readings = [r for r in readings if r.count() >= needed_circles(r.face)]
     readings.sort(key=lambda r: -r.count())
     named: list[FaceReading] = []
     refused: list[RefusedReading] = []
-    own = [float(np.median(candidates.contrast[r.used()])) for r in readings]
-    least = max([contrast, *own]) / MAX_CONTRAST_RATIO
-    faint: set[int] = set()
-    for reading, value in zip(readings, own, strict=True):
-        if value < least and not faint & set(reading.used()):
-            faint |= set(reading.used())
-            note = f"a pattern like face {reading.face.id}: contrast {value:.0f}, {least:.0f} needed; a reflection, "
-            refused.append(RefusedReading(reading.used(), "face_contrast", value, least, f"{note}left out"))
-    readings = [r for r, value in zip(readings, own, strict=True) if value >= least]
     settled: set[int] = set()
     for reading in readings:
-        if settled & set(reading.used()):
+        used = set(reading.used())
+        if settled & used:
             continue
-        settled |= set(reading.used())
+        settled |= used
         ambiguous = [
             r
             for r in readings
             if r is not reading
-            and set(r.used()) & set(reading.used())
+            and used & set(r.used())
             and r.count() >= reading.count()
             and not (r.face is reading.face and (r.index == reading.index).all())
         ]
@@ -233,6 +252,4 @@ def _decide(readings: list[FaceReading], candidates: Candidates, contrast: float
             refused.append(RefusedReading(reading.used(), "face_readings", others, 0, note))
         else:
             named.append(reading)
-    ids = [r.face.id for r in named]
-    repeated = tuple(sorted({i for i in ids if ids.count(i) > 1}))
-    return FaceFinding(tuple(r for r in named if r.face.id not in repeated), tuple(refused), repeated)
+    return FaceFinding(tuple(named), tuple(refused))

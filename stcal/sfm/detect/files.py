@@ -2,7 +2,7 @@
 
 import hashlib
 import json
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from concurrent.futures.process import BrokenProcessPool
 from dataclasses import asdict, dataclass, fields
 from pathlib import Path
@@ -15,13 +15,15 @@ from stcal.geometry.camera import Camera
 from stcal.io.cache import keep, kept
 from stcal.io.camera import CameraModel
 from stcal.io.images import ImageFile, Skipped, decode, grey_8bit, thumbnail
-from stcal.labels import circle_labels
+from stcal.labels import parse_label, parse_labels
 from stcal.parallel import run_parallel
 from stcal.sfm.detect.centres import Centres
 from stcal.sfm.detect.ellipses import EllipseOptions
-from stcal.sfm.detect.image import ImageDetection, detect_image
+from stcal.sfm.detect.image import detect_image
+from stcal.sfm.detect.predict import PredictedCircles, SecondLook, measure_predicted
+from stcal.sfm.detect.sightings import BoardSighting, FaceSighting, ImageDetection
 
-CACHE_VERSION = 2
+CACHE_VERSION = 3
 """Raised whenever detection gives other results for the same image: what was kept is then not used again."""
 
 
@@ -187,30 +189,95 @@ def _save(path: Path, detection: ImageDetection, digest: str, image: np.ndarray)
     meta = {
         "digest": digest,
         "scale": scale,
-        "target_labels": detection.target_labels,
+        "faces": [each.face for each in detection.faces],
+        "boards": len(detection.boards),
+        "mirrored": detection.mirrored,
         "notes": detection.notes,
-        "repeated": detection.repeated,
         "candidates": detection.candidates,
     }
-    arrays = {f.name: getattr(detection.centres, f.name) for f in fields(Centres)}
-    keep(path, {"numberings": detection.numberings, "thumbnail": jpeg, **arrays}, meta)
+    arrays = _centre_arrays(detection.centres)
+    for i, face in enumerate(detection.faces):
+        arrays |= {f"face_rows_{i}": face.rows, f"face_circles_{i}": face.circles}
+    for i, each in enumerate(detection.boards):
+        arrays |= {f"board_rows_{i}": each.rows, f"board_numberings_{i}": each.numberings}
+    keep(path, {"thumbnail": jpeg, **arrays}, meta)
 
 
 def _load(file: ImageFile, path: Path, reused: bool) -> DetectedImage | None:
     """Read what was kept; None where the file is damaged."""
 
     def make(stored, meta) -> DetectedImage:
+        faces = [
+            FaceSighting(face, stored[f"face_rows_{i}"], stored[f"face_circles_{i}"])
+            for i, face in enumerate(meta["faces"])
+        ]
+        boards = [
+            BoardSighting(stored[f"board_rows_{i}"], stored[f"board_numberings_{i}"]) for i in range(meta["boards"])
+        ]
         detection = ImageDetection(
-            Centres(*(stored[f.name] for f in fields(Centres))),
-            circle_labels(meta["target_labels"]),
-            stored["numberings"],
+            _stored_centres(stored),
+            tuple(faces),
+            tuple(boards),
+            tuple(meta["mirrored"]),
             tuple(meta["notes"]),
-            tuple(meta["repeated"]),
             meta["candidates"],
         )
         return DetectedImage(file, detection, meta["digest"], stored["thumbnail"].tobytes(), meta["scale"], reused)
 
     return kept(path, make)
+
+
+def _centre_arrays(centres: Centres) -> dict[str, np.ndarray]:
+    return {f.name: getattr(centres, f.name) for f in fields(Centres)}
+
+
+def _stored_centres(stored) -> Centres:
+    return Centres(*(stored[f.name] for f in fields(Centres)))
+
+
+def look_again(
+    jobs: Sequence[tuple[DetectedImage, PredictedCircles]], camera: Camera, cache: Path, workers: int | None = None
+) -> dict[str, SecondLook]:
+    """Measure the circles that are predicted in images; by name. What an earlier run measured is kept.
+
+    An image that can no longer be read is left as it was after the first look.
+    """
+    found: dict[str, SecondLook] = {}
+    pending = []
+    for image, predicted in jobs:
+        path = cache / f"again-{_predicted_key(image.digest, predicted, camera)}.npz"
+        known = kept(path, _stored_look)
+        if known is None:
+            pending.append((image.file, camera, predicted, path))
+        else:
+            found[image.file.name] = known
+    for k, look in run_parallel(_look_again, pending, workers):
+        if look is not None:
+            found[pending[k][0].name] = look
+    return found
+
+
+def _predicted_key(digest: str, predicted: PredictedCircles, camera: Camera) -> str:
+    hasher = hashlib.sha256(f"{CACHE_VERSION}\0{digest}\0{predicted.labels}\0{predicted.polarity}\0".encode())
+    for values in (predicted.centre_px, predicted.shape_px, predicted.wanted, camera.parameters()):
+        hasher.update(values.tobytes())
+    return hasher.hexdigest()[:40]
+
+
+def _look_again(file: ImageFile, camera: Camera, predicted: PredictedCircles, path: Path) -> SecondLook | None:
+    try:
+        image = decode(file.path.read_bytes(), file.name)
+    except (InputError, OSError):
+        return None
+    look = measure_predicted(image, camera, predicted)
+    meta = {"labels": look.labels, "missed": look.missed}
+    keep(path, _centre_arrays(look.centres), meta)
+    return look
+
+
+def _stored_look(stored, meta) -> SecondLook:
+    missed = {parse_label(label): reason for label, reason in meta["missed"].items()}
+    return SecondLook(parse_labels(meta["labels"]), _stored_centres(stored), missed)
 
 
 def _without_copies(found: list[DetectedImage | Skipped]) -> tuple[list[DetectedImage], list[Skipped]]:
@@ -229,18 +296,20 @@ def _without_copies(found: list[DetectedImage | Skipped]) -> tuple[list[Detected
     return images, skipped
 
 
-def require_single(images: tuple[DetectedImage, ...]) -> None:
-    """Refuse images in which a face or the board is in view more than once.
+def require_upright(images: tuple[DetectedImage, ...]) -> None:
+    """Refuse a set of images that is mirrored.
 
     Raises
     ------
     DetectionError
-        Naming image and face.
+        Of the images that show a face more are mirrored than are not.
     """
-    for image in images:
-        if image.detection.repeated:
-            what = ", ".join(image.detection.repeated)
-            raise DetectionError(
-                f"{image.file.name}: {what} found more than once; only one target and one board may be in view, "
-                "cover or remove the other (or its mirror image)"
-            )
+    mirrored = [image for image in images if image.detection.mirrored]
+    upright = [image for image in images if image.detection.faces and not image.detection.mirrored]
+    if mirrored and len(mirrored) > len(upright):
+        first = mirrored[0]
+        raise DetectionError(
+            f"{len(mirrored)} of {len(mirrored) + len(upright)} images with a face are mirrored, first "
+            f"{first.file.name}: face {', '.join(first.detection.mirrored)} is seen as in a mirror; turn the images "
+            "back, or use the files that the camera wrote"
+        )

@@ -1,21 +1,16 @@
-"""Number the board alike in all images of a group: the board stands still against the target, so that numbering is
-right which keeps board_from_face the same. What stays uncertain is left out."""
+"""Labels of one group's circles: what each image reads by itself, held against the arrangement of the whole group."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
-from stcal.design import BoardDesign, FaceDesign, TargetDesign
-from stcal.errors import ConvergenceError, DegenerateError
-from stcal.geometry.plane import camera_from_plane, fit_homography, refine_planar_pose
-from stcal.geometry.rigid import Rigid
-from stcal.labels import DotLabel, Label
+from stcal.design import BoardDesign, TargetDesign
+from stcal.labels import BOARD, Label
 from stcal.sfm.data.observations import ImageObservations
-from stcal.sfm.detect.image import ImageDetection
-
-MAX_SHIFT_PITCHES = 0.3
-"""board_from_face may differ by this much between images (pitches, at the face); a wrong numbering is one off."""
-MIN_POSE_CIRCLES = 5
+from stcal.sfm.detect.arrangement import Arrangement, PlaneView, Readings, arrange, readings_of
+from stcal.sfm.detect.centres import Centres
+from stcal.sfm.detect.sightings import ImageDetection
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -25,118 +20,107 @@ class LabelledImage:
     observations: ImageObservations
     notes: tuple[str, ...]
 
+    def plus(self, labels: Sequence[Label], centres: Centres, notes: Sequence[str]) -> "LabelledImage":
+        """With further circles and notes."""
+        more = labelled_image(self.observations.name, self.observations.group, labels, centres, ())
+        return LabelledImage(self.observations.plus(more.observations), (*self.notes, *notes))
+
+
+def labelled_image(
+    name: str, group: str, labels: Sequence[Label], centres: Centres, notes: Sequence[str]
+) -> LabelledImage:
+    """Of circles and their labels, one for each."""
+    observations = ImageObservations(
+        name=name,
+        group=group,
+        labels=tuple(labels),
+        centre_px=centres.centre_px,
+        centre=centres.centre,
+        shape=centres.shape,
+        covariance_px2=centres.covariance_px2,
+    )
+    return LabelledImage(observations, tuple(notes))
+
+
+def label_single(name: str, group: str, detection: ImageDetection, target: TargetDesign) -> LabelledImage:
+    """The faces of one image that stands for itself, where the target may move from image to image."""
+    labels, rows = detection.labelled_rows(target)
+    repeated = [f"{what} found more than once; left out" for what in detection.repeated]
+    return labelled_image(name, group, labels, detection.centres.select(rows), [*detection.notes, *repeated])
+
 
 def label_group(
-    images: list[tuple[str, str, ImageDetection]], target: TargetDesign, board: BoardDesign | None
-) -> list[LabelledImage]:
-    """Settle the board's numbering over the images (name, group, detection) of one group."""
-    chosen: dict[int, int] = {}
+    images: list[tuple[str, str, ImageDetection]], target: TargetDesign, board: BoardDesign | None, focal_px: float
+) -> tuple[list[LabelledImage], Arrangement]:
+    """Label the images (name, group, detection) of one group, and the arrangement that their labels keep to."""
+    readings = [[] if d.mirrored else readings_of(d, target, board) for _, _, d in images]
+    patterns = {face.id: face.xy_mm for face in target.faces}
+    arrangement = arrange(readings, patterns, step_mm(target, board), focal_px)
+    return [
+        _labelled(name, group, detection, readings[i], arrangement, i, target)
+        for i, (name, group, detection) in enumerate(images)
+    ], arrangement
+
+
+def step_mm(target: TargetDesign, board: BoardDesign | None) -> float:
+    """Distance from circle to circle: the board's pitch, or the median of the target's."""
     if board is not None:
-        chosen = _choose([d for _, _, d in images], target, board)
-    labelled = []
-    for i, (name, group, detection) in enumerate(images):
-        notes = list(detection.notes)
-        labels: list[Label] = list(detection.target_labels)
-        keep = np.arange(len(labels))
-        if i in chosen:
-            numbering = detection.numberings[chosen[i]]
-            labels += [DotLabel(row, column) for row, column in numbering.tolist()]
-            keep = np.arange(len(labels))
-        elif len(detection.numberings):
-            notes.append(
-                f"board of {detection.numberings.shape[1]} dots left out: {len(detection.numberings)} numberings fit, "
-                "none keeps it where the group's other images see it; show a face that they show, or check that "
-                "nothing was moved"
-            )
-        centres = detection.centres.select(keep)
-        observations = ImageObservations(
-            name=name,
-            group=group,
-            labels=tuple(labels),
-            centre_px=centres.centre_px,
-            centre=centres.centre,
-            shape=centres.shape,
-            covariance_px2=centres.covariance_px2,
+        return board.pitch_mm
+    steps = []
+    for face in target.faces:
+        apart = np.linalg.norm(face.xy_mm[:, None] - face.xy_mm, axis=2) + np.diag(np.full(len(face.ids), np.inf))
+        steps += apart.min(1).tolist()
+    return float(np.median(steps))
+
+
+def _labelled(
+    name: str,
+    group: str,
+    detection: ImageDetection,
+    readings: list[Readings],
+    arrangement: Arrangement,
+    image: int,
+    target: TargetDesign,
+) -> LabelledImage:
+    notes = list(detection.notes)
+    if detection.mirrored:
+        notes.append(
+            f"the image is mirrored: it shows face {', '.join(detection.mirrored)} as a mirror does; left out, turn it "
+            "back, or use the file that the camera wrote"
         )
-        labelled.append(LabelledImage(observations, tuple(notes)))
-    return labelled
+        return labelled_image(name, group, (), detection.centres.select(np.zeros(0, int)), notes)
+    if image in arrangement.views:
+        views = list(arrangement.views[image])
+        notes += [_contradiction(each[0]) for each in arrangement.contradicted.get(image, ())]
+        notes += [_open_board(each) for each in arrangement.open.get(image, ())]
+        notes += [_reflection(each) for each in arrangement.reflected.get(image, ())]
+    else:
+        views = [each[0] for each in readings if len(each) == 1 and _once(each[0], readings)]
+        notes += [_open_board(each) for each in readings if len(each) > 1]
+    labels = [label for view in views for label in view.labels]
+    rows = np.concatenate([view.rows for view in views]) if views else np.zeros(0, int)
+    order = np.argsort(rows, kind="stable")
+    return labelled_image(name, group, [labels[k] for k in order], detection.centres.select(rows[order]), notes)
 
 
-def _choose(detections: list[ImageDetection], target: TargetDesign, board: BoardDesign) -> dict[int, int]:
-    """Numbering by image."""
-    faces = [_face_poses(d, target) for d in detections]
-    boards = [_board_poses(d, board) for d in detections]
-    open_images = {i for i, poses in enumerate(boards) if poses}
-    chosen: dict[int, int] = {}
-    if not open_images:
-        return chosen
-    # The first image that is certain of itself speaks for the group; a plain board's numbering is then by convention.
-    first = min(open_images, key=lambda i: (not faces[i], len(boards[i]), -len(faces[i]), -len(detections[i].centres)))
-    known: dict[str, Rigid] = {}
-    queue = [(first, 0)]
-    while queue:
-        i, numbering = queue.pop()
-        chosen[i] = numbering
-        open_images.discard(i)
-        for face_id, camera_from_face in faces[i].items():
-            known.setdefault(face_id, boards[i][numbering].inverse() @ camera_from_face)
-        for j in sorted(open_images):
-            best = _best_numbering(faces[j], boards[j], known, target, board)
-            if best is not None:
-                queue.append((j, best))
-                break
-    # Where the group's numbering is no convention, one that the image alone makes certain needs no witness, unless a
-    # witness contradicts it.
-    for j in sorted(open_images):
-        if len(boards[first]) == len(boards[j]) == 1 and not set(faces[j]) & set(known):
-            chosen[j] = 0
-    return chosen
+def _once(view: PlaneView, readings: list[Readings]) -> bool:
+    return sum(each[0].plane == view.plane for each in readings) == 1
 
 
-def _best_numbering(faces, boards, known, target: TargetDesign, board: BoardDesign) -> int | None:
-    """The one numbering that puts the faces where the others saw them; None where none or several do."""
-    shared = [f for f in faces if f in known]
-    if not shared:
-        return None
-    shifts = []
-    for board_pose in boards:
-        distances = []
-        for face_id in shared:
-            middle = np.append(target.face(face_id).xy_mm.mean(0), 0)
-            distances.append(np.linalg.norm(board_pose.inverse() @ (faces[face_id] @ middle) - known[face_id] @ middle))
-        shifts.append(np.median(distances) / board.pitch_mm)
-    order = np.argsort(shifts)
-    if shifts[order[0]] > MAX_SHIFT_PITCHES or (len(order) > 1 and shifts[order[1]] < 2 * MAX_SHIFT_PITCHES):
-        return None
-    return int(order[0])
+def _contradiction(view: PlaneView) -> str:
+    what = f"a board of {len(view.rows)} dots" if view.plane == BOARD else f"a pattern like face {view.plane}"
+    return (
+        f"{what}: not where the group's other images see it; left out, it is a reflection or another object, or check "
+        "that nothing was moved"
+    )
 
 
-def _face_poses(detection: ImageDetection, target: TargetDesign) -> dict[str, Rigid]:
-    """camera_from_face by face id, from the design's positions."""
-    poses = {}
-    for face_id in detection.face_ids():
-        face: FaceDesign = target.face(face_id)
-        place = dict(zip(face.labels(), face.xy_mm, strict=True))
-        rows = [i for i, label in enumerate(detection.target_labels) if label in place]
-        pose = _planar_pose(np.array([place[detection.target_labels[i]] for i in rows]), detection.centres.centre[rows])
-        if pose is not None:
-            poses[face_id] = pose
-    return poses
+def _open_board(views: Readings) -> str:
+    return (
+        f"board of {len(views[0].rows)} dots left out: {len(views)} numberings fit, none keeps it where the group's "
+        "other images see it; show a face that they show, or check that nothing was moved"
+    )
 
 
-def _board_poses(detection: ImageDetection, board: BoardDesign) -> list[Rigid]:
-    """camera_from_board by numbering; none where the dots do not fix it."""
-    dots = detection.centres.centre[len(detection.target_labels) :]
-    poses = [_planar_pose(board.pitch_mm * n[:, ::-1].astype(float), dots) for n in detection.numberings]
-    found = [pose for pose in poses if pose is not None]
-    return found if len(found) == len(poses) else []
-
-
-def _planar_pose(xy_mm: np.ndarray, xy_normalised: np.ndarray) -> Rigid | None:
-    if len(xy_mm) < MIN_POSE_CIRCLES:
-        return None
-    try:
-        start = camera_from_plane(fit_homography(xy_mm, xy_normalised))
-        return refine_planar_pose(start, xy_mm, xy_normalised)
-    except (ConvergenceError, DegenerateError):
-        return None
+def _reflection(view: PlaneView) -> str:
+    return f"a pattern like face {view.plane}: the image of another face in a mirror; left out"

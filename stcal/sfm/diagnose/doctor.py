@@ -20,7 +20,7 @@ from stcal.sfm.data.model import MIN_POINTS, MetricModel
 from stcal.sfm.detect.ellipses import EllipseOptions
 from stcal.sfm.diagnose.examine import CircleVerdict, Expected, OptionTrial, by_geometry, examine, labels_found, trials
 from stcal.sfm.diagnose.findings import Diagnosis, Finding, advice, in_order
-from stcal.sfm.diagnose.in_view import missing_circles
+from stcal.sfm.diagnose.missing import missing_circles
 from stcal.sfm.mapping.database import image_ids
 from stcal.sfm.mapping.models import read_model
 from stcal.sfm.run.saved import SavedRun

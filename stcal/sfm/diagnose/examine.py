@@ -120,7 +120,7 @@ class _Examination:
     def _homography(self) -> np.ndarray:
         """What detection itself predicted the circles with, or the model's where it did not come that far."""
         if self.is_board:
-            own = [] if self.reading.board is None else list(self.reading.board.homographies)
+            own = [homography for board in self.reading.boards for homography in board.homographies]
         else:
             own = [r.homography for r in self.reading.faces.faces if r.face.id == self.plane.plane]
         # Of several numberings of the board the group has chosen the one that the model agrees with.
@@ -154,17 +154,17 @@ class _Examination:
         label, reading, candidate = self.plane.labels[i], self.reading, fit.index[i]
         count = int(fit.fits().sum())
         if self.is_board:
-            if reading.board is not None:
-                return None if candidate in reading.board.candidates else CircleVerdict(label, "board_grid")
+            if reading.boards:
+                found = any(candidate in board.candidates for board in reading.boards)
+                return None if found else CircleVerdict(label, "board_grid")
             needed = int(np.ceil(needed_dots(self.board)))
             return CircleVerdict(label, "board_dots" if count < needed else "board_grid", count, needed, "dots")
         named = [r for r in reading.faces.faces if r.face.id == self.plane.plane]
         if named:
-            return None if candidate in named[0].used() else CircleVerdict(label, "pattern")
+            return None if any(candidate in each.used() for each in named) else CircleVerdict(label, "pattern")
         for refused in reading.faces.refused:
             if set(refused.used) & set(fit.index[fit.fits()]):
-                unit = "other readings" if refused.gate == "face_readings" else "grey values"
-                return CircleVerdict(label, refused.gate, refused.value, refused.limit, unit)
+                return CircleVerdict(label, refused.gate, refused.value, refused.limit, "other readings")
         needed = needed_circles(self.target.face(self.plane.plane))
         return CircleVerdict(label, "face_circles" if count < needed else "face_pattern", count, needed, "circles")
 
@@ -235,10 +235,8 @@ def labels_found(
 ) -> set[str]:
     """Labels that detection with these options finds; a dot of the board is told by its place, of those expected."""
     detection = detect_image(image, camera, target, board, options)
-    if detection.repeated:  # a run would end there
-        return set()
-    found: set[str] = set(detection.target_labels)
-    dots = detection.centres.centre_px[len(detection.target_labels) :]
+    found: set[str] = {label for each in detection.faces for label in each.labels(target.face(each.face))}
+    dots = detection.centres.centre_px[[row for each in detection.boards for row in each.rows]]
     for plane in planes:
         if plane.plane == BOARD and len(dots):
             centre, shape = plane.in_px(camera)

@@ -21,7 +21,7 @@ from stcal.parallel import Progress, counted, one_thread
 from stcal.sfm.data.observations import ImageObservations, by_group
 from stcal.sfm.detect.ellipses import EllipseOptions
 from stcal.sfm.detect.files import DetectedImage, detect_files
-from stcal.sfm.detect.labels import label_group
+from stcal.sfm.detect.labels import label_single
 from stcal.sfm.measure.common_errors import common_errors
 from stcal.sfm.measure.files import PosesFile
 from stcal.sfm.measure.pose import PoseOptions, TargetPose, pose_from_circles
@@ -136,7 +136,7 @@ def measure(
     step = counted(progress, "detect", len(files))
     with tempfile.TemporaryDirectory(prefix="stcal-measure-") as scratch:
         detection = detect_files(files, camera, design, board, options.ellipses, Path(scratch), options.workers, step)
-    observations, notes = _labelled(detection.images, design, board)
+    observations, notes = _labelled(detection.images, design)
     prior = None if camera.covariance is None else CameraPrior(camera.colmap_model, camera.covariance)
     result = measure_labelled(observations, detection.camera, target, options, prior)
     left_out = (*other, *detection.skipped, *result.left_out)
@@ -149,15 +149,10 @@ def measure(
     return replace(result, images=measured, left_out=left_out)
 
 
-def _labelled(images: Sequence[DetectedImage], design: TargetDesign, board: BoardDesign | None):
+def _labelled(images: Sequence[DetectedImage], design: TargetDesign):
     """Observations of all images, and the notes on each."""
-    groups: dict[str, list] = {}
-    for image in images:
-        groups.setdefault(image.file.group, []).append((image.file.name, image.file.group, image.detection))
-    labelled = [each for group in groups.values() for each in label_group(group, design, board)]
-    repeated = {i.file.name: tuple(f"{what} found more than once" for what in i.detection.repeated) for i in images}
-    notes = {each.observations.name: each.notes + repeated[each.observations.name] for each in labelled}
-    return [each.observations for each in labelled], notes
+    labelled = [label_single(i.file.name, i.file.group, i.detection, design) for i in images]
+    return [each.observations for each in labelled], {each.observations.name: each.notes for each in labelled}
 
 
 def measure_labelled(

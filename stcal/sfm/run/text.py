@@ -47,8 +47,6 @@ def detection_text(detection: DetectionResult, labelled: Sequence[LabelledImage]
         lines.append(f"{image.name}: faces {faces} ({len(image) - dots} circles), board {dots} dots")
         lines += [f"  {note}" for note in each.notes]
     lines += _skipped(detection.skipped)
-    for image in detection.images:
-        lines += [f"{image.file.name}: {what} found more than once; left out" for what in image.detection.repeated]
     return "\n".join(lines)
 
 

@@ -21,6 +21,7 @@ from stcal.sfm.camera.trust import projection_sigma, split_half
 from stcal.sfm.camera.views import board_views, closed_form, start_camera
 from stcal.sfm.data.observations import ImageObservations
 from stcal.sfm.detect.centres import Centres
+from stcal.sfm.detect.sightings import BoardSighting, ImageDetection
 
 TRUE = Camera(2592, 1728, [2790.0, 2784.0], [1301.0, 859.0], [-0.06, 0.045, 1.5e-4, -1e-4, 0, 0, 0, 0])
 BOARD = reference_board()
@@ -180,8 +181,9 @@ def test_a_board_upside_down_is_numbered_like_the_others():
         both = np.stack([cells, [BOARD.rows - 1, BOARD.columns - 1] - cells])
         n = len(view)
         zeros, ok = np.zeros(n), np.ones(n, bool)
-        centres = Centres(view.centre_px, view.centre, view.shape, view.covariance_px2, zeros, zeros, zeros, ok)
-        detection = SimpleNamespace(numberings=both[::-1] if i % 3 == 1 else both, centres=centres)
+        centres = Centres(view.centre_px, view.centre, view.shape, view.covariance_px2, zeros, zeros, zeros, zeros, ok)
+        seen = BoardSighting(np.arange(n), both[::-1] if i % 3 == 1 else both)
+        detection = ImageDetection(centres, (), (seen,))
         images.append(SimpleNamespace(file=SimpleNamespace(name=view.name, group="."), detection=detection))
         truth.append(view.labels)
     found = [view.labels for view in board_views(images, BOARD, TRUE)]

@@ -8,7 +8,7 @@ from stcal.design import BoardDesign, FaceDesign, TargetDesign, reference_board,
 from stcal.geometry.camera import Camera
 from stcal.geometry.conic import circle_conic, ellipse_of_conic
 from stcal.geometry.rigid import Rigid
-from stcal.sfm.detect.ambiguity import confusable, is_named
+from stcal.sfm.detect.ambiguity import confusable, is_named, mirror_images
 from stcal.sfm.detect.board import find_boards
 from stcal.sfm.detect.candidates import Candidates
 from stcal.sfm.detect.ellipses import Ellipses
@@ -88,8 +88,35 @@ def test_without_the_circle_that_tells_the_faces_apart_nothing_is_named():
     assert any("tell the faces apart" in note for note in finding.notes)
 
 
-def test_three_hidden_circles_are_too_many():
-    assert find_faces(face_ellipses("3", pose(), hidden=("1", "2", "6"))).faces == ()
+@pytest.mark.parametrize("hidden", [("1", "2", "6"), ("4", "5", "7", "b")])
+def test_four_hidden_circles_leave_the_name(hidden):
+    """Six circles are left: four make a homography, two confirm it, and the design has no other reading of them."""
+    finding = find_faces(face_ellipses("3", pose(40, 20, 100), hidden))
+    assert [r.face.id for r in finding.faces] == ["3"]
+    assert finding.faces[0].count() == 10 - len(hidden)
+
+
+def test_five_hidden_circles_are_too_many():
+    assert find_faces(face_ellipses("3", pose(), hidden=("1", "2", "6", "a", "4"))).faces == ()
+
+
+@pytest.mark.parametrize("ratio", [0.15, 0.45, 3.0, 5.0])
+def test_faces_differ_in_brightness(ratio):
+    """Light on one face is unrelated to that on another."""
+    faces = joined(
+        face_ellipses("5", pose(30, 0, 0, x=200), contrast=40.0),
+        face_ellipses("2", pose(40, 10, 0, x=-250), contrast=40.0 * ratio),
+    )
+    assert {r.face.id for r in find_faces(faces).faces} == {"5", "2"}
+
+
+@pytest.mark.parametrize("radius", [4.0, 5.0, 5.66, 8.0])
+def test_a_printed_grid_of_equal_discs_is_no_face(radius):
+    """Between the large and the small circles' radius, equal discs are of neither size by less than 1.45."""
+    grid = np.array([[x, y] for x in range(0, 120, 20) for y in range(0, 120, 20)], float)
+    assert find_faces(ellipses_of(pose(20, 10, 30), grid, np.full(len(grid), radius))).faces == ()
+    own = TARGET.face("5")
+    assert find_faces(ellipses_of(pose(20, 10, 30), own.xy_mm, np.full(10, radius))).faces == ()
 
 
 @pytest.mark.parametrize("seed", range(5))
@@ -100,20 +127,26 @@ def test_random_discs_are_no_faces_and_hide_none(seed):
     assert (finding.faces[0].index >= 150).all()
 
 
-def test_a_mirror_image_is_not_seen_as_another_face():
-    """Swapping x and y turns the pattern of face 5 into that of face 3: its faint reflection must not be named."""
-    mirrored = TARGET.face("5").xy_mm[:, ::-1]
-    reflection = ellipses_of(pose(40, 10, 0, x=-250), mirrored, TARGET.face("5").radius_mm, contrast=30.0)
-    finding = find_faces(joined(face_ellipses("5", pose(30, 0, 0, x=200)), reflection))
-    assert [r.face.id for r in finding.faces] == ["5"]
-    assert any("reflection" in note for note in finding.notes)
-    assert find_faces(reflection, contrast=100.0).faces == ()
-
-
-def test_a_face_in_view_twice_is_reported_and_not_labelled():
+def test_a_face_in_view_twice_has_two_readings():
     finding = find_faces(joined(face_ellipses("1", pose(x=-200)), face_ellipses("1", pose(x=150))))
-    assert finding.repeated == ("1",)
-    assert finding.faces == ()
+    assert [r.face.id for r in finding.faces] == ["1", "1"]
+
+
+def test_which_faces_a_mirror_makes_of_faces():
+    """Swapping x and y turns the pattern of face 5 into that of face 3, and that of face 4 into that of face 2."""
+    assert mirror_images(TARGET) == {"2": "4", "4": "2", "3": "5", "5": "3"}
+
+
+@pytest.mark.parametrize("face_id", ["1", "2"])
+def test_a_mirrored_image_is_told_by_a_face_without_a_mirror_image(face_id):
+    candidates = Candidates.of(
+        joined(face_ellipses("1", pose(30, 0, 0, x=200)), face_ellipses(face_id, pose(40, 10, 0, x=-250))), CAMERA
+    )
+    finder = FaceFinder(TARGET)
+    upright = finder.find(candidates).faces
+    assert finder.find_mirrored(candidates, upright) == ()
+    turned = candidates.mirrored()
+    assert {r.face.id for r in finder.find_mirrored(turned, finder.find(turned).faces)} == {"1"}
 
 
 def test_which_circles_name_a_face():

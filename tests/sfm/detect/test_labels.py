@@ -1,13 +1,16 @@
-"""One numbering of the board in all images of a group, from board_from_face; what is uncertain is left out."""
+"""One arrangement of faces and board in all images of a group: the board's numbering, and what does not fit."""
 
 from dataclasses import replace
 
 import numpy as np
 import pytest
 
+from stcal.design import reference_target
 from stcal.sfm.detect.centres import Centres
-from stcal.sfm.detect.image import ImageDetection
 from stcal.sfm.detect.labels import label_group
+from stcal.sfm.detect.sightings import BoardSighting, FaceSighting, ImageDetection
+
+FOCAL_PX = 5000.0
 
 
 @pytest.fixture(scope="module")
@@ -29,6 +32,7 @@ def detection(image, turn=False, certain=False, shift=None, faces=True):
         np.ones(n),
         np.ones(n),
         np.ones(n),
+        np.ones(n),
         np.ones(n, bool),
     )
     cells = np.array([[int(v) for v in image.labels[i].split(":")[1:]] for i in dots])
@@ -39,12 +43,23 @@ def detection(image, turn=False, certain=False, shift=None, faces=True):
         numberings = numberings[::-1]
     if certain:
         numberings = numberings[:1]
-    return ImageDetection(centres, tuple(image.labels[i] for i in target), np.stack(numberings))
+    board = BoardSighting(np.arange(len(target), n), np.stack(numberings))
+    return ImageDetection(centres, sightings([image.labels[i] for i in target]), (board,) * bool(len(dots)))
+
+
+def sightings(labels):
+    """Of circles that are named face by face."""
+    found = []
+    for face_id in dict.fromkeys(label.split(":")[0] for label in labels):
+        rows = [i for i, label in enumerate(labels) if label.split(":")[0] == face_id]
+        circles = [reference_target().face(face_id).ids.index(labels[i].split(":")[1]) for i in rows]
+        found.append(FaceSighting(face_id, np.array(rows), np.array(circles)))
+    return tuple(found)
 
 
 def labelled(scene, detections):
     named = [(f"12/{i}", "12", d) for i, d in enumerate(detections)]
-    return label_group(named, scene.target, scene.board)
+    return label_group(named, scene.target, scene.board, FOCAL_PX)[0]
 
 
 def is_truth(image, result, turned):
@@ -102,5 +117,5 @@ def test_a_target_that_was_moved_within_the_group_loses_the_board(scene, group):
 
 
 def test_without_a_board_the_target_is_labelled_all_the_same(scene, group):
-    results = label_group([("12/0", "12", detection(group[0]))], scene.target, None)
+    results, _ = label_group([("12/0", "12", detection(group[0]))], scene.target, None, FOCAL_PX)
     assert {label.split(":")[0] for label in results[0].observations.labels} == {"1", "2"}

@@ -1,0 +1,426 @@
+"""How the planes of one group stand to one another, and where its images were taken from.
+
+Within a group nothing moves but the camera. So what the images read as faces and boards must fit one rigid
+arrangement; a reading that does not (a wrong numbering of the board, a second board, a printed grid, a reflection) is
+left out, and the arrangement predicts where every circle lies in every image. It rests on the design and on single
+planes' poses, which is exact enough to find circles; their centres are adjusted later, without it.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
+from itertools import permutations
+
+import numpy as np
+from scipy.spatial import KDTree
+
+from stcal.design import BoardDesign, TargetDesign
+from stcal.errors import ConvergenceError, DegenerateError
+from stcal.geometry.least_squares import minimise
+from stcal.geometry.normal_equations import blocks_of, reduce
+from stcal.geometry.plane import camera_from_plane, fit_homography, refine_planar_pose
+from stcal.geometry.pose_descent import PoseStack
+from stcal.geometry.rigid import Rigid, skew
+from stcal.geometry.robust import huber_cost, huber_weights
+from stcal.labels import BOARD, DotLabel, Label
+from stcal.sfm.detect.sightings import ImageDetection
+
+MIN_POSE_CIRCLES = 5
+MAX_SHIFT_PITCHES = 0.3
+"""By how much a plane may be off its place in an image's first pose, in steps of the pattern; a wrong numbering of the
+board is one off."""
+MAX_SEEDS = 8
+"""Images that the arrangement is started from, until one explains everything."""
+HUBER_PX = 1.5
+MAX_OFF_PITCHES = 0.12
+"""By how much the circles of a reading may be off after the adjustment, in steps of the pattern (median)."""
+SETTLED = 1e-4
+"""Share of χ² that the adjustment may leave: it only has to predict to a fraction of a pixel."""
+MAX_STEPS = 30
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class PlaneView:
+    """One way to read n circles of an image as those of one plane.
+
+    ``plane`` : face id or ``board``; ``rows`` : (n,) among the image's centres; ``xy_mm`` : (n, 2) in the plane;
+    ``xy`` : (n, 2) seen, normalised; ``camera_from_plane`` : from these alone, None of too few or in line.
+    """
+
+    plane: str
+    labels: tuple[Label, ...]
+    rows: np.ndarray
+    xy_mm: np.ndarray
+    xy: np.ndarray
+    camera_from_plane: Rigid
+
+    def xyz_mm(self) -> np.ndarray:
+        """The circles, (n, 3), plane's frame."""
+        return np.column_stack([self.xy_mm, np.zeros(len(self.xy_mm))])
+
+    def span_mm(self) -> np.ndarray:
+        """Three points of the plane about its circles, (3, 3), plane's frame."""
+        low, high = self.xy_mm.min(0), self.xy_mm.max(0)
+        return np.array([[*low, 0.0], [high[0], low[1], 0.0], [low[0], high[1], 0.0]])
+
+
+Readings = list[PlaneView]
+"""The ways to read the same circles; one holds."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Arrangement:
+    """``group_from_plane`` by plane; ``camera_from_group`` by image; ``views`` : accepted, by image; ``contradicted`` :
+    readings that do not fit, by image; ``open`` : boards of which several numberings fit, by image; ``reflected`` :
+    what is a plane's image in a mirror, by image."""
+
+    group_from_plane: dict[str, Rigid]
+    camera_from_group: dict[int, Rigid]
+    views: dict[int, tuple[PlaneView, ...]]
+    contradicted: dict[int, tuple[Readings, ...]] = field(default_factory=dict)
+    open: dict[int, tuple[Readings, ...]] = field(default_factory=dict)
+    reflected: dict[int, tuple[PlaneView, ...]] = field(default_factory=dict)
+
+    def explained(self) -> int:
+        """Circles of the readings that fit."""
+        return sum(len(view.rows) for views in self.views.values() for view in views)
+
+
+def readings_of(detection: ImageDetection, target: TargetDesign, board: BoardDesign | None) -> list[Readings]:
+    """What one image was read as, with a pose for each way to read it; without those too few to have one."""
+    found = []
+    for each in detection.faces:
+        face = target.face(each.face)
+        views = [_view(face.id, each.labels(face), each.rows, face.xy_mm[each.circles], detection)]
+        found.append(views)
+    for each in detection.boards if board is not None else ():
+        views = [
+            _view(
+                BOARD,
+                tuple(DotLabel(*cell) for cell in cells.tolist()),
+                each.rows,
+                board.pitch_mm * cells[:, ::-1].astype(float),
+                detection,
+            )
+            for cells in each.numberings
+        ]
+        found.append(views)
+    return [[v for v in views if v is not None] for views in found if all(v is not None for v in views)]
+
+
+def _view(plane: str, labels, rows: np.ndarray, xy_mm: np.ndarray, detection: ImageDetection) -> PlaneView | None:
+    xy = detection.centres.centre[rows]
+    if len(rows) < MIN_POSE_CIRCLES:
+        return None
+    try:
+        pose = refine_planar_pose(camera_from_plane(fit_homography(xy_mm, xy)), xy_mm, xy)
+    except (ConvergenceError, DegenerateError):
+        return None
+    return PlaneView(plane, labels, rows, xy_mm, xy, pose)
+
+
+def arrange(
+    images: Sequence[list[Readings]], patterns: dict[str, np.ndarray], step_mm: float, focal_px: float
+) -> Arrangement:
+    """The arrangement that explains most circles of one group.
+
+    Parameters
+    ----------
+    images
+        Readings of every image.
+    patterns
+        (n, 2) circles of each plane, mm.
+    step_mm
+        Of the patterns, from circle to circle: what a wrong reading is off by at least.
+    focal_px
+        Of the camera.
+    """
+    total = sum(len(views[0].rows) for readings in images for views in readings)
+    best = Arrangement({}, {}, {})
+    for i, reading in _seeds(images)[:MAX_SEEDS]:
+        found = _adjusted(_grown(images, i, reading, MAX_SHIFT_PITCHES * step_mm), focal_px)
+        found = _without_reflections(_checked(images, found, step_mm), patterns, MAX_SHIFT_PITCHES * step_mm)
+        if found.explained() > best.explained():
+            best = found
+        if best.explained() == total:
+            break
+    return best
+
+
+def _seeds(images: Sequence[list[Readings]]) -> list[tuple[int, PlaneView]]:
+    """Images to start from, the most certain of itself first: its board, or its largest face."""
+    found = []
+    for i, readings in enumerate(images):
+        boards = [views for views in readings if views[0].plane == BOARD]
+        faces = [views for views in readings if views[0].plane != BOARD]
+        if readings:
+            first = max(boards or faces, key=lambda views: len(views[0].rows))
+            circles = sum(len(views[0].rows) for views in readings)
+            found.append(((not boards, not faces, len(first), -len(faces), -circles), i, first[0]))
+    found.sort(key=lambda each: each[:2])
+    return [(i, view) for _, i, view in found]
+
+
+def _grown(images: Sequence[list[Readings]], seed: int, view: PlaneView, reach_mm: float) -> Arrangement:
+    """From one image to all that share planes with those that are placed."""
+    known = {view.plane: Rigid()}
+    # Where the first image's numbering is a convention, another image alone cannot say which it is.
+    by_convention = view.plane == BOARD and len(_same_circles(images[seed], view)) > 1
+    while True:
+        placed = {i: found for i, r in enumerate(images) if (found := _placed(r, known, reach_mm, by_convention))}
+        placed[seed] = _with_seed(images[seed], view, known, reach_mm)
+        new = _new_planes(images, placed, known, reach_mm)
+        if not new:
+            break
+        known |= new
+    poses = {i: pose for i, (pose, _) in placed.items()}
+    return Arrangement(known, poses, {i: tuple(views) for i, (_, views) in placed.items()})
+
+
+def _same_circles(readings: list[Readings], view: PlaneView) -> Readings:
+    return next(views for views in readings if any(each is view for each in views))
+
+
+def _with_seed(readings: list[Readings], view: PlaneView, known: dict[str, Rigid], reach_mm: float):
+    """The first image, held to the reading that the arrangement began with."""
+    pose = view.camera_from_plane @ known[view.plane].inverse()
+    own = _same_circles(readings, view)
+    others, _ = _agreeing([views for views in readings if views is not own], pose, known, reach_mm, {view.plane})
+    return pose, [view, *others]
+
+
+def _placed(readings: list[Readings], known: dict[str, Rigid], reach_mm: float, by_convention: bool):
+    """Pose of an image and the readings that agree with it: that of most planes, faces before the board; None where
+    nothing known is seen, or several poses fit alike."""
+    best, rank, rivals = None, (0, 0, 0), 0
+    for views in readings:
+        for view in views:
+            if view.plane not in known:
+                continue
+            pose = view.camera_from_plane @ known[view.plane].inverse()
+            others, _ = _agreeing([v for v in readings if v is not views], pose, known, reach_mm, {view.plane})
+            agreed = [view, *others]
+            own = (len(agreed), sum(v.plane != BOARD for v in agreed), sum(len(v.rows) for v in agreed))
+            if own > rank:
+                best, rank, rivals = (pose, agreed), own, 0
+            elif own == rank:
+                rivals += best is None or not _alike(best[0], pose, agreed[0], reach_mm)
+    if best is None or (rivals and len(best[1]) == 1):
+        return None
+    if by_convention and len(best[1]) == 1 and best[1][0].plane == BOARD and len(readings) > 1:
+        return None
+    return best
+
+
+def _alike(pose: Rigid, other: Rigid, view: PlaneView, reach_mm: float) -> bool:
+    """Whether two poses put a plane to one place, turned by less than a step at its rim."""
+    difference = pose.inverse() @ other
+    return bool(np.abs(difference @ view.span_mm() - view.span_mm()).max() < reach_mm)
+
+
+def _agreeing(readings: list[Readings], camera_from_group: Rigid, known, reach_mm: float, taken: set[str]):
+    """Of each circles' readings the one that is where the arrangement has its plane, each plane once; and those of
+    which several are."""
+    agreed, ambiguous = [], []
+    ranked = []
+    for views in readings:
+        shifts = sorted(
+            ((_shift_mm(view, camera_from_group, known), k) for k, view in enumerate(views) if view.plane in known)
+        )
+        if not shifts or shifts[0][0] > reach_mm:
+            continue
+        if len(shifts) > 1 and shifts[1][0] < 2 * reach_mm:
+            ambiguous.append(views)
+        else:
+            ranked.append((shifts[0][0], views[shifts[0][1]]))
+    for _, view in sorted(ranked, key=lambda each: each[0]):
+        if view.plane not in taken:
+            taken = taken | {view.plane}
+            agreed.append(view)
+    return agreed, ambiguous
+
+
+def _shift_mm(view: PlaneView, camera_from_group: Rigid, known: dict[str, Rigid]) -> float:
+    """How far circles are seen from where the arrangement has them (median)."""
+    difference = camera_from_group @ known[view.plane]
+    shift = view.camera_from_plane @ view.xyz_mm() - difference @ view.xyz_mm()
+    return float(np.median(np.linalg.norm(shift, axis=1)))
+
+
+def _new_planes(images: Sequence[list[Readings]], placed, known: dict[str, Rigid], reach_mm: float) -> dict[str, Rigid]:
+    """Poses of planes that are not known yet, each where most of the placed images see it."""
+    seen: dict[str, list[tuple[int, PlaneView, Rigid]]] = {}
+    for i, (pose, _) in placed.items():
+        for views in images[i]:
+            for view in views:
+                if view.plane not in known:
+                    group_from_plane = pose.inverse() @ view.camera_from_plane
+                    seen.setdefault(view.plane, []).append((i, view, group_from_plane))
+    new = {}
+    for plane, found in seen.items():
+        span = found[0][1].span_mm()
+        corners = np.array([pose @ span for _, _, pose in found])
+        near = np.linalg.norm(corners[:, None] - corners, axis=3).max(2) < reach_mm
+        image = np.array([i for i, _, _ in found])
+        support = [
+            (len(set(image[row].tolist())), sum(len(found[k][1].rows) for k in np.flatnonzero(row))) for row in near
+        ]
+        new[plane] = found[max(range(len(found)), key=lambda k: support[k])][2]
+    return new
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Problem:
+    """All accepted views: of n circles ``image``, ``plane`` (n,), ``xyz`` (n, 3) in the plane, ``seen`` (n, 2) px."""
+
+    image: np.ndarray
+    plane: np.ndarray
+    xyz: np.ndarray
+    seen: np.ndarray
+    focal_px: float
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Linear:
+    """Normal equations of the images' poses, reduced away, and of all planes' but the first."""
+
+    cost: float
+    poses: np.ndarray
+    pose_right: np.ndarray
+    planes: np.ndarray
+    plane_right: np.ndarray
+    cross: np.ndarray
+
+    def step(self, damping: float | np.ndarray) -> tuple[np.ndarray, float]:
+        """Of the images (6m,), then of the planes."""
+        damped = self.poses * (1 + damping * np.eye(6))
+        away = reduce(damped, self.pose_right, self.cross)
+        k = len(self.plane_right)
+        own = self.planes * (1 + damping * np.eye(k)) - away.normal
+        planes = np.linalg.lstsq(own, self.plane_right - away.right, rcond=1e-12)[0] if k else np.zeros(0)
+        poses = away.back(planes)
+        gain = float((poses * self.pose_right).sum() + planes @ self.plane_right)
+        return np.concatenate([poses.ravel(), planes]), gain
+
+
+def _adjusted(found: Arrangement, focal_px: float) -> Arrangement:
+    """Poses of images and planes of least reprojection error over the accepted views. Where that has no minimum within
+    the steps, the last state is as good a prediction: every circle that it predicts is verified."""
+    images, planes = list(found.camera_from_group), list(found.group_from_plane)
+    rows = [(a, planes.index(v.plane), v) for a, i in enumerate(images) for v in found.views[i]]
+    if not rows:
+        return found
+    problem = _Problem(
+        np.concatenate([np.full(len(v.rows), a) for a, _, v in rows]),
+        np.concatenate([np.full(len(v.rows), b) for _, b, v in rows]),
+        np.concatenate([v.xyz_mm() for _, _, v in rows]),
+        focal_px * np.concatenate([v.xy for _, _, v in rows]),
+        focal_px,
+    )
+    start = (
+        PoseStack.of(*(found.camera_from_group[i] for i in images)),
+        PoseStack.of(*(found.group_from_plane[p] for p in planes)),
+    )
+
+    def moved(state, step: np.ndarray):
+        poses, own = step[: 6 * len(images)].reshape(-1, 6), step[6 * len(images) :].reshape(-1, 6)
+        return state[0].moved(poses), state[1].moved(np.vstack([np.zeros((1, 6)), own]))
+
+    end = minimise(
+        start, lambda state: _linearised(problem, *state), moved, settled=SETTLED, max_steps=MAX_STEPS, damping=1e-3
+    ).state
+    return replace(
+        found,
+        camera_from_group={i: end[0].rigid(a) for a, i in enumerate(images)},
+        group_from_plane={p: end[1].rigid(b) for b, p in enumerate(planes)},
+    )
+
+
+def _linearised(problem: _Problem, poses: PoseStack, planes: PoseStack) -> _Linear:
+    m, k = len(poses), 6 * (len(planes) - 1)
+    turned = np.einsum("nij,nj->ni", planes.rotation[problem.plane], problem.xyz)
+    rotation = poses.rotation[problem.image]
+    placed = np.einsum("nij,nj->ni", rotation, turned + planes.translation[problem.plane])
+    xyz = placed + poses.translation[problem.image]
+    if (xyz[:, 2] <= 0).any():
+        return _Linear(np.inf, np.zeros((m, 6, 6)), np.zeros((m, 6)), np.eye(k), np.zeros(k), np.zeros((m, 6, k)))
+    ideal = xyz[:, :2] / xyz[:, 2:]
+    residual = problem.seen - problem.focal_px * ideal
+    length = np.linalg.norm(residual, axis=1)
+    root = np.sqrt(huber_weights(length, HUBER_PX))
+    by_point = np.zeros((len(xyz), 2, 3))
+    by_point[:, 0, 0] = by_point[:, 1, 1] = 1
+    by_point[:, :, 2] = -ideal
+    by_point *= (root * problem.focal_px / xyz[:, 2])[:, None, None]
+    by_pose = np.concatenate([-by_point @ skew(placed), by_point], axis=2)
+    by_group = by_point @ rotation
+    by_plane = np.concatenate([-by_group @ skew(turned), by_group], axis=2)
+    residual = residual * root[:, None]
+    blocks, right = blocks_of(by_pose, residual, problem.image, m)
+    own, own_right = blocks_of(by_plane, residual, problem.plane, len(planes))
+    normal = np.zeros((k, k))
+    for b in range(1, len(planes)):
+        at = slice(6 * b - 6, 6 * b)
+        normal[at, at] = own[b]
+    cross = np.zeros((m, len(planes), 6, 6))
+    np.add.at(cross, (problem.image, problem.plane), np.swapaxes(by_pose, 1, 2) @ by_plane)
+    return _Linear(
+        float(huber_cost(length, HUBER_PX).sum()),
+        blocks,
+        right,
+        normal,
+        own_right[1:].ravel(),
+        cross[:, 1:].transpose(0, 2, 1, 3).reshape(m, 6, k),
+    )
+
+
+def _checked(images: Sequence[list[Readings]], found: Arrangement, step_mm: float) -> Arrangement:
+    """The arrangement with all readings judged by it, after its adjustment."""
+    views, contradicted, unsettled = {}, {}, {}
+    for i, pose in found.camera_from_group.items():
+        agreed, ambiguous = _agreeing(images[i], pose, found.group_from_plane, MAX_SHIFT_PITCHES * step_mm, set())
+        views[i] = tuple(v for v in agreed if _off_mm(v, pose, found.group_from_plane) < MAX_OFF_PITCHES * step_mm)
+        kept = [id(v) for v in views[i]]
+        rest = [r for r in images[i] if not any(id(v) in kept for v in r)]
+        contradicted[i] = tuple(r for r in rest if not any(r is each for each in ambiguous))
+        unsettled[i] = tuple(ambiguous)
+    return replace(found, views=views, contradicted=contradicted, open=unsettled)
+
+
+def _off_mm(view: PlaneView, camera_from_group: Rigid, known: dict[str, Rigid]) -> float:
+    """Median distance of the circles from where the arrangement has them, at their distance from the camera."""
+    xyz = camera_from_group @ (known[view.plane] @ view.xyz_mm())
+    return float(np.median(np.linalg.norm(view.xy * xyz[:, 2:] - xyz[:, :2], axis=1)))
+
+
+def _without_reflections(found: Arrangement, patterns: dict[str, np.ndarray], reach_mm: float) -> Arrangement:
+    """The arrangement without planes that are the image of another one in a mirror: the mirror lies half way, and who
+    sees them stands on the other one's side. (Two faces of a box may be each other's mirror images too, but whoever
+    sees one stands on its side.)"""
+    for real, image in permutations([p for p in found.group_from_plane if p != BOARD], 2):
+        if not _reflected(found, patterns, real, image, reach_mm):
+            continue
+        gone = {i: tuple(v for v in views if v.plane == image) for i, views in found.views.items()}
+        found = replace(
+            found,
+            group_from_plane={p: pose for p, pose in found.group_from_plane.items() if p != image},
+            views={i: tuple(v for v in views if v.plane != image) for i, views in found.views.items()},
+            reflected={i: found.reflected.get(i, ()) + views for i, views in gone.items() if views},
+        )
+    return found
+
+
+def _reflected(found: Arrangement, patterns: dict[str, np.ndarray], real: str, image: str, reach_mm: float) -> bool:
+    if not {real, image} <= found.group_from_plane.keys() or len(patterns[real]) != len(patterns[image]):
+        return False
+    own, other = (
+        found.group_from_plane[p] @ np.column_stack([patterns[p], np.zeros(len(patterns[p]))]) for p in (real, image)
+    )
+    between = own.mean(0) - other.mean(0)
+    normal, middle = between / np.linalg.norm(between), (own.mean(0) + other.mean(0)) / 2
+    turned = own - 2 * ((own - middle) @ normal)[:, None] * normal
+    apart, at = KDTree(other).query(turned)
+    if apart.max() > reach_mm or len(set(at.tolist())) < len(other):
+        return False
+    seen_by = [i for i, views in found.views.items() if any(v.plane == image for v in views)]
+    sides = [(found.camera_from_group[i].inverse().translation - middle) @ normal > 0 for i in seen_by]
+    return bool(np.mean(sides) > 0.5) if sides else False
