@@ -25,7 +25,6 @@ ADVICE = {
     "pattern": "two circles claim the same outline: uncover the other one",
     "face_circles": "found, but too few of its face: let in those that have lines of their own",
     "face_pattern": "found, but not put together as a face: mend its circles with lines of their own, cover other dots",
-    "face_contrast": "found, but faint as a reflection: light it as brightly as the rest, or cover what is brighter",
     "face_readings": "found, but another reading fits as well: show the circles that tell the faces apart",
     "board_dots": "found, but too few of the board: let in dots that have lines of their own",
     "board_grid": "found, but not joined to the board's grid: show the dots between, cover what is like a dot",
