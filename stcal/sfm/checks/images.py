@@ -3,6 +3,7 @@
 from collections.abc import Callable, Sequence
 
 import numpy as np
+from scipy.special import bdtrc, chdtri
 from scipy.stats import f as fisher
 
 from stcal.geometry.camera import Camera
@@ -13,6 +14,7 @@ from stcal.labels import CircleLabel
 from stcal.sfm.adjust.calibration import Calibration
 from stcal.sfm.adjust.network import Network, solve_score
 from stcal.sfm.checks.verdict import SUSPICIOUS, Check, Measured, Trial, judge
+from stcal.sfm.data.observations import ImageObservations
 
 MIN_CIRCLES = 3
 """Of the faces, and of the board, in an image that can tell whether the one moved against the other."""
@@ -22,6 +24,8 @@ DULL = 1.5
 """An image whose centres are less certain than its group's by this has lost more than half of its weight."""
 MAD_EFFICIENCY = 0.37
 """Of the median absolute deviation: what a spread from n values is worth in degrees of freedom."""
+UNEVEN_BY_CHANCE = 0.01
+"""Share of even circles that noise or a compressed file may make look uneven."""
 FIELD_DEGREE = 3
 FIELD_FLOOR_PX = 0.002
 """σ of a field that any centring leaves: the pixel raster, JPEG's blocks and light from one side do not average out."""
@@ -163,6 +167,30 @@ def sharpness_check(networks: Sequence[Network], blur_px: dict[str, float]) -> C
     remedy = "blurred, out of focus or dark: take the image again; its centres have little weight, no harm is done"
     trials = [*_dull(sigma, "× σ"), *_dull(blur, "× blur")]
     return judge("sharpness", "Sharpness of each image against its group", trials, "values", remedy, "suspicious")
+
+
+def evenness_check(networks: Sequence[Network], images: Sequence[ImageObservations], camera: Camera) -> Check:
+    """Circles whose brightness varies around the rim more than two planes follow, in many images: their centres would
+    be off alike in all views, which no residual shows. Detection follows it, with a larger σ; what it would have cost
+    is said, in µm at the circle. One centre in a hundred may be uneven by chance (binomial tail)."""
+    uneven = {image.name: image.uneven_px for image in images}
+    seen: dict[str, list[float]] = {}
+    for network in networks:
+        model = network.model
+        depth = model.xyz_camera()[:, 2] / float(np.sqrt(camera.focal.prod()))
+        for k, (i, p) in enumerate(zip(model.image_index, model.point_index, strict=True)):
+            shift_px = float(np.linalg.norm(uneven[model.images[i]][model.keypoint[k]]))
+            seen.setdefault(model.labels[p], []).append(1e3 * depth[k] * shift_px)
+    trials = []
+    for label, shifts in seen.items():
+        count = sum(shift > 0 for shift in shifts)
+        chance = float(bdtrc(count - 1, len(shifts), UNEVEN_BY_CHANCE)) if count else 1.0
+        trials.append(Trial(label, float(np.mean(shifts)), "µm", float(chdtri(1, chance)), 1))
+    remedy = (
+        "one side of these circles is darker or brighter, in most views: clean them, shade them from glare, look at "
+        "their light; their centres are measured by a wider model, with a larger σ"
+    )
+    return judge("evenness", "Brightness within the circles", trials, "circles", remedy, "suspicious")
 
 
 def _dull(values: dict[str, float], unit: str) -> list[Trial]:

@@ -22,6 +22,7 @@ from stcal.sfm.checks.faces import (
 )
 from stcal.sfm.checks.images import (
     camera_check,
+    evenness_check,
     field_check,
     image_check,
     moved_check,
@@ -90,6 +91,7 @@ def run_checks(evidence: Evidence) -> tuple[Check, ...]:
         moved_check(networks),
         image_check(networks),
         sharpness_check(networks, evidence.blur_px),
+        evenness_check(networks, evidence.images, camera),
         labels_check(networks, evidence.outliers, evidence.images, camera),
         *board_checks(networks, board),
         pitch_check(calibration.target, target, radii),

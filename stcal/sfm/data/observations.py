@@ -16,7 +16,8 @@ class ImageObservations:
     """The labelled circles of one image, n of them.
 
     ``centre_px`` : (n, 2) ellipse centres in the image as it is, OpenCV pixel origin; ``centre`` : (n, 2) and
-    ``shape`` : (n, 2, 2) the ideal ellipse in normalised coordinates; ``covariance_px2`` : (n, 2, 2).
+    ``shape`` : (n, 2, 2) the ideal ellipse in normalised coordinates; ``covariance_px2`` : (n, 2, 2); ``uneven_px`` :
+    (n, 2) by how much uneven brightness would have moved the centres, zero where none was seen, and by default.
     """
 
     name: str
@@ -26,6 +27,7 @@ class ImageObservations:
     centre: np.ndarray
     shape: np.ndarray
     covariance_px2: np.ndarray
+    uneven_px: np.ndarray = None  # type: ignore[assignment]
 
     def __post_init__(self):
         object.__setattr__(self, "labels", parse_labels(self.labels))
@@ -33,6 +35,8 @@ class ImageObservations:
         for field, shape in (("centre_px", (n, 2)), ("centre", (n, 2)), ("shape", (n, 2, 2))):
             object.__setattr__(self, field, frozen(getattr(self, field), shape, field))
         object.__setattr__(self, "covariance_px2", frozen(self.covariance_px2, (n, 2, 2), "covariance_px2"))
+        uneven = np.zeros((n, 2)) if self.uneven_px is None else self.uneven_px
+        object.__setattr__(self, "uneven_px", frozen(uneven, (n, 2), "uneven_px"))
 
     def __len__(self) -> int:
         return len(self.labels)

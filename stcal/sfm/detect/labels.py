@@ -38,6 +38,7 @@ def labelled_image(
         centre=centres.centre,
         shape=centres.shape,
         covariance_px2=centres.covariance_px2,
+        uneven_px=centres.uneven_px,
     )
     return LabelledImage(observations, tuple(notes))
 

@@ -181,7 +181,18 @@ def test_a_board_upside_down_is_numbered_like_the_others():
         both = np.stack([cells, [BOARD.rows - 1, BOARD.columns - 1] - cells])
         n = len(view)
         zeros, ok = np.zeros(n), np.ones(n, bool)
-        centres = Centres(view.centre_px, view.centre, view.shape, view.covariance_px2, zeros, zeros, zeros, zeros, ok)
+        centres = Centres(
+            view.centre_px,
+            view.centre,
+            view.shape,
+            view.covariance_px2,
+            zeros,
+            zeros,
+            zeros,
+            zeros,
+            0 * view.centre,
+            ok,
+        )
         seen = BoardSighting(np.arange(n), both[::-1] if i % 3 == 1 else both)
         detection = ImageDetection(centres, (), (seen,))
         images.append(SimpleNamespace(file=SimpleNamespace(name=view.name, group="."), detection=detection))

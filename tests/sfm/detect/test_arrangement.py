@@ -52,7 +52,16 @@ class Seen:
         one = np.ones(n)
         shapes = np.tile(np.eye(2), (n, 1, 1))
         centres = Centres(
-            self.centre * FOCAL_PX, self.centre, 0.01 * shapes, 1e-4 * shapes, one, one, one, one, one.astype(bool)
+            self.centre * FOCAL_PX,
+            self.centre,
+            0.01 * shapes,
+            1e-4 * shapes,
+            one,
+            one,
+            one,
+            one,
+            np.zeros((n, 2)),
+            one.astype(bool),
         )
         return ImageDetection(centres, tuple(self.faces), tuple(self.boards), mirrored)
 

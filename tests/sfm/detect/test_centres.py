@@ -5,6 +5,7 @@ from functools import lru_cache
 import cv2
 import numpy as np
 import pytest
+from scipy.ndimage import gaussian_filter
 
 from stcal.geometry.camera import Camera
 from stcal.geometry.conic import circle_image_offset
@@ -149,3 +150,42 @@ def test_nothing_to_measure():
     empty = Ellipses(np.zeros((0, 2)), np.zeros((0, 2, 2)), np.zeros(0))
     found = measure_centres(np.zeros((300, 400), np.uint8), CAMERA, empty, empty)
     assert len(found) == 0
+
+
+def half_dark(rng, radius, share, angle, noise=1.0):
+    """A luminous ellipse, of one half darker by ``share``; 8 × 8 samples a pixel; and its centre."""
+    centre, size, fine = 60 + rng.uniform(-0.5, 0.5, 2), 120, 8
+    y, x = (np.mgrid[: size * fine, : size * fine] + 0.5) / fine - 0.5
+    u, v = (x - centre[0]) / radius, (y - centre[1]) / (0.8 * radius)
+    image = np.where(u * u + v * v < 1, 170.0, 20.0)
+    image[(u * u + v * v < 1) & (u * np.cos(angle) + v * np.sin(angle) > 0)] *= 1 - share
+    image = gaussian_filter(image.reshape(size, fine, size, fine).mean((1, 3)), 0.9)
+    return np.clip(np.round(image + noise * rng.standard_normal(image.shape)), 0, 255).astype(np.uint8), centre
+
+
+@pytest.mark.parametrize(("radius", "before_px"), [(8, 0.038), (14, 0.022), (28, 0.007)])
+def test_a_half_that_is_darker_moves_no_centre(radius, before_px):
+    """Halves darker by a tenth moved the centre by ``before_px`` at least when brightness was two planes; now what is
+    left is chance: σ of the mean of eight, and a fifth of that move."""
+    camera = Camera(120, 120, [1000.0, 1000.0], [60.0, 60.0], np.zeros(8))
+    rng, along, sigma, uneven = np.random.default_rng(radius), [], [], []
+    for k in range(8):
+        angle = 0.3 + k * np.pi / 4
+        image, centre = half_dark(rng, radius, 0.1, angle)
+        start = Ellipses(centre[None] + 0.1, np.diag([radius, 0.8 * radius])[None], np.array([150.0]))
+        found = measure_centres(image, camera, start, start)
+        direction = np.array([np.cos(angle), np.sin(angle)])
+        along.append((found.centre_px[0] - centre) @ direction)
+        uneven.append(found.uneven_px[0] @ direction)
+        sigma.append(found.sigma_px()[0])
+    assert np.mean(uneven) > before_px * 0.8
+    assert abs(np.mean(along)) < 3 * np.mean(sigma) / np.sqrt(8) + 0.2 * before_px
+
+
+def test_an_even_circle_is_called_even():
+    camera = Camera(120, 120, [1000.0, 1000.0], [60.0, 60.0], np.zeros(8))
+    rng = np.random.default_rng(5)
+    for radius in (6, 8, 14, 28):
+        image, centre = half_dark(rng, radius, 0.0, 0.0, noise=2.0)
+        start = Ellipses(centre[None] + 0.1, np.diag([radius, 0.8 * radius])[None], np.array([150.0]))
+        assert (measure_centres(image, camera, start, start).uneven_px == 0).all()

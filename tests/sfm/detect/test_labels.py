@@ -33,6 +33,7 @@ def detection(image, turn=False, certain=False, shift=None, faces=True):
         np.ones(n),
         np.ones(n),
         np.ones(n),
+        np.zeros((n, 2)),
         np.ones(n, bool),
     )
     cells = np.array([[int(v) for v in image.labels[i].split(":")[1:]] for i in dots])
