@@ -71,7 +71,7 @@ Readings = list[PlaneView]
 class Arrangement:
     """``group_from_plane`` by plane; ``camera_from_group`` by image; ``views`` : accepted, by image; ``contradicted`` :
     readings that do not fit, by image; ``open`` : boards of which several numberings fit, by image; ``reflected`` :
-    what is a plane's image in a mirror, by image."""
+    what is a plane's image in a mirror, by image; ``foreign`` : what is at another place than in other groups."""
 
     group_from_plane: dict[str, Rigid]
     camera_from_group: dict[int, Rigid]
@@ -79,6 +79,17 @@ class Arrangement:
     contradicted: dict[int, tuple[Readings, ...]] = field(default_factory=dict)
     open: dict[int, tuple[Readings, ...]] = field(default_factory=dict)
     reflected: dict[int, tuple[PlaneView, ...]] = field(default_factory=dict)
+    foreign: dict[int, tuple[PlaneView, ...]] = field(default_factory=dict)
+
+    def without(self, planes: set[str]) -> tuple["Arrangement", dict[int, tuple[PlaneView, ...]]]:
+        """The arrangement without some planes, and what was read as theirs, by image."""
+        gone = {i: tuple(v for v in views if v.plane in planes) for i, views in self.views.items()}
+        rest = replace(
+            self,
+            group_from_plane={p: pose for p, pose in self.group_from_plane.items() if p not in planes},
+            views={i: tuple(v for v in views if v.plane not in planes) for i, views in self.views.items()},
+        )
+        return rest, {i: views for i, views in gone.items() if views}
 
     def explained(self) -> int:
         """Circles of the readings that fit."""
@@ -144,6 +155,53 @@ def arrange(
         if best.explained() == total:
             break
     return best
+
+
+def across_groups(groups: Sequence[Arrangement], patterns: dict[str, np.ndarray], reach_mm: float) -> list[Arrangement]:
+    """The arrangements of all groups, held against each other: the faces stand to one another alike in all of them.
+
+    A face that a group has elsewhere than most circles of the others goes out there, and comes in where its place is
+    known from them, whether the group read it or not: the second look will tell. What is then known of the target also
+    tells the image in a mirror of a face that the group does not show.
+    """
+    faces = [_as_faces(each) for each in groups]
+    best: Arrangement = Arrangement({}, {}, {})
+    for i, view in _seeds(faces)[:MAX_SEEDS]:
+        found = _grown(faces, i, view, reach_mm)
+        if found.explained() > best.explained():
+            best = found
+    settled = []
+    for i, each in enumerate(groups):
+        if i not in best.views:
+            settled.append(each)
+            continue
+        agreed = {view.plane for view in best.views[i]}
+        rest, foreign = each.without({p for p in each.group_from_plane if p != BOARD} - agreed)
+        pose = best.camera_from_group[i]
+        known = {p: pose @ target_from_face for p, target_from_face in best.group_from_plane.items()}
+        settled.append(replace(rest, group_from_plane=known | rest.group_from_plane, foreign=foreign))
+    cleared = [_without_reflections(each, patterns, reach_mm) for each in settled]
+    gone = [s.group_from_plane.keys() - c.group_from_plane.keys() for s, c in zip(settled, cleared, strict=True)]
+    if not any(gone):
+        return settled
+    real = [replace(g.without(set(p))[0], reflected=c.reflected) for g, p, c in zip(groups, gone, cleared, strict=True)]
+    return across_groups(real, patterns, reach_mm)
+
+
+def _as_faces(group: Arrangement) -> list[Readings]:
+    """A group as if it were an image: its faces, with as many rows as circles were seen."""
+    seen: dict[str, list[PlaneView]] = {}
+    for views in group.views.values():
+        for view in views:
+            if view.plane != BOARD:
+                seen.setdefault(view.plane, []).append(view)
+    found = []
+    for plane, views in seen.items():
+        if plane in group.group_from_plane:
+            rows = np.concatenate([view.rows for view in views])
+            first = max(views, key=lambda view: len(view.rows))
+            found.append([replace(first, rows=rows, camera_from_plane=group.group_from_plane[plane])])
+    return found
 
 
 def _seeds(images: Sequence[list[Readings]]) -> list[tuple[int, PlaneView]]:
@@ -399,13 +457,8 @@ def _without_reflections(found: Arrangement, patterns: dict[str, np.ndarray], re
     for real, image in permutations([p for p in found.group_from_plane if p != BOARD], 2):
         if not _reflected(found, patterns, real, image, reach_mm):
             continue
-        gone = {i: tuple(v for v in views if v.plane == image) for i, views in found.views.items()}
-        found = replace(
-            found,
-            group_from_plane={p: pose for p, pose in found.group_from_plane.items() if p != image},
-            views={i: tuple(v for v in views if v.plane != image) for i, views in found.views.items()},
-            reflected={i: found.reflected.get(i, ()) + views for i, views in gone.items() if views},
-        )
+        found, gone = found.without({image})
+        found = replace(found, reflected={i: found.reflected.get(i, ()) + views for i, views in gone.items()})
     return found
 
 

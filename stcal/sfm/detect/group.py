@@ -6,7 +6,7 @@ import numpy as np
 
 from stcal.design import BoardDesign, TargetDesign
 from stcal.sfm.detect.files import DetectedImage, DetectionResult, look_again
-from stcal.sfm.detect.labels import LabelledImage, label_group
+from stcal.sfm.detect.labels import LabelledImage, label_groups
 from stcal.sfm.detect.predict import PredictedCircles, missed_notes, predict_circles
 
 
@@ -28,9 +28,10 @@ def label_images(
     labelled: list[LabelledImage] = []
     jobs: list[tuple[DetectedImage, PredictedCircles]] = []
     focal_px = float(np.sqrt(camera.focal.prod()))
-    for members in groups.values():
-        named = [(image.file.name, image.file.group, image.detection) for image in members]
-        found, arrangement = label_group(named, target, board, focal_px)
+    named = [[(i.file.name, i.file.group, i.detection) for i in members] for members in groups.values()]
+    for members, (found, arrangement) in zip(
+        groups.values(), label_groups(named, target, board, focal_px), strict=True
+    ):
         for i, (image, each) in enumerate(zip(members, found, strict=True)):
             predicted = predict_circles(arrangement, i, each.observations.labels, target, board, camera)
             if predicted is not None:

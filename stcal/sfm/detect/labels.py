@@ -8,7 +8,15 @@ import numpy as np
 from stcal.design import BoardDesign, TargetDesign
 from stcal.labels import BOARD, Label
 from stcal.sfm.data.observations import ImageObservations
-from stcal.sfm.detect.arrangement import Arrangement, PlaneView, Readings, arrange, readings_of
+from stcal.sfm.detect.arrangement import (
+    MAX_SHIFT_PITCHES,
+    Arrangement,
+    PlaneView,
+    Readings,
+    across_groups,
+    arrange,
+    readings_of,
+)
 from stcal.sfm.detect.centres import Centres
 from stcal.sfm.detect.sightings import ImageDetection
 
@@ -50,17 +58,24 @@ def label_single(name: str, group: str, detection: ImageDetection, target: Targe
     return labelled_image(name, group, labels, detection.centres.select(rows), [*detection.notes, *repeated])
 
 
-def label_group(
-    images: list[tuple[str, str, ImageDetection]], target: TargetDesign, board: BoardDesign | None, focal_px: float
-) -> tuple[list[LabelledImage], Arrangement]:
-    """Label the images (name, group, detection) of one group, and the arrangement that their labels keep to."""
-    readings = [[] if d.mirrored else readings_of(d, target, board) for _, _, d in images]
+def label_groups(
+    groups: Sequence[Sequence[tuple[str, str, ImageDetection]]],
+    target: TargetDesign,
+    board: BoardDesign | None,
+    focal_px: float,
+) -> list[tuple[list[LabelledImage], Arrangement]]:
+    """Label the images (name, group, detection) of all groups, each with the arrangement that its labels keep to."""
     patterns = {face.id: face.xy_mm for face in target.faces}
-    arrangement = arrange(readings, patterns, step_mm(target, board), focal_px)
-    return [
-        _labelled(name, group, detection, readings[i], arrangement, i, target)
-        for i, (name, group, detection) in enumerate(images)
-    ], arrangement
+    step = step_mm(target, board)
+    readings = [[[] if d.mirrored else readings_of(d, target, board) for _, _, d in images] for images in groups]
+    alone = [arrange(own, patterns, step, focal_px) for own in readings]
+    found = []
+    for images, own, arrangement in zip(
+        groups, readings, across_groups(alone, patterns, MAX_SHIFT_PITCHES * step), strict=True
+    ):
+        labelled = [_labelled(*each, own[i], arrangement, i) for i, each in enumerate(images)]
+        found.append((labelled, arrangement))
+    return found
 
 
 def step_mm(target: TargetDesign, board: BoardDesign | None) -> float:
@@ -81,7 +96,6 @@ def _labelled(
     readings: list[Readings],
     arrangement: Arrangement,
     image: int,
-    target: TargetDesign,
 ) -> LabelledImage:
     notes = list(detection.notes)
     if detection.mirrored:
@@ -95,6 +109,7 @@ def _labelled(
         notes += [_contradiction(each[0]) for each in arrangement.contradicted.get(image, ())]
         notes += [_open_board(each) for each in arrangement.open.get(image, ())]
         notes += [_reflection(each) for each in arrangement.reflected.get(image, ())]
+        notes += [_foreign(each) for each in arrangement.foreign.get(image, ())]
     else:
         views = [each[0] for each in readings if len(each) == 1 and _once(each[0], readings)]
         notes += [_open_board(each) for each in readings if len(each) > 1]
@@ -125,3 +140,10 @@ def _open_board(views: Readings) -> str:
 
 def _reflection(view: PlaneView) -> str:
     return f"a pattern like face {view.plane}: the image of another face in a mirror; left out"
+
+
+def _foreign(view: PlaneView) -> str:
+    return (
+        f"a pattern like face {view.plane}: not where other groups see that face against the others; left out, it is a "
+        "reflection or another object"
+    )

@@ -6,7 +6,7 @@ import pytest
 from stcal.design import reference_target
 from stcal.geometry.rigid import Rigid
 from stcal.sfm.detect.centres import Centres
-from stcal.sfm.detect.labels import label_group
+from stcal.sfm.detect.labels import label_groups
 from stcal.sfm.detect.predict import predict_circles
 from stcal.sfm.detect.sightings import BoardSighting, FaceSighting, ImageDetection
 
@@ -73,7 +73,7 @@ def plane_centres(camera_from_plane: Rigid, xy_mm) -> np.ndarray:
 
 def labelled(scene, detections):
     named = [(f"12/{i}", "12", d) for i, d in enumerate(detections)]
-    return label_group(named, scene.target, scene.board, FOCAL_PX)
+    return label_groups([named], scene.target, scene.board, FOCAL_PX)[0]
 
 
 def poses(scene):

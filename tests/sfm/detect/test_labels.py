@@ -7,7 +7,7 @@ import pytest
 
 from stcal.design import reference_target
 from stcal.sfm.detect.centres import Centres
-from stcal.sfm.detect.labels import label_group
+from stcal.sfm.detect.labels import label_groups
 from stcal.sfm.detect.sightings import BoardSighting, FaceSighting, ImageDetection
 
 FOCAL_PX = 5000.0
@@ -60,7 +60,7 @@ def sightings(labels):
 
 def labelled(scene, detections):
     named = [(f"12/{i}", "12", d) for i, d in enumerate(detections)]
-    return label_group(named, scene.target, scene.board, FOCAL_PX)[0]
+    return label_groups([named], scene.target, scene.board, FOCAL_PX)[0][0]
 
 
 def is_truth(image, result, turned):
@@ -118,5 +118,5 @@ def test_a_target_that_was_moved_within_the_group_loses_the_board(scene, group):
 
 
 def test_without_a_board_the_target_is_labelled_all_the_same(scene, group):
-    results, _ = label_group([("12/0", "12", detection(group[0]))], scene.target, None, FOCAL_PX)
+    ((results, _),) = label_groups([[("12/0", "12", detection(group[0]))]], scene.target, None, FOCAL_PX)
     assert {label.split(":")[0] for label in results[0].observations.labels} == {"1", "2"}
