@@ -69,7 +69,6 @@ def run(
     out = claim_folder(out, MarkerFile.of(images, options))
 
     detection, labelled = detect(images, model, out, target, board, options, progress)
-    require_upright(detection.images)
     known = model.calibrated(detection.camera.width, detection.camera.height)
     known = refinable(known) if options.refine_camera else known
     observations = [each.observations for each in labelled]
@@ -118,7 +117,8 @@ def detect(
     step = counted(progress, "detect", len(files))
     detection = detect_files(files, camera, target, board, options.ellipses, out / "cache", options.workers, step)
     detection = replace(detection, skipped=(*other, *detection.skipped))
-    labelled = label_images(detection, target, board, out / "cache", options.workers)
+    require_upright(detection.images)
+    labelled = label_images(detection, target, board, options.ellipses, out / "cache", options.workers)
     save(out / "detections.csv", detections_csv([each.observations for each in labelled]))
     write_overlays(detection, labelled, target, out, progress)
     return detection, labelled

@@ -43,7 +43,8 @@ class PlaneView:
     """One way to read n circles of an image as those of one plane.
 
     ``plane`` : face id or ``board``; ``rows`` : (n,) among the image's centres; ``xy_mm`` : (n, 2) in the plane;
-    ``xy`` : (n, 2) seen, normalised; ``camera_from_plane`` : from these alone, None of too few or in line.
+    ``xy`` : (n, 2) seen, normalised; ``area`` : that they take up, in units of their ellipses'; ``camera_from_plane`` :
+    from these alone.
     """
 
     plane: str
@@ -51,6 +52,7 @@ class PlaneView:
     rows: np.ndarray
     xy_mm: np.ndarray
     xy: np.ndarray
+    area: float
     camera_from_plane: Rigid
 
     def xyz_mm(self) -> np.ndarray:
@@ -126,7 +128,8 @@ def _view(plane: str, labels, rows: np.ndarray, xy_mm: np.ndarray, detection: Im
         pose = refine_planar_pose(camera_from_plane(fit_homography(xy_mm, xy)), xy_mm, xy)
     except (ConvergenceError, DegenerateError):
         return None
-    return PlaneView(plane, labels, rows, xy_mm, xy, pose)
+    area = float(np.abs(np.linalg.det(detection.centres.shape[rows])).sum())
+    return PlaneView(plane, labels, rows, xy_mm, xy, area, pose)
 
 
 def arrange(
@@ -147,7 +150,9 @@ def arrange(
     """
     total = sum(len(views[0].rows) for readings in images for views in readings)
     best = Arrangement({}, {}, {})
-    for i, reading in _seeds(images)[:MAX_SEEDS]:
+    for i, reading in _seeds(images):
+        if any(reading is view for view in best.views.get(i, ())):
+            continue  # it would come to the same
         found = _adjusted(_grown(images, i, reading, MAX_SHIFT_PITCHES * step_mm), focal_px)
         found = _without_reflections(_checked(images, found, step_mm), patterns, MAX_SHIFT_PITCHES * step_mm)
         if found.explained() > best.explained():
@@ -166,7 +171,7 @@ def across_groups(groups: Sequence[Arrangement], patterns: dict[str, np.ndarray]
     """
     faces = [_as_faces(each) for each in groups]
     best: Arrangement = Arrangement({}, {}, {})
-    for i, view in _seeds(faces)[:MAX_SEEDS]:
+    for i, view in _seeds(faces):
         found = _grown(faces, i, view, reach_mm)
         if found.explained() > best.explained():
             best = found
@@ -200,12 +205,14 @@ def _as_faces(group: Arrangement) -> list[Readings]:
         if plane in group.group_from_plane:
             rows = np.concatenate([view.rows for view in views])
             first = max(views, key=lambda view: len(view.rows))
-            found.append([replace(first, rows=rows, camera_from_plane=group.group_from_plane[plane])])
+            area = sum(view.area for view in views)
+            found.append([replace(first, rows=rows, area=area, camera_from_plane=group.group_from_plane[plane])])
     return found
 
 
 def _seeds(images: Sequence[list[Readings]]) -> list[tuple[int, PlaneView]]:
-    """Images to start from, the most certain of itself first: its board, or its largest face."""
+    """Readings to start from, of the image that is most certain of itself first: its board, or its largest face, in
+    every way to read it."""
     found = []
     for i, readings in enumerate(images):
         boards = [views for views in readings if views[0].plane == BOARD]
@@ -213,9 +220,9 @@ def _seeds(images: Sequence[list[Readings]]) -> list[tuple[int, PlaneView]]:
         if readings:
             first = max(boards or faces, key=lambda views: len(views[0].rows))
             circles = sum(len(views[0].rows) for views in readings)
-            found.append(((not boards, not faces, len(first), -len(faces), -circles), i, first[0]))
+            found.append(((not boards, not faces, len(first), -len(faces), -circles), i, first))
     found.sort(key=lambda each: each[:2])
-    return [(i, view) for _, i, view in found]
+    return [(i, view) for _, i, views in found[:MAX_SEEDS] for view in views]
 
 
 def _grown(images: Sequence[list[Readings]], seed: int, view: PlaneView, reach_mm: float) -> Arrangement:
@@ -305,7 +312,8 @@ def _shift_mm(view: PlaneView, camera_from_group: Rigid, known: dict[str, Rigid]
 
 
 def _new_planes(images: Sequence[list[Readings]], placed, known: dict[str, Rigid], reach_mm: float) -> dict[str, Rigid]:
-    """Poses of planes that are not known yet, each where most of the placed images see it."""
+    """Poses of planes that are not known yet, each where it takes up most of the placed images: a second target behind
+    may be seen as often, but is smaller."""
     seen: dict[str, list[tuple[int, PlaneView, Rigid]]] = {}
     for i, (pose, _) in placed.items():
         for views in images[i]:
@@ -318,10 +326,7 @@ def _new_planes(images: Sequence[list[Readings]], placed, known: dict[str, Rigid
         span = found[0][1].span_mm()
         corners = np.array([pose @ span for _, _, pose in found])
         near = np.linalg.norm(corners[:, None] - corners, axis=3).max(2) < reach_mm
-        image = np.array([i for i, _, _ in found])
-        support = [
-            (len(set(image[row].tolist())), sum(len(found[k][1].rows) for k in np.flatnonzero(row))) for row in near
-        ]
+        support = near @ np.array([view.area for _, view, _ in found])
         new[plane] = found[max(range(len(found)), key=lambda k: support[k])][2]
     return new
 

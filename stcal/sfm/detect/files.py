@@ -236,7 +236,11 @@ def _stored_centres(stored) -> Centres:
 
 
 def look_again(
-    jobs: Sequence[tuple[DetectedImage, PredictedCircles]], camera: Camera, cache: Path, workers: int | None = None
+    jobs: Sequence[tuple[DetectedImage, PredictedCircles]],
+    camera: Camera,
+    options: EllipseOptions,
+    cache: Path,
+    workers: int | None = None,
 ) -> dict[str, SecondLook]:
     """Measure the circles that are predicted in images; by name. What an earlier run measured is kept.
 
@@ -245,10 +249,10 @@ def look_again(
     found: dict[str, SecondLook] = {}
     pending = []
     for image, predicted in jobs:
-        path = cache / f"again-{_predicted_key(image.digest, predicted, camera)}.npz"
+        path = cache / f"again-{_predicted_key(image.digest, predicted, camera, options)}.npz"
         known = kept(path, _stored_look)
         if known is None:
-            pending.append((image.file, camera, predicted, path))
+            pending.append((image.file, camera, predicted, options, path))
         else:
             found[image.file.name] = known
     for k, look in run_parallel(_look_again, pending, workers):
@@ -257,19 +261,21 @@ def look_again(
     return found
 
 
-def _predicted_key(digest: str, predicted: PredictedCircles, camera: Camera) -> str:
-    hasher = hashlib.sha256(f"{CACHE_VERSION}\0{digest}\0{predicted.labels}\0{predicted.polarity}\0".encode())
+def _predicted_key(digest: str, predicted: PredictedCircles, camera: Camera, options: EllipseOptions) -> str:
+    hasher = hashlib.sha256(f"{CACHE_VERSION}\0{digest}\0{predicted.labels}\0{predicted.polarity}\0{options}".encode())
     for values in (predicted.centre_px, predicted.shape_px, predicted.wanted, camera.parameters()):
         hasher.update(values.tobytes())
     return hasher.hexdigest()[:40]
 
 
-def _look_again(file: ImageFile, camera: Camera, predicted: PredictedCircles, path: Path) -> SecondLook | None:
+def _look_again(
+    file: ImageFile, camera: Camera, predicted: PredictedCircles, options: EllipseOptions, path: Path
+) -> SecondLook | None:
     try:
         image = decode(file.path.read_bytes(), file.name)
     except (InputError, OSError):
         return None
-    look = measure_predicted(image, camera, predicted)
+    look = measure_predicted(image, camera, predicted, options)
     meta = {"labels": look.labels, "missed": look.missed}
     keep(path, _centre_arrays(look.centres), meta)
     return look

@@ -5,15 +5,17 @@ from pathlib import Path
 import numpy as np
 
 from stcal.design import BoardDesign, TargetDesign
+from stcal.sfm.detect.ellipses import EllipseOptions
 from stcal.sfm.detect.files import DetectedImage, DetectionResult, look_again
 from stcal.sfm.detect.labels import LabelledImage, label_groups
-from stcal.sfm.detect.predict import PredictedCircles, missed_notes, predict_circles
+from stcal.sfm.detect.predict import PredictedCircles, contradicted_notes, contradictions, missed_notes, predict_circles
 
 
 def label_images(
     detection: DetectionResult,
     target: TargetDesign,
     board: BoardDesign | None,
+    options: EllipseOptions,
     cache: Path,
     workers: int | None = None,
 ) -> list[LabelledImage]:
@@ -34,10 +36,14 @@ def label_images(
     ):
         for i, (image, each) in enumerate(zip(members, found, strict=True)):
             predicted = predict_circles(arrangement, i, each.observations.labels, target, board, camera)
-            if predicted is not None:
+            if predicted is None:
+                continue
+            wrong = contradictions(predicted, each.observations, camera)
+            found[i] = each.without(wrong, contradicted_notes(wrong))
+            if predicted.wanted.any():
                 jobs.append((image, predicted))
         labelled += found
-    looks = look_again(jobs, camera, cache, workers)
+    looks = look_again(jobs, camera, options, cache, workers)
     return [_with(each, looks) for each in labelled]
 
 

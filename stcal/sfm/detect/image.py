@@ -1,6 +1,6 @@
 """One image: candidates → board → faces → centres. What only the group can decide stays open."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -13,6 +13,9 @@ from stcal.sfm.detect.centres import Centres, measure_centres
 from stcal.sfm.detect.ellipses import EllipseOptions, Ellipses, find_ellipses
 from stcal.sfm.detect.faces import FaceFinder, FaceFinding, FaceReading
 from stcal.sfm.detect.sightings import BoardSighting, FaceSighting, ImageDetection
+
+FAINT = 0.25
+"""Of the contrast asked for, where an image shows too little with that."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -29,11 +32,31 @@ class ImageReading:
     faces: FaceFinding
     mirrored: tuple[FaceReading, ...]
 
+    def face_ids(self) -> set[str]:
+        """Faces that are named."""
+        return {each.face.id for each in self.faces.faces}
+
 
 def read_image(
     grey: np.ndarray, camera: Camera, target: TargetDesign, board: BoardDesign | None, options: EllipseOptions
 ) -> ImageReading:
-    """Find the outlines of one polarity or both in an 8-bit image, and the boards and the faces among them."""
+    """Find the outlines of one polarity or both in an 8-bit image, and the boards and the faces among them.
+
+    Where that leaves the board or the faces unnamed that an image of a group is to show, fainter outlines are let in.
+    """
+    reading = _read_once(grey, camera, target, board, options)
+    wanted = min(len(target.faces), 1 if board is None else 2)
+    if len(reading.face_ids()) < wanted or (board is not None and not reading.boards):
+        faint = replace(options, min_contrast=FAINT * options.min_contrast)
+        again = _read_once(grey, camera, target, board, faint)
+        better = (len(again.boards) > 0, len(again.face_ids())) > (len(reading.boards) > 0, len(reading.face_ids()))
+        return again if better else reading
+    return reading
+
+
+def _read_once(
+    grey: np.ndarray, camera: Camera, target: TargetDesign, board: BoardDesign | None, options: EllipseOptions
+) -> ImageReading:
     polarities: set[Polarity] = {target.polarity, board.polarity if board else target.polarity}
     found: dict[Polarity, Ellipses] = {p: find_ellipses(grey, p, options) for p in polarities}
     boards: list[BoardReading] = []

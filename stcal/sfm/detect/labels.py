@@ -1,6 +1,6 @@
 """Labels of one group's circles: what each image reads by itself, held against the arrangement of the whole group."""
 
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -32,6 +32,13 @@ class LabelledImage:
         """With further circles and notes."""
         more = labelled_image(self.observations.name, self.observations.group, labels, centres, ())
         return LabelledImage(self.observations.plus(more.observations), (*self.notes, *notes))
+
+    def without(self, labels: Collection[Label], notes: Sequence[str]) -> "LabelledImage":
+        """Without some circles, and with notes."""
+        if not labels:
+            return self
+        keep = [i for i, label in enumerate(self.observations.labels) if label not in labels]
+        return LabelledImage(self.observations.select(keep), (*self.notes, *notes))
 
 
 def labelled_image(

@@ -17,10 +17,11 @@ from stcal.geometry.rigid import Rigid
 from stcal.io.images import grey_fine
 from stcal.labels import BOARD, Label
 from stcal.sfm.data.in_view import ideal_border, in_view
+from stcal.sfm.data.observations import ImageObservations
 from stcal.sfm.detect.arrangement import Arrangement
 from stcal.sfm.detect.candidates import MAX_POSITION_ERROR, MAX_POSITION_ERROR_PX, singular_values
-from stcal.sfm.detect.centres import Centres, measure_centres
-from stcal.sfm.detect.ellipses import MIN_DIAMETER_PX, Ellipses
+from stcal.sfm.detect.centres import MIN_SIGMA, Centres, measure_centres
+from stcal.sfm.detect.ellipses import MIN_DIAMETER_PX, EllipseOptions, Ellipses
 
 MAX_STRETCH = 1.15
 """Between the predicted and the measured ellipse along any direction, on top of half a pixel at each end."""
@@ -87,8 +88,8 @@ def predict_circles(
     board: BoardDesign | None,
     camera: Camera,
 ) -> PredictedCircles | None:
-    """Circles that the arrangement puts into view in an image; None where it does not know the image, or where all of
-    them have been ``seen``."""
+    """Circles that the arrangement puts into view in an image, wanted those that have not been ``seen``; None where it
+    does not know the image."""
     pose = arrangement.camera_from_group.get(image)
     if pose is None:
         return None
@@ -109,9 +110,43 @@ def predict_circles(
         polarity += [pattern.polarity] * len(shown)
     known = set(seen)
     wanted = np.array([label not in known for label in labels], bool)
-    if not wanted.any():
-        return None
     return PredictedCircles(tuple(labels), np.concatenate(centre), np.concatenate(shape), tuple(polarity), wanted)
+
+
+def contradictions(predicted: PredictedCircles, seen: ImageObservations, camera: Camera) -> dict[Label, str]:
+    """Circles of the first look that are not where, or not of the size, that the others of their plane ask for: partly
+    hidden, or something else; with the reason. What most circles of a plane are off is the design's, and let pass."""
+    place = {label: i for i, label in enumerate(predicted.labels)}
+    rows = [k for k, label in enumerate(seen.labels) if label in place]
+    own = np.array([place[seen.labels[k]] for k in rows], int)
+    planes = np.array([seen.labels[k].plane for k in rows])
+    local = camera.focal[:, None] * camera.distort_jacobian(seen.centre[rows])[1]
+    ratio = np.linalg.solve(predicted.shape_px[own], local @ seen.shape[rows])
+    widest, narrowest = singular_values(ratio)
+    radius, minor = np.sqrt(np.linalg.det(predicted.shape_px[own])), singular_values(predicted.shape_px[own])[1]
+    off = np.linalg.norm(seen.centre_px[rows] - predicted.centre_px[own], axis=1)
+    found: dict[Label, str] = {}
+    for plane in dict.fromkeys(planes.tolist()):
+        members = np.flatnonzero(planes == plane)
+        size = np.median(np.sqrt(widest[members] * narrowest[members]))
+        usual = 3 * np.median(off[members])
+        for k in members.tolist():
+            allowed = max(MAX_POSITION_ERROR * radius[k], MAX_POSITION_ERROR_PX, usual)
+            stretch = MAX_STRETCH * (1 + 0.5 / minor[k])
+            most = max(widest[k] / size, size / narrowest[k])
+            if off[k] > allowed:
+                found[seen.labels[rows[k]]] = _off_place(off[k], allowed)
+            elif most > stretch:
+                found[seen.labels[rows[k]]] = _off_size(most, stretch)
+    return found
+
+
+def _off_place(off_px: float, allowed_px: float) -> str:
+    return f"{off_px:.1f} px from its place, {allowed_px:.1f} allowed"
+
+
+def _off_size(stretch: float, allowed: float) -> str:
+    return f"{stretch:.2f} times its size along one direction, {allowed:.2f} allowed"
 
 
 def _ellipses(
@@ -132,12 +167,21 @@ def _ellipses(
     return distorted * camera.focal + camera.centre, (vector * root[:, None]) @ np.swapaxes(vector, 1, 2)
 
 
-def measure_predicted(image: np.ndarray, camera: Camera, predicted: PredictedCircles) -> SecondLook:
-    """Measure the wanted circles in a grey image of any depth."""
+def measure_predicted(
+    image: np.ndarray, camera: Camera, predicted: PredictedCircles, options: EllipseOptions
+) -> SecondLook:
+    """Measure the wanted circles in a grey image of any depth, of the sizes that the options ask for."""
     scaled = grey_fine(image)
     everything = Ellipses(predicted.centre_px, predicted.shape_px, np.ones(len(predicted.labels)))
     wanted = np.flatnonzero(predicted.wanted)
-    wanted = wanted[2 * everything.radius_px()[wanted] >= MIN_DIAMETER_PX]
+    low, high = options.min_diameter_px or MIN_DIAMETER_PX, options.max_diameter_px
+    diameter = 2 * everything.radius_px()
+    missed = {
+        predicted.labels[i]: f"{diameter[i]:.1f} px across, {low:g} to {high:g} px asked for"
+        for i in wanted
+        if not low <= diameter[i] <= high
+    }
+    wanted = np.array([i for i in wanted if predicted.labels[i] not in missed], int)
     expected = everything.select(wanted)
     found = measure_centres(scaled, camera, expected, everything)
     reasons = [_reason(found, expected, k, predicted.polarity[i], camera) for k, i in enumerate(wanted)]
@@ -145,7 +189,7 @@ def measure_predicted(image: np.ndarray, camera: Camera, predicted: PredictedCir
     return SecondLook(
         tuple(predicted.labels[wanted[k]] for k in seen),
         found.select(np.array(seen, int)),
-        {predicted.labels[i]: reason for i, reason in zip(wanted, reasons, strict=True) if reason},
+        missed | {predicted.labels[i]: reason for i, reason in zip(wanted, reasons, strict=True) if reason},
     )
 
 
@@ -154,18 +198,19 @@ def _reason(found: Centres, expected: Ellipses, k: int, polarity: Polarity, came
     if not found.ok[k]:
         return f"{100 * found.rim[k]:.0f} % of its rim follows an ellipse, 80 % needed"
     contrast = found.contrast[k] * (1 if polarity == "bright" else -1)
-    if contrast < MIN_SIGNIFICANCE * found.noise[k]:
-        return f"contrast {contrast:.0f}, {MIN_SIGNIFICANCE * found.noise[k]:.0f} needed"
+    needed = MIN_SIGNIFICANCE * max(found.noise[k], MIN_SIGMA)
+    if contrast < needed:
+        return f"contrast {contrast:.1f}, {needed:.1f} needed"
     size = float(np.sqrt(np.linalg.det(expected.shape_px[k])))
     off, allowed = np.linalg.norm(found.centre_px[k] - expected.centre_px[k]), MAX_POSITION_ERROR * size
     if off > max(allowed, MAX_POSITION_ERROR_PX):
-        return f"{off:.1f} px from its place, {max(allowed, MAX_POSITION_ERROR_PX):.1f} allowed"
+        return _off_place(off, max(allowed, MAX_POSITION_ERROR_PX))
     _, local = camera.distort_jacobian(found.centre[k])
     own = (camera.focal[:, None] * local) @ found.shape[k]
     widest, narrowest = singular_values(np.linalg.solve(expected.shape_px[k], own))
     stretch = MAX_STRETCH * (1 + 0.5 / float(singular_values(expected.shape_px[k])[1]))
     if widest > stretch or narrowest < 1 / stretch:
-        return f"{max(widest, 1 / narrowest):.2f} times its size along one direction, {stretch:.2f} allowed"
+        return _off_size(max(widest, 1 / narrowest), stretch)
     sigma = float(np.sqrt(np.trace(found.covariance_px2[k]) / 2))
     if sigma > MAX_SIGMA_PX:
         return f"σ {sigma:.2f} px, {MAX_SIGMA_PX:g} allowed"
@@ -184,3 +229,8 @@ def missed_notes(missed: dict[Label, str]) -> list[str]:
         more = f" and {len(rows) - 1} more" if len(rows) > 1 else ""
         notes.append(f"{what}: {first}{more} should be in view and not measured; {first}: {reason}; hidden or unclear")
     return notes
+
+
+def contradicted_notes(found: dict[Label, str]) -> list[str]:
+    """One line for each circle."""
+    return [f"{label}: {reason}; partly hidden or something else, left out" for label, reason in found.items()]

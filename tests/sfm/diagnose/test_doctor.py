@@ -215,7 +215,8 @@ def test_too_large_circles(patient, stcal_sfm):
 
 @pytest.mark.slow
 def test_spoiled_circles(patient):
-    """In one set: hidden, seen once, moved, faint, and a rim without an edge; each is told from the others."""
+    """In one set: hidden, seen once, moved, and a rim without an edge; each is told from the others. Faint ones are
+    found where the group has them."""
     patient.hide(FIRST, "2:2", "board:3:4")
     for name in IMAGES[1:]:
         patient.hide(name, "1:a", half=11)
@@ -256,23 +257,12 @@ def test_spoiled_circles(patient):
     # One pixel off, less what four images are pulled along.
     assert all(moved[x].limit < 0.5 < moved[x].value < 1.1 and moved[x].unit == "px" for x in ("2:1", "board:2:2"))
 
-    assert {label for label, f in third.items() if f.gate == "min_contrast"} == faint.keys()
-    for label, contrast in faint.items():  # of a range of about 180 grey values
-        assert third[label].value == pytest.approx(contrast / 180, rel=0.25)
-        assert third[label].limit == pytest.approx(0.08)
+    assert not faint.keys() & third.keys()  # the limit of the first look is 14 of a range of about 180 grey values
 
     assert {label: f.gate for label, f in fourth.items()} == {"2:3": "rim", "board:3:4": "rim", "1:a": "hidden"}
     # Half of 16 sectors have no edge to follow.
     assert all(0.35 < fourth[x].value < 0.7 < fourth[x].limit == 0.8 for x in ("2:3", "board:3:4"))
 
-    options = {
-        option: {x for x, f in third.items() if option in f.options} for f in third.values() for option in f.options
-    }
-    option, helped = max(options.items(), key=lambda item: len(item[1]))
-    assert helped
-    limit = float(option.removeprefix("EllipseOptions(min_contrast=").removesuffix(")"))
-    still = by_label(patient.run(ellipses=EllipseOptions(min_contrast=limit)), THIRD).keys()
-    assert helped == faint.keys() - still
     for name in IMAGES:
         patient.mend(name)
     assert unlabelled(patient.run()) == set()
@@ -293,8 +283,9 @@ def test_another_view_lets_in_a_circle_seen_once(patient):
 
 @pytest.mark.slow
 def test_spoiled_faces_and_boards(patient):
-    """Faces with 7 of 10 circles, 8 needed, and as faint as a reflection; a board of 20 of 63 dots, 23 needed."""
-    hidden = {"2:2", "2:6", "2:7"}
+    """A face with 4 of 10 circles, 6 needed to name it, one at 0.4 of its brightness, and a board of 20 of 63 dots, 23
+    needed: what is hidden costs nothing but itself."""
+    hidden = {"2:2", "2:6", "2:7", "2:1", "2:3", "2:5"}
     patient.hide(FIRST, *hidden)
     face = [f"2:{circle}" for circle in "1234567abc"]
 
@@ -311,21 +302,11 @@ def test_spoiled_faces_and_boards(patient):
     diagnosis = patient.run()
     first, second, third = (by_label(diagnosis, name) for name in (FIRST, SECOND, THIRD))
     assert {label for label, f in first.items() if f.gate == "hidden"} == hidden
-    few = {label for label, f in first.items() if (f.gate, f.value, f.limit) == ("face_circles", 7, 8)}
-    assert few == set(face) - hidden
-    assert {label for label, f in second.items() if f.gate == "face_contrast"} == set(face)
-    assert all(0.6 * second[label].limit < second[label].value < second[label].limit for label in face)
+    assert first.keys() == hidden
+    assert not second.keys() & set(face)
     dark = ("hidden", "min_contrast")  # some of what is painted over differs a little from what is around it
     assert {label for label, f in third.items() if f.gate in dark and abs(f.value) < 0.04} == dots - shown
-    assert {label for label, f in third.items() if (f.gate, f.value, f.limit) == ("board_dots", 20, 23)} == shown
-
-    patient.mend(FIRST)
-    patient.hide(FIRST, *hidden - {"2:6"})
-    patient.mend(THIRD)
-    patient.hide(THIRD, *dots - shown - {f"board:{row}:4" for row in range(3)}, half=12)
-    again = patient.run()
-    assert by_label(again, FIRST).keys() == hidden - {"2:6"}
-    assert not shown & by_label(again, THIRD).keys()
+    assert not shown & third.keys()
 
 
 def test_files_and_images_left_out_whole(patient):
