@@ -103,20 +103,13 @@ def readings_of(detection: ImageDetection, target: TargetDesign, board: BoardDes
     found = []
     for each in detection.faces:
         face = target.face(each.face)
-        views = [_view(face.id, each.labels(face), each.rows, face.xy_mm[each.circles], detection)]
-        found.append(views)
-    for each in detection.boards if board is not None else ():
-        views = [
-            _view(
-                BOARD,
-                tuple(DotLabel(*cell) for cell in cells.tolist()),
-                each.rows,
-                board.pitch_mm * cells[:, ::-1].astype(float),
-                detection,
-            )
-            for cells in each.numberings
-        ]
-        found.append(views)
+        found.append([_view(face.id, each.labels(face), each.rows, face.xy_mm[each.circles], detection)])
+    if board is not None:
+        for each in detection.boards:
+            places = board.pitch_mm * each.numberings[:, :, ::-1].astype(float)
+            labels = [tuple(DotLabel(*cell) for cell in cells.tolist()) for cells in each.numberings]
+            rows = each.rows
+            found.append([_view(BOARD, own, rows, xy, detection) for own, xy in zip(labels, places, strict=True)])
     return [[v for v in views if v is not None] for views in found if all(v is not None for v in views)]
 
 
@@ -474,10 +467,12 @@ def _reflected(found: Arrangement, patterns: dict[str, np.ndarray], real: str, i
         found.group_from_plane[p] @ np.column_stack([patterns[p], np.zeros(len(patterns[p]))]) for p in (real, image)
     )
     between = own.mean(0) - other.mean(0)
+    if np.linalg.norm(between) < reach_mm:
+        return False
     normal, middle = between / np.linalg.norm(between), (own.mean(0) + other.mean(0)) / 2
     turned = own - 2 * ((own - middle) @ normal)[:, None] * normal
     apart, at = KDTree(other).query(turned)
-    if apart.max() > reach_mm or len(set(at.tolist())) < len(other):
+    if apart.max() > reach_mm or len(np.unique(at)) < len(other):
         return False
     seen_by = [i for i, views in found.views.items() if any(v.plane == image for v in views)]
     sides = [(found.camera_from_group[i].inverse().translation - middle) @ normal > 0 for i in seen_by]

@@ -313,7 +313,7 @@ class _Fit:
         jacobian = np.empty((PARAMETERS + 2 * len(WAVES) * len(self.waves), len(rho)), np.float32)
         planes = jacobian[6:]
         planes[0], planes[1], planes[2], planes[3], planes[4], planes[5] = 1, x, y, inside, inside * x, inside * y
-        waves = self._waves(a, b) if self.waves else None
+        waves = self._waves(a, b) if self.waves else np.zeros((0, len(a)), np.float32)
         for k, within in enumerate(self.waves):
             planes[6 + k * len(waves) : 6 + (k + 1) * len(waves)] = waves * (inside if within else 1 - inside)
         levels = self._levels(planes) if self.levels is None else self.levels

@@ -104,7 +104,7 @@ def predict_circles(
             in_view(camera_from_plane, pattern.xy_mm, pattern.radius_mm, pattern.side, camera, border)
         )
         place, outline = _ellipses(camera_from_plane, pattern.xy_mm[shown], pattern.radius_mm[shown], camera)
-        labels += [pattern.labels[i] for i in shown]
+        labels += [pattern.labels[i] for i in shown.tolist()]
         centre.append(place)
         shape.append(outline)
         polarity += [pattern.polarity] * len(shown)
@@ -204,13 +204,13 @@ def _reason(found: Centres, expected: Ellipses, k: int, polarity: Polarity, came
     size = float(np.sqrt(np.linalg.det(expected.shape_px[k])))
     off, allowed = np.linalg.norm(found.centre_px[k] - expected.centre_px[k]), MAX_POSITION_ERROR * size
     if off > max(allowed, MAX_POSITION_ERROR_PX):
-        return _off_place(off, max(allowed, MAX_POSITION_ERROR_PX))
+        return _off_place(float(off), max(float(allowed), MAX_POSITION_ERROR_PX))
     _, local = camera.distort_jacobian(found.centre[k])
     own = (camera.focal[:, None] * local) @ found.shape[k]
     widest, narrowest = singular_values(np.linalg.solve(expected.shape_px[k], own))
     stretch = MAX_STRETCH * (1 + 0.5 / float(singular_values(expected.shape_px[k])[1]))
     if widest > stretch or narrowest < 1 / stretch:
-        return _off_size(max(widest, 1 / narrowest), stretch)
+        return _off_size(float(max(widest, 1 / narrowest)), float(stretch))
     sigma = float(np.sqrt(np.trace(found.covariance_px2[k]) / 2))
     if sigma > MAX_SIGMA_PX:
         return f"σ {sigma:.2f} px, {MAX_SIGMA_PX:g} allowed"
