@@ -9,8 +9,9 @@ from stcal.design import BoardDesign, TargetDesign
 from stcal.errors import MappingError
 from stcal.geometry.camera import Camera
 from stcal.io.camera import CameraPrior
+from stcal.labels import CircleLabel
 from stcal.sfm.adjust.chain import CalibratedTarget, chain_faces
-from stcal.sfm.adjust.faces import FaceInGroup, faces_of_group
+from stcal.sfm.adjust.faces import FaceInGroup, faces_of_group, missing_frame_circles
 from stcal.sfm.adjust.group import adjust
 from stcal.sfm.adjust.joint import SETTLED_PX, JointResult, adjust_jointly
 from stcal.sfm.adjust.options import AdjustOptions
@@ -62,13 +63,8 @@ def calibrate(
         The adjustment finds no minimum.
     """
     scales = {model.group: find_scale(model, board) for model in models}
-    faces, notes = [], []
-    for model in models:
-        found, missing = faces_of_group(
-            model.metric(scales[model.group].group_from_world()), camera, target, options.frame
-        )
-        faces += found
-        notes += missing
+    metric = [model.metric(scales[model.group].group_from_world()) for model in models]
+    faces, notes = _faces(metric, camera, target, options)
     try:
         calibrated = chain_faces(faces, target, options.reference_face)
     except MappingError as error:  # a face without a frame may be why
@@ -92,6 +88,27 @@ def calibrate(
         camera=camera,
         notes=tuple(notes),
     )
+
+
+def _faces(
+    models: Sequence[MetricModel], camera: Camera, target: TargetDesign, options: AdjustOptions
+) -> tuple[list[FaceInGroup], list[str]]:
+    """Frames of the faces in all groups, and notes. A face of which no group maps all frame circles has those that are
+    unseen where the design has them."""
+    seen = {label.face for m in models for label in m.labels if isinstance(label, CircleLabel)}
+    own = [faces_of_group(model, camera, target, options.frame) for model in models]
+    without = frozenset(seen - {face.face for found, _ in own for face in found})
+    if without:
+        own = [faces_of_group(model, camera, target, options.frame, without) for model in models]
+    notes = []
+    for face_id in sorted(without & {face.face for found, _ in own for face in found}):
+        circles = {label.circle for m in models for label in m.labels if label.plane == face_id}
+        names = ", ".join(f"{face_id}:{c}" for c in missing_frame_circles(target.face(face_id), circles))
+        notes.append(
+            f"face {face_id}: frame circle {names or 'in each group'} not mapped; it stands where the design has it "
+            "against the face's other circles, and σ carries how far circles are off the design"
+        )
+    return [face for found, _ in own for face in found], [note for _, more in own for note in more] + notes
 
 
 def _placed(model: WorldModel, scale: Scale, start: CalibratedTarget) -> MetricModel:

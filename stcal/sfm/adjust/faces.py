@@ -1,5 +1,6 @@
 """Face frames from circle centres, and the faces of one group."""
 
+from collections.abc import Collection
 from dataclasses import dataclass
 from typing import Literal
 
@@ -7,6 +8,7 @@ import numpy as np
 
 from stcal.design import FaceDesign, TargetDesign
 from stcal.errors import DegenerateError
+from stcal.geometry.align import align_rigid
 from stcal.geometry.arrays import frozen
 from stcal.geometry.camera import Camera
 from stcal.geometry.plane import fit_plane
@@ -16,6 +18,8 @@ from stcal.sfm.adjust.group import projection_jacobians
 from stcal.sfm.data.model import MetricModel
 
 FrameKind = Literal["plane", "three-point"]
+MIN_DESIGNED = 4
+"""Mapped circles that place the others of the design: three fix it, one more shows how well."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -40,6 +44,60 @@ class FaceInGroup:
         object.__setattr__(self, "information", frozen(self.information, (n, 3, 3), "information"))
 
 
+def missing_frame_circles(face: FaceDesign, mapped: Collection[str]) -> tuple[str, ...]:
+    """Ids of the circles that define the face's frame and are not mapped."""
+    return tuple(circle for circle in (face.origin, face.x, face.y) if circle not in mapped)
+
+
+def with_designed(face: FaceDesign, xyz: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
+    """The circles (3,) by id with those of the frame that are not mapped, where the design has them against the others.
+
+    Raises
+    ------
+    DegenerateError
+        Fewer than four circles are mapped, or they are in line.
+    """
+    missing = missing_frame_circles(face, xyz)
+    if not missing:
+        return xyz
+    names = " and ".join(f"{face.id}:{circle}" for circle in missing)
+    if len(xyz) < MIN_DESIGNED:
+        raise DegenerateError(
+            f"face {face.id}: frame circle {names} not mapped, and {len(xyz)} other circles, {MIN_DESIGNED} needed; "
+            "add views that show it"
+        )
+    try:
+        model_from_design = _design_fit(face, xyz)
+    except DegenerateError as error:
+        raise DegenerateError(f"face {face.id}: frame circle {names} not mapped; add views that show it") from error
+    return xyz | {circle: model_from_design @ _designed(face, circle) for circle in missing}
+
+
+def _designed(face: FaceDesign, circle: str) -> np.ndarray:
+    return np.append(face.xy_mm[face.ids.index(circle)], 0.0)
+
+
+def _design_fit(face: FaceDesign, xyz: dict[str, np.ndarray]) -> Rigid:
+    return align_rigid(np.array(list(xyz.values())), np.array([_designed(face, circle) for circle in xyz]))
+
+
+def placement_sigma_mm(target: TargetDesign, xyz: dict[CircleLabel, np.ndarray]) -> float:
+    """σ per axis, in the plane, of circles (3,) about the design: of rigid fits, pooled over the faces."""
+    square, redundancy = 0.0, 0
+    for face in target.faces:
+        own = {label.circle: place for label, place in xyz.items() if label.face == face.id}
+        if len(own) < MIN_DESIGNED:
+            continue
+        try:
+            fit = _design_fit(face, own)
+        except DegenerateError:
+            continue
+        apart = [(fit.inverse() @ place - _designed(face, circle))[:2] for circle, place in own.items()]
+        square += float((np.array(apart) ** 2).sum())
+        redundancy += 2 * len(own) - 3
+    return float(np.sqrt(square / redundancy)) if redundancy else 0.0
+
+
 def face_frame(face: FaceDesign, xyz: dict[str, np.ndarray], kind: FrameKind, towards: np.ndarray) -> Rigid:
     """model_from_face from circle centres, by Zhang & Wei's Gram–Schmidt (eqs. 8–10).
 
@@ -54,8 +112,7 @@ def face_frame(face: FaceDesign, xyz: dict[str, np.ndarray], kind: FrameKind, to
     DegenerateError
         A frame circle is missing, or the circles are collinear.
     """
-    missing = [circle for circle in (face.origin, face.x, face.y) if circle not in xyz]
-    if missing:
+    if missing := missing_frame_circles(face, xyz):
         names = " and ".join(f"{face.id}:{circle}" for circle in missing)
         raise DegenerateError(f"face {face.id}: frame circle {names} not mapped; add views that show it")
     origin, x, y = (xyz[circle] for circle in (face.origin, face.x, face.y))
@@ -71,9 +128,12 @@ def face_frame(face: FaceDesign, xyz: dict[str, np.ndarray], kind: FrameKind, to
 
 
 def faces_of_group(
-    model: MetricModel, camera: Camera, target: TargetDesign, kind: FrameKind
+    model: MetricModel, camera: Camera, target: TargetDesign, kind: FrameKind, designed: Collection[str] = ()
 ) -> tuple[list[FaceInGroup], list[str]]:
-    """Frames of all faces of one group, and why a face has none."""
+    """Frames of all faces of one group, and why a face has none.
+
+    ``designed`` : faces whose frame circles may stand where the design has them, for want of their own.
+    """
     xyz = model.xyz_model
     information = _point_information(model, camera)
     cameras = np.stack([pose.inverse().translation for pose in model.camera_from_model])
@@ -86,6 +146,8 @@ def faces_of_group(
         observed = np.isin(model.point_index, members)
         seen_by = np.unique(model.image_index[observed])
         try:
+            if face.id in designed:
+                place = with_designed(face, place)
             frame = face_frame(face, place, kind, cameras[seen_by].mean(0) - xyz[members].mean(0))
         except DegenerateError as error:
             notes.append(f"group {model.group}: {error}")

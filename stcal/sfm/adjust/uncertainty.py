@@ -1,6 +1,7 @@
 """The calibrated target of a joint adjustment with its marginal covariances."""
 
 from dataclasses import dataclass
+from functools import partial
 from itertools import combinations
 
 import numpy as np
@@ -9,7 +10,13 @@ from scipy.spatial.transform import Rotation
 from stcal.design import TargetDesign
 from stcal.geometry.rigid import Rigid
 from stcal.sfm.adjust.chain import CalibratedTarget
-from stcal.sfm.adjust.faces import FrameKind, face_frame
+from stcal.sfm.adjust.faces import (
+    FrameKind,
+    face_frame,
+    missing_frame_circles,
+    placement_sigma_mm,
+    with_designed,
+)
 from stcal.sfm.adjust.joint import JointResult
 
 
@@ -18,7 +25,9 @@ class Derivatives:
     """The target in its own frame, and what moves it: derivatives by the circles in the models' frame, mm.
 
     ``target_from_face`` by face; ``xyz_target`` : (c, 3); ``target_from_model`` ; ``faces`` by face: (6, 3c) rotation
-    (rad) and translation (mm), perturbation in the target frame; ``circles`` : (c, 3, 3c).
+    (rad) and translation (mm), perturbation in the target frame; ``circles`` : (c, 3, 3c); ``face_designed`` by face:
+    (6, d) and ``circles_designed`` : (c, 3, d) by the places in their plane of frame circles that were not mapped, and
+    ``designed_sigma_mm`` of these.
     """
 
     target_from_face: dict[str, Rigid]
@@ -26,28 +35,41 @@ class Derivatives:
     target_from_model: Rigid
     faces: dict[str, np.ndarray]
     circles: np.ndarray
+    face_designed: dict[str, np.ndarray]
+    circles_designed: np.ndarray
+    designed_sigma_mm: float
 
     def face_covariance(self, covariance_mm2: np.ndarray) -> dict[str, np.ndarray]:
         """6×6 by face, of the circles' (3c, 3c), whatever their datum."""
-        return {face_id: jacobian @ covariance_mm2 @ jacobian.T for face_id, jacobian in self.faces.items()}
+        variance = self.designed_sigma_mm**2
+        return {
+            face_id: jacobian @ covariance_mm2 @ jacobian.T
+            + variance * self.face_designed[face_id] @ self.face_designed[face_id].T
+            for face_id, jacobian in self.faces.items()
+        }
 
     def distance_sigma_mm(self, covariance_mm2: np.ndarray) -> dict[tuple[str, str], float]:
         """σ of the distance between the origins of every two faces."""
         sigma = {}
         for a, b in combinations(self.target_from_face, 2):
             way = self.target_from_face[b].translation - self.target_from_face[a].translation
-            gradient = way / np.linalg.norm(way) @ (self.faces[b][3:] - self.faces[a][3:])
-            sigma[a, b] = float(np.sqrt(max(gradient @ covariance_mm2 @ gradient, 0.0)))
+            along = way / np.linalg.norm(way)
+            gradient = along @ (self.faces[b][3:] - self.faces[a][3:])
+            designed = self.designed_sigma_mm * along @ (self.face_designed[b][3:] - self.face_designed[a][3:])
+            sigma[a, b] = float(np.sqrt(max(gradient @ covariance_mm2 @ gradient, 0.0) + designed @ designed))
         return sigma
 
     def circle_covariance(self, covariance_mm2: np.ndarray) -> np.ndarray:
         """(c, 3, 3) mm², target frame, of the circles' (3c, 3c)."""
-        return np.einsum("cip,pq,cjq->cij", self.circles, covariance_mm2, self.circles, optimize=True)
+        own = np.einsum("cip,pq,cjq->cij", self.circles, covariance_mm2, self.circles, optimize=True)
+        designed = self.designed_sigma_mm * self.circles_designed
+        return own + designed @ np.swapaxes(designed, 1, 2)
 
     def all_circles_covariance(self, covariance_mm2: np.ndarray) -> np.ndarray:
         """(3c, 3c) mm², target frame, of all circles together; singular, since they carry the frame."""
         flat = self.circles.reshape(-1, self.circles.shape[-1])
-        return flat @ covariance_mm2 @ flat.T
+        designed = self.designed_sigma_mm * self.circles_designed.reshape(len(flat), -1)
+        return flat @ covariance_mm2 @ flat.T + designed @ designed.T
 
 
 def calibrated_target(
@@ -83,20 +105,38 @@ def derivatives(result: JointResult, start: CalibratedTarget, target: TargetDesi
     step = 1e-3
     own = _frames(result, result.xyz_model, start, target, kind)
     origin = _in_target_frame(own, result.xyz_model, start)
-    twists, circles = [], []
-    for i, label in enumerate(result.labels):
-        for axis in range(3):
-            ends = []
-            for sign in (1, -1):
-                xyz = result.xyz_model.copy()
-                xyz[i, axis] += sign * step
-                moved = _frames(result, xyz, start, target, kind, only=label.face)
-                ends.append(_in_target_frame(own | moved, xyz, start))
-            ahead, behind = ends
-            twists.append({f: _perturbation(ahead[0][f], behind[0][f]) / (2 * step) for f in own})
-            circles.append((ahead[1] - behind[1]) / (2 * step))
-    by_face = {face_id: np.column_stack([twist[face_id] for twist in twists]) for face_id in own}
-    return Derivatives(*origin, by_face, np.stack(circles, axis=-1))
+
+    def by(change) -> tuple[dict[str, np.ndarray], np.ndarray]:
+        """Derivatives by one parameter: ``change(±step)`` gives the faces' frames that it moves, and the circles."""
+        (ahead_faces, ahead, _), (behind_faces, behind, _) = (
+            _in_target_frame(own | frames, xyz, start) for frames, xyz in (change(step), change(-step))
+        )
+        twists = {f: _perturbation(ahead_faces[f], behind_faces[f]) / (2 * step) for f in own}
+        return twists, (ahead - behind) / (2 * step)
+
+    def circle(i: int, axis: int, move: float):
+        xyz = result.xyz_model.copy()
+        xyz[i, axis] += move
+        return _frames(result, xyz, start, target, kind, only=result.labels[i].face), xyz
+
+    def designed(face_id: str, circle: str, axis: int, move: float):
+        shift = move * own[face_id].rotation[:, axis]
+        return _frames(result, result.xyz_model, start, target, kind, face_id, {circle: shift}), result.xyz_model
+
+    mapped = {face_id: [x.circle for x in result.labels if x.face == face_id] for face_id in own}
+    places = [(f, c, axis) for f in own for c in missing_frame_circles(target.face(f), mapped[f]) for axis in range(2)]
+    by_circle = [by(partial(circle, i, axis)) for i in range(len(result.labels)) for axis in range(3)]
+    by_place = [by(partial(designed, *place)) for place in places]
+    sigma = placement_sigma_mm(target, dict(zip(result.labels, result.xyz_model, strict=True))) if places else 0.0
+    none = np.zeros((len(result.labels), 3, 0))
+    return Derivatives(
+        *origin,
+        {f: np.column_stack([twists[f] for twists, _ in by_circle]) for f in own},
+        np.stack([moved for _, moved in by_circle], axis=-1),
+        {f: np.column_stack([twists[f] for twists, _ in by_place]) if places else np.zeros((6, 0)) for f in own},
+        np.stack([moved for _, moved in by_place], axis=-1) if places else none,
+        sigma,
+    )
 
 
 def _perturbation(ahead: Rigid, behind: Rigid) -> np.ndarray:
@@ -106,15 +146,24 @@ def _perturbation(ahead: Rigid, behind: Rigid) -> np.ndarray:
 
 
 def _frames(
-    result: JointResult, xyz_model, start: CalibratedTarget, target: TargetDesign, kind: FrameKind, only=None
+    result: JointResult,
+    xyz_model,
+    start: CalibratedTarget,
+    target: TargetDesign,
+    kind: FrameKind,
+    only: str | None = None,
+    shifts: dict[str, np.ndarray] | None = None,
 ) -> dict[str, Rigid]:
-    """model_from_face of all faces, or of one."""
+    """model_from_face of all faces, or of one; ``shifts`` (3,) by id move circles that were not mapped."""
     frames = {}
     for face in target.faces:
         if face.id in start.target_from_face and only in (None, face.id):
             own = {
                 label.circle: xyz for label, xyz in zip(result.labels, xyz_model, strict=True) if label.face == face.id
             }
+            own = with_designed(face, own)
+            for circle, shift in (shifts or {}).items():
+                own = own | {circle: own[circle] + shift}
             frames[face.id] = face_frame(face, own, kind, start.target_from_face[face.id].rotation[:, 2])
     return frames
 
