@@ -1,0 +1,54 @@
+"""Frame circles that no image shows: the design stands for them, and σ says what that is worth."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from stcal.errors import MappingError
+from stcal.sfm.adjust.calibration import calibrate
+from stcal.sfm.adjust.group import adjust
+from stcal.sfm.adjust.options import AdjustOptions
+from stcal.sfm.adjust.refine import eccentricity_px
+
+
+def calibrated(scene, labels_only, hidden, seed=0):
+    observations = [
+        image.select([i for i, label in enumerate(image.labels) if label not in hidden])
+        for image in labels_only.observations(scene, 0.02, np.random.default_rng(seed))
+    ]
+    radius = scene.target.radius_of() | scene.board.radius_of()
+    models = []
+    for start in labels_only.models(scene, observations):
+        model = replace(start, shift_px=eccentricity_px(start, scene.camera, radius, 1.0))
+        models.append(adjust(model, scene.camera))
+    return calibrate(models, scene.camera, scene.target, scene.board, AdjustOptions(reference_face="1"))
+
+
+@pytest.mark.parametrize("hidden", [("1:3",), ("2:1",), ("1:1", "1:5", "2:3")])
+def test_the_faces_are_as_far_off_as_they_say(scene, labels_only, hidden):
+    """Circles are placed with σ 20 µm about the design: σ of the faces grows to that, and covers the error. χ²₆/6 of a
+    true covariance exceeds 4 once in 2000 draws; the placement's own estimate has some 80 degrees of freedom."""
+    whole = calibrated(scene, labels_only, ()).target
+    found = calibrated(scene, labels_only, hidden)
+    for face_id, pose in found.target.target_from_face.items():
+        if face_id == "1":
+            continue
+        truth = scene.target_from_face[face_id]
+        turned = (pose @ truth.inverse()).log()[:3]
+        error = np.concatenate([turned, pose.translation - truth.translation])
+        covariance = found.target.face_covariance[face_id]
+        assert error @ np.linalg.solve(covariance, error) / 6 < 4
+        if hidden[0].startswith("1") or face_id == "2":
+            own, before = (np.sqrt(np.trace(c[3:, 3:])) for c in (covariance, whole.face_covariance[face_id]))
+            assert 0.005 < own < 0.2
+            assert own > 1.5 * before
+    assert sum("stands where the design has it" in note for note in found.notes) == len({x[0] for x in hidden})
+
+
+def test_too_few_other_circles_are_refused(scene, labels_only):
+    hidden = [f"1:{circle}" for circle in "134567c"]
+    with pytest.raises(
+        MappingError, match=r"frame circle 1:1 and 1:3 and 1:5 not mapped, and 3 other circles, 4 needed"
+    ):
+        calibrated(scene, labels_only, hidden)
