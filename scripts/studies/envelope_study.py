@@ -22,6 +22,7 @@ import csv
 import json
 import os
 import re
+import signal
 import subprocess
 import sys
 import tempfile
@@ -769,6 +770,7 @@ def main() -> None:
     parser.add_argument("--picture", type=Path, help="draw recall by kind and strength")
     parser.add_argument("--look", type=Path, help="write the first photograph of each case here, and run nothing")
     given = parser.parse_args()
+    signal.signal(signal.SIGTERM, lambda *_: sys.exit(1))  # folders are removed then
     strengths = [int(k) for k in given.strengths.split(",")]
     done, before = rows_of(given.json), rows_of(given.compare)
     rows = []
