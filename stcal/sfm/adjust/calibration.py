@@ -102,7 +102,12 @@ def _faces(
         own = [faces_of_group(model, camera, target, options.frame, without) for model in models]
     notes = []
     for face_id in sorted(without & {face.face for found, _ in own for face in found}):
-        circles = {label.circle for m in models for label in m.labels if label.plane == face_id}
+        circles = {
+            label.circle
+            for m in models
+            for label in m.labels
+            if isinstance(label, CircleLabel) and label.face == face_id
+        }
         names = ", ".join(f"{face_id}:{c}" for c in missing_frame_circles(target.face(face_id), circles))
         notes.append(
             f"face {face_id}: frame circle {names or 'in each group'} not mapped; it stands where the design has it "
