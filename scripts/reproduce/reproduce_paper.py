@@ -96,7 +96,7 @@ def by_the_paper(observations: list[ImageObservations], scene: Scene, out: Path)
     options = RunOptions(solve="chain", frame="three-point", eccentricity=False).settled(scene.target)
     graph = image_graph(observations, scene.board, options.graph)
     (out / "cache").mkdir(parents=True, exist_ok=True)
-    solutions = solve_groups(
+    solutions, _ = solve_groups(
         observations, graph, out, scene.camera, scene.target, scene.board, options, lambda *_: None
     )
     frames, boards = {}, []

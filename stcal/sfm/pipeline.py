@@ -21,7 +21,7 @@ from stcal.sfm.run.folder import claim_folder, write_overlays, write_run
 from stcal.sfm.run.marker import MarkerFile
 from stcal.sfm.run.options import RunOptions
 from stcal.sfm.run.result import RunResult
-from stcal.sfm.run.solve import require_groups, solve_groups, unseen_board
+from stcal.sfm.run.solve import solve_groups, unseen_board, usable_groups
 
 
 @one_thread()
@@ -72,12 +72,11 @@ def run(
     known = model.calibrated(detection.camera.width, detection.camera.height)
     known = refinable(known) if options.refine_camera else known
     observations = [each.observations for each in labelled]
-    groups = by_group(observations)
-    require_groups(groups, detection.skipped)
+    groups, unusable = usable_groups(by_group(observations), detection.skipped)
 
     progress("map", 0, len(groups))
     graph = image_graph(observations, board, options.graph)
-    solutions = solve_groups(observations, graph, out, known, target, board, options, progress)
+    solutions, unsolved = solve_groups(observations, graph, out, known, target, board, options, progress, groups)
     progress("faces", 0, 1)
     prior = camera_prior(known)
     calibration = calibrate([s.model for s in solutions], known, target, board, options.adjustment(target), prior)
@@ -94,7 +93,7 @@ def run(
         solutions=tuple(solutions),
         calibration=calibration,
         chains=measure_chains(calibration.faces, calibration.target),
-        notes=(*calibration.notes, *unseen_board(solutions, board)),
+        notes=(*unusable, *unsolved, *calibration.notes, *unseen_board(solutions, board)),
     )
     progress("check", 0, 1)
     result = replace(result, checks=run_checks(result.evidence(prior)))

@@ -153,7 +153,12 @@ def require_report(saved: SavedRun) -> None:
 
 
 def _corrected_px(models: Mapping[str, GroupModel], observations: list[ImageObservations]) -> list[np.ndarray]:
-    """All keypoints of every image as the models of the groups correct them."""
+    """All keypoints of every image as the models of the groups correct them; as measured in groups without one."""
     rows = {name: rows for m in models.values() for name, rows in zip(m.images, m.rows_by_image(), strict=True)}
     none = np.zeros(0, int)
-    return [models[image.group].keypoints_px(image, rows.get(image.name, none)) for image in observations]
+    return [
+        models[image.group].keypoints_px(image, rows.get(image.name, none))
+        if image.group in models
+        else image.centre_px
+        for image in observations
+    ]

@@ -3,14 +3,14 @@
 import hashlib
 import json
 import shutil
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import asdict, dataclass, fields
 from pathlib import Path
 
 import numpy as np
 
 from stcal.design import BoardDesign, TargetDesign
-from stcal.errors import MappingError
+from stcal.errors import ConvergenceError, DegenerateError, MappingError, ScaleError, StcalError
 from stcal.geometry.camera import Camera
 from stcal.geometry.rigid import Rigid
 from stcal.io.cache import keep, kept
@@ -19,6 +19,7 @@ from stcal.io.images import SUFFIXES, TOP_GROUP, Skipped
 from stcal.labels import DotLabel, dot_cells, parse_labels
 from stcal.parallel import Progress
 from stcal.sfm.adjust.refine import refine
+from stcal.sfm.adjust.scale import find_scale
 from stcal.sfm.data.model import Outlier, WorldModel
 from stcal.sfm.data.observations import ImageObservations, by_group
 from stcal.sfm.mapping.database import image_ids, write_database
@@ -47,13 +48,16 @@ class GroupSolution:
     outliers: tuple[Outlier, ...]
 
 
-def require_groups(groups: dict[str, list[ImageObservations]], skipped: Sequence[Skipped]) -> None:
-    """Refuse groups that cannot be solved, those of which every image was skipped included; before anything is mapped.
+def usable_groups(
+    groups: dict[str, list[ImageObservations]], skipped: Sequence[Skipped]
+) -> tuple[dict[str, list[ImageObservations]], list[str]]:
+    """Groups that can be solved, and why others cannot, those of which every image was skipped included; before
+    anything is mapped.
 
     Raises
     ------
     MappingError
-        No image or one, no board, or no face in a whole group.
+        None can: no image or one, no board, or no face in a whole group.
     """
     lost: dict[str, list[Skipped]] = {}
     for each in skipped:
@@ -61,13 +65,27 @@ def require_groups(groups: dict[str, list[ImageObservations]], skipped: Sequence
         group = each.name.rpartition("/")[0] or TOP_GROUP
         if each.name.lower().endswith(SUFFIXES) and (group in groups or not each.reason.startswith("the same image")):
             lost.setdefault(group, []).append(each)
+    usable: dict[str, list[ImageObservations]] = {}
+    errors: list[MappingError] = []
     for name in sorted(groups.keys() | lost.keys()):
         group, first = groups.get(name, []), lost.get(name, [])[:1]
-        if len(group) < 2:
-            usable = f"1 usable image ({group[0].name})" if group else "0 usable images"
-            why = "".join(f", not {s.name}: {s.reason}" for s in first)
-            raise MappingError(f"group {name}: {usable}, 2 needed{why}; add photographs from other places")
-        require_usable(group)
+        try:
+            if len(group) < 2:
+                count = f"1 usable image ({group[0].name})" if group else "0 usable images"
+                why = "".join(f", not {s.name}: {s.reason}" for s in first)
+                raise MappingError(f"group {name}: {count}, 2 needed{why}; add photographs from other places")
+            require_usable(group)
+        except MappingError as error:
+            errors.append(error)
+        else:
+            usable[name] = group
+    if not usable:
+        raise errors[0]
+    return usable, [_left_out(error) for error in errors]
+
+
+def _left_out(error: StcalError) -> str:
+    return f"left out whole: {error}"
 
 
 def require_usable(group: list[ImageObservations]) -> None:
@@ -213,20 +231,29 @@ def solve_groups(
     board: BoardDesign,
     options: RunOptions,
     progress: Progress,
-) -> list[GroupSolution]:
-    """Map and refine group by group, in ``out/scratch``, which is removed again."""
+    names: Collection[str] | None = None,
+) -> tuple[list[GroupSolution], list[str]]:
+    """Map and refine group by group, or those of the ``names``, in ``out/scratch``, which is removed again; and why
+    groups have no solution.
+
+    Raises
+    ------
+    MappingError, ScaleError, ConvergenceError, DegenerateError
+        No group has one; that of the first.
+    """
     scratch = out / "scratch"
     shutil.rmtree(scratch, ignore_errors=True)
     scratch.mkdir()
     ids = image_ids(observations)
     database = scratch / "mapping.db"
-    groups = by_group(observations)
-    solutions = []
+    groups = {name: group for name, group in by_group(observations).items() if names is None or name in names}
+    solutions: list[GroupSolution] = []
+    errors: list[StcalError] = []
     try:
         write_database(database, camera, observations, graph.pairs)
-        for name, group in groups.items():
-            solutions.append(
-                solve_group(
+        for done, (name, group) in enumerate(groups.items(), 1):
+            try:
+                solution = solve_group(
                     group,
                     [observations[i].name for i in graph.skeleton[name]],
                     database,
@@ -239,8 +266,14 @@ def solve_groups(
                     options.eccentricity,
                     out / "cache",
                 )
-            )
-            progress("map", len(solutions), len(groups))
+                find_scale(solution.model, board)
+            except (MappingError, ScaleError, ConvergenceError, DegenerateError) as error:
+                errors.append(error)
+            else:
+                solutions.append(solution)
+            progress("map", done, len(groups))
     finally:
         shutil.rmtree(scratch, ignore_errors=True)
-    return solutions
+    if not solutions:
+        raise errors[0]
+    return solutions, [_left_out(error) for error in errors]

@@ -47,7 +47,7 @@ def solve(scene, observations, kind, out):
     graph = image_graph(observations, scene.board, kind)
     (out / "cache").mkdir(parents=True)
     tell = lambda *_: None  # noqa: E731
-    solutions = solve_groups(observations, graph, out, scene.camera, scene.target, scene.board, options, tell)
+    solutions, _ = solve_groups(observations, graph, out, scene.camera, scene.target, scene.board, options, tell)
     return (
         graph,
         solutions,

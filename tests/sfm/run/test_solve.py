@@ -5,7 +5,7 @@ import pytest
 
 from stcal.errors import MappingError
 from stcal.io.images import Skipped
-from stcal.sfm.run.solve import require_groups, require_usable
+from stcal.sfm.run.solve import require_usable, usable_groups
 
 
 @pytest.fixture(scope="module")
@@ -24,7 +24,7 @@ def only(group, board: bool):
 
 def test_two_images_with_board_and_face_will_do(group):
     require_usable(group[:2])
-    require_groups({group[0].group: group[:2]}, [])
+    assert usable_groups({"12": group[:2]}, []) == ({"12": group[:2]}, [])
 
 
 def test_what_is_missing_is_named(group):
@@ -37,10 +37,14 @@ def test_what_is_missing_is_named(group):
 
 
 def test_a_group_of_which_every_file_was_skipped_is_not_forgotten(group):
-    """Its folder is one of the session: without it the answer would lack a face and not say so."""
+    """Its folder is one of the session: the answer without it says so."""
     lost = [Skipped("99/a.jpg", "cannot be read")]
-    with pytest.raises(MappingError, match=r"group 99: 0 usable images, 2 needed, not 99/a.jpg: cannot be read"):
-        require_groups({group[0].group: group}, lost)
+    usable, notes = usable_groups({"12": group}, lost)
+    assert list(usable) == ["12"]
+    assert len(notes) == 1
+    assert notes[0].startswith("left out whole: group 99: 0 usable images, 2 needed, not 99/a.jpg: cannot be read")
+    with pytest.raises(MappingError, match="group 99: 0 usable images"):
+        usable_groups({}, lost)
 
 
 def test_a_folder_of_copies_or_of_notes_is_no_group(group):
@@ -48,4 +52,4 @@ def test_a_folder_of_copies_or_of_notes_is_no_group(group):
         Skipped("copies/a.jpg", "the same image as 12/b.jpg", "copy"),
         Skipped("99/notes.txt", "not an image file"),
     ]
-    require_groups({group[0].group: group}, skipped)
+    assert usable_groups({"12": group}, skipped) == ({"12": group}, [])
