@@ -10,7 +10,7 @@ from stcal.errors import MappingError
 from stcal.geometry.camera import Camera
 from stcal.io.camera import CameraPrior
 from stcal.labels import CircleLabel
-from stcal.sfm.adjust.chain import CalibratedTarget, chain_faces
+from stcal.sfm.adjust.chain import CalibratedTarget, chain_faces, unlinked_faces
 from stcal.sfm.adjust.faces import FaceInGroup, faces_of_group, missing_frame_circles
 from stcal.sfm.adjust.group import adjust
 from stcal.sfm.adjust.joint import SETTLED_PX, JointResult, adjust_jointly
@@ -65,6 +65,13 @@ def calibrate(
     scales = {model.group: find_scale(model, board) for model in models}
     metric = [model.metric(scales[model.group].group_from_world()) for model in models]
     faces, notes = _faces(metric, camera, target, options)
+    gone = unlinked_faces(faces, options.reference_face)
+    faces = [each for each in faces if each.face not in gone]
+    notes += [
+        f"face {face_id}: left out, never linked to reference face {options.reference_face}; add a group that shows it "
+        "together with a face that is linked"
+        for face_id in gone
+    ]
     try:
         calibrated = chain_faces(faces, target, options.reference_face)
     except MappingError as error:  # a face without a frame may be why

@@ -80,6 +80,13 @@ def chain_faces(faces: Sequence[FaceInGroup], target: TargetDesign, reference: s
     return CalibratedTarget(reference, target_from_face, circles, target_from_group)
 
 
+def unlinked_faces(faces: Sequence[FaceInGroup], reference: str) -> list[str]:
+    """Faces that no way through the groups links to the reference face, where another face is linked; else none: then
+    nothing would be left, and :func:`chain_faces` says so."""
+    linked = {each.face for each in faces if each.face == reference or _chains(faces, reference, each.face)}
+    return sorted({each.face for each in faces} - linked) if len(linked) > 1 else []
+
+
 def measure_chains(faces: Sequence[FaceInGroup], calibrated: CalibratedTarget) -> dict[str, tuple[FaceChain, ...]]:
     """All ways to every face but the reference, with their distance from the calibrated pose."""
     return {
