@@ -24,6 +24,35 @@ def circle_image_offset(xyz_camera: np.ndarray, normal_camera: np.ndarray, radiu
     return c + (np.asarray(radius_mm, float) ** 2 / c[..., 2])[..., None] * shift
 
 
+def circle_images(xyz_camera: np.ndarray, axes_camera: np.ndarray, radius_mm: np.ndarray) -> tuple[np.ndarray, ...]:
+    """Ellipses of n circles of one plane before the camera, by the dual conic of :func:`circle_image_offset`.
+
+    Parameters
+    ----------
+    xyz_camera : (n, 3) array
+        Centres, camera frame; the circles lie wholly in front of it.
+    axes_camera : (3, 2) array
+        Orthonormal directions in the plane, camera frame.
+    radius_mm : (n,) array
+        In the unit of ``xyz_camera``.
+
+    Returns
+    -------
+    centre : (n, 2) array, shape : (n, 2, 2) array
+        Normalised; the rim is ``centre + shape @ unit circle``, shape symmetric.
+    """
+    dual = radius_mm[:, None, None] ** 2 * (axes_camera @ axes_camera.T) - xyz_camera[:, :, None] * xyz_camera[:, None]
+    dual = -dual / dual[:, 2:, 2:]
+    centre = -dual[:, :2, 2]
+    return centre, shape_of_square(dual[:, :2, :2] + centre[:, :, None] * centre[:, None])
+
+
+def shape_of_square(square: np.ndarray) -> np.ndarray:
+    """Symmetric shapes S of ellipses, (..., 2, 2), from S·Sᵀ; negative eigenvalues count as zero."""
+    value, vector = np.linalg.eigh(square)
+    return (vector * np.sqrt(np.maximum(value, 0))[..., None, :]) @ np.swapaxes(vector, -1, -2)
+
+
 def circle_conic(xyz_camera: np.ndarray, normal_camera: np.ndarray, radius_mm: float) -> np.ndarray:
     """Conic matrix (3, 3), xᵀ Q x = 0 in normalised coordinates, of one circle's image; Q[0, 0] + Q[1, 1] > 0."""
     n = np.asarray(normal_camera, float)

@@ -15,27 +15,24 @@ from scipy.spatial import KDTree
 
 from stcal.design import BoardDesign, TargetDesign
 from stcal.errors import ConvergenceError, DegenerateError
-from stcal.geometry.least_squares import minimise
-from stcal.geometry.normal_equations import blocks_of, reduce
 from stcal.geometry.plane import camera_from_plane, fit_homography, refine_planar_pose
 from stcal.geometry.pose_descent import PoseStack
-from stcal.geometry.rigid import Rigid, skew
-from stcal.geometry.robust import huber_cost, huber_weights
+from stcal.geometry.rigid import Rigid
 from stcal.labels import BOARD, DotLabel, Label
+from stcal.sfm.data.patterns import Pattern
+from stcal.sfm.detect.plane_bundle import PlaneBundle
 from stcal.sfm.detect.sightings import ImageDetection
 
 MIN_POSE_CIRCLES = 5
+"""Four fix a pose, one more lets it be doubted."""
 MAX_SHIFT_PITCHES = 0.3
 """By how much a plane may be off its place in an image's first pose, in steps of the pattern; a wrong numbering of the
 board is one off."""
 MAX_SEEDS = 8
 """Images that the arrangement is started from, until one explains everything."""
-HUBER_PX = 1.5
 MAX_OFF_PITCHES = 0.12
-"""By how much the circles of a reading may be off after the adjustment, in steps of the pattern (median)."""
-SETTLED = 1e-4
-"""Share of χ² that the adjustment may leave: it only has to predict to a fraction of a pixel."""
-MAX_STEPS = 30
+"""By how much the circles of a reading may be off after the adjustment, in steps of the pattern (median): of the
+reference target 3 mm, where a design is off by tenths and a wrong numbering by a whole step."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -126,7 +123,7 @@ def _view(plane: str, labels, rows: np.ndarray, xy_mm: np.ndarray, detection: Im
 
 
 def arrange(
-    images: Sequence[list[Readings]], patterns: dict[str, np.ndarray], step_mm: float, focal_px: float
+    images: Sequence[list[Readings]], patterns: dict[str, Pattern], step_mm: float, focal_px: float
 ) -> Arrangement:
     """The arrangement that explains most circles of one group.
 
@@ -135,7 +132,7 @@ def arrange(
     images
         Readings of every image.
     patterns
-        (n, 2) circles of each plane, mm.
+        Circles of each plane.
     step_mm
         Of the patterns, from circle to circle: what a wrong reading is off by at least.
     focal_px
@@ -155,7 +152,7 @@ def arrange(
     return best
 
 
-def across_groups(groups: Sequence[Arrangement], patterns: dict[str, np.ndarray], reach_mm: float) -> list[Arrangement]:
+def across_groups(groups: Sequence[Arrangement], patterns: dict[str, Pattern], reach_mm: float) -> list[Arrangement]:
     """The arrangements of all groups, held against each other: the faces stand to one another alike in all of them.
 
     A face that a group has elsewhere than most circles of the others goes out there, and comes in where its place is
@@ -324,108 +321,27 @@ def _new_planes(images: Sequence[list[Readings]], placed, known: dict[str, Rigid
     return new
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class _Problem:
-    """All accepted views: of n circles ``image``, ``plane`` (n,), ``xyz`` (n, 3) in the plane, ``seen`` (n, 2) px."""
-
-    image: np.ndarray
-    plane: np.ndarray
-    xyz: np.ndarray
-    seen: np.ndarray
-    focal_px: float
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class _Linear:
-    """Normal equations of the images' poses, reduced away, and of all planes' but the first."""
-
-    cost: float
-    poses: np.ndarray
-    pose_right: np.ndarray
-    planes: np.ndarray
-    plane_right: np.ndarray
-    cross: np.ndarray
-
-    def step(self, damping: float | np.ndarray) -> tuple[np.ndarray, float]:
-        """Of the images (6m,), then of the planes."""
-        damped = self.poses * (1 + damping * np.eye(6))
-        away = reduce(damped, self.pose_right, self.cross)
-        k = len(self.plane_right)
-        own = self.planes * (1 + damping * np.eye(k)) - away.normal
-        planes = np.linalg.lstsq(own, self.plane_right - away.right, rcond=1e-12)[0] if k else np.zeros(0)
-        poses = away.back(planes)
-        gain = float((poses * self.pose_right).sum() + planes @ self.plane_right)
-        return np.concatenate([poses.ravel(), planes]), gain
-
-
 def _adjusted(found: Arrangement, focal_px: float) -> Arrangement:
-    """Poses of images and planes of least reprojection error over the accepted views. Where that has no minimum within
-    the steps, the last state is as good a prediction: every circle that it predicts is verified."""
+    """Poses of images and planes of least reprojection error over the accepted views."""
     images, planes = list(found.camera_from_group), list(found.group_from_plane)
     rows = [(a, planes.index(v.plane), v) for a, i in enumerate(images) for v in found.views[i]]
     if not rows:
         return found
-    problem = _Problem(
+    bundle = PlaneBundle(
         np.concatenate([np.full(len(v.rows), a) for a, _, v in rows]),
         np.concatenate([np.full(len(v.rows), b) for _, b, v in rows]),
         np.concatenate([v.xyz_mm() for _, _, v in rows]),
         focal_px * np.concatenate([v.xy for _, _, v in rows]),
         focal_px,
     )
-    start = (
+    poses, placed = bundle.adjusted(
         PoseStack.of(*(found.camera_from_group[i] for i in images)),
         PoseStack.of(*(found.group_from_plane[p] for p in planes)),
     )
-
-    def moved(state, step: np.ndarray):
-        poses, own = step[: 6 * len(images)].reshape(-1, 6), step[6 * len(images) :].reshape(-1, 6)
-        return state[0].moved(poses), state[1].moved(np.vstack([np.zeros((1, 6)), own]))
-
-    end = minimise(
-        start, lambda state: _linearised(problem, *state), moved, settled=SETTLED, max_steps=MAX_STEPS, damping=1e-3
-    ).state
     return replace(
         found,
-        camera_from_group={i: end[0].rigid(a) for a, i in enumerate(images)},
-        group_from_plane={p: end[1].rigid(b) for b, p in enumerate(planes)},
-    )
-
-
-def _linearised(problem: _Problem, poses: PoseStack, planes: PoseStack) -> _Linear:
-    m, k = len(poses), 6 * (len(planes) - 1)
-    turned = np.einsum("nij,nj->ni", planes.rotation[problem.plane], problem.xyz)
-    rotation = poses.rotation[problem.image]
-    placed = np.einsum("nij,nj->ni", rotation, turned + planes.translation[problem.plane])
-    xyz = placed + poses.translation[problem.image]
-    if (xyz[:, 2] <= 0).any():
-        return _Linear(np.inf, np.zeros((m, 6, 6)), np.zeros((m, 6)), np.eye(k), np.zeros(k), np.zeros((m, 6, k)))
-    ideal = xyz[:, :2] / xyz[:, 2:]
-    residual = problem.seen - problem.focal_px * ideal
-    length = np.linalg.norm(residual, axis=1)
-    root = np.sqrt(huber_weights(length, HUBER_PX))
-    by_point = np.zeros((len(xyz), 2, 3))
-    by_point[:, 0, 0] = by_point[:, 1, 1] = 1
-    by_point[:, :, 2] = -ideal
-    by_point *= (root * problem.focal_px / xyz[:, 2])[:, None, None]
-    by_pose = np.concatenate([-by_point @ skew(placed), by_point], axis=2)
-    by_group = by_point @ rotation
-    by_plane = np.concatenate([-by_group @ skew(turned), by_group], axis=2)
-    residual = residual * root[:, None]
-    blocks, right = blocks_of(by_pose, residual, problem.image, m)
-    own, own_right = blocks_of(by_plane, residual, problem.plane, len(planes))
-    normal = np.zeros((k, k))
-    for b in range(1, len(planes)):
-        at = slice(6 * b - 6, 6 * b)
-        normal[at, at] = own[b]
-    cross = np.zeros((m, len(planes), 6, 6))
-    np.add.at(cross, (problem.image, problem.plane), np.swapaxes(by_pose, 1, 2) @ by_plane)
-    return _Linear(
-        float(huber_cost(length, HUBER_PX).sum()),
-        blocks,
-        right,
-        normal,
-        own_right[1:].ravel(),
-        cross[:, 1:].transpose(0, 2, 1, 3).reshape(m, 6, k),
+        camera_from_group={i: poses.rigid(a) for a, i in enumerate(images)},
+        group_from_plane={p: placed.rigid(b) for b, p in enumerate(planes)},
     )
 
 
@@ -448,7 +364,7 @@ def _off_mm(view: PlaneView, camera_from_group: Rigid, known: dict[str, Rigid]) 
     return float(np.median(np.linalg.norm(view.xy * xyz[:, 2:] - xyz[:, :2], axis=1)))
 
 
-def _without_reflections(found: Arrangement, patterns: dict[str, np.ndarray], reach_mm: float) -> Arrangement:
+def _without_reflections(found: Arrangement, patterns: dict[str, Pattern], reach_mm: float) -> Arrangement:
     """The arrangement without planes that are the image of another one in a mirror: the mirror lies half way, and who
     sees them stands on the other one's side. (Two faces of a box may be each other's mirror images too, but whoever
     sees one stands on its side.)"""
@@ -460,12 +376,10 @@ def _without_reflections(found: Arrangement, patterns: dict[str, np.ndarray], re
     return found
 
 
-def _reflected(found: Arrangement, patterns: dict[str, np.ndarray], real: str, image: str, reach_mm: float) -> bool:
-    if not {real, image} <= found.group_from_plane.keys() or len(patterns[real]) != len(patterns[image]):
+def _reflected(found: Arrangement, patterns: dict[str, Pattern], real: str, image: str, reach_mm: float) -> bool:
+    if not {real, image} <= found.group_from_plane.keys() or len(patterns[real].labels) != len(patterns[image].labels):
         return False
-    own, other = (
-        found.group_from_plane[p] @ np.column_stack([patterns[p], np.zeros(len(patterns[p]))]) for p in (real, image)
-    )
+    own, other = (found.group_from_plane[p] @ patterns[p].xyz_mm() for p in (real, image))
     between = own.mean(0) - other.mean(0)
     if np.linalg.norm(between) < reach_mm:
         return False

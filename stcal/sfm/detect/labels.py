@@ -8,6 +8,7 @@ import numpy as np
 from stcal.design import BoardDesign, TargetDesign
 from stcal.labels import BOARD, Label
 from stcal.sfm.data.observations import ImageObservations
+from stcal.sfm.data.patterns import patterns_of
 from stcal.sfm.detect.arrangement import (
     MAX_SHIFT_PITCHES,
     Arrangement,
@@ -72,7 +73,7 @@ def label_groups(
     focal_px: float,
 ) -> list[tuple[list[LabelledImage], Arrangement]]:
     """Label the images (name, group, detection) of all groups, each with the arrangement that its labels keep to."""
-    patterns = {face.id: face.xy_mm for face in target.faces}
+    patterns = patterns_of(target, board)
     step = step_mm(target, board)
     readings = [[[] if d.mirrored else readings_of(d, target, board) for _, _, d in images] for images in groups]
     alone = [arrange(own, patterns, step, focal_px) for own in readings]

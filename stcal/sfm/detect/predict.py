@@ -13,22 +13,24 @@ import numpy as np
 from stcal.design import BoardDesign, Polarity, TargetDesign
 from stcal.geometry.arrays import frozen
 from stcal.geometry.camera import Camera
-from stcal.geometry.rigid import Rigid
 from stcal.io.images import grey_fine
 from stcal.labels import BOARD, Label
-from stcal.sfm.data.in_view import ideal_border, in_view
 from stcal.sfm.data.observations import ImageObservations
+from stcal.sfm.data.patterns import ideal_border, images_px, in_view, patterns_of
 from stcal.sfm.detect.arrangement import Arrangement
 from stcal.sfm.detect.candidates import MAX_POSITION_ERROR, MAX_POSITION_ERROR_PX, singular_values
-from stcal.sfm.detect.centres import MIN_SIGMA, Centres, measure_centres
+from stcal.sfm.detect.centres import MIN_RIM, MIN_SIGMA, Centres, measure_centres
 from stcal.sfm.detect.ellipses import MIN_DIAMETER_PX, EllipseOptions, Ellipses
 
 MAX_STRETCH = 1.15
-"""Between the predicted and the measured ellipse along any direction, on top of half a pixel at each end."""
+"""Between the predicted and the measured ellipse along any direction, on top of half a pixel at each end: a circle
+whose edge is cut by a seventh of its diameter has its centre off by as much as the rim test lets pass."""
+USUAL_OFFSETS = 3.0
+"""Of the circles of a plane, median: how far from its place a circle may be where the design is off."""
 MAX_SIGMA_PX = 0.5
-"""Of a centre that is worth having."""
+"""Of a centre: fifty times that of a clear one, so that it weighs nothing and only counts."""
 MIN_SIGNIFICANCE = 8.0
-"""Of the contrast, in σ of a pixel's noise around the rim."""
+"""Of the contrast, in σ of a pixel's noise around the rim: one pixel of clutter or noise is no edge."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -61,25 +63,6 @@ class SecondLook:
     missed: dict[Label, str]
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class _Pattern:
-    """Circles of one plane; ``side`` : as of :func:`stcal.sfm.data.in_view.in_view`."""
-
-    labels: Sequence[Label]
-    xy_mm: np.ndarray
-    radius_mm: np.ndarray
-    polarity: Polarity
-    side: int
-
-
-def patterns_of(target: TargetDesign, board: BoardDesign | None) -> dict[str, _Pattern]:
-    """Of all planes."""
-    found = {f.id: _Pattern(f.labels(), f.xy_mm, f.radius_mm, target.polarity, 1) for f in target.faces}
-    if board is not None:
-        found[BOARD] = _Pattern(board.labels(), board.xy_mm(), board.radii_mm(), board.polarity, -1)
-    return found
-
-
 def predict_circles(
     arrangement: Arrangement,
     image: int,
@@ -94,16 +77,14 @@ def predict_circles(
     if pose is None:
         return None
     labels: list[Label] = []
-    centre, shape, polarity = [], [], []
+    centre, shape, polarity = [np.zeros((0, 2))], [np.zeros((0, 2, 2))], []
     border = ideal_border(camera)
     for plane, pattern in patterns_of(target, board).items():
         if plane not in arrangement.group_from_plane:
             continue
         camera_from_plane = pose @ arrangement.group_from_plane[plane]
-        shown = np.flatnonzero(
-            in_view(camera_from_plane, pattern.xy_mm, pattern.radius_mm, pattern.side, camera, border)
-        )
-        place, outline = _ellipses(camera_from_plane, pattern.xy_mm[shown], pattern.radius_mm[shown], camera)
+        shown = np.flatnonzero(in_view(pattern, camera_from_plane, camera, border))
+        place, outline = images_px(pattern, camera_from_plane, camera, shown)
         labels += [pattern.labels[i] for i in shown.tolist()]
         centre.append(place)
         shape.append(outline)
@@ -117,54 +98,42 @@ def contradictions(predicted: PredictedCircles, seen: ImageObservations, camera:
     """Circles of the first look that are not where, or not of the size, that the others of their plane ask for: partly
     hidden, or something else; with the reason. What most circles of a plane are off is the design's, and let pass."""
     place = {label: i for i, label in enumerate(predicted.labels)}
-    rows = [k for k, label in enumerate(seen.labels) if label in place]
+    rows = np.array([k for k, label in enumerate(seen.labels) if label in place], int)
     own = np.array([place[seen.labels[k]] for k in rows], int)
-    planes = np.array([seen.labels[k].plane for k in rows])
-    local = camera.focal[:, None] * camera.distort_jacobian(seen.centre[rows])[1]
-    ratio = np.linalg.solve(predicted.shape_px[own], local @ seen.shape[rows])
-    widest, narrowest = singular_values(ratio)
-    radius, minor = np.sqrt(np.linalg.det(predicted.shape_px[own])), singular_values(predicted.shape_px[own])[1]
     off = np.linalg.norm(seen.centre_px[rows] - predicted.centre_px[own], axis=1)
+    widest, narrowest = _stretch(predicted.shape_px[own], seen.shape[rows], seen.centre[rows], camera)
+    planes = np.array([seen.labels[k].plane for k in rows], str)
     found: dict[Label, str] = {}
     for plane in dict.fromkeys(planes.tolist()):
         members = np.flatnonzero(planes == plane)
-        size = np.median(np.sqrt(widest[members] * narrowest[members]))
-        usual = 3 * np.median(off[members])
+        size = float(np.median(np.sqrt(widest[members] * narrowest[members])))
+        usual = USUAL_OFFSETS * float(np.median(off[members]))
         for k in members.tolist():
-            allowed = max(MAX_POSITION_ERROR * radius[k], MAX_POSITION_ERROR_PX, usual)
-            stretch = MAX_STRETCH * (1 + 0.5 / minor[k])
-            most = max(widest[k] / size, size / narrowest[k])
-            if off[k] > allowed:
-                found[seen.labels[rows[k]]] = _off_place(off[k], allowed)
-            elif most > stretch:
-                found[seen.labels[rows[k]]] = _off_size(most, stretch)
+            reason = _disagreement(
+                predicted.shape_px[own[k]], float(off[k]), (widest[k] / size, narrowest[k] / size), usual
+            )
+            if reason:
+                found[seen.labels[rows[k]]] = reason
     return found
 
 
-def _off_place(off_px: float, allowed_px: float) -> str:
-    return f"{off_px:.1f} px from its place, {allowed_px:.1f} allowed"
+def _stretch(shape_px: np.ndarray, shape: np.ndarray, centre: np.ndarray, camera: Camera) -> tuple[np.ndarray, ...]:
+    """Largest and smallest ratio, over all directions, of measured ellipses (normalised) to those expected (px)."""
+    local = camera.focal[:, None] * camera.distort_jacobian(centre)[1]
+    return singular_values(np.linalg.solve(shape_px, local @ shape))
 
 
-def _off_size(stretch: float, allowed: float) -> str:
-    return f"{stretch:.2f} times its size along one direction, {allowed:.2f} allowed"
+def _disagreement(shape_px: np.ndarray, off_px: float, stretch: tuple[float, float], usual_px: float = 0.0) -> str:
+    """Why a measured ellipse is not the one expected, of ``shape_px``; empty where it is.
 
-
-def _ellipses(
-    camera_from_plane: Rigid, xy_mm: np.ndarray, radius_mm: np.ndarray, camera: Camera
-) -> tuple[np.ndarray, np.ndarray]:
-    """Images of circles: centres (n, 2) and symmetric shapes (n, 2, 2), px; from the dual conic M·diag(r², r², −1)·Mᵀ,
-    M = [e₁ e₂ C] (Hartley & Zisserman, sec. 2.2 and 8.3). Lens distortion to first order."""
-    axes = camera_from_plane.rotation[:, :2]
-    middle = camera_from_plane @ np.column_stack([xy_mm, np.zeros(len(xy_mm))])
-    dual = radius_mm[:, None, None] ** 2 * (axes @ axes.T) - middle[:, :, None] * middle[:, None, :]
-    dual = -dual / dual[:, 2:, 2:]
-    centre = -dual[:, :2, 2]
-    square = dual[:, :2, :2] + centre[:, :, None] * centre[:, None, :]
-    distorted, by_ideal = camera.distort_jacobian(centre)
-    local = camera.focal[:, None] * by_ideal
-    value, vector = np.linalg.eigh(local @ square @ np.swapaxes(local, 1, 2))
-    root = np.sqrt(np.maximum(value, 0))
-    return distorted * camera.focal + camera.centre, (vector * root[:, None]) @ np.swapaxes(vector, 1, 2)
+    ``off_px`` : its distance from there; ``stretch`` : its largest and smallest size over the one expected.
+    """
+    largest, smallest = singular_values(shape_px)
+    allowed = max(MAX_POSITION_ERROR * float(np.sqrt(largest * smallest)), MAX_POSITION_ERROR_PX, usual_px)
+    if off_px > allowed:
+        return f"{off_px:.1f} px from its place, {allowed:.1f} allowed"
+    most, limit = max(stretch[0], 1 / stretch[1]), MAX_STRETCH * (1 + 0.5 / float(smallest))
+    return f"{most:.2f} times its size along one direction, {limit:.2f} allowed" if most > limit else ""
 
 
 def measure_predicted(
@@ -184,7 +153,7 @@ def measure_predicted(
     wanted = np.array([i for i in wanted if predicted.labels[i] not in missed], int)
     expected = everything.select(wanted)
     found = measure_centres(scaled, camera, expected, everything)
-    reasons = [_reason(found, expected, k, predicted.polarity[i], camera) for k, i in enumerate(wanted)]
+    reasons = _reasons(found, expected, [predicted.polarity[i] for i in wanted], camera)
     seen = [k for k, reason in enumerate(reasons) if not reason]
     return SecondLook(
         tuple(predicted.labels[wanted[k]] for k in seen),
@@ -193,28 +162,24 @@ def measure_predicted(
     )
 
 
-def _reason(found: Centres, expected: Ellipses, k: int, polarity: Polarity, camera: Camera) -> str:
-    """Why a fit is not the circle that was expected; empty where it is."""
-    if not found.ok[k]:
-        return f"{100 * found.rim[k]:.0f} % of its rim follows an ellipse, 80 % needed"
-    contrast = found.contrast[k] * (1 if polarity == "bright" else -1)
-    needed = MIN_SIGNIFICANCE * max(found.noise[k], MIN_SIGMA)
-    if contrast < needed:
-        return f"contrast {contrast:.1f}, {needed:.1f} needed"
-    size = float(np.sqrt(np.linalg.det(expected.shape_px[k])))
-    off, allowed = np.linalg.norm(found.centre_px[k] - expected.centre_px[k]), MAX_POSITION_ERROR * size
-    if off > max(allowed, MAX_POSITION_ERROR_PX):
-        return _off_place(float(off), max(float(allowed), MAX_POSITION_ERROR_PX))
-    _, local = camera.distort_jacobian(found.centre[k])
-    own = (camera.focal[:, None] * local) @ found.shape[k]
-    widest, narrowest = singular_values(np.linalg.solve(expected.shape_px[k], own))
-    stretch = MAX_STRETCH * (1 + 0.5 / float(singular_values(expected.shape_px[k])[1]))
-    if widest > stretch or narrowest < 1 / stretch:
-        return _off_size(float(max(widest, 1 / narrowest)), float(stretch))
-    sigma = float(np.sqrt(np.trace(found.covariance_px2[k]) / 2))
-    if sigma > MAX_SIGMA_PX:
-        return f"σ {sigma:.2f} px, {MAX_SIGMA_PX:g} allowed"
-    return ""
+def _reasons(found: Centres, expected: Ellipses, polarity: Sequence[Polarity], camera: Camera) -> list[str]:
+    """Of each fit why it is not the circle that was expected; empty where it is."""
+    contrast = found.contrast * [1 if each == "bright" else -1 for each in polarity]
+    needed = MIN_SIGNIFICANCE * np.maximum(found.noise, MIN_SIGMA)
+    off, sigma = np.linalg.norm(found.centre_px - expected.centre_px, axis=1), found.sigma_px()
+    widest, narrowest = _stretch(expected.shape_px, found.shape, found.centre, camera)
+    reasons = []
+    for k in range(len(found)):
+        if not found.ok[k]:
+            reason = f"{100 * found.rim[k]:.0f} % of its rim follows an ellipse, {100 * MIN_RIM:.0f} % needed"
+        elif contrast[k] < needed[k]:
+            reason = f"contrast {contrast[k]:.1f}, {needed[k]:.1f} needed"
+        else:
+            reason = _disagreement(expected.shape_px[k], float(off[k]), (widest[k], narrowest[k]))
+            if not reason and sigma[k] > MAX_SIGMA_PX:
+                reason = f"σ {sigma[k]:.2f} px, {MAX_SIGMA_PX:g} allowed"
+        reasons.append(reason)
+    return reasons
 
 
 def missed_notes(missed: dict[Label, str]) -> list[str]:

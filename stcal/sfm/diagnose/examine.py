@@ -9,12 +9,14 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from stcal.design import BoardDesign, TargetDesign
+from stcal.design import BoardDesign, Polarity, TargetDesign
 from stcal.geometry.arrays import frozen
 from stcal.geometry.camera import Camera
-from stcal.geometry.plane import apply_homography, homography_jacobian
+from stcal.geometry.plane import apply_homography
+from stcal.geometry.rigid import Rigid
 from stcal.io.images import grey_8bit, grey_fine
 from stcal.labels import BOARD
+from stcal.sfm.data.patterns import Pattern, images_px
 from stcal.sfm.detect.board import needed_dots
 from stcal.sfm.detect.candidates import (
     MAX_POSITION_ERROR,
@@ -38,30 +40,28 @@ LARGER = (1.02, 1.2)
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Expected:
-    """The n circles of one plane, a face or the board, and where one image should show them.
+    """The n circles of one plane in one image: their ``pattern``, where it lies by ``camera_from_plane``, and those
+    ``missing``, (n,): in view and without a label."""
 
-    ``plane`` : face id or ``board``; ``image_from_plane`` : (3, 3) homography, mm to normalised coordinates;
-    ``xy_mm`` : (n, 2) and ``radius_mm`` : (n,) of the design; ``missing`` : (n,) in view and without a label.
-    """
-
-    plane: str
-    image_from_plane: np.ndarray
-    labels: tuple[str, ...]
-    xy_mm: np.ndarray
-    radius_mm: np.ndarray
+    pattern: Pattern
+    camera_from_plane: Rigid
     missing: np.ndarray
 
     def __post_init__(self):
-        n = len(self.labels)
-        for name, shape in (("image_from_plane", (3, 3)), ("xy_mm", (n, 2)), ("radius_mm", (n,))):
-            object.__setattr__(self, name, frozen(getattr(self, name), shape, name))
-        object.__setattr__(self, "missing", frozen(self.missing, (n,), "missing", dtype=bool))
+        object.__setattr__(self, "missing", frozen(self.missing, (len(self.pattern.labels),), "missing", dtype=bool))
+
+    @property
+    def is_board(self) -> bool:
+        """Whether the plane is the board, not a face."""
+        return self.pattern.plane == BOARD
+
+    def image_from_plane(self) -> np.ndarray:
+        """(3, 3) homography, mm to normalised coordinates."""
+        return np.column_stack([self.camera_from_plane.rotation[:, :2], self.camera_from_plane.translation])
 
     def in_px(self, camera: Camera) -> tuple[np.ndarray, np.ndarray]:
-        """Centres (n, 2) and shapes (n, 2, 2) of the circles in the image as it is."""
-        distorted, by_ideal = camera.distort_jacobian(apply_homography(self.image_from_plane, self.xy_mm))
-        local = homography_jacobian(self.image_from_plane, self.xy_mm) * self.radius_mm[:, None, None]
-        return distorted * camera.focal + camera.centre, camera.focal[:, None] * (by_ideal @ local)
+        """Centres (n, 2) and shapes (n, 2, 2) of the circles' images."""
+        return images_px(self.pattern, self.camera_from_plane, camera)
 
 
 @dataclass(frozen=True, slots=True)
@@ -109,24 +109,26 @@ class _Examination:
 
     def __init__(self, image, camera: Camera, target, board, options, reading: ImageReading, plane: Expected):
         self.image, self.camera, self.options, self.reading, self.plane = image, camera, options, reading, plane
-        self.target, self.board, self.is_board = target, board, plane.plane == BOARD
-        self.polarity = board.polarity if self.is_board else target.polarity
+        self.target, self.board = target, board
+        self.is_board, self.pattern = plane.is_board, plane.pattern
+        self.polarity: Polarity = plane.pattern.polarity
         self.ellipses = reading.found[self.polarity] if self.is_board else reading.free
         self.fit: PatternFit | None = None
         if len(self.ellipses):
             candidates = Candidates.of(self.ellipses, camera)
-            self.fit = fit_pattern(candidates, self._homography(), plane.xy_mm, plane.radius_mm)
+            self.fit = fit_pattern(candidates, self._homography(), self.pattern.xy_mm, self.pattern.radius_mm)
 
     def _homography(self) -> np.ndarray:
         """What detection itself predicted the circles with, or the model's where it did not come that far."""
         if self.is_board:
             own = [homography for board in self.reading.boards for homography in board.homographies]
         else:
-            own = [r.homography for r in self.reading.faces.faces if r.face.id == self.plane.plane]
+            own = [r.homography for r in self.reading.faces.faces if r.face.id == self.pattern.plane]
         # Of several numberings of the board the group has chosen the one that the model agrees with.
-        expected = apply_homography(self.plane.image_from_plane, self.plane.xy_mm)
-        off = [np.abs(apply_homography(h, self.plane.xy_mm) - expected).max() for h in own]
-        return own[int(np.argmin(off))] if own else self.plane.image_from_plane
+        xy, by_model = self.pattern.xy_mm, self.plane.image_from_plane()
+        expected = apply_homography(by_model, xy)
+        off = [np.abs(apply_homography(h, xy) - expected).max() for h in own]
+        return own[int(np.argmin(off))] if own else by_model
 
     def verdicts(self) -> list[CircleVerdict]:
         """Of all missing circles."""
@@ -145,13 +147,13 @@ class _Examination:
                 lost, trace_outlines(grey, self.polarity, self.options, centre[lost], shape[lost]), strict=True
             ):
                 verdicts.append(
-                    CircleVerdict(self.plane.labels[i], end.gate, end.value, end.limit, end.unit, end.cause)
+                    CircleVerdict(self.pattern.labels[i], end.gate, end.value, end.limit, end.unit, end.cause)
                 )
         return verdicts
 
     def _recognised(self, i: int, fit: PatternFit) -> CircleVerdict | None:
         """The gate between outline and rim that stopped a circle, if one did: its face or the board."""
-        label, reading, candidate = self.plane.labels[i], self.reading, fit.index[i]
+        label, reading, candidate = self.pattern.labels[i], self.reading, fit.index[i]
         count = int(fit.fits().sum())
         if self.is_board:
             if reading.boards:
@@ -159,13 +161,13 @@ class _Examination:
                 return None if found else CircleVerdict(label, "board_grid")
             needed = int(np.ceil(needed_dots(self.board)))
             return CircleVerdict(label, "board_dots" if count < needed else "board_grid", count, needed, "dots")
-        named = [r for r in reading.faces.faces if r.face.id == self.plane.plane]
+        named = [r for r in reading.faces.faces if r.face.id == self.pattern.plane]
         if named:
             return None if any(candidate in each.used() for each in named) else CircleVerdict(label, "pattern")
         for refused in reading.faces.refused:
             if set(refused.used) & set(fit.index[fit.fits()]):
                 return CircleVerdict(label, refused.gate, refused.value, refused.limit, "other readings")
-        needed = needed_circles(self.target.face(self.plane.plane))
+        needed = needed_circles(self.target.face(self.pattern.plane))
         return CircleVerdict(label, "face_circles" if count < needed else "face_pattern", count, needed, "circles")
 
     def _rim(self, i: int, fit: PatternFit) -> CircleVerdict:
@@ -173,12 +175,12 @@ class _Examination:
         ellipse = self.ellipses.select(fit.index[i : i + 1])
         measured = measure_centres(grey_fine(self.image), self.camera, ellipse, self.reading.found[self.polarity])
         if not measured.ok[0]:
-            return CircleVerdict(self.plane.labels[i], "rim", float(measured.rim[0]), MIN_RIM, "of the rim")
-        return CircleVerdict(self.plane.labels[i], "board_numbering" if self.is_board else "found_now")
+            return CircleVerdict(self.pattern.labels[i], "rim", float(measured.rim[0]), MIN_RIM, "of the rim")
+        return CircleVerdict(self.pattern.labels[i], "board_numbering" if self.is_board else "found_now")
 
     def _pattern(self, i: int, fit: PatternFit) -> CircleVerdict:
         """Something elliptic is at the place of a circle, but not just there, or of another size or shape."""
-        label = self.plane.labels[i]
+        label = self.pattern.labels[i]
         if not fit.in_place()[i]:
             off, allowed = fit.distance[i] / fit.radius[i], fit.max_distance[i] / fit.radius[i]
             return CircleVerdict(label, "position", float(off), float(allowed), "radii")
@@ -192,13 +194,13 @@ def by_geometry(planes: list[Expected], camera: Camera, options: EllipseOptions)
     verdicts = []
     for plane in planes:
         diameter = 2 * np.sqrt(np.abs(np.linalg.det(plane.in_px(camera)[1])))
-        for i in np.flatnonzero(plane.missing):
+        for i in np.flatnonzero(plane.missing).tolist():
             gate, limit = "not_examined", None
             if diameter[i] < smallest:
                 gate, limit = "min_diameter", smallest
             elif diameter[i] > largest:
                 gate, limit = "max_diameter", largest
-            verdicts.append(CircleVerdict(plane.labels[i], gate, float(diameter[i]), limit, "px"))
+            verdicts.append(CircleVerdict(plane.pattern.labels[i], gate, float(diameter[i]), limit, "px"))
     return verdicts
 
 
@@ -238,9 +240,9 @@ def labels_found(
     found: set[str] = {label for each in detection.faces for label in each.labels(target.face(each.face))}
     dots = detection.centres.centre_px[[row for each in detection.boards for row in each.rows]]
     for plane in planes:
-        if plane.plane == BOARD and len(dots):
+        if plane.is_board and len(dots):
             centre, shape = plane.in_px(camera)
             near = np.maximum(MAX_POSITION_ERROR * np.sqrt(np.abs(np.linalg.det(shape))), MAX_POSITION_ERROR_PX)
             distance = np.linalg.norm(centre[:, None] - dots, axis=2).min(1)
-            found |= {label for label, seen in zip(plane.labels, distance < near, strict=True) if seen}
+            found |= {label for label, seen in zip(plane.pattern.labels, distance < near, strict=True) if seen}
     return found

@@ -12,8 +12,9 @@ import pytest
 
 from stcal.errors import InputError
 from stcal.geometry.rigid import Rigid
+from stcal.labels import CircleLabel
 from stcal.sfm import RunOptions, run
-from stcal.sfm.data.in_view import ideal_border, in_view
+from stcal.sfm.data.patterns import Pattern, ideal_border, in_view
 from stcal.sfm.detect.ellipses import EllipseOptions, find_ellipses
 from stcal.sfm.diagnose.doctor import diagnose
 from stcal.sfm.diagnose.examine import LEAST_MIN_DIAMETER_PX
@@ -142,7 +143,7 @@ def test_in_view_is_what_the_simulation_wants_found(small_run, small_dataset):
         for name in model.images:
             seen = truth[model.group]["images"][name]["circles"]
             wanted = [label for label in seen if seen[label]["must_find"]]
-            found = {plane.plane: np.array(plane.labels)[plane.missing] for plane in expected[name]}
+            found = {each.pattern.plane: np.array(each.pattern.labels)[each.missing] for each in expected[name]}
             for face in model.group:
                 assert found[face].tolist() == [label for label in wanted if label.startswith(f"{face}:")]
             assert len(found["board"]) == sum(label.startswith("board:") for label in wanted) > 50
@@ -152,11 +153,13 @@ def test_in_view_faces_the_camera_whole_and_in_front(small_run):
     """A plane of three circles 20 mm apart at 500 mm, f = 1395 px: tilted, at the border, behind, and upside down."""
     camera = load_run(small_run).camera
     xy, radius = np.array([[-20.0, 0], [0, 0], [20, 0]]), np.full(3, 8.0)
+    labels = [CircleLabel("1", str(i)) for i in range(3)]
 
     def seen(tilt_deg=0.0, xyz=(0.0, 0.0, 500.0), side=1):
         turned = Rigid.exp([np.pi, 0, 0, 0, 0, 0]) @ Rigid.exp([0, np.radians(tilt_deg), 0, 0, 0, 0])
         pose = Rigid(turned.rotation, xyz)
-        return in_view(pose, xy, radius, side, camera, ideal_border(camera)).tolist()
+        pattern = Pattern("1", labels, xy, radius, "bright", side)
+        return in_view(pattern, pose, camera, ideal_border(camera)).tolist()
 
     assert seen() == [True] * 3
     assert seen(side=-1) == [False] * 3
