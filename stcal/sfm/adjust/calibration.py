@@ -9,7 +9,6 @@ from stcal.design import BoardDesign, TargetDesign
 from stcal.errors import MappingError
 from stcal.geometry.camera import Camera
 from stcal.io.camera import CameraPrior
-from stcal.labels import CircleLabel
 from stcal.sfm.adjust.chain import CalibratedTarget, chain_faces, unlinked_faces
 from stcal.sfm.adjust.faces import FaceInGroup, faces_of_group, missing_frame_circles
 from stcal.sfm.adjust.group import adjust
@@ -100,27 +99,35 @@ def calibrate(
 def _faces(
     models: Sequence[MetricModel], camera: Camera, target: TargetDesign, options: AdjustOptions
 ) -> tuple[list[FaceInGroup], list[str]]:
-    """Frames of the faces in all groups, and notes. A face of which no group maps all frame circles has those that are
-    unseen where the design has them."""
-    seen = {label.face for m in models for label in m.labels if isinstance(label, CircleLabel)}
+    """Frames of the faces in all groups, and notes. Frame circles that a group does not map are placed by the face's
+    others: as other groups have them, or, where no group maps all three, as the design has them. (The joint adjustment
+    starts from there, and takes them from all groups.)"""
     own = [faces_of_group(model, camera, target, options.frame) for model in models]
-    without = frozenset(seen - {face.face for found, _ in own for face in found})
-    if without:
-        own = [faces_of_group(model, camera, target, options.frame, without) for model in models]
-    notes = []
-    for face_id in sorted(without & {face.face for found, _ in own for face in found}):
-        circles = {
-            label.circle
-            for m in models
-            for label in m.labels
-            if isinstance(label, CircleLabel) and label.face == face_id
-        }
-        names = ", ".join(f"{face_id}:{c}" for c in missing_frame_circles(target.face(face_id), circles))
-        notes.append(
-            f"face {face_id}: frame circle {names or 'in each group'} not mapped; it stands where the design has it "
-            "against the face's other circles, and σ carries how far circles are off the design"
-        )
-    return [face for found, _ in own for face in found], [note for _, more in own for note in more] + notes
+    whole = _circles_of([face for found, _ in own for face in found])
+    if any(notes for _, notes in own):
+        known = {face.id: whole.get(face.id) for face in target.faces}
+        own = [faces_of_group(model, camera, target, options.frame, known) for model in models]
+    notes = [note for _, more in own for note in more]
+    mapped = {label for m in models for label in m.labels}
+    for face_id in sorted({face.face for found, _ in own for face in found} - whole.keys()):
+        face = target.face(face_id)
+        unseen = missing_frame_circles(face, {x.circle for x in face.labels() if x in mapped})
+        if unseen:
+            notes.append(
+                f"face {face_id}: frame circle {', '.join(f'{face_id}:{c}' for c in unseen)} not mapped; it stands "
+                "where the design has it against the face's other circles, and σ carries how far circles are off the "
+                "design"
+            )
+    return [face for found, _ in own for face in found], notes
+
+
+def _circles_of(faces: Sequence[FaceInGroup]) -> dict[str, dict[str, np.ndarray]]:
+    """Circles (3,) in their face's frame by face and id, means over the groups."""
+    places: dict[str, dict[str, list[np.ndarray]]] = {}
+    for each in faces:
+        for label, xyz in zip(each.labels, each.xyz_face, strict=True):
+            places.setdefault(each.face, {}).setdefault(label.circle, []).append(xyz)
+    return {face_id: {c: np.mean(xyz, axis=0) for c, xyz in own.items()} for face_id, own in places.items()}
 
 
 def _placed(model: WorldModel, scale: Scale, start: CalibratedTarget) -> MetricModel:

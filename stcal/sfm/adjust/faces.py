@@ -1,6 +1,6 @@
 """Face frames from circle centres, and the faces of one group."""
 
-from collections.abc import Collection
+from collections.abc import Collection, Mapping
 from dataclasses import dataclass
 from typing import Literal
 
@@ -18,8 +18,8 @@ from stcal.sfm.adjust.group import projection_jacobians
 from stcal.sfm.data.model import MetricModel
 
 FrameKind = Literal["plane", "three-point"]
-MIN_DESIGNED = 4
-"""Mapped circles that place the others of the design: three fix it, one more shows how well."""
+MIN_PLACING = 4
+"""Mapped circles that place the others of their face: three fix it, one more shows how well."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -49,36 +49,37 @@ def missing_frame_circles(face: FaceDesign, mapped: Collection[str]) -> tuple[st
     return tuple(circle for circle in (face.origin, face.x, face.y) if circle not in mapped)
 
 
-def with_designed(face: FaceDesign, xyz: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
-    """The circles (3,) by id with those of the frame that are not mapped, where the design has them against the others.
+def with_unmapped(
+    face: FaceDesign, xyz: Mapping[str, np.ndarray], known: Mapping[str, np.ndarray] | None = None
+) -> dict[str, np.ndarray]:
+    """The circles (3,) by id with those of the frame that are not mapped, where they are known to lie against the
+    others: by the design, or by ``known`` places (3,) in any frame of the face.
 
     Raises
     ------
     DegenerateError
-        Fewer than four circles are mapped, or they are in line.
+        Fewer than four circles are common to both, or they are in line.
     """
     missing = missing_frame_circles(face, xyz)
     if not missing:
-        return xyz
+        return dict(xyz)
+    known = {circle: _designed(face, circle) for circle in face.ids} if known is None else known
+    common = [circle for circle in xyz if circle in known]
     names = " and ".join(f"{face.id}:{circle}" for circle in missing)
-    if len(xyz) < MIN_DESIGNED:
+    if len(common) < MIN_PLACING:
         raise DegenerateError(
-            f"face {face.id}: frame circle {names} not mapped, and {len(xyz)} other circles, {MIN_DESIGNED} needed; "
+            f"face {face.id}: frame circle {names} not mapped, and {len(common)} other circles, {MIN_PLACING} needed; "
             "add views that show it"
         )
     try:
-        model_from_design = _design_fit(face, xyz)
+        model_from_known = align_rigid(np.array([xyz[c] for c in common]), np.array([known[c] for c in common]))
     except DegenerateError as error:
         raise DegenerateError(f"face {face.id}: frame circle {names} not mapped; add views that show it") from error
-    return xyz | {circle: model_from_design @ _designed(face, circle) for circle in missing}
+    return dict(xyz) | {circle: model_from_known @ known[circle] for circle in missing}
 
 
 def _designed(face: FaceDesign, circle: str) -> np.ndarray:
     return np.append(face.xy_mm[face.ids.index(circle)], 0.0)
-
-
-def _design_fit(face: FaceDesign, xyz: dict[str, np.ndarray]) -> Rigid:
-    return align_rigid(np.array(list(xyz.values())), np.array([_designed(face, circle) for circle in xyz]))
 
 
 def placement_sigma_mm(target: TargetDesign, xyz: dict[CircleLabel, np.ndarray]) -> float:
@@ -86,10 +87,10 @@ def placement_sigma_mm(target: TargetDesign, xyz: dict[CircleLabel, np.ndarray])
     square, redundancy = 0.0, 0
     for face in target.faces:
         own = {label.circle: place for label, place in xyz.items() if label.face == face.id}
-        if len(own) < MIN_DESIGNED:
+        if len(own) < MIN_PLACING:
             continue
         try:
-            fit = _design_fit(face, own)
+            fit = align_rigid(np.array(list(own.values())), np.array([_designed(face, circle) for circle in own]))
         except DegenerateError:
             continue
         apart = [(fit.inverse() @ place - _designed(face, circle))[:2] for circle, place in own.items()]
@@ -128,11 +129,16 @@ def face_frame(face: FaceDesign, xyz: dict[str, np.ndarray], kind: FrameKind, to
 
 
 def faces_of_group(
-    model: MetricModel, camera: Camera, target: TargetDesign, kind: FrameKind, designed: Collection[str] = ()
+    model: MetricModel,
+    camera: Camera,
+    target: TargetDesign,
+    kind: FrameKind,
+    known: Mapping[str, Mapping[str, np.ndarray] | None] | None = None,
 ) -> tuple[list[FaceInGroup], list[str]]:
     """Frames of all faces of one group, and why a face has none.
 
-    ``designed`` : faces whose frame circles may stand where the design has them, for want of their own.
+    ``known`` : faces whose frame circles may be placed by their others, where they are not mapped, as of
+    :func:`with_unmapped`.
     """
     xyz = model.xyz_model
     information = _point_information(model, camera)
@@ -146,8 +152,8 @@ def faces_of_group(
         observed = np.isin(model.point_index, members)
         seen_by = np.unique(model.image_index[observed])
         try:
-            if face.id in designed:
-                place = with_designed(face, place)
+            if known is not None and face.id in known:
+                place = with_unmapped(face, place, known[face.id])
             frame = face_frame(face, place, kind, cameras[seen_by].mean(0) - xyz[members].mean(0))
         except DegenerateError as error:
             notes.append(f"group {model.group}: {error}")

@@ -15,7 +15,7 @@ from stcal.sfm.adjust.faces import (
     face_frame,
     missing_frame_circles,
     placement_sigma_mm,
-    with_designed,
+    with_unmapped,
 )
 from stcal.sfm.adjust.joint import JointResult
 
@@ -161,7 +161,7 @@ def _frames(
             own = {
                 label.circle: xyz for label, xyz in zip(result.labels, xyz_model, strict=True) if label.face == face.id
             }
-            own = with_designed(face, own)
+            own = with_unmapped(face, own)
             for circle, shift in (shifts or {}).items():
                 own = own | {circle: own[circle] + shift}
             frames[face.id] = face_frame(face, own, kind, start.target_from_face[face.id].rotation[:, 2])

@@ -21,7 +21,7 @@ from stcal.geometry.rigid import Rigid
 from stcal.labels import BOARD, DotLabel, Label
 from stcal.sfm.data.patterns import Pattern
 from stcal.sfm.detect.plane_bundle import PlaneBundle
-from stcal.sfm.detect.sightings import ImageDetection
+from stcal.sfm.detect.sightings import FaceSighting, ImageDetection
 
 MIN_POSE_CIRCLES = 5
 """Four fix a pose, one more lets it be doubted."""
@@ -41,7 +41,7 @@ class PlaneView:
 
     ``plane`` : face id or ``board``; ``rows`` : (n,) among the image's centres; ``xy_mm`` : (n, 2) in the plane;
     ``xy`` : (n, 2) seen, normalised; ``area`` : that they take up, in units of their ellipses'; ``camera_from_plane`` :
-    from these alone.
+    from these alone; ``named`` : whether the image by itself tells which plane it is.
     """
 
     plane: str
@@ -51,6 +51,7 @@ class PlaneView:
     xy: np.ndarray
     area: float
     camera_from_plane: Rigid
+    named: bool = True
 
     def xyz_mm(self) -> np.ndarray:
         """The circles, (n, 3), plane's frame."""
@@ -99,18 +100,27 @@ def readings_of(detection: ImageDetection, target: TargetDesign, board: BoardDes
     """What one image was read as, with a pose for each way to read it; without those too few to have one."""
     found = []
     for each in detection.faces:
-        face = target.face(each.face)
-        found.append([_view(face.id, each.labels(face), each.rows, face.xy_mm[each.circles], detection)])
+        found.append([_face_view(each, target, detection, named=True)])
+    for faces in detection.open_faces:
+        own = [_face_view(each, target, detection, named=False) for each in faces]
+        found.append([view for view in own if view is not None])
     if board is not None:
         for each in detection.boards:
             places = board.pitch_mm * each.numberings[:, :, ::-1].astype(float)
             labels = [tuple(DotLabel(*cell) for cell in cells.tolist()) for cells in each.numberings]
             rows = each.rows
             found.append([_view(BOARD, own, rows, xy, detection) for own, xy in zip(labels, places, strict=True)])
-    return [[v for v in views if v is not None] for views in found if all(v is not None for v in views)]
+    return [[v for v in views if v is not None] for views in found if views and all(v is not None for v in views)]
 
 
-def _view(plane: str, labels, rows: np.ndarray, xy_mm: np.ndarray, detection: ImageDetection) -> PlaneView | None:
+def _face_view(each: FaceSighting, target: TargetDesign, detection: ImageDetection, named: bool) -> PlaneView | None:
+    face = target.face(each.face)
+    return _view(face.id, each.labels(face), each.rows, face.xy_mm[each.circles], detection, named)
+
+
+def _view(
+    plane: str, labels, rows: np.ndarray, xy_mm: np.ndarray, detection: ImageDetection, named: bool = True
+) -> PlaneView | None:
     xy = detection.centres.centre[rows]
     if len(rows) < MIN_POSE_CIRCLES:
         return None
@@ -119,7 +129,7 @@ def _view(plane: str, labels, rows: np.ndarray, xy_mm: np.ndarray, detection: Im
     except (ConvergenceError, DegenerateError):
         return None
     area = float(np.abs(np.linalg.det(detection.centres.shape[rows])).sum())
-    return PlaneView(plane, labels, rows, xy_mm, xy, area, pose)
+    return PlaneView(plane, labels, rows, xy_mm, xy, area, pose, named)
 
 
 def arrange(
@@ -138,7 +148,7 @@ def arrange(
     focal_px
         Of the camera.
     """
-    total = sum(len(views[0].rows) for readings in images for views in readings)
+    total = sum(len(views[0].rows) for readings in images for views in readings if views[0].named)
     best = Arrangement({}, {}, {})
     for i, reading in _seeds(images):
         if any(reading is view for view in best.views.get(i, ())):
@@ -147,7 +157,7 @@ def arrange(
         found = _without_reflections(_checked(images, found, step_mm), patterns, MAX_SHIFT_PITCHES * step_mm)
         if found.explained() > best.explained():
             best = found
-        if best.explained() == total:
+        if best.explained() >= total:
             break
     return best
 
@@ -196,7 +206,8 @@ def _as_faces(group: Arrangement) -> list[Readings]:
             rows = np.concatenate([view.rows for view in views])
             first = max(views, key=lambda view: len(view.rows))
             area = sum(view.area for view in views)
-            found.append([replace(first, rows=rows, area=area, camera_from_plane=group.group_from_plane[plane])])
+            pose = group.group_from_plane[plane]
+            found.append([replace(first, rows=rows, area=area, camera_from_plane=pose, named=True)])
     return found
 
 
@@ -206,10 +217,10 @@ def _seeds(images: Sequence[list[Readings]]) -> list[tuple[int, PlaneView]]:
     found = []
     for i, readings in enumerate(images):
         boards = [views for views in readings if views[0].plane == BOARD]
-        faces = [views for views in readings if views[0].plane != BOARD]
-        if readings:
+        faces = [views for views in readings if views[0].plane != BOARD and views[0].named]
+        if boards or faces:
             first = max(boards or faces, key=lambda views: len(views[0].rows))
-            circles = sum(len(views[0].rows) for views in readings)
+            circles = sum(len(views[0].rows) for views in boards + faces)
             found.append(((not boards, not faces, len(first), -len(faces), -circles), i, first))
     found.sort(key=lambda each: each[:2])
     return [(i, view) for _, i, views in found[:MAX_SEEDS] for view in views]
@@ -223,7 +234,7 @@ def _grown(images: Sequence[list[Readings]], seed: int, view: PlaneView, reach_m
     while True:
         placed = {i: found for i, r in enumerate(images) if (found := _placed(r, known, reach_mm, by_convention))}
         placed[seed] = _with_seed(images[seed], view, known, reach_mm)
-        new = _new_planes(images, placed, known, reach_mm)
+        new = _new_planes(images, placed, known, reach_mm) or _agreed_plane(images, placed, known, reach_mm)
         if not new:
             break
         known |= new
@@ -254,12 +265,15 @@ def _placed(readings: list[Readings], known: dict[str, Rigid], reach_mm: float, 
             pose = view.camera_from_plane @ known[view.plane].inverse()
             others, _ = _agreeing([v for v in readings if v is not views], pose, known, reach_mm, {view.plane})
             agreed = [view, *others]
-            own = (len(agreed), sum(v.plane != BOARD for v in agreed), sum(len(v.rows) for v in agreed))
+            faces = sum(v.plane != BOARD and v.named for v in agreed)
+            own = (len(agreed), faces, sum(len(v.rows) for v in agreed))
             if own > rank:
                 best, rank, rivals = (pose, agreed), own, 0
             elif own == rank:
                 rivals += best is None or not _alike(best[0], pose, agreed[0], reach_mm)
-    if best is None or (rivals and len(best[1]) == 1):
+    if best is None or (rivals and (len(best[1]) == 1 or not all(v.named for v in best[1]))):
+        return None
+    if not any(v.named for v in best[1]) and len(best[1]) == 1:
         return None
     if by_convention and len(best[1]) == 1 and best[1][0].plane == BOARD and len(readings) > 1:
         return None
@@ -304,21 +318,49 @@ def _shift_mm(view: PlaneView, camera_from_group: Rigid, known: dict[str, Rigid]
 def _new_planes(images: Sequence[list[Readings]], placed, known: dict[str, Rigid], reach_mm: float) -> dict[str, Rigid]:
     """Poses of planes that are not known yet, each where it takes up most of the placed images: a second target behind
     may be seen as often, but is smaller."""
+    new = {}
+    for plane, found in _unknown_planes(images, placed, known, named=True).items():
+        support = _together(found, reach_mm) @ np.array([view.area for _, view, _ in found])
+        new[plane] = found[int(np.argmax(support))][2]
+    return new
+
+
+def _agreed_plane(images: Sequence[list[Readings]], placed, known: dict[str, Rigid], reach_mm: float):
+    """A plane that no image names by itself, where most images agree on one place for it: two at least, and more than
+    on any other plane that the same circles may be."""
+    ranked = []
+    for plane, found in _unknown_planes(images, placed, known, named=False).items():
+        together = _together(found, reach_mm)
+        by_image = np.array([i for i, _, _ in found])
+        support = [len(np.unique(by_image[row])) for row in together]
+        k = int(np.argmax(support))
+        ranked.append((support[k], plane, found[k][2]))
+    ranked.sort(key=lambda each: -each[0])
+    if not ranked or ranked[0][0] < 2 or (len(ranked) > 1 and ranked[1][0] == ranked[0][0]):
+        return {}
+    return {ranked[0][1]: ranked[0][2]}
+
+
+def _unknown_planes(images: Sequence[list[Readings]], placed, known: dict[str, Rigid], named: bool):
+    """By plane that is not known yet: (image, view, group_from_plane) of the placed images' readings that are named, or
+    of those that are not and agree with no known plane."""
     seen: dict[str, list[tuple[int, PlaneView, Rigid]]] = {}
-    for i, (pose, _) in placed.items():
+    for i, (pose, agreed) in placed.items():
         for views in images[i]:
+            if any(view is each for view in views for each in agreed):
+                continue
             for view in views:
-                if view.plane not in known:
+                if view.plane not in known and view.named == named:
                     group_from_plane = pose.inverse() @ view.camera_from_plane
                     seen.setdefault(view.plane, []).append((i, view, group_from_plane))
-    new = {}
-    for plane, found in seen.items():
-        span = found[0][1].span_mm()
-        corners = np.array([pose @ span for _, _, pose in found])
-        near = np.linalg.norm(corners[:, None] - corners, axis=3).max(2) < reach_mm
-        support = near @ np.array([view.area for _, view, _ in found])
-        new[plane] = found[max(range(len(found)), key=lambda k: support[k])][2]
-    return new
+    return seen
+
+
+def _together(found: list[tuple[int, PlaneView, Rigid]], reach_mm: float) -> np.ndarray:
+    """Mask (n, n) of the views that put their plane to one place."""
+    span = found[0][1].span_mm()
+    corners = np.array([pose @ span for _, _, pose in found])
+    return np.linalg.norm(corners[:, None] - corners, axis=3).max(2) < reach_mm
 
 
 def _adjusted(found: Arrangement, focal_px: float) -> Arrangement:

@@ -56,28 +56,26 @@ class FaceReading:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class RefusedReading:
-    """A reading of the candidates ``used`` that was left out: its ``value`` did not pass the ``limit`` of ``gate``;
-    ``note`` : the same in words."""
+    """Candidates that were not named: ``readings`` that fit them, the ``value`` that did not pass the ``limit`` of
+    ``gate``."""
 
-    used: np.ndarray
+    readings: tuple[FaceReading, ...]
     gate: str
     value: float
     limit: float
-    note: str
+
+    def used(self) -> np.ndarray:
+        """Candidates that any of the readings uses."""
+        return np.unique(np.concatenate([each.used() for each in self.readings]))
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class FaceFinding:
-    """``faces`` : named with certainty, a face in view twice with two readings; ``refused`` : what was seen and left
-    out, and why."""
+    """``faces`` : named with certainty, a face in view twice with two readings; ``refused`` : what was seen and not
+    named, and why."""
 
     faces: tuple[FaceReading, ...]
     refused: tuple[RefusedReading, ...]
-
-    @property
-    def notes(self) -> tuple[str, ...]:
-        """What was seen and left out, and why, in words."""
-        return tuple(reading.note for reading in self.refused)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -243,13 +241,7 @@ def _decide(readings: list[FaceReading], target: TargetDesign) -> FaceFinding:
             and not (r.face is reading.face and (r.index == reading.index).all())
         ]
         if ambiguous or not is_named(reading.face, reading.index >= 0, target):
-            ids = ", ".join(sorted({r.face.id for r in (reading, *ambiguous)}))
-            note = (
-                f"a pattern of {reading.count()} circles that fits face {ids} but may be another; left out, "
-                "show the circles that tell the faces apart"
-            )
-            others = max(len(ambiguous), 1)
-            refused.append(RefusedReading(reading.used(), "face_readings", others, 0, note))
+            refused.append(RefusedReading((reading, *ambiguous), "face_readings", max(len(ambiguous), 1), 0))
         else:
             named.append(reading)
     return FaceFinding(tuple(named), tuple(refused))

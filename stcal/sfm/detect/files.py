@@ -23,7 +23,7 @@ from stcal.sfm.detect.image import detect_image
 from stcal.sfm.detect.predict import PredictedCircles, SecondLook, measure_predicted
 from stcal.sfm.detect.sightings import BoardSighting, FaceSighting, ImageDetection
 
-CACHE_VERSION = 3
+CACHE_VERSION = 4
 """Raised whenever detection gives other results for the same image: what was kept is then not used again."""
 
 
@@ -191,6 +191,7 @@ def _save(path: Path, detection: ImageDetection, digest: str, image: np.ndarray)
         "scale": scale,
         "faces": [each.face for each in detection.faces],
         "boards": len(detection.boards),
+        "open_faces": [[each.face for each in faces] for faces in detection.open_faces],
         "mirrored": detection.mirrored,
         "notes": detection.notes,
         "candidates": detection.candidates,
@@ -198,6 +199,9 @@ def _save(path: Path, detection: ImageDetection, digest: str, image: np.ndarray)
     arrays = _centre_arrays(detection.centres)
     for i, face in enumerate(detection.faces):
         arrays |= {f"face_rows_{i}": face.rows, f"face_circles_{i}": face.circles}
+    for i, faces in enumerate(detection.open_faces):
+        for k, face in enumerate(faces):
+            arrays |= {f"open_rows_{i}_{k}": face.rows, f"open_circles_{i}_{k}": face.circles}
     for i, each in enumerate(detection.boards):
         arrays |= {f"board_rows_{i}": each.rows, f"board_numberings_{i}": each.numberings}
     keep(path, {"thumbnail": jpeg, **arrays}, meta)
@@ -214,6 +218,13 @@ def _load(file: ImageFile, path: Path, reused: bool) -> DetectedImage | None:
         boards = [
             BoardSighting(stored[f"board_rows_{i}"], stored[f"board_numberings_{i}"]) for i in range(meta["boards"])
         ]
+        open_faces = [
+            tuple(
+                FaceSighting(face, stored[f"open_rows_{i}_{k}"], stored[f"open_circles_{i}_{k}"])
+                for k, face in enumerate(names)
+            )
+            for i, names in enumerate(meta["open_faces"])
+        ]
         detection = ImageDetection(
             _stored_centres(stored),
             tuple(faces),
@@ -221,6 +232,7 @@ def _load(file: ImageFile, path: Path, reused: bool) -> DetectedImage | None:
             tuple(meta["mirrored"]),
             tuple(meta["notes"]),
             meta["candidates"],
+            tuple(open_faces),
         )
         return DetectedImage(file, detection, meta["digest"], stored["thumbnail"].tobytes(), meta["scale"], reused)
 

@@ -77,9 +77,9 @@ def detect_image(
     """Find and measure all circles of the target and the board in one grey image of the camera's size."""
     reading = read_image(grey_8bit(image), camera, target, board, options)
     scaled = grey_fine(image)
-    notes = list(reading.faces.notes)
+    notes: list[str] = []
     parts: list[Centres] = []
-    faces, boards = [], []
+    faces, boards, open_faces = [], [], []
     count = 0
 
     def measured(ellipses: Ellipses, polarity: Polarity, labels) -> np.ndarray:
@@ -98,6 +98,12 @@ def detect_image(
         labels = face.face.labels()
         ok = measured(reading.free.select(face.index[circles]), target.polarity, [labels[i] for i in circles])
         faces.append(FaceSighting(face.face.id, np.arange(first, count), circles[ok]))
+    for each in reading.faces.refused:
+        used, first = each.used(), count
+        ok = measured(reading.free.select(used), target.polarity, ["a circle of a face without a name"] * len(used))
+        row = np.full(len(reading.free), -1)
+        row[used[ok]] = np.arange(first, count)
+        open_faces.append(tuple(_sighting(own, row) for own in each.readings))
     for each in reading.boards:
         first, polarity = count, board.polarity if board else target.polarity
         ok = measured(reading.found[polarity].select(each.candidates), polarity, ["a board dot"] * len(each.candidates))
@@ -109,7 +115,15 @@ def detect_image(
         tuple(each.face.id for each in reading.mirrored),
         tuple(notes),
         sum(len(e) for e in reading.found.values()),
+        tuple(open_faces),
     )
+
+
+def _sighting(reading: FaceReading, row: np.ndarray) -> FaceSighting:
+    """``row`` : of each candidate among the centres, −1 where it was not measured."""
+    rows = np.where(reading.index >= 0, row[reading.index], -1)
+    circles = np.flatnonzero(rows >= 0)
+    return FaceSighting(reading.face.id, rows[circles], circles)
 
 
 def _nothing(image: np.ndarray, camera: Camera, ellipses: Ellipses) -> Centres:

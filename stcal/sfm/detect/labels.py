@@ -19,7 +19,7 @@ from stcal.sfm.detect.arrangement import (
     readings_of,
 )
 from stcal.sfm.detect.centres import Centres
-from stcal.sfm.detect.sightings import ImageDetection
+from stcal.sfm.detect.sightings import ImageDetection, open_face_note
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -63,7 +63,8 @@ def label_single(name: str, group: str, detection: ImageDetection, target: Targe
     """The faces of one image that stands for itself, where the target may move from image to image."""
     labels, rows = detection.labelled_rows(target)
     repeated = [f"{what} found more than once; left out" for what in detection.repeated]
-    return labelled_image(name, group, labels, detection.centres.select(rows), [*detection.notes, *repeated])
+    unnamed = [open_face_note(len(faces[0].rows), (each.face for each in faces)) for faces in detection.open_faces]
+    return labelled_image(name, group, labels, detection.centres.select(rows), [*detection.notes, *unnamed, *repeated])
 
 
 def label_groups(
@@ -114,13 +115,13 @@ def _labelled(
         return labelled_image(name, group, (), detection.centres.select(np.zeros(0, int)), notes)
     if image in arrangement.views:
         views = list(arrangement.views[image])
-        notes += [_contradiction(each[0]) for each in arrangement.contradicted.get(image, ())]
-        notes += [_open_board(each) for each in arrangement.open.get(image, ())]
+        notes += [_contradiction(each) for each in arrangement.contradicted.get(image, ())]
+        notes += [_open(each) for each in arrangement.open.get(image, ())]
         notes += [_reflection(each) for each in arrangement.reflected.get(image, ())]
         notes += [_foreign(each) for each in arrangement.foreign.get(image, ())]
     else:
-        views = [each[0] for each in readings if len(each) == 1 and _once(each[0], readings)]
-        notes += [_open_board(each) for each in readings if len(each) > 1]
+        views = [each[0] for each in readings if len(each) == 1 and each[0].named and _once(each[0], readings)]
+        notes += [_open(each) for each in readings if len(each) > 1 or not each[0].named]
     labels = [label for view in views for label in view.labels]
     rows = np.concatenate([view.rows for view in views]) if views else np.zeros(0, int)
     order = np.argsort(rows, kind="stable")
@@ -128,10 +129,13 @@ def _labelled(
 
 
 def _once(view: PlaneView, readings: list[Readings]) -> bool:
-    return sum(each[0].plane == view.plane for each in readings) == 1
+    return sum(each[0].plane == view.plane for each in readings if each[0].named) == 1
 
 
-def _contradiction(view: PlaneView) -> str:
+def _contradiction(views: Readings) -> str:
+    view = views[0]
+    if not view.named:
+        return _open(views)
     what = f"a board of {len(view.rows)} dots" if view.plane == BOARD else f"a pattern like face {view.plane}"
     return (
         f"{what}: not where the group's other images see it; left out, it is a reflection or another object, or check "
@@ -139,7 +143,9 @@ def _contradiction(view: PlaneView) -> str:
     )
 
 
-def _open_board(views: Readings) -> str:
+def _open(views: Readings) -> str:
+    if not views[0].named:
+        return open_face_note(len(views[0].rows), (view.plane for view in views))
     return (
         f"board of {len(views[0].rows)} dots left out: {len(views)} numberings fit, none keeps it where the group's "
         "other images see it; show a face that they show, or check that nothing was moved"

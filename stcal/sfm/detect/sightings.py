@@ -1,5 +1,6 @@
 """What one image shows, before the group is asked: planes of the target and boards, each with its circles."""
 
+from collections.abc import Iterable
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -27,6 +28,18 @@ class FaceSighting:
         return tuple(labels[i] for i in self.circles)
 
 
+OpenFace = tuple[FaceSighting, ...]
+"""A pattern that the image alone cannot name: the faces that it may be."""
+
+
+def open_face_note(circles: int, faces: Iterable[str]) -> str:
+    """What is said of a pattern of so many circles that stays without a name."""
+    return (
+        f"a pattern of {circles} circles that fits face {', '.join(sorted(set(faces)))} but may be another; left out, "
+        "show the circles that tell the faces apart"
+    )
+
+
 @dataclass(frozen=True, slots=True, eq=False)
 class BoardSighting:
     """A board: ``rows`` : (n,) of its dots among the image's centres, ``numberings`` : (k, n, 2) row and column of each
@@ -41,8 +54,9 @@ class ImageDetection:
     """What one image shows.
 
     ``centres`` : the measured circles; ``faces`` and ``boards`` : what they were read as, the boards with the most dots
-    first, a face or the board perhaps more than once; ``mirrored`` : ids of faces that the image shows as a mirror
-    does; ``notes`` : what was seen and left out, and why; ``candidates`` : outlines found.
+    first, a face or the board perhaps more than once; ``open_faces`` : patterns without a name; ``mirrored`` : ids of
+    faces that the image shows as a mirror does; ``notes`` : what was seen and left out, and why; ``candidates`` :
+    outlines found.
     """
 
     centres: Centres
@@ -51,6 +65,7 @@ class ImageDetection:
     mirrored: tuple[str, ...] = ()
     notes: tuple[str, ...] = ()
     candidates: int = field(default=0)
+    open_faces: tuple[OpenFace, ...] = ()
 
     @property
     def repeated(self) -> tuple[str, ...]:

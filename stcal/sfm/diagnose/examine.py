@@ -165,7 +165,7 @@ class _Examination:
         if named:
             return None if any(candidate in each.used() for each in named) else CircleVerdict(label, "pattern")
         for refused in reading.faces.refused:
-            if set(refused.used) & set(fit.index[fit.fits()]):
+            if set(refused.used()) & set(fit.index[fit.fits()]):
                 return CircleVerdict(label, refused.gate, refused.value, refused.limit, "other readings")
         needed = needed_circles(self.target.face(self.pattern.plane))
         return CircleVerdict(label, "face_circles" if count < needed else "face_pattern", count, needed, "circles")

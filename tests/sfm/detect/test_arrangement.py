@@ -26,6 +26,7 @@ class Seen:
         self.centre = np.zeros((0, 2))
         self.faces: list[FaceSighting] = []
         self.boards: list[BoardSighting] = []
+        self.open_faces: list[tuple[FaceSighting, ...]] = []
         if image is not None:
             for face_id in image.face_ids():
                 own = [i for i, x in enumerate(image.labels) if x.plane == face_id]
@@ -47,6 +48,16 @@ class Seen:
         self.boards.append(BoardSighting(self.rows(centre), numberings))
         return self
 
+    def unnamed(self, face_id, others="12345", circles=(0, 1, 3, 4, 6, 7)):
+        """The face shows circles that all have alike: it may be one of the others."""
+        face = next(each for each in self.faces if each.face == face_id)
+        self.faces.remove(face)
+        own = np.isin(face.circles, circles)
+        self.open_faces.append(
+            tuple(FaceSighting(x, face.rows[own], face.circles[own]) for x in sorted({face_id, *others}))
+        )
+        return self
+
     def detection(self, mirrored=()) -> ImageDetection:
         n = len(self.centre)
         one = np.ones(n)
@@ -63,7 +74,9 @@ class Seen:
             np.zeros((n, 2)),
             one.astype(bool),
         )
-        return ImageDetection(centres, tuple(self.faces), tuple(self.boards), mirrored)
+        return ImageDetection(
+            centres, tuple(self.faces), tuple(self.boards), mirrored, open_faces=tuple(self.open_faces)
+        )
 
 
 def plane_centres(camera_from_plane: Rigid, xy_mm) -> np.ndarray:
@@ -184,3 +197,41 @@ def test_a_mirrored_image_gives_no_labels_and_says_so(scene, group):
     assert len(results[1].observations) == 0
     assert any("the image is mirrored: it shows face 1" in note for note in results[1].notes)
     assert set(results[0].observations.labels) == set(group[0].labels)
+
+
+def test_faces_without_a_name_are_named_by_the_group(scene, group):
+    """In all images but one every face could be any of the five; the board has two numberings."""
+    seen = [Seen(o) for o in group]
+    for own in seen[1:]:
+        for face_id in [each.face for each in own.faces]:
+            own.unnamed(face_id)
+    results, _ = labelled(scene, [s.detection() for s in seen])
+    for r, o in zip(results[1:], group[1:], strict=True):
+        found = dict(zip(r.observations.labels, map(tuple, r.observations.centre), strict=True))
+        truth = dict(zip(o.labels, map(tuple, o.centre), strict=True))
+        assert {x.plane for x in found} == {x.plane for x in truth}
+        assert all(found[x] == truth[x] for x in found)
+        assert len(found) == len(truth) - 4 * (len({x.plane for x in truth}) - 1)
+        assert r.notes == ()
+
+
+def test_a_face_that_no_image_names_is_what_the_images_have_in_common(scene, group):
+    """Face 2 could be another in each image, but not the same one in all; where it could, it stays without a name."""
+    for others, planes in (("345", {"1", "2", "board"}), ("4", {"1", "board"})):
+        seen = [Seen(o) for o in group]
+        for i, own in enumerate(seen):
+            if any(each.face == "2" for each in own.faces):
+                own.unnamed("2", others[i % len(others)])
+        results, arrangement = labelled(scene, [s.detection() for s in seen])
+        assert set(arrangement.group_from_plane) == planes
+        for r, o in zip(results, group, strict=True):
+            assert set(r.observations.face_ids()) == set(o.face_ids()) & planes
+            assert (r.notes == ()) == (set(o.face_ids()) <= planes)
+
+
+def test_a_pattern_without_a_name_that_fits_nothing_is_left_out(scene, group):
+    seen = [Seen(o) for o in group]
+    seen[0].face("5", plane_centres(Rigid.exp([2.8, 0.2, 0.1, -300, 200, 1100]), TARGET.face("5").xy_mm)).unnamed("5")
+    results, _ = labelled(scene, [s.detection() for s in seen])
+    assert set(results[0].observations.labels) == set(group[0].labels)
+    assert any("fits face 1, 2, 3, 4, 5 but may be another" in note for note in results[0].notes)
