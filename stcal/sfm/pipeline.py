@@ -14,8 +14,7 @@ from stcal.sfm.adjust.chain import measure_chains
 from stcal.sfm.checks.suite import run_checks
 from stcal.sfm.data.observations import by_group, detections_csv
 from stcal.sfm.detect.files import DetectionResult, detect_files, require_upright
-from stcal.sfm.detect.group import label_images
-from stcal.sfm.detect.labels import LabelledImage
+from stcal.sfm.detect.labels import LabelledImage, label_images
 from stcal.sfm.mapping.graph import image_graph
 from stcal.sfm.run.folder import claim_folder, write_overlays, write_run
 from stcal.sfm.run.marker import MarkerFile

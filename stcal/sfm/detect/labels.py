@@ -1,7 +1,9 @@
-"""Labels of one group's circles: what each image reads by itself, held against the arrangement of the whole group."""
+"""Labels of all circles: what each image reads by itself, held against the arrangement of its group, then a second look
+for what the group says must be in view."""
 
 from collections.abc import Collection, Sequence
 from dataclasses import dataclass
+from pathlib import Path
 
 import numpy as np
 
@@ -9,17 +11,13 @@ from stcal.design import BoardDesign, TargetDesign
 from stcal.labels import BOARD, Label
 from stcal.sfm.data.observations import ImageObservations
 from stcal.sfm.data.patterns import patterns_of
-from stcal.sfm.detect.arrangement import (
-    MAX_SHIFT_PITCHES,
-    Arrangement,
-    PlaneView,
-    Readings,
-    across_groups,
-    arrange,
-    readings_of,
-)
+from stcal.sfm.detect.arrangement import MAX_SHIFT_PITCHES, Arrangement, across_groups, arrange
 from stcal.sfm.detect.centres import Centres
+from stcal.sfm.detect.ellipses import EllipseOptions
+from stcal.sfm.detect.files import DetectedImage, DetectionResult, look_again
+from stcal.sfm.detect.predict import PredictedCircles, contradicted_notes, contradictions, missed_notes, predict_circles
 from stcal.sfm.detect.sightings import ImageDetection, open_face_note
+from stcal.sfm.detect.views import PlaneView, Readings, readings_of
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -65,6 +63,47 @@ def label_single(name: str, group: str, detection: ImageDetection, target: Targe
     repeated = [f"{what} found more than once; left out" for what in detection.repeated]
     unnamed = [open_face_note(len(faces[0].rows), (each.face for each in faces)) for faces in detection.open_faces]
     return labelled_image(name, group, labels, detection.centres.select(rows), [*detection.notes, *unnamed, *repeated])
+
+
+def label_images(
+    detection: DetectionResult,
+    target: TargetDesign,
+    board: BoardDesign | None,
+    options: EllipseOptions,
+    cache: Path,
+    workers: int | None = None,
+) -> list[LabelledImage]:
+    """Labelled circles of all images, in the order of their groups.
+
+    ``cache`` : folder for what the second look measures.
+    """
+    camera = detection.camera
+    groups: dict[str, list[DetectedImage]] = {}
+    for image in detection.images:
+        groups.setdefault(image.file.group, []).append(image)
+    labelled: list[LabelledImage] = []
+    jobs: list[tuple[DetectedImage, PredictedCircles]] = []
+    focal_px = float(np.sqrt(camera.focal.prod()))
+    named = [[(i.file.name, i.file.group, i.detection) for i in members] for members in groups.values()]
+    for members, (found, arrangement) in zip(
+        groups.values(), label_groups(named, target, board, focal_px), strict=True
+    ):
+        for i, (image, each) in enumerate(zip(members, found, strict=True)):
+            predicted = predict_circles(arrangement, i, each.observations.labels, target, board, camera)
+            if predicted is None:
+                continue
+            wrong = contradictions(predicted, each.observations, camera)
+            found[i] = each.without(wrong, contradicted_notes(wrong))
+            if predicted.wanted.any():
+                jobs.append((image, predicted))
+        labelled += found
+    looks = look_again(jobs, camera, options, cache, workers)
+    return [_with(each, looks) for each in labelled]
+
+
+def _with(each: LabelledImage, looks) -> LabelledImage:
+    look = looks.get(each.observations.name)
+    return each if look is None else each.plus(look.labels, look.centres, missed_notes(look.missed))
 
 
 def label_groups(
