@@ -1,6 +1,7 @@
 """Labels of all circles: what each image reads by itself, held against the arrangement of its group, then a second look
 for what the group says must be in view."""
 
+from collections import Counter
 from collections.abc import Collection, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -15,9 +16,21 @@ from stcal.sfm.detect.arrangement import MAX_SHIFT_PITCHES, Arrangement, across_
 from stcal.sfm.detect.centres import Centres
 from stcal.sfm.detect.ellipses import EllipseOptions
 from stcal.sfm.detect.files import DetectedImage, DetectionResult, look_again
-from stcal.sfm.detect.predict import PredictedCircles, contradicted_notes, contradictions, missed_notes, predict_circles
+from stcal.sfm.detect.predict import (
+    PredictedCircles,
+    SecondLook,
+    contradicted_notes,
+    contradictions,
+    missed_notes,
+    predict_circles,
+)
 from stcal.sfm.detect.sightings import ImageDetection, open_face_note
 from stcal.sfm.detect.views import PlaneView, Readings, readings_of
+
+MIN_EXPECTED = 6
+"""Circles that other images must show before their absence says anything: as many as name a face."""
+MIN_CONFIRMED = 0.2
+"""Share of them that is found at least; a face of which less is seen twice could not be mapped either."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -81,7 +94,7 @@ def label_images(
     groups: dict[str, list[DetectedImage]] = {}
     for image in detection.images:
         groups.setdefault(image.file.group, []).append(image)
-    labelled: list[LabelledImage] = []
+    first: list[list[LabelledImage]] = []
     jobs: list[tuple[DetectedImage, PredictedCircles]] = []
     focal_px = float(np.sqrt(camera.focal.prod()))
     named = [[(i.file.name, i.file.group, i.detection) for i in members] for members in groups.values()]
@@ -96,14 +109,41 @@ def label_images(
             found[i] = each.without(wrong, contradicted_notes(wrong))
             if predicted.wanted.any():
                 jobs.append((image, predicted))
-        labelled += found
+        first.append(found)
     looks = look_again(jobs, camera, options, cache, workers)
-    return [_with(each, looks) for each in labelled]
+    return [each for group in first for each in _second(group, looks)]
 
 
-def _with(each: LabelledImage, looks) -> LabelledImage:
-    look = looks.get(each.observations.name)
-    return each if look is None else each.plus(look.labels, look.centres, missed_notes(look.missed))
+def _second(group: list[LabelledImage], looks: dict[str, SecondLook]) -> list[LabelledImage]:
+    """A group's images with what the second look found; without the faces that only one image read and that are not
+    there where other images must show them."""
+    images = []
+    for each in group:
+        look = looks.get(each.observations.name)
+        images.append(each if look is None else each.plus(look.labels, look.centres, missed_notes(look.missed)))
+    for face, seen, expected in _unconfirmed(group, looks):
+        note = (
+            f"face {face}: read in one image of the group alone, {seen} of {expected} of its circles found that other "
+            "images must show; left out, it is a reflection or another object, or hidden there"
+        )
+        for i, each in enumerate(images):
+            own = [label for label in each.observations.labels if label.plane == face]
+            images[i] = each.without(own, [note])
+    return images
+
+
+def _unconfirmed(group: list[LabelledImage], looks: dict[str, SecondLook]) -> list[tuple[str, int, int]]:
+    """Faces that one image alone reads and others contradict: (face, circles found in these, circles expected)."""
+    read = Counter(face for each in group for face in each.observations.face_ids())
+    found = []
+    for face in [face for face, images in read.items() if images == 1]:
+        others = [e.observations.name for e in group if face not in e.observations.face_ids()]
+        own = [looks[name] for name in others if name in looks]
+        seen = sum(label.plane == face for look in own for label in look.labels)
+        expected = seen + sum(label.plane == face for look in own for label in look.missed)
+        if expected >= MIN_EXPECTED and seen < MIN_CONFIRMED * expected:
+            found.append((face, seen, expected))
+    return found
 
 
 def label_groups(
