@@ -3,9 +3,15 @@
 The edge is modelled as a step blurred by a Gaussian (its width is estimated), between two brightness planes, along
 an ellipse in *ideal* coordinates: every pixel is first moved to where a lens without distortion would have put it,
 because a distorted ellipse is none. The fit is a robust Gauss–Newton over the centre (2), the ellipse (3), the blur
-and both planes (6). Its covariance, scaled by the residual, is the σ that the centre carries. (The field's
-alternatives are grey-value centroids, edges along the normals with an ellipse fit, and contours; this model is the
-one nearest to the Cramér–Rao bound, also under a brightness gradient.)
+and both planes (6). (The field's alternatives are grey-value centroids, edges along the normals with an ellipse fit,
+and contours; this model is the one nearest to the Cramér–Rao bound, also under a brightness gradient.)
+
+The σ that a centre carries is that of an M-estimator: what errors in the pixels do to its equation, through the
+inverse of how the equation answers to a shifted image. Errors are not independent from pixel to pixel, as JPEG,
+demosaicing and denoising spread them, and what the model does not follow, as motion blur, is none: it is even about
+the centre and moves nothing. Both are measured where centres live, on the rim: a centre is the residuals' first
+harmonic around it, and the next odd ones, which no parameter takes up, show how large it is by chance. All circles
+measured in one call share that factor; each has its own noise.
 
 Planes do not follow a circle of which one half is darker, or with an edge beside it: the centre then moves by up to
 0.2 px without any residual that a rim's share would show. The third harmonic of the residuals around the rim does show
@@ -13,6 +19,7 @@ it (the first is the planes', even ones move no centre), inside and outside apar
 on with brightness that varies around the rim, at the price of a larger σ.
 """
 
+import math
 from dataclasses import dataclass, fields
 
 import numpy as np
@@ -51,6 +58,8 @@ MAX_RIM_RESIDUAL = 0.15
 RIM_CLEARANCE_PX = 1.5
 MIN_SIGMA = 0.4
 """Grey values: what quantisation leaves of noise, and a little more."""
+MIN_NOISE2 = 1e-12
+"""Square of grey values: no noise at all."""
 WAVES = (1, 2, 3)
 """Harmonics around the rim of what planes do not follow."""
 TOLD_BY = 3
@@ -59,6 +68,16 @@ UNEVEN = 0.004
 UNEVEN_CHI2 = 23.0
 """… and its χ² of two degrees of freedom: by chance one circle in 100 000."""
 WAVE_STEPS = 8
+CHANCE_WAVES = 3
+"""So many odd harmonics around the rim stand for the first: the third, the fifth, the seventh. Higher ones are shorter
+than what correlates the pixels: JPEG's blocks are of 8 px, and the seventh wave around a circle of 6 px is of 5. (Of
+2, 3 and 4 this was within 10 % most often; 2 leave a call's factor to chance.)"""
+SHARP_PX, SHARP = 1.5, 0.33
+"""Where the blur is wider than this, in pixels or in the ellipse's smaller radius, how the fit answers to a shift is
+asked of the image; below it that changed σ by 1 %, and it costs a tenth of the fit."""
+CUSP = 0.3
+"""The edge's distance has a cusp in the middle of the ellipse; slopes and waves are kept to what they are at this share
+of the radius."""
 UNTRUSTED = 0.2
 """Share of the move that following the waves leaves unexplained at most (circles of 8 to 28 px, halves darker by 5 to
 30 %); it goes into σ."""
@@ -139,7 +158,12 @@ def measure_centres(image: np.ndarray, camera: Camera, ellipses: Ellipses, neigh
     ]
     centre = np.array([fit.centre for fit in rows]).reshape(-1, 2) / focal
     shape = np.array([fit.shape for fit in rows]).reshape(-1, 2, 2) / focal
+    rim = np.array([fit.rim for fit in rows], float)
+    uneven = np.array([fit.uneven for fit in rows]).reshape(-1, 2) / focal
+    chance = np.array([fit.chance for fit in rows], float)
     covariance = np.array([fit.covariance for fit in rows]).reshape(-1, 2, 2) / focal**2
+    covariance = _correlation(chance[rim >= MIN_RIM]) * covariance
+    covariance += UNTRUSTED**2 * uneven[:, :, None] * uneven[:, None, :]
     distorted, jacobian = camera.distort_jacobian(centre)
     jacobian = jacobian * camera.focal[:, None]
     return Centres(
@@ -150,10 +174,18 @@ def measure_centres(image: np.ndarray, camera: Camera, ellipses: Ellipses, neigh
         blur_px=np.array([fit.blur for fit in rows], float),
         contrast=np.array([fit.contrast for fit in rows], float),
         noise=np.array([fit.noise for fit in rows], float),
-        rim=np.array([fit.rim for fit in rows], float),
-        uneven_px=(jacobian @ np.array([fit.uneven for fit in rows]).reshape(-1, 2, 1) / focal)[..., 0],
-        ok=np.array([fit.rim >= MIN_RIM for fit in rows], bool),
+        rim=rim,
+        uneven_px=(jacobian @ uneven[..., None])[..., 0],
+        ok=rim >= MIN_RIM,
     )
+
+
+def _correlation(chance: np.ndarray) -> float:
+    """Factor of the covariances of independent pixels, from the squares of n circles' harmonics over what independent
+    pixels would make them; 1 of no circle. Few squares may be small by chance: their mean times ν/(ν−2), ν degrees of
+    freedom, keeps the expectation of squared errors over variances at one (mean of the F distribution)."""
+    freedom = 2 * CHANCE_WAVES * len(chance)
+    return float(chance.mean()) * freedom / (freedom - 2) if freedom else 1.0
 
 
 def _monomials(x: np.ndarray, y: np.ndarray) -> np.ndarray:
@@ -194,11 +226,13 @@ def _intruders(ellipses: Ellipses, neighbours: Ellipses, half: np.ndarray) -> li
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Ellipse:
-    """One ellipse, ideal px: ``centre`` (2,), ``shape`` and ``covariance`` (2, 2), and what :class:`Centres` says."""
+    """One ellipse, ideal px: ``centre`` (2,), ``shape`` and ``covariance`` (2, 2) as if pixels were independent,
+    ``chance``, and what :class:`Centres` says."""
 
     centre: np.ndarray
     shape: np.ndarray
     covariance: np.ndarray
+    chance: float
     blur: float
     contrast: float
     noise: float
@@ -291,7 +325,7 @@ class _Fit:
             ex = self.dx + np.float32(self.place[0] - place[0])
             ey = self.dy + np.float32(self.place[1] - place[1])
             chosen &= (shape[0, 0] * ex + shape[0, 1] * ey) ** 2 + (shape[1, 0] * ex + shape[1, 1] * ey) ** 2 > 1
-        rows, columns = np.nonzero(chosen)
+        self.in_patch = rows, columns = np.nonzero(chosen)
         # Single precision is enough here: coordinates are taken from the start of the centre.
         self.grey = self.patch[rows, columns].astype(np.float32)
         at = _monomials(self.dx[columns].astype(float) / self.half[0], self.dy[rows, 0].astype(float) / self.half[1])
@@ -378,18 +412,73 @@ class _Fit:
         if robust:
             self.weight = 1 / (1 + (self.residual * np.float32(1 / (ROBUST_WIDTH * sigma))) ** 2) ** 2
 
-    def _covariance(self) -> np.ndarray:
-        """Of the centre: errors sit on the edge more than beside it, and the sandwich form (White 1980) weighs them
-        where they act."""
-        score = (self.scores * self.residual).astype(float)
-        half = self.inverse[:2] @ score
-        n = len(self.residual)
-        return half @ half.T * (n / (n - len(self.inverse))) + UNTRUSTED**2 * np.outer(self.uneven, self.uneven)
+    def _covariance(self) -> tuple[np.ndarray, float]:
+        """Of the centre, (2, 2), as if pixels were independent, and :meth:`_chance` over that noise.
+
+        The noise is that of the pixels where the centre's weight is: errors sit on the edge more than beside it. The
+        covariance is S·H·Sᵀ, H the inverse of the normal equations, S⁻¹ the share of a shift of the image that one step
+        answers with (Huber 1981, sec. 6.3). The step's own derivatives would make that share 1; it is less by what the
+        weights give away, and another where the edge is too wide for them, or not as the model has it.
+        """
+        pull = self.scores[0] ** 2 + self.scores[1] ** 2
+        share = pull / self.weight
+        total = float(share.sum())
+        noise2 = max(float(pull @ self.residual**2) / total, MIN_NOISE2)
+        # ψ' over the weight of Geman–McClure, not below zero, where it would reward outliers.
+        influence = np.maximum(4 * np.sqrt(self.weight) - 3, 0)
+        chance = self._chance(np.sqrt(share / self.weight), total) / noise2 if noise2 > MIN_NOISE2 else 1.0
+        if self.blur < min(SHARP_PX, SHARP * self._narrowest()):
+            return noise2 * (float(pull.sum()) / float(pull @ influence)) ** 2 * self.inverse[:2, :2], chance
+        slope = self._exact_slope(self.scores[:2] / self.weight) - self._residual_slope()
+        answer = (self.inverse[:2] @ self.scores) * influence
+        spread = np.linalg.inv(answer @ slope.T)
+        return noise2 * spread @ self.inverse[:2, :2] @ spread.T, chance
+
+    def _narrowest(self) -> float:
+        """The ellipse's smaller radius, px."""
+        (xx, xy), (_, yy) = self.inverse_shape.tolist()
+        return 2 / (xx + yy + math.hypot(xx - yy, 2 * xy))
+
+    def _exact_slope(self, slope: np.ndarray) -> np.ndarray:
+        """Derivatives of the model by the centre, (2, pixels): the step's, ``slope``, and the change of the distance's
+        own slope."""
+        inverse_shape = self.inverse_shape.astype(np.float32)
+        rho = np.maximum(np.hypot(*self.rim_angle), np.float32(CUSP))
+        steepness = np.maximum(np.hypot(*(inverse_shape @ np.stack(self.rim_angle))), np.float32(CUSP / self.radius))
+        turn = np.float32(self.blur) * inverse_shape @ inverse_shape
+        return (2 - 1 / rho) * slope - self.reduced / steepness * (turn @ slope)
+
+    def _residual_slope(self) -> np.ndarray:
+        """Derivatives of the residual by the place, (2, pixels); none where a neighbour is not in the band."""
+        patch = np.full(self.patch.shape, np.nan, np.float32)
+        patch[self.in_patch] = self.residual
+        slope = np.zeros((2, *patch.shape), np.float32)
+        slope[0, :, 1:-1] = patch[:, 2:] - patch[:, :-2]
+        slope[1, 1:-1] = patch[2:] - patch[:-2]
+        by_pixel = np.nan_to_num(slope[:, *self.in_patch]) / 2
+        return np.linalg.inv(self.jacobian).T.astype(np.float32) @ by_pixel
+
+    def _chance(self, edge: np.ndarray, total: float) -> float:
+        """Variance of a pixel from the residuals' :data:`CHANCE_WAVES` on the rim, of amplitude ``edge`` and weighted
+        square ``total``: an estimate from orthonormal series (Phillips 2005), less what the parameters took of these.
+        """
+        wave = np.empty(len(edge), np.complex64)
+        wave.real, wave.imag = self.rim_angle
+        wave /= np.maximum(np.abs(wave), np.float32(CUSP))
+        double, wave = wave * wave, wave * edge
+        waves = np.empty((2 * CHANCE_WAVES, len(edge)), np.float32)
+        for k in range(CHANCE_WAVES):
+            wave *= double
+            waves[2 * k], waves[2 * k + 1] = wave.real, wave.imag
+        taken = (waves @ self.scores.T).astype(float)
+        left = CHANCE_WAVES * total - float((taken @ self.inverse * taken).sum())
+        found = waves @ (self.weight * self.residual)
+        return float(found @ found) / left
 
     def result(self) -> _Ellipse:
         """The fit; of no contrast and no rim where it failed."""
         if self.failed:
-            return _Ellipse(self.start, np.eye(2) * self.radius, np.eye(2), 0.0, 0.0, 0.0, 0.0, np.zeros(2))
+            return _Ellipse(self.start, np.eye(2) * self.radius, np.eye(2), 0.0, 0.0, 0.0, 0.0, 0.0, np.zeros(2))
         near = np.abs(self.reduced) * self.blur < max(1.5, self.blur)
         angle = np.arctan2(self.rim_angle[1][near], self.rim_angle[0][near])
         sector = (angle * (SECTORS / (2 * np.pi))).astype(int) % SECTORS
@@ -399,4 +488,5 @@ class _Fit:
         allowed = (MAX_RIM_RESIDUAL * self.contrast) ** 2 + (2 * noise) ** 2
         rim = float((square <= allowed * total).mean())
         shape = np.linalg.inv(self.inverse_shape)
-        return _Ellipse(self.centre, shape, self._covariance(), self.blur, self.contrast, noise, rim, self.uneven)
+        covariance, chance = self._covariance()
+        return _Ellipse(self.centre, shape, covariance, chance, self.blur, self.contrast, noise, rim, self.uneven)
