@@ -70,8 +70,9 @@ UNEVEN_CHI2 = 23.0
 WAVE_STEPS = 8
 CHANCE_WAVES = 3
 """So many odd harmonics around the rim stand for the first: the third, the fifth, the seventh. Higher ones are shorter
-than what correlates the pixels: JPEG's blocks are of 8 px, and the seventh wave around a circle of 6 px is of 5. (Of
-2, 3 and 4 this was within 10 % most often; 2 leave a call's factor to chance.)"""
+than what correlates the pixels: JPEG's blocks are of 8 px, and the seventh wave around a circle of 6 px is of 5. (JPEG
+50 to 95 on 240 sheets of 200 circles: errors over σ were within 0.9…1.15 on 227 with 1 wave, 235 with 2, 234 with 3,
+219 with 4; the fewer, the more is left to chance.)"""
 SHARP_PX, SHARP = 1.5, 0.33
 """Where the blur is wider than this, in pixels or in the ellipse's smaller radius, how the fit answers to a shift is
 asked of the image; below it that changed σ by 1 %, and it costs a tenth of the fit."""
@@ -462,9 +463,9 @@ class _Fit:
         """Variance of a pixel from the residuals' :data:`CHANCE_WAVES` on the rim, of amplitude ``edge`` and weighted
         square ``total``: an estimate from orthonormal series (Phillips 2005), less what the parameters took of these.
         """
+        a, b = self.rim_angle
         wave = np.empty(len(edge), np.complex64)
-        wave.real, wave.imag = self.rim_angle
-        wave /= np.maximum(np.abs(wave), np.float32(CUSP))
+        wave.real, wave.imag = np.stack([a, b]) / np.maximum(np.sqrt(a * a + b * b), np.float32(CUSP))
         double, wave = wave * wave, wave * edge
         waves = np.empty((2 * CHANCE_WAVES, len(edge)), np.float32)
         for k in range(CHANCE_WAVES):
