@@ -19,7 +19,8 @@ import numpy as np
 from stcal.geometry.camera import Camera
 from stcal.io.images import decode
 from stcal.parallel import one_thread
-from stcal.sfm.detect.centres import Centres, measure_centres
+from stcal.sfm.data.centres import Centres
+from stcal.sfm.detect.centres import measure_centres
 from stcal.sfm.detect.ellipses import Ellipses
 from stcal.synthetic import degrade
 

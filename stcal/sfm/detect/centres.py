@@ -20,14 +20,14 @@ on with brightness that varies around the rim, at the price of a larger σ.
 """
 
 import math
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 
 import numpy as np
 from scipy.special import ndtr
 
-from stcal.geometry.arrays import frozen
 from stcal.geometry.camera import Camera
 from stcal.geometry.robust import robust_sigma
+from stcal.sfm.data.centres import Centres
 from stcal.sfm.detect.ellipses import Ellipses
 
 BAND_PX = 4.0
@@ -73,6 +73,9 @@ CHANCE_WAVES = 3
 than what correlates the pixels: JPEG's blocks are of 8 px, and the seventh wave around a circle of 6 px is of 5. (JPEG
 50 to 95 on 240 sheets of 200 circles: errors over σ were within 0.9…1.15 on 227 with 1 wave, 235 with 2, 234 with 3,
 219 with 4; the fewer, the more is left to chance.)"""
+MAX_CHANCE = 4.2
+"""Squares of one circle over their median: by chance one in a thousand (χ² of six degrees of freedom); a dirty circle
+does not speak for the others."""
 SHARP_PX, SHARP = 1.5, 0.33
 """Where the blur is wider than this, in pixels or in the ellipse's smaller radius, how the fit answers to a shift is
 asked of the image; below it that changed σ by 1 %, and it costs a tenth of the fit."""
@@ -82,62 +85,6 @@ of the radius."""
 UNTRUSTED = 0.2
 """Share of the move that following the waves leaves unexplained at most (circles of 8 to 28 px, halves darker by 5 to
 30 %); it goes into σ."""
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class Centres:
-    """Measured ellipses, n of them.
-
-    ``centre_px`` : (n, 2) centre of the ideal ellipse, put into the image as it is (OpenCV pixel origin);
-    ``centre`` : (n, 2) the same in normalised ideal coordinates; ``shape`` : (n, 2, 2) its shape there, rim = centre +
-    shape @ unit circle; ``covariance_px2`` : (n, 2, 2) of ``centre_px``; ``blur_px`` : (n,); ``contrast`` : (n,) grey
-    values, inside minus outside; ``noise`` : (n,) robust σ of a pixel about the model, grey values; ``rim`` : (n,)
-    share of the rim that follows the model; ``uneven_px`` : (n, 2) how far uneven brightness would have moved the
-    centre, zero where none is seen; ``ok`` : (n,) usable.
-    """
-
-    centre_px: np.ndarray
-    centre: np.ndarray
-    shape: np.ndarray
-    covariance_px2: np.ndarray
-    blur_px: np.ndarray
-    contrast: np.ndarray
-    noise: np.ndarray
-    rim: np.ndarray
-    uneven_px: np.ndarray
-    ok: np.ndarray
-
-    def __post_init__(self):
-        n = len(self.centre_px)
-        for name, shape in (
-            ("centre_px", (n, 2)),
-            ("centre", (n, 2)),
-            ("shape", (n, 2, 2)),
-            ("blur_px", (n,)),
-            ("covariance_px2", (n, 2, 2)),
-            ("contrast", (n,)),
-            ("noise", (n,)),
-            ("rim", (n,)),
-            ("uneven_px", (n, 2)),
-        ):
-            object.__setattr__(self, name, frozen(getattr(self, name), shape, name))
-        object.__setattr__(self, "ok", frozen(self.ok, (n,), "ok", dtype=bool))
-
-    def __len__(self) -> int:
-        return len(self.centre_px)
-
-    def select(self, keep: np.ndarray) -> "Centres":
-        """Those of the indices or mask ``keep``."""
-        return Centres(*(getattr(self, f.name)[keep] for f in fields(self)))
-
-    @classmethod
-    def concatenate(cls, parts: list["Centres"]) -> "Centres":
-        """All parts, one after the other."""
-        return cls(*(np.concatenate([getattr(part, f.name) for part in parts]) for f in fields(cls)))
-
-    def sigma_px(self) -> np.ndarray:
-        """Standard deviation per axis (RMS of the two), (n,)."""
-        return np.sqrt(np.trace(self.covariance_px2, axis1=1, axis2=2) / 2)
 
 
 def measure_centres(image: np.ndarray, camera: Camera, ellipses: Ellipses, neighbours: Ellipses) -> Centres:
@@ -186,7 +133,9 @@ def _correlation(chance: np.ndarray) -> float:
     pixels would make them; 1 of no circle. Few squares may be small by chance: their mean times ν/(ν−2), ν degrees of
     freedom, keeps the expectation of squared errors over variances at one (mean of the F distribution)."""
     freedom = 2 * CHANCE_WAVES * len(chance)
-    return float(chance.mean()) * freedom / (freedom - 2) if freedom else 1.0
+    if not freedom:
+        return 1.0
+    return float(np.minimum(chance, MAX_CHANCE * np.median(chance)).mean()) * freedom / (freedom - 2)
 
 
 def _monomials(x: np.ndarray, y: np.ndarray) -> np.ndarray:

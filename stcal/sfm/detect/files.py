@@ -17,13 +17,13 @@ from stcal.io.camera import CameraModel
 from stcal.io.images import ImageFile, Skipped, decode, grey_8bit, thumbnail
 from stcal.labels import parse_label, parse_labels
 from stcal.parallel import run_parallel
-from stcal.sfm.detect.centres import Centres
+from stcal.sfm.data.centres import Centres
 from stcal.sfm.detect.ellipses import EllipseOptions
 from stcal.sfm.detect.image import detect_image
 from stcal.sfm.detect.predict import PredictedCircles, SecondLook, measure_predicted
 from stcal.sfm.detect.sightings import BoardSighting, FaceSighting, ImageDetection
 
-CACHE_VERSION = 4
+CACHE_VERSION = 5
 """Raised whenever detection gives other results for the same image: what was kept is then not used again."""
 
 

@@ -7,9 +7,10 @@ import numpy as np
 from stcal.design import BoardDesign, Polarity, TargetDesign
 from stcal.geometry.camera import Camera
 from stcal.io.images import grey_8bit, grey_fine
+from stcal.sfm.data.centres import Centres
 from stcal.sfm.detect.board import BoardReading, find_boards
 from stcal.sfm.detect.candidates import Candidates
-from stcal.sfm.detect.centres import Centres, measure_centres
+from stcal.sfm.detect.centres import measure_centres
 from stcal.sfm.detect.ellipses import EllipseOptions, Ellipses, find_ellipses
 from stcal.sfm.detect.faces import FaceFinder, FaceFinding, FaceReading
 from stcal.sfm.detect.sightings import BoardSighting, FaceSighting, ImageDetection

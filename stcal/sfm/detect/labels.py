@@ -10,10 +10,10 @@ import numpy as np
 
 from stcal.design import BoardDesign, TargetDesign
 from stcal.labels import BOARD, Label
+from stcal.sfm.data.centres import Centres
 from stcal.sfm.data.observations import ImageObservations
 from stcal.sfm.data.patterns import patterns_of
 from stcal.sfm.detect.arrangement import MAX_SHIFT_PITCHES, Arrangement, across_groups, arrange
-from stcal.sfm.detect.centres import Centres
 from stcal.sfm.detect.ellipses import EllipseOptions
 from stcal.sfm.detect.files import DetectedImage, DetectionResult, look_again
 from stcal.sfm.detect.predict import (

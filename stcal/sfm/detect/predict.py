@@ -15,11 +15,12 @@ from stcal.geometry.arrays import frozen
 from stcal.geometry.camera import Camera
 from stcal.io.images import grey_fine
 from stcal.labels import BOARD, Label
+from stcal.sfm.data.centres import Centres
 from stcal.sfm.data.observations import ImageObservations
 from stcal.sfm.data.patterns import ideal_border, images_px, in_view, patterns_of
 from stcal.sfm.detect.arrangement import Arrangement
 from stcal.sfm.detect.candidates import MAX_POSITION_ERROR, MAX_POSITION_ERROR_PX, singular_values
-from stcal.sfm.detect.centres import MIN_RIM, MIN_SIGMA, Centres, measure_centres
+from stcal.sfm.detect.centres import MIN_RIM, MIN_SIGMA, measure_centres
 from stcal.sfm.detect.ellipses import MIN_DIAMETER_PX, EllipseOptions, Ellipses
 
 MAX_STRETCH = 1.15

@@ -7,7 +7,7 @@ import numpy as np
 
 from stcal.design import FaceDesign, TargetDesign
 from stcal.labels import BOARD, CircleLabel
-from stcal.sfm.detect.centres import Centres
+from stcal.sfm.data.centres import Centres
 
 SECOND_BOARD_SHARE = 0.8
 """A second board is one with at least this share of the dots of the first."""

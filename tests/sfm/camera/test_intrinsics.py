@@ -19,8 +19,8 @@ from stcal.sfm.camera.calibrate import require_determined
 from stcal.sfm.camera.intrinsics import adjust_intrinsics, model_parameters
 from stcal.sfm.camera.trust import projection_sigma, split_half
 from stcal.sfm.camera.views import board_views, closed_form, start_camera
+from stcal.sfm.data.centres import Centres
 from stcal.sfm.data.observations import ImageObservations
-from stcal.sfm.detect.centres import Centres
 from stcal.sfm.detect.sightings import BoardSighting, ImageDetection
 
 TRUE = Camera(2592, 1728, [2790.0, 2784.0], [1301.0, 859.0], [-0.06, 0.045, 1.5e-4, -1e-4, 0, 0, 0, 0])
