@@ -96,9 +96,8 @@ def by_the_paper(observations: list[ImageObservations], scene: Scene, out: Path)
     options = RunOptions(solve="chain", frame="three-point", eccentricity=False).settled(scene.target)
     graph = image_graph(observations, scene.board, options.graph)
     (out / "cache").mkdir(parents=True, exist_ok=True)
-    solutions, _ = solve_groups(
-        observations, graph, out, scene.camera, scene.target, scene.board, options, lambda *_: None
-    )
+    folders, designs = (out / "scratch", out / "cache"), (scene.target, scene.board)
+    solutions, _ = solve_groups(observations, graph, *folders, scene.camera, *designs, options, lambda *_: None)
     frames, boards = {}, []
     for model in (s.model for s in solutions):
         scale = find_scale(model, scene.board).rows_mm_per_unit

@@ -97,7 +97,7 @@ def measure(count: int, kind: str) -> dict:
         graph = image_graph(observations, scene.board, kind)
         marks.append(("graph", time.perf_counter()))
         arguments = (scene.camera, scene.target, scene.board, options)
-        solutions, _ = solve_groups(observations, graph, out, *arguments, lambda *_: None)
+        solutions, _ = solve_groups(observations, graph, out / "scratch", out / "cache", *arguments, lambda *_: None)
         marks.append(("map", time.perf_counter()))
         adjustment = options.adjustment(scene.target)
         result = calibrate([s.model for s in solutions], scene.camera, scene.target, scene.board, adjustment)

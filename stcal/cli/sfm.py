@@ -150,10 +150,10 @@ def detect(
     """Detect circles alone: detections.csv and an overlay picture of every image."""
     from stcal.io.images import find_images
     from stcal.sfm import pipeline
-    from stcal.sfm.run.folder import claim_folder
     from stcal.sfm.run.marker import MarkerFile
     from stcal.sfm.run.options import RunOptions
     from stcal.sfm.run.text import detection_text
+    from stcal.sfm.run.transaction import run_folder
 
     model = read_camera(camera)
     target_design = target_of(target)
@@ -162,11 +162,11 @@ def detect(
     if (out / "faces.json").exists():
         raise InputError(f"output folder {out}: holds a finished calibration; give another folder with --out")
     find_images(images)
-    folder = claim_folder(out, MarkerFile.of(images, None))
-    with StageProgress() as progress:
+    given = {"images": images, "--camera": camera, "--target": target, "--board": board}
+    with run_folder(out, MarkerFile.of(images, None), given) as folder, StageProgress() as progress:
         detection, labelled = pipeline.detect(images, model, folder, target_design, board_design, options, progress)
     print(detection_text(detection, labelled))
-    print(f"detections: {folder / 'detections.csv'}\noverlays:   {folder / 'overlays'}")
+    print(f"detections: {out / 'detections.csv'}\noverlays:   {out / 'overlays'}")
 
 
 def _flatness(text: str) -> float | None:

@@ -16,11 +16,12 @@ from stcal.sfm.data.observations import by_group, detections_csv
 from stcal.sfm.detect.files import DetectionResult, detect_files, require_upright
 from stcal.sfm.detect.labels import LabelledImage, label_images
 from stcal.sfm.mapping.graph import image_graph
-from stcal.sfm.run.folder import claim_folder, write_overlays, write_run
+from stcal.sfm.run.folder import write_overlays, write_run
 from stcal.sfm.run.marker import MarkerFile
 from stcal.sfm.run.options import RunOptions
 from stcal.sfm.run.result import RunResult
 from stcal.sfm.run.solve import solve_groups, unseen_board, usable_groups
+from stcal.sfm.run.transaction import RunFolder, run_folder
 
 
 @one_thread()
@@ -62,12 +63,29 @@ def run(
     """
     progress = progress or (lambda *_: None)
     model = camera if isinstance(camera, CameraModel) else read_camera(camera)
-    target, board = target_of(target), board_of(board)
-    options = (options or RunOptions()).settled(target)
-    find_images(images)  # before anything of an earlier run is removed
-    out = claim_folder(out, MarkerFile.of(images, options))
+    given = {"images": images, "--camera": camera, "--target": target, "--board": board}
+    find_images(images)
+    designs = target_of(target), board_of(board)
+    options = (options or RunOptions()).settled(designs[0])
+    with run_folder(out, MarkerFile.of(images, options), given) as folder:
+        result = _calibrated(images, model, folder, *designs, options, progress)
+        progress("check", 0, 1)
+        result = replace(result, checks=run_checks(result.evidence(camera_prior(result.camera))))
+        progress("check", 1, 1)
+        write_run(result, folder.stage, progress)
+    return result
 
-    detection, labelled = detect(images, model, out, target, board, options, progress)
+
+def _calibrated(
+    images: str | Path,
+    model: CameraModel,
+    folder: RunFolder,
+    target: TargetDesign,
+    board: BoardDesign,
+    options: RunOptions,
+    progress: Progress,
+) -> RunResult:
+    detection, labelled = detect(images, model, folder, target, board, options, progress)
     known = model.calibrated(detection.camera.width, detection.camera.height)
     known = refinable(known) if options.refine_camera else known
     observations = [each.observations for each in labelled]
@@ -75,13 +93,17 @@ def run(
 
     progress("map", 0, len(groups))
     graph = image_graph(observations, board, options.graph)
-    solutions, unsolved = solve_groups(observations, graph, out, known, target, board, options, progress, groups)
+    scratch = folder.stage / "scratch"
+    solutions, unsolved = solve_groups(
+        observations, graph, scratch, folder.cache, known, target, board, options, progress, groups
+    )
     progress("faces", 0, 1)
-    prior = camera_prior(known)
-    calibration = calibrate([s.model for s in solutions], known, target, board, options.adjustment(target), prior)
+    calibration = calibrate(
+        [s.model for s in solutions], known, target, board, options.adjustment(target), camera_prior(known)
+    )
     progress("faces", 1, 1)
-    result = RunResult(
-        out=out,
+    return RunResult(
+        out=folder.out,
         camera=known,
         target_design=target,
         board_design=board,
@@ -94,17 +116,12 @@ def run(
         chains=measure_chains(calibration.faces, calibration.target),
         notes=(*unusable, *unsolved, *calibration.notes, *unseen_board(solutions, board)),
     )
-    progress("check", 0, 1)
-    result = replace(result, checks=run_checks(result.evidence(prior)))
-    progress("check", 1, 1)
-    write_run(result, progress)
-    return result
 
 
 def detect(
     images: str | Path,
     camera: CameraModel,
-    out: Path,
+    folder: RunFolder,
     target: TargetDesign,
     board: BoardDesign | None,
     options: RunOptions,
@@ -113,10 +130,10 @@ def detect(
     """Detection, labels, ``detections.csv`` and overlays, into a claimed folder."""
     files, other = find_images(images)
     step = counted(progress, "detect", len(files))
-    detection = detect_files(files, camera, target, board, options.ellipses, out / "cache", options.workers, step)
+    detection = detect_files(files, camera, target, board, options.ellipses, folder.cache, options.workers, step)
     detection = replace(detection, skipped=(*other, *detection.skipped))
     require_upright(detection.images)
-    labelled = label_images(detection, target, board, options.ellipses, out / "cache", options.workers)
-    save(out / "detections.csv", detections_csv([each.observations for each in labelled]))
-    write_overlays(detection, labelled, target, out, progress)
+    labelled = label_images(detection, target, board, options.ellipses, folder.cache, options.workers)
+    save(folder.stage / "detections.csv", detections_csv([each.observations for each in labelled]))
+    write_overlays(detection, labelled, target, folder.stage, progress)
     return detection, labelled

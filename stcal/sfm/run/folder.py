@@ -1,7 +1,6 @@
-"""The folder of a run: claimed, its overlays, its results, its report."""
+"""What a run writes into its folder: overlays, results, report."""
 
 import os
-import shutil
 from collections.abc import Mapping
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
@@ -12,7 +11,6 @@ from stcal.design import TargetDesign
 from stcal.errors import InputError
 from stcal.io.camera import CalibratedCamera, write_cameras_txt
 from stcal.io.design import board_toml, target_toml
-from stcal.io.images import RUN_MARKER
 from stcal.io.saving import json_text, save
 from stcal.parallel import Progress
 from stcal.sfm.adjust.file import FacesFile
@@ -21,54 +19,22 @@ from stcal.sfm.data.observations import ImageObservations
 from stcal.sfm.detect.files import DetectionResult
 from stcal.sfm.detect.labels import LabelledImage
 from stcal.sfm.detect.overlay import draw_overlay
-from stcal.sfm.mapping.database import image_ids, labels_csv, remove_database, write_database
+from stcal.sfm.mapping.database import image_ids, labels_csv, write_database
 from stcal.sfm.mapping.models import write_model
 from stcal.sfm.report.page import report_html, shown_overlays
-from stcal.sfm.run.marker import MarkerFile
 from stcal.sfm.run.output import report_of
 from stcal.sfm.run.result import RunResult
 from stcal.sfm.run.saved import BOARD, CAMERA, TARGET, SavedRun
 
-RESULTS = ("faces.json", "report.json", "report.html", "labels.csv", "detections.csv", "compare.json")
-RESULTS += (CAMERA, TARGET, BOARD)
-RESULT_FOLDERS = ("models", "target_model", "overlays", "scratch")
-
-
-def claim_folder(out: str | Path, content: MarkerFile) -> Path:
-    """Make the run's folder, mark it as ours with ``content``, and remove results that will be made anew.
-
-    Raises
-    ------
-    InputError
-        The folder holds something else.
-    """
-    out = Path(out)
-    marker = out / RUN_MARKER
-    try:
-        if out.exists() and not out.is_dir():
-            raise InputError(f"output {out}: not a folder; give a new folder with --out")
-        if out.is_dir() and not marker.exists() and any(not p.name.startswith(RUN_MARKER) for p in out.iterdir()):
-            raise InputError(f"output folder {out}: not empty and not of an earlier run; give a new folder with --out")
-        out.mkdir(parents=True, exist_ok=True)
-        save(marker, json_text(content.content()))
-        for name in RESULTS:
-            (out / name).unlink(missing_ok=True)
-        for name in RESULT_FOLDERS:
-            shutil.rmtree(out / name, ignore_errors=True)
-        remove_database(out / "database.db")
-    except OSError as error:
-        raise InputError(f"output folder {out}: {error.strerror or error}; give a writable folder") from error
-    return out
-
 
 def write_overlays(
-    detection: DetectionResult, labelled: list[LabelledImage], target: TargetDesign, out: Path, progress: Progress
+    detection: DetectionResult, labelled: list[LabelledImage], target: TargetDesign, folder: Path, progress: Progress
 ) -> None:
     """Of every image, what was found in it."""
     face_ids = [face.id for face in target.faces]
 
     def draw(image, each: LabelledImage) -> None:
-        path = overlay_path(out, image.file.name)
+        path = overlay_path(folder, image.file.name)
         path.parent.mkdir(parents=True, exist_ok=True)
         picture = draw_overlay(
             image.thumbnail,
@@ -95,16 +61,14 @@ def overlay_path(out: Path, name: str) -> Path:
     return out / "overlays" / f"{name}.jpg"
 
 
-def write_run(result: RunResult, progress: Progress) -> None:
-    """The database with corrected centres, models, faces and report; ``faces.json`` comes last but for the report."""
-    out = result.out
+def write_run(result: RunResult, out: Path, progress: Progress) -> None:
+    """The database with corrected centres, models, faces and report, into a folder that holds the overlays."""
     observations = result.observations()
     ids = image_ids(observations)
     models = {s.model.group: s.model for s in result.solutions}
     corrected = _corrected_px(models, observations)
     write_database(out / "database.db", result.camera, observations, result.graph.pairs, corrected)
     save(out / "labels.csv", labels_csv(observations, corrected))
-    shutil.rmtree(out / "models", ignore_errors=True)
     for name, model in models.items():
         folder = out / "models" / name  # "models/." where the images lie directly in their folder
         write_model(folder, [model], observations, ids, result.camera)

@@ -225,7 +225,8 @@ def unseen_board(solutions: list[GroupSolution], board: BoardDesign) -> list[str
 def solve_groups(
     observations: Sequence[ImageObservations],
     graph: ImageGraph,
-    out: Path,
+    scratch: Path,
+    cache: Path,
     camera: CalibratedCamera,
     target: TargetDesign,
     board: BoardDesign,
@@ -233,15 +234,15 @@ def solve_groups(
     progress: Progress,
     names: Collection[str] | None = None,
 ) -> tuple[list[GroupSolution], list[str]]:
-    """Map and refine group by group, or those of the ``names``, in ``out/scratch``, which is removed again; and why
-    groups have no solution.
+    """Map and refine group by group, or those of the ``names``; and why groups have no solution.
+
+    ``scratch`` : a folder that is made and removed again; ``cache`` : for what later runs take up.
 
     Raises
     ------
     MappingError, ScaleError, ConvergenceError, DegenerateError
         No group has one; that of the first.
     """
-    scratch = out / "scratch"
     shutil.rmtree(scratch, ignore_errors=True)
     scratch.mkdir()
     ids = image_ids(observations)
@@ -264,7 +265,7 @@ def solve_groups(
                     board,
                     options.pairs,
                     options.eccentricity,
-                    out / "cache",
+                    cache,
                 )
                 find_scale(solution.model, board)
             except (MappingError, ScaleError, ConvergenceError, DegenerateError) as error:

@@ -46,8 +46,8 @@ def solve(scene, observations, kind, out):
     options = RunOptions(graph=kind).settled(scene.target)
     graph = image_graph(observations, scene.board, kind)
     (out / "cache").mkdir(parents=True)
-    tell = lambda *_: None  # noqa: E731
-    solutions, _ = solve_groups(observations, graph, out, scene.camera, scene.target, scene.board, options, tell)
+    folders, designs = (out / "scratch", out / "cache"), (scene.target, scene.board)
+    solutions, _ = solve_groups(observations, graph, *folders, scene.camera, *designs, options, lambda *_: None)
     return (
         graph,
         solutions,

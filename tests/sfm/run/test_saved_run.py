@@ -13,10 +13,10 @@ from stcal.errors import InputError
 from stcal.sfm import run
 from stcal.sfm.detect.ellipses import EllipseOptions
 from stcal.sfm.mapping.pairs import PairOptions
-from stcal.sfm.run.folder import claim_folder
 from stcal.sfm.run.marker import MarkerFile
 from stcal.sfm.run.options import RunOptions
 from stcal.sfm.run.saved import load_run
+from stcal.sfm.run.transaction import run_folder
 from tests.outcome import INPUT, assert_error
 
 FRAME = ("id", "ids", "origin", "x", "y")
@@ -120,7 +120,8 @@ def test_options_that_are_all_other_than_the_defaults(small_run, tmp_path, monke
     )
     assert all(getattr(OTHER.ellipses, n) != getattr(default.ellipses, n) for n in EllipseOptions.__slots__)
     monkeypatch.chdir(tmp_path)
-    claim_folder("new", MarkerFile.of("some images", OTHER))
+    with run_folder("new", MarkerFile.of("some images", OTHER), {}):
+        pass
     own = shutil.copytree(small_run, tmp_path / "run")
     shutil.copy(tmp_path / "new" / "stcal-run.json", own)
     saved = load_run(own)

@@ -1,0 +1,158 @@
+"""A run's folder holds one run's results, the earlier or the new one, whatever ends the run."""
+
+import json
+import multiprocessing
+import os
+import signal
+from contextlib import suppress
+
+import pytest
+
+from stcal.errors import DetectionError, InputError
+from stcal.io.images import RUN_MARKER
+from stcal.sfm.run.marker import MarkerFile
+from stcal.sfm.run.options import RunOptions
+from stcal.sfm.run.transaction import READY, RESULTS, complete, run_folder
+
+MARKER = MarkerFile.of("images", RunOptions())
+
+
+def write(stage, text, names=("faces.json", "report.json", "database.db")):
+    for name in names:
+        (stage / name).write_text(text)
+    (stage / "overlays" / "12").mkdir(parents=True)
+    (stage / "overlays" / "12" / "a.jpg").write_text(text)
+
+
+def make(out, text, **names):
+    with run_folder(out, MARKER, {}) as folder:
+        write(folder.stage, text, **names)
+
+
+def fail(out):
+    with run_folder(out, MARKER, {}) as folder:
+        write(folder.stage, "new", names=("detections.csv",))
+        raise DetectionError("nothing found")
+
+
+def content(out):
+    """What the folder holds, but for the cache."""
+    return {str(p.relative_to(out)): p.read_text() for p in out.rglob("*") if p.is_file() and p.parent.name != "cache"}
+
+
+def test_new_results_take_the_earlier_ones_place(tmp_path):
+    make(tmp_path / "run", "old", names=("faces.json", "labels.csv", "compare.json"))
+    (tmp_path / "run" / "notes.txt").write_text("mine")
+    make(tmp_path / "run", "new")
+    found = content(tmp_path / "run")
+    assert json.loads(found.pop(RUN_MARKER))["program"] == "stcal-sfm"
+    assert found == {
+        "faces.json": "new",
+        "report.json": "new",
+        "database.db": "new",
+        "overlays/12/a.jpg": "new",
+        "notes.txt": "mine",
+    }
+
+
+def test_a_run_that_fails_leaves_the_earlier_results(tmp_path):
+    make(tmp_path / "run", "old")
+    before = content(tmp_path / "run")
+    with pytest.raises(DetectionError, match=r"nothing found; the earlier results stay, .*unfinished holds what"):
+        fail(tmp_path / "run")
+    after = content(tmp_path / "run")
+    assert after.pop("unfinished/detections.csv") == after.pop("unfinished/overlays/12/a.jpg") == "new"
+    assert after == before
+
+
+def test_a_first_run_that_fails_leaves_its_overlays_in_place(tmp_path):
+    with pytest.raises(DetectionError, match=r"^nothing found$"):
+        fail(tmp_path / "run")
+    assert set(content(tmp_path / "run")) == {RUN_MARKER, "detections.csv", "overlays/12/a.jpg"}
+
+
+@pytest.mark.parametrize("moment", range(len(RESULTS) + 2))
+def test_a_run_that_is_killed_while_results_take_their_places_is_completed(tmp_path, moment, monkeypatch):
+    """Killed at each of the renames: what is opened next is whole, and the new one's."""
+    out = tmp_path / "run"
+    make(out, "old", names=("faces.json", "labels.csv", "compare.json"))
+    done, replace = [], os.replace
+
+    def killed(source, place):
+        if len(done) == moment:
+            raise KeyboardInterrupt
+        if READY in (source.parent.name, place.name):
+            done.append(place)
+        replace(source, place)
+
+    monkeypatch.setattr(os, "replace", killed)
+    with suppress(KeyboardInterrupt):
+        make(out, "new")
+    monkeypatch.undo()
+    complete(out)
+    found = content(out)
+    found.pop(RUN_MARKER)
+    new = {"faces.json": "new", "report.json": "new", "database.db": "new", "overlays/12/a.jpg": "new"}
+    old = {"faces.json": "old", "labels.csv": "old", "compare.json": "old", "overlays/12/a.jpg": "old"}
+    assert {name: text for name, text in found.items() if not name.startswith("unfinished")} == (new if moment else old)
+
+
+def hold(out, ready, go_on):
+    with run_folder(out, MARKER, {}):
+        ready.set()
+        go_on.wait()
+
+
+def test_two_runs_into_one_folder_are_refused_and_a_dead_one_holds_nothing(tmp_path):
+    context = multiprocessing.get_context("spawn")
+    ready, go_on = context.Event(), context.Event()
+    other = context.Process(target=hold, args=(tmp_path / "run", ready, go_on))
+    other.start()
+    try:
+        assert ready.wait(60)
+        with pytest.raises(InputError, match=rf"process {other.pid} on .* is writing a run there; wait for its end"):
+            make(tmp_path / "run", "new")
+        os.kill(other.pid, signal.SIGKILL)
+    finally:
+        other.join(60)
+    make(tmp_path / "run", "new")
+    assert content(tmp_path / "run")["faces.json"] == "new"
+
+
+@pytest.mark.parametrize("inside", ["target.toml", "overlays", "scratch/images", "."])
+def test_inputs_in_the_folder_are_refused_and_stay(tmp_path, inside):
+    make(tmp_path / "run", "old")
+    given = tmp_path / "run" / inside
+    before = content(tmp_path / "run")
+    claim = run_folder(tmp_path / "run", MARKER, {"images": tmp_path / "elsewhere", "--target": given})
+    with pytest.raises(InputError, match=r"--target .*: lies in the output folder .*copy it elsewhere"):
+        claim.__enter__()
+    assert content(tmp_path / "run") == before
+
+
+@pytest.mark.parametrize("name", ["models", "overlays", "faces.json"])
+def test_nothing_is_written_through_a_link(tmp_path, name):
+    make(tmp_path / "run", "old")
+    behind = tmp_path / "behind"
+    behind.mkdir()
+    (behind / "a.txt").write_text("mine")
+    place = tmp_path / "run" / name
+    if place.is_dir():
+        (place / "12" / "a.jpg").unlink()
+        (place / "12").rmdir()
+        place.rmdir()
+    place.unlink(missing_ok=True)
+    place.symlink_to(behind if name != "faces.json" else behind / "a.txt")
+    make(tmp_path / "run", "new")
+    assert not place.is_symlink()
+    assert content(behind) == {"a.txt": "mine"}
+
+
+@pytest.mark.parametrize("name", ["cache", "unfinished", "ready"])
+def test_a_folder_of_links_is_refused(tmp_path, name):
+    (tmp_path / "behind").mkdir()
+    (tmp_path / "run").mkdir()
+    (tmp_path / "run" / RUN_MARKER).write_text("{}")
+    (tmp_path / "run" / name).symlink_to(tmp_path / "behind")
+    with pytest.raises(InputError, match=f"{name} in it is a link; remove it"):
+        make(tmp_path / "run", "new")
