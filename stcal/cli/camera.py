@@ -21,9 +21,9 @@ def calibrate_camera(
         Path,
         typer.Argument(help="Read photographs that show the board from this folder, or from IMAGES/<group>/ as run."),
     ],
-    out: Annotated[Path, typer.Option("--out", help="Write the camera to this file, which must not exist.")] = Path(
-        "cameras.txt"
-    ),
+    out: Annotated[
+        Path, typer.Option("--out", writable=True, help="Write the camera to this file, which must not exist.")
+    ] = Path("cameras.txt"),
     target: TargetFile = None,
     board: BoardFile = None,
     model: Annotated[
@@ -34,7 +34,9 @@ def calibrate_camera(
     ] = "OPENCV",
     json_file: Annotated[
         Path | None,
-        typer.Option("--json", help="Write figures and checks to this file (JSON); beside --out if not given."),
+        typer.Option(
+            "--json", writable=True, help="Write figures and checks to this file (JSON); beside --out if not given."
+        ),
     ] = None,
     workers: Workers = None,
 ) -> None:

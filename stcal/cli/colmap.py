@@ -19,7 +19,10 @@ SHOWN_PAIRS = 10
 def export_database(
     run: Run,
     out: Annotated[
-        Path, typer.Argument(metavar="OUT.db", help="Write the copy to this new file; nothing is overwritten.")
+        Path,
+        typer.Argument(
+            metavar="OUT.db", writable=True, help="Write the copy to this new file; nothing is overwritten."
+        ),
     ],
     schema: Annotated[
         str,
@@ -43,7 +46,9 @@ def export_model(
     out: Annotated[
         Path,
         typer.Argument(
-            metavar="OUT", help="Write here: a new file for ply and nvm, a new or empty folder for the others."
+            metavar="OUT",
+            writable=True,
+            help="Write here: a new file for ply and nvm, a new or empty folder for the others.",
         ),
     ],
     kind: Annotated[
@@ -107,7 +112,7 @@ def faces(
     ],
     run: Annotated[Path, typer.Option("--run", help="Read the run in this folder, whose database was mapped.")],
     out: Annotated[
-        Path | None, typer.Option("--out", help="Also write the faces to this new file, as faces.json.")
+        Path | None, typer.Option("--out", writable=True, help="Also write the faces to this new file, as faces.json.")
     ] = None,
 ) -> None:
     """Find scale and faces from a COLMAP model made or edited elsewhere; labels come by (image, keypoint)."""

@@ -10,7 +10,6 @@ import typer
 from stcal.cli.options import JsonFile, ReportFile, Workers
 from stcal.cli.terminal import StageProgress, print_each, write
 from stcal.errors import InputError
-from stcal.io.saving import keep_apart
 
 if TYPE_CHECKING:
     from stcal.handeye.report.file import Outcome
@@ -95,21 +94,27 @@ def handeye(
         int, typer.Option("--splits", min=0, help="Cross-validate over this many splits; 0 for none.")
     ] = 15,
     seed: Annotated[int, typer.Option(min=0, help="Draw the splits with this seed.")] = 0,
-    out: Annotated[Path | None, typer.Option("--out", help="Write the result to this file (JSON).")] = None,
+    out: Annotated[
+        Path | None, typer.Option("--out", writable=True, help="Write the result to this file (JSON).")
+    ] = None,
     ros: Annotated[
-        Path | None, typer.Option("--ros", help="Write a static transform of ROS to this file (YAML, metres).")
+        Path | None,
+        typer.Option("--ros", writable=True, help="Write a static transform of ROS to this file (YAML, metres)."),
     ] = None,
     urdf: Annotated[
-        Path | None, typer.Option("--urdf", help="Write a fixed joint with its origin to this file (URDF, metres).")
+        Path | None,
+        typer.Option("--urdf", writable=True, help="Write a fixed joint with its origin to this file (URDF, metres)."),
     ] = None,
     opencv: Annotated[
-        Path | None, typer.Option("--opencv", help="Write OpenCV's FileStorage to this file (YAML, mm).")
+        Path | None, typer.Option("--opencv", writable=True, help="Write OpenCV's FileStorage to this file (YAML, mm).")
     ] = None,
     parent: Annotated[str, typer.Option(help="Name the flange or base like this in ROS and URDF.")] = "",
     child: Annotated[str, typer.Option(help="Name the camera like this in ROS and URDF.")] = "",
     camera_out: Annotated[
         Path | None,
-        typer.Option("--camera-out", help="Write the camera of --refine-camera with σ to this file (cameras.txt)."),
+        typer.Option(
+            "--camera-out", writable=True, help="Write the camera of --refine-camera with σ to this file (cameras.txt)."
+        ),
     ] = None,
     workers: Workers = None,
     json_file: JsonFile = None,
@@ -124,8 +129,6 @@ def handeye(
 
     robot, seen = (_radians(sigma_robot_deg), sigma_robot_mm), (_radians(sigma_camera_deg), sigma_camera_mm)
     noise = Noise(*robot, *seen, sigma_px, sigma_board_mm)
-    outputs = {"--out": out, "--ros": ros, "--urdf": urdf, "--opencv": opencv, "--camera-out": camera_out}
-    keep_apart(outputs | {"--json": json_file, "--report": report}, (source, poses, camera, board))
     _require_fitting(source, method, refine_camera, camera_out)
     if (parent or child) and not (ros or urdf):
         raise InputError("--parent, --child: only with --ros or --urdf, whose frames they name")

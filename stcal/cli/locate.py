@@ -9,7 +9,6 @@ import typer
 from stcal.cli.options import CameraFile, FlatBoardFile, JsonFile, LayoutFile, ReportFile, Workers
 from stcal.cli.terminal import StageProgress, print_each, write
 from stcal.errors import InputError
-from stcal.io.saving import keep_apart
 
 app = typer.Typer(
     name="stcal locate",
@@ -49,9 +48,9 @@ def calibrate(
     camera: CameraFile,
     board: FlatBoardFile,
     layout: LayoutFile,
-    out: Annotated[Path, typer.Option("--out", help="Write the calibrated layout to this file (TOML).")] = Path(
-        "calibrated.toml"
-    ),
+    out: Annotated[
+        Path, typer.Option("--out", writable=True, help="Write the calibrated layout to this file (TOML).")
+    ] = Path("calibrated.toml"),
     workers: Workers = None,
     json_file: JsonFile = None,
 ) -> None:
@@ -63,7 +62,6 @@ def calibrate(
     from stcal.locate.report.calibration import calibrated_file, calibrated_text, warnings
     from stcal.workflows.locate import calibration_images
 
-    keep_apart({"--out": out, "--json": json_file}, (layout, board, camera))
     plan, design, model = load_plan(layout), load_flat_board(board), read_camera(camera)
     dictionaries = tuple(dict.fromkeys(dictionary for dictionary, _ in plan.tags))
     with StageProgress() as progress:
@@ -85,7 +83,9 @@ def run(
     ],
     layout: LayoutFile,
     camera: CameraFile,
-    out: Annotated[Path | None, typer.Option("--out", help="Write the accepted poses to this file (CSV).")] = None,
+    out: Annotated[
+        Path | None, typer.Option("--out", writable=True, help="Write the accepted poses to this file (CSV).")
+    ] = None,
     method: Annotated[
         MethodName, typer.Option(help="Use joint, all exposures together, or patent, each by itself as published.")
     ] = MethodName.joint,
@@ -166,8 +166,6 @@ def run(
     from stcal.locate.report.located import LocatedFile
     from stcal.locate.report.tables import accepted, poses_csv, run_text
 
-    inputs = (layout, camera, hand_eye, robot_poses, offset)
-    keep_apart({"--out": out, "--json": json_file, "--report": report}, inputs)
     if hand_eye is None and (robot_poses or offset):
         raise InputError("--robot-poses, --offset: only with --hand-eye, which leads from the camera to the robot")
     chain = read_chain(hand_eye, robot_poses, offset) if hand_eye else None

@@ -8,6 +8,7 @@ import typer
 
 import stcal
 from stcal.cli import camera, capture, colmap, handeye, locate, measure, register, robot, sfm, simulate
+from stcal.cli.options import protect_inputs
 from stcal.errors import StcalError
 
 INTERRUPTED = 130
@@ -33,6 +34,7 @@ app.add_typer(robot.app, name="robot")
 app.add_typer(locate.app, name="locate")
 app.command(name="handeye")(handeye.handeye)
 app.command("register")(register.register)
+protect_inputs(app)
 
 
 @sfm.app.callback(invoke_without_command=True)

@@ -10,7 +10,6 @@ from stcal.cli.terminal import StageProgress, print_each, write
 from stcal.errors import InputError
 from stcal.io.camera import read_camera
 from stcal.io.design import load_board, target_of
-from stcal.io.saving import keep_apart
 
 app = typer.Typer()
 
@@ -21,13 +20,15 @@ def measure(
     camera: CameraFile,
     faces: Annotated[Path, typer.Option("--faces", help="Read the calibrated target from this faces.json.")],
     target: TargetFile = None,
-    out: Annotated[Path, typer.Option("--out", help="Write the table of poses to this file (CSV).")] = Path(
-        "poses.csv"
-    ),
+    out: Annotated[
+        Path, typer.Option("--out", writable=True, help="Write the table of poses to this file (CSV).")
+    ] = Path("poses.csv"),
     json_file: Annotated[
         Path | None,
         typer.Option(
-            "--json", help="Also write everything to this file, both solutions of an undecided image too (JSON)."
+            "--json",
+            writable=True,
+            help="Also write everything to this file, both solutions of an undecided image too (JSON).",
         ),
     ] = None,
     report: ReportFile = None,
@@ -64,7 +65,6 @@ def measure(
     from stcal.sfm.measure.pose import PoseOptions
     from stcal.sfm.measure.target import read_target
 
-    keep_apart({"--out": out, "--json": json_file, "--report": report}, (camera, faces, target, board, joints))
     for path in (out, json_file, report):
         if path is not None and not path.parent.is_dir():
             raise InputError(f"{path}: no folder {path.parent}; make it, or give another place")

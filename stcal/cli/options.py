@@ -1,11 +1,15 @@
 """Options that several commands share."""
 
+import inspect
+from collections.abc import Callable
+from functools import wraps
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, get_args
 
 import typer
 
 from stcal.errors import InputError
+from stcal.io.saving import keep_apart
 
 if TYPE_CHECKING:
     from stcal.sfm.detect.ellipses import EllipseOptions
@@ -30,9 +34,12 @@ RobotFile = Annotated[
     Path, typer.Option("--robot", help="Read the robot from this file (TOML); `stcal robot init` writes one.")
 ]
 LayoutFile = Annotated[Path, typer.Option("--layout", help="Read the target's tags from this file (TOML).")]
-JsonFile = Annotated[Path | None, typer.Option("--json", help="Also write everything to this file (JSON).")]
+JsonFile = Annotated[
+    Path | None, typer.Option("--json", writable=True, help="Also write everything to this file (JSON).")
+]
 ReportFile = Annotated[
-    Path | None, typer.Option("--report", help="Also write a page with tables and plots to this file (HTML).")
+    Path | None,
+    typer.Option("--report", writable=True, help="Also write a page with tables and plots to this file (HTML)."),
 ]
 Workers = Annotated[
     int | None, typer.Option("--workers", min=1, help="Use this many processes; one per core if not given.")
@@ -55,3 +62,41 @@ def ellipse_options(min_diameter: float | None, max_diameter: float) -> "Ellipse
     if min_diameter is not None and max_diameter <= min_diameter:
         raise InputError(f"--max-diameter {max_diameter:g} px, more than --min-diameter {min_diameter:g} px needed")
     return EllipseOptions(min_diameter_px=min_diameter, max_diameter_px=max_diameter)
+
+
+def protect_inputs(application: typer.Typer) -> None:
+    """Let no command of an application write over what it was given to read: every path among its parameters is an
+    input, but those whose option says that it is ``writable``."""
+    for command in application.registered_commands:
+        if command.callback is not None:
+            command.callback = _protected(command.callback)
+    for group in application.registered_groups:
+        if group.typer_instance is not None:
+            protect_inputs(group.typer_instance)
+
+
+def _protected(command: Callable) -> Callable:
+    if hasattr(command, "outputs"):  # reached through two applications
+        return command
+    words, outputs = {}, set()
+    for name, parameter in inspect.signature(command, eval_str=True).parameters.items():
+        for info in get_args(parameter.annotation)[1:]:
+            # With Annotated, Typer takes an option's first name for its default.
+            names = [each for each in (info.default, *(info.param_decls or ())) if isinstance(each, str)]
+            words[name] = names[0] if names else name
+            outputs |= {name} if getattr(info, "writable", False) else set()
+
+    @wraps(command)
+    def checked(**given):
+        paths = {
+            name: path
+            for name, value in given.items()
+            for path in (value if isinstance(value, list | tuple) else [value])
+            if isinstance(path, Path)
+        }
+        written, read = ({words[n]: p for n, p in paths.items() if (n in outputs) == own} for own in (True, False))
+        keep_apart(written, read)
+        return command(**given)
+
+    checked.outputs = frozenset(outputs)  # type: ignore[attr-defined]
+    return checked

@@ -9,7 +9,6 @@ import typer
 from stcal.cli.options import ReportFile
 from stcal.cli.terminal import print_each, write
 from stcal.errors import ConvergenceError, DegenerateError, InputError
-from stcal.io.saving import keep_apart
 
 
 class ModelName(StrEnum):
@@ -53,9 +52,14 @@ def register(
         typer.Option("--robot", help="Solve base and kinematics of this robot (TOML) together; PAIRS needs q1_deg …."),
     ] = None,
     identified: Annotated[
-        Path | None, typer.Option("--identified", help="Write the robot identified with --robot to this file (TOML).")
+        Path | None,
+        typer.Option(
+            "--identified", writable=True, help="Write the robot identified with --robot to this file (TOML)."
+        ),
     ] = None,
-    out: Annotated[Path | None, typer.Option("--out", help="Write everything to this file (JSON).")] = None,
+    out: Annotated[
+        Path | None, typer.Option("--out", writable=True, help="Write everything to this file (JSON).")
+    ] = None,
     report: ReportFile = None,
 ) -> None:
     """Find b_from_a from points measured in two frames, some of them wrong; with σ, outliers and where it holds."""
@@ -65,7 +69,6 @@ def register(
     from stcal.register.report.page import registration_page, registration_text
     from stcal.register.workspace.findings import findings
 
-    keep_apart({"--out": out, "--report": report, "--identified": identified}, (pairs_file, robot_file))
     if identified and not robot_file:
         raise InputError(f"--identified {identified}: only with --robot FILE")
     pairs = read_pairs(pairs_file)

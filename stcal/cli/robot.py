@@ -10,7 +10,6 @@ import typer
 from stcal.cli.options import JsonFile, ReportFile, RobotFile
 from stcal.cli.terminal import print_each, write
 from stcal.errors import DegenerateError, InputError
-from stcal.io.saving import keep_apart
 
 app = typer.Typer(
     name="stcal robot",
@@ -23,7 +22,9 @@ app = typer.Typer(
 
 @app.command()
 def init(
-    file: Annotated[Path, typer.Argument(help="Write the robot file here; it must not exist.")] = Path("robot.toml"),
+    file: Annotated[Path, typer.Argument(writable=True, help="Write the robot file here; it must not exist.")] = Path(
+        "robot.toml"
+    ),
 ) -> None:
     """Write an example of a robot file, to edit: a six-axis arm of 2 m reach."""
     from stcal.robot.kinematics.example import mh80
@@ -46,7 +47,8 @@ def axes(
     ],
     robot_file: RobotFile,
     out: Annotated[
-        Path | None, typer.Option("--out", help="Write the robot that the axes make to this file (TOML).")
+        Path | None,
+        typer.Option("--out", writable=True, help="Write the robot that the axes make to this file (TOML)."),
     ] = None,
     still_deg: Annotated[
         float,
@@ -61,7 +63,6 @@ def axes(
     from stcal.robot.kinematics.file import load_robot, robot_toml
     from stcal.robot.kinematics.measurements import read_measurements
 
-    keep_apart({"--out": out, "--json": json_file, "--report": report}, (sweeps, robot_file))
     nominal = load_robot(robot_file)
     data = read_measurements(sweeps, nominal)
     result = robot_from_sweeps(data, nominal, math.radians(still_deg))
@@ -90,7 +91,9 @@ def identify(
         typer.Argument(metavar="DATA", help="Read joint values with what was measured there from this file (CSV)."),
     ],
     robot_file: RobotFile,
-    out: Annotated[Path | None, typer.Option("--out", help="Write the identified robot to this file (TOML).")] = None,
+    out: Annotated[
+        Path | None, typer.Option("--out", writable=True, help="Write the identified robot to this file (TOML).")
+    ] = None,
     observe: Annotated[
         Kind | None, typer.Option(help="Use this of the measurements; the most that was measured if not given.")
     ] = None,
@@ -125,7 +128,6 @@ def identify(
     from stcal.robot.kinematics.file import load_robot, robot_toml
     from stcal.robot.kinematics.measurements import read_measurements
 
-    keep_apart({"--out": out, "--json": json_file, "--report": report}, (data_file, robot_file))
     nominal = load_robot(robot_file)
     data = read_measurements(data_file, nominal)
     kind = observe.value if observe else None
@@ -149,7 +151,9 @@ def compensate(
     ] = None,
     out: Annotated[
         Path | None,
-        typer.Option("--out", help="Write joint values to send, with status and errors, to this file (CSV)."),
+        typer.Option(
+            "--out", writable=True, help="Write joint values to send, with status and errors, to this file (CSV)."
+        ),
     ] = None,
     json_file: JsonFile = None,
     report: ReportFile = None,
@@ -158,7 +162,6 @@ def compensate(
     from stcal.robot.kinematics.file import load_robot
     from stcal.robot.use import compensation as stage
 
-    keep_apart({"--out": out, "--json": json_file, "--report": report}, (targets, robot_file, nominal))
     identified = load_robot(robot_file)
     wanted = stage.read_targets(targets, identified)
     result = stage.compensate(identified, wanted, load_robot(nominal) if nominal else None)
@@ -185,7 +188,8 @@ def verify(
         typer.Argument(help="Read commanded_x_mm … beside measured x_mm … from this file; set: before, after (CSV)."),
     ],
     plot: Annotated[
-        Path | None, typer.Option("--plot", help="Draw the error of each pose and set to this file (.png or .svg).")
+        Path | None,
+        typer.Option("--plot", writable=True, help="Draw the error of each pose and set to this file (.png or .svg)."),
     ] = None,
     json_file: JsonFile = None,
     report: ReportFile = None,
@@ -195,7 +199,6 @@ def verify(
 
     if plot and plot.suffix.lower() not in (".png", ".svg"):
         raise InputError(f"--plot {plot}: a name ending in .png or .svg needed")
-    keep_apart({"--plot": plot, "--json": json_file, "--report": report}, (measured,))
     result = stage.verify(stage.read_measured(measured))
     print(stage.verified_text(result))
     print_each("warning", result.warnings())
@@ -223,7 +226,9 @@ def design(
     robot_file: RobotFile,
     count: Annotated[int, typer.Option(min=1, max=2000, help="Choose this many poses.")] = 40,
     seed: Annotated[int, typer.Option(min=0, help="Draw the candidates with this seed.")] = 0,
-    out: Annotated[Path | None, typer.Option("--out", help="Write the poses to this file (CSV).")] = None,
+    out: Annotated[
+        Path | None, typer.Option("--out", writable=True, help="Write the poses to this file (CSV).")
+    ] = None,
     observe: Annotated[
         ObservedKind, typer.Option(help="Plan for an instrument that measures this.")
     ] = ObservedKind.position,
@@ -248,7 +253,6 @@ def design(
     options = stage.DesignOptions(
         count, seed, observe.value, candidates, sigma_mm, sigma_rad, _box(box) if box else None, target
     )
-    keep_apart({"--out": out, "--json": json_file, "--report": report}, (robot_file,))
     robot = load_robot(robot_file)
     result = stage.design(robot, options)
     print(stage.design_text(result))

@@ -14,12 +14,11 @@ import cv2
 import numpy as np
 
 from stcal.errors import InputError
+from stcal.io.saving import RUN_MARKER
 
 SUFFIXES = (".jpg", ".jpeg", ".png", ".tif", ".tiff", ".bmp")
 TOP_GROUP = "."
 """Name of the group that images lying directly in the folder form."""
-RUN_MARKER = "stcal-run.json"
-"""A folder that holds this file is a run's output and never a group of images."""
 
 THUMBNAIL_PX = 1400
 THUMBNAIL_QUALITY = 80

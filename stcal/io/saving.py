@@ -2,11 +2,36 @@
 
 import json
 import os
-from collections.abc import Sequence
+from collections.abc import Mapping
 from contextlib import suppress
 from pathlib import Path
 
 from stcal.errors import InputError
+
+RUN_MARKER = "stcal-run.json"
+"""Tells a run's folder from others."""
+CAMERA, TARGET, BOARD = "cameras.txt", "target.toml", "board.toml"
+"""Copies of what a run was given."""
+RUN_ENTRIES = (
+    RUN_MARKER,
+    "faces.json",
+    "report.json",
+    "report.html",
+    "labels.csv",
+    "detections.csv",
+    "database.db",
+    CAMERA,
+    TARGET,
+    BOARD,
+    "models",
+    "target_model",
+    "overlays",
+)
+"""What a run makes, in the order in which it takes its place: the marker says what the rest is."""
+UNFINISHED, READY, CACHE = "unfinished", "ready", "cache"
+"""Folders in it: of a run that is going on, of results about to take their places, of what later runs take up."""
+HEAD_BYTES = 400
+"""Of a result file, which hold its format."""
 
 
 def save(path: Path, content: str | bytes) -> None:
@@ -40,28 +65,41 @@ def json_text(content) -> str:
     return json.dumps(plain, indent=1, ensure_ascii=False, allow_nan=False) + "\n"
 
 
-def keep_apart(outputs: dict[str, Path | None], inputs: Sequence[Path | None]) -> None:
-    """Refuse, before the work, files that would replace an input or each other.
+def keep_apart(outputs: Mapping[str, Path], inputs: Mapping[str, Path]) -> None:
+    """Refuse, before the work, files that would replace an input, a file among the inputs, or each other.
 
     Parameters
     ----------
-    outputs : by option
+    outputs, inputs : by option; an input may be a folder
 
     Raises
     ------
     InputError
-        Which, and what they would replace.
+        Which, and what it would replace.
     """
     places: dict[Path, str] = {}
-    own = {path.resolve() for path in inputs if path}
     for option, path in outputs.items():
-        if not path:
-            continue
         place = path.resolve()
-        if place in own:
-            raise InputError(f"{option} {path}: is an input of this command; give another name")
+        for given, read in inputs.items():
+            own = read.resolve()
+            if place == own:
+                raise InputError(f"{option} {path}: is an input of this command; give another name")
+            if own in place.parents and place.exists() and not _is_ours(place, own):
+                raise InputError(f"{option} {path}: is a file of {given} {read}; give another name")
         if place in places:
             raise InputError(f"{option} {path}: is also what {places[place]} writes; give each its own name")
         if place.is_dir():
             raise InputError(f"{option} {path}: is a folder; the name of a file needed")
         places[place] = option
+
+
+def _is_ours(place: Path, folder: Path) -> bool:
+    """Whether a file in an input folder is one that an earlier command left there beside the inputs: in a run's folder
+    whatever no run makes, elsewhere a result file of the package."""
+    if (folder / RUN_MARKER).exists():
+        return place.relative_to(folder).parts[0] not in {*RUN_ENTRIES, UNFINISHED, READY, CACHE}
+    try:
+        with open(place, "rb") as stream:
+            return b'"format": "stcal' in stream.read(HEAD_BYTES)
+    except OSError:
+        return False

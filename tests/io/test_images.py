@@ -9,7 +9,8 @@ import numpy as np
 import pytest
 
 from stcal.errors import InputError
-from stcal.io.images import RUN_MARKER, TOP_GROUP, decode, find_images
+from stcal.io.images import TOP_GROUP, decode, find_images
+from stcal.io.saving import RUN_MARKER
 
 
 def encoded(suffix, image=None, params=()):

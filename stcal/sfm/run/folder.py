@@ -11,7 +11,7 @@ from stcal.design import TargetDesign
 from stcal.errors import InputError
 from stcal.io.camera import CalibratedCamera, write_cameras_txt
 from stcal.io.design import board_toml, target_toml
-from stcal.io.saving import json_text, save
+from stcal.io.saving import BOARD, CAMERA, TARGET, json_text, save
 from stcal.parallel import Progress
 from stcal.sfm.adjust.file import FacesFile
 from stcal.sfm.data.model import GroupModel
@@ -24,7 +24,7 @@ from stcal.sfm.mapping.models import write_model
 from stcal.sfm.report.page import report_html, shown_overlays
 from stcal.sfm.run.output import report_of
 from stcal.sfm.run.result import RunResult
-from stcal.sfm.run.saved import BOARD, CAMERA, TARGET, SavedRun
+from stcal.sfm.run.saved import SavedRun
 
 
 def write_overlays(

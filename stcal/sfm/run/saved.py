@@ -14,8 +14,8 @@ from stcal.geometry.arrays import frozen
 from stcal.geometry.camera import Camera
 from stcal.io.camera import CalibratedCamera, read_camera
 from stcal.io.design import load_board, load_target
-from stcal.io.images import RUN_MARKER
 from stcal.io.json import checked, read_json
+from stcal.io.saving import BOARD, CAMERA, RUN_MARKER, TARGET
 from stcal.sfm.adjust.file import FacesFile
 from stcal.sfm.data.observations import ImageObservations, by_group
 from stcal.sfm.detect.ellipses import EllipseOptions
@@ -23,7 +23,7 @@ from stcal.sfm.mapping.pairs import PairOptions
 from stcal.sfm.run.marker import MarkerFile
 from stcal.sfm.run.options import RunOptions
 from stcal.sfm.run.report import ReportRead
-from stcal.sfm.run.transaction import BOARD, CAMERA, TARGET, complete
+from stcal.sfm.run.transaction import complete
 
 AGAIN = "run it again"
 COVARIANCE = ("var_x_px2", "cov_xy_px2", "var_y_px2")

@@ -16,30 +16,11 @@ from pathlib import Path
 import filelock
 
 from stcal.errors import InputError, StcalError
-from stcal.io.images import RUN_MARKER
-from stcal.io.saving import json_text, save
+from stcal.io.saving import CACHE, READY, RUN_ENTRIES, RUN_MARKER, UNFINISHED, json_text, save
 from stcal.sfm.run.marker import MarkerFile
 
-CAMERA, TARGET, BOARD = "cameras.txt", "target.toml", "board.toml"
-"""Copies of what the run was given."""
-RESULTS = (
-    RUN_MARKER,
-    "faces.json",
-    "report.json",
-    "report.html",
-    "labels.csv",
-    "detections.csv",
-    "compare.json",
-    "database.db",
-    CAMERA,
-    TARGET,
-    BOARD,
-    "models",
-    "target_model",
-    "overlays",
-)
-"""What a run makes, in the order in which it takes its place: the marker says what the rest is."""
-UNFINISHED, READY, CACHE = "unfinished", "ready", "cache"
+RESULTS = (*RUN_ENTRIES, "compare.json")
+"""What new results replace, or take away where they have none of it."""
 HOLDER, ENTRIES, LOCK = "holder.txt", "entries.txt", "lock"
 DATABASE_SIDES = ("-wal", "-shm", "-journal")
 

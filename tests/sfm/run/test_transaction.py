@@ -9,7 +9,7 @@ from contextlib import suppress
 import pytest
 
 from stcal.errors import DetectionError, InputError
-from stcal.io.images import RUN_MARKER
+from stcal.io.saving import RUN_MARKER
 from stcal.sfm.run.marker import MarkerFile
 from stcal.sfm.run.options import RunOptions
 from stcal.sfm.run.transaction import READY, RESULTS, complete, run_folder

@@ -1,0 +1,90 @@
+"""No command writes over what it was given to read: walked over all commands and all their options."""
+
+import inspect
+from pathlib import Path
+from typing import get_args
+
+import pytest
+
+from stcal.cli.main import app
+from stcal.errors import InputError
+from stcal.io.saving import RUN_ENTRIES, RUN_MARKER, keep_apart
+
+FOLDERS = {("run", "out"), ("detect", "out"), ("init", "folder"), ("simulate", "folder"), ("demo", "out")}
+"""Outputs that are folders: new ones, or those of `tests/sfm/run/test_transaction.py`."""
+WRITES = ("Write ", "Also write ", "Draw ", "Keep ")
+
+
+def commands(application, found):
+    for command in application.registered_commands:
+        found[command.callback.__module__, command.callback.__name__] = command.callback
+    for group in application.registered_groups:
+        commands(group.typer_instance, found)
+    return list(found.values())
+
+
+COMMANDS = commands(app, {})
+
+
+def paths(command) -> dict[str, str]:
+    """Parameters that are paths, with their help."""
+    return {
+        name: get_args(parameter.annotation)[1].help
+        for name, parameter in inspect.signature(command, eval_str=True).parameters.items()
+        if "Path" in str(parameter.annotation)
+    }
+
+
+PAIRS = [
+    pytest.param(command, output, read, id=f"{command.__name__}-{output}-{read}")
+    for command in COMMANDS
+    for output in sorted(command.outputs)
+    for read in paths(command)
+    if read not in command.outputs and (command.__name__, read) not in FOLDERS
+]
+
+
+def test_every_option_that_writes_is_known():
+    for command in COMMANDS:
+        for name, says in paths(command).items():
+            writes = name in command.outputs or (command.__name__, name) in FOLDERS
+            assert writes == says.startswith(WRITES), (command.__name__, name, says)
+    assert len(PAIRS) > 60
+
+
+@pytest.mark.parametrize(("command", "output", "read"), PAIRS)
+def test_no_output_replaces_an_input(command, output, read, tmp_path):
+    """The file itself, by another way to it, and a file in a folder that is read."""
+    own = tmp_path / "given"
+    own.write_text("mine")
+    given = dict.fromkeys(paths(command))
+    for place in (own, tmp_path / "." / "x" / ".." / "given"):
+        with pytest.raises(InputError, match="is an input of this command; give another name"):
+            command(**given | {read: own, output: place})
+    with pytest.raises(InputError, match="is a file of "):
+        command(**given | {read: tmp_path, output: own})
+    assert own.read_text() == "mine"
+
+
+def test_a_file_beside_a_runs_own_is_written_again(tmp_path):
+    for name in (RUN_MARKER, "doctor.json", "faces.json"):
+        (tmp_path / name).write_text("{}")
+    keep_apart({"--json": tmp_path / "doctor.json"}, {"run": tmp_path})
+    for name in RUN_ENTRIES:
+        (tmp_path / name).touch()
+        with pytest.raises(InputError, match="is a file of run"):
+            keep_apart({"--json": tmp_path / name}, {"run": tmp_path})
+
+
+def test_a_result_file_in_a_folder_of_images_is_written_again(tmp_path):
+    (tmp_path / "poses.json").write_text('{\n "format": "stcal poses 1"\n}')
+    (tmp_path / "a.jpg").write_bytes(b"x")
+    keep_apart({"--json": tmp_path / "poses.json"}, {"images": Path(tmp_path)})
+    keep_apart({"--json": tmp_path / "new.json"}, {"images": Path(tmp_path)})
+    with pytest.raises(InputError, match="is a file of images"):
+        keep_apart({"--out": tmp_path / "a.jpg"}, {"images": tmp_path})
+
+
+def test_two_outputs_are_kept_apart(tmp_path):
+    with pytest.raises(InputError, match="is also what --out writes"):
+        keep_apart({"--out": tmp_path / "a", "--json": tmp_path / "a"}, {})
