@@ -1,0 +1,113 @@
+"""Light that differs from plane to plane, and circles and boards that are covered, cost what is covered and no more.
+
+Labels are judged by the truth of rendered photographs: one is right within 1.5 px, or a quarter of its radius, of its
+circle's ellipse. Neighbours are three radii apart at least, so that no wrong label passes, and the centres of what must
+be found are off by hundredths. "All" therefore means all, without a tolerance.
+"""
+
+import numpy as np
+import pytest
+
+from stcal.design import reference_board, reference_target
+from stcal.sfm.detect.ellipses import EllipseOptions
+from stcal.sfm.detect.image import read_image
+from stcal.synthetic import degrade
+from tests.sfm.detect.degraded import KINDS
+
+FIRST = "12/IMG_1000"
+OTHERS = [pytest.param(group, marks=pytest.mark.slow) for group in ("14", "15", "23")]
+
+
+def read(bench, pixels):
+    return read_image(
+        degrade.stored(pixels), bench.data.camera, reference_target(), reference_board(), EllipseOptions()
+    )
+
+
+@pytest.mark.parametrize("face", ["1", "2"])
+def test_an_image_alone_reads_a_face_five_times_as_dark_as_the_rest(bench, face):
+    """No other image helps: circles of 35 grey values beside the other face's and the board's of 180."""
+    photo = bench.groups("12").photographs[0]
+    (dark,) = [plane for plane in photo.faces if plane.name == face]
+    reading = read(bench, degrade.brightened(photo.grey, photo.face_region(dark), 0.2))
+    assert {each.face.id: each.count() for each in reading.faces.faces} == {"1": 10, "2": 10}
+    assert [len(board.candidates) for board in reading.boards] == [63]
+
+
+@pytest.mark.parametrize("factor", [3.0, 1 / 3])
+def test_an_image_alone_reads_a_board_in_other_light_than_the_target(bench, factor):
+    """Exposed for the brighter of the two, as a camera does."""
+    photo = bench.groups("12").photographs[0]
+    pixels = KINDS["board brighter"].make(photo, factor, None).pixels
+    on_board = photo.face_region(photo.board) > 0.99
+    before, after = (float(np.percentile(image[on_board], 99)) for image in (photo.grey, pixels))
+    target = photo.face_region(photo.faces[0]) > 0.99
+    darker = float(np.percentile(pixels[target], 99) / np.percentile(photo.grey[target], 99))
+    assert after / before / darker == pytest.approx(factor, rel=0.02)  # light, not exposure
+    reading = read(bench, pixels)
+    assert {each.face.id: each.count() for each in reading.faces.faces} == {"1": 10, "2": 10}
+    assert [len(board.candidates) for board in reading.boards] == [63]
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("group", ["12", "14", "15", "23"])
+@pytest.mark.parametrize(("kind", "value"), [("face dimmed", 0.2), ("board brighter", 3), ("board brighter", 1 / 3)])
+def test_all_circles_are_labelled_whatever_light_a_plane_has(bench, kind, value, group):
+    """The face dimmed is the one that most images show."""
+    bench.label(kind, value, group).assert_all_found()
+
+
+@pytest.mark.parametrize("group", ["12", *OTHERS])
+def test_three_of_ten_circles_of_every_face_hidden_in_every_image(bench, group):
+    """Others in each image, at random: of those in view all are found, and none of the hidden ones."""
+    found = bench.label("circles hidden", 3, group)
+    found.assert_all_found()
+    for name, picture in found.pictures.items():
+        assert len(picture.hidden) >= 6
+        assert not picture.hidden & found.labels(name)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("group", ["12", "14", "15", "23"])
+def test_four_of_ten_circles_of_every_face_hidden_in_every_image(bench, group):
+    """Six circles are the fewest that name a face; where chance leaves them alike on several faces, and no image of the
+    group tells them, a face may be missing: four of five circles are to be found. A wrong one is never to be."""
+    found = bench.label("circles hidden", 4, group)
+    found.assert_all_found(0.8)
+    for name, picture in found.pictures.items():
+        assert len(picture.hidden) >= 8
+        assert not picture.hidden & found.labels(name)
+
+
+def test_a_strip_over_the_first_images_board_leaves_the_others_theirs(bench):
+    """Three of nine columns, or two of seven rows, whole or in part. The first keeps what is left."""
+    found = bench.label("one board covered", 0.3)
+    picture = found.pictures[FIRST]
+    assert 14 <= sum(label.startswith("board:") for label in picture.hidden | picture.waived) <= 27
+    found.assert_all_found()
+    for name in found.images:
+        hidden, waived = (
+            sum(label.startswith("board:") for label in labels) if name == FIRST else 0
+            for labels in (picture.hidden, picture.waived)
+        )
+        assert 63 - hidden - waived <= len(found.labels(name, "board")) <= 63 - hidden
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("value", [0.2, 0.3, 0.4])
+@pytest.mark.parametrize("group", ["12", "14", "15"])
+def test_circles_cut_by_a_part_of_their_area_take_no_other_with_them(bench, value, group):
+    """Four of ten of every face, and a tenth of the board: every other one is found. The ellipse of what is left of a
+    circle is 0.25 radii off at a fifth of its area, 0.42 at two fifths; of those over 10 px in radius none is. (Smaller
+    ones have 1.5 px of slack, against a plane that so many cut circles pull along.)"""
+    found = bench.label("circles cut", value, group)
+    assert (found.counts["found"], found.counts["dots"]) == (found.counts["must"], found.counts["must_dots"])
+    large = 0
+    for photo in bench.groups(group).photographs:
+        name, ellipses = photo.name.rpartition(".")[0], photo.ellipses()
+        observed = found.images[name].observations
+        for label, xy in zip(observed.labels, observed.centre_px, strict=True):
+            if label.plane != "board" and ellipses[label][1] > 10:
+                large += 1
+                assert np.linalg.norm(xy - ellipses[label][0]) < 0.25 * ellipses[label][1], (name, label)
+    assert large > 10

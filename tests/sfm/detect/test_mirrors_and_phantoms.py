@@ -1,0 +1,164 @@
+"""What is not the target: mirror images of its faces, mirrored files, printed grids, plates with a face's pattern.
+
+Rendered photographs are judged as in ``test_light_and_cover``.
+"""
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from stcal.errors import DetectionError
+from stcal.geometry.rigid import Rigid
+from stcal.io.images import ImageFile
+from stcal.sfm.data.centres import Centres
+from stcal.sfm.detect.files import DetectedImage, require_upright
+from stcal.sfm.detect.labels import label_groups
+from stcal.sfm.detect.sightings import FaceSighting, ImageDetection
+from stcal.synthetic import degrade
+from tests.sfm.detect.degraded import study
+from tests.sfm.detect.test_arrangement import FOCAL_PX, TARGET, Seen, plane_centres
+
+FIRST = "12/IMG_1000"
+ALL = ("12", "14", "15", "23")
+MIRRORS = {"vertical": np.array([0.0, 0.0, 1.0]), "floor": np.array([0.0, -1.0, 0.0])}
+"""Normals, target frame, whose y axis points down: the vertical one stands behind face 3."""
+OFF_MM = 40.0
+
+
+def mirrored_in(kind):
+    """A mirror, ``OFF_MM`` off the target's circles, that shows all its faces ``value`` times as bright to group 12."""
+
+    def make(photo, value, case):
+        if photo.group != "12":
+            return study.Picture(photo.grey)
+        normal = MIRRORS[kind]
+        at = (np.array(list(case.data.truth["circles"].values())) @ normal).min() - OFF_MM
+        motion = np.eye(3) - 2 * np.outer(normal, normal), 2 * at * normal
+        planes = study.facing(photo, study.all_faces(photo), motion)
+        assert study.visible_share(photo, planes, 1 - photo.foreground()) > 0.9  # a whole face: enough to mislead
+        circle, plate = photo.levels(photo.faces[0])
+        return study.Picture(degrade.behind(photo, planes, [(value * circle, value * plate)] * len(planes), 15.0))
+
+    return make
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("kind", MIRRORS)
+def test_a_mirror_image_of_the_target_gives_no_wrong_label(bench, kind):
+    """One group of four sees it. That group alone could not tell a face that it does not show from its image."""
+    found = bench.label(mirrored_in(kind), 0.7, *ALL)
+    found.assert_all_found()
+    assert "a pattern like face 3: not where other groups see that face" in found.notes()
+    assert "a pattern like face 4: the image of another face in a mirror" in found.notes()
+
+
+@pytest.mark.slow
+def test_a_mirror_at_another_place_in_every_group_gives_no_wrong_label(bench):
+    """In each the one of 26 of which its photographs show most."""
+    bench.label("reflection", 0.7, *ALL).assert_all_found()
+
+
+@pytest.fixture(scope="module")
+def two_groups(scene, labels_only):
+    """Exact observations of groups 12 and 23."""
+    seen = labels_only.observations(scene, 0.003, np.random.default_rng(0))
+    return [[o for o in seen if o.group == group] for group in scene.groups if "2" in group]
+
+
+def test_a_face_that_another_group_has_elsewhere_goes_out(scene, two_groups):
+    """The first group sees face 1 on a shiny floor as face 3, but for one circle; the second has the real face 3 beside
+    face 2. Without it nothing contradicts."""
+    own, other = two_groups
+    assert {face for o in other for face in o.face_ids()} >= {"2", "3"}
+    face = TARGET.face("3")
+    target_from_image = scene.target_from_face["3"] @ Rigid.exp([0.1, 0.0, 0.0, 30, 250, 20])
+    seen = [Seen(o) for o in own]
+    for each, pose in zip(seen, scene.groups[own[0].group].camera_from_target, strict=True):
+        each.face("3", plane_centres(pose @ target_from_image, face.xy_mm[:9]), range(9))
+    named = [(o.name, o.group, s.detection()) for o, s in zip(own, seen, strict=True)]
+    real = [(o.name, o.group, Seen(o).detection()) for o in other]
+    (alone,) = label_groups([named], scene.target, scene.board, FOCAL_PX)
+    assert all("3" in each.observations.face_ids() for each in alone[0])
+    together = label_groups([named, real], scene.target, scene.board, FOCAL_PX)
+    for results, observed in zip(together, (own, other), strict=True):
+        for result, o in zip(results[0], observed, strict=True):
+            assert set(result.observations.labels) == set(o.labels)
+    notes = [note for each in together[0][0] for note in each.notes]
+    assert sum("a pattern like face 3: not where other groups see that face" in note for note in notes) == len(own)
+
+
+def test_one_mirrored_image_loses_its_labels_and_says_so(bench):
+    found = bench.label("mirrored", "one image")
+    found.assert_all_found()
+    assert found.labels(FIRST) == set()
+    (note,) = found.images[FIRST].notes
+    assert note.startswith("the image is mirrored: it shows face ")
+    assert all(image.notes == () for name, image in found.images.items() if name != FIRST)
+    assert found.counts["must"] == 3 * 10  # of the two others
+    assert found.counts["must_dots"] == 2 * 63
+
+
+def detected(name, faces=(), mirrored=()):
+    """An image that shows these faces, or these as a mirror does."""
+    nothing = Centres(*(np.zeros((0, *shape)) for shape in ((2,), (2,), (2, 2), (2, 2), *[()] * 4, (2,), ())))
+    sightings = tuple(FaceSighting(face, np.zeros(0, int), np.zeros(0, int)) for face in faces)
+    detection = ImageDetection(nothing, sightings, (), mirrored)
+    return DetectedImage(ImageFile(Path(name), name, "12"), detection, name, b"", 1.0, False)
+
+
+def images(mirrored, upright, empty=0):
+    return (
+        *(detected(f"m{i}", mirrored=("2", "5")) for i in range(mirrored)),
+        *(detected(f"u{i}", faces=("1",)) for i in range(upright)),
+        *(detected(f"e{i}") for i in range(empty)),
+    )
+
+
+@pytest.mark.parametrize(("mirrored", "upright", "empty"), [(1, 0, 0), (3, 2, 0), (3, 2, 40), (12, 0, 0)])
+def test_a_set_that_is_mostly_mirrored_is_refused(mirrored, upright, empty):
+    """Images without a face say nothing of it."""
+    words = f"{mirrored} of {mirrored + upright} images with a face are mirrored, first m0: face 2, 5 is seen as in a"
+    with pytest.raises(DetectionError, match=words):
+        require_upright(images(mirrored, upright, empty))
+
+
+@pytest.mark.parametrize(("mirrored", "upright", "empty"), [(0, 0, 3), (0, 4, 0), (1, 11, 0), (2, 2, 0)])
+def test_a_set_of_which_some_images_are_mirrored_goes_on(mirrored, upright, empty):
+    own = images(mirrored, upright, empty)
+    require_upright(own)
+    named = replace(own[0], detection=replace(own[0].detection, mirrored=("1", "2")))
+    with pytest.raises(DetectionError):  # so that it is the number that decides
+        require_upright(
+            (named, *own[: mirrored + 1], *(detected(f"x{i}", mirrored=("1",)) for i in range(upright + 1)))
+        )
+
+
+@pytest.mark.slow
+def test_a_printed_grid_of_equal_discs_beside_the_target_is_no_face(bench):
+    """Discs of the size and pitch of a face's large circles, in all images."""
+    found = bench.label("printed grids", 1)
+    found.assert_all_found()
+
+
+CAMERA_FROM_PLATE = Rigid.exp([np.pi, 0.0, 0.0, 200.0, 150.0, 1200.0])
+"""In the first image of group 12; beside target and board, and the other images would show all of it, too."""
+
+
+def plate_like_a_face(photo, value, case):
+    """A plate with the pattern of face 3 beside the target in the first image, and gone in the others."""
+    if photo.number:
+        return study.Picture(photo.grey)
+    (real,) = [face for face in study.all_faces(photo) if face.name == "3"]
+    pose = CAMERA_FROM_PLATE
+    plate = replace(real, matrix=np.column_stack([pose.rotation[:, :2], pose.translation]))
+    return study.Picture(degrade.behind(photo, [plate], [photo.levels(photo.faces[0])], 15.0))
+
+
+def test_a_phantom_in_one_image_goes_out_and_ends_nothing(bench):
+    found = bench.label(plate_like_a_face)
+    found.assert_all_found()
+    notes = found.images[FIRST].notes
+    assert sum(note.startswith("face 3: read in one image of the group alone, 0 of 20 of its") for note in notes) == 1
+    assert {label.plane for label in found.labels(FIRST)} == {"1", "2", "board"}
