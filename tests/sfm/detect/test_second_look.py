@@ -133,13 +133,13 @@ class Sheet:
         side = len(self.share)
         return self.share[:, k * side : (k + 1) * side]
 
-    def look(self, options=None, noise=1.0, **changes):
+    def look(self, options=None, noise=1.0, polarity="bright", **changes):
         """Measure all, predicted where they were drawn unless changed."""
         height, width = self.share.shape
         camera = Camera(width, height, [3000.0, 3000.0], [width / 2, height / 2], np.zeros(8))
         image = 40 + 120 * self.share + noise * np.random.default_rng(2).standard_normal(self.share.shape)
         values = {"centre_px": self.centre, "shape_px": self.shape, "wanted": np.ones(6, bool)} | changes
-        circles = PredictedCircles(self.labels, polarity=("bright",) * 6, **values)
+        circles = PredictedCircles(self.labels, polarity=(polarity,) * 6, **values)
         pixels = np.clip(np.rint(image), 0, 255).astype(np.uint8)
         return measure_predicted(pixels, camera, circles, options or EllipseOptions())
 
@@ -158,6 +158,13 @@ def test_circles_are_measured_in_their_place():
 def test_only_what_is_wanted_is_measured():
     look = Sheet().look(wanted=np.arange(6) % 2 == 0)
     assert look.labels == ("1:1", "1:3", "1:5")
+
+
+def test_dark_circles_are_measured_where_dark_ones_are_predicted():
+    circles = Sheet()
+    circles.share = 1 - circles.share
+    assert circles.look(polarity="dark").labels == circles.labels
+    assert circles.look(polarity="bright").labels == ()
 
 
 def hide(cell):
