@@ -16,30 +16,53 @@ from stcal.synthetic import degrade
 CAMERA = Camera(400, 300, [1400.0, 1400.0], [199.5, 149.5], [-0.15, 0.1, 1e-3, -5e-4, 0, 0, 0, 0])
 
 
-@lru_cache(maxsize=4)
-def fine_rays(camera, factor):
-    """Subpixel columns and their rays, from the exact inverse distortion."""
-    h, w = camera.height * factor, camera.width * factor
-    x, y = np.meshgrid((np.arange(w) + 0.5) / factor - 0.5, (np.arange(h) + 0.5) / factor - 0.5)
+PAD_PX = 12
+"""About a circle, to where the blur of its rim is nothing, and as much again."""
+
+
+@lru_cache(maxsize=64)
+def fine_rays(camera, window, factor):
+    """Subpixel columns of a window (x0, y0, x1, y1; px) and their rays, from the exact inverse distortion."""
+    x0, y0, x1, y1 = window
+    x, y = np.meshgrid(
+        x0 + (np.arange((x1 - x0) * factor) + 0.5) / factor - 0.5,
+        y0 + (np.arange((y1 - y0) * factor) + 0.5) / factor - 0.5,
+    )
     rays = camera.normalised_from_pixel(np.stack([x, y], -1))
-    return x, np.concatenate([rays, np.ones((h, w, 1))], -1)
+    return x, np.concatenate([rays, np.ones((*x.shape, 1))], -1)
 
 
-def draw(camera, circles, blur=0.9, gradient=0.0, bright=True, factor=8):
-    """Circles (centre, normal, radius; camera frame, mm) by ray casting on a fine grid, then blur.
-
-    Independent of the detector's edge model: a subpixel is inside or it is not.
-    """
-    x, rays = fine_rays(camera, factor)
-    h, w = x.shape
-    fine = np.full((h, w), 30.0 if bright else 200.0)
+def drawn_window(camera, circles, window, blur, gradient, bright, factor):
+    """What :func:`draw` gives inside a window, before it is rounded."""
+    x, rays = fine_rays(camera, window, factor)
+    fine = np.full(x.shape, 30.0 if bright else 200.0)
     for centre, normal, radius in circles:
         depth = (centre @ normal) / (rays @ normal)
         inside = np.linalg.norm(rays * depth[..., None] - centre, axis=-1) < radius
         fine[inside] = 200.0 if bright else 30.0
     fine *= 1 + gradient * np.sin(2 * np.pi * x / 150)
     fine = cv2.GaussianBlur(fine, (0, 0), blur * factor)
-    image = fine.reshape(camera.height, factor, camera.width, factor).mean((1, 3))
+    height, width = x.shape
+    return fine.reshape(height // factor, factor, width // factor, factor).mean((1, 3))
+
+
+def draw(camera, circles, blur=0.9, gradient=0.0, bright=True, factor=8):
+    """Circles (centre, normal, radius; camera frame, mm) by ray casting on a fine grid, then blur.
+
+    Independent of the detector's edge model: a subpixel is inside or it is not. The fine grid is about the circles
+    only: elsewhere the background is as smooth as its gradient.
+    """
+    columns = np.arange(camera.width)
+    row = (30.0 if bright else 200.0) * (1 + gradient * np.sin(2 * np.pi * columns / 150))
+    image = np.tile(row, (camera.height, 1))
+    for centre, _, radius in circles:
+        reach = radius / (centre[2] - radius) * camera.focal.max() + PAD_PX
+        (x0, y0), (x1, y1) = (camera.project(centre[None])[0] + np.array([[-reach], [reach]])).astype(int)
+        x0, y0, x1, y1 = max(x0, 0), max(y0, 0), min(x1, camera.width), min(y1, camera.height)
+        part = drawn_window(camera, circles, (x0, y0, x1, y1), blur, gradient, bright, factor)
+        rim = int(np.ceil(5 * blur))  # of the window: blurred against its mirror image
+        inner = slice(rim, -rim)
+        image[y0:y1, x0:x1][inner, inner] = part[inner, inner]
     return np.clip(np.round(image), 0, 255).astype(np.uint8)
 
 
