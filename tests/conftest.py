@@ -15,6 +15,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from hypothesis import settings
 
 from stcal.geometry.rigid import Rigid, Similarity
 from stcal.sfm.adjust.chain import chain_faces
@@ -31,6 +32,15 @@ from stcal.synthetic.scene import Scene, SceneOptions, make_scene
 
 SHARED = Path(__file__).resolve().parents[2] / "shared" / "data"
 SAMPLE = Path(__file__).parent / "data" / "sample"
+
+
+settings.register_profile("quick", max_examples=20)
+
+
+def pytest_configure(config):
+    """Fewer examples of each property where slow tests are left out; all of them with the others."""
+    if config.option.markexpr == "not slow":
+        settings.load_profile("quick")
 
 
 @pytest.fixture(scope="session")

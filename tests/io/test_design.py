@@ -4,7 +4,7 @@ import re
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from stcal.design import BoardDesign, FaceDesign, TargetDesign, reference_board, reference_target
@@ -101,7 +101,6 @@ def test_board_arrays():
 
 
 @given(st.floats(-np.pi, np.pi), st.floats(-500, 500), st.floats(-500, 500))
-@settings(max_examples=40)
 def test_any_right_handed_drawing_frame_gives_the_same_face(tmp_path_factory, angle, x, y):
     turn = np.array([[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]])
     reference = reference_target()
@@ -122,7 +121,6 @@ identifiers = st.text(
 
 
 @given(st.lists(identifiers, min_size=4, max_size=4, unique=True), st.text(st.characters(codec="utf-8")))
-@settings(max_examples=60)
 def test_any_allowed_id_and_any_name_survive(tmp_path_factory, ids, name):
     xy = [[0, 0], [40, 0], [0, 40], [40, 40]]
     target = TargetDesign(name, "dark", (FaceDesign("f", tuple(ids), xy, [5.0] * 4, *ids[:3]),))

@@ -145,7 +145,7 @@ def test_errors_say_what_to_do():
     with pytest.raises(DegenerateError, match="between the faces, 5° to 130° needed"):
         make_scene(replace(OPTIONS, groups=(("1", "3"),)))
     with pytest.raises(DegenerateError, match="enlarge distance_mm"):
-        make_scene(replace(OPTIONS, distance_mm=350))
+        make_scene(replace(OPTIONS, distance_mm=350, groups=(("1", "2"),)))
     with pytest.raises(InputError, match="no face 9"):
         make_scene(replace(OPTIONS, groups=(("1", "9"),)))
     with pytest.raises(InputError, match="group 12 occurs twice"):

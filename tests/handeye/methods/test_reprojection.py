@@ -35,7 +35,8 @@ def normalised(errors, covariances):
 @pytest.mark.parametrize(
     ("method", "setup"),
     [
-        *(("pose", setup) for setup in SETUPS),
+        ("pose", "eye-in-hand"),
+        pytest.param("pose", "eye-to-hand", marks=pytest.mark.slow),
         ("reprojection", "eye-to-hand"),
         pytest.param("reprojection", "eye-in-hand", marks=pytest.mark.slow),
     ],
@@ -77,7 +78,7 @@ def test_derivatives_of_the_corners(setup):
 
 @pytest.mark.parametrize(
     ("setup", "count"),
-    [("eye-in-hand", 5), *(pytest.param(setup, 20, marks=pytest.mark.slow) for setup in SETUPS)],
+    [("eye-in-hand", 3), *(pytest.param(setup, 20, marks=pytest.mark.slow) for setup in SETUPS)],
 )
 def test_reprojection_knows_its_error(setup, count):
     """20 trials of 6 numbers scatter by 1/√240 = 6.5 %; σ of 12 robot poses by 1/√(2·20·30) = 3 %, and it is

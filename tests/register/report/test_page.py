@@ -2,6 +2,7 @@
 
 import json
 import re
+from functools import cache
 
 import numpy as np
 import pytest
@@ -18,6 +19,7 @@ B_FROM_A = Rigid.exp([0.3, -0.4, 1.1, 2500.0, -300.0, 800.0])
 WILD = (3, 17)
 
 
+@cache
 def found_of(n=40, model="rigid", wild=WILD, where="pairs <a&b>.csv", bend=0.0, method="robust", **options):
     rng = np.random.default_rng(0)
     a = rng.uniform(-200, 200, (n, 3)) + np.array([800, 200, 700])
@@ -117,7 +119,7 @@ def test_page_of_a_plane():
 
 
 def test_the_same_page_twice():
-    assert registration_page(found_of()) == registration_page(found_of())
+    assert registration_page(found_of()) == registration_page(found_of.__wrapped__())
 
 
 def test_sigma_of_the_transform_by_place():
@@ -125,11 +127,12 @@ def test_sigma_of_the_transform_by_place():
     rng = np.random.default_rng(1)
     a = rng.uniform(-100, 100, (20, 3))
     place = np.array([500.0, 0.0, 0.0])
-    seen = []
-    for _ in range(300):
+    seen, stated = [], []
+    for trial in range(100):
         b = B_FROM_A @ a + rng.normal(0, 0.1, a.shape)
         result = register(a, b, method="least-squares", folds=0)
         seen.append(result.b_from_a @ place)
-    predicted = findings("x", range(20), a, b, result).sigma_mm_at(place)
-    # 300 trials know a σ to 4 %; the last trial's own σ to 9 %
-    np.testing.assert_allclose(np.std(seen, axis=0), predicted, rtol=0.3)
+        if trial < 5:
+            stated.append(findings("x", range(20), a, b, result).sigma_mm_at(place))
+    # 100 trials know a σ to 7 %; the own σ of five are good to 9 % / √5
+    np.testing.assert_allclose(np.std(seen, axis=0), np.sqrt(np.mean(np.square(stated), axis=0)), rtol=0.25)

@@ -52,7 +52,7 @@ def cos_sin(angle: float) -> tuple[float, float]:
     return np.cos(angle), np.sin(angle)
 
 
-@settings(max_examples=60, deadline=None)
+@settings(deadline=None)
 @given(st.integers(0, 10**6), st.integers(1, 8), st.sampled_from(["standard", "modified"]))
 def test_forward_is_the_product_of_the_rows(seed, joints, convention):
     robot = arm(seed, joints, convention)
@@ -71,7 +71,7 @@ def test_forward_is_the_product_of_the_rows(seed, joints, convention):
         assert np.abs(found[k].matrix() - pose @ robot.tools[""].matrix()).max() < 1e-9  # mm of metres: rounding
 
 
-@settings(max_examples=40, deadline=None)
+@settings(deadline=None)
 @given(st.integers(0, 10**6), st.integers(1, 8), st.sampled_from(["standard", "modified"]))
 def test_jacobian_is_that_of_differences(seed, joints, convention):
     robot = arm(seed, joints, convention)
@@ -98,7 +98,7 @@ def test_chain_jacobian_is_that_of_differences(convention):
         assert slope == pytest.approx(analytic[:, :, k], abs=1e-5 * max(1.0, np.abs(analytic[:, :, k]).max()))
 
 
-@settings(max_examples=40, deadline=None)
+@settings(deadline=None)
 @given(st.integers(0, 10**6), st.sampled_from(["standard", "modified"]))
 def test_rows_of_a_moved_chain_make_its_poses(seed, convention):
     """The way back to D-H rows, with β where axes are nearly parallel: 1e-9 mm."""

@@ -110,7 +110,9 @@ def test_faces_differ_in_brightness(ratio):
     assert {r.face.id for r in find_faces(faces).faces} == {"5", "2"}
 
 
-@pytest.mark.parametrize("radius", [4.0, 5.0, 5.66, 8.0])
+@pytest.mark.parametrize(
+    "radius", [5.0, 5.66, *(pytest.param(radius, marks=pytest.mark.slow) for radius in (4.0, 8.0))]
+)
 def test_a_printed_grid_of_equal_discs_is_no_face(radius):
     """Between the large and the small circles' radius, equal discs are of neither size by less than 1.45."""
     grid = np.array([[x, y] for x in range(0, 120, 20) for y in range(0, 120, 20)], float)
@@ -119,7 +121,7 @@ def test_a_printed_grid_of_equal_discs_is_no_face(radius):
     assert find_faces(ellipses_of(pose(20, 10, 30), own.xy_mm, np.full(10, radius))).faces == ()
 
 
-@pytest.mark.parametrize("seed", range(5))
+@pytest.mark.parametrize("seed", [0, *(pytest.param(seed, marks=pytest.mark.slow) for seed in range(1, 5))])
 def test_random_discs_are_no_faces_and_hide_none(seed):
     assert find_faces(junk(150, seed)).faces == ()
     finding = find_faces(joined(junk(150, seed), face_ellipses("2", pose(60, 40, 200))))

@@ -11,7 +11,7 @@ from stcal.sfm.measure.pose import pose_from_circles
 from stcal.synthetic.measured.image_poses import faces_view, known_target, pose_error, see, view
 from stcal.synthetic.scene import SceneOptions, make_scene
 
-NOISE_PX, DRAWS = 0.02, 20
+NOISE_PX = 0.02
 SIGMA = np.array([0.3, 0.3, 0.3, 0.3, 1e-4, 3e-4, 1e-5, 1e-5])
 """Of intrinsics: fx, fy, cx, cy, k1, k2, p1, p2."""
 
@@ -43,8 +43,10 @@ def test_what_is_common_is_less_than_the_whole(scene, known):
         assert left[0] > 5e-4
 
 
-@pytest.mark.parametrize("with_camera", [True, pytest.param(False, marks=pytest.mark.slow)])
-def test_poses_err_together_as_stated(scene, known, with_camera):
+@pytest.mark.parametrize(
+    ("with_camera", "draws"), [(True, 8), *(pytest.param(own, 20, marks=pytest.mark.slow) for own in (True, False))]
+)
+def test_poses_err_together_as_stated(scene, known, with_camera, draws):
     """Without noise in the images all errors are common ones: z of each direction, from the errors of all poses, has
     mean square 1, to 1.4 / √(directions × draws)."""
     rng = np.random.default_rng(0)
@@ -59,7 +61,7 @@ def test_poses_err_together_as_stated(scene, known, with_camera):
     own = np.linalg.cholesky([pose.covariance for pose in exact])
     felt = np.linalg.pinv(np.linalg.solve(own, common).reshape(6 * len(images), -1))
     z = []
-    for _ in range(DRAWS):
+    for _ in range(draws):
         target, camera = known.measured(rng), scene.camera
         if with_camera:
             away = intrinsic_basis(scene.camera.colmap_model) @ (SIGMA * rng.standard_normal(8))

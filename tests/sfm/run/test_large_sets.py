@@ -79,7 +79,7 @@ def test_sparse_pairs_hold_every_track_together_as_all_pairs_do(crowd):
 
 
 @given(seed=st.integers(0, 2**32 - 1), share=st.floats(0.1, 0.9))
-@settings(max_examples=6, deadline=None)
+@settings(max_examples=3, deadline=None)
 def test_tracks_hold_together_whatever_is_missing(crowd, seed, share):
     """Images that show a random share of their circles, some of them nearly nothing."""
     scene, observations = crowd

@@ -18,6 +18,14 @@ from stcal.sfm.report.compare import compare
 pytestmark = pytest.mark.usefixtures("no_page")
 
 
+def pair(small_set):
+    """A group of two images."""
+    small = small_set("12")
+    for i in (2, 3):
+        small.image(i).unlink()
+    return small
+
+
 def calibrate(folder, out, **options):
     data = [folder / name for name in ("images", "cameras.txt")]
     return run(*data, out, folder / "target.toml", folder / "board.toml", RunOptions(workers=1, **options))
@@ -34,7 +42,7 @@ def test_an_image_without_a_circle_is_reported_and_harms_nothing(small_set):
 
 
 def test_kept_results_are_not_taken_for_other_options(small_set, tmp_path):
-    small = small_set("12")
+    small = pair(small_set)
     folder = small.folder
     shutil.copytree(small.out, tmp_path / "fresh", ignore=shutil.ignore_patterns("group-*"))  # detections alone
     fresh = calibrate(folder, tmp_path / "fresh", eccentricity=False)
@@ -48,7 +56,7 @@ def test_kept_results_are_not_taken_for_other_options(small_set, tmp_path):
 
 
 def test_a_damaged_cache_is_made_anew(small_set):
-    small = small_set("12")
+    small = pair(small_set)
     first = calibrate(small.folder, small.out)
     assert all(image.reused for image in first.detection.images)
     for path in (small.out / "cache").iterdir():
