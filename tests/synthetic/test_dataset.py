@@ -65,11 +65,12 @@ def test_truth_predicts_its_own_pixels(scene):
         np.testing.assert_allclose(circle["centre_px"], focal * np.array([u, v]) + centre, atol=1.1e-5)
 
 
-def test_data_set_on_disk(tmp_path):
+@pytest.mark.parametrize("workers", [1, pytest.param(2, marks=pytest.mark.slow)])
+def test_data_set_on_disk(tmp_path, workers):
     scene = make_scene(OPTIONS, *second_design())
     finished = []
     paths = write_dataset(
-        tmp_path / "new", scene, RenderOptions(), workers=2, progress=lambda *count: finished.append(count)
+        tmp_path / "new", scene, RenderOptions(), workers=workers, progress=lambda *count: finished.append(count)
     )
     folder = tmp_path / "new"
     assert [str(p.relative_to(folder / "images")) for p in paths] == [

@@ -40,7 +40,7 @@ def _blobs(scene, group, image, options):
     rims = scene.camera.project(rim_points(seen.xyz_camera, seen.normal_camera, seen.radius_mm, 360))
     measured, exact, centres = [], [], []
     for i, rim in enumerate(rims):
-        others = np.delete(rims, i, axis=0).reshape(-1, 2)
+        others = np.delete(rims[:, ::10], i, axis=0).reshape(-1, 2)
         room = np.sqrt(((others[:, None] - rim[::10]) ** 2).sum(-1).min())
         if not seen.must_find[i] or room < 2 * EDGE_PX:
             continue

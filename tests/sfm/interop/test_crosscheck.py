@@ -11,13 +11,15 @@ import subprocess
 import sys
 import tempfile
 import time
-from contextlib import closing
+from contextlib import closing, redirect_stderr, redirect_stdout
 from dataclasses import replace
 from hashlib import sha256
+from io import StringIO
 from pathlib import Path
 
 import pytest
 
+from stcal.cli.main import main_sfm
 from stcal.errors import InputError, MappingError
 from stcal.sfm.interop import native
 from stcal.sfm.interop.crosscheck import crosscheck, mapper_options
@@ -74,20 +76,24 @@ def command(*arguments) -> list[str]:
 
 @pytest.fixture(scope="module")
 def checked(small_run, colmap, tmp_path_factory):
-    """A run that was cross-checked: its folder, its state before, and what the process said."""
+    """A run that was cross-checked: its folder, its state before, and what the command said."""
     run = tmp_path_factory.mktemp("checked") / "run"
     shutil.copytree(small_run, run, ignore=shutil.ignore_patterns("cache"))
     before = state_of(run)
-    done = subprocess.run(command("crosscheck", run), capture_output=True, text=True, timeout=60)
-    return run, before, done
+    out, err = StringIO(), StringIO()
+    with pytest.MonkeyPatch.context() as patch, redirect_stdout(out), redirect_stderr(err):
+        patch.setattr(sys, "argv", ["stcal-sfm", "crosscheck", str(run)])
+        with pytest.raises(SystemExit) as ended:
+            main_sfm()
+    return run, before, (ended.value.code or 0, out.getvalue(), err.getvalue())
 
 
 def test_the_two_programs_agree(checked):
-    run, _, done = checked
-    assert done.returncode == 0, done.stderr
-    assert lines_of(done.stderr) == []
-    assert "allowed: faces 2 µm and 1 mdeg, circles 2 µm, cameras 20 µm and 2 mdeg: they agree" in done.stdout
-    assert done.stdout.splitlines()[-1] == f"report: {run / 'report.html'}"
+    run, _, (code, out, err) = checked
+    assert code == 0, err
+    assert lines_of(err) == []
+    assert "allowed: faces 2 µm and 1 mdeg, circles 2 µm, cameras 20 µm and 2 mdeg: they agree" in out
+    assert out.splitlines()[-1] == f"report: {run / 'report.html'}"
     check = json.loads((run / "report.json").read_text(encoding="utf-8"))["crosscheck"]
     assert check["differences"] == check["notes"] == []
     assert check["images"] == {"native": 8, "pycolmap": 8, "run": 8, "only_native": [], "only_pycolmap": []}

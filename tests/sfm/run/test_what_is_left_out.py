@@ -7,12 +7,14 @@ import cv2
 import numpy as np
 import pytest
 
+from stcal.io.camera import read_camera
 from stcal.sfm import RunOptions, run
 from stcal.sfm.adjust.calibration import image_sigma_factor, with_sigma
 from stcal.sfm.adjust.joint import adjust_jointly
 from stcal.sfm.adjust.uncertainty import calibrated_target
 from stcal.sfm.detect.ellipses import EllipseOptions
 from stcal.sfm.mapping.incremental import left_out
+from stcal.sfm.pipeline import detect
 from stcal.sfm.report.compare import compare
 
 pytestmark = pytest.mark.usefixtures("no_page")
@@ -51,8 +53,12 @@ def test_kept_results_are_not_taken_for_other_options(small_set, tmp_path):
     np.testing.assert_array_equal(
         fresh.target.target_from_face["2"].matrix(), again.target.target_from_face["2"].matrix()
     )
-    coarse = calibrate(folder, small.out, ellipses=EllipseOptions(min_diameter_px=9.0))
-    assert not any(image.reused for image in coarse.detection.images)
+    target, board = again.target_design, again.board_design
+    coarse = RunOptions(workers=1, ellipses=EllipseOptions(min_diameter_px=9.0)).settled(target)
+    detection, _ = detect(
+        folder / "images", read_camera(folder / "cameras.txt"), small.out, target, board, coarse, lambda *_: None
+    )
+    assert not any(image.reused for image in detection.images)
 
 
 def test_a_damaged_cache_is_made_anew(small_set):
