@@ -27,6 +27,8 @@ from stcal.synthetic.measured.handeye import (
 )
 
 SETUPS = ("eye-in-hand", "eye-to-hand")
+ONE_QUICK = ("eye-in-hand", pytest.param("eye-to-hand", marks=pytest.mark.slow))
+"""Where the other setup is the same but for what its poses are called."""
 NOISE = {"robot": (3e-4, 0.1), "camera": (1e-3, 0.3)}
 SETS = pytest.mark.parametrize("seed", [0, 1, *(pytest.param(seed, marks=pytest.mark.slow) for seed in range(2, 10))])
 """Of draws: the quick tests try two."""
@@ -125,7 +127,7 @@ def test_four_dof_where_it_does_not_belong():
 
 @pytest.mark.parametrize("setup", SETUPS)
 @pytest.mark.parametrize("side", ["robot", "camera"])
-@pytest.mark.parametrize("method", ["pose", "daniilidis"])
+@pytest.mark.parametrize("method", ["pose", pytest.param("daniilidis", marks=pytest.mark.slow)])
 def test_one_side_inverted_is_said(setup, side, method):
     truth = simulated(np.random.default_rng(8), 10, setup, **NOISE)
     flange, board = truth.pairs.base_from_flange, truth.pairs.camera_from_board
@@ -170,7 +172,7 @@ def misread(poses):
     return Poses.from_quaternions(poses.quaternions()[:, [1, 2, 3, 0]], poses.translation)
 
 
-@pytest.mark.parametrize("setup", SETUPS)
+@pytest.mark.parametrize("setup", ONE_QUICK)
 @pytest.mark.parametrize("sides", ["the robot's", "the board's", "all"])
 def test_quaternions_in_another_order_are_said(setup, sides):
     pairs = simulated(np.random.default_rng(14), 10, setup, **NOISE).pairs
@@ -182,7 +184,7 @@ def test_quaternions_in_another_order_are_said(setup, sides):
 
 
 @pytest.mark.parametrize("setup", SETUPS)
-@pytest.mark.parametrize("axis", [0, 1, 2])
+@pytest.mark.parametrize("axis", [0, *(pytest.param(axis, marks=pytest.mark.slow) for axis in (1, 2))])
 @pytest.mark.parametrize("side", ["robot", "camera"])
 def test_left_handed_poses_are_said(setup, axis, side):
     pairs = simulated(np.random.default_rng(15), 10, setup, **NOISE).pairs
@@ -333,7 +335,7 @@ HALF = Rigid(np.diag([-1.0, -1, 1]), [200, 175, 0])
 """A chessboard of 8×7 squares of 25 mm seen from its other end."""
 
 
-@pytest.mark.parametrize("setup", SETUPS)
+@pytest.mark.parametrize("setup", ONE_QUICK)
 @pytest.mark.parametrize("turned", [[], [2, 5, 9], [0, 1, 3, 4, 6, 7, 8]])
 def test_turned_views_are_put_right(setup, turned):
     """Up to a turn of all: the numbering of most is kept."""

@@ -245,7 +245,7 @@ def test_images_of_a_symmetric_chessboard(command, chessboard, tmp_path):
     out, ros, urdf, opencv, page, camera = (tmp_path / name for name in names)
     code, shown, _ = command(
         *chessboard.arguments(),
-        *("--workers", 1, "--splits", 3, "--refine-camera", "--out", out, "--ros", ros, "--urdf", urdf, *EXACT),
+        *("--workers", 1, "--splits", 2, "--refine-camera", "--out", out, "--ros", ros, "--urdf", urdf, *EXACT),
         *("--opencv", opencv, "--parent", "tool0", "--report", page, "--camera-out", camera),
     )
     assert code == 0

@@ -25,15 +25,19 @@ def test_every_pose_has_its_turn():
         splits(7, 5)
 
 
-@pytest.mark.parametrize("setup", ["eye-in-hand", pytest.param("eye-to-hand", marks=pytest.mark.slow)])
-def test_held_out_errors_are_those_of_the_poses(setup):
+@pytest.mark.parametrize(
+    ("setup", "count"),
+    [("eye-in-hand", 6), *(pytest.param(x, 15, marks=pytest.mark.slow) for x in ("eye-in-hand", "eye-to-hand"))],
+)
+def test_held_out_errors_are_those_of_the_poses(setup, count):
     """Of many poses X is well known, and what is left is the noise of a pose: a length of 3 coordinates, √(8/π) σ in
-    the mean. 180 values scatter by 0.42/√180 = 3 %; X adds 12/60 of the variance at most."""
+    the mean. 180 values scatter by 0.42/√180 = 3 %, 72 by 5 %; X adds 12/60 of the variance at most."""
     truth = simulated(np.random.default_rng(1), 60, setup, camera=(1e-3, 0.3))
-    found = cross_validate(truth.pairs, setup, "pose", rows=splits(60, 12, 15))
+    found = cross_validate(truth.pairs, setup, "pose", rows=splits(60, 12, count))
     means = found.means()
-    assert means["rotation_rad"] == pytest.approx(np.sqrt(8 / np.pi) * 1e-3, rel=0.15)
-    assert means["translation_mm"] == pytest.approx(np.sqrt(8 / np.pi) * 0.3, rel=0.15)
+    wide = 0.15 if count == 15 else 0.2
+    assert means["rotation_rad"] == pytest.approx(np.sqrt(8 / np.pi) * 1e-3, rel=wide)
+    assert means["translation_mm"] == pytest.approx(np.sqrt(8 / np.pi) * 0.3, rel=wide)
     assert set(means) == {"rotation_rad", "translation_mm"}
 
 

@@ -92,7 +92,9 @@ def test_two_motions_are_refused_unless_allowed(run, tmp_path):
     assert other["apart_mm"] == pytest.approx(9, abs=0.5)
 
 
-@pytest.mark.parametrize("model", ["rigid", "similarity", "affine"])
+@pytest.mark.parametrize(
+    "model", [*(pytest.param(m, marks=pytest.mark.slow) for m in ("rigid", "similarity")), "affine"]
+)
 def test_models(run, tmp_path, model):
     code, printed, _ = run(written(tmp_path, rows_of(*points())), "--model", model, "--out", tmp_path / "o.json")
     assert code == 0

@@ -27,7 +27,7 @@ def cost_ratio(s, found) -> float:
     return ((b - found.b_from_a @ a) ** 2).sum() / ((b - align_rigid(b, a) @ a) ** 2).sum()
 
 
-@pytest.mark.parametrize("share", [0, 0.2, 0.4, *(pytest.param(x, marks=pytest.mark.slow) for x in (0.1, 0.3))])
+@pytest.mark.parametrize("share", [0, 0.4, *(pytest.param(x, marks=pytest.mark.slow) for x in (0.1, 0.2, 0.3))])
 @pytest.mark.parametrize("n", [20, 100])
 def test_within_one_per_cent_of_the_optimum_of_the_clean_points(n, share):
     for trial in range(6):
