@@ -52,6 +52,7 @@ def test_held_out_error_at_the_board(charuco):
     assert (ours.pose_mm.mean(1) < park.pose_mm.mean(1)).all()
 
 
+@pytest.mark.slow
 def test_what_is_wrong_with_the_data_is_said(charuco):
     pairs, views, prior = charuco
     plain = handeye(pairs, "eye-to-hand", views=views)

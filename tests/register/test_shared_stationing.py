@@ -21,6 +21,7 @@ def data(script, shared_data):
     return root, script.stations(root), script.robot_of(root / "data" / "trailblazer.urdf")
 
 
+@pytest.mark.slow
 def test_rows_make_the_poses_of_the_urdf(script, data):
     """The URDF's transforms multiplied one by one, with both stages of the column as it says."""
     root, stations, robot = data
@@ -37,6 +38,7 @@ def test_rows_make_the_poses_of_the_urdf(script, data):
         np.testing.assert_allclose(pose.translation, found, atol=1e-8)
 
 
+@pytest.mark.slow
 def test_rigid_registration_holds_to_a_centimetre_and_affine_to_metres(script, data):
     """The figures of SOURCE.txt: 6.9–9.9 mm, and 3.2–5.4 m of the affine fit to coplanar places."""
     _, stations, robot = data

@@ -141,11 +141,15 @@ def test_simulated_centres_have_the_noise_asked_for(scene):
     assert 0.04 < rms < 0.06  # 3 standard errors of 130 numbers
 
 
+@pytest.mark.slow  # thousands of poses are tried; quick by the command that plans
+def test_a_target_too_near_is_refused():
+    with pytest.raises(DegenerateError, match="enlarge distance_mm"):
+        make_scene(replace(OPTIONS, distance_mm=350, groups=(("1", "2"),)))
+
+
 def test_errors_say_what_to_do():
     with pytest.raises(DegenerateError, match="between the faces, 5° to 130° needed"):
         make_scene(replace(OPTIONS, groups=(("1", "3"),)))
-    with pytest.raises(DegenerateError, match="enlarge distance_mm"):
-        make_scene(replace(OPTIONS, distance_mm=350, groups=(("1", "2"),)))
     with pytest.raises(InputError, match="no face 9"):
         make_scene(replace(OPTIONS, groups=(("1", "9"),)))
     with pytest.raises(InputError, match="group 12 occurs twice"):

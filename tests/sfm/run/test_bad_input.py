@@ -180,7 +180,8 @@ def test_a_name_that_is_not_utf8_is_left_out(small_set, stcal_sfm):
             Path(os.fsdecode(os.fsencode(small.images / "12") + b"/" + name)).write_bytes(small.image().read_bytes())
         except OSError:
             pytest.skip("this file system takes UTF-8 only")
-    out = assert_success(stcal_sfm(*small.arguments()))
+    arguments = ("detect", small.images, "--camera", small.camera, "--out", small.out, "--workers", 1)
+    out = assert_success(stcal_sfm(*arguments))
     assert len(re.findall(r"^skipped 12/\S+: its name is not UTF-8, or holds a control character", out, re.M)) == 2
 
 
@@ -207,6 +208,7 @@ def test_a_group_with_one_image(small_set, stcal_sfm):
     assert_left_out(small, stcal_sfm, *parts)
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("no_page")
 def test_a_group_of_copies_of_one_image(small_set, stcal_sfm):
     small = small_set("12", "14")
@@ -309,7 +311,7 @@ def turning(scene) -> list[Rigid]:
     return [Rigid.exp([*turn, 0, 0, 0]) @ scene.groups["12"].camera_from_target[0] for turn in turns]
 
 
-@pytest.mark.parametrize("poses", [still, turning])
+@pytest.mark.parametrize("poses", [still, pytest.param(turning, marks=pytest.mark.slow)])
 def test_a_camera_that_did_not_move(small_set, small_scene, stcal_sfm, poses):
     small = small_set()
     (small.images / "12").mkdir()
