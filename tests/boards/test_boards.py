@@ -26,7 +26,7 @@ def turn(degrees: float) -> np.ndarray:
 
 @pytest.mark.parametrize(
     ("rows", "columns"),
-    [(5, 8), (6, 6), *(pytest.param(*size, marks=pytest.mark.slow) for size in ((6, 7), (7, 7), (6, 8)))],
+    [(5, 8), *(pytest.param(*size, marks=pytest.mark.slow) for size in ((6, 6), (6, 7), (7, 7), (6, 8)))],
 )
 @pytest.mark.parametrize("degrees", [170, *(pytest.param(d, marks=pytest.mark.slow) for d in (0, 90, -100))])
 def test_chessboard_corners_are_numbered(rows, columns, degrees):
@@ -80,6 +80,7 @@ def test_nothing_in_an_empty_image():
     assert len(find_tags(grey, ["DICT_6X6_250"])) == 0
 
 
+@pytest.mark.slow
 def test_all_corners_of_a_real_charuco_board(shared_data):
     """24 corners in each of 16 real images; OpenCV's own settings lose 28 % of them."""
     board = CharucoDesign(7, 5, 36.195, 18.256, "DICT_6X6_250")

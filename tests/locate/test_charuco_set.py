@@ -20,6 +20,7 @@ from stcal.locate.pose.merge import merge
 from stcal.synthetic.exposure import Light, expose
 from stcal.workflows.locate import calibration_images
 
+pytestmark = pytest.mark.slow  # a set that lies beside the repository
 BOARD = CharucoDesign(7, 5, 36.195, 18.256, "DICT_6X6_250")
 PLAN = LayoutPlan(
     "charuco", tuple((BOARD.dictionary, k) for k in range(17)), np.full(17, 18.256), 8, np.full((17, 4, 2), np.nan)
@@ -56,7 +57,6 @@ def test_poses_from_the_other_half(images, held_out):
     assert np.mean([trial.error_mm for trial in trials]) < 1.0
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize(("size", "accepted"), [(1, 0.0), (2, 0.4), (3, 0.7), (4, 0.8)])
 def test_subsets_are_right_or_not_accepted(images, held_out, size, accepted):
     trials = list(subset_trials(images, held_out[1], held_out[0], size, most=25))
@@ -69,7 +69,6 @@ def test_subsets_are_right_or_not_accepted(images, held_out, size, accepted):
         assert np.mean([trial.error_mm for trial in used]) < 1.5
 
 
-@pytest.mark.slow
 def test_a_scene_takes_little_longer_than_its_decoding(folder, images, tmp_path):
     layout = half_calibrated(images, PLAN, range(16)).layout
     photograph = cv2.imread(str(folder / "images" / images.names[5]), cv2.IMREAD_GRAYSCALE)
@@ -92,7 +91,6 @@ def test_a_scene_takes_little_longer_than_its_decoding(folder, images, tmp_path)
     assert min(ratios[1:]) < 2 * 3
 
 
-@pytest.mark.slow
 def test_exposures_together_see_more(folder, images):
     """Light (simulated) that falls off by eight stops over the target, as from sun to shade, and a spot of glare."""
     layout = half_calibrated(images, PLAN, range(16)).layout

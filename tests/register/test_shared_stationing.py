@@ -8,6 +8,8 @@ from stcal.robot.kinematics.file import load_robot
 from stcal.robot.kinematics.forward import forward
 from tests.scripts import load_script
 
+pytestmark = pytest.mark.slow  # a set that lies beside the repository
+
 
 @pytest.fixture(scope="module")
 def script():
@@ -21,7 +23,6 @@ def data(script, shared_data):
     return root, script.stations(root), script.robot_of(root / "data" / "trailblazer.urdf")
 
 
-@pytest.mark.slow
 def test_rows_make_the_poses_of_the_urdf(script, data):
     """The URDF's transforms multiplied one by one, with both stages of the column as it says."""
     root, stations, robot = data
@@ -38,7 +39,6 @@ def test_rows_make_the_poses_of_the_urdf(script, data):
         np.testing.assert_allclose(pose.translation, found, atol=1e-8)
 
 
-@pytest.mark.slow
 def test_rigid_registration_holds_to_a_centimetre_and_affine_to_metres(script, data):
     """The figures of SOURCE.txt: 6.9–9.9 mm, and 3.2–5.4 m of the affine fit to coplanar places."""
     _, stations, robot = data
@@ -50,7 +50,6 @@ def test_rigid_registration_holds_to_a_centimetre_and_affine_to_metres(script, d
     assert min(affine.values()) > 2000
 
 
-@pytest.mark.slow
 def test_kinematics_of_one_station_serve_another(script, data):
     """Identified where the floor is flat, used where it is not: the error falls to below 70 %."""
     _, stations, robot = data

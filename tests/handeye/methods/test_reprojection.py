@@ -37,8 +37,7 @@ def normalised(errors, covariances):
     [
         ("pose", "eye-in-hand"),
         pytest.param("pose", "eye-to-hand", marks=pytest.mark.slow),
-        ("reprojection", "eye-to-hand"),
-        pytest.param("reprojection", "eye-in-hand", marks=pytest.mark.slow),
+        *(pytest.param("reprojection", setup, marks=pytest.mark.slow) for setup in SETUPS),
     ],
 )
 def test_the_size_of_the_board_is_found(setup, method):
@@ -107,6 +106,7 @@ def test_reprojection_beats_poses_where_the_board_is_rough():
     assert np.sqrt(np.mean(squared["reprojection"])) < 0.5 * np.sqrt(np.mean(squared["pose"]))
 
 
+@pytest.mark.slow
 def test_a_camera_file_that_is_wrong_is_said_and_mended():
     """Distortion left out of the camera file: said; with the intrinsics solved for, the truth comes back."""
     truth = simulated_views(np.random.default_rng(6), 15, "eye-to-hand", (2e-4, 0.05), 0.1)

@@ -230,7 +230,7 @@ def test_turns_follow_the_reference_as_far_as_limits_go():
     assert abs(abs(found[3] - 0.4) - np.pi) < 1e-8
 
 
-@pytest.mark.parametrize("name", ["standard", "made"])
+@pytest.mark.parametrize("name", [pytest.param("standard", marks=pytest.mark.slow), "made"])
 def test_singular_poses(name):
     """Wrist straight; elbow stretched; wrist centre on the first axis."""
     robot = ARMS[name]

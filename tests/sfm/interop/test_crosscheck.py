@@ -429,6 +429,7 @@ def test_a_mapper_that_prints_without_end(tmp_path):
     assert log.count(b"0123456789\n") > 90_000
 
 
+@pytest.mark.slow
 def test_an_interrupted_cross_check(own_run, tmp_path):
     """Ctrl-C while the native mapper works: 130, no folder and no process is left, and the report is as it was."""
     pids, before = tmp_path / "pids", state_of(own_run)
@@ -528,6 +529,7 @@ def test_other_keypoints_are_noticed(own_run, refused, colmap, tmp_path):
 
 
 @pytest.mark.usefixtures("no_page")
+@pytest.mark.slow
 def test_another_geometry_is_noticed(own_run, stcal_sfm, colmap, tmp_path):
     """The same, but the model says our keypoints: face 2 is where the others are not. At 1 m and f = 1393 px, 0.3 px
     are 0.2 mm across; the images see it from sides that differ."""

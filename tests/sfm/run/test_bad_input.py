@@ -228,6 +228,7 @@ def test_a_folder_of_copies_is_no_group(small_set, stcal_sfm):
     assert out.count("4 images") == 1
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("no_page")
 def test_a_group_of_which_nothing_is_left(small_set, stcal_sfm):
     small = small_set("12", "14")
