@@ -64,6 +64,7 @@ def test_json_and_page(run, tmp_path):
     assert not list(tmp_path.glob("*.partial"))
 
 
+@pytest.mark.slow
 def test_the_same_seed_gives_the_same_file(run, tmp_path):
     a, b = points()
     b[::3] += np.random.default_rng(2).uniform(-9, 9, (10, 3))

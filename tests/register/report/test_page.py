@@ -118,6 +118,7 @@ def test_page_of_a_plane():
     assert page.count("data:image/svg+xml;base64,") == 2  # no planes through a body that there is not
 
 
+@pytest.mark.slow
 def test_the_same_page_twice():
     assert registration_page(found_of()) == registration_page(found_of.__wrapped__())
 

@@ -143,7 +143,12 @@ def test_a_blurred_image_is_named(full_scene, lab, stated, caught):
 
 
 @pytest.mark.parametrize(
-    ("over", "verdict"), [pytest.param(1, "passed", marks=pytest.mark.slow), (3, "suspicious"), (6, "failed")]
+    ("over", "verdict"),
+    [
+        pytest.param(1, "passed", marks=pytest.mark.slow),
+        (3, "suspicious"),
+        pytest.param(6, "failed", marks=pytest.mark.slow),
+    ],
 )
 def test_noise_beyond_the_centres_own_sigma_is_said(full_scene, lab, over, verdict):
     """σ stated too small for all centres alike: no image stands out, and the result's σ are scaled."""

@@ -175,6 +175,7 @@ def test_names_and_places_with_spaces_and_beyond_ascii(colmap, small_set, stcal_
     assert "zwei Flächen 1.JPG" in names
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("no_page")
 def test_a_run_with_other_options(colmap, small_set, stcal_sfm):
     """Chained, frames of three points, another reference face: the native models go through the same."""

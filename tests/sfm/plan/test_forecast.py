@@ -94,7 +94,7 @@ def require_chi2(errors: np.ndarray, covariance: np.ndarray):
 
 
 @pytest.mark.parametrize(
-    ("common", "draws"), [(0.0, 10), *(pytest.param(*p, marks=SLOW) for p in ((0.0, 60), (0.99, 25)))]
+    ("common", "draws"), [(0.0, 5), *(pytest.param(*p, marks=SLOW) for p in ((0.0, 60), (0.99, 25)))]
 )
 def test_forecast_is_the_spread_of_simulations(exact, common, draws):
     setup, models = setup_of(exact, common=common), models_of(exact)

@@ -246,6 +246,7 @@ def test_a_group_without_the_board(small_set, small_scene, stcal_sfm):
     assert_left_out(small, stcal_sfm, *parts)
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("no_page")
 def test_a_group_without_a_face(small_set, small_scene, stcal_sfm):
     small = small_set("12", "14")
