@@ -325,7 +325,9 @@ def test_a_camera_that_did_not_move(small_set, small_scene, stcal_sfm, poses):
 
 
 @pytest.mark.usefixtures("no_page")
-@pytest.mark.parametrize(("board", "what"), [(False, "face 1"), (True, "a board of 63 dots")])
+@pytest.mark.parametrize(
+    ("board", "what"), [(False, "face 1"), pytest.param(True, "a board of 63 dots", marks=pytest.mark.slow)]
+)
 def test_two_of_them_in_view(small_set, small_scene, stcal_sfm, board, what):
     """A picture of the target, or of the board, lies in one image's corner: the group tells which is meant."""
     small = small_set("12")
@@ -673,7 +675,7 @@ def to_jpeg_with_a_trailer(path: Path) -> None:
         (to_jpeg_with_a_trailer, 0),
         (to_png_with_alpha, 0),
         # 16 bit are scaled so that the bright end just fits, edges are found at other grey levels.
-        (to_sixteen_bit_png, 0.02),
+        pytest.param(to_sixteen_bit_png, 0.02, marks=pytest.mark.slow),
         (to_sixteen_bit_tiff, 0.02),
     ],
 )
