@@ -71,7 +71,7 @@ class Patient:
 
     def run(self, **options) -> Diagnosis:
         files = [self.folder / name for name in ("images", "cameras.txt", "run", "target.toml", "board.toml")]
-        run(*files, RunOptions(workers=1, **options))
+        run(*files, RunOptions(workers=1, solve="chain", **options))
         return diagnose(load_run(self.folder / "run"), workers=1)
 
     def arguments(self, command: str, *more) -> list:

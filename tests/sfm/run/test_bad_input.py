@@ -25,6 +25,8 @@ from stcal.synthetic.observe import image_circles
 from stcal.synthetic.render import RenderOptions, encode, render
 from tests.outcome import COMPUTATION, INPUT, assert_error, lines_of
 
+CHAIN = ("--solve", "chain")
+"""For what is seen before faces are adjusted together, which takes half of a small run's time."""
 RESULTS = ("faces.json", "report.json", "report.html", "database.db")
 
 
@@ -161,7 +163,7 @@ def test_bad_files_among_good_ones_are_left_out_and_listed(small_set, stcal_sfm)
     (folder / "more.jpg").mkdir()
     bad |= {"link.jpg": (b"", "broken link"), "more.jpg": (b"", "a folder inside a group")}
     # "copy.jpg" sorts after the capitals, so the original is the one that is used.
-    out = assert_success(stcal_sfm(*small.arguments()))
+    out = assert_success(stcal_sfm(*small.arguments(*CHAIN)))
     report = (small.out / "report.json").read_text(encoding="utf-8")
     for name, (_, reason) in bad.items():
         line = next(line for line in out.splitlines() if line.startswith(f"skipped 12/{name}: "))
@@ -190,7 +192,7 @@ def test_a_name_that_is_not_utf8_is_left_out(small_set, stcal_sfm):
 
 def assert_left_out(small, stcal_sfm, *parts: str) -> None:
     """The run goes on without group 14, says why, and does not claim its face."""
-    out = assert_success(stcal_sfm(*small.arguments()))
+    out = assert_success(stcal_sfm(*small.arguments(*CHAIN)))
     notes = json.loads((small.out / "report.json").read_text())["notes"]
     assert any(note.startswith("left out whole: group 14") and all(part in note for part in parts) for note in notes)
     assert "left out whole: group 14" in out
@@ -208,7 +210,6 @@ def test_a_group_with_one_image(small_set, stcal_sfm):
     assert_left_out(small, stcal_sfm, *parts)
 
 
-@pytest.mark.slow
 @pytest.mark.usefixtures("no_page")
 def test_a_group_of_copies_of_one_image(small_set, stcal_sfm):
     small = small_set("12", "14")
@@ -222,13 +223,12 @@ def test_a_group_of_copies_of_one_image(small_set, stcal_sfm):
 def test_a_folder_of_copies_is_no_group(small_set, stcal_sfm):
     small = small_set("12")
     shutil.copytree(small.images / "12", small.images / "12 copy")
-    out = assert_success(stcal_sfm(*small.arguments()))
+    out = assert_success(stcal_sfm(*small.arguments(*CHAIN)))
     assert "skipped 12 copy/IMG_1003.jpg: the same image as 12/IMG_1003.jpg" in out
     assert out.count("skipped") == 4
     assert out.count("4 images") == 1
 
 
-@pytest.mark.slow
 @pytest.mark.usefixtures("no_page")
 def test_a_group_of_which_nothing_is_left(small_set, stcal_sfm):
     small = small_set("12", "14")
@@ -283,7 +283,7 @@ def test_a_face_that_is_never_linked(small_set, other_pair_scene, stcal_sfm):
     for i in range(2):
         picture = render(other_pair_scene, "34", i)
         (small.images / "34" / f"{i}.jpg").write_bytes(encode(picture, ".jpg"))
-    out = assert_success(stcal_sfm(*small.arguments()))
+    out = assert_success(stcal_sfm(*small.arguments(*CHAIN)))
     for face_id in "34":
         assert f"face {face_id}: left out, never linked to reference face 1; add a group that shows" in out
     faces = json.loads((small.out / "faces.json").read_text())["target_from_face"].keys()
@@ -337,7 +337,7 @@ def test_two_of_them_in_view(small_set, small_scene, stcal_sfm, board, what):
     height, width = copied.shape
     picture[-height - 20 : -20, 20 : 20 + width] = copied
     small.image().write_bytes(encoded(".jpg", picture, cv2.IMWRITE_JPEG_QUALITY, 95))
-    code, _, _ = stcal_sfm(*small.arguments())
+    code, _, _ = stcal_sfm(*small.arguments(*CHAIN))
     assert code == 0
     report = json.loads((small.out / "report.json").read_text())
     notes = [each["note"] for each in report["left_out"]["notes"] if each["image"] == "12/IMG_1000.jpg"]
@@ -586,7 +586,11 @@ def test_debug_shows_the_traceback(small_set):
 def test_an_interrupted_run_leaves_nothing_that_looks_complete(small_set, stcal_sfm, how):
     small = small_set("12", detected=False)
     running = subprocess.Popen(
-        command(*small.arguments()), stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, start_new_session=True
+        command(*small.arguments(*CHAIN)),
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+        start_new_session=True,
     )
     cache = small.out / "cache"
     until = time.monotonic() + 60
@@ -602,7 +606,7 @@ def test_an_interrupted_run_leaves_nothing_that_looks_complete(small_set, stcal_
         assert lines_of(err)[0].startswith("interrupted; finished detections are kept, run the same command again")
     assert {p.name for p in small.out.iterdir()} <= {"cache", "stcal-run.json"}
 
-    out = assert_success(stcal_sfm(*small.arguments()))
+    out = assert_success(stcal_sfm(*small.arguments(*CHAIN)))
     assert "group 12: 4 images" in out
     assert results_in(small.out) == list(RESULTS)
     assert {name: (cache / name).stat().st_mtime_ns for name in kept} == kept
@@ -626,7 +630,7 @@ def test_names_with_spaces_and_non_ascii_and_images_directly_in_the_folder(small
     for i, name in enumerate(names):
         small.image(i).rename(small.images / name)
     (small.images / "12").rmdir()
-    out = assert_success(stcal_sfm(*small.arguments()))
+    out = assert_success(stcal_sfm(*small.arguments(*CHAIN)))
     assert "4 images" in out
     known = detections(small_run)
     expected = {(name, label): known[f"12/IMG_{1000 + i}.jpg", label] for i, name in enumerate(names)
@@ -638,7 +642,7 @@ def test_names_with_spaces_and_non_ascii_and_images_directly_in_the_folder(small
 def test_a_group_with_an_odd_name(small_set, stcal_sfm):
     small = small_set("12")
     (small.images / "12").rename(small.images / "Gruppe „12“ & <b>")
-    out = assert_success(stcal_sfm(*small.arguments()))
+    out = assert_success(stcal_sfm(*small.arguments(*CHAIN)))
     assert "group Gruppe „12“ & <b>: 4 images" in out
     assert "Gruppe „12“ & <b>" not in (small.out / "report.html").read_text(encoding="utf-8")
 
@@ -700,7 +704,7 @@ def test_a_camera_of_opencv_without_a_size(small_set, small_run, stcal_sfm):
     text = opencv_yaml(camera.focal[0], *camera.centre, camera.distortion[:5].tolist())
     path.write_text(text, encoding="utf-8")
     small.image(3).write_bytes(encoded(".jpg", pixels(small.image(3))[:-100]))
-    out = assert_success(stcal_sfm(*small.arguments("--camera", path)))
+    out = assert_success(stcal_sfm(*small.arguments("--camera", path, *CHAIN)))
     assert "skipped 12/IMG_1003.jpg: 1296×764 px, but the first readable image says 1296×864 px" in out
     expected = {key: xy for key, xy in detections(small_run).items() if key[0].startswith("12/IMG_1000")}
     found = {key: xy for key, xy in detections(small.out).items() if key[0].startswith("12/IMG_1000")}
@@ -724,7 +728,7 @@ def test_a_second_run_does_only_what_changed(small_set, small_scene, small_run, 
         assert (small.out / name).read_bytes() == (small_run / name).read_bytes()
 
     small.image(2, "14").write_bytes(encode(render(small_scene, "14", 2, RenderOptions(seed=1)), ".jpg"))
-    assert_success(stcal_sfm(*small.arguments()))
+    assert_success(stcal_sfm(*small.arguments(*CHAIN)))
     after = stamps()
     assert {name: after[name] for name in before} == before
     added = sorted(name.startswith("group-") for name in after.keys() - before.keys())

@@ -29,8 +29,11 @@ def pair(small_set):
 
 
 def calibrate(folder, out, **options):
+    """Chained: what is left out, and what is kept, is seen before faces are adjusted together."""
     data = [folder / name for name in ("images", "cameras.txt")]
-    return run(*data, out, folder / "target.toml", folder / "board.toml", RunOptions(workers=1, **options))
+    return run(
+        *data, out, folder / "target.toml", folder / "board.toml", RunOptions(workers=1, solve="chain", **options)
+    )
 
 
 def test_an_image_without_a_circle_is_reported_and_harms_nothing(small_set):
@@ -54,7 +57,7 @@ def test_kept_results_are_not_taken_for_other_options(small_set, tmp_path):
         fresh.target.target_from_face["2"].matrix(), again.target.target_from_face["2"].matrix()
     )
     target, board = again.target_design, again.board_design
-    coarse = RunOptions(workers=1, ellipses=EllipseOptions(min_diameter_px=9.0)).settled(target)
+    coarse = RunOptions(workers=1, solve="chain", ellipses=EllipseOptions(min_diameter_px=9.0)).settled(target)
     detection, _ = detect(
         folder / "images", read_camera(folder / "cameras.txt"), small.out, target, board, coarse, lambda *_: None
     )
