@@ -123,7 +123,7 @@ def test_all_methods_are_compared(command, tmp_path):
 def test_one_method_by_name(command, tmp_path):
     truth = simulated(np.random.default_rng(6), 12, **NOISE)
     source = poses_file(tmp_path / "poses.csv", truth)
-    code, shown, _ = command(source, "--method", "park-martin", "--out", tmp_path / "h.json")
+    code, shown, _ = command(source, "--method", "park-martin", "--splits", 0, "--out", tmp_path / "h.json")
     assert code == 0
     assert "eye-in-hand, park-martin: 12 poses" in shown
     assert json.loads((tmp_path / "h.json").read_text())["covariance"] is None
@@ -136,7 +136,10 @@ def test_stated_sigmas_weight(command, tmp_path):
     truth = simulated(np.random.default_rng(7), 15, **NOISE)
     source, out = poses_file(tmp_path / "poses.csv", truth), tmp_path / "h.json"
     robot = ("--sigma-robot-deg", np.degrees(2e-4), "--sigma-robot-mm", 0.1)
-    assert command(source, *robot, "--sigma-camera-deg", 0.03, "--sigma-camera-mm", 0.2, "--out", out)[0] == 0
+    assert (
+        command(source, *robot, "--sigma-camera-deg", 0.03, "--sigma-camera-mm", 0.2, "--splits", 0, "--out", out)[0]
+        == 0
+    )
     data = json.loads(out.read_text())
     assert data["estimated"] == []
     assert data["sigma"]["camera_rad"] == pytest.approx(np.radians(0.03))
@@ -174,7 +177,7 @@ def test_four_axes(command, tmp_path):
     assert code == COMPUTATION
     assert "rotate the flange about" in err
     out = tmp_path / "h.json"
-    code, shown, _ = command(source, "--four-dof", "--out", out)
+    code, shown, _ = command(source, "--four-dof", "--splits", 0, "--out", out)
     assert code == 0
     data = json.loads(out.read_text())
     found = np.array(data["flange_from_camera"])

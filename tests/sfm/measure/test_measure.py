@@ -395,7 +395,8 @@ def command(small_dataset, small_run, tmp_path, *more, faces=None):
         for i in (1000, 1001):
             shutil.copy(small_dataset / "images" / "12" / f"IMG_{i}.jpg", images)
     arguments = ["measure", images, "--camera", small_dataset / "cameras.txt", "--workers", 1]
-    return [*arguments, "--faces", faces or small_run / "faces.json", "--out", tmp_path / "poses.csv", *more]
+    arguments += ["--faces", faces or small_run / "faces.json", "--board", small_dataset / "board.toml"]
+    return [*arguments, "--out", tmp_path / "poses.csv", *more]
 
 
 def test_command_writes_poses_with_joints(stcal_sfm, small_dataset, small_run, tmp_path):
