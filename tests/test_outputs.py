@@ -11,7 +11,8 @@ from stcal.errors import InputError
 from stcal.io.saving import RUN_ENTRIES, RUN_MARKER, keep_apart
 
 FOLDERS = {("run", "out"), ("detect", "out"), ("init", "folder"), ("simulate", "folder"), ("demo", "out")}
-"""Outputs that are folders: new ones, or those of `tests/sfm/run/test_transaction.py`."""
+FOLDERS |= {("export_model", "out")}
+"""New ones, which replace nothing, or those of `tests/sfm/run/test_transaction.py`."""
 WRITES = ("Write ", "Also write ", "Draw ", "Keep ")
 
 

@@ -47,7 +47,6 @@ def export_model(
         Path,
         typer.Argument(
             metavar="OUT",
-            writable=True,
             help="Write here: a new file for ply and nvm, a new or empty folder for the others.",
         ),
     ],

@@ -27,7 +27,14 @@ from stcal.sfm.interop.native import NativeColmap, find_colmap, map_natively, re
 from stcal.sfm.interop.schema import schema_of_version
 from stcal.sfm.mapping.database import from_colmap_px, image_ids
 from stcal.sfm.mapping.incremental import labelled_model, pipeline_options, seeded_mapping
-from stcal.sfm.mapping.models import KEYPOINT_TOLERANCE_PX, ReadModel, find_models, open_model, read_model
+from stcal.sfm.mapping.models import (
+    KEYPOINT_TOLERANCE_PX,
+    ReadModel,
+    find_models,
+    open_model,
+    read_model,
+    write_reconstruction,
+)
 from stcal.sfm.run.crosscheck import (
     CameraDifference,
     Crosscheck,
@@ -177,7 +184,7 @@ def _own(folder: Path, place: Path, names, pair, group: str, run: SavedRun, ids)
         )
     written = place / "own-model"
     written.mkdir()
-    reconstruction.write_binary(str(written))
+    write_reconstruction(reconstruction, written)
     return read_model(written, run.observations, ids, run.corrected_px)
 
 

@@ -17,7 +17,7 @@ from stcal.errors import InputError
 from stcal.labels import DotLabel, Label
 from stcal.sfm.adjust.file import FacesFile
 from stcal.sfm.mapping.database import colmap_camera, from_colmap_px
-from stcal.sfm.mapping.models import open_model, rigid_from_colmap
+from stcal.sfm.mapping.models import open_model, rigid_from_colmap, write_reconstruction
 from stcal.sfm.run.saved import SavedRun, load_run
 
 ModelFormat = Literal["colmap-bin", "colmap-txt", "ply", "nvm", "bundler"]
@@ -98,10 +98,8 @@ def export_model(run: str | Path, out: str | Path, kind: str) -> ExportedModel:
             partial.mkdir()
         beside.write_text(_labels_csv(points, saved.faces, kind), encoding="utf-8")
         match kind:
-            case "colmap-bin":
-                reconstruction.write_binary(str(partial))
-            case "colmap-txt":
-                reconstruction.write_text(str(partial))
+            case "colmap-bin" | "colmap-txt":
+                write_reconstruction(reconstruction, partial, text=kind == "colmap-txt")
             case "ply":
                 partial.write_text(_ply(points), encoding="utf-8")
             case "nvm":

@@ -78,9 +78,52 @@ def write_model(
     ids: dict[str, int],
     camera: CalibratedCamera,
 ) -> None:
-    """Write models that share one world as COLMAP's binary files."""
+    """Write models that share one world as COLMAP's binary files.
+
+    Raises
+    ------
+    InputError
+        What stands in the files is not what was to be written.
+    """
     folder.mkdir(parents=True, exist_ok=True)
-    to_reconstruction(models, observations, ids, camera)[0].write_binary(str(folder))
+    write_reconstruction(to_reconstruction(models, observations, ids, camera)[0], folder)
+
+
+def write_reconstruction(reconstruction: pycolmap.Reconstruction, folder: Path, text: bool = False) -> None:
+    """Write a model as COLMAP's files into an existing folder and read it back: COLMAP's writers do not say when the
+    disk is full.
+
+    Raises
+    ------
+    InputError
+        What stands in the files is not what was to be written.
+    """
+    try:
+        (reconstruction.write_text if text else reconstruction.write_binary)(str(folder))
+        written = _numbers(open_model(folder))
+        same = all(np.array_equal(a, b) for a, b in zip(_numbers(reconstruction), written, strict=True))
+    except (InputError, RuntimeError, OSError):
+        same = False
+    if not same:
+        raise InputError(
+            f"model {folder}: what stands in its files is not what was written; check the folder's space and rights, "
+            "or give another place"
+        )
+
+
+def _numbers(reconstruction: pycolmap.Reconstruction) -> list[np.ndarray]:
+    """Everything in a model: cameras, poses, keypoints with their points, points with their tracks; 12 digits of each
+    number, as text loses the last ones."""
+    cameras = [[i, *c.params] for i, c in sorted(reconstruction.cameras.items())]
+    images, keypoints, points = [], [], []
+    for i, image in sorted(reconstruction.images.items()):
+        pose = image.cam_from_world().matrix().ravel() if image.has_pose else np.zeros(12)
+        images.append([i, *pose])
+        keypoints += [[*each.xy, each.point3D_id if each.has_point3D() else -1] for each in image.points2D]
+    for i, point in sorted(reconstruction.points3D.items()):
+        points.append([i, *point.xyz, len(point.track.elements)])
+    parts = (np.array(each, float) for each in (cameras, images, keypoints, points))
+    return [np.round(each, 12 - int(np.ceil(np.log10(max(np.abs(each).max(initial=1), 1))))) for each in parts]
 
 
 @dataclass(frozen=True, slots=True, eq=False)

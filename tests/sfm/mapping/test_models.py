@@ -715,7 +715,8 @@ def test_nothing_is_overwritten(saved, stcal_sfm, tmp_path):
     for name in ("mine", "link", "."):
         out = tmp_path / name
         outcome = stcal_sfm("faces", saved.folder / "models", "--run", saved.folder, "--out", out)
-        assert_error(outcome, INPUT, f"{out}: exists; give a new file with --out")
+        said = "is a folder; the name of a file needed" if name == "." else "exists; give a new file with --out"
+        assert_error(outcome, INPUT, f"{out}: {said}")
     out = tmp_path / "no" / "f.json"
     outcome = stcal_sfm("faces", saved.folder / "models", "--run", saved.folder, "--out", out)
     assert_error(outcome, INPUT, f"{out}: no folder {out.parent}; make it, or give another place with --out")
@@ -739,3 +740,28 @@ def test_a_lost_group_is_said_where_a_face_hangs_on_it(saved):
         MappingError, match=r"reference face 2: not mapped in any group.*group 12: in none of the models"
     ):
         faces_from_models([only], replace(saved, options=options))
+
+
+FULL_DISK = """
+import resource, sys
+from pathlib import Path
+import pycolmap
+from stcal.errors import InputError
+from stcal.sfm.mapping.models import write_reconstruction
+reconstruction = pycolmap.Reconstruction(sys.argv[1])
+resource.setrlimit(resource.RLIMIT_FSIZE, (int(sys.argv[3]), resource.RLIM_INFINITY))
+try:
+    write_reconstruction(reconstruction, Path(sys.argv[2]), text=sys.argv[4] == "text")
+except InputError as error:
+    print(error)
+"""
+
+
+@pytest.mark.parametrize("kind", ["binary", "text"])
+def test_a_model_that_the_disk_does_not_take_is_said(small_run, tmp_path, kind):
+    """No file may grow beyond a limit: COLMAP's writers go on without a word."""
+    for limit, said in ((1000, True), (10_000_000, False)):
+        (tmp_path / str(limit)).mkdir()
+        command = [sys.executable, "-c", FULL_DISK, small_run / "target_model", tmp_path / str(limit), str(limit), kind]
+        done = subprocess.run(command, capture_output=True, text=True, check=True)
+        assert ("is not what was written; check the folder's space" in done.stdout) == said, done.stdout
