@@ -61,6 +61,7 @@ def run_parallel(
         for i, job in enumerate(jobs):
             yield i, function(*job)
         return
+    others = multiprocessing.active_children()
     with (
         _plain_main(),
         ProcessPoolExecutor(workers, multiprocessing.get_context("spawn"), initializer=_follow_parent) as pool,
@@ -70,8 +71,12 @@ def run_parallel(
         try:
             for future in as_completed(futures):
                 yield futures[future], future.result()
-        except BaseException:
-            pool.shutdown(cancel_futures=True)
+        except BaseException as error:
+            pool.shutdown(wait=isinstance(error, Exception), cancel_futures=True)
+            if not isinstance(error, Exception):  # asked to end: what is half done is of no use
+                for process in multiprocessing.active_children():
+                    if process not in others:
+                        process.terminate()
             raise
 
 

@@ -1,5 +1,6 @@
 """``stcal``, the umbrella command, and ``stcal-sfm``, its shortcut: errors become one line and an exit code."""
 
+import signal
 import sys
 from io import TextIOWrapper
 from typing import Any, NoReturn
@@ -11,7 +12,9 @@ from stcal.cli import camera, capture, colmap, handeye, locate, measure, registe
 from stcal.cli.options import protect_inputs
 from stcal.errors import StcalError
 
-INTERRUPTED = 130
+INTERRUPTED, TERMINATED = 130, 143
+MESSAGE_CHARACTERS = 600
+"""Of an error's line; what a file holds may be of any length."""
 RESUMED = {"run", "detect"}
 """Commands that keep what they have done when they are interrupted."""
 # Of Click, which newer versions of Typer carry inside.
@@ -59,6 +62,8 @@ def main_sfm() -> None:
 
 def _guarded(application: typer.Typer) -> None:
     debug = "--debug" in sys.argv
+    signal.signal(signal.SIGTERM, _terminate)
+    signal.signal(signal.SIGINT, signal.default_int_handler)
     arguments = [a for a in sys.argv[1:] if a != "--debug"]
     for stream in (sys.stdout, sys.stderr):
         if isinstance(stream, TextIOWrapper):  # a terminal that has no µ must not end a run
@@ -83,6 +88,13 @@ def _guarded(application: typer.Typer) -> None:
         kept = "; finished detections are kept, run the same command again to go on"
         print("interrupted" + kept * bool(RESUMED & set(arguments[:2])), file=sys.stderr)
         sys.exit(INTERRUPTED)
+    except _Terminated:
+        print("terminated", file=sys.stderr)
+        sys.exit(TERMINATED)
+    except MemoryError:
+        if debug:
+            raise
+        _fail("not enough memory; use fewer --workers, smaller images or fewer of them at a time", 3)
     except OSError as error:
         if debug:
             raise
@@ -90,7 +102,21 @@ def _guarded(application: typer.Typer) -> None:
         _fail(f"{where}{error.strerror or error}; check the path, its rights and the free space", 2)
 
 
+def _terminate(*_) -> NoReturn:
+    """SIGTERM ends a command as Ctrl-C does: results that are there stay, and no process is left behind."""
+    signal.signal(signal.SIGTERM, signal.SIG_IGN)
+    raise _Terminated
+
+
+class _Terminated(BaseException):
+    """The process was asked to end."""
+
+
 def _fail(message: str, code: int) -> NoReturn:
-    """One line, and the exit code."""
-    print(f"error: {' '.join(message.split())}", file=sys.stderr)
+    """One line of printable characters, and the exit code."""
+    plain = "".join(c if c.isprintable() else " " for c in message)
+    line = " ".join(plain.split())
+    if len(line) > MESSAGE_CHARACTERS:
+        line = f"{line[: MESSAGE_CHARACTERS // 2]} … {line[-MESSAGE_CHARACTERS // 2 :]}"
+    print(f"error: {line}", file=sys.stderr)
     sys.exit(code)

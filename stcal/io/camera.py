@@ -18,6 +18,8 @@ COLMAP_PIXEL_ORIGIN = 0.5
 SIGMA, CORRELATION = "# SIGMA[]", "# CORRELATION[]"
 """Comments of ``cameras.txt`` that state the uncertainty of its parameters."""
 
+MAX_FOCAL_RATIO = 10.0
+"""Between fx and fy; anamorphic lenses have 2."""
 MAX_SIDE_PX = 1_000_000
 """Longest image side that a camera file may state, px."""
 
@@ -229,6 +231,11 @@ def _model(flat: np.ndarray, colmap_model: str, width, height, path: Path) -> Ca
         raise InputError(f"camera file {path}: a camera parameter is not a finite number; correct it")
     if (flat[:2] <= 0).any():
         raise InputError(f"camera file {path}: focal length {flat[0]:g}, {flat[1]:g} px; positive numbers needed")
+    if max(flat[:2]) > MAX_FOCAL_RATIO * min(flat[:2]):
+        raise InputError(
+            f"camera file {path}: focal lengths {flat[0]:g} and {flat[1]:g} px; not more than {MAX_FOCAL_RATIO:g} "
+            "times apart needed, pixels are nearly square"
+        )
     for side in (width, height):
         if side is not None and not (0 < side <= MAX_SIDE_PX and float(side).is_integer()):
             raise InputError(f"camera file {path}: image side {side:g} px; a whole number in 1…{MAX_SIDE_PX} needed")
@@ -299,7 +306,10 @@ def _from_opencv(values: dict, path: Path) -> CameraModel:
     distortion[: min(len(given), 8)] = given[:8]
     kind = "FULL_OPENCV" if distortion[4:].any() else "OPENCV" if distortion.any() else "PINHOLE"
     # A missing size, or 0, is one the file does not state.
-    width, height = (float(values.get(f"image_{side}") or 0) or None for side in ("width", "height"))
+    sides = [values.get(f"image_{side}") for side in ("width", "height")]
+    if any(isinstance(side, bool) for side in sides):
+        raise InputError(f"camera file {path}: image_width and image_height are {sides}; numbers of pixels needed")
+    width, height = (float(side or 0) or None for side in sides)
     flat = np.concatenate([[matrix[0, 0], matrix[1, 1], matrix[0, 2], matrix[1, 2]], distortion])
     return _model(flat, kind, width, height, path)
 

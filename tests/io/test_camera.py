@@ -93,7 +93,7 @@ def test_projection_agrees_with_pycolmap(tmp_path, name):
 
 @given(
     st.sampled_from(sorted(COLMAP_CASES)),
-    st.lists(st.floats(100, 20000), min_size=4, max_size=4),
+    st.lists(st.floats(2100, 20000), min_size=4, max_size=4),
     st.lists(st.floats(-1, 1), min_size=8, max_size=8),
 )
 def test_cameras_txt_round_trip(tmp_path_factory, name, lengths, coefficients):
@@ -260,6 +260,8 @@ WRONG = {
     "YAML: k1 k2 k3": (yaml_text(d="[0.1, 0.2, 0.3]"), "3 distortion coefficients; 0, 4, 5, 8, 12, 14 are possible"),
     "YAML: distortion null": (yaml_text(d="null"), "1 distortion coefficients"),
     "YAML: distortion a mapping": (yaml_text(d="{a: 1}"), "neither COLMAP's"),
+    "YAML: a width that is true": (yaml_text(more="image_width: true"), "are .True, None.; numbers of pixels needed"),
+    "COLMAP: fy of 2": ("1 PINHOLE 1000 800 1000 2 500 400", "not more than 10 times apart"),
     "YAML: negative width": (yaml_text(more="image_width: -5"), "image side -5 px"),
     "YAML: infinite width": (yaml_text(more="image_width: .inf"), "image side inf px"),
     "YAML: NaN height": (yaml_text(more="image_height: .nan"), "image side nan px"),

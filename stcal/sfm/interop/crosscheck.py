@@ -12,7 +12,6 @@ from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
-import pycolmap
 
 from stcal.errors import InputError, MappingError
 from stcal.geometry.rigid import Rigid
@@ -25,6 +24,7 @@ from stcal.sfm.interop.export_database import export_database
 from stcal.sfm.interop.external import faces_from_models
 from stcal.sfm.interop.native import NativeColmap, find_colmap, map_natively, require_listable
 from stcal.sfm.interop.schema import schema_of_version
+from stcal.sfm.mapping.colmap import pycolmap
 from stcal.sfm.mapping.database import from_colmap_px, image_ids
 from stcal.sfm.mapping.incremental import labelled_model, pipeline_options, seeded_mapping
 from stcal.sfm.mapping.models import (

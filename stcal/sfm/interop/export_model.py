@@ -10,12 +10,12 @@ from pathlib import Path
 from typing import Literal, get_args
 
 import numpy as np
-import pycolmap
 
 from stcal.design import TargetDesign
 from stcal.errors import InputError
 from stcal.labels import DotLabel, Label
 from stcal.sfm.adjust.file import FacesFile
+from stcal.sfm.mapping.colmap import pycolmap
 from stcal.sfm.mapping.database import colmap_camera, from_colmap_px
 from stcal.sfm.mapping.models import open_model, rigid_from_colmap, write_reconstruction
 from stcal.sfm.run.saved import SavedRun, load_run

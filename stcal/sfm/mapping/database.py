@@ -7,12 +7,12 @@ from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
-import pycolmap
 
 from stcal.errors import InputError
 from stcal.io.camera import COLMAP_PIXEL_ORIGIN, CalibratedCamera
 from stcal.labels import CircleLabel
 from stcal.sfm.data.observations import ImageObservations
+from stcal.sfm.mapping.colmap import pycolmap
 
 CAMERA_ID = 1
 RIG_ID = 1

@@ -6,13 +6,13 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-import pycolmap
 
 from stcal.errors import MappingError
 from stcal.geometry.camera import Camera
 from stcal.labels import Label
 from stcal.sfm.data.model import MIN_POINTS, Outlier, WorldModel
 from stcal.sfm.data.observations import ImageObservations
+from stcal.sfm.mapping.colmap import pycolmap
 from stcal.sfm.mapping.database import CAMERA_ID
 from stcal.sfm.mapping.models import rigid_from_colmap
 from stcal.sfm.mapping.pairs import PairScore

@@ -7,7 +7,6 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-import pycolmap
 
 from stcal.errors import InputError
 from stcal.geometry.camera import Camera
@@ -16,6 +15,7 @@ from stcal.io.camera import CalibratedCamera, camera_from_colmap
 from stcal.labels import DotLabel, Label
 from stcal.sfm.data.model import GroupModel, MetricModel, WorldModel
 from stcal.sfm.data.observations import ImageObservations
+from stcal.sfm.mapping.colmap import pycolmap
 from stcal.sfm.mapping.database import CAMERA_ID, colmap_camera, from_colmap_px, to_colmap_px
 
 LOG_NOTHING = 4

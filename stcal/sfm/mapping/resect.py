@@ -1,13 +1,13 @@
 """Bring the images of a group that the mapper did not take into its model: by their labels, one at a time."""
 
 import numpy as np
-import pycolmap
 
 from stcal.geometry.camera import Camera
 from stcal.geometry.rigid import Rigid
 from stcal.labels import Label
 from stcal.sfm.data.model import MIN_POINTS, M, WorldModel
 from stcal.sfm.data.observations import ImageObservations
+from stcal.sfm.mapping.colmap import pycolmap
 from stcal.sfm.mapping.models import rigid_from_colmap
 
 SEED = 1

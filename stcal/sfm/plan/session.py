@@ -70,7 +70,7 @@ class PlanOptions:
     def __post_init__(self):
         if self.images < MIN_IMAGES:
             raise InputError(f"plan: {self.images} images in each group, {MIN_IMAGES} needed; plan for more")
-        if self.camera is not None and self.camera.width is None:
+        if self.camera is not None and not (self.camera.width and self.camera.height):
             raise InputError(f"plan: camera file {self.camera.source} states no image size; add it to the file")
 
 

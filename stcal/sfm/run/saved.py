@@ -113,6 +113,10 @@ def load_run(folder: str | Path) -> SavedRun:
 
 
 def _options(stored: dict) -> RunOptions:
+    for part in (stored, stored["pairs"], stored["ellipses"]):
+        for name, value in part.items():
+            if isinstance(value, list | dict) and name not in ("pairs", "ellipses"):
+                raise ValueError(f"options: {name} {value}: a single value needed")
     pairs, ellipses = PairOptions(**stored["pairs"]), EllipseOptions(**stored["ellipses"])
     return RunOptions(**(stored | {"pairs": pairs, "ellipses": ellipses}))
 

@@ -409,6 +409,8 @@ def test_plan_of_another_design_with_its_faces(tmp_path):
 
 
 def test_plan_needs_the_size_of_the_camera():
-    camera = CameraModel(np.array([2800.0, 2800.0]), np.array([1296.0, 864.0]), np.zeros(8), "PINHOLE", None, None, "f")
-    with pytest.raises(InputError, match="camera file f states no image size"):
-        PlanOptions(camera=camera)
+    for size in ((None, None), (2592, None), (None, 1728)):
+        focal, middle = np.array([2800.0, 2800.0]), np.array([1296.0, 864.0])
+        camera = CameraModel(focal, middle, np.zeros(8), "PINHOLE", *size, "f")
+        with pytest.raises(InputError, match="camera file f states no image size"):
+            PlanOptions(camera=camera)

@@ -227,6 +227,11 @@ WRONG = {
         lambda c: c["circles"].update({"2:1": [1, 2]}),
         "circles.2:1: [1, 2]: shape (2,)",
     ),
+    "a list for an option": (
+        "stcal-run.json",
+        lambda c: c["options"]["pairs"].update(max_angle_rad=[1]),
+        "max_angle_rad [1]: a single value needed",
+    ),
     "a circle not finite": ("faces.json", lambda c: c["circles"].update({"2:1": [1, 2, np.nan]}), "circles.2:1: "),
 }
 

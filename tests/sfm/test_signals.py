@@ -1,0 +1,63 @@
+"""SIGINT and SIGTERM end every command with one line, 130 and 143; earlier results stay."""
+
+import signal
+import subprocess
+import sys
+import time
+
+import pytest
+
+SFM = (sys.executable, "-P", "-c", "from stcal.cli.entry import main_sfm; main_sfm()")
+ENDS = [(signal.SIGTERM, "terminated", 143), (signal.SIGINT, "interrupted", 130)]
+PROGRESS = ("detect: ", "overlays: ", "map: ", "faces: ", "check: ", "report: ")
+
+
+def ended(process, number) -> tuple[int, list[str]]:
+    process.send_signal(number)
+    _, err = process.communicate(timeout=60)
+    return process.returncode, [line for line in err.splitlines() if not line.startswith(PROGRESS)]
+
+
+@pytest.mark.parametrize(("number", "said", "code"), ENDS)
+def test_while_libraries_load(number, said, code):
+    """The moment is when the entry module is there and the program's imports go on."""
+    begin = (
+        "import sys; from stcal.cli import entry; entry._answer(); print('on', flush=True); import time; time.sleep(60)"
+    )
+    process = subprocess.Popen([sys.executable, "-P", "-c", begin], stdout=-1, stderr=-1, text=True)
+    assert process.stdout.readline() == "on\n"
+    assert ended(process, number) == (code, [said])
+
+
+def test_colmaps_bindings_leave_the_signals_as_they_were():
+    begin = (
+        "import signal, sys; signal.signal(signal.SIGTERM, lambda *_: sys.exit(7));"
+        "import stcal.sfm.mapping.colmap; print('on', flush=True); signal.pause()"
+    )
+    process = subprocess.Popen([sys.executable, "-P", "-c", begin], stdout=-1, stderr=-1, text=True)
+    assert process.stdout.readline() == "on\n"
+    assert ended(process, signal.SIGTERM) == (7, [])
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("seconds", [0.5, 2.0, 5.0])
+@pytest.mark.parametrize(("number", "said", "code"), ENDS)
+def test_during_a_run(small_set, number, said, code, seconds):
+    """Earlier results stay, no process of it is left that still writes, and the next run goes through."""
+    small = small_set("12", "14", detected=False)
+    command = [*SFM, *map(str, small.arguments()), "--workers", "2"]
+    subprocess.run(command, check=True, capture_output=True)
+    before = (small.out / "faces.json").read_bytes()
+    for path in (small.out / "cache").glob("*.npz"):
+        path.unlink()
+    process = subprocess.Popen(command, stdout=-1, stderr=-1, text=True)
+    time.sleep(seconds)
+    code_found, lines = ended(process, number)
+    if code_found != 0:  # a fast machine may be through
+        assert code_found == code
+        assert len(lines) == 1
+        assert lines[0].startswith(said)
+    assert (small.out / "faces.json").read_bytes() == before
+    subprocess.run(command, check=True, capture_output=True)
+    assert not (small.out / "unfinished").exists()
+    assert (small.out / "faces.json").read_bytes() == before
