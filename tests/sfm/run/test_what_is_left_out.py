@@ -16,6 +16,7 @@ from stcal.sfm.detect.ellipses import EllipseOptions
 from stcal.sfm.mapping.incremental import left_out
 from stcal.sfm.pipeline import detect
 from stcal.sfm.report.compare import compare
+from stcal.sfm.run.transaction import RunFolder
 
 pytestmark = pytest.mark.usefixtures("no_page")
 
@@ -58,9 +59,8 @@ def test_kept_results_are_not_taken_for_other_options(small_set, tmp_path):
     )
     target, board = again.target_design, again.board_design
     coarse = RunOptions(workers=1, solve="chain", ellipses=EllipseOptions(min_diameter_px=9.0)).settled(target)
-    detection, _ = detect(
-        folder / "images", read_camera(folder / "cameras.txt"), small.out, target, board, coarse, lambda *_: None
-    )
+    own, camera = RunFolder(small.out, small.out / "unfinished", small.out / "cache"), folder / "cameras.txt"
+    detection, _ = detect(folder / "images", read_camera(camera), own, target, board, coarse, lambda *_: None)
     assert not any(image.reused for image in detection.images)
 
 
