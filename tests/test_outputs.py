@@ -70,22 +70,27 @@ def test_no_output_replaces_an_input(command, output, read, tmp_path):
 def test_a_file_beside_a_runs_own_is_written_again(tmp_path):
     for name in (RUN_MARKER, "doctor.json", "faces.json"):
         (tmp_path / name).write_text("{}")
-    keep_apart({"--json": tmp_path / "doctor.json"}, {"run": tmp_path})
+    keep_apart([("--json", tmp_path / "doctor.json")], [("run", tmp_path)])
     for name in RUN_ENTRIES:
         (tmp_path / name).touch()
         with pytest.raises(InputError, match="is a file of run"):
-            keep_apart({"--json": tmp_path / name}, {"run": tmp_path})
+            keep_apart([("--json", tmp_path / name)], [("run", tmp_path)])
 
 
 def test_a_result_file_in_a_folder_of_images_is_written_again(tmp_path):
     (tmp_path / "poses.json").write_text('{\n "format": "stcal poses 1"\n}')
     (tmp_path / "a.jpg").write_bytes(b"x")
-    keep_apart({"--json": tmp_path / "poses.json"}, {"images": Path(tmp_path)})
-    keep_apart({"--json": tmp_path / "new.json"}, {"images": Path(tmp_path)})
+    keep_apart([("--json", tmp_path / "poses.json")], [("images", Path(tmp_path))])
+    keep_apart([("--json", tmp_path / "new.json")], [("images", Path(tmp_path))])
     with pytest.raises(InputError, match="is a file of images"):
-        keep_apart({"--out": tmp_path / "a.jpg"}, {"images": tmp_path})
+        keep_apart([("--out", tmp_path / "a.jpg")], [("images", tmp_path)])
 
 
 def test_two_outputs_are_kept_apart(tmp_path):
     with pytest.raises(InputError, match="is also what --out writes"):
-        keep_apart({"--out": tmp_path / "a", "--json": tmp_path / "a"}, {})
+        keep_apart([("--out", tmp_path / "a"), ("--json", tmp_path / "a")], [])
+
+
+def test_every_path_of_a_list_is_an_input(tmp_path):
+    with pytest.raises(InputError, match="is an input of this command"):
+        keep_apart([("--out", tmp_path / "a")], [("sources", tmp_path / "a"), ("sources", tmp_path / "b")])

@@ -88,13 +88,13 @@ def _protected(command: Callable) -> Callable:
 
     @wraps(command)
     def checked(**given):
-        paths = {
-            name: path
+        paths = [
+            (name, path)
             for name, value in given.items()
             for path in (value if isinstance(value, list | tuple) else [value])
             if isinstance(path, Path)
-        }
-        written, read = ({words[n]: p for n, p in paths.items() if (n in outputs) == own} for own in (True, False))
+        ]
+        written, read = ([(words[n], p) for n, p in paths if (n in outputs) == own] for own in (True, False))
         keep_apart(written, read)
         return command(**given)
 

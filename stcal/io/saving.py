@@ -2,7 +2,7 @@
 
 import json
 import os
-from collections.abc import Mapping
+from collections.abc import Sequence
 from contextlib import suppress
 from pathlib import Path
 
@@ -65,12 +65,12 @@ def json_text(content) -> str:
     return json.dumps(plain, indent=1, ensure_ascii=False, allow_nan=False) + "\n"
 
 
-def keep_apart(outputs: Mapping[str, Path], inputs: Mapping[str, Path]) -> None:
+def keep_apart(outputs: Sequence[tuple[str, Path]], inputs: Sequence[tuple[str, Path]]) -> None:
     """Refuse, before the work, files that would replace an input, a file among the inputs, or each other.
 
     Parameters
     ----------
-    outputs, inputs : by option; an input may be a folder
+    outputs, inputs : (option, path); an input may be a folder
 
     Raises
     ------
@@ -78,9 +78,9 @@ def keep_apart(outputs: Mapping[str, Path], inputs: Mapping[str, Path]) -> None:
         Which, and what it would replace.
     """
     places: dict[Path, str] = {}
-    for option, path in outputs.items():
+    for option, path in outputs:
         place = path.resolve()
-        for given, read in inputs.items():
+        for given, read in inputs:
             own = read.resolve()
             if place == own:
                 raise InputError(f"{option} {path}: is an input of this command; give another name")

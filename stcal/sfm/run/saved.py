@@ -23,7 +23,7 @@ from stcal.sfm.mapping.pairs import PairOptions
 from stcal.sfm.run.marker import MarkerFile
 from stcal.sfm.run.options import RunOptions
 from stcal.sfm.run.report import ReportRead
-from stcal.sfm.run.transaction import complete
+from stcal.sfm.run.transaction import complete_interrupted
 
 AGAIN = "run it again"
 COVARIANCE = ("var_x_px2", "cov_xy_px2", "var_y_px2")
@@ -80,7 +80,7 @@ def load_run(folder: str | Path) -> SavedRun:
     folder = Path(folder)
     if not (folder / RUN_MARKER).is_file():
         raise InputError(f"run {folder}: not a run's folder (no {RUN_MARKER}); give the --out of a finished run")
-    complete(folder)
+    complete_interrupted(folder)
     needed = (CAMERA, TARGET, BOARD, "labels.csv", "database.db", "report.json", "faces.json")
     missing = [name for name in needed if not (folder / name).is_file()]
     if missing:

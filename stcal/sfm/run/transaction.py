@@ -91,8 +91,21 @@ def _unwritable(out: Path, error: OSError) -> InputError:
     return InputError(f"output folder {out}: {error.strerror or error}; give a writable folder")
 
 
+def complete_interrupted(out: Path) -> None:
+    """Before a finished run is read: complete one that was ended from outside while its results took their places.
+
+    Raises
+    ------
+    InputError
+        Another process is writing there.
+    """
+    if (out / READY).exists():
+        with _locked(out), _writable(out):
+            complete(out)
+
+
 def complete(out: Path) -> None:
-    """Put results that are ready into their places: the end of a run, or of one that was ended from outside there."""
+    """Put results that are ready into their places, with the folder locked."""
     ready = out / READY
     if ready.is_symlink() or not (ready / ENTRIES).is_file():
         return

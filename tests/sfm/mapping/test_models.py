@@ -516,7 +516,7 @@ def test_a_model_of_a_like_run(saved, small_set, stcal_sfm):
 
 
 def test_numbers_that_do_not_go_together(saved, model, stcal_sfm):
-    """A file can be whole and its numbers damaged: a focal length that lost a digit."""
+    """A file can be whole and its numbers damaged: a focal length of another camera."""
     model.cameras[1].params = np.array([239.3, *model.cameras[1].params[1:]])
     path = model.as_binary()
     outcome = stcal_sfm("faces", path, "--run", saved.folder)
