@@ -41,8 +41,9 @@ MAX_MOVE_PX = 0.02
 """Contradictory observations make the last steps slow; what still moves less than this has an answer for the checks."""
 DAMPING = 1e-12
 """Nothing that the datum leaves open is determined by less."""
-SETTLED_PX = 1e-7
-"""What moves less has settled; what stops between the two limits is returned, and marked."""
+SETTLED_PX = 1e-6
+"""What moves less has settled, four orders below the σ of a centre: the share ``EXACTLY`` of a χ² of 1e5 is a step of
+1e-5 σ. What stops between the two limits is returned, and marked."""
 MIN_COMMON = 0.1
 MAX_COMMON = 0.99
 """Share of the board's variance that is common to all groups: below the first it is taken as none, above the second

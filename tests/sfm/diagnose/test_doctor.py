@@ -174,20 +174,17 @@ def test_in_view_faces_the_camera_whole_and_in_front(small_run):
 
 @pytest.mark.slow
 def test_too_small_circles(patient, stcal_sfm):
-    """9 px asked for: an option finds those circles that it is said to let in and no others, and places the image."""
+    """9 px asked for: an option finds those circles that it is said to let in, and no others."""
     diagnosis = patient.run(ellipses=EllipseOptions(min_diameter_px=9.0))
     small = [f for f in of_images(diagnosis) if f.gate == "min_diameter"]
     assert len(small) >= 3
     assert all(LEAST_MIN_DIAMETER_PX < f.value < 9.0 == f.limit and f.unit == "px" for f in small)
-    whole = [f for f in of_images(diagnosis) if f.gate == "known_circles"]
-    assert [(f.image, f.limit) for f in whole] == [(THIRD, 6)]
     assert let_in(diagnosis, "--min-diameter 4") == unlabelled(diagnosis) != set()
     options = {option for f in small for option in f.options}
     assert len(options) == 2
     for option in options:
         assert stcal_sfm(*patient.arguments("detect", *option.split()))[0] == 0
         assert let_in(diagnosis, option) == unlabelled(diagnosis) & patient.detected()
-    assert "--min-diameter 4" in whole[0].options
     seen_once = [f for f in diagnosis.findings if f.gate == "views"]
     helped = {label for f in seen_once for label in f.labels if "--min-diameter 4" in f.options}
     assert helped
