@@ -25,6 +25,7 @@ MODULES = (
     "stcal.sfm.adjust.file",
     "stcal.sfm.run.marker",
     "stcal.sfm.run.report",
+    "stcal.sfm.run.verify",
     "stcal.sfm.measure.files",
     "stcal.sfm.report.compare",
     "stcal.synthetic.truth",

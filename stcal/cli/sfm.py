@@ -11,13 +11,15 @@ from stcal.cli.options import (
     BoardFile,
     CameraFile,
     Images,
+    JsonFile,
     MaxDiameter,
     MinDiameter,
+    Run,
     TargetFile,
     Workers,
     ellipse_options,
 )
-from stcal.cli.terminal import StageProgress
+from stcal.cli.terminal import StageProgress, write
 from stcal.errors import InputError
 from stcal.io.camera import read_camera
 from stcal.io.design import board_of, target_of
@@ -167,6 +169,19 @@ def detect(
         detection, labelled = pipeline.detect(images, model, folder, target_design, board_design, options, progress)
     print(detection_text(detection, labelled))
     print(f"detections: {out / 'detections.csv'}\noverlays:   {out / 'overlays'}")
+
+
+@app.command()
+def verify(run: Run, out: JsonFile = None) -> None:
+    """Compare all files of a run's folder with the hashes that the run kept, and its version with this one."""
+    from stcal.sfm.run.verify import require_whole, verified_text
+    from stcal.sfm.run.verify import verify as verified
+
+    result = verified(run)
+    print(verified_text(result))
+    if out:
+        write(out, result, "as JSON")
+    require_whole(result)
 
 
 def _flatness(text: str) -> float | None:

@@ -12,7 +12,7 @@ from stcal.cli.terminal import StageProgress, write
 from stcal.design import reference_board, reference_target
 from stcal.errors import InputError
 from stcal.io.design import board_toml, target_toml
-from stcal.io.saving import save
+from stcal.io.saving import RUN_MARKER, json_text, save
 
 app = typer.Typer()
 
@@ -80,10 +80,18 @@ def compare(
     """Compare a run with a known truth, as a table and as JSON."""
     from stcal.sfm.report.compare import compare as against
     from stcal.sfm.report.compare import comparison_table
+    from stcal.sfm.run.transaction import COMPARISON, added_results
 
+    into_run = run_folder / COMPARISON
+    if (run_folder / RUN_MARKER).is_file() and (out is None or out.resolve() == into_run.resolve()):
+        with added_results(run_folder) as stage:
+            comparison = against(run_folder, truth)
+            save(stage / COMPARISON, json_text(comparison))
+        print(f"{comparison_table(comparison)}\nas JSON: {into_run}")
+        return
     comparison = against(run_folder, truth)
     print(comparison_table(comparison))
-    target = out or (run_folder / "compare.json" if run_folder.is_dir() else None)
+    target = out or (into_run if run_folder.is_dir() else None)
     if target:
         write(target, comparison, "as JSON")
 

@@ -28,8 +28,9 @@ RUN_ENTRIES = (
     "overlays",
 )
 """What a run makes, in the order in which it takes its place: the marker says what the rest is."""
-UNFINISHED, READY, CACHE = "unfinished", "ready", "cache"
-"""Folders in it: of a run that is going on, of results about to take their places, of what later runs take up."""
+UNFINISHED, ADDED, READY, CACHE = "unfinished", "added", "ready", "cache"
+"""Folders in it: of a run that is going on, of files that a command adds to a finished one, of results about to take
+their places, of what later runs take up."""
 HEAD_BYTES = 400
 """Of a result file, which hold its format."""
 
@@ -97,7 +98,7 @@ def _is_ours(place: Path, folder: Path) -> bool:
     """Whether a file in an input folder is one that an earlier command left there beside the inputs: in a run's folder
     whatever no run makes, elsewhere a result file of the package."""
     if (folder / RUN_MARKER).exists():
-        return place.relative_to(folder).parts[0] not in {*RUN_ENTRIES, UNFINISHED, READY, CACHE}
+        return place.relative_to(folder).parts[0] not in {*RUN_ENTRIES, UNFINISHED, ADDED, READY, CACHE}
     try:
         with open(place, "rb") as stream:
             return b'"format": "stcal' in stream.read(HEAD_BYTES)

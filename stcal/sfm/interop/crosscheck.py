@@ -15,6 +15,7 @@ import numpy as np
 
 from stcal.errors import InputError, MappingError
 from stcal.geometry.rigid import Rigid
+from stcal.io.json import read_json
 from stcal.parallel import Progress
 from stcal.report.text import NONE, number, text_table
 from stcal.sfm.adjust.calibration import Calibration, calibrate
@@ -47,7 +48,8 @@ from stcal.sfm.run.crosscheck import (
     Tolerances,
 )
 from stcal.sfm.run.folder import require_report, write_report
-from stcal.sfm.run.saved import SavedRun
+from stcal.sfm.run.saved import AGAIN, SavedRun
+from stcal.sfm.run.transaction import added_results
 
 MICRO = 1e3
 TOLERANCES = Tolerances()
@@ -62,10 +64,14 @@ RENAMED = {
 def crosscheck_run(
     saved: SavedRun, colmap: Path | None, tolerances: Tolerances, timeout_s: float, progress: Progress | None = None
 ) -> Crosscheck:
-    """Cross-check a finished run with the native COLMAP; the comparison is added to its report."""
+    """Cross-check a finished run with the native COLMAP; the comparison is added to its report. Nothing else is
+    written to its folder meanwhile."""
     require_report(saved)  # before minutes of mapping
-    check = crosscheck(saved, colmap, tolerances, timeout_s, progress)
-    write_report(saved.folder, saved.report | {"crosscheck": check.model_dump()})
+    with added_results(saved.folder) as stage:
+        if read_json(saved.folder / "report.json", "", AGAIN) != saved.report:
+            raise InputError(f"run {saved.folder}: other results took their place meanwhile; cross-check it again")
+        check = crosscheck(saved, colmap, tolerances, timeout_s, progress)
+        write_report(stage, saved.report | {"crosscheck": check.model_dump()}, saved.folder)
     return check
 
 

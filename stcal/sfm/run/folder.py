@@ -85,19 +85,19 @@ def write_run(result: RunResult, out: Path, progress: Progress) -> None:
         result.calibration.sigma_factor,
     )
     save(out / "faces.json", json_text(faces.content()))
-    write_report(out, report)
+    write_report(out, report, out)
     progress("report", 1, 1)
 
 
-def write_report(out: Path, report: dict) -> None:
-    """``report.json`` and ``report.html`` of a run's folder."""
-    page = _report_page(out, report)
+def write_report(out: Path, report: dict, run: Path) -> None:
+    """``report.json`` and ``report.html``, into a folder; ``run`` : that of the overlays."""
+    page = _report_page(run, report)
     save(out / "report.json", json_text(report))
     save(out / "report.html", page)
 
 
-def _report_page(out: Path, report: dict) -> bytes:
-    overlays = {name: overlay_path(out, name).read_bytes() for name in shown_overlays(report)}
+def _report_page(run: Path, report: dict) -> bytes:
+    overlays = {name: overlay_path(run, name).read_bytes() for name in shown_overlays(report)}
     return report_html(report, overlays).encode()
 
 

@@ -8,7 +8,7 @@ results, one that is killed after is completed by whoever opens the folder next.
 import os
 import shutil
 import socket
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
@@ -16,10 +16,12 @@ from pathlib import Path
 import filelock
 
 from stcal.errors import InputError, StcalError
-from stcal.io.saving import CACHE, READY, RUN_ENTRIES, RUN_MARKER, UNFINISHED, json_text, save
-from stcal.sfm.run.marker import MarkerFile
+from stcal.io.json import read_result
+from stcal.io.saving import ADDED, CACHE, READY, RUN_ENTRIES, RUN_MARKER, UNFINISHED, json_text, save
+from stcal.sfm.run.marker import MarkerFile, digest_of, files_below
 
-RESULTS = (*RUN_ENTRIES, "compare.json")
+COMPARISON = "compare.json"
+RESULTS = (*RUN_ENTRIES, COMPARISON)
 """What new results replace, or take away where they have none of it."""
 HOLDER, ENTRIES, LOCK = "holder.txt", "entries.txt", "lock"
 DATABASE_SIDES = ("-wal", "-shm", "-journal")
@@ -57,26 +59,60 @@ def run_folder(out: str | Path, content: MarkerFile, inputs: Mapping[str, object
     folder = RunFolder(out, out / UNFINISHED, out / CACHE)
     _require_ours(out)
     _require_no_inputs(out, inputs)
-    with _writable(out):
-        folder.cache.mkdir(parents=True, exist_ok=True)
     with _locked(out):
         with _writable(out):
             complete(out)
             if not (out / RUN_MARKER).exists():
                 save(out / RUN_MARKER, json_text(content.content()))
-            remove(folder.stage)
-            folder.stage.mkdir()
-            save(folder.stage / HOLDER, _me())
+            _make_empty(folder.stage)
         try:
             yield folder
         except BaseException as error:
             _leave(folder, content, error)
             raise
         with _writable(out):
-            save(folder.stage / RUN_MARKER, json_text(content.content()))
-            save(folder.stage / ENTRIES, "\n".join(path.name for path in folder.stage.iterdir()))
-            os.replace(folder.stage, out / READY)
+            _exchange(folder.stage, out, content.sealed(_digests(folder.stage)), [])
+
+
+@contextmanager
+def added_results(out: Path) -> Iterator[Path]:
+    """A folder for files that are added to a finished run, or that replace some of its own.
+
+    At the end of the block they take their places, and the marker has their hashes. No other command writes meanwhile.
+
+    Raises
+    ------
+    InputError
+        Another process is writing there, or the folder is read-only.
+    """
+    stage = out / ADDED
+    with _locked(out):
+        with _writable(out):
             complete(out)
+            _make_empty(stage)
+        try:
+            yield stage
+            marker = read_result(out / RUN_MARKER, MarkerFile, "run", "run it again")
+            if marker.sha256 is not None:  # of a version that kept none
+                marker = marker.sealed(marker.sha256 | _digests(stage))
+            with _writable(out):
+                _exchange(stage, out, marker, [name for name in RESULTS if os.path.lexists(out / name)])
+        finally:
+            remove(stage)
+
+
+def _exchange(stage: Path, out: Path, marker: MarkerFile, kept: Sequence[str]) -> None:
+    """Let what is ready in a folder take its place; ``kept`` : earlier results that stay where there is no new one."""
+    save(stage / RUN_MARKER, json_text(marker))
+    save(stage / ENTRIES, "\n".join([*kept, *(path.name for path in stage.iterdir())]))
+    os.replace(stage, out / READY)
+    complete(out)
+
+
+def _digests(stage: Path) -> dict[str, str]:
+    """Of all results in a folder."""
+    names = sorted(name for name in files_below(stage) if name.split("/")[0] in RESULTS)
+    return {name: digest_of(stage / name) for name in names}
 
 
 @contextmanager
@@ -140,7 +176,11 @@ def _require_ours(out: Path) -> None:
         and any(path.name not in ours and not path.name.startswith(RUN_MARKER) for path in out.iterdir())
     ):
         raise InputError(f"output folder {out}: not empty and not of an earlier run; give a new folder with --out")
-    for name in (UNFINISHED, READY, CACHE):
+    _require_no_links(out)
+
+
+def _require_no_links(out: Path) -> None:
+    for name in (UNFINISHED, ADDED, READY, CACHE):
         if (out / name).is_symlink():
             raise InputError(f"output folder {out}: {name} in it is a link; remove it, a run writes through none")
 
@@ -158,14 +198,17 @@ def _require_no_inputs(out: Path, inputs: Mapping[str, object]) -> None:
 
 @contextmanager
 def _locked(out: Path) -> Iterator[None]:
-    """Hold the folder against other runs; the system lets go of the lock with the process."""
-    lock = filelock.FileLock(out / CACHE / LOCK)
+    """Hold the folder against other commands; the system lets go of the lock with the process."""
+    _require_no_links(out)
+    cache = out / CACHE
+    lock = filelock.FileLock(cache / LOCK)
     try:
+        cache.mkdir(parents=True, exist_ok=True)
         lock.acquire(timeout=0)
     except filelock.Timeout as error:
         try:
-            holder = (out / UNFINISHED / HOLDER).read_text(encoding="utf-8").strip()
-        except OSError:
+            holder = (cache / HOLDER).read_text(encoding="utf-8").strip()
+        except (OSError, ValueError):
             holder = "another process"
         raise InputError(
             f"output folder {out}: {holder} is writing a run there; wait for its end, or give another --out"
@@ -173,9 +216,15 @@ def _locked(out: Path) -> Iterator[None]:
     except OSError as error:
         raise _unwritable(out, error) from error
     try:
+        save(cache / HOLDER, _me())
         yield
     finally:
         lock.release()
+
+
+def _make_empty(folder: Path) -> None:
+    remove(folder)
+    folder.mkdir()
 
 
 def _me() -> str:
@@ -184,7 +233,6 @@ def _me() -> str:
 
 def _leave(folder: RunFolder, content: MarkerFile, error: BaseException) -> None:
     """What a run that failed has made: in place where no earlier run's result is, else beside it."""
-    remove(folder.stage / HOLDER)
     remove(folder.stage / "scratch")
     if not (folder.out / "faces.json").exists():
         save(folder.stage / RUN_MARKER, json_text(content.content()))

@@ -21,6 +21,7 @@ import pytest
 
 from stcal.cli.main import main_sfm
 from stcal.errors import InputError, MappingError
+from stcal.io.saving import RUN_MARKER
 from stcal.sfm.interop import native
 from stcal.sfm.interop.crosscheck import crosscheck, mapper_options
 from stcal.sfm.interop.native import NativeColmap, find_colmap, map_natively, require_listable
@@ -29,14 +30,15 @@ from stcal.sfm.mapping.incremental import pipeline_options
 from stcal.sfm.run.crosscheck import Tolerances
 from stcal.sfm.run.folder import write_report
 from stcal.sfm.run.saved import load_run
+from stcal.sfm.run.verify import verify
 from tests.outcome import COMPUTATION, INPUT, INTERRUPTED, assert_error, lines_of
 
 INSTALL = "install it with `sudo apt-get install colmap`"
 
 
 def state_of(folder) -> dict[str, str]:
-    """Every file below a folder, and a digest of its content."""
-    files = [path for path in folder.rglob("*") if path.is_file()]
+    """Every file below a folder, and a digest of its content; the cache is no result."""
+    files = [path for path in folder.rglob("*") if path.is_file() and path.parent != folder / "cache"]
     return {path.relative_to(folder).as_posix(): sha256(path.read_bytes()).hexdigest() for path in files}
 
 
@@ -120,10 +122,11 @@ def test_the_differences_are_small_but_there(checked):
     assert check["residual_rms_px"]["native"] == pytest.approx(check["residual_rms_px"]["pycolmap"], rel=1e-3)
 
 
-def test_only_the_report_changes(checked):
+def test_only_the_report_and_its_hashes_change(checked):
     run, before, _ = checked
     after = state_of(run)
-    assert {name for name in after if after[name] != before.get(name)} == {"report.json", "report.html"}
+    assert {name for name in after if after[name] != before.get(name)} == {"report.json", "report.html", RUN_MARKER}
+    assert verify(run).whole
     assert after.keys() == before.keys()
     assert after["database.db"] == before["database.db"]
 
@@ -610,7 +613,7 @@ def test_no_half_of_a_report(own_run):
     (own_run / "overlays/12/IMG_1000.jpg.jpg").unlink()
     before = state_of(own_run)
     with pytest.raises(FileNotFoundError):
-        write_report(own_run, load_run(own_run).report | {"notes": ["new"]})
+        write_report(own_run, load_run(own_run).report | {"notes": ["new"]}, own_run)
     assert state_of(own_run) == before
 
 
