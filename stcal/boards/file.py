@@ -2,16 +2,18 @@
 
 import tomllib
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated, Literal, Self
 
 import cv2
 import numpy as np
-from pydantic import AfterValidator, Field
+from pydantic import AfterValidator, Field, model_validator
 
 from stcal.boards.design import CharucoDesign, ChessboardDesign, FlatBoard, TagLayout
 from stcal.design import BoardDesign
 from stcal.errors import InputError
+from stcal.io.covariance import Rows, require_covariance
 from stcal.io.design import Count, load_board
+from stcal.io.mistakes import mistake
 from stcal.io.toml import Finite, Positive, Strict, load_toml
 
 REMEDY = 'a file with type = "chessboard", "charuco" or "tags" needed, or one of dots, see data_layout.md'
@@ -95,6 +97,29 @@ class TagsFile(Strict):
     tag_sigma_px: Annotated[float, Field(ge=0, le=1e3)] = 0.0
     covariance_mm2: list[list[Finite]] | None = None
     tag: list[TagEntry] = Field(min_length=1)
+
+    def covariance(self) -> np.ndarray | None:
+        """(8n, 8n) mm² of the corners' coordinates; None where the file states none."""
+        if self.covariance_mm2 is None:
+            return None
+        full = np.zeros((len(self.covariance_mm2),) * 2)
+        for k, row in enumerate(self.covariance_mm2):
+            full[k, : k + 1] = full[: k + 1, k] = row
+        return full
+
+    @model_validator(mode="after")
+    def _states_a_covariance(self) -> Self:
+        lower, size = self.covariance_mm2, 8 * len(self.tag)
+        if lower is not None and [len(row) for row in lower] != list(range(1, size + 1)):
+            raise mistake(f"covariance_mm2: not the lower triangle of {size} rows, 8 for each tag; calibrate again")
+        full = self.covariance()
+        if full is not None:
+            corners = [f"corner {corner} of tag {tag.id}" for tag in self.tag for corner in range(4)]
+            try:
+                require_covariance(full, size, Rows.of(corners, "xy"))
+            except InputError as error:
+                raise mistake(f"covariance_mm2: {error}; calibrate again") from error
+        return self
 
 
 def load_flat_board(path: str | Path) -> BoardDesign | FlatBoard:

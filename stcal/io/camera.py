@@ -10,6 +10,7 @@ import yaml
 
 from stcal.errors import InputError
 from stcal.geometry.camera import Camera
+from stcal.io.covariance import Rows, require_covariance
 from stcal.io.saving import save
 
 COLMAP_PIXEL_ORIGIN = 0.5
@@ -20,6 +21,8 @@ SIGMA, CORRELATION = "# SIGMA[]", "# CORRELATION[]"
 
 MAX_FOCAL_RATIO = 10.0
 """Between fx and fy; anamorphic lenses have 2."""
+SQUARE_WITHIN = 1e-6
+"""Of correlations of a parameter with itself, which are 1."""
 MAX_SIDE_PX = 1_000_000
 """Longest image side that a camera file may state, px."""
 
@@ -182,7 +185,7 @@ def read_camera(path: str | Path) -> CameraModel:
         rows = [line.split() for line in text.splitlines() if line.strip() and not line.lstrip().startswith("#")]
         if rows and len(rows[0]) >= 5 and re.fullmatch(r"[A-Z][A-Z0-9_]+", rows[0][1]):
             model = _from_colmap(rows, path)
-            return replace(model, covariance=_stated_covariance(text, len(rows[0]) - 4, path))
+            return replace(model, covariance=_stated_covariance(text, parameter_names(rows[0][1]), path))
         return _from_opencv(_yaml_values(text), path)
     except InputError:
         raise
@@ -206,24 +209,38 @@ def write_cameras_txt(path: str | Path, camera: CalibratedCamera) -> None:
     save(Path(path), "\n".join(lines) + "\n")
 
 
-def _stated_covariance(text: str, count: int, path: Path) -> np.ndarray | None:
-    """Covariance (count, count) of the comments that :func:`write_cameras_txt` makes; None without them."""
-    rows = {
+def _stated_covariance(text: str, names: list[str], path: Path) -> np.ndarray | None:
+    """Covariance (q, q) of the comments that :func:`write_cameras_txt` makes; None without them."""
+    stated = {
         key: [line.split()[2:] for line in text.splitlines() if line.startswith(key)] for key in (SIGMA, CORRELATION)
     }
-    if not rows[SIGMA]:
+    if not any(stated.values()):
         return None
+    count = len(names)
     try:
-        sigma = np.array(rows[SIGMA][0], float)
-        correlation = np.array(rows[CORRELATION], float).reshape(count, count)
+        if len(stated[SIGMA]) != 1 or [len(row) for row in stated[CORRELATION]] != [count] * count:
+            raise InputError(f"a line of {count} σ and {count}×{count} correlations needed")
+        sigma, correlation = np.array(stated[SIGMA][0], float), np.array(stated[CORRELATION], float)
+        if len(sigma) != count:
+            raise InputError(f"{len(sigma)} σ, {count} needed")
+        _require_sigmas(sigma, correlation, names)
         covariance = correlation * np.outer(sigma, sigma)
-        np.linalg.cholesky(covariance)
-    except (ValueError, np.linalg.LinAlgError) as error:
+        require_covariance(covariance, count, Rows(tuple(names)), definite=True)
+    except (InputError, ValueError) as error:
         raise InputError(
-            f"camera file {path}: SIGMA and CORRELATION do not state a covariance of {count} parameters; "
-            "write it again, or remove these comments"
+            f"camera file {path}: SIGMA and CORRELATION state no covariance of its parameters: {error}; write it "
+            "again, or remove these comments"
         ) from error
     return covariance
+
+
+def _require_sigmas(sigma: np.ndarray, correlation: np.ndarray, names: list[str]) -> None:
+    """What their product does not show: a sign, and a scale."""
+    for name, own, self_correlation in zip(names, sigma, np.diagonal(correlation), strict=True):
+        if not 0 < own <= MAX_SIDE_PX:
+            raise InputError(f"σ of {name} is {own:g}, a positive number up to {MAX_SIDE_PX} needed")
+        if not abs(self_correlation - 1) <= SQUARE_WITHIN:
+            raise InputError(f"correlation of {name} with itself is {self_correlation:g}, 1 needed")
 
 
 def _model(flat: np.ndarray, colmap_model: str, width, height, path: Path) -> CameraModel:

@@ -16,7 +16,8 @@ from pydantic_core import PydanticCustomError, core_schema
 from stcal.errors import InputError
 from stcal.geometry.arrays import frozen
 from stcal.geometry.rigid import Rigid
-from stcal.io.mistakes import first_mistake
+from stcal.io.covariance import OF_POINT, OF_POSE, Rows, require_covariance
+from stcal.io.mistakes import first_mistake, mistake
 
 
 class Part(BaseModel):
@@ -89,6 +90,21 @@ class PoseShape(Shape):
         return Shape.checked(self, value)
 
 
+@dataclass(frozen=True, slots=True)
+class CovarianceShape(Shape):
+    """A covariance: positive semi-definite up to rounding; ``rows`` : what its rows are of."""
+
+    rows: Rows
+
+    def checked(self, value: Any) -> np.ndarray:
+        try:
+            matrix = frozen(value)
+            require_covariance(matrix, self.sides[0] or len(matrix), self.rows)
+        except (InputError, ValueError, TypeError) as error:
+            raise mistake(str(error).removeprefix("array: ")) from error
+        return matrix
+
+
 Finite = Annotated[
     float | None, BeforeValidator(lambda value: None if value is None or not np.isfinite(value) else value)
 ]
@@ -97,6 +113,8 @@ Pose = Annotated[np.ndarray, PoseShape((4, 4))]
 Matrix3 = Annotated[np.ndarray, Shape((3, 3))]
 Matrix4 = Annotated[np.ndarray, Shape((4, 4))]
 Matrix6 = Annotated[np.ndarray, Shape((6, 6))]
+PointCovariance = Annotated[np.ndarray, CovarianceShape((3, 3), OF_POINT)]
+PoseCovariance = Annotated[np.ndarray, CovarianceShape((6, 6), OF_POSE)]
 Matrix = Annotated[np.ndarray, Shape((None, None))]
 Points = Annotated[np.ndarray, Shape((None, 3))]
 Vector = Annotated[np.ndarray, Shape((None,))]

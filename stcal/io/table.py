@@ -11,13 +11,13 @@ import numpy as np
 
 from stcal.errors import InputError
 from stcal.geometry.rigid import UNIT_WITHIN, Poses, Rigid
+from stcal.io.covariance import OF_POSE, TWIST, Rows, first_fault
 
 LENGTHS = {"mm": 1.0, "m": 1000.0, "um": 1e-3, "cm": 10.0, "in": 25.4}
 ANGLES = {"rad": 1.0, "deg": np.pi / 180}
 FARTHEST = 1e12
 """In any unit: farther than all that is measured, and its square is still a number."""
 QUATERNION = ("qw", "qx", "qy", "qz")
-TWIST = ("rx", "ry", "rz", "x", "y", "z")
 COVARIANCE = tuple(f"cov_{a}_{b}" for i, a in enumerate(TWIST) for b in TWIST[i:])
 """Upper triangle of a pose covariance, rows first: rotation vector (rad) and translation (mm), left perturbation."""
 COMMON = re.compile(r"common\d+_.+")
@@ -130,14 +130,20 @@ class Table:
         full = np.zeros((len(self), 6, 6))
         i, j = np.triu_indices(6)
         full[:, i, j] = full[:, j, i] = np.column_stack([self.numbers(prefix + name) for name in COVARIANCE])
-        sigma = np.sqrt(np.maximum(np.diagonal(full, axis1=1, axis2=2), 1e-300))
-        lowest = np.linalg.eigvalsh(full / sigma[:, :, None] / sigma[:, None, :])[:, 0]
-        bad = np.flatnonzero(lowest <= 0)
-        if len(bad):
-            raise InputError(
-                f"{self.where}: line {self.lines[bad[0]]}: covariance is not positive definite; correct it"
-            )
+        self.require_covariances(full, OF_POSE)
         return full
+
+    def require_covariances(self, full: np.ndarray, rows: Rows) -> None:
+        """Refuse the first line whose covariance, of (m, n, n), is none that can be inverted.
+
+        Raises
+        ------
+        InputError
+            Names the line and what is wrong.
+        """
+        fault = first_fault(full, rows, definite=True)
+        if fault is not None:
+            raise InputError(f"{self.where}: line {self.lines[fault.row]}: covariance: {fault.reason}; correct it")
 
     def common_errors(self, covariance: np.ndarray | None) -> np.ndarray | None:
         """(m, 6, r) of the columns ``common1_rx`` … ``common1_z``, ``common2_rx`` …; None where there are none.
@@ -157,13 +163,10 @@ class Table:
                 raise InputError(f"{self.where}: {name} is missing; all columns common1_rx … or none needed")
         values = np.column_stack([self.numbers(name) for name in common_columns(count)])
         full = np.swapaxes(values.reshape(len(self), count, 6), 1, 2)
-        sigma = np.sqrt(np.diagonal(covariance, axis1=1, axis2=2))
-        own = (covariance - full @ np.swapaxes(full, 1, 2)) / sigma[:, :, None] / sigma[:, None, :]
-        bad = np.flatnonzero(np.linalg.eigvalsh(own)[:, 0] <= 0)
-        if len(bad):
-            raise InputError(
-                f"{self.where}: line {self.lines[bad[0]]}: common errors are larger than the covariance; correct them"
-            )
+        fault = first_fault(covariance - full @ np.swapaxes(full, 1, 2), OF_POSE, definite=True)
+        if fault is not None:
+            where = f"{self.where}: line {self.lines[fault.row]}"
+            raise InputError(f"{where}: common errors are larger than the covariance; correct them")
         return full
 
     def header(self) -> str:

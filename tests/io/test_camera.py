@@ -208,6 +208,35 @@ def test_byte_order_mark_and_windows_line_ends(tmp_path):
     np.testing.assert_array_equal(model.centre, [500, 400])
 
 
+def stated(sigma, correlation, lines: int = 1) -> str:
+    """A camera that states the covariance of f, cx, cy, k1."""
+    text = "".join(f"# SIGMA[] {sigma}\n" for _ in range(lines))
+    return text + "".join(f"# CORRELATION[] {row}\n" for row in correlation) + "1 SIMPLE_RADIAL 640 480 700 320 240 0\n"
+
+
+SIGMA, ALONE = "0.3 0.2 0.2 1e-4", ["1 0 0 0", "0 1 0 0", "0 0 1 0", "0 0 0 1"]
+STATED = {
+    "negative": (
+        ("0.3 -0.2 0.2 1e-4", ALONE),
+        "σ of cx is -0.2, a positive number up to 1000000 needed; write it again",
+    ),
+    "zero": (("0.3 0.2 0 1e-4", ALONE), "σ of cy is 0, a positive"),
+    "NaN": (("nan 0.2 0.2 1e-4", ALONE), "σ of f is nan, a positive"),
+    "too large": (("0.3 0.2 0.2 1e200", ALONE), "σ of k1 is 1e\\+200, a positive"),
+    "a word": (("0.3 0.2 0.2 small", ALONE), "'small'"),
+    "too few": (("0.3 0.2 0.2", ALONE), "3 σ, 4 needed"),
+    "twice": ((SIGMA, ALONE, 2), "a line of 4 σ and 4×4 correlations needed"),
+    "none": ((SIGMA, ALONE, 0), "a line of 4 σ and 4×4 correlations needed"),
+    "no correlations": ((SIGMA, []), "a line of 4 σ and 4×4 correlations needed"),
+    "a row short": ((SIGMA, [*ALONE[:3], "0 0 1"]), "a line of 4 σ and 4×4 correlations needed"),
+    "correlation 9": ((SIGMA, ["1 9 0 0", "9 1 0 0", *ALONE[2:]]), "correlation 9 of f and cx, −1 to 1 needed"),
+    "upper only": ((SIGMA, ["1 0.5 0 0", *ALONE[1:]]), "not symmetric by 100 % at f, cx"),
+    "lower only": ((SIGMA, [ALONE[0], "0.5 1 0 0", *ALONE[2:]]), "not symmetric by 100 % at f, cx"),
+    "diagonal of 9": ((SIGMA, ["9 0 0 0", *ALONE[1:]]), "correlation of f with itself is 9, 1 needed"),
+    "singular": ((SIGMA, ["1 1 0 0", "1 1 0 0", *ALONE[2:]]), "eigenvalue .*, a positive number needed"),
+}
+
+
 # fmt: off
 WRONG = {
     "empty": ("", "neither COLMAP's cameras.txt nor OpenCV's"),
@@ -234,6 +263,7 @@ WRONG = {
     "COLMAP: inf distortion": ("1 SIMPLE_RADIAL 9 9 1 1 1 inf", "not a finite number"),
     "COLMAP: negative focal": ("1 PINHOLE 9 9 1 -7 1 1", "focal length 1, -7 px; positive numbers needed"),
     "COLMAP: zero focal": ("1 SIMPLE_PINHOLE 9 9 0 1 1", "focal length 0, 0 px; positive numbers needed"),
+    **{f"σ: {name}": (stated(*values), message) for name, (values, message) in STATED.items()},
     "YAML: broken": ("camera_matrix: [1, 2", "neither COLMAP's"),
     "YAML: unknown tag": ("a: !!python/object/apply:os.getcwd []", "could not determine a constructor"),
     "YAML: matrix tag on a number": ("camera_matrix: !!opencv-matrix 5", "expected a mapping node"),

@@ -135,13 +135,10 @@ def load_layout(path: str | Path) -> TargetLayout:
             f"{where}: tag {open_places[0][1]}: no place; x_mm, y_mm and size_mm or corners_mm needed, "
             "or the file that `stcal locate calibrate` writes"
         )
-    size = plan.corners_mm.size
-    covariance = data.sigma_mm**2 * np.eye(size)
-    corners = plan.corners_mm
-    if data.covariance_mm2 is not None:
-        covariance = _full(data.covariance_mm2, size, where)
-    else:
+    corners, stated = plan.corners_mm, data.covariance()
+    if stated is None:
         corners = _in_obj(corners, plan.origin)
+    covariance = data.sigma_mm**2 * np.eye(corners.size) if stated is None else _without_rounding(stated)
     return TargetLayout(plan.name, plan.tags, corners, covariance, plan.origin, data.sigma_px, data.tag_sigma_px)
 
 
@@ -206,16 +203,9 @@ def _in_obj(corners: np.ndarray, origin: int) -> np.ndarray:
     return corners @ turn.T + shift
 
 
-def _full(lower: list[list[float]], size: int, where: str) -> np.ndarray:
-    """A symmetric matrix without the negative eigenvalues that rounding makes of zeros."""
-    if [len(row) for row in lower] != list(range(1, size + 1)):
-        raise InputError(f"{where}: covariance_mm2 is not the lower triangle of {size} rows; calibrate again")
-    full = np.zeros((size, size))
-    for k, row in enumerate(lower):
-        full[k, : k + 1] = full[: k + 1, k] = row
-    value, vector = np.linalg.eigh(full)
-    if value[0] < -1e-4 * max(value[-1], 0):
-        raise InputError(f"{where}: covariance_mm2 is not positive; calibrate again")
+def _without_rounding(covariance: np.ndarray) -> np.ndarray:
+    """The same without the negative eigenvalues that rounding makes of zeros."""
+    value, vector = np.linalg.eigh(covariance)
     return (vector * np.maximum(value, 0)) @ vector.T
 
 

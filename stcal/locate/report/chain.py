@@ -10,7 +10,7 @@ import numpy as np
 from stcal.errors import InputError
 from stcal.geometry.rigid import Rigid
 from stcal.geometry.uncertain import UncertainRigid
-from stcal.io.json import Matrix6, Part, Pose, read_result
+from stcal.io.json import Part, Pose, PoseCovariance, read_result
 from stcal.io.table import read_table
 
 MOVING, FIXED = "flange_from_camera", "base_from_camera"
@@ -23,7 +23,7 @@ class HandEyeRead(Part):
     format: Literal["stcal handeye 1"] = "stcal handeye 1"
     flange_from_camera: Pose | None = None
     base_from_camera: Pose | None = None
-    covariance: Matrix6 | None = None
+    covariance: PoseCovariance | None = None
 
 
 class OffsetFile(Part):

@@ -8,10 +8,11 @@ import numpy as np
 
 from stcal.errors import InputError
 from stcal.geometry.arrays import Array, freeze
+from stcal.io.covariance import OF_POINT
 from stcal.io.table import LENGTHS, Table, read_table
 
 WHAT = "point pairs"
-AXES = "xyz"
+AXES = OF_POINT.names
 COVARIANCE = tuple(f"cov_{a}_{b}" for i, a in enumerate(AXES) for b in AXES[i:])
 """Upper triangle, mm², of the covariance of b − b_from_a a in frame b."""
 KINDS = "weight, sigma_mm, or cov_x_x … cov_z_z"
@@ -136,10 +137,5 @@ def _covariances(table: Table) -> np.ndarray:
     full = np.empty((len(table), 3, 3))
     i, j = np.triu_indices(3)
     full[:, i, j] = full[:, j, i] = np.column_stack([table.numbers(name) for name in COVARIANCE])
-    bad = np.flatnonzero(np.linalg.eigvalsh(full)[:, 0] <= 0)
-    if len(bad):
-        more = f" (and {len(bad) - 1} more)" if len(bad) > 1 else ""
-        raise InputError(
-            f"{table.where}: line {table.lines[bad[0]]}: covariance is not positive definite{more}; correct it"
-        )
+    table.require_covariances(full, OF_POINT)
     return full

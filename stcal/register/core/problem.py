@@ -5,6 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from stcal.errors import InputError
+from stcal.io.covariance import OF_POINT, first_fault
 from stcal.register.core.models import Model, Transform, fit, rounding_mm, squares, whitened
 
 
@@ -111,14 +112,20 @@ def noise_of(n: int, weights: np.ndarray | None, covariances: np.ndarray | None)
     if given.shape != (n,) and (name == "weights" or given.shape != (n, 3, 3)):
         raise InputError(f"registration: {name} of shape {given.shape} for {n} point pairs; one for each needed")
     matrices = given.ndim == 3
-    lowest = np.linalg.eigvalsh(given)[:, 0] if matrices else given
-    bad = np.flatnonzero(~(np.isfinite(lowest) & (lowest > 0)))
-    if len(bad):
-        raise InputError(
-            f"registration: {name}: row {bad[0] + 1} has {lowest[bad[0]]:.3g}, a positive number needed; "
-            "leave a row out to give it no weight"
-        )
+    _require_positive(given, name)
     if name == "weights":
         return PointNoise(given * np.mean(1 / given))
     variance = float(np.mean(np.trace(given, axis1=1, axis2=2) / 3 if matrices else given))
     return PointNoise((np.linalg.inv(given) if matrices else 1 / given) * variance, float(np.sqrt(variance)))
+
+
+def _require_positive(given: np.ndarray, name: str) -> None:
+    """Of weights or variances (n,), or covariances (n, 3, 3)."""
+    if given.ndim == 3:
+        fault = first_fault(given, OF_POINT, definite=True)
+        trouble = fault and f"row {fault.row + 1}: {fault.reason}"
+    else:
+        bad = np.flatnonzero(~(np.isfinite(given) & (given > 0)))
+        trouble = f"row {bad[0] + 1} has {given[bad[0]]:.3g}, a positive number needed" if len(bad) else None
+    if trouble:
+        raise InputError(f"registration: {name}: {trouble}; leave a row out to give it no weight")

@@ -1,13 +1,27 @@
 """``faces.json``: the calibrated target as a file."""
 
-from typing import Any, Literal
+from typing import Any, Literal, Self
 
 import numpy as np
-from pydantic import Field
+from pydantic import Field, model_validator
 
 from stcal.design import TargetDesign
+from stcal.errors import InputError
 from stcal.geometry.rigid import Rigid
-from stcal.io.json import ByFace, ByLabel, ByName, Matrix3, Matrix6, Part, Pose, ResultFile, Vector, Vector3
+from stcal.io.covariance import Rows, require_covariance
+from stcal.io.json import (
+    ByFace,
+    ByLabel,
+    ByName,
+    Part,
+    PointCovariance,
+    Pose,
+    PoseCovariance,
+    ResultFile,
+    Vector,
+    Vector3,
+)
+from stcal.io.mistakes import mistake
 from stcal.sfm.adjust.chain import CalibratedTarget
 from stcal.sfm.adjust.faces import FrameKind
 from stcal.sfm.adjust.options import AdjustOptions, Solve
@@ -32,18 +46,25 @@ class JointCovariance(Part):
     upper_triangle: Vector
 
     def matrix(self) -> np.ndarray:
-        """(3c, 3c) in the order of ``labels``.
-
-        Raises
-        ------
-        ValueError
-            The triangle is not of so many circles.
-        """
+        """(3c, 3c) in the order of ``labels``."""
         size = 3 * len(self.labels)
         i, j = np.triu_indices(size)
         full = np.zeros((size, size))
         full[i, j] = full[j, i] = self.upper_triangle
         return full
+
+    @model_validator(mode="after")
+    def _is_covariance(self) -> Self:
+        size = 3 * len(self.labels)
+        needed = size * (size + 1) // 2
+        if len(self.upper_triangle) != needed:
+            count = len(self.upper_triangle)
+            raise mistake(f"upper_triangle of {count} numbers, {needed} needed for {size}×{size}")
+        try:
+            require_covariance(self.matrix(), size, Rows.of(self.labels, "xyz"))
+        except InputError as error:
+            raise mistake(error) from error
+        return self
 
 
 class FacesFile(ResultFile):
@@ -65,7 +86,7 @@ class FacesFile(ResultFile):
         None,
         description="by which residuals of the run's groups exceed the centres' own σ; `measure` multiplies σ by it",
     )
-    target_from_face_covariance: dict[ByFace, Matrix6] = Field(
+    target_from_face_covariance: dict[ByFace, PoseCovariance] = Field(
         {},
         description="only with `joint`: rad and mm, see conventions; that of the reference face is 0 up to rounding",
     )
@@ -73,7 +94,7 @@ class FacesFile(ResultFile):
         {}, description='only with `joint`: `"a b"` → σ of the distance between the origins of two faces, mm'
     )
     scale_sigma_ppm: float | None = Field(None, description="only with `joint`: σ of the target's size")
-    circle_covariance_mm2: dict[ByLabel, Matrix3] = Field(
+    circle_covariance_mm2: dict[ByLabel, PointCovariance] = Field(
         {}, description="only with `joint`: `face:circle` → covariance, target frame, mm²"
     )
     circles_joint_covariance_mm2: JointCovariance | None = Field(

@@ -19,6 +19,7 @@ from stcal.geometry.pose_descent import Minima, PoseStack, block_diagonal
 from stcal.geometry.rigid import Rigid
 from stcal.geometry.uncertain import ImageFit
 from stcal.io.camera import CameraPrior, intrinsic_basis
+from stcal.io.covariance import OF_PIXEL, first_fault
 from stcal.labels import CircleLabel, circle_labels, parse_labels
 from stcal.sfm.data.model import Outlier
 from stcal.sfm.data.projection import CircleImages
@@ -170,8 +171,9 @@ def _problem(labels, centre_px, covariance_px2, target: TargetCircles, camera, o
     unknown = [labels[i] for i in used if labels[i] not in target.place]
     if unknown:
         raise InputError(f"{where}: circle {unknown[0]} is not in the calibrated target; give the target's own labels")
-    if not ((noise[:, 0, 0] > 0) & (np.linalg.det(noise) > 0)).all():
-        raise InputError(f"{where}: a covariance of a centre is not positive definite; correct it")
+    fault = first_fault(noise, OF_PIXEL, definite=True)
+    if fault is not None:
+        raise InputError(f"{where}: covariance of the centre of {labels[fault.row]}: {fault.reason}; correct it")
     place = np.array([target.place[labels[i]] for i in used], int)
     rows = (3 * place[:, None] + np.arange(3)).ravel()
     factor = target.sigma_factor if options.sigma_factor is None else options.sigma_factor

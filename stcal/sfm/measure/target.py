@@ -13,7 +13,8 @@ from stcal.geometry.align import align_rigid
 from stcal.geometry.arrays import frozen
 from stcal.geometry.plane import fit_plane
 from stcal.geometry.rigid import Rigid
-from stcal.io.json import checked, read_json
+from stcal.io.covariance import Rows, require_covariance
+from stcal.io.json import read_result
 from stcal.labels import CircleLabel, circle_labels
 from stcal.sfm.adjust.chain import CalibratedTarget
 from stcal.sfm.adjust.file import FacesFile
@@ -21,8 +22,6 @@ from stcal.sfm.adjust.file import FacesFile
 SAME_DESIGN_MM = 0.5
 """RMS by which a face's circles may differ from the design: made to a tenth of that, and drawn to far more."""
 SAME_RADIUS_MM = 1e-6
-NOT_NEGATIVE = 1e-6
-"""A covariance may have eigenvalues this far below zero, of its largest: it is singular, and its digits are rounded."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -58,6 +57,10 @@ class TargetCircles:
         object.__setattr__(self, "xyz", frozen(self.xyz, (c, 3), "circles"))
         object.__setattr__(self, "radius", frozen(self.radius, (c,), "radii"))
         object.__setattr__(self, "covariance", frozen(self.covariance, (3 * c, 3 * c), "circles' covariance"))
+        try:
+            require_covariance(self.covariance, 3 * c, Rows.of(self.labels, "xyz"))
+        except InputError as error:
+            raise InputError(f"circles' covariance: {error}; make the run again") from error
         object.__setattr__(self, "place", {label: i for i, label in enumerate(self.labels)})
         if len(self.place) < c or not (self.radius > 0).all():
             raise InputError("circles: a label twice, or a radius that is not positive; correct them")
@@ -109,9 +112,8 @@ def read_target(path: str | Path, design: TargetDesign) -> TargetCircles:
         Not a ``faces.json``, or one of another design.
     """
     path = Path(path)
-    content = read_json(path, "faces", "give RUN/faces.json")
+    faces = read_result(path, FacesFile, "faces", "give RUN/faces.json, the faces.json of a run")
     try:
-        faces = checked(content, FacesFile)
         labels = circle_labels(faces.circles)
         xyz = np.array(list(faces.circles.values())).reshape(-1, 3)
         radius = np.array([faces.radius_mm[label] for label in labels])
@@ -149,9 +151,6 @@ def _covariance(
             joint[3 * i : 3 * i + 3, 3 * i : 3 * i + 3] = single[label]
         what = "covariances between circles" if single else "covariances of its circles"
         notes = (f"the target states no {what}: they are taken as zero in the poses' covariances",)
-    value = np.linalg.eigvalsh(joint)
-    if value[0] < -NOT_NEGATIVE * max(value[-1], 0.0):
-        raise InputError("its covariance is not positive semi-definite")
     return joint, notes
 
 

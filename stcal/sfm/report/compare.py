@@ -11,7 +11,7 @@ from pydantic import Field
 from stcal.errors import DegenerateError, InputError
 from stcal.geometry.align import align_rigid
 from stcal.geometry.rigid import Rigid
-from stcal.io.json import ByFace, Matrix6, Part, Pose, ResultFile, Vector3, read_result
+from stcal.io.json import ByFace, Part, Pose, PoseCovariance, ResultFile, Vector3, read_result
 from stcal.labels import BOARD, CircleLabel, DotLabel, parse_label, parse_labels
 from stcal.report.text import number, text_table
 from stcal.synthetic.truth import TrueGroup, TrueImage, TruthFile
@@ -32,7 +32,7 @@ class Answer(Part):
     reference_face: str
     target_from_face: dict[str, Pose]
     circles: dict[str, Vector3]
-    target_from_face_covariance: dict[str, Matrix6] = Field({})
+    target_from_face_covariance: dict[str, PoseCovariance] = Field({})
 
 
 class FaceErrors(Part):

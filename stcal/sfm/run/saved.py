@@ -13,6 +13,7 @@ from stcal.errors import InputError, StcalError
 from stcal.geometry.arrays import frozen
 from stcal.geometry.camera import Camera
 from stcal.io.camera import CalibratedCamera, read_camera
+from stcal.io.covariance import OF_PIXEL, first_fault
 from stcal.io.design import load_board, load_target
 from stcal.io.json import checked, read_json
 from stcal.io.saving import BOARD, CAMERA, RUN_MARKER, TARGET
@@ -149,8 +150,9 @@ def _labels(path: Path, names: list[tuple[str, str, int]], camera: Camera, known
         columns = ("x_px", "y_px", "corrected_x_px", "corrected_y_px", *COVARIANCE)
         values = frozen([[row[column] for column in columns] for row in own] or np.zeros((0, 7)), (None, 7), name)
         covariance = values[:, [4, 5, 5, 6]].reshape(-1, 2, 2)
-        if not ((values[:, 4] > 0) & (np.linalg.det(covariance) > 0)).all():
-            raise ValueError(f"image {name}: a σ that is not positive")
+        fault = first_fault(covariance, OF_PIXEL, definite=True)
+        if fault is not None:
+            raise ValueError(f"image {name}: keypoint {fault.row}: covariance: {fault.reason}")
         observations.append(
             ImageObservations(
                 name=name,

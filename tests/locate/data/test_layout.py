@@ -63,13 +63,13 @@ def test_a_plan_may_leave_places_open(tmp_path):
         ("origin = 9\n" + TAG.format(1), "origin 9: no tag has this id"),
         (TAG.format(1) + "corners_mm = [[0, 0], [0, 9], [9, 9], [9, 0]]\n", "wrong way"),
         (TAG.format(1).replace("4x4_50", "9x9_50"), "unknown dictionary"),
-        ("covariance_mm2 = [[1.0]]\n" + PLACED.format(1, 0, 0, 0), "lower triangle of 8 rows"),
+        ("covariance_mm2 = [[1.0]]\n" + PLACED.format(1, 0, 0, 0), "covariance_mm2: not the lower triangle of 8 rows"),
         (
             "covariance_mm2 = ["
             + ", ".join(str([0.0] * k + [-1.0 if k else 1.0]) for k in range(8))
             + "]\n"
             + PLACED.format(1, 0, 0, 0),
-            "not positive",
+            "covariance_mm2: variance -1 of y of corner 0 of tag 1",
         ),
     ],
 )

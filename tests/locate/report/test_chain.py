@@ -16,6 +16,8 @@ FLANGE = Rigid.exp([1.0, 0, 0.5, 400, 0, 600])
 SEEN = UncertainRigid(Rigid.exp([0.2, 0, 0, 5, 6, 700]), np.diag([1e-6] * 3 + [0.01] * 3))
 OFFSET = Rigid.exp([0, 0, 0.5, 0, 0, -100])
 
+NEGATIVE = np.diag([1e-8, 1e-8, 1e-8, 1e-4, -250_000.0, 1e-4]).tolist()
+
 
 @pytest.fixture
 def files(tmp_path):
@@ -71,6 +73,10 @@ def test_what_is_wrong_is_named(files, tmp_path):
         ("[]", "an object"),
         ("{}", "neither; flange_from_camera or base_from_camera"),
         (json.dumps({"flange_from_camera": [[1, 2], [3, 4]]}), "flange_from_camera.*4×4 needed"),
+        (
+            json.dumps({"flange_from_camera": MOUNT.matrix().tolist(), "covariance": NEGATIVE}),
+            "covariance: variance -2.5e\\+05 of y, 0 or more needed",
+        ),
         (json.dumps({"flange_from_camera": "x"}), "flange_from_camera.*'x'"),
         (json.dumps({"format": "stcal handeye 2", "base_from_camera": MOUNT.matrix().tolist()}), "'stcal handeye 1'"),
     ]:

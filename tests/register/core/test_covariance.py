@@ -122,7 +122,7 @@ def test_weights_have_no_unit():
         (None, np.ones((4, 3)), r"covariances of shape \(4, 3\)"),
         ([1, 1, 0, 1], None, "weights: row 3 has 0, a positive number needed"),
         (None, [1, np.nan, 1, 1], "covariances: row 2 has nan"),
-        (None, np.tile(np.diag([1, 1, -1.0]), (4, 1, 1)), "covariances: row 1 has -1"),
+        (None, np.tile(np.diag([1, 1, -1.0]), (4, 1, 1)), r"covariances: row 1: variance -1 of z"),
     ],
 )
 def test_noise_that_cannot_be(weights, covariances, message):

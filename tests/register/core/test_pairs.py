@@ -61,7 +61,11 @@ def test_noise_of_three_kinds(written):
         (with_cells([1, -2, -1, 4]), HEAD + ",sigma_mm", r"line 3: sigma is -2.*\(and 1 more\)"),
         (with_cells(["1,1"] * 4), HEAD + ",sigma_mm,weight", r"columns weight and sigma; only one of"),
         (with_cells(["1,2"] * 4), HEAD + ",cov_x_x,cov_x_y", r"cov_x_z is missing; all 6 columns"),
-        (with_cells(["1,0,0,1,0,1"] * 3 + ["1,2,0,1,0,1"]), f"{HEAD},{COV}", r"line 5: covariance is not positive"),
+        (
+            with_cells(["1,0,0,1,0,1"] * 3 + ["1,2,0,1,0,1"]),
+            f"{HEAD},{COV}",
+            r"line 5: covariance: correlation 2 of x and y",
+        ),
     ],
 )
 def test_bad_files(written, rows, head, message):

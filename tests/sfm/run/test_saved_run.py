@@ -272,7 +272,7 @@ LABELS = {
     "a label twice": (rows(lambda body: [body[0], [*body[1][:4], body[0][4], *body[1][5:]], *body[2:]]), "label twice"),
     "a word for a number": (value(4, 5, "left"), "'left'"),
     "not a number": (value(4, 7, "nan"), "not finite"),
-    "σ of zero": (value(4, 9, "0"), "σ that is not positive"),
+    "σ of zero": (value(4, 9, "0"), "covariance: variance 0 of x, a positive number needed"),
     "cut in a row": (lambda path: path.write_bytes(path.read_bytes()[:-25]), "run it again"),
     "empty": (lambda path: path.write_bytes(b""), ORDER),
     "not UTF-8": (lambda path: path.write_bytes(b"\xff\xfe\xff"), "utf-8"),

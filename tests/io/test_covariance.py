@@ -1,0 +1,105 @@
+"""What is a covariance: rounding passes, all that cannot be one is named with what was measured."""
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from stcal.errors import InputError
+from stcal.io.covariance import OF_POSE, ROUNDING, Rows, first_fault, require_covariance
+from stcal.io.json import Part, PoseCovariance, checked
+
+SIGMA = np.array([1e-5, 2e-5, 3e-5, 0.01, 0.02, 500.0])
+"""rad and mm: sixteen orders of magnitude between variances."""
+
+
+def with_entry(i: int, j: int, correlation: float, both: bool = True) -> np.ndarray:
+    matrix = np.diag(SIGMA**2)
+    matrix[i, j] += correlation * SIGMA[i] * SIGMA[j] - (i == j) * matrix[i, j]
+    if both:
+        matrix[j, i] = matrix[i, j]
+    return matrix
+
+
+def without_a_reason_in_pairs() -> np.ndarray:
+    """Three correlations of −0.6 are possible alone, but not together: eigenvalue 1 − 2 · 0.6."""
+    correlation = np.eye(6)
+    correlation[:3, :3] -= 0.6 * (1 - np.eye(3))
+    return correlation * np.outer(SIGMA, SIGMA)
+
+
+def without_variance() -> np.ndarray:
+    matrix = with_entry(3, 4, 0.5)
+    matrix[3, 3] = 0
+    return matrix
+
+
+NONE = {
+    "negative variance": (with_entry(3, 3, -3.0), r"^variance -0\.0003 of x, 0 or more needed$"),
+    "correlation of 9": (with_entry(3, 4, 9.0), r"^correlation 9 of x and y, −1 to 1 needed$"),
+    "correlation over 1": (with_entry(0, 5, -1.01), r"^correlation -1\.01 of rx and z"),
+    "not symmetric": (
+        with_entry(0, 1, 0.5) + with_entry(0, 1, 0.06, both=False),
+        r"not symmetric by 10\.7 % at rx, ry",
+    ),
+    "one side only": (with_entry(4, 2, 0.5, both=False), r"not symmetric by 100 % at rz, y"),
+    "not together": (without_a_reason_in_pairs(), r"correlations have the eigenvalue -0\.2, 0 or more needed"),
+    "covariance without variance": (without_variance(), r"^correlation 5e\+03 of x and y"),
+    "NaN": (with_entry(1, 1, np.nan), "not finite"),
+    "infinite": (with_entry(1, 1, np.inf), "not finite"),
+    "too large": (with_entry(5, 5, 1e300), r"^variance 2\.5e\+305 of z, up to 1e\+24 needed$"),
+    "5×5": (np.eye(5), "^5×5, 6×6 needed$"),
+    "a row": (np.ones(6), "^6, 6×6 needed$"),
+}
+
+
+@pytest.mark.parametrize("case", NONE)
+def test_what_is_none_is_named(case):
+    matrix, message = NONE[case]
+    with pytest.raises(InputError, match=message):
+        require_covariance(matrix, 6, OF_POSE)
+
+
+@pytest.mark.parametrize("case", NONE)
+def test_files_name_the_place_and_not_the_numbers(case):
+    class Read(Part):
+        faces: dict[str, PoseCovariance]
+
+    with pytest.raises(InputError, match=r"^faces\.2: [^\[\]]*$"):
+        checked({"faces": {"1": np.eye(6).tolist(), "2": NONE[case][0].tolist()}}, Read)
+
+
+@given(st.integers(0, 2**32 - 1), st.integers(1, 12), st.integers(6, 12))
+def test_all_ranks_pass_with_six_digits(seed, rank, size):
+    """Singular ones too, as a covariance in the target's own frame is."""
+    rng = np.random.default_rng(seed)
+    root = rng.standard_normal((size, rank)) * 10.0 ** rng.uniform(-6, 2, size)[:, None]
+    full = root @ root.T
+    written = np.vectorize(lambda v: float(f"{v:.6g}"))(full)
+    require_covariance((written + written.T) / 2, size, Rows(tuple("abcdefghijkl")))
+
+
+@given(st.integers(0, 2**32 - 1))
+def test_rounding_of_zero_passes(seed):
+    """That of the reference face is computed as 1e-69 to 1e-20 of any sign."""
+    noise = np.random.default_rng(seed).standard_normal((6, 6)) * 1e-20
+    require_covariance(noise, 6, OF_POSE)
+
+
+def test_just_beyond_rounding():
+    low, high = (with_entry(0, 1, 1 + share * 6 * ROUNDING) for share in (0.5, 1.5))
+    require_covariance(low, 6, OF_POSE)
+    with pytest.raises(InputError, match="correlation 1 of rx and ry"):
+        require_covariance(high, 6, OF_POSE)
+
+
+def test_what_is_inverted_must_not_be_singular():
+    stack = np.tile(np.diag(SIGMA**2), (5, 1, 1))
+    assert first_fault(stack, OF_POSE, definite=True) is None
+    stack[2, 5, 5] = stack[4, 5, 5] = 0
+    assert first_fault(stack, OF_POSE) is None
+    fault = first_fault(stack, OF_POSE, definite=True)
+    assert fault is not None
+    assert fault.row == 2
+    assert fault.reason == "variance 0 of z, a positive number needed (and 1 more)"
+    assert first_fault(stack[:0], OF_POSE, definite=True) is None

@@ -1,0 +1,48 @@
+"""What ``compare`` and ``measure`` take of a ``faces.json``: no other format, no other unit, no matrix that is none."""
+
+import json
+
+import numpy as np
+import pytest
+
+from stcal.design import reference_target
+from stcal.errors import InputError
+from stcal.sfm.measure.target import read_target
+from stcal.sfm.report.compare import compare
+
+COVARIANCE = "target_from_face_covariance"
+
+
+def spoilt_covariance(change):
+    def spoil(content) -> None:
+        content[COVARIANCE]["2"] = change(np.array(content[COVARIANCE]["2"])).tolist()
+
+    return spoil
+
+
+def correlated(matrix: np.ndarray) -> np.ndarray:
+    matrix[3, 4] = matrix[4, 3] = 9 * np.sqrt(matrix[3, 3] * matrix[4, 4])
+    return matrix
+
+
+@pytest.mark.parametrize(
+    ("spoil", "message"),
+    [
+        (lambda content: content.update(unit="m"), r"unit: 'm': input should be 'mm'"),
+        (lambda content: content.update(format="stcal faces 2"), r"format: 'stcal faces 2': .*'stcal faces 1'"),
+        (spoilt_covariance(lambda c: c[:5, :5]), rf"{COVARIANCE}\.2: 5×5, 6×6 needed; give"),
+        (spoilt_covariance(lambda c: -c), rf"{COVARIANCE}\.2: variance -\S+ of rx, 0 or more needed; give"),
+        (spoilt_covariance(lambda c: c * np.nan), rf"{COVARIANCE}\.2: holds values that are not finite; give"),
+        (spoilt_covariance(correlated), rf"{COVARIANCE}\.2: correlation 9 of x and y, −1 to 1 needed; give"),
+        (spoilt_covariance(np.triu), rf"{COVARIANCE}\.2: not symmetric by 100 % at r\w, \w+; give"),
+    ],
+)
+def test_what_faces_json_may_not_hold(small_run, small_dataset, tmp_path, spoil, message):
+    content = json.loads((small_run / "faces.json").read_text())
+    spoil(content)
+    path = tmp_path / "faces.json"
+    path.write_text(json.dumps(content))
+    for read in (lambda: compare(path, small_dataset / "truth.json"), lambda: read_target(path, reference_target())):
+        with pytest.raises(InputError, match=message) as caught:
+            read()
+        assert len(str(caught.value).splitlines()) == 1
