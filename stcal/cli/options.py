@@ -49,10 +49,13 @@ MinDiameter = Annotated[
     typer.Option(
         "--min-diameter",
         min=4,
+        max=1e6,
         help="Ignore circles smaller than this, px; 4.5, and 9 over 8 megapixels, if not given.",
     ),
 ]
-MaxDiameter = Annotated[float, typer.Option("--max-diameter", min=8, help="Ignore circles larger than this, px.")]
+MaxDiameter = Annotated[
+    float, typer.Option("--max-diameter", min=8, max=1e6, help="Ignore circles larger than this, px.")
+]
 
 
 def ellipse_options(min_diameter: float | None, max_diameter: float) -> "EllipseOptions":

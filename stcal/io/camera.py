@@ -23,6 +23,8 @@ MAX_FOCAL_RATIO = 10.0
 """Between fx and fy; anamorphic lenses have 2."""
 SQUARE_WITHIN = 1e-6
 """Of correlations of a parameter with itself, which are 1."""
+FARTHEST = 1e12
+"""Of any parameter: its square is still a number."""
 MAX_SIDE_PX = 1_000_000
 """Longest image side that a camera file may state, px."""
 
@@ -246,6 +248,8 @@ def _require_sigmas(sigma: np.ndarray, correlation: np.ndarray, names: list[str]
 def _model(flat: np.ndarray, colmap_model: str, width, height, path: Path) -> CameraModel:
     if not np.isfinite(flat).all():
         raise InputError(f"camera file {path}: a camera parameter is not a finite number; correct it")
+    if (far := np.abs(flat).max()) > FARTHEST:
+        raise InputError(f"camera file {path}: a camera parameter of {far:g}, up to {FARTHEST:g} possible; correct it")
     if (flat[:2] <= 0).any():
         raise InputError(f"camera file {path}: focal length {flat[0]:g}, {flat[1]:g} px; positive numbers needed")
     if max(flat[:2]) > MAX_FOCAL_RATIO * min(flat[:2]):

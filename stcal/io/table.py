@@ -66,13 +66,17 @@ class Table:
     def quantity(self, name: str, units: dict[str, float]) -> np.ndarray:
         """(m,) of the column ``name_unit``, in mm or rad."""
         column = f"{name}_{self.unit(name, units)}"
+        return self._near(column) * units[self.unit(name, units)]
+
+    def _near(self, column: str) -> np.ndarray:
+        """(m,) of a column whose squares are numbers still."""
         values = self.numbers(column)
         far = np.flatnonzero(np.abs(values) > FARTHEST)
         if len(far):
             raise InputError(
                 f"{self.where}: line {self.lines[far[0]]}: {column} is {values[far[0]]:g}, up to {FARTHEST:g} possible"
             )
-        return values * units[self.unit(name, units)]
+        return values
 
     def unit(self, name: str, units: dict[str, float]) -> str:
         """In which of the units ``name`` is given."""
@@ -102,7 +106,7 @@ class Table:
     def poses(self, prefix: str = "") -> Poses:
         """m transforms of ``prefix + x`` … and ``prefix + qw`` …."""
         self.has_rotation(prefix)
-        wxyz = np.column_stack([self.numbers(prefix + c) for c in QUATERNION])
+        wxyz = np.column_stack([self._near(prefix + c) for c in QUATERNION])
         length = np.linalg.norm(wxyz, axis=1)
         bad = np.flatnonzero(np.abs(length - 1) > UNIT_WITHIN)
         if len(bad):

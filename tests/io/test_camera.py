@@ -340,3 +340,15 @@ def test_any_bytes_give_a_camera_or_one_line(tmp_path_factory, content):
     with pytest.raises(InputError) as caught:  # 80 random bytes are no camera
         read_camera(path)
     assert len(str(caught.value).splitlines()) == 1
+
+
+@pytest.mark.filterwarnings("error")
+@pytest.mark.parametrize("place", range(12))
+def test_a_parameter_out_of_all_bounds_is_named(tmp_path, place):
+    """Without a word of what overflows."""
+    values = [900.0, 900.0, 400.0, 300.0, *[0.0] * 8]
+    values[place] = 1e308
+    path = tmp_path / "cameras.txt"
+    path.write_text(f"1 FULL_OPENCV 800 600 {' '.join(map(str, values))}\n")
+    with pytest.raises(InputError, match=r"a camera parameter of 1e\+308, up to 1e\+12 possible; correct it"):
+        read_camera(path)

@@ -238,27 +238,36 @@ def _place(
         rotation = rotation @ np.array([[0, -1], [1, 0]])
     turned = uv @ rotation.T
     size = np.array([board.columns, board.rows])
-    low, high = -turned.max(0), size - turned.min(0)
-    offsets = np.stack(np.meshgrid(np.arange(low[0], high[0]), np.arange(low[1], high[1])), -1).reshape(-1, 2)
-    cells = turned + offsets[:, None]
-    inside = ((cells >= 0) & (cells < size)).all(2)
-    outside_count = (~inside).sum(1)
-    large = _large_dots(candidates, uv, index, board, homography)
     all_cells = np.stack(np.meshgrid(np.arange(size[0]), np.arange(size[1])), -1).reshape(-1, 2)
+    large = _large_dots(candidates, uv, index, board, homography)
     placements = []
-    for k in np.flatnonzero(outside_count <= MAX_UNEXPLAINED):
-        column_row = cells[k]
+    for offset in _offsets(turned, size):
+        column_row = turned + offset
+        inside = ((column_row >= 0) & (column_row < size)).all(1)
+        outside_count = (~inside).sum()
+        if outside_count > MAX_UNEXPLAINED:
+            continue
         if board.corner is not None:
             at_corner = (column_row == board.corner[::-1]).all(1)
-            if (large != at_corner)[inside[k]].any():
+            if (large != at_corner)[inside].any():
                 continue
-        back = (all_cells - offsets[k]) @ rotation
+        back = (all_cells - offset) @ rotation
         missing = np.ones(len(all_cells), bool)
-        missing[column_row[inside[k]] @ [1, board.columns]] = False
+        missing[column_row[inside] @ [1, board.columns]] = False
         expected = _inside_image(apply_homography(homography, back[missing]), homography, back[missing], image_corners)
-        unexplained = int(expected.sum() + outside_count[k])
-        placements.append(_Placement(unexplained, inside[k], column_row[:, ::-1], index))
+        unexplained = int(expected.sum() + outside_count)
+        placements.append(_Placement(unexplained, inside, column_row[:, ::-1], index))
     return placements
+
+
+def _offsets(cells: np.ndarray, size: np.ndarray) -> np.ndarray:
+    """Shifts (k, 2) of cells (n, 2), more than ``MAX_UNEXPLAINED``, that leave no more than that many of them outside
+    of a board along each axis; row by row."""
+    if len(cells) > size.prod() + MAX_UNEXPLAINED:
+        return np.zeros((0, 2), int)
+    in_order = np.sort(cells, axis=0)
+    low, high = -in_order[MAX_UNEXPLAINED], size - in_order[-1 - MAX_UNEXPLAINED]
+    return np.stack(np.meshgrid(np.arange(low[0], high[0]), np.arange(low[1], high[1])), -1).reshape(-1, 2)
 
 
 def _large_dots(candidates: Candidates, uv, index, board: BoardDesign, homography) -> np.ndarray:

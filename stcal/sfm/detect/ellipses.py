@@ -8,6 +8,7 @@ import numpy as np
 from scipy.spatial import KDTree
 
 from stcal.design import Polarity
+from stcal.errors import InputError
 from stcal.geometry.arrays import frozen
 
 WINDOWS_PX = (41, 193)
@@ -37,6 +38,13 @@ MAX_AREA_ERROR = 0.15
 MIN_THRESHOLD = 4.0
 """Grey values, of the 8-bit image."""
 
+OPTION_RANGES = {
+    "min_diameter_px": (1.0, 1e6),
+    "max_diameter_px": (1.0, 1e6),
+    "min_axis_ratio": (0.01, 1.0),
+    "min_contrast": (1e-6, 1.0),
+}
+
 
 @dataclass(frozen=True, slots=True)
 class EllipseOptions:
@@ -52,6 +60,12 @@ class EllipseOptions:
     max_diameter_px: float = 450.0
     min_axis_ratio: float = 0.2
     min_contrast: float = 0.08
+
+    def __post_init__(self):
+        for name, (low, high) in OPTION_RANGES.items():
+            value = getattr(self, name)
+            if value is not None and not low <= value <= high:
+                raise InputError(f"option {name} {value:g}: {low:g} to {high:g} possible; give another")
 
 
 @dataclass(frozen=True, slots=True, eq=False)

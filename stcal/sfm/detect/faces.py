@@ -117,6 +117,7 @@ class FaceFinder:
         """All faces among the candidates. The image of a face in a mirror can pass for another face, which only the
         group can tell."""
         readings: list[FaceReading] = []
+        known = {face.id: np.zeros((0, len(face.ids)), int) for face in self.target.faces}
         tries = np.zeros(len(candidates), int)
         explained: set[int] = set()
         starts = self._hypotheses(candidates) if len(candidates) >= MIN_CIRCLES else []
@@ -126,13 +127,14 @@ class FaceFinder:
             matched = index >= 0
             if tries[first] == MAX_TRIES or first in explained:
                 continue
-            if any(r.face is face and (r.index == index)[matched].sum() >= 2 for r in readings):
+            if ((known[face.id][:, matched] == index[matched]).sum(1) >= 2).any():
                 continue
             if rank >= FIRST_HYPOTHESES:
                 tries[first] += 1
             grown = grow_match(candidates, index, face.xy_mm, face.radius_mm)
             if grown is not None and _seen_from_outside(grown[1], face):
                 readings.append(FaceReading(face, _of_one_size(candidates, face, *grown), grown[1]))
+                known[face.id] = np.vstack([known[face.id], readings[-1].index])
         return _decide(readings, self.target)
 
     def find_mirrored(self, candidates: Candidates, named: tuple[FaceReading, ...]) -> tuple[FaceReading, ...]:

@@ -17,6 +17,9 @@ from stcal.sfm.detect.sightings import BoardSighting, FaceSighting, ImageDetecti
 
 FAINT = 0.25
 """Of the contrast asked for, where an image shows too little with that."""
+MAX_FREE = 400
+"""Outlines beside the boards that are tried for faces, the largest: photographs have up to 130, and time and memory
+grow with each; a fine checkerboard has tens of thousands."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -24,7 +27,8 @@ class ImageReading:
     """What the outlines in one image were read as, before their centres are measured.
 
     ``found`` : all outlines by polarity; ``boards`` : the one with the most dots first; ``free`` : the target's
-    outlines that are no board's; ``faces`` : what they were read as; ``mirrored`` : faces seen as in a mirror.
+    outlines that are no board's, the largest ``MAX_FREE``; ``faces`` : what they were read as; ``mirrored`` : faces
+    seen as in a mirror; ``untried`` : outlines that are too many.
     """
 
     found: dict[Polarity, Ellipses]
@@ -32,6 +36,7 @@ class ImageReading:
     free: Ellipses
     faces: FaceFinding
     mirrored: tuple[FaceReading, ...]
+    untried: int = 0
 
     def face_ids(self) -> set[str]:
         """Faces that are named."""
@@ -47,7 +52,8 @@ def read_image(
     """
     reading = _read_once(grey, camera, target, board, options)
     wanted = min(len(target.faces), 1 if board is None else 2)
-    if len(reading.face_ids()) < wanted or (board is not None and not reading.boards):
+    short = len(reading.face_ids()) < wanted or (board is not None and not reading.boards)
+    if short and not reading.untried:
         faint = replace(options, min_contrast=FAINT * options.min_contrast)
         again = _read_once(grey, camera, target, board, faint)
         better = (len(again.boards) > 0, len(again.face_ids())) > (len(reading.boards) > 0, len(reading.face_ids()))
@@ -66,10 +72,12 @@ def _read_once(
         boards = find_boards(Candidates.of(found[board.polarity], camera), board, _corners(camera))
         for each in boards:
             free[board.polarity][each.candidates] = False
-    ellipses = found[target.polarity].select(free[target.polarity])
+    every = found[target.polarity].select(free[target.polarity])
+    ellipses = every.select(np.sort(np.argsort(-every.radius_px(), kind="stable")[:MAX_FREE]))
     finder, candidates = FaceFinder(target), Candidates.of(ellipses, camera)
     faces = finder.find(candidates)
-    return ImageReading(found, tuple(boards), ellipses, faces, finder.find_mirrored(candidates, faces.faces))
+    mirrored = finder.find_mirrored(candidates, faces.faces)
+    return ImageReading(found, tuple(boards), ellipses, faces, mirrored, len(every) - len(ellipses))
 
 
 def detect_image(
@@ -78,7 +86,7 @@ def detect_image(
     """Find and measure all circles of the target and the board in one grey image of the camera's size."""
     reading = read_image(grey_8bit(image), camera, target, board, options)
     scaled = grey_fine(image)
-    notes: list[str] = []
+    notes = [_untried_note(reading)] if reading.untried else []
     parts: list[Centres] = []
     faces, boards, open_faces = [], [], []
     count = 0
@@ -134,6 +142,14 @@ def _nothing(image: np.ndarray, camera: Camera, ellipses: Ellipses) -> Centres:
 def _rim_note(label: str, rim: float) -> str:
     return (
         f"{label}: {100 * rim:.0f} % of its rim follows an ellipse, 80 % needed; partly hidden or disturbed, left out"
+    )
+
+
+def _untried_note(reading: ImageReading) -> str:
+    tried = len(reading.free)
+    return (
+        f"{tried + reading.untried} outlines like circles beside the board, the {tried} largest "
+        "were tried for faces; keep fine patterns out of view, or raise --min-diameter"
     )
 
 

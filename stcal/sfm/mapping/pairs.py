@@ -6,7 +6,7 @@ from itertools import combinations
 import cv2
 import numpy as np
 
-from stcal.errors import MappingError
+from stcal.errors import InputError, MappingError
 from stcal.geometry.camera import Camera
 from stcal.geometry.rigid import Rigid
 from stcal.sfm.data.observations import ImageObservations
@@ -30,6 +30,10 @@ class PairOptions:
     """
 
     max_angle_rad: float | None = None
+
+    def __post_init__(self):
+        if self.max_angle_rad is not None and not 0 < self.max_angle_rad <= np.pi:
+            raise InputError(f"option max_angle_rad {self.max_angle_rad:g}: more than 0, up to π needed; give another")
 
     def limit_rad(self) -> float:
         """The limit in force."""

@@ -21,6 +21,9 @@ SPREADS_DEG = (80.0, 70.0, 60.0, 50.0, 40.0)
 """Tried from the largest down: the tilts that a view may have keep the views closer together than that."""
 NEARER = 0.8
 MIN_IMAGES = 2
+MAX_DOTS = 500
+"""Of the board: time grows with the cube of their number, memory with its square; so many take half a minute and
+1 GB."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -138,10 +141,15 @@ def plan(
     Raises
     ------
     InputError
-        A face without nominal pose, or an unknown face in a group.
+        A face without nominal pose, an unknown face in a group, or a board of more than ``MAX_DOTS`` dots.
     DegenerateError
         A group cannot be photographed like that.
     """
+    if (dots := board.rows * board.columns) > MAX_DOTS:
+        raise InputError(
+            f"plan: board of {board.rows}×{board.columns} = {dots} dots, up to {MAX_DOTS} possible; plan with "
+            "fewer dots over the same area, the σ of the faces hardly change"
+        )
     scene = _scene(options, target, board, nominal)
     setup, models = _setup(scene, options, board), _models(scene, options)
     whole = forecast(models, setup)

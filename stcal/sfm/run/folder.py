@@ -1,5 +1,6 @@
 """What a run writes into its folder: overlays, results, report."""
 
+import hashlib
 import os
 from collections.abc import Mapping
 from concurrent.futures import ThreadPoolExecutor
@@ -25,6 +26,10 @@ from stcal.sfm.report.page import report_html, shown_overlays
 from stcal.sfm.run.output import report_of
 from stcal.sfm.run.result import RunResult
 from stcal.sfm.run.saved import SavedRun
+
+LONGEST_NAME = 200
+"""Bytes of an image's name in that of its overlay; file systems take 255, with what is added while it is written."""
+HASH_DIGITS = 12
 
 
 def write_overlays(
@@ -57,8 +62,12 @@ def _in_order(detection: DetectionResult, labelled: list[LabelledImage]):
 
 
 def overlay_path(out: Path, name: str) -> Path:
-    """The overlay of an image."""
-    return out / "overlays" / f"{name}.jpg"
+    """The overlay of an image; a long name is cut, and ends in its hash."""
+    group, slash, own = name.rpartition("/")
+    if len(own.encode()) > LONGEST_NAME:
+        cut = own.encode()[: LONGEST_NAME - HASH_DIGITS - 1].decode(errors="ignore")
+        own = f"{cut}-{hashlib.sha256(name.encode()).hexdigest()[:HASH_DIGITS]}"
+    return out / "overlays" / f"{group}{slash}{own}.jpg"
 
 
 def write_run(result: RunResult, out: Path, progress: Progress) -> None:

@@ -8,7 +8,7 @@ import pytest
 
 from stcal.errors import InputError
 from stcal.geometry.rigid import Poses, Rigid
-from stcal.io.table import COVARIANCE, POSE, common_columns, pose_cells
+from stcal.io.table import COVARIANCE, POSE, common_columns, pose_cells, read_table
 from stcal.robot.kinematics.example import mh80
 from stcal.robot.kinematics.file import save_robot
 from stcal.robot.kinematics.measurements import Measurements, read_measurements
@@ -151,3 +151,11 @@ def test_a_quote_without_end_is_named_by_its_line(tmp_path):
     rows[6] = '1,2,3,4,5,"moved'
     with pytest.raises(InputError, match=r"line 8: a quoted cell goes over several lines"):
         read(tmp_path, "\n".join(["q1_mm,q2_deg,x_mm,y_mm,z_mm,note", *rows]))
+
+
+@pytest.mark.filterwarnings("error")
+def test_a_quaternion_out_of_all_bounds_is_named(tmp_path):
+    path = tmp_path / "poses.csv"
+    path.write_text("x_mm,y_mm,z_mm,qw,qx,qy,qz\n1,2,3,1,0,1e308,0\n")
+    with pytest.raises(InputError, match=r"line 2: qy is 1e\+308, up to 1e\+12 possible"):
+        read_table(path, "poses").poses()

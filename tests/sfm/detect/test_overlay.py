@@ -1,11 +1,14 @@
 """What is drawn on an overlay is where it should be."""
 
+from pathlib import Path
+
 import cv2
 import numpy as np
 import pytest
 
 from stcal.sfm.data.observations import ImageObservations
 from stcal.sfm.detect.overlay import draw_overlay
+from stcal.sfm.run.folder import overlay_path
 
 FOCAL = np.array([2000.0, 2000.0])
 GREY = 90
@@ -71,3 +74,15 @@ def test_the_caption_grows_with_the_notes():
     caption = np.s_[-60:, :]
     assert (np.abs(noted - plain)[caption].max(2) > 60).sum() > 100
     assert np.abs(noted - plain)[:-80].max() < 20
+
+
+def test_a_long_name_is_cut_to_one_of_its_own():
+    long = ["ü" * 118 + f"{k}.jpg" for k in range(2)]
+    paths = [overlay_path(Path("out"), f"12/{name}") for name in long]
+    assert paths[0] != paths[1]
+    assert {path.parent for path in paths} == {Path("out/overlays/12")}
+    for path, name in zip(paths, long, strict=True):
+        assert 190 < len(path.name.encode()) <= 204
+        assert path.name[:80] == name[:80]
+    assert overlay_path(Path("out"), "12/a.jpg") == Path("out/overlays/12/a.jpg.jpg")
+    assert overlay_path(Path("out"), "a.jpg") == Path("out/overlays/a.jpg.jpg")

@@ -414,3 +414,9 @@ def test_plan_needs_the_size_of_the_camera():
         camera = CameraModel(focal, middle, np.zeros(8), "PINHOLE", *size, "f")
         with pytest.raises(InputError, match="camera file f states no image size"):
             PlanOptions(camera=camera)
+
+
+def test_a_board_of_too_many_dots_is_refused_at_once():
+    board = replace(reference_board(), rows=100, columns=100)
+    with pytest.raises(InputError, match=r"board of 100×100 = 10000 dots, up to 500 possible; plan with fewer dots"):
+        make_plan(PlanOptions(), reference_target(), board)

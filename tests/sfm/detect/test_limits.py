@@ -1,0 +1,60 @@
+"""Time and memory of detection have bounds, whatever the picture shows."""
+
+import cv2
+import numpy as np
+import pytest
+
+from stcal.design import reference_board, reference_target
+from stcal.errors import InputError
+from stcal.geometry.camera import Camera
+from stcal.sfm.detect import image as stage
+from stcal.sfm.detect.board import MAX_UNEXPLAINED, _offsets
+from stcal.sfm.detect.ellipses import OPTION_RANGES, EllipseOptions
+from stcal.sfm.mapping.pairs import PairOptions
+
+CAMERA = Camera(480, 360, np.array([500.0, 500.0]), np.array([240.0, 180.0]), np.zeros(8))
+
+
+def checkerboard(side: int = 6) -> np.ndarray:
+    y, x = np.mgrid[: CAMERA.height, : CAMERA.width]
+    return cv2.GaussianBlur((((x // side) + (y // side)) % 2 * 160 + 40).astype(np.uint8), (0, 0), 0.7)
+
+
+def test_of_a_fine_pattern_the_largest_outlines_are_tried_and_it_is_said(monkeypatch):
+    monkeypatch.setattr(stage, "MAX_FREE", 60)
+    found = stage.detect_image(checkerboard(), CAMERA, reference_target(), reference_board(), EllipseOptions())
+    assert found.candidates > 1000
+    assert (
+        "the 60 largest were tried for faces; keep fine patterns out of view, or raise --min-diameter" in found.notes[0]
+    )
+    assert found.boards == found.faces == ()
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_shifts_of_a_board_are_those_that_leave_few_dots_outside(seed):
+    """Against all shifts, tried one by one; holes and strays among the dots."""
+    rng, size = np.random.default_rng(seed), np.array([5, 4])
+    grid = np.stack(np.meshgrid(np.arange(5), np.arange(3)), -1).reshape(-1, 2) - [7, -2]
+    cells = np.vstack([rng.permutation(grid)[:11], [[3, 9]]])
+    tried = np.stack(np.meshgrid(np.arange(-20, 20), np.arange(-20, 20)), -1).reshape(-1, 2)
+    outside = [(~((cells + o >= 0) & (cells + o < size)).all(1)).sum() for o in tried]
+    wanted = tried[np.array(outside) <= MAX_UNEXPLAINED].tolist()
+    found = _offsets(cells, size).tolist()
+    kept = [o for o in found if o in wanted]
+    assert kept == wanted
+    assert len(wanted) > 0
+    assert len(found) < 30
+    assert len(_offsets(np.vstack([cells + np.array([100 * k, 0]) for k in range(9)]), size)) == 0
+
+
+@pytest.mark.parametrize("value", [0.0, -1.0, 1e308, np.inf, np.nan])
+@pytest.mark.parametrize("name", OPTION_RANGES)
+def test_options_have_ranges(name, value):
+    with pytest.raises(InputError, match=rf"option {name} .* possible; give another"):
+        EllipseOptions(**{name: value})
+
+
+@pytest.mark.parametrize("value", [0.0, 1e308, np.nan])
+def test_the_angle_of_a_pair_has_a_range(value):
+    with pytest.raises(InputError, match=r"option max_angle_rad .* up to π needed"):
+        PairOptions(value)
