@@ -94,3 +94,14 @@ def test_two_outputs_are_kept_apart(tmp_path):
 def test_every_path_of_a_list_is_an_input(tmp_path):
     with pytest.raises(InputError, match="is an input of this command"):
         keep_apart([("--out", tmp_path / "a")], [("sources", tmp_path / "a"), ("sources", tmp_path / "b")])
+
+
+@pytest.mark.parametrize("name", ["poses.csv", "a.json", "b.HTML", "figure.svg"])
+def test_a_table_in_a_folder_of_images_is_written_again(tmp_path, name):
+    """No command reads one from there."""
+    (tmp_path / name).write_text("an earlier table")
+    keep_apart([("--out", tmp_path / name)], [("images", tmp_path)])
+    for read in ("a.jpg", "cameras.txt", "points3D.bin", "database.db", "drawing.png"):
+        (tmp_path / read).write_text("mine")
+        with pytest.raises(InputError, match="is a file of images"):
+            keep_apart([("--out", tmp_path / read)], [("images", tmp_path)])

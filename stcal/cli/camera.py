@@ -6,7 +6,7 @@ from typing import Annotated
 import typer
 
 from stcal.cli.options import BoardFile, TargetFile, Workers
-from stcal.cli.terminal import StageProgress
+from stcal.cli.terminal import StageProgress, say
 from stcal.errors import InputError
 from stcal.io.camera import CalibratedCamera, write_cameras_txt
 from stcal.io.design import board_of, target_of
@@ -55,5 +55,5 @@ def calibrate_camera(
     summary = CalibrationFile.of(result)
     json_file = json_file or out.with_suffix(".json")
     save(json_file, json_text(summary))
-    print(calibration_text(result, summary))
-    print(f"camera file: {out}\nfigures and checks: {json_file}")
+    say(calibration_text(result, summary))
+    say(f"camera file: {out}\nfigures and checks: {json_file}")

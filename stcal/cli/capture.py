@@ -6,7 +6,7 @@ from typing import Annotated
 import typer
 
 from stcal.cli.options import BoardFile, JsonFile, Run, TargetFile
-from stcal.cli.terminal import StageProgress, write
+from stcal.cli.terminal import StageProgress, say, write
 from stcal.design import reference_board, reference_target
 from stcal.errors import InputError
 from stcal.io.camera import read_camera
@@ -76,7 +76,7 @@ def plan(
         seed,
     )
     result = planned(options, design, load_board(board) if board else reference_board(), nominal_poses(design, faces))
-    print(plan_text(result, source))
+    say(plan_text(result, source))
     if out:
         write(out, PlanFile.of_plan(result), "as JSON")
 
@@ -96,10 +96,10 @@ def advise(
 
     saved = load_run(run)
     if doubt := doubts(saved):
-        print(f"warning: {doubt}")
+        say(f"warning: {doubt}")
     known = known_of(saved)
     with StageProgress() as progress:
         advice = advice_for(known, count, progress)
-    print(advice_text(advice))
+    say(advice_text(advice))
     if out:
         write(out, AdviceFile.of_advice(advice), "as JSON")

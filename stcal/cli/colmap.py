@@ -7,7 +7,7 @@ from typing import Annotated
 import typer
 
 from stcal.cli.options import JsonFile, Run, Workers
-from stcal.cli.terminal import StageProgress, write
+from stcal.cli.terminal import StageProgress, say, write
 from stcal.errors import InputError, MappingError
 
 app = typer.Typer()
@@ -37,7 +37,7 @@ def export_database(
     from stcal.sfm.run.saved import load_run
 
     written = export(load_run(run).database, out, schema)
-    print(database_text(written))
+    say(database_text(written))
 
 
 @app.command(name="export-model")
@@ -59,7 +59,7 @@ def export_model(
     from stcal.sfm.interop.text import model_text
 
     written = export(run, out, kind)
-    print(model_text(written, kind))
+    say(model_text(written, kind))
 
 
 @app.command()
@@ -93,8 +93,8 @@ def crosscheck(
     saved = load_run(run)
     with StageProgress() as progress:
         check = crosscheck_run(saved, colmap, tolerances, timeout, progress)
-    print(comparison_text(check))
-    print(f"report: {run / 'report.html'}")
+    say(comparison_text(check))
+    say(f"report: {run / 'report.html'}")
     if check.differences:
         raise MappingError(
             f"cross-check: native COLMAP {check.native} and stcal differ: {'; '.join(check.differences)}"
@@ -125,10 +125,10 @@ def faces(
         raise InputError(f"{out}: no folder {out.parent}; make it, or give another place with --out")
     saved = load_run(run)
     calibration = calibrate_models(model, saved)
-    print(faces_text(calibration, saved))
+    say(faces_text(calibration, saved))
     if out is not None:
         write_faces(out, calibration, saved)
-        print(f"faces: {out}")
+        say(f"faces: {out}")
 
 
 @app.command()
@@ -147,8 +147,8 @@ def pairs(
     found = run_gates(saved, group)
     for name, rows in found.items():
         images = len({image for row in rows for image in (row.score.first, row.score.second)})
-        print(pairs_table(name, images, rows, len(rows) if everything else SHOWN_PAIRS), end="\n\n")
-    print(limits_text(saved.options.pairs))
+        say(pairs_table(name, images, rows, len(rows) if everything else SHOWN_PAIRS), end="\n\n")
+    say(limits_text(saved.options.pairs))
     if out:
         write(out, PairsFile.of(found), "as JSON")
 
@@ -175,6 +175,6 @@ def doctor(
     saved = load_run(run)
     with StageProgress() as progress:
         diagnosis = diagnose(saved, images, workers, progress)
-    print(findings.table(diagnosis, None if everything else findings.MAX_LINES))
+    say(findings.table(diagnosis, None if everything else findings.MAX_LINES))
     if out:
         write(out, DoctorFile.of(diagnosis), "as JSON")

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from stcal.cli.options import JsonFile, ReportFile, Workers
-from stcal.cli.terminal import StageProgress, print_each, write
+from stcal.cli.terminal import StageProgress, print_each, say, write
 from stcal.errors import InputError
 
 if TYPE_CHECKING:
@@ -144,12 +144,12 @@ def handeye(
         validation = Splits(splits, held_out, seed, workers)
         outcome = calibrate(given, setup.value, method, options, validation, progress)
     result = outcome.result
-    print(outcome_text(outcome))
+    say(outcome_text(outcome))
     for option, given_, able in (("--with-scale", with_scale, SCALED), ("--refine-camera", refine_camera, SCALED[1:])):
         if given_ and result.method not in able:
-            print(f"note: {option} does nothing for {result.method}, only for {' and '.join(able)}")
+            say(f"note: {option} does nothing for {result.method}, only for {' and '.join(able)}")
     for name, reason in outcome.left_out:
-        print(f"left out {name}: {reason}")
+        say(f"left out {name}: {reason}")
     print_each("note", outcome.all_notes())
     for path, content in (
         (out, lambda: HandEyeFile.of(outcome)),
@@ -189,7 +189,7 @@ def _save_camera(path: Path, outcome: "Outcome") -> None:
         raise InputError(f"--camera-out: {outcome.result.method} does not adjust the camera; leave --method out")
     path.parent.mkdir(parents=True, exist_ok=True)
     write_cameras_txt(path, CalibratedCamera.of(found.camera, outcome.colmap_model, found.camera_covariance))
-    print(f"written: {path}")
+    say(f"written: {path}")
 
 
 def _radians(degrees: float | None) -> float | None:

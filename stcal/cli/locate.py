@@ -7,7 +7,7 @@ from typing import Annotated
 import typer
 
 from stcal.cli.options import CameraFile, FlatBoardFile, JsonFile, LayoutFile, ReportFile, Workers
-from stcal.cli.terminal import StageProgress, print_each, write
+from stcal.cli.terminal import StageProgress, print_each, say, write
 from stcal.errors import InputError
 
 app = typer.Typer(
@@ -37,7 +37,7 @@ def schedule(
     from stcal.locate.data.exposures import exposure_times
 
     for time in exposure_times(shortest, longest, count):
-        print(f"{time:.6g}")
+        say(f"{time:.6g}")
 
 
 @app.command()
@@ -67,7 +67,7 @@ def calibrate(
     with StageProgress() as progress:
         found = calibration_images(images, model, design, dictionaries, workers, progress)
     result = calibrated(plan, found.views, found.tags, found.names, found.camera, found.symmetries)
-    print(calibrated_text(result))
+    say(calibrated_text(result))
     print_each("left out", (*found.left_out, *result.left_out))
     print_each("warning", warnings(result, plan.tags))
     write(out, layout_toml(result.layout, [f"Calibrated by stcal locate from {len(result.images)} images."]))
@@ -187,7 +187,7 @@ def run(
     if missing:
         raise InputError(f"robot poses {robot_poses}: none of scene {missing[0]}; add a row, or take the scene away")
     results = list(located(scenes, target, model, LocateOptions(method.value, limits, patent, moved_px, workers)))
-    print(run_text(results, chain))
+    say(run_text(results, chain))
     print_each("not used", (each for scene in scenes for each in scene.skipped))
     if out:
         write(out, poses_csv(results, chain))
@@ -198,5 +198,5 @@ def run(
 
         write(report, run_page(results, scenes, target, model, chain))
     if not accepted(results):
-        print(f"no pose accepted in {len(results)} scene{'s' * (len(results) > 1)}")
+        say(f"no pose accepted in {len(results)} scene{'s' * (len(results) > 1)}")
         raise typer.Exit(NOTHING_ACCEPTED)

@@ -9,7 +9,9 @@ import typer
 
 import stcal
 from stcal.cli import camera, capture, colmap, handeye, locate, measure, register, robot, sfm, simulate
+from stcal.cli.entry import NO_MEMORY, lacks_memory
 from stcal.cli.options import protect_inputs
+from stcal.cli.terminal import printable
 from stcal.errors import StcalError
 
 INTERRUPTED, TERMINATED = 130, 143
@@ -91,15 +93,15 @@ def _guarded(application: typer.Typer) -> None:
     except _Terminated:
         print("terminated", file=sys.stderr)
         sys.exit(TERMINATED)
-    except MemoryError:
-        if debug:
-            raise
-        _fail("not enough memory; use fewer --workers, smaller images or fewer of them at a time", 3)
     except OSError as error:
         if debug:
             raise
         where = f"{error.filename}: " if error.filename else ""
         _fail(f"{where}{error.strerror or error}; check the path, its rights and the free space", 2)
+    except Exception as error:
+        if debug or not lacks_memory(error):
+            raise
+        _fail(f"{NO_MEMORY}; use fewer --workers, smaller images or fewer of them at a time", 3)
 
 
 def _terminate(*_) -> NoReturn:
@@ -114,8 +116,7 @@ class _Terminated(BaseException):
 
 def _fail(message: str, code: int) -> NoReturn:
     """One line of printable characters, and the exit code."""
-    plain = "".join(c if c.isprintable() else " " for c in message)
-    line = " ".join(plain.split())
+    line = " ".join(printable(message).split())
     if len(line) > MESSAGE_CHARACTERS:
         line = f"{line[: MESSAGE_CHARACTERS // 2]} … {line[-MESSAGE_CHARACTERS // 2 :]}"
     print(f"error: {line}", file=sys.stderr)

@@ -6,7 +6,7 @@ from typing import Annotated
 import typer
 
 from stcal.cli.options import CameraFile, MaxDiameter, MinDiameter, ReportFile, TargetFile, Workers, ellipse_options
-from stcal.cli.terminal import StageProgress, print_each, write
+from stcal.cli.terminal import StageProgress, print_each, say, write
 from stcal.errors import InputError
 from stcal.io.camera import read_camera
 from stcal.io.design import load_board, target_of
@@ -79,7 +79,7 @@ def measure(
             images, read_camera(camera), known, design, load_board(board) if board else None, options, progress
         )
     text, apart = work.poses_csv(result, table)
-    print(work.measure_text(result))
+    say(work.measure_text(result))
     print_each("not joined", apart)
     write(out, text, "poses")
     if json_file:

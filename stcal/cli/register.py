@@ -7,7 +7,7 @@ from typing import Annotated
 import typer
 
 from stcal.cli.options import ReportFile
-from stcal.cli.terminal import print_each, write
+from stcal.cli.terminal import print_each, say, write
 from stcal.errors import ConvergenceError, DegenerateError, InputError
 
 
@@ -85,7 +85,7 @@ def register(
         lines=pairs.lines,
     )
     found = findings(pairs.where, pairs.lines, pairs.xyz_a, pairs.xyz_b, result, pairs.weights, pairs.covariances)
-    print(registration_text(found))
+    say(registration_text(found))
     print_each(f"warning: {pairs.where}", result.notes)
     content, sections, failed = RegistrationFile.of(found), [], None
     if robot_file:
@@ -94,7 +94,7 @@ def register(
 
         try:
             beside = compared(pairs, pairs_file, robot_file, found, options, folds)
-            print("", comparison_text(beside), sep="\n")
+            say("", comparison_text(beside), sep="\n")
             content = content.model_copy(update={"robot": robot_part(beside)})
             sections.append(comparison_section(beside))
             if identified:

@@ -8,7 +8,7 @@ from typing import Annotated
 import typer
 
 from stcal.cli.options import JsonFile, ReportFile, RobotFile
-from stcal.cli.terminal import print_each, write
+from stcal.cli.terminal import print_each, say, write
 from stcal.errors import DegenerateError, InputError
 
 app = typer.Typer(
@@ -66,7 +66,7 @@ def axes(
     nominal = load_robot(robot_file)
     data = read_measurements(sweeps, nominal)
     result = robot_from_sweeps(data, nominal, math.radians(still_deg))
-    print(axes_text(result))
+    say(axes_text(result))
     print_each(f"warning: {data.where}", result.notes)
     if out:
         write(out, robot_toml(result.robot, [f"Identified by the axis method from {sweeps.name}."]))
@@ -133,7 +133,7 @@ def identify(
     kind = observe.value if observe else None
     options = IdentifyOptions(kind, sigma_mm, sigma_rad, robust, folds, seed=seed, partial=partial)
     result = identified_from(nominal, data, options)
-    print(identified_text(result, nominal))
+    say(identified_text(result, nominal))
     if out:
         write(out, robot_toml(result.robot, [f"Identified from {data_file.name}: {result.rank} parameters."]))
     if json_file:
@@ -165,9 +165,9 @@ def compensate(
     identified = load_robot(robot_file)
     wanted = stage.read_targets(targets, identified)
     result = stage.compensate(identified, wanted, load_robot(nominal) if nominal else None)
-    print(stage.compensated_text(result, identified))
+    say(stage.compensated_text(result, identified))
     for line in stage.compensated_summary(result):
-        print(line)
+        say(line)
     print_each(f"warning: {wanted.where}", result.notes())
     if out:
         write(out, stage.compensated_csv(result, identified))
@@ -200,7 +200,7 @@ def verify(
     if plot and plot.suffix.lower() not in (".png", ".svg"):
         raise InputError(f"--plot {plot}: a name ending in .png or .svg needed")
     result = stage.verify(stage.read_measured(measured))
-    print(stage.verified_text(result))
+    say(stage.verified_text(result))
     print_each("warning", result.warnings())
     if plot:
         from stcal.robot.use.report import figure_bytes, verification_figure
@@ -255,9 +255,9 @@ def design(
     )
     robot = load_robot(robot_file)
     result = stage.design(robot, options)
-    print(stage.design_text(result))
+    say(stage.design_text(result))
     also = f" and {sigma_rad:g} rad" if observe is ObservedKind.pose else ""
-    print(f"for an instrument whose {observe.value}s have σ {sigma_mm:g} mm{also} per axis (--sigma-mm, --sigma-rad)")
+    say(f"for an instrument whose {observe.value}s have σ {sigma_mm:g} mm{also} per axis (--sigma-mm, --sigma-rad)")
     if out:
         write(out, stage.design_csv(result, robot))
     if json_file:

@@ -19,7 +19,7 @@ from stcal.cli.options import (
     Workers,
     ellipse_options,
 )
-from stcal.cli.terminal import StageProgress, write
+from stcal.cli.terminal import StageProgress, say, write
 from stcal.errors import InputError
 from stcal.io.camera import read_camera
 from stcal.io.design import board_of, target_of
@@ -133,7 +133,7 @@ def run(
     )
     with StageProgress() as progress:
         result = pipeline.run(images, camera, out, target, board, options, progress)
-    print(run_text(result))
+    say(run_text(result))
 
 
 @app.command()
@@ -167,8 +167,8 @@ def detect(
     given = {"images": images, "--camera": camera, "--target": target, "--board": board}
     with run_folder(out, MarkerFile.of(images, None), given) as folder, StageProgress() as progress:
         detection, labelled = pipeline.detect(images, model, folder, target_design, board_design, options, progress)
-    print(detection_text(detection, labelled))
-    print(f"detections: {out / 'detections.csv'}\noverlays:   {out / 'overlays'}")
+    say(detection_text(detection, labelled))
+    say(f"detections: {out / 'detections.csv'}\noverlays:   {out / 'overlays'}")
 
 
 @app.command()
@@ -178,7 +178,7 @@ def verify(run: Run, out: JsonFile = None) -> None:
     from stcal.sfm.run.verify import verify as verified
 
     result = verified(run)
-    print(verified_text(result))
+    say(verified_text(result))
     if out:
         write(out, result, "as JSON")
     require_whole(result)

@@ -8,7 +8,7 @@ from typing import Annotated
 import typer
 
 from stcal.cli.options import JsonFile, Workers
-from stcal.cli.terminal import StageProgress, write
+from stcal.cli.terminal import StageProgress, say, write
 from stcal.design import reference_board, reference_target
 from stcal.errors import InputError
 from stcal.io.design import board_toml, target_toml
@@ -27,7 +27,7 @@ def init(folder: Annotated[Path, typer.Argument(help="Write the two files to thi
             raise InputError(f"{folder / name}: exists; move it away, or give another folder")
     for name, text in texts.items():
         save(folder / name, text)
-        print(folder / name)
+        say(folder / name)
 
 
 @app.command()
@@ -68,7 +68,7 @@ def simulate(
     with StageProgress() as progress:
         step = partial(progress, "render")
         paths = write_dataset(folder, scene, rendering, image_format=kind, workers=workers, progress=step)
-    print(f"{len(paths)} images in {len(scene.groups)} groups: {folder}")
+    say(f"{len(paths)} images in {len(scene.groups)} groups: {folder}")
 
 
 @app.command()
@@ -87,10 +87,10 @@ def compare(
         with added_results(run_folder) as stage:
             comparison = against(run_folder, truth)
             save(stage / COMPARISON, json_text(comparison))
-        print(f"{comparison_table(comparison)}\nas JSON: {into_run}")
+        say(f"{comparison_table(comparison)}\nas JSON: {into_run}")
         return
     comparison = against(run_folder, truth)
-    print(comparison_table(comparison))
+    say(comparison_table(comparison))
     target = out or (into_run if run_folder.is_dir() else None)
     if target:
         write(target, comparison, "as JSON")
@@ -111,9 +111,9 @@ def demo(
     from stcal.workflows.demo import demo as demonstrate
 
     folder = out or Path(tempfile.mkdtemp(prefix="stcal-demo-"))
-    print(WHAT)
+    say(WHAT)
     with StageProgress() as progress:
         result, comparison = demonstrate(folder, workers, progress)
-    print(run_text(result))
-    print("\nagainst the truth:")
-    print(comparison_table(comparison))
+    say(run_text(result))
+    say("\nagainst the truth:")
+    say(comparison_table(comparison))

@@ -1,7 +1,9 @@
-"""What commands say beside their results: progress of long work, on standard error, and the files they write."""
+"""What commands say: results, in characters that a terminal prints and does not obey; progress of long work, on
+standard error; and the files they write."""
 
 import sys
 import time
+import unicodedata
 from collections.abc import Iterable
 from pathlib import Path
 
@@ -45,13 +47,30 @@ class StageProgress:
             print(f"{stage}: {done} of {total}", file=sys.stderr, flush=True)
 
 
+def printable(text: str) -> str:
+    """Text without what a terminal would obey: a space stands for white space other than a line's end, a question mark
+    for each character that is not printed."""
+    return "".join(c if c.isprintable() or c == "\n" else _instead(c) for c in text)
+
+
+def _instead(character: str) -> str:
+    if unicodedata.category(character) == "Zs":
+        return character
+    return " " if character.isspace() else "?"
+
+
+def say(*values: object, sep: str = " ", end: str = "\n") -> None:
+    """Print; names that come from files may hold any characters."""
+    print(printable(sep.join(map(str, values))), end=end)
+
+
 def write(path: Path, content, said: str = "written") -> None:
     """Save text, bytes, or a dict or result file as JSON, and say so."""
     saving.save(path, content if isinstance(content, str | bytes) else saving.json_text(content))
-    print(f"{said}: {path}")
+    say(f"{said}: {path}")
 
 
 def print_each(said: str, lines: Iterable[object]) -> None:
     """Each on a line of its own, after the word."""
     for line in lines:
-        print(f"{said}: {line}")
+        say(f"{said}: {line}")

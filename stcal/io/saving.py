@@ -31,8 +31,9 @@ RUN_ENTRIES = (
 UNFINISHED, ADDED, READY, CACHE = "unfinished", "added", "ready", "cache"
 """Folders in it: of a run that is going on, of files that a command adds to a finished one, of results about to take
 their places, of what later runs take up."""
-HEAD_BYTES = 400
-"""Of a result file, which hold its format."""
+NEVER_READ = (".csv", ".json", ".html", ".svg")
+"""Suffixes of outputs; but for a run's entries, what commands read from a folder are images, YAML poses, and COLMAP's
+models and databases."""
 
 
 def save(path: Path, content: str | bytes) -> None:
@@ -95,12 +96,8 @@ def keep_apart(outputs: Sequence[tuple[str, Path]], inputs: Sequence[tuple[str, 
 
 
 def _is_ours(place: Path, folder: Path) -> bool:
-    """Whether a file in an input folder is one that an earlier command left there beside the inputs: in a run's folder
-    whatever no run makes, elsewhere a result file of the package."""
+    """Whether no command reads a file that lies in an input folder: in a run's folder whatever no run makes, in one of
+    images what has a table's or a page's suffix."""
     if (folder / RUN_MARKER).exists():
         return place.relative_to(folder).parts[0] not in {*RUN_ENTRIES, UNFINISHED, ADDED, READY, CACHE}
-    try:
-        with open(place, "rb") as stream:
-            return b'"format": "stcal' in stream.read(HEAD_BYTES)
-    except OSError:
-        return False
+    return place.name not in RUN_ENTRIES and place.suffix.lower() in NEVER_READ

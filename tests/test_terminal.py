@@ -1,0 +1,54 @@
+"""What commands print is text: a terminal obeys nothing of it."""
+
+import re
+from pathlib import Path
+
+import pytest
+
+import stcal
+from stcal.cli import terminal
+from stcal.cli.entry import lacks_memory
+
+CLI = Path(stcal.__file__).parent / "cli"
+
+
+@pytest.mark.parametrize("name", ["\x1b[31mred", "a\rb", "bell\x07", "\u202egpj.exe", "\x9b2J", "\udc80"])
+def test_what_a_terminal_would_obey_is_a_question_mark(capsys, name):
+    terminal.say(f"12/{name}.jpg: 0.2 µm ± 3 mdeg – σ\n\u2009fine")
+    terminal.print_each("left out", [name])
+    text = capsys.readouterr().out
+    assert all(c.isprintable() or c in "\n\u2009" for c in text)
+    assert "\x1b" not in text
+    assert text.splitlines()[-1] in (
+        "left out: ?[31mred",
+        "left out: a b",
+        "left out: bell?",
+        "left out: ?gpj.exe",
+        "left out: ?2J",
+        "left out: ?",
+    )
+    assert "0.2 µm ± 3 mdeg – σ\n\u2009fine\n" in text
+
+
+def test_every_command_prints_through_it():
+    for path in CLI.glob("*.py"):
+        found = re.findall(r"(?<![\w.])print\((?!stcal|said|f\"error)", path.read_text(encoding="utf-8"))
+        allowed = {"terminal.py": 2, "main.py": 2}.get(path.name, 0)
+        assert len(found) <= allowed, path.name
+
+
+@pytest.mark.parametrize(
+    ("error", "used_up"),
+    [
+        (MemoryError(), True),
+        (RuntimeError("can't start new thread"), True),
+        (ImportError("libx.so: failed to map segment from shared object"), True),
+        (ImportError("No module named 'x'"), False),
+        (RuntimeError("a fault of ours"), False),
+    ],
+)
+def test_how_libraries_say_that_memory_is_used_up(error, used_up):
+    assert lacks_memory(error) == used_up
+    outer = ImportError("install it")
+    outer.__cause__ = error
+    assert lacks_memory(outer) == used_up
