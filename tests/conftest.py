@@ -11,10 +11,12 @@ if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:  # of a suite in the backg
 
 from collections.abc import Callable
 from dataclasses import replace
+from functools import cache
 from pathlib import Path
 
 import numpy as np
 import pytest
+import typer.main
 from hypothesis import settings
 
 from stcal.geometry.rigid import Rigid, Similarity
@@ -35,6 +37,7 @@ SAMPLE = Path(__file__).parent / "data" / "sample"
 
 
 settings.register_profile("quick", max_examples=20)
+typer.main.get_command = cache(typer.main.get_command)  # of hundreds of calls here, each would build the tree anew
 
 
 def pytest_configure(config):

@@ -47,11 +47,11 @@ def frozen(values: ArrayLike, shape: Shape | None = None, what: str = "array", d
         If the shape differs, or a float array holds a value that is not finite.
     """
     array = np.array(values, dtype=dtype)
-    if shape is not None and (
+    if shape not in (None, array.shape) and (
         array.ndim != len(shape) or any(n is not None and n != m for n, m in zip(shape, array.shape, strict=True))
     ):
         raise InputError(f"{what}: shape {array.shape}, {shape} needed")
-    if array.dtype.kind == "f" and not np.isfinite(array).all():
+    if array.dtype.kind == "f" and b"\0" in np.isfinite(array).tobytes():  # a third of the time of all() on few numbers
         raise InputError(f"{what}: holds values that are not finite")
     array.flags.writeable = False
     return array

@@ -132,3 +132,11 @@ def test_hubers_loss_and_its_weight_belong_together():
     assert slope == pytest.approx(2 * huber_weights(length, 3.0) * length, rel=1e-6)
     assert (huber_weights(length, np.inf) == 1).all()
     assert huber_cost(length, np.inf) == pytest.approx(length**2)
+
+
+@pytest.mark.parametrize("count", [1, 2, 7, 8])
+def test_the_middle_of_few_lengths(count):
+    """By which σ goes: of 1, 2, 3 … n it is (n + 1)/2; and one that is no number is not passed over."""
+    lengths = np.random.default_rng(count).permutation(np.arange(1.0, count + 1))
+    assert robust_sigma(lengths) * 0.6744897501960817 == pytest.approx((count + 1) / 2, rel=1e-12)
+    assert np.isnan(robust_sigma(np.append(lengths, np.nan)))

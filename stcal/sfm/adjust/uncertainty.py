@@ -1,5 +1,6 @@
 """The calibrated target of a joint adjustment with its marginal covariances."""
 
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import partial
 from itertools import combinations
@@ -106,13 +107,17 @@ def derivatives(result: JointResult, start: CalibratedTarget, target: TargetDesi
     own = _frames(result, result.xyz_model, start, target, kind)
     origin = _in_target_frame(own, result.xyz_model, start)
 
-    def by(change) -> tuple[dict[str, np.ndarray], np.ndarray]:
-        """Derivatives by one parameter: ``change(±step)`` gives the faces' frames that it moves, and the circles."""
-        (ahead_faces, ahead, _), (behind_faces, behind, _) = (
-            _in_target_frame(own | frames, xyz, start) for frames, xyz in (change(step), change(-step))
+    def by(changes: list[Callable[[float], tuple]]) -> tuple[dict[str, np.ndarray], np.ndarray]:
+        """Derivatives by some parameters: ``change(±step)`` gives the faces' frames that one moves, and the circles."""
+        ahead, behind = (
+            [_in_target_frame(own | frames, xyz, start) for frames, xyz in (change(move) for change in changes)]
+            for move in (step, -step)
         )
-        twists = {f: _perturbation(ahead_faces[f], behind_faces[f]) / (2 * step) for f in own}
-        return twists, (ahead - behind) / (2 * step)
+        if not changes:
+            return {f: np.zeros((6, 0)) for f in own}, np.zeros((len(result.labels), 3, 0))
+        twists = {f: _perturbations([a[0][f] for a in ahead], [b[0][f] for b in behind]) / (2 * step) for f in own}
+        moved = [(a[1] - b[1]) / (2 * step) for a, b in zip(ahead, behind, strict=True)]
+        return twists, np.stack(moved, axis=-1)
 
     def circle(i: int, axis: int, move: float):
         xyz = result.xyz_model.copy()
@@ -125,24 +130,18 @@ def derivatives(result: JointResult, start: CalibratedTarget, target: TargetDesi
 
     mapped = {face_id: [x.circle for x in result.labels if x.face == face_id] for face_id in own}
     places = [(f, c, axis) for f in own for c in missing_frame_circles(target.face(f), mapped[f]) for axis in range(2)]
-    by_circle = [by(partial(circle, i, axis)) for i in range(len(result.labels)) for axis in range(3)]
-    by_place = [by(partial(designed, *place)) for place in places]
+    by_circle = by([partial(circle, i, axis) for i in range(len(result.labels)) for axis in range(3)])
+    by_place = by([partial(designed, *place) for place in places])
     sigma = placement_sigma_mm(target, dict(zip(result.labels, result.xyz_model, strict=True))) if places else 0.0
-    none = np.zeros((len(result.labels), 3, 0))
-    return Derivatives(
-        *origin,
-        {f: np.column_stack([twists[f] for twists, _ in by_circle]) for f in own},
-        np.stack([moved for _, moved in by_circle], axis=-1),
-        {f: np.column_stack([twists[f] for twists, _ in by_place]) if places else np.zeros((6, 0)) for f in own},
-        np.stack([moved for _, moved in by_place], axis=-1) if places else none,
-        sigma,
-    )
+    return Derivatives(*origin, *by_circle, *by_place, sigma)
 
 
-def _perturbation(ahead: Rigid, behind: Rigid) -> np.ndarray:
-    """Rotation (rad) and translation (mm) between two close poses, in the frame they lead to, about the origin of b."""
-    rotation = Rotation.from_matrix(ahead.rotation @ behind.rotation.T).as_rotvec()
-    return np.concatenate([rotation, ahead.translation - behind.translation])
+def _perturbations(ahead: Sequence[Rigid], behind: Sequence[Rigid]) -> np.ndarray:
+    """Rotation (rad) and translation (mm), (6, n), between each two close poses, in the frame they lead to, about the
+    origin of b."""
+    turns = np.array([a.rotation @ b.rotation.T for a, b in zip(ahead, behind, strict=True)])
+    shifts = np.array([a.translation - b.translation for a, b in zip(ahead, behind, strict=True)])
+    return np.hstack([Rotation.from_matrix(turns).as_rotvec(), shifts]).T.copy()
 
 
 def _frames(
