@@ -36,7 +36,8 @@ def export_database(
     from stcal.sfm.interop.text import database_text
     from stcal.sfm.run.saved import load_run
 
-    written = export(load_run(run).database, out, schema)
+    saved = load_run(run)
+    written = export(saved.database, out, schema, saved)
     say(database_text(written))
 
 

@@ -5,10 +5,11 @@ import os
 import re
 import tempfile
 import threading
+import unicodedata
 import zlib
 from collections.abc import Iterator
 from dataclasses import dataclass
-from pathlib import Path
+from pathlib import Path, PurePosixPath, PureWindowsPath
 
 import cv2
 import numpy as np
@@ -95,14 +96,24 @@ def _sort_in(path: Path, name: str, group: str, files: list, skipped: list) -> N
     elif path.suffix.lower() not in SUFFIXES:
         kinds = ", ".join(SUFFIXES)
         skipped.append(Skipped(plain, "not an image file", "file_type", path.suffix or "no suffix", kinds))
-    elif plain != name or any(ord(c) < 32 for c in name):
+    elif plain != name or name_fault(name):
         # No file of results could hold such a name.
-        reason = "its name is not UTF-8, or holds a control character; rename it"
+        reason = f"its name {name_fault(name) or 'is not UTF-8'}; rename it"
         skipped.append(Skipped(repr(plain)[1:-1], reason, "file_name"))
     elif not path.is_file():
         skipped.append(Skipped(name, "cannot be read: not a file, or a broken link"))
     else:
         files.append(ImageFile(path, name, group))
+
+
+def name_fault(name: str) -> str | None:
+    """What is wrong with an image's name, which must lie below the folder of images on any system; None if nothing."""
+    if any(unicodedata.category(character) == "Cc" for character in name):
+        return "holds a control character"
+    for path in (PurePosixPath(name), PureWindowsPath(name)):
+        if path.anchor or path.drive or ".." in path.parts:
+            return "leads out of the folder of images"
+    return None
 
 
 def decode(data: bytes, name: str) -> np.ndarray:

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from stcal.errors import InputError
-from stcal.io.images import TOP_GROUP, decode, find_images
+from stcal.io.images import TOP_GROUP, decode, find_images, name_fault
 from stcal.io.saving import RUN_MARKER
 
 
@@ -106,3 +106,17 @@ def test_a_damaged_image_is_told_from_whole_ones_in_other_threads():
         faults = list(pool.map(fault, range(100)))
     assert [k for k, text in enumerate(faults) if text] == list(range(0, 100, 5))
     assert all("damaged (Corrupt JPEG data" in text for text in faults if text)
+
+
+@pytest.mark.parametrize(
+    ("name", "fault"),
+    [
+        *((name, None) for name in ("12/IMG_1.jpg", "a b/c.d.png", "..a/b..jpg", "a\\b.jpg", "ä/ö.tif")),
+        *((name, "leads out") for name in ("../x.jpg", "12/../x.jpg", "/x.jpg", "C:x.jpg", "C:\\x.jpg", "\\x.jpg")),
+        *((name, "leads out") for name in ("..\\x.jpg", "12\\..\\..\\x.jpg", "\\\\host\\share\\x.jpg", "12/..")),
+        *((name, "control character") for name in ("a\nb.jpg", "a\x1b[31m.jpg", "a\x7f.jpg", "a\x85.jpg", "a\0b")),
+    ],
+)
+def test_names_stay_below_the_folder(name, fault):
+    found = name_fault(name)
+    assert found is None if fault is None else fault in found

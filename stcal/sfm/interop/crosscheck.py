@@ -26,10 +26,9 @@ from stcal.sfm.interop.external import faces_from_models
 from stcal.sfm.interop.native import NativeColmap, find_colmap, map_natively, require_listable
 from stcal.sfm.interop.schema import schema_of_version
 from stcal.sfm.mapping.colmap import pycolmap
-from stcal.sfm.mapping.database import from_colmap_px, image_ids
+from stcal.sfm.mapping.database import image_ids
 from stcal.sfm.mapping.incremental import labelled_model, pipeline_options, seeded_mapping
 from stcal.sfm.mapping.models import (
-    KEYPOINT_TOLERANCE_PX,
     ReadModel,
     find_models,
     open_model,
@@ -101,9 +100,8 @@ def crosscheck(
     groups = run.groups()
     with tempfile.TemporaryDirectory(prefix="stcal-crosscheck-") as scratch:
         folder = Path(scratch)
-        export_database(run.database, folder / "native.db", schema)
-        export_database(run.database, folder / "ours.db", "4.2")
-        _require_keypoints(run, folder / "ours.db", ids)
+        export_database(run.database, folder / "native.db", schema, run)
+        export_database(run.database, folder / "ours.db", "4.2", run)
         for done, (name, group) in enumerate(groups.items()):
             progress("crosscheck", done, len(groups))
             names = [image.name for image in group]
@@ -141,20 +139,6 @@ def mapper_options(native: NativeColmap, names: list[str], pair: tuple[int, int]
 def _initial_pair(run: SavedRun, group: str, ids: dict[str, int]) -> tuple[int, int]:
     chosen = next(each for each in run.report["groups"] if each["name"] == group)["pairs"][0]
     return ids[chosen["first"]], ids[chosen["second"]]
-
-
-def _require_keypoints(run: SavedRun, copy: Path, ids: dict[str, int]) -> None:
-    """The database must hold the keypoints that the labels are of; ``copy`` may be changed."""
-    with pycolmap.Database.open(str(copy)) as opened:
-        names = {image.name: image.image_id for image in opened.read_all_images()}
-        found = {name: opened.read_keypoints(i)[:, :2] for name, i in names.items()} if names == ids else {}
-    for image, expected in zip(run.observations, run.corrected_px, strict=True):
-        xy = found.get(image.name)
-        off = np.inf if xy is None or len(xy) != len(expected) else np.abs(from_colmap_px(xy) - expected).max(initial=0)
-        if off > KEYPOINT_TOLERANCE_PX:
-            raise InputError(
-                f"{run.database}: its keypoints of {image.name} are not those of {run.folder / 'labels.csv'}; run again"
-            )
 
 
 def _native_model(folder: Path, group: str, native: NativeColmap, run: SavedRun, ids) -> tuple[Path, ReadModel]:

@@ -10,7 +10,9 @@ from itertools import zip_longest
 from pathlib import Path
 
 from stcal.errors import InputError, StcalError
+from stcal.sfm.interop.content import damaged, require_of_run, require_whole
 from stcal.sfm.interop.schema import SCHEMAS, SOURCE, Column, Index, Reference, Schema, SchemaTable, find_schema
+from stcal.sfm.run.saved import SavedRun
 
 HEADER = b"SQLite format 3\0"
 WAL_MODE = b"\2\2"
@@ -34,16 +36,18 @@ class Exported:
     camera_models: tuple[str, ...]
 
 
-def export_database(database: Path, out: Path, schema: str) -> Exported:
+def export_database(database: Path, out: Path, schema: str, run: SavedRun | None = None) -> Exported:
     """Write ``out``, the content of ``database`` in the schema of another COLMAP version.
 
-    Ids, the order of keypoints, matches and pairs, and every blob stay. ``database`` is only read, and ``out`` is
-    compared with it and with the published schema before it appears; it appears complete or not at all.
+    Ids, the order of keypoints, matches and pairs, and every blob stay. ``database`` is only read; every blob, name
+    and reference in it must be whole, and with ``run`` all of it what the run has labelled. ``out`` is compared with it
+    and with the published schema before it appears; it appears complete or not at all.
 
     Parameters
     ----------
     database : as pycolmap 4.2 writes it, with no other program at it
     schema : name of a schema of :mod:`stcal.sfm.interop.schema`
+    run : whose database it is
 
     Raises
     ------
@@ -62,6 +66,9 @@ def export_database(database: Path, out: Path, schema: str) -> Exported:
     with closing(_open_unchanged(database)) as source, closing(sqlite3.connect("")) as copy:
         _copy(database, source, copy)
         _require_expressible(database, copy, wanted)
+        require_whole(database, copy)
+        if run is not None:
+            require_of_run(database, copy, run)
         with tempfile.TemporaryDirectory(prefix=f".{out.name}-", dir=out.parent) as scratch:
             partial = Path(scratch) / out.name
             try:
@@ -116,7 +123,7 @@ def _open_unchanged(path: Path) -> sqlite3.Connection:
     except OSError as error:
         raise InputError(f"{path}: {error.strerror or error}; give a readable database") from error
     if not header.startswith(HEADER):
-        raise _damaged(path, "not an SQLite database")
+        raise damaged(path, "not an SQLite database")
     beside = [name for name in (f"{path.name}{suffix}" for suffix in SIDE_FILES) if path.with_name(name).exists()]
     if beside:
         raise _in_use(path, f"{', '.join(beside)} beside it")
@@ -135,19 +142,15 @@ def _copy(database: Path, source: sqlite3.Connection, copy: sqlite3.Connection) 
     except sqlite3.DatabaseError as error:
         if error.sqlite_errorcode in (sqlite3.SQLITE_BUSY, sqlite3.SQLITE_LOCKED):
             raise _in_use(database, str(error)) from error
-        raise _damaged(database, str(error)) from error
+        raise damaged(database, str(error)) from error
     if faults:
-        raise _damaged(database, faults[0])
+        raise damaged(database, faults[0])
     if differences:
-        raise _damaged(database, f"not as COLMAP {SOURCE.name} writes it: {differences[0]}")
+        raise damaged(database, f"not as COLMAP {SOURCE.name} writes it: {differences[0]}")
 
 
 def _in_use(path: Path, sign: str) -> InputError:
     return InputError(f"{path}: in use by another program ({sign}); close it, or make the run again")
-
-
-def _damaged(path: Path, sign: str) -> InputError:
-    return InputError(f"{path}: damaged ({sign}); make the run again")
 
 
 def table_differences(found: dict[str, SchemaTable], wanted: Schema) -> list[str]:

@@ -5,7 +5,7 @@ import io
 import os
 import tempfile
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Literal, get_args
 
@@ -15,9 +15,16 @@ from stcal.design import TargetDesign
 from stcal.errors import InputError
 from stcal.labels import DotLabel, Label
 from stcal.sfm.adjust.file import FacesFile
+from stcal.sfm.interop.fit import View, adjusted_camera, report_of_model, require_fit
 from stcal.sfm.mapping.colmap import pycolmap
 from stcal.sfm.mapping.database import colmap_camera, from_colmap_px
-from stcal.sfm.mapping.models import open_model, rigid_from_colmap, write_reconstruction
+from stcal.sfm.mapping.models import (
+    open_model,
+    pose_of_image,
+    require_keypoints,
+    rigid_from_colmap,
+    write_reconstruction,
+)
 from stcal.sfm.run.saved import SavedRun, load_run
 
 ModelFormat = Literal["colmap-bin", "colmap-txt", "ply", "nvm", "bundler"]
@@ -67,6 +74,9 @@ class _Point:
 def export_model(run: str | Path, out: str | Path, kind: str) -> ExportedModel:
     """Write a run's final model, mm, target frame, in another program's format; it appears complete or not at all.
 
+    The model must be the one that the report is of: every keypoint as near to the image of its point as it says, every
+    camera where it says.
+
     NVM and Bundler know one focal length, little distortion and a centred principal point. They get an ideal camera,
     without distortion, and the keypoints where that camera sees them; it is exact, but photographs have to be
     undistorted to match.
@@ -79,7 +89,7 @@ def export_model(run: str | Path, out: str | Path, kind: str) -> ExportedModel:
     Raises
     ------
     InputError
-        Not a finished run, a damaged model in it, an unknown format, or an ``out`` that exists.
+        Not a finished run, a damaged or changed model in it, an unknown format, or an ``out`` that exists.
     """
     out = Path(out)
     if kind not in get_args(ModelFormat):
@@ -87,7 +97,10 @@ def export_model(run: str | Path, out: str | Path, kind: str) -> ExportedModel:
     labels = out / "labels.csv" if kind in FOLDERS else out.with_name(f"{out.name}.labels.csv")
     _require_free(out, labels, kind)
     saved = load_run(run)
+    report = report_of_model(saved)
+    saved = replace(saved, camera=adjusted_camera(saved, report))
     reconstruction, points = _labelled_points(saved)
+    require_fit(saved.folder / TARGET_MODEL, _views(saved, reconstruction, points), saved.camera, report)
     ideal = kind in ("nvm", "bundler")
     camera = saved.camera
     focal_px = float(camera.focal.mean())
@@ -136,13 +149,14 @@ def _labelled_points(run: SavedRun) -> tuple[pycolmap.Reconstruction, list[_Poin
     native = colmap_camera(run.camera)
     if [camera.params.tolist() for camera in reconstruction.cameras.values()] != [native.params.tolist()]:
         raise InputError(f"model {path}: its camera is not that of the run's cameras.txt; run it again")
-    by_name = {image.name: image for image in run.observations}
+    place = {image.name: i for i, image in enumerate(run.observations)}
     image_of = {}
     for image_id, image in reconstruction.images.items():
-        observed = by_name.get(image.name)
-        if observed is None or len(observed) != image.num_points2D():
+        if image.name not in place or not image.has_pose:
             raise InputError(f"model {path}: image {image.name} is not as in the run's labels.csv; run it again")
-        image_of[image_id] = observed
+        i = place[image.name]
+        image_of[image_id] = run.observations[i]
+        require_keypoints(path, image, run.observations[i].labels, run.corrected_px[i])
     rgb = _colours(run.target)
     points = []
     for point_id, point in sorted(reconstruction.points3D.items()):
@@ -157,6 +171,23 @@ def _labelled_points(run: SavedRun) -> tuple[pycolmap.Reconstruction, list[_Poin
         group = groups.pop() if len(groups) == 1 else ""
         points.append(_Point(point_id, group, label, point.xyz.tolist(), colour, views))
     return reconstruction, points
+
+
+def _views(run: SavedRun, reconstruction: pycolmap.Reconstruction, points: Sequence[_Point]) -> dict[str, View]:
+    """What each image shows, by its name."""
+    images = _images(reconstruction)
+    shown: dict[int, list[tuple[_Point, int]]] = {image.image_id: [] for image in images}
+    for point in points:
+        for image_id, k in point.views:
+            shown[image_id].append((point, k))
+    views = {}
+    for image in images:
+        own = shown[image.image_id]
+        xy = np.array([image.points2D[k].xy for _, k in own]).reshape(-1, 2)
+        xyz = np.array([point.xyz for point, _ in own]).reshape(-1, 3)
+        pose = pose_of_image(run.folder / TARGET_MODEL, image)
+        views[image.name] = View(pose, [point.label for point, _ in own], xyz, from_colmap_px(xy))
+    return views
 
 
 def _colours(target: TargetDesign) -> dict[str, tuple[int, int, int]]:

@@ -50,7 +50,7 @@ def image_graph(
 
     ``kind`` : sparse above ``SPARSE_FROM`` images where None.
     """
-    kind = kind or ("sparse" if len(observations) > SPARSE_FROM else "all")
+    kind = kind_of_graph(len(observations), kind)
     seen = incidence(observations)
     shared = (seen.astype(np.float32) @ seen.T.astype(np.float32)).astype(np.int32)
     groups: dict[str, list[int]] = {}
@@ -68,6 +68,11 @@ def image_graph(
         pairs |= _links(indices, chosen, direction, seen, shared)
     _join_tracks(pairs, seen, shared, np.isin(np.arange(len(observations)), np.concatenate([*skeleton.values()])))
     return ImageGraph(kind, np.array(sorted(pairs), int).reshape(-1, 2), skeleton)
+
+
+def kind_of_graph(images: int, kind: GraphKind | None = None) -> GraphKind:
+    """Which graph so many images get, where it is not given."""
+    return kind or ("sparse" if images > SPARSE_FROM else "all")
 
 
 def incidence(observations: Sequence[ImageObservations]) -> np.ndarray:

@@ -202,7 +202,7 @@ def read_model(
                 f"{observations[-1].name}); {remedy}"
             )
         i = place[image.name]
-        _require_keypoints(path, image, observations[i].labels, corrected_px[i])
+        require_keypoints(path, image, observations[i].labels, corrected_px[i])
         members.setdefault(observations[i].group, []).append((observations[i], corrected_px[i], image))
     point_label, unlabelled = _labels_of_points(reconstruction, place, observations)
     groups, split = [], 0
@@ -264,10 +264,14 @@ class _Walk:
         self.skip(end + 1 - self.at if end >= 0 else len(self.data) + 1)
 
 
+def parameter_count(model: int) -> int:
+    """Of a camera model, by COLMAP's number; ValueError where there is none of that number."""
+    return len(pycolmap.Camera.create_from_model_id(1, pycolmap.CameraModelId(model), 1.0, 1, 1).params)
+
+
 def _skip_camera(walk: _Walk) -> None:
     walk.skip(4)
-    model = pycolmap.CameraModelId(walk.number("i"))
-    walk.skip(16 + 8 * len(pycolmap.Camera.create_from_model_id(1, model, 1.0, 1, 1).params))
+    walk.skip(16 + 8 * parameter_count(walk.number("i")))
 
 
 def _skip_rig(walk: _Walk) -> None:
@@ -318,8 +322,14 @@ def _require_whole(file: Path, skip: Callable[[_Walk], None]) -> None:
         raise ValueError(f"{file.name}: {len(walk.data)} bytes, {walk.at} by its own counts")
 
 
-def _require_keypoints(path: Path, image, labels: Sequence[str], corrected_px: np.ndarray) -> None:
-    """The model must rest on our keypoints, or (image, keypoint) names nothing."""
+def require_keypoints(path: Path, image: pycolmap.Image, labels: Sequence[str], corrected_px: np.ndarray) -> None:
+    """The model must rest on our keypoints, or (image, keypoint) names nothing.
+
+    Raises
+    ------
+    InputError
+        Another number of them, or one that is elsewhere.
+    """
     xy = from_colmap_px(np.array([point.xy for point in image.points2D]).reshape(-1, 2))
     if len(xy) != len(corrected_px):
         raise InputError(
@@ -349,8 +359,14 @@ def _require_fit(path: Path, model: GroupModel, camera: Camera) -> None:
         )
 
 
-def _pose(path: Path, image) -> Rigid:
-    """camera_from_model of an image of the model."""
+def pose_of_image(path: Path, image: pycolmap.Image) -> Rigid:
+    """camera_from_model of an image of the model.
+
+    Raises
+    ------
+    InputError
+        A quaternion that is far from unit length, or a translation that is not finite.
+    """
     pose = image.cam_from_world()
     length = float(np.linalg.norm(pose.rotation.quat))
     if not (abs(length - 1) <= MAX_LENGTH_ERROR and np.isfinite(pose.translation).all()):
@@ -405,7 +421,7 @@ def _group_model(path: Path, group: str, images, reconstruction, point_label) ->
     model = WorldModel(
         group=group,
         images=tuple(o.name for o, _, _ in images),
-        camera_from_model=tuple(_pose(path, image) for _, _, image in images),
+        camera_from_model=tuple(pose_of_image(path, image) for _, _, image in images),
         labels=tuple(labels),
         xyz_model=xyz,
         image_index=image_index,

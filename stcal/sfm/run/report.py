@@ -4,6 +4,7 @@ from typing import Literal
 
 from pydantic import Field
 
+from stcal.io.images import name_fault
 from stcal.io.json import ByFace, ByGroup, ByLabel, Matrix3, Pair, Part, Points, Pose, ResultFile, Vector, Vector3
 from stcal.sfm.adjust.faces import FrameKind
 from stcal.sfm.adjust.options import Solve
@@ -299,10 +300,13 @@ class ReportRead(Part):
         KeyError
             A group of images is missing.
         ValueError
-            A group's initial pair is not of its images.
+            A group's initial pair is not of its images, or a name leads out of the folder of images.
         """
         pairs = {each.name: each.pairs[0] for each in self.groups}
         names = [(each.name, each.group, each.circles) for each in self.images]
+        for name, _, _ in names:
+            if fault := name_fault(name):
+                raise ValueError(f"image {name!r}: its name {fault}")
         for group in {group for _, group, _ in names}:
             own = {name for name, of, _ in names if of == group}
             if not {pairs[group].first, pairs[group].second} <= own:

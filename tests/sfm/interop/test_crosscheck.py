@@ -568,8 +568,8 @@ def test_the_database_of_another_run(own_run, refused, tmp_path):
         opened.execute("PRAGMA journal_mode = DELETE")
         (data,) = opened.execute("SELECT data FROM keypoints WHERE image_id = 6").fetchone()
         opened.execute("UPDATE keypoints SET data = ? WHERE image_id = 6", [data[4:] + data[:4]])
-    parts = (f"{own_run / 'database.db'}: its keypoints of 14/IMG_1001.jpg are not those of", "labels.csv; run again")
-    refused(never(tmp_path), INPUT, *parts)
+    where = f"{own_run / 'database.db'}: its keypoints of 14/IMG_1001.jpg are not those of"
+    refused(never(tmp_path), INPUT, where, "labels.csv (up to", "px off, 0.002 allowed); run again")
 
 
 def test_a_database_with_other_images(own_run, refused, tmp_path):

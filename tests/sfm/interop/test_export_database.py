@@ -273,9 +273,24 @@ def test_native_colmap_maps_the_export(small_run, tmp_path):
 PAIR = "UPDATE two_view_geometries SET {} WHERE pair_id = (SELECT max(pair_id) FROM two_view_geometries)"
 SECOND_CAMERA = "INSERT INTO cameras SELECT 2, model, width, height, params, prior_focal_length FROM cameras"
 REFUSALS = {
-    "EUCM": (["UPDATE cameras SET model = 16"], "4.0", r"camera 1 with model 16 \(EUCM\)", "4.2"),
-    "division": (["UPDATE cameras SET model = 12"], "3.13", r"camera 1 with model 12 \(SIMPLE_DIVISION\)", "4.0"),
-    "thin prism": (["UPDATE cameras SET model = 11"], "3.10", r"model 11 \(RAD_TAN_THIN_PRISM_FISHEYE\)", "3.11"),
+    "EUCM": (
+        ["UPDATE cameras SET model = 16, params = zeroblob(48)"],
+        "4.0",
+        r"camera 1 with model 16 \(EUCM\)",
+        "4.2",
+    ),
+    "division": (
+        ["UPDATE cameras SET model = 12, params = zeroblob(32)"],
+        "3.13",
+        r"camera 1 with model 12 \(SIMPLE_DIVISION\)",
+        "4.0",
+    ),
+    "thin prism": (
+        ["UPDATE cameras SET model = 11, params = zeroblob(128)"],
+        "3.10",
+        r"model 11 \(RAD_TAN_THIN_PRISM_FISHEYE\)",
+        "3.11",
+    ),
     "rig pair": ([PAIR.format("config = 9")], "3.12", r"pair \d+ with config 9 \(CALIBRATED_RIG\)", "3.13"),
     "LoMa": ([DESCRIBE.format(type=3)], "4.0", r"image 1 with type 3 \(LOMA_B\)", "4.2"),
     "ALIKED": ([DESCRIBE.format(type=1)], "3.13", r"image 1 with type 1 \(ALIKED_N16ROT\)", "4.0"),

@@ -258,6 +258,14 @@ def test_one_ideal_camera_sees_what_the_run_saw(small_run, exported, known, keyp
     assert own["residual_rms_px"] < 0.02
 
 
+def allow(run, px: float) -> None:
+    """Let every residual be as large, as if the report said so."""
+    report = json.loads((run / "report.json").read_text(encoding="utf-8"))
+    for row in report["residuals_by_image"]:
+        row["max_px"] = px
+    (run / "report.json").write_text(json.dumps(report), encoding="utf-8")
+
+
 def refusal(run, out) -> str:
     with pytest.raises(InputError) as refused:
         export_model(run, out, "colmap-bin")
@@ -274,6 +282,7 @@ def test_two_focal_lengths_become_one(small_run, tmp_path, keypoints):
     native = pycolmap.Reconstruction(str(own / "target_model"))
     native.camera(1).params = camera.colmap_params()
     native.write_binary(str(own / "target_model"))
+    allow(own, 100.0)  # the lens is another one than that of the photographs
     written = export_model(own, tmp_path / "model.nvm", "nvm")
     assert written.focal_px == pytest.approx(1.01 * model.focal[1], abs=1e-9)
     cameras, points = read_nvm(tmp_path / "model.nvm")
