@@ -18,13 +18,15 @@ from stcal.geometry.rigid import Rigid
 from stcal.labels import BOARD
 from stcal.sfm.data.patterns import Pattern
 from stcal.sfm.detect.plane_bundle import PlaneBundle
-from stcal.sfm.detect.views import PlaneView, Readings
+from stcal.sfm.detect.sightings import PlaneView, Readings, flipped_pose
 
 MAX_SHIFT_PITCHES = 0.3
 """By how much a plane may be off its place in an image's first pose, in steps of the pattern; a wrong numbering of the
 board is one off."""
 MAX_SEEDS = 8
 """Images that the arrangement is started from, until one explains everything."""
+MIN_MIRRORED = 0.5
+"""Share of an image's circles that are where the group has one when the image is turned back."""
 MAX_OFF_PITCHES = 0.12
 """By how much the circles of a reading may be off after the adjustment, in steps of the pattern (median): of the
 reference target 3 mm, where a design is off by tenths and a wrong numbering by a whole step."""
@@ -360,3 +362,35 @@ def _reflected(found: Arrangement, patterns: dict[str, Pattern], real: str, imag
     seen_by = [i for i, views in found.views.items() if any(v.plane == image for v in views)]
     sides = [(found.camera_from_group[i].inverse().translation - middle) @ normal > 0 for i in seen_by]
     return bool(np.mean(sides) > 0.5) if sides else False
+
+
+def mirrored_images(
+    found: Arrangement, images: Sequence[list[Readings]], patterns: dict[str, Pattern], reach_mm: float
+) -> list[int]:
+    """Images of a group that are mirrored, though each of their faces passes for another one: what they show as the
+    board contradicts the group, and turned back it puts their circles where the group has those of its faces."""
+    return [
+        i
+        for i, contradicted in found.contradicted.items()
+        if any(
+            _is_mirrored(found, images[i], view, patterns, reach_mm)
+            for views in contradicted
+            for view in views
+            if view.plane == BOARD
+        )
+    ]
+
+
+def _is_mirrored(found: Arrangement, readings: list[Readings], board: PlaneView, patterns, reach_mm: float) -> bool:
+    seen = [views[0].xy for views in readings if views[0].plane != BOARD]
+    pose = flipped_pose(board, patterns[BOARD].xy_mm)
+    if BOARD not in found.group_from_plane or not seen or pose is None:
+        return False
+    camera_from_group = pose @ found.group_from_plane[BOARD].inverse()
+    planes = [camera_from_group @ (p @ patterns[k].xyz_mm()) for k, p in found.group_from_plane.items() if k != BOARD]
+    xyz = np.concatenate(planes or [np.zeros((0, 3))])
+    xyz = xyz[xyz[:, 2] > 0]
+    if not len(xyz):
+        return False
+    apart, at = KDTree(xyz[:, :2] / xyz[:, 2:]).query(np.concatenate(seen) * [-1, 1])
+    return bool(np.mean(apart * xyz[at, 2] < reach_mm) > MIN_MIRRORED)

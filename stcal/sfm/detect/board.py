@@ -42,12 +42,13 @@ class BoardReading:
 
     ``candidates`` : (n,) the dots found; ``numberings`` : (k, n, 2) row and column of each, one array for each
     numbering that the image admits, the likeliest first; ``homographies`` : (k, 3, 3) from the board plane (mm) into
-    normalised coordinates.
+    normalised coordinates; ``unlikely`` : (u, n, 2) further numberings, that hold where dots are covered.
     """
 
     candidates: np.ndarray
     numberings: np.ndarray
     homographies: np.ndarray
+    unlikely: np.ndarray
 
 
 def find_boards(candidates: Candidates, board: BoardDesign, image_corners: np.ndarray) -> list[BoardReading]:
@@ -188,8 +189,6 @@ def _number(candidates: Candidates, cells, board: BoardDesign, image_corners) ->
     placements = sorted((p for reading in readings for p in reading), key=lambda p: (p.unexplained, -len(p.inside)))
     if not placements:
         return None
-    most = placements[0].unexplained + MAX_UNEXPLAINED
-    placements = [p for p in placements if p.unexplained <= most]
     return _reading(placements, candidates, board)
 
 
@@ -290,9 +289,12 @@ def _inside_image(xy: np.ndarray, homography, uv, image_corners) -> np.ndarray:
 
 
 def _reading(placements: list[_Placement], candidates: Candidates, board: BoardDesign) -> BoardReading:
-    """The dots that all placements number, with their numberings and homographies."""
-    common = np.logical_and.reduce([p.inside for p in placements])
+    """The dots that all likely placements number, with their numberings and homographies, and what else they may be."""
+    most = placements[0].unexplained + MAX_UNEXPLAINED
+    likely = [p for p in placements if p.unexplained <= most]
+    common = np.logical_and.reduce([p.inside for p in likely])
     index = placements[0].index[common]
-    numberings = np.stack([p.cells[common] for p in placements])
+    numberings = np.stack([p.cells[common] for p in likely])
     homographies = [fit_homography(board.pitch_mm * n[:, ::-1].astype(float), candidates.xy[index]) for n in numberings]
-    return BoardReading(index, numberings, np.stack(homographies))
+    further = [p.cells[common] for p in placements if p.unexplained > most and p.inside[common].all()]
+    return BoardReading(index, numberings, np.stack(homographies), np.array(further, int).reshape(-1, len(index), 2))

@@ -203,7 +203,7 @@ def _save(path: Path, detection: ImageDetection, digest: str, image: np.ndarray)
         for k, face in enumerate(faces):
             arrays |= {f"open_rows_{i}_{k}": face.rows, f"open_circles_{i}_{k}": face.circles}
     for i, each in enumerate(detection.boards):
-        arrays |= {f"board_rows_{i}": each.rows, f"board_numberings_{i}": each.numberings}
+        arrays |= {f"board_{f.name}_{i}": getattr(each, f.name) for f in fields(BoardSighting)}
     keep(path, {"thumbnail": jpeg, **arrays}, meta)
 
 
@@ -216,7 +216,8 @@ def _load(file: ImageFile, path: Path, reused: bool) -> DetectedImage | None:
             for i, face in enumerate(meta["faces"])
         ]
         boards = [
-            BoardSighting(stored[f"board_rows_{i}"], stored[f"board_numberings_{i}"]) for i in range(meta["boards"])
+            BoardSighting(*(stored[f"board_{f.name}_{i}"] for f in fields(BoardSighting)))
+            for i in range(meta["boards"])
         ]
         open_faces = [
             tuple(

@@ -116,7 +116,7 @@ def detect_image(
     for each in reading.boards:
         first, polarity = count, board.polarity if board else target.polarity
         ok = measured(reading.found[polarity].select(each.candidates), polarity, ["a board dot"] * len(each.candidates))
-        boards.append(BoardSighting(np.arange(first, count), each.numberings[:, ok]))
+        boards.append(BoardSighting(np.arange(first, count), each.numberings[:, ok], each.unlikely[:, ok]))
     return ImageDetection(
         Centres.concatenate(parts or [_nothing(scaled, camera, reading.free)]),
         tuple(faces),

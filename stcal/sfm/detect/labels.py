@@ -12,10 +12,17 @@ from stcal.design import BoardDesign, TargetDesign
 from stcal.labels import BOARD, Label
 from stcal.sfm.data.centres import Centres
 from stcal.sfm.data.observations import ImageObservations
-from stcal.sfm.data.patterns import patterns_of
-from stcal.sfm.detect.arrangement import MAX_SHIFT_PITCHES, Arrangement, across_groups, arrange
+from stcal.sfm.data.patterns import Pattern, patterns_of
+from stcal.sfm.detect.arrangement import (
+    MAX_SHIFT_PITCHES,
+    Arrangement,
+    across_groups,
+    arrange,
+    mirrored_images,
+)
 from stcal.sfm.detect.ellipses import EllipseOptions
 from stcal.sfm.detect.files import DetectedImage, DetectionResult, look_again
+from stcal.sfm.detect.outlying import outlying_circles
 from stcal.sfm.detect.predict import (
     PredictedCircles,
     SecondLook,
@@ -24,8 +31,7 @@ from stcal.sfm.detect.predict import (
     missed_notes,
     predict_circles,
 )
-from stcal.sfm.detect.sightings import ImageDetection, open_face_note
-from stcal.sfm.detect.views import PlaneView, Readings, readings_of
+from stcal.sfm.detect.sightings import ImageDetection, PlaneView, Readings, likely_views, open_face_note, readings_of
 
 MIN_EXPECTED = 6
 """Circles that other images must show before their absence says anything: as many as name a face."""
@@ -94,13 +100,15 @@ def label_images(
     groups: dict[str, list[DetectedImage]] = {}
     for image in detection.images:
         groups.setdefault(image.file.group, []).append(image)
-    first: list[list[LabelledImage]] = []
+    patterns = patterns_of(target, board)
+    first: list[tuple[list[LabelledImage], Arrangement]] = []
     jobs: list[tuple[DetectedImage, PredictedCircles]] = []
     focal_px = float(np.sqrt(camera.focal.prod()))
     named = [[(i.file.name, i.file.group, i.detection) for i in members] for members in groups.values()]
     for members, (found, arrangement) in zip(
         groups.values(), label_groups(named, target, board, focal_px), strict=True
     ):
+        found, arrangement = _without_outlying(found, arrangement, patterns, focal_px)
         for i, (image, each) in enumerate(zip(members, found, strict=True)):
             predicted = predict_circles(arrangement, i, each.observations.labels, target, board, camera)
             if predicted is None:
@@ -109,9 +117,22 @@ def label_images(
             found[i] = each.without(wrong, contradicted_notes(wrong))
             if predicted.wanted.any():
                 jobs.append((image, predicted))
-        first.append(found)
+        first.append((found, arrangement))
     looks = look_again(jobs, camera, options, cache, workers)
-    return [each for group in first for each in _second(group, looks)]
+    return [
+        each
+        for found, arrangement in first
+        for each in _without_outlying(_second(found, looks), arrangement, patterns, focal_px)[0]
+    ]
+
+
+def _without_outlying(
+    group: list[LabelledImage], arrangement: Arrangement, patterns: dict[str, Pattern], focal_px: float
+) -> tuple[list[LabelledImage], Arrangement]:
+    """A group's images without the circles that contradict the rest, and the arrangement adjusted without them."""
+    arrangement, outlying = outlying_circles(arrangement, [each.observations for each in group], patterns, focal_px)
+    reasons = [outlying.get(i, {}) for i in range(len(group))]
+    return [e.without(r, contradicted_notes(r)) for e, r in zip(group, reasons, strict=True)], arrangement
 
 
 def _second(group: list[LabelledImage], looks: dict[str, SecondLook]) -> list[LabelledImage]:
@@ -156,14 +177,34 @@ def label_groups(
     patterns = patterns_of(target, board)
     step = step_mm(target, board)
     readings = [[[] if d.mirrored else readings_of(d, target, board) for _, _, d in images] for images in groups]
-    alone = [arrange(own, patterns, step, focal_px) for own in readings]
+    reach = MAX_SHIFT_PITCHES * step
+    alone = [_arranged(own, patterns, step, focal_px) for own in readings]
+    mirrored = [mirrored_images(*each, patterns, reach) for each in zip(alone, readings, strict=True)]
+    for group, gone in enumerate(mirrored):
+        if gone:
+            readings[group] = [[] if i in gone else each for i, each in enumerate(readings[group])]
+            alone[group] = _arranged(readings[group], patterns, step, focal_px)
     found = []
-    for images, own, arrangement in zip(
-        groups, readings, across_groups(alone, patterns, MAX_SHIFT_PITCHES * step), strict=True
+    for images, own, gone, arrangement in zip(
+        groups, readings, mirrored, across_groups(alone, patterns, reach), strict=True
     ):
-        labelled = [_labelled(*each, own[i], arrangement, i) for i, each in enumerate(images)]
+        labelled = [
+            _mirrored(*each, "the board") if i in gone else _labelled(*each, likely_views(own[i]), arrangement, i)
+            for i, each in enumerate(images)
+        ]
         found.append((labelled, arrangement))
     return found
+
+
+def _arranged(
+    readings: list[list[Readings]], patterns: dict[str, Pattern], step: float, focal_px: float
+) -> Arrangement:
+    """The arrangement of one group; of readings by which dots are covered only where these explain more."""
+    likely = arrange([likely_views(each) for each in readings], patterns, step, focal_px)
+    if not any(likely.contradicted.values()):
+        return likely
+    every = arrange(readings, patterns, step, focal_px)
+    return every if every.explained() > likely.explained() else likely
 
 
 def step_mm(target: TargetDesign, board: BoardDesign | None) -> float:
@@ -185,13 +226,9 @@ def _labelled(
     arrangement: Arrangement,
     image: int,
 ) -> LabelledImage:
-    notes = list(detection.notes)
     if detection.mirrored:
-        notes.append(
-            f"the image is mirrored: it shows face {', '.join(detection.mirrored)} as a mirror does; left out, turn it "
-            "back, or use the file that the camera wrote"
-        )
-        return labelled_image(name, group, (), detection.centres.select(np.zeros(0, int)), notes)
+        return _mirrored(name, group, detection, f"face {', '.join(detection.mirrored)}")
+    notes = list(detection.notes)
     if image in arrangement.views:
         views = list(arrangement.views[image])
         notes += [_contradiction(each) for each in arrangement.contradicted.get(image, ())]
@@ -205,6 +242,14 @@ def _labelled(
     rows = np.concatenate([view.rows for view in views]) if views else np.zeros(0, int)
     order = np.argsort(rows, kind="stable")
     return labelled_image(name, group, [labels[k] for k in order], detection.centres.select(rows[order]), notes)
+
+
+def _mirrored(name: str, group: str, detection: ImageDetection, shown: str) -> LabelledImage:
+    note = (
+        f"the image is mirrored: it shows {shown} as a mirror does; left out, turn it back, or use the file "
+        "that the camera wrote"
+    )
+    return labelled_image(name, group, (), detection.centres.select(np.zeros(0, int)), [*detection.notes, note])
 
 
 def _once(view: PlaneView, readings: list[Readings]) -> bool:

@@ -26,8 +26,6 @@ from stcal.sfm.detect.ellipses import MIN_DIAMETER_PX, EllipseOptions, Ellipses
 MAX_STRETCH = 1.15
 """Between the predicted and the measured ellipse along any direction, on top of half a pixel at each end: a circle
 whose edge is cut by a seventh of its diameter has its centre off by as much as the rim test lets pass."""
-USUAL_OFFSETS = 3.0
-"""Of the circles of a plane, median: how far from its place a circle may be where the design is off."""
 MAX_SIGMA_PX = 0.5
 """Of a centre: fifty times that of a clear one, so that it weighs nothing and only counts."""
 MIN_SIGNIFICANCE = 8.0
@@ -96,23 +94,20 @@ def predict_circles(
 
 
 def contradictions(predicted: PredictedCircles, seen: ImageObservations, camera: Camera) -> dict[Label, str]:
-    """Circles of the first look that are not where, or not of the size, that the others of their plane ask for: partly
-    hidden, or something else; with the reason. What most circles of a plane are off is the design's, and let pass."""
+    """Circles of the first look that are not of the size that the others of their plane ask for: partly hidden, or
+    something else; with the reason. By how much a plane's circles are all larger or smaller is the design's, and let
+    pass."""
     place = {label: i for i, label in enumerate(predicted.labels)}
     rows = np.array([k for k, label in enumerate(seen.labels) if label in place], int)
     own = np.array([place[seen.labels[k]] for k in rows], int)
-    off = np.linalg.norm(seen.centre_px[rows] - predicted.centre_px[own], axis=1)
     widest, narrowest = _stretch(predicted.shape_px[own], seen.shape[rows], seen.centre[rows], camera)
     planes = np.array([seen.labels[k].plane for k in rows], str)
     found: dict[Label, str] = {}
     for plane in dict.fromkeys(planes.tolist()):
         members = np.flatnonzero(planes == plane)
         size = float(np.median(np.sqrt(widest[members] * narrowest[members])))
-        usual = USUAL_OFFSETS * float(np.median(off[members]))
         for k in members.tolist():
-            reason = _disagreement(
-                predicted.shape_px[own[k]], float(off[k]), (widest[k] / size, narrowest[k] / size), usual
-            )
+            reason = _disagreement(predicted.shape_px[own[k]], 0.0, (widest[k] / size, narrowest[k] / size))
             if reason:
                 found[seen.labels[rows[k]]] = reason
     return found
@@ -124,13 +119,13 @@ def _stretch(shape_px: np.ndarray, shape: np.ndarray, centre: np.ndarray, camera
     return singular_values(np.linalg.solve(shape_px, local @ shape))
 
 
-def _disagreement(shape_px: np.ndarray, off_px: float, stretch: tuple[float, float], usual_px: float = 0.0) -> str:
+def _disagreement(shape_px: np.ndarray, off_px: float, stretch: tuple[float, float]) -> str:
     """Why a measured ellipse is not the one expected, of ``shape_px``; empty where it is.
 
     ``off_px`` : its distance from there; ``stretch`` : its largest and smallest size over the one expected.
     """
     largest, smallest = singular_values(shape_px)
-    allowed = max(MAX_POSITION_ERROR * float(np.sqrt(largest * smallest)), MAX_POSITION_ERROR_PX, usual_px)
+    allowed = max(MAX_POSITION_ERROR * float(np.sqrt(largest * smallest)), MAX_POSITION_ERROR_PX)
     if off_px > allowed:
         return f"{off_px:.1f} px from its place, {allowed:.1f} allowed"
     most, limit = max(stretch[0], 1 / stretch[1]), MAX_STRETCH * (1 + 0.5 / float(smallest))

@@ -1,16 +1,22 @@
-"""What one image shows, before the group is asked: planes of the target and boards, each with its circles."""
+"""What one image shows, before the group is asked: planes of the target and boards, each with its circles, and with the
+pose of each plane that they may be, which a group's arrangement is made from."""
 
 from collections.abc import Iterable
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from stcal.design import FaceDesign, TargetDesign
-from stcal.labels import BOARD, CircleLabel
+from stcal.design import BoardDesign, FaceDesign, TargetDesign
+from stcal.errors import ConvergenceError, DegenerateError
+from stcal.geometry.plane import camera_from_plane, fit_homography, refine_planar_pose
+from stcal.geometry.rigid import Rigid
+from stcal.labels import BOARD, CircleLabel, DotLabel, Label
 from stcal.sfm.data.centres import Centres
 
 SECOND_BOARD_SHARE = 0.8
 """A second board is one with at least this share of the dots of the first."""
+MIN_POSE_CIRCLES = 5
+"""Four fix a pose, one more lets it be doubted."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -43,10 +49,12 @@ def open_face_note(circles: int, faces: Iterable[str]) -> str:
 @dataclass(frozen=True, slots=True, eq=False)
 class BoardSighting:
     """A board: ``rows`` : (n,) of its dots among the image's centres, ``numberings`` : (k, n, 2) row and column of each
-    in each of the k numberings that the image admits, the likeliest first."""
+    in each of the k numberings that the image admits, the likeliest first; ``unlikely`` : (u, n, 2) further ones, by
+    which dots would be covered that lie in the image: they hold where the group says so."""
 
     rows: np.ndarray
     numberings: np.ndarray
+    unlikely: np.ndarray = field(default_factory=lambda: np.zeros((0, 0, 2), int))
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -89,3 +97,98 @@ class ImageDetection:
         faces = self.single_faces()
         labels = [label for each in faces for label in each.labels(target.face(each.face))]
         return labels, np.concatenate([each.rows for each in faces]) if faces else np.zeros(0, int)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class PlaneView:
+    """One way to read n circles of an image as those of one plane.
+
+    ``plane`` : face id or ``board``; ``rows`` : (n,) among the image's centres; ``xy_mm`` : (n, 2) in the plane;
+    ``xy`` : (n, 2) seen, normalised; ``area`` : that they take up, in units of their ellipses'; ``camera_from_plane`` :
+    from these alone; ``named`` : whether the image by itself tells which plane it is; ``likely`` : whether what is not
+    seen of the plane is out of the image, rather than covered.
+    """
+
+    plane: str
+    labels: tuple[Label, ...]
+    rows: np.ndarray
+    xy_mm: np.ndarray
+    xy: np.ndarray
+    area: float
+    camera_from_plane: Rigid
+    named: bool = True
+    likely: bool = True
+
+    def xyz_mm(self) -> np.ndarray:
+        """The circles, (n, 3), plane's frame."""
+        return np.column_stack([self.xy_mm, np.zeros(len(self.xy_mm))])
+
+    def span_mm(self) -> np.ndarray:
+        """Three points of the plane about its circles, (3, 3), plane's frame."""
+        low, high = self.xy_mm.min(0), self.xy_mm.max(0)
+        return np.array([[*low, 0.0], [high[0], low[1], 0.0], [low[0], high[1], 0.0]])
+
+
+Readings = list[PlaneView]
+"""The ways to read the same circles; one holds."""
+
+
+def readings_of(detection: ImageDetection, target: TargetDesign, board: BoardDesign | None) -> list[Readings]:
+    """What one image was read as, with a pose for each way to read it; without those too few to have one."""
+    found = []
+    for each in detection.faces:
+        found.append([_face_view(each, target, detection, named=True)])
+    for faces in detection.open_faces:
+        own = [_face_view(each, target, detection, named=False) for each in faces]
+        found.append([view for view in own if view is not None])
+    if board is not None:
+        for each in detection.boards:
+            found.append(_board_views(each, each.numberings, board, detection))
+            covered = _board_views(each, each.unlikely, board, detection)
+            found[-1] += [replace(view, likely=False) for view in covered if view is not None]
+    return [[v for v in views if v is not None] for views in found if views and all(v is not None for v in views)]
+
+
+def likely_views(readings: list[Readings]) -> list[Readings]:
+    """Without the ways to read circles by which others would be covered."""
+    return [[view for view in views if view.likely] for views in readings]
+
+
+def _board_views(
+    each: BoardSighting, numberings: np.ndarray, board: BoardDesign, detection: ImageDetection
+) -> list[PlaneView | None]:
+    places = board.pitch_mm * numberings[:, :, ::-1].astype(float)
+    labels = [tuple(DotLabel(*cell) for cell in cells.tolist()) for cells in numberings]
+    return [_view(BOARD, own, each.rows, xy, detection) for own, xy in zip(labels, places, strict=True)]
+
+
+def flipped_pose(view: PlaneView, design_mm: np.ndarray) -> Rigid | None:
+    """Pose of a board, of ``design_mm`` (m, 2), that the image shows as a mirror does; for a camera whose X is turned
+    round. None where there is none."""
+    xy_mm = np.column_stack([design_mm[:, 0].min() + design_mm[:, 0].max() - view.xy_mm[:, 0], view.xy_mm[:, 1]])
+    return _pose(xy_mm, view.xy * [-1, 1])
+
+
+def _face_view(each: FaceSighting, target: TargetDesign, detection: ImageDetection, named: bool) -> PlaneView | None:
+    face = target.face(each.face)
+    return _view(face.id, each.labels(face), each.rows, face.xy_mm[each.circles], detection, named)
+
+
+def _view(
+    plane: str, labels, rows: np.ndarray, xy_mm: np.ndarray, detection: ImageDetection, named: bool = True
+) -> PlaneView | None:
+    xy = detection.centres.centre[rows]
+    if len(rows) < MIN_POSE_CIRCLES:
+        return None
+    pose = _pose(xy_mm, xy)
+    if pose is None:
+        return None
+    area = float(np.abs(np.linalg.det(detection.centres.shape[rows])).sum())
+    return PlaneView(plane, labels, rows, xy_mm, xy, area, pose, named)
+
+
+def _pose(xy_mm: np.ndarray, xy: np.ndarray) -> Rigid | None:
+    try:
+        return refine_planar_pose(camera_from_plane(fit_homography(xy_mm, xy)), xy_mm, xy)
+    except (ConvergenceError, DegenerateError):
+        return None

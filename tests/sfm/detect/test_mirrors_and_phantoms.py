@@ -100,6 +100,17 @@ def test_one_mirrored_image_loses_its_labels_and_says_so(bench):
     assert found.counts["must_dots"] == 2 * 63
 
 
+def test_a_mirrored_image_of_which_every_face_passes_for_another_is_told_by_its_board(bench):
+    """Faces 2, 3 and 5 pass for 4, 5 and 3, which no image by itself can tell."""
+    found = bench.label("mirrored", "one image", "23")
+    found.assert_all_found()
+    (mirrored,) = [name for name, picture in found.pictures.items() if picture.mirrored]
+    assert found.labels(mirrored) == set()
+    (note,) = found.images[mirrored].notes
+    assert note.startswith("the image is mirrored: it shows the board as a mirror does; left out")
+    assert found.counts["must"] == 2 * 20
+
+
 def detected(name, faces=(), mirrored=()):
     """An image that shows these faces, or these as a mirror does."""
     nothing = Centres(*(np.zeros((0, *shape)) for shape in ((2,), (2,), (2, 2), (2, 2), *[()] * 4, (2,), ())))

@@ -1,5 +1,5 @@
-"""The second look: circles that are not where their plane asks for are taken out, those that are missing are measured
-where they must be, and a face that one image alone reads is held against the others."""
+"""The second look: circles that are not as large as their plane asks for are taken out, those that are missing are
+measured where they must be, and a face that one image alone reads is held against the others."""
 
 import cv2
 import numpy as np
@@ -42,9 +42,6 @@ class FirstLook:
         self.centre_px = self.place + rng.normal(0, 0.05, (n, 2))
         self.shape_px = self.shape * (1 + rng.normal(0, 0.005, (n, 1, 1)))
 
-    def move(self, circles, by_px):
-        self.centre_px[circles] += by_px
-
     def cut(self, circle, share):
         """A segment of this share of the circle's area covered: the ellipse of what is left."""
         heights = np.linspace(-1, 1, 2001)
@@ -71,26 +68,14 @@ def test_what_is_where_and_as_it_is_predicted_stays():
 
 @pytest.mark.parametrize("share", SHARES)
 def test_a_circle_cut_by_a_part_of_its_area_goes_out_with_its_reason(share):
-    """A fifth: its ellipse is a quarter narrower and off by a quarter of a radius; 15 % of either are allowed, and half
-    a pixel at each end. Nothing else goes, on its plane or another."""
+    """A fifth: its ellipse is a quarter narrower; 15 % are allowed, and half a pixel at each end. Nothing else goes, on
+    its plane or another."""
     look = FirstLook()
     look.cut(3, share)
     look.cut(15, share)
     found = look.taken_out()
     assert list(found) == [look.labels[3], look.labels[15]]
-    assert all(
-        "px from its place" in reason or "times its size along one direction" in reason for reason in found.values()
-    )
-
-
-@pytest.mark.parametrize(("by_radii", "out"), [(0.1, False), (0.2, True), (0.5, True)])
-def test_a_circle_off_its_place_goes_out(by_radii, out):
-    """0.15 radii are allowed: 1.5 to 2.1 px, by how narrow the ellipse is."""
-    look = FirstLook()
-    look.move([5], by_radii * np.sqrt(np.linalg.det(look.shape[5])) * np.array([0.6, 0.8]))
-    found = look.taken_out()
-    assert list(found) == ([look.labels[5]] if out else [])
-    assert all("px from its place" in reason for reason in found.values())
+    assert all("times its size along one direction" in reason for reason in found.values())
 
 
 @pytest.mark.parametrize(("factor", "out"), [(1.1, False), (0.9, False), (1.3, True), (0.75, True), (2.0, True)])
@@ -103,22 +88,12 @@ def test_a_circle_of_another_size_goes_out(factor, out):
     assert all("times its size along one direction" in reason for reason in found.values())
 
 
-def test_a_plane_that_is_off_alike_stays_and_excuses_no_other():
-    """The design of face 1 is off by 3 px, and its circles are a third larger than it says; a dot off by 3 px goes."""
+def test_a_plane_whose_circles_are_all_larger_stays_and_excuses_no_other():
+    """The circles of face 1 are a third larger than its design says; a dot that is goes out."""
     look = FirstLook()
-    look.move(range(10), [2.4, -1.8])
     look.shape_px[:10] *= 1.33
-    look.move([14], [2.4, -1.8])
+    look.shape_px[14] *= 1.33
     assert list(look.taken_out()) == [look.labels[14]]
-
-
-def test_a_circle_far_off_on_a_plane_that_is_off_goes_out():
-    """Three times as far as most is allowed, and no more."""
-    look = FirstLook()
-    look.move(range(10), [2.4, -1.8])
-    look.move([4], [0, -6.0])
-    look.move([6], [0, -12.0])
-    assert list(look.taken_out()) == [look.labels[6]]
 
 
 class Sheet:

@@ -1,0 +1,206 @@
+"""Circles that are not where the rest of their group has them.
+
+The rim of a circle that something cuts follows an ellipse still, about another centre. One image cannot tell it from a
+circle that was made off its place; the group can: where each image was taken from, and where each plane stands, is
+known to a fraction of a pixel from all other circles, and what was made off its place is off it alike in all images.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from stcal.geometry.conic import circle_image_offset
+from stcal.geometry.pose_descent import PoseStack
+from stcal.labels import BOARD, Label
+from stcal.sfm.data.observations import ImageObservations
+from stcal.sfm.data.patterns import Pattern
+from stcal.sfm.detect.arrangement import Arrangement
+from stcal.sfm.detect.plane_bundle import PlaneBundle
+
+MIN_LIMIT_PX = 0.5
+"""What is nearer to its place is never outlying: centres of clear circles are good to hundredths, designs to tenths."""
+BEYOND = 4.0
+"""Times the median of the plane's circles: 4.7 σ of normal errors, of which one in 60 000 is longer."""
+BEYOND_SIGMA = 6.0
+"""Times the centre's own σ."""
+MIN_USUAL = 6
+"""Circles of a plane that have a pose of their own and say what is usual; fewer are held to what others say of both."""
+ALIKE = 0.5
+"""Share of its distance by which another image may have a circle elsewhere, for it to be off alike."""
+MAX_ROUNDS = 10
+
+
+def outlying_circles(
+    arrangement: Arrangement, images: Sequence[ImageObservations], patterns: dict[str, Pattern], focal_px: float
+) -> tuple[Arrangement, dict[int, dict[Label, str]]]:
+    """Circles that contradict the rest of their group, and the arrangement adjusted without them.
+
+    Parameters
+    ----------
+    arrangement
+        Of the group, near its minimum.
+    images
+        All labelled circles of the group's images.
+    patterns
+        Circles of each plane.
+    focal_px
+        Of the camera.
+
+    Returns
+    -------
+    arrangement
+        The same object where nothing is outlying.
+    outlying
+        Reasons by image and label.
+    """
+    circles = _Circles.of(arrangement, images, patterns, focal_px)
+    if not len(circles.rows):
+        return arrangement, {}
+    keep, reasons = np.ones(len(circles.rows), bool), {}
+    for _ in range(MAX_ROUNDS):
+        circles = circles.adjusted(keep)
+        new = _worst(circles, keep)
+        if not new:
+            break
+        reasons |= new
+        keep[list(new)] = False
+    if not reasons:
+        return arrangement, {}
+    found: dict[int, dict[Label, str]] = {}
+    for k, reason in reasons.items():
+        image, label = circles.rows[k]
+        found.setdefault(image, {})[label] = reason
+    return circles.rearranged(arrangement), found
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Circles:
+    """n circles of a group, and its arrangement as stacks.
+
+    ``rows`` : image and label of each; ``image``, ``plane`` : (n,) places in the arrangement; ``xyz_mm`` : (n, 3) in
+    the plane; ``centre_px`` : (n, 2) images of the circles' centres, ideal, without eccentricity; ``sigma_px`` : (n,).
+    """
+
+    rows: list[tuple[int, Label]]
+    image: np.ndarray
+    plane: np.ndarray
+    xyz_mm: np.ndarray
+    centre_px: np.ndarray
+    sigma_px: np.ndarray
+    focal_px: float
+    camera_from_group: PoseStack
+    group_from_plane: PoseStack
+
+    @classmethod
+    def of(
+        cls,
+        arrangement: Arrangement,
+        images: Sequence[ImageObservations],
+        patterns: dict[str, Pattern],
+        focal_px: float,
+    ) -> "_Circles":
+        names, planes = list(arrangement.camera_from_group), list(arrangement.group_from_plane)
+        design = {
+            label: (*xyz, radius)
+            for plane in planes
+            for label, xyz, radius in zip(
+                patterns[plane].labels, patterns[plane].xyz_mm(), patterns[plane].radius_mm, strict=True
+            )
+        }
+        rows, seen = [], []
+        for a, i in enumerate(names):
+            sigma = images[i].sigma_px()
+            for k, label in enumerate(images[i].labels):
+                if label in design:
+                    rows.append((i, label))
+                    seen.append((a, planes.index(label.plane), *images[i].centre[k], sigma[k], *design[label]))
+        table = np.array(seen, float).reshape(-1, 9)
+        found = cls(
+            rows,
+            table[:, 0].astype(int),
+            table[:, 1].astype(int),
+            table[:, 5:8],
+            focal_px * table[:, 2:4],
+            table[:, 4],
+            focal_px,
+            PoseStack.of(*arrangement.camera_from_group.values()),
+            PoseStack.of(*arrangement.group_from_plane.values()),
+        )
+        return replace(found, centre_px=found.centre_px - found._eccentricity_px(table[:, 8])) if rows else found
+
+    def rearranged(self, arrangement: Arrangement) -> Arrangement:
+        """The arrangement with these poses."""
+        cameras = {i: self.camera_from_group.rigid(a) for a, i in enumerate(arrangement.camera_from_group)}
+        planes = {p: self.group_from_plane.rigid(b) for b, p in enumerate(arrangement.group_from_plane)}
+        return replace(arrangement, camera_from_group=cameras, group_from_plane=planes)
+
+    def adjusted(self, keep: np.ndarray) -> "_Circles":
+        """With poses of least error over those to ``keep``, of the planes that show enough for a pose of their own."""
+        use = keep & self.enough()
+        if not use.any():
+            return self
+        bundle = PlaneBundle(self.image[use], self.plane[use], self.xyz_mm[use], self.centre_px[use], self.focal_px)
+        cameras, planes = bundle.adjusted(self.camera_from_group, self.group_from_plane)
+        return replace(self, camera_from_group=cameras, group_from_plane=planes)
+
+    def enough(self) -> np.ndarray:
+        """Mask of the circles whose plane shows enough of them."""
+        return np.bincount(self.plane, minlength=1)[self.plane] >= MIN_USUAL
+
+    def in_one_image(self) -> np.ndarray:
+        """Mask of the circles of faces that one image alone shows."""
+        images = [len(np.unique(self.image[self.plane == p])) for p in range(len(self.group_from_plane))]
+        return np.array(
+            [images[p] == 1 and row[1].plane != BOARD for p, row in zip(self.plane, self.rows, strict=True)]
+        )
+
+    def off_px(self) -> tuple[np.ndarray, np.ndarray]:
+        """By how much centres are off their places, (n, 2), and the derivative (n, 2, 2) by a circle's place in its
+        plane, px/mm."""
+        rotation, xyz = self._placed()
+        ideal = xyz[:, :2] / xyz[:, 2:]
+        by_point = np.zeros((len(xyz), 2, 3))
+        by_point[:, 0, 0] = by_point[:, 1, 1] = 1
+        by_point[:, :, 2] = -ideal
+        by_point *= (self.focal_px / xyz[:, 2])[:, None, None]
+        return self.centre_px - self.focal_px * ideal, by_point @ rotation[:, :, :2]
+
+    def _placed(self) -> tuple[np.ndarray, np.ndarray]:
+        """Rotations camera_from_plane (n, 3, 3), and circles in the camera frame (n, 3)."""
+        camera, plane = self.camera_from_group[self.image], self.group_from_plane[self.plane]
+        xyz = np.einsum("nij,nj->ni", plane.rotation, self.xyz_mm) + plane.translation
+        return camera.rotation @ plane.rotation, np.einsum("nij,nj->ni", camera.rotation, xyz) + camera.translation
+
+    def _eccentricity_px(self, radius_mm: np.ndarray) -> np.ndarray:
+        rotation, xyz = self._placed()
+        centre = circle_image_offset(xyz, rotation[:, :, 2], radius_mm)
+        return self.focal_px * (centre[:, :2] / centre[:, 2:] - xyz[:, :2] / xyz[:, 2:])
+
+
+def _worst(circles: _Circles, keep: np.ndarray) -> dict[int, str]:
+    """Of the circles to ``keep`` that are outlying the worst of every plane in every image: it draws the others."""
+    shift, by_place = circles.off_px()
+    off, limit = np.linalg.norm(shift, axis=1), np.maximum(MIN_LIMIT_PX, BEYOND_SIGMA * circles.sigma_px)
+    alone, enough = circles.in_one_image(), circles.enough()
+    usual = np.full(len(off), np.median(off[keep]))
+    for plane in np.unique(circles.plane[keep & enough]):
+        usual[circles.plane == plane] = np.median(off[keep & (circles.plane == plane)])
+    limit = np.where(alone & enough, limit, np.maximum(limit, BEYOND * usual))
+    outlying = keep & (off > limit)
+    moved_mm = np.linalg.solve(by_place, shift[..., None])[..., 0]
+    found: dict[int, str] = {}
+    for k in np.flatnonzero(outlying):
+        same = keep & (circles.image != circles.image[k]) & [label == circles.rows[k][1] for _, label in circles.rows]
+        apart = np.linalg.norm((moved_mm[same] - moved_mm[k]) @ by_place[k].T, axis=1)
+        outlying[k] = not (apart < ALIKE * off[k]).any()
+    for image, plane in {(circles.image[k], circles.plane[k]) for k in np.flatnonzero(outlying)}:
+        own = np.flatnonzero(keep & (circles.image == image) & (circles.plane == plane))
+        worst = own[np.argmax(np.where(outlying[own], off[own] / limit[own], 0))]
+        away = f"{off[worst]:.1f} px from its place, {limit[worst]:.1f} allowed"
+        if alone[worst] and enough[worst]:
+            why = f"{circles.rows[worst][1]} is {away}, and no other image of the group tells which circles are right"
+            found |= dict.fromkeys(own.tolist(), why)
+        else:
+            found[int(worst)] = away
+    return found

@@ -1,0 +1,116 @@
+"""Circles that are not where the rest of their group has them go out; what is off alike in all images stays."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from stcal.geometry.plane import apply_homography, fit_homography
+from stcal.sfm.data.patterns import patterns_of
+from stcal.sfm.detect.arrangement import Arrangement
+from stcal.sfm.detect.labels import label_groups
+from stcal.sfm.detect.outlying import MIN_LIMIT_PX, outlying_circles
+from tests.sfm.detect.test_arrangement import FOCAL_PX, TARGET, Seen
+
+
+class Group:
+    """Images of group 12 as they are labelled, to be spoilt."""
+
+    def __init__(self, scene, observations):
+        self.images = list(observations)
+        named = [(o.name, o.group, Seen(o).detection()) for o in observations]
+        _, self.arrangement = label_groups([named], scene.target, scene.board, FOCAL_PX)[0]
+        self.patterns = patterns_of(scene.target, scene.board)
+
+    def move_px(self, image, label, by_px):
+        """The centre of a circle in one image."""
+        seen = self.images[image]
+        centre = seen.centre.copy()
+        centre[list(seen.labels).index(label)] += np.array(by_px) / FOCAL_PX
+        self.images[image] = replace(seen, centre=centre)
+
+    def move_mm(self, image, label, by_mm):
+        """A circle in its plane."""
+        seen, face = self.images[image], TARGET.face(label.split(":")[0])
+        own = [i for i, x in enumerate(seen.labels) if x.plane == face.id]
+        xy = face.xy_mm[[face.ids.index(seen.labels[i].circle) for i in own]]
+        homography = fit_homography(xy, seen.centre[own])
+        k = [seen.labels[i] for i in own].index(label)
+        shift = apply_homography(homography, xy[[k]] + by_mm) - apply_homography(homography, xy[[k]])
+        self.move_px(image, label, shift[0] * FOCAL_PX)
+
+    def keep_only(self, face, images):
+        """The face in these images alone."""
+        for i, seen in enumerate(self.images):
+            if i not in images:
+                rows = np.array([k for k, label in enumerate(seen.labels) if label.plane != face])
+                self.images[i] = seen.select(rows)
+
+    def outlying(self) -> tuple[Arrangement, dict]:
+        return outlying_circles(self.arrangement, self.images, self.patterns, FOCAL_PX)
+
+    def assert_out(self, expected):
+        found = self.outlying()[1]
+        assert {(i, label) for i, labels in found.items() for label in labels} == expected
+        return [reason for labels in found.values() for reason in labels.values()]
+
+
+@pytest.fixture
+def group(scene, labels_only):
+    return Group(
+        scene, [o for o in labels_only.observations(scene, 0.003, np.random.default_rng(0)) if o.group == "12"]
+    )
+
+
+def test_what_is_in_its_place_stays_and_leaves_the_arrangement_as_it_is(group):
+    arrangement, found = group.outlying()
+    assert found == {}
+    assert arrangement is group.arrangement
+
+
+@pytest.mark.parametrize(("by_px", "out"), [(0.6 * MIN_LIMIT_PX, False), (2.0 * MIN_LIMIT_PX, True), (30.0, True)])
+def test_a_circle_off_its_place_in_one_image_goes_out(group, by_px, out):
+    """The design is off by 0.06 px here, what measuring leaves is 0.003 px."""
+    group.move_px(1, "1:4", [0.6 * by_px, -0.8 * by_px])
+    reasons = group.assert_out({(1, "1:4")} if out else set())
+    assert all(reason.endswith("px from its place, 0.5 allowed") for reason in reasons)
+
+
+def test_three_of_ten_that_are_cut_do_not_draw_the_others(group):
+    """To one side, as a strip over a row of circles does; the arrangement is adjusted without them."""
+    spoilt = [(0, "2:1"), (0, "2:2"), (0, "2:3"), (2, "1:a"), (2, "1:b"), (2, "1:c")]
+    for image, label in spoilt:
+        group.move_px(image, label, [1.5, 1.2])
+    arrangement, _ = group.outlying()
+    group.assert_out(set(spoilt))
+    clean = group.arrangement.camera_from_group[0] @ group.arrangement.group_from_plane["2"]
+    found = arrangement.camera_from_group[0] @ arrangement.group_from_plane["2"]
+    assert np.abs((found.inverse() @ clean).translation).max() < 0.05  # mm; 1.5 px are 0.5
+
+
+def test_a_circle_that_was_made_off_its_place_stays(group):
+    """Half a millimetre, 1.5 px: every image shows it alike. In one of them it is cut besides."""
+    for image in range(len(group.images)):
+        group.move_mm(image, "1:5", [0.3, 0.4])
+    group.assert_out(set())
+    group.move_px(2, "1:5", [-3.0, 2.0])
+    group.assert_out({(2, "1:5")})
+
+
+def test_a_face_that_one_image_alone_shows_goes_out_where_its_circles_contradict_each_other(group):
+    """Which of them are right no other image tells."""
+    group.keep_only("2", [3])
+    group.assert_out(set())
+    group.move_px(3, "2:6", [1.5, -1.0])
+    reasons = group.assert_out({(3, f"2:{k}") for k in TARGET.face("2").ids})
+    assert all("no other image of the group tells which circles are right" in reason for reason in reasons)
+
+
+def test_few_circles_of_a_face_are_held_to_where_others_have_it(group):
+    group.keep_only("2", [3])
+    seen = group.images[3]
+    rows = np.array([k for k, label in enumerate(seen.labels) if label.plane != "2" or label in ("2:1", "2:2")])
+    group.images[3] = seen.select(rows)
+    group.assert_out(set())
+    group.move_px(3, "2:2", [2.0, 0.0])
+    group.assert_out({(3, "2:2")})
