@@ -13,6 +13,7 @@ from stcal.design import BoardDesign
 from stcal.errors import InputError
 from stcal.io.covariance import Rows, require_covariance
 from stcal.io.design import Count, load_board
+from stcal.io.files import SETTINGS_BYTES, read_bytes
 from stcal.io.mistakes import mistake
 from stcal.io.toml import Finite, Positive, Strict, load_toml
 
@@ -157,7 +158,7 @@ def load_flat_board(path: str | Path) -> BoardDesign | FlatBoard:
 def _kind(path: str | Path) -> str:
     """The file's ``type``; dots where it says nothing, or is no TOML: its own loader then says why."""
     try:
-        content = tomllib.loads(Path(path).read_bytes().decode("utf-8-sig"))
+        content = tomllib.loads(read_bytes(path, SETTINGS_BYTES).decode("utf-8-sig"))
     except OSError as error:
         raise InputError(f"board file {path}: {error.strerror or error}; {REMEDY}") from error
     except (ValueError, RecursionError):

@@ -117,7 +117,8 @@ class _Terminated(BaseException):
 def _fail(message: str, code: int) -> NoReturn:
     """One line of printable characters, and the exit code."""
     line = " ".join(printable(message).split())
-    if len(line) > MESSAGE_CHARACTERS:
-        line = f"{line[: MESSAGE_CHARACTERS // 2]} … {line[-MESSAGE_CHARACTERS // 2 :]}"
+    part = (MESSAGE_CHARACTERS - len("error:  … ")) // 2
+    if len(line) > 2 * part:
+        line = f"{line[:part]} … {line[-part:]}"
     print(f"error: {line}", file=sys.stderr)
     sys.exit(code)

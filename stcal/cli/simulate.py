@@ -12,7 +12,7 @@ from stcal.cli.terminal import StageProgress, say, write
 from stcal.design import reference_board, reference_target
 from stcal.errors import InputError
 from stcal.io.design import board_toml, target_toml
-from stcal.io.saving import RUN_MARKER, json_text, save
+from stcal.io.saving import RUN_MARKER, json_text, real_place, save
 
 app = typer.Typer()
 
@@ -83,7 +83,7 @@ def compare(
     from stcal.sfm.run.transaction import COMPARISON, added_results
 
     into_run = run_folder / COMPARISON
-    if (run_folder / RUN_MARKER).is_file() and (out is None or out.resolve() == into_run.resolve()):
+    if (run_folder / RUN_MARKER).is_file() and (out is None or real_place(out) == real_place(into_run)):
         with added_results(run_folder) as stage:
             comparison = against(run_folder, truth)
             save(stage / COMPARISON, json_text(comparison))

@@ -11,6 +11,7 @@ import yaml
 from stcal.errors import InputError
 from stcal.geometry.camera import Camera
 from stcal.io.covariance import Rows, require_covariance
+from stcal.io.files import SETTINGS_BYTES, read_bytes
 from stcal.io.saving import save
 
 COLMAP_PIXEL_ORIGIN = 0.5
@@ -176,7 +177,7 @@ def read_camera(path: str | Path) -> CameraModel:
     """
     path = Path(path)
     try:
-        text = path.read_text(encoding="utf-8-sig")
+        text = read_bytes(path, SETTINGS_BYTES).decode("utf-8-sig")
     except OSError as error:
         raise InputError(f"camera file {path}: {error.strerror or error}; give a readable file") from error
     except ValueError as error:  # not UTF-8, or a NUL in the name

@@ -81,9 +81,9 @@ def keep_apart(outputs: Sequence[tuple[str, Path]], inputs: Sequence[tuple[str, 
     """
     places: dict[Path, str] = {}
     for option, path in outputs:
-        place = path.resolve()
+        place = real_place(path)
         for given, read in inputs:
-            own = read.resolve()
+            own = real_place(read)
             if place == own:
                 raise InputError(f"{option} {path}: is an input of this command; give another name")
             if own in place.parents and place.exists() and not _is_ours(place, own):
@@ -93,6 +93,11 @@ def keep_apart(outputs: Sequence[tuple[str, Path]], inputs: Sequence[tuple[str, 
         if place.is_dir():
             raise InputError(f"{option} {path}: is a folder; the name of a file needed")
         places[place] = option
+
+
+def real_place(path: str | Path) -> Path:
+    """Where a path leads; links that lead to themselves stay as they are, for who reads to say."""
+    return Path(os.path.realpath(path))
 
 
 def _is_ours(place: Path, folder: Path) -> bool:

@@ -12,6 +12,7 @@ import numpy as np
 from stcal.errors import InputError
 from stcal.geometry.rigid import UNIT_WITHIN, Poses, Rigid
 from stcal.io.covariance import OF_POSE, TWIST, Rows, first_fault
+from stcal.io.files import TABLE_BYTES, read_bytes
 
 LENGTHS = {"mm": 1.0, "m": 1000.0, "um": 1e-3, "cm": 10.0, "in": 25.4}
 ANGLES = {"rad": 1.0, "deg": np.pi / 180}
@@ -193,7 +194,7 @@ def read_table(path: str | Path, what: str) -> Table:
     """
     where = f"{what} {path}"
     try:
-        text = Path(path).read_bytes().decode("utf-8-sig")
+        text = read_bytes(path, TABLE_BYTES).decode("utf-8-sig")
     except OSError as error:
         raise InputError(f"{where}: {error.strerror or error}; check the path") from error
     except UnicodeDecodeError as error:

@@ -8,6 +8,7 @@ from typing import Annotated, TypeVar
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
 from stcal.errors import InputError
+from stcal.io.files import SETTINGS_BYTES, read_bytes
 from stcal.io.mistakes import first_mistake
 
 M = TypeVar("M", bound=BaseModel)
@@ -33,7 +34,7 @@ def load_toml(path: str | Path, model: type[M], what: str, remedy: str) -> M:
         Unreadable, not TOML, or not as ``model`` wants it; the message names file, place and reason.
     """
     try:
-        text = Path(path).read_bytes().decode("utf-8-sig")  # Windows editors put a byte-order mark first
+        text = read_bytes(path, SETTINGS_BYTES).decode("utf-8-sig")  # Windows editors put a byte-order mark first
         return model.model_validate(tomllib.loads(text))
     except OSError as error:
         raise InputError(f"{what} {path}: {error.strerror or error}; {remedy}") from error

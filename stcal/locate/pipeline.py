@@ -7,6 +7,7 @@ from typing import Literal
 from stcal.boards.tags import other_dictionaries
 from stcal.errors import InputError, StcalError
 from stcal.io.camera import CameraModel, CameraPrior
+from stcal.io.files import IMAGE_BYTES, read_bytes
 from stcal.io.images import decode
 from stcal.locate.data.exposures import SceneFiles, SceneTags, read_scenes
 from stcal.locate.data.layout import TargetLayout
@@ -202,7 +203,7 @@ def _why_no_tag(tags: SceneTags, merged: Merged, files: SceneFiles, layout: Targ
     known = layout.dictionaries()
     used = {exposure.name for exposure in tags.readable()}
     file = next(file for file in files.files if file.name in used)
-    others = other_dictionaries(decode(file.path.read_bytes(), file.name), known)
+    others = other_dictionaries(decode(read_bytes(file.path, IMAGE_BYTES), file.name), known)
     if merged.unknown:
         names = ", ".join(str(tag) for _, tag in merged.unknown[:5])
         return f"no tag of the layout, but others of its dictionaries ({names}); is it the layout of this target?"

@@ -19,6 +19,7 @@ from stcal.geometry.conic import circle_image_offset
 from stcal.geometry.plane import camera_from_plane, fit_homography, refine_planar_pose
 from stcal.geometry.rigid import Rigid
 from stcal.io.camera import CameraModel
+from stcal.io.files import IMAGE_BYTES, read_bytes
 from stcal.io.images import ImageFile, Skipped, decode
 from stcal.parallel import run_parallel
 from stcal.sfm.detect.ellipses import EllipseOptions
@@ -109,7 +110,7 @@ def _detect_board(
     file: ImageFile, model: CameraModel, board: Board, dictionaries: tuple[str, ...]
 ) -> BoardDetection | Skipped:
     try:
-        image = decode(file.path.read_bytes(), file.name)
+        image = decode(read_bytes(file.path, IMAGE_BYTES), file.name)
     except OSError as error:
         return Skipped(file.name, f"cannot be read: {error.strerror or error}")
     except InputError as error:

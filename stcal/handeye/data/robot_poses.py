@@ -10,6 +10,7 @@ import yaml
 from stcal.errors import InputError
 from stcal.geometry.rigid import UNIT_WITHIN, Poses
 from stcal.handeye.data.pairs import SIDES, read_side
+from stcal.io.files import SETTINGS_BYTES, read_bytes
 from stcal.io.table import LENGTHS, read_table
 
 
@@ -119,7 +120,7 @@ def _from_yaml(files: list[tuple[str, Path]], where: str) -> RobotPoses:
 
 def _yaml(path: Path, where: str):
     try:
-        return yaml.safe_load(path.read_text(encoding="utf-8"))
+        return yaml.safe_load(read_bytes(path, SETTINGS_BYTES).decode("utf-8"))
     except OSError as error:
         raise InputError(f"{where}: {error.strerror or error}; give a readable file") from error
     except (yaml.YAMLError, ValueError, RecursionError) as error:

@@ -9,7 +9,9 @@ import numpy as np
 
 from stcal.boards.tags import Tags, find_tags
 from stcal.errors import InputError
+from stcal.io.files import IMAGE_BYTES, read_bytes
 from stcal.io.images import SUFFIXES, TOP_GROUP, ImageFile, decode, find_images, grey_8bit
+from stcal.io.saving import real_place
 from stcal.locate.data.layout import TargetLayout
 
 
@@ -107,7 +109,7 @@ def find_scenes(path: str | Path) -> list[SceneFiles]:
     scenes = []
     for group in dict.fromkeys(file.group for file in files):
         left_out = tuple(f"{s.name}: {s.reason}" for s in skipped if (Path(s.name).parent.name or TOP_GROUP) == group)
-        name = path.resolve().name if group == TOP_GROUP else group
+        name = real_place(path).name if group == TOP_GROUP else group
         scenes.append(SceneFiles(name, tuple(f for f in files if f.group == group), left_out))
     return scenes
 
@@ -132,7 +134,7 @@ def _begin(
 ) -> Callable[[], Exposure | Unreadable]:
     """Begin the search for tags; the result is waited for when it is called."""
     try:
-        image = grey_8bit(decode(file.path.read_bytes(), file.name))
+        image = grey_8bit(decode(read_bytes(file.path, IMAGE_BYTES), file.name))
     except (InputError, OSError) as error:
         trouble = Unreadable(file.name, " ".join(str(error).split()))
         return lambda: trouble

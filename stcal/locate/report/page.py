@@ -8,6 +8,7 @@ from markupsafe import Markup
 
 from stcal.geometry.camera import Camera
 from stcal.io.camera import CameraModel
+from stcal.io.files import IMAGE_BYTES, read_bytes
 from stcal.io.images import ImageFile, decode, grey_8bit, thumbnail
 from stcal.locate.data.exposures import Exposure, SceneFiles
 from stcal.locate.data.layout import TargetLayout
@@ -108,7 +109,7 @@ def _picture(
     exposure: Exposure, file: ImageFile, each: Located | None, layout: TargetLayout, model: CameraModel, width_px: int
 ) -> dict:
     """The image with the outlines of its tags; with the axes of {obj} and the tags' places where ``each`` is given."""
-    grey = grey_8bit(decode(file.path.read_bytes(), file.name))
+    grey = grey_8bit(decode(read_bytes(file.path, IMAGE_BYTES), file.name))
     width, height = exposure.size
     known = layout.rows()
     tags = []

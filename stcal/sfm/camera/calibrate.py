@@ -11,6 +11,7 @@ from stcal.design import BoardDesign, TargetDesign
 from stcal.errors import DegenerateError, DetectionError, InputError
 from stcal.geometry.camera import Camera
 from stcal.io.camera import COLMAP_MODELS, CameraModel
+from stcal.io.files import IMAGE_BYTES, read_bytes
 from stcal.io.images import ImageFile, Skipped, decode, find_images
 from stcal.parallel import Progress, counted, one_thread
 from stcal.sfm.camera.intrinsics import Intrinsics, adjust_intrinsics, model_parameters
@@ -133,7 +134,7 @@ def _first_size(files: list[ImageFile]) -> tuple[int, int]:
     """Width and height of the first readable image."""
     for file in files:
         try:
-            height, width = decode(file.path.read_bytes(), file.name).shape
+            height, width = decode(read_bytes(file.path, IMAGE_BYTES), file.name).shape
         except (InputError, OSError):
             continue
         return width, height

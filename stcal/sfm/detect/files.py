@@ -14,6 +14,7 @@ from stcal.errors import ConvergenceError, DetectionError, InputError
 from stcal.geometry.camera import Camera
 from stcal.io.cache import keep, kept
 from stcal.io.camera import CameraModel
+from stcal.io.files import IMAGE_BYTES, read_bytes
 from stcal.io.images import ImageFile, Skipped, decode, grey_8bit, thumbnail
 from stcal.labels import parse_label, parse_labels
 from stcal.parallel import run_parallel
@@ -112,7 +113,7 @@ def _sized(camera_model: CameraModel, files: list[ImageFile]) -> Camera:
         return camera_model.sized(camera_model.width, camera_model.height)
     for file in files:
         try:
-            height, width = decode(file.path.read_bytes(), file.name).shape
+            height, width = decode(read_bytes(file.path, IMAGE_BYTES), file.name).shape
         except (InputError, OSError):
             continue
         camera_model.require_inside(width, height, file.name)
@@ -140,7 +141,7 @@ def _kept(file: ImageFile, settings: str, cache: Path) -> DetectedImage | None:
     if not any(cache.iterdir()):
         return None
     try:
-        path = cache / f"{_key(file.path.read_bytes(), settings)[1]}.npz"
+        path = cache / f"{_key(read_bytes(file.path, IMAGE_BYTES), settings)[1]}.npz"
     except OSError:
         return None
     return _load(file, path, reused=True) if path.exists() else None
@@ -158,7 +159,7 @@ def _detect_file(
 ) -> str | Skipped:
     """Detect in one file and keep the result; returns its key."""
     try:
-        data = file.path.read_bytes()
+        data = read_bytes(file.path, IMAGE_BYTES)
     except OSError as error:
         return Skipped(file.name, f"cannot be read: {error.strerror or error}")
     try:
@@ -285,7 +286,7 @@ def _look_again(
     file: ImageFile, camera: Camera, predicted: PredictedCircles, options: EllipseOptions, path: Path
 ) -> SecondLook | None:
     try:
-        image = decode(file.path.read_bytes(), file.name)
+        image = decode(read_bytes(file.path, IMAGE_BYTES), file.name)
     except (InputError, OSError):
         return None
     look = measure_predicted(image, camera, predicted, options)

@@ -14,6 +14,7 @@ import numpy as np
 from stcal.design import BoardDesign, TargetDesign
 from stcal.errors import InputError
 from stcal.geometry.camera import Camera
+from stcal.io.files import IMAGE_BYTES, read_bytes
 from stcal.io.images import decode
 from stcal.parallel import run_parallel
 from stcal.sfm.data.model import MIN_POINTS, MetricModel
@@ -177,7 +178,7 @@ def _decoded(job: _Job) -> tuple[np.ndarray | None, str]:
     """The image, or what is wrong with it."""
     size = job.camera.height, job.camera.width
     try:
-        image = decode(job.path.read_bytes(), job.name)
+        image = decode(read_bytes(job.path, IMAGE_BYTES), job.name)
     except OSError as error:
         return None, f"{job.path}: {error.strerror or error}"
     except InputError as error:

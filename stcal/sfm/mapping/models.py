@@ -12,6 +12,7 @@ from stcal.errors import InputError
 from stcal.geometry.camera import Camera
 from stcal.geometry.rigid import Rigid, Similarity
 from stcal.io.camera import CalibratedCamera, camera_from_colmap
+from stcal.io.files import MODEL_BYTES, read_bytes
 from stcal.labels import DotLabel, Label
 from stcal.sfm.data.model import GroupModel, MetricModel, WorldModel
 from stcal.sfm.data.observations import ImageObservations
@@ -312,7 +313,7 @@ _RECORDS: dict[str, Callable[[_Walk], None]] = {
 def _require_whole(file: Path, skip: Callable[[_Walk], None]) -> None:
     """The counts in a file must fit its size, or ValueError: behind the end of a file pycolmap reads on without a word,
     for hours and into all memory, or takes for the missing numbers what it read last."""
-    walk = _Walk(file.read_bytes())
+    walk = _Walk(read_bytes(file, MODEL_BYTES))
     try:
         for _ in range(walk.number("Q")):
             skip(walk)

@@ -1,6 +1,7 @@
 """Errors of a run against a known truth: ``truth.json`` and ``compare.json`` (``data_layout.md``)."""
 
 import csv
+import io
 from collections.abc import Collection
 from pathlib import Path
 from typing import Any, Literal
@@ -11,6 +12,7 @@ from pydantic import Field
 from stcal.errors import DegenerateError, InputError
 from stcal.geometry.align import align_rigid
 from stcal.geometry.rigid import Rigid
+from stcal.io.files import TABLE_BYTES, read_bytes
 from stcal.io.json import ByFace, Part, Pose, PoseCovariance, ResultFile, Vector3, read_result
 from stcal.labels import BOARD, CircleLabel, DotLabel, parse_label, parse_labels
 from stcal.report.text import number, text_table
@@ -118,8 +120,7 @@ def _labels(path: Path, circles: Collection[str], groups: dict[str, TrueGroup]) 
     """Labels of ``detections.csv`` against the truth; a board's numbers are known up to its own symmetry, but for a
     whole group at once."""
     try:
-        with open(path, encoding="utf-8", newline="") as stream:
-            rows = list(csv.DictReader(stream))
+        rows = list(csv.DictReader(io.StringIO(read_bytes(path, TABLE_BYTES).decode())))
         measured: dict[str, dict[str, tuple[float, float]]] = {}
         for row in rows:
             measured.setdefault(row["image"], {})[parse_label(row["label"])] = (float(row["x_px"]), float(row["y_px"]))

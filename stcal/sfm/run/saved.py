@@ -1,6 +1,7 @@
 """A finished run read back from its folder, for every command that goes on from it."""
 
 import csv
+import io
 from collections.abc import Collection, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -15,6 +16,7 @@ from stcal.geometry.camera import Camera
 from stcal.io.camera import CalibratedCamera, read_camera
 from stcal.io.covariance import OF_PIXEL, first_fault
 from stcal.io.design import load_board, load_target
+from stcal.io.files import TABLE_BYTES, read_bytes
 from stcal.io.json import checked, read_json
 from stcal.io.saving import BOARD, CAMERA, RUN_MARKER, TARGET
 from stcal.sfm.adjust.file import FacesFile
@@ -135,9 +137,8 @@ def _as_written(path: Path) -> Iterator[None]:
 def _labels(path: Path, names: list[tuple[str, str, int]], camera: Camera, known: Collection[str]):
     """Observations and corrected centres of ``labels.csv`` for the images (name, group, circles) of the database."""
     rows: dict[str, list[dict]] = {name: [] for name, _, _ in names}
-    with open(path, encoding="utf-8", newline="") as stream:
-        for row in csv.DictReader(stream):
-            rows[row["image"]].append(row)
+    for row in csv.DictReader(io.StringIO(read_bytes(path, TABLE_BYTES).decode())):
+        rows[row["image"]].append(row)
     observations, corrected = [], []
     for name, group, circles in names:
         own = rows[name]

@@ -17,7 +17,7 @@ import filelock
 
 from stcal.errors import InputError, StcalError
 from stcal.io.json import read_result
-from stcal.io.saving import ADDED, CACHE, READY, RUN_ENTRIES, RUN_MARKER, UNFINISHED, json_text, save
+from stcal.io.saving import ADDED, CACHE, READY, RUN_ENTRIES, RUN_MARKER, UNFINISHED, json_text, real_place, save
 from stcal.sfm.run.marker import MarkerFile, digest_of, files_below
 
 COMPARISON = "compare.json"
@@ -187,9 +187,9 @@ def _require_no_links(out: Path) -> None:
 
 def _require_no_inputs(out: Path, inputs: Mapping[str, object]) -> None:
     """What a run reads must not lie where it writes."""
-    place = out.resolve()
+    place = real_place(out)
     for word, given in inputs.items():
-        if isinstance(given, str | Path) and place in (own := Path(given).resolve(), *own.parents):
+        if isinstance(given, str | Path) and place in (own := real_place(given), *own.parents):
             raise InputError(
                 f"{word} {given}: lies in the output folder {out}, whose files this run replaces; copy it elsewhere, "
                 "or give another --out"

@@ -1,0 +1,30 @@
+"""Bytes of a file that the user names, as many as its kind can have."""
+
+import errno
+from pathlib import Path
+
+MB = 1_000_000
+SETTINGS_BYTES = 10 * MB
+"""Most that a file has which people write: camera, designs, robot, layout."""
+TABLE_BYTES = 100 * MB
+"""Most that tables and result files have."""
+IMAGE_BYTES = 500 * MB
+"""Most that an image file has: 80 megapixels, 16 bit, colour, as they are."""
+MODEL_BYTES = 1000 * MB
+"""Most that a file of a COLMAP model has."""
+
+
+def read_bytes(path: str | Path, most: int) -> bytes:
+    """All of a file.
+
+    Raises
+    ------
+    OSError
+        It cannot be read, or is larger than ``most`` bytes.
+    """
+    with open(path, "rb") as stream:
+        data = stream.read(most + 1)
+        if len(data) > most:
+            size = f"{Path(path).stat().st_size / MB:.0f} MB" if Path(path).is_file() else "no end"
+            raise OSError(errno.EFBIG, f"{size}, at most {most // MB} MB are read", str(path))
+    return data

@@ -1,0 +1,55 @@
+"""No file is read beyond what its kind can have, and links that lead nowhere are an error like any other."""
+
+import os
+from pathlib import Path
+
+import pytest
+
+from stcal.boards.file import load_flat_board
+from stcal.errors import InputError
+from stcal.io.camera import read_camera
+from stcal.io.design import load_board
+from stcal.io.files import SETTINGS_BYTES, TABLE_BYTES, read_bytes
+from stcal.io.json import read_json
+from stcal.io.saving import keep_apart
+from stcal.io.table import read_table
+
+READERS = {
+    "camera": (read_camera, SETTINGS_BYTES),
+    "board": (load_board, SETTINGS_BYTES),
+    "flat board": (load_flat_board, SETTINGS_BYTES),
+    "table": (lambda path: read_table(path, "table"), TABLE_BYTES),
+    "result": (lambda path: read_json(path, "result", "give another"), TABLE_BYTES),
+}
+
+
+def test_as_much_as_there_may_be_is_read(tmp_path):
+    (tmp_path / "a").write_bytes(b"abcde")
+    assert read_bytes(tmp_path / "a", 5) == b"abcde"
+    with pytest.raises(OSError, match="0 MB, at most 0 MB are read"):
+        read_bytes(tmp_path / "a", 4)
+
+
+@pytest.mark.parametrize("kind", READERS)
+def test_a_larger_file_is_an_error_with_the_limit(tmp_path, kind):
+    read, most = READERS[kind]
+    path = tmp_path / "large"
+    path.touch()
+    os.truncate(path, 3 << 30)
+    with pytest.raises(InputError, match=f"large: 3221 MB, at most {most // 1_000_000} MB are read; "):
+        read(path)
+
+
+@pytest.mark.skipif(not Path("/dev/zero").exists(), reason="no file without end on this system")
+def test_a_file_without_end_is_an_error():
+    with pytest.raises(InputError, match="/dev/zero: no end, at most 10 MB are read"):
+        read_camera("/dev/zero")
+
+
+def test_a_link_to_itself(tmp_path):
+    """Python before 3.13 raises RuntimeError where such a path is resolved."""
+    link = tmp_path / "a"
+    link.symlink_to("a")
+    keep_apart([("--out", tmp_path / "b")], [("pairs", link)])
+    with pytest.raises(InputError, match="symbolic links"):
+        read_camera(link)
