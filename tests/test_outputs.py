@@ -1,53 +1,36 @@
 """No command writes over what it was given to read: walked over all commands and all their options."""
 
-import inspect
 from pathlib import Path
-from typing import get_args
 
 import pytest
 
-from stcal.cli.main import app
 from stcal.errors import InputError
 from stcal.io.saving import RUN_ENTRIES, RUN_MARKER, keep_apart
+from tests.commands import CALLS, COMMANDS, paths_of
 
 FOLDERS = {("run", "out"), ("detect", "out"), ("init", "folder"), ("simulate", "folder"), ("demo", "out")}
 FOLDERS |= {("export_model", "out")}
 """New ones, which replace nothing, or those of `tests/sfm/run/test_transaction.py`."""
 WRITES = ("Write ", "Also write ", "Draw ", "Keep ")
-
-
-def commands(application, found):
-    for command in application.registered_commands:
-        found[command.callback.__module__, command.callback.__name__] = command.callback
-    for group in application.registered_groups:
-        commands(group.typer_instance, found)
-    return list(found.values())
-
-
-COMMANDS = commands(app, {})
-
-
-def paths(command) -> dict[str, str]:
-    """Parameters that are paths, with their help."""
-    return {
-        name: get_args(parameter.annotation)[1].help
-        for name, parameter in inspect.signature(command, eval_str=True).parameters.items()
-        if "Path" in str(parameter.annotation)
-    }
+EVERY = list(COMMANDS.values())
 
 
 PAIRS = [
     pytest.param(command, output, read, id=f"{command.__name__}-{output}-{read}")
-    for command in COMMANDS
+    for command in EVERY
     for output in sorted(command.outputs)
-    for read in paths(command)
+    for read in paths_of(command)
     if read not in command.outputs and (command.__name__, read) not in FOLDERS
 ]
 
 
+def test_every_command_has_a_call_that_goes_through():
+    assert {call.command for call in CALLS} == set(COMMANDS)
+
+
 def test_every_option_that_writes_is_known():
-    for command in COMMANDS:
-        for name, says in paths(command).items():
+    for command in EVERY:
+        for name, says in paths_of(command).items():
             writes = name in command.outputs or (command.__name__, name) in FOLDERS
             assert writes == says.startswith(WRITES), (command.__name__, name, says)
     assert len(PAIRS) > 60
@@ -58,7 +41,7 @@ def test_no_output_replaces_an_input(command, output, read, tmp_path):
     """The file itself, by another way to it, and a file in a folder that is read."""
     own = tmp_path / "given"
     own.write_text("mine")
-    given = dict.fromkeys(paths(command))
+    given = dict.fromkeys(paths_of(command))
     for place in (own, tmp_path / "." / "x" / ".." / "given"):
         with pytest.raises(InputError, match="is an input of this command; give another name"):
             command(**given | {read: own, output: place})

@@ -1,0 +1,98 @@
+"""Whether every file that comes in is judged, and every file that goes out is whole.
+
+.venv/bin/python scripts/studies/fuzz_study.py [--count 1000] [--seed 1] [--kills 20] [--json FILE] [--only CASE]
+
+All commands of both programs, found in the tree: one without a call in `tests/commands.py` ends the study. Three
+parts: inputs spoiled by their bytes, place or structure (`c0`, `c1`, …), realistic mistakes (by name; "silent wrong"
+where nothing is said), and programs ended by signals, a full disk or little memory at random moments (`k0`, `k1`, …).
+The seed and the case's name repeat a case: `--seed 1 --only c17`. Simulated data; a small run is made first. Exits
+with 1 where anything failed.
+"""
+
+import argparse
+import json
+import os
+import sys
+import tempfile
+import time
+from collections import Counter
+from dataclasses import asdict
+from pathlib import Path
+
+sys.path.insert(0, str(Path(__file__).resolve().parents[2]))
+
+from stcal.parallel import ONE_THREAD
+
+os.environ.update(dict.fromkeys(ONE_THREAD, "1"))
+
+from tests.commands import CALLS, COMMANDS
+from tests.fuzzing.cases import Judged
+from tests.fuzzing.mistakes import MISTAKES
+from tests.fuzzing.pool import run_all
+from tests.fuzzing.stock import make_stock
+
+ALLOWED = ("no program could tell",)
+SHOWN = 600
+"""Characters of a failure."""
+
+
+def names_of(arguments: argparse.Namespace) -> list[str]:
+    """Cases: each call on good data, mistakes, kills, and spoiled inputs."""
+    if arguments.only:
+        return [arguments.only]
+    valid = [f"v{i}" for i in range(len(CALLS))]
+    mistakes = [] if arguments.no_mistakes else list(MISTAKES)
+    return [*valid, *mistakes, *(f"k{i}" for i in range(arguments.kills)), *(f"c{i}" for i in range(arguments.count))]
+
+
+def show(found: Judged, seed: int) -> None:
+    """Each failure of a case."""
+    for kind, what in found.failures:
+        print(f"{kind} | {found.said} | --seed {seed} --only {found.name!r}\n    {what[-SHOWN:]}", flush=True)
+
+
+def summary(found: list[Judged], seed: int) -> str:
+    """Counts by kind with the cases, and by command, as Markdown."""
+    kinds: dict[str, list[str]] = {}
+    for each in found:
+        for kind in sorted({kind for kind, _ in each.failures}):
+            kinds.setdefault(kind, []).append(each.name)
+    lines = [f"seed {seed}: {len(found)} cases", "", "| failure | cases | names |", "|---|---|---|"]
+    lines += [f"| {kind} | {len(names)} | {', '.join(names[:12])} |" for kind, names in sorted(kinds.items())]
+    codes = Counter((each.command, each.code) for each in found)
+    lines += ["", "| command | exit 0 | 2 | 3 | other |", "|---|---|---|---|---|"]
+    for command in COMMANDS:
+        own = {code: n for (name, code), n in codes.items() if name == command}
+        known = [own.pop(code, 0) for code in (0, 2, 3)]
+        lines.append(f"| {command} | {' | '.join(map(str, known))} | {sum(own.values())} |")
+    return "\n".join(lines)
+
+
+def main() -> None:
+    """Run; print."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--count", type=int, default=1000, help="of spoiled inputs")
+    parser.add_argument("--seed", type=int, default=1)
+    parser.add_argument("--kills", type=int, default=20)
+    parser.add_argument("--json", type=Path, help="also write every case to this file")
+    parser.add_argument("--only", default="", metavar="CASE")
+    parser.add_argument("--no-mistakes", action="store_true")
+    parser.add_argument("--workers", type=int, default=os.cpu_count() or 1)
+    arguments = parser.parse_args()
+    missing = set(COMMANDS) - {call.command for call in CALLS}
+    if missing:
+        sys.exit(f"no call in tests/commands.py of {', '.join(sorted(missing))}; add one")
+    start, found = time.monotonic(), []
+    with tempfile.TemporaryDirectory(prefix="stcal-stock-") as folder:
+        stock = make_stock(Path(folder) / "stock")
+        for each in run_all(stock, arguments.seed, names_of(arguments), arguments.workers):
+            found.append(each)
+            show(each, arguments.seed)
+    print(f"\n{summary(found, arguments.seed)}\n\n{time.monotonic() - start:.0f} s")
+    if arguments.json:
+        arguments.json.write_text(json.dumps([asdict(each) for each in found], indent=1))
+    sys.exit(any(kind not in ALLOWED for each in found for kind, _ in each.failures))
+
+
+if __name__ == "__main__":
+    main()

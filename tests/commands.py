@@ -1,0 +1,173 @@
+"""All commands of both programs, found in the tree, and for each a call that goes through."""
+
+import inspect
+import shlex
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import get_args
+
+import typer
+from typer.models import OptionInfo
+
+from stcal.cli.main import app, main, main_sfm
+from stcal.cli.sfm import app as sfm
+
+PROGRAMS = {"stcal": (app, main), "stcal-sfm": (sfm, main_sfm)}
+"""The application and the entry point of each program."""
+
+
+def command_tree(application: typer.Typer, above: str = "") -> dict[str, Callable]:
+    """Functions by the words that call them: ``sfm run``."""
+    found = {}
+    for command in application.registered_commands:
+        assert command.callback is not None
+        found[above + (command.name or command.callback.__name__.replace("_", "-"))] = command.callback
+    for group in application.registered_groups:
+        inner = f"{above}{group.name} " if isinstance(group.name, str) else above
+        found |= command_tree(group.typer_instance, inner)
+    return found
+
+
+COMMANDS = command_tree(app)
+PLACES = dict.fromkeys(COMMANDS, "stcal") | {f"sfm {name}": "stcal-sfm" for name in command_tree(sfm)}
+"""Shortest program that has a command: those of ``stcal sfm`` are ``stcal-sfm``'s."""
+
+
+def paths_of(command: Callable) -> dict[str, str]:
+    """Parameters that are paths, with their help."""
+    return {
+        name: get_args(parameter.annotation)[1].help
+        for name, parameter in inspect.signature(command, eval_str=True).parameters.items()
+        if "Path" in str(parameter.annotation)
+    }
+
+
+def options_of(command: str) -> list[str]:
+    """Options that take a number or a word."""
+    found = []
+    for name, parameter in inspect.signature(COMMANDS[command], eval_str=True).parameters.items():
+        kind, info = get_args(parameter.annotation)[:2]
+        if isinstance(info, OptionInfo) and kind is not bool and "Path" not in str(kind):
+            # With Annotated, Typer takes an option's first name for its default.
+            names = [each for each in (info.default, *(info.param_decls or ())) if isinstance(each, str)]
+            found.append(names[0] if names else f"--{name.replace('_', '-')}")
+    return found
+
+
+@dataclass(frozen=True, slots=True)
+class Call:
+    """A call that goes through, with inputs of :mod:`tests.fuzzing.stock`.
+
+    ``words`` : in them ``@place`` is an input, a file or folder of the stock; ``>name`` a file that is written, also
+    over an earlier one; ``+name`` one that must be new; ``~place`` a copy of the stock's folder to write to;
+    ``seconds`` : processor time that it takes about; ``code`` : exit code.
+    """
+
+    command: str
+    words: str
+    seconds: float = 0.3
+    code: int = 0
+
+    def split(self) -> list[str]:
+        return shlex.split(self.words.replace("~", "\\~"))
+
+    @property
+    def inputs(self) -> list[str]:
+        """Places in the stock."""
+        return [word[1:] for word in self.split() if word[0] == "@"]
+
+    @property
+    def outputs(self) -> list[str]:
+        """Names of files that may be there."""
+        return [word[1:] for word in self.split() if word[0] == ">"]
+
+    @property
+    def folders(self) -> list[str]:
+        """Places in the stock of which copies are written to."""
+        return [word[1:] for word in self.split() if word[0] == "~"]
+
+    def arguments(self, read: Path, written: Path) -> list[str]:
+        """The command's words with inputs below one folder and outputs below another."""
+        places = {"@": read, ">": written, "+": written, "~": written}
+        return [
+            *self.command.split(),
+            *(str(places[word[0]] / word[1:]) if word[0] in places else word for word in self.split()),
+        ]
+
+
+_DESIGNS = "--target @data/target.toml --board @data/board.toml"
+_SET = f"@data/images --camera @data/cameras.txt {_DESIGNS} --workers 1"
+_LOCATE = "--layout @locate/layout.toml --camera @locate/cameras.txt"
+_ALL = "--json >all.json --report >page.html"
+
+CALLS = (
+    Call("sfm run", f"{_SET} --out ~run", 3.5),
+    Call("sfm run", f"{_SET} --out +new", 9.0),
+    Call("sfm detect", f"{_SET} --out ~detected", 1.5),
+    Call("sfm init", "+design"),
+    Call("sfm simulate", "+set --width 324 --images 2 --workers 1", 3.0),
+    Call("sfm demo", "--out +demo --workers 1", 40.0),
+    Call("sfm compare", "@run @data/truth.json --json >errors.json"),
+    Call("sfm compare", "@run/faces.json @data/truth.json --json >errors.json"),
+    Call("sfm verify", "@run"),
+    Call("sfm export-database", "@run +copy.db --schema 3.8"),
+    Call("sfm export-database", "@run +copy.db --schema 4.2"),
+    *(Call("sfm export-model", f"@run +model --format {kind}") for kind in ("colmap-bin", "colmap-txt", "ply", "nvm")),
+    Call("sfm export-model", "@run +model --format bundler"),
+    Call("sfm crosscheck", "@run --colmap @no-colmap", code=2),
+    Call("sfm faces", "@run/models --run @run --out +faces.json", 1.0),
+    Call("sfm faces", "@model-txt --run @run --out +faces.json", 1.0),
+    Call("sfm pairs", "@run --json >pairs.json"),
+    Call("sfm doctor", "@run --images @data/images --json >doctor.json --workers 1", 1.5),
+    Call("sfm plan", f"--images 2 --width 800 {_DESIGNS} --json >plan.json", 4.0),
+    Call("sfm plan", "--images 2 --camera @data/cameras.txt --run @run --json >plan.json", 4.0),
+    Call("sfm plan", "--images 2 --faces @faces.json --target @data/target.toml", 3.0),
+    Call("sfm advise", "@run --count 1 --json >advice.json", 10.0),
+    Call("sfm calibrate-camera", f"@data/images {_DESIGNS} --out +cameras.txt --workers 1", 15.0),
+    Call(
+        "sfm measure",
+        f"@shots --camera @data/cameras.txt --faces @run/faces.json {_DESIGNS} --joints @joints.csv "
+        f"--out >poses.csv --workers 1 {_ALL}",
+        1.5,
+    ),
+    Call("robot init", "+robot.toml"),
+    Call("robot axes", f"@robot/sweeps.csv --robot @robot/robot.toml --out >axes.toml {_ALL}", 2.0),
+    Call("robot identify", f"@robot/poses.csv --robot @robot/robot.toml --folds 2 --out >r.toml {_ALL}", 4.0),
+    Call("robot identify", "@robot/sweeps.csv --robot @robot/robot.toml --observe distance --partial --folds 0", 1.0),
+    Call(
+        "robot compensate",
+        f"@robot/targets.csv --robot @robot/made.toml --nominal @robot/robot.toml --out >joints.csv {_ALL}",
+        1.2,
+    ),
+    Call("robot verify", f"@robot/verify.csv --plot >errors.svg {_ALL}", 0.5),
+    Call("robot design", f"--robot @robot/robot.toml --count 20 --candidates 60 --out >poses.csv {_ALL}", 1.5),
+    Call(
+        "handeye",
+        "@handeye/poses.csv --splits 2 --out >h.json --ros >h.yaml --urdf >h.urdf --opencv >h.yml --workers 1 " + _ALL,
+        1.2,
+    ),
+    Call(
+        "handeye",
+        "@handeye/images --poses @handeye/robot.csv --camera @handeye/cameras.txt --board @handeye/board.toml "
+        "--splits 0 --refine-camera --camera-out >cameras.txt --out >h.json --workers 1",
+        3.0,
+    ),
+    Call("locate schedule", "1 100 5"),
+    Call(
+        "locate calibrate",
+        "@locate/images --camera @locate/cameras.txt --board @locate/board.toml --layout @locate/plan.toml "
+        "--out >calibrated.toml --json >all.json --workers 1",
+        4.0,
+    ),
+    Call(
+        "locate run",
+        f"@locate/scenes {_LOCATE} --hand-eye @locate/handeye.json --robot-poses @locate/robot.csv "
+        f"--offset @locate/offset.json --out >poses.csv --workers 1 {_ALL}",
+        1.0,
+    ),
+    Call("locate run", f"@locate/scenes {_LOCATE} --method patent --workers 1", 1.0),
+    Call("register", "@register/pairs.csv --folds 2 --out >all.json --report >page.html", 1.5),
+    Call("register", "@register/pairs.csv --model similarity --method least-squares --folds 0"),
+    Call("register", "@register/arm.csv --robot @robot/robot.toml --identified >r.toml --out >all.json --folds 0", 2.0),
+)

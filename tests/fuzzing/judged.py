@@ -1,0 +1,324 @@
+"""One call of a program on spoiled inputs, in this process, and what must hold of it whatever the inputs are."""
+
+import contextlib
+import csv
+import ctypes
+import hashlib
+import json
+import os
+import re
+import shutil
+import signal
+import sys
+import time
+import traceback
+import warnings
+import xml.etree.ElementTree as ElementTree
+from collections.abc import Iterator
+from dataclasses import dataclass
+from io import TextIOWrapper
+from pathlib import Path
+
+from stcal.cli.main import MESSAGE_CHARACTERS
+from stcal.io.saving import RUN_ENTRIES
+from tests.commands import PROGRAMS, Call
+
+LONGEST_S = 60.0
+"""Of processor time; three times as much by the clock, as others may have the processor."""
+MOST_BYTES = 2 << 30
+LONGEST_PRINTED = 4 << 20
+CODES = (0, 2, 3)
+"""That a command ends with by itself."""
+KINDS = (
+    *("traceback", "crash", "hang", "memory", "exit code", "input changed", "earlier result lost", "broken result"),
+    *("message too long", "not printable", "not one line", "noise"),
+)
+EARLIER = "of an earlier call\n"
+IN, OUT = "in", "out"
+CAPABILITIES, ANY_FILE = 0x20080522, 0b110
+"""Version of Linux's interface, and the bits of CAP_DAC_OVERRIDE and CAP_DAC_READ_SEARCH."""
+_PROGRESS = re.compile(r"[\w ]+: \d+ of \d+")
+_NO_POSE = "no pose accepted"
+"""Said on standard output with exit code 3 by a command that has done its work."""
+
+
+@dataclass(frozen=True, slots=True)
+class Outcome:
+    """How a call ended: ``code`` None where it raised; ``trace`` of what it raised."""
+
+    code: int | None
+    out: str
+    err: str
+    seconds: float
+    peak_bytes: int = 0
+    trace: str = ""
+
+    @property
+    def said(self) -> str:
+        """All that was printed but progress."""
+        return "\n".join([self.out, *lines_of(self.err)])
+
+
+class TooLong(BaseException):
+    """The call has had its time."""
+
+
+def lines_of(err: str) -> list[str]:
+    """Standard error without progress."""
+    return [line for line in err.split("\n") if line and not _PROGRESS.fullmatch(line)]
+
+
+def lay_out(stock: Path, folder: Path, call: Call, earlier: bool) -> tuple[Path, Path]:
+    """Copy the inputs of a call, and what an earlier call left where it writes; the two folders."""
+    read, written = folder / IN, folder / OUT
+    shutil.rmtree(folder, ignore_errors=True)
+    for place, below in [*((p, read) for p in call.inputs), *((p, written) for p in call.folders)]:
+        _copy(stock / place, below / place)
+    for below in (read, written):
+        below.mkdir(parents=True, exist_ok=True)
+    for name in call.outputs if earlier else ():
+        (written / name).write_text(EARLIER)
+    return read, written
+
+
+def _copy(source: Path, to: Path) -> None:
+    to.parent.mkdir(parents=True, exist_ok=True)
+    if source.is_dir():
+        shutil.copytree(source, to, dirs_exist_ok=True, ignore=shutil.ignore_patterns("lock"))
+    else:
+        shutil.copy(source, to)
+
+
+def hashes(folder: Path) -> dict[str, str]:
+    """Of every file and link below a folder, by its place."""
+    found = {}
+    for root, folders, files in os.walk(folder):
+        for name in (*folders, *files):
+            path = os.path.join(root, name)
+            if os.path.islink(path):
+                found[path] = f"link to {os.readlink(path)}"
+            elif os.path.isfile(path):
+                found[path] = _hash(path)
+    return found
+
+
+def _hash(path: str) -> str:
+    size = os.path.getsize(path)
+    if size > 1 << 26 or not os.access(path, os.R_OK):  # a file with a hole that is larger than any that is read
+        return str(size)
+    with open(path, "rb") as stream:
+        return hashlib.blake2b(stream.read()).hexdigest()
+
+
+def in_process(call: Call, program: str, folder: Path, more: tuple[str, ...] = (), plain: bool = False) -> Outcome:
+    """Call a program here, its working directory ``folder``; standard streams are caught as files."""
+    words = [*call.arguments(folder / IN, folder / OUT), *more]
+    words = words[1:] if program == "stcal-sfm" else words
+    before = os.getcwd()
+    trace, code = "", None
+    with _caught_streams() as streams, _own_settings(), _without_rights(plain):
+        sys.argv = [program, *words]
+        os.chdir(folder)
+        _forget_peak()
+        start = time.monotonic()
+        try:
+            signal.setitimer(signal.ITIMER_PROF, LONGEST_S)
+            signal.setitimer(signal.ITIMER_REAL, 3 * LONGEST_S)
+            PROGRAMS[program][1]()
+        except SystemExit as end:
+            code = end.code if isinstance(end.code, int) else 0 if end.code is None else 1
+        except TooLong:
+            trace = "too long\n" + traceback.format_exc()
+        except BaseException:
+            trace = traceback.format_exc()
+        finally:
+            for timer in (signal.ITIMER_PROF, signal.ITIMER_REAL):
+                signal.setitimer(timer, 0)
+            seconds = time.monotonic() - start
+            os.chdir(before)
+    return Outcome(code, *streams, seconds, _peak_bytes(), trace)
+
+
+@contextlib.contextmanager
+def _caught_streams() -> Iterator[list[str]]:
+    """What is written to standard output and error meanwhile, by libraries in C too; filled in at the end."""
+    texts: list[str] = []
+    kept, own = [os.dup(1), os.dup(2)], (sys.stdout, sys.stderr)
+    files = [open(os.memfd_create(name), "r+b") for name in ("out", "err")]  # noqa: SIM115
+    for number, file in enumerate(files, 1):
+        os.dup2(file.fileno(), number)
+    sys.stdout, sys.stderr = (
+        TextIOWrapper(os.fdopen(os.dup(n), "wb", 0), encoding="utf-8", write_through=True) for n in (1, 2)
+    )
+    try:
+        yield texts
+    finally:
+        for stream in (sys.stdout, sys.stderr):
+            with contextlib.suppress(OSError, ValueError):
+                stream.close()
+        sys.stdout, sys.stderr = own
+        for number, (file, old) in enumerate(zip(files, kept, strict=True), 1):
+            os.dup2(old, number)
+            os.close(old)
+            file.seek(0)
+            texts.append(file.read(LONGEST_PRINTED + 1).decode(errors="replace"))
+            file.close()
+
+
+@contextlib.contextmanager
+def _own_settings() -> Iterator[None]:
+    """Signals, arguments and warnings as a new process has them, and afterwards as they were."""
+    argv, numbers = sys.argv, (signal.SIGINT, signal.SIGTERM, signal.SIGALRM, signal.SIGPROF)
+    handlers = [signal.getsignal(number) for number in numbers]
+    for number in (signal.SIGALRM, signal.SIGPROF):
+        signal.signal(number, _end)
+    try:
+        with warnings.catch_warnings():
+            warnings.resetwarnings()
+            warnings.simplefilter("always")
+            for kind in (DeprecationWarning, PendingDeprecationWarning, ImportWarning, ResourceWarning):
+                warnings.simplefilter("ignore", kind)
+            yield
+    finally:
+        sys.argv = argv
+        for number, handler in zip(numbers, handlers, strict=True):
+            signal.signal(number, handler)
+
+
+@contextlib.contextmanager
+def _without_rights(wanted: bool) -> Iterator[None]:
+    """Meanwhile without the superuser's right to read and write any file."""
+    if not wanted or os.geteuid() != 0:
+        yield
+        return
+    libc = ctypes.CDLL(None)
+    header, held = (ctypes.c_uint32 * 2)(CAPABILITIES, 0), (ctypes.c_uint32 * 6)()
+    libc.capget(header, held)
+    fewer = (ctypes.c_uint32 * 6)(*held)
+    fewer[0] &= ~ANY_FILE
+    libc.capset(header, fewer)
+    try:
+        yield
+    finally:
+        libc.capset(header, held)
+
+
+def _end(*_) -> None:
+    raise TooLong
+
+
+def _forget_peak() -> None:
+    with contextlib.suppress(OSError):
+        Path("/proc/self/clear_refs").write_text("5")
+
+
+def _peak_bytes() -> int:
+    with contextlib.suppress(OSError):
+        for line in Path("/proc/self/status").read_text().splitlines():
+            if line.startswith("VmHWM:"):
+                return int(line.split()[1]) * 1024
+    return 0
+
+
+def failures(
+    call: Call, folder: Path, outcome: Outcome, before: dict[str, str], refused: bool
+) -> list[tuple[str, str]]:
+    """(kind, what) of everything that must not be.
+
+    Parameters
+    ----------
+    before : hashes of the folder before the call
+    refused : the inputs are such that the command must not end with 0
+    """
+    found = list(_ending(outcome, refused))
+    if outcome.peak_bytes > MOST_BYTES or "not enough memory" in outcome.err:
+        found.append(("memory", f"{outcome.peak_bytes / 2**20:.0f} MB; {outcome.err[-100:]}"))
+    after = hashes(folder)
+    read = str(folder / IN) + os.sep
+    # The cache of a run holds its lock.
+    changed = [p for p, old in before.items() if p.startswith(read) and "/cache/" not in p and after.get(p) != old]
+    if changed:
+        found.append(("input changed", ", ".join(sorted(changed)[:3])))
+    if outcome.code is not None:
+        found += _printed(outcome)
+        found += _left(call, folder / OUT, outcome.code, before, after)
+    return found
+
+
+def _ending(outcome: Outcome, refused: bool) -> Iterator[tuple[str, str]]:
+    if outcome.trace.startswith("too long"):
+        yield "hang", f"over {LONGEST_S:g} s\n{outcome.trace}"
+    elif outcome.trace:
+        yield "traceback", outcome.trace
+    elif outcome.code not in CODES:
+        yield "exit code", f"{outcome.code}, one of {CODES} needed"
+    elif refused and outcome.code == 0:
+        yield "exit code", "0, an error needed"
+    if "Traceback (most recent call last)" in outcome.out + outcome.err:
+        yield "traceback", outcome.err
+
+
+def _printed(outcome: Outcome) -> Iterator[tuple[str, str]]:
+    lines = lines_of(outcome.err)
+    if outcome.code == 0 and lines:
+        yield "noise", lines[0][:300]
+    done = outcome.code == 3 and not lines and _NO_POSE in outcome.out
+    if outcome.code and not done and (len(lines) != 1 or not lines[0].startswith("error: ")):
+        yield "not one line", f"{len(lines)}: " + " | ".join(line[:150] for line in lines[:4])
+    if any(len(line) > MESSAGE_CHARACTERS for line in lines):
+        yield "message too long", f"{max(map(len, lines))} characters: {max(lines, key=len)[:200]}"
+    for name, text in (("standard output", outcome.out), ("standard error", outcome.err)):
+        bad = next((c for c in text if not c.isprintable() and c not in "\n\t"), None)
+        if bad:
+            yield "not printable", f"{bad!r} on {name}: {text[max(0, text.index(bad) - 60) : text.index(bad) + 20]!r}"
+        if len(text) > LONGEST_PRINTED:
+            yield "message too long", f"over {LONGEST_PRINTED >> 20} MB on {name}"
+
+
+def _left(call: Call, written: Path, code: int, before: dict, after: dict) -> Iterator[tuple[str, str]]:
+    """Of what lies where the command writes."""
+    for path in after:
+        if path.endswith(".partial") and path not in before:
+            yield "broken result", f"{path} is left behind"
+    for name in call.outputs:
+        path = written / name
+        earlier = before.get(str(path))
+        if earlier is not None and str(path) not in after:
+            yield "earlier result lost", f"{name} is gone, exit code {code}"
+        elif str(path) in after and after[str(path)] != earlier:
+            if reason := broken(path):
+                yield "broken result", f"{name}: {reason}, exit code {code}"
+        elif code == 0:
+            yield "broken result", f"{name} was not written, exit code 0"
+    for place in call.folders if code else ():
+        for path, old in before.items():
+            own = path.startswith(str(written / place)) and _entry(path, written / place) in RUN_ENTRIES
+            if own and after.get(path) != old:
+                yield "earlier result lost", f"{path} of the earlier run, exit code {code}"
+
+
+def _entry(path: str, folder: Path) -> str:
+    return Path(path).relative_to(folder).parts[0]
+
+
+def broken(path: Path) -> str:
+    """Why a result file is none; empty where it is one."""
+    try:
+        text = path.read_text(encoding="utf-8")
+        if path.suffix == ".json":
+            json.loads(text, parse_constant=_no_number)
+        elif path.suffix == ".csv":
+            rows = list(csv.reader(line for line in text.splitlines() if not line.startswith("#")))
+            if not rows or len({len(row) for row in rows}) > 1:
+                return "rows of several lengths, or none"
+        elif path.suffix in (".svg", ".urdf"):
+            ElementTree.fromstring(text)
+        elif path.suffix == ".html" and not text.rstrip().endswith("</html>"):
+            return "no end"
+    except (OSError, ValueError, ElementTree.ParseError) as error:
+        return str(error)
+    return "" if text else "empty"
+
+
+def _no_number(name: str) -> float:
+    raise ValueError(f"{name} is not JSON")

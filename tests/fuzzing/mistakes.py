@@ -1,0 +1,436 @@
+"""Mistakes that people make with files that are in order by themselves, and whether they are told."""
+
+import csv
+import json
+import re
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from stcal.geometry.rigid import Poses, Rigid
+from stcal.io.table import POSE, pose_cells
+from tests.commands import CALLS, Call
+from tests.fuzzing.judged import Outcome
+from tests.fuzzing.stock import write_rows
+
+Edit = Callable[[Path], None]
+SAID = r"(?i)\b(warning|note|failed|suspicious|reject)\b"
+INCH = 1 / 25.4
+LENGTHS = ("target_from_face", "circles")
+"""Keys of a faces file and a truth."""
+
+TURNED = "a chessboard turned by a quarter is the same board"
+
+
+@dataclass(frozen=True, slots=True)
+class Mistake:
+    """``edit`` of the folder of inputs; ``untold`` : why no program could tell it, else ""; ``says`` : what a line
+    must have that the same call on good data has not, where the call goes through all the same."""
+
+    name: str
+    call: Call
+    edit: Edit
+    untold: str = ""
+    says: str = SAID
+
+
+def told(mistake: Mistake, outcome: Outcome, valid: Outcome) -> bool:
+    """Whether a call fails, or says what is wrong in a line that the same call on good data does not have."""
+    known = {_plain(line) for line in valid.said.splitlines()}
+    return outcome.code != 0 or any(
+        re.search(mistake.says, line) and _plain(line) not in known for line in outcome.said.splitlines()
+    )
+
+
+def _plain(line: str) -> str:
+    return re.sub(r"[\d.]+", "#", re.sub(r"\s+", " ", line))
+
+
+def call_of(command: str, place: str) -> Call:
+    """The first one of a command that has this input."""
+    return next(call for call in CALLS if call.command == command and place in call.inputs)
+
+
+def columns(place: str, change: Callable[[dict[str, list[str]]], dict[str, list[str]]]) -> Edit:
+    """Change a CSV file as columns."""
+
+    def edit(read: Path) -> None:
+        header, *rows = list(csv.reader((read / place).read_text().splitlines()))
+        found = change(dict(zip(header, map(list, zip(*rows, strict=True)), strict=True)))
+        write_rows(read / place, list(found), zip(*found.values(), strict=True))
+
+    return edit
+
+
+def times(place: str, names: str, factor: float) -> Edit:
+    """Numbers of the columns that match."""
+    return columns(
+        place,
+        lambda table: {
+            n: [repr(float(v) * factor) for v in c] if re.fullmatch(names, n) else c for n, c in table.items()
+        },
+    )
+
+
+def named(place: str, old: str, new: str) -> Edit:
+    """Columns under other names, their numbers as they are."""
+    return columns(place, lambda table: {re.sub(old, new, n): c for n, c in table.items()})
+
+
+def exchanged(place: str, a: str, b: str) -> Edit:
+    """The numbers of two columns."""
+    return columns(place, lambda table: table | {a: table[b], b: table[a]})
+
+
+def moved(place: str, names: str, by: int = 1) -> Edit:
+    """The columns that match against the others by so many rows."""
+    return columns(
+        place, lambda table: {n: c[-by:] + c[:-by] if re.fullmatch(names, n) else c for n, c in table.items()}
+    )
+
+
+def shuffled(place: str, names: str) -> Edit:
+    """The rows of the columns that match against the others."""
+
+    def change(table):
+        order = np.random.default_rng(5).permutation(len(next(iter(table.values()))))
+        return {n: [c[i] for i in order] if re.fullmatch(names, n) else c for n, c in table.items()}
+
+    return columns(place, change)
+
+
+def poses(place: str, change: Callable[[Poses], Poses], prefix: str = "") -> Edit:
+    """Poses of a CSV file by other conventions."""
+
+    def edit_table(table):
+        values = np.array([[float(v) for v in table[prefix + name]] for name in POSE]).T
+        found = change(Poses.from_quaternions(values[:, 3:], values[:, :3]))
+        cells = list(zip(*(pose_cells(p) for p in found), strict=True))
+        return table | {prefix + name: list(c) for name, c in zip(POSE, cells, strict=True)}
+
+    return columns(place, edit_table)
+
+
+def rolled_quaternion(place: str, prefix: str = "") -> Edit:
+    """x, y, z, w under the names of w, x, y, z."""
+
+    def change(table):
+        w, x, y, z = (table[prefix + name] for name in POSE[3:])
+        return table | dict(zip((prefix + name for name in POSE[3:]), (x, y, z, w), strict=True))
+
+    return columns(place, change)
+
+
+def transposed(found: Poses) -> Poses:
+    """Rotations the other way round, places as they are."""
+    return Poses(np.swapaxes(found.rotation, 1, 2), found.translation)
+
+
+def text(place: str, old: str, new: str | Callable[[re.Match], str]) -> Edit:
+    """Replace in a text file what matches."""
+
+    def edit(read: Path) -> None:
+        before = (read / place).read_text()
+        after = re.sub(old, new, before)
+        assert before != after, f"{place} has no {old}"
+        (read / place).write_text(after)
+
+    return edit
+
+
+def number_times(place: str, key: str, factor: float) -> Edit:
+    """Numbers behind a TOML key."""
+    return text(place, rf"\b({key}) = ([-\d.e]+)", lambda m: f"{m[1]} = {float(m[2]) * factor!r}")
+
+
+def json_times(place: str, keys: tuple[str, ...], factor: float) -> Edit:
+    """Translations of 4×4, and points, below these keys."""
+
+    def scaled(value):
+        if isinstance(value, dict):
+            return {key: scaled(each) for key, each in value.items()}
+        if len(value) == 4 and isinstance(value[0], list):
+            return [[*row[:3], row[3] * (factor if i < 3 else 1)] for i, row in enumerate(value)]
+        return [v * factor for v in value]
+
+    def edit(read: Path) -> None:
+        content = json.loads((read / place).read_text())
+        (read / place).write_text(json.dumps(content | {key: scaled(content[key]) for key in keys}))
+
+    return edit
+
+
+def json_inverse(place: str, key: str) -> Edit:
+    """A transform the other way round."""
+
+    def edit(read: Path) -> None:
+        content = json.loads((read / place).read_text())
+        content[key] = Rigid.from_matrix(np.array(content[key])).inverse().matrix().tolist()
+        (read / place).write_text(json.dumps(content))
+
+    return edit
+
+
+def decimal_commas(place: str) -> Edit:
+    """As a spreadsheet of a country with decimal commas writes it."""
+
+    def edit(read: Path) -> None:
+        (read / place).write_text((read / place).read_text().replace(",", ";").replace(".", ","))
+
+    return edit
+
+
+def camera_times(place: str, factor: float) -> Edit:
+    """``cameras.txt`` of photographs of another size."""
+
+    def edit(read: Path) -> None:
+        *head, line = (read / place).read_text().strip().splitlines()
+        number, model, width, height, *rest = line.split()
+        pixels = 3 if model.startswith("SIMPLE") else 4
+        values = [float(v) * (factor if i < pixels else 1) for i, v in enumerate(rest)]
+        size = round(int(width) * factor), round(int(height) * factor)
+        (read / place).write_text("\n".join([*head, " ".join(map(str, [number, model, *size, *values]))]) + "\n")
+
+    return edit
+
+
+def _robot() -> list[Mistake]:
+    data, places, robot = "robot/poses.csv", "[xyz]_mm", "robot/robot.toml"
+    identify = call_of("robot identify", data)
+    found = [
+        Mistake(f"identify: {name}", identify, edit)
+        for name, edit in {
+            "metres as mm": times(data, places, 1e-3),
+            "inches as mm": times(data, places, INCH),
+            "rad as deg": times(data, r"q\d_deg", np.pi / 180),
+            "deg as rad": named(data, r"(q\d)_deg", r"\1_rad"),
+            "x y z w": rolled_quaternion(data),
+            "conjugated": poses(data, transposed),
+            "tool_from_base": poses(data, Poses.inverse),
+            "x and y exchanged": exchanged(data, "x_mm", "y_mm"),
+            "z down": times(data, "z_mm", -1),
+            "joints 2 and 3 exchanged": exchanged(data, "q2_deg", "q3_deg"),
+            "joint 4 the other way": times(data, "q4_deg", -1),
+            "rows shuffled": shuffled(data, r"q\d_deg"),
+            "rows one late": moved(data, r"q\d_deg"),
+            "decimal commas": decimal_commas(data),
+            "robot in metres": number_times(robot, "(?:a|d)_mm", 1e-3),
+            "robot in inches": number_times(robot, "(?:a|d)_mm", INCH),
+            "modified for standard": text(robot, '"standard"', '"modified"'),
+            "alpha in rad": number_times(robot, "alpha_deg", np.pi / 180),
+            "theta of joint 2 left out": text(robot, r"theta_deg = -90\.0", "theta_deg = 0.0"),
+        }.items()
+    ]
+    sweeps = "robot/sweeps.csv"
+    found += [
+        Mistake(f"axes: {name}", call_of("robot axes", sweeps), edit)
+        for name, edit in {
+            "metres as mm": times(sweeps, places, 1e-3),
+            "rad as deg": times(sweeps, r"q\d_deg", np.pi / 180),
+            "joints 2 and 3 exchanged": exchanged(sweeps, "q2_deg", "q3_deg"),
+            "left-handed": times(sweeps, "y_mm", -1),
+            "rows one late": moved(sweeps, r"q\d_deg"),
+            "joint 4 the other way": times(sweeps, "q4_deg", -1),
+            "robot in metres": number_times(robot, "(?:a|d)_mm", 1e-3),
+        }.items()
+    ]
+    targets = "robot/targets.csv"
+    found += [
+        Mistake(f"compensate: {name}", call_of("robot compensate", targets), edit, says=says)
+        for name, edit, says in (
+            ("metres as mm", times(targets, places, 1e-3), "metres|unit"),
+            ("inches as mm", times(targets, places, INCH), "inch|unit"),
+            ("x y z w", rolled_quaternion(targets), "quaternion|convention"),
+            ("conjugated", poses(targets, transposed), "quaternion|convention"),
+            ("tool_from_base", poses(targets, Poses.inverse), "inverse|convention"),
+            ("rad as deg", times(targets, r"q\d_deg", np.pi / 180), "degrees|joint values of"),
+            ("joints one row late", moved(targets, r"q\d_deg"), "order|joint values of"),
+            ("robot in metres", number_times("robot/made.toml", "(?:a|d)_mm", 1e-3), "unit"),
+            ("nominal robot in metres", number_times(robot, "(?:a|d)_mm", 1e-3), "nominal"),
+        )
+    ]
+    verify, before, after = "robot/verify.csv", "commanded_[xyz]_mm", "[xyz]_mm"
+    return found + [
+        Mistake(f"verify: {name}", call_of("robot verify", verify), edit, why)
+        for name, edit, why in (
+            ("commanded in metres", times(verify, before, 1e-3), ""),
+            ("measured in metres", times(verify, after, 1e-3), ""),
+            ("measured in inches", times(verify, after, INCH), ""),
+            ("rows shuffled", shuffled(verify, after), ""),
+            ("x and y exchanged", exchanged(verify, "x_mm", "y_mm"), "distances alone are compared; they have no hand"),
+            ("left-handed", times(verify, "z_mm", -1), "distances alone are compared; they have no hand"),
+            ("commanded and measured exchanged", columns(verify, _sides_exchanged), ""),
+        )
+    ]
+
+
+def _sides_exchanged(table: dict) -> dict:
+    return table | {
+        **{f"commanded_{c}": table[c] for c in POSE[:3]},
+        **{c: table[f"commanded_{c}"] for c in POSE[:3]},
+    }
+
+
+def _handeye() -> list[Mistake]:
+    data, images = "handeye/poses.csv", "handeye/images"
+    robot, board = "handeye/robot.csv", "handeye/board.toml"
+    flange, camera = "base_from_flange_", "camera_from_board_"
+    found = [
+        Mistake(f"handeye, poses: {name}", call_of("handeye", data), edit, why)
+        for name, edit, why in (
+            ("robot in metres", times(data, flange + "[xyz]_mm", 1e-3), ""),
+            ("camera in metres", times(data, camera + "[xyz]_mm", 1e-3), ""),
+            ("both in metres", times(data, ".*[xyz]_mm", 1e-3), ""),
+            ("robot in inches", times(data, flange + "[xyz]_mm", INCH), ""),
+            ("robot x y z w", rolled_quaternion(data, flange), ""),
+            ("camera x y z w", rolled_quaternion(data, camera), ""),
+            ("flange_from_base", poses(data, Poses.inverse, flange), ""),
+            ("board_from_camera", poses(data, Poses.inverse, camera), ""),
+            ("both inverse", _both(poses(data, Poses.inverse, flange), poses(data, Poses.inverse, camera)), ""),
+            ("robot conjugated", poses(data, transposed, flange), ""),
+            ("rows one late", moved(data, flange + ".*"), ""),
+            ("rows shuffled", shuffled(data, flange + ".*"), ""),
+            ("decimal commas", decimal_commas(data), ""),
+        )
+    ]
+    chessboard = call_of("handeye", images)
+    found.append(Mistake("handeye: other setup", _with(call_of("handeye", data), "--setup eye-to-hand"), _nothing))
+    return found + [
+        Mistake(f"handeye, images: {name}", chessboard, edit, TURNED if name.startswith("rows and") else "")
+        for name, edit in {
+            "squares in inches": number_times(board, "square_mm", INCH),
+            "squares in metres": number_times(board, "square_mm", 1e-3),
+            "squares of 21 mm": number_times(board, "square_mm", 1.05),
+            "rows and columns exchanged": text(board, "rows = 6\ncolumns = 8", "rows = 8\ncolumns = 6"),
+            "squares counted, not corners": text(board, "rows = 6\ncolumns = 8", "rows = 7\ncolumns = 9"),
+            "robot in metres": times(robot, ".*[xyz]_mm", 1e-3),
+            "robot x y z w": rolled_quaternion(robot, flange),
+            "flange_from_base": poses(robot, Poses.inverse, flange),
+            "rows one late": moved(robot, flange + ".*"),
+            "camera of double size": camera_times("handeye/cameras.txt", 2),
+        }.items()
+    ]
+
+
+def _with(call: Call, words: str) -> Call:
+    return Call(call.command, f"{call.words} {words}", call.seconds, call.code)
+
+
+def _both(first: Edit, second: Edit) -> Edit:
+    def edit(read: Path) -> None:
+        first(read)
+        second(read)
+
+    return edit
+
+
+def _nothing(_: Path) -> None:
+    """The mistake is in the options."""
+
+
+def _locate() -> list[Mistake]:
+    scenes, images = call_of("locate run", "locate/scenes"), call_of("locate calibrate", "locate/images")
+    layout, robot, camera = "locate/layout.toml", "locate/robot.csv", "locate/cameras.txt"
+    one = "one pose and no other source: any place within reach may be meant"
+    return [
+        Mistake(f"locate {name}", call, edit, why)
+        for name, call, edit, why in (
+            ("run: camera of double size", scenes, camera_times(camera, 2), ""),
+            ("run: camera of another lens", scenes, text(camera, r"1300\.0", "2600.0"), ""),
+            ("run: other dictionary", scenes, text(layout, "6X6_250", "5X5_250"), ""),
+            ("run: robot in metres", scenes, times(robot, "[xyz]_mm", 1e-3), ""),
+            ("run: robot x y z w", scenes, rolled_quaternion(robot), one),
+            ("run: flange_from_base", scenes, poses(robot, Poses.inverse), one),
+            ("run: robot of another scene", scenes, text(robot, r"\na,", "\nb,"), ""),
+            ("run: hand-eye in metres", scenes, json_times("locate/handeye.json", ("flange_from_camera",), 1e-3), ""),
+            ("run: hand-eye inverse", scenes, json_inverse("locate/handeye.json", "flange_from_camera"), one),
+            ("run: offset in metres", scenes, json_times("locate/offset.json", ("obj_from_goal",), 1e-3), one),
+            ("calibrate: camera of double size", images, camera_times(camera, 2), ""),
+            (
+                "calibrate: squares in inches",
+                images,
+                number_times("locate/board.toml", "square_mm", INCH),
+                "a board of squares of 0.8 mm nearer by as much gives the same photographs",
+            ),
+            ("calibrate: other dictionary", images, text("locate/plan.toml", "36h11", "25h9"), ""),
+            (
+                "calibrate: board of another shape",
+                images,
+                text("locate/board.toml", "rows = 4\ncolumns = 9", "rows = 9\ncolumns = 4"),
+                TURNED,
+            ),
+        )
+    ]
+
+
+def _register() -> list[Mistake]:
+    pairs, call = "register/pairs.csv", call_of("register", "register/pairs.csv")
+    arm = call_of("register", "register/arm.csv")
+    found = {
+        "a in metres": times(pairs, "a[xyz]_mm", 1e-3),
+        "a in inches": times(pairs, "a[xyz]_mm", INCH),
+        "b left-handed": times(pairs, "bz_mm", -1),
+        "x and y of b exchanged": exchanged(pairs, "bx_mm", "by_mm"),
+        "rows shuffled": shuffled(pairs, "b[xyz]_mm"),
+        "rows one late": moved(pairs, "b[xyz]_mm"),
+        "decimal commas": decimal_commas(pairs),
+    }
+    return [Mistake(f"register: {name}", call, edit) for name, edit in found.items()] + [
+        Mistake(
+            "register: both in metres",
+            call,
+            times(pairs, ".*_mm", 1e-3),
+            "points within 0.4 mm that fit to 0.1 µm are possible",
+        ),
+        Mistake("register: arm in metres", arm, times("register/arm.csv", "a[xyz]_mm", 1e-3)),
+        Mistake("register: rad as deg", arm, times("register/arm.csv", r"q\d_deg", np.pi / 180)),
+        Mistake("register: robot in metres", arm, number_times("robot/robot.toml", "(?:a|d)_mm", 1e-3)),
+    ]
+
+
+def _sfm() -> list[Mistake]:
+    run = next(call for call in CALLS if call.command == "sfm run" and "+" in call.words)
+    measure, compare = call_of("sfm measure", "shots"), call_of("sfm compare", "run")
+    target, board, camera = "data/target.toml", "data/board.toml", "data/cameras.txt"
+    turned = "its dots have the same distances, and so has the target the same scale"
+    return [
+        Mistake(name, call, edit, why)
+        for name, call, edit, why in (
+            ("run: camera of double size", run, camera_times(camera, 2), ""),
+            ("run: camera of half the focal length", run, _focal(camera, 0.5), ""),
+            ("run: focal length off by 3 %", run, _focal(camera, 1.03), ""),
+            ("run: target in cm", run, number_times(target, "(?:x|y|radius)_mm", 0.1), ""),
+            ("run: target in inches", run, number_times(target, "(?:x|y|radius)_mm", INCH), ""),
+            ("run: target mirrored", run, number_times(target, "x_mm", -1), ""),
+            ("run: pitch of 31 mm", run, number_times(board, "pitch_mm", 31 / 30), ""),
+            ("run: board in inches", run, number_times(board, ".*_mm", INCH), ""),
+            ("run: rows and columns exchanged", run, _rows_for_columns(board), turned),
+            ("run: other polarity", run, text(target, '"bright"', '"dark"'), ""),
+            ("measure: camera of double size", measure, camera_times(camera, 2), ""),
+            ("measure: camera of half the focal length", measure, _focal(camera, 0.5), ""),
+            ("measure: faces in metres", measure, json_times("run/faces.json", LENGTHS, 1e-3), ""),
+            ("measure: target in inches", measure, number_times(target, "(?:x|y|radius)_mm", INCH), ""),
+            ("compare: truth in metres", compare, json_times("data/truth.json", LENGTHS, 1e-3), ""),
+            ("compare: truth of another unit", compare, text("data/truth.json", '"unit": "mm"', '"unit": "m"'), ""),
+        )
+    ]  # fmt: skip
+
+
+def _focal(place: str, factor: float) -> Edit:
+    def edit(read: Path) -> None:
+        *head, line = (read / place).read_text().strip().splitlines()
+        words = line.split()
+        for i in (4,) if words[1].startswith("SIMPLE") else (4, 5):
+            words[i] = repr(float(words[i]) * factor)
+        (read / place).write_text("\n".join([*head, " ".join(words)]) + "\n")
+
+    return edit
+
+
+def _rows_for_columns(place: str) -> Edit:
+    return text(place, r"rows = (\d+)\ncolumns = (\d+)", lambda m: f"rows = {m[2]}\ncolumns = {m[1]}")
+
+
+MISTAKES = {each.name: each for each in (*_robot(), *_handeye(), *_locate(), *_register(), *_sfm())}

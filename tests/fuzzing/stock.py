@@ -1,0 +1,221 @@
+"""Valid inputs of every command, small, made once; a case copies of them what it spoils."""
+
+import csv
+import json
+import shutil
+from dataclasses import replace
+from pathlib import Path
+
+import cv2
+import numpy as np
+
+from stcal.geometry.rigid import Poses, Rigid
+from stcal.io.camera import CalibratedCamera, read_camera, write_cameras_txt
+from stcal.io.table import POSE, pose_cells
+from stcal.locate.data.layout import layout_toml
+from stcal.robot.kinematics.example import mh80
+from stcal.robot.kinematics.file import robot_toml
+from stcal.robot.kinematics.forward import forward
+from stcal.sfm.interop.export_model import export_model
+from stcal.sfm.pipeline import RunOptions, run
+from stcal.synthetic.dataset import write_dataset
+from stcal.synthetic.measured.arms import joint_vectors, made, measured, placed
+from stcal.synthetic.measured.handeye import simulated
+from stcal.synthetic.scene import SceneOptions, make_scene
+from tests.boards.drawn import chessboard_mm, photograph
+from tests.handeye.photographed import looks, photographs
+from tests.locate.drawn_target import CAMERA, LAYOUT, PER_MM, SHEET_MM, photo, sheet, tilted
+
+SMALL = SceneOptions(seed=3, width=1296, height=864, images_per_group=4, groups=(("1", "2"), ("1", "4")))
+"""As the tests' small data set."""
+CHESSBOARD = 'type = "chessboard"\nrows = 6\ncolumns = 8\nsquare_mm = 20\n'
+BOARD_AT_MM = (30, 230)
+"""Of the board beside the tags, on the sheet."""
+
+
+def make_stock(folder: Path, dataset: Path | None = None, finished: Path | None = None) -> Path:
+    """Fill a new folder; data set and run are copied where there are some."""
+    folder.mkdir(parents=True)
+    if dataset:
+        shutil.copytree(dataset, folder / "data")
+    else:
+        write_dataset(folder / "data", make_scene(SMALL), workers=1)
+    data = folder / "data"
+    if finished:
+        shutil.copytree(finished, folder / "run")
+    else:
+        designs = [data / name for name in ("target.toml", "board.toml")]
+        run(data / "images", data / "cameras.txt", folder / "run", *designs, RunOptions(workers=1))
+    _of_runs(folder)
+    _cameras(folder)
+    rng = np.random.default_rng(7)
+    _robots(folder / "robot", rng)
+    _handeye(folder / "handeye", rng)
+    _tags(folder / "locate", rng)
+    _register(folder / "register", rng)
+    return folder
+
+
+def write_rows(path: Path, header, rows) -> None:
+    """A CSV file of cells."""
+    with open(path, "w", newline="", encoding="utf-8") as stream:
+        csv.writer(stream, lineterminator="\n").writerows([header, *rows])
+
+
+def _of_runs(folder: Path) -> None:
+    """Photographs to measure with their joint values, a folder of detections, a model as text."""
+    (folder / "shots").mkdir()
+    shutil.copy(folder / "data/images/12/IMG_1000.jpg", folder / "shots")
+    write_rows(folder / "joints.csv", ["image", "q1_deg", "q2_deg"], [["IMG_1000.jpg", 10.5, -3.25]])
+    truth = json.loads((folder / "data/truth.json").read_text())
+    placed_faces = {key: truth[key] for key in ("unit", "reference_face", "target_from_face", "circles")}
+    (folder / "faces.json").write_text(json.dumps({"format": "stcal faces 1"} | placed_faces, indent=1))
+    export_model(folder / "run", folder / "model-txt", "colmap-txt")
+    (folder / "detected").mkdir()
+    shutil.copytree(folder / "run/cache", folder / "detected/cache")
+    marker = json.loads((folder / "run/stcal-run.json").read_text())
+    (folder / "detected/stcal-run.json").write_text(json.dumps(marker | {"options": None}))
+    (folder / "no-colmap").write_text("no program\n")
+
+
+def _cameras(folder: Path) -> None:
+    """The data set's camera in every form that is read."""
+    given = read_camera(folder / "data/cameras.txt").calibrated(SMALL.width, SMALL.height)
+    (fx, fy), (cx, cy) = given.focal, given.centre
+    forms = folder / "cameras"
+    forms.mkdir()
+    matrix = [fx, 0.0, cx, 0.0, fy, cy, 0.0, 0.0, 1.0]
+    dist = [float(k) for k in given.distortion[:5]]
+    names = dict.fromkeys(("rows: 3, cols: 3", "rows: 1, cols: 5"))
+    one, two = (f"{{{name}, data: {values}}}" for name, values in zip(names, (matrix, dist), strict=True))
+    (forms / "ros.yaml").write_text(
+        f"image_width: {given.width}\nimage_height: {given.height}\ncamera_name: c\ncamera_matrix: {one}\n"
+        f"distortion_model: plumb_bob\ndistortion_coefficients: {two}\n"
+    )
+    node = "!!opencv-matrix\n   rows: {}\n   cols: {}\n   dt: d\n   data: {}\n"
+    (forms / "opencv.yaml").write_text(
+        f"%YAML:1.0\n---\nimage_width: {given.width}\nimage_height: {given.height}\n"
+        f"camera_matrix: {node.format(3, 3, matrix)}distortion_coefficients: {node.format(1, 5, dist)}"
+    )
+    tag = '<{0} type_id="opencv-matrix"><rows>{1}</rows><cols>{2}</cols><dt>d</dt><data>{3}</data></{0}>'
+    (forms / "opencv.xml").write_text(
+        f'<?xml version="1.0"?>\n<opencv_storage>\n<image_width>{given.width}</image_width>\n'
+        f"<image_height>{given.height}</image_height>\n"
+        + tag.format("camera_matrix", 3, 3, " ".join(map(str, matrix)))
+        + tag.format("distortion_coefficients", 1, 5, " ".join(map(str, dist)))
+        + "</opencv_storage>\n"
+    )
+    (forms / "industrial.yaml").write_text(f"intrinsics:\n  fx: {fx}\n  fy: {fy}\n  cx: {cx}\n  cy: {cy}\n")
+    rng = np.random.default_rng(1)
+    spread = rng.normal(size=(len(given.colmap_params()), 40)) * 1e-3
+    write_cameras_txt(forms / "sigma.txt", replace(given, covariance=spread @ spread.T))
+
+
+def _robots(folder: Path, rng: np.random.Generator) -> None:
+    """Nominal and made arm, poses of the arm, sweeps, targets, positions before and after."""
+    folder.mkdir()
+    nominal = mh80()
+    world_from_base, tool = Rigid.exp([0.1, -0.05, 2.1, 2500.0, -900.0, 400.0]), Rigid.exp([0, 0.1, 0, 220, 60, 150])
+    arm = placed(made(nominal, rng), world_from_base, {"": tool})
+    (folder / "robot.toml").write_text(robot_toml(nominal, []))
+    (folder / "made.toml").write_text(robot_toml(arm, []))
+    joints = [f"q{i}_deg" for i in range(1, 7)]
+    q = joint_vectors(arm, 50, rng)
+    seen = measured(arm, q, rng)
+    poses = [pose_cells(Rigid(r, t)) for r, t in zip(seen.rotations, seen.positions, strict=True)]
+    write_rows(folder / "poses.csv", [*joints, *POSE], [[*d, *p] for d, p in zip(np.degrees(q), poses, strict=True)])
+    home = np.array([0.25, -0.25, 0.25, -0.25, 0.25, -0.25])
+    turns = np.linspace(-1.0, 1.0, 12)
+    sweeps = np.array([np.where(np.arange(6) == j, turn, home) for j in range(6) for turn in turns])
+    places = (arm.world_from_base @ forward(arm, sweeps, "")).translation + rng.normal(0, 0.02, (len(sweeps), 3))
+    write_rows(folder / "sweeps.csv", [*joints, *POSE[:3]], np.column_stack([np.degrees(sweeps), places]).tolist())
+    wanted = forward(nominal, q[:8], "")
+    write_rows(
+        folder / "targets.csv",
+        [*joints, *POSE],
+        [[*d, *pose_cells(p)] for d, p in zip(np.degrees(q), wanted, strict=False)],
+    )
+    commanded = rng.uniform(-500, 500, (12, 3))
+    rows = [
+        [name, *c, *(c + rng.normal(0, size, 3))]
+        for name, size in (("before", 0.5), ("after", 0.05))
+        for c in commanded
+    ]
+    write_rows(folder / "verify.csv", ["set", *(f"commanded_{c}" for c in POSE[:3]), *POSE[:3]], rows)
+
+
+def _handeye(folder: Path, rng: np.random.Generator) -> None:
+    """Pairs of poses, and photographs of a chessboard with the robot's poses."""
+    folder.mkdir()
+    pairs = simulated(rng, 14, robot=(2e-4, 0.1), camera=(5e-4, 0.2)).pairs
+    header = [f"{name}_{column}" for name in ("base_from_flange", "camera_from_board") for column in POSE]
+    rows = [
+        [*pose_cells(a), *pose_cells(b)] for a, b in zip(pairs.base_from_flange, pairs.camera_from_board, strict=True)
+    ]
+    write_rows(folder / "poses.csv", header, rows)
+    seen = looks(rng, 7, np.array([70.0, 50.0]), 0.6)
+    _photographed(folder, seen)
+
+
+def _photographed(folder: Path, seen: Poses) -> None:
+    """Of a chessboard; the poses go to a name of their own."""
+    inner = folder / "drawn"
+    inner.mkdir()
+    found = photographs(inner, *chessboard_mm(6, 8, 20.0), seen, CHESSBOARD)
+    for path, name in ((found.poses, "robot.csv"), (found.camera, "cameras.txt"), (found.board, "board.toml")):
+        path.rename(folder / name)
+    found.images.rename(folder / "images")
+
+
+def _tags(folder: Path, rng: np.random.Generator) -> None:
+    """Exposures of a scene with what leads to the robot, and photographs of the target above a board."""
+    (folder / "scenes" / "a").mkdir(parents=True)
+    (folder / "images").mkdir()
+    image = photo(tilted(30))
+    cv2.imwrite(str(folder / "scenes/a/1.png"), image)
+    cv2.imwrite(str(folder / "scenes/a/2.png"), cv2.convertScaleAbs(image, alpha=0.6))
+    (folder / "layout.toml").write_text(layout_toml(LAYOUT), encoding="utf-8")
+    write_cameras_txt(folder / "cameras.txt", CalibratedCamera.of(CAMERA, "PINHOLE"))
+    hand_eye = {"flange_from_camera": Rigid.exp([0, 0, 1, 0, 0, 50]).matrix().tolist()}
+    hand_eye |= {"covariance": np.diag([1e-6] * 3 + [0.01] * 3).tolist()}
+    (folder / "handeye.json").write_text(json.dumps(hand_eye))
+    offset = {"obj_from_goal": Rigid.exp([0, 0, 0, 0, 0, -40]).matrix().tolist()}
+    (folder / "offset.json").write_text(json.dumps(offset))
+    write_rows(folder / "robot.csv", ["scene", *POSE], [["a", *pose_cells(Rigid.exp([1, 0, 0, 400, 0, 300]))]])
+    printed, matrix = _sheet_with_board(), np.array([[1300.0, 0, 599.5], [0, 1300.0, 449.5], [0, 0, 1]])
+    for k in range(3):
+        tilt = Rigid.exp([*rng.uniform(-0.4, 0.4, 2), 0, 0, 0, 0]).rotation
+        turn = tilt @ np.array([[0.0, 1, 0], [-1, 0, 0], [0, 0, 1]])
+        shift = np.array([0, 0, 620.0]) - turn @ np.array([SHEET_MM[0] / 2, 160.0, 0])
+        view = photograph(printed, PER_MM, matrix @ np.column_stack([turn[:, :2], shift]), (1200, 900))
+        cv2.imwrite(str(folder / "images" / f"{k}.png"), view)
+    (folder / "board.toml").write_text('type = "chessboard"\nrows = 4\ncolumns = 9\nsquare_mm = 20.0\n')
+    tags = "".join(f'[[tag]]\ndictionary = "{dictionary}"\nid = {tag}\n' for dictionary, tag in LAYOUT.tags)
+    (folder / "plan.toml").write_text('type = "tags"\norigin = 0\n' + tags)
+
+
+def _sheet_with_board() -> np.ndarray:
+    printed = np.full((320 * PER_MM, int(SHEET_MM[0]) * PER_MM), 255, np.uint8)
+    printed[: sheet().shape[0]] = sheet()
+    side = 20 * PER_MM
+    for row in range(-1, 4):
+        for column in range(-1, 9):
+            x, y = BOARD_AT_MM[0] * PER_MM + column * side, BOARD_AT_MM[1] * PER_MM + row * side
+            if (row + column) % 2 == 0:
+                printed[y : y + side, x : x + side] = 0
+    return printed
+
+
+def _register(folder: Path, rng: np.random.Generator) -> None:
+    """Points in two frames; and those of an arm, with its joint values."""
+    folder.mkdir()
+    names = [f"{frame}{axis}_mm" for frame in "ab" for axis in "xyz"]
+    b_from_a = Rigid.exp([0.3, -0.4, 1.1, 2500.0, -300.0, 800.0])
+    a = rng.uniform(-200, 200, (24, 3)) + np.array([800, 200, 700])
+    write_rows(folder / "pairs.csv", names, np.hstack([a, b_from_a @ a + rng.normal(0, 0.1, a.shape)]).tolist())
+    nominal = mh80()
+    arm = placed(made(nominal, rng), Rigid(), dict(nominal.tools))
+    q = joint_vectors(arm, 40, rng)
+    a, b = forward(nominal, q, "").translation, b_from_a @ forward(arm, q, "").translation
+    head = [*(f"q{i}_deg" for i in range(1, 7)), *names]
+    write_rows(folder / "arm.csv", head, np.hstack([np.degrees(q), a, b + rng.normal(0, 0.05, b.shape)]).tolist())

@@ -1,0 +1,116 @@
+"""Cases of `scripts/studies/fuzz_study.py`: spoiled inputs of every command, and mistakes that must be told."""
+
+import json
+
+import pytest
+
+from stcal.cli.main import MESSAGE_CHARACTERS
+from tests.commands import CALLS, COMMANDS, options_of
+from tests.fuzzing.cases import judged
+from tests.fuzzing.judged import EARLIER, OUT, Outcome, failures, hashes, in_process, lay_out
+from tests.fuzzing.mistakes import MISTAKES, call_of
+from tests.fuzzing.pool import mistaken, went_through
+from tests.fuzzing.stock import make_stock
+
+SEED, CASES, PARTS = 20, 300, 6
+
+
+@pytest.fixture(scope="module")
+def stock(tmp_path_factory, small_dataset, small_run):
+    return make_stock(tmp_path_factory.mktemp("fuzz") / "stock", small_dataset, small_run)
+
+
+@pytest.mark.parametrize("part", range(PARTS))
+def test_whatever_comes_in_is_judged(stock, tmp_path, part):
+    """``--seed 20 --only c17`` of the study is the case c17, where it is not kept brief here."""
+    found = [judged(stock, tmp_path / "case", SEED, n, brief=True) for n in range(part, CASES, PARTS)]
+    assert [(each.name, each.said, each.failures) for each in found if each.failures] == []
+    assert len({each.command for each in found}) > len(COMMANDS) // 2
+    assert {0, 2} <= {each.code for each in found}
+
+
+QUICK = [
+    "register: a in metres",
+    "register: rows one late",
+    "verify: measured in inches",
+    "handeye, poses: both inverse",
+]
+
+
+@pytest.mark.parametrize("name", QUICK)
+def test_a_mistake_is_told(stock, tmp_path, name):
+    assert name in MISTAKES
+    assert mistaken(stock, tmp_path / "case", name).failures == ()
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("number", range(len(CALLS)), ids=[call.command for call in CALLS])
+def test_calls_go_through(stock, tmp_path, number):
+    assert went_through(stock, tmp_path / "case", number).failures == ()
+
+
+@pytest.fixture
+def schedule(stock, tmp_path):
+    """A call with an input, and its folder."""
+    call = call_of("register", "register/pairs.csv")
+    read, written = lay_out(stock, tmp_path, call, earlier=True)
+    return call, tmp_path, read, written, hashes(tmp_path)
+
+
+def kinds(schedule, *outcome, refused=False) -> set[str]:
+    call, folder, _, _, before = schedule
+    return {kind for kind, _ in failures(call, folder, Outcome(*outcome), before, refused)}
+
+
+ERROR = "error: pairs.csv: no rows\n"
+
+
+def test_an_error_of_one_line_is_in_order(schedule):
+    assert kinds(schedule, 2, "", ERROR, 1.0) == set()
+    assert kinds(schedule, 2, "", "detect: 1 of 4\n" + ERROR, 1.0) == set()
+
+
+@pytest.mark.parametrize(
+    ("kind", "outcome"),
+    [
+        ("traceback", (None, "", "", 1.0, 0, "Traceback …")),
+        ("hang", (None, "", "", 60.0, 0, "too long")),
+        ("memory", (2, "", ERROR, 1.0, 3 << 30)),
+        ("memory", (3, "", "error: not enough memory\n", 1.0)),
+        ("exit code", (1, "", ERROR, 1.0)),
+        ("not one line", (2, "", "warning: x\n" + ERROR, 1.0)),
+        ("not one line", (2, "", "", 1.0)),
+        ("message too long", (2, "", "error: " + "x" * MESSAGE_CHARACTERS, 1.0)),
+        ("not printable", (2, "", "error: \x1b[31m\n", 1.0)),
+        ("noise", (0, "", "RuntimeWarning: overflow\n", 1.0)),
+        ("broken result", (0, "", "", 1.0)),
+    ],
+)
+def test_what_must_not_be_is_seen(schedule, kind, outcome):
+    assert kind in kinds(schedule, *outcome)
+
+
+def test_files_are_watched(schedule):
+    _, folder, read, written, _ = schedule
+    assert kinds(schedule, 0, "", "", 1.0, refused=True) >= {"exit code"}
+    (read / "register/pairs.csv").write_text("x")
+    (written / "all.json").write_text('{"a": NaN}')
+    (written / "page.html").unlink()
+    assert (folder / OUT).is_dir()
+    assert kinds(schedule, 2, "", ERROR, 1.0) == {"input changed", "broken result", "earlier result lost"}
+
+
+def test_a_call_in_this_process(stock, tmp_path):
+    call = call_of("sfm compare", "run/faces.json")
+    lay_out(stock, tmp_path, call, earlier=True)
+    outcome = in_process(call, "stcal-sfm", tmp_path)
+    assert outcome.code == 0, outcome.err
+    assert "as JSON" in outcome.out
+    assert (tmp_path / OUT / "errors.json").read_text() != EARLIER
+    assert json.loads((tmp_path / OUT / "errors.json").read_text())["faces"]
+
+
+def test_options_are_found():
+    assert {"--seed", "--folds", "--model"} <= set(options_of("register"))
+    assert "--out" not in options_of("register")
+    assert "--allow-ambiguous" not in options_of("register")
