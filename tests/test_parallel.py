@@ -5,6 +5,7 @@ import subprocess
 import sys
 
 import numpy as np
+import pytest
 from threadpoolctl import threadpool_info
 
 from stcal.parallel import ONE_THREAD, counted
@@ -20,21 +21,17 @@ def threads() -> set[int]:
     return {library["num_threads"] for library in threadpool_info()}
 
 
-def said_by(code: str) -> list[str]:
-    """What a program says whose number of threads nobody limits."""
-    code = f"import numpy, scipy.linalg\nfrom threadpoolctl import threadpool_info\n{code}"
-    done = subprocess.run([sys.executable, "-c", code], env=UNLIMITED, capture_output=True, text=True, check=True)
-    return done.stdout.split()
+BEGIN = """
+import threading
+import numpy, scipy.linalg
+from threadpoolctl import threadpool_info
+from stcal.parallel import one_thread, run_parallel
+from tests.test_parallel import threads
+def say():
+    print(*{library["num_threads"] for library in threadpool_info()}, end=" ")
+"""
 
-
-def test_tests_have_one_thread():
-    assert threads() == {1}
-
-
-def test_the_limit_ends_with_the_outermost_call():
-    code = """
-from stcal.parallel import one_thread
-say = lambda: print(*{library["num_threads"] for library in threadpool_info()})
+OUTERMOST = """
 say()
 with one_thread():
     say()
@@ -42,18 +39,12 @@ with one_thread():
     say()
 say()
 """
-    assert said_by(code) == [CORES, "1", "1", "1", CORES]
 
-
-def test_calls_of_several_threads_leave_no_limit_behind():
-    """The first to begin is the first to end; the second found one thread, and must not restore that."""
-    code = """
-import threading
-from stcal.parallel import one_thread
+SEVERAL_THREADS = """
 began, first_ended = threading.Event(), threading.Event()
 def second():
     with one_thread():
-        print(*{library["num_threads"] for library in threadpool_info()})
+        say()
         began.set()
         first_ended.wait(10)
 def first():
@@ -66,30 +57,50 @@ starter = threading.Thread(target=first)
 starter.start()
 starter.join()
 other.join()
-print(*{library["num_threads"] for library in threadpool_info()})
+say()
 """
-    assert said_by(code) == ["1", CORES]
 
-
-def test_an_error_lifts_the_limit():
-    code = """
-from stcal.parallel import one_thread
+ERROR = """
 try:
     with one_thread():
         raise ValueError
 except ValueError:
-    print(*{library["num_threads"] for library in threadpool_info()})
+    say()
 """
-    assert said_by(code) == [CORES]
 
-
-def test_workers_have_one_thread():
-    code = """
-from stcal.parallel import run_parallel
-from tests.test_parallel import threads
+WORKERS = """
 print(*(number for _, found in run_parallel(threads, [(), ()], 2) for number in found))
 """
-    assert said_by(code) == ["1", "1"]
+
+
+@pytest.fixture(scope="module")
+def said() -> dict[str, list[str]]:
+    """What each of the programs says in a process whose number of threads nobody limits."""
+    programs = (OUTERMOST, SEVERAL_THREADS, ERROR, WORKERS)
+    code = "\nprint()\n".join([BEGIN, *programs])
+    done = subprocess.run([sys.executable, "-c", code], env=UNLIMITED, capture_output=True, text=True, check=True)
+    return dict(zip(programs, map(str.split, done.stdout.splitlines()[1:]), strict=True))
+
+
+def test_tests_have_one_thread():
+    assert threads() == {1}
+
+
+def test_the_limit_ends_with_the_outermost_call(said):
+    assert said[OUTERMOST] == [CORES, "1", "1", "1", CORES]
+
+
+def test_calls_of_several_threads_leave_no_limit_behind(said):
+    """The first to begin is the first to end; the second found one thread, and must not restore that."""
+    assert said[SEVERAL_THREADS] == ["1", CORES]
+
+
+def test_an_error_lifts_the_limit(said):
+    assert said[ERROR] == [CORES]
+
+
+def test_workers_have_one_thread(said):
+    assert said[WORKERS] == ["1", "1"]
 
 
 def test_what_is_done_is_counted():

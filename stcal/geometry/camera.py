@@ -88,7 +88,10 @@ class Camera:
             Distorted normalised coordinates.
         """
         xy = np.asarray(xy, float)
-        return self._distorted(xy, self._radial(xy))
+        x, y = xy[..., 0], xy[..., 1]
+        r2 = x * x + y * y
+        top, bottom = self._radial(r2)
+        return np.stack(self._moved(x, y, r2, top / bottom), axis=-1)
 
     def distort_jacobian(self, xy: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Distort, with the derivative.
@@ -105,38 +108,36 @@ class Camera:
             Their derivative by the ideal ones.
         """
         xy = np.asarray(xy, float)
-        k1, k2, p1, p2, k3, k4, k5, k6 = self.distortion
-        x, y = xy[..., 0], xy[..., 1]
+        distorted, jacobian = np.empty(xy.shape), np.empty((*xy.shape, 2))
+        distorted[..., 0], distorted[..., 1], by_x, cross, by_y = self._distorted_parts(xy[..., 0], xy[..., 1])
+        jacobian[..., 0, 0], jacobian[..., 0, 1], jacobian[..., 1, 0], jacobian[..., 1, 1] = by_x, cross, cross, by_y
+        return distorted, jacobian
+
+    def _distorted_parts(self, x: np.ndarray, y: np.ndarray) -> tuple[np.ndarray, ...]:
+        """Distorted x and y, and their derivatives: x by x, one by the other, y by y; all (...)."""
+        k1, k2, p1, p2, k3, k4, k5, k6 = self.distortion.tolist()
         r2 = x * x + y * y
-        radial = self._radial(xy)
-        bottom = 1 + r2 * (k4 + r2 * (k5 + r2 * k6))
+        top, bottom = self._radial(r2)
+        radial = top / bottom
         by_r2 = (k1 + r2 * (2 * k2 + 3 * r2 * k3) - radial * (k4 + r2 * (2 * k5 + 3 * r2 * k6))) / bottom
-        cross = 2 * x * y * by_r2 + 2 * p1 * x + 2 * p2 * y
-        jacobian = np.stack(
-            [
-                np.stack([radial + 2 * x * x * by_r2 + 2 * p1 * y + 6 * p2 * x, cross], axis=-1),
-                np.stack([cross, radial + 2 * y * y * by_r2 + 6 * p1 * y + 2 * p2 * x], axis=-1),
-            ],
-            axis=-2,
+        return (
+            *self._moved(x, y, r2, radial),
+            radial + 2 * x * x * by_r2 + 2 * p1 * y + 6 * p2 * x,
+            2 * x * y * by_r2 + 2 * p1 * x + 2 * p2 * y,
+            radial + 2 * y * y * by_r2 + 6 * p1 * y + 2 * p2 * x,
         )
-        return self._distorted(xy, radial), jacobian
 
-    def _radial(self, xy: np.ndarray) -> np.ndarray:
-        """Factor (...) by which the rational model moves a point outwards."""
-        k1, k2, _, _, k3, k4, k5, k6 = self.distortion
-        r2 = xy[..., 0] * xy[..., 0] + xy[..., 1] * xy[..., 1]
-        return (1 + r2 * (k1 + r2 * (k2 + r2 * k3))) / (1 + r2 * (k4 + r2 * (k5 + r2 * k6)))
+    def _radial(self, r2: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Top and bottom, (...), of the factor by which the rational model moves points outwards; ``r2`` : (...)."""
+        k1, k2, _, _, k3, k4, k5, k6 = self.distortion.tolist()
+        return 1 + r2 * (k1 + r2 * (k2 + r2 * k3)), 1 + r2 * (k4 + r2 * (k5 + r2 * k6))
 
-    def _distorted(self, xy: np.ndarray, radial: np.ndarray) -> np.ndarray:
-        p1, p2 = self.distortion[2:4]
-        x, y = xy[..., 0], xy[..., 1]
-        r2 = x * x + y * y
-        return np.stack(
-            [
-                x * radial + 2 * p1 * x * y + p2 * (r2 + 2 * x * x),
-                y * radial + p1 * (r2 + 2 * y * y) + 2 * p2 * x * y,
-            ],
-            axis=-1,
+    def _moved(self, x, y, r2, radial) -> tuple[np.ndarray, np.ndarray]:
+        """Distorted x and y, (...)."""
+        p1, p2 = self.distortion[2:4].tolist()
+        return (
+            x * radial + 2 * p1 * x * y + p2 * (r2 + 2 * x * x),
+            y * radial + p1 * (r2 + 2 * y * y) + 2 * p2 * x * y,
         )
 
     def undistort(self, xy_distorted: np.ndarray) -> np.ndarray:
@@ -152,23 +153,23 @@ class Camera:
             return target.copy()
         if not np.isfinite(target).all():
             raise ConvergenceError("camera: a pixel to undistort is not finite; finite coordinates needed")
-        xy, steps = target.copy(), 0
+        x, y = start_x, start_y = target[..., 0].copy(), target[..., 1].copy()
+        steps = 0
         with np.errstate(over="ignore", invalid="ignore"):  # where it diverges; reported below
             while True:
-                value, jac = self.distort_jacobian(xy)
-                residual = value - target
-                (a, b), (c, d) = np.moveaxis(jac, (-2, -1), (0, 1))
-                det = a * d - b * c
-                done = np.abs(residual).max(-1) < UNDISTORT_TOLERANCE
+                now_x, now_y, by_x, cross, by_y = self._distorted_parts(x, y)
+                off_x, off_y = now_x - start_x, now_y - start_y
+                det = by_x * by_y - cross * cross
+                done = np.maximum(np.abs(off_x), np.abs(off_y)) < UNDISTORT_TOLERANCE
                 steps += 1
                 if done.all() or steps == MAX_NEWTON_STEPS:
                     break
-                step = [d * residual[..., 0] - b * residual[..., 1], a * residual[..., 1] - c * residual[..., 0]]
-                xy = xy - np.moveaxis(np.stack(step) / np.where(np.abs(det) > 1e-9, det, 1e-9), 0, -1)
+                safe = np.where(np.abs(det) > 1e-9, det, 1e-9)
+                x, y = x - (by_y * off_x - cross * off_y) / safe, y - (by_x * off_y - cross * off_x) / safe
         # Beyond the fold Newton can end on a mirrored branch: an inverse has a positive definite derivative.
-        good = done & (det >= 0) & (a + d > 0)
+        good = done & (det >= 0) & (by_x + by_y > 0)
         if good.all():
-            return xy
+            return np.stack([x, y], axis=-1)
         worst = np.unravel_index(np.argmin(good), good.shape)
         at = self.focal * target[worst] + self.centre
         raise ConvergenceError(

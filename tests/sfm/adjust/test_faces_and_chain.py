@@ -6,8 +6,12 @@ import pytest
 from stcal.design import reference_target
 from stcal.errors import DegenerateError, InputError, MappingError
 from stcal.geometry.rigid import Rigid
+from stcal.sfm.adjust.calibration import calibrate
 from stcal.sfm.adjust.chain import chain_faces, measure_chains
 from stcal.sfm.adjust.faces import FaceInGroup, face_frame
+from stcal.sfm.adjust.group import adjust
+from stcal.sfm.adjust.options import AdjustOptions
+from stcal.synthetic.scene import SceneOptions, make_scene
 
 TARGET = reference_target()
 FACE = TARGET.face("1")
@@ -114,6 +118,20 @@ def test_an_unlinked_face_is_named_with_the_remedy():
     faces = [in_group("a", "1"), in_group("a", "2"), in_group("b", "3"), in_group("b", "4")]
     with pytest.raises(MappingError, match=r"face 3, 4: never linked to reference face 1; add a group"):
         chain_faces(faces, TARGET, "1")
+
+
+def test_faces_that_no_group_links_are_left_out_with_the_remedy(labels_only):
+    pairs = (("1", "2"), ("3", "4"))
+    scene = make_scene(SceneOptions(seed=3, width=2592, height=1728, images_per_group=2, groups=pairs))
+    observations = labels_only.observations(scene, 0.005, np.random.default_rng(0))
+    models = [adjust(model, scene.camera) for model in labels_only.models(scene, observations)]
+    found = calibrate(models, scene.camera, scene.target, scene.board, AdjustOptions("1", solve="chain"))
+    left_out = {"3", "4"}
+    assert {"1", "2"} <= found.target.target_from_face.keys()
+    assert not left_out & found.target.target_from_face.keys()
+    for face_id in left_out:
+        start = f"face {face_id}: left out, never linked to reference face 1; add a group that shows"
+        assert sum(note.startswith(start) for note in found.notes) == 1
 
 
 def test_the_reference_face_must_be_there():

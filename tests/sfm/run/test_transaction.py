@@ -1,9 +1,9 @@
 """A run's folder holds one run's results, the earlier or the new one, whatever ends the run."""
 
 import json
-import multiprocessing
 import os
-import signal
+import subprocess
+import sys
 from contextlib import suppress
 
 import pytest
@@ -97,24 +97,24 @@ def test_a_run_that_is_killed_while_results_take_their_places_is_completed(tmp_p
     assert {name: text for name, text in found.items() if not name.startswith("unfinished")} == (new if moment else old)
 
 
-def hold(out, ready, go_on):
-    with run_folder(out, MARKER, {}):
-        ready.set()
-        go_on.wait()
+HOLD = """
+import sys
+from stcal.sfm.run.marker import MarkerFile
+from stcal.sfm.run.options import RunOptions
+from stcal.sfm.run.transaction import run_folder
+with run_folder(sys.argv[1], MarkerFile.of("images", RunOptions()), {}):
+    print("held", flush=True)
+    sys.stdin.read()
+"""
 
 
 def test_two_runs_into_one_folder_are_refused_and_a_dead_one_holds_nothing(tmp_path):
-    context = multiprocessing.get_context("spawn")
-    ready, go_on = context.Event(), context.Event()
-    other = context.Process(target=hold, args=(tmp_path / "run", ready, go_on))
-    other.start()
-    try:
-        assert ready.wait(60)
+    command = [sys.executable, "-c", HOLD, tmp_path / "run"]
+    with subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True) as other:
+        assert other.stdout.readline() == "held\n"
         with pytest.raises(InputError, match=rf"process {other.pid} on .* is writing a run there; wait for its end"):
             make(tmp_path / "run", "new")
-        os.kill(other.pid, signal.SIGKILL)
-    finally:
-        other.join(60)
+        other.kill()
     make(tmp_path / "run", "new")
     assert content(tmp_path / "run")["faces.json"] == "new"
 
