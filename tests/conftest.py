@@ -17,7 +17,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import typer.main
-from hypothesis import settings
+from hypothesis import HealthCheck, settings
 
 from stcal.geometry.rigid import Rigid, Similarity
 from stcal.sfm.adjust.chain import chain_faces
@@ -36,7 +36,10 @@ SHARED = Path(__file__).resolve().parents[2] / "shared" / "data"
 SAMPLE = Path(__file__).parent / "data" / "sample"
 
 
-settings.register_profile("quick", max_examples=20)
+# How long examples take is the machine's, and no fault of a test.
+settings.register_profile("all", deadline=None, suppress_health_check=[HealthCheck.too_slow])
+settings.register_profile("quick", settings.get_profile("all"), max_examples=20)
+settings.load_profile("all")
 typer.main.get_command = cache(typer.main.get_command)  # of hundreds of calls here, each would build the tree anew
 
 
