@@ -99,7 +99,7 @@ def test_all_visible_circles_are_found_and_none_is_wrong(calibrated):
 
 
 @pytest.mark.slow
-def test_poses_of_the_target_are_as_far_off_as_they_say(calibrated, sample, tmp_path):
+def test_poses_of_the_target_are_as_far_off_as_they_say(calibrated, tmp_path):
     """Measured in the same photographs with the faces just found; board dots are told apart by the board's file.
 
     All poses share the errors of these faces, whose squares come to 1.6 σ² in JPEG photographs of other renderers than
@@ -107,7 +107,8 @@ def test_poses_of_the_target_are_as_far_off_as_they_say(calibrated, sample, tmp_
     """
     out = calibrated.out
     printed(
-        *("measure", calibrated.images, "--camera", sample / "cameras.txt", "--faces", out / "faces.json"),
+        *("measure", calibrated.images, "--camera", calibrated.truth.parent / "cameras.txt"),
+        *("--faces", out / "faces.json"),
         *("--board", out / "board.toml", "--out", tmp_path / "poses.csv", "--json", tmp_path / "poses.json"),
         *("--workers", 1),
     )
