@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from stcal.cli.options import JsonFile, ReportFile, Workers
+from stcal.cli.options import JsonFile, QuaternionOrder, Quaternions, ReportFile, Workers
 from stcal.cli.terminal import StageProgress, print_each, say, write
 from stcal.errors import InputError
 
@@ -116,6 +116,7 @@ def handeye(
             "--camera-out", writable=True, help="Write the camera of --refine-camera with σ to this file (cameras.txt)."
         ),
     ] = None,
+    quaternions: Quaternions = QuaternionOrder.wxyz,
     workers: Workers = None,
     json_file: JsonFile = None,
     report: ReportFile = None,
@@ -139,7 +140,7 @@ def handeye(
     if source.is_dir() and sigma_camera_mm is not None:
         raise InputError("--sigma-camera-mm, --sigma-camera-deg: only with poses; with images give --sigma-px")
     with StageProgress() as progress:
-        given = read_input(source, poses, camera, board, workers, progress)
+        given = read_input(source, poses, camera, board, workers, progress, quaternions.value)
         options = HandEyeOptions(noise, given.prior if refine_camera else None, with_scale, given.symmetries, four_dof)
         validation = Splits(splits, held_out, seed, workers)
         outcome = calibrate(given, setup.value, method, options, validation, progress)

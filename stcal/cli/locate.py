@@ -6,7 +6,16 @@ from typing import Annotated
 
 import typer
 
-from stcal.cli.options import CameraFile, FlatBoardFile, JsonFile, LayoutFile, ReportFile, Workers
+from stcal.cli.options import (
+    CameraFile,
+    FlatBoardFile,
+    JsonFile,
+    LayoutFile,
+    QuaternionOrder,
+    Quaternions,
+    ReportFile,
+    Workers,
+)
 from stcal.cli.terminal import StageProgress, print_each, say, write
 from stcal.errors import InputError
 
@@ -97,6 +106,7 @@ def run(
         Path | None,
         typer.Option("--robot-poses", help="Read base_from_flange of each scene from this file (CSV, column scene)."),
     ] = None,
+    quaternions: Quaternions = QuaternionOrder.wxyz,
     offset: Annotated[
         Path | None,
         typer.Option(
@@ -168,7 +178,7 @@ def run(
 
     if hand_eye is None and (robot_poses or offset):
         raise InputError("--robot-poses, --offset: only with --hand-eye, which leads from the camera to the robot")
-    chain = read_chain(hand_eye, robot_poses, offset) if hand_eye else None
+    chain = read_chain(hand_eye, robot_poses, offset, quaternions.value) if hand_eye else None
     target, model = load_layout(layout), read_camera(camera)
     limits = VerdictOptions(
         min_tags,

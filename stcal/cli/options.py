@@ -2,6 +2,7 @@
 
 import inspect
 from collections.abc import Callable
+from enum import StrEnum
 from functools import wraps
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, get_args
@@ -43,6 +44,22 @@ ReportFile = Annotated[
 ]
 Workers = Annotated[
     int | None, typer.Option("--workers", min=1, help="Use this many processes; one per core if not given.")
+]
+
+
+class QuaternionOrder(StrEnum):
+    """What four columns of a quaternion hold."""
+
+    wxyz = "wxyz"
+    xyzw = "xyzw"
+
+
+Quaternions = Annotated[
+    QuaternionOrder,
+    typer.Option(
+        "--quaternions",
+        help="Take quaternions as their columns are named, wxyz, or in the order in which these stand, xyzw.",
+    ),
 ]
 MinDiameter = Annotated[
     float | None,

@@ -7,7 +7,7 @@ from typing import Annotated
 
 import typer
 
-from stcal.cli.options import JsonFile, ReportFile, RobotFile
+from stcal.cli.options import JsonFile, QuaternionOrder, Quaternions, ReportFile, RobotFile
 from stcal.cli.terminal import print_each, say, write
 from stcal.errors import DegenerateError, InputError
 
@@ -118,6 +118,7 @@ def identify(
             "--partial", help="Keep parameters nominal that the data leave open, rather than refuse the data."
         ),
     ] = False,
+    quaternions: Quaternions = QuaternionOrder.wxyz,
     json_file: JsonFile = None,
     report: ReportFile = None,
 ) -> None:
@@ -129,7 +130,7 @@ def identify(
     from stcal.robot.kinematics.measurements import read_measurements
 
     nominal = load_robot(robot_file)
-    data = read_measurements(data_file, nominal)
+    data = read_measurements(data_file, nominal, quaternions.value)
     kind = observe.value if observe else None
     options = IdentifyOptions(kind, sigma_mm, sigma_rad, robust, folds, seed=seed, partial=partial)
     result = identified_from(nominal, data, options)
@@ -155,6 +156,7 @@ def compensate(
             "--out", writable=True, help="Write joint values to send, with status and errors, to this file (CSV)."
         ),
     ] = None,
+    quaternions: Quaternions = QuaternionOrder.wxyz,
     json_file: JsonFile = None,
     report: ReportFile = None,
 ) -> None:
@@ -163,7 +165,7 @@ def compensate(
     from stcal.robot.use import compensation as stage
 
     identified = load_robot(robot_file)
-    wanted = stage.read_targets(targets, identified)
+    wanted = stage.read_targets(targets, identified, quaternions.value)
     result = stage.compensate(identified, wanted, load_robot(nominal) if nominal else None)
     say(stage.compensated_text(result, identified))
     for line in stage.compensated_summary(result):

@@ -13,12 +13,13 @@ from stcal.errors import InputError
 from stcal.geometry.rigid import UNIT_WITHIN, Poses, Rigid
 from stcal.io.covariance import OF_POSE, TWIST, Rows, first_fault
 from stcal.io.files import TABLE_BYTES, read_bytes
+from stcal.io.quaternions import COLUMNS as QUATERNION
+from stcal.io.quaternions import Order
 
 LENGTHS = {"mm": 1.0, "m": 1000.0, "um": 1e-3, "cm": 10.0, "in": 25.4}
 ANGLES = {"rad": 1.0, "deg": np.pi / 180}
 FARTHEST = 1e12
 """In any unit: farther than all that is measured, and its square is still a number."""
-QUATERNION = ("qw", "qx", "qy", "qz")
 COVARIANCE = tuple(f"cov_{a}_{b}" for i, a in enumerate(TWIST) for b in TWIST[i:])
 """Upper triangle of a pose covariance, rows first: rotation vector (rad) and translation (mm), left perturbation."""
 COMMON = re.compile(r"common\d+_.+")
@@ -28,11 +29,15 @@ POSE = ("x_mm", "y_mm", "z_mm", *QUATERNION)
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Table:
-    """Rows of a CSV file. ``lines`` : (m,) line of the file that each row stands on, from 1."""
+    """Rows of a CSV file.
+
+    ``lines`` : (m,) line of the file that each row stands on, from 1; ``quaternions`` : what their columns hold.
+    """
 
     where: str
     columns: dict[str, list[str] | np.ndarray]
     lines: Sequence[int]
+    quaternions: Order = "wxyz"
 
     def __len__(self) -> int:
         return len(self.lines)
@@ -104,10 +109,17 @@ class Table:
             raise InputError(f"{self.where}: {', '.join(there)} without {missing}; all four or none needed")
         return bool(there)
 
+    def _order(self, prefix: str) -> list[str]:
+        """Columns, without prefix, that hold w, x, y and z."""
+        standing = [c.removeprefix(prefix) for c in self.columns if c in {prefix + q for q in QUATERNION}]
+        if self.quaternions == "wxyz" or len(standing) < len(QUATERNION):
+            return list(QUATERNION)
+        return [standing[3], *standing[:3]]
+
     def poses(self, prefix: str = "") -> Poses:
         """m transforms of ``prefix + x`` … and ``prefix + qw`` …."""
         self.has_rotation(prefix)
-        wxyz = np.column_stack([self._near(prefix + c) for c in QUATERNION])
+        wxyz = np.column_stack([self._near(prefix + c) for c in self._order(prefix)])
         length = np.linalg.norm(wxyz, axis=1)
         bad = np.flatnonzero(np.abs(length - 1) > UNIT_WITHIN)
         if len(bad):
@@ -184,8 +196,11 @@ class Table:
             raise InputError(f"{self.where}: column {column} is missing; the header is {self.header()}")
 
 
-def read_table(path: str | Path, what: str) -> Table:
+def read_table(path: str | Path, what: str, quaternions: Order = "wxyz") -> Table:
     """Read a CSV file with a header line; empty lines and lines that start with ``#`` are passed over.
+
+    ``quaternions`` : ``xyzw`` where their columns, in the order in which they stand, hold x, y, z, w whatever their
+    names say.
 
     Raises
     ------
@@ -219,7 +234,7 @@ def read_table(path: str | Path, what: str) -> Table:
     try:
         fast = np.loadtxt(io.StringIO("\n".join(rows)), delimiter=",", ndmin=2, comments=None)
         if fast.shape == (len(rows), len(names)):
-            return Table(where, {name: fast[:, k] for k, name in enumerate(names)}, numbers)
+            return Table(where, {name: fast[:, k] for k, name in enumerate(names)}, numbers, quaternions)
     except ValueError:
         pass  # text among the numbers: row by row
     try:
@@ -232,7 +247,7 @@ def read_table(path: str | Path, what: str) -> Table:
     for line, row in zip(numbers, cells, strict=True):
         if len(row) != len(names):
             raise InputError(f"{where}: line {line}: {len(row)} cells, {len(names)} needed as in the header")
-    return Table(where, {n: [row[k].strip() for row in cells] for k, n in enumerate(names)}, numbers)
+    return Table(where, {n: [row[k].strip() for row in cells] for k, n in enumerate(names)}, numbers, quaternions)
 
 
 def common_columns(count: int) -> list[str]:

@@ -16,6 +16,7 @@ from stcal.handeye.report.file import Outcome
 from stcal.handeye.validate import LEAST_LEFT, compare, cross_validate, splits
 from stcal.io.camera import CameraPrior, camera_prior, read_camera, refinable
 from stcal.io.images import ImageFile, find_images
+from stcal.io.quaternions import Order
 from stcal.parallel import Progress
 from stcal.workflows.board_views import detect_boards
 
@@ -57,8 +58,11 @@ def read_input(
     board: Path | None = None,
     workers: int | None = None,
     progress: Progress = lambda *_: None,
+    quaternions: Order = "wxyz",
 ) -> HandEyeInput:
     """Pose pairs from their file; or from a folder of images with the files ``poses``, ``camera`` and ``board``.
+
+    ``quaternions`` : ``xyzw`` where their columns hold x, y, z, w in the order in which they stand.
 
     Raises
     ------
@@ -70,20 +74,20 @@ def read_input(
         missing = [name for name, path in images.items() if path is None]
         if poses is None or camera is None or board is None:
             raise InputError(f"image folder {source}: {', '.join(missing)} needed with images")
-        return _from_images(source, poses, camera, board, workers, progress)
+        return _from_images(source, read_robot_poses(poses, quaternions), poses, camera, board, workers, progress)
     if not source.exists():
         raise InputError(f"{source}: does not exist; a file of poses (CSV) or a folder of images needed")
     extra = [name for name, path in images.items() if path is not None]
     if extra:
         raise InputError(f"{', '.join(extra)}: only with a folder of images; {source} is a file of poses")
-    return HandEyeInput(source.name, read_poses(source))
+    return HandEyeInput(source.name, read_poses(source, quaternions))
 
 
 def _from_images(
-    source: Path, poses: Path, camera: Path, board: Path, workers: int | None, progress: Progress
+    source: Path, robot: RobotPoses, poses: Path, camera: Path, board: Path, workers: int | None, progress: Progress
 ) -> HandEyeInput:
     """Corners of the board in all images that have a pose."""
-    design, model, robot = load_flat_board(board), read_camera(camera), read_robot_poses(poses)
+    design, model = load_flat_board(board), read_camera(camera)
     files, skipped = find_images(source)
     rows, missing = _rows_of_images(robot, files, source)
     with_pose = [file for file in files if file.name in rows]

@@ -15,6 +15,7 @@ from stcal.handeye.data.loop import Loop
 from stcal.handeye.data.views import View, Views, pairs_of_views
 from stcal.handeye.judge.observability import Observability
 from stcal.handeye.judge.symmetry import repair
+from stcal.io.quaternions import INVERTED
 from stcal.synthetic.measured.handeye import (
     BASE_FROM_BOARD,
     BASE_FROM_CAMERA,
@@ -179,8 +180,20 @@ def test_quaternions_in_another_order_are_said(setup, sides):
     flange, board = pairs.base_from_flange, pairs.camera_from_board
     flange = flange if sides == "the board's" else misread(flange)
     board = board if sides == "the robot's" else misread(board)
-    with pytest.raises(InputError, match=f"with {sides} quaternions in another order: .* hold x, y, z, w, name them"):
+    remedy = "give --quaternions xyzw" if sides == "all" else "name the columns so"
+    with pytest.raises(
+        InputError, match=f"with {sides} quaternions in another order: if x, y, z, w in the order .*, {remedy}"
+    ):
         handeye(HandEyePoses(flange, board), setup)
+
+
+@pytest.mark.parametrize("side", ["the robot's", "the board's"])
+def test_conjugated_quaternions_are_said(side):
+    pairs = simulated(np.random.default_rng(14), 10, **NOISE).pairs
+    sides = {"the robot's": pairs.base_from_flange, "the board's": pairs.camera_from_board}
+    sides[side] = INVERTED.poses(sides[side])
+    with pytest.raises(InputError, match=f"with {side} quaternions conjugated: .*, change the sign of qw"):
+        handeye(HandEyePoses(*sides.values()))
 
 
 @pytest.mark.parametrize("setup", SETUPS)

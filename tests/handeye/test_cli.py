@@ -431,3 +431,20 @@ def test_a_board_file_without_a_type_is_said(command, chessboard, tmp_path):
     code, _, err = command(*chessboard.arguments()[:-1], board)
     assert code == INPUT
     assert 'board.toml: no type; a file with type = "chessboard", "charuco" or "tags" needed' in err
+
+
+def test_the_order_of_quaternions_is_an_option(command, tmp_path):
+    """x, y, z, w under the names of w, x, y, z."""
+
+    def roll(rows):
+        for row in rows:
+            row[3:7], row[10:14] = [*row[4:7], row[3]], [*row[11:14], row[10]]
+
+    truth = simulated(np.random.default_rng(5), 8, **NOISE)
+    path, out = poses_file(tmp_path / "poses.csv", truth, roll), tmp_path / "h.json"
+    code, _, err = command(path, "--splits", 0)
+    assert code == INPUT
+    assert "x, y, z, w in the order of their columns, give --quaternions xyzw" in err
+    code, _, err = command(path, "--splits", 0, "--quaternions", "xyzw", "--out", out)
+    assert code == 0, err
+    assert in_sigmas(json.loads(out.read_text()), "flange_from_camera", truth.mount_from_camera) < 5

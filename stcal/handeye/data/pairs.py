@@ -8,6 +8,7 @@ import numpy as np
 from stcal.errors import InputError
 from stcal.geometry.arrays import frozen
 from stcal.geometry.rigid import Poses, Rigid, skew
+from stcal.io.quaternions import Order
 from stcal.io.table import Table, read_table
 
 WHAT = "pose file"
@@ -115,7 +116,7 @@ class HandEyePoses:
             )
 
 
-def read_poses(path: str | Path) -> HandEyePoses:
+def read_poses(path: str | Path, quaternions: Order = "wxyz") -> HandEyePoses:
     """Read a CSV file of pose pairs.
 
     Columns ``base_from_flange_x_mm`` … ``_qw`` … and ``camera_from_board_…`` (or ``flange_from_base_…``,
@@ -125,6 +126,8 @@ def read_poses(path: str | Path) -> HandEyePoses:
     ----------
     path : str or Path
         The file.
+    quaternions : {"wxyz", "xyzw"}
+        As their columns are named, or x, y, z, w in the order in which these stand.
 
     Returns
     -------
@@ -136,7 +139,7 @@ def read_poses(path: str | Path) -> HandEyePoses:
     InputError
         Missing columns; a value that is not finite or a quaternion that is not of unit length, named by line; copies.
     """
-    table = read_table(path, WHAT)
+    table = read_table(path, WHAT, quaternions)
     sides = [read_side(table, *names) for names in SIDES]
     (flange, flange_covariance), (board, board_covariance) = sides
     names = tuple(f"line {line}" for line in table.lines)

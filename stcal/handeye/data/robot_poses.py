@@ -11,7 +11,10 @@ from stcal.errors import InputError
 from stcal.geometry.rigid import UNIT_WITHIN, Poses
 from stcal.handeye.data.pairs import SIDES, read_side
 from stcal.io.files import SETTINGS_BYTES, read_bytes
+from stcal.io.quaternions import Order
 from stcal.io.table import LENGTHS, read_table
+
+YAML = (".yaml", ".yml")
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -50,27 +53,33 @@ class RobotPoses:
         return found, tuple(missing)
 
 
-def read_robot_poses(path: str | Path) -> RobotPoses:
+def read_robot_poses(path: str | Path, quaternions: Order = "wxyz") -> RobotPoses:
     """Read a CSV file with a column ``image`` and ``base_from_flange_x_mm`` … (or ``flange_from_base_…``).
 
     Or ROS-Industrial's calibration data: a folder of YAML files, one for each image, of the same name, with ``x, y, z``
     in metres and ``qx, qy, qz, qw``; or a YAML list of such files, each a ``pose`` with its ``image``.
+    ``quaternions`` : ``xyzw`` where the columns hold x, y, z, w in the order in which they stand.
 
     Raises
     ------
     InputError
         Missing columns, values that are not finite or quaternions that are not of unit length, named by line, or an
-        image that has two rows.
+        image that has two rows; another order of quaternions than their names say, in YAML.
     """
     path = Path(path)
+    if quaternions != "wxyz" and (path.is_dir() or path.suffix.lower() in YAML):
+        raise InputError(
+            f"robot poses {path}: --quaternions {quaternions} is of a CSV file's columns; YAML gives each "
+            "of qx, qy, qz, qw by its name; correct the names"
+        )
     if path.is_dir():
         files = sorted(path.glob("*.yaml")) + sorted(path.glob("*.yml"))
         if not files:
             raise InputError(f"robot poses {path}: a folder without *.yaml; a CSV file, or a YAML file for each image")
         return _from_yaml([(file.stem, file) for file in files], f"robot poses {path}")
-    if path.suffix.lower() in (".yaml", ".yml"):
+    if path.suffix.lower() in YAML:
         return _from_yaml(_listed(path), f"robot poses {path}")
-    table = read_table(path, "robot poses")
+    table = read_table(path, "robot poses", quaternions)
     images, places = table.text("image"), tuple(f"line {line}" for line in table.lines)
     _one_each(images, places, table.where)
     poses, covariance = read_side(table, *SIDES[0])

@@ -13,6 +13,8 @@ from stcal.geometry.rigid import Poses, Rigid
 from stcal.handeye.data.loop import Loop, Setup
 from stcal.handeye.data.pairs import HandEyePoses
 from stcal.handeye.methods.start import mean_pose
+from stcal.io.quaternions import INVERTED as CONJUGATED
+from stcal.io.quaternions import ORDERS, Reading
 
 FAR_BETTER, BETTER = 30.0, 3.0
 """By so many times the product of the typical residuals in rotation and translation must shrink, and the latter."""
@@ -23,8 +25,6 @@ WELL = np.radians(0.5), 5.0
 """Poses whose median residuals (rad, mm) are below are not suspected."""
 LOST = 0.25
 """Share of what the poses differ by that is not explained, from which on robot and camera have nothing in common."""
-ORDERS = {"x, y, z, w": [3, 0, 1, 2], "z, w, x, y": [1, 2, 3, 0]}
-"""What the columns of w, x, y, z may hold, and the columns of w, x, y, z then."""
 MIRROR = np.diag([1.0, -1.0, 1.0])
 Guess = Callable[[Loop, bool], tuple[Rigid, Rigid, float]]
 
@@ -107,20 +107,22 @@ def _variants(loop: Loop, setup: Setup, by_images: bool) -> dict[str, Loop]:
         ),
         f"with one side mirrored: if {states} left-handed poses, {left}": replace(loop, camera_from_board=mirrored),
     }
-    for columns, order in ORDERS.items():
-        robot, board = _reordered(hand, order, loop.inverted), _reordered(eye, order)
-        remedy = f"quaternions in another order: if columns qw, qx, qy, qz hold {columns}, name them so"
-        found[f"with the robot's {remedy}"] = replace(loop, stand_from_mount=robot)
+    for reading in (*ORDERS, CONJUGATED):
+        robot, board = _read_as(reading, hand, loop.inverted), _read_as(reading, eye)
+        other = "conjugated" if reading.conjugated else "in another order"
+        one = f"quaternions {other}: if {reading.held}, "
+        one += reading.remedy if reading.conjugated else "name the columns so"
+        every = f"quaternions {other}: if {reading.held}, {reading.remedy}"
+        found[f"with the robot's {every if by_images else one}"] = replace(loop, stand_from_mount=robot)
         if not by_images:
-            found[f"with the board's {remedy}"] = replace(loop, camera_from_board=board)
-            found[f"with all {remedy}"] = replace(loop, stand_from_mount=robot, camera_from_board=board)
+            found[f"with the board's {one}"] = replace(loop, camera_from_board=board)
+            found[f"with all {every}"] = replace(loop, stand_from_mount=robot, camera_from_board=board)
     return found
 
 
-def _reordered(poses: Poses, order: list[int], inverted: bool = False) -> Poses:
-    """With w, x, y, z of the quaternions from other columns; ``inverted`` : the inverses of ``poses`` were read."""
-    read = poses.inverse() if inverted else poses
-    right = Poses.from_quaternions(read.quaternions()[:, order], read.translation)
+def _read_as(reading: Reading, poses: Poses, inverted: bool = False) -> Poses:
+    """With quaternions that hold something else; ``inverted`` : the inverses of ``poses`` were read."""
+    right = reading.poses(poses.inverse() if inverted else poses)
     return right.inverse() if inverted else right
 
 

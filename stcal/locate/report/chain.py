@@ -11,6 +11,7 @@ from stcal.errors import InputError
 from stcal.geometry.rigid import Rigid
 from stcal.geometry.uncertain import UncertainRigid
 from stcal.io.json import Part, Pose, PoseCovariance, read_result
+from stcal.io.quaternions import Order
 from stcal.io.table import read_table
 
 MOVING, FIXED = "flange_from_camera", "base_from_camera"
@@ -62,8 +63,15 @@ class GoalChain:
         return [scene for scene in scenes if self.moving and scene not in self.flange]
 
 
-def read_chain(hand_eye: str | Path, robot_poses: str | Path | None, offset: str | Path | None = None) -> GoalChain:
+def read_chain(
+    hand_eye: str | Path,
+    robot_poses: str | Path | None,
+    offset: str | Path | None = None,
+    quaternions: Order = "wxyz",
+) -> GoalChain:
     """Read the hand-eye file of ``stcal handeye``, the robot's poses by scene, and the offset.
+
+    ``quaternions`` : of the robot's poses, ``xyzw`` where the columns hold x, y, z, w in the order in which they stand.
 
     Raises
     ------
@@ -88,12 +96,12 @@ def read_chain(hand_eye: str | Path, robot_poses: str | Path | None, offset: str
     if offset is not None:
         read = read_result(offset, OffsetFile, "offset file", "a 4×4 matrix under the key obj_from_goal needed")
         shift = Rigid.from_matrix(read.obj_from_goal)
-    return GoalChain(mount, moving, read_robot_poses(robot_poses) if robot_poses else {}, shift)
+    return GoalChain(mount, moving, read_robot_poses(robot_poses, quaternions) if robot_poses else {}, shift)
 
 
-def read_robot_poses(path: str | Path) -> dict[str, UncertainRigid]:
+def read_robot_poses(path: str | Path, quaternions: Order = "wxyz") -> dict[str, UncertainRigid]:
     """base_from_flange of each scene, from columns ``scene`` and ``x_mm … qz``, or ``base_from_flange_x_mm …``."""
-    table = read_table(path, "robot poses")
+    table = read_table(path, "robot poses", quaternions)
     prefix = ROBOT if any(column.startswith(ROBOT) for column in table.columns) else ""
     poses, covariances = table.poses(prefix), table.pose_covariances(prefix)
     found = {}

@@ -5,14 +5,15 @@ from dataclasses import replace
 
 import numpy as np
 from scipy.optimize import least_squares
-from scipy.spatial.transform import Rotation
 
 from stcal.errors import ConvergenceError, DegenerateError, InputError
 from stcal.geometry.align import align_rigid
 from stcal.geometry.least_squares import NormalEquations, minimise, perturbed
 from stcal.geometry.rigid import Poses, Rigid, skew
+from stcal.io.quaternions import EXPLAINS
 from stcal.robot.identify.residuals import State, observed, residuals
 from stcal.robot.kinematics.damped import reach_mm
+from stcal.robot.kinematics.fit import FITS, require_convention
 from stcal.robot.kinematics.forward import flange_poses
 from stcal.robot.kinematics.measurements import Measurements
 from stcal.robot.kinematics.model import Robot
@@ -23,13 +24,6 @@ REGULAR = 1e-10
 NEARLY = 1e-3
 """Share of the squared misfit that a start may still promise to lose: where the robot file is not that of the data the
 valley is flat, and the misfit says so."""
-FITS = 0.05
-"""A nominal robot fits its data when its RMS error is below this share of their spread; factories err by under 1 %."""
-EXPLAINS = 0.2
-"""A mistake explains a misfit when mending it leaves less than this share of it."""
-TURNED_RAD = 0.2
-"""Orientations of a robot that fits by its positions are within this of the nominal ones, RMS; the zeros of its joints,
-and the base as positions have it, are off by less than half of that (:data:`FITS`)."""
 STILL_MM = 0.01
 AROUND = 0.1
 """Of the arm's reach: how far from the given point of the tool distances are tried too."""
@@ -52,44 +46,9 @@ def start(robot: Robot, data: Measurements) -> State:
     if misfit > FITS * extent:
         _explain(robot, data, tools, misfit, extent)
     if data.rotations is not None:
-        _require_convention(data, state)
+        flange = flange_poses(state.chain, data.q).rotation
+        require_convention(data.where, data.targets, flange, data.rotations)
     return state
-
-
-def _require_convention(data: Measurements, state: State) -> None:
-    """Refuse orientations that fit in another convention only; where none of them can be told apart, all fit."""
-    flange = flange_poses(state.chain, data.q).rotation
-    own = _turned_rad(data, flange, data.poses().rotation)
-    if own < TURNED_RAD:
-        return
-    wxyz = data.poses().quaternions()
-    last = Poses.from_quaternions(wxyz[:, [3, 0, 1, 2]], data.points()).rotation
-    guesses = {
-        "quaternions were x, y, z, w in the order of their columns; call these qx, qy, qz, qw": last,
-        "quaternions were conjugated (instrument seen from the tool); change the sign of qw": (
-            np.swapaxes(data.poses().rotation, 1, 2)
-        ),
-        "quaternions were x, y, z, w in the order of their columns, and conjugated; call these qx, qy, qz, qw and "
-        "change the sign of qw": np.swapaxes(last, 1, 2),
-    }
-    misfits = {reason: _turned_rad(data, flange, rotations) for reason, rotations in guesses.items()}
-    reason = min(misfits, key=lambda guess: misfits[guess])
-    if misfits[reason] < EXPLAINS * own:
-        raise InputError(
-            f"{data.where}: orientations miss the robot by {np.degrees(own):.3g}° RMS, {np.degrees(TURNED_RAD):.2g}° "
-            f"allowed; they would fit to {np.degrees(misfits[reason]):.2g}° if {reason}"
-        )
-
-
-def _turned_rad(data: Measurements, flange: np.ndarray, seen: np.ndarray) -> float:
-    """RMS angle between orientations and those of the flange with the tool, each target's own, that fits best."""
-    between = np.swapaxes(flange, 1, 2) @ seen
-    square = 0.0
-    for name in set(data.targets):
-        own = between[[t == name for t in data.targets]]
-        tool = Rotation.from_matrix(own).mean()
-        square += float(((tool.inv() * Rotation.from_matrix(own)).magnitude() ** 2).sum())
-    return float(np.sqrt(square / len(data)))
 
 
 def _extent(data: Measurements) -> float:

@@ -9,6 +9,7 @@ import numpy as np
 from stcal.errors import InputError
 from stcal.geometry.arrays import Array, freeze
 from stcal.geometry.rigid import Poses
+from stcal.io.quaternions import Order
 from stcal.io.table import ANGLES, LENGTHS, Table, read_table
 from stcal.robot.kinematics.damped import reach_mm
 from stcal.robot.kinematics.model import Robot
@@ -127,7 +128,7 @@ class Measurements:
         return self.distances, self.from_row
 
 
-def read_measurements(path: str | Path, robot: Robot) -> Measurements:
+def read_measurements(path: str | Path, robot: Robot, quaternions: Order = "wxyz") -> Measurements:
     """Read joint values with positions, poses or distances.
 
     Poses of which their ``status`` says that another one fits the image as well, and copies of a row, are left out with
@@ -139,6 +140,8 @@ def read_measurements(path: str | Path, robot: Robot) -> Measurements:
         Table (CSV; form: ``data_layout.md``).
     robot : Robot
         Whose joints moved: their number and types, and the reach that positions are checked against.
+    quaternions : {"wxyz", "xyzw"}
+        As their columns are named, or x, y, z, w in the order in which these stand.
 
     Returns
     -------
@@ -150,7 +153,7 @@ def read_measurements(path: str | Path, robot: Robot) -> Measurements:
     InputError
         Missing columns, bad rows, joint values of another unit or number than the robot's; the message names the line.
     """
-    table = read_table(path, WHAT)
+    table = read_table(path, WHAT, quaternions)
     q = joint_values(table, robot)
     targets = targets_of(table)
     if table.has("x", LENGTHS):

@@ -11,6 +11,7 @@ import numpy as np
 from stcal.errors import InputError
 from stcal.geometry.arrays import freeze
 from stcal.geometry.rigid import Poses
+from stcal.io.quaternions import Order
 from stcal.io.table import LENGTHS, read_table
 from stcal.parallel import one_thread
 from stcal.robot.kinematics.forward import forward
@@ -147,7 +148,7 @@ def _other_tools(identified: Robot, nominal: Robot, used: Sequence[str]) -> tupl
     return tuple(notes)
 
 
-def read_targets(path: str | Path, robot: Robot) -> Targets:
+def read_targets(path: str | Path, robot: Robot, quaternions: Order = "wxyz") -> Targets:
     """Read commanded poses, or joint values that command them.
 
     Parameters
@@ -156,6 +157,8 @@ def read_targets(path: str | Path, robot: Robot) -> Targets:
         Table (CSV; form: ``data_layout.md``).
     robot : Robot
         Whose tools they are of; its joints, where joint values are given.
+    quaternions : {"wxyz", "xyzw"}
+        As their columns are named, or x, y, z, w in the order in which these stand.
 
     Returns
     -------
@@ -167,7 +170,7 @@ def read_targets(path: str | Path, robot: Robot) -> Targets:
     InputError
         Neither poses nor joint values, positions without orientation, bad rows; the message names the line.
     """
-    table = read_table(path, WHAT)
+    table = read_table(path, WHAT, quaternions)
     has_joints = any(name.startswith("q1_") for name in table.columns)
     has_poses = table.has("x", LENGTHS)
     if not has_poses and not has_joints:

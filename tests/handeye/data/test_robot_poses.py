@@ -87,3 +87,15 @@ def test_two_rows_of_one_image_are_said(tmp_path):
     found = read_robot_poses(tmp_path / "poses.csv")
     with pytest.raises(InputError, match=r"line 2 and line 3: both are of image 'g/0\.png'"):
         found.rows(["g/0.png"])
+
+
+def test_the_order_of_columns_is_no_matter_of_yaml(folder):
+    with pytest.raises(InputError, match="--quaternions xyzw is of a CSV file's columns"):
+        read_robot_poses(folder, "xyzw")
+
+
+def test_quaternions_in_the_order_of_their_columns(tmp_path):
+    head = ",".join(f"base_from_flange_{c}" for c in ("x_mm", "y_mm", "z_mm", "qw", "qx", "qy", "qz"))
+    (tmp_path / "r.csv").write_text(f"image,{head}\na.png,1,2,3,0,0.8,0,0.6\n")
+    found = read_robot_poses(tmp_path / "r.csv", "xyzw").base_from_flange
+    assert found.rotation[0] == pytest.approx(np.array([[-0.28, 0, 0.96], [0, 1, 0], [-0.96, 0, -0.28]]))

@@ -87,3 +87,11 @@ def test_what_is_wrong_is_named(files, tmp_path):
     hand_eye.write_text(json.dumps({"base_from_camera": np.eye(4).tolist()}))
     with pytest.raises(InputError, match="no 'obj_from_goal'"):
         read_chain(hand_eye, None, offset)
+
+
+def test_the_order_of_the_robots_quaternions_is_an_option(files):
+    hand_eye, poses, _ = files
+    x, y, z, qw, qx, qy, qz = pose_cells(FLANGE)
+    poses.write_text(",".join(["scene", *POSE]) + "\n" + ",".join(["a", x, y, z, qx, qy, qz, qw]) + "\n")
+    found = read_chain(hand_eye, poses, quaternions="xyzw").flange["a"].rigid
+    assert np.allclose(found.matrix(), FLANGE.matrix(), atol=1e-12)

@@ -5,10 +5,13 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from stcal.cli.main import main
 from stcal.errors import InputError
 from stcal.geometry.rigid import Poses, Rigid
+from stcal.io.table import POSE, pose_cells
 from stcal.robot.identify.start import start
 from stcal.robot.kinematics.example import mh80
+from stcal.robot.kinematics.file import robot_toml
 from stcal.synthetic.measured.arms import joint_vectors, made, measured, placed
 
 LAST = "quaternions were x, y, z, w in the order of their columns"
@@ -33,9 +36,13 @@ def in_order(data, order, conjugated=False):
 @pytest.mark.parametrize(
     ("order", "conjugated", "said"),
     [
-        ([1, 2, 3, 0], False, f"if {LAST}; call these qx, qy, qz, qw"),
-        ([0, 1, 2, 3], True, "if quaternions were conjugated (instrument seen from the tool); change the sign of qw"),
-        ([1, 2, 3, 0], True, f"if {LAST}, and conjugated; call these qx, qy, qz, qw and change the sign of qw"),
+        ([1, 2, 3, 0], False, f"if {LAST}; give --quaternions xyzw"),
+        (
+            [0, 1, 2, 3],
+            True,
+            "if quaternions were conjugated (the first frame seen from the second); change the sign of qw",
+        ),
+        ([1, 2, 3, 0], True, f"if {LAST}, and conjugated; give --quaternions xyzw and change the sign of qw"),
     ],
 )
 def test_another_convention_is_named(seed, order, conjugated, said):
@@ -56,3 +63,20 @@ def test_orientations_that_no_convention_mends_are_left_to_the_adjustment():
     data = seen(1, 20)
     still = np.tile(Rigid.exp([0.4, -0.3, 0.9, 0, 0, 0]).rotation, (20, 1, 1))
     start(mh80(), replace(data, rotations=still))
+
+
+def test_the_order_of_quaternions_is_an_option(tmp_path, monkeypatch, capsys):
+    data = seen(2, 30)
+    (tmp_path / "robot.toml").write_text(robot_toml(mh80()))
+    rows = [
+        [*(repr(float(v)) for v in np.degrees(q)), *cells[:3], *cells[4:], cells[3]]
+        for q, cells in zip(data.q, map(pose_cells, data.poses()), strict=True)
+    ]
+    header = [*(f"q{i}_deg" for i in range(1, 7)), *POSE]
+    (tmp_path / "data.csv").write_text("\n".join(map(",".join, [header, *rows])))
+    words = ["stcal", "robot", "identify", str(tmp_path / "data.csv"), "--robot", str(tmp_path / "robot.toml")]
+    for more, code in (((), 2), (("--quaternions", "xyzw"), 0)):
+        monkeypatch.setattr("sys.argv", [*words, "--folds", "0", *more])
+        with pytest.raises(SystemExit) as end:
+            main()
+        assert (end.value.code or 0) == code, capsys.readouterr().err

@@ -1,0 +1,58 @@
+"""Whether poses and joint values can be of one robot, or only in another convention of quaternions."""
+
+from collections.abc import Sequence
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from stcal.errors import InputError
+from stcal.io.quaternions import explaining
+
+FITS = 0.05
+"""A nominal robot fits its data when its RMS error is below this share of their spread; factories err by under 1 %."""
+TURNED_RAD = 0.2
+"""Orientations of a robot that fits by its positions are within this of the nominal ones, RMS; the zeros of its joints,
+and the base as positions have it, are off by less than half of that (:data:`FITS`)."""
+
+
+def require_convention(where: str, targets: Sequence[str], flange: np.ndarray, seen: np.ndarray) -> None:
+    """Refuse orientations that fit in another convention only; where none of them can be told apart, all fit.
+
+    Parameters
+    ----------
+    where : str
+        Their file, for messages.
+    targets : sequence of str
+        (m,) names of what was seen or commanded.
+    flange : (m, 3, 3) array
+        Rotations of the flange by the robot.
+    seen : (m, 3, 3) array
+        Of the targets as they were read.
+
+    Raises
+    ------
+    InputError
+        Names the convention that fits.
+    """
+    own = turned_rad(targets, flange, seen)
+    if own < TURNED_RAD:
+        return
+    found = explaining(seen, lambda rotations: turned_rad(targets, flange, rotations))
+    if found is not None:
+        reading, left = found
+        raise InputError(
+            f"{where}: orientations miss the robot by {np.degrees(own):.3g}° RMS, {np.degrees(TURNED_RAD):.2g}° "
+            f"allowed; they would fit to {np.degrees(left):.2g}° if quaternions were {reading.held}; {reading.remedy}"
+        )
+
+
+def turned_rad(targets: Sequence[str], flange: np.ndarray, seen: np.ndarray) -> float:
+    """RMS angle between orientations (m, 3, 3) and those of the flange with the tool, each target's own, that fits
+    best."""
+    between = np.swapaxes(flange, 1, 2) @ seen
+    square = 0.0
+    for name in set(targets):
+        own = between[[t == name for t in targets]]
+        tool = Rotation.from_matrix(own).mean()
+        square += float(((tool.inv() * Rotation.from_matrix(own)).magnitude() ** 2).sum())
+    return float(np.sqrt(square / len(seen)))
