@@ -35,7 +35,8 @@ from stcal.robot.kinematics.forward import forward, jacobian
 from stcal.robot.kinematics.inverse import inverse
 from stcal.robot.kinematics.measurements import Measurements
 from stcal.robot.kinematics.model import Joint, Robot
-from stcal.robot.use.compensation import Targets, compensate
+from stcal.robot.use.compensation import compensate
+from stcal.robot.use.targets import Targets
 from stcal.robot.use.verification import MeasuredPoses, SetResult, verify
 from stcal.sfm.measure.common_errors import common_errors
 from stcal.sfm.measure.pose import pose_from_circles

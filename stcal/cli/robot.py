@@ -163,9 +163,10 @@ def compensate(
     """Compute joint values that really reach commanded poses, beside the nominal ones."""
     from stcal.robot.kinematics.file import load_robot
     from stcal.robot.use import compensation as stage
+    from stcal.robot.use.targets import read_targets
 
     identified = load_robot(robot_file)
-    wanted = stage.read_targets(targets, identified, quaternions.value)
+    wanted = read_targets(targets, identified, quaternions.value)
     result = stage.compensate(identified, wanted, load_robot(nominal) if nominal else None)
     say(stage.compensated_text(result, identified))
     for line in stage.compensated_summary(result):

@@ -15,8 +15,8 @@ from .kinematics.model import DHRow as DHRow
 from .kinematics.model import Joint as Joint
 from .kinematics.model import Robot as Robot
 from .use.compensation import compensate as compensate
-from .use.compensation import read_targets as read_targets
 from .use.design import DesignOptions as DesignOptions
 from .use.design import design as design
+from .use.targets import read_targets as read_targets
 from .use.verification import read_measured as read_measured
 from .use.verification import verify as verify

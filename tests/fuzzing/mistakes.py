@@ -84,6 +84,11 @@ def exchanged(place: str, a: str, b: str) -> Edit:
     return columns(place, lambda table: table | {a: table[b], b: table[a]})
 
 
+def without(place: str, names: str) -> Edit:
+    """The columns that match are not there."""
+    return columns(place, lambda table: {n: c for n, c in table.items() if not re.fullmatch(names, n)})
+
+
 def moved(place: str, names: str, by: int = 1) -> Edit:
     """The columns that match against the others by so many rows."""
     return columns(
@@ -248,7 +253,10 @@ def _robot() -> list[Mistake]:
             ("rad as deg", times(targets, r"q\d_deg", np.pi / 180), "degrees|joint values of"),
             ("joints one row late", moved(targets, r"q\d_deg"), "order|joint values of"),
             ("robot in metres", number_times("robot/made.toml", "(?:a|d)_mm", 1e-3), "unit"),
-            ("nominal robot in metres", number_times(robot, "(?:a|d)_mm", 1e-3), "nominal"),
+            ("nominal robot in metres", number_times(robot, "(?:a|d)_mm", 1e-3), "mm apart"),
+            ("nominal robot 4.1 m off", text(robot, r"d_mm = 1025\.0", "d_mm = 5125.0"), "mm apart"),
+            ("poses alone, metres as mm", _both(without(targets, r"q\d_deg"), times(targets, places, 1e-3)), "metres"),
+            ("poses alone, inches as mm", _both(without(targets, r"q\d_deg"), times(targets, places, INCH)), "inches"),
         )
     ]
     verify, before, after = "robot/verify.csv", "commanded_[xyz]_mm", "[xyz]_mm"

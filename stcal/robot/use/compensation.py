@@ -4,23 +4,18 @@ import csv
 import io
 from collections.abc import Sequence
 from dataclasses import dataclass
-from pathlib import Path
 
 import numpy as np
 
 from stcal.errors import InputError
-from stcal.geometry.arrays import freeze
 from stcal.geometry.rigid import Poses
-from stcal.io.quaternions import Order
-from stcal.io.table import LENGTHS, read_table
 from stcal.parallel import one_thread
-from stcal.robot.kinematics.forward import forward
-from stcal.robot.kinematics.inverse import LIMIT, ORIENTATION, SINGULAR_POSE, UNREACHABLE, Inverse, inverse
-from stcal.robot.kinematics.measurements import joint_values, targets_of, within
+from stcal.robot.kinematics.inverse import LIMIT, ORIENTATION, SINGULAR_POSE, UNREACHABLE, Inverse
 from stcal.robot.kinematics.model import Robot
 from stcal.robot.use.files import CompensationFile
+from stcal.robot.use.plausible import on_targets, out_of_reach, robots_apart
+from stcal.robot.use.targets import Targets, joints_of, poses_of
 
-WHAT = "targets"
 FAR_RAD = np.radians(1.0)
 """Arms are made to milliradians; a joint that has to move by more than this does so because others cannot."""
 SAME_TOOL_MM, SAME_TOOL_RAD = 20.0, np.radians(5)
@@ -31,44 +26,6 @@ MEANING = {
     SINGULAR_POSE: "singular: the joint values are not the only ones",
     ORIENTATION: "position reached, orientation as near as the joints allow",
 }
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class Targets:
-    """Commanded poses, one for each row of a file; by joint values where no poses are given.
-
-    Parameters
-    ----------
-    where : str
-        The file, for messages.
-    lines : sequence of int
-        (m,) its lines.
-    tools : tuple of str
-        (m,) names.
-    poses : Poses or None
-        base_from_tool, mm; None where joint values command.
-    q : (m, n) array or None
-        Commanded joint values, or those whose branch is wanted, rad or mm.
-    """
-
-    where: str
-    lines: Sequence[int]
-    tools: tuple[str, ...]
-    poses: Poses | None
-    q: np.ndarray | None
-
-    def __post_init__(self):
-        if self.q is not None:
-            freeze(self, "q", (len(self), None), "joint values")
-
-    def __len__(self) -> int:
-        return len(self.lines)
-
-    def joints(self) -> np.ndarray:
-        """(m, n) commanded joint values, rad or mm; refused where there are none."""
-        if self.q is None:
-            raise InputError(f"{self.where}: poses without joint values; columns q1_deg … needed")
-        return self.q
 
 
 @dataclass(frozen=True, slots=True, eq=False, kw_only=True)
@@ -89,8 +46,8 @@ class Compensated:
         nominal robot.
     sliding : (n,) array
         Which joints are prismatic.
-    other_tools : tuple of str
-        Notes on tools that are others in the nominal robot.
+    doubts : tuple of str
+        Notes on targets that may be meant otherwise, and on tools and arms that are others in the nominal robot.
     """
 
     targets: Targets
@@ -100,7 +57,7 @@ class Compensated:
     before_mm: np.ndarray
     before_rad: np.ndarray
     sliding: np.ndarray
-    other_tools: tuple[str, ...] = ()
+    doubts: tuple[str, ...] = ()
 
     def __len__(self) -> int:
         return len(self.found)
@@ -110,9 +67,9 @@ class Compensated:
         return self.found.usable & self.nominal.usable if self.nominal else np.zeros(len(self), bool)
 
     def notes(self) -> list[str]:
-        """Every row that is not simply reached, or only a long way from the nominal joint values, by its line; tools
-        that the two robots do not share."""
-        return [*self.other_tools, *self._not_simply_reached(), *self._far_moved()]
+        """Every row that is not simply reached, or only a long way from the nominal joint values, by its line; before
+        them what is doubtful of targets and robots."""
+        return [*self.doubts, *self._not_simply_reached(), *self._far_moved()]
 
     def _far_moved(self) -> list[str]:
         if self.nominal is None:
@@ -148,57 +105,6 @@ def _other_tools(identified: Robot, nominal: Robot, used: Sequence[str]) -> tupl
     return tuple(notes)
 
 
-def read_targets(path: str | Path, robot: Robot, quaternions: Order = "wxyz") -> Targets:
-    """Read commanded poses, or joint values that command them.
-
-    Parameters
-    ----------
-    path : str or Path
-        Table (CSV; form: ``data_layout.md``).
-    robot : Robot
-        Whose tools they are of; its joints, where joint values are given.
-    quaternions : {"wxyz", "xyzw"}
-        As their columns are named, or x, y, z, w in the order in which these stand.
-
-    Returns
-    -------
-    Targets
-        base_from_tool, mm; joint values, rad or mm.
-
-    Raises
-    ------
-    InputError
-        Neither poses nor joint values, positions without orientation, bad rows; the message names the line.
-    """
-    table = read_table(path, WHAT, quaternions)
-    has_joints = any(name.startswith("q1_") for name in table.columns)
-    has_poses = table.has("x", LENGTHS)
-    if not has_poses and not has_joints:
-        raise InputError(
-            f"{table.where}: neither poses x_mm … qz nor joint values q1_deg …; commanded poses are needed; "
-            f"the header is {table.header()}"
-        )
-    if has_poses and not table.has_rotation():
-        raise InputError(f"{table.where}: positions without orientation; columns qw, qx, qy, qz needed")
-    tools = targets_of(table)
-    for line, tool in zip(table.lines, tools, strict=True):
-        if tool not in robot.tools:
-            known = ", ".join(repr(name) for name in robot.tools)
-            raise InputError(
-                f"{table.where}: line {line}: target {tool!r} is not in robot {robot.name}; there are {known}"
-            )
-    poses = table.poses() if has_poses else None
-    if poses is not None:
-        within(table, "position", poses.translation, "mm")
-    return Targets(
-        table.where,
-        table.lines,
-        tools,
-        poses,
-        joint_values(table, robot) if has_joints else None,
-    )
-
-
 @one_thread()
 def compensate(identified: Robot, targets: Targets, nominal: Robot | None = None) -> Compensated:
     """Joint values for the commanded poses, by the identified robot and beside it by the nominal one.
@@ -225,7 +131,8 @@ def compensate(identified: Robot, targets: Targets, nominal: Robot | None = None
     Raises
     ------
     InputError
-        Joint values without poses need the nominal robot; robots of different joints; an unknown tool.
+        Joint values without poses need the nominal robot, and that it is the same robot; robots of different joints; an
+        unknown tool; poses to which their joint values lead in another unit or convention only.
     """
     if nominal is not None and (
         len(nominal.rows) != len(identified.rows) or (nominal.prismatic != identified.prismatic).any()
@@ -236,18 +143,24 @@ def compensate(identified: Robot, targets: Targets, nominal: Robot | None = None
         )
     if nominal is None:
         return _without_nominal(identified, targets)
-    poses = _by_tool(nominal, targets, targets.joints()) if targets.poses is None else targets.poses
-    before = _inverse_by_tool(nominal, targets, poses, targets.q)
-    off = poses.difference(_by_tool(identified, targets, before.q))
+    apart = robots_apart(identified, nominal)
+    if apart and targets.poses is None:
+        raise InputError(apart)
+    confirmed, doubts = on_targets(identified if apart else nominal, targets)
+    poses = poses_of(nominal, targets, targets.joints()) if targets.poses is None else targets.poses
+    before = joints_of(nominal, targets, poses, targets.q)
+    off = poses.difference(poses_of(identified, targets, before.q))
+    found = joints_of(identified, targets, poses, before.q)
+    doubts += () if confirmed or apart else out_of_reach(identified, targets, found)
     return Compensated(
         targets=targets,
         poses=poses,
-        found=_inverse_by_tool(identified, targets, poses, before.q),
+        found=found,
         nominal=before,
         before_mm=np.linalg.norm(off[:, 3:], axis=1),
         before_rad=np.linalg.norm(off[:, :3], axis=1),
         sliding=identified.prismatic,
-        other_tools=_other_tools(identified, nominal, targets.tools),
+        doubts=((apart,) if apart else ()) + doubts + _other_tools(identified, nominal, targets.tools),
     )
 
 
@@ -257,7 +170,9 @@ def _without_nominal(identified: Robot, targets: Targets) -> Compensated:
             f"{targets.where}: joint values without poses; only the nominal robot knows which poses they command, "
             "give its file with --nominal"
         )
-    found, none = _inverse_by_tool(identified, targets, targets.poses, targets.q), np.zeros(0)
+    confirmed, doubts = on_targets(identified, targets)
+    found, none = joints_of(identified, targets, targets.poses, targets.q), np.zeros(0)
+    doubts += () if confirmed else out_of_reach(identified, targets, found)
     return Compensated(
         targets=targets,
         poses=targets.poses,
@@ -266,32 +181,8 @@ def _without_nominal(identified: Robot, targets: Targets) -> Compensated:
         before_mm=none,
         before_rad=none,
         sliding=identified.prismatic,
+        doubts=doubts,
     )
-
-
-def _rows_by_tool(targets: Targets) -> list[tuple[str, np.ndarray]]:
-    names = np.array(targets.tools, dtype=object)
-    return [(name, np.flatnonzero(names == name)) for name in dict.fromkeys(targets.tools)]
-
-
-def _by_tool(robot: Robot, targets: Targets, q: np.ndarray) -> Poses:
-    """base_from_tool of joint values (m, n), with each row's tool."""
-    rotation, translation = np.empty((len(q), 3, 3)), np.empty((len(q), 3))
-    for name, rows in _rows_by_tool(targets):
-        part = forward(robot, q[rows], name)
-        rotation[rows], translation[rows] = part.rotation, part.translation
-    return Poses(rotation, translation)
-
-
-def _inverse_by_tool(robot: Robot, targets: Targets, poses: Poses, near: np.ndarray | None) -> Inverse:
-    m = len(poses)
-    q, status = np.empty((m, len(robot.rows))), np.empty(m, object)
-    error_mm, error_rad = np.empty(m), np.empty(m)
-    for name, rows in _rows_by_tool(targets):
-        part = inverse(robot, poses[rows], None if near is None else near[rows], name)
-        q[rows], status[rows] = part.q, part.status
-        error_mm[rows], error_rad[rows] = part.error_mm, part.error_rad
-    return Inverse(q, tuple(status), error_mm, error_rad)
 
 
 def joint_columns(robot: Robot) -> list[str]:

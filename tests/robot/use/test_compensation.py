@@ -17,7 +17,8 @@ from stcal.robot.kinematics.example import mh80
 from stcal.robot.kinematics.file import load_robot, robot_toml
 from stcal.robot.kinematics.forward import forward
 from stcal.robot.kinematics.model import Joint
-from stcal.robot.use.compensation import compensate, compensated_csv, compensation_file, read_targets
+from stcal.robot.use.compensation import compensate, compensated_csv, compensation_file
+from stcal.robot.use.targets import read_targets
 from stcal.synthetic.measured.arms import joint_vectors, made
 
 JOINTS = [f"q{i}_deg" for i in range(1, 7)]

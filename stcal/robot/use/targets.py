@@ -1,0 +1,151 @@
+"""Commanded poses as a file has them, and what a robot makes of them, each row with its own tool."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from stcal.errors import InputError
+from stcal.geometry.arrays import freeze
+from stcal.geometry.rigid import Poses
+from stcal.io.quaternions import Order
+from stcal.io.table import LENGTHS, read_table
+from stcal.robot.kinematics.forward import forward
+from stcal.robot.kinematics.inverse import Inverse, inverse
+from stcal.robot.kinematics.measurements import joint_values, targets_of, within
+from stcal.robot.kinematics.model import Robot
+
+WHAT = "targets"
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Targets:
+    """Commanded poses, one for each row of a file; by joint values where no poses are given.
+
+    Parameters
+    ----------
+    where : str
+        The file, for messages.
+    lines : sequence of int
+        (m,) its lines.
+    tools : tuple of str
+        (m,) names.
+    poses : Poses or None
+        base_from_tool, mm; None where joint values command.
+    q : (m, n) array or None
+        Commanded joint values, or those whose branch is wanted, rad or mm.
+    """
+
+    where: str
+    lines: Sequence[int]
+    tools: tuple[str, ...]
+    poses: Poses | None
+    q: np.ndarray | None
+
+    def __post_init__(self):
+        if self.q is not None:
+            freeze(self, "q", (len(self), None), "joint values")
+
+    def __len__(self) -> int:
+        return len(self.lines)
+
+    def __getitem__(self, rows: np.ndarray) -> "Targets":
+        """Some of them, by their indices."""
+        return Targets(
+            self.where,
+            [self.lines[i] for i in rows],
+            tuple(self.tools[i] for i in rows),
+            None if self.poses is None else self.poses[rows],
+            None if self.q is None else self.q[rows],
+        )
+
+    def commanded(self) -> Poses:
+        """m poses base_from_tool, mm; refused where there are none."""
+        if self.poses is None:
+            raise InputError(f"{self.where}: joint values without poses; columns x_mm … qz needed")
+        return self.poses
+
+    def joints(self) -> np.ndarray:
+        """(m, n) commanded joint values, rad or mm; refused where there are none."""
+        if self.q is None:
+            raise InputError(f"{self.where}: poses without joint values; columns q1_deg … needed")
+        return self.q
+
+
+def read_targets(path: str | Path, robot: Robot, quaternions: Order = "wxyz") -> Targets:
+    """Read commanded poses, or joint values that command them.
+
+    Parameters
+    ----------
+    path : str or Path
+        Table (CSV; form: ``data_layout.md``).
+    robot : Robot
+        Whose tools they are of; its joints, where joint values are given.
+    quaternions : {"wxyz", "xyzw"}
+        As their columns are named, or x, y, z, w in the order in which these stand.
+
+    Returns
+    -------
+    Targets
+        base_from_tool, mm; joint values, rad or mm.
+
+    Raises
+    ------
+    InputError
+        Neither poses nor joint values, positions without orientation, bad rows; the message names the line.
+    """
+    table = read_table(path, WHAT, quaternions)
+    has_joints = any(name.startswith("q1_") for name in table.columns)
+    has_poses = table.has("x", LENGTHS)
+    if not has_poses and not has_joints:
+        raise InputError(
+            f"{table.where}: neither poses x_mm … qz nor joint values q1_deg …; commanded poses are needed; "
+            f"the header is {table.header()}"
+        )
+    if has_poses and not table.has_rotation():
+        raise InputError(f"{table.where}: positions without orientation; columns qw, qx, qy, qz needed")
+    tools = targets_of(table)
+    for line, tool in zip(table.lines, tools, strict=True):
+        if tool not in robot.tools:
+            known = ", ".join(repr(name) for name in robot.tools)
+            raise InputError(
+                f"{table.where}: line {line}: target {tool!r} is not in robot {robot.name}; there are {known}"
+            )
+    poses = table.poses() if has_poses else None
+    if poses is not None:
+        within(table, "position", poses.translation, "mm")
+    return Targets(
+        table.where,
+        table.lines,
+        tools,
+        poses,
+        joint_values(table, robot) if has_joints else None,
+    )
+
+
+def rows_by_tool(targets: Targets) -> list[tuple[str, np.ndarray]]:
+    """Names of tools, each with its rows."""
+    names = np.array(targets.tools, dtype=object)
+    return [(name, np.flatnonzero(names == name)) for name in dict.fromkeys(targets.tools)]
+
+
+def poses_of(robot: Robot, targets: Targets, q: np.ndarray) -> Poses:
+    """base_from_tool of joint values (m, n), with each row's tool."""
+    rotation, translation = np.empty((len(q), 3, 3)), np.empty((len(q), 3))
+    for name, rows in rows_by_tool(targets):
+        part = forward(robot, q[rows], name)
+        rotation[rows], translation[rows] = part.rotation, part.translation
+    return Poses(rotation, translation)
+
+
+def joints_of(robot: Robot, targets: Targets, poses: Poses, near: np.ndarray | None) -> Inverse:
+    """Joint values that bring each row's tool to ``poses``, near to ``near`` (m, n)."""
+    m = len(poses)
+    q, status = np.empty((m, len(robot.rows))), np.empty(m, object)
+    error_mm, error_rad = np.empty(m), np.empty(m)
+    for name, rows in rows_by_tool(targets):
+        part = inverse(robot, poses[rows], None if near is None else near[rows], name)
+        q[rows], status[rows] = part.q, part.status
+        error_mm[rows], error_rad[rows] = part.error_mm, part.error_rad
+    return Inverse(q, tuple(status), error_mm, error_rad)

@@ -1,0 +1,154 @@
+"""Commanded poses and nominal robots that cannot be meant as they stand; and such as can."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from stcal.errors import InputError
+from stcal.geometry.rigid import Poses, Rigid
+from stcal.io.quaternions import INVERTED
+from stcal.robot.kinematics.example import mh80
+from stcal.robot.kinematics.forward import forward
+from stcal.robot.kinematics.model import DHRow, Joint, Robot
+from stcal.robot.use.compensation import compensate
+from stcal.robot.use.plausible import on_targets, robots_apart
+from stcal.robot.use.targets import Targets
+from stcal.synthetic.measured.arms import joint_vectors, made
+
+TOOL = Rigid.exp([0.2, -0.4, 0.1, 30, -20, 180])
+
+
+def arm(seed: int, size: float = 1.0) -> Robot:
+    """Of other lengths."""
+    rng, nominal = np.random.default_rng(seed), mh80()
+    rows = (
+        replace(r, a=r.a * size * rng.uniform(0.7, 1.3), d=r.d * size * rng.uniform(0.7, 1.3)) for r in nominal.rows
+    )
+    return replace(nominal, rows=tuple(rows), tools={"": TOOL})
+
+
+def scara(_: int) -> Robot:
+    rows = DHRow(300, 0, 200, 0), DHRow(250, np.pi, 0, 0), DHRow(0, 0, 0, 0), DHRow(0, 0, 0, 0)
+    turning = Joint("revolute", -2.5, 2.5)
+    return Robot("scara", "standard", rows, (turning, turning, Joint("prismatic", 0, 200), turning), tools={"": TOOL})
+
+
+def targets(poses: Poses, q=None) -> Targets:
+    return Targets("targets t.csv", range(2, len(poses) + 2), ("",) * len(poses), poses, q)
+
+
+def commanded(robot: Robot, count: int, seed: int, share: float = 0.6) -> tuple[np.ndarray, Poses]:
+    q = joint_vectors(robot, count, np.random.default_rng(seed), share)
+    return q, forward(robot, q)
+
+
+def rolled(poses: Poses) -> Poses:
+    """x, y, z, w read as w, x, y, z."""
+    return Poses.from_quaternions(poses.quaternions()[:, [1, 2, 3, 0]], poses.translation)
+
+
+def times(poses: Poses, factor: float) -> Poses:
+    return Poses(poses.rotation, factor * poses.translation)
+
+
+MISTAKES = {
+    "metres": (lambda p, q: (times(p, 1e-3), q), "mm if lengths were metres; call the columns x_m …"),
+    "inches": (lambda p, q: (times(p, 1 / 25.4), q), "mm if lengths were inches; call the columns x_in …"),
+    "inverse": (lambda p, q: (p.inverse(), q), "poses were inverse"),
+    "radians": (lambda p, q: (p, np.radians(q)), "joint values were radians in columns of degrees"),
+    "rows": (lambda p, q: (p, np.roll(q, 1, axis=0)), "joint values stood in other rows"),
+    "xyzw": (lambda p, q: (rolled(p), q), "x, y, z, w in the order of their columns; give --quaternions xyzw"),
+    "conjugated": (lambda p, q: (INVERTED.poses(p), q), "quaternions were conjugated"),
+}
+
+
+@pytest.mark.parametrize("name", MISTAKES)
+@pytest.mark.parametrize("seed", range(3))
+def test_joint_values_prove_what_is_wrong(name, seed):
+    nominal = arm(seed, size=(0.2, 1.0, 1.5)[seed])
+    wrong, says = MISTAKES[name]
+    poses, q = wrong(*reversed(commanded(nominal, 9, seed)))
+    for robot in (nominal, made(nominal, np.random.default_rng(seed))):
+        with pytest.raises(InputError, match="allowed") as caught:
+            on_targets(robot, targets(poses, q))
+        assert says in str(caught.value)
+
+
+@pytest.mark.parametrize("make", [arm, scara])
+@pytest.mark.parametrize("count", [1, 2, 30])
+@pytest.mark.parametrize("share", [0.02, 0.6])
+def test_good_targets_pass(make, count, share):
+    """Far apart and all near one another; with their own joint values, with others that choose a branch, with none."""
+    for seed in range(6):
+        nominal, rng = make(seed), np.random.default_rng([seed, count])
+        q, poses = commanded(nominal, count, seed, share)
+        assert on_targets(nominal, targets(poses, q)) == (True, ())
+        assert on_targets(nominal, targets(poses)) == (False, ())
+        on_targets(nominal, targets(poses, q + rng.normal(0, 0.3, q.shape)))
+        on_targets(nominal, targets(poses, q + np.where(np.arange(q.shape[1]) == q.shape[1] - 1, np.pi, 0)))
+        on_targets(nominal, targets(poses, np.zeros_like(q)))
+
+
+def test_one_orientation_fits_in_every_convention():
+    """The tool points down in all rows, whatever the last joint's value is said to be."""
+    nominal = arm(1)
+    q, poses = commanded(nominal, 8, 1)
+    down = np.repeat(Rotation.from_euler("xz", [180, 40], degrees=True).as_matrix()[None], 8, axis=0)
+    _, notes = on_targets(nominal, targets(Poses(down, poses.translation), q))
+    assert [note.split(",")[0] for note in notes] == ["joint values of 8 of 8 rows"]
+
+
+def test_joint_values_that_lead_elsewhere_are_said():
+    nominal = arm(2)
+    q, poses = commanded(nominal, 6, 2)
+    other = q.copy()
+    other[3:] = commanded(nominal, 3, 9)[0]
+    confirmed, notes = on_targets(nominal, targets(poses, other))
+    assert not confirmed
+    assert "joint values of 3 of 6 rows, first line 5, lead elsewhere than their poses, by" in notes[0]
+
+
+@pytest.mark.parametrize(("factor", "words"), [(1e-3, "metres, call the columns x_m"), (1 / 25.4, "inches")])
+@pytest.mark.parametrize("count", [1, 12])
+def test_targets_in_the_arms_foot_are_said(factor, words, count):
+    for seed in range(4):
+        nominal = arm(seed, 0.3 + 0.4 * seed)
+        _, notes = on_targets(nominal, targets(times(commanded(nominal, count, seed)[1], factor)))
+        assert len(notes) == 1
+        assert "of the base's origin, where no arm works that reaches" in notes[0]
+        assert words in notes[0]
+
+
+def test_a_convention_that_brings_poses_within_reach_is_said():
+    """Of an arm that reaches down alone: its orientations in another order are out of reach."""
+    nominal = arm(3)
+    stiff = [Joint("revolute", -0.6, 0.6) if i in (3, 4, 5) else joint for i, joint in enumerate(nominal.joints)]
+    nominal = replace(nominal, joints=tuple(stiff))
+    _, poses = commanded(nominal, 5, 3, 0.5)
+    assert not any("out of reach" in note for note in compensate(nominal, targets(poses)).notes())
+    notes = compensate(nominal, targets(rolled(poses))).notes()
+    assert (
+        "5 of 5 poses are out of reach; 5 of 5 of these that were tried would be within if quaternions were" in notes[0]
+    )
+
+
+@pytest.mark.parametrize("make", [arm, scara])
+def test_made_arms_are_the_nominal_ones(make):
+    for seed in range(10):
+        rng, nominal = np.random.default_rng(seed), make(seed)
+        moved = replace(made(nominal, rng, 1.0, 2e-3), tools={"": Rigid()}, world_from_base=TOOL)
+        assert robots_apart(moved, nominal) == ""
+
+
+def test_a_nominal_robot_of_another_arm_is_said():
+    nominal = arm(4)
+    off = replace(nominal, rows=tuple(replace(r, d=r.d + 4100 * (i == 3)) for i, r in enumerate(nominal.rows)))
+    real = made(nominal, np.random.default_rng(4))
+    q, poses = commanded(nominal, 3, 4)
+    says = "mm apart at the same joint values (RMS)"
+    assert says in compensate(real, targets(poses, q), off).notes()[0]
+    with pytest.raises(InputError, match="files of the same robot needed"):
+        compensate(real, Targets("t", [2, 3, 4], ("",) * 3, None, q), off)
+    assert not any(says in note for note in compensate(real, targets(poses, q), nominal).notes())
