@@ -12,6 +12,7 @@ with 1 where anything failed.
 import argparse
 import json
 import os
+import signal
 import sys
 import tempfile
 import time
@@ -82,6 +83,7 @@ def main() -> None:
     missing = set(COMMANDS) - {call.command for call in CALLS}
     if missing:
         sys.exit(f"no call in tests/commands.py of {', '.join(sorted(missing))}; add one")
+    signal.signal(signal.SIGTERM, lambda *_: sys.exit(143))  # what it laid out is taken away
     start, found = time.monotonic(), []
     with tempfile.TemporaryDirectory(prefix="stcal-stock-") as folder:
         stock = make_stock(Path(folder) / "stock")

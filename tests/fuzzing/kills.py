@@ -113,7 +113,7 @@ def _ended(call: Call, folder: Path, number: signal.Signals, moment: float) -> t
         return outcome, found
     if outcome.code != code:
         found.append(("exit code", f"{outcome.code}, {code} needed: {outcome.err[-300:]}"))
-    if outcome.seconds > within + 2.0:
+    if outcome.seconds > within:
         found.append(("hang", f"ended {outcome.seconds:.1f} s after {number.name}"))
     lines = lines_of(outcome.err)
     if number is not signal.SIGKILL and (len(lines) != 1 or not lines[0].startswith(("interrupted", "terminated"))):

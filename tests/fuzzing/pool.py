@@ -112,6 +112,7 @@ def run_all(stock: Path, seed: int, names: Sequence[str], workers: int) -> Itera
     finally:
         for worker in at_work:
             worker.process.kill()
+            worker.process.join()
         shutil.rmtree(folder, ignore_errors=True)
 
 

@@ -62,7 +62,7 @@ class LabelledImage:
 def labelled_image(
     name: str, group: str, labels: Sequence[Label], centres: Centres, notes: Sequence[str]
 ) -> LabelledImage:
-    """Of circles and their labels, one for each."""
+    """Of circles and their labels, one for each; notes that say the same become one."""
     observations = ImageObservations(
         name=name,
         group=group,
@@ -73,7 +73,8 @@ def labelled_image(
         covariance_px2=centres.covariance_px2,
         uneven_px=centres.uneven_px,
     )
-    return LabelledImage(observations, tuple(notes))
+    times = Counter(notes)
+    return LabelledImage(observations, tuple(f"{note} ({n} times)" if n > 1 else note for note, n in times.items()))
 
 
 def label_single(name: str, group: str, detection: ImageDetection, target: TargetDesign) -> LabelledImage:

@@ -6,7 +6,7 @@ import pytest
 from stcal.design import reference_target
 from stcal.geometry.rigid import Rigid
 from stcal.sfm.data.centres import Centres
-from stcal.sfm.detect.labels import label_groups
+from stcal.sfm.detect.labels import label_groups, label_single
 from stcal.sfm.detect.predict import predict_circles
 from stcal.sfm.detect.sightings import BoardSighting, FaceSighting, ImageDetection
 
@@ -235,3 +235,12 @@ def test_a_pattern_without_a_name_that_fits_nothing_is_left_out(scene, group):
     results, _ = labelled(scene, [s.detection() for s in seen])
     assert set(results[0].observations.labels) == set(group[0].labels)
     assert any("fits face 1, 2, 3, 4, 5 but may be another" in note for note in results[0].notes)
+
+
+def test_patterns_of_which_the_same_is_said_make_one_note(scene, group):
+    seen = Seen(group[0])
+    for x in (-300, 0, 300):
+        pose = Rigid.exp([2.8, 0.2, 0.1, x, 200, 1100])
+        seen.face("5", plane_centres(pose, TARGET.face("5").xy_mm)).unnamed("5")
+    found = label_single("a.png", "12", seen.detection(), scene.target)
+    assert [note.partition("(")[2] for note in found.notes if "may be another" in note] == ["3 times)"]

@@ -9,8 +9,11 @@ import pytest
 import stcal
 from stcal.errors import InputError
 from stcal.io.saving import RUN_MARKER
+from stcal.sfm.interop import crosscheck as interop
+from stcal.sfm.run.crosscheck import Tolerances
 from stcal.sfm.run.marker import MarkerFile
 from stcal.sfm.run.options import RunOptions
+from stcal.sfm.run.saved import load_run
 from stcal.sfm.run.transaction import added_results, run_folder
 from stcal.sfm.run.verify import require_whole, verified_text, verify
 from tests.outcome import INPUT, assert_error
@@ -120,6 +123,19 @@ def test_a_run_and_an_addition_wait_for_each_other(made):
         run_folder(made, MARKER, {}).__enter__()
     with run_folder(made, MARKER, {}), pytest.raises(InputError, match=r"process \d+ on .* is writing a run there"):
         added_results(made).__enter__()
+
+
+def test_no_run_begins_while_a_crosscheck_maps(small_run, tmp_path, monkeypatch):
+    run = shutil.copytree(small_run, tmp_path / "run")
+
+    def meanwhile(*_):
+        with run_folder(run, MARKER, {}):
+            pytest.fail("a run began")
+
+    monkeypatch.setattr(interop, "crosscheck", meanwhile)
+    with pytest.raises(InputError, match=r"process \d+ on .* is writing a run there"):
+        interop.crosscheck_run(load_run(run), None, Tolerances(), 60)
+    assert verify(run).whole
 
 
 def test_a_run_of_an_earlier_version_has_no_hashes_and_gets_none(made, stcal_sfm):
