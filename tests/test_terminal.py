@@ -1,6 +1,8 @@
 """What commands print is text: a terminal obeys nothing of it."""
 
 import re
+import subprocess
+import sys
 from pathlib import Path
 
 import pytest
@@ -52,3 +54,22 @@ def test_how_libraries_say_that_memory_is_used_up(error, used_up):
     outer = ImportError("install it")
     outer.__cause__ = error
     assert lacks_memory(outer) == used_up
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="no such limit there")
+@pytest.mark.parametrize(("words", "code"), [("run x --camera y --out z", 3), ("--version", 0)])
+def test_too_little_address_space_is_said_before_libraries_load(words, code):
+    """Loaded with 350 to 600 MB, they crashed, hung or sent SIGINT."""
+    import resource
+
+    program = "from stcal.cli.entry import main_sfm; main_sfm()"
+    ended = subprocess.run(
+        [sys.executable, "-P", "-c", program, *words.split()],
+        capture_output=True,
+        text=True,
+        preexec_fn=lambda: resource.setrlimit(resource.RLIMIT_AS, (500 << 20, 500 << 20)),
+        check=False,
+    )
+    assert ended.returncode == code
+    said = "error: not enough memory: 500 MB of address space allowed, 800 MB needed; raise the limit (`ulimit -v`)\n"
+    assert ended.stderr == (said if code else "")

@@ -16,6 +16,8 @@ USED_UP = (
     "insufficient memory",
     "errno 12",
 )
+ADDRESS_SPACE = 800 << 20
+"""Bytes; NumPy, SciPy, OpenCV and pycolmap take 740 MB of it when they are loaded (`VmPeak`)."""
 LOADING = {signal.SIGINT: ("interrupted", 130), signal.SIGTERM: ("terminated", 143)}
 
 
@@ -38,14 +40,34 @@ def lacks_memory(error: BaseException) -> bool:
 
 
 def _program() -> ModuleType:
-    """The commands, once they are loaded."""
+    """The commands, once they are loaded.
+
+    OpenBLAS starts its threads when it is loaded, and sends its own process SIGINT, or tries for ever, where memory is
+    too little for them; the commands use one.
+    """
     _answer()
+    _require_address_space()
+    os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
     try:
         return import_module("stcal.cli.main")
     except Exception as error:
         if "--debug" in sys.argv or not lacks_memory(error):
             raise
         os.write(sys.stderr.fileno(), f"error: {NO_MEMORY} to load the program; allow it more\n".encode())
+        sys.exit(3)
+
+
+def _require_address_space() -> None:
+    """End where a limit of the system (`ulimit -v`) is below what loading takes: C libraries end the process then
+    without a word, or hang. Help and version load none of them."""
+    if sys.platform == "win32" or {"--help", "--version"} & set(sys.argv):
+        return
+    import resource
+
+    limit = resource.getrlimit(resource.RLIMIT_AS)[0]
+    if 0 <= limit < ADDRESS_SPACE:
+        said = f"error: {NO_MEMORY}: {limit >> 20} MB of address space allowed, {ADDRESS_SPACE >> 20} MB needed; "
+        os.write(sys.stderr.fileno(), f"{said}raise the limit (`ulimit -v`)\n".encode())
         sys.exit(3)
 
 

@@ -1,6 +1,7 @@
 """Bytes of a file that the user names, as many as its kind can have."""
 
 import errno
+import os
 from pathlib import Path
 
 MB = 1_000_000
@@ -22,9 +23,13 @@ def read_bytes(path: str | Path, most: int) -> bytes:
     OSError
         It cannot be read, or is larger than ``most`` bytes.
     """
+    chunks, left = [], most + 1
     with open(path, "rb") as stream:
-        data = stream.read(most + 1)
-        if len(data) > most:
+        step = max(os.fstat(stream.fileno()).st_size + 1, MB)  # `read` takes memory for as much as it is asked for
+        while chunk := stream.read(min(step, left)):
+            chunks.append(chunk)
+            left -= len(chunk)
+        if not left:
             size = f"{Path(path).stat().st_size / MB:.0f} MB" if Path(path).is_file() else "no end"
             raise OSError(errno.EFBIG, f"{size}, at most {most // MB} MB are read", str(path))
-    return data
+    return b"".join(chunks)

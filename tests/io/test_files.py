@@ -1,6 +1,7 @@
 """No file is read beyond what its kind can have, and links that lead nowhere are an error like any other."""
 
 import os
+import tracemalloc
 from pathlib import Path
 
 import pytest
@@ -9,7 +10,7 @@ from stcal.boards.file import load_flat_board
 from stcal.errors import InputError
 from stcal.io.camera import read_camera
 from stcal.io.design import load_board
-from stcal.io.files import SETTINGS_BYTES, TABLE_BYTES, read_bytes
+from stcal.io.files import MB, MODEL_BYTES, SETTINGS_BYTES, TABLE_BYTES, read_bytes
 from stcal.io.json import read_json
 from stcal.io.saving import keep_apart
 from stcal.io.table import read_table
@@ -53,3 +54,15 @@ def test_a_link_to_itself(tmp_path):
     keep_apart([("--out", tmp_path / "b")], [("pairs", link)])
     with pytest.raises(InputError, match="symbolic links"):
         read_camera(link)
+
+
+def test_a_file_is_read_in_memory_of_its_own_size(tmp_path):
+    """`read` takes memory for all that it is asked for, and the limits are far above any file."""
+    path = tmp_path / "small.txt"
+    path.write_bytes(b"x" * 1000)
+    tracemalloc.start()
+    try:
+        assert read_bytes(path, MODEL_BYTES) == b"x" * 1000
+        assert tracemalloc.get_traced_memory()[1] < 3 * MB
+    finally:
+        tracemalloc.stop()

@@ -236,7 +236,7 @@ def open_model(path: Path) -> pycolmap.Reconstruction:
             if file.exists():
                 _require_whole(file, skip)
         return pycolmap.Reconstruction(str(path))
-    except (RuntimeError, ValueError, IndexError, MemoryError, OverflowError, OSError) as error:
+    except (RuntimeError, ValueError, IndexError, OverflowError, OSError) as error:
         reason = " ".join(str(error).split())[-150:]
         raise InputError(f"model {path}: damaged or incomplete ({reason}); write or copy it again") from error
 
