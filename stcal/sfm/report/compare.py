@@ -14,6 +14,7 @@ from stcal.geometry.align import align_rigid
 from stcal.geometry.rigid import Rigid
 from stcal.io.files import TABLE_BYTES, read_bytes
 from stcal.io.json import ByFace, Part, Pose, PoseCovariance, ResultFile, Vector3, read_result
+from stcal.io.table import LENGTHS
 from stcal.labels import BOARD, CircleLabel, DotLabel, parse_label, parse_labels
 from stcal.report.text import number, text_table
 from stcal.synthetic.truth import TrueGroup, TrueImage, TruthFile
@@ -23,6 +24,8 @@ DETECTIONS = "detections.csv"
 NEAR_PX = 1.5
 """A label is right when its ellipse centre is this near to the image of the circle's centre; eccentricity makes 0.2."""
 
+OF_A_UNIT = 0.1
+"""Distances in another unit are off by its factor to within this share: runs are off by a few per cent at worst."""
 REMEDY = "give a finished run, and truth.json, as data_layout.md has them"
 
 
@@ -87,7 +90,7 @@ def compare(run: str | Path, truth: str | Path) -> CompareFile:
     Raises
     ------
     InputError
-        A file is missing or has another form, or the reference faces differ.
+        A file is missing or has another form, the reference faces differ, or one of both is in another unit.
     """
     run = Path(run)
     found = read_result(run / FACES if run.is_dir() else run, Answer, "run", REMEDY)
@@ -99,6 +102,7 @@ def compare(run: str | Path, truth: str | Path) -> CompareFile:
         )
     if not known.target_from_face.keys() & found.target_from_face.keys():
         raise InputError(f"run {run}, truth {truth}: no face in common; give the truth of the same target")
+    _require_one_unit(f"run {run}, truth {truth}", found, known)
     faces = {
         face_id: _face(face_id, found, known) for face_id in known.target_from_face if face_id in found.target_from_face
     }
@@ -114,6 +118,25 @@ def compare(run: str | Path, truth: str | Path) -> CompareFile:
         worst=LargestErrors(**worst),
         **({"labels": labels} if labels else {}),
     )
+
+
+def _require_one_unit(where: str, found: Answer, known: TruthFile) -> None:
+    """Refuse lengths of which one side's are in another unit than mm, as distances tell."""
+    labels = [label for label in known.circles if label in found.circles]
+    faces = [face_id for face_id in known.target_from_face if face_id in found.target_from_face]
+    sides = (known, found)
+    for what, points in (
+        ("circles", [np.array([each.circles[label] for label in labels]) for each in sides]),
+        ("faces", [np.array([each.target_from_face[face_id][:3, 3] for face_id in faces]) for each in sides]),
+    ):
+        true, own = (float(np.linalg.norm(p - p.mean(axis=0))) if len(p) else 0.0 for p in points)
+        for unit, factor in LENGTHS.items():
+            for name, small, large in (("truth", true, own), ("run", own, true)):
+                if unit != "mm" and small > 0 and abs(large / small / factor - 1) < OF_A_UNIT:
+                    raise InputError(
+                        f"{where}: distances between {what} are {own / true:.4g} times those of the truth, 1 ± "
+                        f"{OF_A_UNIT:g} expected; if the {name} is in {unit}, multiply its lengths by {factor:g}"
+                    )
 
 
 def _labels(path: Path, circles: Collection[str], groups: dict[str, TrueGroup]) -> LabelCounts | None:

@@ -46,3 +46,40 @@ def test_what_faces_json_may_not_hold(small_run, small_dataset, tmp_path, spoil,
         with pytest.raises(InputError, match=message) as caught:
             read()
         assert len(str(caught.value).splitlines()) == 1
+
+
+def scaled(content: dict, factor: float, keys=("circles", "target_from_face")) -> dict:
+    """Lengths times a factor."""
+    content = json.loads(json.dumps(content))
+    if "circles" in keys:
+        content["circles"] = {label: [factor * v for v in xyz] for label, xyz in content["circles"].items()}
+    for matrix in content["target_from_face"].values() if "target_from_face" in keys else ():
+        for row in matrix[:3]:
+            row[3] *= factor
+    return content
+
+
+@pytest.mark.parametrize(
+    ("side", "factor", "says"),
+    [
+        ("truth", 1e-3, "are 1000 times those of the truth, .* if the truth is in m, multiply its lengths by 1000"),
+        ("truth", 1 / 25.4, "if the truth is in in, multiply its lengths by 25.4"),
+        ("run", 1e-3, "if the run is in m, multiply"),
+        ("run", 0.1, "if the run is in cm, multiply"),
+    ],
+)
+@pytest.mark.parametrize("keys", [("circles",), ("target_from_face",)])
+def test_lengths_in_another_unit_are_said(small_run, small_dataset, tmp_path, side, factor, says, keys):
+    files = {"run": small_run / "faces.json", "truth": small_dataset / "truth.json"}
+    other = tmp_path / "other.json"
+    other.write_text(json.dumps(scaled(json.loads(files[side].read_text()), factor, keys)))
+    with pytest.raises(InputError, match=says):
+        compare(**(files | {side: other}))
+
+
+@pytest.mark.parametrize("factor", [1.0, 1.05, 0.8, 3.0])
+def test_a_run_of_another_size_is_compared(small_run, small_dataset, tmp_path, factor):
+    other = tmp_path / "faces.json"
+    other.write_text(json.dumps(scaled(json.loads((small_run / "faces.json").read_text()), factor)))
+    worst = compare(other, small_dataset / "truth.json").worst.translation_um
+    assert (worst > 1000) == (factor != 1.0)
