@@ -5,8 +5,9 @@
 All commands of both programs, found in the tree: one without a call in `tests/commands.py` ends the study. Three
 parts: inputs spoiled by their bytes, place or structure (`c0`, `c1`, …), realistic mistakes (by name; "silent wrong"
 where nothing is said), and programs ended by signals, a full disk or little memory at random moments (`k0`, `k1`, …).
-The seed and the case's name repeat a case: `--seed 1 --only c17`. Simulated data; a small run is made first. Exits
-with 1 where anything failed.
+With `--json` cases that the file has already are not run again: a study that was stopped goes on. The seed and the
+case's name repeat a case: `--seed 1 --only c17`. Simulated data; a small run is made first. Exits with 1 where
+anything failed.
 """
 
 import argparse
@@ -26,6 +27,8 @@ from stcal.parallel import ONE_THREAD
 
 os.environ.update(dict.fromkeys(ONE_THREAD, "1"))
 
+from stcal.io.saving import json_text
+from stcal.io.saving import save as write
 from tests.commands import CALLS, COMMANDS
 from tests.fuzzing.cases import Judged
 from tests.fuzzing.mistakes import MISTAKES
@@ -44,6 +47,20 @@ def names_of(arguments: argparse.Namespace) -> list[str]:
     valid = [f"v{i}" for i in range(len(CALLS))]
     mistakes = [] if arguments.no_mistakes else list(MISTAKES)
     return [*valid, *mistakes, *(f"k{i}" for i in range(arguments.kills)), *(f"c{i}" for i in range(arguments.count))]
+
+
+def kept(path: Path | None, seed: int) -> list[Judged]:
+    """Cases of an earlier call."""
+    if not path or not path.exists():
+        return []
+    earlier = json.loads(path.read_text(encoding="utf-8"))
+    if earlier["seed"] != seed:
+        sys.exit(f"{path}: cases of seed {earlier['seed']}, not {seed}; give another file")
+    return [Judged(**each | {"failures": tuple(map(tuple, each["failures"]))}) for each in earlier["cases"]]
+
+
+def save(path: Path, seed: int, found: list[Judged]) -> None:
+    write(path, json_text({"seed": seed, "cases": [asdict(each) for each in found]}))
 
 
 def show(found: Judged, seed: int) -> None:
@@ -75,7 +92,7 @@ def main() -> None:
     parser.add_argument("--count", type=int, default=1000, help="of spoiled inputs")
     parser.add_argument("--seed", type=int, default=1)
     parser.add_argument("--kills", type=int, default=20)
-    parser.add_argument("--json", type=Path, help="also write every case to this file")
+    parser.add_argument("--json", type=Path, help="keep every case here, and run none that it has")
     parser.add_argument("--only", default="", metavar="CASE")
     parser.add_argument("--no-mistakes", action="store_true")
     parser.add_argument("--workers", type=int, default=os.cpu_count() or 1)
@@ -84,15 +101,20 @@ def main() -> None:
     if missing:
         sys.exit(f"no call in tests/commands.py of {', '.join(sorted(missing))}; add one")
     signal.signal(signal.SIGTERM, lambda *_: sys.exit(143))  # what it laid out is taken away
-    start, found = time.monotonic(), []
+    start = time.monotonic()
+    found = kept(arguments.json, arguments.seed)
+    known = {each.name for each in found}
     with tempfile.TemporaryDirectory(prefix="stcal-stock-") as folder:
         stock = make_stock(Path(folder) / "stock")
-        for each in run_all(stock, arguments.seed, names_of(arguments), arguments.workers):
-            found.append(each)
-            show(each, arguments.seed)
+        names = [name for name in names_of(arguments) if name not in known]
+        try:
+            for each in run_all(stock, arguments.seed, names, arguments.workers):
+                found.append(each)
+                show(each, arguments.seed)
+        finally:
+            if arguments.json:
+                save(arguments.json, arguments.seed, found)
     print(f"\n{summary(found, arguments.seed)}\n\n{time.monotonic() - start:.0f} s")
-    if arguments.json:
-        arguments.json.write_text(json.dumps([asdict(each) for each in found], indent=1))
     sys.exit(any(kind not in ALLOWED for each in found for kind, _ in each.failures))
 
 
