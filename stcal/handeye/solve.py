@@ -1,7 +1,7 @@
 """One call for every method."""
 
 from dataclasses import dataclass, field, replace
-from functools import partial
+from functools import cache, partial
 
 import numpy as np
 
@@ -13,7 +13,7 @@ from stcal.handeye.data.motions import Motions, poses_with_log
 from stcal.handeye.data.pairs import HandEyePoses
 from stcal.handeye.data.views import Views
 from stcal.handeye.judge import remarks
-from stcal.handeye.judge.conventions import check_conventions
+from stcal.handeye.judge.conventions import Guess, check_conventions
 from stcal.handeye.judge.observability import Observability, check, in_words, require_scale
 from stcal.handeye.judge.symmetry import repair
 from stcal.handeye.methods import start
@@ -80,19 +80,17 @@ class HandEyeOptions:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Task:
-    """One call's input: ``pairs`` and ``views`` repaired; ``seen`` : observability; ``notes`` : so far."""
+    """One call's input: ``pairs`` and ``views`` repaired; ``guess`` : of a loop, and whether the board's scale is free,
+    first X, Z and scale; ``seen`` : observability; ``notes`` : so far."""
 
     pairs: HandEyePoses
     loop: Loop
     setup: Setup
     views: Views | None
     options: HandEyeOptions
+    guess: Guess
     seen: Observability
     notes: tuple[str, ...]
-
-    def guess(self, loop: Loop, with_scale: bool) -> tuple[Rigid, Rigid, float]:
-        """First X, Z and scale."""
-        return _guess(self.options, self.seen, loop, with_scale)
 
 
 def _guess(options: HandEyeOptions, seen: Observability, loop: Loop, with_scale: bool) -> tuple[Rigid, Rigid, float]:
@@ -170,9 +168,9 @@ def _task(pairs: HandEyePoses, setup: Setup, views: Views | None, options: HandE
     if options.symmetries:
         mended = repair(pairs, setup, options.symmetries, views)
         pairs, views, notes = mended.pairs, mended.views, mended.notes()
-    guess = partial(_guess, options, seen)
-    notes += check_conventions(pairs, setup, guess, options.with_scale, views is not None)
-    return _Task(pairs, Loop.of(pairs, setup), setup, views, options, seen, notes)
+    loop, guess = Loop.of(pairs, setup), cache(partial(_guess, options, seen))
+    notes += check_conventions(pairs, loop, setup, guess, options.with_scale, views is not None)
+    return _Task(pairs, loop, setup, views, options, guess, seen, notes)
 
 
 def _by_equations(task: _Task, method: str) -> HandEye:

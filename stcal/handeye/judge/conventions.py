@@ -30,7 +30,7 @@ Guess = Callable[[Loop, bool], tuple[Rigid, Rigid, float]]
 
 
 def check_conventions(
-    pairs: HandEyePoses, setup: Setup, guess: Guess, with_scale: bool, by_images: bool
+    pairs: HandEyePoses, loop: Loop, setup: Setup, guess: Guess, with_scale: bool, by_images: bool
 ) -> tuple[str, ...]:
     """Refuse poses that fit far better in another convention, or in none; notes on what the fit cannot decide.
 
@@ -38,6 +38,7 @@ def check_conventions(
 
     Parameters
     ----------
+    loop : of the pairs
     guess : called with a loop and whether the board's scale is free; X, Z and scale
     with_scale : whether it is
     by_images : whether the board's poses come from images, so that nothing but the robot's can be named wrongly
@@ -47,7 +48,6 @@ def check_conventions(
     InputError
         What is mixed up, and the remedy.
     """
-    loop = Loop.of(pairs, setup)
     given, notes = _typical(loop, guess, with_scale), ()
     if given[0] > WELL[0] or given[1] > WELL[1]:
         by = f"{np.degrees(given[0]):.3g}° and {given[1]:.3g} mm (median)"
