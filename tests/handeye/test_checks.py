@@ -31,8 +31,8 @@ SETUPS = ("eye-in-hand", "eye-to-hand")
 ONE_QUICK = ("eye-in-hand", pytest.param("eye-to-hand", marks=pytest.mark.slow))
 """Where the other setup is the same but for what its poses are called."""
 NOISE = {"robot": (3e-4, 0.1), "camera": (1e-3, 0.3)}
-SETS = pytest.mark.parametrize("seed", [0, 1, *(pytest.param(seed, marks=pytest.mark.slow) for seed in range(2, 10))])
-"""Of draws: the quick tests try two."""
+SETS = pytest.mark.parametrize("seed", [0, *(pytest.param(seed, marks=pytest.mark.slow) for seed in range(1, 10))])
+"""Of draws: the quick tests try one."""
 
 
 def seen_from(flange, setup, rng=None, sigma=(5e-4, 0.1)):
@@ -291,7 +291,7 @@ def test_many_outliers_make_the_setup_suspect():
 
 
 @pytest.mark.parametrize("moved", [pytest.param(False, marks=pytest.mark.slow), True])
-@pytest.mark.parametrize("sets", [3, pytest.param(40, marks=pytest.mark.slow)])
+@pytest.mark.parametrize("sets", [1, pytest.param(40, marks=pytest.mark.slow)])
 def test_a_board_that_was_moved_half_way_is_said(moved, sets):
     """By 5° and 30 mm, every other pose: too many for outliers. Without, no such note for 40 sets in a row."""
     said = 0

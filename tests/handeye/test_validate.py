@@ -27,11 +27,11 @@ def test_every_pose_has_its_turn():
 
 @pytest.mark.parametrize(
     ("setup", "count"),
-    [("eye-in-hand", 6), *(pytest.param(x, 15, marks=pytest.mark.slow) for x in ("eye-in-hand", "eye-to-hand"))],
+    [("eye-in-hand", 4), *(pytest.param(x, 15, marks=pytest.mark.slow) for x in ("eye-in-hand", "eye-to-hand"))],
 )
 def test_held_out_errors_are_those_of_the_poses(setup, count):
     """Of many poses X is well known, and what is left is the noise of a pose: a length of 3 coordinates, √(8/π) σ in
-    the mean. 180 values scatter by 0.42/√180 = 3 %, 72 by 5 %; X adds 12/60 of the variance at most."""
+    the mean. 180 values scatter by 0.42/√180 = 3 %, 48 by 6 %; X adds 12/60 of the variance at most."""
     truth = simulated(np.random.default_rng(1), 60, setup, camera=(1e-3, 0.3))
     found = cross_validate(truth.pairs, setup, "pose", rows=splits(60, 12, count))
     means = found.means()

@@ -51,7 +51,7 @@ def test_json_and_page(run, tmp_path):
     a, b = points()
     b[4] += [0, 9, 0]
     out, page = tmp_path / "new" / "found.json", tmp_path / "found.html"
-    code, printed, err = run(written(tmp_path, rows_of(a, b)), "--out", out, "--report", page)
+    code, printed, err = run(written(tmp_path, rows_of(a, b)), "--folds", 2, "--out", out, "--report", page)
     assert (code, err) == (0, "")
     content = json.loads(out.read_text())
     np.testing.assert_allclose(content["b_from_a"], B_FROM_A.matrix(), atol=1.0)
@@ -274,7 +274,7 @@ def robot_pairs(tmp_path_factory):
 def test_base_and_kinematics_together(run, tmp_path, robot_pairs):
     folder, pairs, real = robot_pairs
     out, page, identified = tmp_path / "o.json", tmp_path / "o.html", tmp_path / "identified.toml"
-    arguments = ("--robot", folder / "robot.toml", "--folds", 3, "--out", out, "--report", page)
+    arguments = ("--robot", folder / "robot.toml", "--folds", 2, "--out", out, "--report", page)
     code, printed, err = run(pairs, *arguments, "--identified", identified)
     assert (code, err) == (0, "")
     content = json.loads(out.read_text())["robot"]

@@ -91,12 +91,12 @@ def test_evolution_follows_its_rules():
     truth = simulated(np.random.default_rng(6), 19, camera=(1e-3, 0.3))
     motions = Motions.consecutive(Loop.of(truth.pairs, "eye-in-hand"))
     objective = Objective(motions, 1000.0, 1.0)
-    runs = [evolve(objective, 500, EvolutionOptions(iterations=n, seed=3)) for n in range(0, 101, 2)]
+    runs = [evolve(objective, 500, EvolutionOptions(iterations=n, seed=3)) for n in range(0, 101, 20)]
     costs = [objective.linear(x).cost for x in runs]
     assert (np.diff(costs) <= 1e-12).all()
-    assert costs[0] > 2 * costs[10] > 4 * costs[50]
+    assert costs[0] > 2 * costs[1] > 4 * costs[5]
     again = evolve(objective, 500, EvolutionOptions(seed=3))
-    assert objective.linear(again).cost == costs[50]
+    assert objective.linear(again).cost == costs[5]
     still = evolve(objective, 500, EvolutionOptions(seed=3, crossover=-1.0))
     assert objective.linear(still).cost == pytest.approx(costs[0], rel=1e-12)
 

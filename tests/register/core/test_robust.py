@@ -30,7 +30,7 @@ def cost_ratio(s, found) -> float:
 @pytest.mark.parametrize("share", [0, 0.4, *(pytest.param(x, marks=pytest.mark.slow) for x in (0.1, 0.2, 0.3))])
 @pytest.mark.parametrize("n", [20, 100])
 def test_within_one_per_cent_of_the_optimum_of_the_clean_points(n, share):
-    for trial in range(6):
+    for trial in range(2):
         s = scene([trial, n], n, share)
         found = register(s.xyz_a, s.xyz_b, folds=0)
         assert cost_ratio(s, found) > 1 - 1e-12
@@ -76,7 +76,7 @@ def test_more_wrong_than_right_is_said():
 @pytest.mark.parametrize("kind", ["one shift", "other motion"])
 @pytest.mark.parametrize("share", [0.5, *(pytest.param(x, marks=pytest.mark.slow) for x in (0.4, 0.6))])
 def test_two_transforms_are_refused_or_told(kind, share):
-    for trial in range(4):
+    for trial in range(2):
         s = scene([trial, 11], 40, share, kind)
         with pytest.raises(DegenerateError, match=r"\d+ point pairs agree on one transform and \d+ others on another"):
             register(s.xyz_a, s.xyz_b, folds=0)
@@ -93,17 +93,17 @@ def test_two_transforms_are_refused_or_told(kind, share):
 def test_half_of_the_points_shifted_by_little():
     """One transform between two groups 2 mm apart looks like noise of 0.6 mm; it is none."""
     refused = 0
-    for trial in range(10):
+    for trial in range(4):
         s = scene([trial, 2], 30, 0.5, "one shift", (2, 2))
         with pytest.raises(DegenerateError, match="agree on one transform"):
             register(s.xyz_a, s.xyz_b, folds=0)
         refused += 1
-    assert refused == 10
+    assert refused == 4
 
 
 def test_groups_that_no_consensus_tells_apart():
     """At 1 mm, 7 σ, between them: trimming sees one set of larger σ, two transforms are seen."""
-    for trial in range(4):
+    for trial in range(2):
         s = scene([trial, 9], 80, 0.5, "one shift", (1, 1))
         found = register(s.xyz_a, s.xyz_b, folds=0, allow_ambiguous=True)
         assert found.ambiguous
@@ -171,7 +171,7 @@ def test_a_far_point_may_be_off_by_what_the_fit_cannot_know():
     """Points of 20 mm tell the place of one 3 m away to 150 times their noise: none of that is an outlier."""
     rng = np.random.default_rng(25)
     a = np.vstack([rng.uniform(-10, 10, (20, 3)), [[3000, 0, 0]]])
-    for trial in range(10):
+    for trial in range(4):
         b = a + np.random.default_rng(trial).normal(0, SIGMA_MM, a.shape)
         assert register(a, b, folds=0).inliers.all()
 
@@ -345,8 +345,8 @@ def test_the_score_has_its_minimum_where_outliers_begin():
 
 
 def test_false_alarms_of_the_search_are_rare():
-    """The bound on all sets together is generous: in 30 sets without outliers none may come near."""
-    for trial in range(30):
+    """The bound on all sets together is generous: in 10 sets without outliers none may come near."""
+    for trial in range(10):
         s = scene([trial, 5], 15)
         total = ((s.xyz_b - align_rigid(s.xyz_b, s.xyz_a) @ s.xyz_a) ** 2).sum()
         problem = Problem(RIGID, s.xyz_a, s.xyz_b, PointNoise())

@@ -129,11 +129,11 @@ def test_sigma_of_the_transform_by_place():
     a = rng.uniform(-100, 100, (20, 3))
     place = np.array([500.0, 0.0, 0.0])
     seen, stated = [], []
-    for trial in range(100):
+    for trial in range(40):
         b = B_FROM_A @ a + rng.normal(0, 0.1, a.shape)
         result = register(a, b, method="least-squares", folds=0)
         seen.append(result.b_from_a @ place)
         if trial < 5:
             stated.append(findings("x", range(20), a, b, result).sigma_mm_at(place))
-    # 100 trials know a σ to 7 %; the own σ of five are good to 9 % / √5
-    np.testing.assert_allclose(np.std(seen, axis=0), np.sqrt(np.mean(np.square(stated), axis=0)), rtol=0.25)
+    # 40 trials know a σ to 11 %; the own σ of five are good to 9 % / √5
+    np.testing.assert_allclose(np.std(seen, axis=0), np.sqrt(np.mean(np.square(stated), axis=0)), rtol=0.35)

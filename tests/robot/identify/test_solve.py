@@ -245,7 +245,7 @@ def test_many_outliers_do_not_pass_for_noise():
 
 def test_report_and_json_hold_the_result():
     _, data = simulated(7, 40)
-    found = identify(mh80(), data, IdentifyOptions(folds=3, repeats=1))
+    found = identify(mh80(), data, IdentifyOptions(folds=2, repeats=1))
     content = json.loads(json.dumps(identified_file(found, mh80()).content(), allow_nan=False))
     assert content["rank"] == 30
     assert len(content["covariance"]) == 30
