@@ -55,8 +55,9 @@ def test_the_axis_is_named_where_the_frames_are_nearly_parallel(mend, text):
         register(a @ mend.T, b)
 
 
-def test_planes_and_few_points_are_not_called_mirrored():
-    for seed in range(12):
+@pytest.mark.parametrize("sets", [12, pytest.param(40, marks=pytest.mark.slow)])
+def test_planes_and_few_points_are_not_called_mirrored(sets):
+    for seed in range(sets):
         s = scene([seed, 5], 5)
         register(s.xyz_a, s.xyz_b, folds=0)
         flat = s.xyz_a * [1, 1, 0]

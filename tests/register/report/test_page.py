@@ -123,17 +123,18 @@ def test_the_same_page_twice():
     assert registration_page(found_of()) == registration_page(found_of.__wrapped__())
 
 
-def test_sigma_of_the_transform_by_place():
+@pytest.mark.parametrize(("count", "tolerance"), [(40, 0.35), pytest.param(100, 0.25, marks=pytest.mark.slow)])
+def test_sigma_of_the_transform_by_place(count, tolerance):
     """By Monte Carlo: the spread of the fitted transform at a point far from the others."""
     rng = np.random.default_rng(1)
     a = rng.uniform(-100, 100, (20, 3))
     place = np.array([500.0, 0.0, 0.0])
     seen, stated = [], []
-    for trial in range(40):
+    for trial in range(count):
         b = B_FROM_A @ a + rng.normal(0, 0.1, a.shape)
         result = register(a, b, method="least-squares", folds=0)
         seen.append(result.b_from_a @ place)
         if trial < 5:
             stated.append(findings("x", range(20), a, b, result).sigma_mm_at(place))
-    # 40 trials know a σ to 11 %; the own σ of five are good to 9 % / √5
-    np.testing.assert_allclose(np.std(seen, axis=0), np.sqrt(np.mean(np.square(stated), axis=0)), rtol=0.35)
+    # 100 trials know a σ to 7 %, 40 to 11 %; the own σ of five are good to 9 % / √5
+    np.testing.assert_allclose(np.std(seen, axis=0), np.sqrt(np.mean(np.square(stated), axis=0)), rtol=tolerance)

@@ -10,9 +10,10 @@ from stcal.sfm.adjust.calibration import calibrate
 from stcal.sfm.adjust.group import adjust
 from stcal.sfm.adjust.options import AdjustOptions
 from stcal.sfm.adjust.refine import eccentricity_px
+from stcal.synthetic.scene import SceneOptions, make_scene
 
 
-def calibrated(scene, labels_only, hidden, seed=0, groups=("12", "14", "15", "23"), solve="joint"):
+def calibrated(scene, labels_only, hidden, seed=0, groups=("12", "14"), solve="joint"):
     """``hidden`` labels in the images of the ``groups``."""
     observations = [
         image.select([i for i, label in enumerate(image.labels) if not (label in hidden and image.group in groups)])
@@ -24,6 +25,14 @@ def calibrated(scene, labels_only, hidden, seed=0, groups=("12", "14", "15", "23
         model = replace(start, shift_px=eccentricity_px(start, scene.camera, radius, 1.0))
         models.append(adjust(model, scene.camera))
     return calibrate(models, scene.camera, scene.target, scene.board, AdjustOptions(reference_face="1", solve=solve))
+
+
+@pytest.fixture(scope="module")
+def scene():
+    """Two groups of five views, half-size camera."""
+    return make_scene(
+        SceneOptions(seed=3, width=2592, height=1728, images_per_group=5, groups=(("1", "2"), ("1", "4")))
+    )
 
 
 @pytest.fixture(scope="module")
@@ -64,10 +73,10 @@ def test_too_few_other_circles_are_refused(scene, labels_only):
 
 @pytest.mark.parametrize("solve", ["joint", "chain"])
 def test_a_frame_circle_that_one_group_lacks_is_taken_from_the_others(scene, labels_only, solve):
-    """Circle 1:3 in group 14 alone, the only one that links face 4: nothing is left to the design, which is 20 µm off.
-    Faces agree with those of all circles to a fraction of their σ, some 5 µm."""
+    """Circle 1:3 in group 14 alone, the only one that links face 4: nothing is left to the design, which is 20 µm off
+    and would move faces 2 and 4 by 24 and 11 µm. They agree with those of all circles to half of their σ of 13 µm."""
     whole = calibrated(scene, labels_only, (), solve=solve)
     found = calibrated(scene, labels_only, ("1:3",), groups=("14",), solve=solve)
     assert found.notes == whole.notes == ()
     for face_id, pose in whole.target.target_from_face.items():
-        assert np.linalg.norm(found.target.target_from_face[face_id].translation - pose.translation) < 0.004
+        assert np.linalg.norm(found.target.target_from_face[face_id].translation - pose.translation) < 0.007

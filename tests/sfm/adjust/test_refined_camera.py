@@ -38,7 +38,7 @@ def test_wrong_intrinsics_are_refined(sets, groups):
     """0.03 % in f, 2 px in c, 1 % in k1: within 1.5 times the error with the true camera; several times it without."""
     errors = []
     for seed in range(sets):
-        scene = make_scene(SceneOptions(seed=seed, images_per_group=6 if groups is None else 5, groups=groups))
+        scene = make_scene(SceneOptions(seed=seed, images_per_group=6 if groups is None else 4, groups=groups))
         observations = observe(scene, NOISE_PX, np.random.default_rng(seed))
         true = scene.camera
         k1 = np.array([0.01 * true.distortion[0], *[0] * 7])

@@ -280,7 +280,7 @@ def as_it_is(image):
     [
         (12, True, as_it_is, 3, as_it_is),  # 1.18 when the weights' cost was left out
         (8, False, as_it_is, 3, as_jpeg(50)),  # 1.5 when pixels were independent
-        (20, True, as_it_is, 3, as_jpeg(75)),  # 1.3
+        pytest.param(20, True, as_it_is, 3, as_jpeg(75), marks=pytest.mark.slow),  # 1.3
         (12, False, moved, 2, as_it_is),  # 0.65 when the model's even misfit was noise
     ],
 )

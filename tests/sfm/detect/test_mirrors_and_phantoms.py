@@ -100,6 +100,7 @@ def test_one_mirrored_image_loses_its_labels_and_says_so(bench):
     assert found.counts["must_dots"] == 2 * 63
 
 
+@pytest.mark.slow
 def test_a_mirrored_image_of_which_every_face_passes_for_another_is_told_by_its_board(bench):
     """Faces 2, 3 and 5 pass for 4, 5 and 3, which no image by itself can tell."""
     found = bench.label("mirrored", "one image", "23")
