@@ -49,8 +49,6 @@ def test_files_in_every_form_say_the_same(tmp_path, truth, unit, robot, camera):
     assert pairs.base_from_flange.difference(flange) == pytest.approx(np.zeros((8, 6)), abs=1e-9)
     assert pairs.camera_from_board.difference(board) == pytest.approx(np.zeros((8, 6)), abs=1e-9)
     assert pairs.names[:2] == ("line 2", "line 3")
-    found = handeye(pairs).flange_from_camera.translation
-    assert found == pytest.approx(handeye(truth.pairs).flange_from_camera.translation, abs=1e-5)
 
 
 @pytest.mark.parametrize(

@@ -111,7 +111,7 @@ def test_stated_sigma_that_are_far_too_large_are_said(robot, ratio):
     assert float(said.group(1)) < ratio
 
 
-@pytest.mark.parametrize("factor", [1, 4])
+@pytest.mark.parametrize("factor", [pytest.param(1, marks=pytest.mark.slow), 4])
 def test_covariances_of_the_board_s_poses_hold_up_to_a_factor(factor):
     """40 poses, 240 − 12 redundancies, most of them for the camera: 1/√(2·228) = 5 % of the factor, and what robot and
     camera take from each other."""

@@ -50,7 +50,7 @@ def test_the_size_of_the_board_is_found(setup, method):
     assert np.abs(error(found, truth)) @ [200, 200, 200, 1, 1, 1] < 4
 
 
-@pytest.mark.parametrize("setup", SETUPS)
+@pytest.mark.parametrize("setup", ["eye-in-hand", pytest.param("eye-to-hand", marks=pytest.mark.slow)])
 def test_derivatives_of_the_corners(setup):
     """Against central differences: of all shared unknowns, every ninth of the board's and the robot's."""
     truth = simulated_views(np.random.default_rng(5), 4, setup)

@@ -106,7 +106,12 @@ def test_a_bad_dot_is_weighed_down():
 
 @pytest.mark.parametrize(
     ("model", "distortion"),
-    [("SIMPLE_PINHOLE", []), ("SIMPLE_RADIAL", [-0.1]), ("RADIAL", [-0.1, 0.05]), ("PINHOLE", [])],
+    [
+        ("SIMPLE_RADIAL", [-0.1]),
+        ("PINHOLE", []),
+        pytest.param("SIMPLE_PINHOLE", [], marks=pytest.mark.slow),
+        pytest.param("RADIAL", [-0.1, 0.05], marks=pytest.mark.slow),
+    ],
 )
 def test_models(model, distortion):
     camera = replace(TRUE, focal=[2790.0, 2790.0], distortion=np.pad(np.array(distortion), (0, 8 - len(distortion))))

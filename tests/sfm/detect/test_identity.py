@@ -66,7 +66,9 @@ def find_faces(ellipses, **kwargs):
 
 
 @pytest.mark.parametrize("face_id", ["1", "2", "3", "4", "5"])
-@pytest.mark.parametrize(("tilt", "azimuth", "roll"), [(0, 0, 0), (45, 80, 100), (68, 200, 250)])
+@pytest.mark.parametrize(
+    ("tilt", "azimuth", "roll"), [(0, 0, 0), pytest.param(45, 80, 100, marks=pytest.mark.slow), (68, 200, 250)]
+)
 def test_every_face_is_named_at_any_tilt(face_id, tilt, azimuth, roll):
     finding = find_faces(face_ellipses(face_id, pose(tilt, azimuth, roll)))
     assert [r.face.id for r in finding.faces] == [face_id]
