@@ -174,7 +174,8 @@ def run(
     from stcal.locate.pose.verdict import VerdictOptions
     from stcal.locate.report.chain import read_chain
     from stcal.locate.report.located import LocatedFile
-    from stcal.locate.report.tables import accepted, poses_csv, run_text
+    from stcal.locate.report.plausible import on_chain
+    from stcal.locate.report.tables import accepted, poses_csv, run_text, uncertain
 
     if hand_eye is None and (robot_poses or offset):
         raise InputError("--robot-poses, --offset: only with --hand-eye, which leads from the camera to the robot")
@@ -197,7 +198,9 @@ def run(
     if missing:
         raise InputError(f"robot poses {robot_poses}: none of scene {missing[0]}; add a row, or take the scene away")
     results = list(located(scenes, target, model, LocateOptions(method.value, limits, patent, moved_px, workers)))
+    doubts = on_chain(chain, {each.name: uncertain(each) for each in accepted(results)}) if chain else ()
     say(run_text(results, chain))
+    print_each("warning", doubts)
     print_each("not used", (each for scene in scenes for each in scene.skipped))
     if out:
         write(out, poses_csv(results, chain))
