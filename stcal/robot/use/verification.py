@@ -20,6 +20,9 @@ from stcal.robot.use.files import VerificationFile
 WHAT = "measured positions"
 SAME_MM = 1e-6
 """Commanded positions nearer than this are the same command: what printing makes of a number."""
+MISSES, MISSES_MM = 0.05, 20.0
+"""Share of the commanded distances, and mm, RMS of all pairs, by which measured ones miss them: arms err by under 1 %
+of their 2 m, and a robot model that is not the arm's, or rows in another order, by more."""
 SCALE_WITHIN = 0.01
 """Arms are off by parts of a thousand; measured distances off by more in common are of another unit or other poses."""
 
@@ -48,7 +51,8 @@ class SetResult:
 
     ``error_mm`` : (m − 1,) measured minus commanded distance from the first position; ``mean_mm``, ``std_mm``,
     ``max_mm`` : of their absolute values, the standard deviation with m − 2 in the denominator; ``pairs_rms_mm`` :
-    of the errors of all pairs; ``scale`` : measured over commanded distances of all pairs, by least squares.
+    of the errors of all pairs; ``pairs_mm`` : of their commanded distances; ``scale`` : measured over commanded
+    distances of all pairs, by least squares.
     """
 
     name: str
@@ -57,7 +61,23 @@ class SetResult:
     std_mm: float
     max_mm: float
     pairs_rms_mm: float
+    pairs_mm: float
     scale: float
+
+    def doubt(self) -> str:
+        """Why this may not be an arm at its commands; empty where it may."""
+        if abs(self.scale - 1) > SCALE_WITHIN:
+            return (
+                f"set {self.name}: measured distances are {self.scale:.4f} times the commanded ones; "
+                "check units and the order of the poses"
+            )
+        allowed = max(MISSES * self.pairs_mm, MISSES_MM)
+        if self.pairs_rms_mm <= allowed:
+            return ""
+        return (
+            f"set {self.name}: measured distances miss the commanded ones by {self.pairs_rms_mm:.4g} mm (RMS of all "
+            f"pairs), {allowed:.3g} mm allowed; check the order of the poses, and the robot that commanded them"
+        )
 
     def figures(self) -> dict[str, float]:
         """What is compared between sets, mm."""
@@ -90,12 +110,7 @@ class Verification:
             for name, poses in self.missing.items()
             if poses
         ]
-        return found + [
-            f"set {s.name}: measured distances are {s.scale:.4f} times the commanded ones; "
-            "check units and the order of the poses"
-            for s in self.sets
-            if abs(s.scale - 1) > SCALE_WITHIN
-        ]
+        return found + [doubt for each in self.sets if (doubt := each.doubt())]
 
 
 def read_measured(path: str | Path) -> MeasuredPoses:
@@ -215,6 +230,7 @@ def _set_result(data: MeasuredPoses, name: str, rows: np.ndarray) -> SetResult:
         std_mm=float(size.std(ddof=1)),
         max_mm=float(size.max()),
         pairs_rms_mm=float(np.sqrt(squares / pairs)),
+        pairs_mm=float(np.sqrt(wanted_squares / pairs)),
         scale=product / wanted_squares,
     )
 

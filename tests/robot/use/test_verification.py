@@ -9,7 +9,7 @@ import pytest
 from stcal.cli.main import main
 from stcal.errors import InputError
 from stcal.geometry.rigid import Rigid
-from stcal.robot.use.verification import read_measured, verification_file, verified_text, verify
+from stcal.robot.use.verification import MeasuredPoses, read_measured, verification_file, verified_text, verify
 
 HEAD = "set,commanded_x_mm,commanded_y_mm,commanded_z_mm,x_mm,y_mm,z_mm"
 COMMANDED = np.array([[0, 0, 0], [30, 0, 0], [0, 40, 0], [0, 0, 50], [60, 80, 0]], float)
@@ -154,3 +154,18 @@ def test_command_line(tmp_path, monkeypatch, capsys):
     with pytest.raises(SystemExit) as caught:
         main()
     assert caught.value.code == 2
+
+
+@pytest.mark.parametrize(("off_mm", "warned"), [(0.0, False), (15.0, False), (4100.0, True)])
+def test_commands_of_another_robot_are_said(off_mm, warned):
+    """Distances that miss the commanded ones, though they are as long in all: no other unit."""
+    rng = np.random.default_rng(3)
+    commanded, away = rng.uniform(-1000, 1000, (40, 3)), rng.normal(0, 1, (40, 3))
+    wrong = commanded + off_mm * away / np.linalg.norm(away, axis=1, keepdims=True)
+
+    def result_of(positions):
+        return verify(MeasuredPoses("t", range(2, 42), ("a",) * 40, tuple(map(str, range(40))), commanded, positions))
+
+    warnings = result_of(wrong / result_of(wrong).sets[0].scale).warnings()
+    assert len(warnings) == warned
+    assert all("set a: measured distances miss the commanded ones by" in warning for warning in warnings)
