@@ -223,6 +223,7 @@ def _robot() -> list[Mistake]:
             "decimal commas": decimal_commas(data),
             "robot in metres": number_times(robot, "(?:a|d)_mm", 1e-3),
             "robot in inches": number_times(robot, "(?:a|d)_mm", INCH),
+            "nominal robot 4.1 m off": text(robot, r"d_mm = 1025\.0", "d_mm = 5125.0"),
             "modified for standard": text(robot, '"standard"', '"modified"'),
             "alpha in rad": number_times(robot, "alpha_deg", np.pi / 180),
             "theta of joint 2 left out": text(robot, r"theta_deg = -90\.0", "theta_deg = 0.0"),

@@ -56,6 +56,8 @@ QUICK = [
     "register: rows one late",
     "verify: measured in inches",
     "handeye, poses: both inverse",
+    "compare: truth in metres",
+    "compensate: x y z w",
 ]
 
 
