@@ -197,7 +197,7 @@ def _worst(circles: _Circles, keep: np.ndarray) -> dict[int, str]:
     for image, plane in {(circles.image[k], circles.plane[k]) for k in np.flatnonzero(outlying)}:
         own = np.flatnonzero(keep & (circles.image == image) & (circles.plane == plane))
         worst = own[np.argmax(np.where(outlying[own], off[own] / limit[own], 0))]
-        away = f"{off[worst]:.1f} px from its place, {limit[worst]:.1f} allowed"
+        away = f"{off[worst]:.3g} px from its place, {limit[worst]:.3g} allowed"
         if alone[worst] and enough[worst]:
             why = f"{circles.rows[worst][1]} is {away}, and no other image of the group tells which circles are right"
             found |= dict.fromkeys(own.tolist(), why)

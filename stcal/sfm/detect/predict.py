@@ -127,9 +127,9 @@ def _disagreement(shape_px: np.ndarray, off_px: float, stretch: tuple[float, flo
     largest, smallest = singular_values(shape_px)
     allowed = max(MAX_POSITION_ERROR * float(np.sqrt(largest * smallest)), MAX_POSITION_ERROR_PX)
     if off_px > allowed:
-        return f"{off_px:.1f} px from its place, {allowed:.1f} allowed"
+        return f"{off_px:.3g} px from its place, {allowed:.3g} allowed"
     most, limit = max(stretch[0], 1 / stretch[1]), MAX_STRETCH * (1 + 0.5 / float(smallest))
-    return f"{most:.2f} times its size along one direction, {limit:.2f} allowed" if most > limit else ""
+    return f"{most:.3g} times its size along one direction, {limit:.3g} allowed" if most > limit else ""
 
 
 def measure_predicted(
