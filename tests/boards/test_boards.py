@@ -24,6 +24,7 @@ def turn(degrees: float) -> np.ndarray:
     return about @ np.array([[c, -s, 0], [s, c, 0], [0, 0, 1]]) @ np.linalg.inv(about) @ IMAGE_FROM_MM
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("rows", "columns"),
     [(5, 8), *(pytest.param(*size, marks=pytest.mark.slow) for size in ((6, 6), (6, 7), (7, 7), (6, 8)))],

@@ -308,6 +308,7 @@ def test_a_board_that_was_moved_half_way_is_said(moved, sets):
     assert said >= 0.9 * sets if moved else said == 0
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("sets", [1, pytest.param(10, marks=pytest.mark.slow)])
 def test_rough_poses_that_fit_another_setup_better_are_said(sets):
     """Errors of 0.5° and 5 mm, and turns of few degrees: no setup fits well, but the right one is named."""

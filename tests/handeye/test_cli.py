@@ -246,6 +246,7 @@ def chessboard(tmp_path_factory):
     return photographs(tmp_path_factory.mktemp("chess"), *chessboard_mm(6, 8, 20.0), seen, toml)
 
 
+@pytest.mark.slow
 def test_images_of_a_symmetric_chessboard(command, chessboard, tmp_path):
     names = ("h.json", "ros.yaml", "h.urdf", "cv.yaml", "page.html", "cameras.txt")
     out, ros, urdf, opencv, page, camera = (tmp_path / name for name in names)

@@ -163,6 +163,7 @@ def with_board(kind: str) -> np.ndarray:
     return printed
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", ["dots", pytest.param("chessboard", marks=pytest.mark.slow)])
 def test_calibrate_with_boards_of_other_kinds(stcal, tmp_path, kind):
     printed, rng = with_board(kind), np.random.default_rng(1)

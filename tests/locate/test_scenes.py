@@ -91,6 +91,7 @@ def test_tags_of_another_target_are_named(located, plain):
     assert "no tag of the layout, but others of its dictionaries" in result.verdict.reasons[0]
 
 
+@pytest.mark.slow
 def test_one_tag_edge_on(located):
     """From 82° on a tag is not read, or its pose not believed."""
     decisions = []

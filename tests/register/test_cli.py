@@ -271,6 +271,7 @@ def robot_pairs(tmp_path_factory):
     return folder, pairs, real
 
 
+@pytest.mark.slow
 def test_base_and_kinematics_together(run, tmp_path, robot_pairs):
     folder, pairs, real = robot_pairs
     out, page, identified = tmp_path / "o.json", tmp_path / "o.html", tmp_path / "identified.toml"

@@ -59,6 +59,7 @@ def _blobs(scene, group, image, options):
     return np.array(measured), np.array(exact), np.array(centres)
 
 
+@pytest.mark.slow
 def test_centroids_and_areas_agree_with_the_exact_rim():
     scene = make_scene(replace(OPTIONS, width=1296, height=864, distortion=(-0.15, 0.05, 1e-3, -5e-4)))
     measured, exact, centres = _blobs(scene, "12", 0, replace(PLAIN, bit_depth=16))
@@ -108,6 +109,7 @@ def test_clutter_adds_objects_behind_but_leaves_circles_alone(scene):
     np.testing.assert_array_equal(plain[y, x], full[y, x])
 
 
+@pytest.mark.slow
 def test_vignetting_gradient_blur_and_exposure(second):
     def picture(**changes):
         return render(second, "top-left", 1, replace(PLAIN, bit_depth=16, **changes)).astype(float)

@@ -50,6 +50,7 @@ def test_the_size_of_the_board_is_found(setup, method):
     assert np.abs(error(found, truth)) @ [200, 200, 200, 1, 1, 1] < 4
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("setup", ["eye-in-hand", pytest.param("eye-to-hand", marks=pytest.mark.slow)])
 def test_derivatives_of_the_corners(setup):
     """Against central differences: of all shared unknowns, every ninth of the board's and the robot's."""
@@ -75,6 +76,7 @@ def test_derivatives_of_the_corners(setup):
             assert np.abs(slope - numeric).max() <= 1e-5 * max(np.abs(slope).max(), 1)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("setup", "count"),
     [("eye-in-hand", 2), *(pytest.param(setup, 20, marks=pytest.mark.slow) for setup in SETUPS)],
@@ -186,6 +188,7 @@ def test_a_camera_file_that_is_right_keeps_its_sigma():
     assert off @ np.linalg.solve(found.reprojection.camera_covariance, off) < 4 * 8
 
 
+@pytest.mark.slow
 def test_a_pose_of_the_robot_that_is_wrong_is_left_out():
     """By 1° and 5 mm, 100 σ: not gross, but told by the other poses."""
     truth = simulated_views(np.random.default_rng(11), 12, robot=(2e-4, 0.05), corner_px=0.1)

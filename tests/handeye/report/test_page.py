@@ -81,6 +81,7 @@ def test_the_text_has_the_transform_with_its_sigma(of_views):
     assert " px (estimated)" in text
 
 
+@pytest.mark.slow
 def test_every_sigma_that_there_is_has_a_name():
     """A camera file that is off: its σ are widened, and the factor is among the σ."""
     truth = simulated_views(np.random.default_rng(2), 7, "eye-in-hand", (2e-4, 0.1), 0.1)

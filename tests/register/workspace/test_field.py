@@ -123,6 +123,7 @@ def test_points_of_different_sigma():
     assert errors["told"] < 0.7 * errors["untold"]
 
 
+@pytest.mark.slow
 def test_few_points_and_many():
     a, b = bent(0, 5)
     assert fitted(a, b)[1] is None
@@ -160,6 +161,7 @@ def test_cubes_by_hand():
     assert outer[3].mean_mm == pytest.approx(5 * 125 / 729, rel=0.05)
 
 
+@pytest.mark.slow
 def test_points_in_the_cube_are_held_out():
     """Ten points in it: a fit to them has residuals 1 − 6/30 of the noise's square, held out it is above."""
     inside = []

@@ -164,6 +164,7 @@ def test_errors_of_pairs_are_as_large_as_their_sigma():
     assert np.mean(np.square(scores), axis=0) == pytest.approx([1, 1], abs=0.33)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("instants", [(12,), pytest.param((3, 30), marks=pytest.mark.slow)])
 def test_leaving_out_a_row_is_fitting_without_it(instants):
     nominal = mh80()
@@ -180,6 +181,7 @@ def test_leaving_out_a_row_is_fitting_without_it(instants):
         assert np.abs(found - [p.distance for p in whole.pairs]).max() > 1e-4
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("off_mm", [2000.0, *(pytest.param(off, marks=pytest.mark.slow) for off in (0.5, 20.0, 300.0))])
 def test_a_gross_error_is_named_and_left_out(off_mm):
     nominal = mh80()
@@ -194,6 +196,7 @@ def test_a_gross_error_is_named_and_left_out(off_mm):
         assert abs(one.distance - two.distance) < 3 * two.distance_sigma  # one of 18 points less
 
 
+@pytest.mark.slow
 def test_a_reflector_on_the_axis_says_nothing_and_breaks_nothing():
     nominal = mh80()
     true = replace(arm(nominal), tools=TOOLS | {"D": Rigid(np.eye(3), [0.01, 0, 300])})

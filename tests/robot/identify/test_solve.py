@@ -232,6 +232,7 @@ def test_an_outlier_is_named_and_does_no_harm():
     assert spoilt.weighting.sigma_mm == pytest.approx(clean.weighting.sigma_mm, rel=0.05)
 
 
+@pytest.mark.slow
 def test_many_outliers_do_not_pass_for_noise():
     _, data = simulated(11, 60)
     positions = data.positions.copy()

@@ -121,6 +121,7 @@ def test_every_tool_by_its_name(case):
         compensate(case.real, read_targets(case.write(["target", *JOINTS], rows), case.real), case.nominal)
 
 
+@pytest.mark.slow
 def test_what_is_not_reached_keeps_its_row_without_joint_values(case):
     rows = case.pose_rows()[:FEW]
     rows[4][:3] = ["5000", "0", "0"]

@@ -121,6 +121,7 @@ def test_targets_in_the_arms_foot_are_said(factor, words, count):
         assert words in notes[0]
 
 
+@pytest.mark.slow
 def test_a_convention_that_brings_poses_within_reach_is_said():
     """Of an arm that reaches down alone: its orientations in another order are out of reach."""
     nominal = arm(3)

@@ -41,6 +41,7 @@ def whole(scene, labels_only):
     return calibrated(scene, labels_only, ()).target
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "hidden", [("1:1", "1:5", "2:3"), *(pytest.param((one,), marks=pytest.mark.slow) for one in ("1:3", "2:1"))]
 )

@@ -33,6 +33,7 @@ def position_error_um(scene, observations, camera, refine_camera: bool) -> float
     return 1e3 * float(np.sqrt(np.mean(np.sum(np.square(off), axis=1))))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("sets", "groups"), [(1, TWO), pytest.param(3, None, marks=pytest.mark.slow)])
 def test_wrong_intrinsics_are_refined(sets, groups):
     """0.03 % in f, 2 px in c, 1 % in k1: within 1.5 times the error with the true camera; several times it without."""

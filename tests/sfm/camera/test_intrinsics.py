@@ -64,6 +64,7 @@ def error(result, truth=TRUE) -> np.ndarray:
     return model_parameters(result.camera, result.colmap_model) - model_parameters(truth, result.colmap_model)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("count", [3, pytest.param(40, marks=pytest.mark.slow)])
 def test_truth_within_predicted_sigma(count):
     # Of 40 calibrations from nothing the normalised squared error of 8 parameters scatters by 8 % about 1.
@@ -80,6 +81,7 @@ def test_truth_within_predicted_sigma(count):
     assert 0.05 < result.sigma()[0] < 0.2
 
 
+@pytest.mark.slow
 def test_sigma_follows_what_the_centres_do():
     # Centres five times as bad as they say: found out, and σ grow as much.
     views = views_of(np.random.default_rng(5), noise_px=0.1)
@@ -154,6 +156,7 @@ def test_a_model_that_does_not_fit_is_refused():
         require_determined(calibrated(views, "PINHOLE"), views)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("count", [1, pytest.param(4, marks=pytest.mark.slow)])
 def test_split_half_passes_honest_views(count):
     p = []
@@ -166,6 +169,7 @@ def test_split_half_passes_honest_views(count):
         assert np.mean(p) == pytest.approx(0.5, abs=0.43)  # uniform: σ of the mean 0.14
 
 
+@pytest.mark.slow
 def test_split_half_fails_a_changed_focus():
     rng = np.random.default_rng(3)
     made = np.column_stack([BOARD.xy_mm(), np.zeros(63)])
@@ -244,6 +248,7 @@ def test_photographs_give_a_camera_file_that_runs_take_as_prior(stcal_sfm, small
     assert any("no dots near the corner" in warning for warning in summary["warnings"])
 
 
+@pytest.mark.slow
 def test_views_give_a_camera_file_that_runs_take_as_prior(stcal_sfm, small_dataset, tmp_path, monkeypatch):
     """The command, with simulated views in place of what is read from the photographs."""
     views, out = views_of(np.random.default_rng(10), count=8), tmp_path / "camera.txt"
@@ -269,6 +274,7 @@ def test_images_without_a_board_are_refused(stcal_sfm, tmp_path):
     assert not (tmp_path / "c.txt").exists()
 
 
+@pytest.mark.slow
 def test_two_views_are_refused_and_another_size_is_named(stcal_sfm, small_set):
     own = small_set("12", detected=False)
     own.image(3).unlink()

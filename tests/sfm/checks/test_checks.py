@@ -96,6 +96,7 @@ def test_honest_runs_pass(full_scene, lab, noise_px, seed):
     assert 20 < max(m.value for m in control if m.unit == "µm") < 300  # tens of µm, at residuals of a hundredth of a px
 
 
+@pytest.mark.slow
 def test_the_joint_result_is_checked_by_its_parts(labels_only, lab):
     """A loop of three groups: halves, groups left out and ways around the loop agree."""
     options = SceneOptions(seed=5, images_per_group=4, width=2592, height=1728)
@@ -178,6 +179,7 @@ def test_a_moved_target_is_named(full_scene, lab, solve):
     assert check.measured[0].value > 80  # µm
 
 
+@pytest.mark.slow
 def test_an_adjustment_that_has_not_settled_is_flagged(lab, monkeypatch):
     """One step comes within a hundredth of a pixel of the minimum, which is not at it."""
     scene = make_scene(SceneOptions(seed=3, images_per_group=4, groups=(("1", "2"), ("1", "4"))))

@@ -275,6 +275,7 @@ def as_it_is(image):
     return image
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("radius", "bright", "before", "noise", "after"),
     [

@@ -123,6 +123,7 @@ def test_a_printed_grid_of_equal_discs_is_no_face(radius):
     assert find_faces(ellipses_of(pose(20, 10, 30), own.xy_mm, np.full(10, radius))).faces == ()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("seed", [0, *(pytest.param(seed, marks=pytest.mark.slow) for seed in range(1, 5))])
 def test_random_discs_are_no_faces_and_hide_none(seed):
     assert find_faces(junk(150, seed)).faces == ()

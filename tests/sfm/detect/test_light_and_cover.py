@@ -57,6 +57,7 @@ def test_all_circles_are_labelled_whatever_light_a_plane_has(bench, kind, value,
     bench.label(kind, value, group).assert_all_found()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("group", ["12", *OTHERS])
 def test_three_of_ten_circles_of_every_face_hidden_in_every_image(bench, group):
     """Others in each image, at random: of those in view all are found, and none of the hidden ones."""
@@ -93,6 +94,7 @@ def test_a_strip_over_the_first_images_board_leaves_the_others_theirs(bench):
         assert 63 - hidden - waived <= len(found.labels(name, "board")) <= 63 - hidden
 
 
+@pytest.mark.slow
 def test_images_that_show_other_halves_of_the_board_number_it_together(bench):
     """Two show three full rows at one end, one at the other: none can tell which rows they are, all three can. The one
     whose covered dots would lie in the image takes them for dots outside of it, when it is asked alone."""

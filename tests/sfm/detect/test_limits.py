@@ -20,6 +20,7 @@ def checkerboard(side: int = 6) -> np.ndarray:
     return cv2.GaussianBlur((((x // side) + (y // side)) % 2 * 160 + 40).astype(np.uint8), (0, 0), 0.7)
 
 
+@pytest.mark.slow
 def test_of_a_fine_pattern_the_largest_outlines_are_tried_and_it_is_said(monkeypatch):
     monkeypatch.setattr(stage, "MAX_FREE", 60)
     found = stage.detect_image(checkerboard(), CAMERA, reference_target(), reference_board(), EllipseOptions())

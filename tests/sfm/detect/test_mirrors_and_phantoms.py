@@ -89,6 +89,7 @@ def test_a_face_that_another_group_has_elsewhere_goes_out(scene, two_groups):
     assert sum("a pattern like face 3: not where other groups see that face" in note for note in notes) == len(own)
 
 
+@pytest.mark.slow
 def test_one_mirrored_image_loses_its_labels_and_says_so(bench):
     found = bench.label("mirrored", "one image")
     found.assert_all_found()

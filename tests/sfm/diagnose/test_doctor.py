@@ -345,6 +345,7 @@ def test_files_and_images_left_out_whole(patient, mended):
         assert patient.mapped()[0] == set(IMAGES)
 
 
+@pytest.mark.slow
 def test_images_that_moved_or_are_gone(patient, tmp_path):
     patient.hide(FIRST, "2:7")
     patient.run()

@@ -397,6 +397,7 @@ def assert_all_ended(pids: Path, count: int) -> None:
     assert all(has_ended(pid) for pid in found)
 
 
+@pytest.mark.slow
 def test_a_mapper_that_hangs_with_a_child(refused, tmp_path):
     pids = tmp_path / "pids"
     path = program(tmp_path, f'sleep 61 & echo $$ $! > "{pids}"; wait')
@@ -406,6 +407,7 @@ def test_a_mapper_that_hangs_with_a_child(refused, tmp_path):
     assert_all_ended(pids, 2)
 
 
+@pytest.mark.slow
 def test_a_program_that_hangs_when_asked(refused, tmp_path, monkeypatch):
     monkeypatch.setattr(native, "ASK_SECONDS", 1.5)
     pids = tmp_path / "pids"
@@ -477,6 +479,7 @@ def test_what_the_mapper_is_given(own_run, refused, tmp_path):
     assert not given["--database_path"].startswith(str(own_run))
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("no_page")
 def test_a_model_that_lacks_an_image(own_run, stcal_sfm, colmap, tmp_path):
     """One that is not of the initial pair, taken from the list."""

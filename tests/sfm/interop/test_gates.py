@@ -108,6 +108,7 @@ def test_the_defaults_want_more(judged):
     assert rows["20 of 25"].defaults.relaxations is None
 
 
+@pytest.mark.slow
 def test_verdicts_are_what_colmap_does(scene, judged, tmp_path):
     """Started from the pair, COLMAP registers it where the verdict says so, and makes no model where it does not."""
     group, rows = judged

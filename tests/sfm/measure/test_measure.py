@@ -77,6 +77,7 @@ SLOW = pytest.mark.slow
 COUNTS = [50, pytest.param(MANY, marks=SLOW)]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("count", COUNTS)
 def test_errors_of_single_faces_are_as_predicted(scene, known, count):
     """500 images: the mean of χ²(6)/6 has a standard error of 0.026; every image has a target of its own."""
@@ -89,6 +90,7 @@ def test_errors_of_single_faces_are_as_predicted(scene, known, count):
     assert flipped == 0
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("count", COUNTS)
 @pytest.mark.parametrize("faces", [pytest.param(("1", "2"), marks=SLOW), ("1", "4", "5")])
 def test_errors_of_several_faces_are_as_predicted(scene, known, faces, count):

@@ -93,6 +93,7 @@ def require_chi2(errors: np.ndarray, covariance: np.ndarray):
     assert low < square < high, square / errors.size
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("common", "draws"), [(0.0, 5), *(pytest.param(*p, marks=SLOW) for p in ((0.0, 60), (0.99, 25)))]
 )
@@ -235,6 +236,7 @@ def test_the_board_dominates_where_it_is_bad(known, advice, coarse):
     assert found.choices[0].sigma_mm > 0.9 * found.now.worst()[1]
 
 
+@pytest.mark.slow
 def test_a_new_group_is_advised_for_faces_not_seen_together(coarse):
     """Faces 2 and 5 meet in no group; the forecast of a third group is what a scene with that group has."""
     pairs = (("1", "2"), ("1", "5"), ("2", "5"))
@@ -296,6 +298,7 @@ def test_advise_command(stcal_sfm, small_run, tmp_path, coarse):
     assert "warning" not in text
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("file", "change", "warning"),
     [
@@ -350,6 +353,7 @@ def test_plan_remedies_are_plans_of_their_own():
     assert 0.65 < two.remedies[0].sigma_mm / two.forecast.worst()[1] < 0.95
 
 
+@pytest.mark.slow
 def test_plan_names_what_dominates():
     one = (("1", "2"),)
     assert plan(noise=CentreNoise(0.0, floor_px=0.05), groups=one).shares["2"]["image noise"] > 0.9
@@ -371,6 +375,7 @@ def test_plan_says_what_is_wrong(stcal_sfm, arguments, message):
     assert message in error
 
 
+@pytest.mark.slow
 def test_plan_out_of_reach(stcal_sfm):
     code, _, error = stcal_sfm("plan", "--distance", 300, "--images", 2, "--groups", "12")
     assert (code, error.count("\n")) == (3, 1)
@@ -397,6 +402,7 @@ def test_plan_of_another_design_needs_its_faces(faces, message, tmp_path):
         nominal_poses(target, None if faces is None else path)
 
 
+@pytest.mark.slow
 def test_plan_of_another_design_with_its_faces(tmp_path):
     from stcal.sfm.plan.nominal import nominal_poses
 

@@ -251,6 +251,7 @@ def test_a_group_without_a_face(small_set, small_scene, stcal_sfm):
     assert_left_out(small, stcal_sfm, *parts)
 
 
+@pytest.mark.slow
 def test_another_target_than_the_file_says(small_set, stcal_sfm, small_scene):
     small = small_set("12", detected=False)
     for i in (2, 3):
@@ -426,6 +427,7 @@ def test_a_camera_of_opencv_for_larger_images(small_set, stcal_sfm):
     assert_error(outcome, INPUT, f"camera file {path}", *parts)
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("no_page")
 def test_another_camera_than_took_the_images(small_set, stcal_sfm):
     small = small_set("12")

@@ -48,6 +48,7 @@ def test_an_image_without_a_circle_is_reported_and_harms_nothing(small_set):
     assert "0 of its circles are in the model, 6 needed" in reasons["12/black.png"]
 
 
+@pytest.mark.slow
 def test_kept_results_are_not_taken_for_other_options(small_set, tmp_path):
     small = small_set("12", "14")  # its groups are kept, with the correction
     folder = small.folder
@@ -67,6 +68,7 @@ def test_kept_results_are_not_taken_for_other_options(small_set, tmp_path):
     assert not any(image.reused for image in detection.images)
 
 
+@pytest.mark.slow
 def test_a_damaged_cache_is_made_anew(small_set):
     small = pair(small_set)
     first = calibrate(small.folder, small.out)
