@@ -23,12 +23,12 @@ LOADING = {signal.SIGINT: ("interrupted", 130), signal.SIGTERM: ("terminated", 1
 
 def main() -> None:
     """Entry point of ``stcal``."""
-    _program().main()
+    _run("main")
 
 
 def main_sfm() -> None:
     """Entry point of ``stcal-sfm``."""
-    _program().main_sfm()
+    _run("main_sfm")
 
 
 def lacks_memory(error: BaseException) -> bool:
@@ -37,6 +37,16 @@ def lacks_memory(error: BaseException) -> bool:
     while last := chain[-1].__cause__ or chain[-1].__context__:
         chain.append(last)
     return any(isinstance(e, MemoryError) or any(words in str(e).lower() for words in USED_UP) for e in chain)
+
+
+def _run(name: str) -> None:
+    """A program; once it has its exit code, signals change it no more. Python takes handlers away while it ends, and a
+    signal would then end a command, whose results are in place, as if it had failed."""
+    try:
+        getattr(_program(), name)()
+    finally:
+        for number in LOADING:
+            signal.signal(number, signal.SIG_IGN)
 
 
 def _program() -> ModuleType:

@@ -2,6 +2,7 @@
 
 import re
 import tracemalloc
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -14,7 +15,9 @@ from stcal.handeye import HandEyeOptions, HandEyePoses, handeye
 from stcal.handeye.data.loop import Loop
 from stcal.handeye.data.views import View, Views, pairs_of_views
 from stcal.handeye.judge.observability import Observability
+from stcal.handeye.judge.remarks import of_size
 from stcal.handeye.judge.symmetry import repair
+from stcal.handeye.methods.noise import Noise
 from stcal.io.quaternions import INVERTED
 from stcal.synthetic.measured.handeye import (
     BASE_FROM_BOARD,
@@ -452,3 +455,15 @@ def test_rough_poses_of_a_square_board_are_put_right(seed):
     mended = repair(HandEyePoses(truth.pairs.base_from_flange, board), "eye-in-hand", tuple(every[1:]))
     left = np.array([every[k].rotation @ every[t].rotation for k, t in zip(labels, mended.turned, strict=True)])
     assert np.abs(left - left[0]).max() < 1e-9
+
+
+def test_a_board_of_another_size_is_said_of_few_poses_too():
+    """It makes the σ of the robot, and with them those of its own step: 7 poses leave 3.6 of them."""
+    truth = simulated(np.random.default_rng(3), 7, robot=(1e-6, 1e-3), camera=(1e-5, 1e-2))
+    seen = truth.pairs.camera_from_board
+    large = replace(truth.pairs, camera_from_board=Poses(seen.rotation, 1.05 * seen.translation))
+    loop = Loop.of(large, "eye-in-hand")
+    (note,) = of_size(loop, (0.9523, 0.0132), Noise())
+    assert "the board is 0.952" in note
+    assert of_size(loop, (0.9523, 0.03), Noise()) == ()
+    assert of_size(Loop.of(truth.pairs, "eye-in-hand"), (0.9523, 0.0132), Noise()) == ()

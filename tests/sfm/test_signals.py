@@ -29,6 +29,16 @@ def test_while_libraries_load(number, said, code):
     assert ended(process, number) == (code, [said])
 
 
+@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT])
+def test_a_signal_after_the_answer_changes_no_exit_code(number):
+    """While Python ends itself; the results are in place."""
+    begin = f"import atexit, os; atexit.register(os.kill, os.getpid(), {int(number)}); {SFM[-1]}"
+    found = subprocess.run(
+        [sys.executable, "-P", "-c", begin, "--version"], capture_output=True, text=True, check=False
+    )
+    assert (found.returncode, found.stderr) == (0, "")
+
+
 def test_colmaps_bindings_leave_the_signals_as_they_were():
     begin = (
         "import signal, sys; signal.signal(signal.SIGTERM, lambda *_: sys.exit(7));"

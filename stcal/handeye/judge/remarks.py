@@ -13,6 +13,8 @@ from stcal.handeye.methods.start import robust
 
 SIZE_SIGMAS, SIZE_SHARE = 4.0, 1e-3
 """A board's size is doubted beyond so many σ, and a share that matters: 0.5 mm at half a metre."""
+HINTED = 2.0
+"""So many σ of one step's scale have it solved for: a wrong size makes these σ itself, and of few poses all of them."""
 MANY = 0.25
 """Share of the poses that may be bad before something else is suspected."""
 LEAST_IN_GROUPS, APART = 10, 0.9
@@ -61,14 +63,14 @@ def of_groups(names: tuple[str, ...], residuals: np.ndarray) -> tuple[str, ...]:
 
 def of_size(loop: Loop, hint: tuple[float, float], noise: Noise) -> tuple[str, ...]:
     """Where the board is of another size than stated: ``hint`` is what one step makes of its scale, with σ."""
-    if not _is_other(*hint):
+    if not _is_other(*hint, HINTED):
         return ()
-    try:  # the step is a large one, and its σ are those of residuals that a wrong size makes
+    try:  # the step is a large one
         found = adjust_poses(loop, LoopState(*robust(loop, with_scale=True)), noise, with_scale=True)
     except StcalError:
         return ()
     scale, sigma = found.state.scale, float(np.sqrt(generalised_inverse(found.normal)[12, 12]))
-    if not (_is_other(scale, sigma) and scale_is_seen(scale, sigma, len(loop))):
+    if not (_is_other(scale, sigma, SIZE_SIGMAS) and scale_is_seen(scale, sigma, len(loop))):
         return ()
     return (
         f"by the robot's motion the board is {scale:.4f} ± {sigma:.2g} times as large as stated{unit_of(scale)}: check "
@@ -76,8 +78,8 @@ def of_size(loop: Loop, hint: tuple[float, float], noise: Noise) -> tuple[str, .
     )
 
 
-def _is_other(scale: float, sigma: float) -> bool:
-    return abs(scale - 1) > max(SIZE_SIGMAS * sigma, SIZE_SHARE)
+def _is_other(scale: float, sigma: float, sigmas: float) -> bool:
+    return abs(scale - 1) > max(sigmas * sigma, SIZE_SHARE)
 
 
 def of_distance(loop: Loop) -> tuple[str, ...]:
