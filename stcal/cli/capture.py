@@ -19,7 +19,7 @@ app = typer.Typer()
 def plan(
     images: Annotated[int, typer.Option("--images", min=2, max=500, help="Plan this many images in each group.")] = 10,
     spread: Annotated[float, typer.Option(min=2, max=80, help="Spread the views by ± this, degrees.")] = 40.0,
-    distance: Annotated[float, typer.Option(min=50, help="Place the camera at this distance, mm.")] = 1000.0,
+    distance: Annotated[float, typer.Option(min=50, max=1e5, help="Place the camera at this distance, mm.")] = 1000.0,
     width: Annotated[
         int, typer.Option(min=320, help="Take images of this width, px; 3:2 images of a 24 mm lens.")
     ] = 5184,

@@ -35,7 +35,7 @@ def simulate(
     folder: Annotated[Path, typer.Argument(help="Write the data set to this new folder.")],
     width: Annotated[int, typer.Option(min=320, help="Render images of this width, px; 3:2 images.")] = 2592,
     images: Annotated[int, typer.Option("--images", min=2, help="Render this many images in each group.")] = 6,
-    distance: Annotated[float, typer.Option(min=200, help="Place the camera at this distance, mm.")] = 1000.0,
+    distance: Annotated[float, typer.Option(min=200, max=1e5, help="Place the camera at this distance, mm.")] = 1000.0,
     spread: Annotated[float, typer.Option(min=2, max=80, help="Spread the views by ± this, degrees.")] = 40.0,
     noise: Annotated[float, typer.Option(min=0, max=0.2, help="Add noise of this fraction of full scale.")] = 0.01,
     blur: Annotated[float, typer.Option(min=0, max=10, help="Blur by this standard deviation, px.")] = 0.7,

@@ -11,6 +11,7 @@ from typing import Any, TypeVar
 import numpy as np
 
 from stcal.errors import StcalError
+from stcal.io.files import TABLE_BYTES, read_bytes
 from stcal.io.saving import save
 
 R = TypeVar("R")
@@ -29,7 +30,9 @@ def keep(path: Path, arrays: Mapping[str, Any], meta: dict[str, Any]) -> None:
 def kept(path: Path, make: Callable[[Mapping[str, np.ndarray], dict[str, Any]], R]) -> R | None:
     """What ``make`` makes of the arrays and values of a file; None where there is none, or a damaged one."""
     try:
-        with np.load(io.BytesIO(path.read_bytes())) as stored:
+        with np.load(io.BytesIO(read_bytes(path, TABLE_BYTES))) as stored:
+            if sum(part.file_size for part in stored.zip.infolist()) > TABLE_BYTES:
+                return None
             return make(stored, json.loads(stored[META].tobytes()))
     except DAMAGE:
         return None

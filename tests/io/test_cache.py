@@ -1,9 +1,14 @@
 """What is kept is read back bit by bit; what is damaged counts as absent."""
 
+import os
+import tracemalloc
+import zipfile
+
 import numpy as np
 import pytest
 
 from stcal.io.cache import keep, kept
+from stcal.io.files import TABLE_BYTES
 
 ARRAYS = {"xyz": np.array([[0.1, 0.2, 0.3]]), "index": np.array([3, 1])}
 META = {"name": "ä", "count": 2}
@@ -34,3 +39,19 @@ def test_a_file_of_another_form_is_none(tmp_path):
     path = tmp_path / "key.npz"
     keep(path, {"xyz": ARRAYS["xyz"]}, META)
     assert kept(path, together) is None
+
+
+def test_a_file_of_gigabytes_is_none_and_takes_no_memory(tmp_path):
+    """Sparse, or of zeros that were packed."""
+    sparse, packed = tmp_path / "sparse.npz", tmp_path / "packed.npz"
+    keep(sparse, ARRAYS, META)
+    os.truncate(sparse, 3 << 30)
+    with zipfile.ZipFile(packed, "w", zipfile.ZIP_DEFLATED) as file:
+        file.writestr("xyz.npy", bytes(TABLE_BYTES + 1))
+    tracemalloc.start()
+    try:
+        assert kept(sparse, together) is None
+        assert kept(packed, together) is None
+        assert tracemalloc.get_traced_memory()[1] < 2 * TABLE_BYTES
+    finally:
+        tracemalloc.stop()
