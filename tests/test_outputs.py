@@ -1,8 +1,11 @@
 """No command writes over what it was given to read: walked over all commands and all their options."""
 
+import inspect
 from pathlib import Path
+from typing import get_args
 
 import pytest
+from typer.models import ParameterInfo
 
 from stcal.errors import InputError
 from stcal.io.saving import RUN_ENTRIES, RUN_MARKER, keep_apart
@@ -88,3 +91,14 @@ def test_a_table_in_a_folder_of_images_is_written_again(tmp_path, name):
         (tmp_path / read).write_text("mine")
         with pytest.raises(InputError, match="is a file of images"):
             keep_apart([("--out", tmp_path / read)], [("images", tmp_path)])
+
+
+def test_numbers_have_both_ends():
+    """A width of 1e20 px, or a distance of 1e308 mm, ends in the numerics; options without a range, and σ of
+    hand-eye, are judged by the stage that they go to."""
+    for command, function in COMMANDS.items():
+        for name, parameter in inspect.signature(function, eval_str=True).parameters.items():
+            info = next(each for each in get_args(parameter.annotation) if isinstance(each, ParameterInfo))
+            if command == "handeye" and name.startswith("sigma"):
+                continue
+            assert (info.min is None) == (info.max is None), f"{command}: {name}"

@@ -5,7 +5,7 @@ from typing import Annotated
 
 import typer
 
-from stcal.cli.options import BoardFile, JsonFile, Run, TargetFile
+from stcal.cli.options import MOST_SEED, BoardFile, JsonFile, Run, TargetFile
 from stcal.cli.terminal import StageProgress, say, write
 from stcal.design import reference_board, reference_target
 from stcal.errors import InputError
@@ -21,7 +21,7 @@ def plan(
     spread: Annotated[float, typer.Option(min=2, max=80, help="Spread the views by ± this, degrees.")] = 40.0,
     distance: Annotated[float, typer.Option(min=50, max=1e5, help="Place the camera at this distance, mm.")] = 1000.0,
     width: Annotated[
-        int, typer.Option(min=320, help="Take images of this width, px; 3:2 images of a 24 mm lens.")
+        int, typer.Option(min=320, max=100_000, help="Take images of this width, px; 3:2 images of a 24 mm lens.")
     ] = 5184,
     camera: Annotated[
         Path | None, typer.Option("--camera", help="Read the camera from this file, in place of --width.")
@@ -43,7 +43,9 @@ def plan(
     one_board: Annotated[
         bool, typer.Option("--one-board/--own-boards", help="Use one plate in all groups, or a new print for each.")
     ] = True,
-    seed: Annotated[int, typer.Option(help="Place board and cameras at random with this seed.")] = 0,
+    seed: Annotated[
+        int, typer.Option(min=0, max=MOST_SEED, help="Place board and cameras at random with this seed.")
+    ] = 0,
     out: JsonFile = None,
 ) -> None:
     """Forecast the σ before any photograph is taken, and what would help most; no Monte Carlo."""

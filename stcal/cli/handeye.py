@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from stcal.cli.options import JsonFile, QuaternionOrder, Quaternions, ReportFile, Workers
+from stcal.cli.options import MOST_SEED, JsonFile, QuaternionOrder, Quaternions, ReportFile, Workers
 from stcal.cli.terminal import StageProgress, print_each, say, write
 from stcal.errors import InputError
 
@@ -88,12 +88,14 @@ def handeye(
     ] = False,
     held_out: Annotated[
         int | None,
-        typer.Option("--held-out", min=1, help="Hold out so many poses in each split; a quarter if not given."),
+        typer.Option(
+            "--held-out", min=1, max=100_000, help="Hold out so many poses in each split; a quarter if not given."
+        ),
     ] = None,
     splits: Annotated[
-        int, typer.Option("--splits", min=0, help="Cross-validate over this many splits; 0 for none.")
+        int, typer.Option("--splits", min=0, max=100_000, help="Cross-validate over this many splits; 0 for none.")
     ] = 15,
-    seed: Annotated[int, typer.Option(min=0, help="Draw the splits with this seed.")] = 0,
+    seed: Annotated[int, typer.Option(min=0, max=MOST_SEED, help="Draw the splits with this seed.")] = 0,
     out: Annotated[
         Path | None, typer.Option("--out", writable=True, help="Write the result to this file (JSON).")
     ] = None,

@@ -113,9 +113,9 @@ def run(
             "--offset", help="Add goal poses by obj_from_goal, 4×4 in the target's frame, of this file (JSON)."
         ),
     ] = None,
-    min_tags: Annotated[int, typer.Option(min=1, help="Reject a pose from fewer tags.")] = 1,
+    min_tags: Annotated[int, typer.Option(min=1, max=10_000, help="Reject a pose from fewer tags.")] = 1,
     min_spread_px: Annotated[
-        float, typer.Option("--min-spread-px", min=0, help="Reject a pose whose corners extend over less, px.")
+        float, typer.Option("--min-spread-px", min=0, max=1e5, help="Reject a pose whose corners extend over less, px.")
     ] = 12.0,
     min_foreshortening: Annotated[
         float,
@@ -128,10 +128,10 @@ def run(
         float, typer.Option(help="Call a pose ambiguous whose second solution has larger odds than this.")
     ] = 1e-6,
     sigma_margin: Annotated[
-        float, typer.Option(min=1, help="Allow for σ that are all too small by up to this factor.")
+        float, typer.Option(min=1, max=1000, help="Allow for σ that are all too small by up to this factor.")
     ] = 1.5,
     equal_deg: Annotated[
-        float, typer.Option("--equal-deg", min=0, help="Treat two solutions nearer than this as one.")
+        float, typer.Option("--equal-deg", min=0, max=180, help="Treat two solutions nearer than this as one.")
     ] = 1.0,
     max_sigma_deg: Annotated[
         float, typer.Option("--max-sigma-deg", help="Reject a pose whose largest σ of rotation exceeds this.")
@@ -156,7 +156,7 @@ def run(
         float, typer.Option("--e-ratio", help="Set the patent's limit of the errors' ratio, for --method patent.")
     ] = 2.0,
     workers: Annotated[
-        int | None, typer.Option(min=1, help="Use this many threads; one per core if not given.")
+        int | None, typer.Option(min=1, max=1024, help="Use this many threads; one per core if not given.")
     ] = None,
     json_file: JsonFile = None,
     report: ReportFile = None,

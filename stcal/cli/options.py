@@ -42,8 +42,9 @@ ReportFile = Annotated[
     Path | None,
     typer.Option("--report", writable=True, help="Also write a page with tables and plots to this file (HTML)."),
 ]
+MOST_SEED = 2**63 - 1
 Workers = Annotated[
-    int | None, typer.Option("--workers", min=1, help="Use this many processes; one per core if not given.")
+    int | None, typer.Option("--workers", min=1, max=1024, help="Use this many processes; one per core if not given.")
 ]
 
 

@@ -6,7 +6,7 @@ from typing import Annotated
 
 import typer
 
-from stcal.cli.options import ReportFile
+from stcal.cli.options import MOST_SEED, ReportFile
 from stcal.cli.terminal import print_each, say, write
 from stcal.errors import ConvergenceError, DegenerateError, InputError
 
@@ -42,8 +42,10 @@ def register(
         float | None,
         typer.Option(help="Count points nearer than this as inliers, mm; estimated from the data if not given."),
     ] = None,
-    seed: Annotated[int, typer.Option(min=0, help="Draw random samples and folds with this seed.")] = 0,
-    folds: Annotated[int, typer.Option(min=0, help="Cross-validate with this many folds; 0 for none.")] = 6,
+    seed: Annotated[int, typer.Option(min=0, max=MOST_SEED, help="Draw random samples and folds with this seed.")] = 0,
+    folds: Annotated[
+        int, typer.Option(min=0, max=100_000, help="Cross-validate with this many folds; 0 for none.")
+    ] = 6,
     allow_ambiguous: Annotated[
         bool, typer.Option("--allow-ambiguous", help="Answer even where another transform is about as good.")
     ] = False,

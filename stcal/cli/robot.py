@@ -7,7 +7,7 @@ from typing import Annotated
 
 import typer
 
-from stcal.cli.options import JsonFile, QuaternionOrder, Quaternions, ReportFile, RobotFile
+from stcal.cli.options import MOST_SEED, JsonFile, QuaternionOrder, Quaternions, ReportFile, RobotFile
 from stcal.cli.terminal import print_each, say, write
 from stcal.errors import DegenerateError, InputError
 
@@ -99,16 +99,23 @@ def identify(
     ] = None,
     sigma_mm: Annotated[
         float | None,
-        typer.Option("--sigma-mm", min=1e-9, help="Set σ of a measured position, mm per axis; estimated if not given."),
+        typer.Option(
+            "--sigma-mm", min=1e-9, max=1e4, help="Set σ of a measured position, mm per axis; estimated if not given."
+        ),
     ] = None,
     sigma_rad: Annotated[
         float | None,
         typer.Option(
-            "--sigma-rad", min=1e-12, help="Set σ of a measured orientation, rad per axis; estimated if not given."
+            "--sigma-rad",
+            min=1e-12,
+            max=4,
+            help="Set σ of a measured orientation, rad per axis; estimated if not given.",
         ),
     ] = None,
-    folds: Annotated[int, typer.Option(min=0, help="Cross-validate with this many folds; 0 for none.")] = 6,
-    seed: Annotated[int, typer.Option(min=0, help="Divide the rows into folds with this seed.")] = 0,
+    folds: Annotated[
+        int, typer.Option(min=0, max=100_000, help="Cross-validate with this many folds; 0 for none.")
+    ] = 6,
+    seed: Annotated[int, typer.Option(min=0, max=MOST_SEED, help="Divide the rows into folds with this seed.")] = 0,
     robust: Annotated[
         bool, typer.Option("--robust/--least-squares", help="Give outliers less weight, or all rows the same.")
     ] = True,
@@ -228,7 +235,7 @@ class ObservedKind(StrEnum):
 def design(
     robot_file: RobotFile,
     count: Annotated[int, typer.Option(min=1, max=2000, help="Choose this many poses.")] = 40,
-    seed: Annotated[int, typer.Option(min=0, help="Draw the candidates with this seed.")] = 0,
+    seed: Annotated[int, typer.Option(min=0, max=MOST_SEED, help="Draw the candidates with this seed.")] = 0,
     out: Annotated[
         Path | None, typer.Option("--out", writable=True, help="Write the poses to this file (CSV).")
     ] = None,

@@ -7,7 +7,7 @@ from typing import Annotated
 
 import typer
 
-from stcal.cli.options import JsonFile, Workers
+from stcal.cli.options import MOST_SEED, JsonFile, Workers
 from stcal.cli.terminal import StageProgress, say, write
 from stcal.design import reference_board, reference_target
 from stcal.errors import InputError
@@ -33,8 +33,10 @@ def init(folder: Annotated[Path, typer.Argument(help="Write the two files to thi
 @app.command()
 def simulate(
     folder: Annotated[Path, typer.Argument(help="Write the data set to this new folder.")],
-    width: Annotated[int, typer.Option(min=320, help="Render images of this width, px; 3:2 images.")] = 2592,
-    images: Annotated[int, typer.Option("--images", min=2, help="Render this many images in each group.")] = 6,
+    width: Annotated[
+        int, typer.Option(min=320, max=50_000, help="Render images of this width, px; 3:2 images.")
+    ] = 2592,
+    images: Annotated[int, typer.Option("--images", min=2, max=500, help="Render this many images in each group.")] = 6,
     distance: Annotated[float, typer.Option(min=200, max=1e5, help="Place the camera at this distance, mm.")] = 1000.0,
     spread: Annotated[float, typer.Option(min=2, max=80, help="Spread the views by ± this, degrees.")] = 40.0,
     noise: Annotated[float, typer.Option(min=0, max=0.2, help="Add noise of this fraction of full scale.")] = 0.01,
@@ -45,7 +47,7 @@ def simulate(
     ] = False,
     png: Annotated[bool, typer.Option("--png", help="Write PNG in place of JPEG.")] = False,
     sixteen_bit: Annotated[bool, typer.Option("--16-bit", help="Write 16-bit PNG.")] = False,
-    seed: Annotated[int, typer.Option(help="Draw everything random with this seed.")] = 0,
+    seed: Annotated[int, typer.Option(min=0, max=MOST_SEED, help="Draw everything random with this seed.")] = 0,
     workers: Workers = None,
 ) -> None:
     """Write a simulated data set with known truth: images, cameras.txt, target.toml, board.toml, truth.json."""
