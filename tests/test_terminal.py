@@ -73,3 +73,9 @@ def test_too_little_address_space_is_said_before_libraries_load(words, code):
     assert ended.returncode == code
     said = "error: not enough memory: 500 MB of address space allowed, 800 MB needed; raise the limit (`ulimit -v`)\n"
     assert ended.stderr == (said if code else "")
+
+
+def test_help_loads_no_numerics():
+    """They take longer than all the rest; Typer itself loads pydantic."""
+    code = "import sys, stcal.cli.main; print([m for m in ('numpy', 'yaml', 'rich.progress') if m in sys.modules])"
+    assert subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout == "[]\n"

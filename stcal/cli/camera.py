@@ -8,8 +8,6 @@ import typer
 from stcal.cli.options import BoardFile, TargetFile, Workers
 from stcal.cli.terminal import StageProgress, say
 from stcal.errors import InputError
-from stcal.io.camera import CalibratedCamera, write_cameras_txt
-from stcal.io.design import board_of, target_of
 from stcal.io.saving import json_text, save
 
 app = typer.Typer()
@@ -41,6 +39,8 @@ def calibrate_camera(
     workers: Workers = None,
 ) -> None:
     """Calibrate the camera from views of the board, without any start: cameras.txt with σ and correlations, for run."""
+    from stcal.io.camera import CalibratedCamera, write_cameras_txt
+    from stcal.io.design import board_of, target_of
     from stcal.sfm.camera.calibrate import calibrate_camera as calibrate
     from stcal.sfm.camera.file import CalibrationFile
     from stcal.sfm.camera.text import calibration_text

@@ -7,10 +7,7 @@ import typer
 
 from stcal.cli.options import MOST_SEED, BoardFile, JsonFile, Run, TargetFile
 from stcal.cli.terminal import StageProgress, say, write
-from stcal.design import reference_board, reference_target
 from stcal.errors import InputError
-from stcal.io.camera import read_camera
-from stcal.io.design import load_board, load_target
 
 app = typer.Typer()
 
@@ -49,6 +46,9 @@ def plan(
     out: JsonFile = None,
 ) -> None:
     """Forecast the σ before any photograph is taken, and what would help most; no Monte Carlo."""
+    from stcal.design import reference_board, reference_target
+    from stcal.io.camera import read_camera
+    from stcal.io.design import load_board, load_target
     from stcal.sfm.plan.file import PlanFile
     from stcal.sfm.plan.noise import expected_noise, noise_of_run, stated_noise
     from stcal.sfm.plan.nominal import nominal_poses

@@ -8,8 +8,6 @@ import typer
 from stcal.cli.options import CameraFile, MaxDiameter, MinDiameter, ReportFile, TargetFile, Workers, ellipse_options
 from stcal.cli.terminal import StageProgress, print_each, say, write
 from stcal.errors import InputError
-from stcal.io.camera import read_camera
-from stcal.io.design import load_board, target_of
 
 app = typer.Typer()
 
@@ -60,6 +58,8 @@ def measure(
     workers: Workers = None,
 ) -> None:
     """Measure the pose of a calibrated target in each image, from whatever faces it shows, with its 6×6 covariance."""
+    from stcal.io.camera import read_camera
+    from stcal.io.design import load_board, target_of
     from stcal.io.table import read_table
     from stcal.sfm.measure import images as work
     from stcal.sfm.measure.pose import PoseOptions

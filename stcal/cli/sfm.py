@@ -4,7 +4,6 @@ from enum import StrEnum
 from pathlib import Path
 from typing import Annotated
 
-import numpy as np
 import typer
 
 from stcal.cli.options import (
@@ -21,8 +20,6 @@ from stcal.cli.options import (
 )
 from stcal.cli.terminal import StageProgress, say, write
 from stcal.errors import InputError
-from stcal.io.camera import read_camera
-from stcal.io.design import board_of, target_of
 
 app = typer.Typer(
     name="stcal-sfm",
@@ -114,6 +111,8 @@ def run(
     workers: Workers = None,
 ) -> None:
     """Calibrate the target: detect, map, scale, chain and adjust; writes faces.json and report.html."""
+    import numpy as np
+
     from stcal.sfm import pipeline
     from stcal.sfm.mapping.pairs import PairOptions
     from stcal.sfm.run.options import RunOptions
@@ -150,6 +149,8 @@ def detect(
     workers: Workers = None,
 ) -> None:
     """Detect circles alone: detections.csv and an overlay picture of every image."""
+    from stcal.io.camera import read_camera
+    from stcal.io.design import board_of, target_of
     from stcal.io.images import find_images
     from stcal.sfm import pipeline
     from stcal.sfm.run.marker import MarkerFile

@@ -9,9 +9,7 @@ import typer
 
 from stcal.cli.options import MOST_SEED, JsonFile, Workers
 from stcal.cli.terminal import StageProgress, say, write
-from stcal.design import reference_board, reference_target
 from stcal.errors import InputError
-from stcal.io.design import board_toml, target_toml
 from stcal.io.saving import RUN_MARKER, json_text, real_place, save
 
 app = typer.Typer()
@@ -20,6 +18,9 @@ app = typer.Typer()
 @app.command()
 def init(folder: Annotated[Path, typer.Argument(help="Write the two files to this folder.")]) -> None:
     """Write target.toml and board.toml of the reference design, commented, to edit."""
+    from stcal.design import reference_board, reference_target
+    from stcal.io.design import board_toml, target_toml
+
     folder.mkdir(parents=True, exist_ok=True)
     texts = {"target.toml": target_toml(reference_target()), "board.toml": board_toml(reference_board())}
     for name in texts:
