@@ -30,6 +30,22 @@ def read_bytes(path: str | Path, most: int) -> bytes:
             chunks.append(chunk)
             left -= len(chunk)
         if not left:
-            size = f"{Path(path).stat().st_size / MB:.0f} MB" if Path(path).is_file() else "no end"
-            raise OSError(errno.EFBIG, f"{size}, at most {most // MB} MB are read", str(path))
+            raise _too_large(path, most)
     return b"".join(chunks)
+
+
+def require_size(path: str | Path, most: int) -> None:
+    """Of a file that another program's library reads.
+
+    Raises
+    ------
+    OSError
+        It is larger than ``most`` bytes.
+    """
+    if Path(path).stat().st_size > most:
+        raise _too_large(path, most)
+
+
+def _too_large(path: str | Path, most: int) -> OSError:
+    size = f"{Path(path).stat().st_size / MB:.0f} MB" if Path(path).is_file() else "no end"
+    return OSError(errno.EFBIG, f"{size}, at most {most // MB} MB are read", str(path))

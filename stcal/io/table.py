@@ -218,7 +218,10 @@ def read_table(path: str | Path, what: str, quaternions: Order = "wxyz") -> Tabl
     used = [(i, line) for i, line in enumerate(lines, 1) if line.strip() and not line.lstrip().startswith("#")]
     if not used:
         raise InputError(f"{where}: empty; a header and rows needed")
-    names = [name.strip() for name in next(csv.reader([used[0][1]]))]
+    try:
+        names = [name.strip() for name in next(csv.reader([used[0][1]]))]
+    except csv.Error as error:
+        raise InputError(f"{where}: line {used[0][0]}: {error}; a header with names and units needed") from error
     if len(names) == 1 and any(separator in names[0] for separator in ";\t"):
         raise InputError(f"{where}: columns separated by ';' or tabs; commas needed, and '.' in numbers")
     for name in names:

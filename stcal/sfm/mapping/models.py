@@ -12,7 +12,7 @@ from stcal.errors import InputError
 from stcal.geometry.camera import Camera
 from stcal.geometry.rigid import Rigid, Similarity
 from stcal.io.camera import CalibratedCamera, camera_from_colmap
-from stcal.io.files import MODEL_BYTES, read_bytes
+from stcal.io.files import MODEL_BYTES, TABLE_BYTES, read_bytes, require_size
 from stcal.labels import DotLabel, Label
 from stcal.sfm.data.model import GroupModel, MetricModel, WorldModel
 from stcal.sfm.data.observations import ImageObservations
@@ -235,6 +235,8 @@ def open_model(path: Path) -> pycolmap.Reconstruction:
             file = Path(path) / f"{name}.bin"
             if file.exists():
                 _require_whole(file, skip)
+        for file in Path(path).glob("*.txt"):
+            require_size(file, TABLE_BYTES)
         return pycolmap.Reconstruction(str(path))
     except (RuntimeError, ValueError, IndexError, OverflowError, OSError) as error:
         reason = " ".join(str(error).split())[-150:]

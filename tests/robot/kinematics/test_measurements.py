@@ -159,3 +159,8 @@ def test_a_quaternion_out_of_all_bounds_is_named(tmp_path):
     path.write_text("x_mm,y_mm,z_mm,qw,qx,qy,qz\n1,2,3,1,0,1e308,0\n")
     with pytest.raises(InputError, match=r"line 2: qy is 1e\+308, up to 1e\+12 possible"):
         read_table(path, "poses").poses()
+
+
+def test_a_header_without_end_is_named(tmp_path):
+    with pytest.raises(InputError, match=r"line 1: field larger than field limit \(131072\); a header"):
+        read(tmp_path, "q1_deg," + 200_000 * "x" + "\n1,2\n")

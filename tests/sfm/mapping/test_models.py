@@ -2,6 +2,7 @@
 
 import csv
 import json
+import os
 import random
 import shutil
 import sqlite3
@@ -297,6 +298,14 @@ def test_a_deleted_board(saved, model):
         model.delete_point3D(point)
     with pytest.raises(ScaleError, match="group 12: scale: 3 board dots mapped, 4 needed"):
         calibrate_models(model.as_binary(), saved)
+
+
+def test_a_text_of_gigabytes_is_not_read(model):
+    """pycolmap takes a line of any length."""
+    path = model.as_text() / "points3D.txt"
+    os.truncate(path, 3 << 30)
+    with pytest.raises(InputError, match="3221 MB, at most 100 MB are read"):
+        open_model(path.parent)
 
 
 def test_points_deleted_from_a_text_by_hand(saved, model, plain):
