@@ -115,8 +115,11 @@ class DesignOptions:
             raise InputError(
                 f"design: {self.count} poses of {self.candidates} candidates; more candidates than poses needed"
             )
-        if not (0 < self.sigma_mm < np.inf and 0 < self.sigma_rad < np.inf):
-            raise InputError(f"design: σ of {self.sigma_mm:g} mm and {self.sigma_rad:g} rad; positive numbers needed")
+        if not (1e-9 <= self.sigma_mm <= 1e4 and 1e-12 <= self.sigma_rad <= 4):
+            raise InputError(
+                f"design: σ of {self.sigma_mm:g} mm and {self.sigma_rad:g} rad; positive numbers needed, "
+                "1e-9 to 1e4 mm and 1e-12 to 4 rad"
+            )
         if self.box is not None and (
             len(self.box) != 6 or any(not a < b for a, b in zip(self.box[:3], self.box[3:], strict=True))
         ):

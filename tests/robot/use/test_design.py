@@ -178,6 +178,8 @@ def test_mistakes_are_named():
         DesignOptions(box=(0, 0, 0, 1, 1, -1))
     with pytest.raises(InputError, match="positive numbers needed"):
         DesignOptions(sigma_mm=0)
+    with pytest.raises(InputError, match="1e-9 to 1e4 mm"):
+        DesignOptions(sigma_mm=1e308)
     with pytest.raises(InputError, match=r"0 bring the tool into the box 5000,"):
         design(ARM, DesignOptions(count=10, candidates=50, box=(5000, 0, 0, 6000, 1, 1)))
     sliding = replace(ARM, joints=(*ARM.joints[:2], Joint("prismatic"), *ARM.joints[3:]))
