@@ -43,6 +43,7 @@ ReportFile = Annotated[
     typer.Option("--report", writable=True, help="Also write a page with tables and plots to this file (HTML)."),
 ]
 MOST_SEED = 2**63 - 1
+"""Of 64 bits with a sign, as other programs read it in result files."""
 Workers = Annotated[
     int | None, typer.Option("--workers", min=1, max=1024, help="Use this many processes; one per core if not given.")
 ]

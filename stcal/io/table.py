@@ -17,6 +17,8 @@ from stcal.io.quaternions import COLUMNS as QUATERNION
 from stcal.io.quaternions import Order
 
 LENGTHS = {"mm": 1.0, "m": 1000.0, "um": 1e-3, "cm": 10.0, "in": 25.4}
+UNIT_WORDS = {"m": "metres", "in": "inches", "cm": "centimetres"}
+"""Units in which lengths come by mistake, in words."""
 ANGLES = {"rad": 1.0, "deg": np.pi / 180}
 FARTHEST = 1e12
 """In any unit: farther than all that is measured, and its square is still a number."""

@@ -8,8 +8,9 @@ from scipy.spatial.transform import Rotation
 from stcal.errors import DegenerateError
 from stcal.geometry.arrays import frozen
 from stcal.handeye.data.loop import FRAMES, Loop, Setup
+from stcal.io.table import LENGTHS, UNIT_WORDS
 
-UNITS = {"metres": 1000.0, "inches": 25.4, "centimetres": 10.0}
+UNITS = {words: LENGTHS[unit] for unit, words in UNIT_WORDS.items()}
 SAME_UNIT = 0.05
 """Logarithm by which a size may be off the ratio of two units."""
 LARGEST_SCALE = 5.0

@@ -10,7 +10,7 @@ from stcal.errors import InputError
 from stcal.geometry.rigid import Poses, Rigid
 from stcal.geometry.uncertain import UncertainRigid
 from stcal.io.quaternions import READINGS
-from stcal.io.table import LENGTHS
+from stcal.io.table import LENGTHS, UNIT_WORDS
 from stcal.locate.report.chain import GoalChain
 
 NEAR_BASE_MM, NEAR_FLANGE_MM = 20.0, 2.0
@@ -21,7 +21,8 @@ STILL, STILL_RAD = 0.02, np.radians(2)
 FAR_BETTER, BETTER = 30.0, 5.0
 """By so many times the product of both must shrink, and the place: targets that move do not stand still by chance in
 another convention, to 2 % of their distance."""
-UNITS = {"m": "metres", "in": "inches"}
+UNITS = ("m", "in")
+"""What lengths in mm may be."""
 
 
 def on_chain(chain: GoalChain, seen: Mapping[str, UncertainRigid]) -> tuple[str, ...]:
@@ -83,11 +84,11 @@ def _guesses(mount: Rigid, flange: Poses) -> Iterator[tuple[str, Poses, Rigid]]:
         yield f"the robot's quaternions were {reading.held}; {reading.remedy}", reading.poses(flange), mount
     yield "the robot's poses were flange_from_base; give base_from_flange", flange.inverse(), mount
     yield "the hand-eye were camera_from_flange; give flange_from_camera", flange, mount.inverse()
-    for unit, words in UNITS.items():
+    for unit in UNITS:
         larger = replace(flange, translation=LENGTHS[unit] * flange.translation)
-        yield f"the robot's lengths were {words}; name the columns _{unit}", larger, mount
+        yield f"the robot's lengths were {UNIT_WORDS[unit]}; name the columns _{unit}", larger, mount
         camera = Rigid(mount.rotation, LENGTHS[unit] * mount.translation)
-        yield f"the hand-eye's lengths were {words}; multiply them by {LENGTHS[unit]:g}", flange, camera
+        yield f"the hand-eye's lengths were {UNIT_WORDS[unit]}; multiply them by {LENGTHS[unit]:g}", flange, camera
 
 
 def _varies(found: Poses) -> tuple[float, float]:

@@ -12,7 +12,7 @@ from scipy.spatial import KDTree
 from stcal.errors import InputError
 from stcal.geometry.rigid import Poses, Rigid
 from stcal.io.quaternions import EXPLAINS, READINGS
-from stcal.io.table import LENGTHS
+from stcal.io.table import LENGTHS, UNIT_WORDS
 from stcal.robot.kinematics.damped import reach_mm
 from stcal.robot.kinematics.fit import FITS, TURNED_RAD, require_convention
 from stcal.robot.kinematics.forward import flange_poses
@@ -20,7 +20,7 @@ from stcal.robot.kinematics.inverse import Inverse
 from stcal.robot.kinematics.model import Robot
 from stcal.robot.use.targets import Targets, joints_of, poses_of, rows_by_tool
 
-UNITS = {"m": "metres", "in": "inches"}
+UNITS = ("m", "in")
 """What columns of mm may hold; of micrometres no arm would reach anything, and a tenth, of cm, may be meant."""
 SAMPLE = 50
 """Joint vectors at which two robots are compared."""
@@ -111,9 +111,9 @@ def _explain(robot: Robot, targets: Targets, poses: Poses, q: np.ndarray, own: f
 def _guesses(robot: Robot, targets: Targets, poses: Poses, q: np.ndarray) -> Iterator[tuple[str, Poses, Poses]]:
     """Frequent mistakes: what would be right, with poses and joint values' poses as if it were."""
     reached = poses_of(robot, targets, q)
-    for unit, words in UNITS.items():
+    for unit in UNITS:
         yield (
-            f"lengths were {words}; call the columns x_{unit} …",
+            f"lengths were {UNIT_WORDS[unit]}; call the columns x_{unit} …",
             Poses(poses.rotation, LENGTHS[unit] * poses.translation),
             reached,
         )
@@ -163,10 +163,10 @@ def _near_base(robot: Robot, targets: Targets, poses: Poses) -> tuple[str, ...]:
     fitting = [unit for unit in UNITS if 0 < far * LENGTHS[unit] <= reach]
     if not fitting:
         return ()
-    words, unit = UNITS[fitting[0]], fitting[0]
+    unit = fitting[0]
     return (
         f"all targets lie within {far:.3g} mm of the base's origin, where no arm works that reaches {reach:.4g} mm: if "
-        f"the unit of x, y, z is {words}, call the columns x_{unit} …",
+        f"the unit of x, y, z is {UNIT_WORDS[unit]}, call the columns x_{unit} …",
     )
 
 

@@ -60,12 +60,6 @@ class Targets:
             None if self.q is None else self.q[rows],
         )
 
-    def commanded(self) -> Poses:
-        """m poses base_from_tool, mm; refused where there are none."""
-        if self.poses is None:
-            raise InputError(f"{self.where}: joint values without poses; columns x_mm … qz needed")
-        return self.poses
-
     def joints(self) -> np.ndarray:
         """(m, n) commanded joint values, rad or mm; refused where there are none."""
         if self.q is None:
