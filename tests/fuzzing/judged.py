@@ -30,7 +30,8 @@ LONGEST_PRINTED = 4 << 20
 CODES = (0, 2, 3)
 """That a command ends with by itself."""
 KINDS = (
-    *("traceback", "crash", "hang", "memory", "exit code", "input changed", "earlier result lost", "broken result"),
+    *("traceback", "crash", "hang", "memory", "exit code", "input changed"),
+    *("earlier result lost", "earlier run lost", "broken result"),
     *("message too long", "not printable", "not one line", "noise"),
 )
 EARLIER = "of an earlier call\n"
@@ -294,7 +295,7 @@ def _left(call: Call, written: Path, code: int, before: dict, after: dict) -> It
         for path, old in before.items():
             own = path.startswith(str(written / place)) and _entry(path, written / place) in RUN_ENTRIES
             if own and after.get(path) != old:
-                yield "earlier result lost", f"{path} of the earlier run, exit code {code}"
+                yield "earlier run lost", f"{path} of the earlier run, exit code {code}"
 
 
 def _entry(path: str, folder: Path) -> str:

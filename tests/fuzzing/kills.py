@@ -40,6 +40,9 @@ LARGEST_FILE = (100, 300_000)
 MEMORY = (500 << 20, 900 << 20)
 STREAM = 10_000_000
 """Keeps the random numbers of kills from those of cases."""
+_SEEN_BELOW = ("not one line", "broken result", "earlier run lost")
+"""Of an ended program: its line is judged where it ends, and new results that are complete are as good as the earlier
+ones."""
 PROGRAM = (sys.executable, "-P", "-c", "from stcal.cli.entry import main; main()")
 
 
@@ -63,9 +66,7 @@ def killed(stock: Path, folder: Path, seed: int, number: int) -> Judged:
         found = []
     after = [f for f in failures(call, folder, outcome, before, refused=False) if f[0] not in ("exit code", "noise")]
     found += [] if kind in ENDED else [("exit code", str(outcome.code))] * (outcome.code not in CODES)
-    found += [
-        f for f in after if f[0] != "memory" and not (kind in ENDED and f[0] in ("not one line", "broken result"))
-    ]
+    found += [f for f in after if f[0] != "memory" and not (kind in ENDED and f[0] in _SEEN_BELOW)]
     found += _whole(folder / OUT, kind is signal.SIGKILL)
     found += _run_whole(call, folder)
     return Judged(f"k{number}", f"{call.command}: {said}", tuple(found), outcome.code, outcome.seconds, call.command)
@@ -153,7 +154,5 @@ def _whole(written: Path, by_force: bool) -> list[tuple[str, str]]:
 
 def _run_whole(call: Call, folder: Path) -> list[tuple[str, str]]:
     """A run's folder holds the earlier results or the new ones, by its own hashes."""
-    if call.command != "sfm run" or not call.folders:
-        return []
-    outcome = in_process(Call("sfm verify", f"+{call.folders[0]}"), "stcal", folder)
-    return [] if outcome.code == 0 else [("earlier result lost", outcome.said[-400:])]
+    verified = [in_process(Call("sfm verify", f"+{place}"), "stcal", folder) for place in call.folders]
+    return [("earlier result lost", outcome.said[-400:]) for outcome in verified if outcome.code]
