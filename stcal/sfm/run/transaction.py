@@ -231,10 +231,19 @@ def _me() -> str:
     return f"process {os.getpid()} on {socket.gethostname()}\n"
 
 
+def _finished(out: Path) -> bool:
+    """Whether the folder holds results of a run, or of a detection alone, that came to its end."""
+    try:
+        marker = read_result(out / RUN_MARKER, MarkerFile, "run", "run it again")
+    except InputError:
+        marker = None
+    return (out / "faces.json").exists() or (marker is not None and marker.sha256 is not None)
+
+
 def _leave(folder: RunFolder, content: MarkerFile, error: BaseException) -> None:
     """What a run that failed has made: in place where no earlier run's result is, else beside it."""
     remove(folder.stage / "scratch")
-    if not (folder.out / "faces.json").exists():
+    if not _finished(folder.out):
         save(folder.stage / RUN_MARKER, json_text(content.content()))
         for name in RESULTS:
             if name != RUN_MARKER:

@@ -55,8 +55,9 @@ def test_new_results_take_the_earlier_ones_place(tmp_path):
     }
 
 
-def test_a_run_that_fails_leaves_the_earlier_results(tmp_path):
-    make(tmp_path / "run", "old")
+@pytest.mark.parametrize("names", [("faces.json", "report.json"), ("detections.csv",)])
+def test_a_run_that_fails_leaves_the_earlier_results(tmp_path, names):
+    make(tmp_path / "run", "old", names=names)
     before = content(tmp_path / "run")
     with pytest.raises(DetectionError, match=r"nothing found; the earlier results stay, .*unfinished holds what"):
         fail(tmp_path / "run")
