@@ -47,6 +47,16 @@ def robust_sigma(length: np.ndarray, coordinates: int = 1, redundancy: float = 1
     return _median(length) / (median_length(coordinates) * np.sqrt(redundancy))
 
 
+def robust_sigmas(length: np.ndarray, among: np.ndarray) -> np.ndarray:
+    """:func:`robust_sigma` of each row of absolute values (n, m), (n,), of those that the mask ``among`` (n, m) takes;
+    NaN where it takes none."""
+    ordered = np.sort(np.where(among, length, np.inf), axis=1)
+    count = among.sum(1)
+    middle = np.maximum(np.stack([(count - 1) // 2, count // 2], 1), 0)
+    median = np.take_along_axis(ordered, middle, 1).mean(1) if ordered.shape[1] else np.full(len(length), np.nan)
+    return np.where(count > 0, median, np.nan) / median_length(1)
+
+
 def _median(values: np.ndarray) -> float:
     """``np.median`` of (n,), which takes five times as long for some hundred numbers."""
     n = len(values)

@@ -19,17 +19,17 @@ it (the first is the planes', even ones move no centre), inside and outside apar
 on with brightness that varies around the rim, at the price of a larger σ.
 """
 
-import math
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 
 import numpy as np
-from scipy.special import ndtr
 
 from stcal.geometry.camera import Camera
-from stcal.geometry.robust import robust_sigma
+from stcal.geometry.robust import robust_sigmas
 from stcal.sfm.data.centres import Centres
 from stcal.sfm.detect.ellipses import Ellipses
 
+PIXELS_AT_ONCE = 30_000
+"""Of the ellipses that are fitted side by side: their derivatives are 1.5 MB, which stay in a core's cache."""
 BAND_PX = 4.0
 """Half width of the band of pixels around the rim, at first and at least …"""
 BAND_BLURS = 4.0
@@ -62,7 +62,6 @@ MIN_NOISE2 = 1e-12
 """Square of grey values: no noise at all."""
 WAVES = (1, 2, 3)
 """Harmonics around the rim of what planes do not follow."""
-TOLD_BY = 3
 UNEVEN = 0.004
 """Amplitude of that harmonic, as a share of the contrast, that moves a centre by about 2 µm in 100 …"""
 UNEVEN_CHI2 = 23.0
@@ -96,35 +95,24 @@ def measure_centres(image: np.ndarray, camera: Camera, ellipses: Ellipses, neigh
     ellipses : what to measure
     neighbours : all candidates of the image; pixels of those that come near are left out
     """
-    half = 1.25 * np.sqrt((ellipses.shape_px**2).sum(2)) + 3 * BAND_PX
-    to_ideal = _local_ideal_maps(camera, ellipses.centre_px, half)
-    masks = _intruders(ellipses, neighbours, half)
     focal = float(np.sqrt(camera.focal.prod()))
-    rows = [
-        _Fit(image, ellipses.centre_px[i], ellipses.shape_px[i], half[i], to_ideal[i], masks[i]).result()
-        for i in range(len(ellipses))
-    ]
-    centre = np.array([fit.centre for fit in rows]).reshape(-1, 2) / focal
-    shape = np.array([fit.shape for fit in rows]).reshape(-1, 2, 2) / focal
-    rim = np.array([fit.rim for fit in rows], float)
-    uneven = np.array([fit.uneven for fit in rows]).reshape(-1, 2) / focal
-    chance = np.array([fit.chance for fit in rows], float)
-    covariance = np.array([fit.covariance for fit in rows]).reshape(-1, 2, 2) / focal**2
-    covariance = _correlation(chance[rim >= MIN_RIM]) * covariance
+    found = _fitted(image, camera, ellipses, neighbours)
+    centre, uneven = found.centre / focal, found.uneven / focal
+    covariance = _correlation(found.chance[found.rim >= MIN_RIM]) * found.covariance / focal**2
     covariance += UNTRUSTED**2 * uneven[:, :, None] * uneven[:, None, :]
     distorted, jacobian = camera.distort_jacobian(centre)
     jacobian = jacobian * camera.focal[:, None]
     return Centres(
         centre_px=distorted * camera.focal + camera.centre,
         centre=centre,
-        shape=shape,
+        shape=found.shape / focal,
         covariance_px2=jacobian @ covariance @ np.swapaxes(jacobian, 1, 2),
-        blur_px=np.array([fit.blur for fit in rows], float),
-        contrast=np.array([fit.contrast for fit in rows], float),
-        noise=np.array([fit.noise for fit in rows], float),
-        rim=rim,
+        blur_px=found.blur,
+        contrast=found.contrast,
+        noise=found.noise,
+        rim=found.rim,
         uneven_px=(jacobian @ uneven[..., None])[..., 0],
-        ok=rim >= MIN_RIM,
+        ok=found.rim >= MIN_RIM,
     )
 
 
@@ -140,8 +128,11 @@ def _correlation(chance: np.ndarray) -> float:
 
 def _monomials(x: np.ndarray, y: np.ndarray) -> np.ndarray:
     """Cubic monomials, (10, ...)."""
-    xx, xy, yy = x * x, x * y, y * y
-    return np.stack([np.ones_like(x), x, y, xx, xy, yy, xx * x, xx * y, x * yy, yy * y])
+    found = np.empty((10, *x.shape), x.dtype)
+    found[0], found[1], found[2] = 1, x, y
+    found[3], found[4], found[5] = x * x, x * y, y * y
+    found[6], found[7], found[8], found[9] = found[3] * x, found[3] * y, x * found[5], found[5] * y
+    return found
 
 
 def _local_ideal_maps(camera: Camera, centre_px: np.ndarray, half: np.ndarray) -> np.ndarray:
@@ -175,268 +166,415 @@ def _intruders(ellipses: Ellipses, neighbours: Ellipses, half: np.ndarray) -> li
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class _Ellipse:
-    """One ellipse, ideal px: ``centre`` (2,), ``shape`` and ``covariance`` (2, 2) as if pixels were independent,
-    ``chance``, and what :class:`Centres` says."""
+class _Rims:
+    """n fitted ellipses, ideal px: ``centre`` (n, 2), ``shape`` and ``covariance`` (n, 2, 2) as if pixels were
+    independent, ``chance`` (n,), and what :class:`Centres` says; of no contrast and no rim where the fit failed."""
 
     centre: np.ndarray
     shape: np.ndarray
     covariance: np.ndarray
-    chance: float
-    blur: float
-    contrast: float
-    noise: float
-    rim: float
+    chance: np.ndarray
+    blur: np.ndarray
+    contrast: np.ndarray
+    noise: np.ndarray
+    rim: np.ndarray
     uneven: np.ndarray
 
+    @classmethod
+    def joined(cls, parts: list["_Rims"], order: np.ndarray) -> "_Rims":
+        """Row k of the parts, one behind the other, in place ``order[k]``."""
+        place = np.argsort(order)
+        return cls(*(np.concatenate([getattr(part, f.name) for part in parts])[place] for f in fields(cls)))
 
-class _Fit:
-    """The fit of one blurred ellipse. Coordinates are rows of (2, pixels) arrays, ideal px."""
 
-    def __init__(self, image, centre_px, shape_px, half, to_ideal, intruders):
-        low = np.maximum(np.floor(centre_px - half).astype(int), 0)
-        high = np.minimum(np.ceil(centre_px + half).astype(int) + 1, image.shape[::-1])
-        self.patch = image[low[1] : high[1], low[0] : high[0]]
-        self.dx = (np.arange(low[0], high[0]) - centre_px[0]).astype(np.float32)
-        self.dy = (np.arange(low[1], high[1]) - centre_px[1]).astype(np.float32)[:, None]
-        self.place, self.half, self.to_ideal, self.intruders = centre_px, half, to_ideal, intruders
-        jacobian = to_ideal[:, 1:3] / half
-        value, vector = np.linalg.eigh((m := jacobian @ shape_px) @ m.T)
-        self.inverse_shape = (vector / np.sqrt(value)) @ vector.T
-        self.jacobian = jacobian
-        self.centre = to_ideal[:, 0] + (to_ideal[:, 3:] @ _monomials(np.zeros(1), np.zeros(1))[3:])[:, 0]
-        self.start = self.centre
-        self.radius = float(np.prod(value) ** 0.25)
-        self.blur = START_BLUR_PX
-        self.waves: tuple[bool, ...] = ()
-        self.uneven = np.zeros(2)
-        self.failed = not (self._run() and self._follow_waves())
+def _fitted(image: np.ndarray, camera: Camera, ellipses: Ellipses, neighbours: Ellipses) -> _Rims:
+    """Fit circles of like size side by side, as many as a processor's cache holds the pixels of."""
+    half = 1.25 * np.sqrt((ellipses.shape_px**2).sum(2)) + 3 * BAND_PX
+    to_ideal = _local_ideal_maps(camera, ellipses.centre_px, half)
+    masks = _intruders(ellipses, neighbours, half)
+    size = ellipses.radius_px()
+    order = np.argsort(size, kind="stable")
+    pixels = np.cumsum(2 * np.pi * size[order] * 2 * BAND_PX)
+    ends = np.flatnonzero(np.diff(pixels // PIXELS_AT_ONCE)) + 1
+    parts = [
+        _Fits(image, ellipses.select(own), half[own], to_ideal[own], [masks[i] for i in own]).result()
+        for own in np.split(order, ends)
+    ]
+    return _Rims.joined(parts, order)
 
-    def _run(self) -> bool:
-        band, selected = 0.0, self.centre
+
+class _Fits:
+    """The fits of n blurred ellipses side by side, ideal px.
+
+    Pixels are rows of (n, …, m) arrays of single precision, which is enough as coordinates are taken from the start of
+    each centre; ``real`` is 1 where a pixel is, 0 behind the last one of an ellipse.
+    """
+
+    def __init__(self, image, ellipses: Ellipses, half, to_ideal, intruders):
+        n, lay = len(ellipses), ellipses.centre_px
+        self.image, self.place, self.half, self.to_ideal, self.intruders = image, lay, half, to_ideal, intruders
+        self.low = np.maximum(np.floor(lay - half).astype(int), 0)
+        self.high = np.minimum(np.ceil(lay + half).astype(int) + 1, image.shape[::-1])
+        self.from_place = [_offsets(*each) for each in zip(self.low, self.high, lay, strict=True)]
+        self.jacobian = to_ideal[:, :, 1:3] / half[:, None]
+        m = self.jacobian @ ellipses.shape_px
+        value, vector = np.linalg.eigh(m @ np.swapaxes(m, 1, 2))
+        self.inverse_shape = (vector / np.sqrt(value)[:, None]) @ np.swapaxes(vector, 1, 2)
+        self.start = self.centre = self.selected = to_ideal[:, :, 0]
+        self.radius = np.prod(value, axis=1) ** 0.25
+        self.blur, self.band = np.full(n, START_BLUR_PX), np.full(n, np.inf)
+        self.levels = np.zeros((n, PARAMETERS - 6 + 4 * len(WAVES)), np.float32)
+        self.uneven, self.failed, self.unlevelled = np.zeros((n, 2)), np.zeros(n, bool), np.ones(n, bool)
+        self.inverse = np.zeros((n, PARAMETERS, PARAMETERS))
+        self.rows, self.columns = [np.zeros(0, int)] * n, [np.zeros(0, int)] * n
+        self.grey, self.real, self.weight, self.residual, self.reduced = np.zeros((5, n, 0), np.float32)
+        self.ideal, self.on_unit = np.zeros((2, n, 2, 0), np.float32)
+        self.scores = np.zeros((n, PARAMETERS, 0), np.float32)
+        self._run()
+        self._follow_waves()
+
+    def _run(self):
+        active = np.arange(len(self.blur))
         for step in range(STEPS):
-            wanted = max(BAND_PX, BAND_BLURS * self.blur)
-            moved = np.abs(self.centre - selected).max()
-            if step == 0 or (step < RESELECTIONS and (moved > RESELECT_PX or abs(wanted / band - 1) > RESELECT_BAND)):
-                band, selected = wanted, self.centre
-                self._select(band)
-                if len(self.grey) < MIN_PIXELS:
-                    return False
-            move = self._step(robust=step >= 1)
-            if not np.isfinite(move) or np.linalg.norm(self.centre - self.start) > MAX_SHIFT * self.radius + 1:
-                return False
-            if step >= 2 and move < CONVERGED_PX:
-                break
-        return True
+            if step < RESELECTIONS:
+                active = self._lay_bands(active)
+            move = self._step(active, robust=step >= 1)
+            active = active[self._holds(active, move) & ((step < 2) | (move >= CONVERGED_PX))]
+            if not len(active):
+                return
 
-    def _follow_waves(self) -> bool:
+    def _holds(self, active, move) -> np.ndarray:
+        """Mask of those whose step was one and stayed near the start; the others have failed."""
+        away = np.linalg.norm(self.centre[active] - self.start[active], axis=1)
+        holds = np.isfinite(move) & (away <= MAX_SHIFT * self.radius[active] + 1)
+        self.failed[active[~holds]] = True
+        return holds
+
+    def _follow_waves(self):
         """Go on with brightness that varies around the rim on the sides, inside or outside, where it does."""
-        self.waves = tuple(inside for inside in (True, False) if self._is_uneven(inside))
-        if not self.waves:
-            return True
+        inside, outside = (self._is_uneven(side) & ~self.failed for side in (True, False))
+        if not (inside | outside).any():
+            return
+        more = (0, 4 * len(WAVES))
+        self.scores = np.pad(self.scores, ((0, 0), more, (0, 0)))
+        self.inverse = np.pad(self.inverse, ((0, 0), more, more))
         before = self.centre
-        self.levels = None
-        for _ in range(WAVE_STEPS):
-            move = self._step(robust=True)
-            if not np.isfinite(move) or np.linalg.norm(self.centre - self.start) > MAX_SHIFT * self.radius + 1:
-                return False
-            if move < CONVERGED_PX:
-                break
-        self.uneven = before - self.centre
-        return True
+        self.unlevelled |= inside | outside
+        for waves, own in (
+            ((True, False), inside & outside),
+            ((True,), inside & ~outside),
+            ((False,), outside & ~inside),
+        ):
+            active = np.flatnonzero(own)
+            for _ in range(WAVE_STEPS):
+                move = self._step(active, robust=True, waves=waves)
+                active = active[self._holds(active, move) & (move >= CONVERGED_PX)]
+        self.uneven = np.where((inside | outside)[:, None], before - self.centre, 0.0)
 
-    def _is_uneven(self, inside: bool) -> bool:
-        """Whether the residuals' third harmonic around the rim, on one side of it, is significant and matters."""
-        away = self.reduced if not inside else -self.reduced
-        own = (away > 1.0) & (self.weight > 0.5)
-        count = int(own.sum())
-        if count < MIN_PIXELS:
-            return False
-        angle = TOLD_BY * np.arctan2(self.rim_angle[1][own], self.rim_angle[0][own])
-        basis = np.stack([np.cos(angle), np.sin(angle)]).astype(float)
-        residual = self.residual[own].astype(float)
-        amplitude = np.linalg.solve(basis @ basis.T, basis @ residual)
-        sigma = max(robust_sigma(np.abs(residual)), MIN_SIGMA)
-        chi2 = float(amplitude @ (basis @ basis.T) @ amplitude) / sigma**2
-        return chi2 > UNEVEN_CHI2 and float(np.hypot(*amplitude)) > UNEVEN * abs(self.contrast)
+    def _is_uneven(self, inside: bool) -> np.ndarray:
+        """Whether the residuals' third harmonic around the rim, on one side of it, is significant and matters; (n,)."""
+        own = ((-self.reduced if inside else self.reduced) > 1.0) & (self.weight > 0.5)
+        many = own.sum(1) >= MIN_PIXELS
+        c, s = np.moveaxis(self._direction(), 1, 0)
+        basis = np.stack([c * (4 * c * c - 3), s * (3 - 4 * s * s)], 1) * own[:, None]
+        gram = (basis @ np.swapaxes(basis, 1, 2)).astype(float)
+        gram[~many] = np.eye(2)
+        found = (basis @ self.residual[..., None]).astype(float)
+        amplitude = np.linalg.solve(gram, found)
+        sigma = np.maximum(robust_sigmas(np.abs(self.residual), own), MIN_SIGMA)
+        chi2 = (amplitude * found).sum((1, 2)) / sigma**2
+        matters = np.hypot(*amplitude[..., 0].T) > UNEVEN * np.abs(self.levels[:, 3])
+        return many & (chi2 > UNEVEN_CHI2) & matters
 
-    def _select(self, band: float):
-        """The pixels within ``band`` of the rim, less those of intruders."""
-        inverse = (self.inverse_shape @ self.jacobian).astype(np.float32)
-        shift = np.linalg.solve(self.jacobian, self.centre - self.start).astype(np.float32)
-        dx, dy = self.dx - shift[0], self.dy - shift[1]
-        vx = inverse[0, 0] * dx + inverse[0, 1] * dy
-        vy = inverse[1, 0] * dx + inverse[1, 1] * dy
+    def _direction(self) -> np.ndarray:
+        """Cosine and sine of each pixel's angle on the unit circle, (n, 2, m)."""
+        square = (self.on_unit**2).sum(1, keepdims=True)
+        return self.on_unit / np.maximum(np.sqrt(square), np.float32(CUSP))
+
+    def _lay_bands(self, active) -> np.ndarray:
+        """Choose the pixels anew where centre or blur have changed; those of ``active`` that have enough."""
+        wanted = np.maximum(BAND_PX, BAND_BLURS * self.blur[active])
+        moved = np.abs(self.centre[active] - self.selected[active]).max(1)
+        anew = (moved > RESELECT_PX) | (np.abs(wanted / self.band[active] - 1) > RESELECT_BAND)
+        if not anew.any():
+            return active
+        chosen = active[anew]
+        self.band[chosen] = wanted[anew]
+        self.selected = np.where(np.isin(np.arange(len(self.blur)), chosen)[:, None], self.centre, self.selected)
+        for i in chosen.tolist():
+            self.rows[i], self.columns[i] = self._near_rim(i)
+        self._widen(max(map(len, self.rows)))
+        for i in chosen.tolist():
+            self._take(i)
+        self.unlevelled[chosen] = True
+        few = np.array([len(self.rows[i]) < MIN_PIXELS for i in active])
+        self.failed[active[few]] = True
+        return active[~few]
+
+    def _near_rim(self, i: int) -> tuple[np.ndarray, np.ndarray]:
+        """Rows and columns, in its box, of the pixels within the band around one rim, less those of intruders."""
+        dx, dy = self.from_place[i]
+        (ia, ib), (ic, id_) = (self.inverse_shape[i] @ self.jacobian[i]).astype(np.float32)
+        shift = np.linalg.solve(self.jacobian[i], self.centre[i] - self.start[i]).astype(np.float32)
+        x, y = dx - shift[0], dy - shift[1]
+        vx, vy = ia * x + ib * y, ic * x + id_ * y
         square = vx * vx + vy * vy
-        gx = inverse[0, 0] * vx + inverse[1, 0] * vy
-        gy = inverse[0, 1] * vx + inverse[1, 1] * vy
-        chosen = (square - np.sqrt(square)) ** 2 < band**2 * (gx * gx + gy * gy)
-        for place, shape in self.intruders:
-            ex = self.dx + np.float32(self.place[0] - place[0])
-            ey = self.dy + np.float32(self.place[1] - place[1])
+        gx, gy = ia * vx + ic * vy, ib * vx + id_ * vy
+        gx *= gx
+        gy *= gy
+        gx += gy
+        gx *= np.float32(self.band[i] ** 2)
+        square -= np.sqrt(square)
+        square *= square
+        chosen = square < gx
+        for place, shape in self.intruders[i]:
+            ex = dx + np.float32(self.place[i, 0] - place[0])
+            ey = dy + np.float32(self.place[i, 1] - place[1])
             chosen &= (shape[0, 0] * ex + shape[0, 1] * ey) ** 2 + (shape[1, 0] * ex + shape[1, 1] * ey) ** 2 > 1
-        self.in_patch = rows, columns = np.nonzero(chosen)
-        # Single precision is enough here: coordinates are taken from the start of the centre.
-        self.grey = self.patch[rows, columns].astype(np.float32)
-        at = _monomials(self.dx[columns].astype(float) / self.half[0], self.dy[rows, 0].astype(float) / self.half[1])
-        self.ideal = (self.to_ideal @ at - self.start[:, None]).astype(np.float32)
-        self.weight = np.ones(len(self.grey), np.float32)
-        self.levels = None
+        rows, columns = np.divmod(np.flatnonzero(chosen), chosen.shape[1])
+        return rows, columns
 
-    def _step(self, robust: bool) -> float:
-        """One Gauss–Newton step over all twelve parameters; returns the move of the centre, NaN where it breaks."""
-        inverse_shape = self.inverse_shape.astype(np.float32)
-        p, q = offset = self.ideal - (self.centre - self.start).astype(np.float32)[:, None]
-        a, b = v = inverse_shape @ offset
-        rho = np.sqrt(a * a + b * b)
-        gradient = inverse_shape @ v
-        slope_rho = np.sqrt(gradient[0] * gradient[0] + gradient[1] * gradient[1])
-        reduced = (rho - 1) * rho / (slope_rho * np.float32(self.blur))
-        inside = ndtr(-reduced)
-        x, y = offset * np.float32(1 / self.radius)
-        jacobian = np.empty((PARAMETERS + 2 * len(WAVES) * len(self.waves), len(rho)), np.float32)
-        planes = jacobian[6:]
-        planes[0], planes[1], planes[2], planes[3], planes[4], planes[5] = 1, x, y, inside, inside * x, inside * y
-        waves = self._waves(a, b) if self.waves else np.zeros((0, len(a)), np.float32)
-        for k, within in enumerate(self.waves):
-            planes[6 + k * len(waves) : 6 + (k + 1) * len(waves)] = waves * (inside if within else 1 - inside)
-        levels = self._levels(planes) if self.levels is None else self.levels
-        amplitude = levels[3] + levels[4] * x + levels[5] * y
-        for k, within in enumerate(self.waves):
-            own = levels[6 + k * len(waves) : 6 + (k + 1) * len(waves)] @ waves
-            amplitude = amplitude + own if within else amplitude - own
-        # d(distance)/d(rho) = rho/slope_rho; the change of the slope itself is of second order on the rim.
-        density = amplitude * np.exp(-0.5 * reduced * reduced) * np.float32(1 / (np.sqrt(2 * np.pi) * self.blur))
-        push = density / slope_rho
-        jacobian[0], jacobian[1] = push * gradient[0], push * gradient[1]
-        jacobian[2], jacobian[3], jacobian[4] = -push * a * p, -push * (a * q + b * p), -push * b * q
-        jacobian[5] = density * reduced
-        self.residual, self.rim_angle, self.reduced = self.grey - levels @ planes, (a, b), reduced
-        self._weigh(inside, robust)
-        weighted = jacobian * self.weight
-        normal = (weighted @ jacobian.T).astype(float)
-        scale = 1 / np.sqrt(np.maximum(np.diag(normal), 1e-300))
-        try:
-            inverse = np.linalg.inv(normal * scale[:, None] * scale) * scale[:, None] * scale
-        except np.linalg.LinAlgError:
-            return float("nan")
-        step = inverse @ (weighted @ self.residual)
-        self.scores, self.inverse = weighted, inverse
-        return self._apply(step, levels)
+    def _widen(self, m: int):
+        """Make room for ``m`` pixels of each ellipse."""
+        more = m - self.grey.shape[1]
+        if more > 0:
+            for name in ("grey", "real", "weight", "residual", "reduced", "ideal", "on_unit", "scores"):
+                array = getattr(self, name)
+                setattr(self, name, np.pad(array, [(0, 0)] * (array.ndim - 1) + [(0, more)]))
+            self.ideal[:, 0, -more:] = self.radius[:, None]  # not in the middle, where nothing has a direction
 
-    @staticmethod
-    def _waves(a, b) -> np.ndarray:
-        """Cosines and sines around the rim, (2 k, n)."""
-        angle = np.arctan2(b, a) * np.array(WAVES, np.float32)[:, None]
-        return np.concatenate([np.cos(angle), np.sin(angle)])
+    def _take(self, i: int):
+        """Grey values and ideal coordinates of one ellipse's pixels."""
+        rows, columns = self.rows[i], self.columns[i]
+        n = len(rows)
+        dx, dy = self.from_place[i]
+        x, y = dx[columns] / np.float32(self.half[i, 0]), dy[rows, 0] / np.float32(self.half[i, 1])
+        (left, top), (right, bottom) = self.low[i], self.high[i]
+        self.grey[i, :n] = self.image[top:bottom, left:right][rows, columns]
+        self.ideal[i, :, :n] = self.to_ideal[i, :, 1:].astype(np.float32) @ _monomials(x, y)[1:]
+        self.ideal[i, :, n:] = [[self.radius[i]], [0]]
+        self.real[i], self.weight[i] = np.arange(self.real.shape[1]) < n, self.real[i]
 
-    def _apply(self, step, levels) -> float:
-        matrix = self.inverse_shape + np.array([[step[2], step[3]], [step[3], step[4]]])
-        if not np.isfinite(step).all() or np.linalg.det(matrix) <= 0 or np.trace(matrix) <= 0:
-            return float("nan")
-        self.inverse_shape = matrix
-        self.centre = self.centre + step[:2]
-        self.blur = float(np.clip(self.blur + np.clip(step[5], -0.4 * self.blur, 0.6 * self.blur), *BLUR_LIMITS_PX))
-        self.levels = (levels + step[6:]).astype(np.float32)
-        self.contrast = float(self.levels[3])
-        return float(np.abs(step[:2]).max())
+    def _step(self, active, robust: bool, waves: tuple[bool, ...] = ()) -> np.ndarray:
+        """One Gauss–Newton step over all parameters of ``active``; the moves of the centres, NaN where one breaks.
 
-    def _levels(self, planes) -> np.ndarray:
-        weighted = planes * self.weight
-        normal = (weighted @ planes.T).astype(float)
-        normal[np.diag_indices(len(planes))] *= 1 + 1e-9
-        try:
-            return np.linalg.solve(normal, weighted @ self.grey).astype(np.float32)
-        except np.linalg.LinAlgError:
-            return np.full(len(planes), np.nan, np.float32)
-
-    def _weigh(self, inside, robust: bool):
-        """Weights of the pixels: equal but for outliers, which are judged by the spread on the edge itself.
-
-        Weighting the darker side up by its lower noise was tried: the edge's own errors decide, and it gained nothing.
+        ``waves`` : sides, inside the rim and outside, on which brightness varies around it.
         """
-        edge = (inside > 0.08) & (inside < 0.92)
-        size = np.abs(self.residual[edge]) if edge.any() else np.abs(self.residual)
-        sigma = max(robust_sigma(size), MIN_SIGMA)
-        self.weight = np.ones(len(self.residual), np.float32)
-        if robust:
-            self.weight = 1 / (1 + (self.residual * np.float32(1 / (ROBUST_WIDTH * sigma))) ** 2) ** 2
+        if not len(active):
+            return np.zeros(0)
+        own = slice(None) if len(active) == len(self.blur) else active
+        grey, real, start = self.grey[own], self.real[own], self.start[own]
+        inverse_shape = self.inverse_shape[own].astype(np.float32)
+        blur = self.blur[own].astype(np.float32)[:, None]
+        offset = self.ideal[own] - (self.centre[own] - start).astype(np.float32)[..., None]
+        on_unit = inverse_shape @ offset
+        (p, q), (a, b) = np.moveaxis(offset, 1, 0), np.moveaxis(on_unit, 1, 0)
+        rho = np.sqrt(a * a + b * b)
+        gradient = inverse_shape @ on_unit
+        slope_rho = np.sqrt(gradient[:, 0] ** 2 + gradient[:, 1] ** 2)
+        reduced = (rho - 1) * rho / (slope_rho * blur)
+        bell = np.exp(np.maximum(-0.5 * reduced * reduced, np.float32(-18)))  # products of smaller ones are denormal
+        inside = _normal_above(reduced, bell)
+        x, y = np.moveaxis(offset / self.radius[own].astype(np.float32)[:, None, None], 1, 0)
+        count, each = PARAMETERS + 2 * len(WAVES) * len(waves), 2 * len(WAVES)
+        jacobian = np.empty((len(active), count, rho.shape[1]), np.float32)
+        planes = jacobian[:, 6:]
+        planes[:, 0], planes[:, 1], planes[:, 2] = 1, x, y
+        planes[:, 3], planes[:, 4], planes[:, 5] = inside, inside * x, inside * y
+        around = _around(a, b) if waves else np.zeros((len(active), 0, rho.shape[1]), np.float32)
+        for k, within in enumerate(waves):
+            planes[:, 6 + k * each : 6 + (k + 1) * each] = around * (inside if within else 1 - inside)[:, None]
+        levels = self.levels[own, : count - 6]
+        if (unlevelled := self.unlevelled[own]).any():
+            these, levels = slice(None) if unlevelled.all() else unlevelled, levels.copy()
+            levels[these] = _levels(planes[these], self.weight[own][these], grey[these])
+            self.unlevelled[own] = False
+        amplitude = levels[:, 3:4] + levels[:, 4:5] * x + levels[:, 5:6] * y
+        for k, within in enumerate(waves):
+            varies = (levels[:, None, 6 + k * each : 6 + (k + 1) * each] @ around)[:, 0]
+            amplitude = amplitude + varies if within else amplitude - varies
+        # d(distance)/d(rho) = rho/slope_rho; the change of the slope itself is of second order on the rim.
+        density = amplitude * bell / (np.float32(np.sqrt(2 * np.pi)) * blur)
+        push = density / slope_rho
+        jacobian[:, :2] = push[:, None] * gradient
+        push_a, push_b = -push * a, -push * b
+        jacobian[:, 2], jacobian[:, 3], jacobian[:, 4] = push_a * p, push_a * q + push_b * p, push_b * q
+        jacobian[:, 5] = density * reduced
+        residual = (grey - (levels[:, None] @ planes)[:, 0]) * real
+        weight = _weights(residual, inside, real) if robust else real
+        weighted = jacobian * weight[:, None]
+        inverse = _inverses((weighted @ np.swapaxes(jacobian, 1, 2)).astype(float))
+        step = (inverse @ (weighted @ residual[..., None]))[..., 0]
+        if len(active) == len(self.blur) and count == self.scores.shape[1]:
+            self.scores, self.inverse = weighted, inverse
+        else:
+            self.scores[own, :count], self.inverse[own, :count, :count] = weighted, inverse
+        self.residual[own], self.weight[own] = residual, weight
+        self.reduced[own], self.on_unit[own] = reduced, on_unit
+        return self._apply(active, step, levels)
 
-    def _covariance(self) -> tuple[np.ndarray, float]:
-        """Of the centre, (2, 2), as if pixels were independent, and :meth:`_chance` over that noise.
+    def _apply(self, active, step, levels) -> np.ndarray:
+        turn = np.stack([step[:, 2:4], step[:, 3:5]], 1)
+        matrix = self.inverse_shape[active] + turn
+        (xx, xy), (_, yy) = np.moveaxis(matrix, 0, 2)
+        good = np.isfinite(step).all(1) & (xx * yy > xy * xy) & (xx + yy > 0)
+        own, step = active[good], step[good]
+        self.inverse_shape[own] = matrix[good]
+        self.centre = self.centre.copy()
+        self.centre[own] += step[:, :2]
+        blur = self.blur[own]
+        blur = blur + np.minimum(np.maximum(step[:, 5], -0.4 * blur), 0.6 * blur)
+        self.blur[own] = np.minimum(np.maximum(blur, BLUR_LIMITS_PX[0]), BLUR_LIMITS_PX[1])
+        self.levels[own, : levels.shape[1]] = levels[good] + step[:, 6:]
+        move = np.full(len(active), np.nan)
+        move[good] = np.abs(step[:, :2]).max(1)
+        return move
+
+    def _covariances(self) -> tuple[np.ndarray, np.ndarray]:
+        """Of the centres, (n, 2, 2), as if pixels were independent, and :meth:`_chance` over that noise.
 
         The noise is that of the pixels where the centre's weight is: errors sit on the edge more than beside it. The
         covariance is S·H·Sᵀ, H the inverse of the normal equations, S⁻¹ the share of a shift of the image that one step
         answers with (Huber 1981, sec. 6.3). The step's own derivatives would make that share 1; it is less by what the
         weights give away, and another where the edge is too wide for them, or not as the model has it.
         """
-        pull = self.scores[0] ** 2 + self.scores[1] ** 2
-        share = pull / self.weight
-        total = float(share.sum())
-        noise2 = max(float(pull @ self.residual**2) / total, MIN_NOISE2)
+        pull = self.scores[:, 0] ** 2 + self.scores[:, 1] ** 2
+        weight = np.where(self.real > 0, self.weight, 1)
+        share = pull / weight
+        total = share.sum(1, dtype=float)
+        noise2 = np.maximum((pull * self.residual**2).sum(1, dtype=float) / total, MIN_NOISE2)
         # ψ' over the weight of Geman–McClure, not below zero, where it would reward outliers.
-        influence = np.maximum(4 * np.sqrt(self.weight) - 3, 0)
-        chance = self._chance(np.sqrt(share / self.weight), total) / noise2 if noise2 > MIN_NOISE2 else 1.0
-        if self.blur < min(SHARP_PX, SHARP * self._narrowest()):
-            return noise2 * (float(pull.sum()) / float(pull @ influence)) ** 2 * self.inverse[:2, :2], chance
-        slope = self._exact_slope(self.scores[:2] / self.weight) - self._residual_slope()
-        answer = (self.inverse[:2] @ self.scores) * influence
-        spread = np.linalg.inv(answer @ slope.T)
-        return noise2 * spread @ self.inverse[:2, :2] @ spread.T, chance
+        influence = np.maximum(4 * np.sqrt(weight) - 3, 0)
+        chance = self._chance(np.sqrt(share / weight), total) / noise2
+        spread = (pull.sum(1, dtype=float) / (pull * influence).sum(1, dtype=float))[:, None, None] * np.eye(2)
+        wide = (self.blur >= np.minimum(SHARP_PX, SHARP * self._narrowest())) & ~self.failed
+        for i in np.flatnonzero(wide).tolist():
+            n = len(self.rows[i])
+            slope = self._exact_slope(i, self.scores[i, :2, :n] / weight[i, :n]) - self._residual_slope(i)
+            answer = (self.inverse[i, :2] @ self.scores[i, :, :n]) * influence[i, :n]
+            spread[i] = np.linalg.inv(answer @ slope.T)
+        covariance = spread @ self.inverse[:, :2, :2] @ np.swapaxes(spread, 1, 2)
+        return noise2[:, None, None] * covariance, np.where(noise2 > MIN_NOISE2, chance, 1.0)
 
-    def _narrowest(self) -> float:
-        """The ellipse's smaller radius, px."""
-        (xx, xy), (_, yy) = self.inverse_shape.tolist()
-        return 2 / (xx + yy + math.hypot(xx - yy, 2 * xy))
+    def _narrowest(self) -> np.ndarray:
+        """The ellipses' smaller radii, px."""
+        xx, xy, yy = self.inverse_shape[:, 0, 0], self.inverse_shape[:, 0, 1], self.inverse_shape[:, 1, 1]
+        return 2 / (xx + yy + np.hypot(xx - yy, 2 * xy))
 
-    def _exact_slope(self, slope: np.ndarray) -> np.ndarray:
-        """Derivatives of the model by the centre, (2, pixels): the step's, ``slope``, and the change of the distance's
+    def _exact_slope(self, i: int, slope: np.ndarray) -> np.ndarray:
+        """Derivatives of one model by the centre, (2, pixels): the step's, ``slope``, and the change of the distance's
         own slope."""
-        inverse_shape = self.inverse_shape.astype(np.float32)
-        rho = np.maximum(np.hypot(*self.rim_angle), np.float32(CUSP))
-        steepness = np.maximum(np.hypot(*(inverse_shape @ np.stack(self.rim_angle))), np.float32(CUSP / self.radius))
-        turn = np.float32(self.blur) * inverse_shape @ inverse_shape
-        return (2 - 1 / rho) * slope - self.reduced / steepness * (turn @ slope)
+        on_unit, reduced = self.on_unit[i, :, : slope.shape[1]], self.reduced[i, : slope.shape[1]]
+        inverse_shape = self.inverse_shape[i].astype(np.float32)
+        rho = np.maximum(np.hypot(*on_unit), np.float32(CUSP))
+        steepness = np.maximum(np.hypot(*(inverse_shape @ on_unit)), np.float32(CUSP / self.radius[i]))
+        turn = np.float32(self.blur[i]) * inverse_shape @ inverse_shape
+        return (2 - 1 / rho) * slope - reduced / steepness * (turn @ slope)
 
-    def _residual_slope(self) -> np.ndarray:
-        """Derivatives of the residual by the place, (2, pixels); none where a neighbour is not in the band."""
-        patch = np.full(self.patch.shape, np.nan, np.float32)
-        patch[self.in_patch] = self.residual
+    def _residual_slope(self, i: int) -> np.ndarray:
+        """Derivatives of one residual by the place, (2, pixels); none where a neighbour is not in the band."""
+        rows, columns = self.rows[i], self.columns[i]
+        patch = np.full((self.high[i] - self.low[i])[::-1], np.nan, np.float32)
+        patch[rows, columns] = self.residual[i, : len(rows)]
         slope = np.zeros((2, *patch.shape), np.float32)
         slope[0, :, 1:-1] = patch[:, 2:] - patch[:, :-2]
         slope[1, 1:-1] = patch[2:] - patch[:-2]
-        by_pixel = np.nan_to_num(slope[:, *self.in_patch]) / 2
-        return np.linalg.inv(self.jacobian).T.astype(np.float32) @ by_pixel
+        by_pixel = np.nan_to_num(slope[:, rows, columns]) / 2
+        return np.linalg.inv(self.jacobian[i]).T.astype(np.float32) @ by_pixel
 
-    def _chance(self, edge: np.ndarray, total: float) -> float:
-        """Variance of a pixel from the residuals' :data:`CHANCE_WAVES` on the rim, of amplitude ``edge`` and weighted
-        square ``total``: an estimate from orthonormal series (Phillips 2005), less what the parameters took of these.
+    def _chance(self, edge: np.ndarray, total: np.ndarray) -> np.ndarray:
+        """Variance of a pixel from the residuals' :data:`CHANCE_WAVES` on the rim, of amplitudes ``edge`` and weighted
+        squares ``total``: an estimate from orthonormal series (Phillips 2005), less what the parameters took of these.
         """
-        a, b = self.rim_angle
-        wave = np.empty(len(edge), np.complex64)
-        wave.real, wave.imag = np.stack([a, b]) / np.maximum(np.sqrt(a * a + b * b), np.float32(CUSP))
+        wave = np.empty(edge.shape, np.complex64)
+        wave.real, wave.imag = np.moveaxis(self._direction(), 1, 0)
         double, wave = wave * wave, wave * edge
-        waves = np.empty((2 * CHANCE_WAVES, len(edge)), np.float32)
+        waves = np.empty((len(edge), 2 * CHANCE_WAVES, edge.shape[1]), np.float32)
         for k in range(CHANCE_WAVES):
             wave *= double
-            waves[2 * k], waves[2 * k + 1] = wave.real, wave.imag
-        taken = (waves @ self.scores.T).astype(float)
-        left = CHANCE_WAVES * total - float((taken @ self.inverse * taken).sum())
-        found = waves @ (self.weight * self.residual)
-        return float(found @ found) / left
+            waves[:, 2 * k], waves[:, 2 * k + 1] = wave.real, wave.imag
+        taken = (waves @ np.swapaxes(self.scores, 1, 2)).astype(float)
+        left = CHANCE_WAVES * total - (taken @ self.inverse * taken).sum((1, 2))
+        found = waves @ (self.weight * self.residual)[..., None]
+        return (found**2).sum((1, 2)) / left
 
-    def result(self) -> _Ellipse:
-        """The fit; of no contrast and no rim where it failed."""
-        if self.failed:
-            return _Ellipse(self.start, np.eye(2) * self.radius, np.eye(2), 0.0, 0.0, 0.0, 0.0, 0.0, np.zeros(2))
-        near = np.abs(self.reduced) * self.blur < max(1.5, self.blur)
-        angle = np.arctan2(self.rim_angle[1][near], self.rim_angle[0][near])
-        sector = (angle * (SECTORS / (2 * np.pi))).astype(int) % SECTORS
-        total = np.bincount(sector, minlength=SECTORS)
-        square = np.bincount(sector, self.residual[near] ** 2, minlength=SECTORS)
-        noise = robust_sigma(np.abs(self.residual))
-        allowed = (MAX_RIM_RESIDUAL * self.contrast) ** 2 + (2 * noise) ** 2
-        rim = float((square <= allowed * total).mean())
-        shape = np.linalg.inv(self.inverse_shape)
-        covariance, chance = self._covariance()
-        return _Ellipse(self.centre, shape, covariance, chance, self.blur, self.contrast, noise, rim, self.uneven)
+    def result(self) -> _Rims:
+        """The fits."""
+        n = len(self.blur)
+        near = (np.abs(self.reduced) * self.blur[:, None] < np.maximum(1.5, self.blur)[:, None]) & (self.real > 0)
+        angle = np.arctan2(self.on_unit[:, 1][near], self.on_unit[:, 0][near])
+        sector = (angle * (SECTORS / (2 * np.pi))).astype(int) % SECTORS + SECTORS * np.nonzero(near)[0]
+        total = np.bincount(sector, minlength=n * SECTORS).reshape(n, SECTORS)
+        square = np.bincount(sector, self.residual[near] ** 2, minlength=n * SECTORS).reshape(n, SECTORS)
+        contrast = self.levels[:, 3].astype(float)
+        with np.errstate(divide="ignore", invalid="ignore"):  # of those that failed
+            noise = robust_sigmas(np.abs(self.residual), self.real > 0)
+            rim = (square <= ((MAX_RIM_RESIDUAL * contrast) ** 2 + (2 * noise) ** 2)[:, None] * total).mean(1)
+            covariance, chance = self._covariances()
+        ok = ~self.failed
+        return _Rims(
+            np.where(ok[:, None], self.centre, self.start),
+            np.where(ok[:, None, None], np.linalg.inv(self.inverse_shape), self.radius[:, None, None] * np.eye(2)),
+            np.where(ok[:, None, None], covariance, np.eye(2)),
+            np.where(ok, chance, 0.0),
+            np.where(ok, self.blur, 0.0),
+            np.where(ok, contrast, 0.0),
+            np.where(ok, noise, 0.0),
+            np.where(ok, rim, 0.0),
+            np.where(ok[:, None], self.uneven, 0.0),
+        )
+
+
+def _offsets(low: np.ndarray, high: np.ndarray, place: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Columns (w,) and rows (h, 1) of a box, px from ``place``."""
+    x, y = ((np.arange(a, b) - c).astype(np.float32) for a, b, c in zip(low, high, place, strict=True))
+    return x, y[:, None]
+
+
+def _normal_above(x: np.ndarray, bell: np.ndarray) -> np.ndarray:
+    """Share of a normal distribution above ``x``, to 3e-7, from ``bell``, exp(−x²/2) (Abramowitz and Stegun 1964,
+    7.1.26): in single precision as good as SciPy's, in a sixth of its time."""
+    t = 1 / (1 + np.float32(0.3275911 / np.sqrt(2)) * np.abs(x))
+    tail = np.float32(1.061405429 / 2) * t
+    for c in (-1.453152027, 1.421413741, -0.284496736, 0.254829592):
+        tail += np.float32(c / 2)
+        tail *= t
+    tail *= bell
+    return np.where(x < 0, 1 - tail, tail)
+
+
+def _around(a: np.ndarray, b: np.ndarray) -> np.ndarray:
+    """Cosines and sines around the rim, (n, 2 k, m)."""
+    angle = np.arctan2(b, a)[:, None] * np.array(WAVES, np.float32)[:, None]
+    return np.concatenate([np.cos(angle), np.sin(angle)], 1)
+
+
+def _levels(planes: np.ndarray, weight: np.ndarray, grey: np.ndarray) -> np.ndarray:
+    """Brightness of the planes, (n, k), by linear least squares; NaN where they cannot be told apart."""
+    weighted = planes * weight[:, None]
+    normal = (weighted @ np.swapaxes(planes, 1, 2)).astype(float)
+    normal[:, *np.diag_indices(normal.shape[1])] *= 1 + 1e-9
+    return (_inverses(normal) @ (weighted @ grey[..., None]))[..., 0]
+
+
+def _inverses(normal: np.ndarray) -> np.ndarray:
+    """Of normal equations (n, k, k), each scaled to a unit diagonal meanwhile; NaN where one has none."""
+    scale = 1 / np.sqrt(np.maximum(np.diagonal(normal, axis1=1, axis2=2), 1e-300))
+    scale = scale[:, :, None] * scale[:, None]
+    try:
+        return np.linalg.inv(normal * scale) * scale
+    except np.linalg.LinAlgError:
+        if len(normal) == 1:
+            return np.full_like(normal, np.nan)
+        return np.concatenate([_inverses(each[None]) for each in normal])
+
+
+def _weights(residual: np.ndarray, inside: np.ndarray, real: np.ndarray) -> np.ndarray:
+    """Weights of the pixels: equal but for outliers, which are judged by the spread on the edge itself.
+
+    Weighting the darker side up by its lower noise was tried: the edge's own errors decide, and it gained nothing.
+    """
+    edge = (inside > 0.08) & (inside < 0.92) & (real > 0)
+    edge |= ~edge.any(1, keepdims=True) & (real > 0)
+    sigma = np.maximum(robust_sigmas(np.abs(residual), edge), MIN_SIGMA)
+    return real / (1 + (residual / (ROBUST_WIDTH * sigma).astype(np.float32)[:, None]) ** 2) ** 2

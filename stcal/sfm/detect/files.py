@@ -24,7 +24,7 @@ from stcal.sfm.detect.image import detect_image
 from stcal.sfm.detect.predict import PredictedCircles, SecondLook, measure_predicted
 from stcal.sfm.detect.sightings import BoardSighting, FaceSighting, ImageDetection
 
-CACHE_VERSION = 6
+CACHE_VERSION = 7
 """Raised whenever detection gives other results for the same image: what was kept is then not used again."""
 
 

@@ -169,7 +169,7 @@ def _reasons(found: Centres, expected: Ellipses, polarity: Sequence[Polarity], c
         if not found.ok[k]:
             reason = f"{100 * found.rim[k]:.0f} % of its rim follows an ellipse, {100 * MIN_RIM:.0f} % needed"
         elif contrast[k] < needed[k]:
-            reason = f"contrast {contrast[k]:.1f}, {needed[k]:.1f} needed"
+            reason = f"contrast {contrast[k]:z.1f}, {needed[k]:.1f} needed"
         else:
             reason = _disagreement(expected.shape_px[k], float(off[k]), (widest[k], narrowest[k]))
             if not reason and sigma[k] > MAX_SIGMA_PX:

@@ -182,7 +182,7 @@ def widen(cell):
     ("spoil", "noise", "reason"),
     [
         (hide, 1, "% of its rim follows an ellipse, 80 % needed"),
-        (hide, 0, "contrast -0.0, 3.2 needed"),
+        (hide, 0, "contrast 0.0, 3.2 needed"),
         (dim, 0, "contrast 2.0, 3.2 needed"),
         (invert, 1, "contrast -1"),
         (cover(0.3), 1, "% of its rim follows an ellipse, 80 % needed"),
