@@ -71,8 +71,9 @@ def fit_homography(xy_b: np.ndarray, xy_a: np.ndarray) -> np.ndarray:
         raise DegenerateError(f"homography: {len(b)} point pairs, 4 needed")
 
     def normaliser(p):
-        scale = np.sqrt(2) / max(np.sqrt(((p - p.mean(0)) ** 2).sum(1)).mean(), 1e-300)
-        return np.array([[scale, 0, -scale * p[:, 0].mean()], [0, scale, -scale * p[:, 1].mean()], [0, 0, 1]])
+        x, y = mean = p.sum(0) / len(p)
+        scale = np.sqrt(2) / max(np.sqrt(((p - mean) ** 2).sum(1)).sum() / len(p), 1e-300)
+        return np.array([[scale, 0, -scale * x], [0, scale, -scale * y], [0, 0, 1]])
 
     na, nb = normaliser(a), normaliser(b)
     a = a @ na[:2, :2].T + na[:2, 2]

@@ -10,6 +10,7 @@ from scipy.spatial import KDTree
 from stcal.design import Polarity
 from stcal.errors import InputError
 from stcal.geometry.arrays import frozen
+from stcal.io.images import percentiles
 
 WINDOWS_PX = (41, 193)
 """Sides of the windows whose mean is the threshold, at every level of the pyramid."""
@@ -181,7 +182,7 @@ def find_ellipses(image: np.ndarray, polarity: Polarity, options: EllipseOptions
 
 def contrast_threshold(image: np.ndarray, options: EllipseOptions) -> tuple[float, float]:
     """Contrast that a circle must exceed, and the image's grey range that it is a fraction of; grey values."""
-    low, high = np.percentile(image[::8, ::8], [0.5, 99.9])
+    low, high = percentiles(image[::8, ::8], [0.5, 99.9])
     grey_range = max(high, 1.0) - low
     return max(MIN_THRESHOLD, options.min_contrast * grey_range), grey_range
 
@@ -228,10 +229,13 @@ def contrast_of(image: np.ndarray, polarity: Polarity, centre: np.ndarray, shape
 def masks(
     level: Level, polarity: Polarity, threshold: float, options: EllipseOptions
 ) -> Iterator[tuple[np.ndarray, OutlineGates]]:
-    """Masks of what stands out in one level, one for each window, with the gates for outlines in them."""
+    """Masks of what stands out in one level, one for each window that circles of the level fit into, with the gates for
+    outlines in them."""
     smooth = cv2.GaussianBlur(level.image, (3, 3), 0)
     for window in WINDOWS_PX:
         highest = min(options.max_diameter_px / level.scale, window / WINDOW_OVER_DIAMETER)
+        if highest < level.lowest:
+            continue
         mean = cv2.blur(smooth, (window, window), borderType=cv2.BORDER_REFLECT)
         difference = cv2.subtract(smooth, mean) if polarity == "bright" else cv2.subtract(mean, smooth)
         # An outline at half the blob's own height neither grows with blur nor runs into a neighbour.

@@ -7,6 +7,7 @@ reading explains more circles than every other.
 """
 
 from dataclasses import dataclass
+from functools import lru_cache
 
 import numpy as np
 
@@ -79,32 +80,71 @@ class FaceFinding:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class _Pair:
-    """Two neighbouring circles of a design with the circles around the first, and the faces that have all of them.
+class _Pairs:
+    """p pairs of neighbouring circles of a design, alike ones of several faces once, each with the s circles around the
+    first, and the u places on the faces where they are.
 
-    ``offset`` : (s, 2) places of the circles around, from the first; ``radius`` : (s,), the first's own in front;
-    ``second`` : which of them is the neighbour; ``faces`` : with the circles' numbers (s,) in each.
+    ``offset`` : (p, s, 2) places of the circles around, from the first; ``radius`` : (p, s), the first's own in front;
+    ``there`` : (p, s), as faces of few circles have fewer; ``second`` : (p,) which of them is the neighbour;
+    ``uses`` : (p + 1,) where each pair's rows of the next two begin; ``face`` : (u,) number of the face; ``circles`` :
+    (u, s) their numbers in it, −1 where there is none.
     """
 
     offset: np.ndarray
     radius: np.ndarray
-    second: int
-    faces: list[tuple[FaceDesign, np.ndarray]]
+    there: np.ndarray
+    second: np.ndarray
+    uses: np.ndarray
+    face: np.ndarray
+    circles: np.ndarray
 
 
-def _pairs(target: TargetDesign) -> list[_Pair]:
-    """All pairs of a design, alike ones of several faces once."""
-    pairs: dict[tuple, _Pair] = {}
-    for face in target.faces:
+@dataclass(frozen=True, slots=True, eq=False)
+class _Starts:
+    """n hypotheses, the best supported first: ``origin`` (n,) the first outline, ``face`` (n,) its number,
+    ``circles`` (n, s) of it, and the ``candidates`` (n, s) that may be them, −1 where there is none."""
+
+    origin: np.ndarray
+    face: np.ndarray
+    circles: np.ndarray
+    candidates: np.ndarray
+
+    def agree(self, face: int, index: np.ndarray) -> np.ndarray:
+        """Those of a face of which a reading, ``index`` by circle, has two circles or more; (n,)."""
+        own = np.flatnonzero(self.face == face)
+        same = (index[self.circles[own]] == self.candidates[own]) & (self.candidates[own] >= 0)
+        return own[same.sum(1) >= 2]
+
+
+@lru_cache(maxsize=8)
+def _pairs(target: TargetDesign) -> _Pairs:
+    width = min(SUPPORT + 2, max(len(face.ids) for face in target.faces))
+    found: dict[tuple, list] = {}
+    for number, face in enumerate(target.faces):
         distance = np.linalg.norm(face.xy_mm[:, None] - face.xy_mm, axis=2)
         for row in np.argsort(distance, axis=1, kind="stable"):
-            near = row[: SUPPORT + 2]
+            near = row[:width]
             offset, radius = face.xy_mm[near] - face.xy_mm[near[0]], face.radius_mm[near]
             same = (*np.round(offset, 6).ravel(), *np.round(radius, 6))
             for second in range(1, min(NEIGHBOURS_IN_DESIGN, len(near) - 1) + 1):
-                pair = pairs.setdefault((second, *same), _Pair(offset, radius, second, []))
-                pair.faces.append((face, near))
-    return list(pairs.values())
+                found.setdefault((second, *same), [offset, radius, []])[2].append((number, near))
+    offsets, radii = np.zeros((len(found), width, 2)), np.ones((len(found), width))
+    there = np.zeros((len(found), width), bool)
+    for i, (offset, radius, _) in enumerate(found.values()):
+        offsets[i, : len(radius)], radii[i, : len(radius)], there[i, : len(radius)] = offset, radius, True
+    uses = [use for _, _, uses in found.values() for use in uses]
+    circles = np.full((len(uses), width), -1)
+    for i, (_, near) in enumerate(uses):
+        circles[i, : len(near)] = near
+    return _Pairs(
+        offsets,
+        radii,
+        there,
+        np.array([second for second, *_ in found], int),
+        np.cumsum([0, *(len(uses) for _, _, uses in found.values())]),
+        np.array([number for number, _ in uses], int),
+        circles,
+    )
 
 
 class FaceFinder:
@@ -117,24 +157,26 @@ class FaceFinder:
         """All faces among the candidates. The image of a face in a mirror can pass for another face, which only the
         group can tell."""
         readings: list[FaceReading] = []
-        known = {face.id: np.zeros((0, len(face.ids)), int) for face in self.target.faces}
-        tries = np.zeros(len(candidates), int)
+        if len(candidates) < MIN_CIRCLES:
+            return _decide(readings, self.target)
+        starts, tries = self._hypotheses(candidates), np.zeros(len(candidates), int)
+        is_open = np.ones(len(starts.origin), bool)
         explained: set[int] = set()
-        starts = self._hypotheses(candidates) if len(candidates) >= MIN_CIRCLES else []
-        for rank, (first, face, index) in enumerate(starts):
+        for rank, first in enumerate(starts.origin.tolist()):
             if rank == FIRST_HYPOTHESES:
                 explained = {i for r in readings for i in r.used() if r.count() >= needed_circles(r.face)}
-            matched = index >= 0
-            if tries[first] == MAX_TRIES or first in explained:
-                continue
-            if ((known[face.id][:, matched] == index[matched]).sum(1) >= 2).any():
+            if not is_open[rank] or tries[first] == MAX_TRIES or first in explained:
                 continue
             if rank >= FIRST_HYPOTHESES:
                 tries[first] += 1
+            number = int(starts.face[rank])
+            face, matched = self.target.faces[number], starts.candidates[rank] >= 0
+            index = np.full(len(face.ids), -1)
+            index[starts.circles[rank][matched]] = starts.candidates[rank][matched]
             grown = grow_match(candidates, index, face.xy_mm, face.radius_mm)
             if grown is not None and _seen_from_outside(grown[1], face):
                 readings.append(FaceReading(face, _of_one_size(candidates, face, *grown), grown[1]))
-                known[face.id] = np.vstack([known[face.id], readings[-1].index])
+                is_open[starts.agree(number, readings[-1].index)] = False
         return _decide(readings, self.target)
 
     def find_mirrored(self, candidates: Candidates, named: tuple[FaceReading, ...]) -> tuple[FaceReading, ...]:
@@ -144,27 +186,28 @@ class FaceFinder:
         found = self.find(candidates.mirrored()).faces
         return tuple(reading for reading in found if reading.face.id not in mirror_images(self.target))
 
-    def _hypotheses(self, candidates: Candidates) -> list[tuple[int, FaceDesign, np.ndarray]]:
-        """Starts (first candidate, face, index), the best supported first."""
+    def _hypotheses(self, candidates: Candidates) -> _Starts:
+        """All pairs of neighbouring outlines that may be a pair of the design, with their support."""
+        pairs = _pairs(self.target)
         first, step, ratio = _candidate_pairs(candidates)
-        length = np.linalg.norm(step, axis=1)
-        found = []
-        for pair in _pairs(self.target):
-            first_radius, distance = pair.radius[0], np.linalg.norm(pair.offset[pair.second])
-            ok = np.abs(length * first_radius / distance - 1) < PAIR_TOLERANCE
-            ok &= np.abs(ratio * first_radius / pair.radius[pair.second] - 1) < PAIR_TOLERANCE
-            if not ok.any():
-                continue
-            linear = candidates.shape[first[ok]] @ _turn(pair.offset[pair.second] * [1, -1], step[ok]) * [1, -1]
-            support = _support(candidates, pair, candidates.xy[first[ok]], linear)
-            hits, contrast, origin = (support >= 0).sum(1), candidates.contrast[first[ok]], first[ok].tolist()
-            for h in np.flatnonzero(hits >= 2 + MIN_SUPPORT):
-                for face, near in pair.faces:
-                    index = np.full(len(face.ids), -1)
-                    index[near] = support[h]
-                    found.append((hits[h], contrast[h], origin[h], face, index))
-        found.sort(key=lambda item: (-item[0], -item[1]))
-        return [(start, face, index) for _, _, start, face, index in found]
+        every = np.arange(len(pairs.second))
+        neighbour, own_radius = pairs.offset[every, pairs.second], pairs.radius[:, 0]
+        length, distance = np.linalg.norm(step, axis=1), np.linalg.norm(neighbour, axis=1)
+        ok = np.abs(length * (own_radius / distance)[:, None] - 1) < PAIR_TOLERANCE
+        ok &= np.abs(ratio * (own_radius / pairs.radius[every, pairs.second])[:, None] - 1) < PAIR_TOLERANCE
+        pair, row = np.nonzero(ok)
+        linear = candidates.shape[first[row]] @ _turn(neighbour[pair] * [1, -1], step[row]) * [1, -1]
+        support = _support(candidates, pairs, pair, candidates.xy[first[row]], linear)
+        hits = (support >= 0).sum(1)
+        kept = np.flatnonzero(hits >= 2 + MIN_SUPPORT)
+        origin = first[row[kept]]
+        best = np.lexsort((-candidates.contrast[origin], -hits[kept]))
+        kept, origin = kept[best], origin[best]
+        begin, count = pairs.uses[pair[kept]], np.diff(pairs.uses)[pair[kept]]
+        use = np.repeat(begin - np.cumsum(count) + count, count) + np.arange(count.sum())
+        return _Starts(
+            np.repeat(origin, count), pairs.face[use], pairs.circles[use], np.repeat(support[kept], count, axis=0)
+        )
 
 
 def _candidate_pairs(candidates: Candidates):
@@ -184,20 +227,25 @@ def _candidate_pairs(candidates: Candidates):
 
 
 def _turn(step_plane: np.ndarray, step_image: np.ndarray) -> np.ndarray:
-    """Turn and scale, (n, 2, 2), that takes one plane vector to each image vector."""
-    a, b = step_plane
-    s = step_image @ np.array([[a, -b], [b, a]]) / (a * a + b * b)
-    return np.stack([np.stack([s[:, 0], -s[:, 1]], 1), np.stack([s[:, 1], s[:, 0]], 1)], 1)
+    """Turn and scale, (n, 2, 2), that takes each plane vector (n, 2) to its image vector (n, 2)."""
+    (a, b), (x, y) = step_plane.T, step_image.T
+    square = a * a + b * b
+    c, s = (a * x + b * y) / square, (a * y - b * x) / square
+    return np.stack([np.stack([c, -s], 1), np.stack([s, c], 1)], 1)
 
 
-def _support(candidates: Candidates, pair: _Pair, xy: np.ndarray, linear: np.ndarray) -> np.ndarray:
-    """Candidates near the affine prediction of the circles around the first: (h, s), −1 where there is none."""
-    predicted = xy[:, None] + np.einsum("hij,mj->hmi", linear, pair.offset)
+def _support(candidates: Candidates, pairs: _Pairs, pair: np.ndarray, xy: np.ndarray, linear: np.ndarray) -> np.ndarray:
+    """Candidates near the affine prediction of the circles around the first: (h, s), −1 where there is none.
+
+    ``pair`` : (h,) of the design; ``xy`` : (h, 2) of the first candidate; ``linear`` : (h, 2, 2) map of the plane
+    """
+    offset, radius = pairs.offset[pair], pairs.radius[pair]
+    predicted = xy[:, None] + offset @ np.swapaxes(linear, 1, 2)
     _, nearest = candidates.tree.query(predicted)
-    error = np.linalg.solve(linear[:, None], (candidates.xy[nearest] - predicted)[..., None])[..., 0]
+    error = (candidates.xy[nearest] - predicted) @ np.swapaxes(np.linalg.inv(linear), 1, 2)
     size = candidates.radius[nearest] / np.sqrt(np.abs(np.linalg.det(linear)))[:, None]
-    ok = np.linalg.norm(error, axis=2) < 0.4 * pair.radius + 0.12 * np.linalg.norm(pair.offset, axis=1)
-    ok &= np.abs(size / pair.radius - 1) < 0.5
+    ok = np.linalg.norm(error, axis=2) < 0.4 * radius + 0.12 * np.linalg.norm(offset, axis=2)
+    ok &= (np.abs(size / radius - 1) < 0.5) & pairs.there[pair]
     return np.where(ok, nearest, -1)
 
 
