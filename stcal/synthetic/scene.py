@@ -1,6 +1,7 @@
 """A scene with known truth: the target and the board as really made, where they stand, and the cameras."""
 
 from dataclasses import dataclass
+from functools import lru_cache
 from itertools import combinations
 
 import numpy as np
@@ -252,13 +253,15 @@ def _rectangle(xy: np.ndarray, radius: np.ndarray, margin: float) -> np.ndarray:
         (x0, y0), (x1, y1) = (turned - radius[:, None]).min(0) - margin, (turned + radius[:, None]).max(0) + margin
         corners = np.array([[x0, y0], [x1, y0], [x1, y1], [x0, y1]])
         found.append(((x1 - x0) * (y1 - y0), corners @ turned_from_plane))
-    return np.column_stack([min(found, key=lambda each: each[0])[1], np.zeros(4)])
+    return frozen(np.column_stack([min(found, key=lambda each: each[0])[1], np.zeros(4)]), (4, 3), "corners")
 
 
+@lru_cache(maxsize=32)
 def _face_rectangle(face: FaceDesign) -> np.ndarray:
     return _rectangle(face.xy_mm, face.radius_mm, FACE_MARGIN_MM)
 
 
+@lru_cache(maxsize=4)
 def _board_rectangle(board: BoardDesign) -> np.ndarray:
     return _rectangle(board.xy_mm(), board.radii_mm(), BOARD_MARGIN_MM)
 

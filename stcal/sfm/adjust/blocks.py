@@ -138,6 +138,20 @@ def without_cameras(
     return normal - cameras.normal, right - cameras.right, cameras
 
 
+def rows_of_view(model: GroupModel, camera: Camera, basis: np.ndarray) -> np.ndarray:
+    """Of a model of one image, n observations: rows (2n − 6, 3p + q) of the whitened equations over its points and the
+    intrinsics that are orthogonal to the pose; their squares are :func:`without_cameras`'s normal matrix."""
+    by_pose, by_point = projection_jacobians(model, camera)
+    n, p = len(model.point_index), len(model.labels)
+    rows = np.zeros((n, 2, 3 * p + basis.shape[1]))
+    columns = 3 * model.point_index[:, None] + np.arange(3)
+    rows[np.arange(n)[:, None, None], np.arange(2)[:, None], columns[:, None]] = model.whiten(by_point)
+    xyz = model.xyz_camera()
+    rows[:, :, 3 * p :] = model.whiten(camera.parameter_jacobian(xyz[:, :2] / xyz[:, 2:]) @ basis)
+    across = np.linalg.qr(model.whiten(by_pose).reshape(2 * n, 6), mode="complete")[0][:, 6:]
+    return across.T @ rows.reshape(2 * n, -1)
+
+
 def _with_board(block: Block, shared: Shared, normal: np.ndarray, right: np.ndarray):
     """Append pose of the board and common shape with the observations dot = pose · (design + shape ± σ); indices of
     what is eliminated (dots, pose) and of what stays (circles, shape, intrinsics)."""

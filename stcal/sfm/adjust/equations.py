@@ -45,6 +45,14 @@ class Setting:
         count = s + shared.basis.shape[1]
         return Places(slice(0, c), slice(c, s), slice(s, count), count)
 
+    def outer(self, block: Block, shared: Shared) -> np.ndarray:
+        """Places of a group's outer unknowns among all: circles, shape, intrinsics."""
+        places = self.places(shared)
+        circles = (3 * block.circle_place[:, None] + np.arange(3)).ravel()
+        shape = places.shape.start + (3 * block.dot_place[:, None] + np.arange(3)).ravel()
+        intrinsics = np.arange(places.intrinsics.start, places.intrinsics.stop)
+        return np.concatenate([circles, shape, intrinsics]).astype(int)
+
     def own_sigma_mm(self) -> float:
         return self.board.sigma_mm * float(np.sqrt(1 - self.common))
 
@@ -103,19 +111,10 @@ class SharedEquations:
         gain = 2 * float(outer @ self.right) - float(outer @ self.normal @ outer) + sum(g.gain for g in self.groups)
         intrinsics = outer[setting.places(shared).intrinsics]
         own = [
-            step_of(b, g, outer[_outer(b, setting, shared)], intrinsics)
+            step_of(b, g, outer[setting.outer(b, shared)], intrinsics)
             for b, g in zip(self.state.blocks, self.groups, strict=True)
         ]
         return np.concatenate([outer, *own]), gain
-
-
-def _outer(block: Block, setting: Setting, shared: Shared) -> np.ndarray:
-    """Places of a group's outer unknowns among all: circles, shape, intrinsics."""
-    places = setting.places(shared)
-    circles = (3 * block.circle_place[:, None] + np.arange(3)).ravel()
-    shape = places.shape.start + (3 * block.dot_place[:, None] + np.arange(3)).ravel()
-    intrinsics = np.arange(places.intrinsics.start, places.intrinsics.stop)
-    return np.concatenate([circles, shape, intrinsics]).astype(int)
 
 
 def _normal_equations(blocks: Sequence[Block], shared: Shared, setting: Setting):
@@ -124,7 +123,7 @@ def _normal_equations(blocks: Sequence[Block], shared: Shared, setting: Setting)
     normal, right = np.zeros((places.count, places.count)), np.zeros(places.count)
     groups = tuple(reduced(b, shared, setting.huber) for b in blocks)
     for b, each in zip(blocks, groups, strict=True):
-        place = _outer(b, setting, shared)
+        place = setting.outer(b, shared)
         normal[np.ix_(place, place)] += each.normal
         right[place] += each.right
     if setting.common:

@@ -21,7 +21,7 @@ from stcal.geometry.rigid import Rigid
 from stcal.geometry.robust import HUBER, robust_sigma
 from stcal.io.camera import CameraPrior, intrinsic_basis
 from stcal.labels import CircleLabel, DotLabel, dot_cells
-from stcal.sfm.adjust.blocks import Block, Shared, normalised, robust_weights
+from stcal.sfm.adjust.blocks import Block, Shared, normalised, robust_weights, rows_of_view
 from stcal.sfm.adjust.equations import (
     FREE_DIRECTIONS,
     JointState,
@@ -135,6 +135,67 @@ def covariance_of(
     if common > 0:
         blocks, setting = _with_common(blocks, setting, common)
     return _result(blocks, shared, setting, 0.0, 1.0)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Extensible:
+    """What :func:`covariance_of` gives of the circles, ready for one more view, however many images it rests on.
+
+    ``camera`` ; ``basis`` : (12, q) derivative of its parameters by those that are adjusted; ``covariance_mm2`` :
+    (3c, 3c) of the circles; ``points`` by group: (3p + q, 3p + q) of its points and the intrinsics; ``to_circles`` by
+    group: (3p + q, 3c).
+    """
+
+    camera: Camera
+    basis: np.ndarray
+    covariance_mm2: np.ndarray
+    points: dict[str, np.ndarray]
+    to_circles: dict[str, np.ndarray]
+
+    def with_view(self, view: MetricModel) -> np.ndarray:
+        """Covariance of the circles, (3c, 3c) mm², with a view: a model of one image and all points of its group.
+
+        The inverse of a matrix with a change of small rank (Woodbury 1950).
+        """
+        rows = rows_of_view(view, self.camera, self.basis)
+        away = rows @ self.to_circles[view.group]
+        inner = np.eye(len(rows)) + rows @ self.points[view.group] @ rows.T
+        return self.covariance_mm2 - away.T @ np.linalg.solve(inner, away)
+
+
+def extensible(
+    models: Sequence[MetricModel],
+    board: BoardDesign,
+    camera: Camera,
+    flatness_mm: float | None = None,
+    prior: CameraPrior | None = None,
+    common: float = 0.0,
+) -> Extensible:
+    """See there; arguments as of :func:`covariance_of`."""
+    blocks, shared, setting = _start(models, board, camera, flatness_mm, prior, camera)
+    if common > 0:
+        blocks, setting = _with_common(blocks, setting, common)
+    equations = SharedEquations.of(JointState(tuple(blocks), shared), setting)
+    inverse = constrained_inverse(equations.normal, free_directions(len(equations.normal), shared))
+    circles = inverse[setting.places(shared).circles]
+    points, to_circles = {}, {}
+    for block, each in zip(blocks, equations.groups, strict=True):
+        kept, inner = setting.outer(block, shared), each.inner
+        from_kept, d, q = inner.from_kept[0], 3 * len(block.dots), shared.basis.shape[1]
+        outer = inverse[np.ix_(kept, kept)]
+        # Rows: the dots, which are reduced away, then what the groups share.
+        to_kept = np.concatenate([-from_kept[:d] @ outer, outer])
+        own = np.block(
+            [[inner.inverse[0, :d, :d] - to_kept[:d] @ from_kept[:d].T, to_kept[:d]], [to_kept[:d].T, outer]]
+        )
+        every = np.concatenate([-from_kept[:d] @ circles[:, kept].T, circles[:, kept].T])
+        row = np.empty(3 * len(block.model.labels) + q, int)
+        row[(3 * block.dots[:, None] + np.arange(3)).ravel()] = np.arange(d)
+        row[(3 * block.circles[:, None] + np.arange(3)).ravel()] = d + np.arange(3 * len(block.circles))
+        row[len(row) - q :] = len(own) - q + np.arange(q)
+        points[block.model.group], to_circles[block.model.group] = own[np.ix_(row, row)], every[row]
+    c = circles.shape[0]
+    return Extensible(shared.camera, shared.basis, circles[:, :c], points, to_circles)
 
 
 def _start(models, board: BoardDesign, camera: Camera, flatness_mm, prior: CameraPrior | None, start: Camera):

@@ -1,6 +1,5 @@
 """After a run: which further photographs would make its worst face better, and when only a better board would."""
 
-from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from itertools import combinations
 
@@ -17,7 +16,16 @@ from stcal.sfm.adjust.joint import JointResult, adjust_jointly
 from stcal.sfm.data.model import MetricModel
 from stcal.sfm.mapping.database import image_ids
 from stcal.sfm.mapping.models import read_model
-from stcal.sfm.plan.forecast import CentreNoise, Forecast, Setup, forecast, variance_shares, without_sources
+from stcal.sfm.plan.forecast import (
+    CentreNoise,
+    Forecast,
+    Setup,
+    forecast,
+    positions_with,
+    variance_shares,
+    without_sources,
+    worst_of,
+)
 from stcal.sfm.plan.simulated import observe, true_models
 from stcal.sfm.plan.views import PlannedView, candidates, known_scene, with_view
 from stcal.sfm.run.saved import SavedRun
@@ -158,34 +166,27 @@ def advise(known: Known, count: int = 5, progress: Progress | None = None) -> Ad
     )
 
 
-def after(known: Known, views: Sequence[PlannedView], now: Forecast) -> Forecast:
-    """The forecast with further views."""
-    models = {model.group: model for model in known.models}
-    for view in views:
-        models[view.group] = with_view(models[view.group], view)
-    return forecast(list(models.values()), known.setup, now.derivatives)
-
-
 def _greedy(known: Known, views: list[PlannedView], now: Forecast, count: int, progress) -> list[Choice]:
     """Always the view that leaves the worst face best, given those chosen before."""
     chosen: list[Choice] = []
+    models = {model.group: model for model in known.models}
     while views and len(chosen) < count:
-        have = [choice.view for choice in chosen]
+        positions = positions_with(list(models.values()), known.setup, now.derivatives)
         results = []
         for view in views:
-            progress(f"view {len(have) + 1}", len(results), len(views))
-            results.append(after(known, [*have, view], now))
-        progress(f"view {len(have) + 1}", len(views), len(views))
-        best = int(np.argmin([result.worst()[1] for result in results]))
-        chosen.append(Choice(views[best], *results[best].worst()))
+            progress(f"view {len(chosen) + 1}", len(results), len(views))
+            results.append(positions(view.model))
+        progress(f"view {len(chosen) + 1}", len(views), len(views))
+        best = int(np.argmin([worst_of(sigma)[1] for sigma in results]))
+        chosen.append(Choice(views[best], *worst_of(results[best])))
+        models[views[best].group] = with_view(models[views[best].group], views[best])
         keep = _promising(results) - {best}
         views = [views[i] for i in sorted(keep)]
     return chosen
 
 
-def _promising(results: list[Forecast]) -> set[int]:
+def _promising(by_view: list[dict[str, float]]) -> set[int]:
     """The best for any face: which one is worst may change."""
-    by_view = [result.position_sigma_mm() for result in results]
     return {i for face in by_view[0] for i in sorted(range(len(by_view)), key=lambda k: by_view[k][face])[:SHORTLIST]}
 
 

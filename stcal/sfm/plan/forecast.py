@@ -1,7 +1,7 @@
 """The σ to expect of a geometry, photographed or only planned: centring noise by the size and tilt of the circles, then
 the covariance of the joint adjustment itself."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -14,7 +14,7 @@ from stcal.io.camera import CameraPrior
 from stcal.labels import CircleLabel, Label
 from stcal.sfm.adjust.chain import CalibratedTarget
 from stcal.sfm.adjust.faces import FrameKind
-from stcal.sfm.adjust.joint import covariance_of
+from stcal.sfm.adjust.joint import covariance_of, extensible
 from stcal.sfm.adjust.uncertainty import Derivatives, derivatives, scale_sigma
 from stcal.sfm.data.model import MetricModel
 from stcal.synthetic.observe import rim_points
@@ -156,14 +156,18 @@ class Forecast:
         object.__setattr__(self, "face_covariance", fixed)
 
     def position_sigma_mm(self) -> dict[str, float]:
-        """By face: root of the trace, so that it is the RMS length of the error."""
-        return {face: float(np.sqrt(np.trace(c[3:, 3:]))) for face, c in self.face_covariance.items()}
+        """By face; see :func:`position_sigma_mm`."""
+        return {face: position_sigma_mm(c) for face, c in self.face_covariance.items()}
 
     def worst(self) -> tuple[str, float]:
         """The face whose position is known worst, and its σ in mm."""
-        sigma = self.position_sigma_mm()
-        face = max(sigma, key=sigma.__getitem__)
-        return face, sigma[face]
+        return worst_of(self.position_sigma_mm())
+
+
+def worst_of(sigma: dict[str, float]) -> tuple[str, float]:
+    """The face of the largest σ, and that."""
+    face = max(sigma, key=sigma.__getitem__)
+    return face, sigma[face]
 
 
 def forecast(models: Sequence[MetricModel], setup: Setup, known: Derivatives | None = None) -> Forecast:
@@ -182,6 +186,24 @@ def forecast(models: Sequence[MetricModel], setup: Setup, known: Derivatives | N
         scale_sigma(joint.xyz_model, covariance),
         own,
     )
+
+
+def positions_with(
+    models: Sequence[MetricModel], setup: Setup, known: Derivatives
+) -> Callable[[MetricModel], dict[str, float]]:
+    """A function that gives :meth:`Forecast.position_sigma_mm` with one further view, as :func:`forecast` would."""
+    now = extensible(models, setup.board, setup.camera, setup.flatness_mm, setup.prior, setup.common)
+
+    def positions(view: MetricModel) -> dict[str, float]:
+        faces = known.face_covariance(setup.sigma0**2 * now.with_view(view))
+        return {f: position_sigma_mm(c) for f, c in faces.items() if f != setup.start.reference_face}
+
+    return positions
+
+
+def position_sigma_mm(face_covariance: np.ndarray) -> float:
+    """Root of the trace of a face's position, so that it is the RMS length of the error."""
+    return float(np.sqrt(np.trace(face_covariance[3:, 3:])))
 
 
 def without_sources(models: Sequence[MetricModel], setup: Setup, known: Derivatives) -> dict[str, Forecast]:

@@ -13,18 +13,28 @@ from scipy.stats import chi2
 from stcal.design import reference_board, reference_target
 from stcal.errors import InputError
 from stcal.geometry.rigid import Rigid
-from stcal.io.camera import CameraModel
+from stcal.io.camera import CameraModel, CameraPrior
 from stcal.sfm.adjust.chain import CalibratedTarget
 from stcal.sfm.adjust.joint import adjust_jointly, covariance_of
 from stcal.sfm.adjust.uncertainty import derivatives
 from stcal.sfm.data.model import MetricModel
 from stcal.sfm.plan import views
-from stcal.sfm.plan.advise import Known, advise, after, known_of
-from stcal.sfm.plan.forecast import BLUR_PX, CONTRAST, IMAGE_NOISE, PRACTICE, CentreNoise, Forecast, Setup, forecast
+from stcal.sfm.plan.advise import Known, advise, known_of
+from stcal.sfm.plan.forecast import (
+    BLUR_PX,
+    CONTRAST,
+    IMAGE_NOISE,
+    PRACTICE,
+    CentreNoise,
+    Forecast,
+    Setup,
+    forecast,
+    positions_with,
+)
 from stcal.sfm.plan.session import PlanOptions
 from stcal.sfm.plan.session import plan as make_plan
 from stcal.sfm.plan.simulated import observe, true_models
-from stcal.sfm.plan.views import candidates, known_scene, with_view
+from stcal.sfm.plan.views import PlannedView, candidates, known_scene, with_view
 from stcal.sfm.run.saved import load_run
 from stcal.synthetic.scene import Scene, SceneOptions, make_scene, nominal_target_from_face, second_design
 
@@ -181,6 +191,29 @@ def known(exact) -> Known:
 @pytest.fixture(scope="module")
 def advice(known):
     return advise(known, 2)
+
+
+def after(known: Known, views: list[PlannedView], now: Forecast) -> Forecast:
+    """The forecast with further views, made anew."""
+    models = {model.group: model for model in known.models}
+    for view in views:
+        models[view.group] = with_view(models[view.group], view)
+    return forecast(list(models.values()), known.setup, now.derivatives)
+
+
+@pytest.mark.parametrize("flatness_mm", [None, 0.01])
+@pytest.mark.parametrize("common", [0.0, 0.6])
+@pytest.mark.parametrize("refined", [False, True])
+def test_one_more_view_needs_no_new_adjustment(known, coarse, flatness_mm, common, refined):
+    prior = CameraPrior("OPENCV", np.diag([2.0] * 4 + [1e-3] * 4) ** 2) if refined else None
+    setup = replace(known.setup, flatness_mm=flatness_mm, common=common, prior=prior, sigma0=1.3)
+    known = replace(known, setup=setup)
+    now = forecast(known.models, setup)
+    positions = positions_with(known.models, setup, now.derivatives)
+    for model, own in offered(known):
+        assert own, model.group
+        for view in own[::3]:
+            assert positions(view.model) == pytest.approx(after(known, [view], now).position_sigma_mm(), rel=1e-6)
 
 
 @pytest.mark.slow
