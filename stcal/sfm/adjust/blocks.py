@@ -38,7 +38,8 @@ class Block:
 
     ``model_from_board`` ; ``design`` : (e, 3) its dots, board frame; ``sigma_mm`` of a dot about the common shape;
     ``dots``, ``circles`` : points of the model that are dots and circles; ``dot_place`` : (e,) of each dot in the
-    common shape, empty where each group has its own; ``circle_place`` : of each circle among all.
+    common shape, empty where each group has its own; ``circle_place`` : of each circle among all; ``photographs`` :
+    (3p + q, 3p + q) normal matrix of its points and the intrinsics, where it is known for all of its images.
     """
 
     model: MetricModel
@@ -49,6 +50,7 @@ class Block:
     circles: np.ndarray
     dot_place: np.ndarray
     circle_place: np.ndarray
+    photographs: np.ndarray | None = None
 
     def expected_dots(self, shared: Shared) -> np.ndarray:
         """Design and common shape, (e, 3), board frame."""
@@ -67,17 +69,17 @@ class Block:
 @dataclass(frozen=True, slots=True, eq=False)
 class Reduced:
     """``normal``, ``right`` over the group's outer unknowns (its circles, dots of the common shape, intrinsics); what
-    brings a step of those back to dots and board (``inner``) and then to the ``cameras``."""
+    brings a step of those back to dots and board (``inner``) and then to the ``cameras``, where these are moved."""
 
     normal: np.ndarray
     right: np.ndarray
     inner: Reduction
-    cameras: Reduction
+    cameras: Reduction | None
 
     @property
     def gain(self) -> float:
         """By how much the unknowns that are reduced away lower the cost alone."""
-        return self.inner.gain + self.cameras.gain
+        return self.inner.gain + (self.cameras.gain if self.cameras else 0.0)
 
 
 def normalised(model: GroupModel, camera: Camera) -> np.ndarray:
@@ -99,7 +101,10 @@ def robust_weights(model: GroupModel, camera: Camera, huber: float) -> np.ndarra
 
 def reduced(block: Block, shared: Shared, huber: float) -> Reduced:
     """Cameras, dots and the board's pose reduced away."""
-    normal, right, cameras = without_cameras(block.model, shared.camera, shared.basis, huber)
+    if block.photographs is None:
+        normal, right, cameras = without_cameras(block.model, shared.camera, shared.basis, huber)
+    else:  # for the covariance alone: nothing is moved
+        normal, right, cameras = block.photographs, np.zeros(len(block.photographs)), None
     full, full_right, inner, outer = _with_board(block, shared, normal, right)
     away = reduce(full[np.ix_(inner, inner)][None], full_right[None, inner], full[np.ix_(inner, outer)][None])
     return Reduced(full[np.ix_(outer, outer)] - away.normal, full_right[outer] - away.right, away, cameras)
@@ -185,6 +190,7 @@ def step_of(block: Block, reduced: Reduced, outer: np.ndarray, intrinsics: np.nd
     (inner,) = reduced.inner.back(outer)
     points[block.circles] = outer[: 3 * len(block.circles)].reshape(-1, 3)
     points[block.dots] = inner[: 3 * d].reshape(-1, 3)
+    assert reduced.cameras is not None, "the normal matrix of the photographs alone moves no camera"
     cameras = reduced.cameras.back(np.concatenate([points.ravel(), intrinsics]))
     return np.concatenate([points.ravel(), cameras.ravel(), inner[3 * d :]])
 

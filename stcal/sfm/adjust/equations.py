@@ -99,7 +99,7 @@ class SharedEquations:
     @classmethod
     def of(cls, state: JointState, setting: Setting) -> "SharedEquations":
         cost = cost_of(state.blocks, state.shared, setting)
-        return cls(cost, state, setting, *_normal_equations(state.blocks, state.shared, setting))
+        return cls(cost, state, setting, *normal_equations(state.blocks, state.shared, setting))
 
     def step(self, damping: float | np.ndarray) -> tuple[np.ndarray, float]:
         """Of what the groups share, then of each group's own."""
@@ -117,7 +117,7 @@ class SharedEquations:
         return np.concatenate([outer, *own]), gain
 
 
-def _normal_equations(blocks: Sequence[Block], shared: Shared, setting: Setting):
+def normal_equations(blocks: Sequence[Block], shared: Shared, setting: Setting):
     """Over circles, common shape and intrinsics: matrix and right-hand side; and the groups, reduced."""
     places = setting.places(shared)
     normal, right = np.zeros((places.count, places.count)), np.zeros(places.count)

@@ -5,7 +5,7 @@ coplanar within a stated σ. Residuals far beyond their σ weigh less (Huber). T
 is the marginal covariance of the circles, everything else accounted for.
 """
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -21,7 +21,7 @@ from stcal.geometry.rigid import Rigid
 from stcal.geometry.robust import HUBER, robust_sigma
 from stcal.io.camera import CameraPrior, intrinsic_basis
 from stcal.labels import CircleLabel, DotLabel, dot_cells
-from stcal.sfm.adjust.blocks import Block, Shared, normalised, robust_weights, rows_of_view
+from stcal.sfm.adjust.blocks import Block, Shared, normalised, robust_weights, rows_of_view, without_cameras
 from stcal.sfm.adjust.equations import (
     FREE_DIRECTIONS,
     JointState,
@@ -29,6 +29,7 @@ from stcal.sfm.adjust.equations import (
     SharedEquations,
     cost_of,
     free_directions,
+    normal_equations,
     planes,
 )
 from stcal.sfm.adjust.scale import MIN_DOTS
@@ -126,15 +127,30 @@ def covariance_of(
     flatness_mm: float | None = None,
     prior: CameraPrior | None = None,
     common: float = 0.0,
+    photographs: Mapping[str, np.ndarray] | None = None,
 ) -> JointResult:
     """What :func:`adjust_jointly` is to report of models that are where they should be: nothing is moved, σ₀ is 1.
 
-    Arguments as there; ``common`` : share of the board's variance that all groups have in common.
+    Arguments as there; ``common`` : share of the board's variance that all groups have in common; ``photographs`` :
+    what :func:`photographs_of` has said of groups.
     """
-    blocks, shared, setting = _start(models, board, camera, flatness_mm, prior, camera)
+    blocks, shared, setting = _start(models, board, camera, flatness_mm, prior, camera, photographs)
     if common > 0:
         blocks, setting = _with_common(blocks, setting, common)
     return _result(blocks, shared, setting, 0.0, 1.0)
+
+
+def basis_of(prior: CameraPrior | None) -> np.ndarray:
+    """Derivative (12, q) of a camera's parameters by those that are adjusted."""
+    return intrinsic_basis(prior.colmap_model) if prior else np.zeros((12, 0))
+
+
+def photographs_of(
+    models: Sequence[MetricModel], board: BoardDesign, camera: Camera, prior: CameraPrior | None
+) -> dict[str, np.ndarray]:
+    """By group, normal matrix (3p + q, 3p + q) of its points and the intrinsics from all of its images, σ₀ = 1."""
+    blocks, shared, _ = _start(models, board, camera, None, prior, camera)
+    return {b.model.group: without_cameras(b.model, camera, shared.basis, np.inf)[0] for b in blocks}
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -170,16 +186,17 @@ def extensible(
     flatness_mm: float | None = None,
     prior: CameraPrior | None = None,
     common: float = 0.0,
+    photographs: Mapping[str, np.ndarray] | None = None,
 ) -> Extensible:
     """See there; arguments as of :func:`covariance_of`."""
-    blocks, shared, setting = _start(models, board, camera, flatness_mm, prior, camera)
+    blocks, shared, setting = _start(models, board, camera, flatness_mm, prior, camera, photographs)
     if common > 0:
         blocks, setting = _with_common(blocks, setting, common)
-    equations = SharedEquations.of(JointState(tuple(blocks), shared), setting)
-    inverse = constrained_inverse(equations.normal, free_directions(len(equations.normal), shared))
+    normal, _, groups = normal_equations(blocks, shared, setting)
+    inverse = constrained_inverse(normal, free_directions(len(normal), shared))
     circles = inverse[setting.places(shared).circles]
     points, to_circles = {}, {}
-    for block, each in zip(blocks, equations.groups, strict=True):
+    for block, each in zip(blocks, groups, strict=True):
         kept, inner = setting.outer(block, shared), each.inner
         from_kept, d, q = inner.from_kept[0], 3 * len(block.dots), shared.basis.shape[1]
         outer = inverse[np.ix_(kept, kept)]
@@ -198,12 +215,20 @@ def extensible(
     return Extensible(shared.camera, shared.basis, circles[:, :c], points, to_circles)
 
 
-def _start(models, board: BoardDesign, camera: Camera, flatness_mm, prior: CameraPrior | None, start: Camera):
+def _start(
+    models,
+    board: BoardDesign,
+    camera: Camera,
+    flatness_mm,
+    prior: CameraPrior | None,
+    start: Camera,
+    photographs: Mapping[str, np.ndarray] | None = None,
+):
     """Groups, what they share, and the setting: each group with its own board, no residual too long."""
     labels = tuple(sorted({label for model in models for label in model.labels if isinstance(label, CircleLabel)}))
-    basis = intrinsic_basis(prior.colmap_model) if prior else np.zeros((12, 0))
+    basis = basis_of(prior)
     weight = np.linalg.inv(prior.covariance) if prior else np.zeros((0, 0))
-    blocks = [_block(model, board, labels) for model in models]
+    blocks = [replace(_block(m, board, labels), photographs=(photographs or {}).get(m.group)) for m in models]
     xyz = _shared_circles(blocks, len(labels))
     shared = Shared(xyz, np.zeros((board.rows * board.columns, 3)), start, basis)
     blocks = [replace(b, model=_with_circles(b, xyz)) for b in blocks]
@@ -315,7 +340,7 @@ def _result(
     blocks: list[Block], shared: Shared, setting: Setting, move_px: float, sigma0: float | None = None
 ) -> JointResult:
     """``move_px`` : of the last step; ``sigma0`` : estimated from the residuals where None."""
-    normal = SharedEquations.of(JointState(tuple(blocks), shared), setting).normal
+    normal = normal_equations(blocks, shared, setting)[0]
     inverse = constrained_inverse(normal, free_directions(len(normal), shared))
     places = setting.places(shared)
     c = places.circles.stop

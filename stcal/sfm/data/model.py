@@ -111,6 +111,10 @@ class GroupModel:
         same = {f.name: getattr(self, f.name) for f in fields(self)}
         return kind(**same | {"camera_from_model": poses, "xyz_model": a_from_model @ self.xyz_model})
 
+    def observed(self: "M", rows: np.ndarray) -> "M":
+        """The model with these of its observations, and all of its images and points."""
+        return replace(self, **{name: getattr(self, name)[rows] for name in _PER_OBSERVATION})
+
     def points_by_face(self) -> dict[str, np.ndarray]:
         """Indices of the points of every face, and of the board under ``board``."""
         members: dict[str, list[int]] = {}

@@ -10,15 +10,17 @@ from stcal.geometry.rigid import Rigid
 from stcal.io.camera import camera_prior
 from stcal.labels import circle_labels
 from stcal.parallel import Progress, one_thread
+from stcal.sfm.adjust.blocks import rows_of_view
 from stcal.sfm.adjust.calibration import with_sigma
 from stcal.sfm.adjust.chain import CalibratedTarget
-from stcal.sfm.adjust.joint import JointResult, adjust_jointly
+from stcal.sfm.adjust.joint import JointResult, adjust_jointly, basis_of, photographs_of
 from stcal.sfm.data.model import MetricModel
 from stcal.sfm.mapping.database import image_ids
 from stcal.sfm.mapping.models import read_model
 from stcal.sfm.plan.forecast import (
     CentreNoise,
     Forecast,
+    Photographs,
     Setup,
     forecast,
     positions_with,
@@ -27,7 +29,7 @@ from stcal.sfm.plan.forecast import (
     worst_of,
 )
 from stcal.sfm.plan.simulated import observe, true_models
-from stcal.sfm.plan.views import PlannedView, candidates, known_scene, with_view
+from stcal.sfm.plan.views import PlannedView, candidates, known_scene
 from stcal.sfm.run.saved import SavedRun
 from stcal.synthetic.placement import GroupShape, place_group, viewing_axes
 from stcal.synthetic.scene import Group, Scene, group_name
@@ -152,26 +154,30 @@ def advise(known: Known, count: int = 5, progress: Progress | None = None) -> Ad
     Advice
         The views, with the worst face and its σ after each, mm; the σ now, and their sources.
     """
-    now = forecast(known.models, known.setup)
-    shares = variance_shares(now, without_sources(known.models, known.setup, now.derivatives))
-    views = [v for model in known.models for v in candidates(known.scene, model, known.setup, known.noise)]
+    setup = known.setup
+    photographs = photographs_of(known.models, setup.board, setup.camera, setup.prior)
+    now = forecast(known.models, setup, photographs=photographs)
+    shares = variance_shares(now, without_sources(known.models, setup, now.derivatives, photographs))
+    views = [v for model in known.models for v in candidates(known.scene, model, setup, known.noise)]
     return Advice(
         now,
         shares,
         known.noise,
-        tuple(_greedy(known, views, now, count, progress or (lambda *_: None))),
-        tuple(_new_groups(known, now, max(count, MIN_NEW_GROUP))),
-        forecast(known.models, known.setup.better_board(0.5), now.derivatives),
+        tuple(_greedy(known, views, now, photographs, count, progress or (lambda *_: None))),
+        tuple(_new_groups(known, now, photographs, max(count, MIN_NEW_GROUP))),
+        forecast(known.models, setup.better_board(0.5), now.derivatives, photographs),
         len(views),
     )
 
 
-def _greedy(known: Known, views: list[PlannedView], now: Forecast, count: int, progress) -> list[Choice]:
+def _greedy(
+    known: Known, views: list[PlannedView], now: Forecast, photographs: Photographs, count: int, progress: Progress
+) -> list[Choice]:
     """Always the view that leaves the worst face best, given those chosen before."""
     chosen: list[Choice] = []
-    models = {model.group: model for model in known.models}
+    setup, photographs = known.setup, dict(photographs)
     while views and len(chosen) < count:
-        positions = positions_with(list(models.values()), known.setup, now.derivatives)
+        positions = positions_with(known.models, setup, now.derivatives, photographs)
         results = []
         for view in views:
             progress(f"view {len(chosen) + 1}", len(results), len(views))
@@ -179,7 +185,8 @@ def _greedy(known: Known, views: list[PlannedView], now: Forecast, count: int, p
         progress(f"view {len(chosen) + 1}", len(views), len(views))
         best = int(np.argmin([worst_of(sigma)[1] for sigma in results]))
         chosen.append(Choice(views[best], *worst_of(results[best])))
-        models[views[best].group] = with_view(models[views[best].group], views[best])
+        rows = rows_of_view(views[best].model, setup.camera, basis_of(setup.prior))
+        photographs[views[best].group] = photographs[views[best].group] + rows.T @ rows
         keep = _promising(results) - {best}
         views = [views[i] for i in sorted(keep)]
     return chosen
@@ -190,7 +197,7 @@ def _promising(by_view: list[dict[str, float]]) -> set[int]:
     return {i for face in by_view[0] for i in sorted(range(len(by_view)), key=lambda k: by_view[k][face])[:SHORTLIST]}
 
 
-def _new_groups(known: Known, now: Forecast, images: int) -> list[NewGroup]:
+def _new_groups(known: Known, now: Forecast, photographs: Photographs, images: int) -> list[NewGroup]:
     """Pairs of faces that no group shows together, where the geometry allows to."""
     together = {
         pair
@@ -204,9 +211,8 @@ def _new_groups(known: Known, now: Forecast, images: int) -> list[NewGroup]:
                 model = _new_model(known, pair, images)
             except DegenerateError:
                 continue  # the two cannot be seen together at this distance
-            found.append(
-                NewGroup(pair, images, *forecast([*known.models, model], known.setup, now.derivatives).worst())
-            )
+            with_it = forecast([*known.models, model], known.setup, now.derivatives, photographs)
+            found.append(NewGroup(pair, images, *with_it.worst()))
     return sorted(found, key=lambda each: each.sigma_mm)
 
 

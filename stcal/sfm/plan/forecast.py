@@ -1,7 +1,7 @@
 """The σ to expect of a geometry, photographed or only planned: centring noise by the size and tilt of the circles, then
 the covariance of the joint adjustment itself."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -14,7 +14,7 @@ from stcal.io.camera import CameraPrior
 from stcal.labels import CircleLabel, Label
 from stcal.sfm.adjust.chain import CalibratedTarget
 from stcal.sfm.adjust.faces import FrameKind
-from stcal.sfm.adjust.joint import covariance_of, extensible
+from stcal.sfm.adjust.joint import covariance_of, extensible, photographs_of
 from stcal.sfm.adjust.uncertainty import Derivatives, derivatives, scale_sigma
 from stcal.sfm.data.model import MetricModel
 from stcal.synthetic.observe import rim_points
@@ -30,6 +30,8 @@ PRACTICE = 1.3
 estimated, quantisation, neighbouring edges."""
 ONE_PLATE = 0.99
 """Share of the board's variance that all groups have in common where one plate is in all of them."""
+ENOUGH = 10_000
+"""Observations from which the law of their noise is read."""
 OFF = 1e-2
 """A source of error that is switched off keeps this share of its σ, so that nothing becomes singular."""
 
@@ -59,12 +61,14 @@ class CentreNoise:
 
     @classmethod
     def measured(cls, models: Sequence[MetricModel], camera: Camera, radius_mm: dict[Label, float]) -> "CentreNoise":
-        """Fitted to the covariances that the observations of metric models carry."""
-        rims = [_Rims.of(model, camera, radius_mm) for model in models]
+        """Fitted to the covariances that the observations of metric models carry, evenly chosen ones of large sets."""
+        step = max(1, sum(len(model.point_index) for model in models) // ENOUGH)
+        some = [model.observed(np.arange(0, len(model.point_index), step)) for model in models]
+        rims = [_Rims.of(model, camera, radius_mm) for model in some]
         ratio = np.concatenate(
             [
                 np.trace(rim.information @ m.covariance_px2, axis1=1, axis2=2) / 2
-                for rim, m in zip(rims, models, strict=True)
+                for rim, m in zip(rims, some, strict=True)
             ]
         )
         narrow = np.concatenate([rim.minor_px for rim in rims]) ** -2
@@ -170,12 +174,22 @@ def worst_of(sigma: dict[str, float]) -> tuple[str, float]:
     return face, sigma[face]
 
 
-def forecast(models: Sequence[MetricModel], setup: Setup, known: Derivatives | None = None) -> Forecast:
+Photographs = Mapping[str, np.ndarray]
+"""By group, what all of its images say of its points and the intrinsics, see
+:func:`stcal.sfm.adjust.joint.photographs_of`: computed once, as the images are many and stay as they are."""
+
+
+def forecast(
+    models: Sequence[MetricModel],
+    setup: Setup,
+    known: Derivatives | None = None,
+    photographs: Photographs | None = None,
+) -> Forecast:
     """σ of the target from metric models, mm, target frame, as the joint adjustment would state them.
 
-    ``known`` : derivatives of an earlier forecast of the same circles.
+    ``known`` : derivatives of an earlier forecast of the same circles; ``photographs`` of groups, where known.
     """
-    joint = covariance_of(models, setup.board, setup.camera, setup.flatness_mm, setup.prior, setup.common)
+    joint = covariance_of(models, setup.board, setup.camera, setup.flatness_mm, setup.prior, setup.common, photographs)
     own = known or derivatives(joint, setup.start, setup.target, setup.frame)
     covariance = setup.sigma0**2 * joint.covariance_mm2
     reference = setup.start.reference_face
@@ -189,10 +203,10 @@ def forecast(models: Sequence[MetricModel], setup: Setup, known: Derivatives | N
 
 
 def positions_with(
-    models: Sequence[MetricModel], setup: Setup, known: Derivatives
+    models: Sequence[MetricModel], setup: Setup, known: Derivatives, photographs: Photographs | None = None
 ) -> Callable[[MetricModel], dict[str, float]]:
     """A function that gives :meth:`Forecast.position_sigma_mm` with one further view, as :func:`forecast` would."""
-    now = extensible(models, setup.board, setup.camera, setup.flatness_mm, setup.prior, setup.common)
+    now = extensible(models, setup.board, setup.camera, setup.flatness_mm, setup.prior, setup.common, photographs)
 
     def positions(view: MetricModel) -> dict[str, float]:
         faces = known.face_covariance(setup.sigma0**2 * now.with_view(view))
@@ -206,15 +220,20 @@ def position_sigma_mm(face_covariance: np.ndarray) -> float:
     return float(np.sqrt(np.trace(face_covariance[3:, 3:])))
 
 
-def without_sources(models: Sequence[MetricModel], setup: Setup, known: Derivatives) -> dict[str, Forecast]:
+def without_sources(
+    models: Sequence[MetricModel], setup: Setup, known: Derivatives, photographs: Photographs | None = None
+) -> dict[str, Forecast]:
     """The forecast with each source of error in turn switched off: images, board, intrinsics where they are refined."""
-    quiet = [replace(m, covariance_px2=OFF**2 * m.covariance_px2) for m in models]
+    if photographs is None:
+        photographs = photographs_of(models, setup.board, setup.camera, setup.prior)
+    quiet = {group: normal / OFF**2 for group, normal in photographs.items()}
     found = {
-        "image noise": forecast(quiet, setup, known),
-        "board": forecast(models, setup.better_board(OFF), known),
+        "image noise": forecast(models, setup, known, quiet),
+        "board": forecast(models, setup.better_board(OFF), known, photographs),
     }
     if setup.prior is not None:
-        found["intrinsics"] = forecast(models, replace(setup, prior=None), known)
+        fixed = {m.group: photographs[m.group][: 3 * len(m.labels), : 3 * len(m.labels)] for m in models}
+        found["intrinsics"] = forecast(models, replace(setup, prior=None), known, fixed)
     return found
 
 

@@ -225,19 +225,3 @@ def _single(model: MetricModel, name: str, pose: Rigid, labels: list[Label], cam
         shift_px=np.zeros((n, 2)),
         covariance_px2=np.tile(np.eye(2), (n, 1, 1)),
     )
-
-
-def with_view(model: MetricModel, view: PlannedView) -> MetricModel:
-    """The group's model with one more image."""
-    new = view.model
-    joined = {
-        name: np.concatenate([getattr(model, name), getattr(new, name)])
-        for name in ("point_index", "keypoint", "measured_px", "shift_px", "covariance_px2")
-    }
-    return replace(
-        model,
-        images=(*model.images, *new.images),
-        camera_from_model=(*model.camera_from_model, *new.camera_from_model),
-        image_index=np.concatenate([model.image_index, new.image_index + len(model.images)]),
-        **joined,
-    )

@@ -34,7 +34,7 @@ from stcal.sfm.plan.forecast import (
 from stcal.sfm.plan.session import PlanOptions
 from stcal.sfm.plan.session import plan as make_plan
 from stcal.sfm.plan.simulated import observe, true_models
-from stcal.sfm.plan.views import PlannedView, candidates, known_scene, with_view
+from stcal.sfm.plan.views import PlannedView, candidates, known_scene
 from stcal.sfm.run.saved import load_run
 from stcal.synthetic.scene import Scene, SceneOptions, make_scene, nominal_target_from_face, second_design
 
@@ -191,6 +191,22 @@ def known(exact) -> Known:
 @pytest.fixture(scope="module")
 def advice(known):
     return advise(known, 2)
+
+
+def with_view(model: MetricModel, view: PlannedView) -> MetricModel:
+    """The group's model with one more image."""
+    new = view.model
+    joined = {
+        name: np.concatenate([getattr(model, name), getattr(new, name)])
+        for name in ("point_index", "keypoint", "measured_px", "shift_px", "covariance_px2")
+    }
+    return replace(
+        model,
+        images=(*model.images, *new.images),
+        camera_from_model=(*model.camera_from_model, *new.camera_from_model),
+        image_index=np.concatenate([model.image_index, new.image_index + len(model.images)]),
+        **joined,
+    )
 
 
 def after(known: Known, views: list[PlannedView], now: Forecast) -> Forecast:
