@@ -1,19 +1,23 @@
 #!/usr/bin/env python
-"""Time ``stcal-sfm run`` on rendered photographs against merely decoding them and against OpenCV's grid finder.
+"""Time the program on rendered photographs against merely decoding them.
 
-All times are wall times on this machine with the same number of worker processes, started afresh for every
-measurement and included in its time; the files are read once before, so that none waits for the disk. The joint
-adjustment alone is that of the run's own models, in one process: scale, faces, chaining and adjustment.
+All times are wall times on this machine, of the program as a user starts it, its processes included; the files are read
+once before, so that none waits for the disk. Ratios are to decoding the same photographs to grey by as many threads of
+one process as there are cores. ``measure`` is told in images a second and core, ``--help`` and what needs no photograph
+in seconds. The joint adjustment alone is that of the run's own models, in one process.
 """
 
 import argparse
 import json
 import os
 import resource
+import shutil
+import statistics
 import subprocess
 import sys
 import tempfile
 import time
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import cv2
@@ -34,9 +38,25 @@ THRESHOLDS = {
 """minThreshold, maxThreshold, thresholdStep, minRepeatability. The last one is the least with which it can work."""
 
 
-def decode_file(path: Path) -> tuple[int, ...]:
+STREAM = 40, 1728
+"""Photographs for ``measure``, and their width, px: 2 megapixels."""
+
+
+def decode_file(path: Path) -> None:
     """Decode and forget."""
-    return cv2.imdecode(np.frombuffer(path.read_bytes(), np.uint8), FLAGS).shape
+    cv2.imdecode(np.frombuffer(path.read_bytes(), np.uint8), FLAGS)
+
+
+def timed_decoding(paths: list[Path]) -> float:
+    """Seconds to decode by threads of this process, one per core and one in each decoder."""
+    threads = cv2.getNumThreads()
+    cv2.setNumThreads(1)
+    start = time.perf_counter()
+    with ThreadPoolExecutor(os.cpu_count()) as pool:
+        list(pool.map(decode_file, paths))
+    seconds = time.perf_counter() - start
+    cv2.setNumThreads(threads)
+    return seconds
 
 
 def opencv_board(path: Path, size: tuple[int, int], areas: tuple[float, float], thresholds) -> np.ndarray | None:
@@ -74,24 +94,56 @@ def timed(function, jobs: list[tuple]) -> tuple[float, list]:
     return time.perf_counter() - start, [results[i] for i in range(len(jobs))]
 
 
-def timed_run(data: Path, out: Path) -> tuple[float, float, float]:
-    """Seconds of the whole run; peak MiB of its largest process, and of all together (0 without /proc)."""
-    program = [sys.executable, "-c", "from stcal.cli.main import main_sfm; main_sfm()"]
-    files = ["--camera", data / "cameras.txt", "--target", data / "target.toml", "--board", data / "board.toml"]
+def timed_program(words: list, log: Path, entry: str = "main_sfm") -> tuple[float, float, float]:
+    """Seconds of one call; peak MiB of its largest process, and of all together (0 without /proc)."""
+    program = [sys.executable, "-P", "-c", f"from stcal.cli.entry import {entry}; {entry}()"]
     start = time.perf_counter()
-    with (out.parent / "run.log").open("w") as log:
-        run = subprocess.Popen([*program, "run", data / "images", *files, "--out", out], stdout=log, stderr=log)
+    with log.open("w") as stream:
+        run = subprocess.Popen([*program, *map(str, words)], stdout=stream, stderr=stream)
         together, done = 0, 0
         while not done:
-            time.sleep(0.05)
+            time.sleep(0.005)
             together = max(together, resident(run.pid))
             done, status, usage = os.wait4(run.pid, os.WNOHANG)
     seconds = time.perf_counter() - start
     run.returncode = os.waitstatus_to_exitcode(status)
     if run.returncode:
-        sys.exit(f"error: the run failed\n{(out.parent / 'run.log').read_text()}")
+        sys.exit(f"error: {words[0]} failed\n{log.read_text()}")
     largest = usage.ru_maxrss * (1 if sys.platform == "darwin" else 1024)
     return seconds, largest / 2**20, together / 2**20
+
+
+def files_of(data: Path) -> list:
+    """Options that name a data set's camera and designs."""
+    return ["--camera", data / "cameras.txt", "--target", data / "target.toml", "--board", data / "board.toml"]
+
+
+def timed_second_run(data: Path, scratch: Path, log: Path) -> float:
+    """Seconds of a run into the folder of an earlier one, after one more photograph."""
+    shutil.copytree(data / "images", scratch / "growing")
+    last = sorted((scratch / "growing").glob("*/*"))[-1]
+    kept = last.rename(scratch / last.name)
+    words = ["run", scratch / "growing", *files_of(data), "--out", scratch / "grown"]
+    timed_program(words, log)
+    kept.rename(last)
+    seconds = timed_program(words, log)[0]
+    shutil.rmtree(scratch / "growing")
+    return seconds
+
+
+def timed_stream(data: Path, out: Path, workers: int) -> float:
+    """Seconds of ``measure`` over all photographs, by its function, the libraries loaded."""
+    from stcal.sfm import MeasureOptions, read_target
+    from stcal.sfm import measure as measure_images
+
+    design, board = load_target(data / "target.toml"), load_board(data / "board.toml")
+    circles, camera = read_target(out / "faces.json", design), read_camera(data / "cameras.txt")
+    start = time.perf_counter()
+    result = measure_images(data / "images", camera, circles, design, board, MeasureOptions(workers=workers))
+    seconds = time.perf_counter() - start
+    if len(result.images) != STREAM[0]:
+        sys.exit(f"error: {len(result.images)} of {STREAM[0]} images measured")
+    return seconds
 
 
 def resident(pid: int) -> int:
@@ -143,9 +195,10 @@ def boards(found: dict[str, np.ndarray], true: dict[str, np.ndarray]) -> dict[st
     return {"found": len(found), "complete": complete, "right": sum(bool(value < RIGHT_PX) for value in off)}
 
 
-def measure(data: Path, scratch: Path) -> dict:
+def measure(data: Path, stream: Path, scratch: Path) -> dict:
     """All measurements, once."""
     scratch.mkdir()
+    log = scratch / "run.log"
     truth = json.loads((data / "truth.json").read_text(encoding="utf-8"))
     true = {
         name: np.array([c["centre_px"] for label, c in image["circles"].items() if label.startswith("board:")])
@@ -153,32 +206,40 @@ def measure(data: Path, scratch: Path) -> dict:
         for name, image in group["images"].items()
     }
     paths = [data / "images" / name for name in true]
+    camera, board = read_camera(data / "cameras.txt"), load_board(data / "board.toml")
     megabytes = sum(len(path.read_bytes()) for path in paths) / 1e6
-    seconds, shapes = timed(decode_file, [(path,) for path in paths])
-    rows = {"decoding alone": {"seconds": seconds}}
-    seconds, largest, together = timed_run(data, scratch / "run")
+    rows = {"decoding alone": {"seconds": timed_decoding(paths)}}
+    words = ["run", data / "images", *files_of(data), "--out", scratch / "run"]
+    seconds, largest, together = timed_program(words, log)
     rows["stcal-sfm run"] = {"seconds": seconds}
+    rows["run again, a photograph more"] = {"seconds": timed_second_run(data, scratch, log)}
     seconds, found = timed_detection(data, scratch / "cache")
     rows["stcal detection"] = {"seconds": seconds} | boards(found, true)
     rows["joint adjustment alone"] = {"seconds": timed_calibration(scratch / "run")}
-    board = load_board(data / "board.toml")
     # At 1 m ± 10 %, tilted by up to 70°, in images as wide as 22.3 mm behind 24 mm: half and twice that for safety.
-    area = np.pi * (board.radius_mm * 24 / 22.3 * shapes[0][1] / 1000) ** 2
+    area = np.pi * (board.radius_mm * 24 / 22.3 * camera.width / 1000) ** 2
     for title, thresholds in THRESHOLDS.items():
         jobs = [(path, (board.columns, board.rows), (0.34 * area / 2, area * 2), thresholds) for path in paths]
         seconds, grids = timed(opencv_board, jobs)
         found = {name: xy for name, xy in zip(true, grids, strict=True) if xy is not None}
         rows[title] = {"seconds": seconds} | boards(found, true)
-    about = {"images": len(paths), "size_px": list(shapes[0][::-1]), "megabytes": megabytes, "workers": os.cpu_count()}
+    rows["advise"] = {"seconds": timed_program(["advise", scratch / "run"], log)[0]}
+    rows["stcal-sfm --help"] = {"seconds": timed_program(["--help"], log)[0]}
+    rows["stcal --version"] = {"seconds": timed_program(["--version"], log, "main")[0]}
+    timed_program(["run", stream / "images", *files_of(stream), "--out", scratch / "stream"], log)
+    rows["measure, 2 Mpx, one core"] = {"seconds": timed_stream(stream, scratch / "stream", 1), "images": STREAM[0]}
+    shutil.rmtree(scratch)
+    about = {"images": len(paths), "size_px": [camera.width, camera.height], "megabytes": megabytes}
+    about["workers"] = os.cpu_count()
     return about | {"rows": rows, "peak_process_mib": largest, "peak_together_mib": together}
 
 
 def best_of(rounds: list[dict]) -> dict:
-    """The smallest time of each row over all rounds (what else the machine did only adds), and the largest memory."""
-    best = rounds[-1]
+    """Of each row the smallest and the median time (what else the machine did only adds), and the largest memory."""
+    best = rounds[-1] | {"rounds": len(rounds)}
     for title, row in best["rows"].items():
         row["all_seconds"] = [each["rows"][title]["seconds"] for each in rounds]
-        row["seconds"] = min(row["all_seconds"])
+        row["seconds"], row["median"] = min(row["all_seconds"]), statistics.median(row["all_seconds"])
         row["ratio"] = row["seconds"] / best["rows"]["decoding alone"]["seconds"]
     for key in ("peak_process_mib", "peak_together_mib"):
         best[key] = max(each[key] for each in rounds)
@@ -191,20 +252,23 @@ def main() -> None:
     parser.add_argument("--images", type=int, default=40, help=f"in {GROUPS} groups")
     parser.add_argument("--width", type=int, default=5184, help="px; 3:2 images")
     parser.add_argument("--keep", type=Path, help="render into this folder, or use what it holds")
-    parser.add_argument("--rounds", type=int, default=3, help="measure so often; the smallest times count")
+    parser.add_argument("--rounds", type=int, default=5, help="measure so often")
     parser.add_argument("--json", type=Path, help="also write the numbers here")
     given = parser.parse_args()
     if given.images % GROUPS or given.images < 4 * GROUPS:
         parser.error(f"--images {given.images}: a multiple of {GROUPS}, at least {4 * GROUPS}, needed")
     with tempfile.TemporaryDirectory() as scratch:
-        data = given.keep or Path(scratch) / "data"
+        keep = given.keep or Path(scratch)
+        data, stream = keep / "photographs", keep / "stream"
         render(data, given.images, given.width)
-        result = best_of([measure(data, Path(scratch) / str(i)) for i in range(max(given.rounds, 1))])
-    print("{images} images of {size_px} px, {megabytes:.0f} MB, {workers} workers".format(**result))
-    print(f"{'':34} {'seconds':>8} {'ratio':>6}   boards found, complete, right")
+        render(stream, *STREAM)
+        result = best_of([measure(data, stream, Path(scratch) / str(i)) for i in range(max(given.rounds, 1))])
+    print("{images} images of {size_px} px, {megabytes:.0f} MB, {workers} workers, {rounds} rounds".format(**result))
+    print(f"{'':30} {'seconds':>8} {'median':>7} {'ratio':>6}   boards found, complete, right")
     for name, row in result["rows"].items():
         counts = f"{row['found']:8} {row['complete']:9} {row['right']:6}" if "found" in row else ""
-        print(f"{name:34} {row['seconds']:8.2f} {row['ratio']:6.2f} {counts}".rstrip())
+        counts = f"{row['images'] / row['seconds']:8.1f} images a second" if "images" in row else counts
+        print(f"{name:30} {row['seconds']:8.2f} {row['median']:7.2f} {row['ratio']:6.2f} {counts}".rstrip())
     print("peak memory of the run: largest process {peak_process_mib:.0f} MiB, together".format(**result), end=" ")
     print("{peak_together_mib:.0f} MiB, pages that they share counted in each".format(**result))
     if given.json:
