@@ -1,10 +1,10 @@
-"""Robust weights and scales: Huber's loss of lengths, and σ from medians.
+"""Robust weights and scales: Huber's loss of lengths, and σ from medians; and what chance exceeds seldom.
 
 A length is that of d coordinates over their σ; of normal errors its square is χ² distributed with d degrees of freedom.
 """
 
 import numpy as np
-from scipy.special import chdtri
+from scipy.special import chdtri, fdtri
 
 HUBER = 3.0
 """Limit of a length of two coordinates over their robust σ: one honest residual in ninety is longer, and loses hardly
@@ -14,6 +14,12 @@ anything."""
 def length_limit(coordinates: int, beyond: float) -> float:
     """Length that normal errors of so many ``coordinates`` exceed with probability ``beyond``."""
     return float(np.sqrt(chdtri(coordinates, beyond)))
+
+
+def ratio_limit(beyond: float, freedom: float, redundancy: float) -> float:
+    """Ratio of two variances, of so many degrees of freedom each, that chance exceeds with probability ``beyond``: of
+    the F distribution, by its lower end, which small probabilities leave exact."""
+    return float(1 / fdtri(redundancy, freedom, beyond))
 
 
 def median_length(coordinates: int) -> float:

@@ -4,7 +4,7 @@ one fits its image."""
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.stats import chi2
+from scipy.special import chdtrc
 
 from stcal.geometry.arrays import Array, freeze
 from stcal.geometry.rigid import Rigid, skew
@@ -28,7 +28,7 @@ class ImageFit:
 
     def p_value(self) -> float:
         """Probability of residuals as large, with those σ."""
-        return float(chi2.sf(self.chi2, self.redundancy))
+        return float(chdtrc(self.redundancy, self.chi2))
 
 
 @dataclass(frozen=True, slots=True, eq=False)

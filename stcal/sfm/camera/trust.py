@@ -5,7 +5,7 @@ from dataclasses import dataclass
 from typing import Literal
 
 import numpy as np
-from scipy.stats import chi2
+from scipy.special import chdtrc
 
 from stcal.design import BoardDesign
 from stcal.errors import ConvergenceError, DegenerateError
@@ -113,7 +113,7 @@ def split_half(result: Intrinsics, views: Sequence[ImageObservations], board: Bo
     difference = np.subtract(*(model_parameters(camera, result.colmap_model) for camera in reversed(both.cameras)))
     apart = np.hstack([-np.eye(q), np.eye(q)])
     covariance = apart @ both.covariance @ apart.T
-    p_value = float(chi2.sf(difference @ np.linalg.solve(covariance, difference), q))
+    p_value = float(chdtrc(q, difference @ np.linalg.solve(covariance, difference)))
     jacobian = projection_jacobian(result.camera, result.colmap_model)
     length = np.linalg.norm(jacobian @ difference, axis=1)
     worst = int(np.argmax(length))

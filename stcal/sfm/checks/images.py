@@ -4,11 +4,10 @@ from collections.abc import Callable, Sequence
 
 import numpy as np
 from scipy.special import bdtrc, chdtri
-from scipy.stats import f as fisher
 
 from stcal.geometry.camera import Camera
 from stcal.geometry.rigid import skew
-from stcal.geometry.robust import robust_sigma
+from stcal.geometry.robust import ratio_limit, robust_sigma
 from stcal.io.camera import CalibratedCamera, CameraPrior, intrinsic_basis
 from stcal.labels import CircleLabel
 from stcal.sfm.adjust.calibration import Calibration
@@ -198,7 +197,7 @@ def _dull(values: dict[str, float], unit: str) -> list[Trial]:
         return []
     own = np.array(list(values.values()))
     freedom = max(MAD_EFFICIENCY * len(own) - 1, 2.0)
-    least = np.log(DULL) / np.sqrt(fisher.isf(SUSPICIOUS / len(own), 1, freedom))
+    least = np.log(DULL) / np.sqrt(ratio_limit(SUSPICIOUS / len(own), 1, freedom))
     sigma = max(robust_sigma(np.abs(own - np.median(own))), least)
     return [
         Trial(name, float(np.exp(value)), unit, max(value / sigma, 0.0) ** 2, 1, freedom, True)

@@ -10,7 +10,9 @@ from dataclasses import dataclass
 from typing import Literal
 
 import numpy as np
-from scipy.stats import f as fisher
+from scipy.special import fdtrc
+
+from stcal.geometry.robust import ratio_limit
 
 Verdict = Literal["passed", "suspicious", "failed", "not possible"]
 SUSPICIOUS = 1e-3
@@ -72,7 +74,7 @@ class Trial:
         """The value beyond which one of ``count`` things is suspicious."""
         if self.statistic <= 0:
             return None
-        limit = self.freedom * float(fisher.isf(SUSPICIOUS / count, self.freedom, self.redundancy))
+        limit = self.freedom * ratio_limit(SUSPICIOUS / count, self.freedom, self.redundancy)
         grown = float(np.sqrt(limit / self.statistic))
         return float(self.value**grown) if self.ratio else abs(self.value) * grown
 
@@ -87,7 +89,7 @@ def judge(key: str, title: str, trials: Sequence[Trial], what: str, remedy: str,
         return impossible(key, title, f"no {what} to test", "")
     count = len(trials)
     statistic, freedom, redundancy = np.array([(t.statistic, t.freedom, t.redundancy) for t in trials], float).T
-    probability = fisher.sf(statistic / freedom, freedom, redundancy)
+    probability = fdtrc(freedom, redundancy, statistic / freedom)
     order = np.lexsort([-statistic / freedom, probability])
     found = [i for i in order if probability[i] * count < SUSPICIOUS]
     verdict: Verdict = "passed"
