@@ -165,18 +165,27 @@ def _with_board(block: Block, shared: Shared, normal: np.ndarray, right: np.ndar
     size = 3 * p + q
     full, full_right = np.zeros((size + 6 + s, size + 6 + s)), np.zeros(size + 6 + s)
     full[:size, :size], full_right[:size] = normal, right
-    rotation = block.model_from_board.rotation
+    rotation, weight = block.model_from_board.rotation, 1 / block.sigma_mm**2
     turned = block.expected_dots(shared) @ rotation.T
     gap = block.model.xyz_model[block.dots] - (turned + block.model_from_board.translation)
-    jacobian = np.zeros((3 * d, size + 6 + s))
-    rows = np.arange(3 * d).reshape(d, 3)
-    jacobian[rows, 3 * block.dots[:, None] + np.arange(3)] = 1
+    # Each dot by itself (1), the pose and its place in the common shape (−rotation): three rows that no other dot has.
+    own, pose = 3 * block.dots[:, None] + np.arange(3), slice(size, size + 6)
     by_pose = np.concatenate([skew(turned), -np.broadcast_to(np.eye(3), (d, 3, 3))], axis=2)
-    jacobian[:, size : size + 6] = by_pose.reshape(3 * d, 6)
+    full[own, own] += weight
+    full_right[own] -= weight * gap
+    full[own, pose] += weight * by_pose
+    full[pose, own.ravel()] = full[own.ravel(), pose].T
+    flat = by_pose.reshape(3 * d, 6)
+    full[pose, pose] += weight * flat.T @ flat
+    full_right[pose] -= weight * gap.ravel() @ flat
     if s:
-        jacobian[rows[:, :, None], (size + 6 + rows)[:, None]] = -rotation
-    full += jacobian.T @ jacobian / block.sigma_mm**2
-    full_right -= jacobian.T @ gap.ravel() / block.sigma_mm**2
+        place = size + 6 + np.arange(s).reshape(d, 3)
+        full[own[:, :, None], place[:, None]] = -weight * rotation
+        full[place[:, :, None], own[:, None]] = -weight * rotation.T
+        full[place, place] += weight
+        full_right[place] += weight * gap @ rotation
+        full[place, pose] = -weight * rotation.T @ by_pose
+        full[pose, place.ravel()] = full[place.ravel(), pose].T
     dots = (3 * block.dots[:, None] + np.arange(3)).ravel()
     circles = (3 * block.circles[:, None] + np.arange(3)).ravel()
     inner = np.concatenate([dots, size + np.arange(6)])
