@@ -11,7 +11,7 @@ inverse of how the equation answers to a shifted image. Errors are not independe
 demosaicing and denoising spread them, and what the model does not follow, as motion blur, is none: it is even about
 the centre and moves nothing. Both are measured where centres live, on the rim: a centre is the residuals' first
 harmonic around it, and the next odd ones, which no parameter takes up, show how large it is by chance. All circles
-measured in one call share that factor; each has its own noise.
+of a pattern share that factor; each has its own noise.
 
 Planes do not follow a circle of which one half is darker, or with an edge beside it: the centre then moves by up to
 0.2 px without any residual that a rim's share would show. The third harmonic of the residuals around the rim does show
@@ -86,7 +86,13 @@ UNTRUSTED = 0.2
 30 %); it goes into σ."""
 
 
-def measure_centres(image: np.ndarray, camera: Camera, ellipses: Ellipses, neighbours: Ellipses) -> Centres:
+def measure_centres(
+    image: np.ndarray,
+    camera: Camera,
+    ellipses: Ellipses,
+    neighbours: Ellipses,
+    groups: np.ndarray | None = None,
+) -> Centres:
     """Measure ``ellipses`` in a grey image of any depth.
 
     Parameters
@@ -94,11 +100,15 @@ def measure_centres(image: np.ndarray, camera: Camera, ellipses: Ellipses, neigh
     image : (height, width) array, uint8 or uint16
     ellipses : what to measure
     neighbours : all candidates of the image; pixels of those that come near are left out
+    groups : (n,) numbers of the patterns that they belong to, whose circles share the factor for what correlates the
+        pixels; one pattern where None
     """
     focal = float(np.sqrt(camera.focal.prod()))
     found = _fitted(image, camera, ellipses, neighbours)
     centre, uneven = found.centre / focal, found.uneven / focal
-    covariance = _correlation(found.chance[found.rim >= MIN_RIM]) * found.covariance / focal**2
+    groups, ok = np.zeros(len(ellipses), int) if groups is None else groups, found.rim >= MIN_RIM
+    factor = np.array([_correlation(found.chance[ok & (groups == i)]) for i in range(groups.max(initial=0) + 1)])
+    covariance = factor[groups, None, None] * found.covariance / focal**2
     covariance += UNTRUSTED**2 * uneven[:, :, None] * uneven[:, None, :]
     distorted, jacobian = camera.distort_jacobian(centre)
     jacobian = jacobian * camera.focal[:, None]
@@ -112,7 +122,7 @@ def measure_centres(image: np.ndarray, camera: Camera, ellipses: Ellipses, neigh
         noise=found.noise,
         rim=found.rim,
         uneven_px=(jacobian @ uneven[..., None])[..., 0],
-        ok=found.rim >= MIN_RIM,
+        ok=ok,
     )
 
 

@@ -1,7 +1,7 @@
 """Candidates: blobs of either polarity whose outline is an ellipse, over a pyramid of scales."""
 
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 
 import cv2
 import numpy as np
@@ -89,6 +89,11 @@ class Ellipses:
 
     def __len__(self) -> int:
         return len(self.centre_px)
+
+    @classmethod
+    def concatenate(cls, parts: list["Ellipses"]) -> "Ellipses":
+        """All parts, one after the other."""
+        return cls(*(np.concatenate([getattr(part, f.name) for part in parts]) for f in fields(cls)))
 
     def radius_px(self) -> np.ndarray:
         """Radius of the circle of the same area, (n,)."""

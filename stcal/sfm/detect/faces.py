@@ -13,6 +13,7 @@ import numpy as np
 
 from stcal.design import FaceDesign, TargetDesign
 from stcal.geometry.plane import homography_jacobian
+from stcal.labels import CircleLabel
 from stcal.sfm.detect.ambiguity import is_named, mirror_images
 from stcal.sfm.detect.candidates import MAX_AXIS_RATIO, Candidates, grow_match, singular_values
 
@@ -53,6 +54,10 @@ class FaceReading:
     def used(self) -> np.ndarray:
         """Candidates that it uses."""
         return self.index[self.index >= 0]
+
+    def labels(self) -> list[CircleLabel]:
+        """Of these."""
+        return [label for label, i in zip(self.face.labels(), self.index, strict=True) if i >= 0]
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -1,12 +1,15 @@
 """One image: candidates → board → faces → centres. What only the group can decide stays open."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from itertools import pairwise
 
 import numpy as np
 
 from stcal.design import BoardDesign, Polarity, TargetDesign
 from stcal.geometry.camera import Camera
 from stcal.io.images import grey_8bit, grey_fine
+from stcal.labels import Label
 from stcal.sfm.data.centres import Centres
 from stcal.sfm.detect.board import BoardReading, find_boards
 from stcal.sfm.detect.candidates import Candidates
@@ -15,6 +18,7 @@ from stcal.sfm.detect.ellipses import EllipseOptions, Ellipses, find_ellipses
 from stcal.sfm.detect.faces import FaceFinder, FaceFinding, FaceReading
 from stcal.sfm.detect.sightings import BoardSighting, FaceSighting, ImageDetection
 
+NAMELESS, DOT = "a circle of a face without a name", "a board dot"
 FAINT = 0.25
 """Of the contrast asked for, where an image shows too little with that."""
 MAX_FREE = 400
@@ -86,46 +90,64 @@ def detect_image(
     """Find and measure all circles of the target and the board in one grey image of the camera's size."""
     reading = read_image(grey_8bit(image), camera, target, board, options)
     scaled = grey_fine(image)
+    named, refused, boards = reading.faces.faces, reading.faces.refused, reading.boards
+    of_board = board.polarity if board else target.polarity
+    free, dots = reading.free, reading.found[of_board]
+    patterns = [_Pattern(target.polarity, free.select(each.used()), each.labels()) for each in named]
+    patterns += [_Pattern(target.polarity, free.select(own := each.used()), [NAMELESS] * len(own)) for each in refused]
+    patterns += [_Pattern(of_board, dots.select(own := each.candidates), [DOT] * len(own)) for each in boards]
+    measured = _measured(scaled, camera, patterns, reading.found)
     notes = [_untried_note(reading)] if reading.untried else []
-    parts: list[Centres] = []
-    faces, boards, open_faces = [], [], []
-    count = 0
-
-    def measured(ellipses: Ellipses, polarity: Polarity, labels) -> np.ndarray:
-        """Mask of those that are usable, which are appended to the parts."""
-        nonlocal count
-        centres = measure_centres(scaled, camera, ellipses, reading.found[polarity])
-        notes.extend(
-            _rim_note(label, rim) for label, rim, ok in zip(labels, centres.rim, centres.ok, strict=True) if not ok
-        )
-        parts.append(centres.select(np.flatnonzero(centres.ok)))
-        count += len(parts[-1])
-        return centres.ok
-
-    for face in reading.faces.faces:
-        circles, first = np.flatnonzero(face.index >= 0), count
-        labels = face.face.labels()
-        ok = measured(reading.free.select(face.index[circles]), target.polarity, [labels[i] for i in circles])
-        faces.append(FaceSighting(face.face.id, np.arange(first, count), circles[ok]))
-    for each in reading.faces.refused:
-        used, first = each.used(), count
-        ok = measured(reading.free.select(used), target.polarity, ["a circle of a face without a name"] * len(used))
+    for pattern, centres in zip(patterns, measured, strict=True):
+        notes += [_rim_note(pattern.names[i], centres.rim[i]) for i in np.flatnonzero(~centres.ok).tolist()]
+    ends = np.cumsum([0, *(int(centres.ok.sum()) for centres in measured)])
+    seen = [(centres.ok, np.arange(*rows)) for centres, rows in zip(measured, pairwise(ends), strict=True)]
+    first, second = len(named), len(named) + len(refused)
+    faces, open_faces, board_sightings = [], [], []
+    for each, (ok, rows) in zip(named, seen[:first], strict=True):
+        faces.append(FaceSighting(each.face.id, rows, np.flatnonzero(each.index >= 0)[ok]))
+    for each, (ok, rows) in zip(refused, seen[first:second], strict=True):
         row = np.full(len(reading.free), -1)
-        row[used[ok]] = np.arange(first, count)
+        row[each.used()[ok]] = rows
         open_faces.append(tuple(_sighting(own, row) for own in each.readings))
-    for each in reading.boards:
-        first, polarity = count, board.polarity if board else target.polarity
-        ok = measured(reading.found[polarity].select(each.candidates), polarity, ["a board dot"] * len(each.candidates))
-        boards.append(BoardSighting(np.arange(first, count), each.numberings[:, ok], each.unlikely[:, ok]))
+    for each, (ok, rows) in zip(boards, seen[second:], strict=True):
+        board_sightings.append(BoardSighting(rows, each.numberings[:, ok], each.unlikely[:, ok]))
     return ImageDetection(
-        Centres.concatenate(parts or [_nothing(scaled, camera, reading.free)]),
+        Centres.concatenate(
+            [centres.select(np.flatnonzero(centres.ok)) for centres in measured] or [_nothing(scaled, camera, free)]
+        ),
         tuple(faces),
-        tuple(boards),
+        tuple(board_sightings),
         tuple(each.face.id for each in reading.mirrored),
         tuple(notes),
         sum(len(e) for e in reading.found.values()),
         tuple(open_faces),
     )
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Pattern:
+    """Ellipses that belong together, what they are, and their names for notes."""
+
+    polarity: Polarity
+    ellipses: Ellipses
+    names: Sequence[Label | str]
+
+
+def _measured(
+    image: np.ndarray, camera: Camera, patterns: list[_Pattern], found: dict[Polarity, Ellipses]
+) -> list[Centres]:
+    """The centres of each pattern, all of one polarity measured at once."""
+    measured: dict[int, Centres] = {}
+    for polarity, every in found.items():
+        own = [i for i, pattern in enumerate(patterns) if pattern.polarity == polarity]
+        if not own:
+            continue
+        groups = np.repeat(np.arange(len(own)), [len(patterns[i].ellipses) for i in own])
+        together = Ellipses.concatenate([patterns[i].ellipses for i in own])
+        centres = measure_centres(image, camera, together, every, groups)
+        measured |= {i: centres.select(np.flatnonzero(groups == k)) for k, i in enumerate(own)}
+    return [measured[i] for i in range(len(patterns))]
 
 
 def _sighting(reading: FaceReading, row: np.ndarray) -> FaceSighting:
@@ -139,7 +161,7 @@ def _nothing(image: np.ndarray, camera: Camera, ellipses: Ellipses) -> Centres:
     return measure_centres(image, camera, ellipses.select(np.zeros(0, int)), ellipses)
 
 
-def _rim_note(label: str, rim: float) -> str:
+def _rim_note(label: Label | str, rim: float) -> str:
     return (
         f"{label}: {100 * rim:.0f} % of its rim follows an ellipse, 80 % needed; partly hidden or disturbed, left out"
     )
