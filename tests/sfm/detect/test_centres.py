@@ -170,6 +170,19 @@ def test_sixteen_bit_values_give_the_same_centres():
     np.testing.assert_array_equal(a.centre_px, b.centre_px)
 
 
+def test_circles_are_measured_together_as_each_alone():
+    """Single precision: 1e-5 px. Each pattern has its own factor for what correlates the pixels."""
+    image, start = draw(CAMERA, CIRCLES), start_from(CAMERA, CIRCLES)
+    image = np.clip(image + np.random.default_rng(3).normal(0, 2, image.shape), 0, 255).astype(np.uint8)
+    groups = np.array([0, 0, 1, 1])
+    together = measure_centres(image, CAMERA, start, start, groups)
+    for k in range(2):
+        own = np.flatnonzero(groups == k)
+        alone = measure_centres(image, CAMERA, start.select(own), start)
+        np.testing.assert_allclose(together.centre_px[own], alone.centre_px, atol=1e-5)
+        np.testing.assert_allclose(together.covariance_px2[own], alone.covariance_px2, rtol=1e-3)
+
+
 def test_nothing_to_measure():
     empty = Ellipses(np.zeros((0, 2)), np.zeros((0, 2, 2)), np.zeros(0))
     found = measure_centres(np.zeros((300, 400), np.uint8), CAMERA, empty, empty)
