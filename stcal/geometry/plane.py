@@ -45,17 +45,23 @@ def fit_plane(xyz: np.ndarray, towards: np.ndarray | None = None) -> Plane:
     DegenerateError
         Fewer than three points, or collinear ones.
     """
-    xyz = np.asarray(xyz, float)
-    if len(xyz) < 3:
-        raise DegenerateError(f"plane: {len(xyz)} points, 3 needed")
-    mean = xyz.mean(0)
-    _, s, vt = np.linalg.svd(xyz - mean, full_matrices=False)
-    if s[1] <= 1e-9 * s[0]:
+    normal, offset, rms = fit_planes(np.asarray(xyz, float)[None], towards)
+    return Plane(normal[0], float(offset[0]), float(rms[0]))
+
+
+def fit_planes(xyz: np.ndarray, towards: np.ndarray | None = None) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """:func:`fit_plane` of each of k sets of points, (k, n, 3): normals (k, 3), offsets (k,) and spreads (k,)."""
+    n = xyz.shape[1]
+    if n < 3:
+        raise DegenerateError(f"plane: {n} points, 3 needed")
+    mean = xyz.mean(1)
+    _, s, vt = np.linalg.svd(xyz - mean[:, None], full_matrices=False)
+    if (s[:, 1] <= 1e-9 * s[:, 0]).any():
         raise DegenerateError("plane: the points are collinear; points off the line are needed")
-    normal = vt[2]
-    if towards is not None and normal @ towards < 0:
-        normal = -normal
-    return Plane(normal, float(normal @ mean), float(s[2] / np.sqrt(len(xyz))))
+    normal = vt[:, 2]
+    if towards is not None:
+        normal = np.where((normal @ towards < 0)[:, None], -normal, normal)
+    return normal, (normal * mean).sum(1), s[:, 2] / np.sqrt(n)
 
 
 def fit_homography(xy_b: np.ndarray, xy_a: np.ndarray) -> np.ndarray:

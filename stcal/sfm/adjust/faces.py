@@ -1,6 +1,6 @@
 """Face frames from circle centres, and the faces of one group."""
 
-from collections.abc import Collection, Mapping
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Literal
 
@@ -11,8 +11,8 @@ from stcal.errors import DegenerateError
 from stcal.geometry.align import align_rigid
 from stcal.geometry.arrays import frozen
 from stcal.geometry.camera import Camera
-from stcal.geometry.plane import fit_plane
-from stcal.geometry.rigid import Rigid
+from stcal.geometry.plane import fit_planes
+from stcal.geometry.rigid import Poses, Rigid
 from stcal.labels import CircleLabel
 from stcal.sfm.adjust.group import projection_jacobians
 from stcal.sfm.data.model import MetricModel
@@ -116,16 +116,26 @@ def face_frame(face: FaceDesign, xyz: dict[str, np.ndarray], kind: FrameKind, to
     if missing := missing_frame_circles(face, xyz):
         names = " and ".join(f"{face.id}:{circle}" for circle in missing)
         raise DegenerateError(f"face {face.id}: frame circle {names} not mapped; add views that show it")
-    origin, x, y = (xyz[circle] for circle in (face.origin, face.x, face.y))
+    frames = face_frames(face, tuple(xyz), np.array(list(xyz.values()))[None], kind, towards)
+    return Rigid(frames.rotation[0], frames.translation[0])
+
+
+def face_frames(
+    face: FaceDesign, circles: Sequence[str], xyz: np.ndarray, kind: FrameKind, towards: np.ndarray
+) -> Poses:
+    """:func:`face_frame` of k sets of centres, (k, n, 3), of the same ``circles``, the frame's among them."""
+    corners = np.stack([xyz[:, list(circles).index(circle)] for circle in (face.origin, face.x, face.y)])
     if kind == "plane":
-        plane = fit_plane(np.array(list(xyz.values())), towards)
-        origin, x, y = plane.project(origin), plane.project(x), plane.project(y)
-    axis_x = (x - origin) / np.linalg.norm(x - origin)
-    across = (y - origin) - (y - origin) @ axis_x * axis_x
-    if np.linalg.norm(across) < 1e-6 * np.linalg.norm(y - origin):
+        normal, offset, _ = fit_planes(xyz, towards)
+        corners = corners - ((corners * normal).sum(2) - offset)[..., None] * normal
+    origin, along_x, along_y = corners[0], corners[1] - corners[0], corners[2] - corners[0]
+    axis_x = along_x / np.linalg.norm(along_x, axis=1, keepdims=True)
+    across = along_y - (along_y * axis_x).sum(1, keepdims=True) * axis_x
+    length = np.linalg.norm(across, axis=1, keepdims=True)
+    if (length[:, 0] < 1e-6 * np.linalg.norm(along_y, axis=1)).any():
         raise DegenerateError(f"face {face.id}: its frame circles are mapped in one line; check their labels")
-    axis_y = across / np.linalg.norm(across)
-    return Rigid(np.column_stack([axis_x, axis_y, np.cross(axis_x, axis_y)]), origin)
+    axis_y = across / length
+    return Poses(np.stack([axis_x, axis_y, np.cross(axis_x, axis_y)], axis=2), origin)
 
 
 def faces_of_group(

@@ -1,24 +1,25 @@
 """The calibrated target of a joint adjustment with its marginal covariances."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Iterable
 from dataclasses import dataclass
-from functools import partial
 from itertools import combinations
 
 import numpy as np
-from scipy.spatial.transform import Rotation
 
-from stcal.design import TargetDesign
-from stcal.geometry.rigid import Rigid
+from stcal.design import FaceDesign, TargetDesign
+from stcal.geometry.rigid import Poses, Rigid
 from stcal.sfm.adjust.chain import CalibratedTarget
 from stcal.sfm.adjust.faces import (
     FrameKind,
-    face_frame,
+    face_frames,
     missing_frame_circles,
     placement_sigma_mm,
     with_unmapped,
 )
 from stcal.sfm.adjust.joint import JointResult
+
+STEP_MM = 1e-3
+"""Of the central differences."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -103,75 +104,112 @@ def scale_sigma(xyz_model: np.ndarray, covariance_mm2: np.ndarray) -> float:
 
 def derivatives(result: JointResult, start: CalibratedTarget, target: TargetDesign, kind: FrameKind) -> Derivatives:
     """Poses and circles in the target frame are functions of all circles; derivatives by central differences."""
-    step = 1e-3
-    own = _frames(result, result.xyz_model, start, target, kind)
-    origin = _in_target_frame(own, result.xyz_model, start)
-
-    def by(changes: list[Callable[[float], tuple]]) -> tuple[dict[str, np.ndarray], np.ndarray]:
-        """Derivatives by some parameters: ``change(±step)`` gives the faces' frames that one moves, and the circles."""
-        ahead, behind = (
-            [_in_target_frame(own | frames, xyz, start) for frames, xyz in (change(move) for change in changes)]
-            for move in (step, -step)
-        )
-        if not changes:
-            return {f: np.zeros((6, 0)) for f in own}, np.zeros((len(result.labels), 3, 0))
-        twists = {f: _perturbations([a[0][f] for a in ahead], [b[0][f] for b in behind]) / (2 * step) for f in own}
-        moved = [(a[1] - b[1]) / (2 * step) for a, b in zip(ahead, behind, strict=True)]
-        return twists, np.stack(moved, axis=-1)
-
-    def circle(i: int, axis: int, move: float):
-        xyz = result.xyz_model.copy()
-        xyz[i, axis] += move
-        return _frames(result, xyz, start, target, kind, only=result.labels[i].face), xyz
-
-    def designed(face_id: str, circle: str, axis: int, move: float):
-        shift = move * own[face_id].rotation[:, axis]
-        return _frames(result, result.xyz_model, start, target, kind, face_id, {circle: shift}), result.xyz_model
-
-    mapped = {face_id: [x.circle for x in result.labels if x.face == face_id] for face_id in own}
-    places = [(f, c, axis) for f in own for c in missing_frame_circles(target.face(f), mapped[f]) for axis in range(2)]
-    by_circle = by([partial(circle, i, axis) for i in range(len(result.labels)) for axis in range(3)])
-    by_place = by([partial(designed, *place) for place in places])
-    sigma = placement_sigma_mm(target, dict(zip(result.labels, result.xyz_model, strict=True))) if places else 0.0
-    return Derivatives(*origin, *by_circle, *by_place, sigma)
-
-
-def _perturbations(ahead: Sequence[Rigid], behind: Sequence[Rigid]) -> np.ndarray:
-    """Rotation (rad) and translation (mm), (6, n), between each two close poses, in the frame they lead to, about the
-    origin of b."""
-    turns = np.array([a.rotation @ b.rotation.T for a, b in zip(ahead, behind, strict=True)])
-    shifts = np.array([a.translation - b.translation for a, b in zip(ahead, behind, strict=True)])
-    return np.hstack([Rotation.from_matrix(turns).as_rotvec(), shifts]).T.copy()
-
-
-def _frames(
-    result: JointResult,
-    xyz_model,
-    start: CalibratedTarget,
-    target: TargetDesign,
-    kind: FrameKind,
-    only: str | None = None,
-    shifts: dict[str, np.ndarray] | None = None,
-) -> dict[str, Rigid]:
-    """model_from_face of all faces, or of one; ``shifts`` (3,) by id move circles that were not mapped."""
-    frames = {}
-    for face in target.faces:
-        if face.id in start.target_from_face and only in (None, face.id):
-            own = {
-                label.circle: xyz for label, xyz in zip(result.labels, xyz_model, strict=True) if label.face == face.id
-            }
-            own = with_unmapped(face, own)
-            for circle, shift in (shifts or {}).items():
-                own = own | {circle: own[circle] + shift}
-            frames[face.id] = face_frame(face, own, kind, start.target_from_face[face.id].rotation[:, 2])
-    return frames
-
-
-def _in_target_frame(model_from_face: dict[str, Rigid], xyz_model: np.ndarray, start: CalibratedTarget):
-    """target_from_face, circles (c, 3) in the target frame, and target_from_model."""
-    target_from_model = model_from_face[start.reference_face].inverse()
-    return (
-        {face_id: target_from_model @ pose for face_id, pose in model_from_face.items()},
-        target_from_model @ xyz_model,
+    seen = [face for face in target.faces if face.id in start.target_from_face]
+    faces = [_MovedFace.of(face, result, start.target_from_face[face.id].rotation[:, 2], kind) for face in seen]
+    own = {each.face.id: each.frames(np.zeros((1, len(each.rows), 3)))[0] for each in faces}
+    target_from_model = own[start.reference_face].inverse()
+    by_circle = _Moves.none(own, len(result.labels), 3 * len(result.labels))
+    by_place = [_Moves.none(own, len(result.labels), 0)]
+    for each in faces:
+        moves = np.eye(3 * len(each.rows)).reshape(-1, len(each.rows), 3)
+        by_circle.put(_moves(each, moves, None, own, start, result), (3 * each.rows[:, None] + np.arange(3)).ravel())
+        if each.placed:  # in their plane, which is where the design has them
+            shifts = np.einsum("pq,ja->pjqa", np.eye(len(each.placed)), own[each.face.id].rotation[:, :2].T)
+            shifts = shifts.reshape(-1, len(each.placed), 3)
+            still = np.zeros((len(shifts), len(each.rows), 3))
+            by_place.append(_moves(each, still, shifts, own, start, result))
+    sigma = 0.0
+    if len(by_place) > 1:
+        sigma = placement_sigma_mm(target, dict(zip(result.labels, result.xyz_model, strict=True)))
+    return Derivatives(
+        {face_id: target_from_model @ pose for face_id, pose in own.items()},
+        target_from_model @ result.xyz_model,
         target_from_model,
+        by_circle.faces,
+        by_circle.circles,
+        {face_id: np.hstack([each.faces[face_id] for each in by_place]) for face_id in own},
+        np.concatenate([each.circles for each in by_place], axis=2),
+        sigma,
     )
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Moves:
+    """Derivatives by k parameters: ``faces`` (6, k) each, rotation and translation, and ``circles`` (c, 3, k)."""
+
+    faces: dict[str, np.ndarray]
+    circles: np.ndarray
+
+    @classmethod
+    def none(cls, faces: Iterable[str], circles: int, count: int) -> "_Moves":
+        return cls({face_id: np.zeros((6, count)) for face_id in faces}, np.zeros((circles, 3, count)))
+
+    def put(self, other: "_Moves", columns: np.ndarray) -> None:
+        """Take over those of other parameters."""
+        self.circles[:, :, columns] = other.circles
+        for face_id, own in other.faces.items():
+            self.faces[face_id][:, columns] = own
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _MovedFace:
+    """A face with its m circles, and how its frame follows them: ``rows`` (m,) among all circles, their ``xyz``
+    (m, 3); ``placed`` : frame circles that were not mapped."""
+
+    face: FaceDesign
+    rows: np.ndarray
+    circles: tuple[str, ...]
+    xyz: np.ndarray
+    placed: tuple[str, ...]
+    kind: FrameKind
+    towards: np.ndarray
+
+    @classmethod
+    def of(cls, face: FaceDesign, result: JointResult, towards: np.ndarray, kind: FrameKind) -> "_MovedFace":
+        rows = np.array([i for i, label in enumerate(result.labels) if label.face == face.id], int)
+        circles = tuple(result.labels[i].circle for i in rows)
+        placed = missing_frame_circles(face, circles)
+        return cls(face, rows, circles, result.xyz_model[rows], placed, kind, towards)
+
+    def frames(self, moves: np.ndarray, shifts: np.ndarray | None = None) -> Poses:
+        """model_from_face after each of k sets of moves (k, m, 3), and shifts (k, p, 3) of the placed circles, mm."""
+        xyz = self.xyz + moves
+        if not self.placed:
+            return face_frames(self.face, self.circles, xyz, self.kind, self.towards)
+        sets = [with_unmapped(self.face, dict(zip(self.circles, each, strict=True))) for each in xyz]
+        every = np.array([list(each.values()) for each in sets])
+        names = tuple(sets[0])
+        if shifts is not None:
+            every[:, [names.index(circle) for circle in self.placed]] += shifts
+        return face_frames(self.face, names, every, self.kind, self.towards)
+
+
+def _moves(
+    moved: _MovedFace,
+    moves: np.ndarray,
+    shifts: np.ndarray | None,
+    own: dict[str, Rigid],
+    start: CalibratedTarget,
+    result: JointResult,
+) -> _Moves:
+    """Derivatives by k parameters that move circles of one face, (k, m, 3), or its placed ones, (k, p, 3)."""
+    found = _Moves.none(own, len(result.labels), len(moves))
+    ahead, behind = (
+        moved.frames(sign * STEP_MM * moves, None if shifts is None else sign * STEP_MM * shifts) for sign in (1, -1)
+    )
+    if moved.face.id != start.reference_face:
+        target_from_model = own[start.reference_face].inverse()
+        twist = (target_from_model @ ahead).difference(target_from_model @ behind)
+        found.faces[moved.face.id][:] = twist.T / (2 * STEP_MM)
+        found.circles[moved.rows] = np.transpose(moves @ target_from_model.rotation.T, (1, 2, 0))
+        return found
+    ahead, behind = ahead.inverse(), behind.inverse()
+    for face_id, pose in own.items():
+        if face_id != moved.face.id:
+            found.faces[face_id][:] = (ahead @ pose).difference(behind @ pose).T / (2 * STEP_MM)
+    for sign, target_from_model in ((1, ahead), (-1, behind)):
+        xyz = np.tile(result.xyz_model, (len(moves), 1, 1))
+        xyz[:, moved.rows] += sign * STEP_MM * moves
+        placed = xyz @ np.swapaxes(target_from_model.rotation, 1, 2) + target_from_model.translation[:, None]
+        found.circles[:] += sign * np.transpose(placed, (1, 2, 0)) / (2 * STEP_MM)
+    return found
