@@ -162,7 +162,7 @@ class FaceFinder:
         """All faces among the candidates. The image of a face in a mirror can pass for another face, which only the
         group can tell."""
         readings: list[FaceReading] = []
-        if len(candidates) < MIN_CIRCLES:
+        if len(candidates) < MIN_CIRCLES or not self.target.faces:
             return _decide(readings, self.target)
         starts, tries = self._hypotheses(candidates), np.zeros(len(candidates), int)
         is_open = np.ones(len(starts.origin), bool)

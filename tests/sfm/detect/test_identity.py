@@ -163,6 +163,23 @@ def test_which_circles_name_a_face():
     assert all(any(len(s) == 9 for s in sets) for sets in confusable(TARGET).values())
 
 
+def test_a_design_without_faces_has_none():
+    """As photographs of a dot board alone are read."""
+    finding = FaceFinder(TargetDesign("none", "bright", ())).find(Candidates.of(face_ellipses("1", pose()), CAMERA))
+    assert finding.faces == finding.refused == ()
+
+
+def test_faces_of_few_and_of_many_circles_are_found_together():
+    face = TARGET.face("2")
+    few = FaceDesign("few", tuple("abcde"), [[0, 0], [31, 0], [64, 7], [5, 38], [36, 52]], [5.0] * 5, "a", "c", "d")
+    target = TargetDesign("mixed", "bright", (few, face))
+    both = joined(
+        ellipses_of(pose(20, 30, 40, x=200), few.xy_mm, few.radius_mm), face_ellipses("2", pose(40, 10, 0, x=-250))
+    )
+    found = FaceFinder(target).find(Candidates.of(both, CAMERA)).faces
+    assert {reading.face.id: reading.count() for reading in found} == {"few": 5, "2": 10}
+
+
 def test_a_face_that_looks_the_same_after_half_a_turn_is_never_named():
     xy = [[0, 0], [30, 0], [60, 0], [0, 40], [30, 40], [60, 40]]
     square = FaceDesign("s", tuple("abcdef"), xy, [5.0] * 6, "a", "c", "d")
