@@ -76,7 +76,7 @@ def simulate(
 
 @app.command()
 def compare(
-    run_folder: Annotated[Path, typer.Argument(metavar="RUN", help="Read this finished run, or its faces.json.")],
+    run: Annotated[Path, typer.Argument(metavar="RUN", help="Read this finished run, or its faces.json.")],
     truth: Annotated[Path, typer.Argument(help="Read the truth from this truth.json.")],
     out: JsonFile = None,
 ) -> None:
@@ -85,16 +85,16 @@ def compare(
     from stcal.sfm.report.compare import comparison_table
     from stcal.sfm.run.transaction import COMPARISON, added_results
 
-    into_run = run_folder / COMPARISON
-    if (run_folder / RUN_MARKER).is_file() and (out is None or real_place(out) == real_place(into_run)):
-        with added_results(run_folder) as stage:
-            comparison = against(run_folder, truth)
+    into_run = run / COMPARISON
+    if (run / RUN_MARKER).is_file() and (out is None or real_place(out) == real_place(into_run)):
+        with added_results(run) as stage:
+            comparison = against(run, truth)
             save(stage / COMPARISON, json_text(comparison))
         say(f"{comparison_table(comparison)}\nas JSON: {into_run}")
         return
-    comparison = against(run_folder, truth)
+    comparison = against(run, truth)
     say(comparison_table(comparison))
-    target = out or (into_run if run_folder.is_dir() else None)
+    target = out or (into_run if run.is_dir() else None)
     if target:
         write(target, comparison, "as JSON")
 

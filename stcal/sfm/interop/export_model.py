@@ -104,28 +104,32 @@ def export_model(run: str | Path, out: str | Path, kind: str) -> ExportedModel:
     ideal = kind in ("nvm", "bundler")
     camera = saved.camera
     focal_px = float(camera.focal.mean())
-    with tempfile.TemporaryDirectory(prefix=f".{out.name}.partial-", dir=out.parent) as scratch:
-        partial = Path(scratch) / out.name
-        beside = partial / labels.name if kind in FOLDERS else Path(scratch) / labels.name
-        if kind in FOLDERS:
-            partial.mkdir()
-        beside.write_text(_labels_csv(points, saved.faces, kind), encoding="utf-8")
-        match kind:
-            case "colmap-bin" | "colmap-txt":
-                write_reconstruction(reconstruction, partial, text=kind == "colmap-txt")
-            case "ply":
-                partial.write_text(_ply(points), encoding="utf-8")
-            case "nvm":
-                partial.write_text(_nvm(reconstruction, points, saved, focal_px), encoding="utf-8")
-            case "bundler":
-                bundle, names = _bundler(reconstruction, points, saved, focal_px)
-                (partial / "bundle.out").write_text(bundle, encoding="utf-8")
-                (partial / "list.txt").write_text(names, encoding="utf-8")
-        if kind not in FOLDERS:
-            os.replace(beside, labels)
-        elif out.exists():
-            out.rmdir()  # empty; not every system lets a folder take its place
-        os.replace(partial, out)
+    try:
+        with tempfile.TemporaryDirectory(prefix=f".{out.name}.partial-", dir=out.parent) as scratch:
+            partial = Path(scratch) / out.name
+            beside = partial / labels.name if kind in FOLDERS else Path(scratch) / labels.name
+            if kind in FOLDERS:
+                partial.mkdir()
+            beside.write_text(_labels_csv(points, saved.faces, kind), encoding="utf-8")
+            match kind:
+                case "colmap-bin" | "colmap-txt":
+                    write_reconstruction(reconstruction, partial, text=kind == "colmap-txt")
+                case "ply":
+                    partial.write_text(_ply(points), encoding="utf-8")
+                case "nvm":
+                    partial.write_text(_nvm(reconstruction, points, saved, focal_px), encoding="utf-8")
+                case "bundler":
+                    bundle, names = _bundler(reconstruction, points, saved, focal_px)
+                    (partial / "bundle.out").write_text(bundle, encoding="utf-8")
+                    (partial / "list.txt").write_text(names, encoding="utf-8")
+            if kind not in FOLDERS:
+                os.replace(beside, labels)
+            elif out.exists():
+                out.rmdir()  # empty; not every system lets a folder take its place
+            os.replace(partial, out)
+    except OSError as error:  # a full disk names no file
+        error.filename = error.filename or str(out)
+        raise
     optics = (focal_px, ((camera.width - 1) / 2, (camera.height - 1) / 2)) if ideal else (None, None)
     return ExportedModel(out, labels, reconstruction.num_reg_images(), len(points), *optics)
 

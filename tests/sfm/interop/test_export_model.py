@@ -1,12 +1,14 @@
 """The exported model read back: by COLMAP, old and new, and by small readers of what the formats' documents say."""
 
 import csv
+import errno
 import json
 import os
 import re
 import shutil
 import subprocess
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pycolmap
@@ -362,6 +364,17 @@ def test_nothing_is_overwritten(small_run, stcal_sfm, tmp_path, kind):
         assert "exists, and nothing is overwritten" in error
     assert (tmp_path / "file").read_text(encoding="utf-8") == "mine"
     assert sorted(path.name for path in tmp_path.rglob("*")) == ["file", "file", "full"]
+
+
+def test_a_full_disk_is_one_line_with_the_place(small_run, stcal_sfm, tmp_path, monkeypatch):
+    def full(*_, **__):
+        raise OSError(errno.ENOSPC, "No space left on device")  # as a write says it, without a name
+
+    monkeypatch.setattr(Path, "write_text", full)
+    code, out, error = stcal_sfm("export-model", small_run, tmp_path / "m.ply", "--format", "ply")
+    assert (code, out, error.count("\n")) == (2, "", 1)
+    assert f"{tmp_path / 'm.ply'}: No space left on device; check the path" in error
+    assert not any(tmp_path.iterdir())
 
 
 def test_labels_are_not_overwritten_either(small_run, stcal_sfm, tmp_path):
