@@ -75,6 +75,13 @@ def test_too_little_address_space_is_said_before_libraries_load(words, code):
     assert ended.stderr == (said if code else "")
 
 
+def test_the_version_loads_nothing():
+    code = "import sys; from stcal.cli.entry import main; main(); print('typer' in sys.modules)"
+    words = [sys.executable, "-P", "-c", code, "--version"]
+    printed = subprocess.run(words, capture_output=True, text=True, check=True).stdout
+    assert printed == f"{stcal.__version__}\nFalse\n"
+
+
 def test_help_loads_no_numerics():
     """They take longer than all the rest; Typer itself loads pydantic."""
     code = "import sys, stcal.cli.main; print([m for m in ('numpy', 'yaml', 'rich.progress') if m in sys.modules])"

@@ -6,6 +6,8 @@ import sys
 from importlib import import_module
 from types import ModuleType
 
+import stcal
+
 NO_MEMORY = "not enough memory"
 USED_UP = (
     "allocate",
@@ -40,6 +42,14 @@ def lacks_memory(error: BaseException) -> bool:
 
 
 def _run(name: str) -> None:
+    """A program, or its version alone, for which scripts need not wait until the commands are loaded."""
+    if sys.argv[1:] == ["--version"]:
+        print(stcal.__version__)
+    else:
+        _run_commands(name)
+
+
+def _run_commands(name: str) -> None:
     """A program; once it has its exit code, signals change it no more. Python takes handlers away while it ends, and a
     signal would then end a command, whose results are in place, as if it had failed."""
     try:
