@@ -18,6 +18,7 @@ from stcal.robot.kinematics.file import robot_toml
 from stcal.robot.kinematics.forward import forward
 from stcal.sfm.interop.export_model import export_model
 from stcal.sfm.pipeline import RunOptions, run
+from stcal.sfm.run.marker import MarkerFile, digest_of
 from stcal.synthetic.dataset import write_dataset
 from stcal.synthetic.measured.arms import joint_vectors, made, measured, placed
 from stcal.synthetic.measured.handeye import simulated
@@ -73,8 +74,10 @@ def _of_runs(folder: Path) -> None:
     export_model(folder / "run", folder / "model-txt", "colmap-txt")
     (folder / "detected").mkdir()
     shutil.copytree(folder / "run/cache", folder / "detected/cache")
-    marker = json.loads((folder / "run/stcal-run.json").read_text())
-    (folder / "detected/stcal-run.json").write_text(json.dumps(marker | {"options": None}))
+    shutil.copy(folder / "run/detections.csv", folder / "detected")
+    marker = MarkerFile.of(folder / "data/images", None)
+    sealed = marker.sealed({"detections.csv": digest_of(folder / "detected/detections.csv")})
+    (folder / "detected/stcal-run.json").write_text(json.dumps(sealed.content()))
     (folder / "no-colmap").write_text("no program\n")
 
 
