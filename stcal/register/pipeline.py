@@ -7,6 +7,7 @@ from functools import partial
 import numpy as np
 
 from stcal.errors import DegenerateError, InputError
+from stcal.io.table import FARTHEST
 from stcal.parallel import one_thread
 from stcal.register.core.covariance import covariance_of, sigma_within
 from stcal.register.core.liu2017 import Liu2017Options, liu2017
@@ -31,6 +32,8 @@ from stcal.register.judge.mistakes import check_mirrored, check_units, mirrored_
 from stcal.register.judge.notes import Subject, notes_of
 
 METHODS = ("robust", "least-squares", "liu2017")
+NEAREST_MM = 1e-9
+"""Of thresholds: the digits of a number end there, 1e12 mm is the farthest point."""
 SUSPICIOUS_SHARE = 0.5
 SUSPICIOUS_SIGMA = 0.05
 """With fewer inliers, or a σ above this share of the points' RMS distance from their middle, a mirrored frame is
@@ -168,8 +171,10 @@ def _checked(xyz_a, xyz_b, model: str, method: str, threshold_mm: float | None, 
         raise InputError(f"registration: model {model!r}; one of {', '.join(MODELS)} needed")
     if method not in METHODS:
         raise InputError(f"registration: method {method!r}; one of {', '.join(METHODS)} needed")
-    if threshold_mm is not None and not (np.isfinite(threshold_mm) and threshold_mm > 0):
-        raise InputError(f"registration: threshold {threshold_mm} mm; a positive number needed")
+    if threshold_mm is not None and not NEAREST_MM <= threshold_mm <= FARTHEST:
+        raise InputError(
+            f"registration: threshold {threshold_mm:g} mm; a positive number, {NEAREST_MM:g} to {FARTHEST:g}, needed"
+        )
     if method == "liu2017" and (weights is not None or covariances is not None):
         raise InputError("registration: method liu2017 knows no weights or covariances; leave them out")
     chosen = MODELS["affine" if method == "liu2017" else model]
