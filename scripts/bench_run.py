@@ -264,11 +264,11 @@ def main() -> None:
         render(stream, *STREAM)
         result = best_of([measure(data, stream, Path(scratch) / str(i)) for i in range(max(given.rounds, 1))])
     print("{images} images of {size_px} px, {megabytes:.0f} MB, {workers} workers, {rounds} rounds".format(**result))
-    print(f"{'':30} {'seconds':>8} {'median':>7} {'ratio':>6}   boards found, complete, right")
+    print(f"{'':34} {'seconds':>8} {'median':>7} {'ratio':>6}   boards found, complete, right")
     for name, row in result["rows"].items():
         counts = f"{row['found']:8} {row['complete']:9} {row['right']:6}" if "found" in row else ""
         counts = f"{row['images'] / row['seconds']:8.1f} images a second" if "images" in row else counts
-        print(f"{name:30} {row['seconds']:8.2f} {row['median']:7.2f} {row['ratio']:6.2f} {counts}".rstrip())
+        print(f"{name:34} {row['seconds']:8.2f} {row['median']:7.2f} {row['ratio']:6.2f} {counts}".rstrip())
     print("peak memory of the run: largest process {peak_process_mib:.0f} MiB, together".format(**result), end=" ")
     print("{peak_together_mib:.0f} MiB, pages that they share counted in each".format(**result))
     if given.json:
