@@ -1,5 +1,6 @@
 """COLMAP's models: ours written in its form, and models that COLMAP made or someone edited read back with labels."""
 
+import math
 import os
 import struct
 from collections.abc import Callable, Sequence
@@ -371,7 +372,7 @@ def pose_of_image(path: Path, image: pycolmap.Image) -> Rigid:
         A quaternion that is far from unit length, or a translation that is not finite.
     """
     pose = image.cam_from_world()
-    length = float(np.linalg.norm(pose.rotation.quat))
+    length = math.hypot(*pose.rotation.quat)  # of any numbers, without a warning
     if not (abs(length - 1) <= MAX_LENGTH_ERROR and np.isfinite(pose.translation).all()):
         raise InputError(
             f"model {path}: image {image.name}: no pose (quaternion of length {length:.4g}, 1 needed; translation "
