@@ -86,3 +86,14 @@ def test_help_loads_no_numerics():
     """They take longer than all the rest; Typer itself loads pydantic."""
     code = "import sys, stcal.cli.main; print([m for m in ('numpy', 'yaml', 'rich.progress') if m in sys.modules])"
     assert subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout == "[]\n"
+
+
+@pytest.mark.skipif(not Path("/dev/full").exists(), reason="no such device there")
+@pytest.mark.parametrize("words", ["--version", "--help"])
+def test_text_that_nothing_takes_is_one_line(words):
+    begin = "from stcal.cli.entry import main; main()"
+    with open("/dev/full", "w") as full:
+        found = subprocess.run([sys.executable, "-c", begin, words], stdout=full, stderr=-1, text=True, check=False)
+    assert found.returncode == 2
+    assert found.stderr.startswith("error: No space left on device; ")
+    assert found.stderr.count("\n") == 1

@@ -42,21 +42,29 @@ def lacks_memory(error: BaseException) -> bool:
 
 
 def _run(name: str) -> None:
-    """A program, or its version alone, for which scripts need not wait until the commands are loaded."""
-    if sys.argv[1:] == ["--version"]:
-        print(stcal.__version__)
-    else:
-        _run_commands(name)
+    """A program, or its version alone, for which scripts need not wait until the commands are loaded.
 
-
-def _run_commands(name: str) -> None:
-    """A program; once it has its exit code, signals change it no more. Python takes handlers away while it ends, and a
-    signal would then end a command, whose results are in place, as if it had failed."""
+    Once it has its exit code, signals change it no more. Python takes handlers away while it ends, and a signal would
+    then end a command, whose results are in place, as if it had failed.
+    """
     try:
-        getattr(_program(), name)()
+        if sys.argv[1:] == ["--version"]:
+            _print_version()
+        else:
+            getattr(_program(), name)()
     finally:
         for number in LOADING:
             signal.signal(number, signal.SIG_IGN)
+
+
+def _print_version() -> None:
+    try:
+        print(stcal.__version__, flush=True)
+    except BrokenPipeError:  # the reader has gone, as with `--help`
+        os._exit(1)
+    except OSError as error:
+        os.write(sys.stderr.fileno(), f"error: {error.strerror}; standard output takes nothing\n".encode())
+        os._exit(2)
 
 
 def _program() -> ModuleType:
