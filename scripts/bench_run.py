@@ -159,7 +159,7 @@ def resident(pid: int) -> int:
 def timed_detection(data: Path, cache: Path):
     """Seconds of detection alone, and the centres of the board's dots by image."""
     from stcal.io.images import find_images
-    from stcal.sfm.detect.ellipses import EllipseOptions
+    from stcal.sfm.detect.circles.ellipses import EllipseOptions
     from stcal.sfm.detect.files import detect_files
 
     designs = load_target(data / "target.toml"), load_board(data / "board.toml")

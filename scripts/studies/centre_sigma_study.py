@@ -20,8 +20,8 @@ from stcal.geometry.camera import Camera
 from stcal.io.images import decode
 from stcal.parallel import one_thread
 from stcal.sfm.data.centres import Centres
-from stcal.sfm.detect.centres import measure_centres
-from stcal.sfm.detect.ellipses import Ellipses
+from stcal.sfm.detect.circles.centres import measure_centres
+from stcal.sfm.detect.circles.ellipses import Ellipses
 from stcal.synthetic import degrade
 
 RADII_PX = (6.0, 8.0, 12.0, 20.0, 30.0)

@@ -13,7 +13,7 @@ from stcal.errors import InputError
 from stcal.io.saving import keep_apart
 
 if TYPE_CHECKING:
-    from stcal.sfm.detect.ellipses import EllipseOptions
+    from stcal.sfm.detect.circles.ellipses import EllipseOptions
 
 Images = Annotated[Path, typer.Argument(help="Read the images of this folder: IMAGES/<group>/*.jpg, png, tif, bmp.")]
 Run = Annotated[Path, typer.Argument(metavar="RUN", help="Read the finished run in this folder.")]
@@ -79,7 +79,7 @@ MaxDiameter = Annotated[
 
 def ellipse_options(min_diameter: float | None, max_diameter: float) -> "EllipseOptions":
     """Sizes of the circles that detection seeks."""
-    from stcal.sfm.detect.ellipses import EllipseOptions
+    from stcal.sfm.detect.circles.ellipses import EllipseOptions
 
     if min_diameter is not None and max_diameter <= min_diameter:
         raise InputError(f"--max-diameter {max_diameter:g} px, more than --min-diameter {min_diameter:g} px needed")

@@ -22,7 +22,7 @@ from stcal.io.camera import CameraModel
 from stcal.io.files import IMAGE_BYTES, read_bytes
 from stcal.io.images import ImageFile, Skipped, decode
 from stcal.parallel import run_parallel
-from stcal.sfm.detect.ellipses import EllipseOptions
+from stcal.sfm.detect.circles.ellipses import EllipseOptions
 from stcal.sfm.detect.image import detect_image
 
 CENTRING_ROUNDS = 3

@@ -26,7 +26,7 @@ from stcal.sfm.camera.trust import (
 )
 from stcal.sfm.camera.views import board_views, closed_form, start_camera
 from stcal.sfm.data.observations import ImageObservations
-from stcal.sfm.detect.ellipses import EllipseOptions
+from stcal.sfm.detect.circles.ellipses import EllipseOptions
 from stcal.sfm.detect.files import DetectionResult, detect_files
 
 MIN_VIEWS = 3

@@ -12,7 +12,7 @@ import numpy as np
 from stcal.design import BoardDesign
 from stcal.errors import DegenerateError
 from stcal.geometry.plane import apply_homography, fit_homography, homography_jacobian
-from stcal.sfm.detect.candidates import MAX_AXIS_RATIO, Candidates, match_pattern, singular_values
+from stcal.sfm.detect.circles.candidates import MAX_AXIS_RATIO, Candidates, match_pattern, singular_values
 
 NEIGHBOURS = 20
 STEP_TOLERANCE = 0.3

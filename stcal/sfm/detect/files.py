@@ -19,7 +19,7 @@ from stcal.io.images import ImageFile, Skipped, decode, grey_8bit, thumbnail
 from stcal.labels import parse_label, parse_labels
 from stcal.parallel import run_parallel
 from stcal.sfm.data.centres import Centres
-from stcal.sfm.detect.ellipses import EllipseOptions
+from stcal.sfm.detect.circles.ellipses import EllipseOptions
 from stcal.sfm.detect.image import detect_image
 from stcal.sfm.detect.predict import PredictedCircles, SecondLook, measure_predicted
 from stcal.sfm.detect.sightings import BoardSighting, FaceSighting, ImageDetection

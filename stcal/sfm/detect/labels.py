@@ -20,7 +20,7 @@ from stcal.sfm.detect.arrangement import (
     arrange,
     mirrored_images,
 )
-from stcal.sfm.detect.ellipses import EllipseOptions
+from stcal.sfm.detect.circles.ellipses import EllipseOptions
 from stcal.sfm.detect.files import DetectedImage, DetectionResult, look_again
 from stcal.sfm.detect.outlying import outlying_circles
 from stcal.sfm.detect.predict import (

@@ -19,9 +19,10 @@ from stcal.sfm.data.centres import Centres
 from stcal.sfm.data.observations import ImageObservations
 from stcal.sfm.data.patterns import ideal_border, images_px, in_view, patterns_of
 from stcal.sfm.detect.arrangement import Arrangement
-from stcal.sfm.detect.candidates import MAX_POSITION_ERROR, MAX_POSITION_ERROR_PX, singular_values
-from stcal.sfm.detect.centres import MIN_RIM, MIN_SIGMA, measure_centres
-from stcal.sfm.detect.ellipses import MIN_DIAMETER_PX, EllipseOptions, Ellipses
+from stcal.sfm.detect.circles.candidates import MAX_POSITION_ERROR, MAX_POSITION_ERROR_PX, singular_values
+from stcal.sfm.detect.circles.centres import MIN_RIM, measure_centres
+from stcal.sfm.detect.circles.ellipses import MIN_DIAMETER_PX, EllipseOptions, Ellipses
+from stcal.sfm.detect.circles.fits import MIN_SIGMA
 
 MAX_STRETCH = 1.15
 """Between the predicted and the measured ellipse along any direction, on top of half a pixel at each end: a circle

@@ -18,7 +18,7 @@ from stcal.io.files import IMAGE_BYTES, read_bytes
 from stcal.io.images import decode
 from stcal.parallel import run_parallel
 from stcal.sfm.data.model import MIN_POINTS, MetricModel
-from stcal.sfm.detect.ellipses import EllipseOptions
+from stcal.sfm.detect.circles.ellipses import EllipseOptions
 from stcal.sfm.diagnose.examine import CircleVerdict, Expected, OptionTrial, by_geometry, examine, labels_found, trials
 from stcal.sfm.diagnose.findings import Diagnosis, Finding, advice, in_order
 from stcal.sfm.diagnose.missing import missing_circles

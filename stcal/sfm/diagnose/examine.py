@@ -18,15 +18,15 @@ from stcal.io.images import grey_8bit, grey_fine
 from stcal.labels import BOARD
 from stcal.sfm.data.patterns import Pattern, images_px
 from stcal.sfm.detect.board import needed_dots
-from stcal.sfm.detect.candidates import (
+from stcal.sfm.detect.circles.candidates import (
     MAX_POSITION_ERROR,
     MAX_POSITION_ERROR_PX,
     Candidates,
     PatternFit,
     fit_pattern,
 )
-from stcal.sfm.detect.centres import MIN_RIM, measure_centres
-from stcal.sfm.detect.ellipses import EllipseOptions, diameter_limits_px
+from stcal.sfm.detect.circles.centres import MIN_RIM, measure_centres
+from stcal.sfm.detect.circles.ellipses import EllipseOptions, diameter_limits_px
 from stcal.sfm.detect.faces import needed_circles
 from stcal.sfm.detect.image import ImageReading, detect_image, read_image
 from stcal.sfm.diagnose.trace import trace_outlines

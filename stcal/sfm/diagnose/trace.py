@@ -6,8 +6,8 @@ import cv2
 import numpy as np
 
 from stcal.design import Polarity
-from stcal.sfm.detect.candidates import MAX_POSITION_ERROR, MAX_POSITION_ERROR_PX
-from stcal.sfm.detect.ellipses import (
+from stcal.sfm.detect.circles.candidates import MAX_POSITION_ERROR, MAX_POSITION_ERROR_PX
+from stcal.sfm.detect.circles.ellipses import (
     EllipseOptions,
     Level,
     OutlineGates,

@@ -19,7 +19,7 @@ from stcal.io.images import Skipped, find_images
 from stcal.io.table import COVARIANCE, POSE, Table, common_columns, pose_cells
 from stcal.parallel import Progress, counted, one_thread
 from stcal.sfm.data.observations import ImageObservations, by_group
-from stcal.sfm.detect.ellipses import EllipseOptions
+from stcal.sfm.detect.circles.ellipses import EllipseOptions
 from stcal.sfm.detect.files import DetectedImage, detect_files
 from stcal.sfm.detect.labels import label_single
 from stcal.sfm.measure.common_errors import common_errors

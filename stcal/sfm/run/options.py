@@ -5,7 +5,7 @@ from dataclasses import asdict, dataclass, field, replace
 from stcal.design import TargetDesign
 from stcal.sfm.adjust.faces import FrameKind
 from stcal.sfm.adjust.options import AdjustOptions, Solve
-from stcal.sfm.detect.ellipses import EllipseOptions
+from stcal.sfm.detect.circles.ellipses import EllipseOptions
 from stcal.sfm.mapping.graph import GraphKind
 from stcal.sfm.mapping.pairs import PairOptions
 

@@ -21,7 +21,7 @@ from stcal.io.json import checked, read_json
 from stcal.io.saving import BOARD, CAMERA, RUN_MARKER, TARGET
 from stcal.sfm.adjust.file import FacesFile
 from stcal.sfm.data.observations import ImageObservations, by_group
-from stcal.sfm.detect.ellipses import EllipseOptions
+from stcal.sfm.detect.circles.ellipses import EllipseOptions
 from stcal.sfm.mapping.pairs import PairOptions
 from stcal.sfm.run.marker import MarkerFile
 from stcal.sfm.run.options import RunOptions

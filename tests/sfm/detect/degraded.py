@@ -9,7 +9,7 @@ from stcal.design import reference_board, reference_target
 from stcal.io.camera import read_camera
 from stcal.io.images import find_images
 from stcal.sfm.data.observations import detections_csv
-from stcal.sfm.detect.ellipses import EllipseOptions
+from stcal.sfm.detect.circles.ellipses import EllipseOptions
 from stcal.sfm.detect.files import detect_files
 from stcal.sfm.detect.labels import LabelledImage, label_images
 from stcal.synthetic.photograph import Photograph, RenderedSet

@@ -9,7 +9,7 @@ from stcal.design import reference_board, reference_target
 from stcal.errors import InputError
 from stcal.io.camera import read_camera
 from stcal.io.images import find_images
-from stcal.sfm.detect.ellipses import EllipseOptions
+from stcal.sfm.detect.circles.ellipses import EllipseOptions
 from stcal.sfm.detect.files import detect_files
 
 IMAGE = "12/IMG_1000.jpg"

@@ -10,8 +10,8 @@ from stcal.geometry.conic import circle_conic, ellipse_of_conic
 from stcal.geometry.rigid import Rigid
 from stcal.sfm.detect.ambiguity import confusable, is_named, mirror_images
 from stcal.sfm.detect.board import find_boards
-from stcal.sfm.detect.candidates import Candidates
-from stcal.sfm.detect.ellipses import Ellipses
+from stcal.sfm.detect.circles.candidates import Candidates
+from stcal.sfm.detect.circles.ellipses import Ellipses
 from stcal.sfm.detect.faces import FaceFinder
 
 CAMERA = Camera(2592, 1728, [2785.0, 2785.0], [1295.5, 863.5], np.zeros(8))

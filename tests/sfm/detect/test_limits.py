@@ -9,7 +9,7 @@ from stcal.errors import InputError
 from stcal.geometry.camera import Camera
 from stcal.sfm.detect import image as stage
 from stcal.sfm.detect.board import MAX_UNEXPLAINED, _offsets
-from stcal.sfm.detect.ellipses import OPTION_RANGES, EllipseOptions
+from stcal.sfm.detect.circles.ellipses import OPTION_RANGES, EllipseOptions
 from stcal.sfm.mapping.pairs import PairOptions
 
 CAMERA = Camera(480, 360, np.array([500.0, 500.0]), np.array([240.0, 180.0]), np.zeros(8))

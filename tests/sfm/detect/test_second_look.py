@@ -10,7 +10,7 @@ from stcal.geometry.camera import Camera
 from stcal.labels import BOARD, parse_labels
 from stcal.sfm.data.centres import Centres
 from stcal.sfm.data.observations import ImageObservations
-from stcal.sfm.detect.ellipses import EllipseOptions
+from stcal.sfm.detect.circles.ellipses import EllipseOptions
 from stcal.sfm.detect.labels import _second, labelled_image
 from stcal.sfm.detect.predict import PredictedCircles, SecondLook, contradictions, measure_predicted
 from tests.sfm.detect.test_centres import sheet

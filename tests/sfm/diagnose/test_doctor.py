@@ -15,7 +15,7 @@ from stcal.geometry.rigid import Rigid
 from stcal.labels import CircleLabel
 from stcal.sfm import RunOptions, run
 from stcal.sfm.data.patterns import Pattern, ideal_border, in_view
-from stcal.sfm.detect.ellipses import EllipseOptions, find_ellipses
+from stcal.sfm.detect.circles.ellipses import EllipseOptions, find_ellipses
 from stcal.sfm.diagnose.doctor import diagnose
 from stcal.sfm.diagnose.examine import LEAST_MIN_DIAMETER_PX
 from stcal.sfm.diagnose.findings import Diagnosis, Finding, GateCount, by_gate, in_order, table

@@ -12,7 +12,7 @@ import pytest
 
 from stcal.errors import InputError
 from stcal.sfm import run
-from stcal.sfm.detect.ellipses import EllipseOptions
+from stcal.sfm.detect.circles.ellipses import EllipseOptions
 from stcal.sfm.mapping.pairs import PairOptions
 from stcal.sfm.run.marker import MarkerFile
 from stcal.sfm.run.options import RunOptions

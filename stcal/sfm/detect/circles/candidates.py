@@ -8,7 +8,7 @@ from scipy.spatial import KDTree
 from stcal.errors import DegenerateError
 from stcal.geometry.camera import Camera
 from stcal.geometry.plane import apply_homography, fit_homography, homography_jacobian
-from stcal.sfm.detect.ellipses import Ellipses
+from stcal.sfm.detect.circles.ellipses import Ellipses
 
 MAX_POSITION_ERROR = 0.15
 """Largest distance between a pattern's prediction and a candidate, in radii of the circle …"""
