@@ -110,7 +110,8 @@ def adjust_jointly(
     ConvergenceError
         No minimum is reached.
     """
-    blocks, shared, setting = _start(models, board, camera, flatness_mm, prior, start or camera)
+    blocks, shared, setting = _start(models, board, camera, flatness_mm, prior)
+    shared = replace(shared, camera=start or camera)
     setting = replace(setting, huber=HUBER * _robust_sigma(blocks, shared.camera))
     blocks, shared, move = _minimise(blocks, shared, setting)
     common = _common_share(blocks, board)
@@ -134,9 +135,7 @@ def covariance_of(
     Arguments as there; ``common`` : share of the board's variance that all groups have in common; ``photographs`` :
     what :func:`photographs_of` has said of groups.
     """
-    blocks, shared, setting = _start(models, board, camera, flatness_mm, prior, camera, photographs)
-    if common > 0:
-        blocks, setting = _with_common(blocks, setting, common)
+    blocks, shared, setting = _start(models, board, camera, flatness_mm, prior, common, photographs)
     return _result(blocks, shared, setting, 0.0, 1.0)
 
 
@@ -149,7 +148,7 @@ def photographs_of(
     models: Sequence[MetricModel], board: BoardDesign, camera: Camera, prior: CameraPrior | None
 ) -> dict[str, np.ndarray]:
     """By group, normal matrix (3p + q, 3p + q) of its points and the intrinsics from all of its images, σ₀ = 1."""
-    blocks, shared, _ = _start(models, board, camera, None, prior, camera)
+    blocks, shared, _ = _start(models, board, camera, None, prior)
     return {b.model.group: without_cameras(b.model, camera, shared.basis, np.inf)[0] for b in blocks}
 
 
@@ -189,9 +188,7 @@ def extensible(
     photographs: Mapping[str, np.ndarray] | None = None,
 ) -> Extensible:
     """See there; arguments as of :func:`covariance_of`."""
-    blocks, shared, setting = _start(models, board, camera, flatness_mm, prior, camera, photographs)
-    if common > 0:
-        blocks, setting = _with_common(blocks, setting, common)
+    blocks, shared, setting = _start(models, board, camera, flatness_mm, prior, common, photographs)
     normal, _, groups = normal_equations(blocks, shared, setting)
     inverse = constrained_inverse(normal, free_directions(len(normal), shared))
     circles = inverse[setting.places(shared).circles]
@@ -221,19 +218,22 @@ def _start(
     camera: Camera,
     flatness_mm,
     prior: CameraPrior | None,
-    start: Camera,
+    common: float = 0.0,
     photographs: Mapping[str, np.ndarray] | None = None,
-):
-    """Groups, what they share, and the setting: each group with its own board, no residual too long."""
+) -> tuple[list[Block], Shared, Setting]:
+    """Groups, what they share, and the setting, no residual too long; ``common`` : see :func:`covariance_of`."""
     labels = tuple(sorted({label for model in models for label in model.labels if isinstance(label, CircleLabel)}))
     basis = basis_of(prior)
     weight = np.linalg.inv(prior.covariance) if prior else np.zeros((0, 0))
     blocks = [replace(_block(m, board, labels), photographs=(photographs or {}).get(m.group)) for m in models]
     xyz = _shared_circles(blocks, len(labels))
-    shared = Shared(xyz, np.zeros((board.rows * board.columns, 3)), start, basis)
+    shared = Shared(xyz, np.zeros((board.rows * board.columns, 3)), camera, basis)
     blocks = [replace(b, model=_with_circles(b, xyz)) for b in blocks]
     flatness_mm = np.inf if flatness_mm is None else flatness_mm
-    return blocks, shared, Setting(labels, board, 0.0, flatness_mm, camera, weight, np.inf)
+    setting = Setting(labels, board, 0.0, flatness_mm, camera, weight, np.inf)
+    if common > 0:
+        blocks, setting = _with_common(blocks, setting, common)
+    return blocks, shared, setting
 
 
 def _with_common(blocks: list[Block], setting: Setting, common: float) -> tuple[list[Block], Setting]:

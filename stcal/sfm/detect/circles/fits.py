@@ -138,7 +138,7 @@ class Fits:
         self.selected = np.where(np.isin(np.arange(len(self.blur)), chosen)[:, None], self.centre, self.selected)
         for i in chosen.tolist():
             centre = np.linalg.solve(self.jacobian[i], self.centre[i] - self.start[i])
-            on_unit, width = self.inverse_shape[i] @ self.jacobian[i], self.band[i]
+            on_unit, width = self.inverse_shape[i] @ self.jacobian[i], float(self.band[i])
             self.rows[i], self.columns[i] = bands.near_rim(self.offset[i], on_unit, centre, width, self.intruders[i])
         self._widen(max(map(len, self.rows)))
         for i in chosen.tolist():
