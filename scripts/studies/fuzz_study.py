@@ -2,12 +2,12 @@
 
 .venv/bin/python scripts/studies/fuzz_study.py [--count 1000] [--seed 1] [--kills 20] [--json FILE] [--only CASE]
 
-All commands of both programs, found in the tree: one without a call in `tests/commands.py` ends the study. Three
-parts: inputs spoiled by their bytes, place or structure (`c0`, `c1`, …), realistic mistakes (by name; "silent wrong"
-where nothing is said), and programs ended by signals, a full disk or little memory at random moments (`k0`, `k1`, …).
-With `--json` cases that the file has already are not run again: a study that was stopped goes on. The seed and the
-case's name repeat a case: `--seed 1 --only c17`. Simulated data; a small run is made first. Exits with 1 where
-anything failed.
+All commands of both programs, found in the tree: one without a call in `tests/commands.py` ends the study. Four
+parts: inputs spoiled by their bytes, place or structure (`c0`, `c1`, …), every option with every value that is none for
+it (`o0`, …), realistic mistakes (by name; "silent wrong" where nothing is said), and programs ended by signals, a full
+disk or little memory at random moments (`k0`, `k1`, …). With `--json` cases that the file has already are not run
+again: a study that was stopped goes on. The seed and the case's name repeat a case: `--seed 1 --only c17`. Simulated
+data; a small run is made first. Exits with 1 where anything failed.
 """
 
 import argparse
@@ -30,7 +30,7 @@ os.environ.update(dict.fromkeys(ONE_THREAD, "1"))
 from stcal.io.saving import json_text
 from stcal.io.saving import save as write
 from tests.commands import CALLS, COMMANDS
-from tests.fuzzing.cases import Judged
+from tests.fuzzing.cases import Judged, option_cases
 from tests.fuzzing.mistakes import MISTAKES
 from tests.fuzzing.pool import run_all
 from tests.fuzzing.stock import make_stock
@@ -41,12 +41,14 @@ SHOWN = 600
 
 
 def names_of(arguments: argparse.Namespace) -> list[str]:
-    """Cases: each call on good data, mistakes, kills, and spoiled inputs."""
+    """Cases: each call on good data, mistakes, every option with every odd value, kills, and spoiled inputs."""
     if arguments.only:
         return [arguments.only]
     valid = [f"v{i}" for i in range(len(CALLS))]
     mistakes = [] if arguments.no_mistakes else list(MISTAKES)
-    return [*valid, *mistakes, *(f"k{i}" for i in range(arguments.kills)), *(f"c{i}" for i in range(arguments.count))]
+    options = [f"o{i}" for i in range(len(option_cases()))]
+    kills, spoilt = (f"k{i}" for i in range(arguments.kills)), (f"c{i}" for i in range(arguments.count))
+    return [*valid, *mistakes, *options, *kills, *spoilt]
 
 
 def kept(path: Path | None, seed: int) -> list[Judged]:

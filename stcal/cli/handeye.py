@@ -125,7 +125,7 @@ def handeye(
 ) -> None:
     """Find where a camera sits on a robot's flange, or in its base, and how well that is known."""
     from stcal.handeye import HandEyeOptions, Noise
-    from stcal.handeye.report.export import opencv_yaml, ros_yaml, urdf_joint
+    from stcal.handeye.report.export import opencv_yaml, require_frame_names, ros_yaml, urdf_joint
     from stcal.handeye.report.file import HandEyeFile
     from stcal.handeye.report.page import outcome_page, outcome_text
     from stcal.workflows.handeye import Splits, calibrate, read_input
@@ -135,6 +135,7 @@ def handeye(
     _require_fitting(source, method, refine_camera, camera_out)
     if (parent or child) and not (ros or urdf):
         raise InputError("--parent, --child: only with --ros or --urdf, whose frames they name")
+    require_frame_names(parent, child)
     if source.is_file() and (sigma_px is not None or sigma_board_mm is not None):
         raise InputError(
             "--sigma-px, --sigma-board-mm: only with images; give --sigma-camera-mm and --sigma-camera-deg"

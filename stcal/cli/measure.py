@@ -44,6 +44,14 @@ def measure(
     previous: Annotated[
         bool, typer.Option("--previous", help="Decide between two solutions by the image before, as motions are small.")
     ] = False,
+    sequence: Annotated[
+        bool,
+        typer.Option(
+            "--sequence",
+            help="Follow the target from image to image of each folder, in order of name, and search an image as a "
+            "whole only where it is lost. An undecided pose is decided as with --previous.",
+        ),
+    ] = False,
     sigma_factor: Annotated[
         float | None,
         typer.Option(
@@ -72,7 +80,7 @@ def measure(
     known = read_target(faces, design)
     table = read_table(joints, "joints") if joints else None
     options = work.MeasureOptions(
-        PoseOptions(sigma_factor=sigma_factor), previous, ellipse_options(min_diameter, max_diameter), workers
+        PoseOptions(sigma_factor=sigma_factor), previous, sequence, ellipse_options(min_diameter, max_diameter), workers
     )
     with StageProgress() as progress:
         result = work.measure(

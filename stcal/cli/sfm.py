@@ -189,9 +189,6 @@ def _flatness(text: str) -> float | None:
     if text == "off":
         return None
     try:
-        value = float(text)
-    except ValueError:
-        value = 0.0
-    if not 0 < value < 1e6:
-        raise InputError(f"--flatness {text}: a σ in mm, more than 0, or off")
-    return value
+        return float(text)
+    except ValueError as error:
+        raise InputError(f"--flatness {text}: a σ in mm, more than 0, or off") from error

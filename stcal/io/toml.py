@@ -5,7 +5,7 @@ import tomllib
 from pathlib import Path
 from typing import Annotated, TypeVar
 
-from pydantic import BaseModel, ConfigDict, Field, ValidationError
+from pydantic import AfterValidator, BaseModel, ConfigDict, Field, ValidationError
 
 from stcal.errors import InputError
 from stcal.io.files import SETTINGS_BYTES, read_bytes
@@ -20,8 +20,18 @@ class Strict(BaseModel):
     model_config = ConfigDict(extra="forbid", frozen=True)
 
 
+LEAST = 1e-9
+"""Of positive lengths and σ, mm: far below an atom; the square of less may be no number."""
+
+
+def _least(value: float) -> float:
+    if value < LEAST:
+        raise ValueError(f"at least {LEAST:g} needed")
+    return value
+
+
 # strict: a quoted number or a true is a slip of the pen; 1e6 mm: a slip of the unit.
-Positive = Annotated[float, Field(gt=0, le=1e6, allow_inf_nan=False, strict=True)]
+Positive = Annotated[float, Field(gt=0, le=1e6, allow_inf_nan=False, strict=True), AfterValidator(_least)]
 Finite = Annotated[float, Field(ge=-1e6, le=1e6, allow_inf_nan=False, strict=True)]
 
 

@@ -2,6 +2,7 @@ from .camera.calibrate import calibrate_camera as calibrate_camera
 from .measure.images import MeasureOptions as MeasureOptions
 from .measure.images import measure as measure
 from .measure.target import read_target as read_target
+from .measure.tracker import Tracker as Tracker
 from .pipeline import run as run
 from .plan.advise import advise as advise
 from .plan.session import PlanOptions as PlanOptions

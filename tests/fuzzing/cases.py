@@ -24,6 +24,8 @@ VALUES = (
     "0",
     "1e308",
     "1e-308",
+    "1e150",
+    "1e-150",
     "-1e308",
     "abc",
     "",
@@ -60,6 +62,24 @@ def judged(stock: Path, folder: Path, seed: int, number: int, brief: bool = Fals
     name = f"c{number}"
     words = f"{program} {' '.join([call.command, *call.inputs])}: {said}"
     return Judged(name, words, tuple(found), outcome.code, outcome.seconds, call.command)
+
+
+def option_cases() -> list[tuple[str, str, str]]:
+    """(command, option, value): every option that takes a number or a word, with everything that is none for it."""
+    commands = dict.fromkeys(call.command for call in CALLS)
+    return [(c, name, value) for c in commands for name in options_of(c) for value in VALUES]
+
+
+def judged_option(stock: Path, folder: Path, number: int) -> Judged:
+    """Run case ``number`` of :func:`option_cases` with the command's shortest call, and judge it."""
+    command, name, value = option_cases()[number]
+    call = min((c for c in CALLS if c.command == command), key=lambda c: (c.code, c.seconds))
+    lay_out(stock, folder, call, earlier=False)
+    before = hashes(folder)
+    outcome = in_process(call, "stcal", folder, (f"{name}={value}",))
+    found = failures(call, folder, outcome, before, refused=False)
+    said = f"{command}: {name}={value[:20]!r}"
+    return Judged(f"o{number}", said, tuple(found), outcome.code, outcome.seconds, command)
 
 
 def chosen(rng: np.random.Generator, brief: bool) -> tuple[Call, str]:

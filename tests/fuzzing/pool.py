@@ -12,7 +12,7 @@ from multiprocessing.connection import Connection, wait
 from pathlib import Path
 
 from stcal.parallel import ONE_THREAD
-from tests.fuzzing.cases import Judged, judged
+from tests.fuzzing.cases import Judged, judged, judged_option
 from tests.fuzzing.judged import LONGEST_S, failures, hashes, in_process, lay_out
 
 LONGEST_WAIT_S = 4 * LONGEST_S + 20
@@ -21,13 +21,16 @@ MOST_MEMORY = 8 << 30
 
 
 def perform(stock: Path, folder: Path, seed: int, name: str) -> Judged:
-    """The case of this name: ``c12`` a spoiled input, ``k3`` a kill, ``v5`` a valid call, else a mistake."""
+    """The case of this name: ``c12`` a spoiled input, ``k3`` a kill, ``o7`` an option, ``v5`` a valid call, else a
+    mistake."""
     from tests.fuzzing.kills import killed
 
     if name[0] == "c" and name[1:].isdigit():
         return judged(stock, folder, seed, int(name[1:]))
     if name[0] == "k" and name[1:].isdigit():
         return killed(stock, folder, seed, int(name[1:]))
+    if name[0] == "o" and name[1:].isdigit():
+        return judged_option(stock, folder, int(name[1:]))
     if name[0] == "v" and name[1:].isdigit():
         return went_through(stock, folder, int(name[1:]))
     return mistaken(stock, folder, name)

@@ -71,11 +71,26 @@ def roll_pitch_yaw(pose: Rigid) -> np.ndarray:
         return Rotation.from_matrix(np.array(pose.rotation)).as_euler("xyz")
 
 
+def require_frame_names(*names: str) -> None:
+    """Refuse names of frames that are none, or not all different; empty ones stand for the usual.
+
+    Raises
+    ------
+    InputError
+        A character that no file and no terminal shows, or a name twice.
+    """
+    given = [name for name in names if name]
+    for name in given:
+        if not name.isprintable():
+            raise InputError(f"frames: {name!r} has control characters; give a name in letters")
+        if given.count(name) > 1:
+            raise InputError(f"frames: parent and child are both {name!r}; two names needed")
+
+
 def _frames(result: HandEye, parent: str, child: str) -> tuple[str, str]:
-    parent, child = parent or FRAMES[result.setup].mount, child or CAMERA_FRAME
-    if parent == child:
-        raise InputError(f"frames: parent and child are both {parent!r}; two names needed")
-    return parent, child
+    names = parent or FRAMES[result.setup].mount, child or CAMERA_FRAME
+    require_frame_names(*names)
+    return names
 
 
 def _metres(pose: Rigid) -> list[float]:

@@ -55,6 +55,10 @@ class VerdictOptions:
                 f"verdict: odds {self.max_p:g} and {self.flip_odds:g}, margin {self.sigma_margin:g}, {self.min_tags} "
                 "tags: odds between 0 and 1, a margin and a number of at least 1 needed"
             )
+        limits = (self.max_sigma_deg, "°"), (self.max_sigma_mm or 0.0, " mm"), (self.min_spread_px, " px")
+        for value, unit in limits:
+            if not 0 <= value < np.inf:
+                raise InputError(f"verdict: limit {value:g}{unit}; a number of at least 0 needed")
 
 
 @dataclass(frozen=True, slots=True)

@@ -4,8 +4,10 @@ from dataclasses import dataclass
 from typing import Literal, get_args
 
 from stcal.errors import InputError
+from stcal.io.toml import LEAST
 from stcal.sfm.adjust.faces import FrameKind
 
+MOST_FLATNESS_MM = 1e6
 Solve = Literal["joint", "chain"]
 
 
@@ -22,7 +24,7 @@ class AdjustOptions:
     Raises
     ------
     InputError
-        A choice that does not exist, or refined intrinsics without the joint adjustment.
+        A choice that does not exist, a σ that is none, or refined intrinsics without the joint adjustment.
     """
 
     reference_face: str
@@ -39,5 +41,9 @@ class AdjustOptions:
         ):
             if value not in choices:
                 raise InputError(f"{what} {value!r}: not a choice; use {' or '.join(choices)}")
+        if self.flatness_mm is not None and not LEAST <= self.flatness_mm <= MOST_FLATNESS_MM:
+            raise InputError(
+                f"--flatness {self.flatness_mm:g}: a σ in mm, {LEAST:g} to {MOST_FLATNESS_MM:g} needed, or off"
+            )
         if self.refine_camera and self.solve != "joint":
             raise InputError("--refine-camera: part of the joint adjustment, the solve is chain; use --solve joint")

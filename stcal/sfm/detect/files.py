@@ -72,10 +72,9 @@ def detect_files(
     InputError
         No file is usable; the message names the first one and its reason.
     """
-    camera = _sized(camera_model, files)
+    camera, size_from = sized_by(camera_model, files)
     cache.mkdir(parents=True, exist_ok=True)
     settings = _fingerprint(camera, target, board, options)
-    size_from = "the camera file" if camera_model.width and camera_model.height else "the first readable image"
     jobs = [(file, camera, size_from, target, board, options, settings, cache) for file in files]
     found: list[DetectedImage | Skipped | None] = [None] * len(files)
     pending = []
@@ -107,17 +106,17 @@ def detect_files(
     return DetectionResult(tuple(images), tuple(skipped), camera)
 
 
-def _sized(camera_model: CameraModel, files: list[ImageFile]) -> Camera:
-    """The camera; a file of OpenCV may not say its size, then the first readable image does."""
+def sized_by(camera_model: CameraModel, files: list[ImageFile]) -> tuple[Camera, str]:
+    """The camera, and what its size is from: a file of OpenCV may not say it, then the first readable image does."""
     if camera_model.width and camera_model.height:
-        return camera_model.sized(camera_model.width, camera_model.height)
+        return camera_model.sized(camera_model.width, camera_model.height), "the camera file"
     for file in files:
         try:
             height, width = decode(read_bytes(file.path, IMAGE_BYTES), file.name).shape
         except (InputError, OSError):
             continue
         camera_model.require_inside(width, height, file.name)
-        return camera_model.sized(width, height)
+        return camera_model.sized(width, height), "the first readable image"
     raise InputError(f"no readable image among {len(files)}, first {files[0].name}; check the files")
 
 
@@ -158,6 +157,21 @@ def _detect_file(
     cache: Path,
 ) -> str | Skipped:
     """Detect in one file and keep the result; returns its key."""
+    loaded = load_image(file, camera, size_from)
+    if isinstance(loaded, Skipped):
+        return loaded
+    data, image = loaded
+    try:
+        detection = detect_image(image, camera, target, board, options)
+    except ConvergenceError as error:
+        return Skipped(file.name, str(error), "distortion")
+    digest, key = _key(data, settings)
+    _save(cache / f"{key}.npz", detection, digest, image)
+    return key
+
+
+def load_image(file: ImageFile, camera: Camera, size_from: str) -> tuple[bytes, np.ndarray] | Skipped:
+    """Content of a file and the grey image in it, or why it cannot be used; ``size_from`` : what the size is from."""
     try:
         data = read_bytes(file.path, IMAGE_BYTES)
     except OSError as error:
@@ -176,13 +190,7 @@ def _detect_file(
             f"{width}×{height} px",
             f"{camera.width}×{camera.height} px",
         )
-    try:
-        detection = detect_image(image, camera, target, board, options)
-    except ConvergenceError as error:
-        return Skipped(file.name, str(error), "distortion")
-    digest, key = _key(data, settings)
-    _save(cache / f"{key}.npz", detection, digest, image)
-    return key
+    return data, image
 
 
 def _save(path: Path, detection: ImageDetection, digest: str, image: np.ndarray) -> None:
@@ -300,6 +308,11 @@ def _stored_look(stored, meta) -> SecondLook:
     return SecondLook(parse_labels(meta["labels"]), _stored_centres(stored), missed)
 
 
+def copy_of(file: ImageFile, first: str) -> Skipped:
+    """Why a second file of the same content is left out."""
+    return Skipped(file.name, f"the same image as {first}", "copy")
+
+
 def _without_copies(found: list[DetectedImage | Skipped]) -> tuple[list[DetectedImage], list[Skipped]]:
     """A second copy of a photograph adds no information and would pass for it."""
     images: list[DetectedImage] = []
@@ -309,7 +322,7 @@ def _without_copies(found: list[DetectedImage | Skipped]) -> tuple[list[Detected
         if isinstance(each, Skipped):
             skipped.append(each)
         elif each.digest in first:
-            skipped.append(Skipped(each.file.name, f"the same image as {first[each.digest]}", "copy"))
+            skipped.append(copy_of(each.file, first[each.digest]))
         else:
             first[each.digest] = each.file.name
             images.append(each)

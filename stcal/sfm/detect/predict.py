@@ -6,7 +6,7 @@ and shape, and stands out from the noise; all else is left out, with its reason.
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -52,6 +52,10 @@ class PredictedCircles:
         object.__setattr__(self, "centre_px", frozen(self.centre_px, (n, 2), "centres"))
         object.__setattr__(self, "shape_px", frozen(self.shape_px, (n, 2, 2), "shapes"))
         object.__setattr__(self, "wanted", frozen(self.wanted, (n,), "wanted", dtype=bool))
+
+    def shifted(self, by_px: np.ndarray) -> "PredictedCircles":
+        """All of them beside their places, by (2,) px."""
+        return replace(self, centre_px=self.centre_px + by_px)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -159,10 +163,22 @@ def measure_predicted(
     )
 
 
+def stands_out(found: Centres, polarity: Sequence[Polarity]) -> np.ndarray:
+    """Mask of the circles whose contrast is of the right sign and far above the noise."""
+    return _signed(found, polarity) >= _needed(found)
+
+
+def _signed(found: Centres, polarity: Sequence[Polarity]) -> np.ndarray:
+    return found.contrast * [1 if each == "bright" else -1 for each in polarity]
+
+
+def _needed(found: Centres) -> np.ndarray:
+    return MIN_SIGNIFICANCE * np.maximum(found.noise, MIN_SIGMA)
+
+
 def _reasons(found: Centres, expected: Ellipses, polarity: Sequence[Polarity], camera: Camera) -> list[str]:
     """Of each fit why it is not the circle that was expected; empty where it is."""
-    contrast = found.contrast * [1 if each == "bright" else -1 for each in polarity]
-    needed = MIN_SIGNIFICANCE * np.maximum(found.noise, MIN_SIGMA)
+    contrast, needed = _signed(found, polarity), _needed(found)
     off, sigma = np.linalg.norm(found.centre_px - expected.centre_px, axis=1), found.sigma_px()
     widest, narrowest = _stretch(expected.shape_px, found.shape, found.centre, camera)
     reasons = []

@@ -1,39 +1,35 @@
 """From a folder of images to camera_from_target of each: the calibrated target at work."""
 
 import csv
+import hashlib
 import io
 import tempfile
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import numpy as np
 
 from stcal.design import BoardDesign, TargetDesign
-from stcal.errors import DetectionError, InputError, StcalError
+from stcal.errors import ConvergenceError, DetectionError, InputError, StcalError
 from stcal.geometry.arrays import frozen
 from stcal.geometry.camera import Camera
-from stcal.geometry.rigid import Rigid
 from stcal.io.camera import CameraModel, CameraPrior
-from stcal.io.images import Skipped, find_images
+from stcal.io.images import ImageFile, Skipped, find_images
 from stcal.io.table import COVARIANCE, POSE, Table, common_columns, pose_cells
-from stcal.parallel import Progress, counted, one_thread
+from stcal.parallel import Progress, counted, one_thread, run_parallel
 from stcal.sfm.data.observations import ImageObservations, by_group
 from stcal.sfm.detect.circles.ellipses import EllipseOptions
-from stcal.sfm.detect.files import DetectedImage, detect_files
+from stcal.sfm.detect.files import DetectedImage, copy_of, detect_files, load_image, sized_by
 from stcal.sfm.detect.labels import label_single
 from stcal.sfm.measure.common_errors import common_errors
 from stcal.sfm.measure.files import PosesFile
-from stcal.sfm.measure.pose import PoseOptions, TargetPose, pose_from_circles
+from stcal.sfm.measure.pose import PoseOptions, TargetPose, fit_verdict, measured_pose, resolved
 from stcal.sfm.measure.target import TargetCircles
+from stcal.sfm.measure.tracker import Tracker
 
-NEAR_PREVIOUS = 1 / 3
-"""The pose nearer to the previous image's is taken where its turn from there is at most this share of the other's."""
 IMAGE, FACES, CIRCLES, STATUS = "image", "faces", "circles", "status"
 QUALITY = ("rms_px", "chi2_per_dof")
-NO_FACE = "no face of the target recognised; if a dot board is in view, give --board"
-SUSPICIOUS, FAILED = 1e-3, 1e-5
-"""Probabilities of a fit's χ², as the checks of a run have them."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -46,6 +42,10 @@ class MeasureOptions:
         Of the single images.
     previous : bool
         An image's own undecided pose is decided by that of the image before it, by name and in the same folder.
+    sequence : bool
+        The images of each folder follow each other, by name: the target is looked for where the pose before puts it,
+        and in the whole image only where it is not there; see :class:`stcal.sfm.measure.tracker.Tracker`. An undecided
+        pose is decided by the one before.
     ellipses : EllipseOptions
         Of detection.
     workers : int, optional
@@ -54,6 +54,7 @@ class MeasureOptions:
 
     pose: PoseOptions = field(default_factory=PoseOptions)
     previous: bool = False
+    sequence: bool = False
     ellipses: EllipseOptions = field(default_factory=EllipseOptions)
     workers: int | None = None
 
@@ -72,7 +73,8 @@ class MeasureResult:
     """``images`` that have a pose, in order of name; ``left_out`` : the others, with reasons; ``notes`` : what the
     covariances lack; ``sigma_factor`` : on the centres' own σ; ``intrinsics_held`` : whether they were taken as exact;
     ``common`` : (m, 6, r) what the poses' errors have in common, see
-    :func:`stcal.sfm.measure.common_errors.common_errors`.
+    :func:`stcal.sfm.measure.common_errors.common_errors`; ``searched`` : images of a sequence that were searched as a
+    whole, None where each stands for itself.
     """
 
     images: tuple[MeasuredImage, ...]
@@ -81,6 +83,7 @@ class MeasureResult:
     sigma_factor: float
     intrinsics_held: bool
     common: np.ndarray
+    searched: int | None = None
 
     def __post_init__(self):
         object.__setattr__(self, "common", frozen(self.common, (len(self.images), 6, None), "common errors"))
@@ -134,19 +137,25 @@ def measure(
     options, progress = options or MeasureOptions(), progress or (lambda *_: None)
     files, other = find_images(images)
     step = counted(progress, "detect", len(files))
-    with tempfile.TemporaryDirectory(prefix="stcal-measure-") as scratch:
-        detection = detect_files(files, camera, design, board, options.ellipses, Path(scratch), options.workers, step)
-    observations, notes = _labelled(detection.images, design)
-    prior = None if camera.covariance is None else CameraPrior(camera.colmap_model, camera.covariance)
-    result = measure_labelled(observations, detection.camera, target, options, prior)
-    left_out = (*other, *detection.skipped, *result.left_out)
+    if options.sequence:
+        result = follow_files(files, camera, replace(target, design=design), board, options, step)
+    else:
+        with tempfile.TemporaryDirectory(prefix="stcal-measure-") as scratch:
+            cache = Path(scratch)
+            detection = detect_files(files, camera, design, board, options.ellipses, cache, options.workers, step)
+        observations, notes = _labelled(detection.images, design)
+        prior = None if camera.covariance is None else CameraPrior(camera.colmap_model, camera.covariance)
+        result = measure_labelled(observations, detection.camera, target, options, prior)
+        measured = tuple(replace(each, notes=notes[each.name]) for each in result.images)
+        result = replace(result, images=measured, left_out=(*detection.skipped, *result.left_out))
+    result = replace(result, left_out=(*other, *result.left_out))
     if not result.images:
+        last = result.left_out[-1]
         raise DetectionError(
-            f"no face of the target measured in {len(detection.images)} images, first {left_out[-1].name}: "
-            f"{left_out[-1].reason}; check target.toml (radii, polarity), faces.json and the exposure"
+            f"no face of the target measured in {len(files)} images, first {last.name}: "
+            f"{last.reason}; check target.toml (radii, polarity), faces.json and the exposure"
         )
-    measured = tuple(replace(each, notes=notes[each.name]) for each in result.images)
-    return replace(result, images=measured, left_out=left_out)
+    return result
 
 
 def _labelled(images: Sequence[DetectedImage], design: TargetDesign):
@@ -167,50 +176,87 @@ def measure_labelled(
     An image that gives no pose is among those left out.
     """
     options = options or MeasureOptions()
-    measured, left_out = [], []
+    found: list[MeasuredImage | Skipped] = []
     for group in by_group(observations).values():
         before: TargetPose | None = None
         for image in sorted(group, key=lambda each: each.name):
-            pose, reason = _measured(image, camera, target, options.pose, prior)
-            if pose is None:
-                left_out.append(Skipped(image.name, reason, "pose"))
-            else:
-                if options.previous and before is not None:
-                    pose = resolved(pose, before.camera_from_target)
-                measured.append(MeasuredImage(image.name, pose))
-            before = pose if pose is not None and pose.status != "ambiguous" else None
+            pose = measured_pose(image, camera, target, options.pose, prior)
+            if options.previous and before is not None and isinstance(pose, TargetPose):
+                pose = resolved(pose, before.camera_from_target)
+            found.append(_outcome(image.name, pose, ()))
+            before = pose if isinstance(pose, TargetPose) and pose.status != "ambiguous" else None
+    return _result(found, target, options, prior)
+
+
+def follow_files(
+    files: Sequence[ImageFile],
+    camera_model: CameraModel,
+    target: TargetCircles,
+    board: BoardDesign | None,
+    options: MeasureOptions,
+    step: Callable[[object], None],
+) -> MeasureResult:
+    """The poses in files of which each folder is a sequence in order of name; folders side by side.
+
+    ``step`` : called once for each file.
+    """
+    camera, size_from = sized_by(camera_model, list(files))
+    folders: dict[str, list[ImageFile]] = {}
+    for file in sorted(files, key=lambda each: each.name):
+        folders.setdefault(file.group, []).append(file)
+    model = replace(camera_model, width=camera.width, height=camera.height)
+    jobs = [(own, model, camera, size_from, target, board, options) for own in folders.values()]
+    followed: list[tuple[list[MeasuredImage | Skipped], int]] = [([], 0)] * len(jobs)
+    for i, outcome in run_parallel(_follow_folder, jobs, options.workers):
+        followed[i] = outcome
+        for file in jobs[i][0]:
+            step(file.name)
+    prior = None if camera_model.covariance is None else CameraPrior(camera_model.colmap_model, camera_model.covariance)
+    result = _result([each for found, _ in followed for each in found], target, options, prior)
+    return replace(result, searched=sum(searched for _, searched in followed))
+
+
+def _follow_folder(
+    files: Sequence[ImageFile], model: CameraModel, camera: Camera, size_from: str, target, board, options
+) -> tuple[list[MeasuredImage | Skipped], int]:
+    """What each image of a folder gives, and how many were searched as a whole."""
+    tracker = Tracker(target, model, board, options.pose, options.ellipses)
+    found: list[MeasuredImage | Skipped] = []
+    first: dict[str, str] = {}
+    searched = 0
+    for file in files:
+        loaded = load_image(file, camera, size_from)
+        if isinstance(loaded, Skipped):
+            found.append(loaded)
+            continue
+        data, image = loaded
+        digest = hashlib.sha256(data).hexdigest()
+        if digest in first:
+            found.append(copy_of(file, first[digest]))
+            continue
+        first[digest] = file.name
+        try:
+            seen, pose = tracker.observe(image, file.name)
+        except ConvergenceError as error:
+            found.append(Skipped(file.name, str(error), "distortion"))
+            continue
+        searched += tracker.searched
+        found.append(_outcome(file.name, pose, seen.notes))
+    return found, searched
+
+
+def _outcome(name: str, pose: TargetPose | StcalError, notes: tuple[str, ...]) -> MeasuredImage | Skipped:
+    if isinstance(pose, StcalError):
+        return Skipped(name, str(pose).removeprefix(f"{name}: "), "pose")
+    return MeasuredImage(name, pose, notes)
+
+
+def _result(found: Sequence[MeasuredImage | Skipped], target: TargetCircles, options, prior) -> MeasureResult:
+    measured = tuple(each for each in found if isinstance(each, MeasuredImage))
+    left_out = tuple(each for each in found if isinstance(each, Skipped))
     factor = target.sigma_factor if options.pose.sigma_factor is None else options.pose.sigma_factor
     common = common_errors([each.pose for each in measured], target, prior)
-    return MeasureResult(tuple(measured), tuple(left_out), target.notes, factor, prior is None, common)
-
-
-def _measured(image: ImageObservations, camera, target: TargetCircles, options, prior):
-    """The pose, or None and why there is none."""
-    known = [i for i, label in enumerate(image.labels) if label in target.place]
-    if not known:
-        seen = ", ".join(dict.fromkeys(x for x in image.face_ids()))
-        return None, f"face {seen} is not calibrated" if seen else NO_FACE
-    own = image.select(known)
-    try:
-        pose = pose_from_circles(
-            own.labels, own.centre_px, own.covariance_px2, target, camera, options, prior, image.name
-        )
-    except StcalError as error:
-        return None, str(error).removeprefix(f"{image.name}: ")
-    return pose, ""
-
-
-def resolved(pose: TargetPose, previous: Rigid) -> TargetPose:
-    """The pose with its two-fold ambiguity decided by another one that is near, camera_from_target of the image before;
-    the same where it is certain, or where that one is near to neither."""
-    if pose.status == "certain" or pose.second is None:
-        return pose
-    own, other = (
-        Rigid(each.camera_from_target.rotation @ previous.rotation.T).angle_rad() for each in (pose, pose.second)
-    )
-    if own <= NEAR_PREVIOUS * other:
-        return replace(pose, status="resolved")
-    return pose.swapped() if other <= NEAR_PREVIOUS * own else pose
+    return MeasureResult(measured, left_out, target.notes, factor, prior is None, common)
 
 
 def poses_csv(result: MeasureResult, joints: Table | None = None) -> tuple[str, tuple[str, ...]]:
@@ -265,12 +311,6 @@ def _joint_cells(joints: Table, header: list[str]) -> tuple[list[str], dict[str,
             raise InputError(f"{joints.where}: line {joints.lines[i]}: image {name} a second time; every image once")
         rows[name] = [c[i] if isinstance(c, list) else repr(float(c[i])) for c in cells]
     return more, rows
-
-
-def fit_verdict(pose: TargetPose) -> str:
-    """``passed``, ``suspicious`` or ``failed`` of the χ² of the residuals."""
-    p = pose.p_value()
-    return "failed" if p < FAILED else "suspicious" if p < SUSPICIOUS else "passed"
 
 
 def poses_file(result: MeasureResult) -> PosesFile:
@@ -350,6 +390,12 @@ def summary(result: MeasureResult) -> list[str]:
     lines = [f"{len(poses)} poses: {told}; centres' σ × {result.sigma_factor:.3g}"]
     held = "held: their errors are not in σ"
     lines[0] += f", intrinsics {held if result.intrinsics_held else 'with their σ'}"
+    if result.searched is not None:
+        total = len(poses) + sum(each.gate == "pose" for each in result.left_out)
+        lines.append(
+            f"sequence: {total - result.searched} images followed from the one before, "
+            f"{result.searched} searched as a whole"
+        )
     if count["ambiguous"]:
         lines.append(
             "ambiguous: two poses fit, mirrored at the line of sight; the likelier one is given, --json has both; "

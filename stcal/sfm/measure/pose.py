@@ -11,7 +11,7 @@ from typing import Literal
 
 import numpy as np
 
-from stcal.errors import DegenerateError, InputError
+from stcal.errors import DegenerateError, DetectionError, InputError, StcalError
 from stcal.geometry.arrays import frozen
 from stcal.geometry.camera import Camera
 from stcal.geometry.plane_poses import MAX_SIGMA_RAD, OUTLIER, deciding_delta, distinct, weigh, weights_of
@@ -22,12 +22,18 @@ from stcal.io.camera import CameraPrior, intrinsic_basis
 from stcal.io.covariance import OF_PIXEL, first_fault
 from stcal.labels import CircleLabel, circle_labels, parse_labels
 from stcal.sfm.data.model import Outlier
+from stcal.sfm.data.observations import ImageObservations
 from stcal.sfm.data.projection import CircleImages
 from stcal.sfm.measure.likelihood import covariance_of_likelihood
 from stcal.sfm.measure.minima import MIN_CIRCLES, minima_without_outliers, start_pose
 from stcal.sfm.measure.problem import HOPELESS, PoseProblem, covariance_of_centres
 from stcal.sfm.measure.target import TargetCircles
 
+NEAR_PREVIOUS = 1 / 3
+"""The pose nearer to the previous image's is taken where its turn from there is at most this share of the other's."""
+NO_FACE = "no face of the target recognised; if a dot board is in view, give --board"
+SUSPICIOUS, FAILED = 1e-3, 1e-5
+"""Probabilities of a fit's χ², as the checks of a run have them."""
 Status = Literal["certain", "resolved", "ambiguous"]
 
 
@@ -304,3 +310,43 @@ def _solution(
         chi2=chi2,
         other_side=other_side,
     )
+
+
+def measured_pose(
+    image: ImageObservations,
+    camera: Camera,
+    target: TargetCircles,
+    options: PoseOptions | None = None,
+    prior: CameraPrior | None = None,
+) -> TargetPose | StcalError:
+    """:func:`pose_from_circles` of what one image shows of the calibrated target, or why there is no pose."""
+    known = [i for i, label in enumerate(image.labels) if label in target.place]
+    if not known:
+        seen = ", ".join(image.face_ids())
+        return DetectionError(f"{image.name}: " + (f"face {seen} is not calibrated" if seen else NO_FACE))
+    own = image.select(known)
+    try:
+        return pose_from_circles(
+            own.labels, own.centre_px, own.covariance_px2, target, camera, options, prior, image.name
+        )
+    except StcalError as error:
+        return error
+
+
+def resolved(pose: TargetPose, previous: Rigid) -> TargetPose:
+    """The pose with its two-fold ambiguity decided by another one that is near, camera_from_target of the image before;
+    the same where it is certain, or where that one is near to neither."""
+    if pose.status == "certain" or pose.second is None:
+        return pose
+    own, other = (
+        Rigid(each.camera_from_target.rotation @ previous.rotation.T).angle_rad() for each in (pose, pose.second)
+    )
+    if own <= NEAR_PREVIOUS * other:
+        return replace(pose, status="resolved")
+    return pose.swapped() if other <= NEAR_PREVIOUS * own else pose
+
+
+def fit_verdict(pose: TargetPose) -> str:
+    """``passed``, ``suspicious`` or ``failed`` of the χ² of the residuals."""
+    p = pose.p_value()
+    return "failed" if p < FAILED else "suspicious" if p < SUSPICIOUS else "passed"

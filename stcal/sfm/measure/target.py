@@ -30,8 +30,9 @@ class TargetCircles:
 
     ``labels`` ; ``xyz`` : (c, 3) centres; ``radius`` : (c,); ``covariance`` : (3c, 3c) mm² of all centres together,
     zero where nothing is known; ``sigma_factor`` : by which centres' own σ are too small, as the run found it;
-    ``notes`` : what the covariance lacks. ``normal`` : (c, 3) of the plane of each circle's face, ``target_from_plane``
-    of each face, the plane's origin amid its circles, and ``place`` of each label follow from the centres.
+    ``notes`` : what the covariance lacks; ``design`` : by which they are found in images, None where they are not to
+    be. ``normal`` : (c, 3) of the plane of each circle's face, ``target_from_plane`` of each face, the plane's origin
+    amid its circles, and ``place`` of each label follow from the centres.
 
     Raises
     ------
@@ -47,6 +48,7 @@ class TargetCircles:
     covariance: np.ndarray
     sigma_factor: float = 1.0
     notes: tuple[str, ...] = ()
+    design: TargetDesign | None = None
     normal: np.ndarray = field(init=False)
     target_from_plane: dict[str, Rigid] = field(init=False)
     place: dict[CircleLabel, int] = field(init=False)
@@ -88,7 +90,7 @@ class TargetCircles:
         labels, radius = tuple(target.circles), design.radius_of()
         covariance, notes = _covariance(labels, target.covariance_mm2, target.circle_covariance)
         xyz = np.array([target.circles[label] for label in labels])
-        return cls(labels, xyz, np.array([radius[label] for label in labels]), covariance, sigma_factor, notes)
+        return cls(labels, xyz, np.array([radius[label] for label in labels]), covariance, sigma_factor, notes, design)
 
 
 def read_target(path: str | Path, design: TargetDesign) -> TargetCircles:
@@ -121,7 +123,7 @@ def read_target(path: str | Path, design: TargetDesign) -> TargetCircles:
         if faces.centre_sigma_factor is None:
             notes += ("faces.json states no centre_sigma_factor: the centres' own σ are used; run it again",)
         factor = 1.0 if faces.centre_sigma_factor is None else faces.centre_sigma_factor
-        target = TargetCircles(labels, xyz, radius, covariance, factor, notes)
+        target = TargetCircles(labels, xyz, radius, covariance, factor, notes, design)
     except (InputError, DegenerateError, LookupError, TypeError, ValueError, AttributeError) as error:
         reason = f"no {error}" if isinstance(error, KeyError) else str(error)[:150]
         raise InputError(f"faces {path}: not the faces.json of a run ({reason}); give RUN/faces.json") from error
