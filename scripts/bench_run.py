@@ -40,6 +40,8 @@ THRESHOLDS = {
 
 STREAM = 40, 1728
 """Photographs for ``measure``, and their width, px: 2 megapixels."""
+TARGET_SIGMA_MM = 0.002
+"""Of the circles of the target that is followed, about that of a run."""
 
 
 def decode_file(path: Path) -> None:
@@ -85,6 +87,24 @@ def render(folder: Path, images: int, width: int) -> None:
     held = len(list((folder / "images").glob("*/*"))), read_camera(folder / "cameras.txt").width
     if held != (images, width):
         sys.exit("error: {} holds {} images {} px wide; give another folder".format(folder, *held))
+
+
+def filmed_scene():
+    """A camera that moves on by up to 5 mm and 0.5° from image to image."""
+    from stcal.synthetic.film import filmed
+    from stcal.synthetic.scene import SceneOptions, make_scene
+
+    images, width = STREAM
+    options = SceneOptions(width=width, height=width * 2 // 3, images_per_group=images // GROUPS)
+    return filmed(make_scene(options), "12", images)
+
+
+def film(folder: Path) -> None:
+    """Render the sequence unless it is there."""
+    from stcal.synthetic.dataset import write_dataset
+
+    if not (folder / "truth.json").exists():
+        write_dataset(folder, filmed_scene())
 
 
 def timed(function, jobs: list[tuple]) -> tuple[float, list]:
@@ -146,6 +166,33 @@ def timed_stream(data: Path, out: Path, workers: int) -> float:
     return seconds
 
 
+def timed_following(film: Path, scene) -> tuple[float, float]:
+    """Seconds of a sequence in one process: ``measure --sequence``, and a tracker on arrays in memory. The target is
+    that of the truth, as the calibration of it is another row."""
+    from stcal.io.images import decode
+    from stcal.sfm import MeasureOptions, Tracker
+    from stcal.sfm import measure as measure_images
+    from stcal.sfm.measure.target import TargetCircles
+
+    labels, radius = tuple(scene.circles_target), scene.target.radius_of()
+    xyz = np.array([scene.circles_target[label] for label in labels])
+    known = np.eye(3 * len(labels)) * TARGET_SIGMA_MM**2
+    circles = TargetCircles(labels, xyz, np.array([radius[label] for label in labels]), known, design=scene.target)
+    camera = read_camera(film / "cameras.txt")
+    options = MeasureOptions(sequence=True, workers=1)
+    start = time.perf_counter()
+    result = measure_images(film / "images", camera, circles, scene.target, scene.board, options)
+    seconds = time.perf_counter() - start
+    if len(result.images) != STREAM[0] or result.searched != 1:
+        sys.exit(f"error: {len(result.images)} of {STREAM[0]} images measured, {result.searched} searched as a whole")
+    images = [decode(path.read_bytes(), path.name) for path in sorted((film / "images").glob("*/*"))]
+    tracker = Tracker(circles, camera, scene.board)
+    start = time.perf_counter()
+    for image in images:
+        tracker.locate(image)
+    return seconds, time.perf_counter() - start
+
+
 def resident(pid: int) -> int:
     """Resident bytes of a process and all that it started, as far as /proc tells."""
     try:
@@ -195,7 +242,7 @@ def boards(found: dict[str, np.ndarray], true: dict[str, np.ndarray]) -> dict[st
     return {"found": len(found), "complete": complete, "right": sum(bool(value < RIGHT_PX) for value in off)}
 
 
-def measure(data: Path, stream: Path, scratch: Path) -> dict:
+def measure(data: Path, stream: Path, film: Path, scratch: Path) -> dict:
     """All measurements, once."""
     scratch.mkdir()
     log = scratch / "run.log"
@@ -228,6 +275,9 @@ def measure(data: Path, stream: Path, scratch: Path) -> dict:
     rows["stcal --version"] = {"seconds": timed_program(["--version"], log, "main")[0]}
     timed_program(["run", stream / "images", *files_of(stream), "--out", scratch / "stream"], log)
     rows["measure, 2 Mpx, one core"] = {"seconds": timed_stream(stream, scratch / "stream", 1), "images": STREAM[0]}
+    following = timed_following(film, filmed_scene())
+    for title, seconds in zip(("measure --sequence, one core", "Tracker.locate, one core"), following, strict=True):
+        rows[title] = {"seconds": seconds, "images": STREAM[0]}
     shutil.rmtree(scratch)
     about = {"images": len(paths), "size_px": [camera.width, camera.height], "megabytes": megabytes}
     about["workers"] = os.cpu_count()
@@ -262,7 +312,10 @@ def main() -> None:
         data, stream = keep / "photographs", keep / "stream"
         render(data, given.images, given.width)
         render(stream, *STREAM)
-        result = best_of([measure(data, stream, Path(scratch) / str(i)) for i in range(max(given.rounds, 1))])
+        film(keep / "film")
+        result = best_of(
+            [measure(data, stream, keep / "film", Path(scratch) / str(i)) for i in range(max(given.rounds, 1))]
+        )
     print("{images} images of {size_px} px, {megabytes:.0f} MB, {workers} workers, {rounds} rounds".format(**result))
     print(f"{'':34} {'seconds':>8} {'median':>7} {'ratio':>6}   boards found, complete, right")
     for name, row in result["rows"].items():

@@ -46,7 +46,13 @@ def patterns_of(target: TargetDesign, board: BoardDesign | None) -> dict[str, Pa
     return found
 
 
-def in_view(pattern: Pattern, camera_from_plane: Rigid, camera: Camera, border: np.ndarray) -> np.ndarray:
+def in_view(
+    pattern: Pattern,
+    camera_from_plane: Rigid,
+    camera: Camera,
+    border: np.ndarray,
+    max_tilt_rad: float = MAX_TILT_RAD,
+) -> np.ndarray:
     """Mask of the circles that face the camera and lie in the image with their whole rim.
 
     ``border`` : of :func:`ideal_border`; beyond it a lens model may fold back.
@@ -54,7 +60,7 @@ def in_view(pattern: Pattern, camera_from_plane: Rigid, camera: Camera, border: 
     axes = camera_from_plane.rotation
     xyz = camera_from_plane @ pattern.xyz_mm()
     cosine = -pattern.side * (xyz @ axes[:, 2]) / np.linalg.norm(xyz, axis=1)
-    shown = (cosine > np.cos(MAX_TILT_RAD)) & (xyz[:, 2] > pattern.radius_mm)
+    shown = (cosine > np.cos(max_tilt_rad)) & (xyz[:, 2] > pattern.radius_mm)
     rim = xyz[shown, None] + pattern.radius_mm[shown, None, None] * (RIM @ axes[:, :2].T)
     ideal = rim[..., :2] / rim[..., 2:]
     whole = ((ideal > border[0]) & (ideal < border[1])).all((1, 2))

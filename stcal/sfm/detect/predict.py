@@ -17,7 +17,7 @@ from stcal.io.images import grey_fine
 from stcal.labels import BOARD, Label
 from stcal.sfm.data.centres import Centres
 from stcal.sfm.data.observations import ImageObservations
-from stcal.sfm.data.patterns import ideal_border, images_px, in_view, patterns_of
+from stcal.sfm.data.patterns import MAX_TILT_RAD, ideal_border, images_px, in_view, patterns_of
 from stcal.sfm.detect.arrangement import Arrangement
 from stcal.sfm.detect.circles.candidates import MAX_POSITION_ERROR, MAX_POSITION_ERROR_PX, singular_values
 from stcal.sfm.detect.circles.centres import MIN_RIM, measure_centres
@@ -74,9 +74,10 @@ def predict_circles(
     target: TargetDesign,
     board: BoardDesign | None,
     camera: Camera,
+    max_tilt_rad: float = MAX_TILT_RAD,
 ) -> PredictedCircles | None:
-    """Circles that the arrangement puts into view in an image, wanted those that have not been ``seen``; None where it
-    does not know the image."""
+    """Circles that the arrangement puts into view in an image, at most so oblique, wanted those that have not been
+    ``seen``; None where it does not know the image."""
     pose = arrangement.camera_from_group.get(image)
     if pose is None:
         return None
@@ -87,7 +88,7 @@ def predict_circles(
         if plane not in arrangement.group_from_plane:
             continue
         camera_from_plane = pose @ arrangement.group_from_plane[plane]
-        shown = np.flatnonzero(in_view(pattern, camera_from_plane, camera, border))
+        shown = np.flatnonzero(in_view(pattern, camera_from_plane, camera, border, max_tilt_rad))
         place, outline = images_px(pattern, camera_from_plane, camera, shown)
         labels += [pattern.labels[i] for i in shown.tolist()]
         centre.append(place)

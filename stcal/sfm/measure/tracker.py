@@ -1,8 +1,10 @@
 """A calibrated target followed from image to image: its circles are measured where the poses before put them."""
 
+from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
+from threadpoolctl import ThreadpoolController
 
 from stcal.design import BoardDesign, TargetDesign
 from stcal.errors import InputError, StcalError
@@ -11,8 +13,9 @@ from stcal.geometry.camera import Camera
 from stcal.geometry.rigid import Rigid
 from stcal.io.camera import CameraModel, CameraPrior
 from stcal.io.images import grey_8bit, grey_fine
-from stcal.parallel import one_thread
+from stcal.labels import Label
 from stcal.sfm.data.observations import ImageObservations
+from stcal.sfm.data.patterns import MAX_TILT_RAD
 from stcal.sfm.detect.arrangement import Arrangement
 from stcal.sfm.detect.circles.ellipses import EllipseOptions
 from stcal.sfm.detect.image import detect_image
@@ -34,6 +37,8 @@ MIN_SHARE = 0.5
 for in the whole image, as if it had not been seen before."""
 MIN_FOUND = 6
 """As many as name a face."""
+MAX_TRIED_TILT_RAD = np.radians(80.0)
+"""A face seen so obliquely may be found by its pattern; beyond 70° none is missed that is not."""
 
 
 class Tracker:
@@ -88,12 +93,12 @@ class Tracker:
         self.searched = False
         self._planes = _target_from_face(target, self.design)
         self._before: list[Rigid] = []
+        self._threads = ThreadpoolController()  # looked up once: it takes 2 ms
 
     def forget(self) -> None:
         """Search the next image as a whole, as after a cut."""
         self._before = []
 
-    @one_thread()
     def locate(self, image: np.ndarray, name: str = "image") -> TargetPose:
         """camera_from_target in the next image.
 
@@ -118,7 +123,8 @@ class Tracker:
         StcalError
             What was seen gives no pose; the next image is searched as a whole then.
         """
-        seen, pose = self.observe(image, name)
+        with self._threads.limit(limits=1):
+            seen, pose = self.observe(image, name)
         self.notes = seen.notes
         if isinstance(pose, StcalError):
             raise pose
@@ -135,7 +141,8 @@ class Tracker:
             return seen, pose
         if self._before:
             pose = resolved(pose, self._before[-1])
-        self._before = [*self._before[-1:], pose.camera_from_target] if pose.status != "ambiguous" else []
+        one_before = [] if self.searched else self._before[-1:]  # no motion is known across a search
+        self._before = [*one_before, pose.camera_from_target] if pose.status != "ambiguous" else []
         return seen, pose
 
     def _camera_of(self, image: np.ndarray, name: str) -> Camera:
@@ -143,7 +150,8 @@ class Tracker:
             raise InputError(f"{name}: {image.dtype} of shape {image.shape}; a grey image of 8 or 16 bits needed")
         height, width = image.shape
         if self.camera is None:
-            self.model.require_inside(width, height, name)
+            if not (self.model.width and self.model.height):
+                self.model.require_inside(width, height, name)
             self.camera = self.model.sized(width, height)
         if (width, height) != (self.camera.width, self.camera.height):
             raise InputError(
@@ -161,7 +169,7 @@ class Tracker:
         """None where the target is not near its predicted place."""
         last = self._before[-1]
         expected = last @ self._before[0].inverse() @ last if len(self._before) == 2 else last
-        predicted = self._predicted(expected, camera)
+        predicted = self._predicted(expected, camera, (), MAX_TRIED_TILT_RAD)
         if len(predicted.labels) < MIN_FOUND:
             return None
         predicted = predicted.shifted(common_shift(grey_8bit(image), predicted))
@@ -181,10 +189,10 @@ class Tracker:
 
     def _completed(self, image: np.ndarray, camera: Camera, seen: LabelledImage, pose: TargetPose) -> LabelledImage:
         """With what the first pose puts into view too, and without what contradicts it."""
-        predicted = self._predicted(pose.camera_from_target, camera, seen.observations)
-        wrong = contradictions(predicted, seen.observations, camera)
-        if wrong:
-            seen = seen.without(wrong, contradicted_notes(wrong))
+        labels, pose_now = seen.observations.labels, pose.camera_from_target
+        wrong = contradictions(self._predicted(pose_now, camera, labels, MAX_TRIED_TILT_RAD), seen.observations, camera)
+        seen = seen.without(wrong, contradicted_notes(wrong))
+        predicted = self._predicted(pose_now, camera, labels, MAX_TILT_RAD)
         if not predicted.wanted.any():
             return seen
         look = measure_predicted(image, camera, predicted, self.ellipses)
@@ -192,9 +200,9 @@ class Tracker:
             return replace(seen, notes=(*seen.notes, *missed_notes(look.missed)))
         return seen.plus(look.labels, look.centres, missed_notes(look.missed))
 
-    def _predicted(self, pose: Rigid, camera: Camera, seen: ImageObservations | None = None) -> PredictedCircles:
+    def _predicted(self, pose: Rigid, camera: Camera, seen: Sequence[Label], max_tilt_rad: float) -> PredictedCircles:
         arrangement = Arrangement(self._planes, {0: pose}, {})
-        predicted = predict_circles(arrangement, 0, seen.labels if seen else (), self.design, None, camera)
+        predicted = predict_circles(arrangement, 0, seen, self.design, None, camera, max_tilt_rad)
         assert predicted is not None  # the arrangement has this image
         return predicted
 
