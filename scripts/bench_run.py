@@ -322,6 +322,9 @@ def main() -> None:
         counts = f"{row['found']:8} {row['complete']:9} {row['right']:6}" if "found" in row else ""
         counts = f"{row['images'] / row['seconds']:8.1f} images a second" if "images" in row else counts
         print(f"{name:34} {row['seconds']:8.2f} {row['median']:7.2f} {row['ratio']:6.2f} {counts}".rstrip())
+    row = result["rows"]["stcal detection"]
+    cost = row["seconds"] * result["workers"] / result["images"]
+    print(f"detection: {cost:.2f} s of a core an image; a million such images a day: {cost * 1e6 / 86400:.1f} cores")
     print("peak memory of the run: largest process {peak_process_mib:.0f} MiB, together".format(**result), end=" ")
     print("{peak_together_mib:.0f} MiB, pages that they share counted in each".format(**result))
     if given.json:

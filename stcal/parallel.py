@@ -1,4 +1,4 @@
-"""Run one function over many jobs on all cores, and BLAS on one."""
+"""Run one function over many jobs on all cores, or by any executor, and BLAS on one."""
 
 import contextlib
 import itertools
@@ -8,7 +8,7 @@ import signal
 import sys
 import threading
 from collections.abc import Callable, Iterator, Sequence
-from concurrent.futures import ProcessPoolExecutor, as_completed
+from concurrent.futures import FIRST_COMPLETED, Executor, Future, ProcessPoolExecutor, as_completed, wait
 from typing import TypeVar
 
 R = TypeVar("R")
@@ -49,13 +49,29 @@ def one_thread() -> Iterator[None]:
 
 
 def run_parallel(
-    function: Callable[..., R], jobs: Sequence[tuple], workers: int | None = None
+    function: Callable[..., R],
+    jobs: Sequence[tuple],
+    workers: int | None = None,
+    executor: Executor | None = None,
+    at_once: int | None = None,
 ) -> Iterator[tuple[int, R]]:
     """Yield (index of the job, result of ``function(*job)``) as results come in, in any order.
 
     Processes are started afresh (forking a process with threads can hang) and do not import the caller's main
     module, so that a script needs no ``if __name__ == "__main__"``. One worker, or one job, runs right here.
+
+    Parameters
+    ----------
+    workers : int, optional
+        Processes; one per core where None.
+    executor : concurrent.futures.Executor, optional
+        Runs the jobs in place of processes of our own, and is left open.
+    at_once : int, optional
+        So many jobs are handed to the executor at a time; all of them where None.
     """
+    if executor is not None:
+        yield from _handed_over(executor, function, jobs, at_once or len(jobs))
+        return
     workers = min(workers or os.cpu_count() or 1, len(jobs))
     if workers <= 1:
         for i, job in enumerate(jobs):
@@ -78,6 +94,22 @@ def run_parallel(
                     if process not in others:
                         process.terminate()
             raise
+
+
+def _handed_over(executor: Executor, function, jobs: Sequence[tuple], at_once: int) -> Iterator[tuple[int, R]]:
+    waiting: dict[Future, int] = {}
+    rest = iter(range(len(jobs)))
+    try:
+        while True:
+            for i in itertools.islice(rest, at_once - len(waiting)):
+                waiting[executor.submit(function, *jobs[i])] = i
+            if not waiting:
+                return
+            for future in wait(waiting, return_when=FIRST_COMPLETED).done:
+                yield waiting.pop(future), future.result()
+    finally:
+        for future in waiting:
+            future.cancel()
 
 
 @contextlib.contextmanager

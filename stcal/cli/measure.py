@@ -5,7 +5,18 @@ from typing import Annotated
 
 import typer
 
-from stcal.cli.options import CameraFile, MaxDiameter, MinDiameter, ReportFile, TargetFile, Workers, ellipse_options
+from stcal.cli.options import (
+    CameraFile,
+    MaxDiameter,
+    MinDiameter,
+    ReportFile,
+    Scheduler,
+    SendImages,
+    TargetFile,
+    Workers,
+    ellipse_options,
+    handed_over,
+)
 from stcal.cli.terminal import StageProgress, print_each, say, write
 from stcal.errors import InputError
 
@@ -64,6 +75,8 @@ def measure(
     min_diameter: MinDiameter = None,
     max_diameter: MaxDiameter = 450.0,
     workers: Workers = None,
+    scheduler: Scheduler = None,
+    send_images: SendImages = False,
 ) -> None:
     """Measure the pose of a calibrated target in each image, from whatever faces it shows, with its 6×6 covariance."""
     from stcal.io.camera import read_camera
@@ -82,7 +95,7 @@ def measure(
     options = work.MeasureOptions(
         PoseOptions(sigma_factor=sigma_factor), previous, sequence, ellipse_options(min_diameter, max_diameter), workers
     )
-    with StageProgress() as progress:
+    with handed_over(scheduler, send_images), StageProgress() as progress:
         result = work.measure(
             images, read_camera(camera), known, design, load_board(board) if board else None, options, progress
         )

@@ -2,6 +2,7 @@
 
 import inspect
 from collections.abc import Callable
+from contextlib import AbstractContextManager, nullcontext
 from enum import StrEnum
 from functools import wraps
 from pathlib import Path
@@ -48,6 +49,19 @@ Workers = Annotated[
     int | None, typer.Option("--workers", min=1, max=1024, help="Use this many processes; one per core if not given.")
 ]
 
+Scheduler = Annotated[
+    str | None,
+    typer.Option(
+        "--scheduler", help="Hand the images to the Dask cluster with the scheduler at this address, tcp://host:8786."
+    ),
+]
+SendImages = Annotated[
+    bool,
+    typer.Option(
+        "--send-images", help="Send the images' content to the cluster, whose machines do not see their folder."
+    ),
+]
+
 
 class QuaternionOrder(StrEnum):
     """What four columns of a quaternion hold."""
@@ -75,6 +89,17 @@ MinDiameter = Annotated[
 MaxDiameter = Annotated[
     float, typer.Option("--max-diameter", min=8, max=1e6, help="Ignore circles larger than this, px.")
 ]
+
+
+def handed_over(scheduler: str | None, send_images: bool) -> AbstractContextManager[None]:
+    """Where images are worked on meanwhile: on a cluster, or by processes of this machine."""
+    if scheduler is None:
+        if send_images:
+            raise InputError("--send-images: only with --scheduler, to whose machines they are sent")
+        return nullcontext()
+    from stcal.workflows.cluster import dask_cluster
+
+    return dask_cluster(scheduler, send_images)
 
 
 def ellipse_options(min_diameter: float | None, max_diameter: float) -> "EllipseOptions":

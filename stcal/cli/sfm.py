@@ -14,9 +14,12 @@ from stcal.cli.options import (
     MaxDiameter,
     MinDiameter,
     Run,
+    Scheduler,
+    SendImages,
     TargetFile,
     Workers,
     ellipse_options,
+    handed_over,
 )
 from stcal.cli.terminal import StageProgress, say, write
 from stcal.errors import InputError
@@ -109,6 +112,8 @@ def run(
     min_diameter: MinDiameter = None,
     max_diameter: MaxDiameter = 450.0,
     workers: Workers = None,
+    scheduler: Scheduler = None,
+    send_images: SendImages = False,
 ) -> None:
     """Calibrate the target: detect, map, scale, chain and adjust; writes faces.json and report.html."""
     import numpy as np
@@ -130,7 +135,7 @@ def run(
         ellipses=ellipse_options(min_diameter, max_diameter),
         workers=workers,
     )
-    with StageProgress() as progress:
+    with handed_over(scheduler, send_images), StageProgress() as progress:
         result = pipeline.run(images, camera, out, target, board, options, progress)
     say(run_text(result))
 
@@ -147,6 +152,8 @@ def detect(
     min_diameter: MinDiameter = None,
     max_diameter: MaxDiameter = 450.0,
     workers: Workers = None,
+    scheduler: Scheduler = None,
+    send_images: SendImages = False,
 ) -> None:
     """Detect circles alone: detections.csv and an overlay picture of every image."""
     from stcal.io.camera import read_camera
@@ -166,7 +173,11 @@ def detect(
         raise InputError(f"output folder {out}: holds a finished calibration; give another folder with --out")
     find_images(images)
     given = {"images": images, "--camera": camera, "--target": target, "--board": board}
-    with run_folder(out, MarkerFile.of(images, None), given) as folder, StageProgress() as progress:
+    with (
+        handed_over(scheduler, send_images),
+        run_folder(out, MarkerFile.of(images, None), given) as folder,
+        StageProgress() as progress,
+    ):
         detection, labelled = pipeline.detect(images, model, folder, target_design, board_design, options, progress)
     say(detection_text(detection, labelled))
     say(f"detections: {out / 'detections.csv'}\noverlays:   {out / 'overlays'}")

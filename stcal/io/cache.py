@@ -20,11 +20,16 @@ DAMAGE = (OSError, ValueError, LookupError, EOFError, TypeError, zipfile.BadZipF
 """What reading, or making the result anew, raises where a file is absent, cut or of another form."""
 
 
-def keep(path: Path, arrays: Mapping[str, Any], meta: dict[str, Any]) -> None:
-    """Save arrays by name, and plain values."""
+def packed(arrays: Mapping[str, Any], meta: dict[str, Any]) -> bytes:
+    """Arrays by name, and plain values, as the content of a file that :func:`kept` reads."""
     stream = io.BytesIO()
     np.savez(stream, **{**arrays, META: np.frombuffer(json.dumps(meta).encode(), np.uint8)})
-    save(path, stream.getvalue())
+    return stream.getvalue()
+
+
+def keep(path: Path, arrays: Mapping[str, Any], meta: dict[str, Any]) -> None:
+    """Save arrays by name, and plain values."""
+    save(path, packed(arrays, meta))
 
 
 def kept(path: Path, make: Callable[[Mapping[str, np.ndarray], dict[str, Any]], R]) -> R | None:

@@ -8,13 +8,14 @@ import threading
 import unicodedata
 import zlib
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
 from pathlib import Path, PurePosixPath, PureWindowsPath
 
 import cv2
 import numpy as np
 
 from stcal.errors import InputError
+from stcal.io.files import IMAGE_BYTES, read_bytes
 from stcal.io.saving import RUN_MARKER
 
 SUFFIXES = (".jpg", ".jpeg", ".png", ".tif", ".tiff", ".bmp")
@@ -37,11 +38,30 @@ _STANDARD_ERROR = threading.Lock()
 
 @dataclass(frozen=True, slots=True)
 class ImageFile:
-    """One file: ``name`` is its path below the image folder, with forward slashes."""
+    """One file: ``name`` is its path below the image folder, with forward slashes; ``content`` where it is carried
+    along, to a machine that does not see the path."""
 
     path: Path
     name: str
     group: str
+    content: bytes | None = field(default=None, repr=False)
+
+    def read(self) -> bytes:
+        """The content.
+
+        Raises
+        ------
+        OSError
+            It cannot be read, or is too large for an image.
+        """
+        return read_bytes(self.path, IMAGE_BYTES) if self.content is None else self.content
+
+    def carried(self) -> "ImageFile":
+        """With its content; as it is where that cannot be read, which is then told where it is wanted."""
+        try:
+            return replace(self, content=self.read())
+        except OSError:
+            return self
 
 
 @dataclass(frozen=True, slots=True)

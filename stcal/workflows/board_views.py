@@ -19,9 +19,8 @@ from stcal.geometry.conic import circle_image_offset
 from stcal.geometry.plane import camera_from_plane, fit_homography, refine_planar_pose
 from stcal.geometry.rigid import Rigid
 from stcal.io.camera import CameraModel
-from stcal.io.files import IMAGE_BYTES, read_bytes
 from stcal.io.images import ImageFile, Skipped, decode
-from stcal.parallel import run_parallel
+from stcal.io.spread import run_on_images
 from stcal.sfm.detect.circles.ellipses import EllipseOptions
 from stcal.sfm.detect.image import detect_image
 
@@ -79,7 +78,7 @@ def detect_boards(
         raise InputError("no image; images of the board needed")
     jobs = [(file, model, board, tuple(dictionaries)) for file in files]
     by_job: dict[int, BoardDetection | Skipped] = {}
-    for i, detection in run_parallel(_detect_board, jobs, workers):
+    for i, detection in run_on_images(_detect_board, jobs, workers):
         by_job[i] = detection
         if progress:
             progress(len(by_job), len(jobs))
@@ -110,7 +109,7 @@ def _detect_board(
     file: ImageFile, model: CameraModel, board: Board, dictionaries: tuple[str, ...]
 ) -> BoardDetection | Skipped:
     try:
-        image = decode(read_bytes(file.path, IMAGE_BYTES), file.name)
+        image = decode(file.read(), file.name)
     except OSError as error:
         return Skipped(file.name, f"cannot be read: {error.strerror or error}")
     except InputError as error:

@@ -2,11 +2,13 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import lru_cache
 from typing import Literal
 
 import numpy as np
 
 from stcal.design import BoardDesign, Polarity, TargetDesign
+from stcal.geometry.arrays import frozen
 from stcal.geometry.camera import Camera
 from stcal.geometry.conic import circle_images, shape_of_square
 from stcal.geometry.rigid import Rigid
@@ -61,6 +63,8 @@ def in_view(
     xyz = camera_from_plane @ pattern.xyz_mm()
     cosine = -pattern.side * (xyz @ axes[:, 2]) / np.linalg.norm(xyz, axis=1)
     shown = (cosine > np.cos(max_tilt_rad)) & (xyz[:, 2] > pattern.radius_mm)
+    if not shown.any():
+        return shown
     rim = xyz[shown, None] + pattern.radius_mm[shown, None, None] * (RIM @ axes[:, :2].T)
     ideal = rim[..., :2] / rim[..., 2:]
     whole = ((ideal > border[0]) & (ideal < border[1])).all((1, 2))
@@ -82,6 +86,7 @@ def images_px(
     return distorted * camera.focal + camera.centre, shape_of_square(turned @ np.swapaxes(turned, 1, 2))
 
 
+@lru_cache(maxsize=8)
 def ideal_border(camera: Camera) -> np.ndarray:
     """Least and largest ideal coordinates, (2, 2), along the image's border."""
     t = np.linspace(0, 1, BORDER_POINTS)
@@ -89,4 +94,4 @@ def ideal_border(camera: Camera) -> np.ndarray:
     zero = np.zeros(BORDER_POINTS)
     sides = [(x, zero), (x, zero + camera.height - 1), (zero, y), (zero + camera.width - 1, y)]
     ideal = camera.normalised_from_pixel(np.concatenate([np.column_stack(side) for side in sides]))
-    return np.stack([ideal.min(0), ideal.max(0)])
+    return frozen(np.stack([ideal.min(0), ideal.max(0)]))

@@ -3,6 +3,7 @@
 import hashlib
 import json
 from collections.abc import Callable, Sequence
+from concurrent.futures import BrokenExecutor
 from concurrent.futures.process import BrokenProcessPool
 from dataclasses import asdict, dataclass, fields
 from pathlib import Path
@@ -12,12 +13,12 @@ import numpy as np
 from stcal.design import BoardDesign, TargetDesign
 from stcal.errors import ConvergenceError, DetectionError, InputError
 from stcal.geometry.camera import Camera
-from stcal.io.cache import keep, kept
+from stcal.io.cache import keep, kept, packed
 from stcal.io.camera import CameraModel
-from stcal.io.files import IMAGE_BYTES, read_bytes
 from stcal.io.images import ImageFile, Skipped, decode, grey_8bit, thumbnail
+from stcal.io.saving import save
+from stcal.io.spread import run_on_images
 from stcal.labels import parse_label, parse_labels
-from stcal.parallel import run_parallel
 from stcal.sfm.data.centres import Centres
 from stcal.sfm.detect.circles.ellipses import EllipseOptions
 from stcal.sfm.detect.image import detect_image
@@ -75,7 +76,7 @@ def detect_files(
     camera, size_from = sized_by(camera_model, files)
     cache.mkdir(parents=True, exist_ok=True)
     settings = _fingerprint(camera, target, board, options)
-    jobs = [(file, camera, size_from, target, board, options, settings, cache) for file in files]
+    jobs = [(file, camera, size_from, target, board, options, settings) for file in files]
     found: list[DetectedImage | Skipped | None] = [None] * len(files)
     pending = []
     for i, file in enumerate(files):
@@ -85,18 +86,15 @@ def detect_files(
         elif progress:
             progress(file.name)
     try:
-        for k, outcome in run_parallel(_detect_file, [jobs[i] for i in pending], workers):
+        for k, outcome in run_on_images(_detect_file, [jobs[i] for i in pending], workers):
             i = pending[k]
-            found[i] = (
-                outcome if isinstance(outcome, Skipped) else _load(files[i], cache / f"{outcome}.npz", reused=False)
-            )
-            if found[i] is None:
-                raise InputError(f"{cache / f'{outcome}.npz'}: written, and cannot be read again; check the disk")
+            found[i] = outcome if isinstance(outcome, Skipped) else _stored(files[i], cache, *outcome)
             if progress:
                 progress(files[i].name)
-    except BrokenProcessPool as error:
+    except BrokenExecutor as error:
         raise DetectionError(
-            f"detection in {len(pending)} images: a process was ended from outside, for lack of memory perhaps; "
+            f"detection in {len(pending)} images: a process was ended from outside, for lack of memory perhaps"
+            f"{f' ({error})' if not isinstance(error, BrokenProcessPool) else ''}; "
             "run again with fewer --workers, finished detections are kept"
         ) from error
     images, skipped = _without_copies([f for f in found if f is not None])
@@ -112,7 +110,7 @@ def sized_by(camera_model: CameraModel, files: list[ImageFile]) -> tuple[Camera,
         return camera_model.sized(camera_model.width, camera_model.height), "the camera file"
     for file in files:
         try:
-            height, width = decode(read_bytes(file.path, IMAGE_BYTES), file.name).shape
+            height, width = decode(file.read(), file.name).shape
         except (InputError, OSError):
             continue
         camera_model.require_inside(width, height, file.name)
@@ -140,7 +138,7 @@ def _kept(file: ImageFile, settings: str, cache: Path) -> DetectedImage | None:
     if not any(cache.iterdir()):
         return None
     try:
-        path = cache / f"{_key(read_bytes(file.path, IMAGE_BYTES), settings)[1]}.npz"
+        path = cache / f"{_key(file.read(), settings)[1]}.npz"
     except OSError:
         return None
     return _load(file, path, reused=True) if path.exists() else None
@@ -154,9 +152,8 @@ def _detect_file(
     board: BoardDesign | None,
     options: EllipseOptions,
     settings: str,
-    cache: Path,
-) -> str | Skipped:
-    """Detect in one file and keep the result; returns its key."""
+) -> tuple[str, bytes] | Skipped:
+    """Detect in one file: the key of the result, and what is to be kept of it."""
     loaded = load_image(file, camera, size_from)
     if isinstance(loaded, Skipped):
         return loaded
@@ -166,14 +163,23 @@ def _detect_file(
     except ConvergenceError as error:
         return Skipped(file.name, str(error), "distortion")
     digest, key = _key(data, settings)
-    _save(cache / f"{key}.npz", detection, digest, image)
-    return key
+    return key, _packed(detection, digest, image)
+
+
+def _stored(file: ImageFile, cache: Path, key: str, content: bytes) -> DetectedImage:
+    """Keep a result, and take it as it is kept."""
+    path = cache / f"{key}.npz"
+    save(path, content)
+    found = _load(file, path, reused=False)
+    if found is None:
+        raise InputError(f"{path}: written, and cannot be read again; check the disk")
+    return found
 
 
 def load_image(file: ImageFile, camera: Camera, size_from: str) -> tuple[bytes, np.ndarray] | Skipped:
     """Content of a file and the grey image in it, or why it cannot be used; ``size_from`` : what the size is from."""
     try:
-        data = read_bytes(file.path, IMAGE_BYTES)
+        data = file.read()
     except OSError as error:
         return Skipped(file.name, f"cannot be read: {error.strerror or error}")
     try:
@@ -193,7 +199,7 @@ def load_image(file: ImageFile, camera: Camera, size_from: str) -> tuple[bytes, 
     return data, image
 
 
-def _save(path: Path, detection: ImageDetection, digest: str, image: np.ndarray) -> None:
+def _packed(detection: ImageDetection, digest: str, image: np.ndarray) -> bytes:
     jpeg, scale = thumbnail(grey_8bit(image))
     meta = {
         "digest": digest,
@@ -213,7 +219,7 @@ def _save(path: Path, detection: ImageDetection, digest: str, image: np.ndarray)
             arrays |= {f"open_rows_{i}_{k}": face.rows, f"open_circles_{i}_{k}": face.circles}
     for i, each in enumerate(detection.boards):
         arrays |= {f"board_{f.name}_{i}": getattr(each, f.name) for f in fields(BoardSighting)}
-    keep(path, {"thumbnail": jpeg, **arrays}, meta)
+    return packed({"thumbnail": jpeg, **arrays}, meta)
 
 
 def _load(file: ImageFile, path: Path, reused: bool) -> DetectedImage | None:
@@ -269,16 +275,19 @@ def look_again(
     An image that can no longer be read is left as it was after the first look.
     """
     found: dict[str, SecondLook] = {}
-    pending = []
+    pending: list[tuple[ImageFile, Camera, PredictedCircles, EllipseOptions]] = []
+    paths: list[Path] = []
     for image, predicted in jobs:
         path = cache / f"again-{_predicted_key(image.digest, predicted, camera, options)}.npz"
         known = kept(path, _stored_look)
         if known is None:
-            pending.append((image.file, camera, predicted, options, path))
+            pending.append((image.file, camera, predicted, options))
+            paths.append(path)
         else:
             found[image.file.name] = known
-    for k, look in run_parallel(_look_again, pending, workers):
+    for k, look in run_on_images(_look_again, pending, workers):
         if look is not None:
+            keep(paths[k], _centre_arrays(look.centres), {"labels": look.labels, "missed": look.missed})
             found[pending[k][0].name] = look
     return found
 
@@ -291,16 +300,13 @@ def _predicted_key(digest: str, predicted: PredictedCircles, camera: Camera, opt
 
 
 def _look_again(
-    file: ImageFile, camera: Camera, predicted: PredictedCircles, options: EllipseOptions, path: Path
+    file: ImageFile, camera: Camera, predicted: PredictedCircles, options: EllipseOptions
 ) -> SecondLook | None:
     try:
-        image = decode(read_bytes(file.path, IMAGE_BYTES), file.name)
+        image = decode(file.read(), file.name)
     except (InputError, OSError):
         return None
-    look = measure_predicted(image, camera, predicted, options)
-    meta = {"labels": look.labels, "missed": look.missed}
-    keep(path, _centre_arrays(look.centres), meta)
-    return look
+    return measure_predicted(image, camera, predicted, options)
 
 
 def _stored_look(stored, meta) -> SecondLook:

@@ -89,6 +89,8 @@ def predict_circles(
             continue
         camera_from_plane = pose @ arrangement.group_from_plane[plane]
         shown = np.flatnonzero(in_view(pattern, camera_from_plane, camera, border, max_tilt_rad))
+        if not len(shown):
+            continue
         place, outline = images_px(pattern, camera_from_plane, camera, shown)
         labels += [pattern.labels[i] for i in shown.tolist()]
         centre.append(place)

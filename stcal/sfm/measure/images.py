@@ -16,8 +16,9 @@ from stcal.geometry.arrays import frozen
 from stcal.geometry.camera import Camera
 from stcal.io.camera import CameraModel, CameraPrior
 from stcal.io.images import ImageFile, Skipped, find_images
+from stcal.io.spread import run_on_images
 from stcal.io.table import COVARIANCE, POSE, Table, common_columns, pose_cells
-from stcal.parallel import Progress, counted, one_thread, run_parallel
+from stcal.parallel import Progress, counted, one_thread
 from stcal.sfm.data.observations import ImageObservations, by_group
 from stcal.sfm.detect.circles.ellipses import EllipseOptions
 from stcal.sfm.detect.files import DetectedImage, copy_of, detect_files, load_image, sized_by
@@ -207,7 +208,7 @@ def follow_files(
     model = replace(camera_model, width=camera.width, height=camera.height)
     jobs = [(own, model, camera, size_from, target, board, options) for own in folders.values()]
     followed: list[tuple[list[MeasuredImage | Skipped], int]] = [([], 0)] * len(jobs)
-    for i, outcome in run_parallel(_follow_folder, jobs, options.workers):
+    for i, outcome in run_on_images(_follow_folder, jobs, options.workers):
         followed[i] = outcome
         for file in jobs[i][0]:
             step(file.name)

@@ -1,0 +1,123 @@
+"""Detection and ``measure`` on the machines of a Dask cluster.
+
+Considered too: Ray and MPI (a cluster of their own to keep, and no worker may come, go or die on the way), job arrays
+of a batch system (each its own program; the cache by content takes what they leave in a shared folder).
+"""
+
+import contextlib
+import logging
+from collections.abc import Callable, Iterator
+from concurrent.futures import BrokenExecutor, Executor, Future
+from importlib import metadata
+from typing import Any
+
+import stcal
+from stcal.errors import InputError
+from stcal.io.spread import spread
+
+ANSWER_S = 10
+"""How long a scheduler, and the first worker, may take to answer."""
+AT_ONCE = 4
+"""Images handed over for each thread of the workers: the next are there when one is done."""
+TRIES = 3
+"""Times that a job is begun again whose worker was lost."""
+SAME = ("stcal", "numpy", "scipy", "opencv-python-headless")
+"""Packages on which a result depends, bit by bit."""
+
+
+@contextlib.contextmanager
+def dask_cluster(address: str, send_images: bool = False) -> Iterator[None]:
+    """Hand what is done image by image meanwhile to a Dask cluster.
+
+    Parameters
+    ----------
+    address : str
+        Of the scheduler, ``tcp://host:8786``.
+    send_images : bool
+        Images go by their content; by their paths, on storage that all workers share, where False.
+
+    Raises
+    ------
+    InputError
+        ``stcal[dask]`` is not installed, no scheduler answers, it has no workers, or a worker has other versions.
+    """
+    try:
+        from distributed import Client
+    except ImportError as error:
+        raise InputError("--scheduler: needs Dask; install stcal[dask]") from error
+    logging.getLogger("distributed").setLevel(logging.CRITICAL)  # what goes wrong is told by what it costs
+    try:
+        client = Client(address, timeout=ANSWER_S, set_as_default=False)
+    except (OSError, ValueError, TypeError) as error:
+        raise InputError(
+            f"--scheduler {address}: no scheduler answers within {ANSWER_S} s; start one with `dask scheduler`, and "
+            "give the address that it prints"
+        ) from error
+    with client:
+        try:
+            client.wait_for_workers(1, timeout=ANSWER_S)
+        except OSError as error:
+            raise InputError(
+                f"--scheduler {address}: no worker within {ANSWER_S} s; start one with `dask worker {address}`"
+            ) from error
+        _require_same(dict[str, dict[str, str]](client.run(versions)), address)  # type: ignore[arg-type]
+        threads = sum(dict[str, int](client.nthreads()).values())  # type: ignore[arg-type]
+        with spread(_Workers(client), AT_ONCE * threads, send_images):
+            yield
+
+
+def versions() -> dict[str, str]:
+    """Of the packages on which a result depends, here; empty for one that is not installed by its name."""
+    found = {"stcal": stcal.__version__}
+    for name in SAME[1:]:
+        try:
+            found[name] = metadata.version(name)
+        except metadata.PackageNotFoundError:
+            found[name] = ""
+    return found
+
+
+def _require_same(found: dict[str, dict[str, str]], address: str) -> None:
+    own = versions()
+    for worker, theirs in found.items():
+        for name, version in own.items():
+            if theirs[name] != version:
+                raise InputError(
+                    f"--scheduler {address}: worker {worker} has {name} {theirs[name] or 'none'}, {version or 'none'} "
+                    "here; results would not be the same, install the same versions"
+                )
+
+
+class _Workers(Executor):
+    """The workers of a cluster; one that is lost on the way costs its jobs a second try."""
+
+    def __init__(self, client):
+        self._client = client
+
+    def submit(self, function: Callable, /, *arguments, **_) -> Future:
+        answer: Future = Future()
+        future = self._client.submit(_alone, function, *arguments, pure=False, retries=TRIES)
+
+        def done(inner) -> None:
+            if inner.status == "finished":
+                answer.set_result(inner.result())
+                return
+            error = inner.exception() if inner.status == "error" else None
+            ours = error is not None and not type(error).__module__.startswith("distributed")
+            answer.set_exception(error if ours else BrokenExecutor(str(error or "the cluster gave the job up")))
+
+        future.add_done_callback(done)
+        return answer
+
+
+_limit: Any = None
+
+
+def _alone(function: Callable, *arguments):
+    """On a worker: with one thread for BLAS, from the first job on, as processes of this machine have."""
+    global _limit
+    if _limit is None:
+        from threadpoolctl import threadpool_limits
+
+        _limit = threadpool_limits(1)
+    return function(*arguments)
