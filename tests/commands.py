@@ -125,6 +125,13 @@ CALLS = (
     Call("sfm plan", "--images 2 --faces @faces.json --target @data/target.toml", 3.0),
     Call("sfm advise", "@run --count 1 --json >advice.json", 10.0),
     Call("sfm calibrate-camera", f"@data/images {_DESIGNS} --out +cameras.txt --workers 1", 15.0),
+    Call("sfm watch", f"{_SET} --out ~run --idle 0.4 --interval 0.2", 5.0),
+    Call(
+        "sfm measure",
+        "@shots --camera @data/cameras.txt --faces @run/faces.json --target @data/target.toml --sequence "
+        "--out >poses.csv --workers 1",
+        3.0,
+    ),
     Call(
         "sfm measure",
         f"@shots --camera @data/cameras.txt --faces @run/faces.json {_DESIGNS} --joints @joints.csv "

@@ -11,7 +11,14 @@ from stcal.errors import InputError
 from stcal.io.saving import RUN_ENTRIES, RUN_MARKER, keep_apart
 from tests.commands import CALLS, COMMANDS, paths_of
 
-FOLDERS = {("run", "out"), ("detect", "out"), ("init", "folder"), ("simulate", "folder"), ("demo", "out")}
+FOLDERS = {
+    ("run", "out"),
+    ("detect", "out"),
+    ("init", "folder"),
+    ("simulate", "folder"),
+    ("demo", "out"),
+    ("watch", "out"),
+}
 FOLDERS |= {("export_model", "out")}
 """New ones, which replace nothing, or those of `tests/sfm/run/test_transaction.py`."""
 WRITES = ("Write ", "Also write ", "Draw ", "Keep ")

@@ -1,12 +1,24 @@
-"""``stcal-sfm plan`` and ``stcal-sfm advise``: what to photograph, before and after."""
+"""``stcal-sfm plan``, ``advise`` and ``watch``: what to photograph, before, after and meanwhile."""
 
+import sys
 from pathlib import Path
 from typing import Annotated
 
 import typer
 
-from stcal.cli.options import MOST_SEED, BoardFile, JsonFile, Run, TargetFile
-from stcal.cli.terminal import StageProgress, say, write
+from stcal.cli.options import (
+    MOST_SEED,
+    BoardFile,
+    CameraFile,
+    JsonFile,
+    MaxDiameter,
+    MinDiameter,
+    Run,
+    TargetFile,
+    Workers,
+    ellipse_options,
+)
+from stcal.cli.terminal import StageProgress, print_each, say, write
 from stcal.errors import InputError
 
 app = typer.Typer()
@@ -105,3 +117,53 @@ def advise(
     say(advice_text(advice))
     if out:
         write(out, AdviceFile.of_advice(advice), "as JSON")
+
+
+@app.command()
+def watch(
+    images: Annotated[
+        Path, typer.Argument(help="Follow this folder, IMAGES/<group>/*.jpg, png, tif, bmp; it may be empty at first.")
+    ],
+    camera: CameraFile,
+    out: Annotated[Path, typer.Option("--out", help="Write the run to this folder: new, empty, or of an earlier run.")],
+    target: TargetFile = None,
+    board: BoardFile = None,
+    interval: Annotated[
+        float, typer.Option(min=0.1, max=3600, help="Look at the folder so often, s; files must stand still for it.")
+    ] = 1.0,
+    idle: Annotated[
+        float | None,
+        typer.Option(min=0.1, max=1e6, help="End when nothing has come for so long, s; by Ctrl-C if not given."),
+    ] = None,
+    views: Annotated[int, typer.Option(min=0, max=50, help="Compute so many views that would help; 0 for none.")] = 1,
+    refine_camera: Annotated[bool, typer.Option("--refine-camera", help="Adjust the intrinsics too.")] = False,
+    min_diameter: MinDiameter = None,
+    max_diameter: MaxDiameter = 450.0,
+    workers: Workers = None,
+) -> None:
+    """Calibrate while photographs are taken: after each, what was found, the worst σ so far and the view that would
+    help most. RUN/report.html is kept up to date and reloads itself."""
+    from stcal.sfm.plan.tables import next_text
+    from stcal.sfm.run.options import RunOptions
+    from stcal.sfm.run.text import found_lines, so_far_text
+    from stcal.workflows.watch import WatchOptions
+    from stcal.workflows.watch import watch as updates
+
+    run_options = RunOptions(
+        refine_camera=refine_camera, ellipses=ellipse_options(min_diameter, max_diameter), workers=workers
+    )
+    options = WatchOptions(interval, idle, views, run_options)
+    say(f"watching {images}; report: {out / 'report.html'}")
+    sys.stdout.flush()
+    for update in updates(images, camera, out, target, board, options):
+        print_each("gone", update.gone)
+        for line in found_lines(update.new):
+            say(line)
+        print_each("left out", (f"{each.name}: {each.reason}" for each in update.left_out))
+        if update.result is None:
+            say(f"not yet: {update.reason}")
+        else:
+            say(so_far_text(update.result))
+        if update.advice is not None:
+            say(f"next: {next_text(update.advice)}")
+        sys.stdout.flush()

@@ -33,6 +33,7 @@ def run(
     board: str | Path | BoardDesign | None = None,
     options: RunOptions | None = None,
     progress: Progress | None = None,
+    reload_s: int | None = None,
 ) -> RunResult:
     """Calibrate a target from photographs.
 
@@ -50,6 +51,8 @@ def run(
         What to do; the defaults where None.
     progress
         Called with (stage, done, total).
+    reload_s
+        The report's page loads itself anew so often, for a run that is repeated; never where None.
 
     Returns
     -------
@@ -72,7 +75,7 @@ def run(
         progress("check", 0, 1)
         result = replace(result, checks=run_checks(result.evidence(camera_prior(result.camera))))
         progress("check", 1, 1)
-        write_run(result, folder.stage, progress)
+        write_run(result, folder.stage, progress, reload_s)
     return result
 
 

@@ -92,6 +92,17 @@ def advice_text(advice: Advice) -> str:
     return "\n".join([*lines, "", _verdict(advice)])
 
 
+def next_text(advice: Advice) -> str:
+    """The first view of :func:`advice_text`, in a line."""
+    if not advice.choices:
+        return "no other view within ±50° shows the whole board and a face"
+    choice = advice.choices[0]
+    return (
+        f"group {choice.view.group}, from {choice.view.middle} {where(choice.view)}, {choice.view.distance_mm:.0f} mm: "
+        f"worst face {MICRO * advice.now.worst()[1]:.2f} → {MICRO * choice.sigma_mm:.2f} µm"
+    )
+
+
 def where(view: PlannedView) -> str:
     """``25° right, 12° up``, as the photograph to go from shows them."""
     parts = []

@@ -17,18 +17,20 @@ SOLVES = {"joint": "joint: one adjustment over all groups", "chain": "chain: gro
 FRAMES = {"plane": "plane: Z from the plane of all circles", "three-point": "three-point: from three circles"}
 
 
-def report_html(report: dict, overlays: dict[str, bytes]) -> str:
+def report_html(report: dict, overlays: dict[str, bytes], reload_s: int | None = None) -> str:
     """The page.
 
     Parameters
     ----------
     report : what :func:`stcal.sfm.run.output.report_of` made
     overlays : JPEG by image name
+    reload_s : the page loads itself anew so often; never where None
     """
     colours = figures.group_colours([group["name"] for group in report["groups"]])
     return render(
         "sfm/report/page.html.jinja",
         report=report,
+        reload_s=reload_s,
         colours=colours,
         factor=_factor_in_words(report["summary"]["sigma_factor"]),
         headline=_headline(report),

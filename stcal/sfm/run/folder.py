@@ -70,8 +70,9 @@ def overlay_path(out: Path, name: str) -> Path:
     return out / "overlays" / f"{group}{slash}{own}.jpg"
 
 
-def write_run(result: RunResult, out: Path, progress: Progress) -> None:
-    """The database with corrected centres, models, faces and report, into a folder that holds the overlays."""
+def write_run(result: RunResult, out: Path, progress: Progress, reload_s: int | None = None) -> None:
+    """The database with corrected centres, models, faces and report, into a folder that holds the overlays; the report
+    loads itself anew every ``reload_s`` seconds."""
     observations = result.observations()
     ids = image_ids(observations)
     models = {s.model.group: s.model for s in result.solutions}
@@ -94,20 +95,20 @@ def write_run(result: RunResult, out: Path, progress: Progress) -> None:
         result.calibration.sigma_factor,
     )
     save(out / "faces.json", json_text(faces.content()))
-    write_report(out, report, out)
+    write_report(out, report, out, reload_s)
     progress("report", 1, 1)
 
 
-def write_report(out: Path, report: dict, run: Path) -> None:
+def write_report(out: Path, report: dict, run: Path, reload_s: int | None = None) -> None:
     """``report.json`` and ``report.html``, into a folder; ``run`` : that of the overlays."""
-    page = _report_page(run, report)
+    page = _report_page(run, report, reload_s)
     save(out / "report.json", json_text(report))
     save(out / "report.html", page)
 
 
-def _report_page(run: Path, report: dict) -> bytes:
+def _report_page(run: Path, report: dict, reload_s: int | None = None) -> bytes:
     overlays = {name: overlay_path(run, name).read_bytes() for name in shown_overlays(report)}
-    return report_html(report, overlays).encode()
+    return report_html(report, overlays, reload_s).encode()
 
 
 def require_report(saved: SavedRun) -> None:

@@ -39,15 +39,34 @@ def run_text(result: RunResult) -> str:
 
 def detection_text(detection: DetectionResult, labelled: Sequence[LabelledImage]) -> str:
     """Faces and dots of each image, and what was left out."""
-    lines = []
+    return "\n".join([*found_lines(labelled), *_skipped(detection.skipped)])
+
+
+def found_lines(labelled: Sequence[LabelledImage]) -> Iterator[str]:
+    """Faces and dots of each image, and what was left out in it."""
     for each in labelled:
         image = each.observations
         dots = sum(isinstance(label, DotLabel) for label in image.labels)
         faces = ", ".join(sorted(image.face_ids())) or "none"
-        lines.append(f"{image.name}: faces {faces} ({len(image) - dots} circles), board {dots} dots")
-        lines += [f"  {note}" for note in each.notes]
-    lines += _skipped(detection.skipped)
-    return "\n".join(lines)
+        yield f"{image.name}: faces {faces} ({len(image) - dots} circles), board {dots} dots"
+        yield from (f"  {note}" for note in each.notes)
+
+
+def so_far_text(result: RunResult) -> str:
+    """One line on a run that goes on: its images, its worst face, its checks."""
+    target = result.target
+    sigma = {
+        face: (float(np.sqrt(np.trace(c[3:, 3:]))), float(np.degrees(np.sqrt(np.trace(c[:3, :3])))))
+        for face, c in target.face_covariance.items()
+        if face != target.reference_face
+    }
+    faces = f"{len(target.target_from_face)} of {len(result.target_design.faces)} faces"
+    if sigma:
+        worst = max(sigma, key=lambda face: sigma[face])
+        faces += f", worst is face {worst}: σ {1e3 * sigma[worst][0]:.1f} µm, {1e3 * sigma[worst][1]:.1f} mdeg"
+    mapped = sum(len(each.model.images) for each in result.solutions)
+    checks = count_verdicts([check.verdict for check in result.checks])
+    return f"{mapped} images mapped, {faces}; checks: {checks}"
 
 
 def _skipped(skipped: Sequence[Skipped]) -> Iterator[str]:

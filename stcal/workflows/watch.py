@@ -1,0 +1,177 @@
+"""A calibration that grows while photographs are taken: after each, what was found, σ so far, and what helps most."""
+
+import time
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+from stcal.design import BoardDesign, TargetDesign
+from stcal.errors import InputError, StcalError
+from stcal.io.camera import CameraModel, read_camera
+from stcal.io.design import board_of, target_of
+from stcal.io.images import ImageFile, Skipped, find_images
+from stcal.io.saving import CACHE
+from stcal.parallel import Progress
+from stcal.sfm.detect.files import detect_files
+from stcal.sfm.detect.labels import LabelledImage, label_images
+from stcal.sfm.pipeline import run
+from stcal.sfm.plan.advise import Advice, advise, known_of
+from stcal.sfm.run.options import RunOptions
+from stcal.sfm.run.result import RunResult
+from stcal.sfm.run.saved import load_run
+
+RELOAD_S = 5
+"""The report's page shows itself anew so often."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class WatchOptions:
+    """How to watch.
+
+    Parameters
+    ----------
+    interval_s : float
+        The folder is looked at so often, s; a photograph counts when it has not changed between two looks.
+    idle_s : float, optional
+        Ends when no photograph has come for so long, s; never where None.
+    views : int
+        Views to advise after each run; none where 0.
+    run : RunOptions
+        Of the runs.
+    """
+
+    interval_s: float = 1.0
+    idle_s: float | None = None
+    views: int = 1
+    run: RunOptions | None = None
+
+    def __post_init__(self):
+        if not (0 < self.interval_s < 1e6 and (self.idle_s is None or 0 < self.idle_s < 1e9) and self.views >= 0):
+            raise InputError(
+                f"watch: every {self.interval_s:g} s, idle {self.idle_s} s, {self.views} views; positive times needed"
+            )
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Update:
+    """After photographs came, or went.
+
+    ``images`` : photographs that are there; ``new`` : what was found in those that came; ``left_out`` : those of them
+    that cannot be used; ``gone`` : names of those that are no longer there; ``result`` : of the run over all of them,
+    None where it is not possible yet, for the ``reason``; ``advice`` : what to photograph next.
+    """
+
+    images: int
+    new: tuple[LabelledImage, ...]
+    left_out: tuple[Skipped, ...]
+    gone: tuple[str, ...]
+    result: RunResult | None
+    reason: str
+    advice: Advice | None
+
+
+def watch(
+    images: str | Path,
+    camera: str | Path | CameraModel,
+    out: str | Path,
+    target: str | Path | TargetDesign | None = None,
+    board: str | Path | BoardDesign | None = None,
+    options: WatchOptions | None = None,
+    progress: Progress | None = None,
+    sleep: Callable[[float], None] = time.sleep,
+) -> Iterator[Update]:
+    """Run again whenever photographs have come into a folder; detections of the others are kept.
+
+    Parameters
+    ----------
+    images : path
+        Folder with one folder of images for each group; may be empty at first.
+    camera : path or CameraModel
+    out : path
+        The run's folder: new, empty, or of an earlier run. Its page reloads itself while it is watched.
+    target, board : paths or designs
+        The reference design where None.
+    options : WatchOptions, optional
+        The defaults where None.
+    progress : callable, optional
+        Called with (stage, done, total).
+    sleep : callable, optional
+        Waits between two looks.
+
+    Yields
+    ------
+    Update
+        After each run, or try.
+
+    Raises
+    ------
+    InputError
+        There is no such folder, a file is not what it is given for, or the output folder is not a run's.
+    """
+    options = options or WatchOptions()
+    model = camera if isinstance(camera, CameraModel) else read_camera(camera)
+    designs = target_of(target), board_of(board)
+    settled = (options.run or RunOptions()).settled(designs[0])
+    images, out = Path(images), Path(out)
+    if not images.is_dir():
+        raise InputError(f"image folder {images}: not there; give the folder that photographs come into")
+    known: dict[str, tuple] = {}
+    before: dict[str, tuple] = {}
+    quiet = 0.0
+    while options.idle_s is None or quiet < options.idle_s:
+        now = _stamps(images)
+        complete = {name: stamp for name, stamp in now.items() if before.get(name) == stamp}
+        before = now
+        if not complete or complete == known:
+            sleep(options.interval_s)
+            quiet += options.interval_s
+            continue
+        gone = tuple(name for name in known if name not in now)
+        came = {name for name, stamp in complete.items() if known.get(name) != stamp}
+        known, quiet = complete, 0.0
+        result, reason, advice = None, "", None
+        try:
+            result = run(images, camera, out, target, board, settled, progress, RELOAD_S)
+            if options.views:
+                advice = advise(known_of(load_run(out)), options.views, progress)
+        except StcalError as error:
+            if not (out / CACHE).is_dir():  # the folder itself is refused
+                raise
+            reason = str(error)
+        new, left_out = _found(images, model, out, *designs, settled, came, result)
+        yield Update(len(complete), new, left_out, gone, result, reason, advice)
+
+
+def _stamps(images: Path) -> dict[str, tuple]:
+    """Size and time of each image file; none where there is none yet."""
+    found = {}
+    try:
+        files, _ = find_images(images)
+    except InputError:
+        return {}
+    for file in files:
+        try:
+            stat = file.path.stat()
+        except OSError:
+            continue  # gone meanwhile
+        found[file.name] = stat.st_size, stat.st_mtime_ns
+    return found
+
+
+def _found(images, camera, out: Path, target, board, options: RunOptions, came: set[str], result: RunResult | None):
+    """What those that came show, by the run, or by what it has kept."""
+    if result is not None:
+        labelled, skipped = result.labelled, result.detection.skipped
+    else:
+        files: list[ImageFile] = []
+        try:
+            files, other = find_images(images)
+            detection = detect_files(files, camera, target, board, options.ellipses, out / CACHE, options.workers)
+            labelled = label_images(detection, target, board, options.ellipses, out / CACHE, options.workers)
+            skipped = (*other, *detection.skipped)
+        except StcalError:  # not one is usable: the reason that the run has given
+            return (), ()
+    return (
+        tuple(each for each in labelled if each.observations.name in came),
+        tuple(each for each in skipped if each.name in came),
+    )

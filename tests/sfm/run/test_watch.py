@@ -1,0 +1,77 @@
+"""Watching a folder: a run after each change, nothing said twice, and an end where nothing comes."""
+
+import shutil
+
+import pytest
+
+from stcal.errors import InputError
+from stcal.workflows.watch import WatchOptions, watch
+
+
+def watched(data, folder, out, sleep, **options):
+    files = data / "cameras.txt", out, data / "target.toml", data / "board.toml"
+    return watch(folder, *files, WatchOptions(interval_s=0.1, idle_s=0.35, **options), sleep=sleep)
+
+
+@pytest.mark.slow
+def test_a_calibration_grows_while_photographs_come(small_dataset, tmp_path):
+    """Photographs come one by one, a group at a time; one of them in two pieces; one is taken away at the end."""
+    folder, out = tmp_path / "images", tmp_path / "run"
+    folder.mkdir()
+    coming = [path.relative_to(small_dataset / "images") for path in sorted((small_dataset / "images").glob("1[24]/*"))]
+    first, group = coming[0], [path for path in coming if path.parent.name == "12"]
+
+    def put(path, share=1.0):
+        if path != first and (folder / path).exists():
+            return
+        content = (small_dataset / "images" / path).read_bytes()
+        (folder / path.parent).mkdir(exist_ok=True)
+        (folder / path).write_bytes(content[: int(share * len(content))])
+
+    steps = iter(
+        [
+            lambda: put(first, 0.5),
+            lambda: put(first),
+            lambda: None,
+            lambda: [put(path) for path in group if path != first],
+            lambda: None,
+            lambda: [put(path) for path in coming if path != first],
+            lambda: None,
+            lambda: (folder / coming[-1]).unlink(),
+        ]
+    )
+    updates = list(watched(small_dataset, folder, out, lambda _: next(steps, lambda: None)(), views=0))
+    assert updates[0].result is None
+    assert "2 needed" in updates[0].reason
+    assert [each.observations.name for each in updates[0].new] == [first.as_posix()]
+    named = [each.observations.name for update in updates for each in update.new]
+    assert sorted(named) == [path.as_posix() for path in coming]
+    assert not any(update.left_out for update in updates)
+    assert updates[-1].gone == (coming[-1].as_posix(),)
+    assert updates[-1].result is not None
+    assert len(updates[-1].result.labelled) == len(coming) - 1
+    assert 'http-equiv="refresh"' in (out / "report.html").read_text(encoding="utf-8")
+
+
+@pytest.mark.slow
+def test_advice_comes_with_the_run(small_dataset, tmp_path):
+    (update,) = watched(small_dataset, small_dataset / "images", tmp_path / "run", lambda _: None)
+    assert len(update.advice.choices) == 1
+    assert update.images == len(update.result.labelled)
+
+
+def test_an_empty_folder_ends_and_none_is_an_error(small_dataset, tmp_path):
+    (tmp_path / "images").mkdir()
+    assert list(watched(small_dataset, tmp_path / "images", tmp_path / "run", lambda _: None)) == []
+    with pytest.raises(InputError, match="not there"):
+        next(watched(small_dataset, tmp_path / "nowhere", tmp_path / "run", lambda _: None))
+    with pytest.raises(InputError, match="positive times"):
+        WatchOptions(interval_s=0)
+
+
+def test_a_folder_that_is_no_runs_is_refused(small_dataset, tmp_path):
+    other = tmp_path / "mine"
+    other.mkdir()
+    shutil.copy(small_dataset / "target.toml", other / "notes.txt")
+    with pytest.raises(InputError, match="mine"):
+        next(watched(small_dataset, small_dataset / "images", other, lambda _: None))
