@@ -18,13 +18,15 @@ import sys
 import tempfile
 import time
 from concurrent.futures import ThreadPoolExecutor
+from dataclasses import replace
 from pathlib import Path
 
 import cv2
 import numpy as np
 
+from stcal.design import reference_board
 from stcal.io.camera import read_camera
-from stcal.io.design import load_board, load_target
+from stcal.io.design import board_toml, load_board, load_target
 from stcal.parallel import run_parallel
 
 FLAGS = cv2.IMREAD_GRAYSCALE | cv2.IMREAD_ANYDEPTH | cv2.IMREAD_IGNORE_ORIENTATION  # as stcal.io.images.decode
@@ -271,6 +273,10 @@ def measure(data: Path, stream: Path, film: Path, scratch: Path) -> dict:
         found = {name: xy for name, xy in zip(true, grids, strict=True) if xy is not None}
         rows[title] = {"seconds": seconds} | boards(found, true)
     rows["advise"] = {"seconds": timed_program(["advise", scratch / "run"], log)[0]}
+    fine = replace(reference_board(), rows=100, columns=100, pitch_mm=4.0, radius_mm=1.2, corner=None)
+    (scratch / "fine.toml").write_text(board_toml(replace(fine, corner_radius_mm=None)), encoding="utf-8")
+    seconds, _, memory = timed_program(["plan", "--board", scratch / "fine.toml"], log)
+    rows["plan, board of 100 × 100 dots"] = {"seconds": seconds, "mib": memory}
     rows["stcal-sfm --help"] = {"seconds": timed_program(["--help"], log)[0]}
     rows["stcal --version"] = {"seconds": timed_program(["--version"], log, "main")[0]}
     timed_program(["run", stream / "images", *files_of(stream), "--out", scratch / "stream"], log)
@@ -321,6 +327,7 @@ def main() -> None:
     for name, row in result["rows"].items():
         counts = f"{row['found']:8} {row['complete']:9} {row['right']:6}" if "found" in row else ""
         counts = f"{row['images'] / row['seconds']:8.1f} images a second" if "images" in row else counts
+        counts = f"{row['mib']:8.0f} MiB" if "mib" in row else counts
         print(f"{name:34} {row['seconds']:8.2f} {row['median']:7.2f} {row['ratio']:6.2f} {counts}".rstrip())
     row = result["rows"]["stcal detection"]
     cost = row["seconds"] * result["workers"] / result["images"]

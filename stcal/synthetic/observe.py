@@ -5,6 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from stcal.geometry.arrays import frozen
+from stcal.geometry.camera import Camera
 from stcal.geometry.conic import circle_image_offset
 from stcal.labels import DotLabel, Label
 from stcal.synthetic.scene import Scene
@@ -13,6 +14,8 @@ MAX_FOUND_TILT_RAD = np.radians(70)
 """Circles tilted more than this need not be found."""
 MAX_SHOWN_TILT_RAD = np.radians(89)
 RIM_POINTS = 72
+NEAR_BORDER = 3.0
+"""Radii of a circle's image seen frontally, from the image's border, beyond which no rim reaches it."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -69,9 +72,8 @@ def image_circles(scene: Scene, group: str, image: int) -> ImageCircles:
     tilt = np.arccos(np.clip(cosine, -1, 1))
     size = np.array([scene.camera.width, scene.camera.height])
     centre = scene.camera.project(xyz)
-    rim = scene.camera.project(rim_points(xyz, normal, radius))
     shown = (tilt <= MAX_SHOWN_TILT_RAD) & ((centre > -0.5) & (centre < size - 0.5)).all(1)
-    whole = ((rim > 0) & (rim < size - 1)).all((1, 2))
+    whole = _whole(scene.camera, xyz, normal, radius, centre)
     must = np.array(wanted) & (tilt <= MAX_FOUND_TILT_RAD) & whole
     return ImageCircles(
         tuple(label for label, keep in zip(labels, shown, strict=True) if keep),
@@ -82,6 +84,17 @@ def image_circles(scene: Scene, group: str, image: int) -> ImageCircles:
         centre[shown],
         must[shown],
     )
+
+
+def _whole(camera: Camera, xyz, normal, radius, centre_px: np.ndarray) -> np.ndarray:
+    """Mask of the circles whose rims lie in the image; only those near its border are looked at."""
+    size = np.array([camera.width, camera.height])
+    reach = NEAR_BORDER * camera.focal.max() * radius / np.maximum(xyz[:, 2], radius)
+    whole = ((centre_px > reach[:, None]) & (centre_px < size - 1 - reach[:, None])).all(1)
+    near = np.flatnonzero(~whole)
+    rim = camera.project(rim_points(xyz[near], normal[near], radius[near]))
+    whole[near] = ((rim > 0) & (rim < size - 1)).all((1, 2))
+    return whole
 
 
 def rim_points(xyz: np.ndarray, normal: np.ndarray, radius: np.ndarray, count: int = RIM_POINTS) -> np.ndarray:

@@ -3,6 +3,7 @@
 from dataclasses import dataclass
 
 import numpy as np
+from scipy.spatial import ConvexHull
 from scipy.spatial.transform import Rotation
 
 from stcal.errors import DegenerateError
@@ -164,7 +165,8 @@ def _look_along(forward: np.ndarray, up: np.ndarray, roll: np.ndarray) -> np.nda
 
 def _board_seen(shape, target_from_board, views: _Views, camera: Camera) -> np.ndarray:
     outline = target_from_board @ shape.outline_board
-    dots = target_from_board @ shape.dots_board
+    # The tangent of the tilt is the distance from the foot of the camera, and that is largest at a corner of the dots.
+    dots = target_from_board @ shape.dots_board[ConvexHull(shape.dots_board[:, :2]).vertices]
     facing = -target_from_board.rotation[:, 2]
     seen = (views.tilt_rad(dots, np.broadcast_to(facing, dots.shape)) <= MAX_BOARD_TILT_RAD).all(1)
     body, plate = views.to_camera(shape.body), views.to_camera(outline)

@@ -130,16 +130,26 @@ def normal_equations(blocks: Sequence[Block], shared: Shared, setting: Setting):
         shape = np.arange(places.shape.start, places.shape.stop)
         normal[shape, shape] += 1 / setting.shape_sigma_mm() ** 2
         right[shape] -= shared.shape_mm.ravel() / setting.shape_sigma_mm() ** 2
-    normal[places.intrinsics, places.intrinsics] += setting.prior
-    right[places.intrinsics] -= setting.prior @ _away(shared, setting)
+    add_knowledge(normal, right, shared, setting, places.intrinsics)
+    return normal, right, groups
+
+
+def add_knowledge(
+    normal: np.ndarray, right: np.ndarray | None, shared: Shared, setting: Setting, intrinsics: slice
+) -> None:
+    """Add what is known besides photographs and board: the intrinsics' prior, the faces' flatness; ``right`` : None
+    where nothing is moved."""
+    normal[intrinsics, intrinsics] += setting.prior
+    if right is not None:
+        right[intrinsics] -= setting.prior @ _away(shared, setting)
     for members, across, normal_model in planes(shared, setting):
         jacobian = across[:, :, None] * normal_model  # distances from the plane by the circles
         flat = jacobian.reshape(len(members), -1)
         place = (3 * members[:, None] + np.arange(3)).ravel()
-        distance = across @ (shared.xyz_model[members] @ normal_model)
         normal[np.ix_(place, place)] += flat.T @ flat / setting.flatness_mm**2
-        right[place] -= flat.T @ distance / setting.flatness_mm**2
-    return normal, right, groups
+        if right is not None:
+            distance = across @ (shared.xyz_model[members] @ normal_model)
+            right[place] -= flat.T @ distance / setting.flatness_mm**2
 
 
 def planes(shared: Shared, setting: Setting):

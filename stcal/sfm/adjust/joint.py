@@ -21,6 +21,7 @@ from stcal.geometry.rigid import Rigid
 from stcal.geometry.robust import HUBER, robust_sigma
 from stcal.io.camera import CameraPrior, intrinsic_basis
 from stcal.labels import CircleLabel, DotLabel, dot_cells
+from stcal.sfm.adjust import dots_first
 from stcal.sfm.adjust.blocks import Block, Shared, normalised, robust_weights, rows_of_view, without_cameras
 from stcal.sfm.adjust.equations import (
     FREE_DIRECTIONS,
@@ -136,7 +137,11 @@ def covariance_of(
     what :func:`photographs_of` has said of groups.
     """
     blocks, shared, setting = _start(models, board, camera, flatness_mm, prior, common, photographs)
-    return _result(blocks, shared, setting, 0.0, 1.0)
+    if photographs or not dots_first.is_cheaper(blocks):
+        return _result(blocks, shared, setting, 0.0, 1.0)
+    normal = dots_first.circle_equations(blocks, shared, setting)
+    c = 3 * len(setting.labels)
+    return _result(blocks, shared, setting, 0.0, 1.0, (normal, slice(0, c), slice(c, len(normal))))
 
 
 def basis_of(prior: CameraPrior | None) -> np.ndarray:
@@ -337,13 +342,21 @@ def _largest_move(old: Block, shared: Shared, new: Block, new_shared: Shared) ->
 
 
 def _result(
-    blocks: list[Block], shared: Shared, setting: Setting, move_px: float, sigma0: float | None = None
+    blocks: list[Block],
+    shared: Shared,
+    setting: Setting,
+    move_px: float,
+    sigma0: float | None = None,
+    equations: tuple[np.ndarray, slice, slice] | None = None,
 ) -> JointResult:
-    """``move_px`` : of the last step; ``sigma0`` : estimated from the residuals where None."""
-    normal = normal_equations(blocks, shared, setting)[0]
+    """``move_px`` : of the last step; ``sigma0`` : estimated from the residuals where None; ``equations`` : normal
+    matrix over circles, intrinsics and perhaps more, and the places of those two, where it is known."""
+    if equations is None:
+        places = setting.places(shared)
+        equations = normal_equations(blocks, shared, setting)[0], places.circles, places.intrinsics
+    normal, circles, intrinsics = equations
     inverse = constrained_inverse(normal, free_directions(len(normal), shared))
-    places = setting.places(shared)
-    c = places.circles.stop
+    c = circles.stop
     flat = sum(len(members) - 3 for members, _, _ in planes(shared, setting))
     observations = sum(2 * len(b.model.image_index) + 3 * len(b.dots) for b in blocks) + flat
     unknowns = c + sum(6 * len(b.model.images) + 3 * len(b.dots) + 6 for b in blocks)
@@ -361,7 +374,7 @@ def _result(
         {b.model.group: b.board_residual() for b in blocks},
         setting.common,
         shared.camera,
-        covariance[places.intrinsics, places.intrinsics],
+        covariance[intrinsics, intrinsics],
         {b.model.group: robust_weights(b.model, shared.camera, setting.huber) for b in blocks},
         redundancy,
         move_px,

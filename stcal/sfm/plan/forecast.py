@@ -14,7 +14,7 @@ from stcal.io.camera import CameraPrior
 from stcal.labels import CircleLabel, Label
 from stcal.sfm.adjust.chain import CalibratedTarget
 from stcal.sfm.adjust.faces import FrameKind
-from stcal.sfm.adjust.joint import covariance_of, extensible, photographs_of
+from stcal.sfm.adjust.joint import covariance_of, extensible
 from stcal.sfm.adjust.uncertainty import Derivatives, derivatives, scale_sigma
 from stcal.sfm.data.model import MetricModel
 from stcal.synthetic.observe import rim_points
@@ -30,6 +30,8 @@ PRACTICE = 1.3
 estimated, quantisation, neighbouring edges."""
 ONE_PLATE = 0.99
 """Share of the board's variance that all groups have in common where one plate is in all of them."""
+AT_ONCE = 1000
+"""Rims at a time: what a core's cache holds."""
 ENOUGH = 10_000
 """Observations from which the law of their noise is read."""
 OFF = 1e-2
@@ -102,16 +104,22 @@ class _Rims:
         normal = np.zeros((len(model.labels), 3))
         for members in model.points_by_face().values():
             normal[members] = fit_plane(model.xyz_model[members]).normal
-        rotation = np.stack([pose.rotation for pose in model.camera_from_model])[model.image_index]
-        normal_camera = np.einsum("nij,nj->ni", rotation, normal[model.point_index])
-        radius = np.array([radius_mm[label] for label in model.labels])[model.point_index]
-        rim = camera.project(rim_points(model.xyz_camera(), normal_camera, radius))
-        side = np.roll(rim, -1, axis=1) - rim
-        across = np.stack([side[..., 1], -side[..., 0]], axis=-1)
-        length = np.linalg.norm(side, axis=2, keepdims=True)
-        spread = rim - rim.mean(1, keepdims=True)
-        moment = np.einsum("nki,nkj->nij", spread, spread) / rim.shape[1]
-        return cls(np.einsum("nki,nkj->nij", across / length, across), np.sqrt(2 * np.linalg.eigvalsh(moment)[:, 0]))
+        radius = np.array([radius_mm[label] for label in model.labels])
+        rotation = np.stack([pose.rotation for pose in model.camera_from_model])
+        xyz = model.xyz_camera()
+        parts = []
+        for start in range(0, len(xyz), AT_ONCE):
+            point, image = (index[start : start + AT_ONCE] for index in (model.point_index, model.image_index))
+            normal_camera = (rotation[image] @ normal[point][..., None])[..., 0]
+            rim = camera.project(rim_points(xyz[start : start + AT_ONCE], normal_camera, radius[point]))
+            side = np.roll(rim, -1, axis=1) - rim
+            across = np.stack([side[..., 1], -side[..., 0]], axis=-1)
+            length = np.linalg.norm(side, axis=2, keepdims=True)
+            spread = rim - rim.mean(1, keepdims=True)
+            moment = np.swapaxes(spread, 1, 2) @ spread / rim.shape[1]
+            narrow = np.sqrt(2 * np.linalg.eigvalsh(moment)[:, 0])
+            parts.append((np.swapaxes(across / length, 1, 2) @ across, narrow))
+        return cls(*(np.concatenate(each) for each in zip(*parts, strict=True)))
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -225,14 +233,16 @@ def without_sources(
 ) -> dict[str, Forecast]:
     """The forecast with each source of error in turn switched off: images, board, intrinsics where they are refined."""
     if photographs is None:
-        photographs = photographs_of(models, setup.board, setup.camera, setup.prior)
-    quiet = {group: normal / OFF**2 for group, normal in photographs.items()}
+        fixed, quiet = None, None
+        quieter = [replace(model, covariance_px2=OFF**2 * model.covariance_px2) for model in models]
+    else:
+        fixed = {m.group: photographs[m.group][: 3 * len(m.labels), : 3 * len(m.labels)] for m in models}
+        quiet, quieter = {group: normal / OFF**2 for group, normal in photographs.items()}, models
     found = {
-        "image noise": forecast(models, setup, known, quiet),
+        "image noise": forecast(quieter, setup, known, quiet),
         "board": forecast(models, setup.better_board(OFF), known, photographs),
     }
     if setup.prior is not None:
-        fixed = {m.group: photographs[m.group][: 3 * len(m.labels), : 3 * len(m.labels)] for m in models}
         found["intrinsics"] = forecast(models, replace(setup, prior=None), known, fixed)
     return found
 

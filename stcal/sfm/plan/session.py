@@ -21,9 +21,10 @@ SPREADS_DEG = (80.0, 70.0, 60.0, 50.0, 40.0)
 """Tried from the largest down: the tilts that a view may have keep the views closer together than that."""
 NEARER = 0.8
 MIN_IMAGES = 2
-MAX_DOTS = 500
-"""Of the board: time grows with the cube of their number, memory with its square; so many take half a minute and
-1 GB."""
+MAX_DOTS = 10_000
+"""Of the board …"""
+FINE_DOTS, MAX_CENTRES = 500, 450_000
+"""… and of boards of more than so many the dots in all images, which take about a minute and 0.8 GB."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -141,7 +142,7 @@ def plan(
     Raises
     ------
     InputError
-        A face without nominal pose, an unknown face in a group, or a board of more than ``MAX_DOTS`` dots.
+        A face without nominal pose, an unknown face in a group, or more dots than ``MAX_DOTS`` and ``MAX_CENTRES``.
     DegenerateError
         A group cannot be photographed like that.
     """
@@ -151,6 +152,11 @@ def plan(
             "fewer dots over the same area, the σ of the faces hardly change"
         )
     scene = _scene(options, target, board, nominal)
+    if dots > FINE_DOTS and (centres := dots * options.images * len(scene.groups)) > MAX_CENTRES:
+        raise InputError(
+            f"plan: {dots} dots in {options.images * len(scene.groups)} images are {centres} centres, up to "
+            f"{MAX_CENTRES} possible; plan fewer images, or fewer dots over the same area"
+        )
     setup, models = _setup(scene, options, board), _models(scene, options)
     whole = forecast(models, setup)
     half_board = forecast(models, setup.better_board(0.5), whole.derivatives)

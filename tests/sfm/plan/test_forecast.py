@@ -14,6 +14,7 @@ from stcal.design import reference_board, reference_target
 from stcal.errors import InputError
 from stcal.geometry.rigid import Rigid
 from stcal.io.camera import CameraModel, CameraPrior
+from stcal.sfm.adjust import dots_first
 from stcal.sfm.adjust.chain import CalibratedTarget
 from stcal.sfm.adjust.joint import adjust_jointly, covariance_of
 from stcal.sfm.adjust.uncertainty import derivatives
@@ -471,7 +472,44 @@ def test_plan_needs_the_size_of_the_camera():
             PlanOptions(camera=camera)
 
 
-def test_a_board_of_too_many_dots_is_refused_at_once():
-    board = replace(reference_board(), rows=100, columns=100)
-    with pytest.raises(InputError, match=r"board of 100×100 = 10000 dots, up to 500 possible; plan with fewer dots"):
-        make_plan(PlanOptions(), reference_target(), board)
+@pytest.mark.parametrize("common", [0.0, 0.99])
+@pytest.mark.parametrize("refined", [False, True])
+def test_dots_reduced_first_are_the_same_as_cameras_first(exact, monkeypatch, common, refined):
+    """To rounding: the two ways differ in the order of elimination alone."""
+    prior = CameraPrior("OPENCV", np.diag([1, 1, 1, 1, 1e-6, 1e-6, 1e-8, 1e-8])) if refined else None
+    models = true_models(exact, observe(exact, 0.02, np.random.default_rng(0)))
+    board = replace(exact.board, sigma_mm=0.02)
+    found = []
+    for first in (True, False):
+        monkeypatch.setattr(dots_first, "is_cheaper", lambda _, first=first: first)
+        found.append(covariance_of(models, board, exact.camera, 0.02, prior, common))
+    dots, cameras = found
+    np.testing.assert_allclose(
+        dots.covariance_mm2, cameras.covariance_mm2, rtol=0, atol=1e-8 * cameras.covariance_mm2.max()
+    )
+    np.testing.assert_allclose(dots.camera_covariance, cameras.camera_covariance, rtol=1e-6, atol=1e-6 * refined)
+    assert (dots.sigma0, dots.redundancy) == (cameras.sigma0, cameras.redundancy)
+
+
+def test_a_fine_board_is_planned():
+    """2500 dots in 8 images; with fewer dots on the same area the σ rise by no more than the root of their number."""
+    fine = replace(
+        reference_board(), rows=50, columns=50, pitch_mm=4.0, radius_mm=1.2, corner=None, corner_radius_mm=None
+    )
+    coarse = replace(fine, rows=10, columns=10, pitch_mm=20.0)
+    options = PlanOptions(images=4, width=2592, groups=(("1", "2"), ("1", "4")))
+    sigma = [
+        make_plan(options, reference_target(), board, nominal_target_from_face()).forecast.worst()[1]
+        for board in (fine, coarse)
+    ]
+    assert sigma[0] < sigma[1] < 5 * sigma[0]
+
+
+@pytest.mark.parametrize(
+    ("rows", "images", "said"), [(101, 10, "10201 dots, up to 10000"), (100, 100, "4000000 centres")]
+)
+def test_a_board_of_too_many_dots_is_refused_at_once(rows, images, said):
+    board = replace(reference_board(), rows=rows, columns=rows if rows > 100 else 100, pitch_mm=4.0, radius_mm=1.2)
+    board = replace(board, corner=None, corner_radius_mm=None)
+    with pytest.raises(InputError, match=said):
+        make_plan(PlanOptions(images=images), reference_target(), board, nominal_target_from_face())
