@@ -83,6 +83,7 @@ def measure(
     from stcal.io.design import load_board, target_of
     from stcal.io.table import read_table
     from stcal.sfm.measure import images as work
+    from stcal.sfm.measure import output
     from stcal.sfm.measure.pose import PoseOptions
     from stcal.sfm.measure.target import read_target
 
@@ -99,12 +100,12 @@ def measure(
         result = work.measure(
             images, read_camera(camera), known, design, load_board(board) if board else None, options, progress
         )
-    text, apart = work.poses_csv(result, table)
-    say(work.measure_text(result))
+    text, apart = output.poses_csv(result, table)
+    say(output.measure_text(result))
     print_each("not joined", apart)
     write(out, text, "poses")
     if json_file:
-        write(json_file, work.poses_file(result), "as JSON")
+        write(json_file, output.poses_file(result), "as JSON")
     if report:
         from stcal.sfm.measure.report import measure_page
 

@@ -16,7 +16,8 @@ from stcal.report.figure import (
 )
 from stcal.report.page import render
 from stcal.report.text import number
-from stcal.sfm.measure.images import MeasuredImage, MeasureResult, summary
+from stcal.sfm.measure.images import MeasuredImage, MeasureResult
+from stcal.sfm.measure.output import summary
 from stcal.sfm.measure.pose import fit_verdict
 
 COLOUR_OF = {"certain": COLOURS[0], "resolved": COLOURS[2], "ambiguous": COLOURS[1]}

@@ -181,8 +181,9 @@ class Tracker:
         if isinstance(pose, StcalError):
             return None
         again = self._completed(image, camera, seen, pose)
-        if again is not seen:
-            seen, pose = again, self._pose(again.observations, camera)
+        if again.observations is not seen.observations:
+            pose = self._pose(again.observations, camera)
+        seen = again
         if isinstance(pose, StcalError) or fit_verdict(pose) == "failed":
             return None
         return seen, pose

@@ -21,7 +21,8 @@ from stcal.io.table import read_table
 from stcal.sfm import RunOptions, run
 from stcal.sfm.data.observations import ImageObservations
 from stcal.sfm.data.projection import project_circles
-from stcal.sfm.measure.images import MeasureOptions, measure, measure_labelled, poses_file
+from stcal.sfm.measure.images import MeasureOptions, measure, measure_labelled
+from stcal.sfm.measure.output import poses_file
 from stcal.sfm.measure.pose import NO_FACE, PoseOptions, pose_from_circles, resolved
 from stcal.sfm.measure.report import measure_page
 from stcal.sfm.measure.target import TargetCircles, read_target
