@@ -12,6 +12,7 @@ from stcal.errors import InputError
 from stcal.geometry.camera import Camera
 from stcal.io.covariance import Rows, require_covariance
 from stcal.io.files import SETTINGS_BYTES, read_bytes
+from stcal.io.plain_yaml import load_yaml
 from stcal.io.saving import save
 
 COLMAP_PIXEL_ORIGIN = 0.5
@@ -345,20 +346,8 @@ def _from_industrial(values: dict, path: Path) -> CameraModel:
     return _model(flat, "OPENCV", None, None, path)
 
 
-class _OpencvLoader(yaml.SafeLoader):
-    """YAML with OpenCV's matrix tag."""
-
-
-def _matrix(loader: yaml.SafeLoader, node: yaml.MappingNode) -> dict:
-    return loader.construct_mapping(node, deep=True)
-
-
-_OpencvLoader.add_constructor("tag:yaml.org,2002:opencv-matrix", _matrix)
-
-
 def _yaml_values(text: str) -> dict:
-    # cv2.FileStorage heads its files with "%YAML:1.0", which is not a YAML directive.
-    values = yaml.load(re.sub(r"\A\s*%YAML:?\s*[\d.]+\s*\n", "", text), _OpencvLoader)
+    values = load_yaml(text)
     if not isinstance(values, dict):
         raise ValueError("no keys")
     return {k: v["data"] if isinstance(v, dict) and "data" in v else v for k, v in values.items()}

@@ -58,6 +58,12 @@ def yaml_text(k="[1000, 0, 500, 0, 1100, 400, 0, 0, 1]", d="[]", more="") -> str
     return f"camera_matrix: {k}\ndistortion_coefficients: {d}\n{more}"
 
 
+BOMB = "a: &a [x,x,x,x,x,x,x,x,x]\n" + "".join(
+    f"{b}: &{b} [{','.join([f'*{a}'] * 9)}]\n" for a, b in zip("abcdefgh", "bcdefghi", strict=True)
+)
+"""Values of 400 million words in ten lines."""
+
+
 def padded(distortion) -> list[float]:
     return [*distortion, *[0.0] * (8 - len(distortion))]
 
@@ -269,6 +275,8 @@ WRONG = {
     "YAML: matrix tag on a number": ("camera_matrix: !!opencv-matrix 5", "expected a mapping node"),
     "YAML: a list as key": ("? [a, b]\n: 1\n", "unhashable key"),
     "YAML: nested too deep": ("[" * 5000, "neither COLMAP's"),
+    "YAML: an alias": (yaml_text("&m [9, 0, 9, 0, 9, 9, 0, 0, 1]") + "\nother: *m", r"alias \*m: write the values"),
+    "YAML: an alias bomb": (BOMB + yaml_text(more="distortion_model: *i\n"), r"alias \*a: write the values"),
     "YAML: contains itself": ("camera_matrix: &a [*a]", "neither COLMAP's"),
     "YAML: no matrix": ("image_width: 640\n", "no camera_matrix; write it with"),
     "YAML: matrix without data": ("camera_matrix: {rows: 3, cols: 3}", "neither COLMAP's"),

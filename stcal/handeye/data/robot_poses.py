@@ -11,6 +11,7 @@ from stcal.errors import InputError
 from stcal.geometry.rigid import UNIT_WITHIN, Poses
 from stcal.handeye.data.pairs import SIDES, read_side
 from stcal.io.files import SETTINGS_BYTES, read_bytes
+from stcal.io.plain_yaml import load_yaml
 from stcal.io.quaternions import Order
 from stcal.io.table import LENGTHS, read_table
 
@@ -129,7 +130,7 @@ def _from_yaml(files: list[tuple[str, Path]], where: str) -> RobotPoses:
 
 def _yaml(path: Path, where: str):
     try:
-        return yaml.safe_load(read_bytes(path, SETTINGS_BYTES).decode("utf-8"))
+        return load_yaml(read_bytes(path, SETTINGS_BYTES).decode("utf-8"))
     except OSError as error:
         raise InputError(f"{where}: {error.strerror or error}; give a readable file") from error
     except (yaml.YAMLError, ValueError, RecursionError) as error:
