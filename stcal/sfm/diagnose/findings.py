@@ -4,6 +4,7 @@ import math
 from collections.abc import Iterable
 from dataclasses import dataclass
 from itertools import groupby
+from numbers import Real
 
 from stcal.labels import BOARD, DotLabel, parse_label, parse_labels
 
@@ -54,6 +55,11 @@ class Finding:
     ``gate`` : name of the threshold; ``value``, ``limit``, ``unit`` : what was measured there and what is allowed or
     needed, None where there is no number; ``remedy`` : what to do with the scene; ``options`` : each lets it in, as
     tried on the image, the gentlest first.
+
+    Raises
+    ------
+    TypeError
+        What a damaged report gave is none of that.
     """
 
     image: str
@@ -64,6 +70,12 @@ class Finding:
     unit: str
     remedy: str
     options: tuple[str, ...] = ()
+
+    def __post_init__(self):
+        words = (self.image, self.gate, self.unit, self.remedy, *self.labels)
+        known = [value for value in (self.value, self.limit) if value is not None]
+        if not (all(isinstance(each, str) for each in words) and all(isinstance(v, Real | str) for v in known)):
+            raise TypeError(f"{self.gate}: value {self.value!r}, limit {self.limit!r}")
 
 
 @dataclass(frozen=True, slots=True)
@@ -194,8 +206,9 @@ def _range(values: list, digits: int) -> str:
     known = [value for value in values if value is not None]
     if not known:
         return ""
-    if isinstance(known[0], str):
-        return known[0]
+    texts = [value for value in known if isinstance(value, str)]
+    if texts:
+        return texts[0]
     low, high = (f"{value:.{digits}g}" for value in (min(known), max(known)))
     return low if low == high else f"{low} to {high}"
 

@@ -388,6 +388,15 @@ def test_a_report_of_another_version_is_refused(small_run):
         diagnose(saved, workers=1)
 
 
+@pytest.mark.parametrize(("key", "wrong"), [("limit", []), ("value", {}), ("gate", 7), ("unit", None), ("label", 1.5)])
+def test_a_damaged_report_is_refused(small_run, key, wrong):
+    saved = load_run(small_run)
+    good = {"image": FIRST, "label": "2:7", "gate": "rim", "value": 0.5, "limit": 0.8, "unit": "px"}
+    saved.report["left_out"]["circles"] = [good, good | {key: wrong}]
+    with pytest.raises(InputError, match="of another version"):
+        diagnose(saved, workers=1)
+
+
 def test_the_table():
     assert table(Diagnosis(4, 4, 4, 90, ())).startswith("nothing was left out: 4 of 4 images mapped, 90 circles")
     findings = in_order(
