@@ -24,6 +24,8 @@ TOP_GROUP = "."
 
 THUMBNAIL_PX = 1400
 THUMBNAIL_QUALITY = 80
+MOST_JPEG_SIDE = 65_000
+"""px; a JPEG holds 65 535."""
 
 _JPEG_MARKER = re.compile(rb"\xff[\x01-\xcf\xd8-\xfe]")
 """A marker other than a restart, which stands inside a scan."""
@@ -177,13 +179,22 @@ def grey_fine(image: np.ndarray) -> np.ndarray:
     return image if image.dtype == np.uint8 else image * np.float32(255.0 / _bright_end(image))
 
 
+def shrunk(image: np.ndarray, scale: float) -> np.ndarray:
+    """The image at a scale of at most 1, at least one pixel wide and high."""
+    height, width = image.shape[:2]
+    if min(height, width) * scale <= 0.5:  # rounded, there would be no pixel
+        size = max(1, round(width * scale)), max(1, round(height * scale))
+        return cv2.resize(image, size, interpolation=cv2.INTER_AREA)
+    return cv2.resize(image, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA)
+
+
 def thumbnail(grey: np.ndarray, width_px: int = THUMBNAIL_PX) -> tuple[np.ndarray, float]:
     """A small JPEG (bytes as a uint8 array) of an 8-bit grey image, and its size over the image's."""
-    width = grey.shape[1]
-    scale = min(1.0, width_px / grey.shape[1])
+    height, width = grey.shape
+    scale = min(1.0, width_px / width, MOST_JPEG_SIDE / height)
     while scale < 0.5:  # halving is cheap, and takes most of the pixels away
-        grey, scale = cv2.resize(grey, None, fx=0.5, fy=0.5, interpolation=cv2.INTER_AREA), 2 * scale
-    small = cv2.resize(grey, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA)
+        grey, scale = shrunk(grey, 0.5), 2 * scale
+    small = shrunk(grey, scale)
     _, jpeg = cv2.imencode(".jpg", small, [cv2.IMWRITE_JPEG_QUALITY, THUMBNAIL_QUALITY])
     return jpeg.ravel(), small.shape[1] / width
 

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from stcal.errors import InputError
-from stcal.io.images import TOP_GROUP, decode, find_images, name_fault, percentiles
+from stcal.io.images import TOP_GROUP, decode, find_images, name_fault, percentiles, thumbnail
 from stcal.io.saving import RUN_MARKER
 
 
@@ -128,3 +128,11 @@ def test_a_damaged_image_is_told_from_whole_ones_in_other_threads():
 def test_names_stay_below_the_folder(name, fault):
     found = name_fault(name)
     assert found is None if fault is None else fault in found
+
+
+@pytest.mark.parametrize("shape", [(1, 9000), (9000, 1), (1, 1), (2, 5000), (70_000, 1), (1, 70_000)])
+def test_a_picture_of_one_row_or_column_has_a_thumbnail(shape):
+    jpeg, scale = thumbnail(np.full(shape, 100, np.uint8))
+    small = cv2.imdecode(jpeg, cv2.IMREAD_GRAYSCALE)
+    assert small.min() > 90
+    assert 0 < scale <= 1

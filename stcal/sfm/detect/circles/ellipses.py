@@ -10,7 +10,7 @@ from scipy.spatial import KDTree
 from stcal.design import Polarity
 from stcal.errors import InputError
 from stcal.geometry.arrays import frozen
-from stcal.io.images import percentiles
+from stcal.io.images import percentiles, shrunk
 
 WINDOWS_PX = (41, 193)
 """Sides of the windows whose mean is the threshold, at every level of the pyramid."""
@@ -202,7 +202,7 @@ def levels(image: np.ndarray, options: EllipseOptions) -> Iterator[Level]:
     """The pyramid, finest level first."""
     scale, minimum = 1.0, diameter_limits_px(image.size, options)[0]
     if image.size > HALF_SCALE_FROM_PX and minimum >= MIN_DIAMETER_AT_HALF_SCALE_PX:
-        image, scale = cv2.resize(image, None, fx=0.5, fy=0.5, interpolation=cv2.INTER_AREA), 2.0
+        image, scale = shrunk(image, 0.5), 2.0
     elif image.size < DOUBLE_SCALE_BELOW_PX:
         image, scale = cv2.resize(image, None, fx=2, fy=2, interpolation=cv2.INTER_CUBIC), 0.5
     first = True
@@ -214,7 +214,7 @@ def levels(image: np.ndarray, options: EllipseOptions) -> Iterator[Level]:
         if options.max_diameter_px / scale <= WINDOWS_PX[-1] / WINDOW_OVER_DIAMETER or min(image.shape) < 16:
             return
         scale, first = 2 * scale, False
-        image = cv2.resize(image, None, fx=0.5, fy=0.5, interpolation=cv2.INTER_AREA)
+        image = shrunk(image, 0.5)
 
 
 def contrast_of(image: np.ndarray, polarity: Polarity, centre: np.ndarray, shape: np.ndarray) -> np.ndarray:
