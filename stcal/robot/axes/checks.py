@@ -30,7 +30,8 @@ def _shape(z: np.ndarray, origin: np.ndarray, sliding: np.ndarray) -> tuple[np.n
             values.append((origin[k] - origin[i]) @ np.cross(z[i], z[k]) / size)
             mirrored.append(-1)
     for three in combinations(range(len(z)), 3):
-        values.append(np.linalg.det(z[list(three)]))
+        a, b, c = z[list(three)]
+        values.append(a @ np.cross(b, c))
         mirrored.append(-1 if sliding[list(three)].sum() % 2 else 1)
     return np.array(values), np.array(mirrored)
 

@@ -10,6 +10,7 @@ from typer.testing import CliRunner
 from stcal.cli.robot import app
 from stcal.errors import DegenerateError, InputError
 from stcal.geometry.rigid import Rigid
+from stcal.robot.axes.checks import _shape
 from stcal.robot.axes.model import fit_axes, pairs_of, robot_from_sweeps
 from stcal.robot.axes.sweeps import find_arcs
 from stcal.robot.kinematics.example import mh80
@@ -350,3 +351,11 @@ def test_command(fanuc, tmp_path):
     page = names["html"].read_text()
     assert "D-H value of joints 2–3 refused" in page
     assert page.count("data:image/svg+xml") == 1
+
+
+def test_axes_that_are_parallel_but_for_the_smallest_number_are_compared_in_silence():
+    """A determinant by elimination divides by what is left of a row."""
+    z = np.array([[0, 0, 1], [0, -1.7e-310, 1], [5e-324, 0, 1]])
+    values, mirrored = _shape(z, np.zeros((3, 3)), np.zeros(3, bool))
+    assert np.isfinite(values).all()
+    assert len(values) == len(mirrored) == 7
