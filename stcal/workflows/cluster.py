@@ -48,7 +48,7 @@ def dask_cluster(address: str, send_images: bool = False) -> Iterator[None]:
     logging.getLogger("distributed").setLevel(logging.CRITICAL)  # what goes wrong is told by what it costs
     try:
         client = Client(address, timeout=ANSWER_S, set_as_default=False)
-    except (OSError, ValueError, TypeError) as error:
+    except (OSError, ValueError, TypeError, AssertionError) as error:  # the last of addresses that are none
         raise InputError(
             f"--scheduler {address}: no scheduler answers within {ANSWER_S} s; start one with `dask scheduler`, and "
             "give the address that it prints"
