@@ -6,6 +6,7 @@ of a batch system (each its own program; the cache by content takes what they le
 
 import contextlib
 import logging
+import re
 from collections.abc import Callable, Iterator
 from concurrent.futures import BrokenExecutor, Executor, Future
 from importlib import metadata
@@ -21,6 +22,7 @@ AT_ONCE = 4
 """Images handed over for each thread of the workers: the next are there when one is done."""
 TRIES = 3
 """Times that a job is begun again whose worker was lost."""
+ADDRESS = re.compile(r"((tcp|tls|ws|wss|ucx)://)?[\w.\[\]:-]+:\d+")
 SAME = ("stcal", "numpy", "scipy", "opencv-python-headless")
 """Packages on which a result depends, bit by bit."""
 
@@ -45,10 +47,12 @@ def dask_cluster(address: str, send_images: bool = False) -> Iterator[None]:
         from distributed import Client
     except ImportError as error:
         raise InputError("--scheduler: needs Dask; install stcal[dask]") from error
+    if not ADDRESS.fullmatch(address):  # Dask waits for ever for some of these
+        raise InputError(f"--scheduler {address}: no address of a scheduler; give one like tcp://host:8786")
     logging.getLogger("distributed").setLevel(logging.CRITICAL)  # what goes wrong is told by what it costs
     try:
         client = Client(address, timeout=ANSWER_S, set_as_default=False)
-    except (OSError, ValueError, TypeError, AssertionError) as error:  # the last of addresses that are none
+    except (OSError, ValueError, TypeError) as error:
         raise InputError(
             f"--scheduler {address}: no scheduler answers within {ANSWER_S} s; start one with `dask scheduler`, and "
             "give the address that it prints"

@@ -78,10 +78,15 @@ def test_workers_that_are_lost_for_good_are_one_line(small_dataset, tmp_path):
         run_into(tmp_path / "run", small_dataset)
 
 
-@pytest.mark.parametrize("address", ["tcp://127.0.0.1:9", "nowhere", "http://x"])
-def test_no_scheduler_is_one_line(monkeypatch, address):
+def test_no_scheduler_is_one_line(monkeypatch):
     monkeypatch.setattr(cluster, "ANSWER_S", 1)
-    with pytest.raises(InputError, match="no scheduler answers"), cluster.dask_cluster(address):
+    with pytest.raises(InputError, match="no scheduler answers"), cluster.dask_cluster("tcp://127.0.0.1:9"):
+        pass
+
+
+@pytest.mark.parametrize("address", ["nowhere", "http://x", "http://x:80", "", "tcp://x", "tcp://x:y", "\x1b[31m:1"])
+def test_what_is_no_address_is_one_line(address):
+    with pytest.raises(InputError, match="no address of a scheduler"), cluster.dask_cluster(address):
         pass
 
 
