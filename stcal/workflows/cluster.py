@@ -4,6 +4,7 @@ Considered too: Ray and MPI (a cluster of their own to keep, and no worker may c
 of a batch system (each its own program; the cache by content takes what they leave in a shared folder).
 """
 
+import asyncio
 import contextlib
 import logging
 import re
@@ -20,9 +21,7 @@ ANSWER_S = 10
 """How long a scheduler, and the first worker, may take to answer."""
 AT_ONCE = 4
 """Images handed over for each thread of the workers: the next are there when one is done."""
-TRIES = 3
-"""Times that a job is begun again whose worker was lost."""
-ADDRESS = re.compile(r"((tcp|tls|ws|wss|ucx)://)?[\w.\[\]:-]+:\d+")
+ADDRESS = re.compile(r"((tcp|tls)://)?([\w.-]+|\[[\da-fA-F:]+\]):\d{1,5}")
 SAME = ("stcal", "numpy", "scipy", "opencv-python-headless")
 """Packages on which a result depends, bit by bit."""
 
@@ -47,17 +46,8 @@ def dask_cluster(address: str, send_images: bool = False) -> Iterator[None]:
         from distributed import Client
     except ImportError as error:
         raise InputError("--scheduler: needs Dask; install stcal[dask]") from error
-    if not ADDRESS.fullmatch(address):  # Dask waits for ever for some of these
-        raise InputError(f"--scheduler {address}: no address of a scheduler; give one like tcp://host:8786")
-    logging.getLogger("distributed").setLevel(logging.CRITICAL)  # what goes wrong is told by what it costs
-    try:
-        client = Client(address, timeout=ANSWER_S, set_as_default=False)
-    except (OSError, ValueError, TypeError) as error:
-        raise InputError(
-            f"--scheduler {address}: no scheduler answers within {ANSWER_S} s; start one with `dask scheduler`, and "
-            "give the address that it prints"
-        ) from error
-    with client:
+    _require_address(address)
+    with _silent("distributed"), Client(address, timeout=ANSWER_S, set_as_default=False) as client:
         try:
             client.wait_for_workers(1, timeout=ANSWER_S)
         except OSError as error:
@@ -68,6 +58,41 @@ def dask_cluster(address: str, send_images: bool = False) -> Iterator[None]:
         threads = sum(dict[str, int](client.nthreads()).values())  # type: ignore[arg-type]
         with spread(_Workers(client), AT_ONCE * threads, send_images):
             yield
+
+
+@contextlib.contextmanager
+def _silent(package: str) -> Iterator[None]:
+    """Dask logs each lost worker and each closed connection; what goes wrong is told by what it costs."""
+    every = logging.root.manager.loggerDict.items()
+    logs = [log for name, log in every if isinstance(log, logging.Logger) and name.split(".")[0] == package]
+    levels = [log.level for log in logs]
+    for log in logs:
+        log.setLevel(logging.CRITICAL)
+    try:
+        yield
+    finally:
+        for log, level in zip(logs, levels, strict=True):
+            log.setLevel(level)
+
+
+def _require_address(address: str) -> None:
+    """Dask's client waits for ever for some addresses that are none, and for answers of what is no scheduler."""
+    from distributed.core import rpc
+    from distributed.security import Security
+
+    async def ask() -> None:
+        async with rpc(address, timeout=ANSWER_S, connection_args=Security().get_connection_args("client")) as peer:
+            await peer.identity()
+
+    if not ADDRESS.fullmatch(address):
+        raise InputError(f"--scheduler {address}: no address of a scheduler; give one like tcp://host:8786")
+    try:
+        asyncio.run(asyncio.wait_for(ask(), ANSWER_S))
+    except Exception as error:  # what is no scheduler may answer anything
+        raise InputError(
+            f"--scheduler {address}: no scheduler answers within {ANSWER_S} s; start one with `dask scheduler`, and "
+            "give the address that it prints"
+        ) from error
 
 
 def versions() -> dict[str, str]:
@@ -93,22 +118,27 @@ def _require_same(found: dict[str, dict[str, str]], address: str) -> None:
 
 
 class _Workers(Executor):
-    """The workers of a cluster; one that is lost on the way costs its jobs a second try."""
+    """The workers of a cluster; what one that is lost had begun, Dask gives to another, three times at most."""
 
     def __init__(self, client):
         self._client = client
 
     def submit(self, function: Callable, /, *arguments, **_) -> Future:
         answer: Future = Future()
-        future = self._client.submit(_alone, function, *arguments, pure=False, retries=TRIES)
+        answer.set_running_or_notify_cancel()  # the client gives up what nobody waits for any more
+        future = self._client.submit(_alone, function, *arguments, pure=False)
 
         def done(inner) -> None:
-            if inner.status == "finished":
-                answer.set_result(inner.result())
-                return
-            error = inner.exception() if inner.status == "error" else None
-            ours = error is not None and not type(error).__module__.startswith("distributed")
-            answer.set_exception(error if ours else BrokenExecutor(str(error or "the cluster gave the job up")))
+            try:
+                result = inner.result()
+            except Exception as error:
+                if inner.status == "error" and not type(error).__module__.startswith("distributed"):
+                    answer.set_exception(error)
+                else:
+                    why = "the connection to the scheduler was lost" if inner.status == "cancelled" else error
+                    answer.set_exception(BrokenExecutor(f"the cluster gave a job up: {why}"))
+            else:
+                answer.set_result(result)
 
         future.add_done_callback(done)
         return answer

@@ -3,8 +3,6 @@
 import hashlib
 import json
 from collections.abc import Callable, Sequence
-from concurrent.futures import BrokenExecutor
-from concurrent.futures.process import BrokenProcessPool
 from dataclasses import asdict, dataclass, fields
 from pathlib import Path
 
@@ -72,6 +70,8 @@ def detect_files(
     ------
     InputError
         No file is usable; the message names the first one and its reason.
+    DetectionError
+        A process that worked on an image was ended from outside.
     """
     camera, size_from = sized_by(camera_model, files)
     cache.mkdir(parents=True, exist_ok=True)
@@ -85,18 +85,11 @@ def detect_files(
             pending.append(i)
         elif progress:
             progress(file.name)
-    try:
-        for k, outcome in run_on_images(_detect_file, [jobs[i] for i in pending], workers):
-            i = pending[k]
-            found[i] = outcome if isinstance(outcome, Skipped) else _stored(files[i], cache, *outcome)
-            if progress:
-                progress(files[i].name)
-    except BrokenExecutor as error:
-        raise DetectionError(
-            f"detection in {len(pending)} images: a process was ended from outside, for lack of memory perhaps"
-            f"{f' ({error})' if not isinstance(error, BrokenProcessPool) else ''}; "
-            "run again with fewer --workers, finished detections are kept"
-        ) from error
+    for k, outcome in run_on_images(_detect_file, [jobs[i] for i in pending], workers, kept=True):
+        i = pending[k]
+        found[i] = outcome if isinstance(outcome, Skipped) else _stored(files[i], cache, *outcome)
+        if progress:
+            progress(files[i].name)
     images, skipped = _without_copies([f for f in found if f is not None])
     if not images:
         first = skipped[0]
@@ -285,7 +278,7 @@ def look_again(
             paths.append(path)
         else:
             found[image.file.name] = known
-    for k, look in run_on_images(_look_again, pending, workers):
+    for k, look in run_on_images(_look_again, pending, workers, kept=True):
         if look is not None:
             keep(paths[k], _centre_arrays(look.centres), {"labels": look.labels, "missed": look.missed})
             found[pending[k][0].name] = look

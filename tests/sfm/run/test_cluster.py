@@ -1,15 +1,20 @@
 """Images worked on elsewhere: by any executor, by a cluster; the same results, bit by bit."""
 
+import contextlib
 import os
 import signal
+import socket
 import subprocess
 import sys
+import threading
 from concurrent.futures import BrokenExecutor, Executor, Future, ThreadPoolExecutor
+from pathlib import Path
 
 import pytest
 
 from stcal.errors import DetectionError, InputError
-from stcal.io.spread import spread
+from stcal.io.images import ImageFile
+from stcal.io.spread import run_on_images, spread
 from stcal.parallel import run_parallel
 from stcal.sfm import RunOptions, run
 from stcal.workflows import cluster
@@ -70,7 +75,7 @@ def test_a_run_by_an_executor_is_the_same(small_dataset, expected, tmp_path, sen
     with spread(executor, 3, send):
         assert run_into(tmp_path / "run", small_dataset) == expected
     assert executor.jobs
-    assert all((job[0].content is not None) == send for job in executor.jobs)
+    assert all((job[1].content is not None) == send for job in executor.jobs)
 
 
 def test_workers_that_are_lost_for_good_are_one_line(small_dataset, tmp_path):
@@ -78,10 +83,51 @@ def test_workers_that_are_lost_for_good_are_one_line(small_dataset, tmp_path):
         run_into(tmp_path / "run", small_dataset)
 
 
-def test_no_scheduler_is_one_line(monkeypatch):
+def end(_):
+    """As a process ends that takes more memory than there is."""
+    os._exit(1)
+
+
+def test_a_process_that_is_ended_from_outside_is_one_line():
+    with pytest.raises(DetectionError, match=r"^images, 2 of them: a process was ended.*fewer --workers$"):
+        dict(run_on_images(end, [(1,), (2,)], 2))
+
+
+def test_a_folder_that_workers_do_not_see_is_one_line(tmp_path):
+    file = ImageFile(tmp_path / "elsewhere" / "a.jpg", "a.jpg", ".")
+    with spread(Here()), pytest.raises(InputError, match=r"elsewhere: not there on worker .*--send-images"):
+        dict(run_on_images(len, [(file,)]))
+
+
+def test_paths_go_to_workers_from_the_root(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    with spread(Here()):
+        assert dict(run_on_images(lambda file: file.path, [(ImageFile(Path("a.jpg"), "a.jpg", "."),)])) == {
+            0: tmp_path / "a.jpg"
+        }
+
+
+@pytest.mark.parametrize("answer", [None, b"", b"HTTP/1.0 404 no\r\n\r\n" * 9])
+def test_no_scheduler_is_one_line(monkeypatch, answer):
+    """Nobody listens; somebody listens and says nothing; or something."""
     monkeypatch.setattr(cluster, "ANSWER_S", 1)
-    with pytest.raises(InputError, match="no scheduler answers"), cluster.dask_cluster("tcp://127.0.0.1:9"):
-        pass
+    with socket.socket() as listening:
+        listening.bind(("127.0.0.1", 0))
+        if answer is not None:
+            listening.listen()
+        threading.Thread(target=_answer, args=(listening, answer), daemon=True).start()
+        address = f"tcp://127.0.0.1:{listening.getsockname()[1]}"
+        with pytest.raises(InputError, match="no scheduler answers"), cluster.dask_cluster(address):
+            pass
+
+
+def _answer(listening, answer):
+    with contextlib.suppress(OSError):
+        while answer is not None:
+            with listening.accept()[0] as peer:
+                peer.sendall(answer)
+                while peer.recv(4096):
+                    pass
 
 
 @pytest.mark.parametrize("address", ["nowhere", "http://x", "http://x:80", "", "tcp://x", "tcp://x:y", "\x1b[31m:1"])
@@ -97,23 +143,47 @@ def test_workers_of_other_versions_are_refused():
         cluster._require_same({"tcp://a": own | {"numpy": "1.0"}}, "tcp://b")
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("send", [False, True])
-def test_a_run_by_a_cluster_that_loses_a_worker_is_the_same(small_dataset, expected, tmp_path, send):
-    script = tmp_path / "start.py"
+@contextlib.contextmanager
+def two_workers(folder):
+    """Address of a scheduler in a process of its own, and the numbers of that process and of its workers'."""
+    script = folder / "start.py"
     script.write_text(CLUSTER)
     started = subprocess.Popen([sys.executable, script], stdin=-1, stdout=-1, stderr=subprocess.DEVNULL, text=True)
     try:
-        address, first, _ = started.stdout.readline().split()
-        lost = []
-
-        def lose(stage, done, _total):
-            if stage == "detect" and done == 2 and not lost:
-                os.kill(int(first), signal.SIGKILL)
-                lost.append(done)
-
-        with cluster.dask_cluster(address, send):
-            assert run_into(tmp_path / "run", small_dataset, progress=lose) == expected
-        assert lost
+        address, *workers = started.stdout.readline().split()
+        yield address, started.pid, [int(each) for each in workers]
     finally:
-        started.communicate("\n", timeout=60)
+        with contextlib.suppress(BrokenPipeError):
+            started.communicate("\n", timeout=60)
+
+
+def killing(process):
+    """A progress that kills a process when two images are done, and the list of what it did."""
+    killed = []
+
+    def progress(stage, done, _total):
+        if stage == "detect" and done == 2 and not killed:
+            os.kill(process, signal.SIGKILL)
+            killed.append(process)
+
+    return progress, killed
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("send", [False, True])
+def test_a_run_by_a_cluster_that_loses_a_worker_is_the_same(small_dataset, expected, tmp_path, send):
+    with two_workers(tmp_path) as (address, _, workers):
+        progress, killed = killing(workers[0])
+        with cluster.dask_cluster(address, send):
+            assert run_into(tmp_path / "run", small_dataset, progress=progress) == expected
+        assert killed
+
+
+@pytest.mark.slow
+def test_a_run_by_a_cluster_that_loses_its_scheduler_ends_in_one_line(small_dataset, tmp_path):
+    with two_workers(tmp_path) as (address, scheduler, _):
+        progress, killed = killing(scheduler)
+        line = r"the connection to the scheduler was lost; run the same command again, finished detections are kept"
+        with pytest.raises(DetectionError, match=line), cluster.dask_cluster(address):
+            run_into(tmp_path / "run", small_dataset, progress=progress)
+        assert killed
