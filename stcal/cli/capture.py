@@ -160,10 +160,10 @@ def watch(
         for line in found_lines(update.new):
             say(line)
         print_each("left out", (f"{each.name}: {each.reason}" for each in update.left_out))
-        if update.result is None:
-            say(f"not yet: {update.reason}")
-        else:
+        if update.result is not None:
             say(so_far_text(update.result))
         if update.advice is not None:
             say(f"next: {next_text(update.advice)}")
+        elif update.reason:
+            say(f"{'not yet' if update.result is None else 'no advice'}: {update.reason}")
         sys.stdout.flush()

@@ -17,7 +17,7 @@ from stcal.errors import StcalError
 INTERRUPTED, TERMINATED = 130, 143
 MESSAGE_CHARACTERS = 600
 """Of an error's line; what a file holds may be of any length."""
-RESUMED = {"run", "detect"}
+RESUMED = {"run", "detect", "watch"}
 """Commands that keep what they have done when they are interrupted."""
 # Of Click, which newer versions of Typer carry inside.
 UsageError: Any = next(c for c in typer.BadParameter.__mro__ if c.__name__ == "ClickException")

@@ -22,7 +22,7 @@ def filmed(
     group : str
     images : int
     shift_mm, turn_deg : float
-        Amplitudes; from image to image the camera moves by up to an eighth of them.
+        Amplitudes; from image to image the camera moves by up to a fifth of them, 2 π over the shortest period.
     seed : int
         Of periods and phases.
     view : int

@@ -58,7 +58,8 @@ class Update:
 
     ``images`` : photographs that are there; ``new`` : what was found in those that came; ``left_out`` : those of them
     that cannot be used; ``gone`` : names of those that are no longer there; ``result`` : of the run over all of them,
-    None where it is not possible yet, for the ``reason``; ``advice`` : what to photograph next.
+    None where it is not possible yet, for the ``reason``; ``advice`` : what to photograph next, None where that was not
+    asked for, or cannot be told, for the ``reason``.
     """
 
     images: int
@@ -88,7 +89,7 @@ def watch(
         Folder with one folder of images for each group; may be empty at first.
     camera : path or CameraModel
     out : path
-        The run's folder: new, empty, or of an earlier run. Its page reloads itself while it is watched.
+        The run's folder: new, empty, or of an earlier run. Its page reloads itself, until another run is written there.
     target, board : paths or designs
         The reference design where None.
     options : WatchOptions, optional
@@ -132,12 +133,15 @@ def watch(
         result, reason, advice = None, "", None
         try:
             result = run(images, camera, out, target, board, settled, progress, RELOAD_S)
-            if options.views:
-                advice = advise(known_of(load_run(out)), options.views, progress)
         except StcalError as error:
             if not (out / CACHE).is_dir():  # the folder itself is refused
                 raise
             reason = str(error)
+        if result is not None and options.views:
+            try:
+                advice = advise(known_of(load_run(out)), options.views, progress)
+            except StcalError as error:
+                reason = str(error)
         new, left_out = _found(images, model, out, *designs, settled, came, result)
         yield Update(len(complete), new, left_out, gone, result, reason, advice)
 

@@ -47,7 +47,8 @@ class Tracker:
     The pose is predicted from those of the two images before, at an even motion; the common shift of the circles from
     there is found in a small picture, and every circle is measured where it then must be, with its whole rim, as in a
     single image. Where too few are found, or the fit fails, the target is searched for in the whole image. Both ways
-    end at the same centres; a pose does not depend on the one before but for the choice between two that fit alike.
+    measure the same circles; what their centres differ by, since the band of pixels lies about another start, is a part
+    of their σ. A pose takes nothing else from the one before but the choice between two that fit alike.
 
     Parameters
     ----------

@@ -16,11 +16,14 @@ from stcal.synthetic.render import RenderOptions, render
 from stcal.synthetic.scene import SceneOptions, make_scene
 
 IMAGES = 6
+OTHER_BAND = 1.0
+"""σ by which a pose may move when the bands of the same rims, mostly the same pixels, lie about another start: two fits
+of independent pixels would differ by √2."""
 
 
 @pytest.fixture(scope="module")
 def film():
-    """Six images that follow each other at up to 12 px, and three of another part of the film."""
+    """Six images that follow each other, and two of another part of the film."""
     scene = make_scene(SceneOptions(seed=5, width=1296, height=864, images_per_group=6))
     return filmed(scene, "12", 30, seed=1)
 
@@ -66,7 +69,7 @@ def test_a_followed_pose_is_that_of_a_search(film, frames, target, model):
         own, other = follower.locate(frames[i], f"{i}"), searcher.locate(frames[i], f"{i}")
         assert follower.searched == (i == 0)
         assert set(other.labels) <= set(own.labels)
-        assert off_sigmas(own, other).max() < 0.5
+        assert off_sigmas(own, other).max() < OTHER_BAND
         truth = film.groups["12"].camera_from_target[i]
         step = (truth @ own.camera_from_target.inverse()).log()
         error = np.r_[step[:3], truth.translation - own.camera_from_target.translation]
@@ -88,6 +91,7 @@ def test_a_hidden_face_is_missed_by_name(film, frames, target, model):
     hidden = frames[1].copy()
     pose = tracker.locate(frames[1])
     face = seen.faces[0]
+    tracker.forget()
     tracker.locate(frames[0])
     own = [label for label in pose.labels if label.face == face]
     where = pose.camera_from_target @ target.xyz[[target.place[label] for label in own]]
@@ -96,8 +100,8 @@ def test_a_hidden_face_is_missed_by_name(film, frames, target, model):
     hidden[max(top, 0) : bottom, max(left, 0) : right] = hidden[:20, :20].mean()
     left_over = tracker.locate(hidden)
     assert face not in left_over.faces
-    if not tracker.searched:
-        assert any(f"face {face}" in note for note in tracker.notes)
+    assert not tracker.searched  # the other face has half of the circles, as many as are asked for
+    assert any(note.startswith(f"face {face}: {face}:1 and 9 more should be in view") for note in tracker.notes)
 
 
 def test_an_image_without_the_target_is_an_error_and_the_next_is_searched(film, frames, target, model):
@@ -142,4 +146,4 @@ def test_measure_follows_a_folder(film, target, model):
     assert single.searched is None
     assert [each.name for each in together.images] == [each.name for each in single.images]
     for own, other in zip(together.images, single.images, strict=True):
-        assert off_sigmas(own.pose, other.pose).max() < 0.5
+        assert off_sigmas(own.pose, other.pose).max() < OTHER_BAND

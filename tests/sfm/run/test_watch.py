@@ -4,7 +4,7 @@ import shutil
 
 import pytest
 
-from stcal.errors import InputError
+from stcal.errors import DegenerateError, InputError
 from stcal.workflows.watch import WatchOptions, watch
 
 
@@ -58,6 +58,16 @@ def test_advice_comes_with_the_run(small_dataset, tmp_path):
     (update,) = watched(small_dataset, small_dataset / "images", tmp_path / "run", lambda _: None)
     assert len(update.advice.choices) == 1
     assert update.images == len(update.result.labelled)
+
+
+@pytest.mark.slow
+def test_advice_that_cannot_be_given_is_told(small_dataset, tmp_path, monkeypatch):
+    def none(*_):
+        raise DegenerateError("no view")
+
+    monkeypatch.setattr("stcal.workflows.watch.advise", none)
+    (update,) = watched(small_dataset, small_dataset / "images", tmp_path / "run", lambda _: None)
+    assert (update.result is None, update.advice, update.reason) == (False, None, "no view")
 
 
 def test_an_empty_folder_ends_and_none_is_an_error(small_dataset, tmp_path):
