@@ -3,12 +3,16 @@
 import contextlib
 import itertools
 import multiprocessing
+import multiprocessing.context
 import os
 import signal
 import sys
 import threading
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import FIRST_COMPLETED, Executor, Future, ProcessPoolExecutor, as_completed, wait
+from contextvars import ContextVar
+from importlib import import_module
+from operator import itemgetter
 from typing import TypeVar
 
 R = TypeVar("R")
@@ -16,6 +20,8 @@ Progress = Callable[[str, int, int], None]
 """Called with (stage, done, total)."""
 ONE_THREAD = ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS", "OPENCV_FOR_THREADS_NUM")
 """Libraries take their number of threads from these when they are loaded; processes side by side need one each."""
+LOADED_ONCE = "stcal.sfm.pipeline"
+"""Module that is loaded before processes are forked, with all that it imports."""
 _limited = threading.Lock()
 
 
@@ -57,13 +63,14 @@ def run_parallel(
 ) -> Iterator[tuple[int, R]]:
     """Yield (index of the job, result of ``function(*job)``) as results come in, in any order.
 
-    Processes are started afresh (forking a process with threads can hang) and do not import the caller's main
-    module, so that a script needs no ``if __name__ == "__main__"``. One worker, or one job, runs right here.
+    Processes are forked from a server that has loaded the libraries and has no threads (forking one with threads can
+    hang), or started afresh where the system cannot; they do not import the caller's main module, so that a script
+    needs no ``if __name__ == "__main__"``. One worker, or one job, runs right here.
 
     Parameters
     ----------
     workers : int, optional
-        Processes; one per core where None.
+        Processes; one per core where None. As many as :func:`kept_processes` says, within it.
     executor : concurrent.futures.Executor, optional
         Runs the jobs in place of processes of our own, and is left open.
     at_once : int, optional
@@ -77,23 +84,112 @@ def run_parallel(
         for i, job in enumerate(jobs):
             yield i, function(*job)
         return
-    others = multiprocessing.active_children()
-    with (
-        _plain_main(),
-        ProcessPoolExecutor(workers, multiprocessing.get_context("spawn"), initializer=_follow_parent) as pool,
-    ):
-        with _deaf_to_interrupts():
-            futures = {pool.submit(function, *job): i for i, job in enumerate(jobs)}
+    kept = _kept.get()
+    with contextlib.nullcontext(kept) if kept else _Processes(workers) as processes:
+        yield from processes.run(function, jobs)
+
+
+def run_briefly(function: Callable[..., R], jobs: Sequence[tuple]) -> list[R]:
+    """Results of ``function(*job)`` in the order of the jobs, of a tenth of a second each: by processes that
+    :func:`kept_processes` has started, right here where there are none."""
+    kept = _kept.get()
+    done = kept.run(function, jobs) if kept and kept.started else enumerate(function(*job) for job in jobs)
+    return [result for _, result in sorted(done, key=itemgetter(0))]
+
+
+@contextlib.contextmanager
+def kept_processes(workers: int | None = None) -> Iterator[None]:
+    """Keep the processes of :func:`run_parallel` from call to call, so that libraries are loaded once; so many of them,
+    one per core where None, started when they are first needed."""
+    if _kept.get():
+        yield
+        return
+    with _Processes(workers or os.cpu_count() or 1) as processes:
+        token = _kept.set(processes)
+        try:
+            yield
+        finally:
+            _kept.reset(token)
+
+
+class _Processes:
+    """Processes of our own, started when the first job comes; they end with the context."""
+
+    def __init__(self, workers: int):
+        self._workers = workers
+        self._pool: ProcessPoolExecutor | None = None
+        self._others = multiprocessing.active_children()
+
+    @property
+    def started(self) -> bool:
+        """Whether there has been a job."""
+        return self._pool is not None
+
+    def run(self, function: Callable[..., R], jobs: Sequence[tuple]) -> Iterator[tuple[int, R]]:
+        """Index and result of each job, in any order."""
+        with _plain_main(), _deaf_to_interrupts():
+            if self._pool is None:
+                self._pool = ProcessPoolExecutor(self._workers, _context(), initializer=_follow_parent)
+            futures = {self._pool.submit(function, *job): i for i, job in enumerate(jobs)}
         try:
             for future in as_completed(futures):
                 yield futures[future], future.result()
-        except BaseException as error:
-            pool.shutdown(wait=isinstance(error, Exception), cancel_futures=True)
-            if not isinstance(error, Exception):  # asked to end: what is half done is of no use
-                for process in multiprocessing.active_children():
-                    if process not in others:
-                        process.terminate()
-            raise
+        finally:
+            for future in futures:
+                future.cancel()
+
+    def everywhere(self, function: Callable, arguments: tuple) -> None:
+        """Begin the same in every process, as far as they are idle."""
+        assert self._pool is not None
+        with _plain_main(), _deaf_to_interrupts():
+            for _ in range(self._workers):
+                self._pool.submit(function, *arguments)
+
+    def __enter__(self) -> "_Processes":
+        return self
+
+    def __exit__(self, kind: type[BaseException] | None, *_) -> None:
+        if self._pool is None:
+            return
+        asked_to_end = kind is not None and not issubclass(kind, Exception)  # what is half done is of no use
+        self._pool.shutdown(wait=not asked_to_end, cancel_futures=True)
+        if asked_to_end:
+            for process in multiprocessing.active_children():
+                if process not in self._others:
+                    process.terminate()
+
+
+def load_in_processes(*modules: str) -> None:
+    """Load modules in the processes that :func:`kept_processes` has started, while this one goes on."""
+    kept = _kept.get()
+    if kept and kept.started:
+        kept.everywhere(_load, modules)
+
+
+def _load(*modules: str) -> None:
+    for name in modules:
+        import_module(name)
+
+
+_kept: ContextVar[_Processes | None] = ContextVar("kept processes", default=None)
+
+
+def load_ahead(workers: int | None = None) -> None:
+    """Load what processes will need, beside this process, which goes on."""
+    if (workers or os.cpu_count() or 1) > 1 and _context().get_start_method() == "forkserver":
+        from multiprocessing.forkserver import ensure_running
+
+        with _plain_main(), _deaf_to_interrupts():
+            ensure_running()
+
+
+def _context() -> multiprocessing.context.BaseContext:
+    """How processes are started: by a server without threads, which has the libraries, where the system can fork."""
+    if "forkserver" not in multiprocessing.get_all_start_methods():
+        return multiprocessing.get_context("spawn")
+    context = multiprocessing.get_context("forkserver")
+    context.set_forkserver_preload([LOADED_ONCE])  # without effect where a server is running
+    return context
 
 
 def _handed_over(executor: Executor, function, jobs: Sequence[tuple], at_once: int) -> Iterator[tuple[int, R]]:

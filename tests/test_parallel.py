@@ -1,14 +1,17 @@
-"""Threads of BLAS: one while heavy functions work, the caller's own number before and after; one in each worker."""
+"""Threads of BLAS: one while heavy functions work, the caller's own number before and after; one in each worker; and
+processes that are kept from call to call."""
 
+import multiprocessing
 import os
 import subprocess
 import sys
+import time
 
 import numpy as np
 import pytest
 from threadpoolctl import threadpool_info
 
-from stcal.parallel import ONE_THREAD, counted
+from stcal.parallel import ONE_THREAD, counted, kept_processes, run_briefly, run_parallel
 
 UNLIMITED = {name: value for name, value in os.environ.items() if name not in ONE_THREAD}
 
@@ -109,3 +112,45 @@ def test_what_is_done_is_counted():
     step("a")
     step("b")
     assert told == [("detect", 0, 2), ("detect", 1, 2), ("detect", 2, 2)]
+
+
+def process(_) -> int:
+    time.sleep(0.05)  # so that one alone does not do all
+    return os.getpid()
+
+
+def test_processes_are_kept_from_call_to_call():
+    with kept_processes(2):
+        assert run_briefly(process, [(i,) for i in range(3)]) == [os.getpid()] * 3  # none is there yet
+        first = {found for _, found in run_parallel(process, [(i,) for i in range(6)])}
+        again = set(run_briefly(process, [(i,) for i in range(6)]))
+    assert len(first) == 2
+    assert again == first
+    assert run_briefly(process, [(0,)]) == [os.getpid()]
+    assert not multiprocessing.active_children()
+
+
+def test_results_are_in_the_order_of_the_jobs():
+    with kept_processes(2):
+        dict(run_parallel(process, [(0,), (1,)]))
+        assert run_briefly(pow, [(i, 2) for i in range(40)]) == [i * i for i in range(40)]
+
+
+def test_what_fails_ends_the_call_and_not_the_processes():
+    with kept_processes(2):
+        with pytest.raises(ZeroDivisionError):
+            dict(run_parallel(divmod, [(1, 0), (2, 0)]))
+        assert len({found for _, found in run_parallel(process, [(i,) for i in range(6)])}) == 2
+
+
+def test_processes_end_when_the_work_is_broken_off():
+    def broken_off():
+        with kept_processes(2):
+            dict(run_parallel(process, [(0,), (1,)]))
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        broken_off()
+    for child in multiprocessing.active_children():
+        child.join(10)
+    assert not multiprocessing.active_children()

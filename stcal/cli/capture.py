@@ -17,6 +17,7 @@ from stcal.cli.options import (
     TargetFile,
     Workers,
     ellipse_options,
+    load_ahead,
 )
 from stcal.cli.terminal import StageProgress, print_each, say, write
 from stcal.errors import InputError
@@ -143,6 +144,7 @@ def watch(
 ) -> None:
     """Calibrate while photographs are taken: after each, what was found, the worst σ so far and the view that would
     help most. RUN/report.html is kept up to date and reloads itself."""
+    load_ahead(workers)
     from stcal.sfm.plan.tables import next_text
     from stcal.sfm.run.options import RunOptions
     from stcal.sfm.run.text import found_lines, so_far_text

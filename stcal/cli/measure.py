@@ -16,6 +16,7 @@ from stcal.cli.options import (
     Workers,
     ellipse_options,
     handed_over,
+    load_ahead,
 )
 from stcal.cli.terminal import StageProgress, print_each, say, write
 from stcal.errors import InputError
@@ -79,6 +80,7 @@ def measure(
     send_images: SendImages = False,
 ) -> None:
     """Measure the pose of a calibrated target in each image, from whatever faces it shows, with its 6×6 covariance."""
+    load_ahead(workers)
     from stcal.io.camera import read_camera
     from stcal.io.design import load_board, target_of
     from stcal.io.table import read_table

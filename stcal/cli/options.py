@@ -102,6 +102,13 @@ def handed_over(scheduler: str | None, send_images: bool) -> AbstractContextMana
     return dask_cluster(scheduler, send_images)
 
 
+def load_ahead(workers: int | None) -> None:
+    """Begin to load what processes need, while the command loads the same."""
+    from stcal.parallel import load_ahead
+
+    load_ahead(workers)
+
+
 def ellipse_options(min_diameter: float | None, max_diameter: float) -> "EllipseOptions":
     """Sizes of the circles that detection seeks."""
     from stcal.sfm.detect.circles.ellipses import EllipseOptions

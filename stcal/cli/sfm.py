@@ -20,6 +20,7 @@ from stcal.cli.options import (
     Workers,
     ellipse_options,
     handed_over,
+    load_ahead,
 )
 from stcal.cli.terminal import StageProgress, say, write
 from stcal.errors import InputError
@@ -116,6 +117,7 @@ def run(
     send_images: SendImages = False,
 ) -> None:
     """Calibrate the target: detect, map, scale, chain and adjust; writes faces.json and report.html."""
+    load_ahead(workers)
     import numpy as np
 
     from stcal.sfm import pipeline
@@ -156,6 +158,7 @@ def detect(
     send_images: SendImages = False,
 ) -> None:
     """Detect circles alone: detections.csv and an overlay picture of every image."""
+    load_ahead(workers)
     from stcal.io.camera import read_camera
     from stcal.io.design import board_of, target_of
     from stcal.io.images import find_images

@@ -8,7 +8,7 @@ from stcal.io.camera import CameraModel, camera_prior, read_camera, refinable
 from stcal.io.design import board_of, target_of
 from stcal.io.images import find_images
 from stcal.io.saving import save
-from stcal.parallel import Progress, counted, one_thread
+from stcal.parallel import Progress, counted, kept_processes, load_in_processes, one_thread
 from stcal.sfm.adjust.calibration import calibrate
 from stcal.sfm.adjust.chain import measure_chains
 from stcal.sfm.checks.suite import run_checks
@@ -16,12 +16,15 @@ from stcal.sfm.data.observations import by_group, detections_csv
 from stcal.sfm.detect.files import DetectionResult, detect_files, require_upright
 from stcal.sfm.detect.labels import LabelledImage, label_images
 from stcal.sfm.mapping.graph import image_graph
-from stcal.sfm.run.folder import write_overlays, write_run
+from stcal.sfm.run.folder import overlays_beside, write_run
 from stcal.sfm.run.marker import MarkerFile
 from stcal.sfm.run.options import RunOptions
 from stcal.sfm.run.result import RunResult
 from stcal.sfm.run.solve import solve_groups, unseen_board, usable_groups
 from stcal.sfm.run.transaction import RunFolder, run_folder
+
+DRAWN_WITH = "matplotlib.backends.backend_svg", "mpl_toolkits.mplot3d.axes3d"
+"""What figures of the report take half a second to load."""
 
 
 @one_thread()
@@ -70,7 +73,7 @@ def run(
     find_images(images)
     designs = target_of(target), board_of(board)
     options = (options or RunOptions()).settled(designs[0])
-    with run_folder(out, MarkerFile.of(images, options), given) as folder:
+    with kept_processes(options.workers), run_folder(out, MarkerFile.of(images, options), given) as folder:
         result = _calibrated(images, model, folder, *designs, options, progress)
         progress("check", 0, 1)
         result = replace(result, checks=run_checks(result.evidence(camera_prior(result.camera))))
@@ -88,7 +91,22 @@ def _calibrated(
     options: RunOptions,
     progress: Progress,
 ) -> RunResult:
-    detection, labelled = detect(images, model, folder, target, board, options, progress)
+    detection, labelled = labelled_images(images, model, folder, target, board, options, progress)
+    with overlays_beside(detection, labelled, target, folder.stage, progress):
+        return _solved(detection, labelled, model, folder, target, board, options, progress)
+
+
+def _solved(
+    detection: DetectionResult,
+    labelled: list[LabelledImage],
+    model: CameraModel,
+    folder: RunFolder,
+    target: TargetDesign,
+    board: BoardDesign,
+    options: RunOptions,
+    progress: Progress,
+) -> RunResult:
+    load_in_processes(*DRAWN_WITH)
     known = model.calibrated(detection.camera.width, detection.camera.height)
     known = refinable(known) if options.refine_camera else known
     observations = [each.observations for each in labelled]
@@ -131,6 +149,21 @@ def detect(
     progress: Progress,
 ) -> tuple[DetectionResult, list[LabelledImage]]:
     """Detection, labels, ``detections.csv`` and overlays, into a claimed folder."""
+    detection, labelled = labelled_images(images, camera, folder, target, board, options, progress)
+    with overlays_beside(detection, labelled, target, folder.stage, progress):
+        return detection, labelled
+
+
+def labelled_images(
+    images: str | Path,
+    camera: CameraModel,
+    folder: RunFolder,
+    target: TargetDesign,
+    board: BoardDesign | None,
+    options: RunOptions,
+    progress: Progress,
+) -> tuple[DetectionResult, list[LabelledImage]]:
+    """Detection, labels and ``detections.csv``, into a claimed folder."""
     files, other = find_images(images)
     step = counted(progress, "detect", len(files))
     detection = detect_files(files, camera, target, board, options.ellipses, folder.cache, options.workers, step)
@@ -138,5 +171,4 @@ def detect(
     require_upright(detection.images)
     labelled = label_images(detection, target, board, options.ellipses, folder.cache, options.workers)
     save(folder.stage / "detections.csv", detections_csv([each.observations for each in labelled]))
-    write_overlays(detection, labelled, target, folder.stage, progress)
     return detection, labelled

@@ -1,6 +1,6 @@
 """Checks of the faces: parts of the images against one another, groups against groups, circles against their plane."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import combinations
 
@@ -12,6 +12,7 @@ from stcal.design import BoardDesign, TargetDesign
 from stcal.errors import DegenerateError, StcalError
 from stcal.geometry.plane import fit_plane
 from stcal.geometry.rigid import Rigid, skew
+from stcal.parallel import run_briefly
 from stcal.sfm.adjust.calibration import Calibration
 from stcal.sfm.adjust.chain import CalibratedTarget, FaceChain, measure_chains
 from stcal.sfm.adjust.joint import SETTLED_PX, JointResult, adjust_jointly
@@ -38,21 +39,40 @@ class Again:
     board: BoardDesign
     options: AdjustOptions
 
-    def adjust(self, models: Sequence[MetricModel], faces: Sequence[str]) -> tuple[CalibratedTarget, JointResult]:
-        """The same adjustment of some models; poses of ``faces``, in the frame of the first.
+    def adjust(self, parts: Sequence[Sequence[MetricModel]]) -> list[JointResult | StcalError]:
+        """The same adjustment of parts of the models, or why there is none."""
+        camera, flatness_mm = self.calibration.camera, self.options.flatness_mm
+        return run_briefly(_adjusted, [(models, self.board, camera, flatness_mm) for models in parts])
+
+    def posed(self, joint: JointResult | StcalError, faces: Sequence[str]) -> tuple[CalibratedTarget, JointResult]:
+        """Poses of ``faces`` by an adjustment of a part, in the frame of the first, and that adjustment.
 
         Raises
         ------
         StcalError
-            The part does not hold the faces.
+            There is none, or it does not hold the faces.
         """
+        if isinstance(joint, StcalError):
+            raise joint
         whole = self.calibration.target
         start = replace(whole, reference_face=faces[0], target_from_face={f: whole.target_from_face[f] for f in faces})
         try:
-            joint = adjust_jointly(models, self.board, self.calibration.camera, self.options.flatness_mm)
             return calibrated_target(joint, start, self.target, self.options.frame), joint
         except np.linalg.LinAlgError as error:
-            raise DegenerateError(f"{len(models)} groups do not fix the target; add images") from error
+            raise _unfixed(joint.models) from error
+
+
+def _adjusted(models: Sequence[MetricModel], board, camera, flatness_mm) -> JointResult | StcalError:
+    try:
+        return adjust_jointly(models, board, camera, flatness_mm)
+    except StcalError as error:
+        return error
+    except np.linalg.LinAlgError:
+        return _unfixed(models)
+
+
+def _unfixed(models: Sequence[MetricModel]) -> DegenerateError:
+    return DegenerateError(f"{len(models)} groups do not fix the target; add images")
 
 
 def _difference(a: Rigid, b: Rigid) -> np.ndarray:
@@ -70,11 +90,11 @@ def halves_check(again: Again) -> Check:
         reason = f"group {fewest.group} has {len(fewest.images)} images, {2 * MIN_HALF} needed"
         return impossible(key, title, reason, "add images")
     faces = [reference, *(f for f in again.calibration.target.target_from_face if f != reference)]
+    joints = again.adjust([[m.without(m.image_index % 2 != k) for m in models] for k in (0, 1)])
     try:
-        parts = [again.adjust([m.without(m.image_index % 2 != k) for m in models], faces) for k in (0, 1)]
+        (first, joint), (second, other) = (again.posed(joint, faces) for joint in joints)
     except StcalError as error:
         return impossible(key, title, f"half of the images do not hold the result ({error})", "add images")
-    (first, joint), (second, other) = parts
     redundancy = joint.redundancy + other.redundancy
     trials = []
     for face in faces[1:]:
@@ -108,9 +128,10 @@ def groups_check(again: Again) -> Check:
         if len(members) > 1 and _linked([s for other, s in members.items() if other != g], reference) >= set(faces)
     ]
     trials = []
-    for group in removable:
+    joints = again.adjust([[m for m in models if m.group != group] for group in removable])
+    for group, found in zip(removable, joints, strict=True):
         try:
-            without, joint = again.adjust([m for m in models if m.group != group], faces)
+            without, joint = again.posed(found, faces)
         except StcalError:
             continue
         scale = (again.joint.sigma0 / joint.sigma0) ** 2
@@ -151,20 +172,25 @@ def loops_check(again: Again) -> Check:
     covariances of the single steps."""
     key, title = "loops", "Ways to a face through different groups"
     calibration = again.calibration
+    pairs = [
+        (face, one, two)
+        for face, found in measure_chains(calibration.faces, calibration.target).items()
+        for one, two in combinations(found, 2)
+        if not set(one.groups) & set(two.groups)
+    ]
+    groups = sorted({group for _, *ways in pairs for way in ways for group in way.groups})
+    alone = again.adjust([[m for m in again.joint.models if m.group == group] for group in groups])
+    single = dict(zip(groups, alone, strict=True))
     trials = []
-    steps: dict[tuple[str, str, str], tuple[Rigid, np.ndarray]] = {}
     redundancy = sum(2 * len(m.image_index) for m in again.joint.models)
-    for face, found in measure_chains(calibration.faces, calibration.target).items():
-        for one, two in combinations(found, 2):
-            if set(one.groups) & set(two.groups):
-                continue
-            try:
-                ends = [_along(again, way, steps) for way in (one, two)]
-            except StcalError:
-                continue
-            apart = _difference(ends[0][0], ends[1][0])
-            name = f"face {face} by groups {' '.join(one.groups)} and {' '.join(two.groups)}"
-            trials.append(_face_trial(name, apart, ends[0][1] + ends[1][1], redundancy))
+    for face, one, two in pairs:
+        try:
+            ends = [_along(again, way, single) for way in (one, two)]
+        except StcalError:
+            continue
+        apart = _difference(ends[0][0], ends[1][0])
+        name = f"face {face} by groups {' '.join(one.groups)} and {' '.join(two.groups)}"
+        trials.append(_face_trial(name, apart, ends[0][1] + ends[1][1], redundancy))
     if not trials:
         reason = "no face is reached in two ways that share no group"
         return impossible(key, title, reason, "to be able to make it, add a group that closes a loop of faces")
@@ -172,15 +198,12 @@ def loops_check(again: Again) -> Check:
     return judge(key, title, trials, "loops", remedy)
 
 
-def _along(again: Again, way: FaceChain, steps) -> tuple[Rigid, np.ndarray]:
-    """reference_from_face along a way, and its covariance (6, 6)."""
+def _along(again: Again, way: FaceChain, single: Mapping[str, JointResult | StcalError]) -> tuple[Rigid, np.ndarray]:
+    """reference_from_face along a way, each group adjusted alone, and its covariance (6, 6)."""
     pose, covariance = Rigid(), np.zeros((6, 6))
     for group, a, b in zip(way.groups, way.faces[:-1], way.faces[1:], strict=True):
-        if (group, a, b) not in steps:
-            models = [m for m in again.joint.models if m.group == group]
-            single, _ = again.adjust(models, (a, b))
-            steps[group, a, b] = single.target_from_face[b], single.face_covariance[b]
-        step, own = steps[group, a, b]
+        target, _ = again.posed(single[group], (a, b))
+        step, own = target.target_from_face[b], target.face_covariance[b]
         # reference_from_b: turned by the way so far; an error of its rotation moves b on the arm from a to b.
         arm = np.block([[np.eye(3), np.zeros((3, 3))], [-skew(pose.rotation @ step.translation), np.eye(3)]])
         turn = block_diag(pose.rotation, pose.rotation)

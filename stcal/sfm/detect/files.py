@@ -3,6 +3,7 @@
 import hashlib
 import json
 from collections.abc import Callable, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import asdict, dataclass, fields
 from pathlib import Path
 
@@ -78,12 +79,12 @@ def detect_files(
     settings = _fingerprint(camera, target, board, options)
     jobs = [(file, camera, size_from, target, board, options, settings) for file in files]
     found: list[DetectedImage | Skipped | None] = [None] * len(files)
-    pending = []
-    for i, file in enumerate(files):
-        found[i] = _kept(file, settings, cache)
-        if found[i] is None:
-            pending.append(i)
-        elif progress:
+    if any(cache.glob("*.npz")):
+        with ThreadPoolExecutor() as pool:  # reading and hashing release the interpreter
+            found[:] = pool.map(lambda file: _kept(file, settings, cache), files)
+    pending = [i for i, each in enumerate(found) if each is None]
+    for file, each in zip(files, found, strict=True):
+        if each is not None and progress:
             progress(file.name)
     for k, outcome in run_on_images(_detect_file, [jobs[i] for i in pending], workers, kept=True):
         i = pending[k]
@@ -128,8 +129,6 @@ def _key(data: bytes, settings: str) -> tuple[str, str]:
 
 def _kept(file: ImageFile, settings: str, cache: Path) -> DetectedImage | None:
     """The result of an earlier run for this content and these settings."""
-    if not any(cache.iterdir()):
-        return None
     try:
         path = cache / f"{_key(file.read(), settings)[1]}.npz"
     except OSError:

@@ -2,14 +2,18 @@
 
 import base64
 import math
+from collections.abc import Callable
 
 from stcal.labels import BOARD, parse_label
+from stcal.parallel import run_briefly
 from stcal.report.page import render, swatch
 from stcal.report.text import NONE, cells, join, number
 from stcal.sfm.report import figures
 from stcal.sfm.report.checks import checks_values
 from stcal.sfm.report.crosscheck import crosscheck_values
 
+SIDES = {-58: "", 122: ", from the other side"}
+"""Azimuths from which target and cameras are drawn."""
 FIRST_PAIRS = 15
 FIRST_IMAGES = 100
 """Rows and overlays that the page has room for."""
@@ -27,6 +31,7 @@ def report_html(report: dict, overlays: dict[str, bytes], reload_s: int | None =
     reload_s : the page loads itself anew so often; never where None
     """
     colours = figures.group_colours([group["name"] for group in report["groups"]])
+    boards, views, bars = _drawn(report, colours)
     return render(
         "sfm/report/page.html.jinja",
         report=report,
@@ -39,16 +44,10 @@ def report_html(report: dict, overlays: dict[str, bytes], reload_s: int | None =
         single_way=[face for face, chains in report["chains"].items() if len(chains) == 1],
         **_faces(report),
         scales=_scales(report),
-        boards=_boards(report),
-        views=[
-            (
-                figures.scene_view(report["scene"], report["camera"], colours, azimuth),
-                figures.target_view(report["scene"]["circles"], report["faces"], azimuth),
-                side,
-            )
-            for azimuth, side in ((-58, ""), (122, ", from the other side"))
-        ],
+        boards=boards,
+        views=views,
         **_residuals(report, colours),
+        bars=bars,
         first_images=FIRST_IMAGES,
         starts=_starts(report),
         first_pairs=FIRST_PAIRS,
@@ -59,6 +58,24 @@ def report_html(report: dict, overlays: dict[str, bytes], reload_s: int | None =
         overlays=_overlays(report, overlays),
         rest=len(report["images"]) - len(overlays),
     )
+
+
+def _drawn(report: dict, colours: dict[str, str]) -> tuple[dict[str, str], list[tuple[str, str, str]], str]:
+    """Plots of the boards' residuals by group, (cameras, target, from where) from two sides, and bars of the images."""
+    scene = report["scene"]
+    boards, jobs = _boards(report), []
+    jobs += [(figures.board_residuals, *own) for own in boards.values()]
+    for azimuth in SIDES:
+        jobs.append((figures.scene_view, scene, report["camera"], colours, azimuth))
+        jobs.append((figures.target_view, scene["circles"], report["faces"], azimuth))
+    drawn = run_briefly(_draw, [*jobs, (figures.image_bars, report["residuals_by_image"], colours)])
+    n = len(boards)
+    views = [(drawn[n + 2 * i], drawn[n + 2 * i + 1], side) for i, side in enumerate(SIDES.values())]
+    return dict(zip(boards, drawn, strict=False)), views, drawn[-1]
+
+
+def _draw(figure: Callable[..., str], *arguments) -> str:
+    return figure(*arguments)
 
 
 # --- result and trust -------------------------------------------------------------------------------------------------
@@ -200,20 +217,20 @@ def _scales(report: dict) -> list[list]:
     ]
 
 
-def _boards(report: dict) -> dict[str, str]:
-    """Plots of the boards' residuals, by group."""
+def _boards(report: dict) -> dict[str, tuple]:
+    """What is drawn of the boards' residuals, by group."""
     residuals = {group["name"]: group["scale"]["board_residuals_um"] for group in report["groups"]}
     vectors = [vector for own in residuals.values() for vector in own.values()]
     reach = max((math.hypot(*vector[:2]) for vector in vectors), default=0.0)
     height = max((abs(vector[2]) for vector in vectors), default=0.0)
-    return {name: figures.board_residuals(own, reach, height) for name, own in residuals.items()}
+    return {name: (own, reach, height) for name, own in residuals.items()}
 
 
 # --- residuals, pairs, left out, overlays -----------------------------------------------------------------------------
 
 
 def _residuals(report: dict, colours: dict[str, str]) -> dict:
-    """By image as rows and bars; by label, face by face and board by board."""
+    """By image as rows; by label, face by face and board by board."""
     images, labels = report["residuals_by_image"], report["residuals_by_label"]
     target: dict[str, list] = {}
     board: dict[str, list] = {}
@@ -234,7 +251,6 @@ def _residuals(report: dict, colours: dict[str, str]) -> dict:
     ]
     return {
         "by_image": rows,
-        "bars": figures.image_bars(images, colours),
         "target_labels": target,
         "board_labels": board,
         "worst_label": max(labels, key=lambda row: row["rms_px"], default=None),

@@ -1,8 +1,9 @@
 """What a run writes into its folder: overlays, results, report."""
 
+import contextlib
 import hashlib
 import os
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
@@ -32,10 +33,11 @@ LONGEST_NAME = 200
 HASH_DIGITS = 12
 
 
-def write_overlays(
+@contextlib.contextmanager
+def overlays_beside(
     detection: DetectionResult, labelled: list[LabelledImage], target: TargetDesign, folder: Path, progress: Progress
-) -> None:
-    """Of every image, what was found in it."""
+) -> Iterator[None]:
+    """Draw into every image what was found in it while other work goes on; all are there at the end."""
     face_ids = [face.id for face in target.faces]
 
     def draw(image, each: LabelledImage) -> None:
@@ -52,7 +54,15 @@ def write_overlays(
         save(path, picture)
 
     with ThreadPoolExecutor() as pool:  # drawing and JPEG release the interpreter
-        for i, _ in enumerate(pool.map(draw, _in_order(detection, labelled), labelled)):
+        drawn = pool.map(draw, _in_order(detection, labelled), labelled)
+        try:
+            yield
+        except Exception:
+            raise
+        except BaseException:  # asked to end
+            pool.shutdown(wait=False, cancel_futures=True)
+            raise
+        for i, _ in enumerate(drawn):
             progress("overlays", i + 1, len(labelled))
 
 
