@@ -75,41 +75,62 @@ def fit_homography(xy_b: np.ndarray, xy_a: np.ndarray) -> np.ndarray:
     b, a = np.asarray(xy_b, float), np.asarray(xy_a, float)
     if len(b) < 4:
         raise DegenerateError(f"homography: {len(b)} point pairs, 4 needed")
-
-    def normaliser(p):
-        x, y = mean = p.sum(0) / len(p)
-        scale = np.sqrt(2) / max(np.sqrt(((p - mean) ** 2).sum(1)).sum() / len(p), 1e-300)
-        return np.array([[scale, 0, -scale * x], [0, scale, -scale * y], [0, 0, 1]])
-
-    na, nb = normaliser(a), normaliser(b)
-    a = a @ na[:2, :2].T + na[:2, 2]
-    b = b @ nb[:2, :2].T + nb[:2, 2]
-    rows = np.zeros((2 * len(b), 9))
-    rows[0::2, 0:2], rows[0::2, 2] = b, 1
-    rows[1::2, 3:5], rows[1::2, 5] = b, 1
-    rows[0::2, 6:8], rows[0::2, 8] = -a[:, :1] * b, -a[:, 0]
-    rows[1::2, 6:8], rows[1::2, 8] = -a[:, 1:] * b, -a[:, 1]
-    _, s, vt = np.linalg.svd(rows, full_matrices=len(b) == 4)
-    # Three of four on a line in both planes leave it open; in one plane only, they force a singular matrix.
-    if s[7] < 1e-9 * s[0] or np.linalg.cond(vt[8].reshape(3, 3)) > 1e9:
+    (found,) = fit_homographies(b[None], a[None], np.ones((1, len(b)), bool))
+    if not np.isfinite(found).all():
         raise DegenerateError("homography: the points do not determine it (three of four on a line)")
-    h = np.linalg.inv(na) @ vt[8].reshape(3, 3) @ nb
-    return h / np.linalg.norm(h) * np.sign(h[2] @ [*np.asarray(xy_b, float)[0], 1.0])
+    return found
+
+
+def fit_homographies(xy_b: np.ndarray, xy_a: np.ndarray, used: np.ndarray) -> np.ndarray:
+    """:func:`fit_homography` of each of k sets of point pairs, (k, n, 2), of which four or more are ``used``, a mask
+    (k, n): (k, 3, 3), NaN where they do not determine one."""
+    count, on = used.sum(1), used[..., None]
+
+    def normalised(p):
+        mean = np.where(on, p, 0).sum(1) / count[:, None]
+        away = p - mean[:, None]
+        size = np.sqrt((away**2).sum(2))
+        scale = np.sqrt(2) / np.maximum(np.where(used, size, 0).sum(1) / count, 1e-300)
+        turn = np.zeros((len(p), 3, 3))
+        turn[:, 0, 0] = turn[:, 1, 1] = scale
+        turn[:, :2, 2], turn[:, 2, 2] = -scale[:, None] * mean, 1
+        return turn, away * scale[:, None, None]
+
+    (na, a), (nb, b) = normalised(xy_a), normalised(xy_b)
+    rows = np.zeros((len(b), b.shape[1], 2, 9))
+    rows[:, :, 0, 0:2] = rows[:, :, 1, 3:5] = b
+    rows[:, :, 0, 2] = rows[:, :, 1, 5] = 1
+    rows[..., 6:8], rows[..., 8] = -a[..., None] * b[:, :, None], -a
+    rows = np.where(on[..., None], rows, 0).reshape(len(b), -1, 9)
+    _, s, vt = np.linalg.svd(rows, full_matrices=rows.shape[1] < 9)
+    normal = vt[:, 8].reshape(-1, 3, 3)
+    # Three of four on a line in both planes leave it open; in one plane only, they force a singular matrix.
+    ok = (s[:, 7] >= 1e-9 * s[:, 0]) & (np.linalg.cond(normal) <= 1e9)
+    h = np.full((len(b), 3, 3), np.nan)
+    h[ok] = np.linalg.inv(na[ok]) @ normal[ok] @ nb[ok]
+    first = np.take_along_axis(xy_b, used.argmax(1)[:, None, None], 1)[:, 0]
+    side = np.sign((h[:, 2, :2] * first).sum(1) + h[:, 2, 2])
+    return h / np.linalg.norm(h, axis=(1, 2), keepdims=True) * side[:, None, None]
 
 
 def apply_homography(a_from_b: np.ndarray, xy_b: np.ndarray) -> np.ndarray:
-    """Map points (..., 2)."""
-    xy_b = np.asarray(xy_b, float)
-    mapped = xy_b @ a_from_b[:, :2].T + a_from_b[:, 2]
+    """Map points (..., 2); (k, n, 2) by k homographies (k, 3, 3) at once."""
+    mapped = _mapped(a_from_b, xy_b)
     return mapped[..., :2] / mapped[..., 2:]
 
 
+def _mapped(a_from_b: np.ndarray, xy_b: np.ndarray) -> np.ndarray:
+    """Homogeneous images (..., 3)."""
+    there = a_from_b[:, 2] if a_from_b.ndim == 2 else a_from_b[:, None, :, 2]
+    return np.asarray(xy_b, float) @ np.swapaxes(a_from_b[..., :2], -1, -2) + there
+
+
 def homography_jacobian(a_from_b: np.ndarray, xy_b: np.ndarray) -> np.ndarray:
-    """Jacobians of :func:`apply_homography`, (n, 2, 2), at points (n, 2)."""
-    xy_b = np.asarray(xy_b, float)
-    mapped = xy_b @ a_from_b[:, :2].T + a_from_b[:, 2]
-    w = mapped[:, 2, None, None]
-    return (a_from_b[:2, :2] - mapped[:, :2, None] / w * a_from_b[2, :2]) / w
+    """Jacobians of :func:`apply_homography`, (..., 2, 2), at points (..., 2); of k homographies likewise."""
+    mapped = _mapped(a_from_b, xy_b)
+    w = mapped[..., 2, None, None]
+    each = a_from_b if a_from_b.ndim == 2 else a_from_b[:, None]
+    return (each[..., :2, :2] - mapped[..., :2, None] / w * each[..., 2:, :2]) / w
 
 
 def camera_from_plane(normalised_from_plane: np.ndarray) -> Rigid:

@@ -15,7 +15,7 @@ from stcal.design import FaceDesign, TargetDesign
 from stcal.geometry.plane import homography_jacobian
 from stcal.labels import CircleLabel
 from stcal.sfm.detect.ambiguity import is_named, mirror_images
-from stcal.sfm.detect.circles.candidates import MAX_AXIS_RATIO, Candidates, grow_match, singular_values
+from stcal.sfm.detect.circles.candidates import MAX_AXIS_RATIO, Candidates, grow_matches, singular_values
 
 NEIGHBOURS_IN_DESIGN = 3
 NEIGHBOURS_IN_IMAGE = 12
@@ -29,6 +29,8 @@ FIRST_HYPOTHESES = 300
 """The best supported ones in an image are all grown, so that rivals meet; of the others …"""
 MAX_TRIES = 8
 """… at most so many from each outline that is in no reading yet: a dim face comes after all clutter."""
+AT_ONCE = 32
+"""Hypotheses that are grown side by side, ahead of their turn."""
 MAX_CONTRAST_RATIO = 4.0
 """Between neighbouring circles of one face, which a shadow or a glare may cross."""
 MIN_CIRCLES = 6
@@ -120,6 +122,41 @@ class _Starts:
         same = (index[self.circles[own]] == self.candidates[own]) & (self.candidates[own] >= 0)
         return own[same.sum(1) >= 2]
 
+    def index(self, rank: int, width: int | None = None) -> np.ndarray:
+        """Candidate of each circle of the hypothesis's face, −1 where there is none; ``width`` : so long."""
+        index = np.full(int(self.circles.max(initial=0)) + 1 if width is None else width, -1)
+        matched = self.candidates[rank] >= 0
+        index[self.circles[rank][matched]] = self.candidates[rank][matched]
+        return index
+
+    def unlike(self, rank: int, wanted: np.ndarray) -> list[int]:
+        """A hypothesis, and ``wanted`` ones behind it of which no two are likely to become the same reading."""
+        left, chosen = wanted.copy(), []
+        left[:rank] = False
+        while len(chosen) < AT_ONCE and left.any():
+            chosen.append(int(left.argmax()))
+            index = self.index(chosen[-1])
+            left[self.agree(int(self.face[chosen[-1]]), index)] = False
+            left[chosen[-1]] = False
+        return chosen
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Circles:
+    """All faces of a design: ``xy`` (f, m, 2), mm, and ``radius`` (f, m), 0 behind the last circle of a face."""
+
+    xy: np.ndarray
+    radius: np.ndarray
+
+
+@lru_cache(maxsize=8)
+def _circles(target: TargetDesign) -> _Circles:
+    width = max(len(face.ids) for face in target.faces)
+    xy, radius = np.zeros((len(target.faces), width, 2)), np.zeros((len(target.faces), width))
+    for i, face in enumerate(target.faces):
+        xy[i], xy[i, : len(face.ids)], radius[i, : len(face.ids)] = face.xy_mm[0], face.xy_mm, face.radius_mm
+    return _Circles(xy, radius)
+
 
 @lru_cache(maxsize=8)
 def _pairs(target: TargetDesign) -> _Pairs:
@@ -166,23 +203,37 @@ class FaceFinder:
             return _decide(readings, self.target)
         starts, tries = self._hypotheses(candidates), np.zeros(len(candidates), int)
         is_open = np.ones(len(starts.origin), bool)
-        explained: set[int] = set()
+        explained = np.zeros(len(candidates), bool)
+        grown: dict[int, tuple[np.ndarray, np.ndarray] | None] = {}
         for rank, first in enumerate(starts.origin.tolist()):
             if rank == FIRST_HYPOTHESES:
-                explained = {i for r in readings for i in r.used() if r.count() >= needed_circles(r.face)}
-            if not is_open[rank] or tries[first] == MAX_TRIES or first in explained:
+                for reading in readings:
+                    explained[reading.used()] |= reading.count() >= needed_circles(reading.face)
+            if not is_open[rank] or tries[first] == MAX_TRIES or explained[first]:
                 continue
             if rank >= FIRST_HYPOTHESES:
                 tries[first] += 1
-            number = int(starts.face[rank])
-            face, matched = self.target.faces[number], starts.candidates[rank] >= 0
-            index = np.full(len(face.ids), -1)
-            index[starts.circles[rank][matched]] = starts.candidates[rank][matched]
-            grown = grow_match(candidates, index, face.xy_mm, face.radius_mm)
-            if grown is not None and _seen_from_outside(grown[1], face):
-                readings.append(FaceReading(face, _of_one_size(candidates, face, *grown), grown[1]))
+            if rank not in grown:
+                wanted = is_open & ((tries < MAX_TRIES) & ~explained)[starts.origin]
+                grown = self._grown(candidates, starts, starts.unlike(rank, wanted))
+            found, number = grown[rank], int(starts.face[rank])
+            face = self.target.faces[number]
+            if found is not None and _seen_from_outside(found[1], face):
+                readings.append(FaceReading(face, _of_one_size(candidates, face, *found), found[1]))
                 is_open[starts.agree(number, readings[-1].index)] = False
         return _decide(readings, self.target)
+
+    def _grown(self, candidates: Candidates, starts: "_Starts", ranks: list[int]):
+        """Circles and homography that each of some hypotheses grows to, side by side; None where none hold together."""
+        circles = _circles(self.target)
+        index = np.stack([starts.index(rank, circles.radius.shape[1]) for rank in ranks])
+        face = starts.face[ranks]
+        found = grow_matches(candidates, index, circles.xy[face], circles.radius[face])
+        size = [len(self.target.faces[number].ids) for number in face.tolist()]
+        return {
+            rank: (found.index[i, : size[i]], found.homography[i]) if found.holds[i] else None
+            for i, rank in enumerate(ranks)
+        }
 
     def find_mirrored(self, candidates: Candidates, named: tuple[FaceReading, ...]) -> tuple[FaceReading, ...]:
         """Faces that the image shows as a mirror does, if none of those ``named`` in it says that it does not."""

@@ -5,9 +5,8 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.spatial import KDTree
 
-from stcal.errors import DegenerateError
 from stcal.geometry.camera import Camera
-from stcal.geometry.plane import apply_homography, fit_homography, homography_jacobian
+from stcal.geometry.plane import apply_homography, fit_homographies, homography_jacobian
 from stcal.sfm.detect.circles.ellipses import Ellipses
 
 MAX_POSITION_ERROR = 0.15
@@ -92,7 +91,7 @@ def fit_pattern(
 ) -> PatternFit:
     """Compare a pattern with the candidates nearest to it; arguments as of :func:`match_pattern`."""
     predicted = apply_homography(image_from_plane, xy_plane)
-    local = homography_jacobian(image_from_plane, xy_plane) * radius[:, None, None]
+    local = homography_jacobian(image_from_plane, xy_plane) * radius[..., None, None]
     size = np.sqrt(np.abs(np.linalg.det(local)))
     distance, index = candidates.tree.query(predicted)
     index = np.where(np.isfinite(distance), index, 0)
@@ -110,43 +109,72 @@ def match_pattern(
 
     Parameters
     ----------
-    image_from_plane : (3, 3) homography into normalised coordinates
-    xy_plane, radius : (m, 2), (m,) circles in the plane
+    image_from_plane : (3, 3) homography into normalised coordinates, or (k, 3, 3) of k patterns
+    xy_plane, radius : (m, 2), (m,) circles in the plane, or (k, m, 2), (k, m)
     slack : factor on the position tolerance
 
     Returns
     -------
-    index : (m,) int, −1 where there is none
+    index : (m,) or (k, m) int, −1 where there is none
     """
     fit = fit_pattern(candidates, image_from_plane, xy_plane, radius, slack)
     index = np.where(fit.fits(), fit.index, -1)
-    # A candidate that two circles claim goes to the nearer one.
-    order = np.lexsort((fit.distance, index))
-    again = np.flatnonzero((index[order][1:] == index[order][:-1]) & (index[order][1:] >= 0)) + 1
-    index[order[again]] = -1
+    # A candidate that two circles of a pattern claim goes to the nearer one.
+    claimed = index.ravel() + np.arange(index.size) // index.shape[-1] * (len(candidates) + 1)
+    order = np.lexsort((fit.distance.ravel(), claimed))
+    again = np.flatnonzero((claimed[order][1:] == claimed[order][:-1]) & (index.ravel()[order][1:] >= 0)) + 1
+    index.reshape(-1)[order[again]] = -1
     return index
 
 
-def grow_match(
-    candidates: Candidates, index: np.ndarray, xy_plane: np.ndarray, radius: np.ndarray, rounds: int = 8
-) -> tuple[np.ndarray, np.ndarray] | None:
-    """Alternate between fitting the homography to the matched circles and matching anew, until nothing changes.
+@dataclass(frozen=True, slots=True, eq=False)
+class Grown:
+    """k patterns: ``index`` (k, m) of the candidates of their circles, −1 where there is none; ``homography`` (k, 3, 3)
+    into normalised coordinates; ``holds`` (k,) where four circles or more hold together."""
 
-    Returns the final (index (m,), homography (3, 3)), or None where fewer than four circles hold together.
+    index: np.ndarray
+    homography: np.ndarray
+    holds: np.ndarray
+
+
+def grow_matches(
+    candidates: Candidates, index: np.ndarray, xy_plane: np.ndarray, radius: np.ndarray, rounds: int = 8
+) -> Grown:
+    """Alternate between fitting homographies to the matched circles and matching anew, until nothing changes.
+
+    Parameters
+    ----------
+    index : (k, m) to start from, −1 where there is none
+    xy_plane, radius : (k, m, 2), (k, m) circles of each pattern; radius 0 behind the last one of a shorter pattern, at
+        the place of one that is there
     """
+    index, there = index.copy(), radius > 0
+    homography, holds = np.full((len(index), 3, 3), np.nan), np.zeros(len(index), bool)
+    active = np.arange(len(index))
     for turn in range(rounds):
-        matched = index >= 0
-        if matched.sum() < MIN_HOMOGRAPHY_POINTS or np.ptp(xy_plane[matched], axis=0).min() == 0:
-            return None
-        try:
-            homography = fit_homography(xy_plane[matched], candidates.xy[index[matched]])
-        except DegenerateError:
-            return None
-        depth = xy_plane @ homography[2, :2] + homography[2, 2]
-        if not np.isfinite(homography).all() or (depth * np.sign(depth[0]) <= 1e-9 * np.abs(depth).max()).any():
-            return None
-        again = match_pattern(candidates, homography, xy_plane, radius, slack=3.0 if turn < 2 else 1.0)
-        if turn >= 2 and (again == index).all():
-            return index, homography
-        index = again
-    return None
+        active = active[_spread_out(index[active] >= 0, xy_plane[active])]
+        if not len(active):
+            break
+        xy, matched = xy_plane[active], index[active] >= 0
+        found = fit_homographies(xy, candidates.xy[index[active]], matched)
+        depth = (xy * found[:, None, 2, :2]).sum(2) + found[:, None, 2, 2]
+        ahead = depth * np.sign(depth[:, :1]) > 1e-9 * np.abs(depth).max(1, keepdims=True)  # no for what is not finite
+        ok = ahead.all(1)
+        active, found = active[ok], found[ok]
+        if not len(active):
+            break
+        slack = 3.0 if turn < 2 else 1.0
+        again = match_pattern(candidates, found, xy_plane[active], np.where(there, radius, 1)[active], slack)
+        again = np.where(there[active], again, -1)
+        settled = (again == index[active]).all(1) & (turn >= 2)
+        homography[active[settled]], holds[active[settled]] = found[settled], True
+        index[active[~settled]] = again[~settled]
+        active = active[~settled]
+    return Grown(index, homography, holds)
+
+
+def _spread_out(matched: np.ndarray, xy: np.ndarray) -> np.ndarray:
+    """Where four circles or more are matched, not all in one row or column; (k,)."""
+    low = np.where(matched[..., None], xy, np.inf).min(1)
+    high = np.where(matched[..., None], xy, -np.inf).max(1)
+    return (matched.sum(1) >= MIN_HOMOGRAPHY_POINTS) & (high > low).all(1)
