@@ -10,7 +10,6 @@ in seconds. The joint adjustment alone is that of the run's own models, in one p
 import argparse
 import json
 import os
-import resource
 import shutil
 import statistics
 import subprocess
@@ -42,6 +41,7 @@ THRESHOLDS = {
 
 STREAM = 40, 1728
 """Photographs for ``measure``, and their width, px: 2 megapixels."""
+MEMORY_EVERY_S = 0.05
 TARGET_SIGMA_MM = 0.002
 """Of the circles of the target that is followed, about that of a run."""
 
@@ -122,10 +122,12 @@ def timed_program(words: list, log: Path, entry: str = "main_sfm") -> tuple[floa
     start = time.perf_counter()
     with log.open("w") as stream:
         run = subprocess.Popen([*program, *map(str, words)], stdout=stream, stderr=stream)
-        together, done = 0, 0
+        together, done, looked = 0, 0, start
         while not done:
             time.sleep(0.005)
-            together = max(together, resident(run.pid))
+            if time.perf_counter() - looked > MEMORY_EVERY_S:
+                looked = time.perf_counter()
+                together = max(together, proportional(run.pid))
             done, status, usage = os.wait4(run.pid, os.WNOHANG)
     seconds = time.perf_counter() - start
     run.returncode = os.waitstatus_to_exitcode(status)
@@ -195,14 +197,16 @@ def timed_following(film: Path, scene) -> tuple[float, float]:
     return seconds, time.perf_counter() - start
 
 
-def resident(pid: int) -> int:
-    """Resident bytes of a process and all that it started, as far as /proc tells."""
+def proportional(pid: int) -> int:
+    """Bytes of a process and all that it started, as far as /proc tells; of a page that several share, each has a part
+    (``Pss``)."""
     try:
-        own = int(Path(f"/proc/{pid}/statm").read_text().split()[1]) * resource.getpagesize()
+        rollup = Path(f"/proc/{pid}/smaps_rollup").read_text()
+        own = int(rollup.partition("\nPss:")[2].split()[0]) * 1024
         children = " ".join(each.read_text() for each in Path(f"/proc/{pid}/task").glob("*/children")).split()
-    except OSError:
+    except (OSError, IndexError):
         return 0  # no /proc, or ended meanwhile
-    return own + sum(resident(int(child)) for child in children)
+    return own + sum(proportional(int(child)) for child in children)
 
 
 def timed_detection(data: Path, cache: Path):
@@ -334,7 +338,7 @@ def main() -> None:
     a_day = f"{cost * 1e6 / 86400:.1f} cores, {result['megabytes'] / result['images'] * 1e6 / 86400:.0f} MB a second"
     print(f"detection: {cost:.2f} s of a core an image; a million such images a day: {a_day}")
     print("peak memory of the run: largest process {peak_process_mib:.0f} MiB, together".format(**result), end=" ")
-    print("{peak_together_mib:.0f} MiB, pages that they share counted in each".format(**result))
+    print("{peak_together_mib:.0f} MiB, pages that they share counted once".format(**result))
     if given.json:
         given.json.write_text(json.dumps(result, indent=1) + "\n", encoding="utf-8")
 

@@ -90,10 +90,10 @@ def run_parallel(
 
 
 def run_briefly(function: Callable[..., R], jobs: Sequence[tuple]) -> list[R]:
-    """Results of ``function(*job)`` in the order of the jobs, of a tenth of a second each: by processes that
-    :func:`kept_processes` has started, right here where there are none."""
+    """Results of ``function(*job)`` in the order of the jobs, of a tenth of a second each: by several processes where
+    :func:`kept_processes` keeps them, else right here."""
     kept = _kept.get()
-    done = kept.run(function, jobs) if kept and kept.started else enumerate(function(*job) for job in jobs)
+    done = kept.run(function, jobs) if kept and kept.workers > 1 else enumerate(function(*job) for job in jobs)
     return [result for _, result in sorted(done, key=itemgetter(0))]
 
 
@@ -116,21 +116,20 @@ class _Processes:
     """Processes of our own, started when the first job comes; they end with the context."""
 
     def __init__(self, workers: int):
-        self._workers = workers
+        self.workers = workers
         self._pool: ProcessPoolExecutor | None = None
         self._others = multiprocessing.active_children()
 
-    @property
-    def started(self) -> bool:
-        """Whether there has been a job."""
-        return self._pool is not None
+    def _start(self) -> ProcessPoolExecutor:
+        if self._pool is None:
+            self._pool = ProcessPoolExecutor(self.workers, _context(), initializer=_follow_parent)
+        return self._pool
 
     def run(self, function: Callable[..., R], jobs: Sequence[tuple]) -> Iterator[tuple[int, R]]:
         """Index and result of each job, in any order."""
         with _plain_main(), _deaf_to_interrupts():
-            if self._pool is None:
-                self._pool = ProcessPoolExecutor(self._workers, _context(), initializer=_follow_parent)
-            futures = {self._pool.submit(function, *job): i for i, job in enumerate(jobs)}
+            pool = self._start()
+            futures = {pool.submit(function, *job): i for i, job in enumerate(jobs)}
         try:
             for future in as_completed(futures):
                 yield futures[future], future.result()
@@ -140,10 +139,9 @@ class _Processes:
 
     def everywhere(self, function: Callable, arguments: tuple) -> None:
         """Begin the same in every process, as far as they are idle."""
-        assert self._pool is not None
         with _plain_main(), _deaf_to_interrupts():
-            for _ in range(self._workers):
-                self._pool.submit(function, *arguments)
+            for _ in range(self.workers):
+                self._start().submit(function, *arguments)
 
     def __enter__(self) -> "_Processes":
         return self
@@ -160,9 +158,9 @@ class _Processes:
 
 
 def load_in_processes(*modules: str) -> None:
-    """Load modules in the processes that :func:`kept_processes` has started, while this one goes on."""
+    """Load modules in the processes that :func:`kept_processes` keeps, while this one goes on."""
     kept = _kept.get()
-    if kept and kept.started:
+    if kept and kept.workers > 1:
         kept.everywhere(_load, modules)
 
 
