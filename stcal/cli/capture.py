@@ -103,6 +103,7 @@ def advise(
     out: JsonFile = None,
 ) -> None:
     """Compute from a run's own geometry which further photographs would lower the σ of its worst face most."""
+    load_ahead(None)
     from stcal.sfm.plan.advise import advise as advice_for
     from stcal.sfm.plan.advise import doubts, known_of
     from stcal.sfm.plan.file import AdviceFile

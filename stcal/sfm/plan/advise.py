@@ -1,5 +1,6 @@
 """After a run: which further photographs would make its worst face better, and when only a better board would."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from itertools import combinations
 
@@ -9,7 +10,7 @@ from stcal.errors import DegenerateError
 from stcal.geometry.rigid import Rigid
 from stcal.io.camera import camera_prior
 from stcal.labels import circle_labels
-from stcal.parallel import Progress, one_thread
+from stcal.parallel import Progress, kept_processes, one_thread, run_briefly
 from stcal.sfm.adjust.blocks import rows_of_view
 from stcal.sfm.adjust.calibration import with_sigma
 from stcal.sfm.adjust.chain import CalibratedTarget
@@ -21,9 +22,9 @@ from stcal.sfm.plan.forecast import (
     CentreNoise,
     Forecast,
     Photographs,
+    PositionsWith,
     Setup,
     forecast,
-    positions_with,
     variance_shares,
     without_sources,
     worst_of,
@@ -37,6 +38,8 @@ from stcal.synthetic.scene import Group, Scene, group_name
 SHORTLIST = 8
 """After the first choice only candidates that were among so many best for one of the faces are looked at again."""
 NEW_GROUP_SPREAD_RAD = float(np.radians(40))
+AT_ONCE = 50
+"""Candidates that one process computes at a time."""
 MIN_NEW_GROUP = 3
 """Images that a new group needs to be mapped."""
 BOARD_DOMINATES = 0.5
@@ -158,12 +161,15 @@ def advise(known: Known, count: int = 5, progress: Progress | None = None) -> Ad
     photographs = photographs_of(known.models, setup.board, setup.camera, setup.prior)
     now = forecast(known.models, setup, photographs=photographs)
     shares = variance_shares(now, without_sources(known.models, setup, now.derivatives, photographs))
-    views = [v for model in known.models for v in candidates(known.scene, model, setup, known.noise)]
+    with kept_processes():
+        by_group = run_briefly(candidates, [(known.scene, model, setup, known.noise) for model in known.models])
+        views = [view for own in by_group for view in own]
+        chosen = _greedy(known, views, now, photographs, count, progress or (lambda *_: None))
     return Advice(
         now,
         shares,
         known.noise,
-        tuple(_greedy(known, views, now, photographs, count, progress or (lambda *_: None))),
+        tuple(chosen),
         tuple(_new_groups(known, now, photographs, max(count, MIN_NEW_GROUP))),
         forecast(known.models, setup.better_board(0.5), now.derivatives, photographs),
         len(views),
@@ -177,11 +183,10 @@ def _greedy(
     chosen: list[Choice] = []
     setup, photographs = known.setup, dict(photographs)
     while views and len(chosen) < count:
-        positions = positions_with(known.models, setup, now.derivatives, photographs)
-        results = []
-        for view in views:
-            progress(f"view {len(chosen) + 1}", len(results), len(views))
-            results.append(positions(view.model))
+        progress(f"view {len(chosen) + 1}", 0, len(views))
+        positions = PositionsWith.of(known.models, setup, now.derivatives, photographs)
+        parts = [views[i : i + AT_ONCE] for i in range(0, len(views), AT_ONCE)]
+        results = [sigma for part in run_briefly(_positions, [(positions, part) for part in parts]) for sigma in part]
         progress(f"view {len(chosen) + 1}", len(views), len(views))
         best = int(np.argmin([worst_of(sigma)[1] for sigma in results]))
         chosen.append(Choice(views[best], *worst_of(results[best])))
@@ -190,6 +195,10 @@ def _greedy(
         keep = _promising(results) - {best}
         views = [views[i] for i in sorted(keep)]
     return chosen
+
+
+def _positions(positions: PositionsWith, views: Sequence[PlannedView]) -> list[dict[str, float]]:
+    return [positions(view.model) for view in views]
 
 
 def _promising(by_view: list[dict[str, float]]) -> set[int]:

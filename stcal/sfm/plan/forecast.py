@@ -1,7 +1,7 @@
 """The σ to expect of a geometry, photographed or only planned: centring noise by the size and tilt of the circles, then
 the covariance of the joint adjustment itself."""
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -14,7 +14,7 @@ from stcal.io.camera import CameraPrior
 from stcal.labels import CircleLabel, Label
 from stcal.sfm.adjust.chain import CalibratedTarget
 from stcal.sfm.adjust.faces import FrameKind
-from stcal.sfm.adjust.joint import covariance_of, extensible
+from stcal.sfm.adjust.joint import Extensible, covariance_of, extensible
 from stcal.sfm.adjust.uncertainty import Derivatives, derivatives, scale_sigma
 from stcal.sfm.data.model import MetricModel
 from stcal.synthetic.observe import rim_points
@@ -210,17 +210,26 @@ def forecast(
     )
 
 
-def positions_with(
-    models: Sequence[MetricModel], setup: Setup, known: Derivatives, photographs: Photographs | None = None
-) -> Callable[[MetricModel], dict[str, float]]:
-    """A function that gives :meth:`Forecast.position_sigma_mm` with one further view, as :func:`forecast` would."""
-    now = extensible(models, setup.board, setup.camera, setup.flatness_mm, setup.prior, setup.common, photographs)
+@dataclass(frozen=True, slots=True, eq=False)
+class PositionsWith:
+    """Gives :meth:`Forecast.position_sigma_mm` with one further view, as :func:`forecast` would."""
 
-    def positions(view: MetricModel) -> dict[str, float]:
-        faces = known.face_covariance(setup.sigma0**2 * now.with_view(view))
-        return {f: position_sigma_mm(c) for f, c in faces.items() if f != setup.start.reference_face}
+    now: Extensible
+    setup: Setup
+    known: Derivatives
 
-    return positions
+    @classmethod
+    def of(
+        cls, models: Sequence[MetricModel], setup: Setup, known: Derivatives, photographs: Photographs | None = None
+    ) -> "PositionsWith":
+        """Beside these models; ``known`` and ``photographs`` as of :func:`forecast`."""
+        now = extensible(models, setup.board, setup.camera, setup.flatness_mm, setup.prior, setup.common, photographs)
+        return cls(now, setup, known)
+
+    def __call__(self, view: MetricModel) -> dict[str, float]:
+        """By face, mm."""
+        faces = self.known.face_covariance(self.setup.sigma0**2 * self.now.with_view(view))
+        return {f: position_sigma_mm(c) for f, c in faces.items() if f != self.setup.start.reference_face}
 
 
 def position_sigma_mm(face_covariance: np.ndarray) -> float:

@@ -28,9 +28,9 @@ from stcal.sfm.plan.forecast import (
     PRACTICE,
     CentreNoise,
     Forecast,
+    PositionsWith,
     Setup,
     forecast,
-    positions_with,
 )
 from stcal.sfm.plan.session import PlanOptions
 from stcal.sfm.plan.session import plan as make_plan
@@ -226,7 +226,7 @@ def test_one_more_view_needs_no_new_adjustment(known, coarse, flatness_mm, commo
     setup = replace(known.setup, flatness_mm=flatness_mm, common=common, prior=prior, sigma0=1.3)
     known = replace(known, setup=setup)
     now = forecast(known.models, setup)
-    positions = positions_with(known.models, setup, now.derivatives)
+    positions = PositionsWith.of(known.models, setup, now.derivatives)
     for model, own in offered(known):
         assert own, model.group
         for view in own[::3]:
