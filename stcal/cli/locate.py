@@ -6,6 +6,7 @@ from typing import Annotated
 
 import typer
 
+from stcal.cli.help import PLAIN, Commands
 from stcal.cli.options import (
     CameraFile,
     FlatBoardFile,
@@ -22,9 +23,8 @@ from stcal.errors import InputError
 app = typer.Typer(
     name="stcal locate",
     help="Find a planar target of several tags under any light, with a verdict whether its pose may be trusted.",
-    no_args_is_help=True,
-    add_completion=False,
-    pretty_exceptions_enable=False,
+    cls=Commands,
+    **PLAIN,
 )
 NOTHING_ACCEPTED = 3
 

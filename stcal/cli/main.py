@@ -10,6 +10,7 @@ import typer
 import stcal
 from stcal.cli import camera, capture, colmap, handeye, locate, measure, register, robot, sfm, simulate
 from stcal.cli.entry import NO_MEMORY, lacks_memory
+from stcal.cli.help import PLAIN, Commands
 from stcal.cli.options import protect_inputs
 from stcal.cli.terminal import printable
 from stcal.errors import StcalError
@@ -25,9 +26,8 @@ UsageError: Any = next(c for c in typer.BadParameter.__mro__ if c.__name__ == "C
 app = typer.Typer(
     name="stcal",
     help="Calibrate stereo targets from photographs of a single camera, and use them.",
-    no_args_is_help=True,
-    add_completion=False,
-    pretty_exceptions_enable=False,
+    cls=Commands,
+    **PLAIN,
 )
 sfm.app.add_typer(simulate.app)
 sfm.app.add_typer(colmap.app)
@@ -81,7 +81,7 @@ def _guarded(application: typer.Typer) -> None:
             raise
         _fail(str(error), error.exit_code)
     except UsageError as error:
-        if not error.format_message():  # no arguments at all: the answer is the help text
+        if type(error).__name__ == "NoArgsIsHelpError":  # the answer is the help text
             error.show()
             sys.exit(error.exit_code)
         where = error.ctx.command_path if error.ctx else application.info.name

@@ -7,6 +7,7 @@ from typing import Annotated
 
 import typer
 
+from stcal.cli.help import PLAIN, Commands
 from stcal.cli.options import MOST_SEED, JsonFile, QuaternionOrder, Quaternions, ReportFile, RobotFile
 from stcal.cli.terminal import print_each, say, write
 from stcal.errors import DegenerateError, InputError
@@ -14,9 +15,8 @@ from stcal.errors import DegenerateError, InputError
 app = typer.Typer(
     name="stcal robot",
     help="Calibrate a robot from measured data of any instrument, and compensate it.",
-    no_args_is_help=True,
-    add_completion=False,
-    pretty_exceptions_enable=False,
+    cls=Commands,
+    **PLAIN,
 )
 
 

@@ -6,6 +6,7 @@ from typing import Annotated
 
 import typer
 
+from stcal.cli.help import PLAIN, Commands
 from stcal.cli.options import (
     BoardFile,
     CameraFile,
@@ -28,9 +29,8 @@ from stcal.errors import InputError
 app = typer.Typer(
     name="stcal-sfm",
     help="Calibrate a target from a folder of images. Any command takes --debug for a traceback.",
-    no_args_is_help=True,
-    add_completion=False,
-    pretty_exceptions_enable=False,
+    cls=Commands,
+    **PLAIN,
 )
 
 
