@@ -2,6 +2,7 @@
 
 from collections.abc import Iterable
 from dataclasses import dataclass
+from functools import lru_cache
 from typing import Literal
 
 import numpy as np
@@ -94,7 +95,7 @@ class BoardDesign:
 
     def labels(self) -> list[DotLabel]:
         """``board:row:column``, row-major."""
-        return [DotLabel(r, c) for r in range(self.rows) for c in range(self.columns)]
+        return list(_dot_labels(self.rows, self.columns))
 
     def places_mm(self, labels: Iterable[Label]) -> np.ndarray:
         """Grid positions of these dots, (n, 3), board frame."""
@@ -104,6 +105,11 @@ class BoardDesign:
     def radius_of(self) -> dict[DotLabel, float]:
         """Radius in mm by label."""
         return dict(zip(self.labels(), self.radii_mm().tolist(), strict=True))
+
+
+@lru_cache(maxsize=4)
+def _dot_labels(rows: int, columns: int) -> tuple[DotLabel, ...]:
+    return tuple(DotLabel(r, c) for r in range(rows) for c in range(columns))
 
 
 def reference_target() -> TargetDesign:

@@ -5,6 +5,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
+from scipy.special import ellipe, ellipk
 
 from stcal.design import BoardDesign, TargetDesign
 from stcal.geometry.arrays import frozen
@@ -14,10 +15,10 @@ from stcal.io.camera import CameraPrior
 from stcal.labels import CircleLabel, Label
 from stcal.sfm.adjust.chain import CalibratedTarget
 from stcal.sfm.adjust.faces import FrameKind
+from stcal.sfm.adjust.group import projection_jacobians
 from stcal.sfm.adjust.joint import Extensible, covariance_of, extensible
 from stcal.sfm.adjust.uncertainty import Derivatives, derivatives, scale_sigma
 from stcal.sfm.data.model import MetricModel
-from stcal.synthetic.observe import rim_points
 
 IMAGE_NOISE = 0.01
 """Standard deviation of the grey values, as a fraction of full scale."""
@@ -30,8 +31,6 @@ PRACTICE = 1.3
 estimated, quantisation, neighbouring edges."""
 ONE_PLATE = 0.99
 """Share of the board's variance that all groups have in common where one plate is in all of them."""
-AT_ONCE = 1000
-"""Rims at a time: what a core's cache holds."""
 ENOUGH = 10_000
 """Observations from which the law of their noise is read."""
 OFF = 1e-2
@@ -101,25 +100,26 @@ class _Rims:
 
     @classmethod
     def of(cls, model: MetricModel, camera: Camera, radius_mm: dict[Label, float]) -> "_Rims":
+        """To first order in radius over distance, which a σ does not notice: ellipses."""
         normal = np.zeros((len(model.labels), 3))
         for members in model.points_by_face().values():
             normal[members] = fit_plane(model.xyz_model[members]).normal
         radius = np.array([radius_mm[label] for label in model.labels])
-        rotation = np.stack([pose.rotation for pose in model.camera_from_model])
-        xyz = model.xyz_camera()
-        parts = []
-        for start in range(0, len(xyz), AT_ONCE):
-            point, image = (index[start : start + AT_ONCE] for index in (model.point_index, model.image_index))
-            normal_camera = (rotation[image] @ normal[point][..., None])[..., 0]
-            rim = camera.project(rim_points(xyz[start : start + AT_ONCE], normal_camera, radius[point]))
-            side = np.roll(rim, -1, axis=1) - rim
-            across = np.stack([side[..., 1], -side[..., 0]], axis=-1)
-            length = np.linalg.norm(side, axis=2, keepdims=True)
-            spread = rim - rim.mean(1, keepdims=True)
-            moment = np.swapaxes(spread, 1, 2) @ spread / rim.shape[1]
-            narrow = np.sqrt(2 * np.linalg.eigvalsh(moment)[:, 0])
-            parts.append((np.swapaxes(across / length, 1, 2) @ across, narrow))
-        return cls(*(np.concatenate(each) for each in zip(*parts, strict=True)))
+        in_plane = np.linalg.svd(normal[:, None])[2][:, 1:] * radius[:, None, None]
+        by_point = projection_jacobians(model, camera)[1]
+        shape = by_point @ np.swapaxes(in_plane, 1, 2)[model.point_index]
+        square, axes = np.linalg.eigh(shape @ np.swapaxes(shape, 1, 2))
+        minor, major = np.sqrt(square).T
+        along = np.stack(_rim_integrals(minor, major), 1)
+        return cls((axes * along[:, None]) @ np.swapaxes(axes, 1, 2), minor)
+
+
+def _rim_integrals(minor: np.ndarray, major: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """∮ nₓ² ds around ellipses with these semi-axes, along the minor and along the major one: complete elliptic
+    integrals (Abramowitz and Stegun 1964, 17.3)."""
+    m = np.maximum(1 - (minor / major) ** 2, 1e-6)  # what a circle itself would need is a limit
+    first, second = ellipk(m), ellipe(m)
+    return 4 * major * (second - (1 - m) * first) / m, 4 * minor**2 / major * (first - second) / m
 
 
 @dataclass(frozen=True, slots=True, eq=False)

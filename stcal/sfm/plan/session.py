@@ -160,11 +160,13 @@ def plan(
     setup, models = _setup(scene, options, board), _models(scene, options)
     whole = forecast(models, setup)
     half_board = forecast(models, setup.better_board(0.5), whole.derivatives)
+    twice = replace(options, images=2 * options.images)
+    nearer = replace(options, distance_mm=NEARER * options.distance_mm)
     remedies = [
-        _remedy("twice the images", replace(options, images=2 * options.images), target, board, nominal),
+        _remedy("twice the images", twice, target, board, nominal),
         _wider(options, target, board, nominal),
         Remedy("a board of half the σ", half_board.worst()[1]),
-        _remedy("nearer by 20 %", replace(options, distance_mm=NEARER * options.distance_mm), target, board, nominal),
+        _remedy("nearer by 20 %", nearer, target, board, nominal),
     ]
     return Plan(
         options,
