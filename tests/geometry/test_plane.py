@@ -11,6 +11,7 @@ from stcal.geometry.plane import (
     Plane,
     apply_homography,
     camera_from_plane,
+    fit_homographies,
     fit_homography,
     fit_plane,
     homography_jacobian,
@@ -92,6 +93,24 @@ def test_homography_comes_back_from_its_points(pose, n):
     np.testing.assert_allclose(found / found[2, 2], true / true[2, 2], atol=1e-9)
     assert found[2] @ [*used[0], 1] > 0
     assert np.linalg.norm(found) == pytest.approx(1, rel=1e-12)
+
+
+def test_homographies_side_by_side_are_those_of_single_ones():
+    """Of points with noise, of which each set uses others; and one set that determines none."""
+    rng = np.random.default_rng(4)
+    used = rng.random((6, len(GRID))) < 0.6
+    used[5] = np.arange(len(GRID)) < 5  # a row
+    xy_a = np.stack([view(Rigid.exp([0.4, 0.1 * k, 0.2, -50, -30, 800]), GRID) for k in range(6)])
+    xy_a += rng.normal(0, 1e-4, xy_a.shape)
+    xy_b = np.tile(GRID, (6, 1, 1))
+    together = fit_homographies(xy_b, xy_a, used)
+    mapped, jacobian = apply_homography(together, xy_b), homography_jacobian(together, xy_b)
+    for k in range(5):
+        alone = fit_homography(GRID[used[k]], xy_a[k][used[k]])
+        np.testing.assert_allclose(together[k], alone, rtol=0, atol=1e-12)
+        np.testing.assert_allclose(mapped[k], apply_homography(alone, GRID), rtol=1e-9)
+        np.testing.assert_allclose(jacobian[k], homography_jacobian(alone, GRID), rtol=1e-9)
+    assert np.isnan(together[5]).all()
 
 
 def test_homography_of_noisy_points_agrees_with_opencv():
