@@ -294,6 +294,69 @@ def measure(data: Path, stream: Path, film: Path, scratch: Path) -> dict:
     return about | {"rows": rows, "peak_process_mib": largest, "peak_together_mib": together}
 
 
+STAGES = {
+    "detect": "detection",
+    "map": "labels, mapping of the groups (overlays beside it)",
+    "faces": "joint adjustment and faces",
+    "overlays": "rest of the overlays",
+    "check": "checks",
+    "report": "results, figures, report",
+}
+"""By the name of a run's stage: what it does until it says that it is done."""
+
+
+def run_profile(data: Path, out: Path) -> dict[str, float]:
+    """Seconds of each stage of a run in this process, its libraries loaded."""
+    from stcal.parallel import load_ahead
+    from stcal.sfm import run
+
+    ends = {}
+    load_ahead()
+    start = time.perf_counter()
+    files = [data / name for name in ("images", "cameras.txt")], [data / name for name in ("target.toml", "board.toml")]
+    run(*files[0], out, *files[1], progress=lambda stage, *_: ends.update({stage: time.perf_counter() - start}))
+    begins = [0.0, *ends.values()]
+    return {STAGES[stage]: end - begin for (stage, end), begin in zip(ends.items(), begins, strict=False)}
+
+
+def detection_profile(paths: list[Path], data: Path) -> dict[str, float]:
+    """Milliseconds an image of detection's parts, one process alone."""
+    from stcal.io.images import decode
+    from stcal.parallel import one_thread
+    from stcal.sfm.detect import files, image
+    from stcal.sfm.detect.circles.ellipses import EllipseOptions
+
+    target, board = load_target(data / "target.toml"), load_board(data / "board.toml")
+    camera = read_camera(data / "cameras.txt")
+    camera = camera.sized(camera.width, camera.height)
+    found: dict[str, float] = {}
+
+    def told(what: str, function):
+        def call(*arguments, **named):
+            start = time.perf_counter()
+            result = function(*arguments, **named)
+            found[what] = found.get(what, 0.0) + 1e3 * (time.perf_counter() - start) / len(paths)
+            return result
+
+        return call
+
+    parts = {"outlines": "find_ellipses", "board": "find_boards", "circles' fits": "measure_centres"}
+    kept = {name: getattr(image, name) for name in parts.values()}
+    try:
+        for what, name in parts.items():
+            setattr(image, name, told(what, kept[name]))
+        with one_thread():
+            for path in paths:
+                picture = told("decoding", decode)(path.read_bytes(), path.name)
+                seen = told("together", image.detect_image)(picture, camera, target, board, EllipseOptions())
+                told("packing, with a small picture", files._packed)(seen, "", picture)
+    finally:
+        for name, function in kept.items():
+            setattr(image, name, function)
+    found["faces' hypotheses, and the rest"] = found.pop("together") - sum(found[what] for what in parts)
+    return found
+
+
 def best_of(rounds: list[dict]) -> dict:
     """Of each row the smallest and the median time (what else the machine did only adds), and the largest memory."""
     best = rounds[-1] | {"rounds": len(rounds)}
@@ -326,6 +389,9 @@ def main() -> None:
         result = best_of(
             [measure(data, stream, keep / "film", Path(scratch) / str(i)) for i in range(max(given.rounds, 1))]
         )
+        result["run_profile_s"] = run_profile(data, Path(scratch) / "profiled")
+        some = sorted((data / "images").glob("*/*"))[:: max(1, given.images // 10)]
+        result["detection_profile_ms"] = detection_profile(some, data)
     print("{images} images of {size_px} px, {megabytes:.0f} MB, {workers} workers, {rounds} rounds".format(**result))
     print(f"{'':34} {'seconds':>8} {'median':>7} {'ratio':>6}   boards found, complete, right")
     for name, row in result["rows"].items():
@@ -339,6 +405,12 @@ def main() -> None:
     print(f"detection: {cost:.2f} s of a core an image; a million such images a day: {a_day}")
     print("peak memory of the run: largest process {peak_process_mib:.0f} MiB, together".format(**result), end=" ")
     print("{peak_together_mib:.0f} MiB, pages that they share counted once".format(**result))
+    print("\nwhere the time of a run goes, s (one run, libraries loaded):")
+    for stage, seconds in result["run_profile_s"].items():
+        print(f"  {stage:52} {seconds:6.2f}")
+    print("where that of detection goes, ms an image (one process alone):")
+    for part, ms in result["detection_profile_ms"].items():
+        print(f"  {part:52} {ms:6.1f}")
     if given.json:
         given.json.write_text(json.dumps(result, indent=1) + "\n", encoding="utf-8")
 

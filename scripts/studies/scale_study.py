@@ -30,7 +30,7 @@ from stcal.synthetic.scene import Scene, SceneOptions, make_scene
 
 NOISE_PX = 0.02
 MISSING = 0.1
-SIZES = (40, 80, 160, 300, 1000, 2000)
+SIZES = (40, 80, 160, 300, 1000, 2000, 10_000)
 ALL_UP_TO = 300
 
 
