@@ -12,8 +12,12 @@ from stcal.cli.terminal import StageProgress, print_each, say, write
 from stcal.errors import InputError
 
 if TYPE_CHECKING:
+    from stcal.handeye import EvolutionOptions
+    from stcal.handeye.methods.evolution import Bounds
     from stcal.handeye.report.file import Outcome
 
+EVOLVED = ("de", "de-polished")
+"""Methods that take the options ``--de-…``."""
 SCALED = ("pose", "reprojection")
 """Methods that can find the board's size."""
 
@@ -118,6 +122,43 @@ def handeye(
             "--camera-out", writable=True, help="Write the camera of --refine-camera with σ to this file (cameras.txt)."
         ),
     ] = None,
+    de_bounds_deg: Annotated[
+        str | None,
+        typer.Option(
+            "--de-bounds-deg",
+            help="Begin --method de within ± this rotation about zero, about X,Y,Z,± (rotation vector) or "
+            "closed-form,±; 180 if not given.",
+        ),
+    ] = None,
+    de_bounds_mm: Annotated[
+        str | None,
+        typer.Option(
+            "--de-bounds-mm",
+            help="Begin --method de within ± this translation, X,Y,Z,± or closed-form,±; the farthest pose if not "
+            "given.",
+        ),
+    ] = None,
+    de_population: Annotated[
+        int | None, typer.Option("--de-population", min=4, max=100_000, help="Use M candidates; 30, the paper's.")
+    ] = None,
+    de_f: Annotated[
+        float | None, typer.Option("--de-f", min=1e-6, max=2, help="Use this mutation factor F; 0.5, the paper's.")
+    ] = None,
+    de_cr: Annotated[
+        float | None, typer.Option("--de-cr", min=0, max=1, help="Use this crossover factor CR; 0.9, the paper's.")
+    ] = None,
+    de_lambda: Annotated[
+        float | None,
+        typer.Option(
+            "--de-lambda", min=1e-12, max=1e12, help="Multiply translations, m, squared by λ; 1, the paper's."
+        ),
+    ] = None,
+    de_generations: Annotated[
+        int | None, typer.Option("--de-generations", min=0, max=100_000, help="End after these; 100, the paper's.")
+    ] = None,
+    de_seed: Annotated[
+        int | None, typer.Option("--de-seed", min=0, max=MOST_SEED, help="Draw the population with this seed.")
+    ] = None,
     quaternions: Quaternions = QuaternionOrder.wxyz,
     workers: Workers = None,
     json_file: JsonFile = None,
@@ -142,9 +183,22 @@ def handeye(
         )
     if source.is_dir() and sigma_camera_mm is not None:
         raise InputError("--sigma-camera-mm, --sigma-camera-deg: only with poses; with images give --sigma-px")
+    evolution = _evolution(
+        method,
+        bounds_rad=_bounds("--de-bounds-deg", de_bounds_deg, math.radians(1)),
+        bounds_mm=_bounds("--de-bounds-mm", de_bounds_mm, 1.0),
+        population=de_population,
+        factor=de_f,
+        crossover=de_cr,
+        weight=de_lambda,
+        generations=de_generations,
+        seed=de_seed,
+    )
     with StageProgress() as progress:
         given = read_input(source, poses, camera, board, workers, progress, quaternions.value)
-        options = HandEyeOptions(noise, given.prior if refine_camera else None, with_scale, given.symmetries, four_dof)
+        options = HandEyeOptions(
+            noise, given.prior if refine_camera else None, with_scale, given.symmetries, four_dof, evolution
+        )
         validation = Splits(splits, held_out, seed, workers)
         outcome = calibrate(given, setup.value, method, options, validation, progress)
     result = outcome.result
@@ -183,6 +237,34 @@ def _require_fitting(source: Path, method: str | None, refine_camera: bool, came
         raise InputError(f"--camera-out: {method} does not adjust the camera; leave --method out")
     if method not in (None, ALL, *METHODS):
         raise InputError(f"--method {method}: unknown; {ALL} or one of {', '.join(METHODS)} needed")
+
+
+def _bounds(option: str, text: str | None, factor: float) -> "Bounds | None":
+    """``±``, ``X,Y,Z,±`` or ``closed-form,±``."""
+    from stcal.handeye.methods.evolution import Bounds
+
+    if text is None:
+        return None
+    *about, half = text.split(",")
+    try:
+        half_width = factor * float(half)
+        if about == ["closed-form"]:
+            return Bounds(half_width, None)
+        x, y, z = (factor * float(each) for each in about or "000")
+        return Bounds(half_width, (x, y, z))
+    except ValueError as error:
+        raise InputError(f"{option} {text}: one number, X,Y,Z,± or closed-form,± needed") from error
+
+
+def _evolution(method: str | None, **given) -> "EvolutionOptions":
+    """Options of differential evolution, those that were given."""
+    from stcal.handeye import EvolutionOptions
+    from stcal.workflows.handeye import ALL
+
+    given = {name: value for name, value in given.items() if value is not None}
+    if given and method not in (ALL, *EVOLVED):
+        raise InputError(f"--de-…: only with --method {', '.join(EVOLVED)} or {ALL}")
+    return EvolutionOptions(**given)
 
 
 def _save_camera(path: Path, outcome: "Outcome") -> None:

@@ -1,5 +1,6 @@
 """``stcal register``: the transform between two instruments' frames from corresponding points."""
 
+from dataclasses import replace
 from enum import StrEnum
 from pathlib import Path
 from typing import Annotated
@@ -40,7 +41,31 @@ def register(
     ] = Method.robust,
     threshold: Annotated[
         float | None,
-        typer.Option(help="Count points nearer than this as inliers, mm; estimated from the data if not given."),
+        typer.Option(
+            "--threshold",
+            "--threshold-mm",
+            help="Count points nearer than this as inliers, mm; if not given estimated from the data, liu2017 0.2.",
+        ),
+    ] = None,
+    sample: Annotated[
+        int | None, typer.Option(min=4, max=100_000, help="Draw samples of so many points, liu2017; 30 if not given.")
+    ] = None,
+    share: Annotated[
+        float | None,
+        typer.Option(
+            min=1e-9, max=1, help="Accept a sample when more than this share of the others are inliers, liu2017; 0.85."
+        ),
+    ] = None,
+    tries: Annotated[
+        int | None, typer.Option(min=1, max=1_000_000, help="Draw so many samples, liu2017; 1000 if not given.")
+    ] = None,
+    orthogonality: Annotated[
+        float | None,
+        typer.Option(
+            min=1e-12,
+            max=1e6,
+            help="Reject a sample whose 3×3 part R has an entry of RᵀR − 1 beyond this, liu2017; 0.01.",
+        ),
     ] = None,
     seed: Annotated[int, typer.Option(min=0, max=MOST_SEED, help="Draw random samples and folds with this seed.")] = 0,
     folds: Annotated[
@@ -66,16 +91,23 @@ def register(
 ) -> None:
     """Find b_from_a from points measured in two frames, some of them wrong; with σ, outliers and where it holds."""
     from stcal.register import register as registered
+    from stcal.register.core.liu2017 import Liu2017Options, sample_sizes
     from stcal.register.core.pairs import read_pairs
     from stcal.register.report.file import RegistrationFile
-    from stcal.register.report.page import registration_page, registration_text
+    from stcal.register.report.page import registration_page, registration_text, sample_size_section
     from stcal.register.workspace.findings import findings
 
     if identified and not robot_file:
         raise InputError(f"--identified {identified}: only with --robot FILE")
+    published = {"sample": sample, "share": share, "tries": tries, "orthogonal_within": orthogonality}
+    published = {name: value for name, value in published.items() if value is not None}
+    if published and method != Method.liu2017:
+        raise InputError("--sample, --share, --tries, --orthogonality: only with --method liu2017")
+    liu2017 = replace(Liu2017Options(), **published) if method == Method.liu2017 else None
     pairs = read_pairs(pairs_file)
     allow_ambiguous |= robot_file is not None  # a bent arm may look like two motions; the kinematics tell
     options = {"model": model.value, "method": method.value, "threshold_mm": threshold, "seed": seed}
+    options |= {"liu2017_options": liu2017} if liu2017 else {}
     result = registered(
         pairs.xyz_a,
         pairs.xyz_b,
@@ -107,6 +139,9 @@ def register(
     if out:
         write(out, content)
     if report:
+        if liu2017:
+            limits = liu2017 if threshold is None else replace(liu2017, limit_mm=threshold)
+            sections.insert(0, sample_size_section(sample_sizes(pairs.xyz_a, pairs.xyz_b, limits, seed), limits))
         write(report, registration_page(found, sections))
     if failed is not None:
         raise failed

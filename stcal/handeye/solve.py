@@ -192,6 +192,8 @@ def _by_equations(task: _Task, method: str) -> HandEye:
         x, z = closed_form(loop, method, unit_mm)
     else:
         x = _by_motions(loop, method, unit_mm, task.options.evolution)
+        if method == "de":
+            notes = (*notes, task.options.evolution.in_words(unit_mm))
         z = start.mean_pose(task.loop.chain(x))
     none = np.zeros(len(task.loop), bool)
     residuals = task.loop.residuals(x, z)
@@ -215,7 +217,8 @@ def _by_motions(loop: Loop, method: str, unit_mm: float, options: EvolutionOptio
         return convex(motions, unit_mm)
     objective = Objective(motions.with_log(method), unit_mm, options.weight)
     farthest = max(np.linalg.norm(p.translation, axis=1).max() for p in (loop.camera_from_board, loop.stand_from_mount))
-    x = evolve(objective, farthest, options)
+    known = closed_form(loop, "park-martin", unit_mm)[0] if options.needs_closed_form() else None
+    x = evolve(objective, options, float(farthest), known)
     return polish(objective, x) if method == "de-polished" else x
 
 

@@ -452,3 +452,33 @@ def test_the_order_of_quaternions_is_an_option(command, tmp_path):
     code, _, err = command(path, "--splits", 0, "--quaternions", "xyzw", "--out", out)
     assert code == 0, err
     assert in_sigmas(json.loads(out.read_text()), "flange_from_camera", truth.mount_from_camera) < 5
+
+
+def test_differential_evolution_begins_where_it_is_told(command, tmp_path):
+    truth = simulated(np.random.default_rng(3), 12, **NOISE)
+    path, out = poses_file(tmp_path / "poses.csv", truth), tmp_path / "found.json"
+    words = ("--method", "de", "--splits", 0, "--out", out)
+    code, text, _ = command(path, *words, "--de-bounds-deg", "closed-form,10", "--de-bounds-mm", "closed-form,20")
+    assert code == 0
+    assert "first population ±10° about the closed-form solution and ±20 mm about the closed-form solution" in text
+    near = Rigid.from_matrix(json.loads(out.read_text())["flange_from_camera"])
+    assert np.linalg.norm(near.translation - FLANGE_FROM_CAMERA.translation) < 5
+    code, text, _ = command(path, *words, "--de-bounds-deg", "0,0,90,45", "--de-generations", 0, "--de-population", 4)
+    assert code == 0
+    assert "±45° about 0, 0, 90° and as far as the farthest pose about zero" in text
+    far = Rigid.from_matrix(json.loads(out.read_text())["flange_from_camera"])
+    assert np.linalg.norm(far.translation - FLANGE_FROM_CAMERA.translation) > 10  # four candidates at random
+
+
+@pytest.mark.parametrize(
+    ("words", "said"),
+    [
+        (("--method", "de", "--de-bounds-deg", "1,2"), "--de-bounds-deg 1,2: one number, X,Y,Z,± or closed-form,±"),
+        (("--method", "de", "--de-bounds-mm", "-5"), "positive half width needed"),
+        (("--method", "pose", "--de-seed", 3), "only with --method de, de-polished or all"),
+    ],
+)
+def test_what_is_no_bounds_of_differential_evolution(command, tmp_path, words, said):
+    path = poses_file(tmp_path / "poses.csv", simulated(np.random.default_rng(3), 6))
+    code, _, error = command(path, *words)
+    assert (code, said in error) == (INPUT, True)

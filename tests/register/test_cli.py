@@ -327,3 +327,22 @@ def test_a_transform_stands_where_the_kinematics_do_not(run, tmp_path, robot_pai
     assert code == 3
     assert "27 parameters" in err
     assert "robot" not in json.loads(out.read_text())
+
+
+def test_the_published_method_takes_its_numbers(run, tmp_path):
+    a, b = points(60)
+    b[:6] += 3.0
+    path = written(tmp_path, rows_of(a, b))
+    words = ("--method", "liu2017", "--sample", 20, "--share", 0.6, "--threshold-mm", 0.4, "--tries", 400)
+    page = tmp_path / "page.html"
+    code, text, _ = run(path, *words, "--orthogonality", 0.05, "--report", page)
+    assert code == 0
+    assert "threshold 0.4 mm" in text
+    assert "eqs. 8 and 9 are not legible" in text
+    shown = page.read_text(encoding="utf-8")
+    assert "Size of the sample" in shown
+    assert re.search(r"within 0\.4 mm .*more than 60 %", shown, re.S)
+    code, _, error = run(path, "--method", "liu2017", "--sample", 60)
+    assert (code, "lower it (--sample)" in error) == (3, True)
+    code, _, error = run(path, "--share", 0.6)
+    assert (code, "only with --method liu2017" in error) == (2, True)

@@ -10,8 +10,38 @@ from stcal.geometry.least_squares import NormalEquations, minimise, perturbed
 from stcal.geometry.rigid import Rigid, skew
 from stcal.handeye.data.motions import Motions
 
+MOST = 100_000
+"""Of candidates, and of generations."""
 EXACT = 1e-24
 """What a step at the minimum may promise, rad²: the objective is in no σ."""
+
+
+@dataclass(frozen=True, slots=True)
+class Bounds:
+    """Of three coordinates of the first population.
+
+    Parameters
+    ----------
+    half_width : float
+        mm, or rad of the rotation vector.
+    centre : (3,) tuple, optional
+        In the middle; where None, that of the closed-form solution (Park & Martin 1994).
+
+    Raises
+    ------
+    InputError
+        The half width is not positive, or a number is not finite.
+    """
+
+    half_width: float
+    centre: tuple[float, float, float] | None = (0.0, 0.0, 0.0)
+
+    def __post_init__(self):
+        if not (0 < self.half_width < np.inf and np.isfinite(self.centre or 0).all()):
+            raise InputError(
+                f"differential evolution: bounds of half width {self.half_width:g} about {self.centre}; finite numbers "
+                "and a positive half width needed"
+            )
 
 
 @dataclass(frozen=True, slots=True)
@@ -20,32 +50,62 @@ class EvolutionOptions:
 
     Parameters
     ----------
-    population, iterations : int
+    population, generations : int
         M and the number of generations.
     factor, crossover : float
         F and CR.
     weight : float
         λ, with lengths in the unit that weighs like one radian (1 m where no σ are stated).
-    reach_mm : float, optional
-        Bounds of each coordinate of the translation where the population starts; those of the rotation vector are ±π.
-        The paper takes them from knowledge of the set-up; without, the farthest board or flange.
+    bounds_rad : Bounds
+        Where the rotation vectors of the first population lie. The paper takes bounds from knowledge of the set-up;
+        what they were is not legible in the source.
+    bounds_mm : Bounds, optional
+        Where its translations lie; about zero, as far as the farthest board or flange, where None.
     seed : int
     """
 
     population: int = 30
-    iterations: int = 100
+    generations: int = 100
     factor: float = 0.5
     crossover: float = 0.9
     weight: float = 1.0
-    reach_mm: float | None = None
+    bounds_rad: Bounds = Bounds(np.pi)
+    bounds_mm: Bounds | None = None
     seed: int = 0
 
     def __post_init__(self):
-        if self.population < 4 or self.iterations < 0 or not (self.weight > 0 and self.factor > 0):
+        if not (
+            4 <= self.population <= MOST
+            and 0 <= self.generations <= MOST
+            and 0 < self.weight < np.inf
+            and 0 < self.factor <= 2
+            and 0 <= self.crossover <= 1
+        ):
             raise InputError(
-                f"differential evolution: population {self.population}, {self.iterations} iterations, "
-                f"F {self.factor:g}, λ {self.weight:g}; at least 4, not negative, and positive needed"
+                f"differential evolution: population {self.population}, {self.generations} generations, F "
+                f"{self.factor:g}, CR {self.crossover:g}, λ {self.weight:g}; 4 to {MOST}, 0 to {MOST}, above 0 to 2, 0 "
+                "to 1, and a positive number needed"
             )
+
+    def needs_closed_form(self) -> bool:
+        """Whether bounds lie about the closed-form solution."""
+        return any(bounds is not None and bounds.centre is None for bounds in (self.bounds_rad, self.bounds_mm))
+
+    def in_words(self, unit_mm: float) -> str:
+        """What the paper leaves to choose, or its copy does not show."""
+        turn = _in_words(self.bounds_rad, 180 / np.pi, "°")
+        shift = _in_words(self.bounds_mm, 1.0, " mm") if self.bounds_mm else "as far as the farthest pose about zero"
+        return (
+            f"differential evolution: first population {turn} and {shift}; λ {self.weight:g} with lengths in units of "
+            f"{unit_mm:g} mm; the paper's own bounds are not legible, and what it reaches depends on them"
+        )
+
+
+def _in_words(bounds: Bounds, factor: float, unit: str) -> str:
+    about = "the closed-form solution"
+    if bounds.centre is not None:
+        about = ", ".join(f"{factor * each:g}" for each in bounds.centre) + unit if any(bounds.centre) else "zero"
+    return f"±{factor * bounds.half_width:.4g}{unit} about {about}"
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -81,13 +141,29 @@ class Objective:
         return rotation, moved - np.einsum("pij,kj->pki", turn, b.translation / self.unit_mm)
 
 
-def evolve(objective: Objective, reach_mm: float, options: EvolutionOptions) -> Rigid:
-    """The best of the last generation. Mutants are not held within the bounds, which are those of the first one."""
+def evolve(objective: Objective, options: EvolutionOptions, reach_mm: float, closed_form: Rigid | None = None) -> Rigid:
+    """The best of the last generation. Mutants are not held within the bounds, which are those of the first one.
+
+    Parameters
+    ----------
+    objective : Objective
+    options : EvolutionOptions
+    reach_mm : float
+        Half width of the translation's bounds where the options have none.
+    closed_form : Rigid, optional
+        In the middle of bounds without a centre.
+    """
     rng, size = np.random.default_rng(options.seed), options.population
-    bounds = np.repeat([np.pi, (options.reach_mm or reach_mm) / objective.unit_mm], 3)
-    x = rng.uniform(-bounds, bounds, (size, 6))
+    about = np.zeros(6) if closed_form is None else closed_form.log()
+    parts = options.bounds_rad, options.bounds_mm or Bounds(reach_mm)
+    centre = np.concatenate(
+        [about[3 * i : 3 * i + 3] if each.centre is None else each.centre for i, each in enumerate(parts)]
+    )
+    scale = np.repeat([1.0, 1 / objective.unit_mm], 3)
+    centre, half = centre * scale, np.repeat([each.half_width for each in parts], 3) * scale
+    x = rng.uniform(centre - half, centre + half, (size, 6))
     value = objective.values(x)
-    for _ in range(options.iterations):
+    for _ in range(options.generations):
         a, b, c = three_others(rng, size)
         mutant = x[a] + options.factor * (x[b] - x[c])
         trial = np.where(rng.random((size, 6)) <= options.crossover, mutant, x)

@@ -8,12 +8,21 @@ wins (eq. 9), and is the answer as it stands: from its sample, not from its inli
 orthogonal the 3×3 part must be and how many samples are drawn; both are options here.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from stcal.errors import DegenerateError, InputError
 from stcal.geometry.affine import Affine
+
+SIZES = range(4, 41, 2)
+"""N of the paper's figure 6."""
+SWEEP_TRIES = 200
+"""Samples of each size there."""
+ASSUMED = (
+    "liu2017: eqs. 8 and 9 are not legible in the source; taken as: the share of inliers among the points outside the "
+    "sample, and the variance of their distances"
+)
 
 
 @dataclass(frozen=True, slots=True)
@@ -120,18 +129,12 @@ def liu2017(xyz_a: np.ndarray, xyz_b: np.ndarray, options: Liu2017Options, seed:
     """
     count, size = len(xyz_a), options.sample
     if count <= size:
-        raise DegenerateError(f"liu2017: {count} point pairs, more than the {size} of a sample needed; lower its size")
-    rng = np.random.default_rng(seed)
+        raise DegenerateError(
+            f"liu2017: {count} point pairs, more than the {size} of a sample needed; lower it (--sample)"
+        )
     best, least, acceptable = None, np.inf, 0
     shares = np.full(options.tries, np.nan)
-    for i in range(options.tries):
-        sample = rng.choice(count, size, replace=False)
-        b_from_a = affine_least_squares(xyz_a[sample], xyz_b[sample])
-        if np.abs(b_from_a.linear.T @ b_from_a.linear - np.eye(3)).max() > options.orthogonal_within:
-            continue
-        error = np.linalg.norm(xyz_b - b_from_a @ xyz_a, axis=1)
-        outside = np.ones(count, bool)
-        outside[sample] = False
+    for i, (sample, b_from_a, error, outside) in _orthogonal_samples(xyz_a, xyz_b, options, seed):
         near = error < options.limit_mm
         shares[i] = near[outside].mean()
         if shares[i] <= options.share:
@@ -145,7 +148,51 @@ def liu2017(xyz_a: np.ndarray, xyz_b: np.ndarray, options: Liu2017Options, seed:
         most = f"at most {100 * tried.max():.0f} %" if len(tried) else "none had an orthogonal 3×3 part"
         raise DegenerateError(
             f"liu2017: no sample of {size} points leaves more than {100 * options.share:g} % of the others within "
-            f"{options.limit_mm:g} mm in {options.tries} tries ({most}); a larger limit (--threshold), or the robust "
-            "method needed"
+            f"{options.limit_mm:g} mm in {options.tries} tries ({most}); a larger limit (--threshold-mm), a smaller "
+            "--share, another --sample, or the robust method needed"
         )
     return Liu2017Result(*best, acceptable, shares)
+
+
+def _orthogonal_samples(xyz_a: np.ndarray, xyz_b: np.ndarray, options: Liu2017Options, seed: int):
+    """Number of each try whose 3×3 part is orthogonal enough, with its sample, transform, errors of all points (n,),
+    and which points are outside the sample."""
+    rng, count = np.random.default_rng(seed), len(xyz_a)
+    for i in range(options.tries):
+        sample = rng.choice(count, options.sample, replace=False)
+        b_from_a = affine_least_squares(xyz_a[sample], xyz_b[sample])
+        if np.abs(b_from_a.linear.T @ b_from_a.linear - np.eye(3)).max() <= options.orthogonal_within:
+            outside = np.ones(count, bool)
+            outside[sample] = False
+            yield i, (sample, b_from_a, np.linalg.norm(xyz_b - b_from_a @ xyz_a, axis=1), outside)
+
+
+@dataclass(frozen=True, slots=True)
+class SampleSize:
+    """What samples of ``points`` points give: ``best`` and ``median`` share of the other points within the limit (NaN
+    where none is), ``orthogonal`` : how many of the ``tries`` were; ``acceptable`` : how many of those."""
+
+    points: int
+    best: float
+    median: float
+    orthogonal: int
+    acceptable: int
+    tries: int
+
+
+def sample_sizes(xyz_a: np.ndarray, xyz_b: np.ndarray, options: Liu2017Options, seed: int = 0) -> list[SampleSize]:
+    """The paper's figure 6: samples of every even size from 4 to 40, as far as there are points; arguments as of
+    :func:`liu2017`."""
+    found = []
+    for points in SIZES:
+        if points < len(xyz_a):
+            own = replace(options, sample=points, tries=min(options.tries, SWEEP_TRIES))
+            shares = np.array(
+                [
+                    (error < own.limit_mm)[outside].mean()
+                    for _, (_, _, error, outside) in _orthogonal_samples(xyz_a, xyz_b, own, seed)
+                ]
+            )
+            best, median = (float(shares.max()), float(np.median(shares))) if len(shares) else (np.nan, np.nan)
+            found.append(SampleSize(points, best, median, len(shares), int((shares > own.share).sum()), own.tries))
+    return found

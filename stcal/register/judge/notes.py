@@ -11,6 +11,7 @@ from scipy.stats import norm
 from stcal.geometry.affine import Affine
 from stcal.geometry.rigid import Similarity
 from stcal.register.core.covariance import Covariance
+from stcal.register.core.liu2017 import ASSUMED
 from stcal.register.core.models import squares
 from stcal.register.core.problem import Problem
 from stcal.register.core.result import Alternative
@@ -85,6 +86,8 @@ def _agreement(subject: Subject) -> list[str]:
             f"{start}{len(other.rows)} of the other points agree on another transform, {other.apart_mm:.4g} mm and "
             f"{np.degrees(other.turn_rad):.3g}° from this one ({shown}{more}); did an instrument move between them?"
         )
+    if subject.method == "liu2017":
+        notes.append(ASSUMED)
     if subject.method == "least-squares":
         notes += _far_rows(subject)
     return notes

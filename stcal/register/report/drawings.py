@@ -2,6 +2,7 @@
 
 import numpy as np
 
+from stcal.register.core.liu2017 import SampleSize
 from stcal.register.workspace.cubes import Cubes
 from stcal.register.workspace.field import Field
 from stcal.register.workspace.findings import Findings
@@ -152,3 +153,21 @@ def _frame(axes, frame: str, i: int, j: int, middle: np.ndarray, reach: np.ndarr
     axes.set_xlabel(f"{'xyz'[i]} of {frame}, mm", fontsize=SMALL + 0.5, color=INK)
     axes.set_ylabel(f"{'xyz'[j]} of {frame}, mm", fontsize=SMALL + 0.5, color=INK, labelpad=1)
     calm(axes)
+
+
+def sample_size_figure(sizes: list[SampleSize], share: float):
+    """Best and median share of inliers against the size of the sample; the share asked for, dashed."""
+    figure = new_figure(6.4, 2.9)
+    axes = figure.add_axes((0.1, 0.17, 0.87, 0.78))
+    points = [each.points for each in sizes]
+    axes.plot(points, [100 * each.best for each in sizes], "o-", color=COLOURS[0], ms=3.5, lw=1.4, label="best")
+    axes.plot(points, [100 * each.median for each in sizes], "o:", color=COLOURS[0], ms=2.5, lw=1.2, label="median")
+    axes.axhline(100 * share, color=INK, lw=0.8, ls=(0, (4, 3)))
+    axes.set(ylim=(0, 102))
+    axes.set_xlabel("points of a sample", fontsize=SMALL + 1, color=INK)
+    axes.set_ylabel("inliers of the other points, %", fontsize=SMALL + 1, color=INK)
+    axes.legend(frameon=False, fontsize=SMALL + 0.5, loc="lower right")
+    axes.xaxis.set_major_locator(locator(integer=True))
+    axes.grid(axis="y", color=FAINT, lw=0.6)
+    calm(axes)
+    return figure

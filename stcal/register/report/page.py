@@ -3,11 +3,13 @@
 from itertools import pairwise
 
 import numpy as np
+from markupsafe import Markup
 
 from stcal.geometry.affine import Affine
 from stcal.geometry.rigid import Similarity
+from stcal.register.core.liu2017 import Liu2017Options, SampleSize
 from stcal.register.core.result import ErrorFigures
-from stcal.register.report.drawings import errors_figure, field_figure, space_figure
+from stcal.register.report.drawings import errors_figure, field_figure, sample_size_figure, space_figure
 from stcal.register.report.file import matrix_of
 from stcal.register.workspace.cubes import Cubes
 from stcal.register.workspace.field import Field
@@ -33,6 +35,27 @@ def registration_text(found: Findings) -> str:
     lines += ["", *_row_lines(found)]
     reach = _field_lines(found) + _cube_lines(found)
     return "\n".join(lines + (["", *reach] if reach else []))
+
+
+def sample_size_section(sizes: list[SampleSize], options: Liu2017Options) -> tuple[str, str, Markup]:
+    """The paper's figure 6 on these points, for the page."""
+    rows = [
+        [
+            str(each.points),
+            *(number(100 * share, 1) for share in (each.best, each.median)),
+            str(each.orthogonal),
+            f"{each.acceptable} of {each.tries}",
+        ]
+        for each in sizes
+    ]
+    content = render(
+        "register/report/sample_size.html.jinja",
+        figure=uri(sample_size_figure(sizes, options.share)),
+        rows=rows,
+        limit=f"{options.limit_mm:g}",
+        share=f"{100 * options.share:g}",
+    )
+    return "sample", "Size of the sample", Markup(content)
 
 
 def matrix_lines(matrix: np.ndarray) -> list[str]:

@@ -13,7 +13,7 @@ from stcal.handeye.data.loop import Loop
 from stcal.handeye.data.motions import Motions, poses_with_log
 from stcal.handeye.methods.closed_form import AX_XB
 from stcal.handeye.methods.convex import convex, equations, smallest_largest
-from stcal.handeye.methods.evolution import EvolutionOptions, Objective, evolve, polish, three_others
+from stcal.handeye.methods.evolution import Bounds, EvolutionOptions, Objective, evolve, polish, three_others
 from stcal.synthetic.measured.handeye import simulated
 
 FROM_POSES = tuple(m for m in METHODS if m != "reprojection")
@@ -91,14 +91,30 @@ def test_evolution_follows_its_rules():
     truth = simulated(np.random.default_rng(6), 19, camera=(1e-3, 0.3))
     motions = Motions.consecutive(Loop.of(truth.pairs, "eye-in-hand"))
     objective = Objective(motions, 1000.0, 1.0)
-    runs = [evolve(objective, 500, EvolutionOptions(iterations=n, seed=3)) for n in range(0, 101, 20)]
+    runs = [evolve(objective, EvolutionOptions(generations=n, seed=3), 500) for n in range(0, 101, 20)]
     costs = [objective.linear(x).cost for x in runs]
     assert (np.diff(costs) <= 1e-12).all()
     assert costs[0] > 2 * costs[1] > 4 * costs[5]
-    again = evolve(objective, 500, EvolutionOptions(seed=3))
+    again = evolve(objective, EvolutionOptions(seed=3), 500)
     assert objective.linear(again).cost == costs[5]
-    still = evolve(objective, 500, EvolutionOptions(seed=3, crossover=-1.0))
+    still = evolve(objective, EvolutionOptions(seed=3, crossover=0.0), 500)
     assert objective.linear(still).cost == pytest.approx(costs[0], rel=1e-12)
+
+
+@pytest.mark.parametrize("centre", ["zero", "closed form", "truth"])
+def test_evolution_from_close_bounds_is_near_the_minimum(centre):
+    """Within ±10° and ±100 mm about what is known: 1.5 times the least objective, where ±180° ends at several times."""
+    truth = simulated(np.random.default_rng(6), 19, camera=(1e-3, 0.3))
+    loop = Loop.of(truth.pairs, "eye-in-hand")
+    objective = Objective(Motions.consecutive(loop), 1000.0, 1.0)
+    least = objective.linear(polish(objective, truth.mount_from_camera)).cost
+    log = truth.mount_from_camera.log()
+    known = {"zero": (0.0,) * 6, "closed form": None, "truth": tuple(log)}[centre]
+    about = (known[:3], known[3:]) if known else (None, None)
+    bounds = Bounds(np.radians(10), about[0]), Bounds(100.0, about[1])
+    x = evolve(objective, EvolutionOptions(bounds_rad=bounds[0], bounds_mm=bounds[1]), 500, truth.mount_from_camera)
+    cost = objective.linear(x).cost / least
+    assert (cost < 1.5) == (centre != "zero")  # zero is not within 10° of it
 
 
 def test_evolution_takes_three_others():
@@ -180,6 +196,8 @@ def test_wrong_arguments(arguments, message):
 def test_wrong_options():
     with pytest.raises(InputError, match="population 3"):
         EvolutionOptions(population=3)
+    with pytest.raises(InputError, match="half width -1"):
+        Bounds(-1.0)
     with pytest.raises(InputError, match="one of σ_rot and σ_trans of the robot"):
         Noise(robot_rad=1e-3)
     with pytest.raises(InputError, match="0 to 10° and 100 mm possible"):
