@@ -16,7 +16,6 @@ Draws the paper's figures 4 and 5: translation and rotation error of each held-o
 """
 
 import argparse
-from concurrent.futures import ProcessPoolExecutor
 from pathlib import Path
 
 import matplotlib as mpl
@@ -32,6 +31,7 @@ from stcal.handeye.solve import UNIT_MM
 from stcal.parallel import one_thread
 from stcal.report.figure import save
 from stcal.synthetic.measured.handeye import Truth, simulated_views
+from stcal.workflows.cluster import executor_of
 
 POSES, FITTED = 25, 18
 ROBOT, CORNER_PX = (3e-4, 0.1), 0.1
@@ -177,8 +177,9 @@ def main() -> None:
     parser.add_argument(
         "--plot", type=Path, metavar="FOLDER", help="draw handeye_translation.svg and …_rotation.svg here"
     )
+    parser.add_argument("--scheduler", metavar="ADDRESS", help="hand the trials to this Dask cluster")
     arguments = parser.parse_args()
-    with ProcessPoolExecutor() as pool:
+    with executor_of(arguments.scheduler) as pool:
         trials = list(pool.map(trial, range(arguments.seeds)))
     print(f"{arguments.seeds} seeds, simulated; {FITTED} motions to solve with, {POSES - 1 - FITTED} held out")
     print_tables(trials)

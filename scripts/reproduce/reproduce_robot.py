@@ -12,7 +12,6 @@ camera measures, and the true ones of 51 other positions all over the arm's reac
 
 import argparse
 import time
-from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass, replace
 from functools import cache
 from pathlib import Path
@@ -44,6 +43,7 @@ from stcal.sfm.measure.target import TargetCircles
 from stcal.synthetic.measured.arms import joint_vectors, made, placed
 from stcal.synthetic.measured.image_poses import KnownTarget, known_target, pose_error, see
 from stcal.synthetic.scene import Scene, SceneOptions, make_scene
+from stcal.workflows.cluster import executor_of
 
 PUBLISHED = {"mean": (0.6493, 0.4742), "std": (0.5596, 0.2967), "max": (2.1259, 1.3311)}
 """Table 3 of the paper, mm: before, after."""
@@ -379,12 +379,13 @@ def main() -> None:
         "--gears", type=float, default=0.0, metavar="MRAD", help="σ of the joints' periodic errors, which no model has"
     )
     parser.add_argument("--plot", type=Path, metavar="FILE", help="draw into FILE.svg or .png")
+    parser.add_argument("--scheduler", metavar="ADDRESS", help="hand the trials to this Dask cluster")
     given = parser.parse_args()
     start = time.perf_counter()
     sweeps()  # once, before the processes part
     for kind in (FAR, NEAR):
         commands(kind)
-    with ProcessPoolExecutor() as pool:
+    with executor_of(given.scheduler) as pool:
         count = given.draws
         draws = list(pool.map(one_draw, [given.seed] * count, range(count), [1e-3 * given.gears] * count))
     error = np.concatenate([draw.pose_error for draw in draws])

@@ -9,7 +9,6 @@ covariance that the result states; 1 is true, more is too sure of itself. Prints
 """
 
 import argparse
-from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass
 from functools import partial
 from itertools import product
@@ -25,6 +24,7 @@ from stcal.handeye.methods.noise import components
 from stcal.handeye.methods.reprojection import problem
 from stcal.parallel import one_thread
 from stcal.synthetic.measured.handeye import Truth, simulated, simulated_views
+from stcal.workflows.cluster import executor_of
 
 CORNERS = {"corner_px": 0.1, "board_mm": 0.03}
 NOISES = {
@@ -98,6 +98,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--trials", type=int, default=500)
     parser.add_argument("--only", default="", metavar="TEXT", help="cases of methods that begin so")
+    parser.add_argument("--scheduler", metavar="ADDRESS", help="hand the trials to this Dask cluster")
     arguments = parser.parse_args()
     trials = arguments.trials
     low, high = np.sqrt(chi2.ppf([0.025, 0.975], 6 * trials) / (6 * trials))
@@ -105,7 +106,7 @@ def main() -> None:
     print(
         "| method | setup | noise | poses | bound | calibration | good poses left out |\n|---|---|---|---|---|---|---|"
     )
-    with ProcessPoolExecutor() as pool:
+    with executor_of(arguments.scheduler) as pool:
         methods = [method for method in COUNTS if method.startswith(arguments.only)]
         cases = (Case(*v, count) for v in product(methods, SETUPS, NOISES) for count in COUNTS[v[0]])
         ratios: dict[tuple[str, int], list[np.ndarray]] = {}

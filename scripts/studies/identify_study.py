@@ -11,7 +11,6 @@ bottom lines one measurement in twenty is off by 2 mm.
 
 import argparse
 import time
-from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -25,6 +24,7 @@ from stcal.robot.kinematics.example import mh80
 from stcal.robot.kinematics.measurements import Measurements
 from stcal.robot.kinematics.model import Robot
 from stcal.synthetic.measured.arms import joint_vectors, made, measured, placed
+from stcal.workflows.cluster import executor_of
 
 SIGMA_MM, SIGMA_RAD = 0.05, 2e-4
 NEW_POSES = 50
@@ -139,11 +139,13 @@ def without_noise(true: Robot, q: np.ndarray, kind: str) -> Observed:
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
     parser.add_argument("--draws", type=int, default=200)
-    draws = parser.parse_args().draws
+    parser.add_argument("--scheduler", metavar="ADDRESS", help="hand the trials to this Dask cluster")
+    given = parser.parse_args()
+    draws = given.draws
     began = time.perf_counter()
     print(f"simulated arms, {draws} draws: eᵀC⁻¹e over its degrees of freedom, expected 1")
     print(f"{'measured':<24}{'rows':>6}  {'σ':<12}{'predicted':>18}{'parameters':>18}")
-    with ProcessPoolExecutor(2) as pool:
+    with executor_of(given.scheduler) as pool:
         for case in CASES:
             found = np.array(list(pool.map(errors, [case] * draws, range(draws), chunksize=10)))
             cells = "".join(

@@ -10,7 +10,6 @@ many of those are called certain, and the time of one pose.
 
 import argparse
 import time
-from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass
 
 import numpy as np
@@ -30,6 +29,7 @@ from stcal.synthetic.measured.image_poses import (
     view,
 )
 from stcal.synthetic.scene import Scene, SceneOptions, make_scene
+from stcal.workflows.cluster import executor_of
 
 CALIBRATION_NOISE_PX = 0.02
 CAMERA_SIGMA = np.array([1.0, 1.0, 0.7, 0.7, 3e-4, 1e-3, 3e-5, 3e-5])
@@ -101,7 +101,9 @@ def main() -> None:
     """Print the table."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--images", type=int, default=500)
-    count = parser.parse_args().images
+    parser.add_argument("--scheduler", metavar="ADDRESS", help="hand the trials to this Dask cluster")
+    given = parser.parse_args()
+    count = given.images
     print(f"{count} simulated images each, 2592×1728 px, 24 mm lens; 600–1500 mm and 0–65° where nothing else is said")
     print(
         f"{'':34} normalised       σ along  across, µm  rotation          flipped,  median\n"
@@ -109,7 +111,7 @@ def main() -> None:
     )
     for case in CASES:
         parts = [range(k * count // 8, (k + 1) * count // 8) for k in range(8)]
-        with ProcessPoolExecutor() as pool:
+        with executor_of(given.scheduler) as pool:
             rows = np.array([r for part in pool.map(rows_of, [case] * 8, parts) for r in part])
         certain, flipped = rows[:, 1] > 0, rows[:, 2] > 0
         square = rows[certain, 0]

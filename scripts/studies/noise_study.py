@@ -10,7 +10,6 @@ was put in, σ₀ = 1), and the position error of the uncorrected control (no ec
 """
 
 import argparse
-from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass, replace
 from itertools import product
 from pathlib import Path
@@ -28,6 +27,7 @@ from stcal.sfm.adjust.refine import eccentricity_px
 from stcal.sfm.plan.simulated import observe, true_models
 from stcal.sfm.run.options import RunOptions
 from stcal.synthetic.scene import Scene, SceneOptions, make_scene, nominal_target_from_face
+from stcal.workflows.cluster import executor_of
 
 
 @dataclass(frozen=True, slots=True)
@@ -97,11 +97,11 @@ def squared_errors(calibration: Calibration, scene: Scene) -> np.ndarray:
     return np.mean(squares, axis=0)
 
 
-def study(seeds: int) -> dict[Point, np.ndarray]:
+def study(seeds: int, scheduler: str | None = None) -> dict[Point, np.ndarray]:
     """RMS over the seeds at every point, (4,), in the order of :func:`one_run`."""
     points = list(dict.fromkeys(Point(**{name: v}) for name, (_, values) in PANELS.items() for v in values))
     jobs = list(product(range(seeds), points))
-    with ProcessPoolExecutor() as pool:
+    with executor_of(scheduler) as pool:
         answers = list(pool.map(one_run, *zip(*jobs, strict=True)))
     squares = np.reshape(answers, (seeds, len(points), 4))
     return dict(zip(points, np.sqrt(squares.mean(0)), strict=True))
@@ -155,8 +155,9 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--seeds", type=int, default=20, help="runs at each point")
     parser.add_argument("--plot", type=Path, metavar="FILE", help="draw into FILE.svg or .png")
+    parser.add_argument("--scheduler", metavar="ADDRESS", help="hand the trials to this Dask cluster")
     given = parser.parse_args()
-    found = study(given.seeds)
+    found = study(given.seeds, given.scheduler)
     print(f"Simulated labels, 5184×3456 px, {given.seeds} runs at each point, RMS over faces 2–5\n")
     print_table(found)
     if given.plot:

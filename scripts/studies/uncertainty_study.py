@@ -8,7 +8,6 @@ covariance with σ₀ = 1 at the noise that was put in), and the mean normalised
 """
 
 import argparse
-from concurrent.futures import ProcessPoolExecutor
 from dataclasses import replace
 
 import numpy as np
@@ -23,6 +22,7 @@ from stcal.sfm.adjust.refine import eccentricity_px
 from stcal.sfm.plan.simulated import observe, true_models
 from stcal.sfm.run.options import RunOptions
 from stcal.synthetic.scene import SceneOptions, make_scene
+from stcal.workflows.cluster import executor_of
 
 NOISE_PX = 0.02
 CAMERA_SIGMA = np.array([1.5, 1.5, 1.0, 1.0, 5e-4, 2e-3, 5e-5, 5e-5])
@@ -66,7 +66,9 @@ def main() -> None:
     """Print the table."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--runs", type=int, default=200)
-    count = parser.parse_args().runs
+    parser.add_argument("--scheduler", metavar="ADDRESS", help="hand the trials to this Dask cluster")
+    given = parser.parse_args()
+    count = given.runs
     print(f"{count} runs each, {NOISE_PX} px noise, 4 groups of 6 images, 2592×1728 px (simulated labels)")
     print(f"{'':28} error / bound   normalised squared error")
     for title, sigma, refine in (
@@ -74,7 +76,7 @@ def main() -> None:
         ("board σ 20 µm", 0.02, False),
         ("board σ 5 µm, camera refined", 0.005, True),
     ):
-        with ProcessPoolExecutor() as pool:
+        with executor_of(given.scheduler) as pool:
             answers = list(pool.map(one_run, range(count), [sigma] * count, [refine] * count))
         rows = np.array([row for answer in answers for row in answer])
         per_run = rows[:, 1].reshape(count, -1).mean(1)

@@ -9,7 +9,7 @@ import contextlib
 import logging
 import re
 from collections.abc import Callable, Iterator
-from concurrent.futures import BrokenExecutor, Executor, Future
+from concurrent.futures import BrokenExecutor, Executor, Future, ProcessPoolExecutor
 from importlib import metadata
 from typing import Any
 
@@ -42,6 +42,25 @@ def dask_cluster(address: str, send_images: bool = False) -> Iterator[None]:
     InputError
         ``stcal[dask]`` is not installed, no scheduler answers, it has no workers, or a worker has other versions.
     """
+    with _connected(address) as workers, spread(workers, AT_ONCE * workers.threads, send_images):
+        yield
+
+
+@contextlib.contextmanager
+def executor_of(address: str | None = None) -> Iterator[Executor]:
+    """The workers of a Dask cluster, or, without an address, processes of this machine, one per core.
+
+    Raises
+    ------
+    InputError
+        As :func:`dask_cluster`.
+    """
+    with ProcessPoolExecutor() if address is None else _connected(address) as executor:
+        yield executor
+
+
+@contextlib.contextmanager
+def _connected(address: str) -> Iterator["_Workers"]:
     try:
         from distributed import Client
     except ImportError as error:
@@ -55,9 +74,7 @@ def dask_cluster(address: str, send_images: bool = False) -> Iterator[None]:
                 f"--scheduler {address}: no worker within {ANSWER_S} s; start one with `dask worker {address}`"
             ) from error
         _require_same(dict[str, dict[str, str]](client.run(versions)), address)  # type: ignore[arg-type]
-        threads = sum(dict[str, int](client.nthreads()).values())  # type: ignore[arg-type]
-        with spread(_Workers(client), AT_ONCE * threads, send_images):
-            yield
+        yield _Workers(client, sum(dict[str, int](client.nthreads()).values()))  # type: ignore[arg-type]
 
 
 @contextlib.contextmanager
@@ -120,8 +137,8 @@ def _require_same(found: dict[str, dict[str, str]], address: str) -> None:
 class _Workers(Executor):
     """The workers of a cluster; what one that is lost had begun, Dask gives to another, three times at most."""
 
-    def __init__(self, client):
-        self._client = client
+    def __init__(self, client, threads: int):
+        self._client, self.threads = client, threads
 
     def submit(self, function: Callable, /, *arguments, **_) -> Future:
         answer: Future = Future()

@@ -187,3 +187,10 @@ def test_a_run_by_a_cluster_that_loses_its_scheduler_ends_in_one_line(small_data
         with pytest.raises(DetectionError, match=line), cluster.dask_cluster(address):
             run_into(tmp_path / "run", small_dataset, progress=progress)
         assert killed
+
+
+@pytest.mark.slow
+def test_trials_of_a_study_go_to_a_cluster_or_stay_here(tmp_path):
+    with two_workers(tmp_path) as (address, *_), cluster.executor_of(address) as there, cluster.executor_of() as here:
+        for pool in (there, here):
+            assert list(pool.map(pow, range(20), [2] * 20)) == [i * i for i in range(20)]
