@@ -132,7 +132,7 @@ class _Starts:
     def unlike(self, rank: int, wanted: np.ndarray) -> list[int]:
         """A hypothesis, and ``wanted`` ones behind it of which no two are likely to become the same reading."""
         left, chosen = wanted.copy(), []
-        left[:rank] = False
+        left[:rank], left[rank] = False, True
         while len(chosen) < AT_ONCE and left.any():
             chosen.append(int(left.argmax()))
             index = self.index(chosen[-1])
@@ -215,7 +215,8 @@ class FaceFinder:
                 tries[first] += 1
             if rank not in grown:
                 wanted = is_open & ((tries < MAX_TRIES) & ~explained)[starts.origin]
-                grown = self._grown(candidates, starts, starts.unlike(rank, wanted))
+                wanted[list(grown)] = False
+                grown |= self._grown(candidates, starts, starts.unlike(rank, wanted))
             found, number = grown[rank], int(starts.face[rank])
             face = self.target.faces[number]
             if found is not None and _seen_from_outside(found[1], face):
