@@ -39,6 +39,8 @@ THRESHOLDS = {
 """minThreshold, maxThreshold, thresholdStep, minRepeatability. The last one is the least with which it can work."""
 
 
+ADVISED = 2000
+"""Images of the larger set for ``advise``."""
 STREAM = 40, 1728
 """Photographs for ``measure``, and their width, px: 2 megapixels."""
 MEMORY_EVERY_S = 0.05
@@ -242,6 +244,42 @@ def timed_calibration(out: Path) -> float:
     return time.perf_counter() - start
 
 
+def timed_large(images: int) -> tuple[float, float]:
+    """Time an image with labels known, over that of 40 images; and MiB, of ``scale_study.py``, in processes of its
+    own."""
+    found = []
+    for count in (40, images):
+        words = [sys.executable, Path(__file__).parent / "studies" / "scale_study.py", "--one", str(count), "sparse"]
+        run = subprocess.run(words, capture_output=True, text=True, check=True)
+        found.append(json.loads(run.stdout))
+    return found[1]["ms_per_image"] / found[0]["ms_per_image"], found[1]["memory_mib"]
+
+
+def timed_advice() -> float:
+    """Seconds of ``advise`` over many images, by its function: labels simulated, the geometry that of a run."""
+    from stcal.geometry.rigid import Rigid
+    from stcal.sfm.adjust.chain import CalibratedTarget
+    from stcal.sfm.adjust.joint import covariance_of
+    from stcal.sfm.plan.advise import Known, advise
+    from stcal.sfm.plan.forecast import CentreNoise, Setup
+    from stcal.sfm.plan.simulated import observe, true_models
+    from stcal.sfm.plan.views import known_scene
+    from stcal.synthetic.scene import SceneOptions, make_scene
+
+    scene = make_scene(SceneOptions(images_per_group=ADVISED // GROUPS))
+    noise, radius = CentreNoise.expected(), scene.target.radius_of() | scene.board.radius_of()
+    models = true_models(scene, observe(scene, 0.0, np.random.default_rng(0)))
+    models = [noise.applied(model, scene.camera, radius) for model in models]
+    poses, groups = dict(scene.target_from_face), dict.fromkeys(scene.groups, Rigid())
+    start = CalibratedTarget(scene.reference_face, poses, scene.circles_target, groups)
+    setup = Setup(scene.target, scene.board, scene.camera, start, "plane", 0.02, None, 0.0)
+    joint = covariance_of(models, setup.board, setup.camera, setup.flatness_mm)
+    known = Known(tuple(models), joint, setup, noise, known_scene(models, joint, setup, "OPENCV"))
+    begin = time.perf_counter()
+    advise(known)
+    return time.perf_counter() - begin
+
+
 def boards(found: dict[str, np.ndarray], true: dict[str, np.ndarray]) -> dict[str, int]:
     """How many boards were found, how many with every dot, and how many with no centre where no dot is."""
     off = [np.linalg.norm(xy[:, None] - true[name], axis=2).min(1).max() for name, xy in found.items()]
@@ -276,6 +314,7 @@ def measure(data: Path, stream: Path, film: Path, scratch: Path) -> dict:
         seconds, grids = timed(opencv_board, jobs)
         found = {name: xy for name, xy in zip(true, grids, strict=True) if xy is not None}
         rows[title] = {"seconds": seconds} | boards(found, true)
+    rows[f"advise, {ADVISED} images, its function"] = {"seconds": timed_advice()}
     rows["advise"] = {"seconds": timed_program(["advise", scratch / "run"], log)[0]}
     fine = replace(reference_board(), rows=100, columns=100, pitch_mm=4.0, radius_mm=1.2, corner=None)
     (scratch / "fine.toml").write_text(board_toml(replace(fine, corner_radius_mm=None)), encoding="utf-8")
@@ -374,6 +413,7 @@ def main() -> None:
     parser.add_argument("--width", type=int, default=5184, help="px; 3:2 images")
     parser.add_argument("--keep", type=Path, help="render into this folder, or use what it holds")
     parser.add_argument("--rounds", type=int, default=5, help="measure so often")
+    parser.add_argument("--large", type=int, default=10_000, help="images of the large set, measured once; 0 for none")
     parser.add_argument("--json", type=Path, help="also write the numbers here")
     given = parser.parse_args()
     if given.images % GROUPS or given.images < 4 * GROUPS:
@@ -390,6 +430,10 @@ def main() -> None:
         words = ["run", data / "images", *files_of(data), "--out", Path(scratch) / "watched"]
         memory = timed_program(words, Path(scratch) / "log", watched=True)[1:]
         result |= dict(zip(("peak_process_mib", "peak_together_mib"), memory, strict=True))
+        if given.large:
+            result["large"] = dict(zip(("ratio", "mib"), timed_large(given.large), strict=True)) | {
+                "images": given.large
+            }
         result["run_profile_s"] = run_profile(data, Path(scratch) / "profiled")
         some = sorted((data / "images").glob("*/*"))[:: max(1, given.images // 10)]
         result["detection_profile_ms"] = detection_profile(some, data)
@@ -406,6 +450,12 @@ def main() -> None:
     print(f"detection: {cost:.2f} s of a core an image; a million such images a day: {a_day}")
     print("peak memory of the run: largest process {peak_process_mib:.0f} MiB, together".format(**result), end=" ")
     print("{peak_together_mib:.0f} MiB, pages that they share counted once".format(**result))
+    if "large" in result:
+        print(
+            "{images} images, labels known: time an image {ratio:.2f} × that of 40, {mib:.0f} MiB".format(
+                **result["large"]
+            )
+        )
     print("\nwhere the time of a run goes, s (one run, libraries loaded):")
     for stage, seconds in result["run_profile_s"].items():
         print(f"  {stage:52} {seconds:6.2f}")
