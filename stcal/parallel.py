@@ -9,7 +9,15 @@ import signal
 import sys
 import threading
 from collections.abc import Callable, Iterator, Sequence
-from concurrent.futures import FIRST_COMPLETED, Executor, Future, ProcessPoolExecutor, as_completed, wait
+from concurrent.futures import (
+    FIRST_COMPLETED,
+    BrokenExecutor,
+    Executor,
+    Future,
+    ProcessPoolExecutor,
+    as_completed,
+    wait,
+)
 from contextvars import ContextVar
 from importlib import import_module
 from operator import itemgetter
@@ -133,9 +141,12 @@ class _Processes:
         try:
             for future in as_completed(futures):
                 yield futures[future], future.result()
-        finally:
+        except BrokenExecutor:  # the pool itself ends its futures; cancelled ones would break its thread
+            raise
+        except (Exception, GeneratorExit):
             for future in futures:
                 future.cancel()
+            raise
 
     def everywhere(self, function: Callable, arguments: tuple) -> None:
         """Begin the same in every process, as far as they are idle."""
