@@ -101,8 +101,12 @@ def run_briefly(function: Callable[..., R], jobs: Sequence[tuple]) -> list[R]:
     """Results of ``function(*job)`` in the order of the jobs, of a tenth of a second each: by several processes where
     :func:`kept_processes` keeps them, else right here."""
     kept = _kept.get()
-    done = kept.run(function, jobs) if kept and kept.workers > 1 else enumerate(function(*job) for job in jobs)
-    return [result for _, result in sorted(done, key=itemgetter(0))]
+    if kept and kept.workers > 1:
+        try:
+            return [result for _, result in sorted(kept.run(function, jobs), key=itemgetter(0))]
+        except BrokenExecutor:  # a process was ended from outside: it goes on here, and takes longer
+            pass
+    return [function(*job) for job in jobs]
 
 
 @contextlib.contextmanager
@@ -172,7 +176,8 @@ def load_in_processes(*modules: str) -> None:
     """Load modules in the processes that :func:`kept_processes` keeps, while this one goes on."""
     kept = _kept.get()
     if kept and kept.workers > 1:
-        kept.everywhere(_load, modules)
+        with contextlib.suppress(BrokenExecutor):
+            kept.everywhere(_load, modules)
 
 
 def _load(*modules: str) -> None:
@@ -246,13 +251,15 @@ def _follow_parent() -> None:
 
 @contextlib.contextmanager
 def _plain_main():
-    """Hide the main module's file from new processes, and keep their libraries to one thread."""
+    """Hide the main module's file from new processes, and the folder that the program runs in, whose files might be
+    named like modules; keep their libraries to one thread."""
     main = sys.modules["__main__"]
     hidden = {name: getattr(main, name) for name in ("__file__", "__spec__") if getattr(main, name, None) is not None}
-    before = {name: os.environ.get(name) for name in ONE_THREAD}
+    meanwhile: dict[str, str] = dict.fromkeys((*ONE_THREAD, "PYTHONSAFEPATH"), "1")
+    before = {name: os.environ.get(name) for name in meanwhile}
     for name in hidden:
         setattr(main, name, None)
-    os.environ.update(dict.fromkeys(ONE_THREAD, "1"))
+    os.environ.update(meanwhile)
     try:
         yield
     finally:

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 from threadpoolctl import threadpool_info
 
-from stcal.parallel import ONE_THREAD, counted, kept_processes, run_briefly, run_parallel
+from stcal.parallel import ONE_THREAD, counted, kept_processes, load_in_processes, run_briefly, run_parallel
 
 UNLIMITED = {name: value for name, value in os.environ.items() if name not in ONE_THREAD}
 
@@ -142,6 +142,36 @@ def test_what_fails_ends_the_call_and_not_the_processes():
         with pytest.raises(ZeroDivisionError):
             dict(run_parallel(divmod, [(1, 0), (2, 0)]))
         assert len({found for _, found in run_parallel(process, [(i,) for i in range(6)])}) == 2
+
+
+def end_elsewhere(parent: int) -> int:
+    """As a process ends that takes more memory than there is."""
+    if os.getpid() != parent:
+        os._exit(1)
+    return parent
+
+
+def test_brief_work_goes_on_here_when_a_process_is_ended():
+    with kept_processes(2):
+        assert run_briefly(end_elsewhere, [(os.getpid(),)] * 4) == [os.getpid()] * 4
+        assert run_briefly(pow, [(2, 3)] * 2) == [8, 8]
+        load_in_processes("json")
+
+
+def test_files_beside_the_user_are_no_modules(tmp_path):
+    """A folder with files named like libraries, where a program works in several processes."""
+    for name in ("numpy", "scipy", "stcal"):
+        (tmp_path / f"{name}.py").write_text("raise RuntimeError('not this one')\n")
+    script = tmp_path / "elsewhere" / "go.py"
+    script.parent.mkdir()
+    script.write_text(
+        "from stcal.parallel import load_ahead, run_parallel\n"
+        "load_ahead()\n"
+        "print(dict(run_parallel(pow, [(2, 3)] * 2, 2)))\n"
+    )
+    environment = {name: value for name, value in os.environ.items() if name != "PYTHONPATH"}
+    done = subprocess.run([sys.executable, script], cwd=tmp_path, env=environment, capture_output=True, text=True)
+    assert (done.stdout, done.stderr) == ("{0: 8, 1: 8}\n", "")
 
 
 def test_processes_end_when_the_work_is_broken_off():
