@@ -88,6 +88,8 @@ def contour_centre(grey: np.ndarray, centre_px: np.ndarray, shape_px: np.ndarray
     low = np.maximum(np.floor(centre_px - half), 0).astype(int)
     high = np.minimum(np.ceil(centre_px + half).astype(int) + 1, grey.shape[::-1])
     window = grey[low[1] : high[1], low[0] : high[0]]
+    if np.ptp(window) == 0:
+        return None
     _, binary = cv2.threshold(window, 0, 255, cv2.THRESH_BINARY + cv2.THRESH_OTSU)
     contours, _ = cv2.findContours(binary, cv2.RETR_LIST, cv2.CHAIN_APPROX_NONE)
     least = MIN_CONTOUR_AREA * np.pi * abs(np.linalg.det(shape_px))
