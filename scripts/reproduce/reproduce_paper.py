@@ -2,41 +2,33 @@
 
 .venv/bin/python scripts/reproduce/reproduce_paper.py [--trials 5] [--width 5184] [--keep FOLDER] [--plot FILE.svg]
 
-Every trial renders a scene of its own (target, board, camera, noise): four groups of ten photographs. It is solved
-- by the paper's method: centres of the ellipses fitted to thresholded contours, all weighted alike, taken for the
-  images of the circles' centres; group by group, scale from the first and last row, faces from three points, chained;
-- by the same with this package's centres, to tell what the centres do from what the adjustment does;
-- by this package with its defaults.
-Prints the mean length of the board residuals per trial and their standard deviation (both columns of Table 1, in every
-group by itself, against the design; the mean against the dots as they really are too), the errors of the faces against
-the truth, and, for this package, their RMS over the trials beside the predicted σ and the goals. Labels are this
-package's in all three. With --keep,
-photographs and detections are used again.
+Every trial renders a scene of its own (target, board, camera, noise): four groups of ten photographs. It is solved as
+published (``--solve paper``: detection by the paper's rules, contours' centres alike in weight, no eccentricity, scale
+from the first and last row, faces from three points, single transforms), then with this package's centres, eccentricity
+and weights added in turn, and by this package with its defaults. Prints the mean length of the board residuals per
+trial and their standard deviation (both columns of Table 1, in every group by itself, against the design; the mean
+against the dots as they really are too), the errors of the faces against the truth, and, for this package, their RMS
+over the trials beside the predicted σ and the goals. With --keep, photographs and detections are used again.
 """
 
 import argparse
 import tempfile
-from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 
-import cv2
 import matplotlib as mpl
 import numpy as np
 
+from stcal.errors import StcalError
 from stcal.geometry.align import align_rigid
-from stcal.geometry.rigid import Rigid, Similarity
+from stcal.geometry.rigid import Rigid
 from stcal.labels import dot_cells
 from stcal.parallel import one_thread
 from stcal.report.figure import save
 from stcal.sfm import run
-from stcal.sfm.adjust.faces import faces_of_group
-from stcal.sfm.adjust.scale import find_scale
 from stcal.sfm.data.model import WorldModel
-from stcal.sfm.data.observations import ImageObservations
-from stcal.sfm.mapping.graph import image_graph
 from stcal.sfm.run.options import RunOptions
-from stcal.sfm.run.solve import solve_groups
+from stcal.sfm.run.published import AS_PUBLISHED, STEPS, Answer, answer_of, in_steps
 from stcal.synthetic.dataset import write_dataset
 from stcal.synthetic.scene import Scene, SceneOptions, make_scene
 
@@ -44,16 +36,12 @@ PUBLISHED_UM = (33.879, 25.255, 35.691, 32.401, 38.982)
 PUBLISHED_SPREAD_UM = (12.645, 12.979, 16.310, 11.595, 14.374)
 """Table 1 of the paper: average error, and what it calls mean square error; that is less than the average, so that it
 can only be the lengths' standard deviation about it."""
-PAPER, MIXED, OURS = "the paper's method", "the same, our centres", "ours"
-COLOURS = {PAPER: "#d55e00", MIXED: "#c98a00", OURS: "#0072b2"}
+PAPER, OURS = AS_PUBLISHED, "ours"
+"""As answered: frames by planes, all groups together."""
+COLOURS = {PAPER: "#d55e00"} | dict(zip((f"+ {s}" for s in STEPS), ("#c98a00", "#009e73", "#56b4e9"), strict=False))
+COLOURS[OURS] = "#0072b2"
 GOALS = {"2": (2.0, 1.2), "3": (3.0, None), "4": (2.0, 1.2), "5": (2.0, 1.2)}
 """Position (µm) and rotation (mdeg), RMS."""
-EQUAL_SIGMA_PX = 0.05
-"""σ of every centre in the paper's method; only that it is the same for all matters."""
-CONTOUR_REACH = 1.5
-"""Side of the window about a circle, in diameters."""
-MIN_CONTOUR_AREA = 0.5
-"""Of the circle's image."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -65,70 +53,6 @@ class Errors:
     faces: dict[str, tuple[float, float]]
     board_um: tuple[float, float, float]
     predicted_um: dict[str, float]
-
-
-def contour_observations(path: Path, image: ImageObservations, scene: Scene) -> ImageObservations:
-    """The observations with the centres of ellipses fitted to contours; circles without a contour are left out."""
-    grey = cv2.GaussianBlur(cv2.imread(str(path), cv2.IMREAD_GRAYSCALE), (5, 5), 0)
-    shapes = image.shape * scene.camera.focal[:, None]
-    found = [contour_centre(grey, xy, shape) for xy, shape in zip(image.centre_px, shapes, strict=True)]
-    keep = [i for i, xy in enumerate(found) if xy is not None]
-    xy = np.array([found[i] for i in keep])
-    return replace(
-        image.select(keep),
-        centre_px=xy,
-        centre=scene.camera.normalised_from_pixel(xy),
-        covariance_px2=np.tile(EQUAL_SIGMA_PX**2 * np.eye(2), (len(keep), 1, 1)),
-    )
-
-
-def contour_centre(grey: np.ndarray, centre_px: np.ndarray, shape_px: np.ndarray) -> np.ndarray | None:
-    """Centre of the ellipse through the thresholded contour about a circle that is known to be near."""
-    half = CONTOUR_REACH * np.linalg.norm(shape_px, axis=1)
-    low = np.maximum(np.floor(centre_px - half), 0).astype(int)
-    high = np.minimum(np.ceil(centre_px + half).astype(int) + 1, grey.shape[::-1])
-    window = grey[low[1] : high[1], low[0] : high[0]]
-    if np.ptp(window) == 0:
-        return None
-    _, binary = cv2.threshold(window, 0, 255, cv2.THRESH_BINARY + cv2.THRESH_OTSU)
-    contours, _ = cv2.findContours(binary, cv2.RETR_LIST, cv2.CHAIN_APPROX_NONE)
-    least = MIN_CONTOUR_AREA * np.pi * abs(np.linalg.det(shape_px))
-    centres = [low + cv2.fitEllipse(c)[0] for c in contours if len(c) >= 5 and cv2.contourArea(c) > least]
-    return min(centres, key=lambda xy: np.linalg.norm(xy - centre_px), default=None)
-
-
-def by_the_paper(observations: list[ImageObservations], scene: Scene, out: Path) -> Errors:
-    """Group by group, without eccentricity and weights."""
-    options = RunOptions(solve="chain", frame="three-point", eccentricity=False).settled(scene.target)
-    graph = image_graph(observations, scene.board, options.graph)
-    (out / "cache").mkdir(parents=True, exist_ok=True)
-    folders, designs = (out / "scratch", out / "cache"), (scene.target, scene.board)
-    solutions, _ = solve_groups(observations, graph, *folders, scene.camera, *designs, options, lambda *_: None)
-    frames, boards = {}, []
-    for model in (s.model for s in solutions):
-        scale = find_scale(model, scene.board).rows_mm_per_unit
-        faces, _ = faces_of_group(model.metric(Similarity(scale, Rigid())), scene.camera, scene.target, options.frame)
-        frames[model.group] = {each.face: each.group_from_face for each in faces}
-        boards.append(board_errors(model, scale, scene))
-    return errors(chained(frames, scene), boards, scene)
-
-
-def chained(frames: dict[str, dict[str, Rigid]], scene: Scene) -> dict[str, Rigid]:
-    """target_from_face by the groups' own two faces, in their order: eq. 11 of the paper."""
-    target_from_face = {scene.reference_face: Rigid()}
-    for name, group in scene.groups.items():
-        known, new = group.faces
-        target_from_face[new] = target_from_face[known] @ frames[name][known].inverse() @ frames[name][new]
-    return target_from_face
-
-
-def by_us(data: Path, scene: Scene, out: Path) -> tuple[Errors, list[ImageObservations]]:
-    """The package's defaults; and its labelled centres."""
-    result = run(data / "images", data / "cameras.txt", out, data / "target.toml", data / "board.toml")
-    calibration = result.calibration
-    boards = [board_errors(s.model, calibration.scales[s.model.group].mm_per_unit, scene) for s in result.solutions]
-    sigma = {f: 1e3 * float(np.sqrt(np.trace(c[3:, 3:]))) for f, c in calibration.target.face_covariance.items()}
-    return errors(calibration.target.target_from_face, boards, scene, sigma), result.observations()
 
 
 def board_errors(model: WorldModel, mm_per_unit: float, scene: Scene) -> tuple[float, float, float]:
@@ -148,12 +72,13 @@ def board_errors(model: WorldModel, mm_per_unit: float, scene: Scene) -> tuple[f
     return float(answers[0].mean()), float(answers[1].mean()), float(answers[0].std())
 
 
-def errors(target_from_face: dict[str, Rigid], boards, scene: Scene, predicted_um=None) -> Errors:
+def errors(answer: Answer, scene: Scene, predicted_um: dict[str, float] | None = None) -> Errors:
     """Errors against the scene."""
+    boards = [board_errors(m, answer.scales[m.group].mm_per_unit, scene) for m in answer.models]
     faces = {}
     for face, true in scene.target_from_face.items():
         if face != scene.reference_face:
-            pose = target_from_face[face]
+            pose = answer.target.target_from_face[face]
             turn = Rigid(pose.rotation @ true.rotation.T).angle_rad()
             shift = np.linalg.norm(pose.translation - true.translation)
             faces[face] = (1e3 * float(shift), 1e3 * float(np.degrees(turn)))
@@ -168,15 +93,16 @@ def trial(seed: int, width: int, folder: Path) -> dict[str, Errors]:
         with tempfile.TemporaryDirectory(dir=folder) as partial:
             write_dataset(Path(partial) / "data", scene)
             (Path(partial) / "data").rename(data)
-    ours, observations = by_us(data, scene, folder / "run")
-    alike = [replace(o, covariance_px2=np.tile(EQUAL_SIGMA_PX**2 * np.eye(2), (len(o), 1, 1))) for o in observations]
-    with ThreadPoolExecutor() as pool:
-        contours = list(pool.map(lambda o: contour_observations(data / "images" / o.name, o, scene), observations))
-    return {
-        PAPER: by_the_paper(contours, scene, folder / "paper"),
-        MIXED: by_the_paper(alike, scene, folder / "mixed"),
-        OURS: ours,
-    }
+    given = data / "images", data / "cameras.txt"
+    designs = data / "target.toml", data / "board.toml"
+    published = run(*given, folder / "paper", *designs, RunOptions(solve="paper"))
+    ours = run(*given, folder / "run", *designs)
+    sigma = {f: 1e3 * float(np.sqrt(np.trace(c[3:, 3:]))) for f, c in ours.target.face_covariance.items()}
+    found = {PAPER: answer_of(published), **in_steps(ours), OURS: answer_of(ours)}
+    failed = {name: str(each) for name, each in found.items() if isinstance(each, StcalError)}
+    if failed:
+        raise SystemExit(f"trial {seed}: {failed}")
+    return {name: errors(each, scene, sigma if name == OURS else None) for name, each in found.items()}
 
 
 def print_tables(trials: list[dict[str, Errors]]) -> None:
@@ -215,12 +141,12 @@ def draw(trials: list[dict[str, Errors]], path: Path, width: int) -> None:
     from matplotlib import pyplot as plt
 
     figure, (left, right) = plt.subplots(1, 2, figsize=(10, 4.2), width_ratios=(3, 2), layout="constrained")
-    faces, offsets = list(trials[0][OURS].faces), np.linspace(-0.22, 0.22, 3)
+    faces, offsets = list(trials[0][OURS].faces), np.linspace(-0.3, 0.3, len(COLOURS))
     for (method, colour), offset in zip(COLOURS.items(), offsets, strict=True):
         values = np.array([[each[method].faces[f][0] for f in faces] for each in trials])
-        x, size = np.arange(len(faces)) + offset, 9 if method == MIXED else 5  # it lies under ours
+        x, size = np.arange(len(faces)) + offset, 5 if method in (PAPER, OURS) else 8  # they lie under ours
         left.plot(np.tile(x, (len(trials), 1)), values, "o", color=colour, ms=4, alpha=0.55, mew=0)
-        left.plot(x, values.mean(0), "_", color=colour, ms=17, mew=2.5, label=method)
+        left.plot(x, values.mean(0), "_", color=colour, ms=12, mew=2.5, label=method)
         board = [each[method].board_um[0] for each in trials]
         right.plot(np.arange(1, len(trials) + 1), board, "o-", color=colour, ms=size, label=method)
     board = [each[OURS].board_um[1] for each in trials]
@@ -231,7 +157,7 @@ def draw(trials: list[dict[str, Errors]], path: Path, width: int) -> None:
     left.set_ylim(bottom=left.get_ylim()[0] / 2.2)
     shown = PUBLISHED_UM[: len(trials)]
     right.plot(np.arange(1, len(shown) + 1), shown, "s--", color="#333333", ms=5, label="published (measured)")
-    right.set(ylabel="mean board residual, µm", xlabel="trial", xticks=range(1, len(trials) + 1), ylim=(0, 60))
+    right.set(ylabel="mean board residual, µm", xlabel="trial", xticks=range(1, len(trials) + 1), ylim=(0, 70))
     right.set_title("Board against its design (Table 1)")
     right.legend(frameon=False, fontsize=9, loc="upper right")
     for axes in (left, right):

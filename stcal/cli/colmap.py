@@ -1,6 +1,7 @@
 """``stcal-sfm``: what goes to and comes from COLMAP, and why something was left out."""
 
 import os
+from enum import StrEnum
 from pathlib import Path
 from typing import Annotated
 
@@ -11,6 +12,14 @@ from stcal.cli.terminal import StageProgress, say, write
 from stcal.errors import InputError, MappingError
 
 app = typer.Typer()
+
+
+class Chained(StrEnum):
+    """How groups that are solved by themselves are combined."""
+
+    chain = "chain"
+    paper = "paper"
+
 
 SHOWN_PAIRS = 10
 
@@ -114,6 +123,13 @@ def faces(
     out: Annotated[
         Path | None, typer.Option("--out", writable=True, help="Also write the faces to this new file, as faces.json.")
     ] = None,
+    solve: Annotated[
+        Chained,
+        typer.Option(
+            help="Solve by chain, every way to a face weighed, or as in the paper: λ by rows, three-point "
+            "frames, single transforms."
+        ),
+    ] = Chained.chain,
 ) -> None:
     """Find scale and faces from a COLMAP model made or edited elsewhere; labels come by (image, keypoint)."""
     from stcal.sfm.interop.external import calibrate_models, write_faces
@@ -125,10 +141,10 @@ def faces(
     if out is not None and not out.parent.is_dir():
         raise InputError(f"{out}: no folder {out.parent}; make it, or give another place with --out")
     saved = load_run(run)
-    calibration = calibrate_models(model, saved)
+    calibration = calibrate_models(model, saved, solve.value)
     say(faces_text(calibration, saved))
     if out is not None:
-        write_faces(out, calibration, saved)
+        write_faces(out, calibration, saved, solve.value)
         say(f"faces: {out}")
 
 

@@ -48,11 +48,18 @@ class PairsChoice(StrEnum):
     sparse = "sparse"
 
 
+class ComparedWith(StrEnum):
+    """What a run's answer is compared with."""
+
+    paper = "paper"
+
+
 class Solve(StrEnum):
     """How the groups are solved."""
 
     joint = "joint"
     chain = "chain"
+    paper = "paper"
 
 
 @app.command()
@@ -64,7 +71,10 @@ def run(
     board: BoardFile = None,
     solve: Annotated[
         Solve | None,
-        typer.Option(help="Use joint, one adjustment over all groups, the default; or chain, the paper's, by group."),
+        typer.Option(
+            help="Use joint, one adjustment over all groups, the default; chain, group by group; or paper, all of "
+            "Zhang & Wei (2017) as published, from detection on, for comparison."
+        ),
     ] = None,
     frame: Annotated[
         Frame | None,
@@ -103,6 +113,12 @@ def run(
         bool,
         typer.Option("--refine-camera", help="Adjust the intrinsics too, from the given ones with their σ."),
     ] = False,
+    compare: Annotated[
+        ComparedWith | None,
+        typer.Option(
+            help="Solve the same photographs as published too, and show what each step from there is worth: paper."
+        ),
+    ] = None,
     pairs: Annotated[
         PairsChoice | None,
         typer.Option(
@@ -132,6 +148,7 @@ def run(
         reference_face=reference_face,
         flatness_mm=_flatness(flatness),
         refine_camera=refine_camera,
+        compare=compare.value if compare is not None else None,
         graph=pairs.value if pairs is not None else None,
         pairs=PairOptions(None if max_angle is None else float(np.radians(max_angle))),
         ellipses=ellipse_options(min_diameter, max_diameter),
@@ -151,6 +168,9 @@ def detect(
     ),
     target: TargetFile = None,
     board: BoardFile = None,
+    solve: Annotated[
+        Solve | None, typer.Option(help="Detect as `run` does with the same option: paper, by the published rules.")
+    ] = None,
     min_diameter: MinDiameter = None,
     max_diameter: MaxDiameter = 450.0,
     workers: Workers = None,
@@ -171,7 +191,11 @@ def detect(
     model = read_camera(camera)
     target_design = target_of(target)
     board_design = board_of(board)
-    options = RunOptions(ellipses=ellipse_options(min_diameter, max_diameter), workers=workers)
+    options = RunOptions(
+        solve=solve.value if solve is not None else None,
+        ellipses=ellipse_options(min_diameter, max_diameter),
+        workers=workers,
+    )
     if (out / "faces.json").exists():
         raise InputError(f"output folder {out}: holds a finished calibration; give another folder with --out")
     find_images(images)

@@ -4,6 +4,7 @@ from dataclasses import replace
 from pathlib import Path
 
 from stcal.design import BoardDesign, TargetDesign
+from stcal.errors import StcalError
 from stcal.io.camera import CameraModel, camera_prior, read_camera, refinable
 from stcal.io.design import board_of, target_of
 from stcal.io.images import find_images
@@ -14,11 +15,13 @@ from stcal.sfm.adjust.chain import measure_chains
 from stcal.sfm.checks.suite import run_checks
 from stcal.sfm.data.observations import by_group, detections_csv
 from stcal.sfm.detect.files import DetectionResult, detect_files, require_upright
-from stcal.sfm.detect.labels import LabelledImage, label_images
+from stcal.sfm.detect.labels import LabelledImage, label_images, label_once
+from stcal.sfm.detect.published import PublishedPattern, detect_published
 from stcal.sfm.mapping.graph import image_graph
 from stcal.sfm.run.folder import overlays_beside, write_run
 from stcal.sfm.run.marker import MarkerFile
 from stcal.sfm.run.options import RunOptions
+from stcal.sfm.run.published import compare_with_paper, require_comparable
 from stcal.sfm.run.result import RunResult
 from stcal.sfm.run.solve import solve_groups, unseen_board, usable_groups
 from stcal.sfm.run.transaction import RunFolder, run_folder
@@ -73,8 +76,13 @@ def run(
     find_images(images)
     designs = target_of(target), board_of(board)
     options = (options or RunOptions()).settled(designs[0])
+    if options.compare:
+        require_comparable(options.adjustment(designs[0]))
     with kept_processes(options.workers), run_folder(out, MarkerFile.of(images, options), given) as folder:
         result = _calibrated(images, model, folder, *designs, options, progress)
+        if options.compare:
+            published = _published(images, model, folder, *designs, options, progress)
+            result = replace(result, comparison=compare_with_paper(result, published))
         progress("check", 0, 1)
         result = replace(result, checks=run_checks(result.evidence(camera_prior(result.camera))))
         progress("check", 1, 1)
@@ -94,6 +102,30 @@ def _calibrated(
     detection, labelled = labelled_images(images, model, folder, target, board, options, progress)
     with overlays_beside(detection, labelled, target, folder.stage, progress):
         return _solved(detection, labelled, model, folder, target, board, options, progress)
+
+
+def _published(
+    images: str | Path,
+    model: CameraModel,
+    folder: RunFolder,
+    target: TargetDesign,
+    board: BoardDesign,
+    options: RunOptions,
+    progress: Progress,
+) -> RunResult | StcalError:
+    """The same photographs by the published method, or why it has no result."""
+    own = replace(
+        options, solve="paper", frame="three-point", eccentricity=False, refine_camera=False, compare=None
+    ).settled(target)
+
+    def told(stage: str, done: int, total: int) -> None:
+        progress(f"{stage}, as published", done, total)
+
+    try:
+        detection, labelled = _labelled(images, model, folder, target, board, own, told)
+        return _solved(detection, labelled, model, folder, target, board, own, told)
+    except StcalError as error:
+        return error
 
 
 def _solved(
@@ -164,11 +196,32 @@ def labelled_images(
     progress: Progress,
 ) -> tuple[DetectionResult, list[LabelledImage]]:
     """Detection, labels and ``detections.csv``, into a claimed folder."""
-    files, other = find_images(images)
-    step = counted(progress, "detect", len(files))
-    detection = detect_files(files, camera, target, board, options.ellipses, folder.cache, options.workers, step)
-    detection = replace(detection, skipped=(*other, *detection.skipped))
-    require_upright(detection.images)
-    labelled = label_images(detection, target, board, options.ellipses, folder.cache, options.workers)
+    detection, labelled = _labelled(images, camera, folder, target, board, options, progress)
     save(folder.stage / "detections.csv", detections_csv([each.observations for each in labelled]))
     return detection, labelled
+
+
+def _labelled(
+    images: str | Path,
+    camera: CameraModel,
+    folder: RunFolder,
+    target: TargetDesign,
+    board: BoardDesign | None,
+    options: RunOptions,
+    progress: Progress,
+) -> tuple[DetectionResult, list[LabelledImage]]:
+    """Detection and labels, by the rules that the options ask for."""
+    files, other = find_images(images)
+    step = counted(progress, "detect", len(files))
+    published = options.solve == "paper"
+    if published:
+        PublishedPattern.of(target)
+    detector = detect_published if published else None
+    detection = detect_files(
+        files, camera, target, board, options.ellipses, folder.cache, options.workers, step, detector
+    )
+    detection = replace(detection, skipped=(*other, *detection.skipped))
+    require_upright(detection.images)
+    if published:
+        return detection, label_once(detection, target, board)
+    return detection, label_images(detection, target, board, options.ellipses, folder.cache, options.workers)

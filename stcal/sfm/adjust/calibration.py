@@ -9,7 +9,7 @@ from stcal.design import BoardDesign, TargetDesign
 from stcal.errors import MappingError
 from stcal.geometry.camera import Camera
 from stcal.io.camera import CameraPrior
-from stcal.sfm.adjust.chain import CalibratedTarget, chain_faces, unlinked_faces
+from stcal.sfm.adjust.chain import CalibratedTarget, chain_faces, chain_singly, unlinked_faces
 from stcal.sfm.adjust.faces import FaceInGroup, faces_of_group, missing_frame_circles
 from stcal.sfm.adjust.group import adjust
 from stcal.sfm.adjust.joint import SETTLED_PX, JointResult, adjust_jointly
@@ -61,7 +61,8 @@ def calibrate(
     ConvergenceError
         The adjustment finds no minimum.
     """
-    scales = {model.group: find_scale(model, board) for model in models}
+    published = options.solve == "paper"
+    scales = {model.group: find_scale(model, board, published) for model in models}
     metric = [model.metric(scales[model.group].group_from_world()) for model in models]
     faces, notes = _faces(metric, camera, target, options)
     gone = unlinked_faces(faces, options.reference_face)
@@ -72,7 +73,7 @@ def calibrate(
         for face_id in gone
     ]
     try:
-        calibrated = chain_faces(faces, target, options.reference_face)
+        calibrated = (chain_singly if published else chain_faces)(faces, target, options.reference_face)
     except MappingError as error:  # a face without a frame may be why
         raise MappingError("; ".join([str(error), *notes])) from error
     factor = image_sigma_factor(models, camera)

@@ -14,6 +14,8 @@ from stcal.sfm.adjust.faces import FaceInGroup
 
 MAX_CHAIN_STEPS = 4
 MAX_CHAINS = 12
+Way = tuple[tuple[str, ...], tuple[str, ...]]
+"""Faces from the first to the last, and the groups between them."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -61,6 +63,37 @@ def chain_faces(faces: Sequence[FaceInGroup], target: TargetDesign, reference: s
     MappingError
         The reference face is not mapped, or a face is not linked to it.
     """
+    chains = _ways(faces, target, reference)
+    target_from_face, target_from_group = _adjust(faces, chains, reference)
+    circles = _circles(faces, target_from_face, target)
+    return CalibratedTarget(reference, target_from_face, circles, target_from_group)
+
+
+def chain_singly(faces: Sequence[FaceInGroup], target: TargetDesign, reference: str) -> CalibratedTarget:
+    """The faces by single transforms, each by its shortest way through the groups: Zhang & Wei (2017), eq. 11 with the
+    inverses where they belong. Other ways to a face are not used; circles are those of the way's last group.
+
+    Raises
+    ------
+    InputError
+        The reference face is not of the design.
+    MappingError
+        The reference face is not mapped, or a face is not linked to it.
+    """
+    shortest = {face_id: found[0] for face_id, found in _ways(faces, target, reference).items()}
+    target_from_face = {face_id: _along(way, faces) for face_id, way in shortest.items()}
+    nearest: dict[str, FaceInGroup] = {}
+    for each in sorted(faces, key=lambda each: len(shortest[each.face][1])):
+        nearest.setdefault(each.group, each)
+    target_from_group = {g: target_from_face[f.face] @ f.group_from_face.inverse() for g, f in nearest.items()}
+    last = {face_id: groups[-1] for face_id, (_, groups) in shortest.items() if groups}
+    last.setdefault(reference, next(each.group for each in faces if each.face == reference))
+    own = [each for each in faces if each.group == last[each.face]]
+    return CalibratedTarget(reference, target_from_face, _circles(own, target_from_face, target), target_from_group)
+
+
+def _ways(faces: Sequence[FaceInGroup], target: TargetDesign, reference: str) -> dict[str, list[Way]]:
+    """From the reference to every face, the shortest first, by face."""
     target.face(reference)
     seen = {each.face for each in faces}
     if reference not in seen:
@@ -75,9 +108,7 @@ def chain_faces(faces: Sequence[FaceInGroup], target: TargetDesign, reference: s
             f"face {', '.join(unlinked)}: never linked to reference face {reference}; "
             f"add a group that shows it together with {reference} or a face that is linked"
         )
-    target_from_face, target_from_group = _adjust(faces, chains, reference)
-    circles = _circles(faces, target_from_face, target)
-    return CalibratedTarget(reference, target_from_face, circles, target_from_group)
+    return chains
 
 
 def unlinked_faces(faces: Sequence[FaceInGroup], reference: str) -> list[str]:
@@ -96,7 +127,7 @@ def measure_chains(faces: Sequence[FaceInGroup], calibrated: CalibratedTarget) -
     }
 
 
-def _chains(faces: Sequence[FaceInGroup], start: str, goal: str) -> list[tuple[tuple[str, ...], tuple[str, ...]]]:
+def _chains(faces: Sequence[FaceInGroup], start: str, goal: str) -> list[Way]:
     """Simple ways from one face to another, the shortest first: (faces, groups)."""
     by_group: dict[str, list[str]] = {}
     for each in faces:

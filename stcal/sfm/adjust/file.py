@@ -74,7 +74,9 @@ class FacesFile(ResultFile):
     unit: Literal["mm"] = Field("mm", description="of all lengths")
     reference_face: str = Field(description="id of the face whose frame is the target frame")
     frame: FrameKind = Field(description="of a face, see the table of frames")
-    solve: Solve = Field(description="one adjustment over all groups (`joint`), or group by group (`chain`)")
+    solve: Solve = Field(
+        description="one adjustment over all groups (`joint`), group by group (`chain`), or as published (`paper`)"
+    )
     eccentricity: bool = Field(
         description="whether it was corrected; without it `solve` is `chain` and `frame` is `three-point`, as "
         "published, unless they are given"

@@ -8,7 +8,7 @@ from stcal.io.toml import LEAST
 from stcal.sfm.adjust.faces import FrameKind
 
 MOST_FLATNESS_MM = 1e6
-Solve = Literal["joint", "chain"]
+Solve = Literal["joint", "chain", "paper"]
 
 
 @dataclass(frozen=True, slots=True)
@@ -16,10 +16,11 @@ class AdjustOptions:
     """How models become a calibrated target; everything is decided.
 
     ``reference_face`` : id of the face whose frame is the target frame; ``solve`` : ``joint`` (one adjustment over all
-    groups) or ``chain`` (as in Zhang & Wei (2017), group by group); ``frame`` : ``plane`` (Z from the plane of all
-    circles of a face) or ``three-point`` (as in Zhang & Wei (2017)); ``eccentricity`` : whether it is corrected;
-    ``flatness_mm`` : σ of a circle about the plane of its face, None for no such knowledge; ``refine_camera`` : adjust
-    the intrinsics, the given ones being observations.
+    groups), ``chain`` (group by group, every way to a face weighed) or ``paper`` (Zhang & Wei 2017: group by group, λ
+    by rows, faces by single transforms); ``frame`` : ``plane`` (Z from the plane of all circles of a face) or
+    ``three-point`` (as in the paper); ``eccentricity`` : whether it is corrected; ``flatness_mm`` : σ of a circle about
+    the plane of its face, None for no such knowledge; ``refine_camera`` : adjust the intrinsics, the given ones being
+    observations.
 
     Raises
     ------
@@ -45,5 +46,11 @@ class AdjustOptions:
             raise InputError(
                 f"--flatness {self.flatness_mm:g}: a σ in mm, {LEAST:g} to {MOST_FLATNESS_MM:g} needed, or off"
             )
+        if self.solve == "paper" and (self.eccentricity or self.frame != "three-point"):
+            raise InputError(
+                "--solve paper: three-point frames without eccentricity, as published; leave --frame out, or use chain"
+            )
         if self.refine_camera and self.solve != "joint":
-            raise InputError("--refine-camera: part of the joint adjustment, the solve is chain; use --solve joint")
+            raise InputError(
+                f"--refine-camera: part of the joint adjustment, the solve is {self.solve}; use --solve joint"
+            )

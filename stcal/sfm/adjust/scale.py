@@ -6,7 +6,7 @@ import numpy as np
 
 from stcal.design import BoardDesign
 from stcal.errors import DegenerateError, ScaleError
-from stcal.geometry.align import align_similarity
+from stcal.geometry.align import align_rigid, align_similarity
 from stcal.geometry.arrays import frozen
 from stcal.geometry.rigid import Rigid, Similarity
 from stcal.labels import DotLabel, dot_cells
@@ -19,7 +19,8 @@ MIN_DOTS = 4
 class Scale:
     """The scale of one group.
 
-    ``board_from_world`` : least-squares similarity over all dots; its scale is λ (mm per unit);
+    ``board_from_world`` : similarity over all dots, by least squares but for a λ that was asked for by rows; its scale
+    is λ (mm per unit);
     ``rows_mm_per_unit`` : λ as in Zhang & Wei (2017) (first and last row, all pairs), ``rows`` those two rows;
     ``labels`` : (n,) the dots; ``residuals_mm`` : (n, 3) reconstructed minus design, board frame;
     ``sigma_mm_per_unit`` : of λ, from the stated σ of the dots' positions.
@@ -37,7 +38,7 @@ class Scale:
 
     @property
     def mm_per_unit(self) -> float:
-        """λ by least squares."""
+        """λ, by least squares or by rows as asked for."""
         return self.board_from_world.scale
 
     def group_from_world(self) -> Similarity:
@@ -53,8 +54,8 @@ class Scale:
         return float(np.linalg.norm(self.residuals_mm, axis=1).mean())
 
 
-def find_scale(model: WorldModel, board: BoardDesign) -> Scale:
-    """Scale of a model from the dots of the board.
+def find_scale(model: WorldModel, board: BoardDesign, by_rows: bool = False) -> Scale:
+    """Scale of a model from the dots of the board; ``by_rows`` : λ as in Zhang & Wei (2017).
 
     Raises
     ------
@@ -77,10 +78,12 @@ def find_scale(model: WorldModel, board: BoardDesign) -> Scale:
     except DegenerateError as error:
         raise ScaleError(f"{where}: the mapped board dots lie in one line; show more rows of the board") from error
     spread = np.sqrt(((xyz_board - xyz_board.mean(0)) ** 2).sum())
-    by_rows, rows = _by_rows(xyz_board, xyz_world, cells[:, 0])
+    mean_ratio, rows = _by_rows(xyz_board, xyz_world, cells[:, 0])
+    if by_rows:
+        board_from_world = Similarity(mean_ratio, align_rigid(xyz_board, mean_ratio * xyz_world))
     return Scale(
         board_from_world,
-        by_rows,
+        mean_ratio,
         rows,
         tuple(labels),
         board_from_world @ xyz_world - xyz_board,

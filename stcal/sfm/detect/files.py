@@ -27,6 +27,9 @@ from stcal.sfm.detect.sightings import BoardSighting, FaceSighting, ImageDetecti
 CACHE_VERSION = 7
 """Raised whenever detection gives other results for the same image: what was kept is then not used again."""
 
+Detector = Callable[[np.ndarray, Camera, TargetDesign, BoardDesign | None, EllipseOptions], ImageDetection]
+"""Reads one grey image."""
+
 
 @dataclass(frozen=True, slots=True, eq=False)
 class DetectedImage:
@@ -59,6 +62,7 @@ def detect_files(
     cache: Path,
     workers: int | None = None,
     progress: Callable[[str], None] | None = None,
+    detector: Detector | None = None,
 ) -> DetectionResult:
     """Detect in all files; what cannot be used is skipped and listed.
 
@@ -66,6 +70,7 @@ def detect_files(
     ----------
     cache : folder for results by content
     progress : called with the name of each finished file, in any order
+    detector : what reads one image; ours where None
 
     Raises
     ------
@@ -76,8 +81,8 @@ def detect_files(
     """
     camera, size_from = sized_by(camera_model, files)
     cache.mkdir(parents=True, exist_ok=True)
-    settings = _fingerprint(camera, target, board, options)
-    jobs = [(file, camera, size_from, target, board, options, settings) for file in files]
+    settings = _fingerprint(detector, camera, target, board, options)
+    jobs = [(file, camera, size_from, target, board, options, settings, detector) for file in files]
     found: list[DetectedImage | Skipped | None] = [None] * len(files)
     if any(cache.glob("*.npz")):
         with ThreadPoolExecutor() as pool:  # reading and hashing release the interpreter
@@ -112,13 +117,16 @@ def sized_by(camera_model: CameraModel, files: list[ImageFile]) -> tuple[Camera,
     raise InputError(f"no readable image among {len(files)}, first {files[0].name}; check the files")
 
 
-def _fingerprint(camera: Camera, target: TargetDesign, board: BoardDesign | None, options: EllipseOptions) -> str:
+def _fingerprint(
+    detector: Detector | None, camera: Camera, target: TargetDesign, board: BoardDesign | None, options: EllipseOptions
+) -> str:
     """Hash of everything but the image that detection depends on."""
 
     def plain(value):
         return value.tolist() if isinstance(value, np.ndarray) else str(value)
 
     parts = [CACHE_VERSION, asdict(camera), asdict(target), asdict(board) if board else None, asdict(options)]
+    parts += [detector.__name__] if detector else []
     return hashlib.sha256(json.dumps(parts, default=plain, sort_keys=True).encode()).hexdigest()
 
 
@@ -144,6 +152,7 @@ def _detect_file(
     board: BoardDesign | None,
     options: EllipseOptions,
     settings: str,
+    detector: Detector | None,
 ) -> tuple[str, bytes] | Skipped:
     """Detect in one file: the key of the result, and what is to be kept of it."""
     loaded = load_image(file, camera, size_from)
@@ -151,7 +160,7 @@ def _detect_file(
         return loaded
     data, image = loaded
     try:
-        detection = detect_image(image, camera, target, board, options)
+        detection = (detector or detect_image)(image, camera, target, board, options)
     except ConvergenceError as error:
         return Skipped(file.name, str(error), "distortion")
     digest, key = _key(data, settings)

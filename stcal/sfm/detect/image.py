@@ -73,7 +73,7 @@ def _read_once(
     boards: list[BoardReading] = []
     free = {p: np.ones(len(e), bool) for p, e in found.items()}
     if board is not None:
-        boards = find_boards(Candidates.of(found[board.polarity], camera), board, _corners(camera))
+        boards = find_boards(Candidates.of(found[board.polarity], camera), board, image_corners(camera))
         for each in boards:
             free[board.polarity][each.candidates] = False
     every = found[target.polarity].select(free[target.polarity])
@@ -175,7 +175,7 @@ def _untried_note(reading: ImageReading) -> str:
     )
 
 
-def _corners(camera: Camera) -> np.ndarray:
+def image_corners(camera: Camera) -> np.ndarray:
     """Corners of the image, around it, in normalised ideal coordinates."""
     right, bottom = camera.width - 0.5, camera.height - 0.5
     return camera.normalised_from_pixel(np.array([[-0.5, -0.5], [right, -0.5], [right, bottom], [-0.5, bottom]]))

@@ -98,17 +98,13 @@ def label_images(
     ``cache`` : folder for what the second look measures.
     """
     camera = detection.camera
-    groups: dict[str, list[DetectedImage]] = {}
-    for image in detection.images:
-        groups.setdefault(image.file.group, []).append(image)
+    groups = _groups(detection)
     patterns = patterns_of(target, board)
     first: list[tuple[list[LabelledImage], Arrangement]] = []
     jobs: list[tuple[DetectedImage, PredictedCircles]] = []
     focal_px = float(np.sqrt(camera.focal.prod()))
-    named = [[(i.file.name, i.file.group, i.detection) for i in members] for members in groups.values()]
-    for members, (found, arrangement) in zip(
-        groups.values(), label_groups(named, target, board, focal_px), strict=True
-    ):
+    labelled = label_groups([named for _, named in groups], target, board, focal_px)
+    for (members, _), (found, arrangement) in zip(groups, labelled, strict=True):
         found, arrangement = _without_outlying(found, arrangement, patterns, focal_px)
         for i, (image, each) in enumerate(zip(members, found, strict=True)):
             predicted = predict_circles(arrangement, i, each.observations.labels, target, board, camera)
@@ -125,6 +121,22 @@ def label_images(
         for found, arrangement in first
         for each in _without_outlying(_second(found, looks), arrangement, patterns, focal_px)[0]
     ]
+
+
+def label_once(detection: DetectionResult, target: TargetDesign, board: BoardDesign | None) -> list[LabelledImage]:
+    """Labelled circles of all images, in the order of their groups, as each image read them: the group names plain
+    boards, and what contradicts it is left out; nothing is looked for again."""
+    groups = [named for _, named in _groups(detection)]
+    focal_px = float(np.sqrt(detection.camera.focal.prod()))
+    return [each for found, _ in label_groups(groups, target, board, focal_px) for each in found]
+
+
+def _groups(detection: DetectionResult) -> list[tuple[list[DetectedImage], list[tuple[str, str, ImageDetection]]]]:
+    """Images of each group; and (name, group, detection) of them."""
+    groups: dict[str, list[DetectedImage]] = {}
+    for image in detection.images:
+        groups.setdefault(image.file.group, []).append(image)
+    return [(own, [(i.file.name, i.file.group, i.detection) for i in own]) for own in groups.values()]
 
 
 def _without_outlying(

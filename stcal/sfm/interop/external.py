@@ -3,6 +3,7 @@
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
+from typing import Literal
 
 import numpy as np
 
@@ -12,14 +13,25 @@ from stcal.io.saving import json_text, save
 from stcal.parallel import one_thread
 from stcal.sfm.adjust.calibration import Calibration, calibrate
 from stcal.sfm.adjust.file import FacesFile
+from stcal.sfm.adjust.options import AdjustOptions
 from stcal.sfm.data.model import WorldModel
 from stcal.sfm.mapping.database import image_ids
 from stcal.sfm.mapping.models import ReadModel, find_models, read_model
 from stcal.sfm.run.saved import SavedRun
 
+Chained = Literal["chain", "paper"]
 
-def faces_from_models(read: Sequence[ReadModel], run: SavedRun) -> Calibration:
-    """Our scale and face stages, group by group and chained, on models of the run's groups as they are.
+
+def _options(run: SavedRun, solve: Chained) -> AdjustOptions:
+    options = replace(run.options, solve=solve)
+    if solve == "paper":
+        options = replace(options, frame="three-point", eccentricity=False)
+    return options.adjustment(run.target)
+
+
+def faces_from_models(read: Sequence[ReadModel], run: SavedRun, solve: Chained = "chain") -> Calibration:
+    """Our scale and face stages, group by group and chained, on models of the run's groups as they are; or as
+    Zhang & Wei (2017) have these stages, with ``solve`` ``paper``.
 
     Raises
     ------
@@ -61,7 +73,7 @@ def faces_from_models(read: Sequence[ReadModel], run: SavedRun) -> Calibration:
             if model.group not in models or len(model.images) > len(models[model.group].images):
                 models[model.group] = model
     notes += [f"group {name}: in none of the models" for name in run.groups() if name not in models]
-    options = replace(run.options, solve="chain").adjustment(run.target)
+    options = _options(run, solve)
     ordered = [models[name] for name in run.groups() if name in models]
     try:
         calibration = calibrate(ordered, read[0].camera, run.target, run.board, options)
@@ -71,16 +83,16 @@ def faces_from_models(read: Sequence[ReadModel], run: SavedRun) -> Calibration:
 
 
 @one_thread()
-def calibrate_models(model: Path, run: SavedRun) -> Calibration:
+def calibrate_models(model: Path, run: SavedRun, solve: Chained = "chain") -> Calibration:
     """Scale and faces from a COLMAP model, or the models in a folder, that rest on the run's database."""
     ids = image_ids(run.observations)
     read = [read_model(path, run.observations, ids, run.corrected_px) for path in find_models(model)]
-    return faces_from_models(read, run)
+    return faces_from_models(read, run, solve)
 
 
-def write_faces(path: Path, calibration: Calibration, run: SavedRun) -> None:
+def write_faces(path: Path, calibration: Calibration, run: SavedRun, solve: Chained = "chain") -> None:
     """``faces.json`` of models that were chained."""
-    options = replace(run.options, solve="chain").adjustment(run.target)
+    options = _options(run, solve)
     faces = FacesFile.of(calibration.target, run.target, options, calibration.sigma_factor)
     save(path, json_text(faces.content()))
 

@@ -10,6 +10,7 @@ from stcal.report.page import render, swatch
 from stcal.report.text import NONE, cells, join, number
 from stcal.sfm.report import figures
 from stcal.sfm.report.checks import checks_values
+from stcal.sfm.report.comparison import comparison_cells
 from stcal.sfm.report.crosscheck import crosscheck_values
 
 SIDES = {-58: "", 122: ", from the other side"}
@@ -17,7 +18,11 @@ SIDES = {-58: "", 122: ", from the other side"}
 FIRST_PAIRS = 15
 FIRST_IMAGES = 100
 """Rows and overlays that the page has room for."""
-SOLVES = {"joint": "joint: one adjustment over all groups", "chain": "chain: group by group, then combined"}
+SOLVES = {
+    "joint": "joint: one adjustment over all groups",
+    "chain": "chain: group by group, then combined",
+    "paper": "paper: as published by Zhang & Wei (2017), for comparison",
+}
 FRAMES = {"plane": "plane: Z from the plane of all circles", "three-point": "three-point: from three circles"}
 
 
@@ -54,6 +59,7 @@ def report_html(report: dict, overlays: dict[str, bytes], reload_s: int | None =
         circles_left_out=_circles_left_out(report),
         notes=list(enumerate(report["notes"], 1)),
         **(checks_values(report["checks"]) if "checks" in report else {}),
+        **({"compared": comparison_cells(report["comparison"])} if "comparison" in report else {}),
         **({"cross": crosscheck_values(report["crosscheck"])} if "crosscheck" in report else {}),
         overlays=_overlays(report, overlays),
         rest=len(report["images"]) - len(overlays),

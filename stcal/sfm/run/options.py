@@ -1,13 +1,17 @@
 """What a run is asked for."""
 
 from dataclasses import asdict, dataclass, field, replace
+from typing import Literal, get_args
 
 from stcal.design import TargetDesign
+from stcal.errors import InputError
 from stcal.sfm.adjust.faces import FrameKind
 from stcal.sfm.adjust.options import AdjustOptions, Solve
 from stcal.sfm.detect.circles.ellipses import EllipseOptions
 from stcal.sfm.mapping.graph import GraphKind
 from stcal.sfm.mapping.pairs import PairOptions
+
+Compare = Literal["paper"]
 
 
 @dataclass(frozen=True, slots=True)
@@ -16,9 +20,10 @@ class RunOptions:
 
     Parameters
     ----------
-    solve : {"joint", "chain"}, optional
-        One adjustment over all groups, or group by group as in Zhang & Wei (2017). Where None ``joint``, but for the
-        uncorrected control, which is chained.
+    solve : {"joint", "chain", "paper"}, optional
+        One adjustment over all groups; or group by group; or Zhang & Wei (2017) as published, from detection on, which
+        settles ``frame`` and ``eccentricity`` too. Where None ``joint``, but for the uncorrected control, which is
+        chained.
     frame : {"plane", "three-point"}, optional
         Frame of a face: Z from the plane of all its circles, or as in Zhang & Wei (2017). Where None ``plane``, but for
         the uncorrected control.
@@ -38,6 +43,13 @@ class RunOptions:
         σ of a circle about the plane of its face, mm; None for no such knowledge.
     refine_camera : bool
         Adjust the intrinsics too, the given ones being observations.
+    compare : {"paper"}, optional
+        Solve the same photographs as published too, and step by step from there, for the report.
+
+    Raises
+    ------
+    InputError
+        A choice that does not exist.
     """
 
     solve: Solve | None = None
@@ -50,6 +62,11 @@ class RunOptions:
     workers: int | None = None
     flatness_mm: float | None = 0.02
     refine_camera: bool = False
+    compare: Compare | None = None
+
+    def __post_init__(self):
+        if self.compare not in (None, *get_args(Compare)):
+            raise InputError(f"compare {self.compare!r}: not a choice; use {' or '.join(get_args(Compare))}")
 
     def adjustment(self, target: TargetDesign) -> AdjustOptions:
         """What of it the adjustment is asked for, decided.
@@ -59,11 +76,12 @@ class RunOptions:
         InputError
             A choice that does not exist.
         """
+        eccentricity = self.eccentricity and self.solve != "paper"
         return AdjustOptions(
             target.face(self.reference_face or target.faces[0].id).id,
-            self.solve or ("joint" if self.eccentricity else "chain"),
-            self.frame or ("plane" if self.eccentricity else "three-point"),
-            self.eccentricity,
+            self.solve or ("joint" if eccentricity else "chain"),
+            self.frame or ("plane" if eccentricity else "three-point"),
+            eccentricity,
             self.flatness_mm,
             self.refine_camera,
         )

@@ -86,6 +86,7 @@ def report_of(result: RunResult) -> ReportFile:
             ],
             "scene": _scene(result),
         }
+        | ({} if result.comparison is None else {"comparison": result.comparison})
     )
 
 

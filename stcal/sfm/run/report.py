@@ -9,6 +9,7 @@ from stcal.io.json import ByFace, ByGroup, ByLabel, Matrix3, Pair, Part, Points,
 from stcal.sfm.adjust.faces import FrameKind
 from stcal.sfm.adjust.options import Solve
 from stcal.sfm.checks.verdict import Verdict
+from stcal.sfm.run.comparison import Comparison
 from stcal.sfm.run.crosscheck import Crosscheck
 
 Number = int | float
@@ -224,7 +225,7 @@ class ReportFile(ResultFile):
         "`faces_not_seen`, `observations`; `residual_rms_px` per coordinate; `centre_sigma_rms_px` of the σ used; "
         "`sigma_factor` by which the residuals of the single groups exceed the centres' own σ; `scale_sigma_ppm`: σ of "
         "the target's size; `sigma0` and `redundancy` of the joint adjustment, `last_move_px` by which its last step "
-        "moved a projection at most (settled: less than 1e-7); these four are null with `chain`"
+        "moved a projection at most (settled: less than 1e-7); these four are null with `chain` and `paper`"
     )
     faces: dict[ByFace, FaceRow] = Field(
         description="`target_from_face`, `translation_mm`, `angle_to_reference_deg`, `translation_sigma_um` and "
@@ -267,6 +268,7 @@ class ReportFile(ResultFile):
         description="target frame, mm: `cameras`: `image`, `group`, `position_mm`, `axes` (rows X, Y, Z of the "
         "camera); `boards` group → mapped dots; `circles` label → `[x, y, z]`"
     )
+    comparison: Comparison | None = Field(None, description="only of a run with `--compare paper`")
     crosscheck: Crosscheck | None = Field(None, description="only after `crosscheck`, with")
 
 

@@ -15,6 +15,7 @@ from stcal.sfm.data.observations import ImageObservations
 from stcal.sfm.detect.files import DetectionResult
 from stcal.sfm.detect.labels import LabelledImage
 from stcal.sfm.mapping.graph import ImageGraph
+from stcal.sfm.run.comparison import Comparison
 from stcal.sfm.run.options import RunOptions
 from stcal.sfm.run.solve import GroupSolution
 
@@ -49,6 +50,8 @@ class RunResult:
         What was left out or did not settle, and what to do.
     checks : tuple of Check
         In the order of the report.
+    comparison : Comparison, optional
+        With the published method, where it was asked for.
     """
 
     out: Path
@@ -64,6 +67,7 @@ class RunResult:
     chains: dict[str, tuple[FaceChain, ...]]
     notes: tuple[str, ...]
     checks: tuple[Check, ...] = ()
+    comparison: Comparison | None = None
 
     @property
     def target(self):

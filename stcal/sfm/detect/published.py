@@ -1,0 +1,377 @@
+"""Detection by the rules of Zhang & Wei (2017), §1.2: threshold, two tests of ellipses, names by directions.
+
+It is for comparison. The rules need a whole pattern of ten circles in view, and name a face by scalar and vector
+products in the image, which perspective bends. A pattern that they miss is noted with what was measured; one that they
+misname keeps the name that its own plane gives it, which is noted too.
+What the document leaves open is decided here: the threshold is Otsu's, one for the image; "= 0" is within half of the
+45° to the next name; distances are measured in radii of the circle that they start from, and the board, of which §1.2
+says nothing, is found as everywhere in this package.
+"""
+
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+
+from stcal.design import BoardDesign, FaceDesign, Polarity, TargetDesign
+from stcal.errors import DegenerateError, InputError
+from stcal.geometry.camera import Camera
+from stcal.geometry.plane import apply_homography, fit_homography
+from stcal.io.images import grey_8bit
+from stcal.sfm.data.centres import Centres
+from stcal.sfm.detect.board import find_boards
+from stcal.sfm.detect.circles.candidates import Candidates
+from stcal.sfm.detect.circles.ellipses import (
+    EllipseOptions,
+    Ellipses,
+    contrast_of,
+    contrast_threshold,
+    diameter_limits_px,
+    distinct,
+    outline_area,
+    outlines,
+)
+from stcal.sfm.detect.image import image_corners
+from stcal.sfm.detect.sightings import BoardSighting, FaceSighting, ImageDetection
+
+SMOOTHING_PX = 5
+"""Side of the Gaussian filter."""
+EQUAL_SIGMA_PX = 0.05
+"""σ of every centre; only that it is the same for all matters."""
+MIN_OUTLINE_PX = 6
+AREA_RATIO = 2.0
+"""Areas of circles of one size in one pattern differ by perspective, at most so many times."""
+STEP_RATIO = 1.4
+"""Distances from one circle to the next, likewise."""
+ZERO_COSINE = float(np.sin(np.radians(22.5)))
+"""What passes for the scalar product of perpendicular directions: half way to those 45° off."""
+MAX_MISFIT = 0.25
+"""Of a circle about its place in the face's plane, radii."""
+
+
+@dataclass(frozen=True, slots=True)
+class PublishedPattern:
+    """The pattern that the rules know, by circle ids.
+
+    ``lines`` : along X, Y and the diagonal, from the ``origin`` on, the circles as (id, distance in steps); ``a``,
+    ``b`` : the small circles beside the origin; ``c`` : the small circle that names the face, beside ``last``, at
+    ``c_radii`` radii of it; ``names`` : (sign of the scalar, of the vector product) with the diagonal → face id;
+    ``step_radii`` : from the origin to ``a`` in its radii; ``small`` : area of the small circles in that of the large.
+    """
+
+    origin: str
+    a: str
+    b: str
+    c: str
+    last: str
+    lines: tuple[tuple[tuple[str, float], ...], ...]
+    names: dict[tuple[int, int], str]
+    step_radii: float
+    c_radii: float
+    small: float
+
+    @classmethod
+    def of(cls, target: TargetDesign) -> "PublishedPattern":
+        """That of a design.
+
+        Raises
+        ------
+        InputError
+            The design is not of that form.
+        """
+        try:
+            return cls._of(target)
+        except (LookupError, ValueError) as error:
+            raise InputError(
+                f"target {target.name}: not read by the rules of Zhang & Wei (2017) ({error}); --solve paper needs "
+                "faces with large circles along X, Y and the diagonal, a small one beside the origin on each axis, and "
+                "a small one beside the diagonal's last whose direction names the face; use joint or chain"
+            ) from error
+
+    @classmethod
+    def _of(cls, target: TargetDesign) -> "PublishedPattern":
+        first = target.faces[0]
+        common, own = _common(target)
+        place = {circle: first.xy_mm[i] for i, circle in enumerate(first.ids) if circle in common}
+        radius = {circle: float(first.radius_mm[first.ids.index(circle)]) for circle in common}
+        largest = max(radius.values())
+        large = [circle for circle in common if radius[circle] > 0.75 * largest and circle != first.origin]
+        small = [circle for circle in common if circle not in large and circle != first.origin]
+        lines = []
+        for direction in ((1.0, 0.0), (0.0, 1.0), (1.0, 1.0)):
+            lines.append(_along(np.array(direction), {circle: place[circle] for circle in large}))
+        (a, step), (b, other) = (
+            _along(np.array(d), {circle: place[circle] for circle in small})[0] for d in ((1.0, 0.0), (0.0, 1.0))
+        )
+        if not np.isclose(step, other) or len(large) != sum(len(line) for line in lines) or len(small) != 2:
+            raise ValueError("its circles lie elsewhere")
+        last = lines[2][-1][0]
+        names: dict[tuple[int, int], str] = {}
+        away = []
+        for face, circle in own.items():
+            direction = _place(face, circle) - place[last]
+            away.append(float(np.linalg.norm(direction)))
+            names[_signs(direction, np.ones(2))] = face.id
+        if len(names) < len(target.faces) or not np.allclose(away, away[0], rtol=0.05):
+            raise ValueError("the circles beside the last do not tell its faces apart")
+        return cls(
+            origin=first.origin,
+            a=a,
+            b=b,
+            c=next(iter(own.values())),
+            last=last,
+            lines=tuple(tuple((circle, far / step) for circle, far in line) for line in lines),
+            names=names,
+            step_radii=step / radius[first.origin],
+            c_radii=away[0] / radius[last],
+            small=(radius[a] / radius[first.origin]) ** 2,
+        )
+
+
+def _place(face: FaceDesign, circle: str) -> np.ndarray:
+    return face.xy_mm[face.ids.index(circle)]
+
+
+def _common(target: TargetDesign) -> tuple[list[str], dict[FaceDesign, str]]:
+    """Circles at the same place in every face, and by face the one that is not."""
+    first = target.faces[0]
+    common = [
+        circle
+        for circle in first.ids
+        if all(circle in f.ids and np.allclose(_place(f, circle), _place(first, circle)) for f in target.faces)
+    ]
+    own = {face: [circle for circle in face.ids if circle not in common] for face in target.faces}
+    if any(len(circles) != 1 for circles in own.values()) or len({c[0] for c in own.values()}) != 1:
+        raise ValueError("not one circle alone differs from face to face")
+    return common, {face: circles[0] for face, circles in own.items()}
+
+
+def _along(direction: np.ndarray, place: dict[str, np.ndarray]) -> list[tuple[str, float]]:
+    """Circles in a direction from the origin, nearest first, and how far: in units of ``direction``."""
+    found = []
+    for circle, xy in place.items():
+        far = float(xy @ direction / (direction @ direction))
+        if far > 0 and np.allclose(xy, far * direction, atol=0.01 * far):
+            found.append((circle, far))
+    if not found:
+        raise ValueError(f"no circle along ({direction[0]:g}, {direction[1]:g})")
+    return sorted(found, key=lambda each: each[1])
+
+
+def _signs(direction: np.ndarray, diagonal: np.ndarray) -> tuple[int, int]:
+    """Of the scalar product, and, unless that is zero, of the vector product from the diagonal on."""
+    cosine = direction @ diagonal / (np.linalg.norm(direction) * np.linalg.norm(diagonal))
+    if abs(cosine) < ZERO_COSINE:
+        return 0, 0
+    return int(np.sign(cosine)), int(np.sign(_cross(diagonal, direction)))
+
+
+def _cross(u: np.ndarray, v: np.ndarray) -> float:
+    return float(u[0] * v[1] - u[1] * v[0])
+
+
+def detect_published(
+    image: np.ndarray, camera: Camera, target: TargetDesign, board: BoardDesign | None, options: EllipseOptions
+) -> ImageDetection:
+    """All circles of the target and the board in one grey image of the camera's size, by the published rules.
+
+    Parameters
+    ----------
+    image
+        (h, w), grey, 8 or 16 bits.
+    camera
+        Its intrinsics, px.
+    target, board
+        Designs; no board is sought where None.
+    options
+        ``min_diameter_px``, ``max_diameter_px`` and ``min_axis_ratio`` are the rules' two tests.
+
+    Returns
+    -------
+    ImageDetection
+        Centres of ellipses fitted to contours, px, all of the same σ.
+
+    Raises
+    ------
+    InputError
+        The design is not of the published form.
+    """
+    pattern = PublishedPattern.of(target)
+    grey = cv2.GaussianBlur(grey_8bit(image), (SMOOTHING_PX, SMOOTHING_PX), 0)
+    polarities: set[Polarity] = {target.polarity, board.polarity if board else target.polarity}
+    found = {polarity: contour_ellipses(grey, polarity, options) for polarity in sorted(polarities)}
+    start = dict(zip(found, np.cumsum([0, *(len(each) for each in found.values())]).tolist(), strict=False))
+    candidates = {polarity: Candidates.of(each, camera) for polarity, each in found.items()}
+    boards, free = [], np.ones(len(found[target.polarity]), bool)
+    if board is not None:
+        for each in find_boards(candidates[board.polarity], board, image_corners(camera)):
+            boards.append(BoardSighting(start[board.polarity] + each.candidates, each.numberings, each.unlikely))
+            if board.polarity == target.polarity:
+                free[each.candidates] = False
+    faces, notes = _Rules(pattern, target, candidates[target.polarity], found[target.polarity]).find(free)
+    first = start[target.polarity]
+    return ImageDetection(
+        centres=Centres.concatenate([_centres(each, candidates[p]) for p, each in found.items()]),
+        faces=tuple(FaceSighting(face, first + rows, circles) for face, rows, circles in faces),
+        boards=tuple(boards),
+        notes=tuple(notes),
+        candidates=sum(len(each) for each in found.values()),
+    )
+
+
+def contour_ellipses(grey: np.ndarray, polarity: Polarity, options: EllipseOptions) -> Ellipses:
+    """Ellipses fitted to the contours of what a threshold sets apart, kept by pixel count and by axis ratio."""
+    kind = cv2.THRESH_BINARY if polarity == "bright" else cv2.THRESH_BINARY_INV
+    level, mask = cv2.threshold(grey, 0, 255, kind + cv2.THRESH_OTSU)
+    smallest, largest = (np.pi / 4 * d**2 for d in diameter_limits_px(grey.size, options))
+    rows = []
+    for contour in outlines(mask) if grey.min() <= level < grey.max() else []:
+        if len(contour) < MIN_OUTLINE_PX or not smallest <= outline_area(contour) <= largest:
+            continue
+        (x, y), (d1, d2), angle_deg = cv2.fitEllipse(contour)
+        if np.isfinite([x, y, d1, d2]).all() and min(d1, d2) >= options.min_axis_ratio * max(d1, d2) > 0:
+            rows.append((x, y, d1 + 1, d2 + 1, angle_deg))  # a contour runs through the outermost pixels' centres
+    centre, shape = distinct(np.array(rows).reshape(-1, 5))
+    contrast = contrast_of(grey, polarity, centre, shape)
+    keep = contrast > contrast_threshold(grey, options)[0]
+    return Ellipses(centre[keep], shape[keep], contrast[keep])
+
+
+def _centres(ellipses: Ellipses, candidates: Candidates) -> Centres:
+    n = len(ellipses)
+    return Centres(
+        centre_px=ellipses.centre_px,
+        centre=candidates.xy,
+        shape=candidates.shape,
+        covariance_px2=np.broadcast_to(EQUAL_SIGMA_PX**2 * np.eye(2), (n, 2, 2)),
+        blur_px=np.zeros(n),
+        contrast=ellipses.contrast,
+        noise=np.zeros(n),
+        rim=np.ones(n),
+        uneven_px=np.zeros((n, 2)),
+        ok=np.ones(n, bool),
+    )
+
+
+class _Rules:
+    """§1.2 (3) on the ellipses of one image; directions are taken in the image without its distortion."""
+
+    def __init__(self, pattern: PublishedPattern, target: TargetDesign, candidates: Candidates, ellipses: Ellipses):
+        self.pattern, self.target, self.found, self.ellipses = pattern, target, candidates, ellipses
+        self.area = candidates.radius**2
+
+    def find(self, free: np.ndarray) -> tuple[list[tuple[str, np.ndarray, np.ndarray]], list[str]]:
+        """(face id, rows among the candidates, circles of the design) of the faces, and why patterns are none."""
+        free = free.copy()
+        faces, notes = [], []
+        for origin in np.argsort(-self.area, kind="stable").tolist():
+            if not free[origin]:
+                continue
+            beside = self._beside(origin, self.pattern.step_radii, free)
+            if len(beside) != 2:
+                continue
+            circles = {self.pattern.origin: origin} | self._axes(origin, beside)
+            where = "a pattern about ({:.0f}, {:.0f}) px".format(*self.ellipses.centre_px[origin])
+            named = self._walk(circles, free) or self._name(circles, free)
+            if isinstance(named, str):
+                notes.append(f"{where}: {named}; left out by the published rules")
+                continue
+            face, rows, note = named
+            free[rows] = False
+            faces.append((face.id, rows, np.arange(len(face.ids))))
+            notes += [f"{where}: {note}"] if note else []
+        return faces, notes
+
+    def _beside(self, centre: int, radii: float, free: np.ndarray) -> list[int]:
+        """Small circles at that distance from a large one, in its radii."""
+        away = np.linalg.norm(
+            np.linalg.solve(self.found.shape[centre], (self.found.xy - self.found.xy[centre]).T), axis=0
+        )
+        size = self.area / (self.pattern.small * self.area[centre])
+        near = (away > radii / STEP_RATIO) & (away < radii * STEP_RATIO)
+        alike = (size > 1 / AREA_RATIO) & (size < AREA_RATIO)
+        return np.flatnonzero(free & near & alike).tolist()
+
+    def _axes(self, origin: int, beside: list[int]) -> dict[str, int]:
+        """a and b by the sign of the vector product; the image's y points down."""
+        first, second = beside
+        at = self.found.xy[origin]
+        if _cross(self.found.xy[first] - at, self.found.xy[second] - at) > 0:
+            first, second = second, first
+        return {self.pattern.a: first, self.pattern.b: second}
+
+    def _walk(self, circles: dict[str, int], free: np.ndarray) -> str:
+        """Label the large circles along the three directions, the diagonal's being the median of the other two; why
+        not, where one is missing."""
+        origin = circles[self.pattern.origin]
+        at = self.found.xy[origin]
+        step_x, step_y = (self.found.xy[circles[circle]] - at for circle in (self.pattern.a, self.pattern.b))
+        size = self.area / self.area[origin]
+        large = free & (size > 1 / AREA_RATIO) & (size < AREA_RATIO)
+        large[origin] = False
+        for line, step in zip(self.pattern.lines, (step_x, step_y, step_x + step_y), strict=True):
+            way = step / np.linalg.norm(step)
+            for circle, far in line:
+                off = self.found.xy - at
+                along = off @ way
+                across = np.abs(off @ [-way[1], way[0]])
+                far_seen = along / (far * np.linalg.norm(step))
+                there = large & (across < self.found.radius) & (far_seen > 1 / STEP_RATIO) & (far_seen < STEP_RATIO)
+                if not there.any():
+                    return f"circle {circle} not found in its direction"
+                rows = np.flatnonzero(there)
+                circles[circle] = int(rows[np.argmin(np.abs(far_seen[rows] - 1))])
+                own = self.found.xy[[origin, *(circles[c] for c, _ in line if c in circles)]]
+                way = _fitted_direction(own, way)
+        return ""
+
+    def _name(self, circles: dict[str, int], free: np.ndarray) -> str | tuple[FaceDesign, np.ndarray, str]:
+        """The face by its circle c, the rows of its circles in the design's order, and what is to be noted of the name;
+        why not, where there is none."""
+        pattern = self.pattern
+        last = circles[pattern.last]
+        known = set(circles.values())
+        beside = [i for i in self._beside(last, pattern.c_radii, free) if i not in known]
+        if len(beside) != 1:
+            return f"{len(beside)} small circles beside circle {pattern.last}, 1 needed"
+        on_diagonal = self.found.xy[[circles[c] for c in (pattern.origin, *(c for c, _ in pattern.lines[2]))]]
+        diagonal = _fitted_direction(on_diagonal, on_diagonal[-1] - on_diagonal[0])
+        direction = self.found.xy[beside[0]] - self.found.xy[last]
+        flip = np.array([1.0, -1.0])  # the image's y points down
+        told = pattern.names.get(_signs(flip * direction, flip * diagonal))
+        placed = self._placed(circles, beside[0])
+        if isinstance(placed, str):
+            return placed
+        face = min(self.target.faces, key=lambda f: float(np.linalg.norm(_place(f, pattern.c) - placed)))
+        rows = np.array([{**circles, pattern.c: beside[0]}[circle] for circle in face.ids])
+        if told == face.id:
+            return face, rows, ""
+        cosine = direction @ diagonal / np.linalg.norm(direction)
+        return (
+            face,
+            rows,
+            f"perspective breaks the published name: the products in the image (cosine {cosine:+.2f}) say "
+            f"{f'face {told}' if told else 'no face'}, its own plane says face {face.id}, which was taken",
+        )
+
+    def _placed(self, circles: dict[str, int], c: int) -> np.ndarray | str:
+        """Circle c in the plane of the face, mm; or why the others are no face."""
+        face = self.target.faces[0]
+        common = [i for i, circle in enumerate(face.ids) if circle in circles]
+        xy = self.found.xy[[circles[face.ids[i]] for i in common]]
+        try:
+            plane = fit_homography(xy, face.xy_mm[common])
+        except DegenerateError:
+            return "its circles lie in one line"
+        off = np.linalg.norm(apply_homography(plane, xy) - face.xy_mm[common], axis=1) / face.radius_mm[common]
+        worst = int(np.argmax(off))
+        if off[worst] > MAX_MISFIT:
+            circle = face.ids[common[worst]]
+            return f"circle {circle} lies {off[worst]:.2f} radii off in the plane of the others, {MAX_MISFIT:g} allowed"
+        return apply_homography(plane, self.found.xy[[c]])[0]
+
+
+def _fitted_direction(xy: np.ndarray, towards: np.ndarray) -> np.ndarray:
+    """Of the line fitted to points, unit length."""
+    way = np.linalg.svd(xy - xy.mean(0))[2][0]
+    return way if way @ towards > 0 else -way
