@@ -113,6 +113,12 @@ def run(
         bool,
         typer.Option("--refine-camera", help="Adjust the intrinsics too, from the given ones with their σ."),
     ] = False,
+    board_only: Annotated[
+        bool,
+        typer.Option(
+            "--board-only", help="Take the board alone, though other circles are in view: λ and residuals."
+        ),
+    ] = False,
     compare: Annotated[
         ComparedWith | None,
         typer.Option(
@@ -148,6 +154,7 @@ def run(
         reference_face=reference_face,
         flatness_mm=_flatness(flatness),
         refine_camera=refine_camera,
+        board_only=board_only,
         compare=compare.value if compare is not None else None,
         graph=pairs.value if pairs is not None else None,
         pairs=PairOptions(None if max_angle is None else float(np.radians(max_angle))),

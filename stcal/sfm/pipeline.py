@@ -10,10 +10,11 @@ from stcal.io.design import board_of, target_of
 from stcal.io.images import find_images
 from stcal.io.saving import save
 from stcal.parallel import Progress, counted, kept_processes, load_in_processes, one_thread
-from stcal.sfm.adjust.calibration import calibrate
+from stcal.sfm.adjust.calibration import calibrate, calibrate_board
 from stcal.sfm.adjust.chain import measure_chains
 from stcal.sfm.checks.suite import run_checks
 from stcal.sfm.data.observations import by_group, detections_csv
+from stcal.sfm.detect.board_alone import is_board_alone, label_boards
 from stcal.sfm.detect.files import DetectionResult, detect_files, require_upright
 from stcal.sfm.detect.labels import LabelledImage, label_images, label_once
 from stcal.sfm.detect.published import PublishedPattern, detect_published
@@ -80,7 +81,7 @@ def run(
         require_comparable(options.adjustment(designs[0]))
     with kept_processes(options.workers), run_folder(out, MarkerFile.of(images, options), given) as folder:
         result = _calibrated(images, model, folder, *designs, options, progress)
-        if options.compare:
+        if options.compare and result.target.target_from_face:
             published = _published(images, model, folder, *designs, options, progress)
             result = replace(result, comparison=compare_with_paper(result, published))
         progress("check", 0, 1)
@@ -142,7 +143,10 @@ def _solved(
     known = model.calibrated(detection.camera.width, detection.camera.height)
     known = refinable(known) if options.refine_camera else known
     observations = [each.observations for each in labelled]
-    groups, unusable = usable_groups(by_group(observations), detection.skipped)
+    board_alone = options.board_only or is_board_alone(detection)
+    if board_alone and options.solve == "joint":  # of faces, which there are none of
+        options = replace(options, solve="chain", refine_camera=False)
+    groups, unusable = usable_groups(by_group(observations), detection.skipped, board_alone)
 
     progress("map", 0, len(groups))
     graph = image_graph(observations, board, options.graph)
@@ -151,9 +155,11 @@ def _solved(
         observations, graph, scratch, folder.cache, known, target, board, options, progress, groups
     )
     progress("faces", 0, 1)
-    calibration = calibrate(
-        [s.model for s in solutions], known, target, board, options.adjustment(target), camera_prior(known)
-    )
+    models, settled = [s.model for s in solutions], options.adjustment(target)
+    if board_alone:
+        calibration = calibrate_board(models, known, board, settled)
+    else:
+        calibration = calibrate(models, known, target, board, settled, camera_prior(known))
     progress("faces", 1, 1)
     return RunResult(
         out=folder.out,
@@ -222,6 +228,8 @@ def _labelled(
     )
     detection = replace(detection, skipped=(*other, *detection.skipped))
     require_upright(detection.images)
+    if board is not None and (options.board_only or is_board_alone(detection)):
+        return detection, label_boards(detection, target, board)
     if published:
         return detection, label_once(detection, target, board)
     return detection, label_images(detection, target, board, options.ellipses, folder.cache, options.workers)

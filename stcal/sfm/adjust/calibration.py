@@ -8,6 +8,7 @@ import numpy as np
 from stcal.design import BoardDesign, TargetDesign
 from stcal.errors import MappingError
 from stcal.geometry.camera import Camera
+from stcal.geometry.rigid import Rigid
 from stcal.io.camera import CameraPrior
 from stcal.sfm.adjust.chain import CalibratedTarget, chain_faces, chain_singly, unlinked_faces
 from stcal.sfm.adjust.faces import FaceInGroup, faces_of_group, missing_frame_circles
@@ -94,6 +95,30 @@ def calibrate(
         models=tuple(metric),
         camera=camera,
         notes=tuple(notes),
+    )
+
+
+def calibrate_board(
+    models: Sequence[WorldModel], camera: Camera, board: BoardDesign, options: AdjustOptions
+) -> Calibration:
+    """Scale from models of the board alone: a target without faces, the models in the board's frame. Zhang & Wei
+    (2017), §4.1.
+
+    Raises
+    ------
+    ScaleError
+        A group's board is not mapped.
+    """
+    scales = {model.group: find_scale(model, board, options.solve == "paper") for model in models}
+    return Calibration(
+        target=CalibratedTarget(options.reference_face, {}, {}, {name: Rigid() for name in scales}),
+        scales=scales,
+        faces=(),
+        joint=None,
+        sigma_factor=image_sigma_factor(models, camera),
+        models=tuple(model.metric(scales[model.group].board_from_world) for model in models),
+        camera=camera,
+        notes=(),
     )
 
 

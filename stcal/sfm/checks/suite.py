@@ -103,6 +103,8 @@ def run_checks(evidence: Evidence) -> tuple[Check, ...]:
 
 def _joint_checks(evidence: Evidence, networks: list[Network]) -> list[Check]:
     joint = evidence.calibration.joint
+    if not evidence.calibration.target.target_from_face:
+        return [impossible(key, title, "the board alone, no face", "") for key, title in JOINT]
     if joint is None:
         reason = "needs the covariances of the joint adjustment"
         return [impossible(key, title, reason, "run with --solve joint") for key, title in JOINT]
@@ -135,7 +137,8 @@ def control_check(evidence: Evidence, networks: list[Network]) -> Check:
     )
     check = judge(key, CONTROL, [trial], "corrections", remedy)
     try:
-        told, measured = _control(evidence)
+        whole = evidence.calibration.target.target_from_face
+        told, measured = _control(evidence) if whole else ("no face that it could move", ())
     except StcalError as error:
         told, measured = f"no uncorrected result ({error})", ()
     reason = f"{1 + test.estimate[0]:.3f} ± {np.sqrt(test.covariance[0, 0]):.3f} of the eccentricity found; {told}"

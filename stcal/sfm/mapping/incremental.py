@@ -15,7 +15,7 @@ from stcal.sfm.data.observations import ImageObservations
 from stcal.sfm.mapping.colmap import pycolmap
 from stcal.sfm.mapping.database import CAMERA_ID
 from stcal.sfm.mapping.models import rigid_from_colmap
-from stcal.sfm.mapping.pairs import PairScore
+from stcal.sfm.mapping.pairs import PairScore, share_board_alone
 from stcal.sfm.mapping.resect import assemble, complete
 
 SEED = 1
@@ -56,8 +56,14 @@ def map_group(
         No model of two or more images.
     """
     names = [image.name for image in group if image.name in skeleton]
-    seeded = "COLMAP's estimate of the chosen pair"
-    reconstruction = seeded_mapping(database, scratch, names, (ids[pairs[0].first], ids[pairs[0].second]))
+    first, second = (next(i for i in group if i.name == name) for name in (pairs[0].first, pairs[0].second))
+    reconstruction = None
+    if share_board_alone(first, second):
+        seeded = "our relative pose of the chosen pair, by the board (a plane has two essential matrices)"
+        reconstruction = _own_mapping(database, names, ids, pairs[0])
+    if reconstruction is None:
+        seeded = "COLMAP's estimate of the chosen pair"
+        reconstruction = seeded_mapping(database, scratch, names, (ids[first.name], ids[second.name]))
     if reconstruction is None:
         seeded = "our relative pose of the chosen pair (COLMAP's gates refused its own)"
         reconstruction = _own_mapping(database, names, ids, pairs[0])
@@ -141,6 +147,7 @@ def seeded_mapping(
 
 def _own_mapping(database: Path, names, ids, pair: PairScore) -> pycolmap.Reconstruction | None:
     """COLMAP's incremental mapper driven from here, starting from our relative pose of the pair."""
+    pycolmap.logging.minloglevel = LOG_ERRORS_ONLY
     options = pipeline_options(names, (ids[pair.first], ids[pair.second]))
     with pycolmap.Database.open(str(database)) as opened:
         cache = pycolmap.DatabaseCache.create(

@@ -6,9 +6,12 @@ from itertools import combinations
 import cv2
 import numpy as np
 
-from stcal.errors import InputError, MappingError
+from stcal.design import BoardDesign
+from stcal.errors import ConvergenceError, DegenerateError, InputError, MappingError
 from stcal.geometry.camera import Camera
+from stcal.geometry.plane import camera_from_plane, fit_homography, refine_planar_pose
 from stcal.geometry.rigid import Rigid
+from stcal.labels import DotLabel
 from stcal.sfm.data.observations import ImageObservations
 from stcal.sfm.mapping.database import match_labels
 
@@ -68,15 +71,19 @@ class PairScore:
         return self.second_from_first
 
 
-def rank_pairs(group: list[ImageObservations], camera: Camera, options: PairOptions) -> list[PairScore]:
+def rank_pairs(
+    group: list[ImageObservations], camera: Camera, options: PairOptions, board: BoardDesign | None = None
+) -> list[PairScore]:
     """All pairs of a group, the chosen one first, then the usable by angle, then the rest.
+
+    ``board`` : by which pairs are posed that have nothing else in common; a plane has two essential matrices.
 
     Raises
     ------
     MappingError
         No pair is usable: too few common labels, or a camera that did not move.
     """
-    scores = [_score(a, b, camera, options) for a, b in combinations(group, 2)]
+    scores = [_score(a, b, camera, options, board) for a, b in combinations(group, 2)]
     scores.sort(key=lambda s: (s.verdict != "usable", -round(s.median_angle_rad, 9), -s.shared, s.first, s.second))
     over = [s for s in scores if s.verdict.startswith(OVER_LIMIT)]
     if over and scores[0].verdict != "usable" and options.max_angle_rad is None:
@@ -115,13 +122,18 @@ def _no_pair(group, scores: list[PairScore], options: PairOptions) -> str:
     )
 
 
-def _score(a: ImageObservations, b: ImageObservations, camera: Camera, options: PairOptions) -> PairScore:
+def _score(
+    a: ImageObservations, b: ImageObservations, camera: Camera, options: PairOptions, board: BoardDesign | None
+) -> PairScore:
     matches = match_labels(a, b)
     n = len(matches)
     if n < MIN_LABELS:
         return PairScore(a.name, b.name, n, 0.0, 0.0, 0.0, None, f"{n} labels in common, {MIN_LABELS} needed")
     xy_a, xy_b = a.centre[matches[:, 0]], b.centre[matches[:, 1]]
-    pose = _relative_pose(xy_a, xy_b, RANSAC_PX / float(np.sqrt(camera.focal.prod())))
+    if board is not None and share_board_alone(a, b):
+        pose = _pose_by_board(xy_a, xy_b, board.places_mm(a.labels[i] for i in matches[:, 0])[:, :2])
+    else:
+        pose = _relative_pose(xy_a, xy_b, RANSAC_PX / float(np.sqrt(camera.focal.prod())))
     if pose is None:
         return PairScore(a.name, b.name, n, 0.0, 0.0, 0.0, None, "no essential matrix")
     xyz, front = triangulate(xy_a, xy_b, pose)
@@ -167,6 +179,22 @@ def _relative_pose(xy_a: np.ndarray, xy_b: np.ndarray, threshold: float) -> Rigi
     if not np.isfinite(rotation).all() or np.linalg.norm(translation) == 0:
         return None
     return Rigid(rotation, translation.ravel())
+
+
+def share_board_alone(a: ImageObservations, b: ImageObservations) -> bool:
+    """Whether two images have nothing in common but dots of the board."""
+    return all(isinstance(label, DotLabel) for label in set(a.labels) & set(b.labels))
+
+
+def _pose_by_board(xy_a: np.ndarray, xy_b: np.ndarray, xy_mm: np.ndarray) -> Rigid | None:
+    """b_from_a with unit translation, from both images' poses of the board."""
+    try:
+        a, b = (refine_planar_pose(camera_from_plane(fit_homography(xy_mm, xy)), xy_mm, xy) for xy in (xy_a, xy_b))
+    except (ConvergenceError, DegenerateError):
+        return None
+    found = b @ a.inverse()
+    length = float(np.linalg.norm(found.translation))
+    return Rigid(found.rotation, found.translation / length) if length > 0 else None
 
 
 def triangulate(xy_a: np.ndarray, xy_b: np.ndarray, b_from_a: Rigid) -> tuple[np.ndarray, np.ndarray]:

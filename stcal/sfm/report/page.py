@@ -216,7 +216,7 @@ def _scales(report: dict) -> list[list]:
             group["name"],
             *cells(scale := group["scale"], "mm_per_unit:6 mm_per_unit_rows:6"),
             " and ".join(str(row) for row in scale["rows"]),
-            *cells(scale, "difference_ppm:1 sigma_ppm:1 dots board_mean_um:1 board_rms_um:1"),
+            *cells(scale, "difference_ppm:1 sigma_ppm:1 dots board_mean_um:1 board_spread_um:1 board_rms_um:1"),
             number(max((math.hypot(*v) for v in scale["board_residuals_um"].values()), default=None), 1),
         ]
         for group in report["groups"]

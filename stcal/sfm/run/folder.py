@@ -98,13 +98,10 @@ def write_run(result: RunResult, out: Path, progress: Progress, reload_s: int | 
     save(out / TARGET, target_toml(result.target_design))
     save(out / BOARD, board_toml(result.board_design))
     report = report_of(result).content()
-    faces = FacesFile.of(
-        result.target,
-        result.target_design,
-        result.options.adjustment(result.target_design),
-        result.calibration.sigma_factor,
-    )
-    save(out / "faces.json", json_text(faces.content()))
+    if result.target.target_from_face:  # none of the board alone
+        options, factor = result.options.adjustment(result.target_design), result.calibration.sigma_factor
+        faces = FacesFile.of(result.target, result.target_design, options, factor)
+        save(out / "faces.json", json_text(faces.content()))
     write_report(out, report, out, reload_s)
     progress("report", 1, 1)
 

@@ -43,6 +43,8 @@ class RunOptions:
         σ of a circle about the plane of its face, mm; None for no such knowledge.
     refine_camera : bool
         Adjust the intrinsics too, the given ones being observations.
+    board_only : bool
+        The board alone was photographed: λ and its residuals are the answer. Where not, it is found out.
     compare : {"paper"}, optional
         Solve the same photographs as published too, and step by step from there, for the report.
 
@@ -62,6 +64,7 @@ class RunOptions:
     workers: int | None = None
     flatness_mm: float | None = 0.02
     refine_camera: bool = False
+    board_only: bool = False
     compare: Compare | None = None
 
     def __post_init__(self):

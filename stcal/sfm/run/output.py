@@ -164,6 +164,7 @@ def _group(result: RunResult, solution) -> dict:
             "sigma_ppm": 1e6 * scale.sigma_mm_per_unit / scale.mm_per_unit,
             "dots": len(scale.labels),
             "board_mean_um": MICRO * scale.mean_mm(),
+            "board_spread_um": MICRO * scale.spread_mm(),
             "board_rms_um": MICRO * scale.rms_mm(),
             "board_residuals_um": {
                 label: MICRO * residual for label, residual in zip(scale.labels, scale.residuals_mm, strict=True)

@@ -122,6 +122,7 @@ class ScaleRow(Part):
     sigma_ppm: float
     dots: int
     board_mean_um: float
+    board_spread_um: float
     board_rms_um: float
     board_residuals_um: dict[ByLabel, Vector3]
 
@@ -137,7 +138,8 @@ class GroupRow(Part):
     scale: ScaleRow = Field(
         description="`mm_per_unit` by least squares over all dots, `mm_per_unit_rows` from all pairs of the two "
         "`rows`, `difference_ppm`, `sigma_ppm`, `dots`; residuals after the similarity, reconstructed minus design, "
-        "board frame: `board_mean_um`, `board_rms_um` of their lengths, `board_residuals_um` label → `[x, y, z]`"
+        "board frame: `board_mean_um`, `board_spread_um` (standard deviation), `board_rms_um` of their lengths, "
+        "`board_residuals_um` label → `[x, y, z]`"
     )
 
 

@@ -86,6 +86,11 @@ def load_run(folder: str | Path) -> SavedRun:
     complete_interrupted(folder)
     needed = (CAMERA, TARGET, BOARD, "labels.csv", "database.db", "report.json", "faces.json")
     missing = [name for name in needed if not (folder / name).is_file()]
+    if missing == ["faces.json"]:
+        raise InputError(
+            f"run {folder}: no faces.json: of the board alone, or of another version; for faces, run it on photographs "
+            "that show them"
+        )
     if missing:
         raise InputError(f"run {folder}: unfinished, or of another version: no {', '.join(missing)}; run it again")
     marker, faces, report = (read_json(folder / n, "", AGAIN) for n in (RUN_MARKER, "faces.json", "report.json"))

@@ -28,7 +28,7 @@ from stcal.sfm.mapping.incremental import left_out, map_group
 from stcal.sfm.mapping.pairs import PairOptions, PairScore, rank_pairs
 from stcal.sfm.run.options import RunOptions
 
-CACHE_VERSION = 5
+CACHE_VERSION = 6
 _ARRAYS = ("xyz_model", "image_index", "point_index", "keypoint", "measured_px", "shift_px", "covariance_px2")
 
 
@@ -49,10 +49,10 @@ class GroupSolution:
 
 
 def usable_groups(
-    groups: dict[str, list[ImageObservations]], skipped: Sequence[Skipped]
+    groups: dict[str, list[ImageObservations]], skipped: Sequence[Skipped], board_alone: bool = False
 ) -> tuple[dict[str, list[ImageObservations]], list[str]]:
     """Groups that can be solved, and why others cannot, those of which every image was skipped included; before
-    anything is mapped.
+    anything is mapped. With ``board_alone`` they need no face.
 
     Raises
     ------
@@ -74,7 +74,7 @@ def usable_groups(
                 count = f"1 usable image ({group[0].name})" if group else "0 usable images"
                 why = "".join(f", not {s.name}: {s.reason}" for s in first)
                 raise MappingError(f"group {name}: {count}, 2 needed{why}; add photographs from other places")
-            require_usable(group)
+            require_usable(group, board_alone)
         except MappingError as error:
             errors.append(error)
         else:
@@ -88,8 +88,8 @@ def _left_out(error: StcalError) -> str:
     return f"left out whole: {error}"
 
 
-def require_usable(group: list[ImageObservations]) -> None:
-    """Refuse a group that cannot be solved, before anything is mapped.
+def require_usable(group: list[ImageObservations], board_alone: bool = False) -> None:
+    """Refuse a group that cannot be solved, before anything is mapped; with ``board_alone`` it needs no face.
 
     Raises
     ------
@@ -99,10 +99,10 @@ def require_usable(group: list[ImageObservations]) -> None:
     where = f"group {group[0].group}"
     if len(group) < 2:
         raise MappingError(f"{where}: 1 usable image ({group[0].name}), 2 needed; add photographs from other places")
-    if not any(image.face_ids() for image in group):
+    if not board_alone and not any(image.face_ids() for image in group):
         raise MappingError(
             f"{where}: no face of the target recognised in {len(group)} images; look at the overlays, "
-            "check target.toml (radii, polarity) and the exposure"
+            "check target.toml (radii, polarity) and the exposure; of the board alone, use --board-only"
         )
     if not any(isinstance(label, DotLabel) for image in group for label in image.labels):
         raise MappingError(
@@ -137,7 +137,7 @@ def solve_group(
     known = kept(path, _stored)
     if known is not None:
         return known
-    pairs = rank_pairs([image for image in group if image.name in skeleton], camera, pair_options)
+    pairs = rank_pairs([image for image in group if image.name in skeleton], camera, pair_options, board)
     mapping = map_group(database, scratch, group, skeleton, ids, pairs, camera)
     refined = refine(mapping.model, camera, target, board, eccentricity)
     solution = GroupSolution(

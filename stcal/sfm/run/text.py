@@ -41,10 +41,12 @@ def run_text(result: RunResult) -> str:
     reused = sum(image.reused for image in result.detection.images)
     if reused:
         lines.append(f"detections kept from an earlier run: {reused} of {len(result.detection.images)}")
-    lines += [*_faces(result), *_checks(result.checks)]
+    lines += [*(_faces(result) if result.target.target_from_face else _boards(result)), *_checks(result.checks)]
     if result.comparison is not None:
         lines += _compared(result.comparison)
-    return "\n".join([*lines, f"faces:  {result.out / 'faces.json'}", f"report: {result.out / 'report.html'}"])
+    if result.target.target_from_face:
+        lines.append(f"faces:  {result.out / 'faces.json'}")
+    return "\n".join([*lines, f"report: {result.out / 'report.html'}"])
 
 
 def detection_text(detection: DetectionResult, labelled: Sequence[LabelledImage]) -> str:
@@ -115,6 +117,21 @@ def _faces(result: RunResult) -> Iterator[str]:
     unseen = [f.id for f in result.target_design.faces if f.id not in target.target_from_face]
     if unseen:
         yield f"not seen in any image: face {', '.join(unseen)}"
+
+
+def _boards(result: RunResult) -> Iterator[str]:
+    """λ and residuals of the board alone."""
+    images = len(result.labelled)
+    yield (
+        f"the board alone: no face of the target in {images} images, so that there is no faces.json; length of the "
+        "board's residuals, as in table 1 of Zhang & Wei (2017)"
+    )
+    rows = [["<group", "dots", "λ mm/unit", "λ by rows", "mean µm", "± µm"]]
+    for name, scale in result.calibration.scales.items():
+        residuals = [f"{1e3 * value:.2f}" for value in (scale.mean_mm(), scale.spread_mm())]
+        lengths = [f"{value:.6g}" for value in (scale.mm_per_unit, scale.rows_mm_per_unit)]
+        rows.append([name, str(len(scale.labels)), *lengths, *residuals])
+    yield from (f"  {line}" for line in text_table(rows))
 
 
 def _checks(checks: Sequence[Check]) -> Iterator[str]:

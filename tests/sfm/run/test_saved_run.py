@@ -33,8 +33,8 @@ OTHER = RunOptions(
     workers=3,
     flatness_mm=0.3,
 )
-JOINT = ("refine_camera", "compare")
-"""No value is a default but those that only the joint adjustment knows."""
+SPECIAL = ("refine_camera", "compare", "board_only")
+"""No value is a default but those that only the joint adjustment knows, and that of runs without faces."""
 
 
 @pytest.fixture(scope="module")
@@ -120,7 +120,7 @@ def test_options_answers_and_places_are_the_same(written):
 def test_options_that_are_all_other_than_the_defaults(small_run, tmp_path, monkeypatch):
     """What ``run`` puts into the folder at its start, into a copy of a finished run."""
     default = RunOptions()
-    assert all(getattr(OTHER, name) != getattr(default, name) for name in RunOptions.__slots__ if name not in JOINT)
+    assert all(getattr(OTHER, name) != getattr(default, name) for name in RunOptions.__slots__ if name not in SPECIAL)
     assert all(getattr(OTHER.ellipses, n) != getattr(default.ellipses, n) for n in EllipseOptions.__slots__)
     monkeypatch.chdir(tmp_path)
     with run_folder("new", MarkerFile.of("some images", OTHER), {}):
