@@ -78,18 +78,30 @@ def crosscheck(
     colmap: Annotated[
         Path | None, typer.Option("--colmap", help="Run this native program; `colmap` on the PATH if not given.")
     ] = None,
+    tolerance_sigma: Annotated[
+        float,
+        typer.Option(
+            min=0,
+            max=1e6,
+            help="Accept differences of our answer from the native models up to this, in σ of faces and circles.",
+        ),
+    ] = 0.5,
     tolerance_um: Annotated[
-        float, typer.Option(min=0, max=1e6, help="Accept differences of faces and circles up to this, µm.")
-    ] = 2.0,
+        float | None,
+        typer.Option(min=0, max=1e6, help="Accept differences of faces and circles up to this, µm; any if not given."),
+    ] = None,
     tolerance_mdeg: Annotated[
-        float, typer.Option(min=0, max=1e6, help="Accept differences of faces up to this, millidegrees.")
-    ] = 1.0,
+        float | None,
+        typer.Option(min=0, max=1e6, help="Accept differences of faces up to this, millidegrees; any if not given."),
+    ] = None,
     camera_tolerance_um: Annotated[
-        float, typer.Option(min=0, max=1e6, help="Accept differences of camera positions up to this, µm.")
-    ] = 20.0,
+        float | None,
+        typer.Option(min=0, max=1e6, help="Accept differences of camera positions up to this, µm; any if not given."),
+    ] = None,
     camera_tolerance_mdeg: Annotated[
-        float, typer.Option(min=0, max=1e6, help="Accept differences of camera attitudes up to this, millidegrees.")
-    ] = 2.0,
+        float | None,
+        typer.Option(min=0, max=1e6, help="Accept differences of camera attitudes up to this, mdeg; any if not given."),
+    ] = None,
     timeout: Annotated[
         float, typer.Option(min=1, max=1e6, help="Stop the native mapper after this time for one group, s.")
     ] = 600.0,
@@ -99,7 +111,9 @@ def crosscheck(
     from stcal.sfm.run.crosscheck import Tolerances
     from stcal.sfm.run.saved import load_run
 
-    tolerances = Tolerances(tolerance_um, tolerance_mdeg, tolerance_um, camera_tolerance_um, camera_tolerance_mdeg)
+    tolerances = Tolerances(
+        tolerance_um, tolerance_mdeg, tolerance_um, camera_tolerance_um, camera_tolerance_mdeg, tolerance_sigma
+    )
     saved = load_run(run)
     with StageProgress() as progress:
         check = crosscheck_run(saved, colmap, tolerances, timeout, progress)

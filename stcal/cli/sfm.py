@@ -115,9 +115,7 @@ def run(
     ] = False,
     board_only: Annotated[
         bool,
-        typer.Option(
-            "--board-only", help="Take the board alone, though other circles are in view: λ and residuals."
-        ),
+        typer.Option("--board-only", help="Take the board alone, though other circles are in view: λ and residuals."),
     ] = False,
     compare: Annotated[
         ComparedWith | None,

@@ -57,6 +57,11 @@ class Network:
         place = (3 * np.asarray(points)[:, None] + np.arange(3)).ravel()
         return self.covariance_mm2[np.ix_(place, place)]
 
+    def pose_covariance(self) -> np.ndarray:
+        """Of the poses, (m, 6, 6) rad and mm, rotation perturbed from the left, in the datum of the points."""
+        to_points = self.inverse @ self.coupling
+        return self.inverse + to_points @ self.covariance_mm2 @ np.swapaxes(to_points, 1, 2)
+
     def score(self, columns: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Normal matrix (q, q) and right-hand side (q,) of q further parameters of the whole group, all else
         eliminated; ``columns`` : (n, 2, q) derivative of the projections by them, over σ."""

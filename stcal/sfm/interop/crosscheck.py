@@ -8,18 +8,20 @@ weights and the joint adjustment are worth; no tolerance applies to it.
 """
 
 import tempfile
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from pathlib import Path
 
 import numpy as np
 
 from stcal.errors import InputError, MappingError
-from stcal.geometry.rigid import Rigid
+from stcal.geometry.align import align_similarity
+from stcal.geometry.rigid import Poses, Rigid
 from stcal.io.json import read_json
 from stcal.parallel import Progress
-from stcal.report.text import NONE, number, text_table
+from stcal.report.text import number, text_table
 from stcal.sfm.adjust.calibration import Calibration, calibrate
 from stcal.sfm.adjust.chain import CalibratedTarget
+from stcal.sfm.adjust.network import free_network
 from stcal.sfm.adjust.refine import refine
 from stcal.sfm.interop.export_database import export_database
 from stcal.sfm.interop.external import faces_from_models
@@ -45,6 +47,7 @@ from stcal.sfm.run.crosscheck import (
     ResidualRms,
     ResultCompared,
     Tolerances,
+    allowed_text,
 )
 from stcal.sfm.run.folder import require_report, write_report
 from stcal.sfm.run.saved import AGAIN, SavedRun
@@ -52,6 +55,8 @@ from stcal.sfm.run.transaction import added_results
 
 MICRO = 1e3
 TOLERANCES = Tolerances()
+FACE_FLOOR = np.array([1e-7] * 3 + [1e-4] * 3)
+"""rad, mm: what never matters, 6 µdeg and 0.1 µm; circles that carry the frame have no σ of their own."""
 RENAMED = {
     "ba_global_images_freq": "ba_global_frames_freq",
     "ba_global_images_ratio": "ba_global_frames_ratio",
@@ -195,14 +200,20 @@ def _comparison(
         only_native=sorted(theirs - ours),
         only_pycolmap=sorted(ours - theirs),
     )
+    faces = run.faces.target_from_face_covariance
     mapping = MappingCompared(
-        faces=_faces(external.target.target_from_face, own.target.target_from_face),
+        faces=_faces(external.target.target_from_face, own.target.target_from_face, faces),
         circles_um=_circles(external.target.circles, own.target.circles),
-        cameras=_cameras(external, own),
+        circles_sigmas=_circle_sigmas(external.target.circles, own.target.circles, run),
+        cameras=_cameras(external, own, run),
     )
     result = ResultCompared(
-        faces=face_differences(again.target, run), circles_um=_circles(again.target.circles, run.faces.circles)
+        faces=face_differences(again.target, run),
+        circles_um=_circles(again.target.circles, run.faces.circles),
+        circles_sigmas=_circle_sigmas(again.target.circles, run.faces.circles, run),
     )
+    if not faces:
+        tolerances = tolerances.without_sigma()
     return Crosscheck(
         native=native.version,
         pycolmap=pycolmap.__version__,
@@ -213,36 +224,59 @@ def _comparison(
         mapping=mapping,
         result=result,
         plain=FacesCompared(faces=face_differences(external.target, run)),
-        notes=list(external.notes),
+        notes=[*external.notes, *_camera_notes(mapping, result)],
         differences=_differences(images, mapping, result, tolerances),
     )
 
 
 def face_differences(target: CalibratedTarget, run: SavedRun) -> dict[str, FaceDifference | None]:
     """Differences of a target's faces from those of ``RUN/faces.json`` by face; None for what only one has."""
-    return _faces(target.target_from_face, run.faces.poses())
+    return _faces(target.target_from_face, run.faces.poses(), run.faces.target_from_face_covariance)
 
 
-def _faces(a: dict[str, Rigid], b: dict[str, Rigid]) -> dict[str, FaceDifference | None]:
+def _faces(
+    a: dict[str, Rigid], b: dict[str, Rigid], covariance: Mapping[str, np.ndarray]
+) -> dict[str, FaceDifference | None]:
     """Differences by face, for those that both have; None for the others."""
     rows: dict[str, FaceDifference | None] = {}
     for face in sorted(a.keys() | b.keys()):
         rows[face] = None
         if face in a and face in b:
-            turn = Rigid(a[face].rotation @ b[face].rotation.T)
-            shift = np.linalg.norm(a[face].translation - b[face].translation)
+            off = _off(a[face], b[face])
             rows[face] = FaceDifference(
-                translation_um=MICRO * float(shift), rotation_mdeg=MICRO * float(np.degrees(turn.angle_rad()))
+                translation_um=MICRO * float(np.linalg.norm(off[3:])),
+                rotation_mdeg=MICRO * float(np.degrees(np.linalg.norm(off[:3]))),
+                sigmas=_sigmas(off, np.asarray(covariance[face]), FACE_FLOOR) if face in covariance else None,
             )
     return rows
+
+
+def _off(pose: Rigid, other: Rigid) -> np.ndarray:
+    """Rotation vector (rad) and translation (mm) from ``other`` to ``pose``, in the frame that both lead to, (6,)."""
+    return Poses.of([pose]).difference(Poses.of([other]))[0]
+
+
+def _sigmas(off: np.ndarray, covariance: np.ndarray, floor: np.ndarray) -> float:
+    """√(dᵀC⁻¹d/k); ``floor`` : (k,) σ below which no difference matters."""
+    return float(np.sqrt(off @ np.linalg.solve(covariance + np.diag(floor**2), off) / len(off)))
+
+
+def _circle_sigmas(a: dict, b: dict, run: SavedRun) -> dict[str, float]:
+    known = run.faces.circle_covariance_mm2
+    return {
+        label: _sigmas(np.subtract(a[label], b[label]), np.asarray(known[label]), FACE_FLOOR[3:])
+        for label in a
+        if label in b and label in known
+    }
 
 
 def _circles(a: dict, b: dict) -> dict[str, float]:
     return {label: MICRO * float(np.linalg.norm(np.subtract(a[label], b[label]))) for label in a if label in b}
 
 
-def _cameras(a: Calibration, b: Calibration) -> list[CameraDifference]:
+def _cameras(a: Calibration, b: Calibration, run: SavedRun) -> list[CameraDifference]:
     """Differences of camera positions and attitudes against the target."""
+    sigmas = _camera_sigmas(a, b, run)
     poses = [{n: p for m in each.models for n, p in zip(m.images, m.camera_from_model, strict=True)} for each in (a, b)]
     rows = []
     for name in sorted(poses[0].keys() & poses[1].keys()):
@@ -253,9 +287,48 @@ def _cameras(a: Calibration, b: Calibration) -> list[CameraDifference]:
                 image=name,
                 position_um=MICRO * float(np.linalg.norm(one.translation - other.translation)),
                 rotation_mdeg=MICRO * float(np.degrees(turn.angle_rad())),
+                sigmas=sigmas[name],
             )
         )
     return rows
+
+
+def _camera_sigmas(a: Calibration, b: Calibration, run: SavedRun) -> dict[str, float]:
+    """Differences of the cameras against the circles of their group, in their own σ: the groups' models laid on one
+    another by all circles, which is the datum of the covariances."""
+    factor = run.faces.centre_sigma_factor or 1.0
+    ours = {model.group: model for model in b.models}
+    found = {}
+    for theirs in a.models:
+        model = ours.get(theirs.group)
+        if model is None:
+            continue
+        place = {label: i for i, label in enumerate(theirs.labels)}
+        both = [(place[label], i) for i, label in enumerate(model.labels) if label in place]
+        rows = np.array(both, int).reshape(-1, 2).T
+        laid = align_similarity(model.xyz_model[rows[1]], theirs.xyz_model[rows[0]])
+        covariance = dict(zip(model.images, free_network(model, run.camera, factor).pose_covariance(), strict=True))
+        poses = dict(zip(model.images, model.camera_from_model, strict=True))
+        for name, pose in zip(theirs.images, theirs.camera_from_model, strict=True):
+            if name in poses:
+                turned = pose.rotation @ laid.rigid.rotation.T
+                moved = Rigid(turned, laid.scale * pose.translation - turned @ laid.rigid.translation)
+                found[name] = _sigmas(_off(moved, poses[name]), covariance[name], np.zeros(6))
+    return found
+
+
+def _camera_notes(mapping: MappingCompared, result: ResultCompared) -> list[str]:
+    """The camera that differs most, where that is more than its σ."""
+    worst = max(mapping.cameras, key=lambda camera: camera.sigmas, default=None)
+    if worst is None or worst.sigmas <= 1:
+        return []
+    count = sum(camera.sigmas > 1 for camera in mapping.cameras)
+    faces = max((row.translation_um for row in result.faces.values() if row is not None), default=0.0)
+    return [
+        f"camera {worst.image}{f' and {count - 1} more' if count > 1 else ''}: {worst.position_um:.1f} µm, "
+        f"{worst.sigmas:.1f} σ between the programs, which end their iterations at other places; from the native "
+        f"models our adjustment comes to the same faces within {faces:.3f} µm"
+    ]
 
 
 def _images(calibration: Calibration) -> set[str]:
@@ -273,28 +346,30 @@ def _run_rms(run: SavedRun) -> float:
 
 def comparison_text(check: Crosscheck) -> str:
     """The comparison as a text table."""
-    limits, residual, images, cameras = check.tolerances, check.residual_rms_px, check.images, check.mapping.cameras
-    rows = [["face", *("µm", "mdeg") * 3]]
+    residual, images, cameras = check.residual_rms_px, check.images, check.mapping.cameras
+    rows = [["face", *("µm", "mdeg", "σ") * 3]]
     for face in check.mapping.faces:
         cells = [face]
         for compared in (check.mapping, check.result, check.plain):
             row = compared.faces.get(face)
-            cells += [number(row.translation_um, 3), number(row.rotation_mdeg, 3)] if row else [NONE, NONE]
+            values = (row.translation_um, row.rotation_mdeg, row.sigmas) if row else (None, None, None)
+            cells += [number(value, digits) for value, digits in zip(values, (3, 3, 2), strict=True)]
         rows.append(cells)
     width = max(6, *(len(row[0]) for row in rows))
+    circles = check.mapping.circles_um
     lines = [
         f"COLMAP {check.native} (schema {check.schema_}): {images.native} of {images.run} images, residual "
         f"{residual.native:.4f} px RMS",
         f"pycolmap {check.pycolmap}: {images.pycolmap} of {images.run} images, residual "
         f"{residual.pycolmap:.4f} px RMS; the run: {residual.run:.4f} px",
-        f"{'':{width}} {'native – pycolmap':>19} {'adjusted – faces.json':>23} {'as it is – faces.json':>23}",
-        *text_table(rows, least=(6, 10, 8, 14, 8, 14, 8), gap=1),
-        f"largest between the two programs: circles {max(check.mapping.circles_um.values(), default=0.0):.3f} µm, "
+        f"{'':{width}} {'native – pycolmap':>24} {'adjusted – faces.json':>28} {'as it is – faces.json':>28}",
+        *text_table(rows, least=(6, 10, 8, 4, 14, 8, 4, 14, 8, 4), gap=1),
+        f"largest between the two programs: circles {max(circles.values(), default=0.0):.3f} µm, "
+        f"{max(check.mapping.circles_sigmas.values(), default=0.0):.2f} σ; "
         f"cameras {max((c.position_um for c in cameras), default=0.0):.2f} µm and "
-        f"{max((c.rotation_mdeg for c in cameras), default=0.0):.3f} mdeg",
-        f"allowed: faces {limits.face_um:g} µm and {limits.face_mdeg:g} mdeg, circles {limits.circle_um:g} "
-        f"µm, cameras {limits.camera_um:g} µm and {limits.camera_mdeg:g} mdeg: "
-        f"{'exceeded' if check.differences else 'they agree'}",
+        f"{max((c.rotation_mdeg for c in cameras), default=0.0):.3f} mdeg, "
+        f"{max((c.sigmas for c in cameras), default=0.0):.2f} σ",
+        f"allowed: {allowed_text(check.tolerances)}: {'exceeded' if check.differences else 'they agree'}",
     ]
     return "\n".join([*check.notes, *lines])
 
@@ -308,23 +383,43 @@ def _differences(
         if names:
             more = f" and {len(names) - 1} more" if len(names) > 1 else ""
             found.append(f"image {names[0]}{more}: registered by {who} only")
-    for compared, what in ((mapping, "mapped by both"), (result, "from the native model against faces.json")):
+    for compared, what, sigma in (
+        (mapping, "mapped by both", tolerances.mapped_sigma),
+        (result, "from the native model against faces.json", tolerances.sigma),
+    ):
         for face, row in compared.faces.items():
             if row is None:
                 found.append(f"face {face} ({what}): only one of the two has it")
-            elif row.translation_um > tolerances.face_um or row.rotation_mdeg > tolerances.face_mdeg:
+                continue
+            limits = _exceeded(row, tolerances, sigma)
+            if limits:
+                beside = "" if row.sigmas is None else f", {row.sigmas:.2f} σ"
                 found.append(
-                    f"face {face} ({what}) {row.translation_um:.1f} µm, {row.rotation_mdeg:.2f} mdeg; "
-                    f"{tolerances.face_um:g} µm, {tolerances.face_mdeg:g} mdeg allowed"
+                    f"face {face} ({what}) {row.translation_um:.1f} µm, {row.rotation_mdeg:.2f} mdeg{beside}; "
+                    f"{', '.join(limits)} allowed"
                 )
-        label, worst = max(compared.circles_um.items(), key=lambda each: each[1], default=("", 0.0))
-        if worst > tolerances.circle_um:
-            found.append(f"circle {label} ({what}) {worst:.1f} µm; {tolerances.circle_um:g} µm allowed")
+        for unit, values, limit in (
+            ("µm", compared.circles_um, tolerances.circle_um),
+            ("σ", compared.circles_sigmas, sigma),
+        ):
+            label, worst = max(values.items(), key=lambda each: each[1], default=("", 0.0))
+            if limit is not None and worst > limit:
+                found.append(f"circle {label} ({what}) {worst:.1f} {unit}; {limit:g} {unit} allowed")
     for what, key, limit, unit in (
         ("position", "position_um", tolerances.camera_um, "µm"),
         ("attitude", "rotation_mdeg", tolerances.camera_mdeg, "mdeg"),
     ):
         image, worst = max(((c.image, getattr(c, key)) for c in mapping.cameras), key=lambda c: c[1], default=("", 0.0))
-        if worst > limit:
+        if limit is not None and worst > limit:
             found.append(f"camera {image}: {what} {worst:.1f} {unit}; {limit:g} {unit} allowed")
     return found
+
+
+def _exceeded(row: FaceDifference, tolerances: Tolerances, sigma: float) -> list[str]:
+    """The limits that a face is beyond."""
+    limits = (
+        (row.translation_um, tolerances.face_um, "µm"),
+        (row.rotation_mdeg, tolerances.face_mdeg, "mdeg"),
+        (row.sigmas, sigma, "σ"),
+    )
+    return [f"{limit:g} {unit}" for v, limit, unit in limits if v is not None and limit is not None and v > limit]

@@ -1,6 +1,6 @@
 """What ``report.json`` holds of a cross-check with the native COLMAP."""
 
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 
 import numpy as np
 from pydantic import Field
@@ -11,18 +11,44 @@ from stcal.io.json import ByFace, ByLabel, Part
 
 @dataclass(frozen=True, slots=True)
 class Tolerances:
-    """Largest differences allowed: faces and circles in the target frame, cameras against the target."""
+    """Largest differences allowed: faces and circles in the target frame, cameras against the target.
 
-    face_um: float = 2.0
-    face_mdeg: float = 1.0
-    circle_um: float = 2.0
-    camera_um: float = 20.0
-    camera_mdeg: float = 2.0
+    ``sigma`` : of our answer from the native models, faces and circles in their own σ: half a σ, added to it, makes
+    1.12 of it; ``mapped_sigma`` : of the two programs' own answers, group by group and with looser ends of iterations,
+    which noise does not explain beyond 3 σ. The others are in force where they are given, and ``face_um``,
+    ``face_mdeg``, ``circle_um`` for a run without σ, by default 2, 1, 2.
+    """
+
+    face_um: float | None = None
+    face_mdeg: float | None = None
+    circle_um: float | None = None
+    camera_um: float | None = None
+    camera_mdeg: float | None = None
+    sigma: float = 0.5
+    mapped_sigma: float = 3.0
+
+    def without_sigma(self) -> "Tolerances":
+        """For a run that states no σ."""
+        defaults = {"face_um": 2.0, "face_mdeg": 1.0, "circle_um": 2.0}
+        return replace(self, **{name: value for name, value in defaults.items() if getattr(self, name) is None})
 
     def __post_init__(self):
         for name, value in asdict(self).items():
-            if not 0 <= value < np.inf:
+            if value is not None and not 0 <= value < np.inf:
                 raise InputError(f"tolerance {name} {value:g}: a number of 0 or more needed; give another")
+
+
+def allowed_text(tolerances: Tolerances) -> str:
+    """The limits in force, in words."""
+    parts = [f"faces and circles {tolerances.mapped_sigma:g} σ between the programs, {tolerances.sigma:g} σ adjusted"]
+    for what, values in (
+        ("faces", ((tolerances.face_um, "µm"), (tolerances.face_mdeg, "mdeg"))),
+        ("circles", ((tolerances.circle_um, "µm"),)),
+        ("cameras", ((tolerances.camera_um, "µm"), (tolerances.camera_mdeg, "mdeg"))),
+    ):
+        known = [f"{value:g} {unit}" for value, unit in values if value is not None]
+        parts += [f"{what} {' and '.join(known)}"] if known else []
+    return ", ".join(parts)
 
 
 class ImagesRegistered(Part):
@@ -42,12 +68,14 @@ class ResidualRms(Part):
 class FaceDifference(Part):
     translation_um: float
     rotation_mdeg: float
+    sigmas: float | None = None
 
 
 class CameraDifference(Part):
     image: str
     position_um: float
     rotation_mdeg: float
+    sigmas: float
 
 
 class FacesCompared(Part):
@@ -56,6 +84,7 @@ class FacesCompared(Part):
 
 class ResultCompared(FacesCompared):
     circles_um: dict[ByLabel, float]
+    circles_sigmas: dict[ByLabel, float] = Field({})
 
 
 class MappingCompared(ResultCompared):
@@ -68,7 +97,10 @@ class Crosscheck(Part):
     native: str = Field(description="version of the native program")
     pycolmap: str = Field(description="version of ours")
     schema_: str = Field(alias="schema", description="of the exported database")
-    tolerances: Tolerances = Field(description="`face_um`, `face_mdeg`, `circle_um`, `camera_um`, `camera_mdeg`")
+    tolerances: Tolerances = Field(
+        description="`face_um`, `face_mdeg`, `circle_um`, `camera_um`, `camera_mdeg` as given, else null; `sigma` of "
+        "faces and circles of our answer from the native models, `mapped_sigma` of the programs' own, in σ"
+    )
     images: ImagesRegistered = Field(
         description="registered by `native` and by `pycolmap`, and those of the `run`; `only_native`, `only_pycolmap`: "
         "names of those that the other did not register"
@@ -78,16 +110,20 @@ class Crosscheck(Part):
     )
     mapping: MappingCompared = Field(
         description="native against pycolmap, both as COLMAP adjusts them, through our scale and face stages, target "
-        "frame: `faces` face → `translation_um`, `rotation_mdeg` (null where only one has it), `circles_um` label → "
-        "distance, `cameras`: `image`, `position_um`, `rotation_mdeg`"
+        "frame: `faces` face → `translation_um`, `rotation_mdeg`, `sigmas` (null where only one has it), `circles_um` "
+        "label → distance, `circles_sigmas`, `cameras`: `image`, `position_um`, `rotation_mdeg`, `sigmas`. `sigmas`: "
+        "√(dᵀC⁻¹d/k) of the k components of the difference, with the run's own covariance of the face or circle, and "
+        "with that of the camera in its group, circles held together"
     )
     result: ResultCompared = Field(
         description="native models after our whole adjustment against `faces.json`: `faces` with `translation_um`, "
-        "`rotation_mdeg`; `circles_um`"
+        "`rotation_mdeg`, `sigmas`; `circles_um`, `circles_sigmas`"
     )
     plain: FacesCompared = Field(
-        description="native models as they are against `faces.json`: `faces` with `translation_um`, `rotation_mdeg`; "
-        "no tolerance applies"
+        description="native models as they are against `faces.json`: `faces` with `translation_um`, `rotation_mdeg`, "
+        "`sigmas`; no tolerance applies"
     )
-    notes: list[str] = Field(description="what was left out on the way")
-    differences: list[str] = Field(description="what is outside of the tolerances")
+    notes: list[str] = Field(
+        description="what was left out on the way; cameras that differ by more than their σ, and what becomes of faces"
+    )
+    differences: list[str] = Field(description="what is outside of the tolerances: what matters for the faces")

@@ -94,7 +94,7 @@ def test_the_two_programs_agree(checked):
     run, _, (code, out, err) = checked
     assert code == 0, err
     assert lines_of(err) == []
-    assert "allowed: faces 2 µm and 1 mdeg, circles 2 µm, cameras 20 µm and 2 mdeg: they agree" in out
+    assert "allowed: faces and circles 3 σ between the programs, 0.5 σ adjusted: they agree" in out
     assert out.splitlines()[-1] == f"report: {run / 'report.html'}"
     check = json.loads((run / "report.json").read_text(encoding="utf-8"))["crosscheck"]
     assert check["differences"] == check["notes"] == []
@@ -153,9 +153,10 @@ def test_outside_the_tolerances_it_says_where(colmap, checked, stcal_sfm):
     outcome = stcal_sfm("crosscheck", run, "--tolerance-um", 0, "--camera-tolerance-um", 0)
     line = assert_error(outcome, COMPUTATION, "cross-check: native COLMAP ", " and stcal differ: ")
     for face in ("2", "4", "5"):
-        assert re.search(rf"face {face} \(mapped by both\) \d\.\d µm, 0\.\d\d mdeg; 0 µm, 1 mdeg allowed", line)
+        assert re.search(rf"face {face} \(mapped by both\) \d\.\d µm, 0\.\d\d mdeg, 0\.\d\d σ; 0 µm allowed", line)
     assert "face 1 (mapped" not in line
-    assert re.search(r"circle \d:\w \(mapped by both\) \d\.\d µm; 0 µm allowed", line)
+    differences = json.loads((run / "report.json").read_text(encoding="utf-8"))["crosscheck"]["differences"]
+    assert any(re.match(r"circle \d:\w \(mapped by both\) \d\.\d µm; 0 µm allowed", each) for each in differences)
     assert re.search(r"camera 1[24]/IMG_100\d.jpg: position \d\.\d µm; 0 µm allowed", line)
     assert "exceeded" in outcome[1]
     assert json.loads((run / "report.json").read_text(encoding="utf-8"))["crosscheck"]["differences"]
@@ -543,7 +544,7 @@ def test_another_geometry_is_noticed(own_run, stcal_sfm, colmap, tmp_path):
     are 0.2 mm across; the images see it from sides that differ."""
     path = spoiling(tmp_path, colmap, own_run, "hidden")
     outcome = stcal_sfm("crosscheck", own_run, "--colmap", path)
-    line = assert_error(outcome, COMPUTATION, "face 2 (mapped by both)", "2 µm, 1 mdeg allowed", "circle 2:")
+    line = assert_error(outcome, COMPUTATION, "face 2 (mapped by both)", " σ; 3 σ allowed", "circle 2:")
     assert 70 < float(re.search(r"face 2 \(mapped by both\) ([\d.]+) µm", line)[1]) < 600
     check = json.loads((own_run / "report.json").read_text(encoding="utf-8"))["crosscheck"]
     assert "face 4 (" not in line  # in group 14, which does not show face 2

@@ -70,6 +70,7 @@ def group() -> dict:
             "sigma_ppm": 6.4293,
             "dots": 4,
             "board_mean_um": 3.0,
+            "board_spread_um": 2.0,
             "board_rms_um": 3.6,
             "board_residuals_um": residuals,
         },
@@ -254,7 +255,7 @@ def test_numbers_have_their_digits(joint):
     assert ["2", *pose, *sigma, "4", "10", "0.4", "2", "a"] in faces
     assert ["1 – 2", "161.5999", "3.2", "90.0000"] in faces
     assert ["2", "1 → 2", "a", "13.1", "7.25"] in faces
-    scale = ["a", "116.217538", "116.217598", "0 and 1", "-0.5", "6.4", "4", "3.0", "3.6", "5.0"]
+    scale = ["a", "116.217538", "116.217598", "0 and 1", "-0.5", "6.4", "4", "3.0", "2.0", "3.6", "5.0"]
     assert scale in rows_of(joint, "scale")
     assert ["1:0", "2", "0.0046", "0.0166"] in rows_of(joint, "residuals")
 
@@ -380,19 +381,21 @@ def test_a_large_set_shows_the_overlays_that_deserve_a_look():
 
 
 def crosscheck(differences: list[str]) -> dict:
-    row = {"translation_um": 0.7631, "rotation_mdeg": 0.3037}
-    faces = {"1": {"translation_um": 0.0, "rotation_mdeg": 0.0}, "2": row}
+    row = {"translation_um": 0.7631, "rotation_mdeg": 0.3037, "sigmas": 0.261}
+    faces = {"1": {"translation_um": 0.0, "rotation_mdeg": 0.0, "sigmas": None}, "2": row}
     return {
         "native": "3.8",
         "pycolmap": "4.2.1",
         "schema": "3.8",
-        "tolerances": {"face_um": 2, "face_mdeg": 1, "circle_um": 2, "camera_um": 20, "camera_mdeg": 2},
+        "tolerances": dict.fromkeys(("face_um", "face_mdeg", "circle_um", "camera_mdeg"))
+        | {"camera_um": 20, "sigma": 0.5, "mapped_sigma": 3},
         "images": {"native": 2, "pycolmap": 2, "run": 2},
         "residual_rms_px": {"native": 0.00356, "pycolmap": 0.00357, "run": 0.00386},
         "mapping": {
             "faces": faces,
             "circles_um": {"1:0": 0.1, "2:0": 0.765},
-            "cameras": [{"image": NASTY, "position_um": 9.184, "rotation_mdeg": 0.536}],
+            "circles_sigmas": {"1:0": 0.05},
+            "cameras": [{"image": NASTY, "position_um": 9.184, "rotation_mdeg": 0.536, "sigmas": 0.33}],
         },
         "result": {"faces": faces, "circles_um": {}},
         "plain": {"faces": faces | {"2": None}},
@@ -408,9 +411,11 @@ def test_the_crosscheck_is_a_section_of_its_own():
     assert "They agree." in parsed.text
     rows = rows_of(page, "crosscheck")
     assert ["COLMAP 3.8", "2", "0.0036"] in rows
-    assert ["2", "0.763", "0.304", "0.763", "0.304", "–", "–"] in rows
-    assert [NASTY, "9.18", "0.536"] in rows
+    assert ["2", *["0.763", "0.304", "0.26"] * 2, "–", "–", "–"] in rows
+    assert [NASTY, "9.18", "0.536", "0.33"] in rows
     assert "group b: <none>" in parsed.text
+    assert "Allowed in the first two: 3 σ of faces and circles between the programs, 0.5 σ" in parsed.text
+    assert "20 µm of cameras" in parsed.text
     differing = Page(report_html(make() | {"crosscheck": crosscheck(["face <2> 5 µm"])}, OVERLAYS)).text
     assert "They differ: face <2> 5 µm." in differing
     assert "They agree." not in differing
