@@ -158,7 +158,10 @@ NEEDED = ["cameras.txt", "target.toml", "board.toml", "labels.csv", "database.db
 def test_a_file_is_missing(own_run, stcal_sfm, name):
     (own_run / name).unlink()
     outcome = stcal_sfm(*faces_of(own_run))
-    assert_error(outcome, INPUT, f"run {own_run}: unfinished, or of another version: no {name}; run it again")
+    if name == "faces.json":
+        assert_error(outcome, INPUT, f"run {own_run}: no faces.json: of the board alone, or of another version")
+    else:
+        assert_error(outcome, INPUT, f"run {own_run}: unfinished, or of another version: no {name}; run it again")
 
 
 def test_not_a_run(own_run, tmp_path, stcal_sfm):
