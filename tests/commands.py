@@ -151,7 +151,8 @@ CALLS = (
     Call("robot design", f"--robot @robot/robot.toml --count 20 --candidates 60 --out >poses.csv {_ALL}", 1.5),
     Call(
         "handeye",
-        "@handeye/poses.csv --splits 2 --out >h.json --ros >h.yaml --urdf >h.urdf --opencv >h.yml --workers 1 " + _ALL,
+        "@handeye/poses.csv --splits 2 --out >h.json --ros >h.yaml --urdf >h.urdf --opencv >h.yml "
+        "--motions-held-out 2 --workers 1 " + _ALL,
         1.2,
     ),
     Call(

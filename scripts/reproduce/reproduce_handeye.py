@@ -23,7 +23,7 @@ import numpy as np
 
 from stcal.errors import StcalError
 from stcal.geometry.rigid import Rigid
-from stcal.handeye import METHODS, handeye
+from stcal.handeye import METHODS, handeye, motion_errors
 from stcal.handeye.data.loop import Loop
 from stcal.handeye.data.motions import Motions
 from stcal.handeye.methods.evolution import Bounds, EvolutionOptions, Objective, evolve, polish
@@ -68,7 +68,7 @@ def trial(seed: int) -> dict:
             continue
         off = truth.mount_from_camera.inverse() @ x
         own = (float(np.linalg.norm(off.translation)), off.angle_rad())
-        found[method] = prediction_errors(x, motions[FITTED:]), own
+        found[method] = motion_errors(x, motions[FITTED:])[:, ::-1], own
     return found
 
 
@@ -111,12 +111,6 @@ def by_unit(truth: Truth, motions: Motions) -> dict[str, tuple[float, float]]:
         off = truth.mount_from_camera.inverse() @ polish(Objective(motions, unit_mm, 1.0), truth.mount_from_camera)
         found[name] = float(np.linalg.norm(off.translation)), off.angle_rad()
     return found
-
-
-def prediction_errors(x: Rigid, motions: Motions) -> np.ndarray:
-    """Of Â = X B X⁻¹ against A, (k, 2): mm and rad."""
-    off = (x @ motions.camera @ x.inverse()).difference(motions.mount)
-    return np.column_stack([np.linalg.norm(off[:, 3:], axis=1), np.linalg.norm(off[:, :3], axis=1)])
 
 
 def print_tables(trials: list[dict]) -> None:

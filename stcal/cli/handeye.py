@@ -100,6 +100,16 @@ def handeye(
         int, typer.Option("--splits", min=0, max=100_000, help="Cross-validate over this many splits; 0 for none.")
     ] = 15,
     seed: Annotated[int, typer.Option(min=0, max=MOST_SEED, help="Draw the splits with this seed.")] = 0,
+    motions_held_out: Annotated[
+        int | None,
+        typer.Option(
+            "--motions-held-out",
+            min=1,
+            max=100_000,
+            help="Hold out so many last motions and predict them by the solution of those before, as the paper on "
+            "differential evolution does with 6 of 24.",
+        ),
+    ] = None,
     out: Annotated[
         Path | None, typer.Option("--out", writable=True, help="Write the result to this file (JSON).")
     ] = None,
@@ -199,7 +209,7 @@ def handeye(
         options = HandEyeOptions(
             noise, given.prior if refine_camera else None, with_scale, given.symmetries, four_dof, evolution
         )
-        validation = Splits(splits, held_out, seed, workers)
+        validation = Splits(splits, held_out, seed, workers, motions_held_out)
         outcome = calibrate(given, setup.value, method, options, validation, progress)
     result = outcome.result
     say(outcome_text(outcome))

@@ -11,7 +11,10 @@ from .solve import METHODS as METHODS
 from .solve import HandEyeOptions as HandEyeOptions
 from .solve import handeye as handeye
 from .validate import Compared as Compared
+from .validate import HeldOutMotions as HeldOutMotions
 from .validate import HeldOutPoses as HeldOutPoses
 from .validate import compare as compare
 from .validate import cross_validate as cross_validate
+from .validate import motion_errors as motion_errors
+from .validate import predict_motions as predict_motions
 from .validate import splits as splits

@@ -13,7 +13,7 @@ from stcal.handeye import HandEyeOptions, HandEyePoses, View, Views, handeye, pa
 from stcal.handeye.data.loop import Setup
 from stcal.handeye.data.robot_poses import RobotPoses, read_robot_poses
 from stcal.handeye.report.file import Outcome
-from stcal.handeye.validate import LEAST_LEFT, compare, cross_validate, splits
+from stcal.handeye.validate import LEAST_LEFT, compare, cross_validate, predict_motions, splits
 from stcal.io.camera import CameraPrior, camera_prior, read_camera, refinable
 from stcal.io.images import ImageFile, find_images
 from stcal.io.quaternions import Order
@@ -43,12 +43,14 @@ class HandEyeInput:
 
 @dataclass(frozen=True, slots=True)
 class Splits:
-    """Of the cross-validation: how many, poses in each (a quarter if None), which, and processes for it."""
+    """Of the cross-validation: how many, poses in each (a quarter if None), which, and processes for it; and the last
+    motions to predict, if any."""
 
     repeats: int = 15
     held_out: int | None = None
     seed: int = 0
     workers: int | None = None
+    motions: int | None = None
 
 
 def read_input(
@@ -168,6 +170,9 @@ def _outcome(
             held_out = cross_validate(pairs, setup, chosen, views, options, rows, validation.workers, done)
         except DegenerateError as error:
             notes = (f"no errors on poses held out: {error}",)
+    motions = None
+    if validation.motions is not None:
+        motions = predict_motions(pairs, setup, result.method, views, options, validation.motions)
     model = options.intrinsics.colmap_model if options.intrinsics else ""
     own = views is not None and all(view.covariance is not None for view in views.views)
-    return Outcome(given.where, result, held_out, compared, given.pitch_mm, model, own, given.left_out, notes)
+    return Outcome(given.where, result, held_out, compared, given.pitch_mm, model, own, given.left_out, notes, motions)

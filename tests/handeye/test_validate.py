@@ -8,7 +8,20 @@ from scipy.spatial.transform import Rotation
 
 from stcal.errors import DegenerateError, InputError
 from stcal.geometry.rigid import Poses, Rigid
-from stcal.handeye import METHODS, HandEyeOptions, HandEyePoses, Noise, compare, cross_validate, handeye, splits
+from stcal.handeye import (
+    METHODS,
+    HandEyeOptions,
+    HandEyePoses,
+    Noise,
+    compare,
+    cross_validate,
+    handeye,
+    motion_errors,
+    predict_motions,
+    splits,
+)
+from stcal.handeye.data.loop import Loop
+from stcal.handeye.data.motions import Motions
 from stcal.handeye.validate import predicted
 from stcal.synthetic.measured.handeye import simulated, simulated_views
 
@@ -91,3 +104,22 @@ def test_a_split_that_cannot_be_solved_is_named():
     truth = simulated(np.random.default_rng(5), 12)
     with pytest.raises(DegenerateError, match=r"without pose 3, pose 4, .*: .*3 needed"):
         cross_validate(truth.pairs, rows=np.arange(2, 12)[None])
+
+
+def test_the_last_motions_are_predicted_by_those_before():
+    """Exact poses: exactly. A mount 1 mm off across a motion's axis turns with it: Â is off by 2 sin(½ angle) mm."""
+    truth = simulated(np.random.default_rng(4), 9, "eye-in-hand", robot=(1e-9, 1e-9), camera=(1e-9, 1e-9))
+    found = predict_motions(truth.pairs, "eye-in-hand", "pose", count=3)
+    names = truth.pairs.names
+    assert found.fitted == 5
+    assert found.names == tuple((names[i], names[i + 1]) for i in (5, 6, 7))
+    assert found.translation_mm.max() < 1e-5
+    motions = Motions.consecutive(Loop.of(truth.pairs, "eye-in-hand"))
+    axis = motions.alpha / np.linalg.norm(motions.alpha, axis=1, keepdims=True)
+    across = np.cross(axis[0], [0.3, -0.5, 0.8])
+    across /= np.linalg.norm(across)
+    off = Rigid(np.eye(3), across) @ truth.mount_from_camera
+    expected = 2 * np.sin(np.linalg.norm(motions.alpha[0]) / 2)
+    assert motion_errors(off, motions)[0] == pytest.approx([0, expected], abs=1e-5)
+    with pytest.raises(InputError, match="--motions-held-out 7: of 8 motions, 1 to 6 can be held out"):
+        predict_motions(truth.pairs, count=7)

@@ -10,7 +10,7 @@ import stcal
 from stcal.handeye.data.loop import FRAMES, Setup
 from stcal.handeye.judge.observability import Observability
 from stcal.handeye.result import HandEye
-from stcal.handeye.validate import Compared, HeldOutPoses
+from stcal.handeye.validate import Compared, HeldOutMotions, HeldOutPoses
 from stcal.io.camera import PARAMETER_NAMES, parameter_names
 from stcal.io.json import Finite, Matrix3, Matrix6, NamedReason, Part, Pose, ResultFile, Vector, Vector3
 
@@ -38,6 +38,8 @@ class Outcome:
         Images and rows that did not take part, and why.
     notes : tuple of str
         Besides those of the result.
+    motions : HeldOutMotions, optional
+        Errors of the last motions, held out.
     """
 
     where: str
@@ -49,6 +51,7 @@ class Outcome:
     own_sigmas: bool = False
     left_out: tuple[tuple[str, str], ...] = ()
     notes: tuple[str, ...] = ()
+    motions: HeldOutMotions | None = None
 
     def all_notes(self) -> tuple[str, ...]:
         """Of the result, then the others."""
@@ -92,6 +95,20 @@ class HeldOutMeans(Part):
     board_mm: float | None = None
     pose_mm: float | None = None
     agreeing: dict[str, float] | None
+
+
+class PredictedMotion(Part):
+    first: str
+    second: str
+    rotation_rad: float
+    translation_mm: float
+
+
+class HeldOutMotionRows(Part):
+    fitted: int
+    rotation_rad: float
+    translation_mm: float
+    motions: list[PredictedMotion]
 
 
 class SeenTurns(Part):
@@ -167,6 +184,11 @@ class HandEyeFile(ResultFile):
         "robot has put it, mean over the corners, and `pose_mm`: distance of the corners by the robot from those by "
         "the pose that the image gives alone; `agreeing`: the same means without `outliers`, null where there are none"
     )
+    motions_held_out: HeldOutMotionRows | None = Field(
+        None,
+        description="with `--motions-held-out`: number of `fitted` motions; means `rotation_rad`, `translation_mm` of "
+        "X B X⁻¹ against A over the others, and of each of the `motions`, which lead from pose `first` to `second`",
+    )
     observability: SeenTurns | None = Field(
         description="`turns_rad` RMS between poses about the principal `axes_flange`; `sigma_rad`, `sigma_mm` of the "
         "worst direction from poses of a common camera (1 mrad, 0.5 mm)"
@@ -190,7 +212,8 @@ class HandEyeFile(ResultFile):
         result, names, board = outcome.result, outcome.result.names, FRAMES[outcome.result.setup].board
         poses = {name: pose.matrix() for name, pose in result.transforms.items()}
         compared = [_method(each, names) for each in outcome.compared]
-        more = {"splits": _splits(outcome.held_out, names), "methods": compared} if whole else {}
+        more = {} if outcome.motions is None else {"motions_held_out": _motions(outcome.motions)}
+        more |= {"splits": _splits(outcome.held_out, names), "methods": compared} if whole else {}
         return cls.model_validate(
             {
                 "format": "stcal handeye 1",
@@ -249,6 +272,19 @@ def _held_out(found: HeldOutPoses | None, outliers: np.ndarray) -> HeldOutMeans 
     splits, poses = found.rows.shape
     agreeing = (found.means(~outliers) or None) if outliers.any() else None
     return HeldOutMeans(splits=splits, poses=poses, **found.means(), agreeing=agreeing)
+
+
+def _motions(found: HeldOutMotions) -> HeldOutMotionRows:
+    errors = zip(found.rotation_rad.tolist(), found.translation_mm.tolist(), strict=True)
+    return HeldOutMotionRows(
+        fitted=found.fitted,
+        rotation_rad=float(found.rotation_rad.mean()),
+        translation_mm=float(found.translation_mm.mean()),
+        motions=[
+            PredictedMotion(first=first, second=second, rotation_rad=turn, translation_mm=shift)
+            for (first, second), (turn, shift) in zip(found.names, errors, strict=True)
+        ],
+    )
 
 
 def _splits(found: HeldOutPoses | None, names: tuple[str, ...]) -> list[SplitErrors]:

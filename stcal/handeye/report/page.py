@@ -48,6 +48,8 @@ def outcome_text(outcome: Outcome) -> str:
     if outcome.held_out is not None:
         lines.append(f"held out ({_splits_text(outcome)}): {_means_text(outcome.held_out.means())}")
         lines += [f"held out, {text}" for text in _agreeing_text(outcome)]
+    if outcome.motions is not None:
+        lines += ["", _motions_text(outcome), *text_table(_motion_cells(outcome)), ""]
     lines += [f"σ of {text}: {value} ({how})" for text, value, how in _sigma_rows(outcome)]
     if result.sigma_scale is not None:
         lines.append(scale_text(outcome, result.sigma_scale))
@@ -57,6 +59,24 @@ def outcome_text(outcome: Outcome) -> str:
         lines += ["", f"Methods, on the same {_splits_text(outcome)} held out; off: from {frames.camera} above"]
         lines += text_table(_compared_cells(outcome))
     return "\n".join(lines)
+
+
+def _motions_text(outcome: Outcome) -> str:
+    found = outcome.motions
+    return f"motions predicted by those before (Jin et al., eqs. 24–26): fitted to {found.fitted}" if found else ""
+
+
+def _motion_cells(outcome: Outcome) -> list[list[str]]:
+    """Heads, a row for each motion that was held out, and their means."""
+    found = outcome.motions
+    if found is None:
+        return []
+    rows = [
+        [f"{first} → {second}", number(shift, 3), number(np.degrees(turn), 4)]
+        for (first, second), shift, turn in zip(found.names, found.translation_mm, found.rotation_rad, strict=True)
+    ]
+    means = ["mean", number(found.translation_mm.mean(), 3), number(np.degrees(found.rotation_rad.mean()), 4)]
+    return [["<motion held out", "mm", "°"], *rows, means]
 
 
 def scale_text(outcome: Outcome, sigma_scale: float) -> str:
@@ -169,6 +189,8 @@ def outcome_page(outcome: Outcome) -> str:
         adjusted=_adjusted(outcome),
         compared=compared,
         splits=_splits_text(outcome),
+        predicted=_motion_cells(outcome),
+        predicted_text=_motions_text(outcome),
         board_seen=ERRORS["board_mm"][0] in compared[0],
         good=GOOD,
         bad=BAD,
