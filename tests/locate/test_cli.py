@@ -98,6 +98,8 @@ def test_limits_are_options(stcal, files):
     code, shown, _ = stcal("locate", "run", image, *target, "--method", "patent", "--e-lim-px", 0.001)
     assert code == 3
     assert "error 0." in shown
+    for part in ("area px²", "det J 1/mm²", "kept", "≤ 0.001 failed", "patent: assumed where the text has no formula"):
+        assert part in shown
 
 
 @pytest.mark.parametrize(

@@ -2,7 +2,7 @@
 Anhui Yuanguji, steps S5 to S9. Every step is a function that can be replaced."""
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy.spatial import Delaunay, QhullError
@@ -15,6 +15,10 @@ from stcal.geometry.rigid import Rigid
 from stcal.locate.data.layout import TargetLayout
 from stcal.locate.pose.verdict import PoseCheck, Verdict
 
+ASSUMED = (
+    "assumed where the text has no formula or no value: E_res is the larger reprojection error over the smaller; "
+    "errors are RMS over the corners; exposures form a geometric series; S_dis, J_lim, E_lim and E_ratio as given"
+)
 SAME_RAD, SAME_SHARE = 1e-3, 1e-3
 """T_a and T_b are the same pose when they differ by less: turned, and shifted in shares of the distance."""
 TINY_PX = 1e-9
@@ -43,11 +47,42 @@ class PatentOptions:
     min_error_ratio: float = 2.0
 
     def __post_init__(self):
-        if not (0 <= self.area_share <= 1 and self.max_error_px > 0 and self.min_error_ratio >= 1):
+        if not (0 <= self.area_share < 1 and self.max_error_px > 0 and self.min_error_ratio >= 1):
             raise InputError(
                 f"patent: S_dis {self.area_share:g}, E_lim {self.max_error_px:g}, E_ratio {self.min_error_ratio:g}: "
-                "0 … 1, a positive number and 1 or more needed"
+                "0 to less than 1, a positive number and 1 or more needed"
             )
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class PatentExposure:
+    """How one exposure fared.
+
+    Parameters
+    ----------
+    exposure : int
+        Its index.
+    tags : int
+        Of the layout, seen in it.
+    area_px2 : float or None
+        That their triangles span; None where others show more tags.
+    candidate : bool
+        Whether it was among those whose poses were compared.
+    poses : (Rigid, Rigid) or None
+        T_a and T_b, the one of the smaller error first; None where it is no candidate, or has none.
+    errors_px : (float, float) or None
+        RMS of both.
+    det_j : float or None
+        Determinant of the homography's derivative at the normalised centre, 1/mm².
+    """
+
+    exposure: int
+    tags: int
+    area_px2: float | None = None
+    candidate: bool = False
+    poses: tuple[Rigid, Rigid] | None = None
+    errors_px: tuple[float, float] | None = None
+    det_j: float | None = None
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -72,6 +107,10 @@ class PatentPose:
         Number of tags used.
     verdict : Verdict
         Of the patent's gate.
+    exposures : tuple of PatentExposure
+        How each fared, in their order.
+    same : bool
+        Whether both poses are one.
     """
 
     exposure: int
@@ -82,6 +121,8 @@ class PatentPose:
     det_j: float
     tags: int
     verdict: Verdict
+    exposures: tuple[PatentExposure, ...] = ()
+    same: bool = False
 
 
 def most_tags(corners: Sequence[np.ndarray]) -> list[int]:
@@ -93,7 +134,7 @@ def most_tags(corners: Sequence[np.ndarray]) -> list[int]:
 def largest_area(corners: Sequence[np.ndarray], chosen: Sequence[int], share: float) -> list[int]:
     """S5: of the chosen exposures those whose tags span more than ``share`` of the largest area."""
     area = {i: triangulated_area(corners[i].reshape(-1, 2)) for i in chosen}
-    return [i for i in chosen if area[i] >= share * max(area.values())]
+    return [i for i in chosen if area[i] > share * max(area.values())]
 
 
 def triangulated_area(points: np.ndarray) -> float:
@@ -143,8 +184,11 @@ def locate_as_patent(
     corners = [tags.corners_px[own] for tags, own in zip(exposures, known, strict=True)]
     if not any(known):
         raise DegenerateError(f"{where}: no tag of the layout; 1 needed")
-    chosen = largest_area(corners, most_tags(corners), options.area_share)
-    best = None
+    most = most_tags(corners)
+    chosen = largest_area(corners, most, options.area_share)
+    fared = {i: PatentExposure(i, len(own)) for i, own in enumerate(known)}
+    for i in most:
+        fared[i] = replace(fared[i], area_px2=triangulated_area(corners[i].reshape(-1, 2)), candidate=i in chosen)
     for i in chosen:
         xy = layout.corners_mm[[rows[exposures[i].tags[k]] for k in known[i]]].reshape(-1, 2)
         pixels = corners[i].reshape(-1, 2)
@@ -152,17 +196,31 @@ def locate_as_patent(
             found = solve(xy, camera.normalised_from_pixel(pixels))
         except DegenerateError:
             continue
-        errors = [reprojection_rms(pose, xy, pixels, camera) for pose in found.poses]
-        if best is None or min(errors) < min(best[2]):
-            best = (i, found, errors)
-    if best is None:
+        (low, first), (high, second) = sorted(
+            ((reprojection_rms(pose, xy, pixels, camera), pose) for pose in found.poses), key=lambda each: each[0]
+        )
+        fared[i] = replace(fared[i], poses=(first, second), errors_px=(low, high), det_j=found.determinant)
+    solved = [
+        (each.errors_px, each.poses, each.det_j, i)
+        for i, each in fared.items()
+        if each.errors_px is not None and each.poses is not None and each.det_j is not None
+    ]
+    if not solved:
         raise DegenerateError(f"{where}: no exposure shows the tags' corners so; check layout and camera file")
-    i, found, errors = best
-    first, second = found.poses if errors[0] <= errors[1] else found.poses[::-1]
-    errors = sorted(errors)
-    verdict = gate(found.determinant, errors[0], errors[1] / max(errors[0], TINY_PX), same_pose(first, second), options)
+    errors, (first, second), det_j, i = min(solved, key=lambda each: each[0][0])
+    same = same_pose(first, second)
+    verdict = gate(det_j, errors[0], errors[1] / max(errors[0], TINY_PX), same, options)
     return PatentPose(
-        i, tuple(chosen), first, second, (errors[0], errors[1]), found.determinant, len(known[i]), verdict
+        exposure=i,
+        candidates=tuple(chosen),
+        camera_from_obj=first,
+        second=second,
+        errors_px=errors,
+        det_j=det_j,
+        tags=len(known[i]),
+        verdict=verdict,
+        exposures=tuple(fared.values()),
+        same=same,
     )
 
 

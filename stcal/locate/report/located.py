@@ -11,6 +11,7 @@ from stcal.locate.data.layout import TargetLayout
 from stcal.locate.pipeline import Located
 from stcal.locate.pose.estimate import ObjPose
 from stcal.locate.pose.merge import Shift
+from stcal.locate.pose.patent import ASSUMED, PatentPose
 from stcal.locate.report.chain import GoalChain
 from stcal.locate.report.tables import camera_from_obj, uncertain
 
@@ -42,6 +43,24 @@ class CornerRow(Part):
     weight: float
 
 
+class PatentExposureRow(Part):
+    image: str
+    tags: int
+    area_px2: float | None
+    candidate: bool
+    kept: bool
+    errors_px: list[Finite] | None
+    det_j: float | None
+    camera_from_obj: Pose | None
+    twin: Pose | None
+
+
+class PatentRow(Part):
+    exposures: list[PatentExposureRow]
+    same_pose: bool
+    assumed: str
+
+
 class SceneRow(Part):
     scene: str
     verdict: str
@@ -62,6 +81,12 @@ class SceneRow(Part):
     covariance: Matrix6 | None = Field(None, description="its covariance; not with `--method patent`")
     twin: Pose | None = Field(None, description="the other pose that fits, null where there is none")
     errors_px: list[Finite] | None = Field(None, description="only with `--method patent`: of the two poses")
+    patent: PatentRow | None = Field(
+        None,
+        description="only with `--method patent`: `exposures`: `image`, `tags` used, `area_px2` of their triangles "
+        "(null where others show more tags), `candidate`, `kept`, and of candidates `errors_px` of both poses, `det_j` "
+        "(1/mm²), `camera_from_obj` and `twin`; `same_pose`: both poses are one; what was `assumed`",
+    )
     delta_chi2: Finite = Field(None, description="this and all below as in [measure](#out-what-measure-writes)")
     rms_px: float | None = Field(None, description="of the residuals, per coordinate")
     chi2: float | None = Field(None, description="of the residuals")
@@ -103,7 +128,11 @@ def _scene(each: Located, layout: TargetLayout, chain: GoalChain | None) -> Scen
         "camera_from_obj": pose,
     }
     if each.patent is not None:
-        content |= {"twin": each.patent.second, "errors_px": each.patent.errors_px}
+        content |= {
+            "twin": each.patent.second,
+            "errors_px": each.patent.errors_px,
+            "patent": _patent(each, each.patent),
+        }
     if each.pose is not None:
         content |= _fit(each.pose, layout)
     if chain and pose is not None and not chain.without_pose([each.name]):
@@ -115,6 +144,27 @@ def _scene(each: Located, layout: TargetLayout, chain: GoalChain | None) -> Scen
 def _exposure(own: Exposure | Unreadable) -> ExposureRow:
     read = isinstance(own, Exposure)
     return ExposureRow(image=own.name, tags=len(own.tags) if read else None, trouble=None if read else own.trouble)
+
+
+def _patent(each: Located, patent: PatentPose) -> PatentRow:
+    names = [exposure.name for exposure in each.tags.readable()]
+    rows = []
+    for own in patent.exposures:
+        first, second = own.poses or (None, None)
+        rows.append(
+            {
+                "image": names[own.exposure],
+                "tags": own.tags,
+                "area_px2": own.area_px2,
+                "candidate": own.candidate,
+                "kept": own.exposure == patent.exposure,
+                "errors_px": own.errors_px,
+                "det_j": own.det_j,
+                "camera_from_obj": first,
+                "twin": second,
+            }
+        )
+    return PatentRow.model_validate({"exposures": rows, "same_pose": patent.same, "assumed": ASSUMED})
 
 
 def _shift(own: Shift) -> ShiftRow:

@@ -13,8 +13,9 @@ from stcal.io.images import ImageFile, decode, grey_8bit, thumbnail
 from stcal.locate.data.exposures import Exposure, SceneFiles
 from stcal.locate.data.layout import TargetLayout
 from stcal.locate.pipeline import Located
+from stcal.locate.pose.patent import ASSUMED
 from stcal.locate.report.chain import GoalChain
-from stcal.locate.report.tables import accepted, camera_from_obj, uncertain
+from stcal.locate.report.tables import accepted, camera_from_obj, patent_cells, uncertain
 from stcal.report.figure import AXIS_COLOURS, COLOURS
 from stcal.report.page import render, verdict
 from stcal.report.text import number
@@ -100,6 +101,8 @@ def _scene(each: Located, files: SceneFiles, layout: TargetLayout, model: Camera
             ]
             for check in each.verdict.checks
         ],
+        "patent": [] if each.patent is None else patent_cells(each),
+        "assumed": "" if each.patent is None else ASSUMED,
         "best": best and _picture(best, by_name[best.name], each, layout, model, WIDE_PX),
         "small": [_picture(own, by_name[own.name], None, layout, model, SMALL_PX) for own in few],
     }

@@ -11,7 +11,9 @@ from stcal.geometry.rigid import Rigid
 from stcal.geometry.uncertain import UncertainRigid
 from stcal.io.table import COVARIANCE, POSE, pose_cells
 from stcal.locate.pipeline import Located
+from stcal.locate.pose.patent import ASSUMED
 from stcal.locate.report.chain import GoalChain
+from stcal.report.text import NONE, number, text_table
 
 BASE = "base_from_goal_"
 
@@ -33,6 +35,9 @@ def run_text(results: Sequence[Located], chain: GoalChain | None = None) -> str:
             sigma = each.pose.sigma_mm(), np.degrees(each.pose.sigma_rad()), each.pose.rms_px()
             start += "{:10.3f}{:11.4f}{:9.3f}".format(*sigma)
         lines += [start, *(f"{'':<{width}}    {reason}" for reason in (*each.verdict.reasons, *each.notes))]
+        if each.patent is not None:
+            lines += [f"    {line}" for line in text_table(patent_cells(each))]
+            lines += [f"    gates: {gates_text(each)}"]
     if chain and accepted(results):
         lines += ["", f"{'base_from_goal':<{width + 22}}      x_mm      y_mm      z_mm  rotation vector, deg"]
         for each in accepted(results):
@@ -40,7 +45,34 @@ def run_text(results: Sequence[Located], chain: GoalChain | None = None) -> str:
             turn = np.degrees(goal.log()[:3])
             place = "".join(f"{v:10.2f}" for v in goal.translation)
             lines.append(f"{each.name:<{width + 22}}{place}" + "".join(f"{v:10.3f}" for v in turn))
+    if any(each.patent is not None for each in results):
+        lines += ["", f"patent: {ASSUMED}"]
     return "\n".join(lines)
+
+
+def patent_cells(each: Located) -> list[list[str]]:
+    """Heads, and a row for each exposure: how it fared by the published rules."""
+    rows = [["<exposure", "<", "tags", "area px²", "error px", "of the other", "det J 1/mm²"]]
+    if each.patent is None:
+        return rows
+    for name, own in zip((e.name for e in each.tags.readable()), each.patent.exposures, strict=True):
+        kept = "kept" if own.exposure == each.patent.exposure else "candidate" if own.candidate else "left out"
+        errors = own.errors_px or (None, None)
+        det_j = NONE if own.det_j is None else f"{own.det_j:.3g}"
+        rows.append([name, kept, str(own.tags), number(own.area_px2, 0), *(number(e, 3) for e in errors), det_j])
+    return rows
+
+
+def gates_text(each: Located) -> str:
+    """Every gate with its value and limit, in words."""
+    found = [
+        f"{check.name} {check.value:.4g}{check.unit} {'≥' if check.at_least is not None else '≤'} "
+        f"{check.at_least if check.at_least is not None else check.at_most:.4g}{'' if check.passed else ' failed'}"
+        for check in each.verdict.checks
+    ]
+    if each.patent is not None and each.patent.same:
+        found.append("both poses are one, no ratio")
+    return "; ".join(found)
 
 
 def camera_from_obj(each: Located) -> Rigid | None:

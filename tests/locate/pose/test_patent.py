@@ -41,6 +41,8 @@ def test_selection_by_number_and_area():
     assert most_tags(corners) == [0, 2, 3]
     assert largest_area(corners, [0, 2, 3], 0.8) == [2, 3]
     assert largest_area(corners, [0, 2, 3], 0.2) == [0, 2, 3]
+    share = triangulated_area(small.reshape(-1, 2)) / triangulated_area(large.reshape(-1, 2))
+    assert largest_area(corners, [0, 2, 3], share) == [2, 3]  # more than S_dis, as written
 
 
 def test_the_exposure_with_the_smallest_error_is_kept():
@@ -51,6 +53,15 @@ def test_the_exposure_with_the_smallest_error_is_kept():
     found = locate_as_patent([coarse, fine, few], LAYOUT, CAMERA)
     assert found.exposure == 1
     assert found.candidates == (0, 1)
+    assert [(each.tags, each.candidate, each.poses is None) for each in found.exposures] == [
+        (len(LAYOUT.tags), True, False),
+        (len(LAYOUT.tags), True, False),
+        (2, False, True),
+    ]
+    assert found.exposures[1].errors_px == found.errors_px
+    assert found.exposures[0].errors_px[0] > found.errors_px[0]
+    assert found.exposures[1].det_j == found.det_j
+    assert found.exposures[2].area_px2 is None
     assert (found.camera_from_obj @ TRUTH.inverse()).angle_rad() < np.radians(0.2)
     assert found.verdict.decision == "accept"
 
