@@ -3,7 +3,7 @@
 import math
 from enum import StrEnum
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
@@ -11,6 +11,9 @@ from stcal.cli.help import PLAIN, Commands
 from stcal.cli.options import MOST_SEED, JsonFile, QuaternionOrder, Quaternions, ReportFile, RobotFile
 from stcal.cli.terminal import print_each, say, write
 from stcal.errors import DegenerateError, InputError
+
+if TYPE_CHECKING:
+    from stcal.robot.kinematics.measurements import Measurements
 
 app = typer.Typer(
     name="stcal robot",
@@ -54,6 +57,13 @@ def axes(
         float,
         typer.Option(min=1e-9, max=1.0, help="Take joints that change by less than this as standing still, degrees."),
     ] = 0.0015,
+    orientations: Annotated[
+        str,
+        typer.Option(
+            help="Use measured orientations too, as reflectors so far from the target, mm, where an error of rotation "
+            "is worth one of position; auto, by their stated σ and not without, or off."
+        ),
+    ] = "auto",
     json_file: JsonFile = None,
     report: ReportFile = None,
 ) -> None:
@@ -65,8 +75,13 @@ def axes(
 
     nominal = load_robot(robot_file)
     data = read_measurements(sweeps, nominal)
-    result = robot_from_sweeps(data, nominal, math.radians(still_deg))
+    length_mm = _length(orientations, data)
+    result = robot_from_sweeps(data, nominal, math.radians(still_deg), length_mm)
     say(axes_text(result))
+    if length_mm is not None:
+        say(f"orientations: used, as points {length_mm:.0f} mm from the target")
+    elif data.rotations is not None:
+        say("orientations: not used; state σ (cov_… columns), or give --orientations a length")
     print_each(f"warning: {data.where}", result.notes)
     if out:
         write(out, robot_toml(result.robot, [f"Identified by the axis method from {sweeps.name}."]))
@@ -74,6 +89,18 @@ def axes(
         write(json_file, axes_file(result))
     if report:
         write(report, axes_page(result, data.where))
+
+
+def _length(text: str, data: "Measurements") -> float | None:
+    """Distance of virtual reflectors, mm; None for positions alone."""
+    from stcal.robot.axes.orientations import length_of
+
+    if text in ("auto", "off"):
+        return length_of(data) if text == "auto" else None
+    try:
+        return float(text)
+    except ValueError as error:
+        raise InputError(f"--orientations {text}: a length in mm, auto or off needed") from error
 
 
 class Kind(StrEnum):

@@ -12,6 +12,7 @@ from stcal.geometry.rigid import Rigid
 from stcal.parallel import one_thread
 from stcal.robot.axes.checks import AGREES_RAD, require_like_nominal
 from stcal.robot.axes.fit import GROSS, REWEIGHTINGS, TINY, AxisFit, fit_axis, refit_axis
+from stcal.robot.axes.orientations import VirtualReflectors, virtual_reflectors
 from stcal.robot.axes.sweeps import STILL_RAD, Arc, called, find_arcs
 from stcal.robot.kinematics.dh import PARALLEL_RAD, robot_from_chain
 from stcal.robot.kinematics.measurements import Measurements
@@ -106,7 +107,9 @@ class AxesResult:
 
 
 @one_thread()
-def robot_from_sweeps(data: Measurements, nominal: Robot, still_rad: float = STILL_RAD) -> AxesResult:
+def robot_from_sweeps(
+    data: Measurements, nominal: Robot, still_rad: float = STILL_RAD, length_mm: float | None = None
+) -> AxesResult:
     """The axis method: axes, robot, and how far to trust them.
 
     Axes do not determine everything: what :func:`~stcal.robot.kinematics.dh.robot_from_chain` keeps of the nominal
@@ -120,6 +123,9 @@ def robot_from_sweeps(data: Measurements, nominal: Robot, still_rad: float = STI
         Convention, joint types, coupling, and about how the arm is built.
     still_rad : float
         Revolute joints stand still within this.
+    length_mm : float, optional
+        Take orientations too, by three virtual reflectors at this distance from each pose's origin: where an error of
+        rotation moves a point as much as one of position. Positions alone where None.
 
     Returns
     -------
@@ -131,7 +137,8 @@ def robot_from_sweeps(data: Measurements, nominal: Robot, still_rad: float = STI
     ConvergenceError
         The fit of an axis reaches no minimum.
     InputError
-        A joint never swept, a reflector that does not move, mirrored positions, a robot of another build.
+        A joint never swept, a reflector that does not move, mirrored positions, a robot of another build; no
+        orientations where they are asked for.
     DegenerateError
         Axes that their arcs do not determine.
 
@@ -141,16 +148,21 @@ def robot_from_sweeps(data: Measurements, nominal: Robot, still_rad: float = STI
     Ginés, "Uncertainty estimation in robot kinematic calibration", Robotics and Computer-Integrated Manufacturing 29,
     2013.
     """
+    virtual = None if length_mm is None else virtual_reflectors(data, length_mm)
+    data = data if virtual is None else virtual.data
     arcs, notes = find_arcs(data, nominal, still_rad)
     notes = [*data.notes, *notes]
-    fits, covariance, unwound = fit_axes(data, nominal, arcs)
+    fits, covariance, unwound = fit_axes(data, nominal, arcs, virtual)
     frames = [fit.world_from_axis for fit in fits]
     require_like_nominal(data.where, frames, nominal)
     axes = _chain(frames, nominal)
     tools, spread = _tools(data, frames[-1], unwound)
+    if virtual is not None:
+        tools, spread = virtual.tools(tools, spread)
     robot = robot_from_chain(axes, tools, nominal)
-    kept = {name: nominal.tools[name].rotation if name in nominal.tools else np.eye(3) for name in tools}
-    robot = replace(robot, tools={n: Rigid(kept[n], t.translation) for n, t in robot.tools.items()})
+    if virtual is None:
+        kept = {name: nominal.tools[name].rotation if name in nominal.tools else np.eye(3) for name in tools}
+        robot = replace(robot, tools={n: Rigid(kept[n], t.translation) for n, t in robot.tools.items()})
     row_sigma = _sigma(_jacobian(lambda f: _row_values(f, nominal), frames, nominal), covariance).reshape(-1, 5)
     pairs = pairs_of(frames, covariance, robot)
     notes += _notes(data, fits, robot, nominal)
@@ -173,10 +185,12 @@ def robot_from_sweeps(data: Measurements, nominal: Robot, still_rad: float = STI
     )
 
 
-def fit_axes(data: Measurements, robot: Robot, arcs: list[Arc]) -> tuple[list[AxisFit], np.ndarray, np.ndarray]:
+def fit_axes(
+    data: Measurements, robot: Robot, arcs: list[Arc], virtual: VirtualReflectors | None = None
+) -> tuple[list[AxisFit], np.ndarray, np.ndarray]:
     """Fits in order, each on points with the joints before unwound; covariance of all; points with all unwound.
 
-    The covariance counts a row once, however many sweeps it belongs to.
+    The covariance counts a row once, however many sweeps it belongs to, and a pose once for all its reflectors.
     """
     kinematic = data.q @ robot.coupling.T
     points, m = np.array(data.points()), len(data)
@@ -197,7 +211,8 @@ def fit_axes(data: Measurements, robot: Robot, arcs: list[Arc]) -> tuple[list[Ax
         fits.append(fit)
         response.append(to_noise)
         points, turned = after, turn @ turned
-    stacked = np.concatenate(response).reshape(-1, 3 * m)
+    rows = np.concatenate(response)
+    stacked = rows.reshape(-1, 3 * m) if virtual is None else virtual.by_pose(rows)
     return fits, stacked @ stacked.T, points
 
 

@@ -1,0 +1,102 @@
+"""Orientations in sweeps: a pose is three virtual reflectors about its origin, which the axis method takes like others.
+
+Zhang & Wei (2017) measure poses of their target, of which the axis method as usually written takes positions alone.
+"""
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from stcal.errors import InputError
+from stcal.geometry.align import align_rigid
+from stcal.geometry.arrays import Array, freeze
+from stcal.geometry.rigid import Rigid, skew
+from stcal.robot.kinematics.measurements import Measurements
+
+SHORTEST_MM, LONGEST_MM = 1.0, 10_000.0
+ANGLES = 2 * np.pi / 3 * np.arange(3)
+UNIT_PLACES = np.column_stack([np.cos(ANGLES), np.sin(ANGLES), np.zeros(3)])
+"""Of the reflectors about the target's origin, in its XY plane: their mean is the origin."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class VirtualReflectors:
+    """``data`` : three rows for each of m poses; ``length_mm`` : of the reflectors from the origin; ``pose`` : (3m,)
+    number of the pose of each row; ``lever`` : (3m, 3) unit vectors from the origin, instrument's frame."""
+
+    data: Measurements
+    length_mm: float
+    pose: Array
+    lever: Array
+
+    def __post_init__(self):
+        freeze(self, "pose", (len(self.data),), "poses", int)
+        freeze(self, "lever", (len(self.data), 3), "levers")
+
+    def by_pose(self, response: np.ndarray) -> np.ndarray:
+        """(p, 6 m) response to the poses' own noise of that (p, 3m, 3) to the noise of rows taken for independent.
+
+        A pose errs by a translation and by a rotation that moves a reflector as much: √(1 + ⅔) of it together.
+        """
+        by_row = np.concatenate([np.broadcast_to(np.eye(3), (len(self.lever), 3, 3)), -skew(self.lever)], axis=2)
+        shared = np.zeros((len(response), int(self.pose.max()) + 1, 6))
+        np.add.at(shared.swapaxes(0, 1), self.pose, np.einsum("pmc,mcd->mpd", response, by_row))
+        return np.sqrt(3 / 5) * shared.reshape(len(response), -1)
+
+    def tools(self, places: dict[str, Rigid], spread_mm: dict[str, float]) -> tuple[dict[str, Rigid], dict[str, float]]:
+        """Poses of the targets from the places of their reflectors, and RMS of these about their places."""
+        tools, spread = {}, {}
+        for name in dict.fromkeys(self.data.targets):
+            target, _, number = name.rpartition(SEPARATOR)
+            if number == "1":
+                own = [f"{target}{SEPARATOR}{i + 1}" for i in range(3)]
+                xyz = np.array([places[each].translation for each in own])
+                tools[target] = align_rigid(xyz, self.length_mm * UNIT_PLACES)
+                spread[target] = float(np.sqrt(np.mean([spread_mm[each] ** 2 for each in own])))
+        return tools, spread
+
+
+SEPARATOR = " point "
+
+
+def length_of(data: Measurements) -> float | None:
+    """Distance at which the stated σ of rotations is worth that of positions, mm; None where none are stated."""
+    if data.rotations is None or data.covariance is None:
+        return None
+    variance = np.einsum("mii->mi", np.asarray(data.covariance))
+    rotation, position = variance[:, :3].mean(axis=1), variance[:, 3:].mean(axis=1)
+    if not (rotation > 0).all():
+        return None
+    return float(np.clip(np.median(np.sqrt(position / rotation)), SHORTEST_MM, LONGEST_MM))
+
+
+def virtual_reflectors(data: Measurements, length_mm: float) -> VirtualReflectors:
+    """Three reflectors for each pose, at ``length_mm`` from its origin: where an error of rotation is worth one of
+    position.
+
+    Raises
+    ------
+    InputError
+        No orientations, or a length out of range.
+    """
+    if data.rotations is None or data.positions is None:
+        raise InputError(
+            f"{data.where}: no orientations; columns of a rotation needed for --orientations, or leave it out"
+        )
+    if not SHORTEST_MM <= length_mm <= LONGEST_MM:
+        raise InputError(f"--orientations {length_mm:g}: {SHORTEST_MM:g} to {LONGEST_MM:g} mm needed, auto or off")
+    m = len(data)
+    lever = np.einsum("mij,kj->mki", data.rotations, UNIT_PLACES).reshape(-1, 3)
+    row = np.repeat(np.arange(m), 3)
+    at = row.tolist()
+    own = replace(
+        data,
+        lines=[data.lines[i] for i in at],
+        q=data.q[row],
+        targets=tuple(f"{data.targets[i]}{SEPARATOR}{k % 3 + 1}" for k, i in enumerate(at)),
+        positions=np.asarray(data.positions)[row] + length_mm * lever,
+        rotations=None,
+        covariance=None,
+        common=None,
+    )
+    return VirtualReflectors(own, length_mm, row, lever)
