@@ -14,12 +14,13 @@ class ChessboardDesign:
     """``rows`` × ``columns`` inner corners of squares of ``square_mm``.
 
     X along a row, Y down the columns, Z into the board, origin at inner corner (0, 0); the square between inner
-    corners (0, 0) and (1, 1) is black.
+    corners (0, 0) and (1, 1) is black. ``sigma_mm`` : σ of a corner about the grid, per axis.
     """
 
     rows: int
     columns: int
     square_mm: float
+    sigma_mm: float = 0.01
 
     def xy_mm(self) -> np.ndarray:
         """Inner corners, (rows·columns, 2), row-major, mm."""
@@ -40,7 +41,8 @@ class CharucoDesign:
     """``rows`` × ``columns`` squares of ``square_mm``, tags of ``marker_mm`` of ``dictionary`` in the white ones.
 
     X along a row, Y down the columns, Z into the board, origin at the outer corner of the first square. ``legacy`` :
-    printed by OpenCV before 4.6, which began boards of an even number of rows with a white square.
+    printed by OpenCV before 4.6, which began boards of an even number of rows with a white square. ``sigma_mm`` :
+    σ of a corner about the grid, per axis.
     """
 
     rows: int
@@ -49,6 +51,7 @@ class CharucoDesign:
     marker_mm: float
     dictionary: str
     legacy: bool = False
+    sigma_mm: float = 0.01
 
     def xy_mm(self) -> np.ndarray:
         """Inner corners, ((rows − 1)·(columns − 1), 2), row-major, mm."""

@@ -48,6 +48,7 @@ class _Chessboard(Strict):
     rows: Count
     columns: Count
     square_mm: Positive
+    sigma_mm: Positive = 0.01
 
 
 class _Charuco(Strict):
@@ -58,6 +59,7 @@ class _Charuco(Strict):
     marker_mm: Positive
     dictionary: Dictionary
     legacy: bool = False
+    sigma_mm: Positive = 0.01
 
 
 class TagEntry(Strict):
@@ -137,14 +139,22 @@ def load_flat_board(path: str | Path) -> BoardDesign | FlatBoard:
         return load_board(path)
     if kind == "chessboard":
         data = load_toml(path, _Chessboard, "board file", REMEDY)
-        return ChessboardDesign(data.rows, data.columns, data.square_mm)
+        return ChessboardDesign(data.rows, data.columns, data.square_mm, data.sigma_mm)
     if kind == "charuco":
         data = load_toml(path, _Charuco, "board file", REMEDY)
         if data.marker_mm >= data.square_mm:
             raise InputError(
                 f"{where}: marker_mm {data.marker_mm:g}, under square_mm {data.square_mm:g} needed; are they swapped?"
             )
-        return CharucoDesign(data.rows, data.columns, data.square_mm, data.marker_mm, data.dictionary, data.legacy)
+        return CharucoDesign(
+            data.rows,
+            data.columns,
+            data.square_mm,
+            data.marker_mm,
+            data.dictionary,
+            data.legacy,
+            data.sigma_mm,
+        )
     if kind == "tags":
         data = load_toml(path, TagsFile, "board file", REMEDY)
         corners = [tag.corners(where) for tag in data.tag]

@@ -5,7 +5,7 @@ from typing import Annotated
 
 import typer
 
-from stcal.cli.options import BoardFile, TargetFile, Workers
+from stcal.cli.options import TargetFile, Workers
 from stcal.cli.terminal import StageProgress, say
 from stcal.errors import InputError
 from stcal.io.saving import json_text, save
@@ -23,7 +23,13 @@ def calibrate_camera(
         Path, typer.Option("--out", writable=True, help="Write the camera to this file, which must not exist.")
     ] = Path("cameras.txt"),
     target: TargetFile = None,
-    board: BoardFile = None,
+    board: Annotated[
+        Path | None,
+        typer.Option(
+            "--board",
+            help="Read the board from this file: dots, chessboard or ChArUco (TOML), in place of the reference board.",
+        ),
+    ] = None,
     model: Annotated[
         str,
         typer.Option(
@@ -39,18 +45,24 @@ def calibrate_camera(
     workers: Workers = None,
 ) -> None:
     """Calibrate the camera from views of the board, without any start: cameras.txt with σ and correlations, for run."""
+    from stcal.boards.file import load_flat_board
+    from stcal.design import BoardDesign
     from stcal.io.camera import CalibratedCamera, write_cameras_txt
     from stcal.io.design import board_of, target_of
     from stcal.sfm.camera.calibrate import calibrate_camera as calibrate
     from stcal.sfm.camera.file import CalibrationFile
     from stcal.sfm.camera.text import calibration_text
+    from stcal.workflows.calibrate_camera import calibrate_camera_by_corners
 
     if out.exists():
         raise InputError(f"{out}: exists; give a new file with --out")
     target_design = target_of(target)
-    board_design = board_of(board)
+    board_design = board_of(None) if board is None else load_flat_board(board)
     with StageProgress() as progress:
-        result = calibrate(images, target_design, board_design, model, workers=workers, progress=progress)
+        if isinstance(board_design, BoardDesign):
+            result = calibrate(images, target_design, board_design, model, workers=workers, progress=progress)
+        else:
+            result = calibrate_camera_by_corners(images, board_design, model, workers, progress)
     write_cameras_txt(out, CalibratedCamera.of(result.intrinsics.camera, model, result.intrinsics.covariance))
     summary = CalibrationFile.of(result)
     json_file = json_file or out.with_suffix(".json")

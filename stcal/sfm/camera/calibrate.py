@@ -105,7 +105,7 @@ def calibrate_camera(
         raise InputError(f"camera model {colmap_model}: not supported; use one of {', '.join(COLMAP_MODELS)}")
     progress = progress or (lambda *_: None)
     files, other = find_images(images)
-    camera = start_camera(*_first_size(files))
+    camera = start_camera(*first_size(files))
     before: Intrinsics | None = None
     settled = False
     with tempfile.TemporaryDirectory(prefix="stcal-camera-") as cache:
@@ -124,13 +124,25 @@ def calibrate_camera(
             if settled:
                 break
             before = result
+    return judged(result, views, skipped, rounds, settled, board)
+
+
+def judged(
+    result: Intrinsics,
+    views: Sequence[ImageObservations],
+    skipped: tuple[Skipped, ...],
+    rounds: int,
+    settled: bool,
+    board: BoardDesign,
+) -> CameraCalibration:
+    """A calibration with σ over the image, split-half check and warnings; ``settled`` : whether detection was."""
     projection = projection_sigma(result)
     split = split_half(result, views, board)
     warnings = [*_of_rounds(result, settled), *_warnings(result, projection, split, board)]
     return CameraCalibration(result, tuple(views), skipped, rounds, projection, split, tuple(warnings))
 
 
-def _first_size(files: list[ImageFile]) -> tuple[int, int]:
+def first_size(files: list[ImageFile]) -> tuple[int, int]:
     """Width and height of the first readable image."""
     for file in files:
         try:

@@ -1,0 +1,76 @@
+"""Cameras from photographs of a chessboard and of a ChArUco board: drawn, and measured."""
+
+import json
+
+import cv2
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from stcal.boards.design import ChessboardDesign, TagLayout
+from stcal.errors import InputError
+from stcal.workflows.calibrate_camera import calibrate_camera_by_corners, corner_grid
+from tests.boards.drawn import chessboard_mm, photograph
+
+FOCAL, CENTRE = (1500.0, 1490.0), (610.0, 440.0)
+CHESSBOARD = 'type = "chessboard"\nrows = 7\ncolumns = 10\nsquare_mm = 12.0\n'
+
+
+@pytest.fixture(scope="module")
+def photographs(tmp_path_factory):
+    """A chessboard in ten poses before a camera without distortion, 1200×900 px, with noise."""
+    folder = tmp_path_factory.mktemp("chessboard")
+    sheet, first_mm = chessboard_mm(7, 10, 12.0)
+    rng = np.random.default_rng(5)
+    inner = np.array([[FOCAL[0], 0, CENTRE[0]], [0, FOCAL[1], CENTRE[1]], [0, 0, 1]])
+    for i in range(10):
+        turn = Rotation.from_euler("xyz", [*rng.uniform(-35, 35, 2), rng.uniform(-30, 30)], degrees=True).as_matrix()
+        middle = np.array([9, 6, 0]) * 6.0
+        place = np.array([rng.uniform(-25, 25), rng.uniform(-20, 20), rng.uniform(230, 300)]) - turn @ middle
+        image_from_mm = inner @ np.column_stack([turn[:, :2], place])
+        seen = photograph(sheet, 4, image_from_mm @ np.array([[1, 0, -first_mm], [0, 1, -first_mm], [0, 0, 1.0]]))
+        noisy = np.clip(seen + rng.normal(0, 2, seen.shape), 0, 255).astype(np.uint8)
+        cv2.imwrite(str(folder / f"{i}.png"), noisy)
+    return folder
+
+
+def test_a_chessboard_gives_the_camera_with_its_sigma(photographs, tmp_path, stcal_sfm):
+    (tmp_path / "board.toml").write_text(CHESSBOARD, encoding="utf-8")
+    out = tmp_path / "cameras.txt"
+    code, text, error = stcal_sfm(
+        "calibrate-camera", photographs, "--board", tmp_path / "board.toml", "--out", out, "--model", "PINHOLE"
+    )
+    assert code == 0, error
+    found = json.loads((tmp_path / "cameras.json").read_text())["parameters"]
+    assert "split-half check" in text
+    for name, true in zip(("fx", "fy", "cx", "cy"), (*FOCAL, *CENTRE), strict=True):
+        assert found[name]["sigma"] < 5
+        assert abs(found[name]["value"] - true) < 4 * found[name]["sigma"] + 0.5  # half a pixel of drawing
+
+
+def test_corners_are_dots_without_extent():
+    grid = corner_grid(ChessboardDesign(4, 6, 25.0, 0.02))
+    assert (grid.rows, grid.columns, grid.pitch_mm, grid.sigma_mm) == (4, 6, 25.0, 0.02)
+    with pytest.raises(InputError, match="tags; a board of dots, a chessboard or a ChArUco board needed"):
+        corner_grid(TagLayout((("DICT_4X4_50", 1),), np.zeros((1, 4, 2))))
+
+
+def test_a_folder_without_the_board(photographs, tmp_path):
+    with pytest.raises(InputError, match="does not exist"):
+        calibrate_camera_by_corners(tmp_path / "none", ChessboardDesign(7, 10, 12.0))
+
+
+def test_a_measured_charuco_board(shared_data, tmp_path, stcal_sfm):
+    """Mako camera, whose makers of the set state fx 1352, fy 1356 px: another calibration, to some per cent."""
+    images = shared_data("charuco_handeye/test_set_charuco/images")
+    (tmp_path / "board.toml").write_text(
+        'type = "charuco"\nrows = 7\ncolumns = 5\nsquare_mm = 36.195\nmarker_mm = 18.256\ndictionary = "DICT_6X6_250"\n'
+    )
+    code, text, error = stcal_sfm(
+        "calibrate-camera", images, "--board", tmp_path / "board.toml", "--out", tmp_path / "cameras.txt"
+    )
+    assert code == 0, error
+    found = json.loads((tmp_path / "cameras.json").read_text())["parameters"]
+    assert found["fx"]["value"] == pytest.approx(1352, rel=0.02)
+    assert found["fy"]["value"] == pytest.approx(1356, rel=0.02)
+    assert "16 views of the board, 384 dots" in text
