@@ -7,7 +7,18 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from stcal.cli.options import MOST_SEED, JsonFile, QuaternionOrder, Quaternions, ReportFile, Workers
+from stcal.cli.options import (
+    MOST_SEED,
+    FirstTable,
+    JsonFile,
+    Key,
+    QuaternionOrder,
+    Quaternions,
+    ReportFile,
+    SecondTable,
+    Workers,
+    one_table,
+)
 from stcal.cli.terminal import StageProgress, print_each, say, write
 from stcal.errors import InputError
 
@@ -31,13 +42,13 @@ class SetupName(StrEnum):
 
 def handeye(
     source: Annotated[
-        Path,
+        Path | None,
         typer.Argument(
             metavar="POSES.csv|IMAGES",
             help="Read pose pairs from this file: base_from_flange_… and camera_from_board_… (CSV); or photographs of "
             "a board from this folder.",
         ),
-    ],
+    ] = None,
     poses: Annotated[
         Path | None,
         typer.Option("--poses", help="Read the robot's poses from this file: image, base_from_flange_… (CSV)."),
@@ -169,6 +180,9 @@ def handeye(
     de_seed: Annotated[
         int | None, typer.Option("--de-seed", min=0, max=MOST_SEED, help="Draw the population with this seed.")
     ] = None,
+    first: FirstTable = None,
+    second: SecondTable = None,
+    key: Key = "image",
     quaternions: Quaternions = QuaternionOrder.wxyz,
     workers: Workers = None,
     json_file: JsonFile = None,
@@ -183,15 +197,19 @@ def handeye(
 
     robot, seen = (_radians(sigma_robot_deg), sigma_robot_mm), (_radians(sigma_camera_deg), sigma_camera_mm)
     noise = Noise(*robot, *seen, sigma_px, sigma_board_mm)
-    _require_fitting(source, method, refine_camera, camera_out)
+    pairs = one_table(
+        source, first, second, key, "POSES.csv|IMAGES", ("base_from_flange_", "camera_from_board_"), quaternions.value
+    )
+    folder = isinstance(pairs, Path) and pairs.is_dir()
+    _require_fitting(not folder, method, refine_camera, camera_out)
     if (parent or child) and not (ros or urdf):
         raise InputError("--parent, --child: only with --ros or --urdf, whose frames they name")
     require_frame_names(parent, child)
-    if source.is_file() and (sigma_px is not None or sigma_board_mm is not None):
+    if not folder and (sigma_px is not None or sigma_board_mm is not None):
         raise InputError(
             "--sigma-px, --sigma-board-mm: only with images; give --sigma-camera-mm and --sigma-camera-deg"
         )
-    if source.is_dir() and sigma_camera_mm is not None:
+    if folder and sigma_camera_mm is not None:
         raise InputError("--sigma-camera-mm, --sigma-camera-deg: only with poses; with images give --sigma-px")
     evolution = _evolution(
         method,
@@ -205,7 +223,7 @@ def handeye(
         seed=de_seed,
     )
     with StageProgress() as progress:
-        given = read_input(source, poses, camera, board, workers, progress, quaternions.value)
+        given = read_input(pairs, poses, camera, board, workers, progress, quaternions.value)
         options = HandEyeOptions(
             noise, given.prior if refine_camera else None, with_scale, given.symmetries, four_dof, evolution
         )
@@ -234,14 +252,14 @@ def handeye(
         write(json_file, HandEyeFile.of(outcome, whole=True))
 
 
-def _require_fitting(source: Path, method: str | None, refine_camera: bool, camera_out: Path | None) -> None:
+def _require_fitting(of_poses: bool, method: str | None, refine_camera: bool, camera_out: Path | None) -> None:
     """Options of the camera and the method go together."""
     from stcal.handeye import METHODS
     from stcal.workflows.handeye import ALL
 
     if camera_out and not refine_camera:
         raise InputError("--camera-out: only with --refine-camera; the camera is as given else")
-    if refine_camera and source.is_file():
+    if refine_camera and of_poses:
         raise InputError("--refine-camera: only with images; poses tell nothing of the camera")
     if camera_out and method not in (None, ALL, "reprojection"):
         raise InputError(f"--camera-out: {method} does not adjust the camera; leave --method out")

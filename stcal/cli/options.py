@@ -14,6 +14,8 @@ from stcal.errors import InputError
 from stcal.io.saving import keep_apart
 
 if TYPE_CHECKING:
+    from stcal.io.quaternions import Order
+    from stcal.io.table import Table
     from stcal.sfm.detect.circles.ellipses import EllipseOptions
 
 Images = Annotated[Path, typer.Argument(help="Read the images of this folder: IMAGES/<group>/*.jpg, png, tif, bmp.")]
@@ -89,6 +91,43 @@ MinDiameter = Annotated[
 MaxDiameter = Annotated[
     float, typer.Option("--max-diameter", min=8, max=1e6, help="Ignore circles larger than this, px.")
 ]
+
+
+FirstTable = Annotated[
+    Path | None,
+    typer.Option("--a", help="Read rows from this file (CSV), in place of the one named first, and join those of --b."),
+]
+SecondTable = Annotated[
+    Path | None, typer.Option("--b", help="Read what belongs to the rows of --a from this file (CSV).")
+]
+Key = Annotated[str, typer.Option("--key", help="Match rows of --a and --b by this column.")]
+
+
+def one_table(
+    given: Path | None,
+    first: Path | None,
+    second: Path | None,
+    key: str,
+    what: str,
+    prefixes: tuple[str, str] = ("", ""),
+    quaternions: "Order" = "wxyz",
+) -> "Path | Table":
+    """The file that was named first; or --a and --b joined, with what was left out printed."""
+    if (given is None) == (first is None) or (first is None) != (second is None):
+        raise InputError(f"{what}: one file, or --a and --b with --key, needed")
+    if given is not None:
+        return given
+    from stcal.cli.terminal import print_each
+    from stcal.io.join import join
+
+    joined = join(str(first), str(second), key, prefixes, quaternions)
+    print_each("note", joined.notes)
+    return joined.table
+
+
+def name_of(source: "Path | Table") -> str:
+    """Of what :func:`one_table` returned, without its folder."""
+    return source.name if isinstance(source, Path) else source.where
 
 
 def handed_over(scheduler: str | None, send_images: bool) -> AbstractContextManager[None]:

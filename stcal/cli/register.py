@@ -7,7 +7,7 @@ from typing import Annotated
 
 import typer
 
-from stcal.cli.options import MOST_SEED, ReportFile
+from stcal.cli.options import MOST_SEED, FirstTable, Key, ReportFile, SecondTable, name_of, one_table
 from stcal.cli.terminal import print_each, say, write
 from stcal.errors import ConvergenceError, DegenerateError, InputError
 
@@ -30,11 +30,11 @@ class Method(StrEnum):
 
 def register(
     pairs_file: Annotated[
-        Path,
+        Path | None,
         typer.Argument(
             metavar="PAIRS", help="Read ax_mm,ay_mm,az_mm,bx_mm,by_mm,bz_mm of the same points from this file (CSV)."
         ),
-    ],
+    ] = None,
     model: Annotated[ModelName, typer.Option(help="Fit a transform of this kind.")] = ModelName.rigid,
     method: Annotated[
         Method, typer.Option(help="Fit it with this method; liu2017 is a published one, always affine.")
@@ -84,6 +84,9 @@ def register(
             "--identified", writable=True, help="Write the robot identified with --robot to this file (TOML)."
         ),
     ] = None,
+    first: FirstTable = None,
+    second: SecondTable = None,
+    key: Key = "name",
     out: Annotated[
         Path | None, typer.Option("--out", writable=True, help="Write everything to this file (JSON).")
     ] = None,
@@ -104,7 +107,10 @@ def register(
     if published and method != Method.liu2017:
         raise InputError("--sample, --share, --tries, --orthogonality: only with --method liu2017")
     liu2017 = replace(Liu2017Options(), **published) if method == Method.liu2017 else None
-    pairs = read_pairs(pairs_file)
+    source = one_table(pairs_file, first, second, key, "PAIRS", ("a", "b"))
+    pairs = read_pairs(source)
+    if not isinstance(source, Path) and any("cov_" in column for column in source.columns):
+        say("note: the covariances of --a and --b are not used; the noise of the points is estimated")
     allow_ambiguous |= robot_file is not None  # a bent arm may look like two motions; the kinematics tell
     options = {"model": model.value, "method": method.value, "threshold_mm": threshold, "seed": seed}
     options |= {"liu2017_options": liu2017} if liu2017 else {}
@@ -127,12 +133,12 @@ def register(
         from stcal.workflows.register_robot import compared, comparison_section, comparison_text, robot_part
 
         try:
-            beside = compared(pairs, pairs_file, robot_file, found, options, folds)
+            beside = compared(pairs, source, robot_file, found, options, folds)
             say("", comparison_text(beside), sep="\n")
             content = content.model_copy(update={"robot": robot_part(beside)})
             sections.append(comparison_section(beside))
             if identified:
-                comments = [f"Identified from {pairs_file.name}: {beside.identified.rank} parameters."]
+                comments = [f"Identified from {name_of(source)}: {beside.identified.rank} parameters."]
                 write(identified, robot_toml(beside.identified.robot, comments))
         except (DegenerateError, ConvergenceError) as error:  # the transform stands all the same
             failed = error

@@ -8,7 +8,19 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from stcal.cli.help import PLAIN, Commands
-from stcal.cli.options import MOST_SEED, JsonFile, QuaternionOrder, Quaternions, ReportFile, RobotFile
+from stcal.cli.options import (
+    MOST_SEED,
+    FirstTable,
+    JsonFile,
+    Key,
+    QuaternionOrder,
+    Quaternions,
+    ReportFile,
+    RobotFile,
+    SecondTable,
+    name_of,
+    one_table,
+)
 from stcal.cli.terminal import print_each, say, write
 from stcal.errors import DegenerateError, InputError
 
@@ -45,10 +57,11 @@ def init(
 
 @app.command()
 def axes(
-    sweeps: Annotated[
-        Path, typer.Argument(help="Read joint values and positions of reflectors in sweeps from this file (CSV).")
-    ],
     robot_file: RobotFile,
+    sweeps: Annotated[
+        Path | None,
+        typer.Argument(help="Read joint values and positions of reflectors in sweeps from this file (CSV)."),
+    ] = None,
     out: Annotated[
         Path | None,
         typer.Option("--out", writable=True, help="Write the robot that the axes make to this file (TOML)."),
@@ -64,6 +77,9 @@ def axes(
             "is worth one of position; auto, by their stated σ and not without, or off."
         ),
     ] = "auto",
+    first: FirstTable = None,
+    second: SecondTable = None,
+    key: Key = "image",
     json_file: JsonFile = None,
     report: ReportFile = None,
 ) -> None:
@@ -74,7 +90,8 @@ def axes(
     from stcal.robot.kinematics.measurements import read_measurements
 
     nominal = load_robot(robot_file)
-    data = read_measurements(sweeps, nominal)
+    source = one_table(sweeps, first, second, key, "SWEEPS")
+    data = read_measurements(source, nominal)
     length_mm = _length(orientations, data)
     result = robot_from_sweeps(data, nominal, math.radians(still_deg), length_mm)
     say(axes_text(result))
@@ -84,7 +101,7 @@ def axes(
         say("orientations: not used; state σ (cov_… columns), or give --orientations a length")
     print_each(f"warning: {data.where}", result.notes)
     if out:
-        write(out, robot_toml(result.robot, [f"Identified by the axis method from {sweeps.name}."]))
+        write(out, robot_toml(result.robot, [f"Identified by the axis method from {name_of(source)}."]))
     if json_file:
         write(json_file, axes_file(result))
     if report:
@@ -113,11 +130,11 @@ class Kind(StrEnum):
 
 @app.command()
 def identify(
-    data_file: Annotated[
-        Path,
-        typer.Argument(metavar="DATA", help="Read joint values with what was measured there from this file (CSV)."),
-    ],
     robot_file: RobotFile,
+    data_file: Annotated[
+        Path | None,
+        typer.Argument(metavar="DATA", help="Read joint values with what was measured there from this file (CSV)."),
+    ] = None,
     out: Annotated[
         Path | None, typer.Option("--out", writable=True, help="Write the identified robot to this file (TOML).")
     ] = None,
@@ -153,6 +170,9 @@ def identify(
         ),
     ] = False,
     quaternions: Quaternions = QuaternionOrder.wxyz,
+    first: FirstTable = None,
+    second: SecondTable = None,
+    key: Key = "image",
     json_file: JsonFile = None,
     report: ReportFile = None,
 ) -> None:
@@ -164,13 +184,17 @@ def identify(
     from stcal.robot.kinematics.measurements import read_measurements
 
     nominal = load_robot(robot_file)
-    data = read_measurements(data_file, nominal, quaternions.value)
+    source = one_table(data_file, first, second, key, "DATA", quaternions=quaternions.value)
+    data = read_measurements(source, nominal, quaternions.value)
     kind = observe.value if observe else None
     options = IdentifyOptions(kind, sigma_mm, sigma_rad, robust, folds, seed=seed, partial=partial)
     result = identified_from(nominal, data, options)
     say(identified_text(result, nominal))
     if out:
-        write(out, robot_toml(result.robot, [f"Identified from {data_file.name}: {result.rank} parameters."]))
+        write(
+            out,
+            robot_toml(result.robot, [f"Identified from {name_of(source)}: {result.rank} parameters."]),
+        )
     if json_file:
         write(json_file, identified_file(result, nominal))
     if report:

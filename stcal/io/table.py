@@ -198,8 +198,9 @@ class Table:
             raise InputError(f"{self.where}: column {column} is missing; the header is {self.header()}")
 
 
-def read_table(path: str | Path, what: str, quaternions: Order = "wxyz") -> Table:
-    """Read a CSV file with a header line; empty lines and lines that start with ``#`` are passed over.
+def read_table(path: "str | Path | Table", what: str, quaternions: Order = "wxyz") -> Table:
+    """Read a CSV file with a header line; empty lines and lines that start with ``#`` are passed over. A table is taken
+    as it is.
 
     ``quaternions`` : ``xyzw`` where their columns, in the order in which they stand, hold x, y, z, w whatever their
     names say.
@@ -209,6 +210,8 @@ def read_table(path: str | Path, what: str, quaternions: Order = "wxyz") -> Tabl
     InputError
         Unreadable, not UTF-8, no header or no rows, another separator, a name twice, or a row of another length.
     """
+    if isinstance(path, Table):
+        return path
     where = f"{what} {path}"
     try:
         text = read_bytes(path, TABLE_BYTES).decode("utf-8-sig")

@@ -17,6 +17,7 @@ from stcal.handeye.validate import LEAST_LEFT, compare, cross_validate, predict_
 from stcal.io.camera import CameraPrior, camera_prior, read_camera, refinable
 from stcal.io.images import ImageFile, find_images
 from stcal.io.quaternions import Order
+from stcal.io.table import Table
 from stcal.parallel import Progress
 from stcal.workflows.board_views import detect_boards
 
@@ -54,7 +55,7 @@ class Splits:
 
 
 def read_input(
-    source: Path,
+    source: Path | Table,
     poses: Path | None = None,
     camera: Path | None = None,
     board: Path | None = None,
@@ -72,6 +73,11 @@ def read_input(
         A file is missing or not as it should be, one too many was given, or no image shows the board.
     """
     images = {"--poses": poses, "--camera": camera, "--board": board}
+    extra = [name for name, path in images.items() if path is not None]
+    if isinstance(source, Table):
+        if extra:
+            raise InputError(f"{', '.join(extra)}: only with a folder of images; {source.where} are poses")
+        return HandEyeInput(source.where, read_poses(source, quaternions))
     if source.is_dir():
         missing = [name for name, path in images.items() if path is None]
         if poses is None or camera is None or board is None:
@@ -79,7 +85,6 @@ def read_input(
         return _from_images(source, read_robot_poses(poses, quaternions), poses, camera, board, workers, progress)
     if not source.exists():
         raise InputError(f"{source}: does not exist; a file of poses (CSV) or a folder of images needed")
-    extra = [name for name, path in images.items() if path is not None]
     if extra:
         raise InputError(f"{', '.join(extra)}: only with a folder of images; {source} is a file of poses")
     return HandEyeInput(source.name, read_poses(source, quaternions))

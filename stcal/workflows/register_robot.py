@@ -11,7 +11,7 @@ from scipy.stats import chi2
 from stcal.errors import InputError
 from stcal.geometry.align import align_rigid
 from stcal.held_out import dealt, held_out_errors
-from stcal.io.table import read_table
+from stcal.io.table import Table, read_table
 from stcal.register import register
 from stcal.register.core.pairs import WHAT, Pairs
 from stcal.register.core.result import ErrorFigures
@@ -68,7 +68,9 @@ class Comparison:
         return bool(len(transform) and kinematics.mean() < transform.mean())
 
 
-def compared(pairs: Pairs, file: Path, robot_file: Path, found: Findings, options: dict, folds: int) -> Comparison:
+def compared(
+    pairs: Pairs, file: Path | Table, robot_file: Path, found: Findings, options: dict, folds: int
+) -> Comparison:
     """Identify base and kinematics from the joint values of ``file``, and hold rows out of both ways.
 
     ``options`` : of :func:`stcal.register.pipeline`, as ``found`` was made with.
@@ -109,7 +111,7 @@ def compared(pairs: Pairs, file: Path, robot_file: Path, found: Findings, option
     return Comparison(robot, identified, found.registration.model, pairs.lines, done, rows, by_one, by_both, wild, off)
 
 
-def _measurements(pairs: Pairs, file: Path, robot: Robot) -> Measurements:
+def _measurements(pairs: Pairs, file: Path | Table, robot: Robot) -> Measurements:
     table = read_table(file, WHAT)
     try:
         q = joint_values(table, robot)

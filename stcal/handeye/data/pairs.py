@@ -116,7 +116,7 @@ class HandEyePoses:
             )
 
 
-def read_poses(path: str | Path, quaternions: Order = "wxyz") -> HandEyePoses:
+def read_poses(path: str | Path | Table, quaternions: Order = "wxyz") -> HandEyePoses:
     """Read a CSV file of pose pairs.
 
     Columns ``base_from_flange_x_mm`` … ``_qw`` … and ``camera_from_board_…`` (or ``flange_from_base_…``,

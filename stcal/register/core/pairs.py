@@ -62,7 +62,7 @@ class Pairs:
         return len(self.lines)
 
 
-def read_pairs(path: str | Path) -> Pairs:
+def read_pairs(path: str | Path | Table) -> Pairs:
     """Read ``ax_mm, ay_mm, az_mm, bx_mm, by_mm, bz_mm`` and what noise they have (form: ``data_layout.md``).
 
     Parameters

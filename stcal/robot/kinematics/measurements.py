@@ -128,7 +128,7 @@ class Measurements:
         return self.distances, self.from_row
 
 
-def read_measurements(path: str | Path, robot: Robot, quaternions: Order = "wxyz") -> Measurements:
+def read_measurements(path: str | Path | Table, robot: Robot, quaternions: Order = "wxyz") -> Measurements:
     """Read joint values with positions, poses or distances.
 
     Poses of which their ``status`` says that another one fits the image as well, and copies of a row, are left out with

@@ -1,0 +1,85 @@
+"""Tables of two commands as one: rows by their key, columns as the next command reads them."""
+
+import json
+
+import numpy as np
+import pytest
+from typer.testing import CliRunner
+
+from stcal.cli.main import app
+from stcal.errors import InputError
+from stcal.geometry.rigid import Rigid
+from stcal.io.join import join
+from stcal.register.core.pairs import read_pairs
+from stcal.synthetic.measured.handeye import simulated
+
+
+def written(path, text: str):
+    path.write_text(text, encoding="utf-8")
+    return path
+
+
+def test_rows_of_one_key_stand_side_by_side(tmp_path):
+    a = written(tmp_path / "poses.csv", "image,x_mm,y_mm,z_mm,status\np1,1,2,3,ok\np2,4,5,6,ok\np9,0,0,0,ok\n")
+    b = written(tmp_path / "tracker.csv", "image,x_m,y_m,z_m,cov_x_x,status\np2,0.4,0.5,0.6,1,?\np1,0.1,0.2,0.3,1,?\n")
+    found = join(a, b, "image", ("a", "b"))
+    pairs = read_pairs(found.table)
+    assert np.allclose(pairs.xyz_a, [[1, 2, 3], [4, 5, 6]])
+    assert np.allclose(pairs.xyz_b, [[100, 200, 300], [400, 500, 600]])
+    assert list(pairs.lines) == [2, 3]
+    assert found.table.text("status") == ["ok", "ok"]
+    assert "bcov_x_x" in found.table
+    assert found.notes == (f"1 rows of {a} have no partner: image p9",)
+
+
+@pytest.mark.parametrize(
+    ("second", "key", "said"),
+    [
+        ("image,x_mm,y_mm,z_mm\nq1,1,2,3\n", "image", "no image in common: p1 … in the one, q1 … in the other"),
+        ("name,x_mm,y_mm,z_mm\np1,1,2,3\n", "image", "no column image; the header is"),
+        ("image,x_mm,y_mm,z_mm\np1,1,2,3\np1,1,2,4\n", "image", "line 3: image p1 stands on line 2 too"),
+        ("image,x_mm,y_mm,z_mm\np1,1,2,3\n", "image", "both have x_mm"),
+    ],
+)
+def test_what_cannot_be_joined_says_why(tmp_path, second, key, said):
+    a = written(tmp_path / "a.csv", "image,x_mm,y_mm,z_mm\np1,1,2,3\n")
+    b = written(tmp_path / "b.csv", second)
+    with pytest.raises(InputError, match=said):
+        join(a, b, key)
+
+
+def test_registration_of_two_files(tmp_path):
+    rng = np.random.default_rng(3)
+    true = Rigid.exp([0.1, 0.2, -0.3, 100, 50, 20])
+    xyz = rng.uniform(-200, 200, (30, 3))
+    other = true @ xyz + rng.normal(0, 0.01, xyz.shape)
+    rows = ["name,x_mm,y_mm,z_mm", *(f"n{i},{x:.6f},{y:.6f},{z:.6f}" for i, (x, y, z) in enumerate(xyz))]
+    a = written(tmp_path / "a.csv", "\n".join(rows))
+    rows = ["name,x_mm,y_mm,z_mm", *(f"n{i},{x:.6f},{y:.6f},{z:.6f}" for i, (x, y, z) in enumerate(other))]
+    b = written(tmp_path / "b.csv", "\n".join([rows[0], *reversed(rows[1:])]))
+    out = tmp_path / "r.json"
+    done = CliRunner().invoke(app, ["register", "--a", str(a), "--b", str(b), "--out", str(out), "--folds", "0"])
+    assert done.exit_code == 0, done.output
+    found = np.array(json.loads(out.read_text())["b_from_a"])
+    assert np.abs(found - true.matrix()).max() < 0.05
+    alone = CliRunner().invoke(app, ["register", "--a", str(a)])
+    assert alone.exit_code != 0
+
+
+def test_hand_eye_of_robot_and_camera_files(tmp_path):
+    """The robot's poses and those of ``measure``, as each writes its own."""
+    pairs = simulated(np.random.default_rng(1), 12, "eye-in-hand").pairs
+
+    def rows(poses, order):
+        lines = ["image,x_mm,y_mm,z_mm,qw,qx,qy,qz"]
+        for i in order:
+            q = poses.quaternions()[i]
+            x, y, z = poses.translation[i]
+            lines.append(f"{i}.png,{x:.12g},{y:.12g},{z:.12g}," + ",".join(repr(float(v)) for v in q))
+        return "\n".join(lines)
+
+    a = written(tmp_path / "robot.csv", rows(pairs.base_from_flange, range(12)))
+    b = written(tmp_path / "poses.csv", rows(pairs.camera_from_board, reversed(range(12))))
+    done = CliRunner().invoke(app, ["handeye", "--a", str(a), "--b", str(b), "--splits", "0"])
+    assert done.exit_code == 0, done.output
+    assert "eye-in-hand, pose: 12 poses" in done.output
