@@ -35,6 +35,7 @@ MODULES = (
     "stcal.sfm.diagnose.file",
     "stcal.handeye.report.file",
     "stcal.register.report.file",
+    "stcal.locate.data.capture",
     "stcal.locate.report.files",
     "stcal.locate.report.located",
     "stcal.robot.axes.files",

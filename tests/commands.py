@@ -162,6 +162,7 @@ CALLS = (
         3.0,
     ),
     Call("locate schedule", "1 100 5"),
+    Call("locate capture", "+scenes --simulate @locate/scenes/a/1.png --shortest 0.5 --longest 2 --count 3"),
     Call(
         "locate calibrate",
         "@locate/images --camera @locate/cameras.txt --board @locate/board.toml --layout @locate/plan.toml "

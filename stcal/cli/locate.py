@@ -50,6 +50,57 @@ def schedule(
 
 
 @app.command()
+def capture(
+    out: Annotated[
+        Path, typer.Argument(metavar="SCENES", help="Write the scene's folder of images below this folder.")
+    ] = Path("scenes"),
+    scene: Annotated[str, typer.Option(help="Name the scene like this; its folder must not exist.")] = "scene-1",
+    device: Annotated[
+        str, typer.Option(help="Use this camera: a number, or a place such as /dev/video0 (V4L2, UVC).")
+    ] = "0",
+    shortest: Annotated[
+        float, typer.Option(min=1e-9, max=1e9, help="Start with this exposure, in the driver's unit; V4L2: 100 µs.")
+    ] = 10.0,
+    longest: Annotated[
+        float, typer.Option(min=1e-9, max=1e9, help="End with this exposure, in the driver's unit.")
+    ] = 1000.0,
+    count: Annotated[int, typer.Option(min=1, max=1000, help="Take so many, in a geometric series.")] = 5,
+    gain: Annotated[
+        float | None, typer.Option(min=0, max=1e6, help="Set this gain, in the driver's unit; as it is if not given.")
+    ] = None,
+    settle: Annotated[
+        float, typer.Option("--settle-s", min=0, max=60, help="Give the camera this time after each change, s.")
+    ] = 0.3,
+    simulate: Annotated[
+        Path | None,
+        typer.Option(help="Use a simulated camera that sees this image at exposure 1, in place of --device."),
+    ] = None,
+) -> None:
+    """Take an exposure series with a camera of this machine, for run: SCENES/<scene>/<exposure>.png."""
+    from stcal.locate.data.capture import OpenCVSource, Settings, SimulatedSource, capture, scene_folder
+    from stcal.locate.data.exposures import exposure_times
+
+    settings, folder = Settings(gain, settle), scene_folder(out, scene)
+    exposures = exposure_times(shortest, longest, count)
+    source = OpenCVSource(device, gain) if simulate is None else SimulatedSource(simulate, gain)
+    try:
+        say(f"{source.name}: {count} exposures")
+        capture(
+            source,
+            exposures.tolist(),
+            folder,
+            settings,
+            lambda row: say(
+                f"  {row.image}: exposure {row.exposure_set:g} set for {row.exposure:g}, "
+                f"{100 * row.saturated_share:.1f} % saturated, {100 * row.dark_share:.1f} % dark"
+            ),
+        )
+    finally:
+        source.close()
+    say(f"scene: {folder}")
+
+
+@app.command()
 def calibrate(
     images: Annotated[
         Path, typer.Argument(help="Read photographs of the target with a board in the same plane from this folder.")

@@ -31,8 +31,7 @@ def spoiled(stock, folder, numbers) -> list[Judged]:
 
 
 # One of each command, of each kind of file, and of each way to spoil one; those that take long are left to the others.
-FEW = (11, 29, 44, 52, 55, 78, 82, 88, 89, 90, 110, 112, 117, 119, 127, 133, 137, 139, 141, 148)
-FEW += (151, 156, 157, 158, 167, 176, 177, 183, 191, 193, 195, 203, 213, 215, 245, 247, 248, 274, 277, 285, 291)
+FEW = (0, 1, 2, 3, 4, 5, 7, 8, 10, 12, 14, 20, 28, 29, 31, 32, 39, 47, 49, 55, 58, 83, 90, 92, 96, 126, 139, 150, 204)
 
 
 def test_a_case_of_every_kind_is_judged(stock, tmp_path):
@@ -41,7 +40,8 @@ def test_a_case_of_every_kind_is_judged(stock, tmp_path):
         chosen(np.random.default_rng([SEED, n]), brief=True)[0].command for n in range(CASES)
     }
     files = {suffix for each in found for suffix in BY_SUFFIX if f"{suffix}: " in each.said}
-    assert files == {".bin", ".csv", ".db", ".json", ".toml", ".txt"}  # photographs, YAML and XML take long
+    # Photographs, YAML and XML take long; an image is all that a simulated camera is given.
+    assert files - {".png"} == {".bin", ".csv", ".db", ".json", ".toml", ".txt"}
 
 
 @pytest.mark.slow

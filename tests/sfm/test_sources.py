@@ -40,6 +40,7 @@ GIVEN = {
     "stcal register --robot": "@register/arm.csv --folds 0",
     "stcal handeye": _POSES,
     "stcal locate schedule": "1 100 5",
+    "stcal locate capture": "+scenes --simulate @locate/scenes/a/1.png --shortest 0.5 --longest 2",
     "stcal locate calibrate": "@locate/images --camera @locate/cameras.txt --board @locate/board.toml --layout "
     "@locate/plan.toml --out >calibrated.toml",
     "stcal locate run": _LOCATE,

@@ -67,6 +67,10 @@ class SceneTags:
         return [exposure for exposure in self.exposures if isinstance(exposure, Unreadable)]
 
 
+CAPTURED = "capture.json"
+"""What ``capture`` writes beside the images of a scene."""
+
+
 def exposure_times(shortest: float, longest: float, count: int) -> np.ndarray:
     """``count`` exposure times from ``shortest`` to ``longest`` in a geometric series, in their unit.
 
@@ -108,7 +112,8 @@ def find_scenes(path: str | Path) -> list[SceneFiles]:
     files, skipped = find_images(path)
     scenes = []
     for group in dict.fromkeys(file.group for file in files):
-        left_out = tuple(f"{s.name}: {s.reason}" for s in skipped if (Path(s.name).parent.name or TOP_GROUP) == group)
+        others = [s for s in skipped if (Path(s.name).parent.name or TOP_GROUP) == group]
+        left_out = tuple(f"{s.name}: {s.reason}" for s in others if Path(s.name).name != CAPTURED)
         name = real_place(path).name if group == TOP_GROUP else group
         scenes.append(SceneFiles(name, tuple(f for f in files if f.group == group), left_out))
     return scenes
