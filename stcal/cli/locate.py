@@ -155,7 +155,15 @@ def run(
     ] = None,
     robot_poses: Annotated[
         Path | None,
-        typer.Option("--robot-poses", help="Read base_from_flange of each scene from this file (CSV, column scene)."),
+        typer.Option("--robot-poses", help="Read base_from_flange of each scene from this file (CSV)."),
+    ] = None,
+    key: Annotated[str, typer.Option("--key", help="Match scenes and rows of --robot-poses by this column.")] = "scene",
+    registration: Annotated[
+        Path | None,
+        typer.Option(
+            "--registration",
+            help="Add poses in the robot's base by this result of `stcal register` (JSON): a the camera, b the base.",
+        ),
     ] = None,
     quaternions: Quaternions = QuaternionOrder.wxyz,
     offset: Annotated[
@@ -223,14 +231,22 @@ def run(
     from stcal.locate.pipeline import run as located
     from stcal.locate.pose.patent import PatentOptions
     from stcal.locate.pose.verdict import VerdictOptions
-    from stcal.locate.report.chain import read_chain
+    from stcal.locate.report.chain import read_chain, read_registered
     from stcal.locate.report.located import LocatedFile
     from stcal.locate.report.plausible import on_chain
     from stcal.locate.report.tables import accepted, poses_csv, run_text, uncertain
 
-    if hand_eye is None and (robot_poses or offset):
-        raise InputError("--robot-poses, --offset: only with --hand-eye, which leads from the camera to the robot")
-    chain = read_chain(hand_eye, robot_poses, offset, quaternions.value) if hand_eye else None
+    if hand_eye and registration:
+        raise InputError(f"--hand-eye {hand_eye}, --registration {registration}: two ways to one base; give one")
+    chain = None
+    if hand_eye is None and robot_poses:
+        raise InputError("--robot-poses: only with --hand-eye, of a camera on the flange")
+    if hand_eye is None and registration is None and offset:
+        raise InputError("--offset: only with --hand-eye or --registration, which lead from the camera to the robot")
+    if hand_eye:
+        chain = read_chain(hand_eye, robot_poses, offset, quaternions.value, key)
+    elif registration:
+        chain = read_registered(registration, offset)
     target, model = load_layout(layout), read_camera(camera)
     limits = VerdictOptions(
         min_tags,

@@ -1,7 +1,7 @@
 """Options that several commands share."""
 
 import inspect
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from contextlib import AbstractContextManager, nullcontext
 from enum import StrEnum
 from functools import wraps
@@ -113,16 +113,30 @@ def one_table(
     quaternions: "Order" = "wxyz",
 ) -> "Path | Table":
     """The file that was named first; or --a and --b joined, with what was left out printed."""
-    if (given is None) == (first is None) or (first is None) != (second is None):
+    tables = several_tables(given, first, [second] if second else [], key, what, prefixes, quaternions)
+    return tables if isinstance(tables, Path) else tables[0]
+
+
+def several_tables(
+    given: Path | None,
+    first: Path | None,
+    seconds: Sequence[Path],
+    key: str,
+    what: str,
+    prefixes: tuple[str, str] = ("", ""),
+    quaternions: "Order" = "wxyz",
+) -> "Path | list[Table]":
+    """The file that was named first; or --a joined with each --b, with what was left out printed."""
+    if (given is None) == (first is None) or (first is None) != (not seconds):
         raise InputError(f"{what}: one file, or --a and --b with --key, needed")
     if given is not None:
         return given
     from stcal.cli.terminal import print_each
     from stcal.io.join import join
 
-    joined = join(str(first), str(second), key, prefixes, quaternions)
-    print_each("note", joined.notes)
-    return joined.table
+    joined = [join(str(first), str(second), key, prefixes, quaternions) for second in seconds]
+    print_each("note", (note for each in joined for note in each.notes))
+    return [each.table for each in joined]
 
 
 def name_of(source: "Path | Table") -> str:

@@ -20,6 +20,7 @@ from stcal.cli.options import (
     SecondTable,
     name_of,
     one_table,
+    several_tables,
 )
 from stcal.cli.terminal import print_each, say, write
 from stcal.errors import DegenerateError, InputError
@@ -203,8 +204,10 @@ def identify(
 
 @app.command()
 def compensate(
-    targets: Annotated[Path, typer.Argument(help="Read commanded poses or joint values from this file (CSV).")],
     robot_file: Annotated[Path, typer.Option("--robot", help="Read the identified robot from this file (TOML).")],
+    targets: Annotated[
+        Path | None, typer.Argument(help="Read commanded poses or joint values from this file (CSV).")
+    ] = None,
     nominal: Annotated[
         Path | None, typer.Option("--nominal", help="Read the robot as its controller has it from this file (TOML).")
     ] = None,
@@ -215,6 +218,9 @@ def compensate(
         ),
     ] = None,
     quaternions: Quaternions = QuaternionOrder.wxyz,
+    first: FirstTable = None,
+    second: SecondTable = None,
+    key: Key = "pose",
     json_file: JsonFile = None,
     report: ReportFile = None,
 ) -> None:
@@ -224,7 +230,8 @@ def compensate(
     from stcal.robot.use.targets import read_targets
 
     identified = load_robot(robot_file)
-    wanted = read_targets(targets, identified, quaternions.value)
+    source = one_table(targets, first, second, key, "TARGETS", quaternions=quaternions.value)
+    wanted = read_targets(source, identified, quaternions.value)
     result = stage.compensate(identified, wanted, load_robot(nominal) if nominal else None)
     say(stage.compensated_text(result, identified))
     for line in stage.compensated_summary(result):
@@ -245,22 +252,35 @@ def compensate(
 @app.command()
 def verify(
     measured: Annotated[
-        Path,
+        Path | None,
         typer.Argument(help="Read commanded_x_mm … beside measured x_mm … from this file; set: before, after (CSV)."),
-    ],
+    ] = None,
     plot: Annotated[
         Path | None,
         typer.Option("--plot", writable=True, help="Draw the error of each pose and set to this file (.png or .svg)."),
     ] = None,
+    first: FirstTable = None,
+    seconds: Annotated[
+        list[Path] | None,
+        typer.Option(
+            "--b",
+            metavar="<path>",
+            help="Read what was measured from this file (CSV); several are sets, called like them.",
+        ),
+    ] = None,
+    key: Key = "pose",
     json_file: JsonFile = None,
     report: ReportFile = None,
 ) -> None:
     """Compare distances of measured positions from the first with the commanded ones, before and after."""
+    from stcal.io.join import stack
     from stcal.robot.use import verification as stage
 
     if plot and plot.suffix.lower() not in (".png", ".svg"):
         raise InputError(f"--plot {plot}: a name ending in .png or .svg needed")
-    result = stage.verify(stage.read_measured(measured))
+    tables = several_tables(measured, first, seconds or [], key, "MEASURED", ("commanded_", ""))
+    source = tables if isinstance(tables, Path) else stack(tables, [path.stem for path in seconds or ()], {"pose": key})
+    result = stage.verify(stage.read_measured(source))
     say(stage.verified_text(result))
     print_each("warning", result.warnings())
     if plot:

@@ -1,6 +1,7 @@
 """Two tables as one: rows of the same key side by side, columns renamed to what a command reads."""
 
 import re
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -78,6 +79,30 @@ def join(
             notes.append(f"{len(alone)} rows of {path} have no partner: {key} {', '.join(alone[:SHOWN])}{more}")
     where = f"{Path(a).name} with {Path(b).name}"
     return Joined(Table(where, columns, lines, tables[0].quaternions), tuple(notes))
+
+
+def stack(tables: Sequence[Table], names: Sequence[str], called: dict[str, str], column: str = "set") -> Table:
+    """Tables below each other, the columns that all of them have, those of ``called`` by a second name too; ``column``
+    holds each one's name.
+
+    Raises
+    ------
+    InputError
+        A name twice.
+    """
+    twice = next((name for name in names if names.count(name) > 1), None)
+    if twice is not None:
+        raise InputError(f"{tables[0].where}: two files are called {twice}; rename one, {column}s are called like them")
+    common = [name for name in tables[0].columns if name != column and all(name in each for each in tables)]
+    columns: dict[str, list[str] | np.ndarray] = {}
+    for name in common:
+        parts = [each.columns[name] for each in tables]
+        numeric = all(isinstance(part, np.ndarray) for part in parts)
+        columns[name] = np.concatenate(parts) if numeric else [v for each in tables for v in each.text(name)]
+    columns |= {second: columns[first] for second, first in called.items()}
+    columns[column] = [name for name, each in zip(names, tables, strict=True) for _ in range(len(each))]
+    lines = [line for each in tables for line in each.lines]
+    return Table(", ".join(each.where for each in tables), columns, lines, tables[0].quaternions)
 
 
 def _places(table: Table, key: str) -> dict[str, int]:

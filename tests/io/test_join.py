@@ -9,7 +9,7 @@ from typer.testing import CliRunner
 from stcal.cli.main import app
 from stcal.errors import InputError
 from stcal.geometry.rigid import Rigid
-from stcal.io.join import join
+from stcal.io.join import join, stack
 from stcal.register.core.pairs import read_pairs
 from stcal.synthetic.measured.handeye import simulated
 
@@ -83,3 +83,20 @@ def test_hand_eye_of_robot_and_camera_files(tmp_path):
     done = CliRunner().invoke(app, ["handeye", "--a", str(a), "--b", str(b), "--splits", "0"])
     assert done.exit_code == 0, done.output
     assert "eye-in-hand, pose: 12 poses" in done.output
+
+
+def test_files_of_one_kind_stand_below_each_other(tmp_path):
+    a = written(tmp_path / "wanted.csv", "image,x_mm,y_mm,z_mm\np1,1,2,3\np2,4,5,6\n")
+    files = [
+        written(tmp_path / "before.csv", "image,x_mm,y_mm,z_mm,only\np2,7,7,7,1\np1,8,8,8,1\n"),
+        written(tmp_path / "after.csv", "image,x_mm,y_mm,z_mm\np1,9,9,9\n"),
+    ]
+    joined = [join(a, file, "image", ("commanded_", "")).table for file in files]
+    found = stack(joined, ["before", "after"], {"pose": "image"})
+    assert found.text("set") == ["before", "before", "after"]
+    assert found.text("pose") == ["p1", "p2", "p1"]
+    assert "only" not in found
+    assert np.allclose(found.points(), [[8, 8, 8], [7, 7, 7], [9, 9, 9]])
+    assert np.allclose(found.points("commanded_"), [[1, 2, 3], [4, 5, 6], [1, 2, 3]])
+    with pytest.raises(InputError, match="two files are called after; rename one, sets are called like them"):
+        stack(joined, ["after", "after"], {})

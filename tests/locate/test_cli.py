@@ -106,6 +106,8 @@ def test_limits_are_options(stcal, files):
     ("arguments", "reason"),
     [
         (["--robot-poses", "x.csv"], "only with --hand-eye"),
+        (["--offset", "x.json"], "only with --hand-eye or --registration"),
+        (["--hand-eye", "x.json", "--registration", "y.json"], "two ways to one base"),
         (["--flip-odds", "2"], "odds between 0 and 1"),
         (["--s-dis", "3"], "S_dis 3"),
         (["--moved-px", "-1"], "moved_px -1"),

@@ -10,7 +10,7 @@ import numpy as np
 from stcal.errors import InputError
 from stcal.geometry.rigid import Rigid
 from stcal.geometry.uncertain import UncertainRigid
-from stcal.io.json import Part, Pose, PoseCovariance, read_result
+from stcal.io.json import Matrix, Matrix4, Part, Pose, PoseCovariance, read_result
 from stcal.io.quaternions import Order
 from stcal.io.table import read_table
 
@@ -27,21 +27,37 @@ class HandEyeRead(Part):
     covariance: PoseCovariance | None = None
 
 
+class RegistrationRead(Part):
+    """What of the file of ``stcal register`` is needed here: a is the camera's frame, b the robot's base."""
+
+    format: Literal["stcal registration 1"] = "stcal registration 1"
+    model: str
+    method: str
+    b_from_a: Matrix4
+    covariance: Matrix
+
+
 class OffsetFile(Part):
     """Where to go in the target's frame, exact."""
 
     obj_from_goal: Pose
 
 
+ROTATION_WITHIN = 1e-6
+"""Of RᵀR − 1: a rigid registration is written with all its digits."""
+
+
 @dataclass(frozen=True, slots=True, eq=False)
 class GoalChain:
     """``mount`` : flange_from_camera of a camera on the flange, base_from_camera of a fixed one; ``flange`` :
-    base_from_flange by scene, empty for a fixed camera; ``offset`` : obj_from_goal, exact."""
+    base_from_flange by scene, empty for a fixed camera; ``offset`` : obj_from_goal, exact; ``source`` : of ``mount``,
+    for messages."""
 
     mount: UncertainRigid
     moving: bool
     flange: dict[str, UncertainRigid]
     offset: Rigid
+    source: str = "hand-eye file"
 
     def base_from_goal(self, scene: str, camera_from_obj: UncertainRigid) -> UncertainRigid:
         """The target's pose (with the offset) in the robot's base; the errors of all links add up.
@@ -68,10 +84,12 @@ def read_chain(
     robot_poses: str | Path | None,
     offset: str | Path | None = None,
     quaternions: Order = "wxyz",
+    key: str = "scene",
 ) -> GoalChain:
     """Read the hand-eye file of ``stcal handeye``, the robot's poses by scene, and the offset.
 
     ``quaternions`` : of the robot's poses, ``xyzw`` where the columns hold x, y, z, w in the order in which they stand.
+    ``key`` : the column of the robot's poses that names the scenes.
 
     Raises
     ------
@@ -92,20 +110,47 @@ def read_chain(
         raise InputError(f"{where}: the camera is on the flange; robot poses of the scenes (--robot-poses) needed")
     if not moving and robot_poses is not None:
         raise InputError(f"{where}: the camera is fixed; it needs no robot poses, leave --robot-poses away")
-    shift = Rigid()
-    if offset is not None:
-        read = read_result(offset, OffsetFile, "offset file", "a 4×4 matrix under the key obj_from_goal needed")
-        shift = Rigid.from_matrix(read.obj_from_goal)
-    return GoalChain(mount, moving, read_robot_poses(robot_poses, quaternions) if robot_poses else {}, shift)
+    flange = read_robot_poses(robot_poses, quaternions, key) if robot_poses else {}
+    return GoalChain(mount, moving, flange, _offset(offset))
 
 
-def read_robot_poses(path: str | Path, quaternions: Order = "wxyz") -> dict[str, UncertainRigid]:
-    """base_from_flange of each scene, from columns ``scene`` and ``x_mm … qz``, or ``base_from_flange_x_mm …``."""
+def read_registered(registration: str | Path, offset: str | Path | None = None) -> GoalChain:
+    """Read the file of ``stcal register`` for points that a fixed camera (a) and the robot (b, its base) measured.
+
+    Raises
+    ------
+    InputError
+        A file that is not as ``data_layout.md`` has it, or a registration that is not rigid.
+    """
+    advice = "give the file of stcal register --out"
+    read = read_result(registration, RegistrationRead, "registration file", advice)
+    where = f"registration file {registration}"
+    linear = read.b_from_a[:3, :3]
+    off = float(np.abs(linear.T @ linear - np.eye(3)).max())
+    if read.covariance.shape != (6, 6) or off > ROTATION_WITHIN or np.linalg.det(linear) < 0:
+        kind = read.method if read.method == "liu2017" else read.model
+        raise InputError(
+            f"{where}: b_from_a is no rigid motion ({kind}: RᵀR is {off:.2g} from 1); base_from_camera needs one, "
+            "register with --model rigid"
+        )
+    mount = UncertainRigid(Rigid.from_matrix(read.b_from_a), read.covariance)
+    return GoalChain(mount, False, {}, _offset(offset), "registration file")
+
+
+def _offset(offset: str | Path | None) -> Rigid:
+    if offset is None:
+        return Rigid()
+    read = read_result(offset, OffsetFile, "offset file", "a 4×4 matrix under the key obj_from_goal needed")
+    return Rigid.from_matrix(read.obj_from_goal)
+
+
+def read_robot_poses(path: str | Path, quaternions: Order = "wxyz", key: str = "scene") -> dict[str, UncertainRigid]:
+    """base_from_flange of each scene, named in column ``key``, from ``x_mm … qz``, or ``base_from_flange_x_mm …``."""
     table = read_table(path, "robot poses", quaternions)
     prefix = ROBOT if any(column.startswith(ROBOT) for column in table.columns) else ""
     poses, covariances = table.poses(prefix), table.pose_covariances(prefix)
     found = {}
-    for row, (name, pose) in enumerate(zip(table.text("scene"), poses, strict=True)):
+    for row, (name, pose) in enumerate(zip(table.text(key), poses, strict=True)):
         if name in found:
             raise InputError(f"{table.where}: line {table.lines[row]}: scene {name} again; every scene once needed")
         found[name] = UncertainRigid(pose, np.zeros((6, 6)) if covariances is None else covariances[row])

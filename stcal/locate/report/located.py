@@ -94,7 +94,7 @@ class SceneRow(Part):
     p_value: float | None = Field(None, description="of as much by chance")
     outliers: list[int] = Field([], description="ids of tags that contradict the others")
     corners: list[CornerRow] = Field([], description="`corner` as `id:0` … `id:3`, `residual_px`, `weight`")
-    base_from_goal: Pose | None = Field(None, description="with `--hand-eye`")
+    base_from_goal: Pose | None = Field(None, description="with `--hand-eye` or `--registration`")
     base_covariance: Matrix6 | None = Field(None, description="its covariance")
 
 

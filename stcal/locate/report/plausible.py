@@ -57,7 +57,7 @@ def _camera_near(chain: GoalChain) -> Iterator[str]:
     frame, least = ("flange", NEAR_FLANGE_MM) if chain.moving else ("base", NEAR_BASE_MM)
     if 0 < away < least:
         yield (
-            f"hand-eye file: the camera is {away:.2g} mm from the origin of the {frame}, more than {least:g} mm "
+            f"{chain.source}: the camera is {away:.2g} mm from the origin of the {frame}, more than {least:g} mm "
             "expected: if its lengths are metres, multiply them by 1000"
         )
 

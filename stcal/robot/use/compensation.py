@@ -200,14 +200,20 @@ def compensated_csv(result: Compensated, robot: Robot) -> str:
     stream = io.StringIO()
     writer = csv.writer(stream, lineterminator="\n")
     columns = joint_columns(robot)
-    head = ["line", "target", *columns, "status", "error_mm", "error_deg"]
+    names = result.targets.names
+    head = [*names, "line", "target", *columns, "status", "error_mm", "error_deg"]
     if result.nominal:
         head += [*(f"nominal_{c}" for c in columns), "nominal_status", "nominal_error_mm", "nominal_error_deg"]
     writer.writerow(head)
     none = [""] * len(columns)
     for i, line in enumerate(result.targets.lines):
         found = result.found
-        row = [line, result.targets.tools[i], *(joint_cells(robot, found.q[i]) if found.usable[i] else none)]
+        row = [
+            *(own[i] for own in names.values()),
+            line,
+            result.targets.tools[i],
+            *(joint_cells(robot, found.q[i]) if found.usable[i] else none),
+        ]
         row += [found.status[i], f"{found.error_mm[i]:.6f}", f"{np.degrees(found.error_rad[i]):.6f}"]
         if result.nominal:
             usable = result.nominal.usable[i]

@@ -1,7 +1,7 @@
 """Commanded poses as a file has them, and what a robot makes of them, each row with its own tool."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
@@ -10,13 +10,15 @@ from stcal.errors import InputError
 from stcal.geometry.arrays import freeze
 from stcal.geometry.rigid import Poses
 from stcal.io.quaternions import Order
-from stcal.io.table import LENGTHS, read_table
+from stcal.io.table import LENGTHS, Table, read_table
 from stcal.robot.kinematics.forward import forward
 from stcal.robot.kinematics.inverse import Inverse, inverse
 from stcal.robot.kinematics.measurements import joint_values, targets_of, within
 from stcal.robot.kinematics.model import Robot
 
 WHAT = "targets"
+NAMES = ("pose", "image", "name", "scene")
+"""Columns that say which pose a row is of, where they are there: kept in what is computed of it."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -35,6 +37,8 @@ class Targets:
         base_from_tool, mm; None where joint values command.
     q : (m, n) array or None
         Commanded joint values, or those whose branch is wanted, rad or mm.
+    names : dict
+        Of the columns :data:`NAMES` that are there, (m,) each.
     """
 
     where: str
@@ -42,6 +46,7 @@ class Targets:
     tools: tuple[str, ...]
     poses: Poses | None
     q: np.ndarray | None
+    names: dict[str, tuple[str, ...]] = field(default_factory=dict)
 
     def __post_init__(self):
         if self.q is not None:
@@ -58,6 +63,7 @@ class Targets:
             tuple(self.tools[i] for i in rows),
             None if self.poses is None else self.poses[rows],
             None if self.q is None else self.q[rows],
+            {column: tuple(own[i] for i in rows) for column, own in self.names.items()},
         )
 
     def joints(self) -> np.ndarray:
@@ -67,12 +73,12 @@ class Targets:
         return self.q
 
 
-def read_targets(path: str | Path, robot: Robot, quaternions: Order = "wxyz") -> Targets:
+def read_targets(path: str | Path | Table, robot: Robot, quaternions: Order = "wxyz") -> Targets:
     """Read commanded poses, or joint values that command them.
 
     Parameters
     ----------
-    path : str or Path
+    path : str or Path or Table
         Table (CSV; form: ``data_layout.md``).
     robot : Robot
         Whose tools they are of; its joints, where joint values are given.
@@ -115,6 +121,7 @@ def read_targets(path: str | Path, robot: Robot, quaternions: Order = "wxyz") ->
         tools,
         poses,
         joint_values(table, robot) if has_joints else None,
+        {column: tuple(table.text(column)) for column in NAMES if column in table},
     )
 
 

@@ -113,12 +113,12 @@ class Verification:
         return found + [doubt for each in self.sets if (doubt := each.doubt())]
 
 
-def read_measured(path: str | Path) -> MeasuredPoses:
+def read_measured(path: str | Path | Table) -> MeasuredPoses:
     """Read commanded and measured positions.
 
     Parameters
     ----------
-    path : str or Path
+    path : str or Path or Table
         Table (CSV; form: ``data_layout.md``).
 
     Returns

@@ -9,7 +9,7 @@ from stcal.errors import InputError
 from stcal.geometry.rigid import Rigid
 from stcal.geometry.uncertain import UncertainRigid
 from stcal.io.table import COVARIANCE, POSE, pose_cells
-from stcal.locate.report.chain import read_chain
+from stcal.locate.report.chain import read_chain, read_registered
 
 MOUNT = Rigid.exp([0.1, 0.2, 0.3, 10, 20, 30])
 FLANGE = Rigid.exp([1.0, 0, 0.5, 400, 0, 600])
@@ -57,6 +57,44 @@ def test_a_fixed_camera_needs_no_robot_poses(files, tmp_path):
     assert np.allclose(goal.rigid.matrix(), (MOUNT @ SEEN.rigid).matrix())
     with pytest.raises(InputError, match="camera is fixed"):
         read_chain(fixed, files[1])
+
+
+def registered(path, b_from_a, model="rigid", covariance=None):
+    content = {"format": "stcal registration 1", "model": model, "method": "robust", "b_from_a": b_from_a.tolist()}
+    content["covariance"] = (np.eye(6) * 1e-6 if covariance is None else covariance).tolist()
+    path.write_text(json.dumps(content))
+    return path
+
+
+def test_a_registration_leads_to_the_base_too(files, tmp_path):
+    file = registered(tmp_path / "register.json", MOUNT.matrix())
+    goal = read_registered(file, files[2]).base_from_goal("any", SEEN)
+    mount = UncertainRigid(MOUNT, np.eye(6) * 1e-6)
+    wanted = mount @ SEEN @ UncertainRigid.exact(OFFSET)
+    assert np.allclose(goal.rigid.matrix(), wanted.rigid.matrix())
+    assert np.allclose(goal.covariance, wanted.covariance)
+
+
+@pytest.mark.parametrize(
+    ("matrix", "model", "size"),
+    [
+        (np.diag([1.001, 1.001, 1.001, 1]), "similarity", 7),
+        (np.diag([-1.0, 1, 1, 1]), "rigid", 6),
+        (np.diag([1.0, 1.0, 1.0, 1]), "affine", 12),
+    ],
+)
+def test_a_registration_that_is_no_rigid_motion_is_refused(tmp_path, matrix, model, size):
+    file = registered(tmp_path / "register.json", matrix, model, np.eye(size))
+    with pytest.raises(InputError, match=f"no rigid motion \\({model}: .*register with --model rigid"):
+        read_registered(file)
+
+
+def test_scenes_are_found_by_another_column(files):
+    hand_eye, poses, _ = files
+    poses.write_text(poses.read_text().replace("scene", "image"))
+    assert list(read_chain(hand_eye, poses, key="image").flange) == ["a"]
+    with pytest.raises(InputError, match="column scene is missing"):
+        read_chain(hand_eye, poses)
 
 
 def test_what_is_wrong_is_named(files, tmp_path):
