@@ -56,7 +56,7 @@ LIBRARIES = {
     "sqlite3": ("sfm/mapping", "sfm/interop"),
     "cv2": (
         *("io/images.py", "boards", "sfm/detect", "sfm/diagnose", "synthetic"),
-        *("locate/data/capture.py", "handeye/methods/closed_form.py", "sfm/mapping/pairs.py"),
+        *("io/device.py", "handeye/methods/closed_form.py", "sfm/mapping/pairs.py"),
     ),
 }
 """Library: folders or files that may use it. ``cv2`` where pixels are, and in two places for a method of its own."""

@@ -14,7 +14,7 @@ from stcal.errors import InputError
 from stcal.io.covariance import Rows, require_covariance
 from stcal.io.design import Count, load_board
 from stcal.io.files import SETTINGS_BYTES, read_bytes
-from stcal.io.mistakes import mistake
+from stcal.io.json import mistake
 from stcal.io.toml import Finite, Positive, Strict, load_toml
 
 REMEDY = 'a file with type = "chessboard", "charuco" or "tags" needed, or one of dots, see data_layout.md'

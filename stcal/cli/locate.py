@@ -77,7 +77,8 @@ def capture(
     ] = None,
 ) -> None:
     """Take an exposure series with a camera of this machine, for run: SCENES/<scene>/<exposure>.png."""
-    from stcal.locate.data.capture import OpenCVSource, Settings, SimulatedSource, capture, scene_folder
+    from stcal.io.device import OpenCVSource, SimulatedSource
+    from stcal.locate.data.capture import Settings, capture, scene_folder
     from stcal.locate.data.exposures import exposure_times
 
     settings, folder = Settings(gain, settle), scene_folder(out, scene)

@@ -9,7 +9,7 @@ from pydantic import AfterValidator, BaseModel, ConfigDict, Field, ValidationErr
 
 from stcal.errors import InputError
 from stcal.io.files import SETTINGS_BYTES, read_bytes
-from stcal.io.mistakes import first_mistake
+from stcal.io.json import first_mistake
 
 M = TypeVar("M", bound=BaseModel)
 

@@ -20,8 +20,8 @@ from stcal.io.json import (
     ResultFile,
     Vector,
     Vector3,
+    mistake,
 )
-from stcal.io.mistakes import mistake
 from stcal.sfm.adjust.chain import CalibratedTarget
 from stcal.sfm.adjust.faces import FrameKind
 from stcal.sfm.adjust.options import AdjustOptions, Solve

@@ -9,8 +9,9 @@ from typer.testing import CliRunner
 
 from stcal.cli.main import app
 from stcal.errors import InputError
-from stcal.locate.data import capture as module
-from stcal.locate.data.capture import OpenCVSource, Settings, SimulatedSource, capture, scene_folder
+from stcal.io import device as module
+from stcal.io.device import OpenCVSource, SimulatedSource
+from stcal.locate.data.capture import Settings, capture, scene_folder
 from stcal.locate.data.exposures import find_scenes
 
 
@@ -72,7 +73,7 @@ def test_what_was_really_set_is_written(driver, tmp_path):
 
 def test_a_camera_that_refuses_says_so_and_nothing_is_written(driver, tmp_path):
     for name, value, said in (
-        ("takes_exposure", False, "its driver takes no exposure 10; give --shortest and --longest in its unit"),
+        ("takes_exposure", False, "its driver takes no exposure 10; give exposures in its unit"),
         ("ends_after", 4, "gives no image any more"),
     ):
         before = getattr(driver, name)
@@ -97,7 +98,7 @@ def test_a_simulated_camera_is_as_bright_as_its_exposure(tmp_path):
         assert really == exposure
         assert image.mean() == pytest.approx(grey, abs=0.1)
     with pytest.raises(InputError, match="an image needed to simulate a camera"):
-        SimulatedSource(tmp_path / "none.png")
+        SimulatedSource(tmp_path / "none.png").expose(1.0, 0.0)
 
 
 def test_the_command_writes_a_scene_that_run_reads(tmp_path):

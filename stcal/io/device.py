@@ -1,0 +1,158 @@
+"""Cameras of this machine, over V4L2 or UVC through OpenCV, and simulated ones."""
+
+import re
+import time
+from itertools import repeat
+from pathlib import Path
+from typing import Protocol
+
+import cv2
+import numpy as np
+
+from stcal.errors import InputError
+from stcal.io.files import IMAGE_BYTES, read_bytes
+from stcal.io.images import decode, find_images, grey_8bit
+
+MANUAL_V4L2, MANUAL_OTHERS = 1.0, 0.25
+"""What OpenCV's AUTO_EXPOSURE means by manual: V4L2's menu, and the convention of the other back ends."""
+SATURATED = 250
+DARK = 5
+FULL_SCALE = 255
+SIMULATED_NOISE = 1.0
+"""σ of a pixel of the simulated camera, grey values."""
+READINGS = 3
+"""Frames that a driver may still have in its queue when it is told another exposure."""
+
+
+class Source(Protocol):
+    """What takes images."""
+
+    name: str
+
+    def expose(self, exposure: float | None, settle_s: float) -> tuple[np.ndarray, float]:
+        """A grey image (h, w) at an exposure, in the driver's unit, as it is where None; and what was really set."""
+        ...
+
+    def close(self) -> None:
+        """Give the camera back."""
+        ...
+
+
+class OpenCVSource:
+    """A camera of this machine.
+
+    Parameters
+    ----------
+    device
+        Number, or place such as ``/dev/video0``.
+    gain
+        In the driver's unit; as it is where None.
+    by_hand
+        Whether exposures are set by hand, or left to the camera.
+
+    Raises
+    ------
+    InputError
+        No such camera, or one that takes no gain.
+    """
+
+    def __init__(self, device: str, gain: float | None = None, by_hand: bool = True):
+        self.name = f"camera {device}"
+        place = int(device) if device.isdigit() else device
+        self._capture = cv2.VideoCapture(place)
+        if not self._capture.isOpened():
+            raise InputError(
+                f"{self.name}: cannot be opened; check that it is plugged in and free (`ls /dev/video*`), or "
+                "--simulate with an image"
+            )
+        back_end = self._capture.getBackendName()
+        manual = MANUAL_V4L2 if back_end == "V4L2" else MANUAL_OTHERS
+        if by_hand:
+            self._capture.set(cv2.CAP_PROP_AUTO_EXPOSURE, manual)
+        if gain is not None and not self._capture.set(cv2.CAP_PROP_GAIN, gain):
+            self.close()
+            raise InputError(f"{self.name}: its driver ({back_end}) takes no gain; leave --gain out")
+
+    def expose(self, exposure: float | None, settle_s: float) -> tuple[np.ndarray, float]:
+        """As of :class:`Source`; frames are passed over until the settle time is over."""
+        if exposure is not None and not self._capture.set(cv2.CAP_PROP_EXPOSURE, exposure):
+            raise InputError(
+                f"{self.name}: its driver takes no exposure {exposure:g}; give exposures in its unit (V4L2: 100 µs), "
+                "see `v4l2-ctl --list-ctrls`"
+            )
+        until, frame = time.monotonic() + settle_s, None
+        read = 0
+        while read < READINGS or time.monotonic() < until:
+            there, frame = self._capture.read()
+            read += 1
+            if not there or frame is None:
+                raise InputError(f"{self.name}: gives no image any more; check its cable and other programs")
+        if frame is None:
+            raise InputError(f"{self.name}: gives no image; check it")
+        grey = frame if frame.ndim == 2 else cv2.cvtColor(frame, cv2.COLOR_BGR2GRAY)
+        return grey, float(self._capture.get(cv2.CAP_PROP_EXPOSURE))
+
+    def close(self) -> None:
+        """Give the camera back."""
+        self._capture.release()
+
+
+class SimulatedSource:
+    """A camera that sees given images, which were taken at exposure 1: at others they are that many times as bright.
+
+    Parameters
+    ----------
+    images
+        An image, which it sees for ever; or a folder, whose images it sees one after another, by name.
+    gain
+        By which they are brighter; 1 where None.
+    seed
+        Of its noise.
+
+    Raises
+    ------
+    InputError
+        No image, or one that cannot be read.
+    """
+
+    def __init__(self, images: str | Path, gain: float | None = None, seed: int = 0):
+        place = Path(images)
+        self.name = f"simulated camera before {place.name}"
+        self._next = iter([file.path for file in find_images(place)[0]] if place.is_dir() else repeat(place))
+        self._gain = 1.0 if gain is None else gain
+        self._rng = np.random.default_rng(seed)
+
+    def expose(self, exposure: float | None, settle_s: float) -> tuple[np.ndarray, float]:
+        """As of :class:`Source`; there is nothing to settle."""
+        image = next(self._next, None)
+        if image is None:
+            raise InputError(f"{self.name}: has shown all of its images; give more, or a lower --count")
+        try:
+            content = read_bytes(image, IMAGE_BYTES)
+        except OSError as error:
+            raise InputError(f"{image}: {error.strerror or error}; an image needed to simulate a camera") from error
+        really = 1.0 if exposure is None else exposure
+        seen = really * self._gain * grey_8bit(decode(content, str(image))).astype(float)
+        seen += self._rng.normal(0, SIMULATED_NOISE, seen.shape)
+        return np.clip(np.round(seen), 0, FULL_SCALE).astype(np.uint8), really
+
+    def close(self) -> None:
+        """Nothing to give back."""
+
+
+def png(image: np.ndarray) -> bytes:
+    """A file of a grey image."""
+    return cv2.imencode(".png", image)[1].tobytes()
+
+
+def checked_name(name: str, what: str) -> str:
+    """The name of a folder.
+
+    Raises
+    ------
+    InputError
+        One that is none.
+    """
+    if not re.fullmatch(r"[\w][\w .-]{0,99}", name):
+        raise InputError(f"{what} {name!r}: letters, digits, spaces, '.', '-' and '_' needed, up to 100")
+    return name
