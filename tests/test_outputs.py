@@ -19,7 +19,7 @@ FOLDERS = {
     ("demo", "out"),
     ("watch", "out"),
 }
-FOLDERS |= {("export_model", "out"), ("capture", "out")}
+FOLDERS |= {("export_model", "out"), ("capture", "out"), ("capture", "images")}
 """New ones, which replace nothing, or those of `tests/sfm/run/test_transaction.py`."""
 WRITES = ("Write ", "Also write ", "Draw ", "Keep ")
 EVERY = list(COMMANDS.values())

@@ -1,8 +1,8 @@
-"""``stcal-sfm plan``, ``advise`` and ``watch``: what to photograph, before, after and meanwhile."""
+"""``stcal-sfm plan``, ``advise``, ``watch`` and ``capture``: what to photograph, before, after and meanwhile."""
 
 import sys
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
@@ -21,6 +21,9 @@ from stcal.cli.options import (
 )
 from stcal.cli.terminal import StageProgress, print_each, say, write
 from stcal.errors import InputError
+
+if TYPE_CHECKING:
+    from stcal.workflows.watch import Update
 
 app = typer.Typer()
 
@@ -146,9 +149,7 @@ def watch(
     """Calibrate while photographs are taken: after each, what was found, the worst σ so far and the view that would
     help most. RUN/report.html is kept up to date and reloads itself."""
     load_ahead(workers)
-    from stcal.sfm.plan.tables import next_text
     from stcal.sfm.run.options import RunOptions
-    from stcal.sfm.run.text import found_lines, so_far_text
     from stcal.workflows.watch import WatchOptions
     from stcal.workflows.watch import watch as updates
 
@@ -159,14 +160,91 @@ def watch(
     say(f"watching {images}; report: {out / 'report.html'}")
     sys.stdout.flush()
     for update in updates(images, camera, out, target, board, options):
-        print_each("gone", update.gone)
-        for line in found_lines(update.new):
-            say(line)
-        print_each("left out", (f"{each.name}: {each.reason}" for each in update.left_out))
-        if update.result is not None:
-            say(so_far_text(update.result))
-        if update.advice is not None:
-            say(f"next: {next_text(update.advice)}")
-        elif update.reason:
-            say(f"{'not yet' if update.result is None else 'no advice'}: {update.reason}")
-        sys.stdout.flush()
+        _say_update(update)
+
+
+def _say_update(update: "Update") -> None:
+    """What was found in what came, σ so far, and what would help most."""
+    from stcal.sfm.plan.tables import next_text
+    from stcal.sfm.run.text import found_lines, so_far_text
+
+    print_each("gone", update.gone)
+    for line in found_lines(update.new, update.blur_px):
+        say(line)
+    print_each("left out", (f"{each.name}: {each.reason}" for each in update.left_out))
+    if update.result is not None:
+        say(so_far_text(update.result))
+    if update.advice is not None:
+        say(f"next: {next_text(update.advice)}")
+    elif update.reason:
+        say(f"{'not yet' if update.result is None else 'no advice'}: {update.reason}")
+    sys.stdout.flush()
+
+
+@app.command()
+def capture(
+    images: Annotated[
+        Path, typer.Argument(help="Write photographs to this folder, IMAGES/<group>/IMG_0001.png; earlier ones stay.")
+    ],
+    camera: CameraFile,
+    out: Annotated[Path, typer.Option("--out", help="Write the run to this folder: new, empty, or of an earlier run.")],
+    group: Annotated[
+        str, typer.Option(help="Name the group like this; between its photographs only the camera may move.")
+    ],
+    target: TargetFile = None,
+    board: BoardFile = None,
+    device: Annotated[
+        str, typer.Option(help="Use this camera: a number, or a place such as /dev/video0 (V4L2, UVC).")
+    ] = "0",
+    exposure: Annotated[
+        float | None,
+        typer.Option(
+            min=1e-9, max=1e9, help="Set this exposure, in the driver's unit; left to the camera if not given."
+        ),
+    ] = None,
+    gain: Annotated[
+        float | None, typer.Option(min=0, max=1e6, help="Set this gain, in the driver's unit; as it is if not given.")
+    ] = None,
+    settle: Annotated[
+        float, typer.Option("--settle-s", min=0, max=60, help="Give the camera this time before each photograph, s.")
+    ] = 0.3,
+    count: Annotated[
+        int | None, typer.Option(min=1, max=100_000, help="End after so many; by Ctrl-C or Ctrl-D if not given.")
+    ] = None,
+    every: Annotated[
+        float | None,
+        typer.Option("--every", min=0, max=86_400, help="Take one each so many seconds; at each Enter if not given."),
+    ] = None,
+    simulate: Annotated[
+        Path | None,
+        typer.Option(
+            help="Use a simulated camera that sees this image, or those of this folder, in place of --device."
+        ),
+    ] = None,
+    views: Annotated[int, typer.Option(min=0, max=50, help="Compute so many views that would help; 0 for none.")] = 1,
+    refine_camera: Annotated[bool, typer.Option("--refine-camera", help="Adjust the intrinsics too.")] = False,
+    min_diameter: MinDiameter = None,
+    max_diameter: MaxDiameter = 450.0,
+    workers: Workers = None,
+) -> None:
+    """Take photographs with a camera of this machine and calibrate meanwhile: after each, what was found, blur,
+    saturation, the worst σ so far and the view that would help most."""
+    load_ahead(workers)
+    from stcal.io.device import OpenCVSource, SimulatedSource
+    from stcal.sfm.run.options import RunOptions
+    from stcal.workflows.capture import Trigger, photograph
+    from stcal.workflows.watch import Growing, WatchOptions
+
+    run_options = RunOptions(
+        refine_camera=refine_camera, ellipses=ellipse_options(min_diameter, max_diameter), workers=workers
+    )
+    growing = Growing.of(images, camera, out, target, board, WatchOptions(views=views, run=run_options))
+    source = SimulatedSource(simulate, gain) if simulate else OpenCVSource(device, gain, exposure is not None)
+    trigger = Trigger(count, every, sys.stdin, lambda text: (say(text), sys.stdout.flush()))
+    try:
+        say(f"{source.name}; report: {out / 'report.html'}")
+        for taken in photograph(source, growing, group, exposure, settle, trigger.ready):
+            say(f"taken {taken.name}: {taken.light()}")
+            _say_update(taken.update)
+    finally:
+        source.close()

@@ -59,7 +59,10 @@ class OpenCVSource:
     def __init__(self, device: str, gain: float | None = None, by_hand: bool = True):
         self.name = f"camera {device}"
         place = int(device) if device.isdigit() else device
+        before = cv2.utils.logging.getLogLevel()
+        cv2.utils.logging.setLogLevel(0)  # what OpenCV says of a camera that is not there is said below
         self._capture = cv2.VideoCapture(place)
+        cv2.utils.logging.setLogLevel(before)
         if not self._capture.isOpened():
             raise InputError(
                 f"{self.name}: cannot be opened; check that it is plugged in and free (`ls /dev/video*`), or "

@@ -1,9 +1,11 @@
 """A calibration that grows while photographs are taken: after each, what was found, σ so far, and what helps most."""
 
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Collection, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+
+import numpy as np
 
 from stcal.design import BoardDesign, TargetDesign
 from stcal.errors import InputError, StcalError
@@ -59,7 +61,8 @@ class Update:
     ``images`` : photographs that are there; ``new`` : what was found in those that came; ``left_out`` : those of them
     that cannot be used; ``gone`` : names of those that are no longer there; ``result`` : of the run over all of them,
     None where it is not possible yet, for the ``reason``; ``advice`` : what to photograph next, None where that was not
-    asked for, or cannot be told, for the ``reason``.
+    asked for, or cannot be told, for the ``reason``; ``blur_px`` : by name of those that came, the median σ of the blur
+    of edges.
     """
 
     images: int
@@ -69,6 +72,81 @@ class Update:
     result: RunResult | None
     reason: str
     advice: Advice | None
+    blur_px: dict[str, float]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Growing:
+    """A calibration over photographs that come: folders, and what is known beforehand.
+
+    ``camera`` : its file or model; ``out`` : the run's folder.
+    """
+
+    images: Path
+    camera: str | Path | CameraModel
+    out: Path
+    target: TargetDesign
+    board: BoardDesign
+    views: int
+    options: RunOptions
+
+    @classmethod
+    def of(
+        cls,
+        images: str | Path,
+        camera: str | Path | CameraModel,
+        out: str | Path,
+        target: str | Path | TargetDesign | None,
+        board: str | Path | BoardDesign | None,
+        options: WatchOptions,
+    ) -> "Growing":
+        """From what a user gives; files are read, so that what is wrong in them is said at once."""
+        designs = target_of(target), board_of(board)
+        settled = (options.run or RunOptions()).settled(designs[0])
+        read = camera if isinstance(camera, CameraModel) else read_camera(camera)
+        given = read if isinstance(camera, CameraModel) else camera
+        return cls(Path(images), given, Path(out), *designs, options.views, settled)
+
+    def update(
+        self, images: int, came: Collection[str], gone: Sequence[str], progress: Progress | None = None
+    ) -> Update:
+        """A run over all photographs that are there; detections of earlier ones are kept."""
+        result, reason, advice = None, "", None
+        try:
+            result = run(self.images, self.camera, self.out, self.target, self.board, self.options, progress, RELOAD_S)
+        except StcalError as error:
+            if not (self.out / CACHE).is_dir():  # the folder itself is refused
+                raise
+            reason = str(error)
+        if result is not None and self.views:
+            try:
+                advice = advise(known_of(load_run(self.out)), self.views, progress)
+            except StcalError as error:
+                reason = str(error)
+        new, left_out, blur_px = self._found(came, result)
+        return Update(images, new, left_out, tuple(gone), result, reason, advice, blur_px)
+
+    def _found(self, came: Collection[str], result: RunResult | None):
+        """What those that came show, by the run, or by what it has kept."""
+        if result is not None:
+            detection, labelled, skipped = result.detection, result.labelled, result.detection.skipped
+        else:
+            files: list[ImageFile] = []
+            model = self.camera if isinstance(self.camera, CameraModel) else read_camera(self.camera)
+            cache, ellipses, workers = self.out / CACHE, self.options.ellipses, self.options.workers
+            try:
+                files, other = find_images(self.images)
+                detection = detect_files(files, model, self.target, self.board, ellipses, cache, workers)
+                labelled = label_images(detection, self.target, self.board, ellipses, cache, workers)
+                skipped = (*other, *detection.skipped)
+            except StcalError:  # not one is usable: the reason that the run has given
+                return (), (), {}
+        blur = {each.file.name: each.detection.centres.blur_px for each in detection.images}
+        return (
+            tuple(each for each in labelled if each.observations.name in came),
+            tuple(each for each in skipped if each.name in came),
+            {name: float(np.median(own)) for name, own in blur.items() if name in came and len(own)},
+        )
 
 
 def watch(
@@ -110,10 +188,8 @@ def watch(
         There is no such folder, a file is not what it is given for, or the output folder is not a run's.
     """
     options = options or WatchOptions()
-    model = camera if isinstance(camera, CameraModel) else read_camera(camera)
-    designs = target_of(target), board_of(board)
-    settled = (options.run or RunOptions()).settled(designs[0])
-    images, out = Path(images), Path(out)
+    growing = Growing.of(images, camera, out, target, board, options)
+    images = Path(images)
     if not images.is_dir():
         raise InputError(f"image folder {images}: not there; give the folder that photographs come into")
     known: dict[str, tuple] = {}
@@ -130,20 +206,7 @@ def watch(
         gone = tuple(name for name in known if name not in now)
         came = {name for name, stamp in complete.items() if known.get(name) != stamp}
         known, quiet = complete, 0.0
-        result, reason, advice = None, "", None
-        try:
-            result = run(images, camera, out, target, board, settled, progress, RELOAD_S)
-        except StcalError as error:
-            if not (out / CACHE).is_dir():  # the folder itself is refused
-                raise
-            reason = str(error)
-        if result is not None and options.views:
-            try:
-                advice = advise(known_of(load_run(out)), options.views, progress)
-            except StcalError as error:
-                reason = str(error)
-        new, left_out = _found(images, model, out, *designs, settled, came, result)
-        yield Update(len(complete), new, left_out, gone, result, reason, advice)
+        yield growing.update(len(complete), came, gone, progress)
 
 
 def _stamps(images: Path) -> dict[str, tuple]:
@@ -160,22 +223,3 @@ def _stamps(images: Path) -> dict[str, tuple]:
             continue  # gone meanwhile
         found[file.name] = stat.st_size, stat.st_mtime_ns
     return found
-
-
-def _found(images, camera, out: Path, target, board, options: RunOptions, came: set[str], result: RunResult | None):
-    """What those that came show, by the run, or by what it has kept."""
-    if result is not None:
-        labelled, skipped = result.labelled, result.detection.skipped
-    else:
-        files: list[ImageFile] = []
-        try:
-            files, other = find_images(images)
-            detection = detect_files(files, camera, target, board, options.ellipses, out / CACHE, options.workers)
-            labelled = label_images(detection, target, board, options.ellipses, out / CACHE, options.workers)
-            skipped = (*other, *detection.skipped)
-        except StcalError:  # not one is usable: the reason that the run has given
-            return (), ()
-    return (
-        tuple(each for each in labelled if each.observations.name in came),
-        tuple(each for each in skipped if each.name in came),
-    )

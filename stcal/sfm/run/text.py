@@ -1,6 +1,6 @@
 """What a run and a detection found, in a few lines for the terminal."""
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -54,13 +54,14 @@ def detection_text(detection: DetectionResult, labelled: Sequence[LabelledImage]
     return "\n".join([*found_lines(labelled), *_skipped(detection.skipped)])
 
 
-def found_lines(labelled: Sequence[LabelledImage]) -> Iterator[str]:
-    """Faces and dots of each image, and what was left out in it."""
+def found_lines(labelled: Sequence[LabelledImage], blur_px: Mapping[str, float] | None = None) -> Iterator[str]:
+    """Faces and dots of each image, its blur where that is known, and what was left out in it."""
     for each in labelled:
         image = each.observations
         dots = sum(isinstance(label, DotLabel) for label in image.labels)
         faces = ", ".join(sorted(image.face_ids())) or "none"
-        yield f"{image.name}: faces {faces} ({len(image) - dots} circles), board {dots} dots"
+        blur = f", edges blurred by {blur_px[image.name]:.2f} px" if blur_px and image.name in blur_px else ""
+        yield f"{image.name}: faces {faces} ({len(image) - dots} circles), board {dots} dots{blur}"
         yield from (f"  {note}" for note in each.notes)
 
 
