@@ -66,7 +66,10 @@ def handeye(
     ] = SetupName.in_hand,
     method: Annotated[
         str | None,
-        typer.Option(help="Use this method, or compare all; reprojection for images and pose for poses if not given."),
+        typer.Option(
+            help="Use this method, or compare all. If not given, by poses and by corners, with camera and board as "
+            "filed and solved for: what predicts poses held out best."
+        ),
     ] = None,
     sigma_robot_mm: Annotated[
         float | None,
@@ -193,7 +196,7 @@ def handeye(
     from stcal.handeye.report.export import opencv_yaml, require_frame_names, ros_yaml, urdf_joint
     from stcal.handeye.report.file import HandEyeFile
     from stcal.handeye.report.page import outcome_page, outcome_text
-    from stcal.workflows.handeye import Splits, calibrate, read_input
+    from stcal.workflows.handeye import AUTO, Splits, calibrate, read_input
 
     robot, seen = (_radians(sigma_robot_deg), sigma_robot_mm), (_radians(sigma_camera_deg), sigma_camera_mm)
     noise = Noise(*robot, *seen, sigma_px, sigma_board_mm)
@@ -228,6 +231,8 @@ def handeye(
             noise, given.prior if refine_camera else None, with_scale, given.symmetries, four_dof, evolution
         )
         validation = Splits(splits, held_out, seed, workers, motions_held_out)
+        if method is None and not (refine_camera or with_scale or four_dof):
+            method = AUTO
         outcome = calibrate(given, setup.value, method, options, validation, progress)
     result = outcome.result
     say(outcome_text(outcome))

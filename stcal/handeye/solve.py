@@ -1,9 +1,12 @@
 """One call for every method."""
 
+from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from functools import cache, partial
+from typing import TypeVar
 
 import numpy as np
+from scipy.stats import chi2
 
 from stcal.errors import DegenerateError, InputError
 from stcal.geometry.normal_equations import generalised_inverse
@@ -21,12 +24,13 @@ from stcal.handeye.methods.closed_form import AX_XB, AX_ZB, closed_form
 from stcal.handeye.methods.convex import convex
 from stcal.handeye.methods.evolution import EvolutionOptions, Objective, evolve, polish
 from stcal.handeye.methods.noise import Noise
-from stcal.handeye.methods.pose_adjustment import LoopState, adjust_poses
-from stcal.handeye.methods.reprojection import adjust_views, resected
+from stcal.handeye.methods.pose_adjustment import LoopState, PoseSolution, adjust_poses
+from stcal.handeye.methods.reprojection import AdjustedViews, adjust_views, resected
 from stcal.handeye.result import HandEye
 from stcal.io.camera import CameraPrior
 from stcal.parallel import one_thread
 
+S = TypeVar("S", PoseSolution, AdjustedViews)
 OTHERS = ("zhao", "de", "de-polished", "pose", "reprojection")
 METHODS = (*AX_XB, *AX_ZB, *OTHERS)
 """Names of the methods."""
@@ -45,6 +49,11 @@ WIDENED = 2.0
 """Factor of the σ of a camera file, or of the poses by it, from which on the file is doubted."""
 CAMERA_GAIN = 5.0
 """Eight intrinsics that are right gain 8 ± 4 in cost, 1 ± 0.5 each; eight that gain 5 each are wrong."""
+ROBOT_BEYOND, BY_CHANCE = 2.0, 5e-4
+"""A robot's stated σ are doubted from so many times on, where chance makes as much so rarely."""
+REST_WORSE = 1.2
+"""Times by which corners fit worse if a robot that is called exact is."""
+ROBOT = ("robot_rad", "robot_mm")
 HELD_MM = 1e-6
 """σ by which X is held where it slides along the one axis of a robot of four axes."""
 
@@ -224,12 +233,14 @@ def _by_motions(loop: Loop, method: str, unit_mm: float, options: EvolutionOptio
 
 def _by_poses(task: _Task) -> HandEye:
     options = task.options
-    solution = adjust_poses(
-        task.loop, LoopState(*task.guess(task.loop, options.with_scale)), options.noise, options.with_scale
+    first = LoopState(*task.guess(task.loop, options.with_scale))
+    solution, contradicted = _by_true_robot(
+        task, lambda loop, noise: adjust_poses(loop, first, noise, options.with_scale)
     )
+    noise = options.noise if not contradicted else replace(options.noise, robot_rad=None, robot_mm=None)
     state, normal = solution.state, solution.normal
     x, z = state.mount_from_camera, state.stand_from_board
-    notes, covariance = task.notes, generalised_inverse(normal)
+    notes, covariance = task.notes + contradicted, generalised_inverse(normal)
     sigma_scale = float(np.sqrt(covariance[12, 12])) if options.with_scale else None
     if sigma_scale is not None:
         require_scale(state.scale, sigma_scale, task.loop, task.pairs.where)
@@ -238,9 +249,12 @@ def _by_poses(task: _Task) -> HandEye:
     notes += _remarks(task, solution.outliers, solution.residuals, solution.scale_hint)
     if (factor := solution.sigma.get("camera_factor", 1.0)) > WIDENED:
         notes += (f"the board's poses err {factor:.2g} times what their σ say: check the intrinsics",)
-    if not solution.sigma or options.noise.robot_rad is not None or options.noise.camera_rad is not None:
-        notes += remarks.of_variance(solution.variance_factor, solution.redundancy)
-    stated = {name: getattr(options.noise, name) for name in ("robot_rad", "robot_mm", "camera_rad", "camera_mm")}
+    if not solution.sigma or noise.robot_rad is not None or noise.camera_rad is not None:
+        beyond = remarks.of_variance(solution.variance_factor, solution.redundancy)
+        notes += beyond
+        if beyond and solution.variance_factor > 1:
+            covariance = covariance * solution.variance_factor
+    stated = {name: getattr(noise, name) for name in ("robot_rad", "robot_mm", "camera_rad", "camera_mm")}
     return HandEye(
         method="pose",
         setup=task.setup,
@@ -262,19 +276,17 @@ def _by_poses(task: _Task) -> HandEye:
 
 def _by_views(task: _Task, views: Views) -> HandEye:
     options, names = task.options, task.pairs.names
-    solution = adjust_views(
-        task.loop,
-        task.pairs.base_from_flange,
-        views,
-        task.guess(task.loop, options.with_scale),
-        options.noise,
-        options.intrinsics,
-        options.with_scale,
-    )
+    first = task.guess(task.loop, options.with_scale)
+
+    def solved(loop: Loop, noise: Noise) -> AdjustedViews:
+        flange = task.pairs.base_from_flange
+        return adjust_views(loop, flange, views, first, noise, options.intrinsics, options.with_scale)
+
+    solution, contradicted = _by_true_robot(task, solved)
     if solution.sigma_scale is not None:
         require_scale(solution.state.scale, solution.sigma_scale, task.loop, task.pairs.where)
     x, z = solution.state.mount_from_camera, solution.state.stand_from_board
-    notes, covariance = task.notes, solution.covariance
+    notes, covariance = task.notes + contradicted, solution.covariance
     if options.four_dof:
         x, z, covariance, notes = _without_slide(task, x, z, solution.normal)
     seen = replace(task.loop, camera_from_board=resected(names, views, solution))
@@ -306,6 +318,42 @@ def _by_views(task: _Task, views: Views) -> HandEye:
         observability=task.seen,
         notes=notes + remarks.of_rounds(solution.settled),
     )
+
+
+def _by_true_robot(task: _Task, solved: Callable[[Loop, Noise], S]) -> tuple[S, tuple[str, ...]]:
+    """Solved with the robot's σ as stated, or, where its poses contradict these, as estimated; and a note.
+
+    A robot that is held too tightly is not seen in its own residuals: the camera and the board are blamed instead.
+    """
+    noise, loop = task.options.noise, task.loop
+    given, own = solved(loop, noise), loop.robot_covariance
+    if own is not None:
+        rad, mm = np.sqrt(np.diagonal(own, axis1=1, axis2=2).reshape(-1, 2, 3).mean((0, 2))).tolist()
+    elif noise.robot_rad is not None and noise.robot_mm is not None:
+        rad, mm = noise.robot_rad, noise.robot_mm
+    else:
+        return given, ()
+    free = solved(replace(loop, robot_covariance=None), replace(noise, robot_rad=None, robot_mm=None))
+    found = tuple(free.sigma.get(name, 0.0) for name in ROBOT)
+    if not _contradicted((rad, mm), found, given.sigma, free.sigma, len(loop)):
+        return given, ()
+    return free, (
+        f"the robot's poses err by {np.degrees(found[0]):.2g}° and {found[1]:.2g} mm an axis, where "
+        f"{np.degrees(rad):.2g}° and {mm:.2g} mm are stated: its σ are estimated instead; check the robot's poses",
+    )
+
+
+def _contradicted(
+    stated: tuple[float, ...], found: tuple[float, ...], given: dict[str, float], free: dict[str, float], poses: int
+) -> bool:
+    """Whether the robot errs by more than is stated: its own σ are larger, or all else fits worse if it is exact."""
+    dof = max(3 * (poses - LEAST_WITH_SCALE), 3)
+    limit = max(ROBOT_BEYOND, float(np.sqrt(chi2.ppf(1 - BY_CHANCE, dof) / dof)))
+    if all(stated):
+        return any(own > limit * value for own, value in zip(found, stated, strict=True))
+    rest = [name for name in ("corner_px", "camera_factor") if given.get(name) and free.get(name)]
+    worse = max((given[name] / free[name] for name in rest), default=1.0)
+    return any(found) and worse > REST_WORSE
 
 
 def _remarks(task: _Task, outliers: np.ndarray, residuals: np.ndarray, hint: tuple[float, float]) -> tuple[str, ...]:

@@ -19,6 +19,10 @@ from stcal.handeye.solve import METHODS, HandEyeOptions, handeye
 from stcal.held_out import repeated_splits
 from stcal.parallel import one_thread, run_parallel
 
+SETUP_SPLITS = 6
+"""Splits that tell which setup is meant."""
+SETUP_BETTER = 4.0
+"""Times by which the product of both errors must be smaller in the other setup."""
 LEAST_LEFT = 3
 """Poses that must be left to solve with."""
 
@@ -182,15 +186,22 @@ def cross_validate(
     jobs = [(pairs, setup, method, views, options, out) for out in rows]
     found: list[dict[str, np.ndarray]] = [{}] * len(jobs)
     slow = views is not None and method in (None, "reprojection")
-    for done, (i, errors) in enumerate(run_parallel(_without, jobs, workers if slow else 1), 1):
+    for done, (i, errors) in enumerate(run_parallel(errors_without, jobs, workers if slow else 1), 1):
         found[i] = errors
         if progress:
             progress(done, len(jobs))
     return HeldOutPoses(rows, **{name: np.array([errors[name] for errors in found]) for name in found[0]})
 
 
-def _without(pairs: HandEyePoses, setup: Setup, method, views: Views | None, options: HandEyeOptions, out: np.ndarray):
-    """Errors on the poses ``out``, (k,), of the solution of the others."""
+def errors_without(
+    pairs: HandEyePoses,
+    setup: Setup,
+    method: str | None,
+    views: Views | None,
+    options: HandEyeOptions,
+    out: np.ndarray,
+) -> dict[str, np.ndarray]:
+    """Errors of :class:`HeldOutPoses` on the poses ``out``, (k,), of the solution of the others."""
     kept = np.setdiff1d(np.arange(len(pairs)), out)
     try:
         result = handeye(pairs[kept], setup, method, None if views is None else views[kept], options)
@@ -224,6 +235,38 @@ def predicted(result: HandEye, pairs: HandEyePoses, views: Views | None) -> dict
         "board_mm": np.array([_beside(view, camera, pose) for view, pose in zip(seen, by_robot, strict=True)]),
         "pose_mm": np.array([_apart(view, *two) for view, *two in zip(seen, by_robot, by_view, strict=True)]),
     }
+
+
+@one_thread()
+def better_setup(pairs: HandEyePoses, setup: Setup, options: HandEyeOptions, rows: np.ndarray) -> str:
+    """Whether poses held out are predicted far better in the other setup, by method ``pose``; empty where not.
+
+    Parameters
+    ----------
+    pairs, setup, options
+        As of :func:`~stcal.handeye.handeye`.
+    rows : (s, k) int array
+        Poses to hold out.
+
+    Returns
+    -------
+    str
+        A note, with both errors.
+    """
+    other: Setup = "eye-to-hand" if setup == "eye-in-hand" else "eye-in-hand"
+    plain = replace(options, intrinsics=None, symmetries=())
+    rows = rows[:SETUP_SPLITS]
+    try:
+        means = [cross_validate(pairs, each, "pose", None, plain, rows).means() for each in (setup, other)]
+    except StcalError:  # of the one, which was told before, or of the other, which is none then
+        return ""
+    (turn, shift), (other_turn, other_shift) = ((m["rotation_rad"], m["translation_mm"]) for m in means)
+    if not (turn * shift > SETUP_BETTER * other_turn * other_shift and turn > other_turn and shift > other_shift):
+        return ""
+    return (
+        f"poses held out are missed by {np.degrees(turn):.2g}° and {shift:.2g} mm as {setup}, by "
+        f"{np.degrees(other_turn):.2g}° and {other_shift:.2g} mm as {other}: give --setup {other} if it is that"
+    )
 
 
 def motion_errors(mount_from_camera: Rigid, motions: Motions) -> np.ndarray:

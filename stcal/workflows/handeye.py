@@ -10,10 +10,11 @@ from stcal.boards.file import load_flat_board
 from stcal.errors import DegenerateError, InputError, StcalError
 from stcal.geometry.rigid import Rigid
 from stcal.handeye import HandEyeOptions, HandEyePoses, View, Views, handeye, pairs_of_views, read_poses
+from stcal.handeye.choose import choose
 from stcal.handeye.data.loop import Setup
 from stcal.handeye.data.robot_poses import RobotPoses, read_robot_poses
 from stcal.handeye.report.file import Outcome
-from stcal.handeye.validate import LEAST_LEFT, compare, cross_validate, predict_motions, splits
+from stcal.handeye.validate import LEAST_LEFT, better_setup, compare, cross_validate, predict_motions, splits
 from stcal.io.camera import CameraPrior, camera_prior, read_camera, refinable
 from stcal.io.images import ImageFile, find_images
 from stcal.io.quaternions import Order
@@ -21,8 +22,8 @@ from stcal.io.table import Table
 from stcal.parallel import Progress
 from stcal.workflows.board_views import detect_boards
 
-ALL = "all"
-"""In place of a method's name: all of them, compared."""
+ALL, AUTO = "all", "auto"
+"""In place of a method's name: all of them, compared; the way of solving that predicts best."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -135,7 +136,8 @@ def calibrate(
     validation: Splits,
     progress: Progress = lambda *_: None,
 ) -> Outcome:
-    """The result, its errors on poses held out, and all methods compared where ``method`` is :data:`ALL`.
+    """The result, its errors on poses held out, and all methods compared where ``method`` is :data:`ALL`, or the way
+    of solving that predicts best where it is :data:`AUTO`.
 
     Raises
     ------
@@ -160,24 +162,39 @@ def _outcome(
     progress: Progress,
 ) -> Outcome:
     pairs, views = given.pairs, given.views
-    chosen = None if method == ALL else method
-    result = handeye(pairs, setup, chosen, views, options)
+    asked = None if method in (ALL, AUTO) else method
     compared, held_out, notes, rows = (), None, (), np.zeros((0, 0), int)
+    choice = None
     if validation.repeats and (validation.held_out or len(pairs) > LEAST_LEFT):
         rows = splits(len(pairs), validation.held_out, validation.repeats, validation.seed)
+    if method == AUTO and len(rows):
+        prior, done = given.prior if views is not None else None, partial(progress, "held out")
+        try:
+            choice = choose(pairs, setup, views, options, prior, rows, validation.workers, done)
+        except DegenerateError as error:
+            notes = (f"no errors on poses held out: {error}",)
+    if choice is not None:
+        options = choice.chosen.options(options, prior)
+        result, held_out, asked = choice.result, choice.held_out, choice.chosen.method
+    else:
+        result = handeye(pairs, setup, asked, views, options)
     if method == ALL:
         done = partial(progress, "methods")
         compared = compare(pairs, setup, views, options, rows=rows, workers=validation.workers, progress=done)
         held_out = next(each.held_out for each in compared if each.method == result.method)
-    elif len(rows):
+    elif len(rows) and choice is None and not notes:
         done = partial(progress, "held out")
         try:
-            held_out = cross_validate(pairs, setup, chosen, views, options, rows, validation.workers, done)
+            held_out = cross_validate(pairs, setup, asked, views, options, rows, validation.workers, done)
         except DegenerateError as error:
             notes = (f"no errors on poses held out: {error}",)
+    if len(rows) and (meant := better_setup(pairs, setup, options, rows)):
+        notes = (*notes, meant)
     motions = None
     if validation.motions is not None:
         motions = predict_motions(pairs, setup, result.method, views, options, validation.motions)
     model = options.intrinsics.colmap_model if options.intrinsics else ""
     own = views is not None and all(view.covariance is not None for view in views.views)
-    return Outcome(given.where, result, held_out, compared, given.pitch_mm, model, own, given.left_out, notes, motions)
+    return Outcome(
+        given.where, result, held_out, compared, given.pitch_mm, model, own, given.left_out, notes, motions, choice
+    )

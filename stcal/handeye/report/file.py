@@ -7,6 +7,7 @@ import numpy as np
 from pydantic import Field
 
 import stcal
+from stcal.handeye.choose import Choice, Tried
 from stcal.handeye.data.loop import FRAMES, Setup
 from stcal.handeye.judge.observability import Observability
 from stcal.handeye.result import HandEye
@@ -40,6 +41,8 @@ class Outcome:
         Besides those of the result.
     motions : HeldOutMotions, optional
         Errors of the last motions, held out.
+    choice : Choice, optional
+        What else was tried, where no method was named.
     """
 
     where: str
@@ -52,10 +55,11 @@ class Outcome:
     left_out: tuple[tuple[str, str], ...] = ()
     notes: tuple[str, ...] = ()
     motions: HeldOutMotions | None = None
+    choice: Choice | None = None
 
     def all_notes(self) -> tuple[str, ...]:
         """Of the result, then the others."""
-        return (*self.result.notes, *self.notes)
+        return (*self.result.notes, *(self.choice.notes if self.choice else ()), *self.notes)
 
     def outliers(self) -> tuple[str, ...]:
         """Names of the poses that contradict the others."""
@@ -137,6 +141,19 @@ class MethodRow(Part):
     splits: list[SplitErrors]
 
 
+class TriedRow(Part):
+    way: str
+    splits: int
+    error_mm: Finite
+    reason: str | None
+
+
+class ChoicePart(Part):
+    chosen: str
+    sentence: str
+    tried: list[TriedRow]
+
+
 class HandEyeFile(ResultFile):
     """Of ``handeye``: mm, rad, px; null where there is no value."""
 
@@ -189,6 +206,12 @@ class HandEyeFile(ResultFile):
         description="with `--motions-held-out`: number of `fitted` motions; means `rotation_rad`, `translation_mm` of "
         "X B X⁻¹ against A over the others, and of each of the `motions`, which lead from pose `first` to `second`",
     )
+    choice: ChoicePart | None = Field(
+        None,
+        description="where no method was named: the way of solving that was `chosen` by errors on poses held out, a "
+        "`sentence` on it, and all that were `tried`: `way` (method, with camera and scale solved for), `splits`, mean "
+        "`error_mm` (3-D at the board; of poses, of the board's origin), `reason` why it was given up or fails",
+    )
     observability: SeenTurns | None = Field(
         description="`turns_rad` RMS between poses about the principal `axes_flange`; `sigma_rad`, `sigma_mm` of the "
         "worst direction from poses of a common camera (1 mrad, 0.5 mm)"
@@ -212,7 +235,8 @@ class HandEyeFile(ResultFile):
         result, names, board = outcome.result, outcome.result.names, FRAMES[outcome.result.setup].board
         poses = {name: pose.matrix() for name, pose in result.transforms.items()}
         compared = [_method(each, names) for each in outcome.compared]
-        more = {} if outcome.motions is None else {"motions_held_out": _motions(outcome.motions)}
+        more: dict = {} if outcome.motions is None else {"motions_held_out": _motions(outcome.motions)}
+        more |= {} if outcome.choice is None else {"choice": _choice(outcome.choice)}
         more |= {"splits": _splits(outcome.held_out, names), "methods": compared} if whole else {}
         return cls.model_validate(
             {
@@ -285,6 +309,24 @@ def _motions(found: HeldOutMotions) -> HeldOutMotionRows:
             for (first, second), (turn, shift) in zip(found.names, errors, strict=True)
         ],
     )
+
+
+def _choice(found: Choice) -> ChoicePart:
+    tried = [
+        TriedRow(
+            way=each.candidate.name,
+            splits=len(each.error_mm),
+            error_mm=each.mean_mm() if each.error_mm.size else None,
+            reason=why_out(each) or None,
+        )
+        for each in found.tried
+    ]
+    return ChoicePart(chosen=found.chosen.name, sentence=found.sentence, tried=tried)
+
+
+def why_out(each: Tried) -> str:
+    """Why a way of solving was not followed to the end; empty where it was."""
+    return each.reason or (f"surely worse after {each.out} splits" if each.out else "")
 
 
 def _splits(found: HeldOutPoses | None, names: tuple[str, ...]) -> list[SplitErrors]:

@@ -7,7 +7,7 @@ from stcal.geometry.rigid import Rigid
 from stcal.handeye.data.loop import FRAMES
 from stcal.handeye.judge.observability import Observability
 from stcal.handeye.methods.reprojection import Reprojection
-from stcal.handeye.report.file import Outcome
+from stcal.handeye.report.file import Outcome, why_out
 from stcal.handeye.result import HandEye
 from stcal.handeye.solve import FACTORS
 from stcal.handeye.validate import Compared
@@ -55,6 +55,8 @@ def outcome_text(outcome: Outcome) -> str:
         lines.append(scale_text(outcome, result.sigma_scale))
     if result.observability is not None:
         lines.append(_turns_text(result.observability))
+    if outcome.choice is not None:
+        lines += ["", *text_table(_choice_cells(outcome)), "", outcome.choice.sentence]
     if outcome.compared:
         lines += ["", f"Methods, on the same {_splits_text(outcome)} held out; off: from {frames.camera} above"]
         lines += text_table(_compared_cells(outcome))
@@ -160,6 +162,18 @@ def _compared_cells(outcome: Outcome) -> list[list[str]]:
     return rows if any(row[-1] for row in rows[1:]) else [row[:-1] for row in rows]
 
 
+def _choice_cells(outcome: Outcome) -> list[list[str]]:
+    """Heads, and a row for each way of solving that was tried."""
+    found = outcome.choice
+    if found is None:
+        return []
+    rows = [["<solved by", "held out mm", "splits", "<"]]
+    for each in found.tried:
+        said = "taken" if each.candidate == found.chosen else why_out(each)
+        rows.append([each.candidate.name, number(each.mean_mm(), 3), str(len(each.error_mm)), said])
+    return rows
+
+
 def _off(each: Compared, result: HandEye) -> list[str]:
     if each.result is None:
         return [NONE, NONE]
@@ -189,6 +203,8 @@ def outcome_page(outcome: Outcome) -> str:
         adjusted=_adjusted(outcome),
         compared=compared,
         splits=_splits_text(outcome),
+        choice=_choice_cells(outcome),
+        sentence=outcome.choice.sentence if outcome.choice else "",
         predicted=_motion_cells(outcome),
         predicted_text=_motions_text(outcome),
         board_seen=ERRORS["board_mm"][0] in compared[0],

@@ -1,0 +1,112 @@
+"""What a user gets who names no method: chosen by errors on poses held out."""
+
+import re
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from stcal.geometry.camera import Camera
+from stcal.handeye import HandEyeOptions, Views, handeye, pairs_of_views, splits
+from stcal.handeye.choose import BY_VIEWS, Candidate, choose
+from stcal.io.camera import CalibratedCamera, camera_prior
+from stcal.synthetic.measured.handeye import CAMERA, simulated, simulated_views
+
+ROBOT = (5e-4, 0.2)
+"""σ of a common arm: rad, mm."""
+
+
+def filed(truth, camera):
+    """The same corners with another camera file: pairs and views."""
+    views = Views(camera, truth.views.views)
+    return pairs_of_views(truth.pairs.base_from_flange, views, truth.pairs.names), views
+
+
+def prior_of(camera):
+    return camera_prior(CalibratedCamera.of(camera, "OPENCV"))
+
+
+def chosen(truth, camera=CAMERA, count=10, seed=0):
+    pairs, views = filed(truth, camera)
+    return choose(pairs, truth.setup, views, HandEyeOptions(), prior_of(camera), splits(len(pairs), None, count, seed))
+
+
+def off_mm(found, truth):
+    return np.linalg.norm(found.mount_from_camera.translation - truth.mount_from_camera.translation)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("seed", range(3))
+def test_files_that_are_right_are_trusted(seed):
+    truth = simulated_views(np.random.default_rng(seed), 14, "eye-in-hand", ROBOT, 0.1)
+    found = chosen(truth)
+    assert found.chosen.method == "reprojection"
+    assert [each.candidate for each in found.tried] == list(BY_VIEWS)
+    assert "on poses held out" in found.sentence
+    # What is printed is what poses held out by none really show: the robot's error, 3-D, a little less across.
+    assert 0.5 * ROBOT[1] < found.held_out.board_mm.mean() < 4 * ROBOT[1]
+
+
+@pytest.mark.slow
+def test_a_camera_file_that_is_wrong_is_found_out():
+    camera = Camera(1280, 1024, [1478.0, 1478.0], [655.5, 500.5], np.zeros(8))  # 2 %, 16 px, and no distortion
+    truth = simulated_views(np.random.default_rng(5), 14, "eye-in-hand", ROBOT, 0.1)
+    found = chosen(truth, camera)
+    assert found.chosen.camera
+    plain = next(each for each in found.tried if each.candidate == Candidate("reprojection"))
+    assert plain.mean_mm() > 1.5 * found.held_out.board_mm.mean()
+    assert "the camera file costs" in found.sentence
+    pairs, views = filed(truth, camera)
+    assert off_mm(found.result, truth) < off_mm(handeye(pairs, truth.setup, views=views), truth) / 2
+
+
+@pytest.mark.slow
+def test_a_board_of_another_size_is_found_out():
+    truth = simulated_views(np.random.default_rng(6), 14, "eye-to-hand", ROBOT, 0.1, scale=1.01)
+    found = chosen(truth)
+    assert found.chosen.scale
+    assert found.result.scale == pytest.approx(1.01, abs=4 * found.result.sigma_scale)
+    assert "% larger than stated" in found.sentence
+
+
+@pytest.mark.parametrize(("scale", "name"), [(1.0, "pose"), (1.02, "pose + scale")])
+def test_poses_alone_are_chosen_among_too(scale, name):
+    truth = simulated(np.random.default_rng(7), 16, "eye-in-hand", ROBOT, (5e-4, 0.2))
+    eye = truth.pairs.camera_from_board
+    pairs = replace(truth.pairs, camera_from_board=replace(eye, translation=eye.translation / scale))
+    found = choose(pairs, truth.setup, None, HandEyeOptions(), None, splits(16, None, 8))
+    assert found.chosen.name == name
+    assert found.held_out.board_mm is None
+    assert found.held_out.rows.shape == (8, 4)
+
+
+def test_one_split_is_enough():
+    truth = simulated(np.random.default_rng(8), 6, "eye-in-hand", ROBOT)
+    found = choose(truth.pairs, truth.setup, None, HandEyeOptions(), None, splits(6, None, 1))
+    assert found.held_out.rows.shape == (1, 1)
+
+
+def test_answers_that_contradict_widen_sigma(monkeypatch):
+    """Two that predict alike, of which one is 5 mm off by σ that are a hundredth of that."""
+    truth = simulated(np.random.default_rng(9), 12, "eye-in-hand", ROBOT)
+    rows = splits(12, None, 6)
+    plain = choose(truth.pairs, truth.setup, None, HandEyeOptions(), None, rows)
+    assert plain.notes == ()
+
+    def moved(pairs, setup, method, views, options):
+        found = handeye(pairs, setup, method, views, options)
+        if options.with_scale:
+            x = found.mount_from_camera
+            found = replace(found, mount_from_camera=replace(x, translation=x.translation + np.array([5.0, 0, 0])))
+        return found
+
+    monkeypatch.setattr("stcal.handeye.choose.handeye", moved)
+    found = choose(truth.pairs, truth.setup, None, HandEyeOptions(), None, rows)
+    assert found.chosen.name == "pose"
+    (note,) = found.notes
+    assert "pose + scale predicts as well as pose" in note
+    assert re.search(r" 5(\.\d)? mm off", note)
+    factor = np.sqrt(found.result.covariance[3, 3] / plain.result.covariance[3, 3])
+    assert f"{factor:.2g} times what their σ allow" in note
+    # As far as the other is off, spread over six parameters: 5/√6 along this axis, less what the other's σ take.
+    assert 0.5 * 5 / np.sqrt(6) < np.sqrt(found.result.covariance[3, 3]) < 1.5 * 5 / np.sqrt(6)

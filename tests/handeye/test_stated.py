@@ -1,0 +1,63 @@
+"""σ that are stated of the robot, and the setup, are tested against the data by every method that uses them."""
+
+import numpy as np
+import pytest
+
+from stcal.handeye import HandEyeOptions, Noise, handeye, splits
+from stcal.handeye.validate import better_setup
+from stcal.synthetic.measured.handeye import simulated, simulated_views
+
+BAD = (8e-3, 3.0)
+"""σ of a robot in need of repair: rad, mm."""
+STATED = Noise(np.radians(0.02), 0.1)
+
+
+@pytest.mark.parametrize("noise", [STATED, Noise(0.0, 0.0)])
+@pytest.mark.parametrize("seed", [0, pytest.param(1, marks=pytest.mark.slow)])
+def test_a_bad_robot_is_called_so_by_its_corners(noise, seed):
+    truth = simulated_views(np.random.default_rng(seed), 14, "eye-in-hand", BAD, 0.1)
+    told = handeye(truth.pairs, views=truth.views, options=HandEyeOptions(noise=noise))
+    free = handeye(truth.pairs, views=truth.views)
+    assert any("its σ are estimated instead; check the robot's poses" in note for note in told.notes)
+    assert not any("board" in note for note in told.notes)
+    np.testing.assert_allclose(told.covariance, free.covariance)
+    assert told.sigma["robot_mm"] == pytest.approx(BAD[1], rel=0.5)
+    assert {"robot_rad", "robot_mm"} <= set(told.estimated)
+
+
+@pytest.mark.parametrize("camera", [(None, None), (1e-3, 0.3)])
+def test_a_bad_robot_is_called_so_by_its_poses(camera):
+    truth = simulated(np.random.default_rng(2), 16, "eye-in-hand", BAD, (1e-3, 0.3))
+    told = handeye(truth.pairs, options=HandEyeOptions(noise=Noise(STATED.robot_rad, STATED.robot_mm, *camera)))
+    assert any("its σ are estimated instead" in note for note in told.notes)
+    off = np.linalg.norm(told.mount_from_camera.translation - truth.mount_from_camera.translation)
+    assert off < 3 * np.sqrt(np.trace(told.covariance[3:, 3:]))
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("setup", ["eye-in-hand", "eye-to-hand"])
+def test_a_robot_as_stated_is_believed(setup):
+    """Of 20 sets one may be doubted by a chance of 1 in 100."""
+    doubted = 0
+    for seed in range(20):
+        truth = simulated_views(np.random.default_rng(seed), 12, setup, (5e-4, 0.2), 0.1)
+        found = handeye(truth.pairs, setup, views=truth.views, options=HandEyeOptions(noise=Noise(5e-4, 0.2)))
+        doubted += any("estimated instead" in note for note in found.notes)
+    assert doubted <= 1
+
+
+def test_errors_of_a_stated_pair_widen_sigma():
+    """Robot exact and camera five times as bad as stated: σ of the answer are five times as large."""
+    truth = simulated(np.random.default_rng(3), 20, camera=(1e-3, 0.3))
+    right = handeye(truth.pairs, options=HandEyeOptions(noise=Noise(0.0, 0.0, 1e-3, 0.3)))
+    told = handeye(truth.pairs, options=HandEyeOptions(noise=Noise(0.0, 0.0, 2e-4, 0.06)))
+    np.testing.assert_allclose(np.diag(told.covariance), np.diag(right.covariance), rtol=0.5)
+
+
+@pytest.mark.parametrize("setup", ["eye-in-hand", "eye-to-hand"])
+@pytest.mark.parametrize("seed", range(3))
+def test_the_other_setup_is_named_where_it_predicts_better(setup, seed):
+    truth = simulated(np.random.default_rng(seed), 5, setup, (5e-3, 2.0), (2e-3, 0.5))
+    other = {"eye-in-hand": "eye-to-hand", "eye-to-hand": "eye-in-hand"}[setup]
+    assert better_setup(truth.pairs, setup, HandEyeOptions(), splits(5)) == ""
+    assert f"give --setup {setup} if it is that" in better_setup(truth.pairs, other, HandEyeOptions(), splits(5))
