@@ -28,7 +28,7 @@ from stcal.register.core.search import LEAST_SHARE
 from stcal.register.core.validate import held_out
 from stcal.register.judge.degeneracy import check_extent, check_supports, row_name
 from stcal.register.judge.groups import two_groups
-from stcal.register.judge.mistakes import check_mirrored, check_units, mirrored_error
+from stcal.register.judge.mistakes import check_mirrored, check_units, mirrored_error, mirrored_ratio
 from stcal.register.judge.notes import Subject, notes_of
 
 METHODS = ("robust", "least-squares", "liu2017")
@@ -284,7 +284,8 @@ def _check_mirrored_with_outliers(problem: Problem, fitted: Fitted | None, thres
     if chance(image, mirrored) < 2 * usual + np.log(BY_CHANCE) and (
         fitted is None or mirrored.inliers.sum() > fitted.inliers.sum() or mirrored.sigma < fitted.sigma / 2
     ):
-        times = 1 if fitted is None else fitted.sigma / mirrored.sigma
+        agreeing = problem[mirrored.inliers]
+        times = float(np.sqrt(mirrored_ratio(agreeing.xyz_a, agreeing.xyz_b)[0]))
         linear = parts(mirrored.transform)[0]
         rotation = linear / np.cbrt(np.linalg.det(linear))
         raise mirrored_error(rotation * flip, mirrored.inliers.sum(), len(problem), times)

@@ -17,10 +17,13 @@ from stcal.register.core.problem import Problem
 from stcal.register.core.result import Alternative
 from stcal.register.core.robust import CLEAN_SETS_WITH_OUTLIER, LEVERAGE_UP_TO, Fitted
 from stcal.register.judge.degeneracy import WIDER_THAN, row_name, single_supports, spreads, symmetry, symmetry_note
+from stcal.register.judge.lengths import Wider, wider
 from stcal.register.judge.mistakes import SHOWN, UNIT_WITHIN, UNITS, outlier_notes
 
 LOW_REDUNDANCY = 6
 """Below so many degrees of freedom σ is uncertain by more than 30 %."""
+ONE_TOO_FEW = 4
+"""Points of which three of any fit: which one is wrong their residuals do not tell."""
 MAJORITY = 0.5
 """Of the point pairs; where fewer agree, a note says so."""
 NEIGHBOURS = 2000
@@ -68,7 +71,10 @@ class Subject:
 
 def notes_of(subject: Subject) -> list[str]:
     """The lines."""
-    notes = [*_agreement(subject), *_noise(subject), *_layout(subject)]
+    inside = subject.problem[subject.fitted.inliers]
+    other = wider(inside, subject.fitted.transform) if subject.method != "liu2017" else None
+    sigma = subject.fitted.sigma if other is None else other.sigma_mm
+    notes = [*_agreement(subject), *_noise(subject, other), *_layout(subject, sigma)]
     return notes + outlier_notes(subject.problem, subject.fitted, subject.name)
 
 
@@ -109,10 +115,14 @@ def _far_rows(subject: Subject) -> list[str]:
     ]
 
 
-def _noise(subject: Subject) -> list[str]:
+def _noise(subject: Subject, other: Wider | None) -> list[str]:
     fitted, notes = subject.fitted, []
-    inside = subject.problem[fitted.inliers]
-    if neighbours_alike(inside.xyz_a, inside.residuals(fitted.transform)):
+    inside, transform = subject.problem[fitted.inliers], fitted.transform
+    if other is not None:
+        notes.append(other.note)
+        inside, transform = other.problem, other.transform
+    residuals = inside.residuals(transform)
+    if np.abs(residuals).max() > inside.rounding_mm() and neighbours_alike(inside.xyz_a, residuals):
         notes.append(
             "the residuals are not noise: neighbours are off alike, so that the frames are bent against each other and "
             "a transform holds only where its points are; see the residual field"
@@ -122,6 +132,8 @@ def _noise(subject: Subject) -> list[str]:
             f"residuals exceed the σ given {subject.factor:.3g} times, which chance does not explain; the covariance "
             "is scaled by it"
         )
+    if len(inside) == ONE_TOO_FEW and subject.problem.noise.sigma_mm is None:
+        notes.append(f"of {ONE_TOO_FEW} points one that is wrong cannot be told from the others: measure two more")
     redundancy = subject.covariance.redundancy
     if redundancy < LOW_REDUNDANCY:
         notes.append(f"σ rests on {redundancy:.0f} degrees of freedom and is a rough guess; measure more points")
@@ -150,10 +162,11 @@ def neighbours_alike(xyz_a: np.ndarray, residuals: np.ndarray) -> bool:
     return bool(norm.sf(product.sum() / max(np.sqrt((product**2).sum()), 1e-300)) < BY_NEIGHBOURS)
 
 
-def _layout(subject: Subject) -> list[str]:
+def _layout(subject: Subject, sigma: float) -> list[str]:
+    """``sigma`` : of a coordinate, by a model that explains the points."""
     model, fitted, notes = subject.problem.model, subject.fitted, []
     rows = np.flatnonzero(fitted.inliers)
-    inside, sigma, transform = subject.problem.xyz_a[rows], fitted.sigma, fitted.transform
+    inside, transform = subject.problem.xyz_a[rows], fitted.transform
     if len(rows) <= LEVERAGE_UP_TO and subject.method != "liu2017":
         alone = single_supports(model, inside, sigma)
         kind = "plane" if model.name == "affine" else "line"

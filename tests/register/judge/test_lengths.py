@@ -1,0 +1,90 @@
+"""Frames of different scale, skewed and mirrored ones, and points too few: named for what they are."""
+
+import numpy as np
+import pytest
+
+from stcal.errors import DegenerateError, InputError
+from stcal.geometry.rigid import Rigid
+from stcal.register import register
+
+B_FROM_A = Rigid.exp([0.3, -0.2, 0.5, 100, 50, -30])
+SIGMA_MM = 0.05
+
+
+def points(count=80, seed=0):
+    rng = np.random.default_rng(seed)
+    a = rng.uniform(-300, 300, (count, 3))
+    return a, B_FROM_A @ a, rng.normal(0, SIGMA_MM, (count, 3))
+
+
+@pytest.mark.parametrize("scale", [1.5, 1.002, 0.99809, 1.0002])
+def test_another_scale_is_named_with_its_sigma(scale):
+    a, b, noise = points()
+    notes = register(a, scale * b + noise).notes
+    (note,) = notes  # neither bent nor in a plane
+    found, sigma = (float(note.split()[at]) for at in (4, 6))
+    # σ of a scale: of a coordinate over the root of the square sum of the coordinates about their mean.
+    assert sigma == pytest.approx(SIGMA_MM / np.sqrt(((a - a.mean(0)) ** 2).sum()), rel=0.3)
+    assert abs(found - scale) < 4 * sigma
+    assert "use --model similarity" in note
+    assert ("ppm, of temperature" in note) == (scale == 1.0002)
+    assert register(a, scale * b + noise, model="similarity").notes == ()
+
+
+@pytest.mark.slow
+def test_one_scale_is_rarely_called_two():
+    """One in 10 000 by each of two tests: of 300 sets, two have a chance of 1 in 600."""
+    said = 0
+    for seed in range(300):
+        a, b, noise = points(12, seed)
+        said += any("lengths in b" in note for note in register(a, b + noise).notes)
+    assert said <= 1
+
+
+def test_an_axis_that_is_scaled_is_told_from_a_scale():
+    a, b, noise = points()
+    (note,) = register(a, (b - b.mean(0)) * [1.0, 1.0, 1.01] + noise).notes
+    assert "lengths in b are 1.01" in note
+    assert "along three axes" in note
+
+
+def test_a_bend_is_still_said_beside_a_scale():
+    a, b, noise = points(300)
+    bent = 2.0 * np.sin(a[:, [1, 2, 0]] / 60.0)
+    notes = register(a, 1.01 * b + bent + noise).notes
+    assert any("lengths in b" in note for note in notes)
+    assert any("the frames are bent" in note for note in notes)
+
+
+@pytest.mark.parametrize("wrong", [0, 20])
+def test_how_much_better_a_mirrored_frame_fits_is_true(wrong):
+    a, b, noise = points()
+    b = b * [1, -1, 1] + noise
+    b[:wrong] += 500
+    with pytest.raises(InputError, match="left-handed: mirrored") as caught:
+        register(a, b)
+    times = float(str(caught.value).split(" fit ")[1].split()[0])
+    assert times > 100  # noise of 0.05 mm against half a metre of thickness
+
+
+def test_equal_frames_are_not_bent():
+    a, b, _ = points()
+    assert register(a, a).notes == ()
+    assert register(a, b).notes == ()
+
+
+@pytest.mark.parametrize("seed", range(6))
+def test_one_wrong_among_four_is_refused_or_said_to_be_beyond_telling(seed):
+    a, b, noise = points(4, seed)
+    b[2] += [3, 4, 0]
+    try:
+        notes = register(a, b + noise).notes
+    except DegenerateError as error:
+        assert "needed to tell which are wrong" in str(error)  # noqa: PT017
+    else:
+        assert any("cannot be told from the others: measure two more" in note for note in notes)
+
+
+def test_six_points_tell():
+    a, b, noise = points(6)
+    assert not any("cannot be told" in note for note in register(a, b + noise).notes)
