@@ -5,7 +5,8 @@
 Poses are simulated, and corners of a chessboard of 8×7 squares of 25 mm from about 450 mm; nothing is real. "Bound":
 RMS over trials and the six numbers of X of the error in units of the inverse information at the truth, with the σ that
 were put in (Cramér–Rao); 1 is the least that an unbiased method can have. "Calibration": the same in units of the
-covariance that the result states; 1 is true, more is too sure of itself. Prints Markdown.
+covariance that the result states; 1 is true, more is too sure of itself. A second table is of a camera file that is
+off: by the σ that is stated of it, and by four times as much. Prints Markdown.
 """
 
 import argparse
@@ -19,11 +20,13 @@ from scipy.stats import chi2
 from stcal.geometry.rigid import Poses
 from stcal.handeye import HandEyeOptions, Noise, handeye
 from stcal.handeye.data.loop import SETUPS, Loop
+from stcal.handeye.data.views import Views, pairs_of_views
 from stcal.handeye.methods.bundle import Bundle
 from stcal.handeye.methods.noise import components
 from stcal.handeye.methods.reprojection import problem
+from stcal.io.camera import CalibratedCamera, camera_prior, intrinsic_basis
 from stcal.parallel import one_thread
-from stcal.synthetic.measured.handeye import Truth, simulated, simulated_views
+from stcal.synthetic.measured.handeye import CAMERA, Truth, simulated, simulated_views
 from stcal.workflows.cluster import executor_of
 
 CORNERS = {"corner_px": 0.1, "board_mm": 0.03}
@@ -32,6 +35,16 @@ NOISES = {
     "camera ≈ robot": Noise(5e-4, 0.2, 5e-4, 0.2, **CORNERS),
     "robot ≫ camera": Noise(1e-3, 0.3, 1e-4, 0.03, **CORNERS),
 }
+PRIOR = camera_prior(CalibratedCamera.of(CAMERA, "OPENCV"))
+"""What is stated of the camera."""
+CAMERAS = {
+    "pose, camera as filed": ("pose", HandEyeOptions(camera=PRIOR)),
+    "reprojection, camera as filed": ("reprojection", HandEyeOptions(camera=PRIOR)),
+    "reprojection, camera solved for": ("reprojection", HandEyeOptions(intrinsics=PRIOR)),
+}
+OFF = (1.0, 4.0)
+"""By how many σ of the camera file its intrinsics are off."""
+POSES_OFF = 12
 EXACT = Noise(0, 0, 1e-12, 1e-12, 1e-9, 0)
 COUNTS = {
     "pose, σ stated": (4, 8, 20),
@@ -76,6 +89,31 @@ def trial(case: Case, seed: int) -> tuple[float, float, int]:
     )
 
 
+def camera_trial(method: str, setup: str, name: str, off: float, seed: int) -> tuple[float, float]:
+    """Squared error of X by a camera file that is off: in units of the stated covariance, and of its translation, mm²;
+    σ are estimated."""
+    noise, rng = NOISES[name], np.random.default_rng([seed, 1])
+    truth = simulated_views(rng, POSES_OFF, setup, (noise.robot_rad, noise.robot_mm), noise.corner_px, noise.board_mm)
+    error = off * rng.multivariate_normal(np.zeros(len(PRIOR.covariance)), PRIOR.covariance)
+    camera = CAMERA.with_parameters(CAMERA.parameters() + intrinsic_basis(PRIOR.colmap_model) @ error)
+    views = Views(camera, truth.views.views)
+    solved_by, options = CAMERAS[method]
+    found = handeye(pairs_of_views(truth.pairs.base_from_flange, views), setup, solved_by, views, options)
+    apart = Poses.of([found.mount_from_camera]).difference(Poses.of([truth.mount_from_camera]))[0]
+    return float(apart @ np.linalg.solve(found.covariance, apart)), float(apart[3:] @ apart[3:])
+
+
+def print_cameras(pool, trials: int, only: str) -> None:
+    """The table of camera files that are off."""
+    print(f"\n{POSES_OFF} poses, σ estimated:\n")
+    print("| method | setup | noise | camera off | calibration | RMS error, mm |\n|---|---|---|---|---|---|")
+    for case in product([name for name in CAMERAS if name.startswith(only)], SETUPS, NOISES, OFF):
+        found = np.array(list(pool.map(partial(camera_trial, *case), range(trials), chunksize=10)))
+        ratio, rms = np.sqrt(found.mean(0) / [6, 1])
+        method, setup, noise, off = case
+        print(f"| {method} | {setup} | {noise} | {off:g} σ | {ratio:.3f} | {rms:.3g} |", flush=True)
+
+
 def pose_bound(exact: Truth, noise: Noise) -> np.ndarray:
     """Inverse information (6, 6) on X of poses, Z unknown."""
     loop = Loop.of(exact.pairs, exact.setup)
@@ -98,6 +136,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--trials", type=int, default=500)
     parser.add_argument("--only", default="", metavar="TEXT", help="cases of methods that begin so")
+    parser.add_argument("--cameras", action="store_true", help="only the table of camera files that are off")
     parser.add_argument("--scheduler", metavar="ADDRESS", help="hand the trials to this Dask cluster")
     arguments = parser.parse_args()
     trials = arguments.trials
@@ -107,6 +146,9 @@ def main() -> None:
         "| method | setup | noise | poses | bound | calibration | good poses left out |\n|---|---|---|---|---|---|---|"
     )
     with executor_of(arguments.scheduler) as pool:
+        if arguments.cameras:
+            print_cameras(pool, trials, arguments.only)
+            return
         methods = [method for method in COUNTS if method.startswith(arguments.only)]
         cases = (Case(*v, count) for v in product(methods, SETUPS, NOISES) for count in COUNTS[v[0]])
         ratios: dict[tuple[str, int], list[np.ndarray]] = {}
@@ -116,6 +158,7 @@ def main() -> None:
             ratios.setdefault((case.method, case.count), []).append(both)
             row = f"{case.method} | {case.setup} | {case.noise} | {case.count} | {both[0]:.3f} | {both[1]:.3f}"
             print(f"| {row} | {int(found[:, 2].sum())} of {trials * case.count} |", flush=True)
+        print_cameras(pool, trials, arguments.only)
     print("\nover setups and noises:\n\n| method | poses | bound | calibration |\n|---|---|---|---|")
     for (method, count), values in ratios.items():
         spans = " | ".join(

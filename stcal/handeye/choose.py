@@ -14,7 +14,7 @@ from stcal.handeye.data.views import Views
 from stcal.handeye.judge.symmetry import repair
 from stcal.handeye.result import HandEye
 from stcal.handeye.solve import HandEyeOptions, handeye
-from stcal.handeye.validate import HeldOutPoses, errors_without
+from stcal.handeye.validate import HeldOutPoses, errors_without, widened_by_scatter
 from stcal.io.camera import CameraPrior
 from stcal.parallel import one_thread, run_parallel
 
@@ -258,7 +258,7 @@ def choose(
             results[each] = handeye(pairs, setup, each.method, views, each.options(options, prior))
     tried = tuple(Tried(each, race.of(each), race.failed.get(each, ""), race.out.get(each, 0)) for each in candidates)
     rivals = {each: results[each] for each in race.running if each != chosen and _as_good(race, each, chosen)}
-    result, notes = _widened(results[chosen], chosen, rivals)
+    result, notes = _widened(widened_by_scatter(results[chosen], held_out), chosen, rivals)
     return Choice(tried, chosen, result, held_out, _sentence(tried, chosen, result, race.measure), notes)
 
 
@@ -287,11 +287,7 @@ def _widened(result: HandEye, chosen: Candidate, rivals: dict[Candidate, HandEye
                 f"{candidate.name} predicts as well as {chosen.name} and is {np.degrees(np.linalg.norm(turn)):.2g}° "
                 f"and {np.linalg.norm(off[3:]):.2g} mm off, {own:.2g} times what their σ allow: σ are widened by that"
             )
-    if factor == 1.0:
-        return result, ()
-    square = factor**2
-    stand = None if result.stand_covariance is None else square * result.stand_covariance
-    return replace(result, covariance=square * result.covariance, stand_covariance=stand), tuple(notes)
+    return result.widened(factor), tuple(notes)
 
 
 def _sentence(tried: tuple[Tried, ...], chosen: Candidate, result: HandEye, measure: str) -> str:

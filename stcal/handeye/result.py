@@ -1,6 +1,6 @@
 """What every hand-eye method returns."""
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
@@ -99,6 +99,12 @@ class HandEye:
         if name not in self.transforms:
             raise InputError(f"hand-eye: {self.setup} has no {name}; it has {' and '.join(self.transforms)}")
         return self.transforms[name]
+
+    def widened(self, factor: float) -> "HandEye":
+        """With all σ of the two unknowns times ``factor``."""
+        square, stand = factor**2, self.stand_covariance
+        own = None if self.covariance is None else square * self.covariance
+        return replace(self, covariance=own, stand_covariance=None if stand is None else square * stand)
 
     def rms(self) -> tuple[float, float]:
         """RMS lengths of the residuals of the poses used: rad, mm."""

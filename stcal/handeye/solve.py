@@ -20,6 +20,7 @@ from stcal.handeye.judge.conventions import Guess, check_conventions
 from stcal.handeye.judge.observability import Observability, check, in_words, require_scale
 from stcal.handeye.judge.symmetry import repair
 from stcal.handeye.methods import start
+from stcal.handeye.methods.camera_error import of_poses
 from stcal.handeye.methods.closed_form import AX_XB, AX_ZB, closed_form
 from stcal.handeye.methods.convex import convex
 from stcal.handeye.methods.evolution import EvolutionOptions, Objective, evolve, polish
@@ -77,6 +78,9 @@ class HandEyeOptions:
         The flange turns about one axis only: solve for all but X along it; ``pose`` and ``reprojection`` only.
     evolution : EvolutionOptions
         Of ``de`` and ``de-polished``.
+    camera : CameraPrior, optional
+        What is known of the camera's parameters where they are not solved for: their errors become part of σ, with
+        views. They are exact where None.
     """
 
     noise: Noise = field(default_factory=Noise)
@@ -85,6 +89,7 @@ class HandEyeOptions:
     symmetries: tuple[Rigid, ...] = ()
     four_dof: bool = False
     evolution: EvolutionOptions = field(default_factory=EvolutionOptions)
+    camera: CameraPrior | None = None
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -254,6 +259,9 @@ def _by_poses(task: _Task) -> HandEye:
         notes += beyond
         if beyond and solution.variance_factor > 1:
             covariance = covariance * solution.variance_factor
+    if task.views is not None and options.camera is not None:
+        error = of_poses(task.loop, solution, task.views, options.camera)
+        covariance = error.covariance(covariance[:12, :12])
     stated = {name: getattr(noise, name) for name in ("robot_rad", "robot_mm", "camera_rad", "camera_mm")}
     return HandEye(
         method="pose",
@@ -280,7 +288,8 @@ def _by_views(task: _Task, views: Views) -> HandEye:
 
     def solved(loop: Loop, noise: Noise) -> AdjustedViews:
         flange = task.pairs.base_from_flange
-        return adjust_views(loop, flange, views, first, noise, options.intrinsics, options.with_scale)
+        intrinsics, camera = options.intrinsics, options.camera
+        return adjust_views(loop, flange, views, first, noise, intrinsics, options.with_scale, camera)
 
     solution, contradicted = _by_true_robot(task, solved)
     if solution.sigma_scale is not None:
@@ -289,6 +298,8 @@ def _by_views(task: _Task, views: Views) -> HandEye:
     notes, covariance = task.notes + contradicted, solution.covariance
     if options.four_dof:
         x, z, covariance, notes = _without_slide(task, x, z, solution.normal)
+    if solution.camera_error is not None:
+        covariance = solution.camera_error.covariance(covariance)
     seen = replace(task.loop, camera_from_board=resected(names, views, solution))
     residuals = seen.residuals(x, z)
     notes += _remarks(task, solution.outliers, residuals, solution.scale_hint)

@@ -8,12 +8,14 @@ import numpy as np
 from stcal.errors import DegenerateError, InputError, StcalError
 from stcal.geometry.arrays import frozen
 from stcal.geometry.camera import Camera
-from stcal.geometry.rigid import Rigid
+from stcal.geometry.normal_equations import generalised_inverse
+from stcal.geometry.rigid import Poses, Rigid
 from stcal.handeye.data.loop import Loop, Setup
 from stcal.handeye.data.motions import Motions
 from stcal.handeye.data.pairs import HandEyePoses
 from stcal.handeye.data.views import View, Views, resect
 from stcal.handeye.judge.symmetry import repair
+from stcal.handeye.methods.noise import UNKNOWNS
 from stcal.handeye.result import HandEye
 from stcal.handeye.solve import METHODS, HandEyeOptions, handeye
 from stcal.held_out import repeated_splits
@@ -23,6 +25,9 @@ SETUP_SPLITS = 6
 """Splits that tell which setup is meant."""
 SETUP_BETTER = 4.0
 """Times by which the product of both errors must be smaller in the other setup."""
+SCATTERED = 1.5
+"""Times by which solutions scatter that are told of: of twelve simulated poses that err as is assumed, one set in a
+hundred does so."""
 LEAST_LEFT = 3
 """Poses that must be left to solve with."""
 
@@ -43,6 +48,8 @@ class HeldOutPoses:
     pose_mm : (s, k) array, or None without corners
         Mean distance of the corners by the robot's chain from those by the pose that the view gives by itself; holds
         the error of that pose, mostly along the line of sight.
+    mount_from_camera : (s, 4, 4) array, optional
+        The solution of the other poses of each split, mm.
     """
 
     rows: np.ndarray
@@ -50,12 +57,16 @@ class HeldOutPoses:
     translation_mm: np.ndarray
     board_mm: np.ndarray | None = None
     pose_mm: np.ndarray | None = None
+    mount_from_camera: np.ndarray | None = None
 
     def __post_init__(self):
         object.__setattr__(self, "rows", frozen(self.rows, (None, None), "held-out poses", int))
         for name in ("rotation_rad", "translation_mm", "board_mm", "pose_mm"):
             if getattr(self, name) is not None:
                 object.__setattr__(self, name, frozen(getattr(self, name), self.rows.shape, name))
+        if self.mount_from_camera is not None:
+            four = frozen(self.mount_from_camera, (len(self.rows), 4, 4), "solutions")
+            object.__setattr__(self, "mount_from_camera", four)
 
     def means(self, of: np.ndarray | None = None) -> dict[str, float]:
         """Means over all splits of every error there is; ``of`` : which poses (m,) count, all where
@@ -201,14 +212,15 @@ def errors_without(
     options: HandEyeOptions,
     out: np.ndarray,
 ) -> dict[str, np.ndarray]:
-    """Errors of :class:`HeldOutPoses` on the poses ``out``, (k,), of the solution of the others."""
+    """Of :class:`HeldOutPoses`, by name, on the poses ``out``, (k,): errors of the solution of the others, and it."""
     kept = np.setdiff1d(np.arange(len(pairs)), out)
     try:
         result = handeye(pairs[kept], setup, method, None if views is None else views[kept], options)
     except DegenerateError as error:
         names = ", ".join(pairs.names[i] for i in out)
         raise DegenerateError(f"without {names}: {error}") from error
-    return predicted(result, pairs[out], None if views is None else views[out])
+    errors = predicted(result, pairs[out], None if views is None else views[out])
+    return errors | {"mount_from_camera": result.mount_from_camera.matrix()}
 
 
 def predicted(result: HandEye, pairs: HandEyePoses, views: Views | None) -> dict[str, np.ndarray]:
@@ -267,6 +279,50 @@ def better_setup(pairs: HandEyePoses, setup: Setup, options: HandEyeOptions, row
         f"poses held out are missed by {np.degrees(turn):.2g}° and {shift:.2g} mm as {setup}, by "
         f"{np.degrees(other_turn):.2g}° and {other_shift:.2g} mm as {other}: give --setup {other} if it is that"
     )
+
+
+def scatter(result: HandEye, held_out: HeldOutPoses) -> float:
+    """By how much solutions without some of the poses scatter about the one of all, in units of what its σ say.
+
+    Of m poses with independent errors of which k are held out, the difference has the covariance C k / (m − k), where C
+    is the solution's (the jackknife of Shao & Wu, Ann. Statist. 17, 1989, with several left out at once); a little
+    more where few are left, for what they see differs (as the mean of an inverse Wishart matrix exceeds the inverse of
+    the mean). Errors that are not independent, or not as large in all poses, show as more.
+
+    Parameters
+    ----------
+    result : HandEye
+        Of all poses.
+    held_out : HeldOutPoses
+        Of the same poses, with ``mount_from_camera``.
+
+    Returns
+    -------
+    float
+        RMS over splits and the six numbers; 1 is expected, NaN where a covariance or the solutions are missing.
+    """
+    if result.covariance is None or held_out.mount_from_camera is None or not len(held_out.rows):
+        return float("nan")
+    four, k = held_out.mount_from_camera, held_out.rows.shape[1]
+    each = Poses(four[:, :3, :3], four[:, :3, 3])
+    off = each.difference(Poses.of([result.mount_from_camera] * len(each)))
+    squared = np.einsum("sa,ab,sb->s", off, generalised_inverse(result.covariance), off)
+    left = 6 * (len(result.names) - k) - UNKNOWNS - 1
+    return float(np.sqrt(squared.mean() / 6 * left / (6 * k)))
+
+
+def widened_by_scatter(result: HandEye, held_out: HeldOutPoses) -> HandEye:
+    """With σ that reach the :func:`scatter` of solutions without some of the poses; a note where that is much."""
+    factor = scatter(result, held_out)
+    if not factor > 1:
+        return result
+    notes = result.notes
+    if factor > SCATTERED:
+        notes += (
+            f"solutions of parts of the poses scatter {factor:.2g} times as much as σ say, so that poses do not err "
+            "independently and alike: σ are widened by that",
+        )
+    return replace(result.widened(factor), notes=notes)
 
 
 def motion_errors(mount_from_camera: Rigid, motions: Motions) -> np.ndarray:

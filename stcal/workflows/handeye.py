@@ -14,7 +14,15 @@ from stcal.handeye.choose import choose
 from stcal.handeye.data.loop import Setup
 from stcal.handeye.data.robot_poses import RobotPoses, read_robot_poses
 from stcal.handeye.report.file import Outcome
-from stcal.handeye.validate import LEAST_LEFT, better_setup, compare, cross_validate, predict_motions, splits
+from stcal.handeye.validate import (
+    LEAST_LEFT,
+    better_setup,
+    compare,
+    cross_validate,
+    predict_motions,
+    splits,
+    widened_by_scatter,
+)
 from stcal.io.camera import CameraPrior, camera_prior, read_camera, refinable
 from stcal.io.images import ImageFile, find_images
 from stcal.io.quaternions import Order
@@ -162,6 +170,8 @@ def _outcome(
     progress: Progress,
 ) -> Outcome:
     pairs, views = given.pairs, given.views
+    if options.camera is None:
+        options = replace(options, camera=given.prior)
     asked = None if method in (ALL, AUTO) else method
     compared, held_out, notes, rows = (), None, (), np.zeros((0, 0), int)
     choice = None
@@ -182,10 +192,12 @@ def _outcome(
         done = partial(progress, "methods")
         compared = compare(pairs, setup, views, options, rows=rows, workers=validation.workers, progress=done)
         held_out = next(each.held_out for each in compared if each.method == result.method)
+        result = result if held_out is None else widened_by_scatter(result, held_out)
     elif len(rows) and choice is None and not notes:
         done = partial(progress, "held out")
         try:
             held_out = cross_validate(pairs, setup, asked, views, options, rows, validation.workers, done)
+            result = widened_by_scatter(result, held_out)
         except DegenerateError as error:
             notes = (f"no errors on poses held out: {error}",)
     if len(rows) and (meant := better_setup(pairs, setup, options, rows)):

@@ -22,7 +22,7 @@ from stcal.handeye import (
 )
 from stcal.handeye.data.loop import Loop
 from stcal.handeye.data.motions import Motions
-from stcal.handeye.validate import predicted
+from stcal.handeye.validate import predicted, scatter, widened_by_scatter
 from stcal.synthetic.measured.handeye import simulated, simulated_views
 
 
@@ -72,6 +72,23 @@ def test_errors_at_the_board():
 
 
 @pytest.mark.slow
+def test_solutions_of_parts_scatter_as_sigma_says():
+    """40 splits of 20 poses: six numbers each, of which 20/5 · 6 are independent, so that one set's ratio scatters by
+    1/√(2·24) = 14 %, the mean of eight by 5 %; three times that. σ that are three times too small are put right."""
+    ratios = []
+    for seed in range(8):
+        truth = simulated(np.random.default_rng(seed), 20, robot=(5e-4, 0.2), camera=(5e-4, 0.2))
+        found = handeye(truth.pairs, truth.setup)
+        held_out = cross_validate(truth.pairs, truth.setup, rows=splits(20, 5, 40))
+        ratios.append(scatter(found, held_out))
+        sure = replace(found, covariance=found.covariance / 9)
+        wide = widened_by_scatter(sure, held_out)
+        assert np.allclose(wide.covariance, ratios[-1] ** 2 * found.covariance)
+        assert any("solutions of parts of the poses scatter" in note for note in wide.notes)
+    assert np.mean(ratios) == pytest.approx(1, abs=0.15)
+    assert np.isnan(scatter(handeye(truth.pairs, truth.setup, "li"), held_out))
+
+
 def test_compare_lists_every_method():
     truth = simulated_views(np.random.default_rng(3), 10, robot=(3e-4, 0.1), corner_px=0.1)
     found = compare(truth.pairs, views=truth.views, rows=splits(10, 3, 2))

@@ -82,13 +82,8 @@ class Corners:
         return {name: slice(int(i), int(j)) for name, i, j in zip(sizes, ends[:-1], ends[1:], strict=True)}
 
     def camera_parts(self) -> list[tuple[str, np.ndarray]]:
-        """Intrinsics whose knowledge may be wrong by a factor of its own: kinds, or all where they are correlated."""
-        first = self.basis.argmax(0)
-        if np.count_nonzero(self.information - np.diag(np.diag(self.information))):
-            return [("camera_all", np.arange(len(first)))]
-        kinds = {"focal": (0, 1), "centre": (2, 3), "radial": (4, 5, 8, 9, 10, 11), "tangential": (6, 7)}
-        parts = [(f"camera_{kind}", np.flatnonzero(np.isin(first, numbers))) for kind, numbers in kinds.items()]
-        return [(name, rows) for name, rows in parts if len(rows)]
+        """As :func:`camera_parts`, of the intrinsics solved for."""
+        return camera_parts(self.basis, self.information)
 
     def count(self) -> int:
         """Number of unknowns."""
@@ -183,6 +178,19 @@ class Corners:
             return NormalEquations.impossible(self.count())
         first, *others = (group.linear() for group in self.groups(state))
         return sum(others, first)
+
+
+def camera_parts(basis: np.ndarray, information: np.ndarray) -> list[tuple[str, np.ndarray]]:
+    """Intrinsics whose knowledge may be wrong by a factor of its own: kinds, or all where they are correlated.
+
+    ``basis`` : (12, q) of the intrinsics; ``information`` : (q, q) about them.
+    """
+    first = basis.argmax(0)
+    if np.count_nonzero(information - np.diag(np.diag(information))):
+        return [("camera_all", np.arange(len(first)))]
+    kinds = {"focal": (0, 1), "centre": (2, 3), "radial": (4, 5, 8, 9, 10, 11), "tangential": (6, 7)}
+    parts = [(f"camera_{kind}", np.flatnonzero(np.isin(first, numbers))) for kind, numbers in kinds.items()]
+    return [(name, rows) for name, rows in parts if len(rows)]
 
 
 @dataclass(frozen=True, slots=True, eq=False)

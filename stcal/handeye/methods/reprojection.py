@@ -14,6 +14,7 @@ from stcal.geometry.rigid import Poses, Rigid
 from stcal.handeye.data.loop import Loop
 from stcal.handeye.data.views import View, Views, resect
 from stcal.handeye.methods.bundle import LEAST, Bundle, Corners, adjust
+from stcal.handeye.methods.camera_error import CameraError, of_corners
 from stcal.handeye.methods.noise import Noise
 from stcal.handeye.methods.pose_adjustment import FALSE_ALARM, LEAST_POSES
 from stcal.io.camera import CameraPrior, intrinsic_basis
@@ -21,10 +22,10 @@ from stcal.io.camera import CameraPrior, intrinsic_basis
 GROSS_RAD, GROSS_SHARE = np.radians(10), 0.2
 """A pose that misses by more (rotation; translation in shares of the distance) is wrong from the start: no error of the
 camera file, which is solved for here, makes so much."""
-CAMERA_MODEL = "OPENCV"
-"""Model of the camera in which is looked for errors of the camera file."""
 NO_PRIOR = 1e-12
 """Information that keeps nothing back, px⁻²."""
+CAMERA_MODEL = "OPENCV"
+"""Model of the camera in which is looked for errors of the camera file."""
 SAME_DIGITS = 6
 """Decimals of a millimetre in which places on the board that are one corner agree."""
 SEEN = 1e-3
@@ -86,8 +87,8 @@ class AdjustedViews:
     """``state`` : of the poses used; ``outliers`` : (m,); ``normal`` : (12, 12) of X and Z, all else eliminated;
     ``covariance`` : its inverse; ``sigma_scale``; ``sigma`` : by group; ``estimated`` : which of them;
     ``scale_hint`` : what the scale would become if it were solved for, and its σ;
-    ``camera_gain`` : by how much the cost would fall, per parameter, if intrinsics were; ``found``; ``settled`` :
-    whether the estimated σ did."""
+    ``camera_gain`` : by how much the cost would fall, per parameter, if intrinsics were; ``camera_error`` : of those as
+    filed, where something is known of them; ``found``; ``settled`` : whether the estimated σ did."""
 
     state: Bundle
     outliers: np.ndarray
@@ -98,6 +99,7 @@ class AdjustedViews:
     estimated: tuple[str, ...]
     scale_hint: tuple[float, float]
     camera_gain: float
+    camera_error: CameraError | None
     found: Reprojection
     settled: bool
 
@@ -110,12 +112,14 @@ def adjust_views(
     noise: Noise,
     intrinsics: CameraPrior | None = None,
     with_scale: bool = False,
+    camera: CameraPrior | None = None,
 ) -> AdjustedViews:
     """Least squares of all corners from ``first`` X, Z, scale; ``loop`` holds the same poses, the board's by them.
 
     Unknowns: X, Z, and by their σ where the robot really was and where the board's corners really are; intrinsics about
-    ``intrinsics`` (whose σ are widened where the corners contradict them) and the board's scale on
-    demand. Corners and poses have Huber's weights; then poses that contradict the others are left out.
+    ``intrinsics`` (whose σ are widened where the corners contradict them) and the board's scale on demand. Errors of
+    intrinsics that are not solved for are considered by what is known of them, ``camera``. Corners and poses have
+    Huber's weights; then poses that contradict the others are left out.
 
     Raises
     ------
@@ -160,6 +164,7 @@ def adjust_views(
         estimated=free,
         scale_hint=_scale_hint(corners, state),
         camera_gain=_camera_gain(corners, state),
+        camera_error=of_corners(corners, state, camera, free) if camera is not None and intrinsics is None else None,
         found=found,
         settled=solution.settled,
     )

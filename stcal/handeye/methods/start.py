@@ -14,6 +14,8 @@ SUBSETS = 200
 """Of three or four poses: with a third of all poses bad, hundreds of clean ones are among them on average …"""
 LEAST_LENGTH = 0.1
 """Of the camera's paths over those of the flange, as they fit: 1 but for the board's size, 0 where neither moves."""
+LEAST_SCALE = 1e-6
+"""Of the board: its lengths in metres make it 0.001."""
 SEED = 0
 """… and the same ones every time."""
 
@@ -21,9 +23,10 @@ SEED = 0
 def robust(loop: Loop, with_scale: bool = False) -> tuple[Rigid, Rigid, float]:
     """The best X, Z and scale of many small subsets: with the least product of the median rotation and translation.
 
-    The product has no unit that would have to be weighed. Solved once more from all poses within three times the
-    medians. Rotations by Shah (2013), then translations, and the board's scale where wanted, by linear least squares:
-    no logarithms, so that half turns are motions like any other.
+    The product has no unit that would have to be weighed; translations are in units of the board, of which one that is
+    shrunk to nothing would fit a flange that turns about a point. Solved once more from all poses within three times
+    the medians. Rotations by Shah (2013), then translations, and the board's scale where wanted, by linear least
+    squares: no logarithms, so that half turns are motions like any other.
 
     Raises
     ------
@@ -41,15 +44,23 @@ def robust(loop: Loop, with_scale: bool = False) -> tuple[Rigid, Rigid, float]:
         candidates.append(_linear(loop, order[:, :size], with_scale))
     parts = [np.concatenate(part) for part in zip(*candidates, strict=True)]
     turn, shift = _misses(loop, *parts)
+    shift = _in_board_units(shift, parts[4])
     best = np.argmin(np.log(np.median(turn, 1) + 1e-15) + np.log(np.median(shift, 1) + 1e-12))
     inside = (turn[best] <= 3 * np.median(turn[best])) & (shift[best] <= 3 * np.median(shift[best]))
     if inside.sum() >= 3:
         again = _linear(loop, np.flatnonzero(inside)[None], with_scale)
         new_turn, new_shift = _misses(loop, *again)
+        new_shift = _in_board_units(new_shift, again[4])
         if np.median(new_turn) * np.median(new_shift) < np.median(turn[best]) * np.median(shift[best]):
             parts, best = again, 0
     x, t_x, z, t_z, scale = (part[best] for part in parts)
     return Rigid(x, t_x), Rigid(z, t_z), float(scale)
+
+
+def _in_board_units(shift: np.ndarray, scale: np.ndarray) -> np.ndarray:
+    """Distances (s, m) over scales (s,); infinite for a board of no size."""
+    with np.errstate(divide="ignore", invalid="ignore"):
+        return np.where(np.abs(scale) < LEAST_SCALE, np.inf, shift.T / np.abs(scale)).T
 
 
 def about_one_axis(loop: Loop, mount_axis: np.ndarray, with_scale: bool = False) -> tuple[Rigid, Rigid, float]:

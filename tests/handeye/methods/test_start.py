@@ -8,6 +8,7 @@ import pytest
 from stcal.errors import DegenerateError
 from stcal.geometry.rigid import Poses, Rigid
 from stcal.handeye.data.loop import SETUPS, Loop
+from stcal.handeye.data.pairs import HandEyePoses
 from stcal.handeye.methods.start import mean_pose, robust
 from stcal.synthetic.measured.handeye import disturbed, simulated
 
@@ -65,3 +66,18 @@ def test_mean_pose_of_two_turns_is_half_way():
     mean = mean_pose(poses)
     assert mean.log()[:3] == pytest.approx([0, 0, 0.3])
     assert mean.translation == pytest.approx(poses.translation.mean(0))
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_a_flange_that_turns_about_a_point_does_not_shrink_the_board(seed):
+    """Six of nine poses turn about one point of the flange, exactly, which a board of no size would fit; the camera
+    errs by 1 mm at a quarter of a metre or more, so that the size is known to 1 % or so from the three that move."""
+    rng = np.random.default_rng(seed)
+    truth = simulated(rng, 9, camera=(1e-3, 0.3))
+    flange, point = truth.pairs.base_from_flange, np.array([20.0, 10.0, 350.0])
+    place = np.array(flange.translation)
+    place[:6] = place[0] + (flange.rotation[0] @ point) - flange.rotation[:6] @ point
+    moved = Poses(flange.rotation, place)
+    board = (moved @ truth.mount_from_camera).inverse() @ Poses.of([truth.stand_from_board] * 9)
+    pairs = HandEyePoses(moved, disturbed(rng, board, 1e-3, 1.0))
+    assert robust(Loop.of(pairs, "eye-in-hand"), True)[2] == pytest.approx(1, abs=0.1)
