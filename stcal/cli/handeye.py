@@ -28,7 +28,7 @@ if TYPE_CHECKING:
     from stcal.handeye.data.loop import Setup
     from stcal.handeye.methods.evolution import Bounds
     from stcal.handeye.report.export.frames import CameraFrame
-    from stcal.handeye.report.file import Outcome
+    from stcal.handeye.report.outcome import Outcome
 
 EVOLVED = ("de", "de-polished")
 """Methods that take the options ``--de-…``."""

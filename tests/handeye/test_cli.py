@@ -425,7 +425,8 @@ def test_methods_without_splits_are_compared_without_errors(command, tmp_path):
     rows = json.loads(out.read_text())["methods"]
     assert code == 0
     assert [row["held_out"] for row in rows] == [None] * len(rows)
-    assert "held out" not in shown.split("Methods")[0]
+    assert "\nheld out (" not in shown.split("Methods")[0]
+    assert "verdict: use with care: no errors on poses held out are known" in shown
 
 
 @pytest.mark.slow
