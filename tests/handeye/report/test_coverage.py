@@ -8,7 +8,7 @@ import pytest
 
 from stcal.geometry.rigid import Poses, Rigid
 from stcal.handeye import HandEyeOptions, handeye
-from stcal.handeye.data.views import View, Views
+from stcal.handeye.data.views import View, Views, pairs_of_views
 from stcal.handeye.report.coverage import by_robot, equal_area, image_coverage, turns_between
 from stcal.handeye.report.figures import MOST_NAMED, enlargement, pose_bars
 from stcal.handeye.report.outcome import Outcome
@@ -98,6 +98,18 @@ def test_corners_by_the_robot_are_where_they_were_seen(truth, outcome):
         off = np.linalg.norm(px - view.xy_px, axis=1)
         assert 0 < off.max() < 5
         assert np.isfinite(off).all()
+
+
+@pytest.mark.parametrize("method", ["reprojection", "pose"])
+def test_corners_of_a_board_of_another_size(truth, method):
+    """Stated a tenth too small: with its true size, which is found, the corners are where they were seen."""
+    small = [View(view.xyz_board / 1.1, view.xy_px, view.covariance) for view in truth.views.views]
+    views = Views(truth.views.camera, tuple(small))
+    pairs = pairs_of_views(truth.pairs.base_from_flange, views)
+    result = handeye(pairs, truth.setup, method, views, HandEyeOptions(with_scale=True))
+    assert result.scale == pytest.approx(1.1, abs=0.01)
+    for view, px in zip(views.views, by_robot(result, pairs, views), strict=True):
+        assert np.linalg.norm(px - view.xy_px, axis=1).max() < 5
 
 
 def test_a_robot_that_is_off_is_seen_in_the_image(truth, outcome):
