@@ -28,8 +28,8 @@ def join(values: Iterable) -> str:
 
 
 def telling_names(names: Sequence[str], most: int = 14) -> list[str]:
-    """Short names that tell things apart: without what all begin and end with, whole numbers kept, and longer ones with
-    an ellipsis in their middle; all are left as they are where they could not be told apart else, but by number.
+    """Short names that tell things apart: without what all begin and end with, words and numbers whole; of longer ones
+    both ends, or what stands between, with an ellipsis for the rest; numbers from 1 where that does not do.
 
     ``most`` : characters
     """
@@ -50,7 +50,15 @@ def telling_names(names: Sequence[str], most: int = 14) -> list[str]:
         short = [_shortened(name, most, head) for name in own]
         if len(set(short)) == len(set(names)):
             return short
-    return [str(i) for i in range(1, len(names) + 1)]
+    windows = [[_window(name, at, most) for name in own] for at in range(1, max(map(len, own)) - most + 2)]
+    different = [short for short in windows if all(short) and len(set(short)) == len(set(names))]
+    return different[len(different) // 2] if different else [str(i) for i in range(1, len(names) + 1)]
+
+
+def _window(name: str, at: int, most: int) -> str:
+    """What stands from there on, between ellipses where there is more."""
+    part = name[at : at + most - 2]
+    return name if len(name) <= most else f"…{part}{'…' * (at + len(part) < len(name))}" if part else ""
 
 
 def _common(names: Sequence[str]) -> int:

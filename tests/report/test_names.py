@@ -21,7 +21,11 @@ from stcal.report.text import telling_names
         (["one.png"], ["one.png"]),
         (["a_very_long_name_of_a_pose.png"], ["a_very_…se.png"]),
         (["b" * 30 + "1" + "c" * 30, "d" * 30 + "2" + "e" * 30], ["bbbbbbb…cccccc", "ddddddd…eeeeee"]),
-        (["x" + "b" * 20 + "1" + "c" * 20, "x" + "b" * 20 + "2" + "c" * 20, "y" + "d" * 40], ["1", "2", "3"]),
+        (
+            ["x" + "b" * 20 + "1" + "c" * 20, "x" + "b" * 20 + "2" + "c" * 20, "y" + "d" * 41],
+            ["…bbbbb1cccccc…", "…bbbbb2cccccc…", "…dddddddddddd…"],
+        ),
+        ([f"{i}{'b' * 20}{j}{'b' * 20}{k}" for i in "12" for j in "12" for k in "12"], list("12345678")),
     ],
 )
 def test_what_tells_names_apart(names, short):

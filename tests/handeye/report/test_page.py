@@ -182,4 +182,4 @@ def test_the_chart_of_poses_has_the_names_that_tell_them_apart(of_methods):
     for i, name in enumerate(names):
         assert f"<title>{name}</title>{i:02d}</text>" in page
         assert f"<title>{name}: " in page  # of its bar, with the value
-    assert "names below it without what all have in common" in page
+    assert "names below it are cut to what tells them apart" in page
