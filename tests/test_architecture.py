@@ -212,7 +212,7 @@ def test_no_file_repeats_its_folder():
         ("io/design.py", "import cv2"),
         ("handeye/data/pairs.py", "import cv2"),
         ("handeye/report/page.py", "from stcal.sfm.detect.image import detect_image"),
-        ("handeye/report/export.py", "from stcal.workflows.board_views import detect_boards"),
+        ("handeye/report/export/ros.py", "from stcal.workflows.board_views import detect_boards"),
         ("workflows/board_views.py", "import cv2"),
         ("workflows/board_views.py", "from stcal.cli.main import main"),
         ("boards/tags.py", "from stcal.locate.pose import estimate"),

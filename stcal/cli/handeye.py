@@ -21,16 +21,26 @@ from stcal.cli.options import (
 )
 from stcal.cli.terminal import StageProgress, print_each, say, write
 from stcal.errors import InputError
+from stcal.io.saving import keep_apart
 
 if TYPE_CHECKING:
     from stcal.handeye import EvolutionOptions
+    from stcal.handeye.data.loop import Setup
     from stcal.handeye.methods.evolution import Bounds
-    from stcal.handeye.report.file import Outcome
+    from stcal.handeye.report.export.frames import CameraFrame
+    from stcal.handeye.report.outcome import Outcome
 
 EVOLVED = ("de", "de-polished")
 """Methods that take the options ``--de-…``."""
 SCALED = ("pose", "reprojection")
 """Methods that can find the board's size."""
+
+
+class CameraFrameName(StrEnum):
+    """Which of ROS's two frames of a camera."""
+
+    optical = "optical"
+    link = "link"
 
 
 class SetupName(StrEnum):
@@ -138,8 +148,25 @@ def handeye(
     opencv: Annotated[
         Path | None, typer.Option("--opencv", writable=True, help="Write OpenCV's FileStorage to this file (YAML, mm).")
     ] = None,
+    export: Annotated[
+        list[str] | None,
+        typer.Option(
+            "--export",
+            metavar="FORM=FILE",
+            help="Write the transform to this file, again for each further one; forms: ros2, moveit, moveit2, "
+            "easy-handeye, easy-handeye2, zivid, kuka, abb, ur, fanuc.",
+        ),
+    ] = None,
     parent: Annotated[str, typer.Option(help="Name the flange or base like this in ROS and URDF.")] = "",
     child: Annotated[str, typer.Option(help="Name the camera like this in ROS and URDF.")] = "",
+    camera_frame: Annotated[
+        CameraFrameName,
+        typer.Option(
+            "--camera-frame",
+            help="Give ROS and URDF the camera's optical frame (Z forward), or its link (X forward) with the optical "
+            "frame in it.",
+        ),
+    ] = CameraFrameName.optical,
     camera_out: Annotated[
         Path | None,
         typer.Option(
@@ -193,7 +220,7 @@ def handeye(
 ) -> None:
     """Find where a camera sits on a robot's flange, or in its base, and how well that is known."""
     from stcal.handeye import HandEyeOptions, Noise
-    from stcal.handeye.report.export import opencv_yaml, require_frame_names, ros_yaml, urdf_joint
+    from stcal.handeye.report.export import exported, opencv_yaml, ros_yaml, urdf_joint
     from stcal.handeye.report.file import HandEyeFile
     from stcal.handeye.report.page import outcome_page, outcome_text
     from stcal.workflows.handeye import AUTO, Splits, calibrate, read_input
@@ -205,9 +232,15 @@ def handeye(
     )
     folder = isinstance(pairs, Path) and pairs.is_dir()
     _require_fitting(not folder, method, refine_camera, camera_out)
-    if (parent or child) and not (ros or urdf):
-        raise InputError("--parent, --child: only with --ros or --urdf, whose frames they name")
-    require_frame_names(parent, child)
+    exports = _exports(export or [])
+    written = {"--out": out, "--ros": ros, "--urdf": urdf, "--opencv": opencv, "--camera-out": camera_out}
+    written |= {"--json": json_file, "--report": report}
+    read = {"source": source, "--poses": poses, "--camera": camera, "--board": board, "--a": first, "--b": second}
+    keep_apart(
+        [*((name, path) for name, path in written.items() if path), *(("--export", path) for _, path in exports)],
+        [(name, path) for name, path in read.items() if path],
+    )
+    _require_frames(ros or urdf, exports, setup.value, parent, child, camera_frame.value)
     if not folder and (sigma_px is not None or sigma_board_mm is not None):
         raise InputError(
             "--sigma-px, --sigma-board-mm: only with images; give --sigma-camera-mm and --sigma-camera-deg"
@@ -244,13 +277,15 @@ def handeye(
     print_each("note", outcome.all_notes())
     for path, content in (
         (out, lambda: HandEyeFile.of(outcome)),
-        (ros, lambda: ros_yaml(result, parent, child)),
-        (urdf, lambda: urdf_joint(result, parent, child)),
+        (ros, lambda: ros_yaml(result, parent, child, camera_frame.value)),
+        (urdf, lambda: urdf_joint(result, parent, child, camera_frame.value)),
         (opencv, lambda: opencv_yaml(result)),
         (report, lambda: outcome_page(outcome)),
     ):
         if path:
             write(path, content())
+    for form, path in exports:
+        write(path, exported(result, form, path.stem, parent, child, camera_frame.value))
     if camera_out:
         _save_camera(camera_out, outcome)
     if json_file:
@@ -270,6 +305,39 @@ def _require_fitting(of_poses: bool, method: str | None, refine_camera: bool, ca
         raise InputError(f"--camera-out: {method} does not adjust the camera; leave --method out")
     if method not in (None, ALL, *METHODS):
         raise InputError(f"--method {method}: unknown; {ALL} or one of {', '.join(METHODS)} needed")
+
+
+def _exports(words: list[str]) -> list[tuple[str, Path]]:
+    """(form, file) of each FORM=FILE."""
+    from stcal.handeye.report.export import require_form
+
+    found = []
+    for word in words:
+        form, _, path = word.partition("=")
+        require_form(form)
+        if not path:
+            raise InputError(f"--export {word}: no file; give {form}=FILE")
+        found.append((form, Path(path)))
+    return found
+
+
+def _require_frames(
+    ros: Path | None,
+    exports: list[tuple[str, Path]],
+    setup: "Setup",
+    parent: str,
+    child: str,
+    camera_frame: "CameraFrame",
+) -> None:
+    """Frames are named only where there are any, and each has a name of its own."""
+    from stcal.handeye.report.export import ROS_FORMS, frame_names, require_frame_names
+
+    if (parent or child or camera_frame != "optical") and not (ros or any(form in ROS_FORMS for form, _ in exports)):
+        raise InputError(
+            "--parent, --child, --camera-frame: only with --ros, --urdf or --export of a ROS form, whose frames they "
+            "name"
+        )
+    require_frame_names(*frame_names(setup, parent, child, camera_frame))
 
 
 def _bounds(option: str, text: str | None, factor: float) -> "Bounds | None":

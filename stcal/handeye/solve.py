@@ -17,6 +17,7 @@ from stcal.handeye.data.pairs import HandEyePoses
 from stcal.handeye.data.views import Views
 from stcal.handeye.judge import remarks
 from stcal.handeye.judge.conventions import Guess, check_conventions
+from stcal.handeye.judge.notes import Aside
 from stcal.handeye.judge.observability import Observability, check, in_words, require_scale
 from stcal.handeye.judge.symmetry import repair
 from stcal.handeye.methods import start
@@ -195,7 +196,7 @@ def _by_equations(task: _Task, method: str) -> HandEye:
     unit_mm = noise.camera_mm / noise.camera_rad if noise.camera_mm and noise.camera_rad else UNIT_MM
     if method in AX_XB and not (used := poses_with_log(loop)).all():
         left_out = ", ".join(name for name, u in zip(task.pairs.names, used, strict=True) if not u)
-        notes = (*notes, f"left out, for they turn by more than 170° against others: {left_out}")
+        notes = (*notes, Aside(f"left out, for they turn by more than 170° against others: {left_out}"))
         loop = loop[used]
         if len(loop) < 3 or Observability.of(loop).useless:
             raise DegenerateError(
@@ -207,7 +208,7 @@ def _by_equations(task: _Task, method: str) -> HandEye:
     else:
         x = _by_motions(loop, method, unit_mm, task.options.evolution)
         if method == "de":
-            notes = (*notes, task.options.evolution.in_words(unit_mm))
+            notes = (*notes, Aside(task.options.evolution.in_words(unit_mm)))
         z = start.mean_pose(task.loop.chain(x))
     none = np.zeros(len(task.loop), bool)
     residuals = task.loop.residuals(x, z)

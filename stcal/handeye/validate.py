@@ -14,6 +14,7 @@ from stcal.handeye.data.loop import Loop, Setup
 from stcal.handeye.data.motions import Motions
 from stcal.handeye.data.pairs import HandEyePoses
 from stcal.handeye.data.views import View, Views, resect
+from stcal.handeye.judge.notes import Grave
 from stcal.handeye.judge.symmetry import repair
 from stcal.handeye.methods.noise import UNKNOWNS
 from stcal.handeye.result import HandEye
@@ -275,7 +276,7 @@ def better_setup(pairs: HandEyePoses, setup: Setup, options: HandEyeOptions, row
     (turn, shift), (other_turn, other_shift) = ((m["rotation_rad"], m["translation_mm"]) for m in means)
     if not (turn * shift > SETUP_BETTER * other_turn * other_shift and turn > other_turn and shift > other_shift):
         return ""
-    return (
+    return Grave(
         f"poses held out are missed by {np.degrees(turn):.2g}° and {shift:.2g} mm as {setup}, by "
         f"{np.degrees(other_turn):.2g}° and {other_shift:.2g} mm as {other}: give --setup {other} if it is that"
     )

@@ -13,7 +13,8 @@ from stcal.handeye import HandEyeOptions, HandEyePoses, View, Views, handeye, pa
 from stcal.handeye.choose import choose
 from stcal.handeye.data.loop import Setup
 from stcal.handeye.data.robot_poses import RobotPoses, read_robot_poses
-from stcal.handeye.report.file import Outcome
+from stcal.handeye.judge.symmetry import repair
+from stcal.handeye.report.outcome import Outcome
 from stcal.handeye.validate import (
     LEAST_LEFT,
     better_setup,
@@ -49,6 +50,7 @@ class HandEyeInput:
     prior: CameraPrior | None = None
     pitch_mm: float | None = None
     left_out: tuple[tuple[str, str], ...] = ()
+    folder: Path | None = None
 
 
 @dataclass(frozen=True, slots=True)
@@ -123,7 +125,7 @@ def _from_images(
     pitch = getattr(design, "pitch_mm", getattr(design, "square_mm", None))
     prior = camera_prior(refinable(model.calibrated(found.camera.width, found.camera.height)))
     where = f"{source.name}, {poses.name}"
-    return HandEyeInput(where, pairs, seen, found.symmetries, prior, pitch, tuple(left_out))
+    return HandEyeInput(where, pairs, seen, found.symmetries, prior, pitch, tuple(left_out), source)
 
 
 def _rows_of_images(robot: RobotPoses, files: list[ImageFile], source: Path):
@@ -207,6 +209,22 @@ def _outcome(
         motions = predict_motions(pairs, setup, result.method, views, options, validation.motions)
     model = options.intrinsics.colmap_model if options.intrinsics else ""
     own = views is not None and all(view.covariance is not None for view in views.views)
+    if options.symmetries:
+        mended = repair(pairs, setup, options.symmetries, views)
+        pairs, views = mended.pairs, mended.views
     return Outcome(
-        given.where, result, held_out, compared, given.pitch_mm, model, own, given.left_out, notes, motions, choice
+        given.where,
+        result,
+        held_out,
+        compared,
+        given.pitch_mm,
+        model,
+        own,
+        given.left_out,
+        notes,
+        motions,
+        choice,
+        pairs=pairs,
+        views=views,
+        folder=given.folder,
     )

@@ -155,7 +155,7 @@ def test_one_board_behind_the_camera_is_named():
     board = list(truth.pairs.camera_from_board)
     board[6] = Rigid(board[6].rotation, -board[6].translation)
     found = handeye(HandEyePoses(truth.pairs.base_from_flange, Poses.of(board)))
-    assert found.notes[0] == "pose 7: the board lies behind the camera; check its pose"
+    assert found.notes[0] == "the board lies behind the camera in pose 7: check its pose"
     assert found.outliers[6]
 
 

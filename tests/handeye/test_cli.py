@@ -11,6 +11,7 @@ from stcal.cli.main import main
 from stcal.design import BoardDesign
 from stcal.geometry.rigid import Poses, Rigid
 from stcal.handeye import METHODS
+from stcal.handeye.report.export import FORMS
 from stcal.io.camera import read_camera
 from stcal.io.table import POSE, pose_cells
 from stcal.synthetic.measured.handeye import BASE_FROM_BOARD, FLANGE_FROM_CAMERA, simulated
@@ -268,7 +269,12 @@ def test_images_of_a_symmetric_chessboard(command, chessboard, tmp_path):
     assert yaml.safe_load(ros.read_text())["header"]["frame_id"] == "tool0"
     assert 'link="tool0"' in urdf.read_text()
     assert "flange_from_camera: !!opencv-matrix" in opencv.read_text()
-    assert "Camera, as adjusted" in page.read_text()
+    text = page.read_text()
+    assert "Camera, as adjusted" in text
+    # Photographs numbered from another end have their corners where the robot predicts them: drawn to 0.1 px or so.
+    rms = [float(words.rsplit(">")[-1]) for words in text.split(" px RMS by the robot")[:-1]]
+    assert len(rms) == text.count("<image href") == 3
+    assert max(rms) < 0.5
     for path in (out, ros, urdf, opencv, page, camera):
         assert f"written: {path}" in shown
 
@@ -353,11 +359,55 @@ def test_no_output_replaces_an_input_or_another(command, tmp_path):
     assert list(tmp_path.iterdir()) == [source]
 
 
+def test_every_form_of_export(command, tmp_path):
+    """In one call, each in its file, and each gives the transform of the result file back."""
+    source, out = poses_file(tmp_path / "poses.csv", simulated(np.random.default_rng(5), 8, **NOISE)), tmp_path / "h"
+    words = [word for form in FORMS for word in ("--export", f"{form}={tmp_path / 'deep' / form}.txt")]
+    words += ["--camera-frame", "link", "--parent", "tool0", "--child", "left_link"]
+    code, shown, _ = command(source, "--splits", 0, "--out", out, *words)
+    assert code == 0
+    wanted = Rigid.from_matrix(json.loads(out.read_text())["flange_from_camera"])
+    for form, kind in FORMS.items():
+        path = tmp_path / "deep" / f"{form}.txt"
+        assert f"written: {path}" in shown
+        found = kind.read(path.read_text())
+        if not isinstance(found, Rigid):
+            assert (found[0].parent, found[0].child) == ("tool0", "left_link")
+            found = found[0].pose @ Rigid([[0, 0, 1], [-1, 0, 0], [0, -1, 0]], [0, 0, 0])
+        assert np.abs(found.matrix() - wanted.matrix()).max() < 1e-6  # mm, as printed
+
+
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        (("--export", "kuka=poses.csv"), "--export poses.csv: is an input of this command; give another name"),
+        (("--export", "kuka=a", "--export", "ur=a"), "--export a: is also what --export writes"),
+        (("--export", "ur=a", "--out", "a"), "--export a: is also what --out writes"),
+        (("--export", "ur"), "--export ur: no file; give ur=FILE"),
+        (("--export", "motoman=a"), "--export motoman: unknown; one of ros2, moveit, "),
+        (
+            ("--export", "ur=a", "--camera-frame", "link"),
+            "--camera-frame: only with --ros, --urdf or --export of a ROS",
+        ),
+        (("--ros", "a", "--camera-frame", "link", "--parent", "camera_optical_frame"), "both 'camera_optical_frame'"),
+    ],
+)
+def test_exports_that_cannot_be_are_refused(command, tmp_path, monkeypatch, words, message):
+    source = poses_file(tmp_path / "poses.csv", simulated(np.random.default_rng(5), 8, **NOISE))
+    monkeypatch.chdir(tmp_path)
+    before = source.read_text()
+    code, shown, err = command("poses.csv", "--splits", 0, *words)
+    assert (code, shown) == (INPUT, "")
+    assert message in err
+    assert source.read_text() == before
+    assert list(tmp_path.iterdir()) == [source]
+
+
 @pytest.mark.parametrize(
     ("options", "message"),
     [
         (("--sigma-px", 0.1), "--sigma-px, --sigma-board-mm: only with images"),
-        (("--parent", "tool0"), "--parent, --child: only with --ros or --urdf"),
+        (("--parent", "tool0"), "--parent, --child, --camera-frame: only with --ros, --urdf or --export of a ROS form"),
         (("--sigma-robot-mm", 1000, "--sigma-robot-deg", 1), "0 to 10° and 100 mm possible"),
         (("--sigma-robot-mm", "inf", "--sigma-robot-deg", 1), "0 to 10° and 100 mm possible"),
         (
@@ -380,7 +430,8 @@ def test_methods_without_splits_are_compared_without_errors(command, tmp_path):
     rows = json.loads(out.read_text())["methods"]
     assert code == 0
     assert [row["held_out"] for row in rows] == [None] * len(rows)
-    assert "held out" not in shown.split("Methods")[0]
+    assert "\nheld out (" not in shown.split("Methods")[0]
+    assert "verdict: use with care: no errors on poses held out are known" in shown
 
 
 @pytest.mark.slow

@@ -12,6 +12,7 @@ from stcal.errors import InputError
 from stcal.geometry.rigid import Poses, Rigid
 from stcal.handeye.data.loop import Loop, Setup
 from stcal.handeye.data.pairs import HandEyePoses
+from stcal.handeye.judge.notes import Grave
 from stcal.handeye.methods.start import mean_pose
 from stcal.io.quaternions import INVERTED as CONJUGATED
 from stcal.io.quaternions import ORDERS, Reading
@@ -65,9 +66,8 @@ def check_conventions(
         other = next(what for what in found if what.startswith(INVERTED))
         if gain[other] > DOUBTFUL and given[1] > found[other][1]:
             turn, shift = found[other]
-            notes = (
-                f"the poses contradict each other by {by}, but by {np.degrees(turn):.2g}° and {shift:.2g} mm {other}",
-            )
+            than = f"by {np.degrees(turn):.2g}° and {shift:.2g} mm {other}"
+            notes = (Grave(f"the poses contradict each other by {by}, but {than}"),)
         turn, shift = np.divide(_typical(loop, guess, True), _differ(loop))
         if max(turn, shift) > LOST:
             pair = "pair each pose of the board with that of the flange at the same moment"
@@ -77,10 +77,10 @@ def check_conventions(
     if behind.all():
         return (
             *notes,
-            "the board lies behind the camera in all poses: if these are board_from_camera, name the columns so",
+            Grave("the board lies behind the camera in all poses: if these are board_from_camera, name the columns so"),
         )
     if behind.any():
-        return (*notes, f"{pairs.names[int(behind.argmax())]}: the board lies behind the camera; check its pose")
+        return (*notes, f"the board lies behind the camera in {pairs.names[int(behind.argmax())]}: check its pose")
     return notes
 
 

@@ -6,6 +6,7 @@ from scipy.stats import chi2
 from stcal.errors import StcalError
 from stcal.geometry.normal_equations import generalised_inverse
 from stcal.handeye.data.loop import Loop
+from stcal.handeye.judge.notes import Aside, Grave
 from stcal.handeye.judge.observability import scale_is_seen, unit_of
 from stcal.handeye.methods.noise import Noise
 from stcal.handeye.methods.pose_adjustment import LoopState, adjust_poses
@@ -29,11 +30,13 @@ def of_outliers(names: tuple[str, ...], outliers: np.ndarray, residuals: np.ndar
     found = []
     for i in np.flatnonzero(outliers):
         turn, shift = np.degrees(np.linalg.norm(residuals[i, :3])), np.linalg.norm(residuals[i, 3:])
-        found.append(f"{names[i]} contradicts the others, by {turn:.2g}° and {shift:.2g} mm, and was left out")
+        found.append(Aside(f"{names[i]} contradicts the others, by {turn:.2g}° and {shift:.2g} mm, and was left out"))
     if outliers.mean() > MANY:
         found.append(
-            f"{outliers.sum()} of {len(outliers)} poses contradict the others: with so many look first for a wrong "
-            "setup, for poses of the robot beside those of other images, and for a camera file that does not fit"
+            Grave(
+                f"{outliers.sum()} of {len(outliers)} poses contradict the others: with so many look first for a wrong "
+                "setup, for poses of the robot beside those of other images, and for a camera file that does not fit"
+            )
         )
     return tuple(found)
 
@@ -73,8 +76,10 @@ def of_size(loop: Loop, hint: tuple[float, float], noise: Noise) -> tuple[str, .
     if not (_is_other(scale, sigma, SIZE_SIGMAS) and scale_is_seen(scale, sigma, len(loop))):
         return ()
     return (
-        f"by the robot's motion the board is {scale:.4f} ± {sigma:.2g} times as large as stated{unit_of(scale)}: check "
-        "its size and the camera file, or solve with the scale",
+        Grave(
+            f"by the robot's motion the board is {scale:.4f} ± {sigma:.2g} times as large as stated{unit_of(scale)}: "
+            "check its size and the camera file, or solve with the scale"
+        ),
     )
 
 
@@ -87,7 +92,8 @@ def of_distance(loop: Loop) -> tuple[str, ...]:
     away = float(np.median(np.linalg.norm(loop.camera_from_board.translation, axis=1)))
     if away >= NEAR_MM:
         return ()
-    return (f"the board is {away:.2g} mm from the camera (median): if lengths are in metres, name the columns _m",)
+    said = f"the board is {away:.2g} mm from the camera (median): if lengths are in metres, name the columns _m"
+    return (Grave(said),)
 
 
 def of_rounds(settled: bool) -> tuple[str, ...]:

@@ -9,6 +9,7 @@ from stcal.geometry.rigid import Poses, Rigid, skew
 from stcal.handeye.data.loop import Loop, Setup
 from stcal.handeye.data.pairs import HandEyePoses
 from stcal.handeye.data.views import View, Views
+from stcal.handeye.judge.notes import Aside
 from stcal.handeye.methods import start
 
 ROUNDS = 20
@@ -28,7 +29,7 @@ class Repair:
         names = [name for name, turn in zip(self.pairs.names, self.turned, strict=True) if turn]
         if not names:
             return ()
-        return (f"numbered from another end of the board, and put right: {', '.join(names)}",)
+        return (Aside(f"numbered from another end of the board, and put right: {', '.join(names)}"),)
 
 
 def repair(pairs: HandEyePoses, setup: Setup, symmetries: tuple[Rigid, ...], views: Views | None = None) -> Repair:

@@ -1,6 +1,5 @@
 """All that a hand-eye calibration found, and its file."""
 
-from dataclasses import dataclass
 from typing import Literal
 
 import numpy as np
@@ -10,60 +9,27 @@ import stcal
 from stcal.handeye.choose import Choice, Tried
 from stcal.handeye.data.loop import FRAMES, Setup
 from stcal.handeye.judge.observability import Observability
+from stcal.handeye.report.outcome import Outcome
+from stcal.handeye.report.verdict import Verdict, Word, judged
 from stcal.handeye.result import HandEye
 from stcal.handeye.validate import Compared, HeldOutMotions, HeldOutPoses
 from stcal.io.camera import PARAMETER_NAMES, parameter_names
 from stcal.io.json import Finite, Matrix3, Matrix6, NamedReason, Part, Pose, ResultFile, Vector, Vector3
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class Outcome:
-    """A calibration as it is reported.
+class FindingRow(Part):
+    title: str
+    word: Word
+    said: str
+    value: str
+    limit: str
+    remedy: str
 
-    Parameters
-    ----------
-    where : str
-        What it was made from.
-    result : HandEye
-    held_out : HeldOutPoses, optional
-        Errors of its method on poses held out.
-    compared : tuple of Compared
-        Every method, where that was asked for.
-    pitch_mm : float, optional
-        Of dots or squares, as the board's file states it.
-    colmap_model : str
-        Of the camera whose intrinsics were solved for.
-    own_sigmas : bool
-        Whether corners came with covariances, of which the result's ``corner_px`` is the factor.
-    left_out : tuple of (str, str)
-        Images and rows that did not take part, and why.
-    notes : tuple of str
-        Besides those of the result.
-    motions : HeldOutMotions, optional
-        Errors of the last motions, held out.
-    choice : Choice, optional
-        What else was tried, where no method was named.
-    """
 
-    where: str
-    result: HandEye
-    held_out: HeldOutPoses | None = None
-    compared: tuple[Compared, ...] = ()
-    pitch_mm: float | None = None
-    colmap_model: str = ""
-    own_sigmas: bool = False
-    left_out: tuple[tuple[str, str], ...] = ()
-    notes: tuple[str, ...] = ()
-    motions: HeldOutMotions | None = None
-    choice: Choice | None = None
-
-    def all_notes(self) -> tuple[str, ...]:
-        """Of the result, then the others."""
-        return (*self.result.notes, *(self.choice.notes if self.choice else ()), *self.notes)
-
-    def outliers(self) -> tuple[str, ...]:
-        """Names of the poses that contradict the others."""
-        return tuple(name for name, bad in zip(self.result.names, self.result.outliers, strict=True) if bad)
+class VerdictPart(Part):
+    word: Word
+    sentence: str
+    findings: list[FindingRow]
 
 
 class BoardSize(Part):
@@ -160,6 +126,10 @@ class HandEyeFile(ResultFile):
     format: Literal["stcal handeye 1"] = Field(description="the file's form and its version")
     version: str = Field(description="of stcal")
     where: str = Field(alias="from", description="names of the files")
+    verdict: VerdictPart = Field(
+        description="`word`: `good`, `use with care` or `do not use`; a `sentence` with the reasons; `findings`, each "
+        "with `title`, `word`, what was `said`, `value` and `limit`, `remedy`"
+    )
     setup: Setup = Field(description="what carries the camera")
     method: str = Field(description="that found the result")
     flange_from_camera: Pose | None = Field(None, description="`X` of eye-in-hand")
@@ -243,6 +213,7 @@ class HandEyeFile(ResultFile):
                 "format": "stcal handeye 1",
                 "version": stcal.__version__,
                 "where": outcome.where,
+                "verdict": _verdict(judged(outcome)),
                 "setup": result.setup,
                 "method": result.method,
                 **poses,
@@ -267,6 +238,11 @@ class HandEyeFile(ResultFile):
                 **more,
             }
         )
+
+
+def _verdict(found: Verdict) -> VerdictPart:
+    rows = [FindingRow(**{name: getattr(each, name) for name in FindingRow.model_fields}) for each in found.findings]
+    return VerdictPart(word=found.word, sentence=found.sentence(), findings=rows)
 
 
 def _camera(outcome: Outcome) -> AdjustedCamera | None:

@@ -5,15 +5,20 @@ from scipy.spatial.transform import Rotation
 
 from stcal.geometry.rigid import Rigid
 from stcal.handeye.data.loop import FRAMES
+from stcal.handeye.judge.notes import Aside
 from stcal.handeye.judge.observability import Observability
-from stcal.handeye.methods.reprojection import Reprojection
-from stcal.handeye.report.file import Outcome, why_out
+from stcal.handeye.report.coverage import by_robot, image_coverage, turns_between
+from stcal.handeye.report.figures import BAD, GOOD, corner_figure, image_figure, pose_bars, turns_figure
+from stcal.handeye.report.file import why_out
+from stcal.handeye.report.outcome import Outcome
+from stcal.handeye.report.overlays import overlays
+from stcal.handeye.report.verdict import judged
 from stcal.handeye.result import HandEye
 from stcal.handeye.solve import FACTORS
 from stcal.handeye.validate import Compared
 from stcal.io.camera import PARAMETER_NAMES, parameter_names
-from stcal.report.figure import COLOURS, FAINT, INK, SMALL, calm, new_figure, uri
-from stcal.report.page import render
+from stcal.report.figure import uri
+from stcal.report.page import render, verdict
 from stcal.report.text import NONE, number, text_table
 
 HEADS = ("", "mm", "± σ", "rotation vector °", "± σ")
@@ -34,13 +39,14 @@ SIGMA_NAMES = {
     "board_mm": ("corner on the board", "mm", 1.0),
     **{key: (f"camera file, {name}", "times its σ", 1.0) for key, name in FACTORS.items()},
 }
-GOOD, BAD = COLOURS[0], COLOURS[1]
+VERDICTS = {"good": "#1b7837", "use with care": "#b26a00", "do not use": "#b3261e"}
+"""Colours of the words."""
 
 
 def outcome_text(outcome: Outcome) -> str:
     """Tables for the terminal."""
     result, frames = outcome.result, FRAMES[outcome.result.setup]
-    lines = [_headline(outcome)]
+    lines = [_headline(outcome), f"verdict: {judged(outcome).sentence()}"]
     for name, pose, covariance in _transforms(result):
         lines += ["", *text_table([["<" + name, *HEADS[1:]], *_transform_rows(pose, covariance)])]
     turn, shift = result.rms()
@@ -193,7 +199,7 @@ def outcome_page(outcome: Outcome) -> str:
         counts=_headline(outcome),
         headline=_tiles(outcome),
         agreeing=_agreeing_text(outcome) if outcome.held_out is not None else [],
-        notes=list(outcome.all_notes()),
+        notes=[note for note in outcome.all_notes() if isinstance(note, Aside)],
         heads=HEADS,
         transforms=[
             (name, _transform_rows(pose, covariance), _matrix_text(pose))
@@ -210,12 +216,50 @@ def outcome_page(outcome: Outcome) -> str:
         board_seen=ERRORS["board_mm"][0] in compared[0],
         good=GOOD,
         bad=BAD,
-        residuals=uri(_residual_figure(result)),
-        corners=[uri(figure) for figure in _corner_figures(result)],
+        bars=pose_bars(result),
         poses=_pose_rows(result),
+        **_verdict(outcome),
+        **_coverage(outcome),
         motions=seen and _motion_rows(seen),
         sigma_deg=seen and np.degrees(seen.sigma_rad),
     )
+
+
+def _verdict(outcome: Outcome) -> dict:
+    """The word, its reasons and remedies, and all that was judged."""
+    found = judged(outcome)
+    rows = [
+        [each.title, verdict(each.word, VERDICTS[each.word]), each.value or NONE, each.limit or NONE, each.said]
+        for each in found.findings
+    ]
+    reasons = [": ".join(filter(None, (each.said, each.remedy))) for each in found.reasons()]
+    return {"word": found.word, "verdict_colour": VERDICTS[found.word], "reasons": reasons, "findings": rows}
+
+
+def _coverage(outcome: Outcome) -> dict:
+    """Of the image, of rotations, and the images themselves; None and empty where there is nothing to show."""
+    shown, missing = overlays(outcome)
+    found: dict = {"image": None, "corners": None, "turns": None, "overlays": shown, "missing": missing}
+    views, pairs, board = outcome.views, outcome.pairs, outcome.result.reprojection
+    if board is not None:
+        found["corners"] = uri(corner_figure(board))
+    if pairs is not None:
+        found["turns"] = uri(turns_figure(turns_between(pairs), outcome.result.observability))
+    if views is None or pairs is None:
+        return found
+    if board is None:
+        seen = np.concatenate([view.xy_px for view in views.views])
+        off = np.concatenate(by_robot(outcome.result, pairs, views)) - seen
+    else:
+        used = [views.views[i].xy_px for i in np.unique(board.view)]
+        seen, off = np.concatenate(used), board.residuals_px
+    known = np.isfinite(off).all(1)
+    covered = image_coverage(views)
+    size = views.camera.width, views.camera.height
+    figure, factor = image_figure(size, covered, seen[known], off[known])
+    by = "the adjustment" if board is not None else "robot and transforms"
+    found["image"] = uri(figure), f"{covered.share:.0%}", f"{factor:g}", by
+    return found
 
 
 def _matrix_text(pose: Rigid) -> str:
@@ -270,74 +314,6 @@ def _pose_rows(result: HandEye) -> list[list[str]]:
             row.append(number(result.reprojection.rms_px(i), 3))
         rows.append([*row, "left out" if result.outliers[i] else ""])
     return rows
-
-
-def _residual_figure(result: HandEye):
-    """Bars of each pose: rotation above, translation below."""
-    figure = new_figure(9.0, 3.6)
-    at = np.arange(1, len(result.names) + 1)
-    parts = ((np.degrees(result.residuals[:, :3]), "rotation, °"), (result.residuals[:, 3:], "board's origin, mm"))
-    for k, (part, label) in enumerate(parts):
-        axes = figure.add_axes((0.08, 0.57 - 0.43 * k, 0.91, 0.37))
-        colours = [BAD if bad else GOOD for bad in result.outliers]
-        axes.vlines(at, 0, np.linalg.norm(part, axis=1), color=colours, lw=_width(300, len(at)))
-        axes.set_xlim(0.3, len(at) + 0.7)
-        axes.set_ylim(0, None)
-        _finish(axes, "", label)
-        few = len(at) <= 30
-        short = [name if len(name) <= 12 else f"…{name[-11:]}" for name in result.names]
-        if few:
-            axes.set_xticks(
-                at, short if k else [""] * len(at), rotation=40 if max(map(len, short)) > 3 else 0, ha="right"
-            )
-        elif not k:
-            axes.tick_params(labelbottom=False)
-    return figure
-
-
-def _corner_figures(result: HandEye) -> list:
-    """Residuals of all corners, and their RMS by pose; none where no corners were adjusted."""
-    found = result.reprojection
-    return [] if found is None else [_corner_figure(found), _corner_rms_figure(found, len(result.names))]
-
-
-def _corner_figure(found: Reprojection):
-    figure = new_figure(4.4, 4.0)
-    axes = figure.add_axes((0.15, 0.12, 0.8, 0.86))
-    off = found.residuals_px
-    axes.plot(*off.T, ".", color=GOOD, ms=2.2, alpha=0.6)
-    radius = float(np.quantile(np.linalg.norm(off, axis=1), 0.95))
-    turn = np.linspace(0, 2 * np.pi, 100)
-    axes.plot(radius * np.cos(turn), radius * np.sin(turn), color=INK, lw=0.8)
-    axes.set_aspect("equal", adjustable="datalim")
-    _finish(axes, "x, px", "y, px (down)")
-    axes.invert_yaxis()
-    return figure
-
-
-def _corner_rms_figure(found: Reprojection, count: int):
-    figure = new_figure(4.4, 4.0)
-    axes = figure.add_axes((0.15, 0.12, 0.8, 0.86))
-    rms = np.array([found.rms_px(i) for i in range(count)])
-    axes.vlines(
-        np.arange(1, len(rms) + 1), 0, np.nan_to_num(rms), color=GOOD, lw=float(np.clip(150 / len(rms), 0.8, 6))
-    )
-    axes.set_xlim(0.3, len(rms) + 0.7)
-    axes.set_ylim(0, None)
-    _finish(axes, "pose, in order of the table", "px")
-    return figure
-
-
-def _width(room: float, bars: int) -> float:
-    return float(np.clip(room / bars, 0.8, 8))
-
-
-def _finish(axes, x: str, y: str) -> None:
-    calm(axes)
-    axes.grid(axis="y", color=FAINT, lw=0.6)
-    axes.set_axisbelow(True)
-    axes.set_xlabel(x, fontsize=SMALL + 1, color=INK)
-    axes.set_ylabel(y, fontsize=SMALL + 1, color=INK)
 
 
 def _motion_rows(seen: Observability) -> list[list[str]]:

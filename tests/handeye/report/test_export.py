@@ -13,7 +13,9 @@ from scipy.spatial.transform import Rotation
 from stcal.errors import InputError
 from stcal.geometry.rigid import Rigid
 from stcal.handeye import HandEye
-from stcal.handeye.report.export import opencv_yaml, ros_yaml, urdf_joint
+from stcal.handeye.report.export import FORMS, ROS_FORMS, exported, opencv_yaml, ros_yaml, tree, urdf_joint
+from stcal.handeye.report.export.robots import program_name
+from stcal.handeye.report.export.ros import read_ros, read_urdf
 
 angle, length = st.floats(-3.1, 3.1), st.floats(-3000, 3000)
 
@@ -43,6 +45,7 @@ def test_ros(twist):
 @given(st.tuples(angle, angle, angle, length, length, length))
 @example((0, np.pi / 2, 0, 1, 2, 3))  # pitch of 90°: roll and yaw are one turn
 @example((0, -np.pi / 2, 0, 1, 2, 3))
+@example((0, np.pi / 2 - 1e-8, 0, 1, 2, 3))  # beside it, where the sine of the pitch is 1 to the last digit
 def test_urdf(twist):
     """URDF's rule: R = R_z(yaw) R_y(pitch) R_x(roll)."""
     pose = Rigid.exp(twist)
@@ -53,7 +56,7 @@ def test_urdf(twist):
     roll, pitch, yaw = (float(v) for v in origin.get("rpy").split())
     turns = [Rotation.from_euler(axis, value).as_matrix() for axis, value in (("z", yaw), ("y", pitch), ("x", roll))]
     metres = [float(v) for v in origin.get("xyz").split()]
-    assert np.abs(turns[0] @ turns[1] @ turns[2] - pose.rotation).max() < 1e-7  # near the pole half of the digits stay
+    assert np.abs(turns[0] @ turns[1] @ turns[2] - pose.rotation).max() < 1e-12
     assert_same(pose.rotation, metres, pose)
 
 
@@ -75,3 +78,152 @@ def test_opencv(setup, tmp_path):
 def test_frames_of_the_same_name_are_refused():
     with pytest.raises(InputError, match="both 'tool0'"):
         ros_yaml(result_of(Rigid()), "tool0", "tool0")
+
+
+COVARIANCE = np.diag([1e-8, 4e-8, 9e-8, 0.01, 0.04, 0.09])
+LINK = Rigid([[0, 0, 1], [-1, 0, 0], [0, -1, 0]], [0, 0, 0])
+"""REP 103: the line of sight, Z of the optical frame, is X of the link; its X, to the right, is the link's -Y."""
+
+
+@pytest.mark.parametrize("setup", ["eye-in-hand", "eye-to-hand"])
+@pytest.mark.parametrize("form", FORMS)
+@given(st.tuples(angle, angle, angle, length, length, length))
+@example((0, 0, 0, 0, 0, 0))
+@example((0, np.pi / 2, 0, 1, 2, 3))
+@example((0, -np.pi / 2, 0, 1, 2, 3))
+@example((0, np.pi / 2 - 1e-8, 0, 1, 2, 3))
+@example((np.pi, 0, 0, -1e-7, 2, 3))
+@example((0, 0, -3.14159265358, 1, 2, 3))
+def test_every_form_gives_the_transform_back(form, setup, twist):
+    pose = Rigid.exp(twist)
+    found = FORMS[form].read(
+        exported(result_of(pose, setup, COVARIANCE), form, parent="tool 0" if form == "ros2" else "")
+    )
+    if not isinstance(found, Rigid):
+        (own,) = found
+        mount = "tool 0" if form == "ros2" else {"eye-in-hand": "flange", "eye-to-hand": "base"}[setup]
+        assert (own.parent, own.child) == (mount, "camera_optical_frame")
+        found = own.pose
+    off = found.inverse() @ pose
+    assert off.angle_rad() < 2e-11  # half of the last digit of a degree, 5e-10, of three angles
+    assert np.abs(off.translation).max() < 2e-6 * 0.5  # of a millimetre, of three
+
+
+@pytest.mark.parametrize("form", ROS_FORMS)
+def test_the_link_has_the_optical_frame_in_it(form):
+    """One parent for each frame, and the way to the optical frame is the same."""
+    pose = Rigid.exp([0.3, -2, 1, 12.5, -900, 3])
+    found = FORMS[form].read(exported(result_of(pose), form, child="left_link", camera_frame="link"))
+    assert (found[0].parent, found[0].child) == ("flange", "left_link")
+    assert np.abs((found[0].pose @ LINK).matrix() - pose.matrix()).max() < 1e-8
+    for fixed in found[1:]:
+        assert (fixed.parent, fixed.child) == ("left_link", "left_optical_frame")
+        assert np.abs(fixed.pose.matrix() - LINK.matrix()).max() < 1e-14
+    assert len(found) == (1 if form.startswith("easy") else 2)
+
+
+@pytest.mark.parametrize(("write", "read"), [(ros_yaml, read_ros), (urdf_joint, read_urdf)])
+def test_the_link_in_ros_and_urdf(write, read):
+    pose = Rigid.exp([0.3, -2, 1, 12.5, -900, 3])
+    first, fixed = read(write(result_of(pose), camera_frame="link"))
+    assert [first.parent, first.child, fixed.parent, fixed.child] == [
+        "flange",
+        "camera_link",
+        "camera_link",
+        "camera_optical_frame",
+    ]
+    assert np.abs((first.pose @ fixed.pose).matrix() - pose.matrix()).max() < 1e-9
+    (only,) = read(write(result_of(pose)))
+    assert only.child == "camera_optical_frame"
+    assert np.abs(only.pose.matrix() - pose.matrix()).max() < 1e-9
+
+
+def test_axes_of_the_link():
+    """A camera that looks along the flange's Z with its X along the flange's X: the link's X looks along Z too."""
+    link, optical = tree(result_of(Rigid()), camera_frame="link")
+    assert (link.pose.rotation @ [1, 0, 0] == [0, 0, 1]).all()  # forward
+    assert (link.pose.rotation @ [0, 1, 0] == [-1, 0, 0]).all()  # left
+    assert (link.pose.rotation @ [0, 0, 1] == [0, -1, 0]).all()  # up
+    assert Rotation.from_matrix(np.array(optical.pose.rotation)).as_euler("xyz") == pytest.approx(
+        [-np.pi / 2, 0, -np.pi / 2]
+    )
+
+
+POSE = Rigid(Rotation.from_euler("ZYX", [30, -20, 10], degrees=True).as_matrix(), [1.5, -20, 300.25])
+"""A = 30°, B = -20°, C = 10° of KUKA; W = 10°, P = -20°, R = 30° of FANUC."""
+
+
+def test_kuka_by_its_handbook():
+    text = exported(result_of(POSE), "kuka", "my camera")
+    assert "DEFDAT my_camera PUBLIC" in text
+    frame = "X 1.500000,Y -20.000000,Z 300.250000,A 30.000000000,B -20.000000000,C 10.000000000"
+    assert f"DECL GLOBAL FRAME flange_from_camera={{{frame}}}" in text
+
+
+def test_fanuc_by_its_handbook():
+    text = exported(result_of(POSE, covariance=COVARIANCE), "fanuc")
+    assert "X = 1.500000  mm,\tY = -20.000000  mm,\tZ = 300.250000  mm," in text
+    assert "W = 10.000000000 deg,\tP = -20.000000000 deg,\tR = 30.000000000 deg" in text
+    remarks = [line.split("!")[1].removesuffix(" ;") for line in text.splitlines() if "!" in line]
+    assert remarks == ["flange_from_camera", "sigma mm 0.1 0.2 0.3", "sigma deg 0.0057 0.011 0.017"]
+
+
+def test_abb_by_its_handbook():
+    """q1 is the real part."""
+    text = exported(result_of(Rigid(Rotation.from_euler("z", 60, degrees=True).as_matrix(), [1, 2, 3])), "abb")
+    assert "PERS pose flange_from_camera:=[[1.000000,2.000000,3.000000],[0.866025403784,0.0" in text
+    assert ",0.500000000000]];" in text
+
+
+def test_universal_robots_by_their_handbook():
+    text = exported(result_of(Rigid.exp([0, 0, 1.5, 1, -2, 3]), "eye-to-hand"), "ur")
+    assert text.endswith(
+        "base_from_camera = p[0.001000000000, -0.002000000000, 0.003000000000, "
+        "0.000000000000, 0.000000000000, 1.500000000000]\n"
+    )
+
+
+def test_moveit_is_an_argument_list_of_roslaunch():
+    """x y z qx qy qz qw parent child."""
+    text = exported(result_of(Rigid.exp([0, 0, np.pi / 3, 100, 200, -300])), "moveit")
+    node = ElementTree.fromstring(text).find("node")
+    assert (node.get("pkg"), node.get("type")) == ("tf2_ros", "static_transform_publisher")
+    words = node.get("args").split()
+    assert [float(word) for word in words[:7]] == pytest.approx([0.1, 0.2, -0.3, 0, 0, 0.5, 0.75**0.5], abs=1e-12)
+    assert words[7:] == ["flange", "camera_optical_frame"]
+    with pytest.raises(InputError, match="'tool 0' has white space"):
+        exported(result_of(Rigid()), "moveit", parent="tool 0")
+
+
+@pytest.mark.parametrize(("setup", "kind"), [("eye-in-hand", "eye_in_hand"), ("eye-to-hand", "eye_on_base")])
+def test_easy_handeye_names_its_frames(setup, kind):
+    text = exported(result_of(Rigid(), setup), "easy-handeye2", "mine", parent="tool0", child="cam")
+    frames = yaml.safe_load(text)["parameters"]
+    assert (frames["name"], frames["calibration_type"], frames["tracking_base_frame"]) == ("mine", kind, "cam")
+    own, other = ("robot_effector_frame", "robot_base_frame")[:: 1 if setup == "eye-in-hand" else -1]
+    assert (frames[own], frames[other]) == ("tool0", "base" if setup == "eye-in-hand" else "flange")
+    assert yaml.safe_load(exported(result_of(Rigid(), setup), "easy-handeye"))["parameters"]["eye_on_hand"] == (
+        setup == "eye-in-hand"
+    )
+
+
+@pytest.mark.parametrize("form", sorted(set(FORMS) - {"fanuc"}))
+def test_the_covariance_is_stated(form):
+    text = exported(result_of(POSE, covariance=COVARIANCE), form)
+    assert "sigma along x y z of the flange: 0.1 0.2 0.3 mm; about them: 0.00573 0.01146 0.01719 deg" in text
+    assert "9.000000e-02" in text
+    assert "no covariance" in exported(result_of(POSE), form)
+    assert text[: text.index("axes of the flange:")].isascii()
+
+
+def test_a_form_that_is_none_is_refused():
+    with pytest.raises(InputError, match="--export staubli: unknown; one of ros2, "):
+        exported(result_of(POSE), "staubli")
+
+
+@pytest.mark.parametrize(
+    ("stem", "name"),
+    [("cam", "cam"), ("my cam.v2", "my_cam_v2"), ("2cam", "stcal_2cam"), ("x" * 40, "x" * 24), ("é", "stcal")],
+)
+def test_names_of_programs(stem, name):
+    assert program_name(stem) == name

@@ -9,7 +9,8 @@ import numpy as np
 import pytest
 
 from stcal.handeye import HandEyeOptions, handeye
-from stcal.handeye.report.file import HandEyeFile, Outcome
+from stcal.handeye.report.file import HandEyeFile
+from stcal.handeye.report.outcome import Outcome
 from stcal.handeye.report.page import outcome_page, outcome_text
 from stcal.handeye.solve import FACTORS
 from stcal.handeye.validate import Compared, compare, cross_validate, splits
@@ -28,7 +29,7 @@ class Tags(HTMLParser):
         self.open, self.images, self.text = [], 0, []
 
     def handle_starttag(self, tag, attrs):
-        self.images += tag == "img"
+        self.images += tag in ("img", "image")
         if tag not in VOID:
             self.open.append(tag)
 
@@ -53,7 +54,15 @@ def of_views() -> Outcome:
     result = handeye(truth.pairs, truth.setup, None, truth.views, options)
     result = replace(result, notes=("a note with <markup> & more",))
     held_out = cross_validate(truth.pairs, truth.setup, None, truth.views, options, splits(10, 2, 2))
-    return Outcome("images & poses", result, held_out, pitch_mm=25.0, left_out=(("x<1>.png", "no board"),))
+    return Outcome(
+        "images & poses",
+        result,
+        held_out,
+        pitch_mm=25.0,
+        left_out=(("x<1>.png", "no board"),),
+        pairs=truth.pairs,
+        views=truth.views,
+    )
 
 
 @pytest.fixture(scope="module")
@@ -61,7 +70,7 @@ def of_methods() -> Outcome:
     truth = simulated(np.random.default_rng(3), 10, robot=(2e-4, 0.1), camera=(5e-4, 0.2))
     compared = compare(truth.pairs, methods=("tsai-lenz", "pose"), rows=splits(10, 2, 2))
     failed = Compared("zhao", None, None, "hand-eye: zhao finds no rotation")
-    return Outcome("poses.csv", compared[1].result, compared[1].held_out, (*compared, failed))
+    return Outcome("poses.csv", compared[1].result, compared[1].held_out, (*compared, failed), pairs=truth.pairs)
 
 
 def test_the_text_has_the_transform_with_its_sigma(of_views):
@@ -108,9 +117,12 @@ def test_the_page_is_whole_and_shows_every_part(of_views, of_methods):
     text = " ".join(page.text)
     for part in ("base_from_camera", "flange_from_board", "a note with <markup> & more", "x<1>.png", "pose 10"):
         assert part in text
+    assert "Coverage of the image" in text
     page = read(outcome_page(of_methods))
     assert page.images == 1
     text = " ".join(page.text)
+    assert "Coverage of the image" not in text
+    assert "Overlays" not in text
     assert "tsai-lenz" in text
     assert "zhao finds no rotation" in text
 
@@ -142,3 +154,32 @@ def test_methods_of_which_none_could_be_validated_are_listed(of_methods):
     outcome = replace(of_methods, held_out=None, compared=(each,))
     assert "tsai-lenz" in outcome_text(outcome)
     assert "without pose 1: too few" in " ".join(read(outcome_page(outcome)).text)
+
+
+def test_a_page_without_poses_and_views_is_whole(of_views):
+    """Of an outcome that a program made of a result alone."""
+    page = read(outcome_page(replace(of_views, pairs=None, views=None, held_out=None)))
+    assert page.images == 0
+    assert "no errors on poses held out are known" in " ".join(page.text)
+
+
+def test_the_verdict_stands_in_text_page_and_file(of_views):
+    line = outcome_text(of_views).splitlines()[1]
+    assert line.startswith("verdict: use with care: ")
+    assert line.endswith("; a note with <markup> & more")
+    text = " ".join(read(outcome_page(of_views)).text)
+    assert "Use with care" in text
+    assert "What the verdict rests on" in text
+    found = HandEyeFile.of(of_views).verdict
+    assert (found.word, found.sentence) == ("use with care", line.removeprefix("verdict: "))
+    assert [row.title for row in found.findings][-1] == "Note"
+
+
+def test_the_chart_of_poses_has_the_names_that_tell_them_apart(of_methods):
+    names = tuple(f"session_of_monday/left_{i:02d}_long_exposure.png" for i in range(10))
+    outcome = replace(of_methods, result=replace(of_methods.result, names=names))
+    page = outcome_page(outcome)
+    for i, name in enumerate(names):
+        assert f"<title>{name}</title>{i:02d}</text>" in page
+        assert f"<title>{name}: " in page  # of its bar, with the value
+    assert "names below it are cut to what tells them apart" in page

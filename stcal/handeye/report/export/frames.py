@@ -1,0 +1,128 @@
+"""Frames of an exported transform: their names, ROS's two frames of a camera, and what is said of the result."""
+
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+import stcal
+from stcal.errors import InputError
+from stcal.geometry.rigid import Rigid
+from stcal.handeye.data.loop import FRAMES, Setup
+from stcal.handeye.result import HandEye
+
+METRE_MM = 1000.0
+"""ROS, URDF and Universal Robots have metres."""
+CAMERA_FRAME = "camera_optical_frame"
+"""What ROS calls a frame whose Z looks along the line of sight and X to the right, as ours does."""
+CAMERA_LINK = "camera_link"
+"""What ROS calls one whose X looks along the line of sight, Y to the left and Z up."""
+LINK_FROM_OPTICAL = Rigid([[0, 0, 1], [-1, 0, 0], [0, -1, 0]], [0, 0, 0])
+"""Of one origin: REP 103, suffix frames."""
+CameraFrame = Literal["optical", "link"]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Static:
+    """A fixed transform of a tree of frames, ``parent_from_child``."""
+
+    parent: str
+    child: str
+    pose: Rigid
+
+
+def tree(result: HandEye, parent: str = "", child: str = "", camera_frame: CameraFrame = "optical") -> list[Static]:
+    """What a tree of frames needs to hold the camera, each frame with one parent.
+
+    Parameters
+    ----------
+    parent, child : str
+        Names of the frames; flange or base, and :data:`CAMERA_FRAME` or :data:`CAMERA_LINK`, where none are given.
+    camera_frame : str
+        ``optical``: the camera's own frame; ``link``: the link, and the optical frame in it.
+
+    Raises
+    ------
+    InputError
+        Names that are none, or not all different.
+    """
+    mount, *names = frame_names(result.setup, parent, child, camera_frame)
+    require_frame_names(mount, *names)
+    if camera_frame == "optical":
+        return [Static(mount, names[0], result.mount_from_camera)]
+    link, optical = names
+    mount_from_link = result.mount_from_camera @ LINK_FROM_OPTICAL.inverse()
+    return [Static(mount, link, mount_from_link), Static(link, optical, LINK_FROM_OPTICAL)]
+
+
+def frame_names(setup: Setup, parent: str, child: str, camera_frame: CameraFrame) -> tuple[str, ...]:
+    """Of the frames of :func:`tree`, from the root; the optical frame of a link NAME_link is NAME_optical_frame."""
+    mount = parent or FRAMES[setup].mount
+    if camera_frame == "optical":
+        return mount, child or CAMERA_FRAME
+    link = child or CAMERA_LINK
+    return mount, link, f"{link.removesuffix('_link')}_optical_frame"
+
+
+def require_frame_names(*names: str) -> None:
+    """Refuse names of frames that are none, or not all different; empty ones stand for the usual.
+
+    Raises
+    ------
+    InputError
+        A character that no file and no terminal shows, or a name twice.
+    """
+    given = [name for name in names if name]
+    for name in given:
+        if not name.isprintable():
+            raise InputError(f"frames: {name!r} has control characters; give a name in letters")
+        if given.count(name) > 1:
+            raise InputError(f"frames: parent and child are both {name!r}; two names needed")
+
+
+def said_of(result: HandEye) -> list[str]:
+    """Lines for comments, in ASCII, as controllers of robots need them: what it is, σ, and the covariance."""
+    frames = FRAMES[result.setup]
+    lines = [f"stcal {stcal.__version__}: {frames.camera}, {result.setup}, {result.method}, {len(result.names)} poses"]
+    if result.covariance is None:
+        return [*lines, f"no covariance: method {result.method} gives none"]
+    sigma = np.sqrt(np.diag(result.covariance))
+    turn, shift = (" ".join(f"{v:.4g}" for v in part) for part in (np.degrees(sigma[:3]), sigma[3:]))
+    lines.append(f"sigma along x y z of the {frames.mount}: {shift} mm; about them: {turn} deg")
+    lines.append(f"covariance, rotation about x y z (rad), then shift along x y z (mm), axes of the {frames.mount}:")
+    return lines + ["  " + " ".join(f"{v:.6e}" for v in row) for row in result.covariance]
+
+
+def roll_pitch_yaw(pose: Rigid) -> np.ndarray:
+    """(3,) rad, about the fixed axes X, Y, Z, in this order.
+
+    At a pitch of ±90° roll and yaw are one turn. The roll is what the other two leave, so that the rotation is right to
+    the last digits there and beside it, where angles taken from single elements lose half of theirs.
+    """
+    r = pose.rotation
+    pitch = np.arctan2(-r[2, 0], np.hypot(r[0, 0], r[1, 0]))
+    yaw = np.arctan2(r[1, 0], r[0, 0])
+    left = from_roll_pitch_yaw([0.0, pitch, yaw]).T @ r
+    return np.array([np.arctan2(left[2, 1], left[1, 1]), pitch, yaw])
+
+
+def from_roll_pitch_yaw(angles) -> np.ndarray:
+    """The rotation (3, 3)."""
+    return Rotation.from_euler("xyz", angles).as_matrix()
+
+
+def metres(pose: Rigid) -> list[float]:
+    """Its translation."""
+    return [float(v) / METRE_MM for v in pose.translation]
+
+
+def xyzw(pose: Rigid) -> list[float]:
+    """Its quaternion, in the order of ROS, w ≥ 0."""
+    return [float(v) for v in Rotation.from_matrix(np.array(pose.rotation)).as_quat(canonical=True)]
+
+
+def pose_of_metres(translation_m, quaternion_xyzw) -> Rigid:
+    """Back from these."""
+    turn = Rotation.from_quat([float(v) for v in quaternion_xyzw]).as_matrix()
+    return Rigid(turn, [METRE_MM * float(v) for v in translation_m])

@@ -1,0 +1,47 @@
+"""Matrices of a hand-eye calibration as YAML: of OpenCV's FileStorage, and of Zivid's SDK."""
+
+import numpy as np
+import yaml
+
+from stcal.geometry.rigid import Rigid
+from stcal.handeye.report.export.frames import said_of
+from stcal.handeye.result import HandEye
+from stcal.io.plain_yaml import load_yaml
+
+
+def opencv_yaml(result: HandEye) -> str:
+    """A file for ``cv2.FileStorage``: both transforms, 4×4, and their covariances where there are any; mm, rad."""
+    covariances = (result.covariance, result.stand_covariance)
+    lines = ["%YAML:1.0", "---", f'setup: "{result.setup}"', f'method: "{result.method}"', 'unit: "mm"']
+    for (name, pose), covariance in zip(result.transforms.items(), covariances, strict=True):
+        lines += _matrix(name, pose.matrix())
+        if covariance is not None:
+            lines += _matrix(f"{name}_covariance", covariance)
+    return "\n".join(lines) + "\n"
+
+
+def zivid_yaml(result: HandEye) -> str:
+    """What ``zivid.Matrix4x4`` saves and loads: 4×4, mm."""
+    head = "".join(f"# {line}\n" for line in said_of(result))
+    content = {
+        "__version__": {"serializer": 1, "data": 1},
+        "FloatMatrix": {"Data": result.mount_from_camera.matrix().tolist()},
+    }
+    return head + yaml.safe_dump(content, sort_keys=False, default_flow_style=None, width=200)
+
+
+def read_zivid(text: str) -> Rigid:
+    """Back from it."""
+    return Rigid.from_matrix(load_yaml(text)["FloatMatrix"]["Data"])
+
+
+def _matrix(name: str, values: np.ndarray) -> list[str]:
+    rows, columns = values.shape
+    numbers = ",\n       ".join(", ".join(repr(float(v)) for v in row) for row in values)
+    return [
+        f"{name}: !!opencv-matrix",
+        f"   rows: {rows}",
+        f"   cols: {columns}",
+        "   dt: d",
+        f"   data: [ {numbers} ]",
+    ]

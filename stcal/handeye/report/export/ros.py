@@ -1,0 +1,271 @@
+"""A hand-eye transform for ROS: messages, URDF, publishers of static transforms, MoveIt, easy_handeye.
+
+Each file has a reader here, by the rules of the program that takes it.
+"""
+
+import ast
+import json
+import shlex
+import xml.etree.ElementTree as ElementTree
+from xml.sax.saxutils import quoteattr
+
+import numpy as np
+import yaml
+
+from stcal.errors import InputError
+from stcal.geometry.rigid import Poses, Rigid
+from stcal.handeye.data.loop import FRAMES
+from stcal.handeye.report.export.frames import (
+    METRE_MM,
+    CameraFrame,
+    Static,
+    from_roll_pitch_yaw,
+    metres,
+    pose_of_metres,
+    roll_pitch_yaw,
+    said_of,
+    tree,
+    xyzw,
+)
+from stcal.handeye.result import HandEye
+from stcal.io.plain_yaml import load_yaml
+from stcal.report.text import number
+
+ARGUMENTS = ("--x", "--y", "--z", "--qx", "--qy", "--qz", "--qw")
+"""Of ROS 2's ``static_transform_publisher``."""
+METRE_DIGITS, QUATERNION_DIGITS = 12, 15
+"""Of arguments, written without exponents: 10⁻⁹ mm."""
+IN_HAND = "eye-in-hand"
+
+
+def ros_yaml(result: HandEye, parent: str = "", child: str = "", camera_frame: CameraFrame = "optical") -> str:
+    """``geometry_msgs/TransformStamped`` as YAML, for a static transform; lengths in metres.
+
+    ``parent``, ``child``, ``camera_frame`` : as of :func:`~stcal.handeye.report.export.frames.tree`; a document for
+    each of its transforms.
+    """
+    return "---\n".join(
+        yaml.safe_dump(_message(each), sort_keys=False, allow_unicode=True)
+        for each in tree(result, parent, child, camera_frame)
+    )
+
+
+def read_ros(text: str) -> list[Static]:
+    """Back from :func:`ros_yaml`."""
+    found = []
+    for document in yaml.safe_load_all(text):
+        own = document["transform"]
+        pose = pose_of_metres([own["translation"][c] for c in "xyz"], [own["rotation"][c] for c in "xyzw"])
+        found.append(Static(document["header"]["frame_id"], document["child_frame_id"], pose))
+    return found
+
+
+def _message(each: Static) -> dict:
+    w, x, y, z = (float(v) for v in Poses.of([each.pose]).quaternions()[0])
+    return {
+        "header": {"frame_id": each.parent},
+        "child_frame_id": each.child,
+        "transform": {
+            "translation": dict(zip("xyz", metres(each.pose), strict=True)),
+            "rotation": {"x": x, "y": y, "z": z, "w": w},
+        },
+    }
+
+
+def urdf_joint(result: HandEye, parent: str = "", child: str = "", camera_frame: CameraFrame = "optical") -> str:
+    """A fixed joint of URDF: ``origin`` in metres, and roll, pitch, yaw about the parent's axes in rad.
+
+    Of ``camera_frame`` ``link`` two joints with the links that they lead to, in a ``robot`` that xacro includes.
+    """
+    transforms = tree(result, parent, child, camera_frame)
+    joints = [_joint(each) for each in transforms]
+    if len(joints) == 1:
+        return joints[0]
+    links = [f"<link name={quoteattr(each.child)}/>\n" for each in transforms]
+    return "<robot>\n" + "".join(link + joint for link, joint in zip(links, joints, strict=True)) + "</robot>\n"
+
+
+def read_urdf(text: str) -> list[Static]:
+    """Back from :func:`urdf_joint`."""
+    root = ElementTree.fromstring(text)
+    return [_static_of_joint(joint) for joint in ([root] if root.tag == "joint" else root.findall("joint"))]
+
+
+def _joint(each: Static) -> str:
+    name = quoteattr(f"{each.parent}_to_{each.child}")
+    origin = " ".join(repr(v) for v in metres(each.pose))
+    angles = " ".join(repr(float(v)) for v in roll_pitch_yaw(each.pose))
+    return (
+        f'<joint name={name} type="fixed">\n'
+        f"  <parent link={quoteattr(each.parent)}/>\n"
+        f"  <child link={quoteattr(each.child)}/>\n"
+        f'  <origin xyz="{origin}" rpy="{angles}"/>\n'
+        "</joint>\n"
+    )
+
+
+def _static_of_joint(joint: ElementTree.Element) -> Static:
+    parts = {part.tag: part.attrib for part in joint}
+    place, angles = ([float(v) for v in parts["origin"][key].split()] for key in ("xyz", "rpy"))
+    pose = Rigid(from_roll_pitch_yaw(angles), METRE_MM * np.array(place))
+    return Static(parts["parent"]["link"], parts["child"]["link"], pose)
+
+
+def ros2_commands(result: HandEye, transforms: list[Static]) -> str:
+    """A shell script of ``ros2 run tf2_ros static_transform_publisher``, a call for each transform; all but the last go
+    on in the background."""
+    calls = [shlex.join(["ros2", "run", "tf2_ros", "static_transform_publisher", *_arguments(t)]) for t in transforms]
+    head = ["#!/bin/sh", *(f"# {line}" for line in said_of(result))]
+    return "\n".join(head) + "\n" + " &\n".join(calls) + "\n"
+
+
+def read_ros2(text: str) -> list[Static]:
+    """Back from :func:`ros2_commands`."""
+    calls = [line.removesuffix("&") for line in text.splitlines() if line.startswith("ros2 ")]
+    return [_static_of_arguments(shlex.split(call)[4:]) for call in calls]
+
+
+def moveit_launch(result: HandEye, transforms: list[Static]) -> str:
+    """The launch file that MoveIt's calibration plugin writes in ROS 1.
+
+    Raises
+    ------
+    InputError
+        A name with white space, at which ``roslaunch`` would split it.
+    """
+    lines = ["<launch>", *(f"  <!-- {line} -->" for line in said_of(result))]
+    for each in transforms:
+        names = each.parent, each.child
+        if spaced := [name for name in names if name.split() != [name]]:
+            raise InputError(f"frames: {spaced[0]!r} has white space, at which roslaunch splits; give another name")
+        words = [*_fixed(metres(each.pose), METRE_DIGITS), *_fixed(xyzw(each.pose), QUATERNION_DIGITS), *names]
+        node = f"{each.child}_broadcaster".replace("/", "_")
+        lines.append(f'  <node pkg="tf2_ros" type="static_transform_publisher" name={quoteattr(node)}')
+        lines.append(f"      args={quoteattr(' '.join(words))} />")
+    return "\n".join(lines) + "\n</launch>\n"
+
+
+def read_moveit(text: str) -> list[Static]:
+    """Back from :func:`moveit_launch`."""
+    found = []
+    for node in ElementTree.fromstring(text).findall("node"):
+        words = node.attrib["args"].split()
+        found.append(Static(words[7], words[8], pose_of_metres(words[:3], words[3:7])))
+    return found
+
+
+def moveit2_launch(result: HandEye, transforms: list[Static]) -> str:
+    """The launch file that MoveIt 2's calibration plugin writes."""
+    lines = [f"# {line}" for line in said_of(result)]
+    lines += ["from launch import LaunchDescription", "from launch_ros.actions import Node", "", ""]
+    lines += ["def generate_launch_description() -> LaunchDescription:", "    nodes = ["]
+    for each in transforms:
+        lines += ["        Node(", '            package="tf2_ros",']
+        lines += ['            executable="static_transform_publisher",', '            output="log",']
+        lines += ["            arguments=["]
+        lines += [f"                {json.dumps(word, ensure_ascii=False)}," for word in _arguments(each)]
+        lines += ["            ],", "        ),"]
+    return "\n".join([*lines, "    ]", "    return LaunchDescription(nodes)"]) + "\n"
+
+
+def read_moveit2(text: str) -> list[Static]:
+    """Back from :func:`moveit2_launch`."""
+    words = [node.value for node in ast.walk(ast.parse(text)) if isinstance(node, ast.keyword) and node.arg]
+    lists = [ast.literal_eval(node) for node in words if isinstance(node, ast.List)]
+    return [_static_of_arguments(each) for each in lists]
+
+
+def easy_handeye(result: HandEye, transforms: list[Static], name: str) -> str:
+    """``~/.ros/easy_handeye/NAME.yaml`` of ROS 1's easy_handeye."""
+    first = transforms[0]
+    turn = dict(zip(("qx", "qy", "qz", "qw"), xyzw(first.pose), strict=True))
+    content = {
+        "parameters": {
+            "eye_on_hand": result.setup == IN_HAND,
+            "freehand_robot_movement": True,
+            "move_group": "manipulator",
+            "move_group_namespace": "/",
+            "namespace": f"/{name}/",
+            **_robot_frames(result, first),
+        },
+        "transformation": turn | dict(zip("xyz", metres(first.pose), strict=True)),
+    }
+    return _commented_yaml(result, transforms, content)
+
+
+def read_easy_handeye(text: str) -> list[Static]:
+    """Back from :func:`easy_handeye`."""
+    content = load_yaml(text)
+    own, frames = content["transformation"], content["parameters"]
+    pose = pose_of_metres([own[c] for c in "xyz"], [own[f"q{c}"] for c in "xyzw"])
+    return [_static_of_frames(frames, frames["eye_on_hand"], pose)]
+
+
+def easy_handeye2(result: HandEye, transforms: list[Static], name: str) -> str:
+    """``~/.ros2/easy_handeye2/calibrations/NAME.calib`` of ROS 2's easy_handeye2."""
+    first = transforms[0]
+    content = {
+        "parameters": {
+            "name": name,
+            "calibration_type": "eye_in_hand" if result.setup == IN_HAND else "eye_on_base",
+            **_robot_frames(result, first),
+            "freehand_robot_movement": True,
+            "move_group_namespace": "/",
+            "move_group": "manipulator",
+        },
+        "transform": {
+            "translation": dict(zip("xyz", metres(first.pose), strict=True)),
+            "rotation": dict(zip("xyzw", xyzw(first.pose), strict=True)),
+        },
+    }
+    return _commented_yaml(result, transforms, content)
+
+
+def read_easy_handeye2(text: str) -> list[Static]:
+    """Back from :func:`easy_handeye2`."""
+    content = load_yaml(text)
+    own, frames = content["transform"], content["parameters"]
+    pose = pose_of_metres([own["translation"][c] for c in "xyz"], [own["rotation"][c] for c in "xyzw"])
+    return [_static_of_frames(frames, frames["calibration_type"] == "eye_in_hand", pose)]
+
+
+def _robot_frames(result: HandEye, first: Static) -> dict[str, str]:
+    """The robot's frame that does not carry the camera, and the board's, have no part in the transform."""
+    frames = FRAMES[result.setup]
+    carries = {frames.mount: first.parent, frames.stand: frames.stand}
+    return {
+        "robot_base_frame": carries["base"],
+        "robot_effector_frame": carries["flange"],
+        "tracking_base_frame": first.child,
+        "tracking_marker_frame": "board",
+    }
+
+
+def _static_of_frames(frames: dict, in_hand: bool, pose: Rigid) -> Static:
+    return Static(
+        frames["robot_effector_frame" if in_hand else "robot_base_frame"], frames["tracking_base_frame"], pose
+    )
+
+
+def _commented_yaml(result: HandEye, transforms: list[Static], content: dict) -> str:
+    lines = said_of(result)
+    for each in transforms[1:]:
+        words = " ".join(_fixed(xyzw(each.pose), 3))
+        lines.append(f"{each.child} is not in this file: in {each.parent} at 0 0 0, quaternion x y z w {words}")
+    return "".join(f"# {line}\n" for line in lines) + yaml.safe_dump(content, sort_keys=False, allow_unicode=True)
+
+
+def _arguments(each: Static) -> list[str]:
+    values = [*_fixed(metres(each.pose), METRE_DIGITS), *_fixed(xyzw(each.pose), QUATERNION_DIGITS)]
+    pairs = [("--frame-id", each.parent), ("--child-frame-id", each.child), *zip(ARGUMENTS, values, strict=True)]
+    return [word for pair in pairs for word in pair]
+
+
+def _static_of_arguments(words: list[str]) -> Static:
+    given = dict(zip(words[::2], words[1::2], strict=True))
+    values = [given[name] for name in ARGUMENTS]
+    return Static(given["--frame-id"], given["--child-frame-id"], pose_of_metres(values[:3], values[3:]))
+
+
+def _fixed(values, digits: int) -> list[str]:
+    return [number(v, digits) for v in values]

@@ -1,0 +1,188 @@
+"""Plots of the report of a hand-eye calibration."""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from stcal.handeye.judge.observability import Observability
+from stcal.handeye.methods.reprojection import Reprojection
+from stcal.handeye.report.coverage import LEAST_TURN, ImageCoverage, equal_area
+from stcal.handeye.result import HandEye
+from stcal.report.figure import COLOURS, FAINT, INK, SMALL, calm, locator, new_figure, round_below
+from stcal.report.text import number, telling_names
+
+GOOD, BAD = COLOURS[0], COLOURS[1]
+MOST_NAMED = 40
+"""Poses of which each has its name below the chart; of more poses, every second, third …"""
+MOST_VECTORS = 1500
+"""Residuals that are drawn over the image."""
+WIDE, HIGH, LEFT, GAP = 960.0, 112.0, 62.0, 30.0
+"""Of the chart of poses, px: width, height of one panel, room for its numbers, and between panels."""
+LONGEST = 0.06
+"""Of the image's width: the residual that 95 % are below, as drawn."""
+
+
+@dataclass(frozen=True, slots=True)
+class Panel:
+    """Bars of one quantity: ``ticks`` (y, text) and ``bars`` (x, top, height, colour, title), px."""
+
+    label: str
+    top: float
+    ticks: list[tuple[float, str]]
+    bars: list[tuple[float, float, float, str, str]]
+
+
+@dataclass(frozen=True, slots=True)
+class PoseBars:
+    """The chart of poses: ``panels`` one below the other, ``names`` (x, text, full name) below them, slanted where
+    ``slope``, shorter than they are where ``cut``."""
+
+    width: float
+    height: float
+    left: float
+    bar: float
+    panels: list[Panel]
+    names: list[tuple[float, str, str]]
+    slope: bool
+    cut: bool
+
+
+def pose_bars(result: HandEye) -> PoseBars:
+    """Of each pose: rotation, board's origin, and RMS of its corners where these were adjusted."""
+    turn, shift = (np.linalg.norm(part, axis=1) for part in np.split(result.residuals, 2, axis=1))
+    rows = [("rotation, °", np.degrees(turn), 4, "°"), ("board's origin, mm", shift, 3, " mm")]
+    if result.reprojection is not None:
+        rms = np.array([result.reprojection.rms_px(i) for i in range(len(result.names))])
+        rows.append(("corners, RMS px", rms, 3, " px"))
+    step = (WIDE - LEFT) / len(result.names)
+    at = [LEFT + (i + 0.5) * step for i in range(len(result.names))]
+    panels = []
+    for k, (label, values, digits, unit) in enumerate(rows):
+        top = 20 + k * (HIGH + GAP)
+        largest = float(np.nanmax(values, initial=0)) or 1.0
+        ticks = [t for t in locator().tick_values(0, largest) if 0 <= t <= 1.001 * largest]
+        bars = []
+        for x, value, name, bad in zip(at, values, result.names, result.outliers, strict=True):
+            title = f"{name}: {number(value, digits)}{unit}{', left out' if bad else ''}"
+            height = HIGH * float(np.nan_to_num(value)) / largest
+            bars.append((x, top + HIGH - height, height, BAD if bad else GOOD, title))
+        panels.append(Panel(label, top, [(top + HIGH * (1 - t / largest), f"{t:g}") for t in ticks], bars))
+    every = int(np.ceil(len(at) / MOST_NAMED))
+    short = telling_names(result.names)
+    slope = max(map(len, short)) * 7.5 > every * step
+    names = list(zip(at, short, result.names, strict=True))[::every]
+    room = 22 if not slope else 18 + 5.0 * max(len(text) for _, text, _ in names)
+    height = panels[-1].top + HIGH + room
+    return PoseBars(
+        WIDE, height, LEFT, float(np.clip(0.7 * step, 1, 26)), panels, names, slope, short != list(result.names)
+    )
+
+
+def corner_figure(found: Reprojection):
+    """Residuals of all corners."""
+    figure = new_figure(4.4, 4.0)
+    axes = figure.add_axes((0.15, 0.12, 0.8, 0.86))
+    off = found.residuals_px[_some(len(found.residuals_px))]
+    axes.plot(*off.T, ".", color=GOOD, ms=2.2, alpha=0.6)
+    radius = float(np.quantile(np.linalg.norm(found.residuals_px, axis=1), 0.95))
+    turn = np.linspace(0, 2 * np.pi, 100)
+    axes.plot(radius * np.cos(turn), radius * np.sin(turn), color=INK, lw=0.8)
+    axes.set_aspect("equal", adjustable="datalim")
+    _finish(axes, "x, px", "y, px (down)")
+    axes.invert_yaxis()
+    return figure
+
+
+def image_figure(size: tuple[int, int], covered: ImageCoverage, seen: np.ndarray, off: np.ndarray):
+    """Where the board was in the image, and residuals ``off`` (n, 2) of the corners ``seen`` (n, 2), enlarged.
+
+    Returns
+    -------
+    figure, and by what the residuals are enlarged
+    """
+    from matplotlib.collections import LineCollection
+
+    width, height = size
+    figure = new_figure(6.0, 6.0 * height / width * 0.92 + 0.4)
+    axes = figure.add_axes((0.09, 0.11, 0.89, 0.87))
+    shade = np.minimum(covered.counts / max(covered.counts.max(), 1), 1.0)
+    axes.imshow(
+        np.where(covered.counts > 0, 0.25 + 0.75 * shade, 0.0),
+        extent=(-0.5, width - 0.5, height - 0.5, -0.5),
+        cmap="Blues",
+        vmin=0,
+        vmax=2.6,
+        interpolation="nearest",
+        aspect="equal",
+    )
+    factor = enlargement(off, width)
+    some = _some(len(seen))
+    seen, off = seen[some], off[some]
+    axes.add_collection(LineCollection(np.stack([seen, seen + factor * off], axis=1).tolist(), colors=BAD, lw=0.8))
+    axes.plot(*seen.T, ".", color=INK, ms=1.6)
+    axes.set_xlim(-0.5, width - 0.5)
+    axes.set_ylim(height - 0.5, -0.5)
+    axes.xaxis.set_major_locator(locator())
+    axes.yaxis.set_major_locator(locator())
+    axes.tick_params(labelsize=SMALL, length=2)
+    axes.set_xlabel("x, px", fontsize=SMALL + 1, color=INK)
+    axes.set_ylabel("y, px", fontsize=SMALL + 1, color=INK)
+    return figure, factor
+
+
+def enlargement(off: np.ndarray, width: float) -> float:
+    """A round factor by which residuals (n, 2) are seen on an image of this width, and do not cover it; 1 or more."""
+    length = np.linalg.norm(off[np.isfinite(off).all(1)], axis=1)
+    usual = float(np.quantile(length, 0.95)) if len(length) else 0.0
+    return max(1.0, round_below(LONGEST * width / usual)) if usual else 1.0
+
+
+def turns_figure(turns: np.ndarray, seen: Observability | None):
+    """Axes of the turns (n, 3) between poses on the half sphere, and how large these turns are."""
+    figure = new_figure(9.4, 4.1)
+    axes = figure.add_axes((0.01, 0.03, 0.44, 0.94))
+    angle = np.linalg.norm(turns, axis=1)
+    large = angle > LEAST_TURN
+    around = np.linspace(0, 2 * np.pi, 200)
+    for tilt in (30, 60, 90):
+        radius = np.sqrt(2) * np.sin(np.radians(tilt) / 2)
+        axes.plot(radius * np.cos(around), radius * np.sin(around), color=INK if tilt == 90 else FAINT, lw=0.8)
+        if tilt < 90:
+            axes.text(0, -radius, f"{tilt}°", fontsize=SMALL - 1, color="#556270", ha="center", va="bottom")
+    for text, x, y in (("+X", 1.07, 0), ("−X", -1.07, 0), ("+Y", 0, 1.05), ("−Y", 0, -1.05)):
+        axes.text(x, y, text, fontsize=SMALL + 0.5, ha="center", va="center", color=INK)
+    axes.plot(0, 0, "+", color="#9aa0a8", ms=6)
+    axes.text(0.03, 0.03, "Z", fontsize=SMALL + 0.5, color=INK)
+    at = equal_area(turns[large] / angle[large, None])
+    dots = axes.scatter(*at.T, c=np.degrees(angle[large]), s=11, cmap="viridis_r", vmin=0, lw=0, alpha=0.85, zorder=2)
+    if seen is not None:
+        for k, axis in enumerate(np.where(seen.axes[:, 2:] < 0, -seen.axes, seen.axes), 1):
+            x, y = equal_area(axis[None])[0]
+            axes.plot(x, y, "o", mfc="none", mec=BAD, ms=11, mew=1.6, zorder=3)
+            axes.text(x + 0.07, y, str(k), fontsize=SMALL + 1.5, color=BAD, weight="bold", va="center", zorder=3)
+    axes.set(xlim=(-1.16, 1.16), ylim=(-1.12, 1.12), aspect="equal")
+    axes.axis("off")
+    if large.any():
+        bar = figure.colorbar(dots, cax=figure.add_axes((0.465, 0.2, 0.014, 0.6)))
+        bar.ax.tick_params(labelsize=SMALL - 1, length=2)
+        bar.outline.set_visible(False)
+        bar.ax.set_title("turn, °", fontsize=SMALL)
+    counts = figure.add_axes((0.60, 0.13, 0.385, 0.82))
+    largest = max(10.0, 10.0 * np.ceil(np.degrees(angle.max(initial=0)) / 10))
+    counts.hist(np.degrees(angle), bins=np.linspace(0, largest, 19).tolist(), color=GOOD)
+    _finish(counts, "turn between two poses, °", "pairs of poses")
+    counts.yaxis.set_major_locator(locator(integer=True))
+    return figure
+
+
+def _some(count: int) -> np.ndarray:
+    """All, or as many as are drawn, at random."""
+    return np.sort(np.random.default_rng(0).permutation(count)[:MOST_VECTORS])
+
+
+def _finish(axes, x: str, y: str) -> None:
+    calm(axes)
+    axes.grid(axis="y", color=FAINT, lw=0.6)
+    axes.set_axisbelow(True)
+    axes.set_xlabel(x, fontsize=SMALL + 1, color=INK)
+    axes.set_ylabel(y, fontsize=SMALL + 1, color=INK)

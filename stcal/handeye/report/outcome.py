@@ -1,0 +1,69 @@
+"""A hand-eye calibration as it is reported."""
+
+from dataclasses import dataclass
+from pathlib import Path
+
+from stcal.handeye.choose import Choice
+from stcal.handeye.data.pairs import HandEyePoses
+from stcal.handeye.data.views import Views
+from stcal.handeye.result import HandEye
+from stcal.handeye.validate import Compared, HeldOutMotions, HeldOutPoses
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Outcome:
+    """A calibration as it is reported.
+
+    Parameters
+    ----------
+    where : str
+        What it was made from.
+    result : HandEye
+    held_out : HeldOutPoses, optional
+        Errors of its method on poses held out.
+    compared : tuple of Compared
+        Every method, where that was asked for.
+    pitch_mm : float, optional
+        Of dots or squares, as the board's file states it.
+    colmap_model : str
+        Of the camera whose intrinsics were solved for.
+    own_sigmas : bool
+        Whether corners came with covariances, of which the result's ``corner_px`` is the factor.
+    left_out : tuple of (str, str)
+        Images and rows that did not take part, and why.
+    notes : tuple of str
+        Besides those of the result.
+    motions : HeldOutMotions, optional
+        Errors of the last motions, held out.
+    choice : Choice, optional
+        What else was tried, where no method was named.
+    pairs : HandEyePoses, optional
+        What was solved, numberings of a symmetric board put right.
+    views : Views, optional
+        The corners, likewise, where there were images.
+    folder : Path, optional
+        Where the images lie, of which the pairs have the names.
+    """
+
+    where: str
+    result: HandEye
+    held_out: HeldOutPoses | None = None
+    compared: tuple[Compared, ...] = ()
+    pitch_mm: float | None = None
+    colmap_model: str = ""
+    own_sigmas: bool = False
+    left_out: tuple[tuple[str, str], ...] = ()
+    notes: tuple[str, ...] = ()
+    motions: HeldOutMotions | None = None
+    choice: Choice | None = None
+    pairs: HandEyePoses | None = None
+    views: Views | None = None
+    folder: Path | None = None
+
+    def all_notes(self) -> tuple[str, ...]:
+        """Of the result, then the others."""
+        return (*self.result.notes, *(self.choice.notes if self.choice else ()), *self.notes)
+
+    def outliers(self) -> tuple[str, ...]:
+        """Names of the poses that contradict the others."""
+        return tuple(name for name, bad in zip(self.result.names, self.result.outliers, strict=True) if bad)

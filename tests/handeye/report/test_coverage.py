@@ -1,0 +1,201 @@
+"""What the poses covered, and pictures of how corners by the robot miss."""
+
+from dataclasses import replace
+
+import cv2
+import numpy as np
+import pytest
+
+from stcal.geometry.rigid import Poses, Rigid
+from stcal.handeye import HandEyeOptions, handeye
+from stcal.handeye.data.views import View, Views, pairs_of_views
+from stcal.handeye.report.coverage import by_robot, equal_area, image_coverage, turns_between
+from stcal.handeye.report.figures import MOST_NAMED, enlargement, pose_bars
+from stcal.handeye.report.outcome import Outcome
+from stcal.handeye.report.overlays import overlays
+from stcal.handeye.report.page import outcome_page
+from stcal.synthetic.measured.handeye import simulated, simulated_views
+
+MOST_BYTES = 3_000_000
+
+
+@pytest.fixture(scope="module")
+def truth():
+    return simulated_views(np.random.default_rng(2), 10, "eye-in-hand", (2e-4, 0.1), 0.1)
+
+
+@pytest.fixture(scope="module", params=["reprojection", "pose"])
+def outcome(request, truth) -> Outcome:
+    result = handeye(truth.pairs, truth.setup, request.param, truth.views, HandEyeOptions(with_scale=True))
+    return Outcome("images", result, pairs=truth.pairs, views=truth.views)
+
+
+def with_images(outcome: Outcome, folder, broken=()) -> Outcome:
+    """Noise stands for photographs, the largest that fill a page most."""
+    camera = outcome.views.camera
+    noise = np.random.default_rng(0).integers(0, 255, (camera.height, camera.width), np.uint8)
+    names = tuple(f"{i}.png" for i in range(len(outcome.pairs.names)))
+    for name in names:
+        if name not in broken:
+            cv2.imwrite(str(folder / name), noise)
+    result, pairs = (replace(each, names=names) for each in (outcome.result, outcome.pairs))
+    return replace(outcome, result=result, pairs=pairs, folder=folder)
+
+
+def views_of(camera, *corners) -> Views:
+    return Views(
+        camera, tuple(View(np.pad(np.array(xy, float), ((0, 0), (0, 1))), np.array(xy, float)) for xy in corners)
+    )
+
+
+def test_the_share_of_the_image(truth):
+    """A quarter, by one view and by two that are the same; two quarters that meet are half. Cells of a sixtieth of the
+    width let a straight border be off by one of them: 1/60 and 1/45 of the sides."""
+    camera = truth.views.camera
+    w, h = camera.width, camera.height
+    first = [(0, 0), (w / 2, 0), (w / 2, h / 2), (0, h / 2), (w / 5, h / 5)]
+    second = [(x + w / 2, y) for x, y in first]
+    for views, share, most in (((first,), 0.25, 1), ((first, first), 0.25, 2), ((first, second), 0.5, 1)):
+        found = image_coverage(views_of(camera, *views))
+        assert found.share == pytest.approx(share, abs=0.04)
+        assert found.counts.max() == most
+    found = image_coverage(views_of(camera, first))
+    assert found.counts[:20, :25].min() == 1  # rows are y, columns x
+    assert found.counts[-20:].max() == 0
+
+
+def test_corners_on_a_line_cover_nothing(truth):
+    line = [(x, 10) for x in range(10, 60, 10)]
+    assert image_coverage(views_of(truth.views.camera, line)).share == 0
+
+
+def test_turns_are_those_of_the_flange():
+    """About its own X by 10°, and by 20° the other way: the two turns and the one between them are about ± X."""
+    start = Rigid.exp([0.4, -2, 1, 0, 0, 0])
+    poses = Poses.of([start @ Rigid.exp([np.radians(a), 0, 0.0, 5, 6, 7]) for a in (0, 10, -20)])
+    pairs = replace(simulated(np.random.default_rng(1), 3).pairs, base_from_flange=poses)
+    turns = turns_between(pairs)
+    assert np.sort(np.degrees(np.linalg.norm(turns, axis=1))) == pytest.approx([10, 20, 30])
+    assert np.abs(turns[:, 1:]).max() < 1e-12
+    assert (turns[:, 2] >= 0).all()
+
+
+def test_the_map_keeps_areas():
+    """Directions spread evenly over the half sphere are spread evenly over the disc: as many within radius r as r²."""
+    rng = np.random.default_rng(0)
+    directions = rng.normal(size=(40_000, 3))
+    directions[:, 2] = np.abs(directions[:, 2])
+    radius = np.linalg.norm(equal_area(directions / np.linalg.norm(directions, axis=1)[:, None]), axis=1)
+    assert radius.max() <= 1 + 1e-12
+    for r in (0.3, 0.6, 0.9):
+        assert (radius < r).mean() == pytest.approx(r**2, abs=4 * np.sqrt(r**2 * (1 - r**2) / 40_000))
+
+
+def test_corners_by_the_robot_are_where_they_were_seen(truth, outcome):
+    """Within what the robot errs: 0.2 mrad and 0.1 mm an axis at half a metre and 1000 px, some 0.3 px an axis, and
+    twice as much for the transforms; five times that is beyond chance."""
+    for view, px in zip(truth.views.views, by_robot(outcome.result, truth.pairs, truth.views), strict=True):
+        off = np.linalg.norm(px - view.xy_px, axis=1)
+        assert 0 < off.max() < 5
+        assert np.isfinite(off).all()
+
+
+@pytest.mark.parametrize("method", ["reprojection", "pose"])
+def test_corners_of_a_board_of_another_size(truth, method):
+    """Stated a tenth too small: with its true size, which is found, the corners are where they were seen."""
+    small = [View(view.xyz_board / 1.1, view.xy_px, view.covariance) for view in truth.views.views]
+    views = Views(truth.views.camera, tuple(small))
+    pairs = pairs_of_views(truth.pairs.base_from_flange, views)
+    result = handeye(pairs, truth.setup, method, views, HandEyeOptions(with_scale=True))
+    assert result.scale == pytest.approx(1.1, abs=0.01)
+    for view, px in zip(views.views, by_robot(result, pairs, views), strict=True):
+        assert np.linalg.norm(px - view.xy_px, axis=1).max() < 5
+
+
+def test_a_robot_that_is_off_is_seen_in_the_image(truth, outcome):
+    """A flange moved by 5 mm along its X moves the corners by 5 mm · f / distance, within what perspective adds."""
+    wrong = truth.pairs.base_from_flange
+    moved = replace(truth.pairs, base_from_flange=Poses.of(each @ Rigid(translation=[5, 0, 0]) for each in wrong))
+    first = by_robot(outcome.result, truth.pairs, truth.views)
+    second = by_robot(outcome.result, moved, truth.views)
+    shift = outcome.result.mount_from_camera.rotation.T @ [5, 0, 0]
+    for one, two, seen in zip(first, second, truth.pairs.camera_from_board, strict=True):
+        expected = -shift[:2] * truth.views.camera.focal / seen.translation[2]
+        if np.linalg.norm(shift[:2]) > 4:  # else along the line of sight
+            assert np.linalg.norm((two - one).mean(0) - expected) < 0.35 * np.linalg.norm(expected)
+
+
+def test_a_board_behind_the_camera_is_nowhere(truth, outcome):
+    behind = replace(outcome.result, stand_from_board=Rigid(translation=[0, 0, 1e5]) @ outcome.result.stand_from_board)
+    assert any(np.isnan(px).any() for px in by_robot(behind, truth.pairs, truth.views))
+    assert outcome_page(replace(outcome, result=behind))
+
+
+def test_overlays_of_the_worst_a_usual_and_the_best(outcome, tmp_path):
+    outcome = with_images(outcome, tmp_path)
+    found, missing = overlays(outcome)
+    assert missing == []
+    assert [each.title.split(":")[0] for each in found] == ["worst", "usual", "best"]
+    predicted = by_robot(outcome.result, outcome.pairs, outcome.views)
+    rms = [
+        np.sqrt(((px - view.xy_px) ** 2).sum(1).mean()) for px, view in zip(predicted, outcome.views.views, strict=True)
+    ]
+    assert found[0].title == f"worst: {np.argmax(rms)}.png"
+    assert found[2].title == f"best: {np.argmin(rms)}.png"
+    worst = int(np.argmax(rms))
+    assert found[0].says == f"{max(rms):.3g} px RMS by the robot's pose"
+    x, y, u, v, title = found[0].corners[0]
+    seen, off = outcome.views.views[worst].xy_px[0], predicted[worst][0] - outcome.views.views[worst].xy_px[0]
+    assert (x, y) == pytest.approx(tuple(seen))
+    assert (u - x, v - y) == pytest.approx(tuple(found[0].factor * off))
+    assert f"{np.hypot(*off):.2f} px" in title
+    page = outcome_page(outcome)
+    assert f"enlarged {found[0].factor:.0f} times" in page
+    assert len(page) < MOST_BYTES
+    assert page.count("<image href") == 3
+
+
+def test_an_image_that_is_gone_is_said_and_no_error(outcome, tmp_path):
+    whole = with_images(outcome, tmp_path)
+    name = overlays(whole)[0][0].title.removeprefix("worst: ")
+    (tmp_path / name).unlink()
+    found, missing = overlays(whole)
+    assert [each.title.split(":")[0] for each in found] == ["usual", "best"]
+    assert missing == [f"{name} cannot be shown: No such file or directory"]
+    (tmp_path / name).write_bytes(b"no image")
+    assert "not readable as an image" in overlays(whole)[1][0]
+    assert "cannot be shown" in outcome_page(whole)
+    for path in tmp_path.iterdir():
+        path.unlink()
+    assert "cannot be shown" in outcome_page(whole)
+
+
+@pytest.mark.parametrize(("length", "factor"), [(0.05, 500), (0.2, 200), (1.0, 20), (30.0, 1), (500.0, 1), (0.0, 1)])
+def test_residuals_are_enlarged_by_a_round_number(length, factor):
+    """So that they are at most 6 % of an image 800 px wide, 48 px."""
+    off = np.full((50, 2), length / np.sqrt(2))
+    assert enlargement(off, 800) == factor
+
+
+def test_a_chart_of_many_poses_has_room():
+    """Of 120, every third has its name; bars stay within their panel."""
+    truth = simulated(np.random.default_rng(3), 120, robot=(2e-4, 0.1), camera=(5e-4, 0.2))
+    result = handeye(truth.pairs, truth.setup, "park-martin")
+    chart = pose_bars(result)
+    assert len(chart.names) == 40 <= MOST_NAMED
+    assert [text for _, text, _ in chart.names][:3] == ["1", "4", "7"]
+    for panel in chart.panels:
+        heights = [height for _, _, height, _, _ in panel.bars]
+        assert max(heights) == pytest.approx(
+            chart.panels[1].bars[0][1] + chart.panels[1].bars[0][2] - chart.panels[1].top
+        )
+        assert all(chart.left <= x <= chart.width for x, *_ in panel.bars)
+    turn = np.degrees(np.linalg.norm(result.residuals[:, :3], axis=1))
+    heights = np.array([height for _, _, height, _, _ in chart.panels[0].bars])
+    assert heights / heights.max() == pytest.approx(turn / turn.max())
+    assert chart.panels[0].bars[4][4] == f"pose 5: {turn[4]:.4f}°"
+
+
+def test_the_page_is_the_same_twice(outcome, tmp_path):
+    whole = with_images(outcome, tmp_path)
+    assert outcome_page(whole) == outcome_page(whole)
