@@ -43,6 +43,10 @@ class Outcome:
         Errors of the last motions, held out.
     choice : Choice, optional
         What else was tried, where no method was named.
+    understood : tuple of str
+        What files of other programs were taken for.
+    unit_mm : float, optional
+        Of a model without a unit: mm by which the camera's lengths were multiplied before.
     """
 
     where: str
@@ -56,6 +60,8 @@ class Outcome:
     notes: tuple[str, ...] = ()
     motions: HeldOutMotions | None = None
     choice: Choice | None = None
+    understood: tuple[str, ...] = ()
+    unit_mm: float | None = None
 
     def all_notes(self) -> tuple[str, ...]:
         """Of the result, then the others."""
@@ -70,6 +76,7 @@ class BoardSize(Part):
     scale: float
     scale_sigma: Finite
     pitch_mm: float | None
+    unit_mm: float | None = None
 
 
 class AdjustedCamera(Part):
@@ -171,7 +178,7 @@ class HandEyeFile(ResultFile):
     flange_from_board_covariance: Matrix6 | None = Field(None, description="its covariance, likewise")
     board: BoardSize = Field(
         description="`scale`: true size over stated size, 1 where it was not solved for; `scale_sigma`; `pitch_mm` of "
-        "dots or squares, times `scale`; null for tags and poses"
+        "dots or squares, times `scale`; null for tags and poses; `unit_mm`, only of a model of COLMAP: mm of its unit"
     )
     camera: AdjustedCamera | None = Field(
         description="with `--refine-camera`: COLMAP `model`; `parameters` fx, fy, cx, cy, k1, k2, p1, p2, k3 … k6, "
@@ -217,6 +224,9 @@ class HandEyeFile(ResultFile):
         "worst direction from poses of a common camera (1 mrad, 0.5 mm)"
     )
     notes: list[str] = Field(description="what should be known about the result")
+    understood: list[str] = Field(
+        [], description="only of files of other programs: what each was taken for, a sentence each"
+    )
     splits: list[SplitErrors] = Field(
         [],
         description="only in `--json`: names of the `poses` held out, and the errors of each: `rotation_rad`, "
@@ -237,6 +247,7 @@ class HandEyeFile(ResultFile):
         compared = [_method(each, names) for each in outcome.compared]
         more: dict = {} if outcome.motions is None else {"motions_held_out": _motions(outcome.motions)}
         more |= {} if outcome.choice is None else {"choice": _choice(outcome.choice)}
+        more |= {"understood": outcome.understood} if outcome.understood else {}
         more |= {"splits": _splits(outcome.held_out, names), "methods": compared} if whole else {}
         return cls.model_validate(
             {
@@ -248,11 +259,7 @@ class HandEyeFile(ResultFile):
                 **poses,
                 "covariance": result.covariance,
                 f"{board}_covariance": result.stand_covariance,
-                "board": BoardSize(
-                    scale=result.scale,
-                    scale_sigma=result.sigma_scale,
-                    pitch_mm=None if outcome.pitch_mm is None else outcome.pitch_mm * result.scale,
-                ),
+                "board": _board(outcome),
                 "camera": _camera(outcome),
                 "sigma": result.sigma,
                 "estimated": result.estimated,
@@ -267,6 +274,13 @@ class HandEyeFile(ResultFile):
                 **more,
             }
         )
+
+
+def _board(outcome: Outcome) -> BoardSize:
+    result = outcome.result
+    pitch = None if outcome.pitch_mm is None else outcome.pitch_mm * result.scale
+    unit = {} if outcome.unit_mm is None else {"unit_mm": outcome.unit_mm * result.scale}
+    return BoardSize(scale=result.scale, scale_sigma=result.sigma_scale, pitch_mm=pitch, **unit)
 
 
 def _camera(outcome: Outcome) -> AdjustedCamera | None:
