@@ -33,6 +33,8 @@ def load_npy(data: bytes, where: str) -> np.ndarray:
     left, needed = len(data) - stream.tell(), int(np.prod([int(n) for n in shape], dtype=object)) * kind.itemsize
     if left != needed:
         raise InputError(f"{where}: {left} bytes of numbers, {needed} needed by its head; save it again")
+    if not shape or not needed:
+        raise InputError(f"{where}: an array of shape {shape}; poses needed")
     try:
         return np.array(np.load(io.BytesIO(data), allow_pickle=False), dtype=float)
     except (ValueError, EOFError, OSError) as error:

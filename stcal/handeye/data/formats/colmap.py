@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 
 from stcal.errors import InputError
-from stcal.handeye.data.formats.record import Content, Frames, Side, of_quaternions, require_each_once
+from stcal.handeye.data.formats.record import Content, Frames, Side, of_quaternions, require_each_once, require_finite
 from stcal.io.files import MODEL_BYTES, read_bytes
 
 TEXT, BINARY = "images.txt", "images.bin"
@@ -25,7 +25,9 @@ def model_file(folder: Path) -> Path | None:
 def is_text(text: str) -> bool:
     """Whether these are the lines of images.txt."""
     first = next((line for line in text.splitlines() if line.strip() and not line.lstrip().startswith("#")), "")
-    return bool(_IMAGE.fullmatch(first.strip())) and _floats(first.split()[1:8]) is not None
+    if not _IMAGE.fullmatch(first.strip()) or _floats(first.split()) is not None:
+        return False
+    return _floats(first.split()[1:8]) is not None
 
 
 def read_text(text: str, where: str) -> Content:
@@ -89,6 +91,7 @@ def _content(rows: list, names: list[str], places: list[str], where: str) -> Con
         raise InputError(f"{where}: a model without images; map them first")
     require_each_once(names, places, where)
     values = np.array(rows, dtype=float)
+    require_finite(values, places, where)
     rotation = of_quaternions(values[:, :4], places, where)
     frames = Frames("camera_from_board", "the model's camera_from_world, its world for the board", False)
     turned = "quaternions w, x, y, z"

@@ -16,6 +16,7 @@ from stcal.handeye.data.formats.record import (
     of_matrices,
     of_quaternions,
     require_each_once,
+    require_finite,
 )
 from stcal.handeye.data.formats.single import turned_values
 
@@ -73,6 +74,7 @@ def read_numbers(text: str, said: Said, where: str) -> Content | None:
     if width not in (6, 7, TUM, MATRIX):
         return None
     values, places = np.array([line.values for line in lines]), tuple(f"line {line.number}" for line in lines)
+    require_finite(values, places, where)
     names = tuple(line.label for line in lines) if all(line.label for line in lines) else ()
     if width == TUM:
         return _tum(values, lines, places, comments, where)

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 
 from stcal.errors import InputError
-from stcal.handeye.data.formats.record import MATRICES, Said, Unit, of_matrices, of_quaternions, proper
+from stcal.handeye.data.formats.record import MATRICES, Said, Unit, of_matrices, of_quaternions, proper, require_finite
 from stcal.handeye.data.formats.rotations import (
     QUATERNIONS,
     ROTATION_VECTOR,
@@ -123,6 +123,7 @@ def _of_array(array: np.ndarray, said: Said, place: str, where: str) -> One | No
         rotation, translation = of_matrices(array[None], (place,), where)
         return One(rotation[0], translation[0], MATRICES)
     if array.shape in ((6,), (7,)):
+        require_finite(array[None], (place,), where)
         rotation, turned = turned_values(array[None, 3:], said, "the numbers after x, y, z", (place,), where)
         return One(rotation[0], array[:3], turned)
     return None
@@ -151,6 +152,7 @@ def _of_parts(value: Mapping, said: Said, place: str, where: str) -> One | None:
     translation = numbers(at)
     if translation is None or translation.size != len("xyz"):
         raise InputError(f"{where}: {place}: a translation of three numbers needed; correct it")
+    require_finite(translation.reshape(1, 3), (place,), where)
     if isinstance(turn, Mapping) and {"x", "y", "z", "w"} <= turn.keys():
         wxyz = numbers([turn["w"], turn["x"], turn["y"], turn["z"]])
         if wxyz is None:
@@ -179,5 +181,6 @@ def _of_scalars(value: Mapping, place: str, where: str) -> One | None:
     row = numbers([value[key] for key in keys])
     if row is None:
         raise InputError(f"{where}: {place}: {', '.join(keys)} must be numbers; correct them")
+    require_finite(row[None], (place,), where)
     rotation = of_quaternions(row[None, 3:], (place,), where)
     return One(rotation[0], row[:3], "quaternions by name", Unit("m", "as in ROS"), "ROS-Industrial poses")

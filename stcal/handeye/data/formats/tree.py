@@ -19,6 +19,7 @@ from stcal.handeye.data.formats.record import (
     of_matrices,
     proper,
     require_each_once,
+    require_finite,
 )
 from stcal.handeye.data.formats.rotations import ROTATION_VECTOR, Convention, rotations
 from stcal.handeye.data.formats.single import ROS, One, name_in, numbers, one, turned_values
@@ -144,40 +145,33 @@ def _of_parts(parts: dict[str, Any], said: Said, where: str, frames: Frames) -> 
         raise InputError(f"{where}: {', '.join(parts)}: more than one set of the same poses; leave one in the file")
     arrays = {}
     for key, value in parts.items():
-        array = numbers(value if not isinstance(value, list) else [_flat(each) for each in value])
+        array = numbers([_flat(each) for each in value] if isinstance(value, list) else value)
         if array is None:
             raise InputError(f"{where}: {key}: not as many numbers for each pose; correct it")
-        if array.ndim >= 2 and array.shape[0] != array.size and array.shape in ((3, 3),) and "r" in key.lower()[:3]:
-            array = array[None]
-        arrays[key] = array.reshape(len(array), -1) if array.ndim > 1 else array.reshape(1, -1)
-    keys = sorted(arrays, key=lambda key: (-arrays[key].shape[1], not _is_rotation(key)))
-    turn, at = (arrays[key] for key in keys)
-    if len(turn) != len(at):
-        raise InputError(f"{where}: {keys[0]} of {len(turn)} poses, {keys[1]} of {len(at)}; as many needed")
-    if at.shape[1] != len("xyz"):
-        raise InputError(f"{where}: {keys[1]}: {at.shape[1]} numbers for each pose, 3 of a translation needed")
+        arrays[key] = array
+    keys = sorted(arrays, key=lambda key: (-arrays[key].size, not key.lower().startswith("r")))
+    sizes = [arrays[key].size for key in keys]
+    count = 1 if sizes[1] == len("xyz") else len(arrays[keys[1]])
+    if sizes[1] != len("xyz") * count or sizes[0] % count or sizes[0] // count not in (3, 4, 9):
+        raise InputError(
+            f"{where}: {keys[0]} of shape {arrays[keys[0]].shape}, {keys[1]} of {arrays[keys[1]].shape}; a rotation of "
+            "9, 4 or 3 numbers and a translation of 3 for each pose needed"
+        )
+    turn, at = (arrays[key].reshape(count, -1) for key in keys)
     places = tuple(f"pose {i}" for i in range(1, len(at) + 1))
+    require_finite(at, places, where)
     if turn.shape[1] == 9:
         return Side(proper(turn.reshape(-1, 3, 3), places, where), at, places, "3×3 matrices", frames=frames)
-    if turn.shape[1] == 3:
-        if keys[0].lower().startswith("r"):  # OpenCV's functions take rotation vectors in place of matrices
-            rotation, words = rotations(turn, Convention(ROTATION_VECTOR, "rad"), places, where)
-        else:
-            rotation, words = turned_values(turn, said, keys[0], places, where)
-        return Side(rotation, at, places, words, frames=frames)
-    if turn.shape[1] == 4:
+    if turn.shape[1] == 3 and keys[0].lower().startswith("r"):  # OpenCV takes rotation vectors in place of matrices
+        rotation, words = rotations(turn, Convention(ROTATION_VECTOR, "rad"), places, where)
+    else:
         rotation, words = turned_values(turn, said, keys[0], places, where)
-        return Side(rotation, at, places, words, frames=frames)
-    raise InputError(f"{where}: {keys[0]}: {turn.shape[1]} numbers for each pose, 9, 4 or 3 of a rotation needed")
+    return Side(rotation, at, places, words, frames=frames)
 
 
 def _flat(value: Any) -> Any:
     array = numbers(value)
-    return value if array is None else array.ravel()
-
-
-def _is_rotation(key: str) -> bool:
-    return key.lower().startswith("r")
+    return value if array is None else array.ravel().tolist()
 
 
 def _by_name(value: Mapping, form: str, said: Said, where: str) -> Content | None:
@@ -266,6 +260,7 @@ def _side_of(value: Any, said: Said, where: str, frames: Frames | None) -> Side 
         array = array.reshape(-1, 4, 4)
     if array.ndim == 2 and array.shape[1] in (6, 7):
         places = tuple(f"pose {i}" for i in range(1, len(array) + 1))
+        require_finite(array, places, where)
         turned, words = turned_values(array[:, 3:], said, "the numbers after x, y, z", places, where)
         return Side(turned, array[:, :3], places, words, frames=frames)
     if array.ndim != 3 or array.shape[1:] != (4, 4):
