@@ -177,11 +177,13 @@ def settled(side: Side, role: Role, content: Content, path: Path, said: Said) ->
         A unit that cannot be told, or an option that the file contradicts.
     """
     said = said.of(role)
+    far = np.flatnonzero(np.abs(side.translation).max(axis=1) > FARTHEST)
+    if len(far):
+        measured = np.abs(side.translation[far[0]]).max()
+        raise InputError(f"{path}: {side.places[far[0]]}: a length of {measured:.3g}, up to {FARTHEST:g} possible")
     frames = _direction(side, role, path, said)
     factor, unit, guessed = _unit(side, frames.name, path, said)
     poses = Poses(side.rotation, factor * side.translation)
-    if (np.abs(poses.translation) > FARTHEST).any():
-        raise InputError(f"{path}: a length of {np.abs(poses.translation).max():.3g} mm, up to {FARTHEST:g} possible")
     covariance = side.covariance
     wanted = FRAMES[role][0]
     if frames.name != wanted:

@@ -1,7 +1,9 @@
 """NumPy's files npy and npz, without anything that could be code."""
 
 import io
+import tokenize
 import zipfile
+import zlib
 from typing import Any
 
 import numpy as np
@@ -11,6 +13,8 @@ from stcal.io.files import MB, TABLE_BYTES
 
 NPY, NPZ = b"\x93NUMPY", b"PK\x03\x04"
 """With which the files begin."""
+DAMAGED = (ValueError, TypeError, EOFError, OSError, MemoryError, OverflowError, SyntaxError, tokenize.TokenError)
+"""What NumPy raises of files that are not whole; their heads are literals of Python."""
 
 
 def load_npy(data: bytes, where: str) -> np.ndarray:
@@ -26,7 +30,7 @@ def load_npy(data: bytes, where: str) -> np.ndarray:
         version = np.lib.format.read_magic(stream)
         read = np.lib.format.read_array_header_1_0 if version == (1, 0) else np.lib.format.read_array_header_2_0
         shape, _, kind = read(stream)
-    except (ValueError, EOFError, OSError) as error:
+    except DAMAGED as error:
         raise _damaged(where, error) from error
     if kind.hasobject or kind.kind not in "iuf":
         raise InputError(f"{where}: an array of {kind}, numbers needed; save it with np.save of a float array")
@@ -37,7 +41,7 @@ def load_npy(data: bytes, where: str) -> np.ndarray:
         raise InputError(f"{where}: an array of shape {shape}; poses needed")
     try:
         return np.array(np.load(io.BytesIO(data), allow_pickle=False), dtype=float)
-    except (ValueError, EOFError, OSError) as error:
+    except DAMAGED as error:
         raise _damaged(where, error) from error
 
 
@@ -67,7 +71,7 @@ def load_npz(data: bytes, where: str) -> tuple[dict[str, Any], tuple[str, ...]]:
                     found[name] = load_npy(content, f"{where}: {name}")
                 except InputError:
                     other.append(name)
-    except (zipfile.BadZipFile, OSError, EOFError, ValueError, NotImplementedError, RuntimeError) as error:
+    except (zipfile.BadZipFile, zlib.error, NotImplementedError, RuntimeError, *DAMAGED) as error:
         raise _damaged(where, error) from error
     if not found:
         raise InputError(f"{where}: no arrays of numbers; save it with np.savez")

@@ -195,7 +195,8 @@ def proper(rotation: np.ndarray, places: Sequence[str], where: str) -> np.ndarra
     require_finite(rotation, places, where)
     u, size, vt = np.linalg.svd(rotation)
     off = np.abs(size - 1).max(axis=1)
-    determinant = np.linalg.det(rotation)
+    with np.errstate(over="ignore", invalid="ignore"):  # of what is refused by its size
+        determinant = np.linalg.det(rotation)
     bad = np.flatnonzero((off > UNIT_WITHIN) | (determinant < 0))
     if len(bad):
         i = bad[0]
@@ -220,7 +221,8 @@ def of_quaternions(wxyz: np.ndarray, places: Sequence[str], where: str) -> np.nd
         One that is not of unit length.
     """
     require_finite(wxyz, places, where)
-    length = np.linalg.norm(wxyz, axis=1)
+    with np.errstate(over="ignore"):  # of what is refused
+        length = np.linalg.norm(wxyz, axis=1)
     bad = np.flatnonzero(np.abs(length - 1) > UNIT_WITHIN)
     if len(bad):
         more = f" (and {len(bad) - 1} more)" if len(bad) > 1 else ""

@@ -123,6 +123,23 @@ def test_a_head_that_promises_more_than_there_is(tmp_path):
     assert "64 bytes of numbers, 128000000000000 needed" in refused(tmp_path / "a.npy")
 
 
+def test_damaged_arrays_are_named(tmp_path):
+    np.save(tmp_path / "a.npy", GOOD)
+    data = (tmp_path / "a.npy").read_bytes()
+    (tmp_path / "a.npy").write_bytes(data.replace(b"(5, 4, 4)", b"(5, 4, 4 "))
+    assert "not a file of NumPy" in refused(tmp_path / "a.npy")
+    np.savez_compressed(tmp_path / "a.npz", poses=GOOD)
+    data = (tmp_path / "a.npz").read_bytes()
+    (tmp_path / "a.npz").write_bytes(data[:60] + b"\xff" * 20 + data[80:])
+    assert "not a file of NumPy" in refused(tmp_path / "a.npz")
+
+
+def test_lengths_beyond_measure_are_named(tmp_path):
+    path = tmp_path / "poses.npy"
+    np.save(path, at(1e300))
+    assert "pose 1: a length of" in refused(path)
+
+
 def test_a_small_archive_of_much_is_not_unpacked(tmp_path):
     with zipfile.ZipFile(tmp_path / "a.npz", "w", zipfile.ZIP_DEFLATED) as archive:
         archive.writestr("poses.npy", b"\0" * 150_000_000)
@@ -142,6 +159,7 @@ TUM = "1.5 0.1 0.2 0.3 0 0 0 1\n"
         ("1 0 0 5 0 1 0 6 0 0 1 7\n", ["12 numbers in a line", "4×4 needed"]),
         (TUM + TUM, ["line 1 and line 2: both are of '1.5'"]),
         (TUM.replace("0 1\n", "0.5 1\n"), ["line 1: quaternion of length 1.118, 1 ± 0.001 needed"]),
+        (TUM.replace("0 1\n", "1e308 1\n"), ["line 1: quaternion of length inf"]),
         (TUM.replace("0.3", "nan"), ["not finite"]),
         ("a.png 1 2 3 0 0 0 1\n", ["the numbers after x, y, z may be quaternions", "like wxyz or xyzw"]),
         ("1 2 3 10 20 30\n", ["Euler angles", "give --rotation, like"]),
