@@ -25,10 +25,13 @@ from stcal.io.saving import keep_apart
 
 if TYPE_CHECKING:
     from stcal.handeye import EvolutionOptions
+    from stcal.handeye.data.formats.record import Said
     from stcal.handeye.data.loop import Setup
     from stcal.handeye.methods.evolution import Bounds
     from stcal.handeye.report.export.frames import CameraFrame
     from stcal.handeye.report.outcome import Outcome
+    from stcal.io.quaternions import Order
+    from stcal.workflows.handeye_input import Source
 
 EVOLVED = ("de", "de-polished")
 """Methods that take the options ``--de-…``."""
@@ -54,14 +57,18 @@ def handeye(
     source: Annotated[
         Path | None,
         typer.Argument(
-            metavar="POSES.csv|IMAGES",
-            help="Read pose pairs from this file: base_from_flange_… and camera_from_board_… (CSV); or photographs of "
-            "a board from this folder.",
+            metavar="POSES|IMAGES",
+            help="Read pose pairs from this file: base_from_flange_… and camera_from_board_… (CSV, JSON, YAML, npz), "
+            "or samples of easy_handeye or MoveIt; or photographs of a board from this folder.",
         ),
     ] = None,
     poses: Annotated[
         Path | None,
-        typer.Option("--poses", help="Read the robot's poses from this file: image, base_from_flange_… (CSV)."),
+        typer.Option(
+            "--poses",
+            help="Read the robot's poses from this file: image, base_from_flange_… (CSV), 4×4 matrices, TUM, Zivid, "
+            "ROS …; or from this folder, a file for each image.",
+        ),
     ] = None,
     camera: Annotated[
         Path | None,
@@ -72,8 +79,39 @@ def handeye(
         typer.Option("--board", help="Read the board from this file: dots, chessboard, ChArUco or tags (TOML)."),
     ] = None,
     setup: Annotated[
-        SetupName, typer.Option(help="Choose eye-in-hand, camera on the flange, or eye-to-hand, board on the flange.")
-    ] = SetupName.in_hand,
+        SetupName | None,
+        typer.Option(
+            help="Choose eye-in-hand, camera on the flange, or eye-to-hand, board on the flange; as the file says, or "
+            "eye-in-hand, if not given."
+        ),
+    ] = None,
+    rotation: Annotated[
+        list[str] | None,
+        typer.Option(
+            "--rotation",
+            help="Read angles of unnamed convention like this: kuka-abc, fanuc-wpr, ur-rotvec, rpy …, rotvec, xyz "
+            "(fixed axes), ZYX (turned axes) …; robot=… or camera=… for one side.",
+        ),
+    ] = None,
+    length_unit: Annotated[
+        list[str] | None,
+        typer.Option(
+            "--length-unit",
+            help="Take lengths in files that do not say it in this unit: mm, m, cm, um, in; robot=… or camera=… for "
+            "one side.",
+        ),
+    ] = None,
+    poses_are: Annotated[
+        list[str] | None,
+        typer.Option(
+            "--poses-are",
+            help="Take poses in files that do not say it as base_from_flange or flange_from_base, or as "
+            "camera_from_board or board_from_camera; once for each side.",
+        ),
+    ] = None,
+    dry_run: Annotated[
+        bool, typer.Option("--dry-run", help="Print what was understood of the files, and solve and write nothing.")
+    ] = False,
     method: Annotated[
         str | None,
         typer.Option(
@@ -220,16 +258,18 @@ def handeye(
 ) -> None:
     """Find where a camera sits on a robot's flange, or in its base, and how well that is known."""
     from stcal.handeye import HandEyeOptions, Noise
+    from stcal.handeye.data.formats.record import Said
     from stcal.handeye.report.export import exported, opencv_yaml, ros_yaml, urdf_joint
     from stcal.handeye.report.file import HandEyeFile
     from stcal.handeye.report.page import outcome_page, outcome_text
-    from stcal.workflows.handeye import AUTO, Splits, calibrate, read_input
+    from stcal.workflows.handeye import AUTO, Splits, calibrate
+    from stcal.workflows.handeye_input import dry_run as understood
+    from stcal.workflows.handeye_input import read_input, setup_of
 
     robot, seen = (_radians(sigma_robot_deg), sigma_robot_mm), (_radians(sigma_camera_deg), sigma_camera_mm)
     noise = Noise(*robot, *seen, sigma_px, sigma_board_mm)
-    pairs = one_table(
-        source, first, second, key, "POSES.csv|IMAGES", ("base_from_flange_", "camera_from_board_"), quaternions.value
-    )
+    said = Said.of_options(rotation or [], length_unit or [], poses_are or [], setup and setup.value)
+    pairs = _source(source, first, second, key, said, quaternions.value)
     folder = isinstance(pairs, Path) and pairs.is_dir()
     _require_fitting(not folder, method, refine_camera, camera_out)
     exports = _exports(export or [])
@@ -240,7 +280,7 @@ def handeye(
         [*((name, path) for name, path in written.items() if path), *(("--export", path) for _, path in exports)],
         [(name, path) for name, path in read.items() if path],
     )
-    _require_frames(ros or urdf, exports, setup.value, parent, child, camera_frame.value)
+    _require_frames(ros or urdf, exports, (setup or SetupName.in_hand).value, parent, child, camera_frame.value)
     if not folder and (sigma_px is not None or sigma_board_mm is not None):
         raise InputError(
             "--sigma-px, --sigma-board-mm: only with images; give --sigma-camera-mm and --sigma-camera-deg"
@@ -258,15 +298,21 @@ def handeye(
         generations=de_generations,
         seed=de_seed,
     )
+    if dry_run:
+        say("\n".join(understood(pairs, poses, camera, board, quaternions.value, said)))
+        return
     with StageProgress() as progress:
-        given = read_input(pairs, poses, camera, board, workers, progress, quaternions.value)
+        given = read_input(pairs, poses, camera, board, workers, progress, quaternions.value, said)
+        for line in given.understood:
+            say(line)
+        with_scale = with_scale or given.unit_mm is not None
         options = HandEyeOptions(
             noise, given.prior if refine_camera else None, with_scale, given.symmetries, four_dof, evolution
         )
         validation = Splits(splits, held_out, seed, workers, motions_held_out)
         if method is None and not (refine_camera or with_scale or four_dof):
             method = AUTO
-        outcome = calibrate(given, setup.value, method, options, validation, progress)
+        outcome = calibrate(given, setup_of(said, given.setup, given.where), method, options, validation, progress)
     result = outcome.result
     say(outcome_text(outcome))
     for option, given_, able in (("--with-scale", with_scale, SCALED), ("--refine-camera", refine_camera, SCALED[1:])):
@@ -290,6 +336,20 @@ def handeye(
         _save_camera(camera_out, outcome)
     if json_file:
         write(json_file, HandEyeFile.of(outcome, whole=True))
+
+
+def _source(
+    source: Path | None, first: Path | None, second: Path | None, key: str, said: "Said", quaternions: "Order"
+) -> "Source":
+    """The file or folder that was named first; or --a and --b joined, whatever their formats."""
+    from stcal.workflows.handeye_input import two_files
+
+    if source is None and first is not None and second is not None:
+        told = two_files(first, second, key, said, quaternions)
+        if told is not None:
+            return told
+    prefixes = ("base_from_flange_", "camera_from_board_")
+    return one_table(source, first, second, key, "POSES|IMAGES", prefixes, quaternions)
 
 
 def _require_fitting(of_poses: bool, method: str | None, refine_camera: bool, camera_out: Path | None) -> None:

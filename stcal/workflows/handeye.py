@@ -2,17 +2,13 @@
 
 from dataclasses import dataclass, replace
 from functools import partial
-from pathlib import Path
 
 import numpy as np
 
-from stcal.boards.file import load_flat_board
-from stcal.errors import DegenerateError, InputError, StcalError
-from stcal.geometry.rigid import Rigid
-from stcal.handeye import HandEyeOptions, HandEyePoses, View, Views, handeye, pairs_of_views, read_poses
+from stcal.errors import DegenerateError, StcalError
+from stcal.handeye import HandEyeOptions, handeye
 from stcal.handeye.choose import choose
 from stcal.handeye.data.loop import Setup
-from stcal.handeye.data.robot_poses import RobotPoses, read_robot_poses
 from stcal.handeye.judge.symmetry import repair
 from stcal.handeye.report.outcome import Outcome
 from stcal.handeye.validate import (
@@ -24,33 +20,11 @@ from stcal.handeye.validate import (
     splits,
     widened_by_scatter,
 )
-from stcal.io.camera import CameraPrior, camera_prior, read_camera, refinable
-from stcal.io.images import ImageFile, find_images
-from stcal.io.quaternions import Order
-from stcal.io.table import Table
 from stcal.parallel import Progress
-from stcal.workflows.board_views import detect_boards
+from stcal.workflows.handeye_input import HandEyeInput
 
 ALL, AUTO = "all", "auto"
 """In place of a method's name: all of them, compared; the way of solving that predicts best."""
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class HandEyeInput:
-    """What is calibrated from.
-
-    ``where`` : its files; ``views`` : of the board, where images were given, with its ``symmetries`` and the camera's
-    ``prior``; ``pitch_mm`` of the board's file; ``left_out`` : (image or row, why).
-    """
-
-    where: str
-    pairs: HandEyePoses
-    views: Views | None = None
-    symmetries: tuple[Rigid, ...] = ()
-    prior: CameraPrior | None = None
-    pitch_mm: float | None = None
-    left_out: tuple[tuple[str, str], ...] = ()
-    folder: Path | None = None
 
 
 @dataclass(frozen=True, slots=True)
@@ -63,79 +37,6 @@ class Splits:
     seed: int = 0
     workers: int | None = None
     motions: int | None = None
-
-
-def read_input(
-    source: Path | Table,
-    poses: Path | None = None,
-    camera: Path | None = None,
-    board: Path | None = None,
-    workers: int | None = None,
-    progress: Progress = lambda *_: None,
-    quaternions: Order = "wxyz",
-) -> HandEyeInput:
-    """Pose pairs from their file; or from a folder of images with the files ``poses``, ``camera`` and ``board``.
-
-    ``quaternions`` : ``xyzw`` where their columns hold x, y, z, w in the order in which they stand.
-
-    Raises
-    ------
-    InputError
-        A file is missing or not as it should be, one too many was given, or no image shows the board.
-    """
-    images = {"--poses": poses, "--camera": camera, "--board": board}
-    extra = [name for name, path in images.items() if path is not None]
-    if isinstance(source, Table):
-        if extra:
-            raise InputError(f"{', '.join(extra)}: only with a folder of images; {source.where} are poses")
-        return HandEyeInput(source.where, read_poses(source, quaternions))
-    if source.is_dir():
-        missing = [name for name, path in images.items() if path is None]
-        if poses is None or camera is None or board is None:
-            raise InputError(f"image folder {source}: {', '.join(missing)} needed with images")
-        return _from_images(source, read_robot_poses(poses, quaternions), poses, camera, board, workers, progress)
-    if not source.exists():
-        raise InputError(f"{source}: does not exist; a file of poses (CSV) or a folder of images needed")
-    if extra:
-        raise InputError(f"{', '.join(extra)}: only with a folder of images; {source} is a file of poses")
-    return HandEyeInput(source.name, read_poses(source, quaternions))
-
-
-def _from_images(
-    source: Path, robot: RobotPoses, poses: Path, camera: Path, board: Path, workers: int | None, progress: Progress
-) -> HandEyeInput:
-    """Corners of the board in all images that have a pose."""
-    design, model = load_flat_board(board), read_camera(camera)
-    files, skipped = find_images(source)
-    rows, missing = _rows_of_images(robot, files, source)
-    with_pose = [file for file in files if file.name in rows]
-    found = detect_boards(with_pose, model, design, (), workers, partial(progress, "board"))
-    views = found.views()
-    left_out = [(each.name, each.reason) for each in (*skipped, *found.skipped)]
-    left_out += [(file.name, f"no row in {poses.name}") for file in files if file.name not in rows]
-    left_out += [(name, f"no such image, in a row of {poses.name}") for name in missing]
-    if not views:
-        first = f"{found.skipped[0].name}: {found.skipped[0].reason}"
-        raise InputError(f"image folder {source}: the board is in none of {len(with_pose)} images: {first}")
-    seen = Views(found.camera, tuple(View(v.xyz_board, v.xy_px, v.covariance_px2) for v in views.values()))
-    at = [rows[name] for name in views]
-    pairs = pairs_of_views(robot.base_from_flange[at], seen, tuple(views), str(source))
-    if robot.covariance is not None:
-        pairs = replace(pairs, base_from_flange_covariance=robot.covariance[at])
-    pitch = getattr(design, "pitch_mm", getattr(design, "square_mm", None))
-    prior = camera_prior(refinable(model.calibrated(found.camera.width, found.camera.height)))
-    where = f"{source.name}, {poses.name}"
-    return HandEyeInput(where, pairs, seen, found.symmetries, prior, pitch, tuple(left_out), source)
-
-
-def _rows_of_images(robot: RobotPoses, files: list[ImageFile], source: Path):
-    rows, missing = robot.rows([file.name for file in files])
-    if not rows:
-        raise InputError(
-            f"{robot.where}: no row is of an image in {source}: {robot.images[0]} … there, {files[0].name} … here; "
-            "correct them"
-        )
-    return rows, missing
 
 
 def calibrate(
@@ -224,6 +125,8 @@ def _outcome(
         notes,
         motions,
         choice,
+        understood=given.understood,
+        unit_mm=given.unit_mm,
         pairs=pairs,
         views=views,
         folder=given.folder,

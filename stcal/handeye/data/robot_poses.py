@@ -1,7 +1,7 @@
 """The robot's poses at which images were taken."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -9,6 +9,9 @@ import yaml
 
 from stcal.errors import InputError
 from stcal.geometry.rigid import UNIT_WITHIN, Poses
+from stcal.handeye.data.formats.record import Said
+from stcal.handeye.data.formats.tell import SUFFIXES, NotToldError
+from stcal.handeye.data.inputs import partners, read_robot, trailing_number
 from stcal.handeye.data.pairs import SIDES, read_side
 from stcal.io.files import SETTINGS_BYTES, read_bytes
 from stcal.io.plain_yaml import load_yaml
@@ -16,18 +19,50 @@ from stcal.io.quaternions import Order
 from stcal.io.table import LENGTHS, read_table
 
 YAML = (".yaml", ".yml")
+INDUSTRIAL = "poses of ROS-Industrial; base_from_flange by default; quaternions by name; m as in ROS"
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class RobotPoses:
     """``images`` : name of each; ``base_from_flange`` : m, mm; ``covariance`` : (m, 6, 6) or None; ``places`` : where
-    each stands in ``where``, for messages."""
+    each stands in ``where``, for messages; ``understood`` : what the file was taken for; ``own`` : whether it is a
+    table of the package. Without ``images`` the poses are of the images in their order."""
 
     images: tuple[str, ...]
     base_from_flange: Poses
     covariance: np.ndarray | None
     places: tuple[str, ...]
     where: str
+    understood: str = ""
+    own: bool = True
+
+    def pairing(self, names: list[str]) -> tuple[dict[str, int], tuple[str, ...], str]:
+        """As :meth:`rows`; where no name fits, by times or the numbers at the ends of names; without names in order.
+        The last is how, empty where it is by names.
+
+        Raises
+        ------
+        InputError
+            A name that may be of two images; poses without names that are not as many as the images.
+        """
+        if not self.images:
+            if len(names) != len(self.base_from_flange):
+                raise InputError(
+                    f"{self.where}: {len(self.base_from_flange)} poses without names for {len(names)} images; as many, "
+                    "or a name for each, needed"
+                )
+            numbers = [trailing_number(name) for name in names]
+            order = list(range(len(names)))
+            if None not in numbers and len(set(numbers)) == len(numbers):
+                order.sort(key=lambda i: numbers[i] or 0)
+            how = f"by order, for the poses have no names: {self.places[0]} is of {names[order[0]]}"
+            return {names[i]: row for row, i in enumerate(order)}, (), how
+        rows, missing = self.rows(names)
+        if rows or (found := partners(self.images, names)) is None:
+            return rows, missing, ""
+        pairs, how = found
+        used = {i for i, _ in pairs}
+        return {names[j]: i for i, j in pairs}, tuple(n for i, n in enumerate(self.images) if i not in used), how
 
     def rows(self, names: list[str]) -> tuple[dict[str, int], tuple[str, ...]]:
         """Row by image, of those of ``names`` that have one, and the images of rows that have none.
@@ -54,12 +89,15 @@ class RobotPoses:
         return found, tuple(missing)
 
 
-def read_robot_poses(path: str | Path, quaternions: Order = "wxyz") -> RobotPoses:
-    """Read a CSV file with a column ``image`` and ``base_from_flange_x_mm`` … (or ``flange_from_base_…``).
+def read_robot_poses(path: str | Path, quaternions: Order = "wxyz", said: Said | None = None) -> RobotPoses:
+    """Read any of :mod:`stcal.handeye.data.formats`.
+
+    Or a CSV file with a column ``image`` and ``base_from_flange_x_mm`` … (or ``flange_from_base_…``).
 
     Or ROS-Industrial's calibration data: a folder of YAML files, one for each image, of the same name, with ``x, y, z``
     in metres and ``qx, qy, qz, qw``; or a YAML list of such files, each a ``pose`` with its ``image``.
-    ``quaternions`` : ``xyzw`` where the columns hold x, y, z, w in the order in which they stand.
+    ``quaternions`` : ``xyzw`` where the columns hold x, y, z, w in the order in which they stand; ``said`` : what a
+    file of another program does not say itself.
 
     Raises
     ------
@@ -67,7 +105,11 @@ def read_robot_poses(path: str | Path, quaternions: Order = "wxyz") -> RobotPose
         Missing columns, values that are not finite or quaternions that are not of unit length, named by line, or an
         image that has two rows; another order of quaternions than their names say, in YAML.
     """
-    path = Path(path)
+    path, said = Path(path), said or Said()
+    if (found := _of_others(path, said, quaternions)) is not None:
+        return found
+    if said.options():
+        raise InputError(f"robot poses {path}: its columns or keys say all; leave {', '.join(said.options())} out")
     if quaternions != "wxyz" and (path.is_dir() or path.suffix.lower() in YAML):
         raise InputError(
             f"robot poses {path}: --quaternions {quaternions} is of a CSV file's columns; YAML gives each "
@@ -77,14 +119,49 @@ def read_robot_poses(path: str | Path, quaternions: Order = "wxyz") -> RobotPose
         files = sorted(path.glob("*.yaml")) + sorted(path.glob("*.yml"))
         if not files:
             raise InputError(f"robot poses {path}: a folder without *.yaml; a CSV file, or a YAML file for each image")
-        return _from_yaml([(file.stem, file) for file in files], f"robot poses {path}")
+        read = _from_yaml([(file.stem, file) for file in files], f"robot poses {path}")
+        return replace(read, understood=f"{path.name}: folder of {len(files)} {INDUSTRIAL}", own=False)
     if path.suffix.lower() in YAML:
-        return _from_yaml(_listed(path), f"robot poses {path}")
+        read = _from_yaml(_listed(path), f"robot poses {path}")
+        return replace(read, understood=f"{path.name}: list of {len(read.images)} {INDUSTRIAL}", own=False)
     table = read_table(path, "robot poses", quaternions)
     images, places = table.text("image"), tuple(f"line {line}" for line in table.lines)
     _one_each(images, places, table.where)
     poses, covariance = read_side(table, *SIDES[0])
-    return RobotPoses(tuple(images), poses, covariance, places, table.where)
+    frame = next(name for name in SIDES[0] if any(column.startswith(f"{name}_") for column in table.columns))
+    understood = f"{path.name}: table; {len(images)} poses; {frame} by its columns; {table.unit(f'{frame}_x', LENGTHS)}"
+    return RobotPoses(tuple(images), poses, covariance, places, table.where, understood)
+
+
+def _of_others(path: Path, said: Said, quaternions: Order) -> RobotPoses | None:
+    """Of formats of other programs; None of tables, and of data of ROS-Industrial, whose readers follow."""
+    if path.is_dir() and _industrial(path):
+        return None
+    try:
+        found = read_robot(path, said, "image", quaternions)
+    except NotToldError:
+        if path.suffix.lower() in YAML:  # a list of images and files
+            return None
+        raise
+    if found is None:
+        return None
+    where = f"robot poses {path}"
+    return RobotPoses(found.names, found.poses, found.covariance, found.places, where, found.understood, own=False)
+
+
+def _industrial(folder: Path) -> bool:
+    """Whether a file of the folder has a pose as ROS-Industrial writes it, and all are YAML."""
+    files = [file for file in sorted(folder.iterdir()) if file.suffix.lower() in SUFFIXES]
+    if any(file.suffix.lower() not in YAML for file in files):
+        return False
+    for file in files:
+        try:
+            content = load_yaml(read_bytes(file, SETTINGS_BYTES).decode("utf-8"))
+        except (OSError, yaml.YAMLError, ValueError, RecursionError):
+            continue
+        if isinstance(content, dict) and {"x", "y", "z"} <= content.keys():
+            return True
+    return False
 
 
 def _one_each(images: Sequence[str], places: Sequence[str], where: str) -> None:

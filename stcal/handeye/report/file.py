@@ -36,6 +36,7 @@ class BoardSize(Part):
     scale: float
     scale_sigma: Finite
     pitch_mm: float | None
+    unit_mm: float | None = None
 
 
 class AdjustedCamera(Part):
@@ -141,7 +142,7 @@ class HandEyeFile(ResultFile):
     flange_from_board_covariance: Matrix6 | None = Field(None, description="its covariance, likewise")
     board: BoardSize = Field(
         description="`scale`: true size over stated size, 1 where it was not solved for; `scale_sigma`; `pitch_mm` of "
-        "dots or squares, times `scale`; null for tags and poses"
+        "dots or squares, times `scale`; null for tags and poses; `unit_mm`, only of a model of COLMAP: mm of its unit"
     )
     camera: AdjustedCamera | None = Field(
         description="with `--refine-camera`: COLMAP `model`; `parameters` fx, fy, cx, cy, k1, k2, p1, p2, k3 … k6, "
@@ -187,6 +188,9 @@ class HandEyeFile(ResultFile):
         "worst direction from poses of a common camera (1 mrad, 0.5 mm)"
     )
     notes: list[str] = Field(description="what should be known about the result")
+    understood: list[str] = Field(
+        [], description="only of files of other programs: what each was taken for, a sentence each"
+    )
     splits: list[SplitErrors] = Field(
         [],
         description="only in `--json`: names of the `poses` held out, and the errors of each: `rotation_rad`, "
@@ -207,6 +211,7 @@ class HandEyeFile(ResultFile):
         compared = [_method(each, names) for each in outcome.compared]
         more: dict = {} if outcome.motions is None else {"motions_held_out": _motions(outcome.motions)}
         more |= {} if outcome.choice is None else {"choice": _choice(outcome.choice)}
+        more |= {"understood": outcome.understood} if outcome.understood else {}
         more |= {"splits": _splits(outcome.held_out, names), "methods": compared} if whole else {}
         return cls.model_validate(
             {
@@ -219,11 +224,7 @@ class HandEyeFile(ResultFile):
                 **poses,
                 "covariance": result.covariance,
                 f"{board}_covariance": result.stand_covariance,
-                "board": BoardSize(
-                    scale=result.scale,
-                    scale_sigma=result.sigma_scale,
-                    pitch_mm=None if outcome.pitch_mm is None else outcome.pitch_mm * result.scale,
-                ),
+                "board": _board(outcome),
                 "camera": _camera(outcome),
                 "sigma": result.sigma,
                 "estimated": result.estimated,
@@ -243,6 +244,13 @@ class HandEyeFile(ResultFile):
 def _verdict(found: Verdict) -> VerdictPart:
     rows = [FindingRow(**{name: getattr(each, name) for name in FindingRow.model_fields}) for each in found.findings]
     return VerdictPart(word=found.word, sentence=found.sentence(), findings=rows)
+
+
+def _board(outcome: Outcome) -> BoardSize:
+    result = outcome.result
+    pitch = None if outcome.pitch_mm is None else outcome.pitch_mm * result.scale
+    unit = {} if outcome.unit_mm is None else {"unit_mm": outcome.unit_mm * result.scale}
+    return BoardSize(scale=result.scale, scale_sigma=result.sigma_scale, pitch_mm=pitch, **unit)
 
 
 def _camera(outcome: Outcome) -> AdjustedCamera | None:

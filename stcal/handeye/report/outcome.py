@@ -43,6 +43,10 @@ class Outcome:
         The corners, likewise, where there were images.
     folder : Path, optional
         Where the images lie, of which the pairs have the names.
+    understood : tuple of str
+        What files of other programs were taken for.
+    unit_mm : float, optional
+        Of a model without a unit: mm by which the camera's lengths were multiplied before.
     """
 
     where: str
@@ -59,6 +63,8 @@ class Outcome:
     pairs: HandEyePoses | None = None
     views: Views | None = None
     folder: Path | None = None
+    understood: tuple[str, ...] = ()
+    unit_mm: float | None = None
 
     def all_notes(self) -> tuple[str, ...]:
         """Of the result, then the others."""

@@ -1,0 +1,1 @@
+"""Poses as other programs write them, each file told by its content: read :mod:`.tell` first."""

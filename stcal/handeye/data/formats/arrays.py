@@ -1,0 +1,94 @@
+"""NumPy's files npy and npz, without anything that could be code."""
+
+import io
+import tokenize
+import zipfile
+import zlib
+from typing import Any
+
+import numpy as np
+
+from stcal.errors import InputError
+from stcal.io.files import MB, TABLE_BYTES
+
+NPY, NPZ = b"\x93NUMPY", b"PK\x03\x04"
+"""With which the files begin."""
+DAMAGED = (ValueError, TypeError, EOFError, OSError, MemoryError, OverflowError, SyntaxError, tokenize.TokenError)
+"""What NumPy raises of files that are not whole; their heads are literals of Python."""
+
+
+def load_npy(data: bytes, where: str) -> np.ndarray:
+    """The array of an npy file.
+
+    Raises
+    ------
+    InputError
+        Damaged, or of objects, which only a program could load.
+    """
+    stream = io.BytesIO(data)
+    try:
+        version = np.lib.format.read_magic(stream)
+        read = np.lib.format.read_array_header_1_0 if version == (1, 0) else np.lib.format.read_array_header_2_0
+        shape, _, kind = read(stream)
+    except DAMAGED as error:
+        raise _damaged(where, error) from error
+    if kind.hasobject or kind.kind not in "iuf":
+        raise InputError(f"{where}: an array of {kind}, numbers needed; save it with np.save of a float array")
+    left, needed = len(data) - stream.tell(), int(np.prod([int(n) for n in shape], dtype=object)) * kind.itemsize
+    if left != needed:
+        raise InputError(f"{where}: {left} bytes of numbers, {needed} needed by its head; save it again")
+    if not shape or not needed:
+        raise InputError(f"{where}: an array of shape {shape}; poses needed")
+    try:
+        return np.array(np.load(io.BytesIO(data), allow_pickle=False), dtype=float)
+    except DAMAGED as error:
+        raise _damaged(where, error) from error
+
+
+def load_npz(data: bytes, where: str) -> tuple[dict[str, Any], tuple[str, ...]]:
+    """The arrays of an npz file by name, and the names of those that are not numbers.
+
+    Raises
+    ------
+    InputError
+        Damaged, or larger than any such file is when unpacked.
+    """
+    found, other = {}, []
+    try:
+        with zipfile.ZipFile(io.BytesIO(data)) as archive:
+            members = [each for each in archive.infolist() if each.filename.endswith(".npy")]
+            size = sum(each.file_size for each in members)
+            if size > TABLE_BYTES:
+                raise InputError(f"{where}: {size / MB:.0f} MB unpacked, at most {TABLE_BYTES // MB} MB are read")
+            for each in members:
+                with archive.open(each) as stream:
+                    content = stream.read(TABLE_BYTES + 1)
+                name = each.filename.removesuffix(".npy")
+                if _is_text(content):
+                    found[name] = _texts(content)
+                    continue
+                try:
+                    found[name] = load_npy(content, f"{where}: {name}")
+                except InputError:
+                    other.append(name)
+    except (zipfile.BadZipFile, zlib.error, NotImplementedError, RuntimeError, *DAMAGED) as error:
+        raise _damaged(where, error) from error
+    if not found:
+        raise InputError(f"{where}: no arrays of numbers; save it with np.savez")
+    return found, tuple(other)
+
+
+def _is_text(content: bytes) -> bool:
+    return b"'descr': '<U" in content[:128]
+
+
+def _texts(content: bytes) -> list[str]:
+    """Names of images, mostly."""
+    try:
+        return [str(each) for each in np.load(io.BytesIO(content), allow_pickle=False).ravel()]
+    except MemoryError as error:
+        raise ValueError("a head that is larger than its file") from error
+
+
+def _damaged(where: str, error: Exception) -> InputError:
+    return InputError(f"{where}: not a file of NumPy ({' '.join(str(error).split())[:80]}); save it again")

@@ -1,0 +1,262 @@
+"""CSV files with columns of other programs: Euler angles, rotation vectors, exports of ROS bags."""
+
+import csv
+import re
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from stcal.errors import InputError
+from stcal.handeye.data.formats.keys import role_of
+from stcal.handeye.data.formats.record import (
+    EVERY_FRAME,
+    FRAMES,
+    Content,
+    Frames,
+    Role,
+    Said,
+    Side,
+    Unit,
+    of_quaternions,
+    proper,
+    require_each_once,
+)
+from stcal.handeye.data.formats.rotations import ROTATION_VECTOR, Convention, rotations, said_convention
+from stcal.handeye.data.formats.single import ROS, turned_values
+from stcal.io.quaternions import COLUMNS as QUATERNION
+from stcal.io.table import ANGLES, LENGTHS, Table
+
+TABLE = "table"
+NAMES = (
+    *("image", "image_name", "filename", "file", "name", "pose"),
+    *("field.header.stamp", "header.stamp", "header_stamp", "timestamp", "stamp", "%time", "__time", "time"),
+)
+"""Columns that name a row, in order of preference."""
+TRIPLES = (("rx", "ry", "rz"), ("a", "b", "c"), ("w", "p", "r"), ("o", "a", "t"), ("roll", "pitch", "yaw"))
+BY_AXIS = (("rx", "ry", "rz"), ("roll", "pitch", "yaw"))
+_MESSAGE = re.compile(r"(?P<of>.*?)[./_]?(?:position|translation)[./_]x", re.IGNORECASE)
+_EULER = re.compile(r"euler_([xyz]{3}|[XYZ]{3})_1_(deg|rad)")
+_STAMP = (("secs", "nsecs"), ("sec", "nanosec"))
+
+
+def todays(table: Table) -> bool:
+    """Whether the columns are those of the package's own tables, a place with its unit and a quaternion."""
+    prefixes = ("", *(f"{name}_" for name in EVERY_FRAME))
+    return any(table.has(f"{each}x", LENGTHS) and f"{each}qw" in table for each in prefixes)
+
+
+def read_columns(table: Table, text: str, key: str, said: Said) -> Content | None:
+    """What is told of a table by its columns; None where no poses are in it.
+
+    Raises
+    ------
+    InputError
+        Some columns of a pose only, no rotations, several topics in one file, or a convention that must be said.
+    """
+    messages = _messages(table)
+    if messages:
+        return _of_messages(table, messages, _row_names(table, text, key))
+    names = _row_names(table, text, key)
+    sides = []
+    for frame in EVERY_FRAME:
+        side = _side(table, f"{frame}_", Frames(frame, f"by the columns {frame}_…"), names, said)
+        if side is not None:
+            sides.append(side)
+    if not sides:
+        side = _side(table, "", None, names, said)
+        sides = [side] if side is not None else []
+    if not sides:
+        return None
+    roles = [side.frames.role for side in sides if side.frames is not None]
+    if len(set(roles)) < len(roles):
+        both = ", ".join(side.frames.name for side in sides if side.frames is not None)
+        raise InputError(f"{table.where}: columns of {both}; one of each side needed, take the others out")
+    return Content(TABLE, tuple(sides))
+
+
+def _row_names(table: Table, text: str, key: str) -> tuple[str, ...]:
+    """Image or time of each row as it is written, for nanoseconds have more digits than a float; or none."""
+    column = next((name for name in (key, *NAMES) if name in table), None)
+    if column is None:
+        lower = {name.lower(): name for name in table.columns}
+        column = next((lower[name] for name in NAMES if name in lower), None)
+    if column is not None:
+        return _cells(text, column, table)
+    for prefix in ("field.header.stamp.", "header.stamp.", "stamp."):
+        for seconds, rest in _STAMP:
+            if f"{prefix}{seconds}" in table and f"{prefix}{rest}" in table:
+                whole, part = (_cells(text, f"{prefix}{each}", table) for each in (seconds, rest))
+                return tuple(f"{s}.{n.zfill(9)}" for s, n in zip(whole, part, strict=True))
+    return ()
+
+
+def _cells(text: str, column: str, table: Table) -> tuple[str, ...]:
+    rows = [row for row in text.splitlines() if row.strip() and not row.lstrip().startswith("#")]
+    cells = list(csv.reader(rows))
+    at = [name.strip() for name in cells[0]].index(column)
+    found = tuple(row[at].strip() for row in cells[1:])
+    require_each_once(found, _places(table), table.where)
+    return found
+
+
+def _places(table: Table) -> tuple[str, ...]:
+    return tuple(f"line {line}" for line in table.lines)
+
+
+@dataclass(frozen=True, slots=True)
+class _Message:
+    """``of`` : its topic or field; ``place``, ``turn`` : its columns, x, y, z and w, x, y, z."""
+
+    of: str
+    place: tuple[str, ...]
+    turn: tuple[str, ...]
+
+
+def _messages(table: Table) -> list[_Message]:
+    """Poses and transforms of ROS among the columns, as ``rostopic echo -p``, PlotJuggler and pandas name them."""
+    found = []
+    for column in table.columns:
+        match = _MESSAGE.fullmatch(column)
+        if not match:
+            continue
+        place = tuple(f"{column[:-1]}{axis}" for axis in "xyz")
+        stem = column[:-1].lower()
+        for at, turn in (("position", "orientation"), ("translation", "rotation")):
+            if at in stem:
+                start = stem.rindex(at)
+                head = column[:start] + turn + column[start + len(at) : -1]
+                turned = tuple(f"{head}{axis}" for axis in "wxyz")
+                missing = [name for name in (*place, *turned) if name not in table]
+                if missing:
+                    raise InputError(f"{table.where}: {column} without {missing[0]}; export the whole pose")
+                found.append(_Message(match["of"], place, turned))
+    return found
+
+
+def _of_messages(table: Table, messages: Sequence[_Message], names: tuple[str, ...]) -> Content:
+    sides = []
+    for each in messages:
+        role: Role | None = None
+        if len(messages) > 1:
+            said_by: list[Role | None] = [role_of(word) for word in re.split(r"[./]+", each.of) if word]
+            role = next((found for found in said_by if found is not None), None)
+        frames = Frames(FRAMES[role][0], f"by the topic {each.of}", False) if role else None
+        places = _places(table)
+        rotation = of_quaternions(np.column_stack([table.numbers(c) for c in each.turn]), places, table.where)
+        at = np.column_stack([table.numbers(c) for c in each.place])
+        sides.append(Side(rotation, at, places, "quaternions x, y, z, w by name", ROS, frames, names))
+    roles = [side.frames.role if side.frames else None for side in sides]
+    if len(sides) > 1 and (None in roles or len(set(roles)) < len(roles)):
+        topics = ", ".join(each.of for each in messages)
+        raise InputError(
+            f"{table.where}: poses of {len(messages)} topics, {topics}; export the robot's and the camera's each to a "
+            "file of its own, and give --a and --b"
+        )
+    for column in ("field.header.frame_id", "header.frame_id", "field.child_frame_id", "child_frame_id"):
+        if column in table and len(found := sorted(set(table.text(column)))) > 1:
+            raise InputError(f"{table.where}: {column} is {', '.join(found[:3])}; export the rows of one of them alone")
+    return Content("ROS bag export", tuple(sides))
+
+
+def _side(table: Table, prefix: str, frames: Frames | None, names: tuple[str, ...], said: Said) -> Side | None:
+    """Poses of the columns that begin with a prefix; None where it has no place or no rotation."""
+    place = _place(table, prefix)
+    if place is None:
+        return None
+    at, unit = place
+    turned = _rotation(table, prefix, said)
+    if turned is None:
+        return None
+    rotation, words = turned
+    covariance = table.pose_covariances(prefix)
+    return Side(rotation, at, _places(table), words, unit, frames, names, covariance=covariance)
+
+
+def _find(table: Table, prefix: str, name: str) -> str | None:
+    """A column by its name, in capital letters too."""
+    return next((c for c in (f"{prefix}{name}", f"{prefix}{name.upper()}") if c in table), None)
+
+
+def _place(table: Table, prefix: str) -> tuple[np.ndarray, Unit | None] | None:
+    for form in ("{}", "t{}", "p{}", "pos_{}", "{}_pos"):
+        for unit in LENGTHS:
+            columns = [_find(table, prefix, f"{form.format(axis)}_{unit}") for axis in "xyz"]
+            found = [column for column in columns if column is not None]
+            if len(found) == len("xyz"):
+                values = np.column_stack([table.numbers(column) for column in found])
+                return values, Unit(unit, "by the columns", True)
+            if found and form == "{}":
+                raise InputError(f"{table.where}: {', '.join(found)} alone; x, y and z in one unit needed")
+        columns = [_find(table, prefix, form.format(axis)) for axis in "xyz"]
+        found = [column for column in columns if column is not None]
+        if len(found) == len("xyz"):
+            return np.column_stack([table.numbers(column) for column in found]), None
+    return None
+
+
+def _rotation(table: Table, prefix: str, said: Said) -> tuple[np.ndarray, str] | None:
+    """Rotations (m, 3, 3), and how they are written; None where there are none."""
+    places, where = _places(table), table.where
+    if f"{prefix}qw" in table or f"{prefix}qx" in table:
+        table.has_rotation(prefix)
+        standing = [c for c in table.columns if c in {prefix + q for q in QUATERNION}]
+        by_order = table.quaternions != "wxyz"
+        columns = [standing[3], *standing[:3]] if by_order else [prefix + q for q in QUATERNION]
+        words = "quaternions x, y, z, w by the order of their columns" if by_order else "quaternions by name"
+        return of_quaternions(np.column_stack([table.numbers(c) for c in columns]), places, where), words
+    for unit in ANGLES:
+        columns = [f"{prefix}rotvec_{axis}_{unit}" for axis in "xyz"]
+        if (values := _all(table, columns)) is not None:
+            return rotations(values, Convention(ROTATION_VECTOR, unit), places, where)
+    for column in table.columns:
+        if column.startswith(prefix) and (euler := _EULER.fullmatch(column.removeprefix(prefix))):
+            values = _all(table, [f"{prefix}euler_{euler[1]}_{i}_{euler[2]}" for i in (1, 2, 3)])
+            if values is not None:
+                return rotations(values, Convention(euler[1], euler[2]), places, where)
+    matrix = [f"{prefix}r{i}{j}" for i in (1, 2, 3) for j in (1, 2, 3)]
+    if (values := _all(table, matrix)) is not None:
+        return proper(values.reshape(-1, 3, 3), places, where), "3×3 matrices"
+    return _said_rotation(table, prefix, said)
+
+
+def _all(table: Table, columns: list[str]) -> np.ndarray | None:
+    """(m, k) of columns; None where one of them is missing from the first on, an error where a later one is."""
+    there = [column for column in columns if column in table]
+    if not there:
+        return None
+    if len(there) < len(columns):
+        missing = next(column for column in columns if column not in table)
+        raise InputError(f"{table.where}: {', '.join(there)} without {missing}; all {len(columns)} needed")
+    return np.column_stack([table.numbers(column) for column in columns])
+
+
+def _said_rotation(table: Table, prefix: str, said: Said) -> tuple[np.ndarray, str] | None:
+    """Angles in columns whose convention only the user knows."""
+    places, where = _places(table), table.where
+    for triple in TRIPLES:
+        for unit in (*ANGLES, ""):
+            columns = [_find(table, prefix, f"{name}_{unit}" if unit else name) for name in triple]
+            found = [column for column in columns if column is not None]
+            if len(found) < len(triple):
+                continue
+            what = ", ".join(triple) if triple in BY_AXIS else "".join(triple)
+            convention = said_convention(said, what, where)
+            if unit and convention.unit not in ("", unit) and "-" in (said.rotation or "") and _own_unit(said):
+                raise InputError(f"{where}: {found[0]} and --rotation {said.rotation} are of two units; correct one")
+            convention = Convention(convention.order, unit or convention.unit)
+            values = np.column_stack([table.numbers(column) for column in found])
+            rotation, words = rotations(values, convention, places, where, triple in BY_AXIS)
+            return rotation, f"{', '.join(found)} as {words}"
+    columns = [_find(table, prefix, f"q{i}") for i in (1, 2, 3, 4)]
+    found = [column for column in columns if column is not None]
+    if len(found) == len(columns):
+        values = np.column_stack([table.numbers(column) for column in found])
+        rotation, words = turned_values(values, said, "q1, q2, q3, q4", places, where)
+        return rotation, words
+    return None
+
+
+def _own_unit(said: Said) -> bool:
+    """Whether the user wrote a unit, and not a robot's name that has one."""
+    return (said.rotation or "").endswith(tuple(f"-{unit}" for unit in ANGLES))

@@ -1,0 +1,133 @@
+"""Three numbers that state a rotation: in which convention, and in which unit."""
+
+import re
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from stcal.errors import InputError
+from stcal.handeye.data.formats.record import Said, require_finite
+from stcal.io.table import ANGLES
+
+ROTATION_VECTOR = "rotvec"
+QUATERNIONS = ("wxyz", "xyzw")
+ALIASES: dict[str, tuple[str, str]] = {
+    "kuka-abc": ("ZYX", "deg"),
+    "fanuc-wpr": ("xyz", "deg"),
+    "yaskawa": ("xyz", "deg"),
+    "mitsubishi-abc": ("xyz", "deg"),
+    "staubli": ("XYZ", "deg"),
+    "kawasaki-oat": ("ZYZ", "deg"),
+    "ur-rotvec": (ROTATION_VECTOR, "rad"),
+    "rpy": ("xyz", ""),
+    "abb-quaternion": ("wxyz", ""),
+}
+"""Names by robot: order of axes as SciPy writes it (small: about fixed axes, capital: about the turned ones), or what
+else, and unit of angles, empty where it is not said."""
+LIKELY = {
+    "abc": "kuka-abc or mitsubishi-abc",
+    "wpr": "fanuc-wpr",
+    "oat": "kawasaki-oat",
+    "roll, pitch, yaw": "rpy",
+    "rx, ry, rz": "ur-rotvec, yaskawa, staubli, xyz, XYZ or ZYX",
+    "quaternions": "wxyz or xyzw",
+}
+"""What to say for columns of such names."""
+_ORDER = re.compile(r"[xyz]{3}|[XYZ]{3}")
+
+
+@dataclass(frozen=True, slots=True)
+class Convention:
+    """``order`` : :data:`ROTATION_VECTOR`, one of :data:`QUATERNIONS`, or an order of axes; ``unit`` of angles, empty
+    where it is not said."""
+
+    order: str
+    unit: str = ""
+
+    @property
+    def count(self) -> int:
+        """Numbers that state a rotation."""
+        return 4 if self.order in QUATERNIONS else 3
+
+    def words(self) -> str:
+        """For what is said of a file."""
+        if self.order in QUATERNIONS:
+            return f"quaternions {', '.join(self.order)}"
+        if self.order == ROTATION_VECTOR:
+            return "rotation vectors"
+        about = "fixed axes" if self.order.islower() else "turned axes"
+        return f"Euler angles {self.order} (about {about})"
+
+
+def convention_of(name: str) -> Convention:
+    """Of a name that the user gives: ``kuka-abc``, ``ZYX``, ``zyx-rad``, ``rotvec-deg``.
+
+    Raises
+    ------
+    InputError
+        None of them.
+    """
+    if name in ALIASES:
+        return Convention(*ALIASES[name])
+    order, _, unit = name.partition("-")
+    known = order in (ROTATION_VECTOR, *QUATERNIONS)
+    euler = bool(_ORDER.fullmatch(order)) and order[0] != order[1] != order[2]
+    if not (known or euler) or unit not in ("", *ANGLES) or (order in QUATERNIONS and unit):
+        raise InputError(
+            f"--rotation {name}: unknown; rotvec, an order of axes (xyz … about fixed axes, ZYX … about turned ones), "
+            f"each also with -deg or -rad, wxyz, xyzw, {', '.join(ALIASES)}"
+        )
+    return Convention(order, unit)
+
+
+def said_convention(said: Said, what: str, where: str, count: int = 3) -> Convention:
+    """That of ``--rotation``; ``what`` : the names of the columns, or what stands in their place.
+
+    Raises
+    ------
+    InputError
+        Not given, or of another number of values.
+    """
+    if said.rotation is None:
+        likely = LIKELY["quaternions"] if count == len("wxyz") else LIKELY.get(what, "kuka-abc, ur-rotvec, xyz or ZYX")
+        form = "quaternions" if count == len("wxyz") else "Euler angles in any order of axes or rotation vectors"
+        raise InputError(f"{where}: {what} may be {form}; give --rotation, like {likely}")
+    found = convention_of(said.rotation)
+    if found.count != count:
+        raise InputError(
+            f"{where}: {what} are {count} numbers, --rotation {said.rotation} is of {found.count}; correct the option"
+        )
+    return found
+
+
+def rotations(
+    values: np.ndarray, convention: Convention, places: tuple[str, ...], where: str, by_axis: bool = False
+) -> tuple[np.ndarray, str]:
+    """Matrices (m, 3, 3) of three angles, or a vector, each (m, 3); and how they were read, in words.
+
+    ``by_axis`` : the columns are named by the axes x, y, z and not by the order of turning.
+
+    Raises
+    ------
+    InputError
+        Not finite, or of a unit that cannot be told.
+    """
+    require_finite(values, places, where)
+    unit, guessed = convention.unit, False
+    if not unit:
+        largest = float(np.abs(values).max())
+        if largest <= 2 * np.pi * 1.01:
+            raise InputError(
+                f"{where}: angles up to {largest:.3g} may be radians or degrees; give --rotation "
+                f"{convention.order}-rad or {convention.order}-deg, or name the columns _rad or _deg"
+            )
+        unit, guessed = "deg", True
+    angles = values * ANGLES[unit]
+    words = f"{convention.words()}, {'degrees' if unit == 'deg' else 'radians'}{' by their size' if guessed else ''}"
+    if convention.order == ROTATION_VECTOR:
+        return Rotation.from_rotvec(angles).as_matrix(), words
+    if by_axis and len(set(convention.order)) == len("xyz"):
+        angles = angles[:, ["xyz".index(axis) for axis in convention.order.lower()]]
+        words += ", each about the axis of its name"
+    return Rotation.from_euler(convention.order, angles).as_matrix(), words

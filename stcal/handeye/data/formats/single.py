@@ -1,0 +1,186 @@
+"""One pose as JSON and YAML files hold it: a matrix, a message of ROS, a file of Zivid, OpenCV's matrix."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from stcal.errors import InputError
+from stcal.handeye.data.formats.record import MATRICES, Said, Unit, of_matrices, of_quaternions, proper, require_finite
+from stcal.handeye.data.formats.rotations import (
+    QUATERNIONS,
+    ROTATION_VECTOR,
+    Convention,
+    rotations,
+    said_convention,
+)
+
+PLACE_KEYS = ("translation", "position", "t", "tvec", "trans", "xyz")
+TURN_KEYS = ("rotation", "orientation", "quaternion", "R", "rvec", "rot", "q")
+WRAPPED = ("pose", "transform", "matrix", "T", "H", "homogeneous", "transformation", "pose_matrix", "robot_pose")
+"""Keys under which a pose stands beside its name or header."""
+NAME_KEYS = (
+    *("image", "img", "image_name", "image_file", "image_path", "filename", "file", "name"),
+    *("timestamp", "stamp", "time", "id", "index"),
+)
+ROS = Unit("m", "as in ROS")
+ZIVID = Unit("mm", "as in Zivid")
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class One:
+    """``rotation`` (3, 3), ``translation`` (3,), ``turned`` and ``unit`` as of :class:`.record.Side`; ``form`` : of the
+    file, where the pose shows it; ``name``."""
+
+    rotation: np.ndarray
+    translation: np.ndarray
+    turned: str
+    unit: Unit | None = None
+    form: str = ""
+    name: str = ""
+
+
+def numbers(value: Any) -> np.ndarray | None:
+    """An array of numbers as lists, arrays or OpenCV's matrix hold it; None of all else, and of ragged lists."""
+    if isinstance(value, Mapping):
+        if not {"rows", "cols", "data"} <= value.keys():
+            return None
+        flat = numbers(value["data"])
+        rows, columns = value["rows"], value["cols"]
+        fits = isinstance(rows, int) and isinstance(columns, int) and flat is not None and flat.size == rows * columns
+        return flat.reshape(rows, columns) if fits and flat is not None else None
+    if not isinstance(value, list | tuple | np.ndarray) or not len(value):
+        return None
+    if not isinstance(value, np.ndarray) and not _all_numbers(value):
+        return None
+    try:
+        return np.array(value, dtype=float)
+    except (ValueError, TypeError):
+        return None
+
+
+def _all_numbers(value: Any) -> bool:
+    """Text that looks like a number is none; null is not a number, to be told by its place."""
+    if isinstance(value, list | tuple):
+        return all(_all_numbers(each) for each in value)
+    return value is None or (isinstance(value, int | float) and not isinstance(value, bool))
+
+
+def one(value: Any, said: Said, place: str, where: str) -> One | None:
+    """The pose in a value, None where it has not the shape of one.
+
+    Raises
+    ------
+    InputError
+        It has the shape, but is no pose; or its convention must be said.
+    """
+    array = numbers(value)
+    if array is not None:
+        return _of_array(array, said, place, where)
+    if not isinstance(value, Mapping):
+        return None
+    if isinstance(value.get("FloatMatrix"), Mapping):
+        found = one(value["FloatMatrix"].get("Data"), said, place, where)
+        return found and _named(found, value, unit=ZIVID, form="Zivid pose file")
+    found = _of_parts(value, said, place, where) or _of_scalars(value, place, where)
+    if found is None:
+        inside = [value[key] for key in WRAPPED if key in value]
+        if not inside:  # OpenCV's FileStorage: one matrix under any name
+            inside = [each for each in value.values() if isinstance(each, Mapping) and "rows" in each]
+            inside = inside if len(inside) == 1 else []
+        if len(inside) == 1:
+            found = one(inside[0], said, place, where)
+    return found and _named(found, value)
+
+
+def _named(found: One, value: Mapping, unit: Unit | None = None, form: str = "") -> One:
+    name = found.name or name_in(value)
+    return One(found.rotation, found.translation, found.turned, unit or found.unit, form or found.form, name)
+
+
+def name_in(value: Mapping) -> str:
+    """Image, timestamp or number that stands beside a pose; of a message of ROS, its stamp."""
+    for key in NAME_KEYS:
+        given = value.get(key)
+        if isinstance(given, str | int | float) and not isinstance(given, bool):
+            return str(given).strip()
+    header = value.get("header")
+    stamp = header.get("stamp") if isinstance(header, Mapping) else value.get("stamp")
+    if isinstance(stamp, Mapping):
+        seconds, rest = stamp.get("secs", stamp.get("sec")), stamp.get("nsecs", stamp.get("nanosec"))
+        if isinstance(seconds, int) and isinstance(rest, int):
+            return f"{seconds}.{rest:09d}"
+    return str(stamp) if isinstance(stamp, int | float) and not isinstance(stamp, bool) else ""
+
+
+def _of_array(array: np.ndarray, said: Said, place: str, where: str) -> One | None:
+    if array.shape == (16,):
+        array = array.reshape(4, 4)
+    if array.shape in ((3, 4), (12,)):
+        raise InputError(f"{where}: {place}: a matrix 3×4, 4×4 needed; add the row 0 0 0 1")
+    if array.shape == (4, 4):
+        rotation, translation = of_matrices(array[None], (place,), where)
+        return One(rotation[0], translation[0], MATRICES)
+    if array.shape in ((6,), (7,)):
+        require_finite(array[None], (place,), where)
+        rotation, turned = turned_values(array[None, 3:], said, "the numbers after x, y, z", (place,), where)
+        return One(rotation[0], array[:3], turned)
+    return None
+
+
+def turned_values(
+    values: np.ndarray, said: Said, what: str, places: tuple[str, ...], where: str
+) -> tuple[np.ndarray, str]:
+    """Rotations (m, 3, 3) of (m, 3) or (m, 4) numbers whose convention only the user knows, and how they were read."""
+    convention = said_convention(said, what, where, values.shape[1])
+    if convention.order in QUATERNIONS:
+        order = [0, 1, 2, 3] if convention.order == "wxyz" else [3, 0, 1, 2]
+        return of_quaternions(values[:, order], places, where), convention.words()
+    return rotations(values, convention, places, where)
+
+
+def _of_parts(value: Mapping, said: Said, place: str, where: str) -> One | None:
+    """A translation and a rotation under two keys."""
+    at = next((value[key] for key in PLACE_KEYS if key in value), None)
+    turn_key = next((key for key in TURN_KEYS if key in value), None)
+    if at is None or turn_key is None:
+        return None
+    turn, unit, form = value[turn_key], None, ""
+    if isinstance(at, Mapping) and {"x", "y", "z"} <= at.keys():
+        at, unit, form = [at["x"], at["y"], at["z"]], ROS, "ROS messages"
+    translation = numbers(at)
+    if translation is None or translation.size != len("xyz"):
+        raise InputError(f"{where}: {place}: a translation of three numbers needed; correct it")
+    require_finite(translation.reshape(1, 3), (place,), where)
+    if isinstance(turn, Mapping) and {"x", "y", "z", "w"} <= turn.keys():
+        wxyz = numbers([turn["w"], turn["x"], turn["y"], turn["z"]])
+        if wxyz is None:
+            raise InputError(f"{where}: {place}: a quaternion of four numbers needed; correct it")
+        rotation, turned = of_quaternions(wxyz[None], (place,), where), "quaternions x, y, z, w by name"
+        return One(rotation[0], translation.ravel(), turned, unit, form)
+    array = numbers(turn)
+    if array is not None and array.size == 9:
+        rotation = proper(array.reshape(1, 3, 3), (place,), where)
+        return One(rotation[0], translation.ravel(), "3×3 matrices", unit, form)
+    if array is None or array.size not in (3, 4):
+        raise InputError(f"{where}: {place}: {turn_key} is no rotation; 3×3, a quaternion or three angles needed")
+    values = array.reshape(1, -1)
+    if turn_key == "rvec":
+        rotation, turned = rotations(values, Convention(ROTATION_VECTOR, "rad"), (place,), where)
+    else:
+        rotation, turned = turned_values(values, said, turn_key, (place,), where)
+    return One(rotation[0], translation.ravel(), turned, unit, form)
+
+
+def _of_scalars(value: Mapping, place: str, where: str) -> One | None:
+    """x, y, z, qw, qx, qy, qz beside each other: metres, as in data of ROS-Industrial."""
+    keys = ("x", "y", "z", "qw", "qx", "qy", "qz")
+    if not set(keys) <= value.keys():
+        return None
+    row = numbers([value[key] for key in keys])
+    if row is None:
+        raise InputError(f"{where}: {place}: {', '.join(keys)} must be numbers; correct them")
+    require_finite(row[None], (place,), where)
+    rotation = of_quaternions(row[None, 3:], (place,), where)
+    return One(rotation[0], row[:3], "quaternions by name", Unit("m", "as in ROS"), "ROS-Industrial poses")

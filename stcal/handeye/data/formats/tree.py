@@ -1,0 +1,303 @@
+"""Poses in JSON, YAML and npz files: which values are poses, and of which side."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+
+from stcal.errors import InputError
+from stcal.handeye.data.formats.keys import frames_of, role_of
+from stcal.handeye.data.formats.record import (
+    FRAMES,
+    MATRICES,
+    Content,
+    Frames,
+    Role,
+    Said,
+    Side,
+    of_matrices,
+    proper,
+    require_each_once,
+    require_finite,
+)
+from stcal.handeye.data.formats.rotations import ROTATION_VECTOR, Convention, rotations
+from stcal.handeye.data.formats.single import ROS, One, name_in, numbers, one, turned_values
+
+HOLDERS = ("poses", "data", "samples", "pairs", "frames", "transforms", "measurements", "captures", "robot_poses")
+"""Keys under which the list of poses may stand."""
+LISTED_NAMES = ("images", "image_names", "names", "files", "filenames", "timestamps", "stamps")
+"""Keys of lists that name the poses of the stacks beside them."""
+MOVEIT = {"effector_wrt_world", "object_wrt_sensor"}
+OPENCV = "OpenCV's hand-eye arrays"
+
+
+def read_tree(value: Any, form: str, said: Said, where: str) -> Content | None:
+    """What is told of plain values; None where no poses are found.
+
+    Raises
+    ------
+    InputError
+        Poses that are none, more than two sides, or a convention that must be said.
+    """
+    if isinstance(value, Mapping):
+        if "parameters" in value and "transform" in value:
+            raise InputError(f"{where}: the result of an easy_handeye calibration; give its samples, NAME.samples")
+        if (found := easy_handeye(value, said, where)) is not None:
+            return found
+        if (found := _of_keys(value, form, said, where)) is not None:
+            return found
+        if (single := one(value, said, "the pose", where)) is not None:
+            return Content(single.form or form, (_side([single], ("the pose",), where),))
+        if (found := _by_name(value, form, said, where)) is not None:
+            return found
+        for key in HOLDERS:
+            if isinstance(value.get(key), Mapping | list | np.ndarray):
+                found = read_tree(value[key], form, said, where)
+                if found is not None:
+                    others = tuple(str(other) for other in value if other != key)
+                    return Content(found.form, found.sides, found.setup, (*found.passed_over, *others))
+        return None
+    return _of_list(value, form, said, where) if isinstance(value, list | np.ndarray) and len(value) else None
+
+
+def easy_handeye(value: Mapping, said: Said, where: str) -> Content | None:
+    """Samples of easy_handeye, ROS 1 and 2. For a camera that stands still it writes the robot's poses inverted."""
+    samples, parameters = value.get("samples", value), value.get("parameters")
+    if isinstance(samples, Mapping) and {"hand_world_samples", "camera_marker_samples"} <= samples.keys():
+        lists = [samples["hand_world_samples"], samples["camera_marker_samples"]]
+        lists = [each.get("transforms") if isinstance(each, Mapping) else each for each in lists]
+    elif isinstance(samples, list) and samples and all(isinstance(each, Mapping) for each in samples):
+        seen = next((key for key in ("tracking", "optical") if key in samples[0]), None)
+        if seen is None or "robot" not in samples[0]:
+            return None
+        for i, sample in enumerate(samples, 1):
+            if "robot" not in sample or seen not in sample:
+                raise InputError(f"{where}: sample {i}: robot and {seen} needed; take it out")
+        lists = [[each["robot"] for each in samples], [each[seen] for each in samples]]
+    else:
+        return None
+    setup = None
+    if isinstance(parameters, Mapping):
+        by_type = {"eye_in_hand": "eye-in-hand", "eye_on_base": "eye-to-hand", "eye_to_hand": "eye-to-hand"}
+        setup = by_type.get(str(parameters.get("calibration_type", "")))
+        if isinstance(parameters.get("eye_on_hand"), bool):
+            setup = "eye-in-hand" if parameters["eye_on_hand"] else "eye-to-hand"
+    fixed = (setup or said.setup) == "eye-to-hand"
+    of_setup = "eye-to-hand" if fixed else "eye-in-hand"
+    frames = (
+        Frames(FRAMES["robot"][fixed], f"as easy_handeye writes it of {of_setup}", False),
+        Frames("camera_from_board", "as easy_handeye writes it", False),
+    )
+    sides = []
+    for each, of in zip(lists, frames, strict=True):
+        side = _listed(each if isinstance(each, list) else [], said, where, of, "sample")
+        if side is None:
+            raise InputError(f"{where}: samples of easy_handeye without transforms; take samples, and save them")
+        sides.append(side)
+    return Content("easy_handeye samples", _same_count(sides, where), setup)
+
+
+def _of_keys(value: Mapping, form: str, said: Said, where: str) -> Content | None:
+    """Stacks of poses, of each side under keys that name it."""
+    parts: dict[str, dict[str, Any]] = {}
+    named: dict[str, Frames] = {}
+    other, names = [], ()
+    for key, each in value.items():
+        if str(key).lower() in LISTED_NAMES and isinstance(each, list | np.ndarray):
+            names = tuple(str(name) for name in each)
+            continue
+        frames = frames_of(key)
+        role = role_of(key) if frames is None else frames.role
+        shaped = isinstance(each, list | Mapping | np.ndarray)
+        if role is None or not shaped or (frames is None and _side_of(each, said, where, None) is None):
+            other.append(str(key))
+            continue
+        frames = frames or Frames(FRAMES[role][0], "by default", False)
+        parts.setdefault(frames.name, {})[str(key)] = each
+        named[frames.name] = frames
+    if not parts:
+        return None
+    roles = [frames.role for frames in named.values()]
+    if len(set(roles)) < len(roles):
+        keys = ", ".join(key for each in parts.values() for key in each)
+        raise InputError(f"{where}: {keys}: more than one set of the same poses; leave one of each side in the file")
+    sides = []
+    for name, each in parts.items():
+        side = _of_parts(each, said, where, named[name])
+        if side is None:
+            keys = ", ".join(each)
+            raise InputError(f"{where}: {keys}: no poses; 4×4 matrices, or rotations and translations, needed")
+        sides.append(side)
+    if names and len(names) != len(sides[0]):
+        raise InputError(f"{where}: {len(names)} names of {len(sides[0])} poses; one each needed")
+    if names:
+        sides = [_renamed(side, names, where) for side in sides]
+    opencv = any("2" in key for each in parts.values() for key in each)
+    return Content(OPENCV if opencv else form, _same_count(sides, where), None, tuple(other))
+
+
+def _of_parts(parts: dict[str, Any], said: Said, where: str, frames: Frames) -> Side | None:
+    """Poses under one key, or rotations and translations under two."""
+    if len(parts) == 1:
+        return _side_of(next(iter(parts.values())), said, where, frames)
+    if len(parts) != 2:
+        raise InputError(f"{where}: {', '.join(parts)}: more than one set of the same poses; leave one in the file")
+    arrays = {}
+    for key, value in parts.items():
+        array = numbers([_flat(each) for each in value] if isinstance(value, list) else value)
+        if array is None:
+            raise InputError(f"{where}: {key}: not as many numbers for each pose; correct it")
+        arrays[key] = array
+    keys = sorted(arrays, key=lambda key: (-arrays[key].size, not key.lower().startswith("r")))
+    sizes = [arrays[key].size for key in keys]
+    count = 1 if sizes[1] == len("xyz") else len(arrays[keys[1]])
+    if sizes[1] != len("xyz") * count or sizes[0] % count or sizes[0] // count not in (3, 4, 9):
+        raise InputError(
+            f"{where}: {keys[0]} of shape {arrays[keys[0]].shape}, {keys[1]} of {arrays[keys[1]].shape}; a rotation of "
+            "9, 4 or 3 numbers and a translation of 3 for each pose needed"
+        )
+    turn, at = (arrays[key].reshape(count, -1) for key in keys)
+    places = tuple(f"pose {i}" for i in range(1, len(at) + 1))
+    require_finite(at, places, where)
+    if turn.shape[1] == 9:
+        return Side(proper(turn.reshape(-1, 3, 3), places, where), at, places, "3×3 matrices", frames=frames)
+    if turn.shape[1] == 3 and keys[0].lower().startswith("r"):  # OpenCV takes rotation vectors in place of matrices
+        rotation, words = rotations(turn, Convention(ROTATION_VECTOR, "rad"), places, where)
+    else:
+        rotation, words = turned_values(turn, said, keys[0], places, where)
+    return Side(rotation, at, places, words, frames=frames)
+
+
+def _flat(value: Any) -> Any:
+    array = numbers(value)
+    return value if array is None else array.ravel().tolist()
+
+
+def _by_name(value: Mapping, form: str, said: Said, where: str) -> Content | None:
+    """A pose for each name: of images, mostly."""
+    if not value or not all(isinstance(each, Mapping | list | np.ndarray) for each in value.values()):
+        return None
+    found = []
+    for key, each in value.items():
+        single = one(each, said, str(key), where)
+        if single is None:
+            return None
+        found.append(One(single.rotation, single.translation, single.turned, single.unit, single.form, str(key)))
+    return Content(found[0].form or form, (_side(found, tuple(map(str, value)), where),))
+
+
+def _of_list(value: Any, form: str, said: Said, where: str) -> Content | None:
+    if all(isinstance(each, Mapping) for each in value):
+        found = _of_pairs(value, form, said, where)
+        if found is not None:
+            return found
+    side = _side_of(value, said, where, None)
+    if side is None:
+        return None
+    singles = [one(each, said, "pose", where) for each in value[:1]] if isinstance(value, list) else []
+    return Content((singles[0].form if singles and singles[0] else "") or form, (side,))
+
+
+def _of_pairs(value: Sequence[Mapping], form: str, said: Said, where: str) -> Content | None:
+    """A list of which each entry holds the poses of both sides, or of one, under keys that name them."""
+    sides: dict[Role, tuple[str, Frames]] = {}
+    other = []
+    for key, each in value[0].items():
+        frames = frames_of(key)
+        role = role_of(key) if frames is None else frames.role
+        if role is None or one(each, said, "pose 1", where) is None:
+            other.append(str(key))
+            continue
+        if role in sides:
+            raise InputError(f"{where}: {sides[role][0]} and {key}: poses of one side twice; leave one in the file")
+        sides[role] = (key, frames or Frames(FRAMES[role][0], "by default", False))
+    if not sides:
+        return None
+    names = [name_in(each) for each in value]
+    named = all(names)
+    read = []
+    for key, frames in sides.values():
+        for i, each in enumerate(value, 1):
+            if key not in each:
+                raise InputError(f"{where}: pose {i}: {key} is missing, which pose 1 has; add it, or take the pose out")
+        side = _listed([each[key] for each in value], said, where, frames, "pose")
+        if side is None:
+            raise InputError(f"{where}: {key}: not a pose in every entry; correct it")
+        read.append(_renamed(side, tuple(names), where) if named else side)
+    moveit = {key for key, _ in sides.values()} == MOVEIT
+    if moveit:
+        read = [replace(side, unit=ROS) for side in read]
+    rest = tuple(key for key in other if not (named and key in ("image", "name", "header", "timestamp", "stamp", "id")))
+    return Content("MoveIt hand-eye samples" if moveit else form, tuple(read), None, rest)
+
+
+def _renamed(side: Side, names: tuple[str, ...], where: str) -> Side:
+    require_each_once(names, side.places, where)
+    return replace(side, names=names)
+
+
+def _side_of(value: Any, said: Said, where: str, frames: Frames | None) -> Side | None:
+    """One side in a list, a stack or a mapping by name; None where that holds no poses."""
+    if isinstance(value, Mapping):
+        single = one(value, said, "the pose", where)
+        if single is not None:
+            return _side([single], ("the pose",), where, frames)
+        found = _by_name(value, "", said, where)
+        return found and replace(found.sides[0], frames=frames)
+    if not isinstance(value, list | np.ndarray) or not len(value):
+        return None
+    if isinstance(value, list) and any(isinstance(each, Mapping) for each in value):
+        return _listed(value, said, where, frames, "pose")
+    array = numbers(value)
+    if array is None:
+        return _listed(value, said, where, frames, "pose") if isinstance(value, list) else None
+    if array.ndim == 3 and array.shape[1:] == (3, 4):
+        raise InputError(f"{where}: {len(array)} matrices 3×4, 4×4 needed; add the row 0 0 0 1 to each")
+    if array.shape == (4, 4) or array.shape == (16,):
+        array = array.reshape(1, 4, 4)
+    if array.ndim == 2 and array.shape[1] == 16:
+        array = array.reshape(-1, 4, 4)
+    if array.ndim == 2 and array.shape[1] in (6, 7):
+        places = tuple(f"pose {i}" for i in range(1, len(array) + 1))
+        require_finite(array, places, where)
+        turned, words = turned_values(array[:, 3:], said, "the numbers after x, y, z", places, where)
+        return Side(turned, array[:, :3], places, words, frames=frames)
+    if array.ndim != 3 or array.shape[1:] != (4, 4):
+        return None
+    places = tuple(f"pose {i}" for i in range(1, len(array) + 1))
+    rotation, translation = of_matrices(array, places, where)
+    return Side(rotation, translation, places, MATRICES, frames=frames)
+
+
+def _listed(values: Sequence, said: Said, where: str, frames: Frames | None, what: str) -> Side | None:
+    """Poses one by one; None where the first is none."""
+    places = tuple(f"{what} {i}" for i in range(1, len(values) + 1))
+    found = []
+    for value, place in zip(values, places, strict=True):
+        single = one(value, said, place, where)
+        if single is None and not found:
+            return None
+        if single is None:
+            raise InputError(f"{where}: {place}: no pose like the one before it; correct it, or take it out")
+        found.append(single)
+    return _side(found, places, where, frames) if found else None
+
+
+def _side(found: Sequence[One], places: tuple[str, ...], where: str, frames: Frames | None = None) -> Side:
+    units = {(each.unit.name if each.unit else "", each.turned) for each in found}
+    if len(units) > 1:
+        raise InputError(f"{where}: poses of {len(units)} kinds: {'; '.join(sorted(t for _, t in units))}; one needed")
+    names = tuple(each.name for each in found)
+    if not all(names):
+        names = ()
+    require_each_once(names, places[: len(names)], where)
+    rotation, translation = np.array([e.rotation for e in found]), np.array([e.translation for e in found])
+    return Side(rotation, translation, places, found[0].turned, found[0].unit, frames, names)
+
+
+def _same_count(sides: list[Side], where: str) -> tuple[Side, ...]:
+    if len({len(side) for side in sides}) > 1:
+        counts = " and ".join(f"{len(side)} of {side.frames.name if side.frames else 'one side'}" for side in sides)
+        raise InputError(f"{where}: {counts}; pairs needed")
+    return tuple(sides)

@@ -1,0 +1,335 @@
+"""From what files hold to what is calibrated from: one direction, mm, and rows of both sides that belong together."""
+
+import re
+from collections.abc import Callable, Hashable, Sequence
+from dataclasses import dataclass
+from decimal import Decimal, InvalidOperation
+from pathlib import Path, PurePosixPath
+
+import numpy as np
+
+from stcal.errors import InputError
+from stcal.geometry.rigid import Poses
+from stcal.handeye.data.formats.columns import read_columns
+from stcal.handeye.data.formats.record import FRAMES, Content, Frames, Role, Said, Side
+from stcal.handeye.data.formats.tell import read_content
+from stcal.handeye.data.pairs import HandEyePoses, inverse_covariance
+from stcal.io.files import TABLE_BYTES, read_bytes
+from stcal.io.quaternions import Order
+from stcal.io.table import FARTHEST, LENGTHS, Table, read_table
+
+METRES_UP_TO, MILLIMETRES_FROM = 5.0, 50.0
+"""Lengths of which all are below are metres, and of which one is above are millimetres: flanges and boards are farther
+from base and camera than 5 mm, and nearer than 50 m."""
+MIXED = 100.0
+"""Poses of which the farthest is so many times as far as the nearest are of two units."""
+NANOSECONDS_FROM = Decimal(10) ** 14
+SHOWN = 3
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Posed:
+    """Poses of one side in the direction that is wanted, mm.
+
+    ``names`` : image or timestamp of each, or none; ``places`` : where each stands; ``understood`` : what the file was
+    taken for; ``scaled`` : whether lengths have no unit; ``guessed`` : the unit that was told by size, empty where it
+    is known.
+    """
+
+    poses: Poses
+    names: tuple[str, ...]
+    places: tuple[str, ...]
+    covariance: np.ndarray | None
+    where: str
+    understood: str
+    scaled: bool = False
+    guessed: str = ""
+
+    def __len__(self) -> int:
+        return len(self.poses)
+
+    def called(self, row: int) -> str:
+        """Name of a row, or its place."""
+        return self.names[row] if self.names else self.places[row]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Told:
+    """Pose pairs; ``understood`` : a line for each input; ``setup`` : where a file says so; ``scaled`` : whether the
+    camera's lengths have no unit; ``left_out`` : (name, why)."""
+
+    pairs: HandEyePoses
+    understood: tuple[str, ...]
+    setup: str | None = None
+    scaled: bool = False
+    left_out: tuple[tuple[str, str], ...] = ()
+
+
+def read_pairs(path: Path, said: Said, key: str = "image", quaternions: Order = "wxyz") -> Told | None:
+    """Pose pairs of one file; None where it is one of the package's own tables.
+
+    Raises
+    ------
+    InputError
+        What is wrong with the file, or poses of one side only.
+    """
+    content = read_content(path, said, key, quaternions)
+    if content is None:
+        return None
+    if not content.both:
+        side = content.sides[0]
+        held = f"{side.frames.name} alone" if side.frames is not None else "poses of one side, which is not said,"
+        raise InputError(f"{path}: {content.form} with {held}; give the robot's file as --a and the camera's as --b")
+    robot, camera = (settled(_side(content, role, path), role, content, path, said) for role in FRAMES)
+    if robot.guessed != camera.guessed and robot.guessed and camera.guessed:
+        raise InputError(
+            f"{path}: by their size the robot's lengths are in {robot.guessed} and the camera's in {camera.guessed}; "
+            "write both in one unit, or to two files for --a and --b"
+        )
+    rows = list(range(len(robot)))
+    names = robot.names or camera.names or robot.places
+    return Told(_pairs(robot, camera, rows, rows, names, path.name), _both(robot, camera), content.setup, camera.scaled)
+
+
+def read_two(first: Path, second: Path, said: Said, key: str, quaternions: Order = "wxyz") -> Told | None:
+    """The robot's poses and the camera's of two files, joined by image or time, or by their order where neither file
+    says any; None where both are the package's own tables.
+
+    Raises
+    ------
+    InputError
+        What is wrong with a file, or that nothing fits together.
+    """
+    by_role = [said.of(role) for role in FRAMES]
+    contents = [read_content(path, each, key, quaternions) for path, each in zip((first, second), by_role, strict=True)]
+    if contents[0] is None and contents[1] is None:
+        return None
+    sides = []
+    for role, path, content in zip(FRAMES, (first, second), contents, strict=True):
+        found = content or own_table(path, said, key, quaternions)
+        sides.append(settled(_side(found, role, path), role, found, path, said))
+    robot, camera = sides
+    rows, how = matched(robot, camera, key)
+    notes = () if not how else (f"rows joined {how}",)
+    a, b = [i for i, _ in rows], [j for _, j in rows]
+    names = tuple(robot.called(i) for i in a)
+    left_out = [(robot.called(i), f"in {first.name} alone") for i in sorted(set(range(len(robot))) - set(a))]
+    left_out += [(camera.called(j), f"in {second.name} alone") for j in sorted(set(range(len(camera))) - set(b))]
+    setup = next((content.setup for content in contents if content is not None and content.setup), None)
+    where = f"{first.name} with {second.name}"
+    pairs = _pairs(robot, camera, a, b, names, where)
+    return Told(pairs, (*_both(robot, camera), *notes), setup, camera.scaled, tuple(left_out))
+
+
+def read_robot(path: Path, said: Said, key: str = "image", quaternions: Order = "wxyz") -> Posed | None:
+    """The robot's poses of a file or folder; None where it is one of the package's own tables.
+
+    Raises
+    ------
+    InputError
+        What is wrong with it.
+    """
+    content = read_content(path, said.of("robot"), key, quaternions)
+    return None if content is None else settled(_side(content, "robot", path), "robot", content, path, said)
+
+
+def own_told(source: Path | Table, quaternions: Order = "wxyz") -> list[str]:
+    """Lines on a table of pose pairs of the package's own."""
+    table = read_table(source, "pose file", quaternions)
+    lines = []
+    for role, names in FRAMES.items():
+        frame = next((name for name in names if any(column.startswith(f"{name}_") for column in table.columns)), "")
+        unit = table.unit(f"{frame}_x", LENGTHS)
+        own = ", with covariances" if f"{frame}_cov_rx_rx" in table else ""
+        turned = "quaternions by name" if quaternions == "wxyz" else "quaternions x, y, z, w by their order"
+        held = f"{len(table)} poses; {frame} by its columns; {turned}; {unit}{own}"
+        lines.append(f"{role}: {table.where.removeprefix('pose file ')}: table; {held}")
+    return lines
+
+
+def own_table(path: Path, said: Said, key: str, quaternions: Order) -> Content:
+    """A table of the package's own, of one side."""
+    table = read_table(path, "table", quaternions)
+    found = read_columns(table, read_bytes(path, TABLE_BYTES).decode("utf-8-sig"), key, said)
+    if found is None:
+        raise InputError(f"{table.where}: no poses in its columns; the header is {table.header()}")
+    return found
+
+
+def _side(content: Content, role: Role, path: Path) -> Side:
+    """The side of a role, or the only one where nothing says whose it is."""
+    found = content.of(role)
+    if found is None and len(content.sides) == 1 and content.sides[0].frames is None:
+        found = content.sides[0]
+    if found is None:
+        frames = content.sides[0].frames
+        held = frames.name if frames else "poses"
+        raise InputError(f"{path}: {content.form} of {held}, {FRAMES[role][0]} needed here; give another file")
+    return found
+
+
+def settled(side: Side, role: Role, content: Content, path: Path, said: Said) -> Posed:
+    """Poses in the direction wanted, mm, with a line on how they were read.
+
+    Raises
+    ------
+    InputError
+        A unit that cannot be told, or an option that the file contradicts.
+    """
+    said = said.of(role)
+    far = np.flatnonzero(np.abs(side.translation).max(axis=1) > FARTHEST)
+    if len(far):
+        measured = np.abs(side.translation[far[0]]).max()
+        raise InputError(f"{path}: {side.places[far[0]]}: a length of {measured:.3g}, up to {FARTHEST:g} possible")
+    frames = _direction(side, role, path, said)
+    factor, unit, guessed = _unit(side, frames.name, path, said)
+    poses = Poses(side.rotation, factor * side.translation)
+    covariance = side.covariance
+    wanted = FRAMES[role][0]
+    if frames.name != wanted:
+        covariance = None if covariance is None else inverse_covariance(poses, covariance)
+        poses = poses.inverse()
+    parts = [f"{path.name}: {content.form}", f"{len(side)} poses", f"{frames.name} {frames.by}", side.turned, unit]
+    if content.passed_over:
+        more = " …" if len(content.passed_over) > SHOWN else ""
+        parts.append(f"passed over: {', '.join(content.passed_over[:SHOWN])}{more}")
+    scaled = side.scaled and said.length_unit is None
+    return Posed(poses, side.names, side.places, covariance, str(path), "; ".join(parts), scaled, guessed)
+
+
+def _direction(side: Side, role: Role, path: Path, said: Said) -> Frames:
+    """As the file or the user says; else base_from_flange and camera_from_board, of trajectories what moves in its
+    world."""
+    option = said.frames_of(role)
+    if option is not None:
+        if side.frames is not None and side.frames.stated and side.frames.name != option:
+            raise InputError(
+                f"{path}: {side.frames.name} {side.frames.by}, --poses-are {option}; rename it, or leave the option out"
+            )
+        return Frames(option, "as you say")
+    if side.frames is not None:
+        return side.frames
+    if side.trajectory and role == "camera":
+        return Frames("board_from_camera", "by default, the camera's trajectory")
+    return Frames(FRAMES[role][0], "by default")
+
+
+def _unit(side: Side, name: str, path: Path, said: Said) -> tuple[float, str, str]:
+    """mm of a unit of length; how it is known; and the unit where it is told by size."""
+    given = side.unit
+    if given is not None and given.stated:
+        return LENGTHS[given.name], f"{given.name} {given.by}", ""
+    if said.length_unit is not None:
+        return LENGTHS[said.length_unit], f"{said.length_unit} as you say", ""
+    if side.scaled:
+        return 1.0, "lengths without a unit, whose scale is solved for", ""
+    if given is not None:
+        return LENGTHS[given.name], f"{given.name} {given.by}", ""
+    distances = np.linalg.norm(side.translation, axis=1)
+    farthest, nearest = float(distances.max()), float(distances.min())
+    if 0 < nearest < farthest / MIXED:
+        near, far = side.places[int(distances.argmin())], side.places[int(distances.argmax())]
+        raise InputError(
+            f"{path}: {name}: {near} is {nearest:.3g} away and {far} {farthest:.3g}, as if in two units; write all in "
+            "one and give --length-unit mm or m"
+        )
+    if METRES_UP_TO < farthest < MILLIMETRES_FROM or farthest == 0:
+        raise InputError(
+            f"{path}: {name}: lengths up to {farthest:.3g}, {METRES_UP_TO:g} or less for metres and "
+            f"{MILLIMETRES_FROM:g} or more for mm needed to tell the unit; give --length-unit mm, cm or m"
+        )
+    unit = "m" if farthest <= METRES_UP_TO else "mm"
+    return LENGTHS[unit], f"{unit} by their size, up to {farthest:.4g}", unit
+
+
+def _pairs(
+    robot: Posed, camera: Posed, a: Sequence[int], b: Sequence[int], names: tuple[str, ...], where: str
+) -> HandEyePoses:
+    of_robot = None if robot.covariance is None else robot.covariance[list(a)]
+    of_camera = None if camera.covariance is None else camera.covariance[list(b)]
+    return HandEyePoses(robot.poses[list(a)], camera.poses[list(b)], of_robot, of_camera, names, where)
+
+
+def _both(robot: Posed, camera: Posed) -> tuple[str, ...]:
+    return f"robot: {robot.understood}", f"camera: {camera.understood}"
+
+
+def matched(robot: Posed, camera: Posed, key: str) -> tuple[list[tuple[int, int]], str]:
+    """Rows of both sides that belong together, in the order of the robot's; and how they were matched, empty where the
+    names are the same.
+
+    Raises
+    ------
+    InputError
+        None do.
+    """
+    if not robot.names and not camera.names:
+        if len(robot) != len(camera):
+            raise InputError(
+                f"{robot.where}, {camera.where}: {len(robot)} and {len(camera)} poses without names or times; as many "
+                "of each, or names, needed"
+            )
+        return [(i, i) for i in range(len(robot))], "by their order, for neither file has names or times"
+    if not robot.names or not camera.names:
+        without, other = (robot, camera) if not robot.names else (camera, robot)
+        raise InputError(
+            f"{without.where}: no names or times of its poses, {other.where} has: {other.names[0]} …; name both, like "
+            f"with a column {key}"
+        )
+    found = partners(robot.names, camera.names)
+    if found is None:
+        raise InputError(
+            f"{robot.where}, {camera.where}: no name or time in common: {robot.names[0]} … in the one, "
+            f"{camera.names[0]} … in the other; correct them"
+        )
+    return found
+
+
+def partners(first: Sequence[str], second: Sequence[str]) -> tuple[list[tuple[int, int]], str] | None:
+    """Places of names in both lists that mean the same, and how that was told; None where none do.
+
+    As they are; as times; without folder and ending; by the number at their ends, where no number occurs twice.
+    """
+    ways: tuple[tuple[Callable[[str], Hashable | None], str], ...] = (
+        (str, ""),
+        (_time, "by their times as numbers"),
+        (_stem, "by names without folder and ending"),
+        (trailing_number, "by the number at the end of each name, like"),
+    )
+    for way, how in ways:
+        keys = [[way(name) for name in names] for names in (first, second)]
+        places = []
+        for each in keys:
+            known = [key for key in each if key is not None]
+            if len(set(known)) < len(known) or not known:
+                break
+            places.append({key: i for i, key in enumerate(each) if key is not None})
+        if len(places) < 2:
+            continue
+        rows = [(i, places[1][key]) for key, i in places[0].items() if key in places[1]]
+        if rows:
+            i, j = rows[0]
+            return rows, f"{how} {first[i]} and {second[j]}" if how.endswith("like") else how
+    return None
+
+
+def _time(name: str) -> Decimal | None:
+    """Seconds; numbers of nanoseconds as seconds too."""
+    try:
+        value = Decimal(_stem(name) if not re.fullmatch(r"[-+\d.eE]+", name) else name)
+    except InvalidOperation:
+        return None
+    if not value.is_finite():
+        return None
+    return value.scaleb(-9) if value >= NANOSECONDS_FROM else value.normalize()
+
+
+def _stem(name: str) -> str:
+    last = PurePosixPath(name.replace("\\", "/")).name
+    return last.rsplit(".", 1)[0] if re.search(r"\.[A-Za-z]\w{1,4}$", last) else last
+
+
+def trailing_number(name: str) -> int | None:
+    """Of ``img07.png``: 7; None where the name ends otherwise, or is a time."""
+    found = re.fullmatch(r"(?:.*[^\d.])?(\d{1,9})", _stem(name))
+    return int(found[1]) if found else None

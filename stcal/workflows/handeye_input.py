@@ -1,0 +1,263 @@
+"""What hand-eye is calibrated from: pose pairs of one file or two, or images of a board with the robot's poses."""
+
+from dataclasses import dataclass, replace
+from functools import partial
+from pathlib import Path
+
+from stcal.boards.file import load_flat_board
+from stcal.errors import DegenerateError, InputError
+from stcal.geometry.rigid import Poses, Rigid
+from stcal.handeye import HandEyePoses, View, Views, pairs_of_views, read_poses
+from stcal.handeye.data.formats.record import Said
+from stcal.handeye.data.inputs import Told, own_told, read_pairs, read_two
+from stcal.handeye.data.loop import SETUPS, Loop, Setup
+from stcal.handeye.data.robot_poses import RobotPoses, read_robot_poses
+from stcal.handeye.judge.spread import spread_text
+from stcal.handeye.methods import start
+from stcal.io.camera import CameraPrior, camera_prior, read_camera, refinable
+from stcal.io.images import ImageFile, find_images
+from stcal.io.quaternions import Order
+from stcal.io.table import Table
+from stcal.parallel import Progress
+from stcal.workflows.board_views import detect_boards
+
+NOTHING_SAID = Said()
+Source = Path | Table | Told
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class HandEyeInput:
+    """What is calibrated from.
+
+    ``where`` : its files; ``views`` : of the board, where images were given, with its ``symmetries`` and the camera's
+    ``prior``; ``pitch_mm`` of the board's file; ``left_out`` : (image or row, why); ``understood`` : a line for each
+    file that is not a table of the package; ``setup`` : as a file says it; ``unit_mm`` : of a model without a unit,
+    about, by which ``pairs`` are multiplied already; ``folder`` : of the images.
+    """
+
+    where: str
+    pairs: HandEyePoses
+    views: Views | None = None
+    symmetries: tuple[Rigid, ...] = ()
+    prior: CameraPrior | None = None
+    pitch_mm: float | None = None
+    left_out: tuple[tuple[str, str], ...] = ()
+    understood: tuple[str, ...] = ()
+    setup: Setup | None = None
+    unit_mm: float | None = None
+    folder: Path | None = None
+
+
+def two_files(first: Path, second: Path, key: str, said: Said, quaternions: Order = "wxyz") -> Told | None:
+    """The robot's poses and the camera's, joined; None of two tables of the package's own, which are joined as such.
+
+    Raises
+    ------
+    InputError
+        As :func:`~stcal.handeye.data.inputs.read_two`; options that tables do not need.
+    """
+    found = read_two(first, second, said, key, quaternions)
+    if found is None:
+        _require_unsaid(said, f"{first}, {second}")
+    return found
+
+
+def read_input(
+    source: Source,
+    poses: Path | None = None,
+    camera: Path | None = None,
+    board: Path | None = None,
+    workers: int | None = None,
+    progress: Progress = lambda *_: None,
+    quaternions: Order = "wxyz",
+    said: Said = NOTHING_SAID,
+) -> HandEyeInput:
+    """Pose pairs from their file or files; or from a folder of images with the files ``poses``, ``camera`` and
+    ``board``.
+
+    ``quaternions`` : ``xyzw`` where their columns hold x, y, z, w in the order in which they stand; ``said`` : what
+    files do not say themselves.
+
+    Raises
+    ------
+    InputError
+        A file is missing or not as it should be, one too many was given, or no image shows the board.
+    """
+    if isinstance(source, Path) and source.is_dir():
+        poses, camera, board = _all_three(source, poses, camera, board)
+        robot = read_robot_poses(poses, quaternions, said)
+        return _from_images(source, robot, poses, camera, board, workers, progress)
+    _require_no_images(source, poses, camera, board)
+    if isinstance(source, Table):
+        return HandEyeInput(source.where, read_poses(source, quaternions))
+    if isinstance(source, Told):
+        return _from_told(source, said)
+    told = read_pairs(source, said, quaternions=quaternions)
+    if told is not None:
+        return _from_told(told, said)
+    _require_unsaid(said, str(source))
+    return HandEyeInput(source.name, read_poses(source, quaternions))
+
+
+def _all_three(source: Path, poses: Path | None, camera: Path | None, board: Path | None) -> tuple[Path, Path, Path]:
+    images = {"--poses": poses, "--camera": camera, "--board": board}
+    missing = [name for name, path in images.items() if path is None]
+    if poses is None or camera is None or board is None:
+        raise InputError(f"image folder {source}: {', '.join(missing)} needed with images")
+    return poses, camera, board
+
+
+def _require_no_images(source: Source, poses: Path | None, camera: Path | None, board: Path | None) -> None:
+    images = {"--poses": poses, "--camera": camera, "--board": board}
+    extra = [name for name, path in images.items() if path is not None]
+    if isinstance(source, Path) and not source.exists():
+        raise InputError(f"{source}: does not exist; a file of poses or a folder of images needed")
+    if extra:
+        what = f"{source} is a file of poses"
+        if not isinstance(source, Path):
+            what = f"{source.where if isinstance(source, Table) else source.pairs.where} are poses"
+        raise InputError(f"{', '.join(extra)}: only with a folder of images; {what}")
+
+
+def _require_unsaid(said: Said, where: str) -> None:
+    if said.options():
+        raise InputError(f"{where}: tables whose columns say all; leave {', '.join(said.options())} out")
+
+
+def setup_of(said: Said, told: str | None, where: str) -> Setup:
+    """As the user says, as a file says, or eye-in-hand.
+
+    Raises
+    ------
+    InputError
+        Both say, but not the same.
+    """
+    if said.setup and told and said.setup != told:
+        raise InputError(f"{where}: of a setup {told}, --setup {said.setup}; leave the option out")
+    name = said.setup or told or SETUPS[0]
+    return "eye-to-hand" if name == "eye-to-hand" else "eye-in-hand"
+
+
+def _from_told(told: Told, said: Said) -> HandEyeInput:
+    """With lengths of a model without a unit brought to mm, about, by the robot's motions."""
+    setup, pairs, unit, understood = setup_of(said, told.setup, told.pairs.where), told.pairs, None, told.understood
+    if told.scaled:
+        pairs, unit = _about_mm(pairs, setup)
+        understood = (*understood, "the model has no unit: --with-scale is implied; give --length-unit if it is metric")
+    return HandEyeInput(
+        pairs.where,
+        pairs,
+        left_out=told.left_out,
+        understood=understood,
+        setup=setup if told.setup else None,
+        unit_mm=unit,
+    )
+
+
+def _about_mm(pairs: HandEyePoses, setup: Setup) -> tuple[HandEyePoses, float]:
+    """Pairs with the camera's lengths times what the robot's motions make of their unit, mm."""
+    scale = start.robust(Loop.of(pairs, setup), True)[2]
+    if not scale > 0:
+        raise DegenerateError(
+            f"{pairs.where}: the model's lengths do not follow the robot's motions; check that images and poses belong "
+            "together, and move the flange farther"
+        )
+    seen = pairs.camera_from_board
+    return replace(pairs, camera_from_board=Poses(seen.rotation, scale * seen.translation)), scale
+
+
+def _from_images(
+    source: Path, robot: RobotPoses, poses: Path, camera: Path, board: Path, workers: int | None, progress: Progress
+) -> HandEyeInput:
+    """Corners of the board in all images that have a pose."""
+    design, model = load_flat_board(board), read_camera(camera)
+    files, skipped = find_images(source)
+    rows, missing, how = _rows_of_images(robot, files, source)
+    with_pose = [file for file in files if file.name in rows]
+    found = detect_boards(with_pose, model, design, (), workers, partial(progress, "board"))
+    views = found.views()
+    left_out = [(each.name, each.reason) for each in (*skipped, *found.skipped)]
+    left_out += _without_partner(files, rows, missing, poses)
+    if not views:
+        first = f"{found.skipped[0].name}: {found.skipped[0].reason}"
+        raise InputError(f"image folder {source}: the board is in none of {len(with_pose)} images: {first}")
+    seen = Views(found.camera, tuple(View(v.xyz_board, v.xy_px, v.covariance_px2) for v in views.values()))
+    at = [rows[name] for name in views]
+    pairs = pairs_of_views(robot.base_from_flange[at], seen, tuple(views), str(source))
+    if robot.covariance is not None:
+        pairs = replace(pairs, base_from_flange_covariance=robot.covariance[at])
+    pitch = getattr(design, "pitch_mm", getattr(design, "square_mm", None))
+    prior = camera_prior(refinable(model.calibrated(found.camera.width, found.camera.height)))
+    where = f"{source.name}, {poses.name}"
+    understood = _robot_lines(robot, how) if not robot.own else ()
+    return HandEyeInput(where, pairs, seen, found.symmetries, prior, pitch, tuple(left_out), understood, folder=source)
+
+
+def _rows_of_images(
+    robot: RobotPoses, files: list[ImageFile], source: Path
+) -> tuple[dict[str, int], tuple[str, ...], str]:
+    rows, missing, how = robot.pairing([file.name for file in files])
+    if not rows:
+        raise InputError(
+            f"{robot.where}: no row is of an image in {source}: {robot.images[0]} … there, {files[0].name} … here; "
+            "correct them"
+        )
+    return rows, missing, how
+
+
+def _without_partner(
+    files: list[ImageFile], rows: dict[str, int], missing: tuple[str, ...], poses: Path
+) -> list[tuple[str, str]]:
+    left_out = [(file.name, f"no row in {poses.name}") for file in files if file.name not in rows]
+    return left_out + [(name, f"no such image, in a row of {poses.name}") for name in missing]
+
+
+def _robot_lines(robot: RobotPoses, how: str) -> tuple[str, ...]:
+    return (f"robot: {robot.understood}", *((f"images matched {how}",) if how else ()))
+
+
+def dry_run(
+    source: Source,
+    poses: Path | None = None,
+    camera: Path | None = None,
+    board: Path | None = None,
+    quaternions: Order = "wxyz",
+    said: Said = NOTHING_SAID,
+) -> list[str]:
+    """What is understood of the inputs, line by line, without looking for the board in images.
+
+    Raises
+    ------
+    InputError
+        As :func:`read_input`.
+    """
+    if isinstance(source, Path) and source.is_dir():
+        return _dry_images(source, *_all_three(source, poses, camera, board), quaternions, said)
+    given = read_input(source, poses, camera, board, quaternions=quaternions, said=said)
+    lines = list(given.understood) if isinstance(source, Told) or given.understood else own_told(source, quaternions)
+    setup = setup_of(said, given.setup, given.where)
+    how = "as you say" if said.setup else "as the file says" if given.setup else "by default"
+    lines += [f"setup: {setup}, {how}", f"pairs: {len(given.pairs)}"]
+    if given.unit_mm is not None:
+        lines.append(f"scale: a unit of the model is about {given.unit_mm:.6g} mm by the robot's motions")
+    lines += spread_text(given.pairs.base_from_flange, setup)
+    return lines + [f"left out {name}: {reason}" for name, reason in given.left_out]
+
+
+def _dry_images(source: Path, poses: Path, camera: Path, board: Path, quaternions: Order, said: Said) -> list[str]:
+    robot = read_robot_poses(poses, quaternions, said)
+    design, model = load_flat_board(board), read_camera(camera)
+    files, skipped = find_images(source)
+    rows, missing, how = _rows_of_images(robot, files, source)
+    setup = setup_of(said, None, source.name)
+    kind = type(design).__name__.removesuffix("Design").lower()
+    lines = [
+        *_robot_lines(robot, how),
+        f"camera: {camera.name}: {model.width} × {model.height} px, focal length {model.focal[0]:.6g} px",
+        f"board: {board.name}: {kind}",
+        f"setup: {setup}, {'as you say' if said.setup else 'by default'}",
+        f"images: {len(rows)} of {len(files)} with a pose of the robot; the board was not looked for",
+        *spread_text(robot.base_from_flange[list(rows.values())], setup),
+    ]
+    left_out = [(each.name, each.reason) for each in skipped] + _without_partner(files, rows, missing, poses)
+    return lines + [f"left out {name}: {reason}" for name, reason in left_out]

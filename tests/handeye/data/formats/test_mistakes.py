@@ -1,0 +1,344 @@
+"""What is wrong with a file of poses is said in one line: where, what, and what to do."""
+
+import io
+import json
+import pickle
+import re
+import zipfile
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from stcal.errors import InputError
+from stcal.handeye.data.formats.record import Said
+from stcal.handeye.data.inputs import partners, read_pairs, read_robot, read_two
+from stcal.synthetic.measured.handeye import simulated
+from tests.handeye.written import easy_handeye, in_metres, line, matrices, message, moveit, ros_csv, tum
+
+PAIRS = simulated(np.random.default_rng(5), 5).pairs
+GOOD = matrices(PAIRS.base_from_flange)
+
+
+def refused(path, said=None, call=read_robot) -> str:
+    with pytest.raises(InputError) as caught:
+        call(path, said or Said())
+    message = str(caught.value)
+    assert "\n" not in message
+    assert str(path) in message
+    return message
+
+
+def changed(i: int, edit) -> np.ndarray:
+    found = GOOD.copy()
+    edit(found[i])
+    return found
+
+
+def scaled(m):
+    m[:3, :3] *= 1.01
+
+
+def mirrored(m):
+    m[:3, 1] *= -1
+
+
+def transposed(m):
+    m[:] = m.T.copy()
+
+
+def one_nan(m):
+    m[1, 3] = np.nan
+
+
+def in_m(m):
+    m[:3, 3] /= 1000
+
+
+@pytest.mark.parametrize(
+    ("matrices", "parts"),
+    [
+        (changed(2, scaled), ["pose 3", "not a rotation", "1.01", "1 ± 0.001 needed"]),
+        (changed(2, mirrored), ["pose 3", "a reflection, determinant −1", "change the sign of one axis"]),
+        (changed(1, transposed), ["pose 2", "last row", "0 0 0 1 needed", "transposed"]),
+        (changed(4, one_nan), ["pose 5", "not finite"]),
+        (changed(0, in_m), ["pose 1 is", "as if in two units", "--length-unit"]),
+        (GOOD[:, :3], ["5 matrices 3×4, 4×4 needed; add the row 0 0 0 1"]),
+        (np.zeros((0, 4, 4)), ["shape (0, 4, 4); poses needed"]),
+        (np.zeros((3, 5)), ["no poses found", "4×4 matrices", "TUM", "needed"]),
+    ],
+)
+def test_bad_arrays_are_named(tmp_path, matrices, parts):
+    path = tmp_path / "poses.npy"
+    np.save(path, matrices)
+    said = refused(path)
+    for part in parts:
+        assert part in said
+
+
+def at(factor: float) -> np.ndarray:
+    found = GOOD.copy()
+    found[:, :3, 3] *= factor / np.linalg.norm(GOOD[:, :3, 3], axis=1).max()
+    return found
+
+
+@pytest.mark.parametrize(("farthest", "unit"), [(4.9, "m"), (5.1, None), (49, None), (51, "mm")])
+def test_the_unit_is_told_by_size_or_asked_for(tmp_path, farthest, unit):
+    path = tmp_path / "poses.npy"
+    np.save(path, at(farthest))
+    if unit is None:
+        said = refused(path)
+        assert f"lengths up to {farthest:.3g}" in said
+        assert "give --length-unit mm, cm or m" in said
+    else:
+        found = read_robot(path, Said())
+        assert f"{unit} by their size, up to {farthest:.4g}" in found.understood
+        farthest_mm = np.linalg.norm(found.poses.translation, axis=1).max()
+        assert farthest_mm == pytest.approx(farthest * {"m": 1000, "mm": 1}[unit])
+    stated = read_robot(path, Said.of_options([], ["robot=cm", "camera=m"], []))
+    assert np.linalg.norm(stated.poses.translation, axis=1).max() == pytest.approx(10 * farthest)
+    assert "cm as you say" in stated.understood
+
+
+def test_two_sides_in_two_units_are_refused(tmp_path):
+    np.savez(tmp_path / "p.npz", base_from_flange=GOOD, camera_from_board=in_metres(PAIRS.camera_from_board))
+    assert "the robot's lengths are in mm and the camera's in m" in refused(tmp_path / "p.npz", call=read_pairs)
+    told = read_pairs(tmp_path / "p.npz", Said.of_options([], ["camera=m", "robot=mm"], []))
+    assert np.abs(told.pairs.camera_from_board.difference(PAIRS.camera_from_board)).max() < 1e-9
+
+
+def test_numpy_files_hold_no_programs(tmp_path):
+    np.save(tmp_path / "a.npy", np.array([{"a": 1}]), allow_pickle=True)
+    assert "an array of object, numbers needed" in refused(tmp_path / "a.npy")
+    (tmp_path / "b.npy").write_bytes(pickle.dumps(GOOD))
+    assert read_robot(tmp_path / "b.npy", Said()) is None  # the reader of tables says that it is no text
+    np.savez(tmp_path / "c.npz", poses=np.array([{"a": 1}], dtype=object))
+    assert "no arrays of numbers" in refused(tmp_path / "c.npz")
+
+
+def test_a_head_that_promises_more_than_there_is(tmp_path):
+    whole = io.BytesIO()
+    np.lib.format.write_array_header_1_0(whole, {"descr": "<f8", "fortran_order": False, "shape": (10**12, 4, 4)})
+    (tmp_path / "a.npy").write_bytes(whole.getvalue() + b"\0" * 64)
+    assert "64 bytes of numbers, 128000000000000 needed" in refused(tmp_path / "a.npy")
+
+
+def test_damaged_arrays_are_named(tmp_path):
+    np.save(tmp_path / "a.npy", GOOD)
+    data = (tmp_path / "a.npy").read_bytes()
+    (tmp_path / "a.npy").write_bytes(data.replace(b"(5, 4, 4)", b"(5, 4, 4 "))
+    assert "not a file of NumPy" in refused(tmp_path / "a.npy")
+    np.savez_compressed(tmp_path / "a.npz", poses=GOOD)
+    data = (tmp_path / "a.npz").read_bytes()
+    (tmp_path / "a.npz").write_bytes(data[:60] + b"\xff" * 20 + data[80:])
+    assert "not a file of NumPy" in refused(tmp_path / "a.npz")
+
+
+def test_lengths_beyond_measure_are_named(tmp_path):
+    path = tmp_path / "poses.npy"
+    np.save(path, at(1e300))
+    assert "pose 1: a length of" in refused(path)
+
+
+def test_a_small_archive_of_much_is_not_unpacked(tmp_path):
+    with zipfile.ZipFile(tmp_path / "a.npz", "w", zipfile.ZIP_DEFLATED) as archive:
+        archive.writestr("poses.npy", b"\0" * 150_000_000)
+    assert "150 MB unpacked, at most 100 MB are read" in refused(tmp_path / "a.npz")
+
+
+ROW = line(GOOD[0].ravel())
+EULER = "x_mm,y_mm,z_mm"
+TUM = "1.5 0.1 0.2 0.3 0 0 0 1\n"
+
+
+@pytest.mark.parametrize(
+    ("text", "parts"),
+    [
+        (f"{ROW}\n{ROW} 1\n{ROW}\n", ["line 2: 17 numbers, 16 in most other lines"]),
+        ("1 0 0 5\n0 1 0 6\n0 0 1 7\n", ["3 rows of 4 numbers, 4 for each matrix", "0 0 0 1 each"]),
+        ("1 0 0 5 0 1 0 6 0 0 1 7\n", ["12 numbers in a line", "4×4 needed"]),
+        (TUM + TUM, ["line 1 and line 2: both are of '1.5'"]),
+        (TUM.replace("0 1\n", "0.5 1\n"), ["line 1: quaternion of length 1.118, 1 ± 0.001 needed"]),
+        (TUM.replace("0 1\n", "1e308 1\n"), ["line 1: quaternion of length inf"]),
+        (TUM.replace("0.3", "nan"), ["not finite"]),
+        ("a.png 1 2 3 0 0 0 1\n", ["the numbers after x, y, z may be quaternions", "like wxyz or xyzw"]),
+        ("1 2 3 10 20 30\n", ["Euler angles", "give --rotation, like"]),
+        (f"{EULER},a,b,c\n1,2,3,10,20,30\n", ["abc may be", "--rotation, like kuka-abc or mitsubishi-abc"]),
+        (f"{EULER},rx,ry,rz\n1,2,3,10,20,30\n", ["like ur-rotvec, yaskawa, staubli, xyz, XYZ or ZYX"]),
+        (f"{EULER},roll,pitch,yaw\n1,2,3,10,20,30\n", ["give --rotation, like rpy"]),
+        (f"{EULER},q1,q2,q3,q4\n1,2,3,1,0,0,0\n", ["q1, q2, q3, q4 may be quaternions"]),
+        (f"{EULER},euler_ZYX_1_deg,euler_ZYX_2_deg\n1,2,3,1,2\n", ["without euler_ZYX_3_deg; all 3 needed"]),
+        (f"image,{EULER},rotvec_x_rad,rotvec_y_rad,rotvec_z_rad\na,1,2,3,0,0,0\na,1,2,3,0,0,1\n", ["both are of 'a'"]),
+        (f"x_mm,y_mm,z_m,{'rotvec_x_rad,rotvec_y_rad,rotvec_z_rad'}\n1,2,3,0,0,0\n", ["x, y and z in one unit needed"]),
+        (
+            "field.pose.position.x,field.pose.position.y\n1,2\n",
+            ["without field.pose.position.z; export the whole pose"],
+        ),
+        ("a: &a [1, 1]\nb: [*a, *a]\n", ["alias *a: write the values out"]),
+        ("{" * 100_000, ["not YAML"]),
+        ("name: cell\n", ["no poses found in it"]),
+        ("- {image: a, matrix: [1, 2]}\n", ["no poses found in it"]),
+        ('{"a.png": [[1,0,0,0],[0,1,0,0],[0,0,1,0]]}', ["a.png: a matrix 3×4, 4×4 needed"]),
+        ('{"parameters": {}, "transform": {}}', ["the result of an easy_handeye calibration; give its samples"]),
+        (
+            '[{"position": {"x": 1, "y": 2, "z": null}, "orientation": {"x": 0, "y": 0, "z": 0, "w": 1}}]',
+            ["not finite"],
+        ),
+        ('[{"position": [1, 2], "orientation": [0, 0, 0, 1]}]', ["pose 1: a translation of three numbers needed"]),
+        (
+            "# id\n1 1 0 0 0 1 2 3 1 a.png\n\n2 1 0 0 0 1 2 1 b.png\n\n",
+            ["line 4: not `id qw qx qy qz tx ty tz camera name`"],
+        ),
+    ],
+)
+def test_bad_text_is_named(tmp_path, text, parts):
+    path = tmp_path / "poses"
+    path.write_text(text)
+    said = refused(path)
+    for part in parts:
+        assert part in said
+
+
+@pytest.mark.parametrize(
+    ("rotation", "part"),
+    [
+        ("kuka", "--rotation kuka: unknown; rotvec, an order of axes"),
+        ("xxz", "unknown"),
+        ("xyz-grad", "unknown"),
+        ("wxyz", "are 3 numbers, --rotation wxyz is of 4"),
+        ("ZYX", "angles up to 0.3 may be radians or degrees; give --rotation ZYX-rad or ZYX-deg"),
+    ],
+)
+def test_bad_conventions_are_named(tmp_path, rotation, part):
+    path = tmp_path / "poses.csv"
+    path.write_text(f"{EULER},a,b,c\n1,2,300,0.1,0.2,0.3\n")
+    with pytest.raises(InputError, match=re.escape(part)):
+        read_robot(path, Said(rotation=rotation))
+
+
+@pytest.mark.parametrize(
+    ("options", "part"),
+    [
+        (([], ["feet"], []), "--length-unit feet: unknown; mm, m"),
+        (([], ["tool=m"], []), "--length-unit tool=m: robot= or camera= needed"),
+        (([], ["m", "mm"], []), "--length-unit mm: given twice"),
+        (([], [], ["tool_from_base"]), "--poses-are tool_from_base: unknown; base_from_flange"),
+        (([], [], ["base_from_flange", "flange_from_base"]), "one of each of robot and camera at most"),
+    ],
+)
+def test_bad_options_are_named(options, part):
+    with pytest.raises(InputError) as caught:
+        Said.of_options(*options)
+    assert part in str(caught.value)
+
+
+def test_a_direction_that_the_file_states_is_not_changed(tmp_path):
+    np.savez(tmp_path / "p.npz", flange_from_base=GOOD, camera_from_board=matrices(PAIRS.camera_from_board))
+    said = Said(frames=("base_from_flange",))
+    assert "flange_from_base by its name flange_from_base, --poses-are base_from_flange" in refused(
+        tmp_path / "p.npz", said, read_pairs
+    )
+    np.save(tmp_path / "p.npy", GOOD)
+    turned = read_robot(tmp_path / "p.npy", Said(frames=("flange_from_base",)))
+    assert turned.poses.inverse().translation == pytest.approx(GOOD[:, :3, 3])
+
+
+def test_the_file_of_the_other_side_is_named(tmp_path):
+    (arguments,) = easy_handeye(tmp_path, PAIRS)
+    np.save(tmp_path / "p.npy", GOOD)
+    (tmp_path / "c.json").write_text(json.dumps({"camera_from_board": GOOD.tolist()}))
+    assert "of camera_from_board, base_from_flange needed here" in refused(tmp_path / "c.json")
+    assert "give the robot's file as --a and the camera's as --b" in refused(tmp_path / "p.npy", call=read_pairs)
+    assert len(read_robot(tmp_path / "demo.samples", Said())) == len(PAIRS)  # both sides: the robot's are taken
+    assert arguments.endswith("demo.samples")
+
+
+def test_samples_without_one_side_are_named(tmp_path):
+    (path,) = moveit(tmp_path, PAIRS)
+    text = Path(path).read_text()
+    broken = tmp_path / "broken.yaml"
+    broken.write_text(text.replace("object_wrt_sensor", "object", 2).replace("object", "object_wrt_sensor", 1))
+    assert "pose 2: object_wrt_sensor is missing, which pose 1 has" in refused(broken, call=read_pairs)
+    samples = [{"robot": message(GOOD[0]), "tracking": message(GOOD[0])}, {"robot": message(GOOD[1])}]
+    (tmp_path / "s.json").write_text(json.dumps({"samples": samples}))
+    assert "sample 2: robot and tracking needed" in refused(tmp_path / "s.json", call=read_pairs)
+
+
+def test_topics_of_one_kind_are_to_be_separated(tmp_path):
+    parts = [f"position/{c}" for c in "xyz"] + [f"orientation/{c}" for c in "xyzw"]
+    head = [f"/tf/{i}/{part}" for i in (1, 2) for part in parts]
+    (tmp_path / "bag.csv").write_text(",".join(head) + "\n" + ",".join(["0.5"] * len(head)) + "\n")
+    assert "poses of 2 topics, /tf/1, /tf/2; export" in refused(tmp_path / "bag.csv")
+
+
+def test_frames_are_not_mixed(tmp_path):
+    _, a, _, _ = ros_csv(tmp_path, PAIRS)
+    rows = Path(a).read_text().splitlines()
+    frames = ["field.header.frame_id", "base", "base", "tool", "base", "base"]
+    (tmp_path / "a.csv").write_text("\n".join(f"{row},{frame}" for row, frame in zip(rows, frames, strict=True)))
+    assert "field.header.frame_id is base, tool" in refused(tmp_path / "a.csv")
+
+
+def test_rows_of_two_files_that_do_not_fit(tmp_path):
+    np.save(tmp_path / "a.npy", GOOD)
+    np.save(tmp_path / "b.npy", matrices(PAIRS.camera_from_board)[:4])
+    with pytest.raises(InputError, match="5 and 4 poses without names or times; as many"):
+        read_two(tmp_path / "a.npy", tmp_path / "b.npy", Said(), "image")
+    _, a, _, b = tum(tmp_path, PAIRS)
+    with pytest.raises(InputError, match=r"b\.npy: no names or times of its poses, .*robot\.txt has: 100\.5000"):
+        read_two(tmp_path / "robot.txt", tmp_path / "b.npy", Said(), "image")
+    late = [f"9{row}" if row[0] != "#" else row for row in Path(b).read_text().splitlines()]
+    (tmp_path / "late.txt").write_text("\n".join(late))
+    with pytest.raises(InputError, match=r"no name or time in common: 100\.5000 … in the one, 9100\.5"):
+        read_two(tmp_path / "robot.txt", tmp_path / "late.txt", Said(), "image")
+    assert a.endswith("robot.txt")
+
+
+def test_rows_in_one_file_alone_are_left_out(tmp_path):
+    _, a, _, b = tum(tmp_path, PAIRS)
+    lines = Path(b).read_text().splitlines()
+    (tmp_path / "fewer.txt").write_text("\n".join(lines[:3] + lines[4:]))
+    told = read_two(tmp_path / "robot.txt", tmp_path / "fewer.txt", Said(), "image")
+    assert told.left_out == (("102.5000", "in robot.txt alone"),)
+    assert len(told.pairs) == 4
+    assert a.endswith("robot.txt")
+
+
+@pytest.mark.parametrize(
+    ("first", "second", "rows", "how"),
+    [
+        (["a", "b"], ["b", "c"], [(1, 0)], ""),
+        (["1.50", "2"], ["2.0", "1.5"], [(0, 1), (1, 0)], "by their times as numbers"),
+        (["1500000000000000001"], ["1500000000.000000001"], [(0, 0)], "by their times as numbers"),
+        (["x/a.png"], ["a.jpg"], [(0, 0)], "by names without folder and ending"),
+        (["pos01", "pos02"], ["img2.png", "img1.png"], [(0, 1), (1, 0)], "by the number at the end of each name"),
+        (["pos01", "pre01"], ["img1.png", "img2.png"], None, ""),
+        (["1.25"], ["img25.png"], None, ""),
+    ],
+)
+def test_names_that_mean_the_same(first, second, rows, how):
+    found = partners(first, second)
+    if rows is None:
+        assert found is None
+    else:
+        assert found is not None
+        assert found[0] == rows
+        assert found[1].startswith(how)
+        assert bool(found[1]) == bool(how)
+
+
+def test_a_folder_of_one_kind(tmp_path):
+    for i, m in enumerate(GOOD):
+        (tmp_path / f"{i}.txt").write_text("\n".join(line(row) for row in m))
+    assert read_robot(tmp_path, Said()).names == ("0", "1", "2", "3", "4")
+    (tmp_path / "5.txt").write_text(ROW + "\n" + ROW)
+    assert "5.txt: 2 poses, one in each file needed" in refused(tmp_path)
+    (tmp_path / "5.txt").write_text("notes\n")
+    assert "5.txt: no pose, one in each file needed" in refused(tmp_path)
+    (tmp_path / "5.txt").write_text(ROW)
+    assert "files of 2 kinds" in refused(tmp_path)
+
+
+def test_a_damaged_model_is_said(tmp_path):
+    (tmp_path / "images.bin").write_bytes(b"\5" + b"\0" * 20)
+    assert "not a COLMAP model's images.bin" in refused(tmp_path / "images.bin")

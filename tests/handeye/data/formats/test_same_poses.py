@@ -1,0 +1,40 @@
+"""The same poses, written in each format, are read as the same poses."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from stcal.handeye.data.formats.record import Said
+from stcal.synthetic.measured.handeye import simulated
+from stcal.workflows.handeye_input import read_input, two_files
+from tests.handeye.written import FORMATS
+
+PAIRS = simulated(np.random.default_rng(5), 7).pairs
+ROUNDING = 1e-9
+"""rad and mm: rotations go through quaternions and angles, lengths of a metre through metres."""
+
+
+def read(arguments, path=None):
+    options = {"--rotation": [], "--length-unit": [], "--poses-are": [], "--a": [], "--b": []}
+    own = list(arguments)
+    source = own.pop(0) if not own[0].startswith("--") else None
+    for name, value in zip(own[::2], own[1::2], strict=True):
+        options[name].append(value)
+    said = Said.of_options(options["--rotation"], options["--length-unit"], options["--poses-are"])
+    if source is not None:
+        return read_input(Path(source), said=said)
+    told = two_files(Path(options["--a"][0]), Path(options["--b"][0]), "image", said)
+    return read_input(told, said=said)
+
+
+@pytest.mark.parametrize("name", FORMATS)
+def test_every_format_gives_the_same_poses(name, tmp_path):
+    found = read(FORMATS[name](tmp_path, PAIRS))
+    for wanted, got in (
+        (PAIRS.base_from_flange, found.pairs.base_from_flange),
+        (PAIRS.camera_from_board, found.pairs.camera_from_board),
+    ):
+        assert np.abs(got.difference(wanted)).max() < ROUNDING
+    assert len(found.understood) >= 2
+    assert (found.left_out, found.unit_mm) == ((), None)
