@@ -298,9 +298,9 @@ def _sentence(tried: tuple[Tried, ...], chosen: Candidate, result: HandEye, meas
     parts = [f"of {len(tried)} ways {chosen.in_words()} is taken: {mine:.3g} mm {where} on poses held out"]
     if plain.candidate != chosen:
         parts[0] += f", {plain.candidate.in_words()} {plain.mean_mm():.3g} mm" if plain.error_mm.size else ""
-    filed = by.get(replace(chosen, camera=False)) if chosen.camera else None
-    if filed is not None and filed.error_mm.size:
-        parts.append(f"the camera file costs {filed.mean_mm() - mine:.2g} mm")
+    filed = [each.mean_mm() for each in tried if chosen.camera and not each.candidate.camera and each.error_mm.size]
+    if filed:
+        parts.append(f"the camera file costs {min(filed) - mine:.2g} mm")
     if chosen.scale and result.sigma_scale is not None:
         off = 100 * (result.scale - 1)
         size = "larger" if off > 0 else "smaller"
