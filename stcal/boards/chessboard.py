@@ -1,4 +1,11 @@
-"""The inner corners of a chessboard (through ``cv2.findChessboardCornersSB``, after Duda & Frese 2018)."""
+"""The inner corners of a chessboard, by both detectors of OpenCV in images of several sizes.
+
+``cv2.findChessboardCornersSB`` (after Duda & Frese 2018) stands noise, shade and small squares; the older one, which
+joins dark squares, stands steep views and blur. What neither finds in the image as it is may be found in a smaller one,
+in which a blur is smaller; of a large image a smaller one is looked at first, for it is the faster one.
+"""
+
+from collections.abc import Iterator
 
 import cv2
 import numpy as np
@@ -10,7 +17,15 @@ from stcal.io.images import grey_8bit
 WINDOW_SHARE = 0.4
 """Half the side of the window in which a corner is refined, as a share of the smallest square's side."""
 REFINE_STEPS = (cv2.TERM_CRITERIA_EPS + cv2.TERM_CRITERIA_MAX_ITER, 100, 1e-5)
+LEAST_WINDOW, MOST_WINDOW, MOST_AT_FIRST = 2.0, 20.0, 100.0
+"""Of it, px."""
+SMOOTHED_SHARE, LEAST_SMOOTHING = 0.05, 0.3
+"""σ of the smoothing before, as a share of it, and px: a saddle stays where it is, and noise of the gradients, which
+would keep a corner where it was looked for, goes."""
 FLAGS = cv2.CALIB_CB_NORMALIZE_IMAGE | cv2.CALIB_CB_EXHAUSTIVE | cv2.CALIB_CB_ACCURACY
+OLDER_FLAGS = cv2.CALIB_CB_ADAPTIVE_THRESH | cv2.CALIB_CB_NORMALIZE_IMAGE
+FIRST_SIDE, LEAST_SIDE = 1600, 300
+"""Longer side of the image that is looked at first, and of the smallest, px."""
 
 
 def find_chessboard(image: np.ndarray, name: str, board: ChessboardDesign) -> BoardView | None:
@@ -19,10 +34,44 @@ def find_chessboard(image: np.ndarray, name: str, board: ChessboardDesign) -> Bo
     A board that looks the same after half a turn may come out turned: :meth:`ChessboardDesign.symmetries`.
     """
     grey = grey_8bit(image)
-    there, corners = cv2.findChessboardCornersSB(grey, (board.columns, board.rows), flags=FLAGS)
-    if not there:
-        return None
-    grid = _refined(grey, corners.reshape(board.rows, board.columns, 2).astype(np.float32))
+    for found in _found(grey, board):
+        grid = _refined(grey, found)
+        if _is_a_grid(found, grid):
+            return view_of(name, board, np.arange(board.rows * board.columns), _numbered(grey, grid, board))
+    return None
+
+
+def _found(grey: np.ndarray, board: ChessboardDesign) -> Iterator[np.ndarray]:
+    """Grids (rows, columns, 2) that a detector takes for the board, px of the image as it is."""
+    height, width = grey.shape
+    longer = max(height, width)
+    sides = [longer * 0.5**k for k in range(6)]
+    first = [side for side in sides if side <= FIRST_SIDE][:1]
+    rest = [side for side in sides if side not in first and side >= LEAST_SIDE]
+    for side in first + rest:
+        scale = side / longer
+        size = (max(round(scale * width), 1), max(round(scale * height), 1))
+        small = grey if scale == 1 else cv2.resize(grey, size, interpolation=cv2.INTER_AREA)
+        pixel = np.array([width / size[0], height / size[1]])
+        for there, corners in (
+            cv2.findChessboardCornersSB(small, (board.columns, board.rows), flags=FLAGS),
+            cv2.findChessboardCorners(small, (board.columns, board.rows), flags=OLDER_FLAGS),
+        ):
+            if there:
+                yield (corners.reshape(board.rows, board.columns, 2).astype(float) + 0.5) * pixel - 0.5
+
+
+def _is_a_grid(found: np.ndarray, refined: np.ndarray) -> bool:
+    """Whether no corner went to another place, and none of the squares is folded."""
+    steps = [np.linalg.norm(np.diff(refined, axis=axis), axis=2).min() for axis in (0, 1)]
+    across, down = refined[:-1, 1:] - refined[:-1, :-1], refined[1:, :-1] - refined[:-1, :-1]
+    turn = across[..., 0] * down[..., 1] - across[..., 1] * down[..., 0]
+    stayed = np.linalg.norm(refined - found, axis=2).max() < min(steps) / 2
+    return bool(stayed and (np.sign(turn) == np.sign(turn[0, 0])).all())
+
+
+def _numbered(grey: np.ndarray, grid: np.ndarray, board: ChessboardDesign) -> np.ndarray:
+    """The corners (k, 2) in the order of the design."""
     across, down = grid[0, -1] - grid[0, 0], grid[-1, 0] - grid[0, 0]
     if across[0] * down[1] - across[1] * down[0] < 0:  # seen from the front, X to Y turns clockwise on the screen
         grid = grid[:, ::-1]
@@ -30,15 +79,24 @@ def find_chessboard(image: np.ndarray, name: str, board: ChessboardDesign) -> Bo
         grid = grid[::-1, ::-1]
     if not _first_is_black(grey, grid, board) and board.rows == board.columns:
         grid = np.rot90(grid)
-    return view_of(name, board, np.arange(board.rows * board.columns), grid.reshape(-1, 2))
+    return grid.reshape(-1, 2)
 
 
 def _refined(grey: np.ndarray, grid: np.ndarray) -> np.ndarray:
-    """The corners to a few hundredths of a pixel; the detector's own are a quarter to a half off in slanted views."""
+    """The corners to a few hundredths of a pixel; the detectors' own are a quarter to a half off in slanted views.
+
+    First in windows in which blurred edges have room, then in small ones in which a lens bends no edge.
+    """
     steps = [np.linalg.norm(np.diff(grid, axis=axis), axis=2).min() for axis in (0, 1)]
-    half = int(np.clip(WINDOW_SHARE * min(steps), 2, 20))
-    found = cv2.cornerSubPix(grey, np.ascontiguousarray(grid.reshape(-1, 1, 2)), (half, half), (-1, -1), REFINE_STEPS)
-    return found.reshape(grid.shape).astype(float)
+    own = max(WINDOW_SHARE * min(steps), LEAST_WINDOW)
+    for most in (MOST_AT_FIRST, MOST_WINDOW):
+        half = int(min(own, most))
+        smooth = cv2.GaussianBlur(grey.astype(np.float32), (0, 0), max(SMOOTHED_SHARE * half, LEAST_SMOOTHING))
+        places = np.ascontiguousarray(grid.reshape(-1, 1, 2), np.float32)
+        grid = cv2.cornerSubPix(smooth, places, (half, half), (-1, -1), REFINE_STEPS).reshape(grid.shape).astype(float)
+        if own <= MOST_WINDOW:
+            break
+    return grid
 
 
 def _first_is_black(grey: np.ndarray, grid: np.ndarray, board: ChessboardDesign) -> bool:

@@ -43,6 +43,59 @@ def test_chessboard_corners_are_numbered(rows, columns, degrees):
     assert len(numberings) == {(5, 8): 1, (6, 7): 1, (7, 7): 2, (6, 6): 4, (6, 8): 2}[rows, columns]
 
 
+def spoiled(grey: np.ndarray, blur_px: float, contrast: float, noise: float) -> np.ndarray:
+    """Out of focus, dim and noisy."""
+    seen = cv2.GaussianBlur(grey.astype(float), (0, 0), blur_px) if blur_px else grey.astype(float)
+    noisy = 40 + contrast * seen + np.random.default_rng(1).normal(0, noise, seen.shape)
+    return np.clip(noisy, 0, 255).astype(np.uint8)
+
+
+@pytest.mark.parametrize(
+    ("blur_px", "contrast", "noise", "enlarged"),
+    [
+        (4.0, 0.8, 2.0, 1),
+        (0.0, 0.4, 15.0, 1),
+        (0.0, 0.08, 2.0, 1),
+        pytest.param(8.0, 0.8, 3.0, 3, marks=pytest.mark.slow),
+    ],
+)
+def test_chessboards_out_of_focus_dim_and_noisy(blur_px, contrast, noise, enlarged):
+    """σ of a corner by the gradients of its window, noise / (rise · √pixels): below 0.1 px in all; three times that,
+    and of the large image, whose grey values stem from fewer pixels, as much in pixels before it was enlarged."""
+    board = ChessboardDesign(5, 8, 20.0)
+    sheet, first = chessboard_mm(5, 8, 20.0)
+    image_from_mm = turn(20)
+    grey = photograph(sheet, 4, image_from_mm)
+    size = (enlarged * grey.shape[1], enlarged * grey.shape[0])
+    view = find_chessboard(
+        spoiled(cv2.resize(grey, size, interpolation=cv2.INTER_CUBIC), blur_px, contrast, noise), "a", board
+    )
+    true = enlarged * (apply_homography(image_from_mm, board.xy_mm() + first) + 0.5) - 0.5
+    error = np.linalg.norm(true - view.xy_px, axis=1)
+    assert np.sqrt((error**2).mean()) < 0.3 * enlarged
+
+
+def test_a_steep_chessboard_is_found():
+    """65° off its normal, seen from 1.2 m: squares of 17 × 8 px at the far edge."""
+    board = ChessboardDesign(6, 9, 20.0)
+    sheet, first = chessboard_mm(6, 9, 20.0)
+    middle = first + 20 * np.array([4, 2.5])
+    tilt, away = np.radians(65), 1200.0
+    turned = np.array([[1, 0], [0, np.cos(tilt)], [0, np.sin(tilt)]])
+    eye = np.column_stack([turned, np.array([0, 0, away]) - turned @ middle])
+    image_from_mm = np.array([[1500.0, 0, 599.5], [0, 1500.0, 449.5], [0, 0, 1]]) @ eye
+    view = find_chessboard(photograph(sheet, 4, image_from_mm), "a", board)
+    flat = np.pad(board.xy_mm(), ((0, 0), (0, 1)))
+    numberings = [flat[:, :2]] + [(half @ flat)[:, :2] for half in board.symmetries()]
+    errors = [np.abs(apply_homography(image_from_mm, xy + first) - view.xy_px).max() for xy in numberings]
+    assert min(errors) < 3 * CORNER_PX
+
+
+def test_noise_is_no_chessboard():
+    grey = np.random.default_rng(2).integers(0, 255, (480, 640)).astype(np.uint8)
+    assert find_chessboard(grey, "a", ChessboardDesign(5, 8, 20.0)) is None
+
+
 def test_tags_of_two_families_and_sizes():
     families = ("DICT_6X6_250", "DICT_APRILTAG_36h11")
     places = {(families[0], 3): (60, 50, 40), (families[1], 3): (150, 60, 30), (families[0], 9): (80, 130, 50)}
