@@ -19,7 +19,7 @@ from stcal.io.camera import CameraPrior, camera_prior, read_camera, refinable
 from stcal.io.images import ImageFile, find_images
 from stcal.io.quaternions import Order
 from stcal.io.table import Table
-from stcal.parallel import Progress
+from stcal.parallel import Progress, one_thread
 from stcal.workflows.board_views import detect_boards
 
 ALL, AUTO = "all", "auto"
@@ -55,6 +55,7 @@ class Splits:
     motions: int | None = None
 
 
+@one_thread()
 def read_input(
     source: Path | Table,
     poses: Path | None = None,
@@ -128,6 +129,7 @@ def _rows_of_images(robot: RobotPoses, files: list[ImageFile], source: Path):
     return rows, missing
 
 
+@one_thread()
 def calibrate(
     given: HandEyeInput,
     setup: Setup,

@@ -4,7 +4,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from scipy.optimize import root_scalar
-from scipy.stats import chi2
+from scipy.special import chdtr, chdtrc
 
 from stcal.geometry.arrays import Array, freeze
 from stcal.register.core.models import Model, Transform, unit_covariance
@@ -40,12 +40,12 @@ class Covariance:
 
 def kept_share(cut: float) -> float:
     """Share of points within ``cut`` σ: χ²₃."""
-    return float(chi2.cdf(cut**2, 3))
+    return float(chdtr(3, cut**2))
 
 
 def kept_variance(cut: float) -> float:
     """Share of the points' whole square sum that those within ``cut`` σ hold: χ²₅."""
-    return float(chi2.cdf(cut**2, 5))
+    return float(chdtr(5, cut**2))
 
 
 def sigma_within(square_sum: float, model: Model, count: int, threshold: float) -> float:
@@ -107,7 +107,7 @@ def covariance_of(inliers: Problem, b_from_a: Transform, sigma: float, threshold
     redundancy = float(inliers.redundancy)
     used, scaled = sigma, True
     if noise.sigma_mm is not None:
-        scaled = bool(chi2.sf(redundancy * (sigma / noise.sigma_mm) ** 2, redundancy) < CONTRADICTED_AT)
+        scaled = bool(chdtrc(redundancy, redundancy * (sigma / noise.sigma_mm) ** 2) < CONTRADICTED_AT)
         if not scaled:
             used, redundancy = noise.sigma_mm, np.inf
     matrix = used**2 * unit_covariance(model, b_from_a, inliers.xyz_a, noise.precision)

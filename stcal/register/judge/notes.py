@@ -5,11 +5,11 @@ from dataclasses import dataclass
 
 import numpy as np
 from scipy.spatial import KDTree
-from scipy.stats import f as fisher
-from scipy.stats import norm
+from scipy.special import ndtr
 
 from stcal.geometry.affine import Affine
 from stcal.geometry.rigid import Similarity
+from stcal.geometry.robust import ratio_limit
 from stcal.register.core.covariance import Covariance
 from stcal.register.core.liu2017 import ASSUMED
 from stcal.register.core.models import squares
@@ -104,7 +104,7 @@ def _far_rows(subject: Subject) -> list[str]:
     problem = subject.problem
     redundancy = problem.redundancy
     square = squares(problem.residuals(subject.fitted.transform))
-    bound = square.sum() / redundancy * 3 * fisher.isf(CLEAN_SETS_WITH_OUTLIER / len(problem), 3, redundancy)
+    bound = square.sum() / redundancy * 3 * ratio_limit(CLEAN_SETS_WITH_OUTLIER / len(problem), 3, redundancy)
     far = np.flatnonzero(square > bound)
     if not len(far):
         return []
@@ -159,7 +159,7 @@ def neighbours_alike(xyz_a: np.ndarray, residuals: np.ndarray) -> bool:
     pairs = np.column_stack([np.arange(len(xyz)), nearest])
     one, two = np.unique(np.sort(pairs, axis=1), axis=0).T
     product = np.einsum("ni,ni->n", r[one], r[two])
-    return bool(norm.sf(product.sum() / max(np.sqrt((product**2).sum()), 1e-300)) < BY_NEIGHBOURS)
+    return bool(ndtr(-product.sum() / max(np.sqrt((product**2).sum()), 1e-300)) < BY_NEIGHBOURS)
 
 
 def _layout(subject: Subject, sigma: float) -> list[str]:
