@@ -1,6 +1,6 @@
 """What σ the residuals have, and what covariance follows for the transform."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy.optimize import root_scalar
@@ -115,3 +115,11 @@ def covariance_of(inliers: Problem, b_from_a: Transform, sigma: float, threshold
         cut = threshold / used
         matrix = matrix * kept_share(cut) / kept_variance(cut)
     return Covariance(matrix, scaled, redundancy)
+
+
+def shifted_too(covariance: Covariance, off_mm: np.ndarray) -> Covariance:
+    """Covariance of a fit that lies between two groups of points: that of a shift (3,) of all points added, mm."""
+    p = len(covariance.matrix)
+    by_step = np.zeros(p)
+    by_step[slice(3, None, 4) if p == 12 else slice(3, 6)] = off_mm
+    return replace(covariance, matrix=covariance.matrix + np.outer(by_step, by_step))
