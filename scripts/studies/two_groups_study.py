@@ -4,8 +4,9 @@
 
 n points in a cube of 200 mm, noise σ; a share of them is off by the same shift, or by a small turn about their middle.
 An answer is wrong when its RMS error over the cube is above three times what its covariance states and above 1.5 times
-that of the fit to the good rows; it is wrong in silence when no note names another group, a bent frame or disagreement; ``clear`` are those of them with 100 rows or more, and
-wrong ones 4.5 σ off or more: of fewer or nearer ones data tell little.
+that of the fit to the good rows; it is wrong in silence when no note names another group, a bend or another scale;
+``clear`` are those of them with 100 rows or more, and wrong ones 4.5 σ off or more: of fewer or nearer ones data tell
+little.
 
 shifts
     By kind: the wrong rows anywhere (``anywhere``), in one half of the workspace (``one half``), shifted along an axis
