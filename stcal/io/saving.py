@@ -4,6 +4,7 @@ import json
 import os
 from collections.abc import Sequence
 from contextlib import suppress
+from itertools import chain
 from pathlib import Path
 
 from stcal.errors import InputError
@@ -64,7 +65,38 @@ def save(path: Path, content: str | bytes) -> None:
 def json_text(content) -> str:
     """As all JSON files of the package are written: of a dict, or of a result file (``stcal.io.json.ResultFile``)."""
     plain = content if isinstance(content, dict) else content.content()
-    return json.dumps(plain, indent=1, ensure_ascii=False, allow_nan=False) + "\n"
+    return _indented(plain, "\n") + "\n"
+
+
+_encode = json.JSONEncoder(ensure_ascii=False, allow_nan=False, separators=(",", ":")).encode
+PLAIN = {float, int, bool, type(None)}
+"""Types whose text holds neither a comma nor a bracket."""
+
+
+def _indented(value, line: str) -> str:
+    """The text of ``json.dumps`` with ``indent=1``, whose writer works on one number after the other: lists of numbers,
+    and lists of such lists, are written at once. ``line`` : a line's end and the indent of what follows."""
+    inner = line + " "
+    if isinstance(value, dict):
+        items = [f"{_key(key)}: {_indented(each, inner)}" for key, each in value.items()]
+        return f"{{{inner}{f',{inner}'.join(items)}{line}}}" if items else "{}"
+    if not isinstance(value, list | tuple):
+        return _encode(value)
+    if not value:
+        return "[]"
+    kinds = set(map(type, value))
+    if kinds <= PLAIN:
+        return f"[{inner}{_encode(value)[1:-1].replace(',', f',{inner}')}{line}]"
+    if kinds == {list} and all(value) and set(map(type, chain.from_iterable(value))) <= PLAIN:
+        ends, between = f"{inner}]", f"{inner} "
+        rows = _encode(value)[2:-2].replace(",", f",{between}").replace(f"],{between}[", f"{ends},{inner}[{between}")
+        return f"[{inner}[{between}{rows}{ends}{line}]"
+    return f"[{inner}{f',{inner}'.join([_indented(each, inner) for each in value])}{line}]"
+
+
+def _key(key) -> str:
+    """As ``json.dumps`` writes it: numbers in quotes."""
+    return _encode(key) if isinstance(key, str) else _encode({key: 0})[1:-3]
 
 
 def keep_apart(outputs: Sequence[tuple[str, Path]], inputs: Sequence[tuple[str, Path]]) -> None:

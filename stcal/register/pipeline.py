@@ -9,7 +9,7 @@ import numpy as np
 from stcal.errors import DegenerateError, InputError
 from stcal.io.table import FARTHEST
 from stcal.parallel import one_thread
-from stcal.register.core.covariance import covariance_of, sigma_within
+from stcal.register.core.covariance import covariance_of, shifted_too, sigma_within
 from stcal.register.core.liu2017 import Liu2017Options, liu2017
 from stcal.register.core.models import MODELS, parts, squares
 from stcal.register.core.problem import Problem, noise_of
@@ -28,8 +28,10 @@ from stcal.register.core.search import LEAST_SHARE
 from stcal.register.core.validate import held_out
 from stcal.register.judge.degeneracy import check_extent, check_supports, row_name
 from stcal.register.judge.groups import two_groups
+from stcal.register.judge.lengths import Wider, wider
 from stcal.register.judge.mistakes import check_mirrored, check_units, mirrored_error, mirrored_ratio
 from stcal.register.judge.notes import Subject, notes_of
+from stcal.register.judge.shifts import Shifted, shifted_rows
 
 METHODS = ("robust", "least-squares", "liu2017")
 NEAREST_MM = 1e-9
@@ -112,13 +114,13 @@ def register(
         check_units(problem.xyz_a, problem.xyz_b, seed)
     if method == "robust":
         again: Callable[[Problem], Fitted] = partial(robust_fit, threshold=threshold_mm, seed=seed)
-        fitted, other = _robust(problem, threshold_mm, seed)
+        fitted, second = _robust(problem, threshold_mm, seed)
     else:
         published = partial(_liu2017, options=_liu2017_options(liu2017_options, threshold_mm), seed=seed)
         again = _least_squares if method == "least-squares" else published
-        fitted, other = again(problem), None
+        fitted, second = again(problem), None
     _check_geometry(problem, method, fitted, lines)
-    alternative = None if other is None else _alternative(fitted, other, problem.xyz_a)
+    alternative = None if second is None else _alternative(fitted, second, problem.xyz_a)
     ambiguous = alternative is not None and len(alternative.rows) >= AS_GOOD * fitted.inliers.sum()
     if alternative is not None and ambiguous and not allow_ambiguous:
         raise DegenerateError(
@@ -126,7 +128,11 @@ def register(
             f"others on another, {alternative.apart_mm:.4g} mm from it; register one group of rows alone, or allow "
             "ambiguous answers"
         )
-    covariance = covariance_of(problem[fitted.inliers], fitted.transform, fitted.sigma, fitted.threshold)
+    inside = problem[fitted.inliers]
+    covariance = covariance_of(inside, fitted.transform, fitted.sigma, fitted.threshold)
+    other, shifted = (None, None) if method == "liu2017" else _beside(inside, fitted)
+    if shifted is not None:
+        covariance = shifted_too(covariance, shifted.off_mm())
     given = problem.noise.sigma_mm
     subject = Subject(
         problem=problem,
@@ -134,6 +140,8 @@ def register(
         fitted=fitted,
         alternative=alternative,
         ambiguous=ambiguous,
+        other=other,
+        shifted=shifted,
         covariance=covariance,
         factor=None if given is None else fitted.sigma / given,
         lines=lines,
@@ -204,6 +212,14 @@ def _check_geometry(problem: Problem, method: str, fitted: Fitted, lines: Sequen
     check_extent(problem.model, inside.xyz_a, fitted.sigma)
     if method == "robust" and not fitted.inliers.all():
         check_supports(problem.model, problem.xyz_a, fitted.inliers, fitted.sigma, lambda row: row_name(row, lines))
+
+
+def _beside(inside: Problem, fitted: Fitted) -> tuple[Wider | None, Shifted | None]:
+    """A wider model that explains the inliers, and those of them that are shifted together."""
+    other = wider(inside, fitted.transform)
+    if other is None:
+        return None, shifted_rows(inside, fitted.transform)
+    return other, shifted_rows(other.problem, other.transform)
 
 
 def _least_squares(problem: Problem) -> Fitted:

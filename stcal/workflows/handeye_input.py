@@ -18,7 +18,7 @@ from stcal.io.camera import CameraPrior, camera_prior, read_camera, refinable
 from stcal.io.images import ImageFile, find_images
 from stcal.io.quaternions import Order
 from stcal.io.table import Table
-from stcal.parallel import Progress
+from stcal.parallel import Progress, one_thread
 from stcal.workflows.board_views import detect_boards
 
 NOTHING_SAID = Said()
@@ -62,6 +62,7 @@ def two_files(first: Path, second: Path, key: str, said: Said, quaternions: Orde
     return found
 
 
+@one_thread()
 def read_input(
     source: Source,
     poses: Path | None = None,

@@ -6,12 +6,13 @@ from pathlib import Path
 
 import numpy as np
 from markupsafe import Markup
-from scipy.stats import chi2
 
 from stcal.errors import InputError
 from stcal.geometry.align import align_rigid
+from stcal.geometry.robust import length_limit
 from stcal.held_out import dealt, held_out_errors
 from stcal.io.table import Table, read_table
+from stcal.parallel import one_thread
 from stcal.register import register
 from stcal.register.core.pairs import WHAT, Pairs
 from stcal.register.core.result import ErrorFigures
@@ -68,6 +69,7 @@ class Comparison:
         return bool(len(transform) and kinematics.mean() < transform.mean())
 
 
+@one_thread()
 def compared(
     pairs: Pairs, file: Path | Table, robot_file: Path, found: Findings, options: dict, folds: int
 ) -> Comparison:
@@ -125,7 +127,7 @@ def grown(robot: Robot, data: Measurements, good: np.ndarray, settings: Identify
     found = identify(robot, data[good], settings)
     for _ in range(ROUNDS):
         error = np.linalg.norm(data.positions - positions(found.robot, data), axis=1)
-        explained = good | (error < found.weighting.sigma_mm * np.sqrt(chi2.isf(CLEAN_SETS / len(data), 3)))
+        explained = good | (error < found.weighting.sigma_mm * length_limit(3, CLEAN_SETS / len(data)))
         if (explained == good).all():
             break
         good = explained

@@ -1,10 +1,10 @@
 """What σ the residuals have, and what covariance follows for the transform."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy.optimize import root_scalar
-from scipy.stats import chi2
+from scipy.special import chdtr, chdtrc
 
 from stcal.geometry.arrays import Array, freeze
 from stcal.register.core.models import Model, Transform, unit_covariance
@@ -40,12 +40,12 @@ class Covariance:
 
 def kept_share(cut: float) -> float:
     """Share of points within ``cut`` σ: χ²₃."""
-    return float(chi2.cdf(cut**2, 3))
+    return float(chdtr(3, cut**2))
 
 
 def kept_variance(cut: float) -> float:
     """Share of the points' whole square sum that those within ``cut`` σ hold: χ²₅."""
-    return float(chi2.cdf(cut**2, 5))
+    return float(chdtr(5, cut**2))
 
 
 def sigma_within(square_sum: float, model: Model, count: int, threshold: float) -> float:
@@ -107,7 +107,7 @@ def covariance_of(inliers: Problem, b_from_a: Transform, sigma: float, threshold
     redundancy = float(inliers.redundancy)
     used, scaled = sigma, True
     if noise.sigma_mm is not None:
-        scaled = bool(chi2.sf(redundancy * (sigma / noise.sigma_mm) ** 2, redundancy) < CONTRADICTED_AT)
+        scaled = bool(chdtrc(redundancy, redundancy * (sigma / noise.sigma_mm) ** 2) < CONTRADICTED_AT)
         if not scaled:
             used, redundancy = noise.sigma_mm, np.inf
     matrix = used**2 * unit_covariance(model, b_from_a, inliers.xyz_a, noise.precision)
@@ -115,3 +115,11 @@ def covariance_of(inliers: Problem, b_from_a: Transform, sigma: float, threshold
         cut = threshold / used
         matrix = matrix * kept_share(cut) / kept_variance(cut)
     return Covariance(matrix, scaled, redundancy)
+
+
+def shifted_too(covariance: Covariance, off_mm: np.ndarray) -> Covariance:
+    """Covariance of a fit that lies between two groups of points: that of a shift (3,) of all points added, mm."""
+    p = len(covariance.matrix)
+    by_step = np.zeros(p)
+    by_step[slice(3, None, 4) if p == 12 else slice(3, 6)] = off_mm
+    return replace(covariance, matrix=covariance.matrix + np.outer(by_step, by_step))

@@ -14,6 +14,7 @@ import numpy as np
 
 from stcal.errors import DegenerateError, InputError
 from stcal.geometry.affine import Affine
+from stcal.parallel import one_thread
 
 SIZES = range(4, 41, 2)
 """N of the paper's figure 6."""
@@ -180,6 +181,7 @@ class SampleSize:
     tries: int
 
 
+@one_thread()
 def sample_sizes(xyz_a: np.ndarray, xyz_b: np.ndarray, options: Liu2017Options, seed: int = 0) -> list[SampleSize]:
     """The paper's figure 6: samples of every even size from 4 to 40, as far as there are points; arguments as of
     :func:`liu2017`."""

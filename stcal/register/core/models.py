@@ -113,7 +113,7 @@ def squares(residuals: np.ndarray, precision: np.ndarray | None = None) -> np.nd
 
 def rounding_mm(xyz_a: np.ndarray, xyz_b: np.ndarray) -> float:
     """What of residuals rounding of numbers may make; of most points, whatever the size of wrong ones."""
-    return EXACT * float(max(np.median(np.abs(xyz).max(axis=1)) for xyz in (xyz_a, xyz_b)))
+    return EXACT * float(max(np.median(np.maximum.reduce(np.abs(xyz.T))) for xyz in (xyz_a, xyz_b)))
 
 
 def unit_covariance(

@@ -12,11 +12,10 @@
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.special import gammaln
-from scipy.stats import chi2
-from scipy.stats import f as fisher
+from scipy.special import chdtri, gammaln
 
 from stcal.errors import DegenerateError
+from stcal.geometry.robust import ratio_limit
 from stcal.register.core.covariance import sigma_within
 from stcal.register.core.models import Model, Transform, leverages, parts
 from stcal.register.core.problem import Problem
@@ -201,14 +200,14 @@ def _chosen(
     """The threshold at the middle of the points, mm, and who passes the test."""
     total, redundancy = len(problem), problem.model.redundancy(int(used.sum()))
     beyond = CLEAN_SETS_WITH_OUTLIER / total
-    outside = 3 * sigma**2 * fisher.isf(beyond, 3, redundancy)
+    outside = 3 * sigma**2 * ratio_limit(beyond, 3, redundancy)
     if total > LEVERAGE_UP_TO:
         return float(np.sqrt(outside)), square <= outside
     deletion = deletion_squares(problem, transform, used)
     passed = deletion <= outside
     if redundancy > 3:  # a point that was used is tested against the σ of the others
         rest = np.maximum(redundancy * sigma**2 - deletion[used], 0) / (redundancy - 3)
-        passed[used] = deletion[used] <= 3 * fisher.isf(beyond, 3, redundancy - 3) * np.maximum(rest, 1e-300)
+        passed[used] = deletion[used] <= 3 * ratio_limit(beyond, 3, redundancy - 3) * np.maximum(rest, 1e-300)
     return float(np.sqrt(outside)), passed
 
 
@@ -299,7 +298,7 @@ def alternative_fit(problem: Problem, fitted: Fitted, seed: int) -> Fitted | Non
     tried = outside if len(outside) <= SUBSET else np.sort(rng.choice(outside, SUBSET, replace=False))
     redundancy = model.redundancy(int(fitted.inliers.sum()))
     # σ may be so large
-    threshold = fitted.threshold * float(np.sqrt(redundancy / chi2.isf(1 - FALSE_ALARMS, redundancy)))
+    threshold = fitted.threshold * float(np.sqrt(redundancy / chdtri(redundancy, 1 - FALSE_ALARMS)))
     found = search(problem[tried], by_threshold(threshold), rng)
     if found is None or found.inliers.sum() <= model.sample:
         return None

@@ -179,7 +179,8 @@ def _concentrated(problem: Problem, score: Score, inliers: np.ndarray) -> Consen
 def _squares_of_many(linear: np.ndarray, translation: np.ndarray, problem: Problem) -> np.ndarray:
     """Squared distances (s, n) under s transforms."""
     turned = (linear.reshape(-1, 3) @ problem.xyz_a.T).reshape(len(linear), 3, -1)
-    residual = problem.xyz_b.T - translation[:, :, None] - turned
+    residual = problem.xyz_b.T - translation[:, :, None]
+    residual -= turned
     precision = problem.noise.precision
     if precision is not None and precision.ndim == 3:
         weighted = np.einsum("nij,sjn->sin", precision, residual, optimize=True)

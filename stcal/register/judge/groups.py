@@ -14,8 +14,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from scipy.spatial import KDTree
-from scipy.special import gammaln
-from scipy.stats import binom, chi2
+from scipy.special import bdtrc, chdtrc, gammaln
 
 from stcal.errors import ConvergenceError, DegenerateError
 from stcal.register.core.models import Model, Transform
@@ -114,7 +113,7 @@ def _log_chance(model: Model, whole: np.ndarray, parted: np.ndarray) -> float:
 def sphericity(scatter: np.ndarray, redundancy: float) -> float:
     """p-value of equal noise along all axes (Mauchly 1940, with Bartlett's factor)."""
     w = np.linalg.slogdet(scatter)[1] - 3 * np.log(np.trace(scatter) / 3)
-    return float(chi2.sf(-(redundancy - 23 / 18) * w, 5))
+    return float(chdtrc(5, max(-(redundancy - 23 / 18) * w, 0.0)))
 
 
 def wilks_bound(log_ratio: float, of_error: float, of_hypothesis: float) -> float:
@@ -134,7 +133,7 @@ def lies_together(xyz_a: np.ndarray, group: np.ndarray) -> bool:
     nearest = np.asarray(KDTree(xyz_a).query(xyz_a, k=2)[1])[:, 1]
     same = int((group[nearest] == group).sum())
     share = group.mean()
-    return bool(binom.sf(same - 1, len(group), share**2 + (1 - share) ** 2) < TOGETHER)
+    return bool(bdtrc(same - 1, len(group), share**2 + (1 - share) ** 2) < TOGETHER)
 
 
 def _assigned(problem: Problem, rng: np.random.Generator) -> _Assignment | None:

@@ -3,11 +3,11 @@
 from dataclasses import dataclass, replace
 
 import numpy as np
-from scipy.stats import f as fisher
 
 from stcal.errors import StcalError
 from stcal.geometry.affine import Affine
 from stcal.geometry.rigid import Similarity
+from stcal.geometry.robust import ratio_limit
 from stcal.register.core.models import MODELS, Transform, unit_covariance
 from stcal.register.core.problem import Problem
 
@@ -60,7 +60,7 @@ def wider(problem: Problem, transform: Transform) -> Wider | None:
         gain = (before - after) / more / max(after / left, rounding / left)
         sigma = np.sqrt(max(after, 0) / left)
         enough = sigma < (1 - MATTERS) * np.sqrt(before / narrow[0].redundancy)
-        if before > rounding and gain > fisher.isf(BY_CHANCE, more, left) and enough:
+        if before > rounding and gain > ratio_limit(BY_CHANCE, more, left) and enough:
             narrow = other, fitted
             found = Wider(other, fitted, float(sigma), _said(other, fitted, float(sigma)))
     return found

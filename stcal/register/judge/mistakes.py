@@ -5,11 +5,11 @@ from collections.abc import Callable
 import numpy as np
 from scipy.spatial import KDTree
 from scipy.spatial.transform import Rotation
-from scipy.stats import binom
-from scipy.stats import f as fisher
+from scipy.special import bdtrc
 
 from stcal.errors import InputError
 from stcal.geometry.align import best_rotations
+from stcal.geometry.robust import ratio_limit
 from stcal.register.core.models import Model, parts
 from stcal.register.core.problem import Problem
 from stcal.register.core.robust import BY_CHANCE, Fitted
@@ -81,7 +81,7 @@ def check_mirrored(model: Model, xyz_a: np.ndarray, xyz_b: np.ndarray) -> None:
         return
     ratio, reflection = mirrored_ratio(xyz_a, xyz_b)
     redundancy = model.redundancy(len(xyz_a))
-    if ratio > max(MIRROR_RATIO, fisher.isf(MIRROR_CHANCE, redundancy, redundancy)):
+    if ratio > max(MIRROR_RATIO, ratio_limit(MIRROR_CHANCE, redundancy, redundancy)):
         raise mirrored_error(reflection, len(xyz_a), len(xyz_a), np.sqrt(ratio))
 
 
@@ -115,7 +115,7 @@ def outlier_notes(problem: Problem, fitted: Fitted, name: Namer) -> list[str]:
     distance, nearest = (np.asarray(each) for each in KDTree(mapped).query(xyz_b[rows]))
     swapped = np.flatnonzero((distance <= reach) & (nearest != np.arange(len(rows))))
     taken = np.minimum(1, 2 * reach / np.maximum(np.ptp(mapped, axis=0), 1e-300)).prod()
-    by_chance = binom.sf(len(swapped) - 1, len(rows), 1 - (1 - taken) ** (len(rows) - 1))
+    by_chance = bdtrc(len(swapped) - 1, len(rows), 1 - (1 - taken) ** (len(rows) - 1))
     if len(swapped) and by_chance < BY_CHANCE:
         exchanged = [(int(rows[i]), int(rows[nearest[i]])) for i in swapped[:SHOWN]]
         shown = ", ".join(f"{name(i)} is the point of {name(j)}" for i, j in exchanged)

@@ -4,12 +4,10 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.spatial import KDTree
-from scipy.stats import f as fisher
-from scipy.stats import norm
 
 from stcal.geometry.affine import Affine
 from stcal.geometry.rigid import Similarity
+from stcal.geometry.robust import ratio_limit
 from stcal.register.core.covariance import Covariance
 from stcal.register.core.liu2017 import ASSUMED
 from stcal.register.core.models import squares
@@ -17,21 +15,15 @@ from stcal.register.core.problem import Problem
 from stcal.register.core.result import Alternative
 from stcal.register.core.robust import CLEAN_SETS_WITH_OUTLIER, LEVERAGE_UP_TO, Fitted
 from stcal.register.judge.degeneracy import WIDER_THAN, row_name, single_supports, spreads, symmetry, symmetry_note
-from stcal.register.judge.lengths import Wider, wider
+from stcal.register.judge.lengths import Wider
 from stcal.register.judge.mistakes import SHOWN, UNIT_WITHIN, UNITS, outlier_notes
+from stcal.register.judge.neighbours import neighbours_alike
+from stcal.register.judge.shifts import Shifted
 
 LOW_REDUNDANCY = 6
 """Below so many degrees of freedom σ is uncertain by more than 30 %."""
-ONE_TOO_FEW = 4
-"""Points of which three of any fit: which one is wrong their residuals do not tell."""
 MAJORITY = 0.5
 """Of the point pairs; where fewer agree, a note says so."""
-NEIGHBOURS = 2000
-"""Of so many points residuals are compared with the nearest neighbour's …"""
-FEWEST_NEIGHBOURS = 20
-"""… and of no fewer: the sum of fewer products is not normal."""
-BY_NEIGHBOURS = 1e-4
-"""Clean data called bent: so many."""
 TIGHT = 2.5
 """A threshold of 2.5 σ cuts off a tenth of the good points; below it the covariance of few points is too small."""
 
@@ -48,6 +40,10 @@ class Subject:
     alternative : Alternative or None
     ambiguous : bool
         The alternative is about as good.
+    other : Wider or None
+        A wider model that explains the points.
+    shifted : Shifted or None
+        Inliers that are shifted together.
     covariance : Covariance
     factor : float or None
         By which residuals exceed the σ given; None where none was given.
@@ -60,6 +56,8 @@ class Subject:
     fitted: Fitted
     alternative: Alternative | None
     ambiguous: bool
+    other: Wider | None
+    shifted: Shifted | None
     covariance: Covariance
     factor: float | None
     lines: Sequence[int] | None
@@ -71,8 +69,7 @@ class Subject:
 
 def notes_of(subject: Subject) -> list[str]:
     """The lines."""
-    inside = subject.problem[subject.fitted.inliers]
-    other = wider(inside, subject.fitted.transform) if subject.method != "liu2017" else None
+    other = subject.other
     sigma = subject.fitted.sigma if other is None else other.sigma_mm
     notes = [*_agreement(subject), *_noise(subject, other), *_layout(subject, sigma)]
     return notes + outlier_notes(subject.problem, subject.fitted, subject.name)
@@ -104,7 +101,7 @@ def _far_rows(subject: Subject) -> list[str]:
     problem = subject.problem
     redundancy = problem.redundancy
     square = squares(problem.residuals(subject.fitted.transform))
-    bound = square.sum() / redundancy * 3 * fisher.isf(CLEAN_SETS_WITH_OUTLIER / len(problem), 3, redundancy)
+    bound = square.sum() / redundancy * 3 * ratio_limit(CLEAN_SETS_WITH_OUTLIER / len(problem), 3, redundancy)
     far = np.flatnonzero(square > bound)
     if not len(far):
         return []
@@ -127,13 +124,17 @@ def _noise(subject: Subject, other: Wider | None) -> list[str]:
             "the residuals are not noise: neighbours are off alike, so that the frames are bent against each other and "
             "a transform holds only where its points are; see the residual field"
         )
+    if subject.shifted is not None:
+        notes.append(_two_groups(subject, subject.shifted))
     if subject.factor is not None and subject.covariance.scaled:
         notes.append(
             f"residuals exceed the σ given {subject.factor:.3g} times, which chance does not explain; the covariance "
             "is scaled by it"
         )
-    if len(inside) == ONE_TOO_FEW and subject.problem.noise.sigma_mm is None:
-        notes.append(f"of {ONE_TOO_FEW} points one that is wrong cannot be told from the others: measure two more")
+    enough = inside.model.sample + 1  # of so many, any but one fit: which one is wrong their residuals do not tell
+    if len(inside) <= enough and subject.covariance.scaled:
+        more = enough + 2 - len(inside)
+        notes.append(f"of {len(inside)} points one that is wrong cannot be told from the others: measure {more} more")
     redundancy = subject.covariance.redundancy
     if redundancy < LOW_REDUNDANCY:
         notes.append(f"σ rests on {redundancy:.0f} degrees of freedom and is a rough guess; measure more points")
@@ -145,21 +146,17 @@ def _noise(subject: Subject, other: Wider | None) -> list[str]:
     return notes
 
 
-def neighbours_alike(xyz_a: np.ndarray, residuals: np.ndarray) -> bool:
-    """Whether points (n, 3) have residuals (n, 3) in common with their nearest neighbours, more than chance has it.
-
-    Of independent ones the products r · r' of neighbours have mean zero (a little less after a fit), and their sum is
-    normal with the variance Σ (r · r')².
-    """
-    rows = slice(None, None, max(1, len(xyz_a) // NEIGHBOURS))
-    xyz, r = xyz_a[rows], residuals[rows]
-    if len(xyz) < FEWEST_NEIGHBOURS:
-        return False
-    nearest = np.asarray(KDTree(xyz).query(xyz, k=2)[1])[:, 1]
-    pairs = np.column_stack([np.arange(len(xyz)), nearest])
-    one, two = np.unique(np.sort(pairs, axis=1), axis=0).T
-    product = np.einsum("ni,ni->n", r[one], r[two])
-    return bool(norm.sf(product.sum() / max(np.sqrt((product**2).sum()), 1e-300)) < BY_NEIGHBOURS)
+def _two_groups(subject: Subject, shifted: Shifted) -> str:
+    inliers = np.flatnonzero(subject.fitted.inliers)
+    shown = ", ".join(subject.name(int(inliers[i])) for i in shifted.rows[:SHOWN])
+    more = ", …" if len(shifted.rows) > SHOWN else ""
+    by = ", ".join(f"{v:.3g}" for v in shifted.by_mm)
+    where = ", and lie together" if shifted.together else ""
+    return (
+        f"{len(shifted.rows)} rows agree with each other on a shift of ({by}) mm against the other "
+        f"{shifted.count - len(shifted.rows)}{where} ({shown}{more}): two groups, and which is right cannot be told "
+        "from the data (or noise far from normal); σ of the transform hold either; did an instrument move between them?"
+    )
 
 
 def _layout(subject: Subject, sigma: float) -> list[str]:

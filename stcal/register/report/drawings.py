@@ -15,6 +15,8 @@ ARROW_SHARE, FEW = 0.12, 80
 """Of the picture's side that the RMS residual of the inliers takes up, of so few points; less among more."""
 LONGEST_SHARE = 0.3
 """Of the picture's side; longer arrows of outliers are cut off there."""
+MOST_LABELS = 60
+"""Of arrows cut off, the longest; more lie over each other."""
 RASTER = 41
 MARGIN = 0.25
 
@@ -33,6 +35,8 @@ def space_figure(found: Findings):
     cut = np.minimum(1, LONGEST_SHARE * side / np.maximum(scale * length, 1e-300))
     arrow = scale * residual * np.where(inlier, 1, cut)[:, None]
     middle = (place.min(0) + place.max(0)) / 2
+    beyond = np.flatnonzero(~inlier & (cut < 1))
+    beyond = beyond[np.argsort(-length[beyond], kind="stable")]
     reach = np.abs(np.concatenate([place, place + arrow]) - middle).max(0) * 1.06 + 0.01 * side
     figure = new_figure(10.2, 3.7)
     width = 0.27
@@ -55,9 +59,9 @@ def space_figure(found: Findings):
                     zorder=2 if kind else 3,
                 )
                 axes.plot(*place[own][:, [i, j]].T, ".", color=colour, ms=2.5, zorder=2)
-        for row in np.flatnonzero(~inlier & (cut < 1)):
-            end = (place[row] + arrow[row])[[i, j]]
-            axes.plot(*end, "o", mfc="white", mec=COLOURS[1], ms=4, mew=0.8, zorder=4)
+        ends = (place + arrow)[:, [i, j]]
+        axes.plot(*ends[beyond].T, "o", mfc="white", mec=COLOURS[1], ms=4, mew=0.8, zorder=4)
+        for row, end in zip(beyond[:MOST_LABELS].tolist(), ends[beyond], strict=False):
             axes.annotate(
                 f"{length[row]:.2g}", end, (3, 3), textcoords="offset points", fontsize=SMALL - 1, color=INK, zorder=5
             )

@@ -224,7 +224,7 @@ class RegistrationFile(ResultFile):
                 "alternative": result.alternative and _alternative(result.alternative, lines),
                 "lines": lines,
                 "inliers": result.inliers.tolist(),
-                "outliers": [_outlier(found, row) for row in result.outliers],
+                "outliers": _outliers(found),
                 "field": found.field and _field(found.field, found),
                 "cubes": found.cubes and _cubes(found.cubes),
             }
@@ -259,9 +259,14 @@ def _alternative(other: Alternative, lines: Sequence[int]) -> OtherTransform:
     )
 
 
-def _outlier(found: Findings, row: int) -> WrongPairRow:
-    residual = found.registration.residuals[row]
-    return WrongPairRow(line=found.lines[row], residual_mm=residual, length_mm=float(np.linalg.norm(residual)))
+def _outliers(found: Findings) -> list[WrongPairRow]:
+    """Made without being checked one by one: a registration holds finite residuals, and there may be many thousands."""
+    rows = found.registration.outliers
+    residuals, lengths = found.registration.residuals[rows], found.length_mm[rows].tolist()
+    return [
+        WrongPairRow.model_construct(line=found.lines[row], residual_mm=residual, length_mm=length)
+        for row, residual, length in zip(rows.tolist(), residuals, lengths, strict=True)
+    ]
 
 
 def _field(field: ResidualField, found: Findings) -> FieldPart:

@@ -7,6 +7,7 @@ from markupsafe import Markup
 
 from stcal.geometry.affine import Affine
 from stcal.geometry.rigid import Similarity
+from stcal.parallel import one_thread
 from stcal.register.core.liu2017 import Liu2017Options, SampleSize
 from stcal.register.core.result import ErrorFigures
 from stcal.register.report.drawings import errors_figure, field_figure, sample_size_figure, space_figure
@@ -181,11 +182,13 @@ def holds(reach: Cubes) -> list[str]:
     return [text]
 
 
+@one_thread()
 def registration_page(found: Findings, more: Sections = ()) -> str:
     """The report page; ``more`` sections stand before the rows."""
     result = found.registration
     space, enlarged = space_figure(found)
     field = None if found.field is None else field_figure(found, found.field)
+    length = found.length_mm
     return render(
         "register/report/page.html.jinja",
         more=list(more),
@@ -201,8 +204,8 @@ def registration_page(found: Findings, more: Sections = ()) -> str:
         systematic="" if found.field is None else field_sentence(found.field),
         field=field and uri(field),
         cubes=found.cubes and _cubes(found, found.cubes),
-        outliers=[_row(found, row) for row in result.outliers[:ROWS_ON_PAGE]],
-        rows=[_row(found, row) for row in range(min(len(result), ROWS_ON_PAGE))],
+        outliers=[_row(found, row, length) for row in result.outliers[:ROWS_ON_PAGE]],
+        rows=[_row(found, row, length) for row in range(min(len(result), ROWS_ON_PAGE))],
         count=len(result),
     )
 
@@ -235,8 +238,9 @@ def _cubes(found: Findings, reach: Cubes) -> dict:
     }
 
 
-def _row(found: Findings, row: int) -> list[str]:
+def _row(found: Findings, row: int, length: np.ndarray) -> list[str]:
+    """Cells of a row; ``length`` : (n,) of all residuals."""
     result = found.registration
     kind = "inlier" if result.inliers[row] else "outlier"
-    values = [number(v, 4) for v in (*result.residuals[row], found.length_mm[row])]
+    values = [number(v, 4) for v in (*result.residuals[row], length[row])]
     return [str(found.lines[row]), kind, *values]

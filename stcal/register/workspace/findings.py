@@ -6,6 +6,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from stcal.geometry.arrays import Array, freeze
+from stcal.parallel import one_thread
 from stcal.register.core.models import MODELS, jacobian
 from stcal.register.core.result import Registration
 from stcal.register.workspace.cubes import Cubes, cubes
@@ -43,6 +44,7 @@ class Findings:
         return np.sqrt(np.diag(by_step @ found.covariance @ by_step.T).clip(0))
 
 
+@one_thread()
 def findings(
     where: str,
     lines: Sequence[int],

@@ -7,7 +7,7 @@ from stcal.errors import DegenerateError
 from stcal.geometry.rigid import Rigid
 from stcal.register import register
 from stcal.register.core.models import MODELS
-from stcal.register.judge.degeneracy import single_supports, spreads, symmetry
+from stcal.register.judge.degeneracy import WIDER_THAN, single_supports, spreads, symmetry
 
 B_FROM_A = Rigid.exp([0.2, -0.7, 1.0, 500, 100, -900])
 SIGMA = 0.1
@@ -118,3 +118,24 @@ def test_cubes_are_symmetric_and_random_points_are_not():
     assert symmetry(moved, 0.5) is None
     assert symmetry(np.random.default_rng(1).uniform(-100, 100, (30, 3)), 0.5) is None
     assert symmetry(np.random.default_rng(1).uniform(-1, 1, (30, 3)), 0.5) is None  # too near each other to tell
+
+
+@pytest.mark.parametrize("model", ["rigid", "affine"])
+@pytest.mark.parametrize("width", [0.4, 0.6])
+def test_supports_are_those_of_leaving_out_one_after_the_other(model, width):
+    """Most points are passed over, as none alone could matter: the others must be the right ones."""
+    rng = np.random.default_rng(round(10 * width))
+    found = 0
+    for _ in range(60):
+        xyz = rng.normal(size=(12, 3)) * [
+            100,
+            width if model == "rigid" else 100,
+            width / 2 if model == "rigid" else width,
+        ]
+        xyz[rng.integers(12)] += [0, 5 * rng.random(), 5 * rng.random()]
+        values = [spreads(np.delete(xyz, i, axis=0)) for i in range(len(xyz))]
+        off = [value[2] if model == "affine" else np.hypot(value[1], value[2]) for value in values]
+        alone = single_supports(MODELS[model], xyz, 0.2)
+        assert alone.tolist() == np.flatnonzero(np.array(off) < WIDER_THAN * 0.2).tolist()
+        found += len(alone)
+    assert 20 < found < 480  # some alone, not all

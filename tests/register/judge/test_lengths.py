@@ -82,7 +82,7 @@ def test_one_wrong_among_four_is_refused_or_said_to_be_beyond_telling(seed):
     except DegenerateError as error:
         assert "needed to tell which are wrong" in str(error)  # noqa: PT017
     else:
-        assert any("cannot be told from the others: measure two more" in note for note in notes)
+        assert any("cannot be told from the others: measure 2 more" in note for note in notes)
 
 
 def test_six_points_tell():

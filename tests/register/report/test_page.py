@@ -10,9 +10,13 @@ from markupsafe import Markup
 
 from stcal.geometry.rigid import Rigid, Similarity
 from stcal.io.saving import json_text
+from stcal.parallel import _limited
 from stcal.register import register
+from stcal.register.report import page
+from stcal.register.report.drawings import MOST_LABELS, space_figure
 from stcal.register.report.file import GRID, RegistrationFile
 from stcal.register.report.page import FEW_ROWS, registration_page, registration_text
+from stcal.register.workspace import findings as workspace
 from stcal.register.workspace.findings import findings
 
 B_FROM_A = Rigid.exp([0.3, -0.4, 1.1, 2500.0, -300.0, 800.0])
@@ -138,3 +142,30 @@ def test_sigma_of_the_transform_by_place(count, tolerance):
             stated.append(findings("x", range(20), a, b, result).sigma_mm_at(place))
     # 100 trials know a σ to 7 %, 40 to 11 %; the own σ of five are good to 9 % / √5
     np.testing.assert_allclose(np.std(seen, axis=0), np.sqrt(np.mean(np.square(stated), axis=0)), rtol=tolerance)
+
+
+def test_thousands_of_outliers_are_told_in_few_lines_and_labels(monkeypatch):
+    """The farthest by line, the others by their number; the lengths of all residuals are computed once a page, not once
+    a row."""
+    found = found_of(n=3000, wild=range(1000))
+    assert "… and 970 more outliers; all are in --out and --report" in registration_text(found)
+    figure, _ = space_figure(found)
+    assert [len(axes.texts) for axes in figure.axes] == [MOST_LABELS] * 3
+    asked = []
+    whole = type(found).length_mm.fget
+    monkeypatch.setattr(type(found), "length_mm", property(lambda self: asked.append(1) or whole(self)))
+    registration_page(found)
+    assert len(asked) < 5
+
+
+def test_the_field_and_the_page_keep_blas_to_one_thread(monkeypatch):
+    """As `register` does: small matrices, on which threads wait for each other."""
+    held = []
+    for module, name in ((workspace, "cubes"), (page, "space_figure")):
+        inner = getattr(module, name)
+        monkeypatch.setattr(module, name, lambda *given, inner=inner: held.append(_limited.locked()) or inner(*given))
+    before = found_of(n=30)
+    b = before.registration.residuals + before.registration.b_from_a @ before.xyz_a
+    registration_page(findings("pairs", before.lines, before.xyz_a, b, before.registration))
+    assert len(held) > 1
+    assert all(held)
