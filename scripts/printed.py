@@ -44,7 +44,7 @@ class Block:
     @property
     def name(self) -> str:
         """What names it in lists: the document and the words of its first row."""
-        return f"{self.document}: {' '.join(self.rows[0])}"[:80]
+        return f"{self.document}: {' '.join(' '.join(self.rows[0]).split())}"[:60].strip()
 
 
 def cells_of(line: str) -> tuple[str, ...]:
@@ -72,9 +72,8 @@ def blocks(document: str, text: str) -> list[Block]:
             end += 1
         body = lines[begin + 1 : end] if fenced else lines[begin:end]
         rows = tuple(cells_of(line) for line in body if line.strip() and not is_rule(line))
-        if _is_of_figures(lines[begin], body, rows):
-            above = next((line for line in reversed(lines[:begin]) if line.strip()), "")
-            mark = MARK.fullmatch(above.strip())
+        mark = MARK.fullmatch(lines[begin - 1].strip()) if begin else None
+        if mark or _is_of_figures(lines[begin], body, rows):
             found.append(Block(document, begin + 1, rows, mark and mark[1]))
         i = end + fenced
     return found

@@ -1,0 +1,124 @@
+"""Figures of the documents are those that their scripts printed, cell by cell, and the scripts print them still."""
+
+import shlex
+
+import pytest
+
+from tests.scripts import load_script
+
+printed = load_script("printed")
+BLOCKS = printed.of_documents()
+
+FACTS: set[str] = set()
+"""Tables of figures that are written by hand. Those of docs/sources.md are words beside figures and count as none;
+data_layout.md holds formats and options, which tests/test_documents.py compares with the code."""
+
+NOT_YET = {
+    "README.md: simulated photographs of the reference target: 4",  # scripts/demo
+    "README.md: clean, cross-check with the native COLMAP:",  # scripts/studies/measure_shared.py
+    "README.md: 51 positions model mean, mm std, mm max, mm mean",  # reproduce_robot.py
+    "README.md: poses accepted ambiguous wrong branch off by > 5°",  # locate_study.py
+    "README.md: 3-D error at the board, mm reprojection pose shah",  # handeye_shared.py
+    "README.md: method poses error / bound error / σ",  # handeye_study.py
+    "README.md: first population median worst within 0.1 % within",  # reproduce_handeye.py
+    "README.md: clean, corrected, joint adjustment: 24 of 24 imag",  # measure_shared.py
+    "README.md: trial published as published + centres of blurred",  # reproduce_paper.py
+    "README.md: face as published + centres of blurred edges + ec",
+    "README.md: face position, µm predicted σ, µm rotation, mdeg",
+    "README.md: position, µm bound, µm position / bound rotation,",  # noise_study.py
+    "README.md: 200 runs each, 0.02 px noise, 4 groups of 6 image",  # uncertainty_study.py
+    "README.md: 40 images of [5184, 3456] px, 150 MB, 2 workers,",  # bench_run.py, times
+    "README.md: images pairs mapped pairs matched ms an image gra",  # scale_study.py
+}
+"""Printed by scripts that take long and whose output is not stored yet; to become fewer."""
+
+QUICK = {"register_shared": "hilti_stationing", "reproduce_registration": None}
+"""Commands of about half a minute, and the data set that they are run on, which is not part of the repository."""
+
+
+def marked():
+    return [block for block in BLOCKS if block.command]
+
+
+def test_every_block_of_figures_says_what_printed_it():
+    unmarked = {block.name for block in BLOCKS if not block.command}
+    known = NOT_YET | FACTS
+    assert sorted(unmarked - known) == []
+    assert sorted(known - unmarked) == []  # a block that has its comment leaves the list
+
+
+@pytest.mark.parametrize("block", marked(), ids=lambda block: block.name)
+def test_the_document_has_what_was_printed(block):
+    _, lines = printed.stored(block.command)
+    assert printed.first_missing(block, lines) is None
+
+
+def test_every_stored_file_is_of_a_block_and_every_script_is_there():
+    commands = {printed.name_of(block.command): block.command for block in marked()}
+    assert sorted(path.stem for path in printed.PRINTED.iterdir()) == sorted(commands)
+    assert [c for c in commands.values() if not (printed.ROOT / shlex.split(c)[0]).is_file()] == []
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", QUICK)
+def test_quick_scripts_print_the_same_again(name, shared_data):
+    """To one unit of the last digit shown: another processor rounds otherwise."""
+    (command,) = {block.command for block in marked() if printed.name_of(block.command) == name}
+    data = QUICK[name] and shlex.quote(str(shared_data(QUICK[name])))
+    now = printed.run(f"{command} {data or ''}")
+    assert printed.differing_figures(printed.stored(command)[1], now) == []
+
+
+TABLE = """Text.
+
+<!-- printed by: scripts/some.py --only one -->
+| case | a | b |
+|---|---|---|
+| first | 1.25 | 3 ± 1 |
+| second | 2.5 | – |
+
+| word | other |
+|---|---|
+| 1 | none |
+
+```
+head   x     y
+one    1.25  2.50
+two    -1.00 3.75  4.5
+```
+"""
+OUTPUT = ["Title", "", "| case | a | b |", "|---|---|---|", "| first | 1.25 | 3 ± 1 |", "| second  | 2.5 | – |", "end"]
+
+
+def test_blocks_of_a_document():
+    """A table of words is none; a comment stands for one of few figures too."""
+    one, two = printed.blocks("x.md", TABLE)
+    assert (one.line, one.command, len(one.rows)) == (4, "scripts/some.py --only one", 3)
+    assert (two.line, two.command, two.rows[1]) == (13, None, ("one", "1.25", "2.50"))
+    assert printed.name_of(one.command) == "some_only_one"
+
+
+def test_a_cell_that_differs_is_named():
+    block = printed.blocks("x.md", TABLE)[0]
+    assert printed.first_missing(block, OUTPUT) is None
+    other = [line.replace("2.5", "2.6") for line in OUTPUT]
+    assert printed.first_missing(block, other) == "second | 2.5 | –"
+    assert printed.first_missing(block, [*OUTPUT[:5], "| between | 1 | 2 |", *OUTPUT[5:]]) == "second | 2.5 | –"
+
+
+def test_runs_are_compared_by_the_digits_shown():
+    differing = printed.differing_figures
+    assert differing(["a 1.25 of 30"], ["a  1.26 of 30"]) == []
+    assert differing(["a 1.25 of 30"], ["a 1.27 of 30"]) != []
+    assert differing(["a 1.25"], ["b 1.25"]) != []
+    assert differing(["a"], ["a", "b"]) != []
+
+
+def test_a_stored_file_says_command_and_commit(tmp_path, monkeypatch):
+    monkeypatch.setattr(printed, "PRINTED", tmp_path)
+    path = tmp_path / "some_only_one.txt"
+    path.write_text("# scripts/some.py --only one, at commit 5a02514\n1 2\n")
+    assert printed.stored("scripts/some.py --only one")[1] == ["1 2"]
+    path.write_text("# scripts/some.py --only two, at commit 5a02514\n1 2\n")
+    with pytest.raises(ValueError, match="needed"):
+        printed.stored("scripts/some.py --only one")
