@@ -6,6 +6,8 @@ from .data.views import Views as Views
 from .data.views import pairs_of_views as pairs_of_views
 from .methods.evolution import EvolutionOptions as EvolutionOptions
 from .methods.noise import Noise as Noise
+from .plan import NextPoses as NextPoses
+from .plan import plan_poses as plan_poses
 from .result import HandEye as HandEye
 from .solve import METHODS as METHODS
 from .solve import HandEyeOptions as HandEyeOptions

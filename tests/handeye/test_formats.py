@@ -4,6 +4,7 @@ import json
 
 import numpy as np
 import pytest
+from markupsafe import escape
 
 from stcal.geometry.rigid import Poses
 from stcal.synthetic.measured.handeye import simulated
@@ -33,6 +34,13 @@ def test_every_format_gives_the_same_answer(command, tmp_path, truth, name):  # 
     assert "understood" not in wanted
     assert len(found["understood"]) >= 2
     assert shown.splitlines()[: len(found["understood"])] == found["understood"]
+
+
+def test_the_report_says_what_files_were_taken_for(command, tmp_path, truth):  # noqa: F811
+    page = tmp_path / "report.html"
+    code, shown, _ = command(*FORMATS["KUKA"](tmp_path, truth.pairs), *QUICK, "--report", page)
+    assert code == 0
+    assert f"<li>{escape(shown.splitlines()[0])}</li>" in page.read_text()
 
 
 def test_a_dry_run_says_what_it_understood_and_writes_nothing(command, tmp_path, truth):  # noqa: F811

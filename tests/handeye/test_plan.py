@@ -1,0 +1,92 @@
+"""Poses that are planned keep what they promise."""
+
+import numpy as np
+import pytest
+
+from stcal.errors import InputError
+from stcal.geometry.rigid import Poses
+from stcal.handeye import HandEyeOptions, HandEyePoses, Noise, handeye, plan_poses
+from stcal.handeye.data.loop import SETUPS, Loop
+from stcal.handeye.plan import worst_sigma
+from stcal.synthetic.measured.handeye import CAMERA, board_corners, disturbed, simulated
+
+ROBOT, SEEN = (5e-4, 0.2), (2e-4, 0.05)
+OUTLINE = board_corners(8, 7, 25.0)
+
+
+def few(seed: int, setup: str = "eye-in-hand"):
+    """Six poses that turn by little, σ stated."""
+    truth = simulated(np.random.default_rng(seed), 6, setup, ROBOT, SEEN, tilt=0.15)
+    return truth, handeye(truth.pairs, setup, "pose", options=HandEyeOptions(Noise(*ROBOT, *SEEN)))
+
+
+def with_more(truth, planned, rng):
+    """The pairs with those planned, as robot and camera would have measured them by the true transforms."""
+    flange = planned.base_from_flange
+    stand = flange.inverse() if truth.setup == "eye-to-hand" else flange
+    board = (stand @ truth.mount_from_camera).inverse() @ truth.stand_from_board
+    measured = (disturbed(rng, flange, *ROBOT), disturbed(rng, board, *SEEN))
+    pairs = (truth.pairs.base_from_flange, truth.pairs.camera_from_board)
+    return HandEyePoses(*(Poses.of([*old, *new]) for old, new in zip(pairs, measured, strict=True)))
+
+
+@pytest.mark.parametrize("setup", SETUPS)
+def test_sigma_comes_out_as_planned(setup):
+    """The information of poses within a degree and a few mm of those planned: 10 %. Errors of X are then within what
+    the σ of the new result say: χ² of six numbers, of which four sets of eight exceed 12 in one case in a thousand."""
+    squared = []
+    for seed in range(4):
+        truth, found = few(seed, setup)
+        planned = plan_poses(truth.pairs, found, 3, OUTLINE, CAMERA)
+        again = with_more(truth, planned, np.random.default_rng(seed))
+        result = handeye(again, setup, "pose", options=HandEyeOptions(Noise(*ROBOT, *SEEN)))
+        off = Poses.of([result.mount_from_camera]).difference(Poses.of([truth.mount_from_camera]))[0]
+        squared.append(off @ np.linalg.solve(result.covariance, off))
+        eye = truth.pairs.camera_from_board
+        middle = (eye.rotation @ OUTLINE.mean(0) + eye.translation).mean(0)
+        now = worst_sigma(np.linalg.inv(result.covariance), result.mount_from_camera, middle[None])
+        # Planned is the worst of seven points at the board and about it, this the one in their middle.
+        assert now < 1.1 * planned.sigma_mm[-1]
+        assert planned.sigma_mm[-1] < planned.sigma_mm[0] / 2
+        assert (np.diff(planned.sigma_mm) < 0).all()
+    assert np.sum(squared) < 51.2  # χ² of 24, one in a thousand
+
+
+def test_planned_poses_are_better_than_such_as_were_taken():
+    """Three more that turn as little as those before lower σ far less."""
+    truth, found = few(1)
+    planned = plan_poses(truth.pairs, found, 3, OUTLINE, CAMERA)
+    more = simulated(np.random.default_rng(99), 9, "eye-in-hand", ROBOT, SEEN, tilt=0.15)
+    alike = handeye(more.pairs, "eye-in-hand", "pose", options=HandEyeOptions(Noise(*ROBOT, *SEEN)))
+    eye = truth.pairs.camera_from_board.translation.mean(0)
+    by_chance = worst_sigma(np.linalg.inv(alike.covariance), alike.mount_from_camera, eye[None])
+    assert planned.sigma_mm[-1] < by_chance / 1.5
+
+
+@pytest.mark.parametrize("setup", SETUPS)
+def test_the_board_stays_in_the_image(setup):
+    truth, found = few(2, setup)
+    planned = plan_poses(truth.pairs, found, 4, OUTLINE, CAMERA)
+    loop = Loop.of(HandEyePoses(planned.base_from_flange, planned.camera_from_board), setup)
+    assert np.abs(loop.residuals(found.mount_from_camera, found.stand_from_board)).max() < 1e-9
+    for pose in planned.camera_from_board:
+        px = CAMERA.project(pose @ OUTLINE)
+        assert (px > 0.1 * np.array([1280, 1024]) - 1e-6).all()
+        assert (px < 0.9 * np.array([1280, 1024]) + 1e-6).all()
+    turned = np.degrees(planned.turn_rad)
+    assert (turned > 15).all()
+
+
+def test_only_what_the_robot_reaches_is_planned():
+    truth, found = few(3)
+    height = np.median(truth.pairs.base_from_flange.translation[:, 2])
+    planned = plan_poses(truth.pairs, found, 3, OUTLINE, CAMERA, lambda flange: flange.translation[:, 2] > height)
+    assert (planned.base_from_flange.translation[:, 2] > height).all()
+    with pytest.raises(InputError, match="views of the whole board is in the robot's reach"):
+        plan_poses(truth.pairs, found, 1, OUTLINE, CAMERA, lambda flange: np.zeros(len(flange), bool))
+
+
+def test_a_method_without_sigma_cannot_plan():
+    truth, _ = few(4)
+    with pytest.raises(InputError, match="park-martin gives no σ"):
+        plan_poses(truth.pairs, handeye(truth.pairs, method="park-martin"))
