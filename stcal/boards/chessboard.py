@@ -53,10 +53,8 @@ def _found(grey: np.ndarray, board: ChessboardDesign) -> Iterator[np.ndarray]:
         size = (max(round(scale * width), 1), max(round(scale * height), 1))
         small = grey if scale == 1 else cv2.resize(grey, size, interpolation=cv2.INTER_AREA)
         pixel = np.array([width / size[0], height / size[1]])
-        for there, corners in (
-            cv2.findChessboardCornersSB(small, (board.columns, board.rows), flags=FLAGS),
-            cv2.findChessboardCorners(small, (board.columns, board.rows), flags=OLDER_FLAGS),
-        ):
+        for find, flags in ((cv2.findChessboardCornersSB, FLAGS), (cv2.findChessboardCorners, OLDER_FLAGS)):
+            there, corners = find(small, (board.columns, board.rows), flags=flags)
             if there:
                 yield (corners.reshape(board.rows, board.columns, 2).astype(float) + 0.5) * pixel - 0.5
 
