@@ -15,7 +15,13 @@ PLAIN: dict[str, Any] = {
 
 
 class Commands(TyperGroup):
-    """A group whose help has the whole sentence of each command."""
+    """A group whose help has the whole sentence of each command, and whose commands may have names of two words."""
+
+    def resolve_command(self, ctx, args):
+        """``handeye plan`` before ``handeye``, whose first argument is a file."""
+        if len(args) > 1 and self.get_command(ctx, two := " ".join(args[:2])) is not None:
+            args = [two, *args[2:]]
+        return super().resolve_command(ctx, args)
 
     def format_commands(self, ctx, formatter) -> None:
         """Name and help of each."""

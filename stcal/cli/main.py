@@ -37,7 +37,7 @@ sfm.app.add_typer(measure.app)
 app.add_typer(sfm.app, name="sfm")
 app.add_typer(robot.app, name="robot")
 app.add_typer(locate.app, name="locate")
-app.command(name="handeye")(handeye.handeye)
+app.add_typer(handeye.app)
 app.command("register")(register.register)
 protect_inputs(app)
 
