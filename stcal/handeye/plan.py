@@ -65,7 +65,9 @@ def plan_poses(
 
     Candidates show the board as near and as far as it was seen, tilted by up to 40° and turned about the line of sight
     at will; each adds its information, with the σ of robot and camera that the result states or estimated, to that of
-    the poses taken (so that the wide rotations of Tsai & Lenz 1989 come out by themselves).
+    the poses taken (so that the wide rotations of Tsai & Lenz 1989 come out by themselves). σ are of independent errors
+    of the poses alone: without what the camera file errs, and without the scatter of :func:`~.scatter.scatter`, which
+    further poses do not lower alike.
 
     Parameters
     ----------
@@ -103,7 +105,7 @@ def plan_poses(
     eye = loop.camera_from_board
     seen = Poses(eye.rotation, result.scale * eye.translation)
     outline = np.zeros((1, 3)) if outline is None else result.scale * np.asarray(outline, float)
-    points = _points(seen.rotation @ outline.mean(0) + seen.translation)
+    points = judged_at(seen.rotation @ outline.mean(0) + seen.translation)
     sigma, flanges, views, turns = [worst_sigma(normal, x, points)], [], [], []
     taken = pairs.base_from_flange.rotation[kept]
     for _ in range(count):
@@ -111,6 +113,11 @@ def plan_poses(
         stand_from_mount = z @ ahead.inverse() @ x.inverse()
         flange = stand_from_mount.inverse() if loop.inverted else stand_from_mount
         rows = np.arange(len(flange)) if reachable is None else np.flatnonzero(reachable(flange))
+        if not len(flange):
+            raise InputError(
+                f"plan: none of {CANDIDATES} views as near and as far as the board was seen holds all of it and "
+                f"{MARGIN:.0%} of the image around; take it from farther away, or give a smaller board"
+            )
         if not len(rows):
             raise InputError(
                 f"plan: none of {len(flange)} views of the whole board is in the robot's reach; check robot file, "
@@ -169,8 +176,8 @@ def _information(loop: Loop, errors: _Errors, result: HandEye) -> np.ndarray:
     return np.swapaxes(jacobian, 1, 2) @ np.linalg.solve(spread, jacobian)
 
 
-def _points(board_mm: np.ndarray) -> np.ndarray:
-    """(7, 3) in the camera's frame: at the board's mean place (m, 3), and about it."""
+def judged_at(board_mm: np.ndarray) -> np.ndarray:
+    """Points (7, 3) in the camera's frame at which σ is judged: the board's mean place (m, 3), and about it."""
     middle = board_mm.mean(0)
     reach = ABOUT * float(np.linalg.norm(board_mm, axis=1).mean())
     return middle + reach * np.concatenate([np.zeros((1, 3)), np.eye(3), -np.eye(3)])

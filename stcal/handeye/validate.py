@@ -8,15 +8,12 @@ import numpy as np
 from stcal.errors import DegenerateError, InputError, StcalError
 from stcal.geometry.arrays import frozen
 from stcal.geometry.camera import Camera
-from stcal.geometry.normal_equations import generalised_inverse
-from stcal.geometry.rigid import Poses, Rigid
+from stcal.geometry.rigid import Rigid
 from stcal.handeye.data.loop import Loop, Setup
-from stcal.handeye.data.motions import Motions
 from stcal.handeye.data.pairs import HandEyePoses
 from stcal.handeye.data.views import View, Views, resect
 from stcal.handeye.judge.notes import Grave
 from stcal.handeye.judge.symmetry import repair
-from stcal.handeye.methods.noise import UNKNOWNS
 from stcal.handeye.result import HandEye
 from stcal.handeye.solve import METHODS, HandEyeOptions, handeye
 from stcal.held_out import repeated_splits
@@ -26,9 +23,6 @@ SETUP_SPLITS = 6
 """Splits that tell which setup is meant."""
 SETUP_BETTER = 4.0
 """Times by which the product of both errors must be smaller in the other setup."""
-SCATTERED = 1.5
-"""Times by which solutions scatter that are told of: of twelve simulated poses that err as is assumed, one set in a
-hundred does so."""
 LEAST_LEFT = 3
 """Poses that must be left to solve with."""
 
@@ -77,30 +71,6 @@ class HeldOutPoses:
         if not rows.any():
             return {}
         return {name: float(getattr(self, name)[rows].mean()) for name in names if getattr(self, name) is not None}
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class HeldOutMotions:
-    """Errors of the last k motions as predicted by the solution of the poses before them: Jin et al., eqs. 24–26.
-
-    Parameters
-    ----------
-    fitted : int
-        Motions that the solution rests on.
-    names : tuple of (str, str)
-        Poses that each motion leads from and to.
-    rotation_rad, translation_mm : (k,) arrays
-        Of Â = X B X⁻¹ against A.
-    """
-
-    fitted: int
-    names: tuple[tuple[str, str], ...]
-    rotation_rad: np.ndarray
-    translation_mm: np.ndarray
-
-    def __post_init__(self):
-        for name in ("rotation_rad", "translation_mm"):
-            object.__setattr__(self, name, frozen(getattr(self, name), (len(self.names),), name))
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -280,113 +250,6 @@ def better_setup(pairs: HandEyePoses, setup: Setup, options: HandEyeOptions, row
         f"poses held out are missed by {np.degrees(turn):.2g}° and {shift:.2g} mm as {setup}, by "
         f"{np.degrees(other_turn):.2g}° and {other_shift:.2g} mm as {other}: give --setup {other} if it is that"
     )
-
-
-def scatter(result: HandEye, held_out: HeldOutPoses) -> float:
-    """By how much solutions without some of the poses scatter about the one of all, in units of what its σ say.
-
-    Of m poses with independent errors of which k are held out, the difference has the covariance C k / (m − k), where C
-    is the solution's (the jackknife of Shao & Wu, Ann. Statist. 17, 1989, with several left out at once); a little
-    more where few are left, for what they see differs (as the mean of an inverse Wishart matrix exceeds the inverse of
-    the mean). Errors that are not independent, or not as large in all poses, show as more.
-
-    Parameters
-    ----------
-    result : HandEye
-        Of all poses.
-    held_out : HeldOutPoses
-        Of the same poses, with ``mount_from_camera``.
-
-    Returns
-    -------
-    float
-        RMS over splits and the six numbers; 1 is expected, NaN where a covariance or the solutions are missing.
-    """
-    if result.covariance is None or held_out.mount_from_camera is None or not len(held_out.rows):
-        return float("nan")
-    four, k = held_out.mount_from_camera, held_out.rows.shape[1]
-    each = Poses(four[:, :3, :3], four[:, :3, 3])
-    off = each.difference(Poses.of([result.mount_from_camera] * len(each)))
-    squared = np.einsum("sa,ab,sb->s", off, generalised_inverse(result.covariance), off)
-    left = 6 * (len(result.names) - k) - UNKNOWNS - 1
-    return float(np.sqrt(squared.mean() / 6 * left / (6 * k)))
-
-
-def widened_by_scatter(result: HandEye, held_out: HeldOutPoses) -> HandEye:
-    """With σ that reach the :func:`scatter` of solutions without some of the poses; a note where that is much."""
-    factor = scatter(result, held_out)
-    if not factor > 1:
-        return result
-    notes = result.notes
-    if factor > SCATTERED:
-        notes += (
-            f"solutions of parts of the poses scatter {factor:.2g} times as much as σ say, so that poses do not err "
-            "independently and alike: σ are widened by that",
-        )
-    return replace(result.widened(factor), notes=notes)
-
-
-def motion_errors(mount_from_camera: Rigid, motions: Motions) -> np.ndarray:
-    """Errors of Â = X B X⁻¹ against A: Jin et al., eqs. 24–26.
-
-    Parameters
-    ----------
-    mount_from_camera
-        X.
-    motions
-        k of them: A of the mount, B of the camera.
-
-    Returns
-    -------
-    (k, 2) array
-        Angle of the difference, rad; distance of the translations, mm.
-    """
-    off = (mount_from_camera @ motions.camera @ mount_from_camera.inverse()).difference(motions.mount)
-    return np.column_stack([np.linalg.norm(off[:, :3], axis=1), np.linalg.norm(off[:, 3:], axis=1)])
-
-
-@one_thread()
-def predict_motions(
-    pairs: HandEyePoses,
-    setup: Setup = "eye-in-hand",
-    method: str | None = None,
-    views: Views | None = None,
-    options: HandEyeOptions | None = None,
-    count: int = 6,
-) -> HeldOutMotions:
-    """Solve with the poses before the last ``count`` motions from pose to pose, and predict these.
-
-    Jin et al. do so with the last 6 of 24.
-
-    Parameters
-    ----------
-    pairs, setup, method, views, options
-        As of :func:`~stcal.handeye.handeye`.
-    count : int
-        Motions to hold out.
-
-    Returns
-    -------
-    HeldOutMotions
-
-    Raises
-    ------
-    InputError
-        Too few poses are left.
-    StcalError
-        As of :func:`~stcal.handeye.handeye`.
-    """
-    left = len(pairs) - count
-    if count < 1 or left < LEAST_LEFT:
-        raise InputError(
-            f"--motions-held-out {count}: of {max(len(pairs) - 1, 0)} motions, 1 to {max(len(pairs) - LEAST_LEFT, 0)} "
-            "can be held out; give another number, or more poses"
-        )
-    kept = np.arange(left)
-    result = handeye(pairs[kept], setup, method, None if views is None else views[kept], options)
-    errors = motion_errors(result.mount_from_camera, Motions.consecutive(Loop.of(pairs, setup))[left - 1 :])
-    names = tuple(zip(pairs.names[left - 1 : -1], pairs.names[left:], strict=True))
-    return HeldOutMotions(left - 1, names, errors[:, 0], errors[:, 1])
 
 
 @one_thread()

@@ -6,13 +6,35 @@ from typing import Literal
 
 import numpy as np
 
-from stcal.geometry.rigid import Poses
+from stcal.errors import InputError
+from stcal.geometry.rigid import UNIT_WITHIN, Poses
 
 Order = Literal["wxyz", "xyzw"]
 """``wxyz`` : as the columns are named; ``xyzw`` : x, y, z, w in the order in which the columns stand."""
 COLUMNS = ("qw", "qx", "qy", "qz")
 EXPLAINS = 0.2
 """A mistake explains a misfit when mending it leaves less than this share of it."""
+
+
+def require_unit(wxyz: np.ndarray, place: Callable[[int], str], where: str, remedy: str) -> None:
+    """Refuse quaternions (m, 4) that are not of unit length.
+
+    ``place`` : where row i stands in ``where``; ``remedy`` : the end of the message.
+
+    Raises
+    ------
+    InputError
+        Names the first, its length, and how many more there are.
+    """
+    with np.errstate(over="ignore"):  # of what is refused
+        length = np.linalg.norm(wxyz, axis=1)
+    bad = np.flatnonzero(~(np.abs(length - 1) <= UNIT_WITHIN))
+    if len(bad):
+        more = f" (and {len(bad) - 1} more)" if len(bad) > 1 else ""
+        raise InputError(
+            f"{where}: {place(bad[0])}: quaternion of length {length[bad[0]]:.4g}, 1 ± {UNIT_WITHIN:g} needed{more}; "
+            f"{remedy}"
+        )
 
 
 @dataclass(frozen=True, slots=True)

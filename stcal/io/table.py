@@ -10,11 +10,11 @@ from pathlib import Path
 import numpy as np
 
 from stcal.errors import InputError
-from stcal.geometry.rigid import UNIT_WITHIN, Poses, Rigid
+from stcal.geometry.rigid import Poses, Rigid
 from stcal.io.covariance import OF_POSE, TWIST, Rows, first_fault
 from stcal.io.files import TABLE_BYTES, read_bytes
 from stcal.io.quaternions import COLUMNS as QUATERNION
-from stcal.io.quaternions import Order
+from stcal.io.quaternions import Order, require_unit
 
 LENGTHS = {"mm": 1.0, "m": 1000.0, "um": 1e-3, "cm": 10.0, "in": 25.4}
 UNIT_WORDS = {"m": "metres", "in": "inches", "cm": "centimetres"}
@@ -122,14 +122,7 @@ class Table:
         """m transforms of ``prefix + x`` … and ``prefix + qw`` …."""
         self.has_rotation(prefix)
         wxyz = np.column_stack([self._near(prefix + c) for c in self._order(prefix)])
-        length = np.linalg.norm(wxyz, axis=1)
-        bad = np.flatnonzero(np.abs(length - 1) > UNIT_WITHIN)
-        if len(bad):
-            more = f" (and {len(bad) - 1} more)" if len(bad) > 1 else ""
-            raise InputError(
-                f"{self.where}: line {self.lines[bad[0]]}: quaternion of length {length[bad[0]]:.4g}, "
-                f"1 ± {UNIT_WITHIN:g} needed{more}; is the order qw, qx, qy, qz?"
-            )
+        require_unit(wxyz, lambda i: f"line {self.lines[i]}", self.where, "is the order qw, qx, qy, qz?")
         return Poses.from_quaternions(wxyz, self.points(prefix))
 
     def pose_covariances(self, prefix: str = "") -> np.ndarray | None:

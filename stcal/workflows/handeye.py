@@ -10,15 +10,15 @@ from stcal.handeye import HandEyeOptions, handeye
 from stcal.handeye.choose import choose
 from stcal.handeye.data.loop import Setup
 from stcal.handeye.judge.symmetry import repair
+from stcal.handeye.predict import predict_motions
 from stcal.handeye.report.outcome import Outcome
+from stcal.handeye.scatter import widened_by_scatter
 from stcal.handeye.validate import (
     LEAST_LEFT,
     better_setup,
     compare,
     cross_validate,
-    predict_motions,
     splits,
-    widened_by_scatter,
 )
 from stcal.parallel import Progress
 from stcal.workflows.handeye_input import HandEyeInput
@@ -95,14 +95,14 @@ def _outcome(
         done = partial(progress, "methods")
         compared = compare(pairs, setup, views, options, rows=rows, workers=validation.workers, progress=done)
         held_out = next(each.held_out for each in compared if each.method == result.method)
-        result = result if held_out is None else widened_by_scatter(result, held_out)
     elif len(rows) and choice is None and not notes:
         done = partial(progress, "held out")
         try:
             held_out = cross_validate(pairs, setup, asked, views, options, rows, validation.workers, done)
-            result = widened_by_scatter(result, held_out)
         except DegenerateError as error:
             notes = (f"no errors on poses held out: {error}",)
+    if held_out is not None and choice is None:  # a choice is widened when it is made, beside its rivals
+        result = widened_by_scatter(result, held_out)
     if len(rows) and (meant := better_setup(pairs, setup, options, rows)):
         notes = (*notes, meant)
     motions = None

@@ -7,7 +7,7 @@ from stcal.errors import InputError
 from stcal.geometry.rigid import Poses
 from stcal.handeye import HandEyeOptions, HandEyePoses, Noise, handeye, plan_poses
 from stcal.handeye.data.loop import SETUPS, Loop
-from stcal.handeye.plan import worst_sigma
+from stcal.handeye.plan import judged_at, worst_sigma
 from stcal.synthetic.measured.handeye import CAMERA, board_corners, disturbed, simulated
 
 ROBOT, SEEN = (5e-4, 0.2), (2e-4, 0.05)
@@ -43,10 +43,9 @@ def test_sigma_comes_out_as_planned(setup):
         off = Poses.of([result.mount_from_camera]).difference(Poses.of([truth.mount_from_camera]))[0]
         squared.append(off @ np.linalg.solve(result.covariance, off))
         eye = truth.pairs.camera_from_board
-        middle = (eye.rotation @ OUTLINE.mean(0) + eye.translation).mean(0)
-        now = worst_sigma(np.linalg.inv(result.covariance), result.mount_from_camera, middle[None])
-        # Planned is the worst of seven points at the board and about it, this the one in their middle.
-        assert now < 1.1 * planned.sigma_mm[-1]
+        points = judged_at(eye.rotation @ OUTLINE.mean(0) + eye.translation)
+        now = worst_sigma(np.linalg.inv(result.covariance), result.mount_from_camera, points)
+        assert now == pytest.approx(planned.sigma_mm[-1], rel=0.1)
         assert planned.sigma_mm[-1] < planned.sigma_mm[0] / 2
         assert (np.diff(planned.sigma_mm) < 0).all()
     assert np.sum(squared) < 51.2  # χ² of 24, one in a thousand
@@ -58,8 +57,9 @@ def test_planned_poses_are_better_than_such_as_were_taken():
     planned = plan_poses(truth.pairs, found, 3, OUTLINE, CAMERA)
     more = simulated(np.random.default_rng(99), 9, "eye-in-hand", ROBOT, SEEN, tilt=0.15)
     alike = handeye(more.pairs, "eye-in-hand", "pose", options=HandEyeOptions(Noise(*ROBOT, *SEEN)))
-    eye = truth.pairs.camera_from_board.translation.mean(0)
-    by_chance = worst_sigma(np.linalg.inv(alike.covariance), alike.mount_from_camera, eye[None])
+    eye = truth.pairs.camera_from_board
+    points = judged_at(eye.rotation @ OUTLINE.mean(0) + eye.translation)
+    by_chance = worst_sigma(np.linalg.inv(alike.covariance), alike.mount_from_camera, points)
     assert planned.sigma_mm[-1] < by_chance / 1.5
 
 
@@ -90,3 +90,9 @@ def test_a_method_without_sigma_cannot_plan():
     truth, _ = few(4)
     with pytest.raises(InputError, match="park-martin gives no σ"):
         plan_poses(truth.pairs, handeye(truth.pairs, method="park-martin"))
+
+
+def test_a_board_that_never_fits_the_image_is_said_to_be_so():
+    truth, found = few(5)
+    with pytest.raises(InputError, match="holds all of it"):
+        plan_poses(truth.pairs, found, 1, 1000 * OUTLINE, CAMERA)

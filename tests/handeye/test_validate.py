@@ -22,7 +22,8 @@ from stcal.handeye import (
 )
 from stcal.handeye.data.loop import Loop
 from stcal.handeye.data.motions import Motions
-from stcal.handeye.validate import predicted, scatter, widened_by_scatter
+from stcal.handeye.scatter import scatter, widened_by_scatter
+from stcal.handeye.validate import predicted
 from stcal.synthetic.measured.handeye import simulated, simulated_views
 
 

@@ -1,6 +1,5 @@
 """The robot's poses at which images were taken."""
 
-from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -8,14 +7,14 @@ import numpy as np
 import yaml
 
 from stcal.errors import InputError
-from stcal.geometry.rigid import UNIT_WITHIN, Poses
-from stcal.handeye.data.formats.record import Said
+from stcal.geometry.rigid import Poses
+from stcal.handeye.data.formats.record import Said, require_each_once
 from stcal.handeye.data.formats.tell import SUFFIXES, NotToldError
 from stcal.handeye.data.inputs import partners, read_robot, trailing_number
 from stcal.handeye.data.pairs import SIDES, read_side
 from stcal.io.files import SETTINGS_BYTES, read_bytes
 from stcal.io.plain_yaml import load_yaml
-from stcal.io.quaternions import Order
+from stcal.io.quaternions import Order, require_unit
 from stcal.io.table import LENGTHS, read_table
 
 YAML = (".yaml", ".yml")
@@ -126,7 +125,7 @@ def read_robot_poses(path: str | Path, quaternions: Order = "wxyz", said: Said |
         return replace(read, understood=f"{path.name}: list of {len(read.images)} {INDUSTRIAL}", own=False)
     table = read_table(path, "robot poses", quaternions)
     images, places = table.text("image"), tuple(f"line {line}" for line in table.lines)
-    _one_each(images, places, table.where)
+    require_each_once(images, places, table.where, "image ")
     poses, covariance = read_side(table, *SIDES[0])
     frame = next(name for name in SIDES[0] if any(column.startswith(f"{name}_") for column in table.columns))
     understood = f"{path.name}: table; {len(images)} poses; {frame} by its columns; {table.unit(f'{frame}_x', LENGTHS)}"
@@ -164,14 +163,6 @@ def _industrial(folder: Path) -> bool:
     return False
 
 
-def _one_each(images: Sequence[str], places: Sequence[str], where: str) -> None:
-    first: dict[str, str] = {}
-    for image, place in zip(images, places, strict=True):
-        if image in first:
-            raise InputError(f"{where}: {first[image]} and {place}: both are of image {image!r}; one row needed")
-        first[image] = place
-
-
 def _listed(path: Path) -> list[tuple[str, Path]]:
     """Images and pose files of a list of both, alone or under ``data``."""
     content = _yaml(path, f"robot poses {path}")
@@ -188,7 +179,7 @@ def _listed(path: Path) -> list[tuple[str, Path]]:
 def _from_yaml(files: list[tuple[str, Path]], where: str) -> RobotPoses:
     """One pose from each file, by the name of its image."""
     names, values = [file.name for _, file in files], []
-    _one_each([image for image, _ in files], names, where)
+    require_each_once([image for image, _ in files], names, where, "image ")
     for _, file in files:
         pose = _yaml(file, f"{where}: {file.name}")
         keys = ("x", "y", "z", "qw", "qx", "qy", "qz")
@@ -196,11 +187,9 @@ def _from_yaml(files: list[tuple[str, Path]], where: str) -> RobotPoses:
         for key, value in zip(keys, row, strict=True):
             if isinstance(value, bool) or not isinstance(value, int | float) or not np.isfinite(value):
                 raise InputError(f"{where}: {file.name}: {key} is {value!r}, a finite number needed")
-        length = float(np.linalg.norm(np.array(row[3:], float)))
-        if abs(length - 1) > UNIT_WITHIN:
-            raise InputError(f"{where}: {file.name}: quaternion of length {length:.4g}, 1 ± {UNIT_WITHIN:g} needed")
         values.append(row)
     flat = np.array(values, float)
+    require_unit(flat[:, 3:], names.__getitem__, where, "correct it")
     poses = Poses.from_quaternions(flat[:, 3:], LENGTHS["m"] * flat[:, :3])
     return RobotPoses(tuple(image for image, _ in files), poses, None, tuple(names), where)
 

@@ -152,6 +152,15 @@ def project_jacobian(camera: Camera, xyz_camera: np.ndarray) -> tuple[np.ndarray
     return distorted * camera.focal + camera.centre, camera.focal[:, None] * (by_ideal @ by_point)
 
 
+def whitened(view: View, camera: Camera, camera_from_board: Rigid) -> tuple[np.ndarray, np.ndarray]:
+    """Residuals (2k,) of a view's corners in units of their σ, and their derivative (2k, 6) by the board's pose."""
+    weight = view.whitening()
+    rotated = view.xyz_board @ camera_from_board.rotation.T
+    px, by_point = project_jacobian(camera, rotated + camera_from_board.translation)
+    by_pose = np.concatenate([-by_point @ skew(rotated), by_point], axis=2)
+    return np.einsum("kab,kb->ka", weight, px - view.xy_px).ravel(), (weight @ by_pose).reshape(-1, 6)
+
+
 def _pose_of(view: View, camera: Camera, name: str) -> Minimum[Rigid, NormalEquations]:
     if len(view) < LEAST_CORNERS:
         raise DegenerateError(f"{name}: {len(view)} corners of the board, {LEAST_CORNERS} needed; take the image out")
@@ -159,17 +168,11 @@ def _pose_of(view: View, camera: Camera, name: str) -> Minimum[Rigid, NormalEqua
         homography = fit_homography(view.xyz_board[:, :2], camera.normalised_from_pixel(view.xy_px))
     except DegenerateError as error:
         raise DegenerateError(f"{name}: the corners seen lie on a line; take the image out") from error
-    weight = view.whitening()
 
     def linearise(pose: Rigid) -> NormalEquations:
-        rotated = view.xyz_board @ pose.rotation.T
-        point = rotated + pose.translation
-        if (point[:, 2] <= 0).any():
+        if ((view.xyz_board @ pose.rotation[2] + pose.translation[2]) <= 0).any():
             return NormalEquations.impossible(6)
-        px, by_point = project_jacobian(camera, point)
-        by = np.concatenate([-by_point @ skew(rotated), by_point], axis=2)
-        white = np.einsum("kab,kb->ka", weight, px - view.xy_px).ravel()
-        return NormalEquations.of(white, (weight @ by).reshape(-1, 6))
+        return NormalEquations.of(*whitened(view, camera, pose))
 
     found = minimise(camera_from_plane(homography), linearise, perturbed)
     return found.required(name, "take the image out")

@@ -9,9 +9,9 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from stcal.geometry.normal_equations import generalised_inverse
-from stcal.geometry.rigid import Poses, skew
+from stcal.geometry.rigid import Poses
 from stcal.handeye.data.loop import Loop
-from stcal.handeye.data.views import Views, project_jacobian
+from stcal.handeye.data.views import Views, whitened
 from stcal.handeye.methods.bundle import Bundle, Corners, camera_parts, estimated
 from stcal.handeye.methods.pose_adjustment import LoopState, PoseSolution
 from stcal.io.camera import CameraPrior, intrinsic_basis
@@ -90,13 +90,10 @@ def poses_by_camera(
     q = basis.shape[1]
     information, gradient, cost, slopes = np.zeros((q, q)), np.zeros(q), 0.0, []
     for view, pose in zip(views.views, camera_from_board, strict=True):
-        rotated = view.xyz_board @ pose.rotation.T
-        point = rotated + pose.translation
-        px, by_point = project_jacobian(views.camera, point)
-        weight = view.whitening()
-        white = np.einsum("kab,kb->ka", weight, px - view.xy_px).ravel()
-        by_pose = (weight @ np.concatenate([-by_point @ skew(rotated), by_point], axis=2)).reshape(-1, 6)
-        by_own = (weight @ views.camera.parameter_jacobian(point[:, :2] / point[:, 2:]) @ basis).reshape(-1, q)
+        white, by_pose = whitened(view, views.camera, pose)
+        point = pose @ view.xyz_board
+        by_own = view.whitening() @ views.camera.parameter_jacobian(point[:, :2] / point[:, 2:]) @ basis
+        by_own = by_own.reshape(-1, q)
         slopes.append(-np.linalg.lstsq(by_pose, by_own)[0])
         left = by_own + by_pose @ slopes[-1]
         information += left.T @ left

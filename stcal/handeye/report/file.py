@@ -9,10 +9,11 @@ import stcal
 from stcal.handeye.choose import Choice, Tried
 from stcal.handeye.data.loop import FRAMES, Setup
 from stcal.handeye.judge.observability import Observability
+from stcal.handeye.predict import HeldOutMotions
 from stcal.handeye.report.outcome import Outcome
 from stcal.handeye.report.verdict import Verdict, Word, judged
 from stcal.handeye.result import HandEye
-from stcal.handeye.validate import Compared, HeldOutMotions, HeldOutPoses
+from stcal.handeye.validate import Compared, HeldOutPoses
 from stcal.io.camera import PARAMETER_NAMES, parameter_names
 from stcal.io.json import Finite, Matrix3, Matrix6, NamedReason, Part, Pose, ResultFile, Vector, Vector3
 

@@ -6,8 +6,9 @@ from pathlib import Path
 from stcal.handeye.choose import Choice
 from stcal.handeye.data.pairs import HandEyePoses
 from stcal.handeye.data.views import Views
+from stcal.handeye.predict import HeldOutMotions
 from stcal.handeye.result import HandEye
-from stcal.handeye.validate import Compared, HeldOutMotions, HeldOutPoses
+from stcal.handeye.validate import Compared, HeldOutPoses
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -9,6 +9,7 @@ import numpy as np
 from stcal.errors import InputError
 from stcal.geometry.arrays import frozen
 from stcal.geometry.rigid import UNIT_WITHIN, Poses
+from stcal.io.quaternions import require_unit
 from stcal.io.table import LENGTHS
 
 Role = Literal["robot", "camera"]
@@ -221,15 +222,7 @@ def of_quaternions(wxyz: np.ndarray, places: Sequence[str], where: str) -> np.nd
         One that is not of unit length.
     """
     require_finite(wxyz, places, where)
-    with np.errstate(over="ignore"):  # of what is refused
-        length = np.linalg.norm(wxyz, axis=1)
-    bad = np.flatnonzero(np.abs(length - 1) > UNIT_WITHIN)
-    if len(bad):
-        more = f" (and {len(bad) - 1} more)" if len(bad) > 1 else ""
-        raise InputError(
-            f"{where}: {places[bad[0]]}: quaternion of length {length[bad[0]]:.4g}, 1 ± {UNIT_WITHIN:g} needed{more}; "
-            "correct it"
-        )
+    require_unit(wxyz, places.__getitem__, where, "correct it")
     return np.array(Poses.from_quaternions(wxyz, np.zeros((len(wxyz), 3))).rotation)
 
 
@@ -259,10 +252,10 @@ def require_finite(values: np.ndarray, places: Sequence[str], where: str) -> Non
         raise InputError(f"{where}: {places[bad[0]]}: a value that is not finite, numbers needed{more}; take it out")
 
 
-def require_each_once(names: Sequence[str], places: Sequence[str], where: str) -> None:
-    """Refuse an image or a timestamp that has two poses."""
+def require_each_once(names: Sequence[str], places: Sequence[str], where: str, kind: str = "") -> None:
+    """Refuse a name, of an image or a time stamp as ``kind`` says, that has two poses."""
     first: dict[str, str] = {}
     for name, place in zip(names, places, strict=True):
         if name in first:
-            raise InputError(f"{where}: {first[name]} and {place}: both are of {name!r}; one pose each needed")
+            raise InputError(f"{where}: {first[name]} and {place}: both are of {kind}{name!r}; one row needed")
         first[name] = place
