@@ -142,13 +142,12 @@ def main() -> None:
     trials = arguments.trials
     low, high = np.sqrt(chi2.ppf([0.025, 0.975], 6 * trials) / (6 * trials))
     print(f"{trials} trials each, simulated; a ratio that is 1 lies within {low:.3f} … {high:.3f}\n")
-    print(
-        "| method | setup | noise | poses | bound | calibration | good poses left out |\n|---|---|---|---|---|---|---|"
-    )
     with executor_of(arguments.scheduler) as pool:
         if arguments.cameras:
             print_cameras(pool, trials, arguments.only)
             return
+        print("| method | setup | noise | poses | bound | calibration | good poses left out |")
+        print("|---|---|---|---|---|---|---|")
         methods = [method for method in COUNTS if method.startswith(arguments.only)]
         cases = (Case(*v, count) for v in product(methods, SETUPS, NOISES) for count in COUNTS[v[0]])
         ratios: dict[tuple[str, int], list[np.ndarray]] = {}
