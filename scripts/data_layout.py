@@ -34,6 +34,7 @@ MODULES = (
     "stcal.sfm.interop.file",
     "stcal.sfm.diagnose.file",
     "stcal.handeye.report.file",
+    "stcal.handeye.report.planned",
     "stcal.register.report.file",
     "stcal.locate.data.capture",
     "stcal.locate.report.files",
@@ -52,6 +53,8 @@ def models() -> dict[str, type[Part]]:
     for module in map(import_module, MODULES):
         for name, each in vars(module).items():
             if isinstance(each, type) and issubclass(each, Part) and each.__module__ == module.__name__:
+                if name in found:
+                    raise ValueError(f"{name}: in {found[name].__module__} and {module.__name__}; rename one")
                 found[name] = each
     return found
 

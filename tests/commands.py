@@ -167,6 +167,7 @@ CALLS = (
         "--splits 0 --refine-camera --camera-out >cameras.txt --out >h.json --workers 1",
         3.0,
     ),
+    Call("handeye plan", "@handeye/poses.csv --count 2 --seed 1 --out >next.csv --json >all.json"),
     Call("locate schedule", "1 100 5"),
     Call("locate capture", "+scenes --simulate @locate/scenes/a/1.png --shortest 0.5 --longest 2 --count 3"),
     Call(

@@ -17,6 +17,8 @@ from stcal.handeye.result import HandEye
 
 CANDIDATES = 2000
 """Views of the board that are looked at for each pose that is named."""
+ASKED = 64
+"""Poses at a time of which is asked whether the robot reaches them."""
 MOST_TILT = np.radians(40)
 """Of the board against the line of sight: beyond, dots and corners lose accuracy."""
 MARGIN = 0.1
@@ -82,7 +84,8 @@ def plan_poses(
     camera : Camera, optional
         Whose image they are to be in; without it they stay where the board's origin was seen.
     reachable : callable, optional
-        Which of base_from_flange (n poses) the robot reaches, (n,) bool; all where None.
+        Which of base_from_flange (n poses) the robot reaches, (n,) bool; all where None. It is asked for
+        :data:`ASKED` at a time, the best first.
     seed : int
         Of the candidates.
 
@@ -112,23 +115,17 @@ def plan_poses(
         ahead = _views(rng, seen, outline, camera)
         stand_from_mount = z @ ahead.inverse() @ x.inverse()
         flange = stand_from_mount.inverse() if loop.inverted else stand_from_mount
-        rows = np.arange(len(flange)) if reachable is None else np.flatnonzero(reachable(flange))
         if not len(flange):
             raise InputError(
                 f"plan: none of {CANDIDATES} views as near and as far as the board was seen holds all of it and "
                 f"{MARGIN:.0%} of the image around; take it from farther away, or give a smaller board"
             )
-        if not len(rows):
-            raise InputError(
-                f"plan: none of {len(flange)} views of the whole board is in the robot's reach; check robot file, "
-                "board and setup"
-            )
-        unscaled = Poses(ahead.rotation[rows], ahead.translation[rows] / result.scale)
-        each = normal + _information(Loop(stand_from_mount[rows], unscaled, loop.inverted), errors, result)
+        unscaled = Poses(ahead.rotation, ahead.translation / result.scale)
+        each = normal + _information(Loop(stand_from_mount, unscaled, loop.inverted), errors, result)
         after = np.array([worst_sigma(own, x, points) for own in each])
-        best = int(after.argmin())
-        normal, row = each[best], int(rows[best])
-        sigma.append(float(after[best]))
+        row = _first_reachable(flange, np.argsort(after), reachable)
+        normal = each[row]
+        sigma.append(float(after[row]))
         flanges.append(flange[row])
         views.append(ahead[row])
         cosine = (np.einsum("mab,ab->m", taken, flange.rotation[row]) - 1) / 2
@@ -143,6 +140,21 @@ def worst_sigma(normal: np.ndarray, mount_from_camera: Rigid, points: np.ndarray
     by = np.zeros((len(points), 3, 6))
     by[:, :, :3], by[:, :, 3:] = -skew(points @ mount_from_camera.rotation.T), np.eye(3)
     return float(np.sqrt(np.linalg.eigvalsh(by @ covariance @ np.swapaxes(by, 1, 2)).max()))
+
+
+def _first_reachable(flange: Poses, order: np.ndarray, reachable: Callable[[Poses], np.ndarray] | None) -> int:
+    """Row of the first pose, in this order (n,), that the robot reaches."""
+    if reachable is None:
+        return int(order[0])
+    for start in range(0, len(order), ASKED):
+        part = order[start : start + ASKED]
+        within = np.flatnonzero(reachable(flange[part]))
+        if len(within):
+            return int(part[within[0]])
+    raise InputError(
+        f"plan: none of {len(flange)} views of the whole board is in the robot's reach; check robot file, board and "
+        "setup"
+    )
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -2,7 +2,8 @@
 
 import typer
 
-from stcal.cli.handeye import calibrate
+from stcal.cli.handeye import calibrate, plan
 
 app = typer.Typer()
 app.command("handeye")(calibrate.handeye)
+app.command("handeye plan")(plan.plan)

@@ -7,6 +7,18 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from stcal.cli.handeye.inputs import (
+    LengthUnit,
+    OwnBoard,
+    OwnCamera,
+    PosesAre,
+    PosesFile,
+    RotationOption,
+    SetupName,
+    SetupOption,
+    SourceFile,
+    source_of,
+)
 from stcal.cli.options import (
     MOST_SEED,
     FirstTable,
@@ -17,7 +29,6 @@ from stcal.cli.options import (
     ReportFile,
     SecondTable,
     Workers,
-    one_table,
 )
 from stcal.cli.terminal import StageProgress, print_each, say, write
 from stcal.errors import InputError
@@ -25,13 +36,10 @@ from stcal.io.saving import keep_apart
 
 if TYPE_CHECKING:
     from stcal.handeye import EvolutionOptions
-    from stcal.handeye.data.formats.record import Said
     from stcal.handeye.data.loop import Setup
     from stcal.handeye.methods.evolution import Bounds
     from stcal.handeye.report.export.frames import CameraFrame
     from stcal.handeye.report.outcome import Outcome
-    from stcal.io.quaternions import Order
-    from stcal.workflows.handeye_input import Source
 
 EVOLVED = ("de", "de-polished")
 """Methods that take the options ``--de-…``."""
@@ -46,69 +54,15 @@ class CameraFrameName(StrEnum):
     link = "link"
 
 
-class SetupName(StrEnum):
-    """What carries the camera."""
-
-    in_hand = "eye-in-hand"
-    to_hand = "eye-to-hand"
-
-
 def handeye(
-    source: Annotated[
-        Path | None,
-        typer.Argument(
-            metavar="POSES|IMAGES",
-            help="Read pose pairs from this file: base_from_flange_… and camera_from_board_… (CSV, JSON, YAML, npz), "
-            "or samples of easy_handeye or MoveIt; or photographs of a board from this folder.",
-        ),
-    ] = None,
-    poses: Annotated[
-        Path | None,
-        typer.Option(
-            "--poses",
-            help="Read the robot's poses from this file: image, base_from_flange_… (CSV), 4×4 matrices, TUM, Zivid, "
-            "ROS …; or from this folder, a file for each image.",
-        ),
-    ] = None,
-    camera: Annotated[
-        Path | None,
-        typer.Option("--camera", help="Read the intrinsics from this file: COLMAP cameras.txt, OpenCV or ROS."),
-    ] = None,
-    board: Annotated[
-        Path | None,
-        typer.Option("--board", help="Read the board from this file: dots, chessboard, ChArUco or tags (TOML)."),
-    ] = None,
-    setup: Annotated[
-        SetupName | None,
-        typer.Option(
-            help="Choose eye-in-hand, camera on the flange, or eye-to-hand, board on the flange; as the file says, or "
-            "eye-in-hand, if not given."
-        ),
-    ] = None,
-    rotation: Annotated[
-        list[str] | None,
-        typer.Option(
-            "--rotation",
-            help="Read angles of unnamed convention like this: kuka-abc, fanuc-wpr, ur-rotvec, rpy …, rotvec, xyz "
-            "(fixed axes), ZYX (turned axes) …; robot=… or camera=… for one side.",
-        ),
-    ] = None,
-    length_unit: Annotated[
-        list[str] | None,
-        typer.Option(
-            "--length-unit",
-            help="Take lengths in files that do not say it in this unit: mm, m, cm, um, in; robot=… or camera=… for "
-            "one side.",
-        ),
-    ] = None,
-    poses_are: Annotated[
-        list[str] | None,
-        typer.Option(
-            "--poses-are",
-            help="Take poses in files that do not say it as base_from_flange or flange_from_base, or as "
-            "camera_from_board or board_from_camera; once for each side.",
-        ),
-    ] = None,
+    source: SourceFile = None,
+    poses: PosesFile = None,
+    camera: OwnCamera = None,
+    board: OwnBoard = None,
+    setup: SetupOption = None,
+    rotation: RotationOption = None,
+    length_unit: LengthUnit = None,
+    poses_are: PosesAre = None,
     dry_run: Annotated[
         bool, typer.Option("--dry-run", help="Print what was understood of the files, and solve and write nothing.")
     ] = False,
@@ -269,7 +223,7 @@ def handeye(
     robot, seen = (_radians(sigma_robot_deg), sigma_robot_mm), (_radians(sigma_camera_deg), sigma_camera_mm)
     noise = Noise(*robot, *seen, sigma_px, sigma_board_mm)
     said = Said.of_options(rotation or [], length_unit or [], poses_are or [], setup and setup.value)
-    pairs = _source(source, first, second, key, said, quaternions.value)
+    pairs = source_of(source, first, second, key, said, quaternions.value)
     folder = isinstance(pairs, Path) and pairs.is_dir()
     _require_fitting(not folder, method, refine_camera, camera_out)
     exports = _exports(export or [])
@@ -336,20 +290,6 @@ def handeye(
         _save_camera(camera_out, outcome)
     if json_file:
         write(json_file, HandEyeFile.of(outcome, whole=True))
-
-
-def _source(
-    source: Path | None, first: Path | None, second: Path | None, key: str, said: "Said", quaternions: "Order"
-) -> "Source":
-    """The file or folder that was named first; or --a and --b joined, whatever their formats."""
-    from stcal.workflows.handeye_input import two_files
-
-    if source is None and first is not None and second is not None:
-        told = two_files(first, second, key, said, quaternions)
-        if told is not None:
-            return told
-    prefixes = ("base_from_flange_", "camera_from_board_")
-    return one_table(source, first, second, key, "POSES|IMAGES", prefixes, quaternions)
 
 
 def _require_fitting(of_poses: bool, method: str | None, refine_camera: bool, camera_out: Path | None) -> None:

@@ -1,0 +1,92 @@
+"""What the commands of hand-eye read, and the options that say it."""
+
+from enum import StrEnum
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from stcal.cli.options import one_table
+
+if TYPE_CHECKING:
+    from stcal.handeye.data.formats.record import Said
+    from stcal.io.quaternions import Order
+    from stcal.workflows.handeye_input import Source
+
+
+class SetupName(StrEnum):
+    """What carries the camera."""
+
+    in_hand = "eye-in-hand"
+    to_hand = "eye-to-hand"
+
+
+SourceFile = Annotated[
+    Path | None,
+    typer.Argument(
+        metavar="POSES|IMAGES",
+        help="Read pose pairs from this file: base_from_flange_… and camera_from_board_… (CSV, JSON, YAML, npz), "
+        "or samples of easy_handeye or MoveIt; or photographs of a board from this folder.",
+    ),
+]
+PosesFile = Annotated[
+    Path | None,
+    typer.Option(
+        "--poses",
+        help="Read the robot's poses from this file: image, base_from_flange_… (CSV), 4×4 matrices, TUM, Zivid, "
+        "ROS …; or from this folder, a file for each image.",
+    ),
+]
+OwnCamera = Annotated[
+    Path | None,
+    typer.Option("--camera", help="Read the intrinsics from this file: COLMAP cameras.txt, OpenCV or ROS."),
+]
+OwnBoard = Annotated[
+    Path | None,
+    typer.Option("--board", help="Read the board from this file: dots, chessboard, ChArUco or tags (TOML)."),
+]
+SetupOption = Annotated[
+    SetupName | None,
+    typer.Option(
+        help="Choose eye-in-hand, camera on the flange, or eye-to-hand, board on the flange; as the file says, or "
+        "eye-in-hand, if not given."
+    ),
+]
+RotationOption = Annotated[
+    list[str] | None,
+    typer.Option(
+        "--rotation",
+        help="Read angles of unnamed convention like this: kuka-abc, fanuc-wpr, ur-rotvec, rpy …, rotvec, xyz "
+        "(fixed axes), ZYX (turned axes) …; robot=… or camera=… for one side.",
+    ),
+]
+LengthUnit = Annotated[
+    list[str] | None,
+    typer.Option(
+        "--length-unit",
+        help="Take lengths in files that do not say it in this unit: mm, m, cm, um, in; robot=… or camera=… for "
+        "one side.",
+    ),
+]
+PosesAre = Annotated[
+    list[str] | None,
+    typer.Option(
+        "--poses-are",
+        help="Take poses in files that do not say it as base_from_flange or flange_from_base, or as "
+        "camera_from_board or board_from_camera; once for each side.",
+    ),
+]
+
+
+def source_of(
+    source: Path | None, first: Path | None, second: Path | None, key: str, said: "Said", quaternions: "Order"
+) -> "Source":
+    """The file or folder that was named first; or --a and --b joined, whatever their formats."""
+    from stcal.workflows.handeye_input import two_files
+
+    if source is None and first is not None and second is not None:
+        told = two_files(first, second, key, said, quaternions)
+        if told is not None:
+            return told
+    prefixes = ("base_from_flange_", "camera_from_board_")
+    return one_table(source, first, second, key, "POSES|IMAGES", prefixes, quaternions)

@@ -1,0 +1,106 @@
+"""Poses to take next: for the terminal, as a table, and for programs."""
+
+import csv
+import io
+from typing import Literal
+
+import numpy as np
+from pydantic import Field
+
+from stcal.handeye.plan import NextPoses
+from stcal.handeye.result import HandEye
+from stcal.io.json import Part, Pose, ResultFile
+from stcal.io.table import POSE, pose_cells
+from stcal.report.text import NONE, number, text_table
+
+JOINT_DIGITS = 3
+"""Of joint values, deg or mm, on the terminal."""
+
+
+class PlannedPose(Part):
+    base_from_flange: Pose
+    camera_from_board: Pose
+    worst_sigma_mm: float
+    turn_rad: float
+    joints: dict[str, float] | None
+
+
+class HandEyePlanFile(ResultFile):
+    """Of ``handeye plan``."""
+
+    format: Literal["stcal handeye plan 1"] = Field(description="the file's form and its version")
+    setup: str = Field(description="`eye-in-hand` or `eye-to-hand`")
+    method: str = Field(description="that solved for the poses taken")
+    taken: list[str] = Field(description="names of the poses taken that the solution rests on")
+    worst_sigma_mm: float = Field(description="largest σ, in any direction, of a point at the board: now")
+    poses: list[PlannedPose] = Field(
+        description="to take, in order: `base_from_flange`, `camera_from_board` (how the board is seen there), "
+        "`worst_sigma_mm` with this pose and those before, `turn_rad` against the nearest pose taken, `joints` by "
+        "column (deg or mm; null without a robot file)"
+    )
+
+
+def planned_text(result: HandEye, planned: NextPoses, joints: dict[str, np.ndarray]) -> str:
+    """Tables for the terminal."""
+    taken = int((~result.outliers).sum())
+    rotvec = np.degrees([flange.log()[:3] for flange in planned.base_from_flange])
+    heads = ["<pose", "worst σ, mm", "turn, °", "x, mm", "y, mm", "z, mm", "rx, °", "ry, °", "rz, °"]
+    rows = [[f"{taken} taken", number(planned.sigma_mm[0], 3), *[NONE] * 7]]
+    for k, (sigma, turn) in enumerate(zip(planned.sigma_mm[1:], planned.turn_rad, strict=True)):
+        place = [f"{value:.2f}" for value in (*planned.base_from_flange[k].translation, *rotvec[k])]
+        rows.append([f"next {k + 1}", number(sigma, 3), f"{np.degrees(turn):.0f}", *place])
+    lines = [
+        f"{result.setup}, method {result.method}: poses of the flange in the base, in order, and the worst σ of a "
+        "point at the board with each",
+        *text_table([heads, *rows]),
+    ]
+    if joints:
+        cells = [
+            [f"next {k + 1}", *(f"{of[k]:.{JOINT_DIGITS}f}" for of in joints.values())] for k in range(len(rotvec))
+        ]
+        lines += ["", *text_table([["<joints", *joints], *cells])]
+    last = "joint limits and the image" if joints else "the image; give --robot for joint limits"
+    lines += [
+        "",
+        "turn: against the nearest pose taken; rx, ry, rz: rotation vector. σ are of independent errors of the poses",
+        f"alone. Collisions are not looked at, only {last}.",
+    ]
+    return "\n".join(lines)
+
+
+def planned_csv(planned: NextPoses, joints: dict[str, np.ndarray]) -> str:
+    """The table of ``--out`` (form: ``data_layout.md``)."""
+    stream = io.StringIO()
+    writer = csv.writer(stream, lineterminator="\n")
+    frames = {"base_from_flange": planned.base_from_flange, "camera_from_board": planned.camera_from_board}
+    writer.writerow(["pose", "worst_sigma_mm", "turn_deg", *joints, *(f"{name}_{c}" for name in frames for c in POSE)])
+    for k, turn in enumerate(planned.turn_rad):
+        own = [planned.sigma_mm[k + 1], np.degrees(turn), *(of[k] for of in joints.values())]
+        cells = [repr(float(value)) for value in own]
+        writer.writerow([k + 1, *cells, *(cell for poses in frames.values() for cell in pose_cells(poses[k]))])
+    return stream.getvalue()
+
+
+def planned_file(result: HandEye, planned: NextPoses, joints: dict[str, np.ndarray]) -> HandEyePlanFile:
+    """All of it, for programs."""
+    rows = [
+        {
+            "base_from_flange": planned.base_from_flange[k].matrix(),
+            "camera_from_board": planned.camera_from_board[k].matrix(),
+            "worst_sigma_mm": planned.sigma_mm[k + 1],
+            "turn_rad": turn,
+            "joints": {name: of[k] for name, of in joints.items()} or None,
+        }
+        for k, turn in enumerate(planned.turn_rad)
+    ]
+    taken = [name for name, out in zip(result.names, result.outliers, strict=True) if not out]
+    return HandEyePlanFile.model_validate(
+        {
+            "format": "stcal handeye plan 1",
+            "setup": result.setup,
+            "method": result.method,
+            "taken": taken,
+            "worst_sigma_mm": planned.sigma_mm[0],
+            "poses": rows,
+        }
+    )

@@ -1,0 +1,106 @@
+"""The robot poses to take next for hand-eye calibration, within an arm's reach: ``stcal handeye plan``."""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+
+from stcal.errors import InputError
+from stcal.geometry.rigid import Poses
+from stcal.handeye import HandEyeOptions, NextPoses, handeye, plan_poses
+from stcal.handeye.data.loop import Setup
+from stcal.handeye.result import HandEye
+from stcal.parallel import one_thread
+from stcal.robot import Robot, inverse
+from stcal.robot.kinematics.inverse import REACHED
+from stcal.robot.use.compensation import joint_columns
+from stcal.workflows.handeye_input import HandEyeInput
+
+LEAST_REACHED = 0.5
+"""Share of the poses taken that a robot file must reach to be that robot's."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Planned:
+    """``result`` : of the poses taken; ``poses`` : those to take; ``joints`` : (k,) values of each by its column, deg
+    or mm, with a robot file; ``notes`` : on them."""
+
+    result: HandEye
+    poses: NextPoses
+    joints: dict[str, np.ndarray]
+    notes: tuple[str, ...]
+
+
+@one_thread()
+def plan_next(given: HandEyeInput, setup: Setup, count: int = 3, robot: Robot | None = None, seed: int = 0) -> Planned:
+    """Solve with the poses taken, and name those that would lower the worst σ most.
+
+    Parameters
+    ----------
+    given : HandEyeInput
+        Poses taken so far.
+    setup : {"eye-in-hand", "eye-to-hand"}
+        What carries the camera.
+    count : int
+        Poses wanted.
+    robot : Robot, optional
+        Within whose joint limits they are to be, from its own base to its flange, no tool.
+    seed : int
+        Of the candidates.
+
+    Returns
+    -------
+    Planned
+
+    Raises
+    ------
+    InputError
+        As :func:`stcal.handeye.plan_poses`, or the robot does not reach half of the poses taken.
+    DegenerateError
+        As :func:`stcal.handeye.handeye`.
+    """
+    options = HandEyeOptions(with_scale=given.unit_mm is not None, symmetries=given.symmetries)
+    result = handeye(given.pairs, setup, None, given.views, options)
+    camera = outline = None
+    if given.views is not None:
+        camera = given.views.camera
+        outline = np.unique(np.concatenate([view.xyz_board for view in given.views.views]), axis=0)
+    if robot is None:
+        return Planned(result, plan_poses(given.pairs, result, count, outline, camera, None, seed), {}, ())
+    near, notes = _taken(robot, given)
+    planned = plan_poses(given.pairs, result, count, outline, camera, _reach(robot, near), seed)
+    return Planned(result, planned, _joints(robot, planned.base_from_flange, near), notes)
+
+
+def _taken(robot: Robot, given: HandEyeInput) -> tuple[np.ndarray, tuple[str, ...]]:
+    """Joint values (n,) of the last pose taken that the robot reaches."""
+    flange = given.pairs.base_from_flange
+    found = inverse(robot, flange, _middle(robot))
+    beyond = [name for name, usable in zip(given.pairs.names, found.usable, strict=True) if not usable]
+    what = f"robot {robot.name}: reaches {len(flange) - len(beyond)} of the {len(flange)} poses taken"
+    if len(beyond) > (1 - LEAST_REACHED) * len(flange):
+        raise InputError(
+            f"{what}, first not {beyond[0]}; give the robot's own file, in whose base and flange (no tool) the "
+            "poses are"
+        )
+    notes = (f"{what}, not {', '.join(beyond)}: do its lengths and limits hold for this arm?",) if beyond else ()
+    return found.q[np.flatnonzero(found.usable)[-1]], notes
+
+
+def _middle(robot: Robot) -> np.ndarray:
+    """(n,) of the limits, 0 where there are none."""
+    middle = robot.limits().mean(1)
+    return np.where(np.isfinite(middle), middle, 0.0)
+
+
+def _reach(robot: Robot, near: np.ndarray) -> Callable[[Poses], np.ndarray]:
+    def reachable(flange: Poses) -> np.ndarray:
+        """Whether within the limits, and not where joints are not determined."""
+        return np.array([status == REACHED for status in inverse(robot, flange, near).status])
+
+    return reachable
+
+
+def _joints(robot: Robot, flange: Poses, near: np.ndarray) -> dict[str, np.ndarray]:
+    q = inverse(robot, flange, near).q
+    return dict(zip(joint_columns(robot), np.where(robot.prismatic, q, np.degrees(q)).T, strict=True))
