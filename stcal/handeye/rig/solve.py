@@ -115,6 +115,21 @@ def handeye_rig(given: RigPoses, setup: Setup = "eye-in-hand", options: RigOptio
     return _rig(given, setup, options, solution, {i: first.notes for i, first in known.items()})
 
 
+def same_numbering(given: RigPoses, setup: Setup, symmetries: tuple[Rigid, ...]) -> RigPoses:
+    """With views of a symmetric board that were numbered from another end put right, as :func:`handeye_rig` does.
+
+    Raises
+    ------
+    StcalError
+        As there.
+    """
+    if not symmetries:
+        return given
+    options = RigOptions(symmetries=symmetries)
+    firsts = [_first(given, i, setup, options) for i in range(len(given.cameras))]
+    return _same_numbering(given, firsts, symmetries)[0]
+
+
 def alone(given: RigPoses, i: int, setup: Setup, options: RigOptions) -> HandEye:
     """One camera of a rig by itself, as :func:`~stcal.handeye.handeye` finds it by method ``reprojection``.
 
@@ -147,7 +162,8 @@ def of_places(names: tuple[str, ...], found: list[HandEye | None]) -> tuple[str,
         where = f"{np.linalg.norm(off[3:]):.2g} mm and {np.degrees(np.linalg.norm(off[:3])):.2g}°"
         said = f"{who} and {whom} find the board {where} apart" if many or len(names) < 3 else ""
         said = said or f"{who} finds the board {where} from where {whom} do{'es' * (len(against) == 1)}"
-        notes.append(Grave(f"{said}, more than σ allow: check images, intrinsics and board of {who}"))
+        whose = "both" if not many and len(names) < 3 else who
+        notes.append(Grave(f"{said}, more than σ allow: check images, intrinsics and board of {whose}"))
     return tuple(notes)
 
 
@@ -225,11 +241,12 @@ def _require_one_board(given: RigPoses, known: dict[int, _First]) -> None:
         return
     (odd, *_), others, off = named[0]
     name, whom = given.cameras[odd].name, ", ".join(given.cameras[k].name for k in others)
-    pair = f"{name} and {whom} see it" if len(known) < 3 else f"{name} sees it other than {whom}"
+    away = f"{np.linalg.norm(off[3:]):.3g} mm and {np.degrees(np.linalg.norm(off[:3])):.3g}°"
+    pair = f"{name} and {whom} see it {away} apart" if len(known) < 3 else f"{name} sees it {away} from {whom}"
+    one = "both" if len(known) < 3 else name
     raise DegenerateError(
-        f"{given.where}: one board in one place needed, but {pair}: {np.linalg.norm(off[3:]):.3g} mm and "
-        f"{np.degrees(np.linalg.norm(off[:3])):.3g}° apart; check images, intrinsics, board and poses of {name}, or "
-        "leave it out"
+        f"{given.where}: one board in one place needed, but {pair}; check images, intrinsics, board and poses of "
+        f"{one}, or leave one camera out"
     )
 
 
