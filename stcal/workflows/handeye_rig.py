@@ -39,26 +39,26 @@ def calibrate_rig(
         out = [(each.name, *one) for each, own in zip(given.files.cameras, given.left_out, strict=True) for one in own]
         if not out:
             raise
-        raise type(error)(f"{error}; {len(out)} left out before, first {out[0][0]}: {out[0][1]}: {out[0][2]}") from error
+        raise type(error)(
+            f"{error}; {len(out)} left out before, first {out[0][0]}: {out[0][1]}: {out[0][2]}"
+        ) from error
     poses, options = same_numbering(poses, setup, given.symmetries), replace(options, symmetries=())
-    notes, held_out = given.notes, None
+    notes, held_out, factor = given.notes, None, 1.0
     if validation.repeats and (validation.held_out or len(poses) > LEAST_LEFT):
         rows = splits(len(poses), validation.held_out, validation.repeats, validation.seed)
         done = partial(progress, "held out")
         try:
             held_out = cross_validate_rig(poses, setup, options, rows, validation.workers, done)
-            rig = widened_by_scatter(rig, held_out)
+            rig, factor = widened_by_scatter(rig, held_out)
         except DegenerateError as error:
             notes += (f"no errors on poses held out: {error}",)
     by_itself = tuple(alone_or_none(poses, i, setup, options) for i in range(len(poses.cameras)))
     notes += of_places(rig.names, list(by_itself))
     cameras = tuple(_part(given, poses, rig, held_out, refine, i) for i in range(len(poses.cameras)))
-    return RigOutcome(given.files.file.name, rig, cameras, by_itself, held_out, notes, given.understood)
+    return RigOutcome(given.files.file.name, rig, cameras, by_itself, held_out, notes, given.understood, factor)
 
 
-def _part(
-    given: RigInput, poses: RigPoses, rig: Rig, held_out: RigHeldOut | None, refine: bool, i: int
-) -> Outcome:
+def _part(given: RigInput, poses: RigPoses, rig: Rig, held_out: RigHeldOut | None, refine: bool, i: int) -> Outcome:
     camera, result = poses.cameras[i], rig.cameras[i]
     own = all(view.covariance is not None for view in camera.views.views)
     errors = None if held_out is None else held_out.cameras[i].poses()
@@ -75,4 +75,3 @@ def _part(
         views=camera.views,
         folder=given.files.cameras[i].images,
     )
-

@@ -106,7 +106,7 @@ def _shared(cameras: list[tuple[RobotPoses, Photographed]]) -> tuple[Poses, tupl
     has one pose twice says that poses are commanded ones: then a row of a file is a pose.
     """
     keys = []
-    for robot, seen in cameras:
+    for _, seen in cameras:
         taken = seen.base_from_flange[seen.rows]
         both = zip(taken.rotation, taken.translation, strict=True)
         keys.append([turn.tobytes() + place.tobytes() for turn, place in both])

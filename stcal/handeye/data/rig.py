@@ -89,7 +89,7 @@ class RigPoses:
         if not called or len(set(called)) < len(called):
             raise InputError(f"{self.where}: cameras {', '.join(called) or '–'}; one or more, each of its own name")
         for camera in self.cameras:
-            if len(camera) and not (0 <= camera.rows.min() and camera.rows.max() < m):
+            if len(camera) and not (camera.rows.min() >= 0 and camera.rows.max() < m):
                 raise InputError(f"{self.where}: camera {camera.name}: a row that none of {m} poses has; correct it")
 
     def __len__(self) -> int:

@@ -270,8 +270,29 @@ class Problem(Protocol):
         """Of each group."""
         ...
 
+    @property
+    def base_from_flange(self) -> Poses:
+        """As reported."""
+        ...
+
     def with_sigma(self, sigma: dict[str, float]) -> Any:
         """With other σ."""
+        ...
+
+    def with_board_scale(self) -> Any:
+        """With the board's scale among the unknowns."""
+        ...
+
+    def places(self) -> dict[str, slice]:
+        """Where the unknowns stand in a step."""
+        ...
+
+    def factors(self) -> dict[str, float]:
+        """1 for each kind of the intrinsics solved for."""
+        ...
+
+    def robot_weight(self) -> np.ndarray:
+        """(m, 6, 6) whitening of errors of base_from_flange."""
         ...
 
     def count(self) -> int:

@@ -5,6 +5,7 @@ Methods for Discrete Sequential Estimation", 1977, ch. VIII): what is known of t
 """
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
@@ -12,9 +13,8 @@ from stcal.geometry.normal_equations import generalised_inverse
 from stcal.geometry.rigid import Poses
 from stcal.handeye.data.loop import Loop
 from stcal.handeye.data.views import Views, whitened
-from stcal.handeye.methods.bundle import Bundle, Corners, camera_parts, estimated
+from stcal.handeye.methods.bundle import Bundle, Corners, Problem, camera_parts, estimated
 from stcal.handeye.methods.pose_adjustment import LoopState, PoseSolution
-from stcal.handeye.methods.rig_bundle import RigBundle, RigCorners
 from stcal.io.camera import CameraPrior, intrinsic_basis
 
 ROUNDS = 50
@@ -45,7 +45,7 @@ def of_corners(corners: Corners, state: Bundle, prior: CameraPrior, free: tuple[
     return considered(corners.with_intrinsics(intrinsic_basis(prior.colmap_model), known), state, free)
 
 
-def considered(wider: Corners | RigCorners, state: Bundle | RigBundle, free: tuple[str, ...]) -> CameraError:
+def considered(wider: Problem, state: Any, free: tuple[str, ...]) -> CameraError:
     """Of intrinsics that were not solved for, but are among the unknowns of ``wider``.
 
     Corners that are off by the camera's error make all ``free`` σ too large: they are estimated anew with the

@@ -2,6 +2,7 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 from scipy.spatial import KDTree
@@ -14,11 +15,10 @@ from stcal.geometry.normal_equations import generalised_inverse
 from stcal.geometry.rigid import Poses, Rigid
 from stcal.handeye.data.loop import Loop
 from stcal.handeye.data.views import View, Views, resect
-from stcal.handeye.methods.bundle import LEAST, Bundle, Corners, adjust
+from stcal.handeye.methods.bundle import LEAST, Bundle, Corners, Problem, adjust
 from stcal.handeye.methods.camera_error import CameraError, of_corners
 from stcal.handeye.methods.noise import Noise
 from stcal.handeye.methods.pose_adjustment import FALSE_ALARM, LEAST_POSES
-from stcal.handeye.methods.rig_bundle import RigBundle, RigCorners
 from stcal.io.camera import CameraPrior, intrinsic_basis
 
 GROSS_RAD, GROSS_SHARE = np.radians(10), 0.2
@@ -240,7 +240,7 @@ def board_of(every: Sequence[Views]) -> np.ndarray:
     return np.unique(np.round(np.concatenate(seen), SAME_DIGITS), axis=0)
 
 
-def contradicting(corners: Corners | RigCorners, state: Bundle | RigBundle, inverse: np.ndarray) -> np.ndarray:
+def contradicting(corners: Problem, state: Any, inverse: np.ndarray) -> np.ndarray:
     """Poses (m,) of which the robot's error is not by chance: its estimate against the variance that it should have."""
     m = len(corners.base_from_flange)
     at = corners.places()["robot"]
@@ -258,7 +258,7 @@ def contradicting(corners: Corners | RigCorners, state: Bundle | RigBundle, inve
     return squared > 6 * f.ppf(1 - FALSE_ALARM / m, 6, redundancy)
 
 
-def scale_hint(corners: Corners | RigCorners, state: Bundle | RigBundle) -> tuple[float, float]:
+def scale_hint(corners: Problem, state: Any) -> tuple[float, float]:
     """One step from the solution with the scale among the unknowns."""
     wider = corners.with_board_scale()
     linear, at = wider.linear(state), wider.places()["scale"].start
@@ -272,7 +272,7 @@ def _camera_gain(corners: Corners, state: Bundle) -> float:
     return camera_gain(corners.with_intrinsics(*UNKNOWN_LENS), state)
 
 
-def camera_gain(wider: Corners | RigCorners, state: Bundle | RigBundle) -> float:
+def camera_gain(wider: Problem, state: Any) -> float:
     """By how much the cost would fall, per parameter of one camera, with intrinsics among the unknowns as of
     :data:`UNKNOWN_LENS`: predicted by one step from the solution; about 1 where the camera is right."""
     linear = wider.linear(state)

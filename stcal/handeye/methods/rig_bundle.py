@@ -113,10 +113,9 @@ class RigCorners:
         """Everything that is known: what each camera saw, and what was known before."""
         count, found = self.count(), []
         for i, (name, own) in enumerate(zip(self.names, self.each, strict=True)):
-            bundle, columns = state.of(i), self.columns(i)
-            groups = own.own_groups(bundle) + (own.shared_groups(bundle) if i == 0 else [])
-            found += [_among(group, columns, count, name) for group in groups]
-        return found
+            found += [_among(group, self.columns(i), count, name) for group in own.own_groups(state.of(i))]
+        shared = self.each[0].shared_groups(state.of(0))
+        return found + [_among(group, self.columns(0), count, "") for group in shared]
 
     def linear(self, state: RigBundle) -> NormalEquations:
         """Cost and normal equations; infinite cost where a corner lies behind its camera."""
@@ -133,5 +132,5 @@ def _renamed(key: str, name: str) -> str:
 def _among(group: Knowledge, columns: np.ndarray, count: int, name: str) -> Knowledge:
     """One camera's group by all unknowns."""
     own = group.jacobian
-    jacobian = csr_matrix((own.data, columns[own.indices], own.indptr), shape=(own.shape[0], count))
+    jacobian = csr_matrix((own.data, columns[own.indices], own.indptr), shape=(len(own.indptr) - 1, count))
     return replace(group, names=tuple(_renamed(key, name) for key in group.names), jacobian=jacobian)

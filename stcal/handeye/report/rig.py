@@ -20,6 +20,7 @@ from stcal.handeye.report.page import (
     verdict_parts,
 )
 from stcal.handeye.report.rig_outcome import RigOutcome, asides, rig_judged
+from stcal.handeye.result import HandEye
 from stcal.report.page import render
 from stcal.report.text import NONE, number, text_table
 
@@ -32,12 +33,18 @@ def rig_text(outcome: RigOutcome) -> str:
         rows = transform_rows(camera.mount_from_camera, camera.covariance)
         lines += ["", *text_table([[f"<{frames.mount}_from_{name}", *HEADS[1:]], *rows])]
     for first, second in combinations(rig.names, 2):
-        lines += ["", *text_table([[f"<{first}_from_{second}", *HEADS[1:]], *transform_rows(*rig.relative(first, second))])]
+        lines += [
+            "",
+            *text_table([[f"<{first}_from_{second}", *HEADS[1:]], *transform_rows(*rig.relative(first, second))]),
+        ]
     rows = transform_rows(rig.stand_from_board, rig.cameras[0].stand_covariance)
     lines += ["", *text_table([["<" + frames.board, *HEADS[1:]], *rows])]
     lines += ["", *text_table(_camera_cells(outcome))]
     if outcome.held_out is not None:
-        lines += ["", f"Poses of the robot held out ({_splits_text(outcome)}), 3-D at the board, all cameras or each alone"]
+        lines += [
+            "",
+            f"Poses of the robot held out ({_splits_text(outcome)}), 3-D at the board, all cameras or each alone",
+        ]
         lines += text_table(_held_out_cells(outcome))
     lines += ["", *(f"σ of {text}: {value} ({how})" for text, value, how in _shared_sigmas(outcome))]
     one = rig.cameras[0]
@@ -64,25 +71,39 @@ def _splits_text(outcome: RigOutcome) -> str:
 
 
 def _camera_cells(outcome: RigOutcome) -> list[list[str]]:
-    """Heads, and a row for each camera: images, σ of its corners, residuals, and its σ by itself and with the others."""
-    rows = [["<camera", "images", "corner σ", "<", "residual °", "residual mm", "σ place mm", "alone mm", "σ turn °", "alone °"]]
+    """Heads, and a row for each camera: images, σ of its corners, residuals, its σ with the others and by itself."""
+    rows = [
+        [
+            "<camera",
+            "images",
+            "corner σ",
+            "<",
+            "residual °",
+            "residual mm",
+            "σ place mm",
+            "alone mm",
+            "σ turn °",
+            "alone °",
+        ]
+    ]
     for name, camera, own, alone in zip(
         outcome.rig.names, outcome.rig.cameras, outcome.cameras, outcome.alone, strict=True
     ):
         turn, shift = camera.rms()
         unit = "× its own" if own.own_sigmas else "px"
-        joint, single = (_worst(each and each.covariance) for each in (camera, alone))
+        joint, single = _worst(camera, outcome.widened), _worst(alone)
         cells = [str(int((~camera.outliers).sum())), number(camera.sigma["corner_px"], 3), unit]
         cells += [number(np.degrees(turn), 4), number(shift, 3)]
         rows.append([name, *cells, joint[1], single[1], joint[0], single[0]])
     return rows
 
 
-def _worst(covariance: np.ndarray | None) -> tuple[str, str]:
-    """σ of rotation (°) and place (mm) in their worst directions."""
-    if covariance is None:
+def _worst(result: HandEye | None, widened: float = 1.0) -> tuple[str, str]:
+    """σ of rotation (°) and place (mm) in their worst directions, as the adjustment has them."""
+    if result is None or result.covariance is None:
         return NONE, NONE
-    turn, place = (float(np.sqrt(np.linalg.eigvalsh(part)[-1])) for part in (covariance[:3, :3], covariance[3:, 3:]))
+    parts = result.covariance[:3, :3], result.covariance[3:, 3:]
+    turn, place = (float(np.sqrt(np.linalg.eigvalsh(part)[-1])) / widened for part in parts)
     return number(np.degrees(turn), 4), number(place, 3)
 
 
@@ -92,12 +113,16 @@ def _held_out_cells(outcome: RigOutcome) -> list[list[str]]:
         return rows
     for name, held in zip(outcome.rig.names, outcome.held_out.cameras, strict=True):
         joint, alone, gain = held.means(), held.means("alone"), held.gain()
-        said = "cannot be found alone" if gain is None else f"{gain:+.0%}"
+        said = "cannot be found alone" if gain is None else _percent(gain)
         each = [(joint, "board_mm", 1.0, 3), (alone, "board_mm", 1.0, 3)]
         each += [(joint, "rotation_rad", np.degrees(1.0), 4), (alone, "rotation_rad", np.degrees(1.0), 4)]
         cells = [number(means.get(key, np.nan) * unit, digits) for means, key, unit, digits in each]
         rows.append([name, str(len(held.view)), *cells[:2], said, *cells[2:]])
     return rows
+
+
+def _percent(share: float) -> str:
+    return f"{round(100 * share)} %"
 
 
 def _shared_sigmas(outcome: RigOutcome) -> list[list[str]]:

@@ -2,6 +2,7 @@
 
 from dataclasses import dataclass
 
+from stcal.handeye.data.loop import FRAMES
 from stcal.handeye.judge.notes import Aside
 from stcal.handeye.report.outcome import Outcome
 from stcal.handeye.report.verdict import Finding, Verdict, judged, of_notes
@@ -31,6 +32,8 @@ class RigOutcome:
         Besides those of the rig.
     understood : tuple of str
         What files were taken for.
+    widened : float
+        By which σ of the transforms were multiplied, for solutions of parts of the poses scatter more than they say.
     """
 
     where: str
@@ -40,6 +43,7 @@ class RigOutcome:
     held_out: RigHeldOut | None = None
     notes: tuple[str, ...] = ()
     understood: tuple[str, ...] = ()
+    widened: float = 1.0
 
     def all_notes(self) -> tuple[str, ...]:
         """Of the rig and its cameras, then the others."""
@@ -57,14 +61,15 @@ def rig_judged(outcome: RigOutcome) -> Verdict:
     for name, camera in zip(outcome.rig.names, outcome.cameras, strict=True):
         for each in judged(camera).findings:
             if each.title != MOTIONS:
-                found.append(_of(name, each))
+                found.append(_of(name, each, FRAMES[outcome.rig.setup].mount))
             elif all(own.title != MOTIONS for own in found):
                 found.insert(0, each)
     return Verdict((*found, *of_notes((*outcome.rig.notes, *outcome.notes))))
 
 
-def _of(name: str, each: Finding) -> Finding:
-    return Finding(f"{name}: {each.title}", each.word, f"{name}: {each.said}", each.value, each.limit, each.remedy)
+def _of(name: str, each: Finding, mount: str) -> Finding:
+    said = each.said.replace(f"{mount}_from_camera", f"{mount}_from_{name}")
+    return Finding(f"{name}: {each.title}", each.word, f"{name}: {said}", each.value, each.limit, each.remedy)
 
 
 def asides(outcome: RigOutcome) -> list[str]:

@@ -199,9 +199,7 @@ def _first(given: RigPoses, i: int, setup: Setup, options: RigOptions) -> "_Firs
     return _First(x, z, scale, views, notes)
 
 
-def _same_numbering(
-    given: RigPoses, firsts: list, symmetries: tuple[Rigid, ...]
-) -> tuple[RigPoses, dict[int, _First]]:
+def _same_numbering(given: RigPoses, firsts: list, symmetries: tuple[Rigid, ...]) -> tuple[RigPoses, dict[int, _First]]:
     """Corners of a symmetric board numbered alike by all cameras, as the first one that stands for itself does."""
     known, cameras = {}, list(given.cameras)
     for i, first in enumerate(firsts):
@@ -226,9 +224,7 @@ def _same_numbering(
 
 def _require_one_board(given: RigPoses, known: dict[int, _First]) -> None:
     """Refuse cameras that see boards at different places, far beyond what noise makes."""
-    reach = {
-        i: float(np.median(np.linalg.norm(given.pairs(i).camera_from_board.translation, axis=1))) for i in known
-    }
+    reach = {i: float(np.median(np.linalg.norm(given.pairs(i).camera_from_board.translation, axis=1))) for i in known}
     apart = {}
     for i, one in known.items():
         for j, other in known.items():
@@ -264,7 +260,9 @@ def _rig(
     loops = [Loop.of(given.pairs(i), setup) for i in range(c)]
     rows = np.unique(np.concatenate([camera.rows for camera in given.cameras]))
     flange = given.base_from_flange[rows[~solution.outliers[rows]]]
-    seen = Observability.of(Loop(flange.inverse() if setup == "eye-to-hand" else flange, flange, setup == "eye-to-hand"))
+    seen = Observability.of(
+        Loop(flange.inverse() if setup == "eye-to-hand" else flange, flange, setup == "eye-to-hand")
+    )
     most = int(np.argmax([used.sum() for used in solution.used]))
     largest = loops[most][solution.used[most]]
     if solution.sigma_scale is not None:

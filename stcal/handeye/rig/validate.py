@@ -1,6 +1,7 @@
 """How good a rig's calibration is on poses of the robot that it has not seen, beside each camera by itself."""
 
 from collections.abc import Callable
+from contextlib import suppress
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -144,10 +145,8 @@ def _errors_without(
         if len(held):
             pairs, views = given.pairs(i)[held], camera.views[held]
             own["joint"] = predicted(rig.cameras[i], pairs, views)
-            try:
+            with suppress(StcalError):  # too few of its images may be left: it is then known by the others alone
                 own["alone"] = predicted(alone(kept, i, setup, options), pairs, views)
-            except StcalError:  # too few of its images are left: it is then known by the others alone
-                pass
         found.append(own)
     return found, np.array([each.mount_from_camera.matrix() for each in rig.cameras])
 
@@ -168,15 +167,15 @@ def rig_scatter(rig: Rig, held_out: RigHeldOut) -> float:
     return float(np.sqrt(squared.mean() / size * left / (POSE * images * k / len(rig.poses))))
 
 
-def widened_by_scatter(rig: Rig, held_out: RigHeldOut) -> Rig:
-    """With σ that reach the :func:`rig_scatter`; a note where that is much."""
+def widened_by_scatter(rig: Rig, held_out: RigHeldOut) -> tuple[Rig, float]:
+    """With σ that reach the :func:`rig_scatter`, and by what they were multiplied; a note where that is much."""
     factor = rig_scatter(rig, held_out)
     if not factor > 1:
-        return rig
+        return rig, 1.0
     notes = rig.notes
     if factor > SCATTERED:
         notes += (
             f"solutions of parts of the poses scatter {factor:.2g} times as much as σ say, so that poses do not err "
             "independently and alike: σ of all transforms are widened by that",
         )
-    return replace(rig.widened(factor), notes=notes)
+    return replace(rig.widened(factor), notes=notes), factor
