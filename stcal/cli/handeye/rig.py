@@ -5,7 +5,7 @@ from typing import Annotated
 
 import typer
 
-from stcal.cli.handeye.inputs import LengthUnit, PosesAre, RotationOption
+from stcal.cli.handeye.inputs import LengthUnit, PosesAre, RotationOption, TimeTolerance
 from stcal.cli.options import MOST_SEED, JsonFile, QuaternionOrder, Quaternions, ReportFile, Workers
 from stcal.cli.terminal import StageProgress, print_each, say, write
 from stcal.io.saving import keep_apart
@@ -30,6 +30,7 @@ def rig(
     length_unit: LengthUnit = None,
     poses_are: PosesAre = None,
     quaternions: Quaternions = QuaternionOrder.wxyz,
+    time_tolerance: TimeTolerance = 0.02,
     held_out: Annotated[
         int | None,
         typer.Option(
@@ -64,7 +65,7 @@ def rig(
     keep_apart([(name, path) for name, path in written.items() if path], files.read())
     said = Said.of_options(rotation or [], length_unit or [], poses_are or [], None)
     with StageProgress() as progress:
-        given = read_rig(files, workers, progress, quaternions.value, said)
+        given = read_rig(files, workers, progress, quaternions.value, said, time_tolerance)
         print_each("understood", given.understood)
         validation = Splits(splits, held_out, seed, workers)
         outcome = calibrate_rig(given, refine_camera, with_scale, validation, progress)

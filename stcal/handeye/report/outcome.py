@@ -8,6 +8,7 @@ from stcal.handeye.data.pairs import HandEyePoses
 from stcal.handeye.data.views import Views
 from stcal.handeye.predict import HeldOutMotions
 from stcal.handeye.result import HandEye
+from stcal.handeye.time_offset import TimeOffset
 from stcal.handeye.validate import Compared, HeldOutPoses
 
 
@@ -48,6 +49,8 @@ class Outcome:
         What files of other programs were taken for.
     unit_mm : float, optional
         Of a model without a unit: mm by which the camera's lengths were multiplied before.
+    time_offset : TimeOffset, optional
+        Of the robot's clock from the camera's, where it was solved for; σ of the result hold its own.
     """
 
     where: str
@@ -66,6 +69,7 @@ class Outcome:
     folder: Path | None = None
     understood: tuple[str, ...] = ()
     unit_mm: float | None = None
+    time_offset: TimeOffset | None = None
 
     def all_notes(self) -> tuple[str, ...]:
         """Of the result, then the others."""
