@@ -21,6 +21,7 @@ from stcal.handeye.validate import (
     splits,
 )
 from stcal.parallel import Progress
+from stcal.workflows.handeye_arm import with_arm
 from stcal.workflows.handeye_input import HandEyeInput
 
 ALL, AUTO = "all", "auto"
@@ -113,7 +114,7 @@ def _outcome(
     if options.symmetries:
         mended = repair(pairs, setup, options.symmetries, views)
         pairs, views = mended.pairs, mended.views
-    return Outcome(
+    outcome = Outcome(
         given.where,
         result,
         held_out,
@@ -131,3 +132,7 @@ def _outcome(
         views=views,
         folder=given.folder,
     )
+    if given.arm is None:
+        return outcome
+    done = partial(progress, "with the arm")
+    return with_arm(outcome, given.arm, options, given.prior, rows, validation.workers, done)

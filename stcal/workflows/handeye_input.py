@@ -19,7 +19,9 @@ from stcal.io.images import ImageFile, find_images
 from stcal.io.quaternions import Order
 from stcal.io.table import Table
 from stcal.parallel import Progress, one_thread
+from stcal.robot import Robot
 from stcal.workflows.board_views import detect_boards
+from stcal.workflows.handeye_arm import Arm, read_arm
 
 NOTHING_SAID = Said()
 Source = Path | Table | Told
@@ -32,7 +34,8 @@ class HandEyeInput:
     ``where`` : its files; ``views`` : of the board, where images were given, with its ``symmetries`` and the camera's
     ``prior``; ``pitch_mm`` of the board's file; ``left_out`` : (image or row, why); ``understood`` : a line for each
     file that is not a table of the package; ``setup`` : as a file says it; ``unit_mm`` : of a model without a unit,
-    about, by which ``pairs`` are multiplied already; ``folder`` : of the images.
+    about, by which ``pairs`` are multiplied already; ``folder`` : of the images; ``arm`` : at the joint values of the
+    ``pairs``, where its parameters are to be solved for.
     """
 
     where: str
@@ -46,6 +49,7 @@ class HandEyeInput:
     setup: Setup | None = None
     unit_mm: float | None = None
     folder: Path | None = None
+    arm: Arm | None = None
 
 
 def two_files(first: Path, second: Path, key: str, said: Said, quaternions: Order = "wxyz") -> Told | None:
@@ -72,12 +76,14 @@ def read_input(
     progress: Progress = lambda *_: None,
     quaternions: Order = "wxyz",
     said: Said = NOTHING_SAID,
+    robot: Robot | None = None,
 ) -> HandEyeInput:
     """Pose pairs from their file or files; or from a folder of images with the files ``poses``, ``camera`` and
     ``board``.
 
     ``quaternions`` : ``xyzw`` where their columns hold x, y, z, w in the order in which they stand; ``said`` : what
-    files do not say themselves.
+    files do not say themselves; ``robot`` : at whose joint values, in ``poses``, the images were taken, if its
+    parameters are to be solved for.
 
     Raises
     ------
@@ -86,8 +92,13 @@ def read_input(
     """
     if isinstance(source, Path) and source.is_dir():
         poses, camera, board = _all_three(source, poses, camera, board)
-        robot = read_robot_poses(poses, quaternions, said)
-        return _from_images(source, robot, poses, camera, board, workers, progress)
+        if robot is None:
+            found = read_robot_poses(poses, quaternions, said)
+            return _from_images(source, found, poses, camera, board, workers, progress)
+        found, arm = read_arm(poses, robot, quaternions)
+        return _from_images(source, found, poses, camera, board, workers, progress, arm)
+    if robot is not None:
+        raise InputError("--with-kinematics: only with a folder of images, in which the arm is seen to err")
     _require_no_images(source, poses, camera, board)
     if isinstance(source, Table):
         return HandEyeInput(source.where, read_poses(source, quaternions))
@@ -168,7 +179,14 @@ def _about_mm(pairs: HandEyePoses, setup: Setup) -> tuple[HandEyePoses, float]:
 
 
 def _from_images(
-    source: Path, robot: RobotPoses, poses: Path, camera: Path, board: Path, workers: int | None, progress: Progress
+    source: Path,
+    robot: RobotPoses,
+    poses: Path,
+    camera: Path,
+    board: Path,
+    workers: int | None,
+    progress: Progress,
+    arm: Arm | None = None,
 ) -> HandEyeInput:
     """Corners of the board in all images that have a pose."""
     design, model = load_flat_board(board), read_camera(camera)
@@ -191,7 +209,10 @@ def _from_images(
     prior = camera_prior(refinable(model.calibrated(found.camera.width, found.camera.height)))
     where = f"{source.name}, {poses.name}"
     understood = _robot_lines(robot, how) if not robot.own else ()
-    return HandEyeInput(where, pairs, seen, found.symmetries, prior, pitch, tuple(left_out), understood, folder=source)
+    left = tuple(left_out)
+    return HandEyeInput(
+        where, pairs, seen, found.symmetries, prior, pitch, left, understood, folder=source, arm=arm and arm[at]
+    )
 
 
 def _rows_of_images(
@@ -224,6 +245,7 @@ def dry_run(
     board: Path | None = None,
     quaternions: Order = "wxyz",
     said: Said = NOTHING_SAID,
+    robot: Robot | None = None,
 ) -> list[str]:
     """What is understood of the inputs, line by line, without looking for the board in images.
 
@@ -233,7 +255,7 @@ def dry_run(
         As :func:`read_input`.
     """
     if isinstance(source, Path) and source.is_dir():
-        return _dry_images(source, *_all_three(source, poses, camera, board), quaternions, said)
+        return _dry_images(source, *_all_three(source, poses, camera, board), quaternions, said, robot)
     given = read_input(source, poses, camera, board, quaternions=quaternions, said=said)
     lines = list(given.understood) if isinstance(source, Told) or given.understood else own_told(source, quaternions)
     setup = setup_of(said, given.setup, given.where)
@@ -245,8 +267,10 @@ def dry_run(
     return lines + [f"left out {name}: {reason}" for name, reason in given.left_out]
 
 
-def _dry_images(source: Path, poses: Path, camera: Path, board: Path, quaternions: Order, said: Said) -> list[str]:
-    robot = read_robot_poses(poses, quaternions, said)
+def _dry_images(
+    source: Path, poses: Path, camera: Path, board: Path, quaternions: Order, said: Said, arm: Robot | None
+) -> list[str]:
+    robot = read_robot_poses(poses, quaternions, said) if arm is None else read_arm(poses, arm, quaternions)[0]
     design, model = load_flat_board(board), read_camera(camera)
     files, skipped = find_images(source)
     rows, missing, how = _rows_of_images(robot, files, source)

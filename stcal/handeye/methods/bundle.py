@@ -1,6 +1,6 @@
 """The adjustment of corners behind the reprojection method: unknowns, residuals, normal equations, σ of each group."""
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from scipy.sparse import csr_matrix
@@ -12,11 +12,19 @@ from stcal.geometry.rigid import Poses, Rigid, skew
 from stcal.geometry.robust import huber_cost, huber_weights, length_limit
 from stcal.geometry.variances import Parts
 from stcal.handeye.data.views import project_jacobian
+from stcal.handeye.methods.arm import LinearArm
 from stcal.handeye.methods.noise import CAUTION
 
 CORNER, POSE = length_limit(2, 0.001), length_limit(6, 0.001)
 """Huber's limits: one good corner, and one good pose, in a thousand weighs less than one."""
-LEAST = {"corner_px": 1e-6, "robot_rad": 1e-8, "robot_mm": 1e-5, "board_mm": 1e-5}
+LEAST = {
+    "corner_px": 1e-6,
+    "robot_rad": 1e-8,
+    "robot_mm": 1e-5,
+    "board_mm": 1e-5,
+    "arm_rad": 1e-8,
+    "arm_mm": 1e-5,
+}
 """Estimated σ stay above: exact data have none. Factors of what is stated of a camera stay above 1."""
 ROUNDS = 20
 ROUGHLY = 1e-6
@@ -32,7 +40,8 @@ FARTHEST = 7.0
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Bundle:
-    """The unknowns: X, Z, base_from_flange as it really was (m), the board's corners (K, 3), camera and scale."""
+    """The unknowns: X, Z, base_from_flange as it really was (m), the board's corners (K, 3), camera, scale, and a step
+    of the arm's parameters (k,)."""
 
     mount_from_camera: Rigid
     stand_from_board: Rigid
@@ -40,6 +49,7 @@ class Bundle:
     corners: np.ndarray
     camera: Camera
     scale: float = 1.0
+    arm: np.ndarray = field(default_factory=lambda: np.zeros(0))
 
     def camera_from_board(self, inverted: bool) -> Poses:
         """By the robot's poses, of the scaled board."""
@@ -55,7 +65,7 @@ class Corners:
     ``corner`` : (n,) of each measurement; ``xy_px`` : (n, 2); ``weight`` : (n, 2, 2) whitening at σ 1; ``robot`` :
     (m, 6, 6) whitening in place of σ, or None; ``sigma`` : of each group, 0 where exact; ``basis`` : (12, q) of the
     intrinsics solved for, ``information`` : (q, q) about ``camera``, over the square of factors;
-    ``with_scale``.
+    ``with_scale``; ``arm`` : whose parameters are solved for, by which ``base_from_flange`` was computed, or None.
     """
 
     inverted: bool
@@ -71,10 +81,12 @@ class Corners:
     basis: np.ndarray
     information: np.ndarray
     with_scale: bool
+    arm: LinearArm | None = None
 
     def places(self) -> dict[str, slice]:
         """Where the unknowns stand in a step; empty for what is not solved for."""
         sizes = {"x": 6, "z": 6, "camera": self.basis.shape[1], "scale": int(self.with_scale)}
+        sizes["arm"] = 0 if self.arm is None else len(self.arm.parameters)
         sizes["board"] = self.xyz_board.size if self.sigma["board_mm"] else 0
         exact = self.robot is None and not self.sigma["robot_mm"]
         sizes["robot"] = 0 if exact else 6 * len(self.base_from_flange)
@@ -84,6 +96,14 @@ class Corners:
     def camera_parts(self) -> list[tuple[str, np.ndarray]]:
         """As :func:`camera_parts`, of the intrinsics solved for."""
         return camera_parts(self.basis, self.information)
+
+    def no_step(self) -> np.ndarray:
+        """(k,) zeros for the arm's parameters."""
+        return np.zeros(0 if self.arm is None else len(self.arm.parameters))
+
+    def by_arm(self, step: np.ndarray) -> Poses:
+        """base_from_flange after a step (k,) of the arm's parameters; as reported without an arm."""
+        return self.base_from_flange if self.arm is None else self.arm.moved(self.base_from_flange, step)
 
     def count(self) -> int:
         """Number of unknowns."""
@@ -105,11 +125,17 @@ class Corners:
         if len(part["robot"]):
             each = part["robot"].reshape(-1, 6)
             turn = Rotation.from_rotvec(each[:, :3]).as_matrix()
-            flange = Poses(turn @ flange.rotation, flange.translation + each[:, 3:])
+            if self.arm is not None:
+                before, after = self.by_arm(state.arm), self.by_arm(state.arm + part["arm"])
+                turn = turn @ flange.rotation @ np.swapaxes(before.rotation, 1, 2) @ after.rotation
+                flange = Poses(turn, flange.translation + after.translation - before.translation + each[:, 3:])
+            else:
+                flange = Poses(turn @ flange.rotation, flange.translation + each[:, 3:])
         if len(part["board"]):
             corners = corners + part["board"].reshape(-1, 3)
         x, z = perturbed(state.mount_from_camera, part["x"]), perturbed(state.stand_from_board, part["z"])
-        return Bundle(x, z, flange, corners, camera, state.scale + float(part["scale"].sum()))
+        scale = state.scale + float(part["scale"].sum())
+        return Bundle(x, z, flange, corners, camera, scale, state.arm + part["arm"])
 
     def seen(self, state: Bundle) -> tuple[np.ndarray, dict[str, np.ndarray]]:
         """White residuals of the corners (n, 2), and their derivatives (n, 2, ·) by each kind of unknown, of the own
@@ -140,6 +166,8 @@ class Corners:
             "board": state.scale * by_stand @ z.rotation,
             "robot": by_mount @ by_hand,
         }
+        if self.arm is not None:
+            by["arm"] = by["robot"] @ self.arm.slope_after(state.arm)[self.view]
         return np.einsum("nab,nb->na", self.weight, px - self.xy_px) / self.sigma["corner_px"], by
 
     def groups(self, state: Bundle) -> list["Knowledge"]:
@@ -164,10 +192,15 @@ class Corners:
             found.append(Knowledge(("board_mm",), off, jacobian, np.inf))
         if at["robot"].stop > at["robot"].start:
             weight = self.robot_weight()
-            off = np.einsum("mab,mb->ma", weight, state.base_from_flange.difference(self.base_from_flange))
+            off = np.einsum("mab,mb->ma", weight, state.base_from_flange.difference(self.by_arm(state.arm)))
             jacobian = _sparse({"robot": weight}, at, count, {"robot": np.arange(len(off))})
             names = ("robot_rad", "robot_mm") if self.robot is None else ()
             found.append(Knowledge(names, off, jacobian, POSE))
+        if self.arm is not None:
+            for name, rows in self.arm.parts().items():
+                root = np.eye(len(state.arm))[rows] / self.sigma[name]
+                off = (root @ (self.arm.parameters + state.arm))[None]
+                found.append(Knowledge((name,), off, _sparse({"arm": root[None]}, at, count, {}), np.inf))
         return found
 
     def linear(self, state: Bundle) -> NormalEquations:
