@@ -14,7 +14,7 @@ from stcal.handeye import HandEyeOptions, cross_validate, handeye, splits
 from stcal.handeye.data.loop import SETUPS
 from stcal.robot import forward, load_robot
 from stcal.robot.kinematics.file import save_robot
-from stcal.synthetic.measured.arm import arm_at
+from stcal.synthetic.measured.arms import arm_at
 from stcal.synthetic.measured.handeye import simulated_views
 from stcal.workflows.handeye_arm import Arm
 from tests.boards.drawn import chessboard_mm
