@@ -19,6 +19,7 @@ from stcal.robot.identify.adjustment import (
     solve,
     unseen,
 )
+from stcal.robot.identify.consensus import agreeing
 from stcal.robot.identify.nominal import Deviations, NominalRows
 from stcal.robot.identify.observability import ObservabilityIndices, parameter_scale
 from stcal.robot.identify.residuals import (
@@ -168,23 +169,26 @@ def _weighting(state: State, seen: Observed, options: IdentifyOptions) -> Weight
 def _adjusted(
     nominal: Robot, state: State, seen: Observed, options: IdentifyOptions, rows: NominalRows | None = None
 ) -> Adjustment:
-    """Solve, and estimate σ; once more without what are errors and no noise: Huber's weights bound their pull, but let
-    each pull as hard as the worst honest observation, which no covariance knows of."""
+    """Solve with the observations that agree, and estimate σ; once more without what are errors and no noise, and with
+    what is none: Huber's weights bound their pull, but let each pull as hard as the worst honest observation, which no
+    covariance knows of."""
     rows = rows or NominalRows.about(state, parameter_units(jacobian(state, seen)), nominal)
-    found, good = _settled(state, seen, options, rows), np.ones(len(seen), bool)
-    for _ in range(OUTLIER_ROUNDS):
+    good = np.ones(len(seen), bool)
+    if options.robust:
+        good = agreeing(state, seen, _weighting(state, seen, options))
+        good |= good.mean() < MOSTLY_GOOD
+    for _ in range(OUTLIER_ROUNDS + 1):
+        found = _settled(state, seen if good.all() else only_of(seen, good), options, rows)
+        if not good.all():
+            left = residuals(found.solution.state, seen)
+            length = np.linalg.norm(found.weighting.whiten(left, seen), axis=1)
+            weights = huber_weights(length, huber_limit(seen.kind))
+            found = replace(found, solution=replace(found.solution, residuals=left, weights=weights))
         if not _errors_change(found, good):
             return found
-        good = found.solution.weights >= GROSS
-        found = _settled(found.solution.state, only_of(seen, good), options, rows)
-        left = residuals(found.solution.state, seen)
-        length = np.linalg.norm(found.weighting.whiten(left, seen), axis=1)
-        weights = huber_weights(length, huber_limit(seen.kind))
-        found = replace(found, solution=replace(found.solution, residuals=left, weights=weights))
-    if _errors_change(found, good):
-        note = f"which observations are errors still changes after {OUTLIER_ROUNDS} rounds; look at the outliers"
-        found = replace(found, notes=(*found.notes, note))
-    return found
+        good, state = found.solution.weights >= GROSS, found.solution.state
+    note = f"which observations are errors still changes after {OUTLIER_ROUNDS} rounds; look at the outliers"
+    return replace(found, notes=(*found.notes, note))
 
 
 def _errors_change(found: Adjustment, good: np.ndarray) -> bool:
