@@ -18,7 +18,6 @@ NOT_YET = {
     "README.md: clean, cross-check with the native COLMAP:",  # scripts/studies/measure_shared.py
     "README.md: 51 positions model mean, mm std, mm max, mm mean",  # reproduce_robot.py
     "README.md: poses accepted ambiguous wrong branch off by > 5°",  # locate_study.py
-    "README.md: 3-D error at the board, mm reprojection pose shah",  # handeye_shared.py
     "README.md: method poses error / bound error / σ",  # handeye_study.py
     "README.md: first population median worst within 0.1 % within",  # reproduce_handeye.py
     "README.md: clean, corrected, joint adjustment: 24 of 24 imag",  # measure_shared.py

@@ -7,6 +7,7 @@ of the 16 held out, with the camera and the board as their files have them, and 
 dotgrid_handeye: 15 photographs of a dot board by a camera on a robot; the pitch of the dots from the robot's motion.
 """
 
+import argparse
 import sys
 import tempfile
 from dataclasses import replace
@@ -44,6 +45,7 @@ radius_mm = 10.0
 """
 # The two camera files of the data set differ by 8 and 14 px, and have no distortion.
 DOTS_CAMERA_SIGMA = (10.0, 10.0, 15.0, 15.0, 0.1, 0.1, 0.01, 0.01)
+SHOWN = ("reprojection", "pose", "shah", "park-martin", "tsai-lenz", "daniilidis", "zhao")
 SPLITS, DEFAULT = Splits(15, held_out=5), Splits()
 
 
@@ -103,6 +105,14 @@ def by_split(data: dict) -> np.ndarray:
     return np.array([np.mean(split["board_mm"]) for split in data["splits"]])
 
 
+def _side_by_side(rows: dict[str, dict]) -> None:
+    """Mean 3-D error at the board of the methods shown, by what they were given."""
+    print(f"\n| 3-D error at the board, mm | {' | '.join(SHOWN)} |\n|{'---|' * (len(SHOWN) + 1)}")
+    for name, found in rows.items():
+        of = {row["method"]: by_split(row).mean() for row in found["methods"]}
+        print(f"| {name} | {' | '.join(f'{of[each]:.3f}' for each in SHOWN)} |")
+
+
 def _compare(found: dict) -> None:
     park, ours = by_split(next(row for row in found["methods"] if row["method"] == "park-martin")), by_split(found)
     print("3-D error at the board by split:")
@@ -112,7 +122,11 @@ def _compare(found: dict) -> None:
 
 
 def main() -> None:
-    data = Path(sys.argv[1]) if len(sys.argv) > 1 else Path(__file__).resolve().parents[3] / "shared" / "data"
+    """Both data sets."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    shared = Path(__file__).resolve().parents[3] / "shared" / "data"
+    parser.add_argument("data", nargs="?", type=Path, default=shared, help="folder of the data sets")
+    data = parser.parse_args().data
     for name in ("charuco_handeye", "dotgrid_handeye"):
         if not (data / name).is_dir():
             sys.exit(f"error: {data / name} is missing; give the folder that holds it")
@@ -120,9 +134,11 @@ def main() -> None:
         found, text = charuco(data, Path(scratch) / "charuco", method=ALL)
         print(f"charuco_handeye\n\n{text}")
         _compare(found)
+        as_filed = found
         found, text = charuco(data, Path(scratch) / "adjusted", method=ALL, adjusted=found)
         print(f"\ncharuco_handeye, camera and board as adjusted\n\n{text[text.index('Methods') :]}")
         _compare(found)
+        _side_by_side({"camera and board as filed": as_filed, "camera and board as adjusted": found})
         many, _ = charuco(data, Path(scratch) / "many", replace(SPLITS, repeats=60))
         print(f"reprojection over 60 splits, all adjusted: mean {by_split(many).mean():.3f} mm")
         found, text = dots(data, Path(scratch) / "dots")

@@ -21,6 +21,7 @@ from stcal.handeye.judge.notes import Aside
 from stcal.handeye.judge.observability import Observability, check, in_words, require_scale
 from stcal.handeye.judge.symmetry import repair
 from stcal.handeye.methods import start
+from stcal.handeye.methods.arm import ArmModel
 from stcal.handeye.methods.camera_error import of_poses
 from stcal.handeye.methods.closed_form import AX_XB, AX_ZB, closed_form
 from stcal.handeye.methods.convex import convex
@@ -80,6 +81,9 @@ class HandEyeOptions:
     camera : CameraPrior, optional
         What is known of the camera's parameters where they are not solved for: their errors become part of σ, with
         views. They are exact where None.
+    arm : ArmModel, optional
+        With the joint vectors of the same poses: solve for its parameters too, held by σ that are estimated;
+        ``reprojection`` only. Its poses replace those of the pairs.
     """
 
     noise: Noise = field(default_factory=Noise)
@@ -89,6 +93,7 @@ class HandEyeOptions:
     four_dof: bool = False
     evolution: EvolutionOptions = field(default_factory=EvolutionOptions)
     camera: CameraPrior | None = None
+    arm: ArmModel | None = None
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -162,7 +167,10 @@ def handeye(
         raise InputError(f"hand-eye: method {method!r} is unknown; one of {', '.join(METHODS)} needed")
     if method == "reprojection" and (views is None or len(views) != len(pairs)):
         raise InputError("hand-eye: reprojection needs the corners of every pose; give views, or use method pose")
-    task = _task(pairs, setup, views, options or HandEyeOptions())
+    options = options or HandEyeOptions()
+    if options.arm is not None and method != "reprojection":
+        raise InputError(f"hand-eye: {method} does not solve for the arm; give views, and method reprojection")
+    task = _task(pairs, setup, views, options)
     if method == "pose":
         return _by_poses(task)
     if method == "reprojection" and task.views is not None:
@@ -288,7 +296,7 @@ def _by_views(task: _Task, views: Views) -> HandEye:
     def solved(loop: Loop, noise: Noise) -> AdjustedViews:
         flange = task.pairs.base_from_flange
         intrinsics, camera = options.intrinsics, options.camera
-        return adjust_views(loop, flange, views, first, noise, intrinsics, options.with_scale, camera)
+        return adjust_views(loop, flange, views, first, noise, intrinsics, options.with_scale, camera, options.arm)
 
     solution, contradicted = _by_true_robot(task, solved)
     if solution.sigma_scale is not None:
@@ -299,7 +307,7 @@ def _by_views(task: _Task, views: Views) -> HandEye:
         x, z, covariance, notes = _without_slide(task, x, z, solution.normal)
     if solution.camera_error is not None:
         covariance = solution.camera_error.covariance(covariance)
-    seen = replace(task.loop, camera_from_board=resected(names, views, solution.found))
+    seen = replace(solution.loop, camera_from_board=resected(names, views, solution.found))
     residuals = seen.residuals(x, z)
     notes += _remarks(task, solution.outliers, residuals, solution.scale_hint)
     notes += of_camera_file(solution.camera_gain, solution.sigma)

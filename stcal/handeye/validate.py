@@ -184,13 +184,18 @@ def errors_without(
     out: np.ndarray,
 ) -> dict[str, np.ndarray]:
     """Of :class:`HeldOutPoses`, by name, on the poses ``out``, (k,): errors of the solution of the others, and it."""
-    kept = np.setdiff1d(np.arange(len(pairs)), out)
+    kept, arm = np.setdiff1d(np.arange(len(pairs)), out), options.arm
+    if arm is not None:
+        options = replace(options, arm=arm[kept])
     try:
         result = handeye(pairs[kept], setup, method, None if views is None else views[kept], options)
     except DegenerateError as error:
         names = ", ".join(pairs.names[i] for i in out)
         raise DegenerateError(f"without {names}: {error}") from error
-    errors = predicted(result, pairs[out], None if views is None else views[out])
+    unseen = pairs[out]
+    if arm is not None and result.reprojection is not None and result.reprojection.arm is not None:
+        unseen = replace(unseen, base_from_flange=arm[out].poses(result.reprojection.arm))
+    errors = predicted(result, unseen, None if views is None else views[out])
     return errors | {"mount_from_camera": result.mount_from_camera.matrix()}
 
 

@@ -22,8 +22,10 @@ from stcal.io.images import ImageFile, find_images
 from stcal.io.quaternions import Order
 from stcal.io.table import Table
 from stcal.parallel import Progress, one_thread
+from stcal.robot import Robot
 from stcal.workflows.board_views import Board, detect_boards
-from stcal.workflows.handeye_times import Timing, robot_at_images
+from stcal.workflows.handeye_arm import Arm, read_arm
+from stcal.workflows.handeye_times import AtImages, Timing, robot_at_images
 
 NOTHING_SAID = Said()
 WITHOUT_OPTIONS = Timing()
@@ -38,7 +40,8 @@ class HandEyeInput:
     ``prior``; ``pitch_mm`` of the board's file; ``left_out`` : (image or row, why); ``understood`` : a line for each
     file that is not a table of the package; ``setup`` : as a file says it; ``unit_mm`` : of a model without a unit,
     about, by which ``pairs`` are multiplied already; ``folder`` : of the images; ``timed`` : times of the pairs in the
-    robot's stream, where its poses were taken by time.
+    robot's stream, where its poses were taken by time; ``arm`` : at the joint values of the ``pairs``, where its
+    parameters are to be solved for.
     """
 
     where: str
@@ -53,6 +56,7 @@ class HandEyeInput:
     unit_mm: float | None = None
     folder: Path | None = None
     timed: Timed | None = None
+    arm: Arm | None = None
 
 
 def two_files(
@@ -87,12 +91,14 @@ def read_input(
     quaternions: Order = "wxyz",
     said: Said = NOTHING_SAID,
     timing: Timing = WITHOUT_OPTIONS,
+    robot: Robot | None = None,
 ) -> HandEyeInput:
     """Pose pairs from their file or files; or from a folder of images with the files ``poses``, ``camera`` and
     ``board``.
 
     ``quaternions`` : ``xyzw`` where their columns hold x, y, z, w in the order in which they stand; ``said`` : what
-    files do not say themselves; ``timing`` : of poses by time.
+    files do not say themselves; ``timing`` : of poses by time; ``robot`` : at whose joint values, in ``poses``, the
+    images were taken, if its parameters are to be solved for.
 
     Raises
     ------
@@ -101,8 +107,15 @@ def read_input(
     """
     if isinstance(source, Path) and source.is_dir():
         poses, camera, board = _all_three(source, poses, camera, board)
-        robot = read_robot_poses(poses, quaternions, said)
-        return _from_images(source, robot, poses, camera, board, workers, progress, timing)
+        if robot is None:
+            found = read_robot_poses(poses, quaternions, said)
+            return _from_images(source, found, poses, camera, board, workers, progress, timing)
+        if timing.offset or timing.image_times:
+            raise InputError("--time-offset, --image-times: not with --with-kinematics; joint values are by image")
+        found, arm = read_arm(poses, robot, quaternions)
+        return _from_images(source, found, poses, camera, board, workers, progress, timing, arm)
+    if robot is not None:
+        raise InputError("--with-kinematics: only with a folder of images, in which the arm is seen to err")
     _require_no_images(source, poses, camera, board)
     _require_timed(source, timing)
     if isinstance(source, Table):
@@ -224,9 +237,9 @@ def photographed(
     design: Board,
     workers: int | None,
     progress: Progress,
-    timing: Timing = WITHOUT_OPTIONS,
+    timing: Timing | None = WITHOUT_OPTIONS,
 ) -> Photographed:
-    """Corners of the board in all images that have a pose.
+    """Corners of the board in all images that have a pose; None of ``timing`` : by their names alone.
 
     Raises
     ------
@@ -235,7 +248,9 @@ def photographed(
     """
     model = read_camera(camera)
     files, skipped = find_images(source)
-    at_images = robot_at_images(robot, [file.name for file in files], timing)
+    at_images = AtImages(robot)
+    if timing is not None:
+        at_images = robot_at_images(robot, [file.name for file in files], timing)
     robot, late = at_images.robot, dict(at_images.left_out)
     files = [file for file in files if file.name not in late]
     rows, missing, how = _rows_of_images(robot, files, source)
@@ -274,10 +289,12 @@ def _from_images(
     workers: int | None,
     progress: Progress,
     timing: Timing,
+    arm: Arm | None = None,
 ) -> HandEyeInput:
     """Pairs of all images that show the board and have a pose."""
     design = load_flat_board(board)
-    found = photographed(source, robot, camera, design, workers, progress, timing)
+    by_time = timing if arm is None else None
+    found = photographed(source, robot, camera, design, workers, progress, by_time)
     robot = found.robot
     pairs = pairs_of_views(found.base_from_flange[found.rows], found.seen, found.names, str(source))
     if found.covariance is not None:
@@ -294,6 +311,7 @@ def _from_images(
         understood,
         folder=source,
         timed=found.timed,
+        arm=arm and arm[found.rows],
     )
 
 
@@ -333,6 +351,7 @@ def dry_run(
     quaternions: Order = "wxyz",
     said: Said = NOTHING_SAID,
     timing: Timing = WITHOUT_OPTIONS,
+    robot: Robot | None = None,
 ) -> list[str]:
     """What is understood of the inputs, line by line, without looking for the board in images.
 
@@ -342,7 +361,7 @@ def dry_run(
         As :func:`read_input`.
     """
     if isinstance(source, Path) and source.is_dir():
-        return _dry_images(source, *_all_three(source, poses, camera, board), quaternions, said, timing)
+        return _dry_images(source, *_all_three(source, poses, camera, board), quaternions, said, timing, robot)
     given = read_input(source, poses, camera, board, quaternions=quaternions, said=said, timing=timing)
     lines = list(given.understood) if isinstance(source, Told) or given.understood else own_told(source, quaternions)
     setup = setup_of(said, given.setup, given.where)
@@ -355,12 +374,21 @@ def dry_run(
 
 
 def _dry_images(
-    source: Path, poses: Path, camera: Path, board: Path, quaternions: Order, said: Said, timing: Timing
+    source: Path,
+    poses: Path,
+    camera: Path,
+    board: Path,
+    quaternions: Order,
+    said: Said,
+    timing: Timing,
+    arm: Robot | None,
 ) -> list[str]:
-    robot = read_robot_poses(poses, quaternions, said)
+    robot = read_robot_poses(poses, quaternions, said) if arm is None else read_arm(poses, arm, quaternions)[0]
     design, model = load_flat_board(board), read_camera(camera)
     files, skipped = find_images(source)
-    at_images = robot_at_images(robot, [file.name for file in files], timing)
+    at_images = AtImages(robot)
+    if arm is None:
+        at_images = robot_at_images(robot, [file.name for file in files], timing)
     robot, every = at_images.robot, len(files)
     files = [file for file in files if file.name not in dict(at_images.left_out)]
     rows, missing, how = _rows_of_images(robot, files, source)

@@ -103,6 +103,20 @@ def handeye(
     with_scale: Annotated[
         bool, typer.Option("--with-scale", help="Find the board's true size from the robot's motion.")
     ] = False,
+    with_kinematics: Annotated[
+        Path | None,
+        typer.Option(
+            "--with-kinematics",
+            help="Adjust the parameters of this robot (TOML) and the intrinsics too, from images and joint values: "
+            "columns q1_deg … of --poses.",
+        ),
+    ] = None,
+    robot_out: Annotated[
+        Path | None,
+        typer.Option(
+            "--robot-out", writable=True, help="Write the robot of --with-kinematics to this file, as adjusted (TOML)."
+        ),
+    ] = None,
     four_dof: Annotated[
         bool,
         typer.Option("--four-dof", help="Solve for what a flange that turns about one axis only (SCARA) tells."),
@@ -232,10 +246,10 @@ def handeye(
     from stcal.handeye.report.export import exported, opencv_yaml, ros_yaml, urdf_joint
     from stcal.handeye.report.file import HandEyeFile
     from stcal.handeye.report.page import outcome_page, outcome_text
-    from stcal.workflows.handeye import AUTO, Splits, calibrate
+    from stcal.robot import load_robot, save_robot
+    from stcal.workflows.handeye import AUTO, Splits, at_offset, calibrate, with_offset
     from stcal.workflows.handeye_input import dry_run as understood
     from stcal.workflows.handeye_input import read_input, setup_of
-    from stcal.workflows.handeye_offset import at_offset, with_offset
     from stcal.workflows.handeye_times import Timing
 
     robot, seen = (_radians(sigma_robot_deg), sigma_robot_mm), (_radians(sigma_camera_deg), sigma_camera_mm)
@@ -244,12 +258,15 @@ def handeye(
     timing = Timing(time_tolerance, image_times, time_offset)
     pairs = source_of(source, first, second, key, said, quaternions.value, timing)
     folder = isinstance(pairs, Path) and pairs.is_dir()
-    _require_fitting(not folder, method, refine_camera, camera_out)
+    _require_fitting(not folder, method, refine_camera, camera_out, with_kinematics is not None)
+    _require_arm(folder, method, four_dof, with_kinematics, robot_out)
+    robot_model = load_robot(with_kinematics) if with_kinematics else None
     exports = _exports(export or [])
     written = {"--out": out, "--ros": ros, "--urdf": urdf, "--opencv": opencv, "--camera-out": camera_out}
+    written |= {"--robot-out": robot_out}
     written |= {"--json": json_file, "--report": report}
     read = {"source": source, "--poses": poses, "--camera": camera, "--board": board, "--a": first, "--b": second}
-    read |= {"--image-times": image_times}
+    read |= {"--image-times": image_times, "--with-kinematics": with_kinematics}
     keep_apart(
         [*((name, path) for name, path in written.items() if path), *(("--export", path) for _, path in exports)],
         [(name, path) for name, path in read.items() if path],
@@ -273,10 +290,11 @@ def handeye(
         seed=de_seed,
     )
     if dry_run:
-        say("\n".join(understood(pairs, poses, camera, board, quaternions.value, said, timing)))
+        say("\n".join(understood(pairs, poses, camera, board, quaternions.value, said, timing, robot_model)))
         return
     with StageProgress() as progress:
-        given = read_input(pairs, poses, camera, board, workers, progress, quaternions.value, said, timing)
+        read = (pairs, poses, camera, board, workers, progress, quaternions.value, said, timing, robot_model)
+        given = read_input(*read)
         for line in given.understood:
             say(line)
         with_scale = with_scale or given.unit_mm is not None
@@ -311,17 +329,36 @@ def handeye(
         write(path, exported(result, form, path.stem, parent, child, camera_frame.value))
     if camera_out:
         _save_camera(camera_out, outcome)
+    if robot_out and given.arm is not None and result.reprojection is not None and result.reprojection.arm is not None:
+        save_robot(robot_out, given.arm.identified(result.reprojection.arm))
+        say(f"written: {robot_out}")
     if json_file:
         write(json_file, HandEyeFile.of(outcome, whole=True))
 
 
-def _require_fitting(of_poses: bool, method: str | None, refine_camera: bool, camera_out: Path | None) -> None:
+def _require_arm(
+    folder: bool, method: str | None, four_dof: bool, with_kinematics: Path | None, robot_out: Path | None
+) -> None:
+    """Options of the arm go together."""
+    if robot_out and not with_kinematics:
+        raise InputError("--robot-out: only with --with-kinematics; the robot is as its file says else")
+    if with_kinematics and not folder:
+        raise InputError("--with-kinematics: only with a folder of images, in which the arm is seen to err")
+    if with_kinematics and method not in (None, "reprojection"):
+        raise InputError(f"--with-kinematics: {method} does not solve for the arm; leave --method out")
+    if with_kinematics and four_dof:
+        raise InputError("--with-kinematics, --four-dof: one of them; an arm that turns about one axis hides its own")
+
+
+def _require_fitting(
+    of_poses: bool, method: str | None, refine_camera: bool, camera_out: Path | None, with_arm: bool
+) -> None:
     """Options of the camera and the method go together."""
     from stcal.handeye import METHODS
     from stcal.workflows.handeye import ALL
 
-    if camera_out and not refine_camera:
-        raise InputError("--camera-out: only with --refine-camera; the camera is as given else")
+    if camera_out and not (refine_camera or with_arm):
+        raise InputError("--camera-out: only with --refine-camera or --with-kinematics; the camera is as given else")
     if refine_camera and of_poses:
         raise InputError("--refine-camera: only with images; poses tell nothing of the camera")
     if camera_out and method not in (None, ALL, "reprojection"):

@@ -1,6 +1,6 @@
 """Reprojection adjustment: X and Z from the corners in the images, with the errors of robot, board and camera."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -15,10 +15,12 @@ from stcal.geometry.normal_equations import generalised_inverse
 from stcal.geometry.rigid import Poses, Rigid
 from stcal.handeye.data.loop import Loop
 from stcal.handeye.data.views import View, Views, resect
-from stcal.handeye.methods.bundle import LEAST, Bundle, Corners, Problem, adjust
+from stcal.handeye.methods.arm import ROUNDS, SETTLED_MM, ArmModel, LinearArm
+from stcal.handeye.methods.bundle import Bundle, Corners
 from stcal.handeye.methods.camera_error import CameraError, of_corners
 from stcal.handeye.methods.noise import Noise
 from stcal.handeye.methods.pose_adjustment import FALSE_ALARM, LEAST_POSES
+from stcal.handeye.methods.rounds import LEAST, Problem, adjust
 from stcal.io.camera import CameraPrior, intrinsic_basis
 
 GROSS_RAD, GROSS_SHARE = np.radians(10), 0.2
@@ -36,7 +38,7 @@ SAME_DIGITS = 6
 """Decimals of a millimetre in which places on the board that are one corner agree."""
 SEEN = 1e-3
 """A share of the robot's variance below which the corners say nothing of its error."""
-FIRST = Noise(1e-3, 0.5, corner_px=0.3, board_mm=0.1)
+FIRST = {"corner_px": 0.3, "robot_rad": 1e-3, "robot_mm": 0.5, "board_mm": 0.1, "arm_rad": 1e-3, "arm_mm": 0.5}
 """Where the estimate of σ starts."""
 
 
@@ -58,6 +60,8 @@ class Reprojection:
         Of each measured corner: which pose, and which of ``corners``. Outliers have none.
     residuals_px : (n, 2) array
         Projected minus measured.
+    arm, arm_covariance : (k,), (k, k) arrays, optional
+        Parameters of the arm, where they were solved for; rad, mm.
     """
 
     camera: Camera
@@ -68,6 +72,8 @@ class Reprojection:
     view: np.ndarray
     corner: np.ndarray
     residuals_px: np.ndarray
+    arm: np.ndarray | None = None
+    arm_covariance: np.ndarray | None = None
 
     def __post_init__(self):
         object.__setattr__(self, "designed", frozen(self.designed, (None, 3), "corners"))
@@ -90,12 +96,13 @@ class Reprojection:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class AdjustedViews:
-    """``state`` : of the poses used; ``outliers`` : (m,); ``normal`` : (12, 12) of X and Z, all else eliminated;
-    ``covariance`` : its inverse; ``sigma_scale``; ``sigma`` : by group; ``estimated`` : which of them;
+    """``loop`` : that was adjusted; ``state`` : of the poses used; ``outliers`` : (m,); ``normal`` : (12, 12) of X and
+    Z, all else eliminated; ``covariance`` : its inverse; ``sigma_scale``; ``sigma`` : by group; ``estimated`` : which;
     ``scale_hint`` : what the scale would become if it were solved for, and its σ;
     ``camera_gain`` : by how much the cost would fall, per parameter, if intrinsics were; ``camera_error`` : of those as
     filed, where something is known of them; ``found``; ``settled`` : whether the estimated σ did."""
 
+    loop: Loop
     state: Bundle
     outliers: np.ndarray
     normal: np.ndarray
@@ -119,13 +126,15 @@ def adjust_views(
     intrinsics: CameraPrior | None = None,
     with_scale: bool = False,
     camera: CameraPrior | None = None,
+    arm: ArmModel | None = None,
 ) -> AdjustedViews:
     """Least squares of all corners from ``first`` X, Z, scale; ``loop`` holds the same poses, the board's by them.
 
     Unknowns: X, Z, and by their σ where the robot really was and where the board's corners really are; intrinsics about
     ``intrinsics`` (whose σ are widened where the corners contradict them) and the board's scale on demand. Errors of
-    intrinsics that are not solved for are considered by what is known of them, ``camera``. Corners and poses have
-    Huber's weights; then poses that contradict the others are left out.
+    intrinsics that are not solved for are considered by what is known of them, ``camera``. Of an ``arm``, which then
+    makes the poses in place of ``base_from_flange``, the parameters are unknowns too. Corners and poses have Huber's
+    weights; then poses that contradict the others are left out.
 
     Raises
     ------
@@ -134,6 +143,34 @@ def adjust_views(
     DegenerateError
         Fewer than three poses agree.
     """
+    if arm is None:
+        return _adjusted(loop, base_from_flange, views, first, noise, intrinsics, with_scale, camera)
+    parameters, sigma = np.zeros(len(arm.angles)), FIRST
+    for _ in range(ROUNDS):
+        linear, flange = LinearArm.about(arm, parameters), arm.poses(parameters)
+        moved = replace(loop, stand_from_mount=flange.inverse() if loop.inverted else flange)
+        found = _adjusted(moved, flange, views, first, noise, intrinsics, with_scale, camera, linear, sigma)
+        sigma = FIRST | found.sigma
+        parameters = parameters + found.state.arm
+        first = (found.state.mount_from_camera, found.state.stand_from_board, found.state.scale)
+        if linear.moves_mm(found.state.arm) < SETTLED_MM:
+            return found
+    return replace(found, settled=False)
+
+
+def _adjusted(
+    loop: Loop,
+    base_from_flange: Poses,
+    views: Views,
+    first: tuple[Rigid, Rigid, float],
+    noise: Noise,
+    intrinsics: CameraPrior | None,
+    with_scale: bool,
+    camera: CameraPrior | None,
+    arm: LinearArm | None = None,
+    sigma: Mapping[str, float] = FIRST,
+) -> AdjustedViews:
+    """With the arm linear, if there is one; ``sigma`` : where those that are estimated start."""
     x, z, scale = first
     miss = loop.residuals(x, z, scale)
     far = np.linalg.norm(miss[:, 3:], axis=1) > GROSS_SHARE * np.linalg.norm(loop.camera_from_board.translation, axis=1)
@@ -145,8 +182,10 @@ def adjust_views(
                 "check that poses and images belong together, and the conventions of both"
             )
         rows = np.flatnonzero(used)
-        corners, free = problem(loop[rows], base_from_flange[rows], views[rows], noise, intrinsics, with_scale)
-        begin = Bundle(x, z, corners.base_from_flange, corners.xyz_board, views.camera, scale)
+        own = None if arm is None else arm[rows]
+        given = (loop[rows], base_from_flange[rows], views[rows], noise, intrinsics, with_scale)
+        corners, free = problem(*given, arm=own, first=sigma)
+        begin = Bundle(x, z, corners.base_from_flange, corners.xyz_board, views.camera, scale, corners.no_step())
         solution = adjust(corners, begin, free)
         corners, state, normal = solution.corners, solution.state, solution.normal
         inverse = generalised_inverse(normal)
@@ -161,6 +200,7 @@ def adjust_views(
     rest = generalised_inverse(normal[12:, 12:])
     own = normal[:12, :12] - normal[:12, 12:] @ rest @ normal[12:, :12]
     return AdjustedViews(
+        loop=loop,
         state=state,
         outliers=~used,
         normal=own,
@@ -191,8 +231,10 @@ def problem(
     with_scale: bool = False,
     rows: np.ndarray | None = None,
     designed: np.ndarray | None = None,
+    arm: LinearArm | None = None,
+    first: Mapping[str, float] = FIRST,
 ) -> tuple[Corners, tuple[str, ...]]:
-    """The problem, and which groups' σ are to be estimated.
+    """The problem, and which groups' σ are to be estimated, from ``first``.
 
     ``rows`` : (v,) which of base_from_flange each view is of, one each in their order where None; ``designed`` :
     (K, 3) the board's corners, of :func:`board_of`, those of the views where None.
@@ -206,8 +248,8 @@ def problem(
         value = getattr(noise, name)
         if value is None:
             free.append(name)
-        sigma[name] = getattr(FIRST, name) if value is None else value
-    if sigma["robot_rad"] or sigma["robot_mm"]:  # exact in one of the two only: nearly
+        sigma[name] = first[name] if value is None else value
+    if sigma["robot_rad"] or sigma["robot_mm"] or arm is not None:  # exact in one of the two only: nearly
         sigma |= {name: max(sigma[name], LEAST[name]) for name in ("robot_rad", "robot_mm")}
     robot = None
     if loop.robot_covariance is not None:
@@ -229,7 +271,11 @@ def problem(
         basis,
         information,
         with_scale,
+        arm,
     )
+    if arm is not None:
+        sigma |= {name: first[name] for name in arm.parts()}
+        free += list(arm.parts())
     factors = corners.factors()
     return replace(corners, sigma=sigma | factors), (*free, *factors)
 
@@ -299,4 +345,6 @@ def found_of(
         rows[corners.view],
         corners.corner,
         residuals,
+        None if corners.arm is None else corners.arm.parameters + state.arm,
+        None if corners.arm is None else inverse[at["arm"], at["arm"]],
     )

@@ -10,7 +10,7 @@ from stcal.handeye.choose import Choice, Tried
 from stcal.handeye.data.loop import FRAMES, Setup
 from stcal.handeye.judge.observability import Observability
 from stcal.handeye.predict import HeldOutMotions
-from stcal.handeye.report.outcome import Outcome
+from stcal.handeye.report.outcome import ArmFound, Outcome
 from stcal.handeye.report.verdict import Verdict, Word, judged
 from stcal.handeye.result import HandEye
 from stcal.handeye.validate import Compared, HeldOutPoses
@@ -129,6 +129,13 @@ class TimeOffsetPart(Part):
     speed_rad_s: float
 
 
+class ArmPart(Part):
+    robot: str
+    parameters: dict[str, float]
+    sigma: dict[str, float]
+    plain: HeldOutMeans | None
+
+
 class HandEyeFile(ResultFile):
     """Of ``handeye``: mm, rad, px; null where there is no value."""
 
@@ -158,7 +165,8 @@ class HandEyeFile(ResultFile):
     )
     sigma: dict[str, float] = Field(
         description="`robot_rad`, `robot_mm`, `camera_rad`, `camera_mm`, `corner_px`, `board_mm` as far as the method "
-        "weights by them; `camera_factor`: by which the σ of given covariances of `camera_from_board` were multiplied; "
+        "weights by them; `arm_rad`, `arm_mm`: of the axes about the robot's file; "
+        "`camera_factor`: by which the σ of given covariances of `camera_from_board` were multiplied; "
         "`camera_focal`, `camera_centre`, `camera_radial`, `camera_tangential` (`camera_all` where their covariance is "
         "stated): factors, 1 or more, by which the σ of the camera file were widened"
     )
@@ -184,6 +192,13 @@ class HandEyeFile(ResultFile):
         None,
         description="with `--motions-held-out`: number of `fitted` motions; means `rotation_rad`, `translation_mm` of "
         "X B X⁻¹ against A over the others, and of each of the `motions`, which lead from pose `first` to `second`",
+    )
+    arm: ArmPart | None = Field(
+        None,
+        description="with `--with-kinematics`: name of the `robot`, `parameters` by which its axes are off its file, "
+        "small motions of their frames (`J2 rx`: rad, `J2 x`: mm), their `sigma`, and `plain`: as `held_out` "
+        "(`splits`, `poses`, `rotation_rad`, `translation_mm`, `board_mm`, `pose_mm`, `agreeing`), on the same poses, "
+        "of the solution without them",
     )
     choice: ChoicePart | None = Field(
         None,
@@ -227,6 +242,7 @@ class HandEyeFile(ResultFile):
         more |= {} if outcome.choice is None else {"choice": _choice(outcome.choice)}
         if (offset := outcome.time_offset) is not None:
             more["time_offset"] = {name: getattr(offset, name) for name in TimeOffsetPart.model_fields}
+        more |= {} if outcome.arm is None else {"arm": _arm(outcome.arm)}
         more |= {"understood": outcome.understood} if outcome.understood else {}
         more |= {"splits": _splits(outcome.held_out, names), "methods": compared} if whole else {}
         return cls.model_validate(
@@ -322,6 +338,15 @@ def _choice(found: Choice) -> ChoicePart:
         for each in found.tried
     ]
     return ChoicePart(chosen=found.chosen.name, sentence=found.sentence, tried=tried)
+
+
+def _arm(found: ArmFound) -> ArmPart:
+    return ArmPart(
+        robot=found.robot,
+        parameters=dict(zip(found.names, found.parameters.tolist(), strict=True)),
+        sigma=dict(zip(found.names, found.sigma.tolist(), strict=True)),
+        plain=_held_out(found.plain, np.zeros(0, bool)),
+    )
 
 
 def why_out(each: Tried) -> str:

@@ -3,6 +3,8 @@
 from dataclasses import dataclass
 from pathlib import Path
 
+import numpy as np
+
 from stcal.handeye.choose import Choice
 from stcal.handeye.data.pairs import HandEyePoses
 from stcal.handeye.data.views import Views
@@ -10,6 +12,29 @@ from stcal.handeye.predict import HeldOutMotions
 from stcal.handeye.result import HandEye
 from stcal.handeye.time_offset import TimeOffset
 from stcal.handeye.validate import Compared, HeldOutPoses
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class ArmFound:
+    """Parameters of the arm that were solved for too.
+
+    Parameters
+    ----------
+    robot : str
+        Its name.
+    names : tuple of str
+        (k,) of the parameters: small motions of the axes, J2 ry in rad, J2 x in mm.
+    parameters, sigma : (k,) arrays
+        By how much the axes are off the robot's file, and its σ.
+    plain : HeldOutPoses, optional
+        Errors on the same poses held out, of the solution without them.
+    """
+
+    robot: str
+    names: tuple[str, ...]
+    parameters: np.ndarray
+    sigma: np.ndarray
+    plain: HeldOutPoses | None = None
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -51,6 +76,8 @@ class Outcome:
         Of a model without a unit: mm by which the camera's lengths were multiplied before.
     time_offset : TimeOffset, optional
         Of the robot's clock from the camera's, where it was solved for; σ of the result hold its own.
+    arm : ArmFound, optional
+        Where the arm's parameters were solved for too.
     """
 
     where: str
@@ -70,6 +97,19 @@ class Outcome:
     understood: tuple[str, ...] = ()
     unit_mm: float | None = None
     time_offset: TimeOffset | None = None
+    arm: ArmFound | None = None
+
+    def sentence(self) -> str:
+        """What was solved for, and what that gains; empty where the user said what to solve for."""
+        if self.arm is None:
+            return self.choice.sentence if self.choice else ""
+        if self.arm.plain is None or self.held_out is None:
+            return f"solved for the parameters of {self.arm.robot} too"
+        now, before = self.held_out.means(), self.arm.plain.means()
+        return (
+            f"with the parameters of {self.arm.robot} solved for, poses held out are missed by "
+            f"{now['board_mm']:.3g} mm at the board, {before['board_mm']:.3g} mm without"
+        )
 
     def all_notes(self) -> tuple[str, ...]:
         """Of the result, then the others."""

@@ -10,7 +10,7 @@ from stcal.handeye.judge.observability import Observability
 from stcal.handeye.report.coverage import by_robot, image_coverage, turns_between
 from stcal.handeye.report.figures import BAD, GOOD, corner_figure, image_figure, pose_bars, turns_figure
 from stcal.handeye.report.file import why_out
-from stcal.handeye.report.outcome import Outcome
+from stcal.handeye.report.outcome import ArmFound, Outcome
 from stcal.handeye.report.overlays import overlays
 from stcal.handeye.report.verdict import Verdict, judged
 from stcal.handeye.result import HandEye
@@ -37,6 +37,8 @@ SIGMA_NAMES = {
     "camera_mm": ("board's pose, position", "mm", 1.0),
     "camera_factor": ("board's pose", "times its own σ", 1.0),
     "board_mm": ("corner on the board", "mm", 1.0),
+    "arm_rad": ("axis of the arm, direction", "°", np.degrees(1.0)),
+    "arm_mm": ("axis of the arm, place", "mm", 1.0),
     **{key: (f"camera file, {name}", "times its σ", 1.0) for key, name in FACTORS.items()},
 }
 VERDICTS = {"good": "#1b7837", "use with care": "#b26a00", "do not use": "#b3261e"}
@@ -64,7 +66,11 @@ def outcome_text(outcome: Outcome) -> str:
     if result.observability is not None:
         lines.append(turns_text(result.observability))
     if outcome.choice is not None:
-        lines += ["", *text_table(_choice_cells(outcome)), "", outcome.choice.sentence]
+        lines += ["", *text_table(_choice_cells(outcome))]
+    if outcome.arm is not None:
+        lines += ["", *text_table(_arm_cells(outcome.arm))]
+    if outcome.sentence():
+        lines += ["", outcome.sentence()]
     if outcome.compared:
         lines += ["", f"Methods, on the same {_splits_text(outcome)} held out; off: from {frames.camera} above"]
         lines += text_table(_compared_cells(outcome))
@@ -173,6 +179,19 @@ def _compared_cells(outcome: Outcome) -> list[list[str]]:
     return rows if any(row[-1] for row in rows[1:]) else [row[:-1] for row in rows]
 
 
+def _arm_cells(arm: ArmFound) -> list[list[str]]:
+    """Heads, and a row for each axis: by how much it is off the robot's file, and σ."""
+    found: dict[str, list[str]] = {}
+    for name, value, sigma in zip(arm.names, arm.parameters, arm.sigma, strict=True):
+        axis, component = name.split()
+        unit, factor, digits = ("°", np.degrees(1.0), 4) if component.startswith("r") else ("mm", 1.0, 3)
+        text = f"{component} {number(value * factor, digits)} ± {number(sigma * factor, digits)} {unit}"
+        found.setdefault(axis, []).append(text)
+    width = max(len(cells) for cells in found.values())
+    rows = [[axis, *cells, *[""] * (width - len(cells))] for axis, cells in found.items()]
+    return [[f"<axis of {arm.robot}", "off its file", *[""] * (width - 1)], *rows]
+
+
 def _choice_cells(outcome: Outcome) -> list[list[str]]:
     """Heads, and a row for each way of solving that was tried."""
     found = outcome.choice
@@ -215,7 +234,8 @@ def outcome_page(outcome: Outcome) -> str:
         compared=compared,
         splits=_splits_text(outcome),
         choice=_choice_cells(outcome),
-        sentence=outcome.choice.sentence if outcome.choice else "",
+        arm=_arm_cells(outcome.arm) if outcome.arm else [],
+        sentence=outcome.sentence(),
         predicted=_motion_cells(outcome),
         predicted_text=_motions_text(outcome),
         board_seen=ERRORS["board_mm"][0] in compared[0],

@@ -87,6 +87,7 @@ def _of_prediction(outcome: Outcome) -> Finding | None:
     fitted = result.rms()[1]
     known = result.reprojection.camera_covariance if result.reprojection else None
     unknowns = 12 + (result.sigma_scale is not None) + (0 if known is None else len(known))
+    unknowns += len(outcome.arm.parameters) if outcome.arm else 0
     equations, left = 6 * int(good.sum()), 6 * (len(good) - held.rows.shape[1])
     if unknowns >= min(equations, left) or fitted < NOTHING_MM:
         return None
@@ -106,9 +107,9 @@ def _of_prediction(outcome: Outcome) -> Finding | None:
 
 
 def _of_share(outcome: Outcome) -> Finding | None:
-    """What the transform's σ add to a prediction."""
+    """What the transform's σ add to a prediction; unknown where errors of an arm that was solved for cancel them."""
     share = share_of_variance(outcome)
-    if share is None:
+    if share is None or outcome.arm is not None:
         return None
     seen, sigma, shift = share
     worth, word = sigma**2 / (sigma**2 + shift**2), _word(sigma**2 / (sigma**2 + shift**2), HALF, MOST)

@@ -55,7 +55,9 @@ class IdentifiedFile(ResultFile):
     rank: int = Field(description="parameters determined by the data used")
     parameters: int = Field(description="of how many")
     ranks: dict[str, int] = Field(description="`rank` by kind of observation at the same joint values")
-    undetermined: list[str] = Field(description="parameters kept nominal (`--partial`)")
+    undetermined: list[str] = Field(
+        description="directions kept nominal (`--partial`), each once, by its parameters: `J2 y (with tool z and J1 x)`"
+    )
     notes: list[str] = Field(description="rows left out; what is to be known of the rows found")
     sigma_mm: float | None = Field(
         description="of one coordinate, given or estimated (null where each row has its own)"

@@ -110,7 +110,7 @@ class Identified:
     ranks : dict of str to int
         Parameters that these joint values determine, by kind of observation.
     undetermined : tuple of str
-        Names of parameters along directions that were kept nominal.
+        Directions that were kept nominal, each by its parameters.
     nominal_mm : (r,) array
         Errors with nominal axes, base and tools fitted.
     held_out : HeldOutRows or None

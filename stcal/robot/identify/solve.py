@@ -19,6 +19,7 @@ from stcal.robot.identify.adjustment import (
     solve,
     unseen,
 )
+from stcal.robot.identify.consensus import agreeing
 from stcal.robot.identify.nominal import Deviations, NominalRows
 from stcal.robot.identify.observability import ObservabilityIndices, parameter_scale
 from stcal.robot.identify.residuals import (
@@ -57,6 +58,8 @@ OUTLIER_ROUNDS = 5
 """Of leaving errors out; after 1 to 3 the same ones are left out again."""
 MOSTLY_GOOD = 0.5
 """Share of the observations below which nothing is called an error."""
+TOGETHER, MOST_BESIDE = 0.2, 2
+"""Share of a direction's largest motion from which on a parameter moves with it; so many are named beside the first."""
 REPEATS, FEW_ROWS = 5, 300
 """Divisions of the cross-validation of few rows; one does for more."""
 
@@ -168,23 +171,26 @@ def _weighting(state: State, seen: Observed, options: IdentifyOptions) -> Weight
 def _adjusted(
     nominal: Robot, state: State, seen: Observed, options: IdentifyOptions, rows: NominalRows | None = None
 ) -> Adjustment:
-    """Solve, and estimate σ; once more without what are errors and no noise: Huber's weights bound their pull, but let
-    each pull as hard as the worst honest observation, which no covariance knows of."""
+    """Solve with the observations that agree, and estimate σ; once more without what are errors and no noise, and with
+    what is none: Huber's weights bound their pull, but let each pull as hard as the worst honest observation, which no
+    covariance knows of."""
     rows = rows or NominalRows.about(state, parameter_units(jacobian(state, seen)), nominal)
-    found, good = _settled(state, seen, options, rows), np.ones(len(seen), bool)
-    for _ in range(OUTLIER_ROUNDS):
+    good = np.ones(len(seen), bool)
+    if options.robust:
+        good = agreeing(state, seen, _weighting(state, seen, options))
+        good |= good.mean() < MOSTLY_GOOD
+    for _ in range(OUTLIER_ROUNDS + 1):
+        found = _settled(state, seen if good.all() else only_of(seen, good), options, rows)
+        if not good.all():
+            left = residuals(found.solution.state, seen)
+            length = np.linalg.norm(found.weighting.whiten(left, seen), axis=1)
+            weights = huber_weights(length, huber_limit(seen.kind))
+            found = replace(found, solution=replace(found.solution, residuals=left, weights=weights))
         if not _errors_change(found, good):
             return found
-        good = found.solution.weights >= GROSS
-        found = _settled(found.solution.state, only_of(seen, good), options, rows)
-        left = residuals(found.solution.state, seen)
-        length = np.linalg.norm(found.weighting.whiten(left, seen), axis=1)
-        weights = huber_weights(length, huber_limit(seen.kind))
-        found = replace(found, solution=replace(found.solution, residuals=left, weights=weights))
-    if _errors_change(found, good):
-        note = f"which observations are errors still changes after {OUTLIER_ROUNDS} rounds; look at the outliers"
-        found = replace(found, notes=(*found.notes, note))
-    return found
+        good, state = found.solution.weights >= GROSS, found.solution.state
+    note = f"which observations are errors still changes after {OUTLIER_ROUNDS} rounds; look at the outliers"
+    return replace(found, notes=(*found.notes, note))
 
 
 def _errors_change(found: Adjustment, good: np.ndarray) -> bool:
@@ -213,21 +219,40 @@ def _settled(state: State, seen: Observed, options: IdentifyOptions, rows: Nomin
 
 
 def _undetermined(solution: Solution, names: list[str], seen: Observed, partial: bool) -> tuple[str, ...]:
-    """Parameters along the directions that the data leave open, beyond those that distances never see."""
+    """Directions that the data leave open, by the parameters along each, beyond those that distances never see."""
     _, directions, good = solution.spectrum()
     expected = unseen(seen.kind)
-    open_ones = directions[:, ~good]
-    if open_ones.shape[1] <= expected:
+    if (~good).sum() <= expected:
         return ()
-    strength = (open_ones**2).sum(1)
-    found = tuple(names[i] for i in np.argsort(-strength) if strength[i] > 0.1)
+    found = _directions(directions[:, ~good][:, expected:], names)
     if not partial:
+        first = ", ".join(found[:4]) + (" …" if len(found) > 4 else "")
         raise DegenerateError(
             f"{seen.data.where}: the data determine {solution.rank()} of {len(names) - expected} parameters, open are "
-            f"{', '.join(found[:6])}; measure more varied poses (`stcal robot design`), or keep the nominal values of "
-            "these with --partial"
+            f"{first}; measure more varied poses (`stcal robot design`), or keep the nominal values of these with "
+            "--partial"
         )
     return found
+
+
+def _directions(open_ones: np.ndarray, names: list[str]) -> tuple[str, ...]:
+    """Names of directions (k, d): each led by a parameter that no other one has, with those that move with it."""
+    lead, reduced = [], open_ones.copy()
+    for column in range(reduced.shape[1]):
+        free = np.abs(reduced)
+        free[lead] = 0
+        i, j = np.unravel_index(free[:, column:].argmax(), free[:, column:].shape)
+        reduced[:, [column, column + j]] = reduced[:, [column + j, column]]
+        reduced[:, column] /= reduced[i, column]
+        others = np.arange(reduced.shape[1]) != column
+        reduced[:, others] -= np.outer(reduced[:, column], reduced[i, others])
+        lead.append(int(i))
+    found = []
+    for i, own in zip(lead, reduced.T, strict=True):
+        strong = [k for k in np.argsort(-np.abs(own)) if k != i and abs(own[k]) > TOGETHER * np.abs(own).max()]
+        beside = " and ".join(names[k] for k in strong[:MOST_BESIDE]) + (" …" if len(strong) > MOST_BESIDE else "")
+        found.append(f"{names[i]} (with {beside})" if beside else names[i])
+    return tuple(found)
 
 
 def _ranks(state: State, data: Measurements) -> dict[str, int]:

@@ -11,6 +11,7 @@ from stcal.geometry.align import align_rigid
 from stcal.geometry.least_squares import NormalEquations, minimise, perturbed
 from stcal.geometry.rigid import Poses, Rigid, skew
 from stcal.io.quaternions import EXPLAINS
+from stcal.robot.identify.adjustment import USELESS_MM
 from stcal.robot.identify.residuals import State, observed, residuals
 from stcal.robot.kinematics.damped import reach_mm
 from stcal.robot.kinematics.fit import FITS, require_convention
@@ -18,7 +19,7 @@ from stcal.robot.kinematics.forward import flange_poses
 from stcal.robot.kinematics.measurements import Measurements
 from stcal.robot.kinematics.model import Robot
 
-ROUNDS = 50
+ROUNDS = 500
 REGULAR = 1e-10
 """Damping that keeps what these positions leave open, as of a tool that never turned, where it is."""
 NEARLY = 1e-3
@@ -116,23 +117,29 @@ def _base_and_points(where: str, flange: Poses, positions: np.ndarray, rows: np.
             "instrument stands about it; move other joints, or give the tool in the robot file if it is off the axis"
         ) from error
     moving = (rows[:, None] == np.arange(len(points)))[:, None, :, None]
+    spread = np.linalg.norm(positions - positions.mean(0), axis=1).max()
+    held = 1 / np.array([*[USELESS_MM / spread] * 3, *[USELESS_MM] * (3 + points.size)]) ** 2
 
-    def linearise(at: tuple[Rigid, np.ndarray]) -> NormalEquations:
+    def linearise(at: tuple[Rigid, np.ndarray, np.ndarray]) -> NormalEquations:
         seen = flange @ at[1][rows]
         turned = np.where(moving, (at[0].rotation @ flange.rotation)[:, :, None], 0.0).reshape(len(rows), 3, -1)
         by = np.concatenate([-skew(seen @ at[0].rotation.T), np.tile(np.eye(3), (len(rows), 1, 1)), turned], axis=2)
-        return NormalEquations.of((at[0] @ seen - positions).ravel(), by.reshape(-1, by.shape[2]))
+        own = NormalEquations.of((at[0] @ seen - positions).ravel(), by.reshape(-1, by.shape[2]))
+        return own + NormalEquations(float(at[2] @ (held * at[2])), np.diag(held), held * at[2])
 
     found = minimise(
-        (base, points),
+        (base, points, np.zeros(len(held))),
         linearise,
-        lambda at, step: (perturbed(at[0], step[:6]), at[1] + step[6:].reshape(-1, 3)),
+        lambda at, step: (perturbed(at[0], step[:6]), at[1] + step[6:].reshape(-1, 3), at[2] + step),
         least_damping=REGULAR,
         max_steps=ROUNDS,
     )
-    square = float(found.linear.cost)
-    found.required(f"{where}: base and tools", "check the D-H rows and the joint values", NEARLY * square)
-    return *found.state, float(np.sqrt(square / len(rows)))
+    found.required(
+        f"{where}: base and tools", "check the D-H rows and the joint values", NEARLY * float(found.linear.cost)
+    )
+    base, points, _ = found.state
+    misfit = np.linalg.norm(base @ (flange @ points[rows]) - positions, axis=1)
+    return base, points, float(np.sqrt((misfit**2).mean()))
 
 
 def _points_of_distances(robot: Robot, flange: Poses, data: Measurements, rows: np.ndarray, points: np.ndarray):

@@ -1,17 +1,23 @@
 """Simulated arms as they leave the factory, and what an instrument sees of them."""
 
 from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from stcal.geometry.rigid import Rigid
+from stcal.errors import ConvergenceError
+from stcal.geometry.rigid import Poses, Rigid
 from stcal.robot.identify.residuals import State, tips
 from stcal.robot.kinematics.dh import robot_from_chain
-from stcal.robot.kinematics.forward import chain_parameters, moved_chain
+from stcal.robot.kinematics.example import mh80
+from stcal.robot.kinematics.forward import chain_parameters, flange_poses, jacobian, moved_chain
+from stcal.robot.kinematics.inverse import inverse
 from stcal.robot.kinematics.measurements import Measurements
-from stcal.robot.kinematics.model import Robot
+from stcal.robot.kinematics.model import Joint, Robot
+
+STEPS, REACHED = 50, 1e-9
+"""Of Newton's steps to a pose; rad and mm at which it is reached."""
 
 
 def made(robot: Robot, rng: np.random.Generator, sigma_mm: float = 0.3, sigma_rad: float = 5e-4) -> Robot:
@@ -61,3 +67,34 @@ def measured(
     turn = Rotation.from_rotvec(noise[:, :3]).as_matrix()
     place = tip.translation + noise[:, 3:]
     return Measurements("simulated", range(2, len(q) + 2), q, targets, place, turn @ tip.rotation, covariance)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class TrueArm:
+    """``robot`` : as its file says, without joint limits; ``parameters`` : (k,) by which its axes really are off, small
+    motions of the joints' frames; ``q`` : (m, n) joint values at which the flange is where it was wanted."""
+
+    robot: Robot
+    parameters: np.ndarray
+    q: np.ndarray
+
+
+def arm_at(rng: np.random.Generator, base_from_flange: Poses, sigma_rad: float, sigma_mm: float) -> TrueArm:
+    """The example of a robot with axes off by these σ, at poses of its flange.
+
+    Raises
+    ------
+    ConvergenceError
+        A pose is not reached.
+    """
+    robot = replace(mh80(), joints=(Joint(),) * 6)
+    chain = replace(robot, world_from_base=Rigid()).chain()
+    sigma = [sigma_rad if component < 3 else sigma_mm for _, component in chain_parameters(chain)]
+    parameters = rng.normal(0, sigma)
+    true, q = moved_chain(chain, parameters), inverse(robot, base_from_flange).q.copy()
+    for _ in range(STEPS):
+        off = base_from_flange.difference(flange_poses(true, q))
+        if np.abs(off).max() < REACHED:
+            return TrueArm(robot, parameters, q)
+        q += np.linalg.solve(jacobian(robot, q), off[:, :, None])[:, :, 0]
+    raise ConvergenceError(f"arm: a pose of the flange is missed by {np.abs(off).max():.2g}; take others")

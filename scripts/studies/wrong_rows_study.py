@@ -1,0 +1,134 @@
+"""What wrong rows do to ``stcal robot identify``: simulated arms as they leave the factory, some rows of few off.
+
+.venv/bin/python scripts/studies/wrong_rows_study.py [--draws 200] [--only TEXT]
+
+Each line is a kind of observation, a number of rows, the share of them that is off, and by how much (in a random
+direction; 1–50 mm: uniform). ``within 1.1`` : draws in which positions at 50 new joint vectors err by at most 1.1 times
+what they do by the good rows alone, these known; ``worst`` of that ratio; ``named`` : draws in which each wrong row is
+among the outliers; ``called wrong`` : good rows that are, of all draws.
+"""
+
+import argparse
+from dataclasses import dataclass, replace
+from functools import partial
+
+import numpy as np
+
+from stcal.geometry.rigid import Rigid
+from stcal.parallel import one_thread
+from stcal.robot.identify.residuals import State, observed, residuals, tips
+from stcal.robot.identify.result import Identified, IdentifyOptions
+from stcal.robot.identify.solve import identify
+from stcal.robot.kinematics.example import mh80
+from stcal.robot.kinematics.measurements import Measurements
+from stcal.robot.kinematics.model import Robot
+from stcal.synthetic.measured.arms import joint_vectors, made, measured, placed
+from stcal.workflows.cluster import executor_of
+
+NEW_POSES = 50
+MIXED = (1.0, 50.0)
+
+
+@dataclass(frozen=True)
+class Case:
+    """``kind`` of observations, ``rows`` of which ``share`` are off by ``off_mm``, or uniformly between two."""
+
+    kind: str
+    rows: int
+    share: float
+    off_mm: float | tuple[float, float]
+
+    def title(self) -> str:
+        """First cells of its line."""
+        off = f"{self.off_mm:g}" if isinstance(self.off_mm, float) else "–".join(f"{each:g}" for each in self.off_mm)
+        return f"{self.kind} | {self.rows} | {self.share:.0%} | {off if self.share else '–'}"
+
+
+CASES = (
+    *(Case(kind, 40, 0.0, 0.0) for kind in ("position", "pose")),
+    *(Case("position", 40, 0.05, off) for off in (2.0, 10.0)),
+    *(Case("position", 40, 0.1, off) for off in (1.0, 5.0, 50.0)),
+    *(Case("position", 40, 0.25, off) for off in (1.0, 2.0, 5.0, 10.0, 50.0, MIXED)),
+    *(Case("pose", 40, 0.25, off) for off in (1.0, MIXED)),
+    *(Case("distance", 60, share, MIXED) for share in (0.0, 0.15)),
+    Case("position", 300, 0.25, MIXED),
+)
+
+
+def simulated(case: Case, seed: int) -> tuple[Robot, Measurements, np.ndarray]:
+    """An arm as made, somewhere, with a tool of its own; what was measured of it; and which rows are wrong."""
+    rng = np.random.default_rng([CASES.index(case), seed])
+    tool = Rigid.exp(rng.normal(0, 0.5, 6) * [1, 1, 1, 200, 200, 200])
+    true = placed(made(mh80(), rng), Rigid.exp(rng.normal(0, 1, 6) * [1, 1, 1, 1000, 1000, 1000]), {"": tool})
+    data = measured(true, joint_vectors(true, case.rows, rng), rng)
+    bad = np.sort(rng.choice(np.arange(1, case.rows), round(case.share * case.rows), replace=False))
+    span = case.off_mm if isinstance(case.off_mm, tuple) else (case.off_mm, case.off_mm)
+    size = rng.uniform(*span, (len(bad), 1))
+    if case.kind == "distance":
+        length = np.linalg.norm(data.points() - data.points()[0], axis=1)
+        length[bad] += rng.choice([-1, 1], len(bad)) * size[:, 0]
+        start = np.zeros(case.rows, int)
+        return true, replace(data, positions=None, rotations=None, distances=length, from_row=start), bad
+    away = rng.normal(0, 1, (len(bad), 3))
+    positions = np.array(data.points())
+    positions[bad] += size * away / np.linalg.norm(away, axis=1)[:, None]
+    return true, replace(data, positions=positions, rotations=data.rotations if case.kind == "pose" else None), bad
+
+
+def draw(case: Case, seed: int) -> tuple[float, bool, int]:
+    """Ratio of the errors, whether each wrong row was named, and how many good ones were."""
+    true, data, bad = simulated(case, seed)
+    options = IdentifyOptions(folds=0)
+    found = identify(mh80(), data, options)
+    good = identify(mh80(), without(data, bad), replace(options, robust=False))
+    ratio = error(found, true, seed) / error(good, true, seed)
+    named = {int(max(found.seen.first[row], found.seen.second[row])) for row, _ in found.outliers()}
+    return ratio, set(bad.tolist()) <= named, len(named - set(bad.tolist()))
+
+
+def without(data: Measurements, bad: np.ndarray) -> Measurements:
+    """The other rows; of distances all are from the first, which is good."""
+    kept = np.setdiff1d(np.arange(len(data)), bad)
+    if data.distances is None:
+        return data[kept]
+    part = {"distances": data.distances[kept], "from_row": np.zeros(len(kept), int)}
+    return Measurements(data.where, [data.lines[i] for i in kept], data.q[kept], ("",) * len(kept), **part)
+
+
+def error(found: Identified, true: Robot, seed: int) -> float:
+    """RMS error of positions (of distances from the first, where these were measured) at new joint vectors, mm."""
+    q = joint_vectors(true, NEW_POSES, np.random.default_rng([seed]))
+    tip = tips(State(true.chain(), dict(true.tools)), q, ("",) * len(q)).translation
+    exact = Measurements("", range(len(q)), q, ("",) * len(q), tip)
+    if found.seen.kind == "distance":
+        apart, start = np.linalg.norm(tip - tip[0], axis=1), np.zeros(len(q), int)
+        exact = replace(exact, positions=None, distances=apart, from_row=start)
+    kind = "distance" if found.seen.kind == "distance" else "position"
+    return float(np.sqrt((residuals(found.state, observed(exact, kind)) ** 2).sum(1).mean()))
+
+
+@one_thread()
+def main() -> None:
+    """Run all cases; print."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--draws", type=int, default=200)
+    parser.add_argument("--only", default="", metavar="TEXT", help="cases whose lines begin so")
+    parser.add_argument("--scheduler", metavar="ADDRESS", help="hand the draws to this Dask cluster")
+    arguments = parser.parse_args()
+    print(f"{arguments.draws} draws each, simulated\n")
+    print("| observed | rows | wrong | by, mm | within 1.1 | worst | named | called wrong |\n" + "|---" * 8 + "|")
+    with executor_of(arguments.scheduler) as pool:
+        for case in (each for each in CASES if each.title().startswith(arguments.only)):
+            found = list(pool.map(partial(draw, case), range(arguments.draws), chunksize=5))
+            ratio = np.array([each[0] for each in found])
+            cells = (
+                f"{(ratio <= 1.1).sum()}",
+                f"{ratio.max():.2f}",
+                f"{sum(each[1] for each in found)}",
+                f"{sum(each[2] for each in found)} of {len(found) * case.rows}",
+            )
+            print(f"| {case.title()} | {' | '.join(cells)} |", flush=True)
+
+
+if __name__ == "__main__":
+    main()

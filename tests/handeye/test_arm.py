@@ -1,0 +1,155 @@
+"""The arm's parameters beside hand and eye."""
+
+import json
+import sys
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from stcal.cli.main import main
+from stcal.errors import InputError
+from stcal.geometry.rigid import Poses
+from stcal.handeye import HandEyeOptions, cross_validate, handeye, splits
+from stcal.handeye.data.loop import SETUPS
+from stcal.robot import forward, load_robot
+from stcal.robot.kinematics.file import save_robot
+from stcal.synthetic.measured.arms import arm_at
+from stcal.synthetic.measured.handeye import simulated_views
+from stcal.workflows.handeye_arm import Arm
+from tests.boards.drawn import chessboard_mm
+from tests.handeye.photographed import BASE_FROM_BOARD, FLANGE_FROM_CAMERA, PER_MM, looks, photographs
+
+OFF = (1e-3, 0.5)
+"""σ of the axes about the robot's file: rad, mm."""
+INPUT = 2
+
+
+def scene(seed: int, setup: str = "eye-in-hand", count: int = 16):
+    """Truth, pairs by the robot's file, and the arm at their joint values; the robot repeats to 0.02 mm."""
+    rng = np.random.default_rng(seed)
+    truth = simulated_views(rng, count, setup, (2e-5, 0.02), 0.1)
+    arm = arm_at(rng, truth.pairs.base_from_flange, *OFF)
+    pairs = replace(truth.pairs, base_from_flange=forward(arm.robot, arm.q))
+    return truth, pairs, arm, Arm(arm.robot, arm.q)
+
+
+def test_the_slope_is_that_of_the_poses():
+    _, _, _, arm = scene(1)
+    step = 1e-6
+    numeric = [arm.poses(step * unit).difference(arm.poses(-step * unit)) / (2 * step) for unit in np.eye(24)]
+    slope = arm.slope(np.zeros(24))
+    assert np.abs(np.stack(numeric, axis=2) - slope).max() < 1e-3  # of lengths up to 2000 mm
+    assert np.abs(arm.slope(np.full(24, 1e-3)) - slope).max() > 0.1
+
+
+@pytest.mark.parametrize("setup", [SETUPS[0], pytest.param(SETUPS[1], marks=pytest.mark.slow)])
+def test_what_the_arm_errs_is_found(setup):
+    """Poses held out are missed by what robot and corners scatter, 0.02 mm and 0.1 px, in place of millimetres."""
+    truth, pairs, arm, model = scene(2, setup)
+    options, rows = HandEyeOptions(arm=model), splits(len(pairs), 4, 1)
+    found = handeye(pairs, setup, None, truth.views, options)
+    plain, own = (cross_validate(pairs, setup, None, truth.views, each, rows).means() for each in (None, options))
+    assert own["board_mm"] < 0.5 * plain["board_mm"]
+    off = found.reprojection.arm - arm.parameters
+    # χ² of 24, of which 1 in 1000 exceeds 51; what poses tell little of is held by σ that are estimated from 24 values.
+    assert off @ np.linalg.solve(found.reprojection.arm_covariance, off) < 51 * 1.5
+    assert found.sigma["arm_rad"] == pytest.approx(OFF[0], rel=0.8)
+    assert found.sigma["arm_mm"] == pytest.approx(OFF[1], rel=0.8)
+
+
+@pytest.mark.slow
+def test_sigma_is_honest_with_an_arm_that_errs():
+    """240 numbers of χ²: their mean lies within 1 ± 4 √(2 / 240) by chance; σ of groups are estimated of few values."""
+    squared = []
+    for seed in range(40):
+        truth, pairs, _, model = scene(100 + seed, count=25)
+        found = handeye(pairs, truth.setup, None, truth.views, HandEyeOptions(arm=model))
+        off = Poses.of([found.mount_from_camera]).difference(Poses.of([truth.mount_from_camera]))[0]
+        squared.append(off @ np.linalg.solve(found.covariance, off) / 6)
+    assert 1 - 4 * np.sqrt(2 / 240) < np.mean(squared) < 1 + 4 * np.sqrt(2 / 240)
+
+
+def test_only_corners_tell_of_the_arm():
+    _, pairs, _, model = scene(3)
+    with pytest.raises(InputError, match="pose does not solve for the arm"):
+        handeye(pairs, options=HandEyeOptions(arm=model))
+
+
+@pytest.fixture(scope="module")
+def photographed(tmp_path_factory):
+    """Ten photographs of a chessboard by an arm that is off its file: arguments, joint values by image in its poses."""
+    folder = tmp_path_factory.mktemp("arm")
+    rng = np.random.default_rng(4)
+    seen = looks(rng, 12, np.array([70.0, 50.0]), 0.6)
+    sheet, first = chessboard_mm(6, 8, 20, PER_MM)
+    files = photographs(folder, sheet, first, seen, 'type = "chessboard"\nrows = 6\ncolumns = 8\nsquare_mm = 20\n')
+    arm = arm_at(rng, BASE_FROM_BOARD @ seen.inverse() @ FLANGE_FROM_CAMERA.inverse(), *OFF)
+    heads = ["image", *(f"q{i}_deg" for i in range(1, 7))]
+    rows = [[f"{i}.png", *(repr(float(v)) for v in np.degrees(q))] for i, q in enumerate(arm.q)]
+    files.poses.write_text("\n".join(",".join(row) for row in [heads, *rows]) + "\n")
+    save_robot(folder / "robot.toml", arm.robot)
+    return files, folder / "robot.toml", arm
+
+
+@pytest.fixture
+def command(monkeypatch, capsys):
+    """Exit code, standard output and error."""
+
+    def call(*arguments):
+        monkeypatch.setattr(sys, "argv", ["stcal", "handeye", *map(str, arguments)])
+        with pytest.raises(SystemExit) as end:
+            main()
+        output = capsys.readouterr()
+        return end.value.code or 0, output.out, output.err
+
+    return call
+
+
+@pytest.mark.slow
+def test_photographs_and_joint_values(command, photographed, tmp_path):
+    files, robot_file, arm = photographed
+    out, written, page = tmp_path / "h.json", tmp_path / "made.toml", tmp_path / "h.html"
+    more = ("--out", out, "--robot-out", written, "--report", page, "--splits", 2, "--workers", 1)
+    code, shown, error = command(*files.arguments(), "--with-kinematics", robot_file, *more)
+    assert code == 0, error
+    assert "joint values of 12 images; poses by the file of MH80" in shown
+    assert "with the parameters of MH80 solved for, poses held out are missed by" in shown
+    data = json.loads(out.read_text())
+    now, before = data["held_out"]["board_mm"], data["arm"]["plain"]["board_mm"]
+    assert now < before / 3
+    assert len(data["arm"]["parameters"]) == 24
+    # The written arm carries the board where it is: a rigid move of base and flange beside, which X and Z take up.
+    by_file, made = (forward(robot, arm.q) for robot in (arm.robot, load_robot(written)))
+    true = BASE_FROM_BOARD
+    x, z = (np.array(data[name]) for name in ("flange_from_camera", "base_from_board"))
+    assert np.abs(made.difference(by_file)).max() > 0.1
+    assert np.linalg.norm(z[:3, 3] - true.translation) < 5
+    assert np.linalg.norm(x[:3, 3] - FLANGE_FROM_CAMERA.translation) < 2
+    assert "The arm" in page.read_text()
+
+
+@pytest.mark.parametrize(
+    ("more", "says"),
+    [
+        (("--method", "pose"), "pose does not solve for the arm"),
+        (("--four-dof",), "--four-dof: one of them"),
+    ],
+)
+def test_options_that_do_not_go_with_it(command, photographed, more, says):
+    files, robot_file, _ = photographed
+    code, _, error = command(*files.arguments(), "--with-kinematics", robot_file, *more)
+    assert (code, says in error) == (INPUT, True)
+
+
+def test_it_needs_images_and_joint_values(command, photographed, tmp_path):
+    files, robot_file, _ = photographed
+    code, _, error = command(files.poses, "--with-kinematics", robot_file)
+    assert (code, "only with a folder of images" in error) == (INPUT, True)
+    code, _, error = command(*files.arguments(), "--robot-out", tmp_path / "r.toml")
+    assert (code, "--robot-out: only with --with-kinematics" in error) == (INPUT, True)
+    lines = [line.rsplit(",", 1)[0] for line in files.poses.read_text().splitlines()]
+    (tmp_path / "five.csv").write_text("\n".join(lines) + "\n")
+    words = [tmp_path / "five.csv" if word == str(files.poses) else word for word in files.arguments()]
+    code, _, error = command(*words, "--with-kinematics", robot_file)
+    assert (code, "q6" in error) == (INPUT, True)
