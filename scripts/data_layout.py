@@ -34,6 +34,7 @@ MODULES = (
     "stcal.sfm.interop.file",
     "stcal.sfm.diagnose.file",
     "stcal.handeye.report.file",
+    "stcal.handeye.report.rig_file",
     "stcal.handeye.report.planned",
     "stcal.register.report.file",
     "stcal.locate.data.capture",

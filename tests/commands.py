@@ -168,6 +168,7 @@ CALLS = (
         3.0,
     ),
     Call("handeye plan", "@handeye/poses.csv --count 2 --seed 1 --out >next.csv --json >all.json"),
+    Call("handeye rig", f"@handeye/rig.toml --splits 0 --out >h.json --workers 1 {_ALL}", 5.0),
     Call("locate schedule", "1 100 5"),
     Call("locate capture", "+scenes --simulate @locate/scenes/a/1.png --shortest 0.5 --longest 2 --count 3"),
     Call(

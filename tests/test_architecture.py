@@ -42,7 +42,7 @@ INSIDE = {
     ),
     "robot": (("kinematics",), ("identify", "axes"), ("use",), (".",)),
     "register": (("core",), ("judge", "workspace"), (".",), ("report",)),
-    "handeye": (("data",), ("methods",), ("judge",), (".",), ("report",)),
+    "handeye": (("data",), ("methods",), ("judge",), (".",), ("rig",), ("report",)),
     "locate": (("data",), ("pose", "calibrate"), (".",), ("report",)),
 }
 """Folders of each system, from below; ``.`` stands for the files beside them. Folders of one layer know nothing of each

@@ -1,6 +1,8 @@
 from .data.loop import SETUPS as SETUPS
 from .data.pairs import HandEyePoses as HandEyePoses
 from .data.pairs import read_poses as read_poses
+from .data.rig import RigCamera as RigCamera
+from .data.rig import RigPoses as RigPoses
 from .data.views import View as View
 from .data.views import Views as Views
 from .data.views import pairs_of_views as pairs_of_views
@@ -12,6 +14,9 @@ from .predict import HeldOutMotions as HeldOutMotions
 from .predict import motion_errors as motion_errors
 from .predict import predict_motions as predict_motions
 from .result import HandEye as HandEye
+from .rig.result import Rig as Rig
+from .rig.solve import RigOptions as RigOptions
+from .rig.solve import handeye_rig as handeye_rig
 from .solve import METHODS as METHODS
 from .solve import HandEyeOptions as HandEyeOptions
 from .solve import handeye as handeye

@@ -28,7 +28,7 @@ from stcal.handeye.methods.convex import convex
 from stcal.handeye.methods.evolution import EvolutionOptions, Objective, evolve, polish
 from stcal.handeye.methods.noise import Noise
 from stcal.handeye.methods.pose_adjustment import LoopState, PoseSolution, adjust_poses
-from stcal.handeye.methods.reprojection import AdjustedViews, adjust_views, resected
+from stcal.handeye.methods.reprojection import CAMERA_GAIN, AdjustedViews, adjust_views, resected
 from stcal.handeye.result import HandEye
 from stcal.io.camera import CameraPrior
 from stcal.parallel import one_thread
@@ -50,8 +50,6 @@ LEAST_WITH_SCALE = 4
 """Three poses leave five redundancies, with which no σ can be told."""
 WIDENED = 2.0
 """Factor of the σ of a camera file, or of the poses by it, from which on the file is doubted."""
-CAMERA_GAIN = 5.0
-"""Eight intrinsics that are right gain 8 ± 4 in cost, 1 ± 0.5 each; eight that gain 5 each are wrong."""
 ROBOT_BEYOND, BY_CHANCE = 2.0, 5e-4
 """A robot's stated σ are doubted from so many times on, where chance makes as much so rarely."""
 REST_WORSE = 1.2
@@ -309,17 +307,10 @@ def _by_views(task: _Task, views: Views) -> HandEye:
         x, z, covariance, notes = _without_slide(task, x, z, solution.normal)
     if solution.camera_error is not None:
         covariance = solution.camera_error.covariance(covariance)
-    seen = replace(solution.loop, camera_from_board=resected(names, views, solution))
+    seen = replace(solution.loop, camera_from_board=resected(names, views, solution.found))
     residuals = seen.residuals(x, z)
     notes += _remarks(task, solution.outliers, residuals, solution.scale_hint)
-    if solution.camera_gain > CAMERA_GAIN:
-        notes += (
-            "the camera file does not fit the corners: solve for the intrinsics too, or calibrate the camera anew",
-        )
-    doubted = {name: factor for name, factor in solution.sigma.items() if name in FACTORS and factor > WIDENED}
-    if doubted:
-        which = ", ".join(f"{FACTORS[name]} {factor:.2g} times" for name, factor in doubted.items())
-        notes += (f"the corners contradict the camera file: its σ were widened ({which}); calibrate the camera",)
+    notes += of_camera_file(solution.camera_gain, solution.sigma)
     return HandEye(
         method="reprojection",
         setup=task.setup,
@@ -338,6 +329,20 @@ def _by_views(task: _Task, views: Views) -> HandEye:
         observability=task.seen,
         notes=notes + remarks.of_rounds(solution.settled),
     )
+
+
+def of_camera_file(camera_gain: float, sigma: dict[str, float]) -> tuple[str, ...]:
+    """Notes on a camera file that the corners contradict, by what other intrinsics gain, and by its widened σ."""
+    notes: tuple[str, ...] = ()
+    if camera_gain > CAMERA_GAIN:
+        notes += (
+            "the camera file does not fit the corners: solve for the intrinsics too, or calibrate the camera anew",
+        )
+    doubted = {name: factor for name, factor in sigma.items() if name in FACTORS and factor > WIDENED}
+    if doubted:
+        which = ", ".join(f"{FACTORS[name]} {factor:.2g} times" for name, factor in doubted.items())
+        notes += (f"the corners contradict the camera file: its σ were widened ({which}); calibrate the camera",)
+    return notes
 
 
 def _by_true_robot(task: _Task, solved: Callable[[Loop, Noise], S]) -> tuple[S, tuple[str, ...]]:

@@ -33,13 +33,15 @@ POSE = ("x_mm", "y_mm", "z_mm", *QUATERNION)
 class Table:
     """Rows of a CSV file.
 
-    ``lines`` : (m,) line of the file that each row stands on, from 1; ``quaternions`` : what their columns hold.
+    ``lines`` : (m,) line of the file that each row stands on, from 1; ``quaternions`` : what their columns hold;
+    ``rows`` : (m,) the lines themselves where all columns are numbers: 01 is a name, too.
     """
 
     where: str
     columns: dict[str, list[str] | np.ndarray]
     lines: Sequence[int]
     quaternions: Order = "wxyz"
+    rows: Sequence[str] = ()
 
     def __len__(self) -> int:
         return len(self.lines)
@@ -51,7 +53,12 @@ class Table:
         """A column as it stands, without white space around."""
         self._need(column)
         values = self.columns[column]
-        return values if isinstance(values, list) else [f"{v:g}" for v in values]
+        if isinstance(values, list):
+            return values
+        if self.rows:
+            at = list(self.columns).index(column)
+            return [row.split(",")[at].strip() for row in self.rows]
+        return [f"{v:.15g}" for v in values]
 
     def numbers(self, column: str) -> np.ndarray:
         """(m,) finite numbers."""
@@ -235,7 +242,7 @@ def read_table(path: "str | Path | Table", what: str, quaternions: Order = "wxyz
     try:
         fast = np.loadtxt(io.StringIO("\n".join(rows)), delimiter=",", ndmin=2, comments=None)
         if fast.shape == (len(rows), len(names)):
-            return Table(where, {name: fast[:, k] for k, name in enumerate(names)}, numbers, quaternions)
+            return Table(where, {name: fast[:, k] for k, name in enumerate(names)}, numbers, quaternions, rows)
     except ValueError:
         pass  # text among the numbers: row by row
     try:

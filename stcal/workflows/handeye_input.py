@@ -4,6 +4,8 @@ from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 
+import numpy as np
+
 from stcal.boards.file import load_flat_board
 from stcal.errors import DegenerateError, InputError
 from stcal.geometry.rigid import Poses, Rigid
@@ -20,7 +22,7 @@ from stcal.io.quaternions import Order
 from stcal.io.table import Table
 from stcal.parallel import Progress, one_thread
 from stcal.robot import Robot
-from stcal.workflows.board_views import detect_boards
+from stcal.workflows.board_views import Board, detect_boards
 from stcal.workflows.handeye_arm import Arm, read_arm
 
 NOTHING_SAID = Said()
@@ -178,6 +180,60 @@ def _about_mm(pairs: HandEyePoses, setup: Setup) -> tuple[HandEyePoses, float]:
     return replace(pairs, camera_from_board=Poses(seen.rotation, scale * seen.translation)), scale
 
 
+@dataclass(frozen=True, slots=True, eq=False)
+class Photographed:
+    """What one camera's images show: ``names`` : of those that show the board and have a pose; ``seen`` : the board in
+    them; ``rows`` : (k,) their robot poses, of ``base_from_flange``; ``covariance`` of these; ``how`` they were
+    matched; others as :class:`HandEyeInput`."""
+
+    names: tuple[str, ...]
+    seen: Views
+    rows: np.ndarray
+    base_from_flange: Poses
+    covariance: np.ndarray | None
+    symmetries: tuple[Rigid, ...]
+    prior: CameraPrior
+    left_out: tuple[tuple[str, str], ...]
+    how: str
+
+
+def photographed(
+    source: Path, robot: RobotPoses, camera: Path, design: Board, workers: int | None, progress: Progress
+) -> Photographed:
+    """Corners of the board in all images that have a pose.
+
+    Raises
+    ------
+    InputError
+        No image shows the board, or none has a pose.
+    """
+    model = read_camera(camera)
+    files, skipped = find_images(source)
+    rows, missing, how = _rows_of_images(robot, files, source)
+    with_pose = [file for file in files if file.name in rows]
+    found = detect_boards(with_pose, model, design, (), workers, partial(progress, "board"))
+    views = found.views()
+    left_out = [(each.name, each.reason) for each in (*skipped, *found.skipped)]
+    left_out += _without_partner(files, rows, missing, robot.file)
+    if not views:
+        first = f"{found.skipped[0].name}: {found.skipped[0].reason}"
+        raise InputError(f"image folder {source}: the board is in none of {len(with_pose)} images: {first}")
+    seen = Views(found.camera, tuple(View(v.xyz_board, v.xy_px, v.covariance_px2) for v in views.values()))
+    at = np.array([rows[name] for name in views])
+    prior = camera_prior(refinable(model.calibrated(found.camera.width, found.camera.height)))
+    return Photographed(
+        tuple(views),
+        seen,
+        at,
+        robot.base_from_flange,
+        robot.covariance,
+        found.symmetries,
+        prior,
+        tuple(left_out),
+        how,
+    )
+
+
 def _from_images(
     source: Path,
     robot: RobotPoses,
@@ -188,31 +244,30 @@ def _from_images(
     progress: Progress,
     arm: Arm | None = None,
 ) -> HandEyeInput:
-    """Corners of the board in all images that have a pose."""
-    design, model = load_flat_board(board), read_camera(camera)
-    files, skipped = find_images(source)
-    rows, missing, how = _rows_of_images(robot, files, source)
-    with_pose = [file for file in files if file.name in rows]
-    found = detect_boards(with_pose, model, design, (), workers, partial(progress, "board"))
-    views = found.views()
-    left_out = [(each.name, each.reason) for each in (*skipped, *found.skipped)]
-    left_out += _without_partner(files, rows, missing, poses)
-    if not views:
-        first = f"{found.skipped[0].name}: {found.skipped[0].reason}"
-        raise InputError(f"image folder {source}: the board is in none of {len(with_pose)} images: {first}")
-    seen = Views(found.camera, tuple(View(v.xyz_board, v.xy_px, v.covariance_px2) for v in views.values()))
-    at = [rows[name] for name in views]
-    pairs = pairs_of_views(robot.base_from_flange[at], seen, tuple(views), str(source))
-    if robot.covariance is not None:
-        pairs = replace(pairs, base_from_flange_covariance=robot.covariance[at])
-    pitch = getattr(design, "pitch_mm", getattr(design, "square_mm", None))
-    prior = camera_prior(refinable(model.calibrated(found.camera.width, found.camera.height)))
-    where = f"{source.name}, {poses.name}"
-    understood = _robot_lines(robot, how) if not robot.own else ()
-    left = tuple(left_out)
+    """Pairs of all images that show the board and have a pose."""
+    design = load_flat_board(board)
+    found = photographed(source, robot, camera, design, workers, progress)
+    pairs = pairs_of_views(found.base_from_flange[found.rows], found.seen, found.names, str(source))
+    if found.covariance is not None:
+        pairs = replace(pairs, base_from_flange_covariance=found.covariance[found.rows])
+    understood = _robot_lines(robot, found.how) if not robot.own else ()
     return HandEyeInput(
-        where, pairs, seen, found.symmetries, prior, pitch, left, understood, folder=source, arm=arm and arm[at]
+        f"{source.name}, {poses.name}",
+        pairs,
+        found.seen,
+        found.symmetries,
+        found.prior,
+        pitch_of(design),
+        found.left_out,
+        understood,
+        folder=source,
+        arm=arm and arm[found.rows],
     )
+
+
+def pitch_of(design: Board) -> float | None:
+    """Of dots or squares, mm; None of tags."""
+    return getattr(design, "pitch_mm", getattr(design, "square_mm", None))
 
 
 def _rows_of_images(
@@ -228,10 +283,10 @@ def _rows_of_images(
 
 
 def _without_partner(
-    files: list[ImageFile], rows: dict[str, int], missing: tuple[str, ...], poses: Path
+    files: list[ImageFile], rows: dict[str, int], missing: tuple[str, ...], poses: str
 ) -> list[tuple[str, str]]:
-    left_out = [(file.name, f"no row in {poses.name}") for file in files if file.name not in rows]
-    return left_out + [(name, f"no such image, in a row of {poses.name}") for name in missing]
+    left_out = [(file.name, f"no row in {poses}") for file in files if file.name not in rows]
+    return left_out + [(name, f"no such image, in a row of {poses}") for name in missing]
 
 
 def _robot_lines(robot: RobotPoses, how: str) -> tuple[str, ...]:
@@ -284,5 +339,5 @@ def _dry_images(
         f"images: {len(rows)} of {len(files)} with a pose of the robot; the board was not looked for",
         *spread_text(robot.base_from_flange[list(rows.values())], setup),
     ]
-    left_out = [(each.name, each.reason) for each in skipped] + _without_partner(files, rows, missing, poses)
+    left_out = [(each.name, each.reason) for each in skipped] + _without_partner(files, rows, missing, poses.name)
     return lines + [f"left out {name}: {reason}" for name, reason in left_out]

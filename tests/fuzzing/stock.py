@@ -22,6 +22,7 @@ from stcal.sfm.run.marker import MarkerFile, digest_of
 from stcal.synthetic.dataset import write_dataset
 from stcal.synthetic.measured.arms import joint_vectors, made, measured, placed
 from stcal.synthetic.measured.handeye import simulated
+from stcal.synthetic.measured.handeye_rig import FIRST_FROM
 from stcal.synthetic.scene import SceneOptions, make_scene
 from tests.boards.drawn import chessboard_mm, photograph
 from tests.handeye.photographed import looks, photographs
@@ -158,6 +159,7 @@ def _handeye(folder: Path, rng: np.random.Generator) -> None:
     write_rows(folder / "poses.csv", header, rows)
     seen = looks(rng, 7, np.array([70.0, 50.0]), 0.6)
     _photographed(folder, seen)
+    _rig(folder, seen)
 
 
 def _photographed(folder: Path, seen: Poses) -> None:
@@ -168,6 +170,22 @@ def _photographed(folder: Path, seen: Poses) -> None:
     for path, name in ((found.poses, "robot.csv"), (found.camera, "cameras.txt"), (found.board, "board.toml")):
         path.rename(folder / name)
     found.images.rename(folder / "images")
+    inner.rmdir()
+
+
+def _rig(folder: Path, seen: Poses) -> None:
+    """A second camera beside the one that took ``seen``, and the file of both."""
+    second = FIRST_FROM[1].inverse() @ seen
+    inner = folder / "drawn"
+    inner.mkdir()
+    found = photographs(inner, *chessboard_mm(6, 8, 20.0), second, CHESSBOARD)
+    found.images.rename(folder / "right")
+    shutil.rmtree(inner)
+    cameras = "".join(
+        f'\n[[camera]]\nname = "{name}"\nimages = "{images}"\ncamera = "cameras.txt"\n'
+        for name, images in (("left", "images"), ("right", "right"))
+    )
+    (folder / "rig.toml").write_text(f'setup = "eye-in-hand"\nboard = "board.toml"\nposes = "robot.csv"\n{cameras}')
 
 
 def _tags(folder: Path, rng: np.random.Generator) -> None:

@@ -2,8 +2,9 @@
 
 import typer
 
-from stcal.cli.handeye import calibrate, plan
+from stcal.cli.handeye import calibrate, plan, rig
 
 app = typer.Typer()
 app.command("handeye")(calibrate.handeye)
 app.command("handeye plan")(plan.plan)
+app.command("handeye rig")(rig.rig)

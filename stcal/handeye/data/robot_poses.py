@@ -35,6 +35,11 @@ class RobotPoses:
     understood: str = ""
     own: bool = True
 
+    @property
+    def file(self) -> str:
+        """Name of the file or folder, without those above it."""
+        return Path(self.where.removeprefix("robot poses ")).name
+
     def pairing(self, names: list[str]) -> tuple[dict[str, int], tuple[str, ...], str]:
         """As :meth:`rows`; where no name fits, by times or the numbers at the ends of names; without names in order.
         The last is how, empty where it is by names.

@@ -63,7 +63,7 @@ def repair(pairs: HandEyePoses, setup: Setup, symmetries: tuple[Rigid, ...], vie
         covariance = _carried(covariance, seen, poses)
     repaired = replace(pairs, camera_from_board=poses, camera_from_board_covariance=covariance)
     if views is not None:
-        turned = (_turned(view, every[k]) for view, k in zip(views.views, best, strict=True))
+        turned = (turned_view(view, every[k]) for view, k in zip(views.views, best, strict=True))
         views = Views(views.camera, tuple(turned))
     return Repair(repaired, views, best)
 
@@ -131,6 +131,6 @@ def _carried(covariance: np.ndarray, seen: Poses, poses: Poses) -> np.ndarray:
     return by @ covariance @ np.swapaxes(by, 1, 2)
 
 
-def _turned(view: View, turn: Rigid) -> View:
+def turned_view(view: View, turn: Rigid) -> View:
     """The same corners under the numbers that they have after the turn."""
     return View(turn.inverse() @ view.xyz_board, view.xy_px, view.covariance)

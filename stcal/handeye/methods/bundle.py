@@ -1,6 +1,7 @@
 """The adjustment of corners behind the reprojection method: unknowns, residuals, normal equations, σ of each group."""
 
 from dataclasses import dataclass, field, replace
+from typing import Any, Generic, Protocol, TypeVar
 
 import numpy as np
 from scipy.sparse import csr_matrix
@@ -170,8 +171,29 @@ class Corners:
             by["arm"] = by["robot"] @ self.arm.slope_after(state.arm)[self.view]
         return np.einsum("nab,nb->na", self.weight, px - self.xy_px) / self.sigma["corner_px"], by
 
+    def with_sigma(self, sigma: dict[str, float]) -> "Corners":
+        """With other σ."""
+        return replace(self, sigma=sigma)
+
+    def with_board_scale(self) -> "Corners":
+        """With the board's scale among the unknowns."""
+        return replace(self, with_scale=True)
+
+    def with_intrinsics(self, basis: np.ndarray, information: np.ndarray) -> "Corners":
+        """With intrinsics among the unknowns, about ``camera``; factors of what is known of them are 1."""
+        wider = replace(self, basis=basis, information=information)
+        return replace(wider, sigma=wider.sigma | wider.factors())
+
+    def factors(self) -> dict[str, float]:
+        """1 for each kind of the intrinsics solved for."""
+        return dict.fromkeys((name for name, _ in self.camera_parts()), 1.0)
+
     def groups(self, state: Bundle) -> list["Knowledge"]:
         """Everything that is known: the corners seen, and what was known before."""
+        return [*self.own_groups(state), *self.shared_groups(state)]
+
+    def own_groups(self, state: Bundle) -> list["Knowledge"]:
+        """Of this camera: the corners seen, and what was known of its intrinsics."""
         at, count = self.places(), self.count()
         white, by = self.seen(state)
         found = [
@@ -185,6 +207,11 @@ class Corners:
                 whole[:, rows] = root
                 jacobian = _sparse({"camera": whole[None]}, at, count, {})
                 found.append(Knowledge((name,), (whole @ off)[None], jacobian, np.inf))
+        return found
+
+    def shared_groups(self, state: Bundle) -> list["Knowledge"]:
+        """Of what all cameras see: the board as designed, and the robot's poses as reported."""
+        at, count, found = self.places(), self.count(), []
         if at["board"].stop > at["board"].start:
             off = (state.corners - self.xyz_board) / self.sigma["board_mm"]
             jacobian = np.tile(np.eye(3) / self.sigma["board_mm"], (len(off), 1, 1))
@@ -205,12 +232,16 @@ class Corners:
 
     def linear(self, state: Bundle) -> NormalEquations:
         """Cost and normal equations; infinite cost where a corner lies behind the camera."""
-        poses = state.camera_from_board(self.inverted)
-        depth = (poses.rotation[self.view, 2] * (state.scale * state.corners[self.corner])).sum(1)
-        if (depth + poses.translation[self.view, 2] <= 0).any():
+        if not self.in_front(state):
             return NormalEquations.impossible(self.count())
         first, *others = (group.linear() for group in self.groups(state))
         return sum(others, first)
+
+    def in_front(self, state: Bundle) -> bool:
+        """Whether all corners lie before the camera."""
+        poses = state.camera_from_board(self.inverted)
+        depth = (poses.rotation[self.view, 2] * (state.scale * state.corners[self.corner])).sum(1)
+        return bool((depth + poses.translation[self.view, 2] > 0).all())
 
 
 def camera_parts(basis: np.ndarray, information: np.ndarray) -> list[tuple[str, np.ndarray]]:
@@ -264,18 +295,72 @@ class Knowledge:
         return found
 
 
+class Problem(Protocol):
+    """What is adjusted: the corners of one camera, or of several about the same board."""
+
+    @property
+    def sigma(self) -> dict[str, float]:
+        """Of each group."""
+        ...
+
+    @property
+    def base_from_flange(self) -> Poses:
+        """As reported."""
+        ...
+
+    def with_sigma(self, sigma: dict[str, float]) -> Any:
+        """With other σ."""
+        ...
+
+    def with_board_scale(self) -> Any:
+        """With the board's scale among the unknowns."""
+        ...
+
+    def places(self) -> dict[str, slice]:
+        """Where the unknowns stand in a step."""
+        ...
+
+    def factors(self) -> dict[str, float]:
+        """1 for each kind of the intrinsics solved for."""
+        ...
+
+    def robot_weight(self) -> np.ndarray:
+        """(m, 6, 6) whitening of errors of base_from_flange."""
+        ...
+
+    def count(self) -> int:
+        """Number of unknowns."""
+        ...
+
+    def moved(self, state: Any, step: np.ndarray) -> Any:
+        """A state after a step of all unknowns."""
+        ...
+
+    def groups(self, state: Any) -> list[Knowledge]:
+        """Everything that is known."""
+        ...
+
+    def linear(self, state: Any) -> NormalEquations:
+        """Cost and normal equations."""
+        ...
+
+
+P = TypeVar("P", bound=Problem)
+S = TypeVar("S")
+
+
 @dataclass(frozen=True, slots=True, eq=False)
-class BundleSolution:
+class BundleSolution(Generic[P, S]):
     """``corners`` : with the σ that were estimated; ``state``; ``normal`` : matrix about it; ``settled`` : whether the
     σ did within :data:`ROUNDS`."""
 
-    corners: Corners
-    state: Bundle
+    corners: P
+    state: S
     normal: np.ndarray
     settled: bool
 
 
-def adjust(corners: Corners, start: Bundle, free: tuple[str, ...]) -> BundleSolution:
+def adjust(corners: P, start: S, free: tuple[str, ...]) -> BundleSolution[P, S]:
     """Solve, and estimate the σ of the ``free`` groups in rounds.
 
     Raises
@@ -288,7 +373,7 @@ def adjust(corners: Corners, start: Bundle, free: tuple[str, ...]) -> BundleSolu
         state = minimise(state, corners.linear, corners.moved, settled=ROUGHLY).required("hand-eye", WORST).state
         sigma = corners.sigma | estimated(corners, state, free)
         change = max(abs(np.log(sigma[name] / corners.sigma[name])) for name in free)
-        corners = replace(corners, sigma=sigma)
+        corners = corners.with_sigma(sigma)
         settled = bool(change < SETTLED)
         if settled:
             break
@@ -296,7 +381,7 @@ def adjust(corners: Corners, start: Bundle, free: tuple[str, ...]) -> BundleSolu
     return BundleSolution(corners, found.state, found.linear.normal, settled)
 
 
-def estimated(corners: Corners, state: Bundle, free: tuple[str, ...]) -> dict[str, float]:
+def estimated(corners: Problem, state: Any, free: tuple[str, ...]) -> dict[str, float]:
     """Restricted maximum-likelihood σ of the ``free`` groups, all else linear about a state (as
     :func:`~stcal.handeye.methods.noise.variance_components`)."""
     unknowns = corners.count()
@@ -313,13 +398,18 @@ def estimated(corners: Corners, state: Bundle, free: tuple[str, ...]) -> dict[st
         each=NormalEquations.stacked([linear for _, linear in parts.values()]),
         count=np.array([count for count, _ in parts.values()]),
         fixed=fixed,
-        caution=np.array([CAUTION if name in LEAST else 0.0 for name in names]),
+        caution=np.array([CAUTION if kind(name) in LEAST else 0.0 for name in names]),
         held=HELD,
     )
-    least = np.log([LEAST.get(name, 1.0) / corners.sigma[name] for name in names])
+    least = np.log([LEAST.get(kind(name), 1.0) / corners.sigma[name] for name in names])
     farthest = np.full(len(names), FARTHEST)
     best = found.best(np.maximum(least, -farthest), farthest, [np.zeros(len(names))])
     return {name: float(corners.sigma[name] * np.exp(x)) for name, x in zip(names, best, strict=True)}
+
+
+def kind(name: str) -> str:
+    """``corner_px`` of a group that is one camera's of several, ``corner_px:left``."""
+    return name.partition(":")[0]
 
 
 def _sparse(by: dict, at: dict[str, slice], count: int, own: dict[str, np.ndarray]) -> csr_matrix:

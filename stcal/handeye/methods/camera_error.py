@@ -4,7 +4,8 @@ Parameters that are not solved for, but are not exact either, are *considered* (
 Methods for Discrete Sequential Estimation", 1977, ch. VIII): what is known of them is carried through the solution.
 """
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
@@ -12,7 +13,7 @@ from stcal.geometry.normal_equations import generalised_inverse
 from stcal.geometry.rigid import Poses
 from stcal.handeye.data.loop import Loop
 from stcal.handeye.data.views import Views, whitened
-from stcal.handeye.methods.bundle import Bundle, Corners, camera_parts, estimated
+from stcal.handeye.methods.bundle import Bundle, Corners, Problem, camera_parts, estimated
 from stcal.handeye.methods.pose_adjustment import LoopState, PoseSolution
 from stcal.io.camera import CameraPrior, intrinsic_basis
 
@@ -25,7 +26,7 @@ SETTLED = 1e-3
 class CameraError:
     """``slope`` : (12, q) of the normal equations of X and Z, by the intrinsics; ``moment`` : (q, q) second moment of
     the intrinsics' error about zero, from what is known of them and from the corners; ``noise`` : (12, 12) covariance
-    of the gradient by all other errors, None where it is the normal matrix."""
+    of the gradient by all other errors, None where it is the normal matrix. Of a rig of c cameras, 6c + 6 for 12."""
 
     slope: np.ndarray
     moment: np.ndarray
@@ -39,17 +40,20 @@ class CameraError:
 
 
 def of_corners(corners: Corners, state: Bundle, prior: CameraPrior, free: tuple[str, ...]) -> CameraError:
-    """Of a reprojection adjustment with the intrinsics as filed.
+    """Of a reprojection adjustment with the intrinsics as filed."""
+    known = np.linalg.inv(prior.covariance)
+    return considered(corners.with_intrinsics(intrinsic_basis(prior.colmap_model), known), state, free)
+
+
+def considered(wider: Problem, state: Any, free: tuple[str, ...]) -> CameraError:
+    """Of intrinsics that were not solved for, but are among the unknowns of ``wider``.
 
     Corners that are off by the camera's error make all ``free`` σ too large: they are estimated anew with the
     intrinsics among the unknowns, linear about the state.
     """
-    information = np.linalg.inv(prior.covariance)
-    wider = replace(corners, basis=intrinsic_basis(prior.colmap_model), information=information)
-    factors = dict.fromkeys((name for name, _ in wider.camera_parts()), 1.0)
-    wider = replace(wider, sigma=wider.sigma | factors)
+    factors, poses = wider.factors(), wider.places()["z"].stop
     sigma = wider.sigma | estimated(wider, state, (*free, *factors))
-    at, linear = wider.places(), replace(wider, sigma=sigma).linear(state)
+    at, linear = wider.places(), wider.with_sigma(sigma).linear(state)
     camera = np.arange(at["camera"].start, at["camera"].stop)
     others = np.setdiff1d(np.arange(wider.count()), camera)
     covariance = generalised_inverse(linear.normal)
@@ -61,9 +65,9 @@ def of_corners(corners: Corners, state: Bundle, prior: CameraPrior, free: tuple[
             if name not in factors:
                 normal += part.normal
                 noise += part.normal * (sigma[name] / wider.sigma[name]) ** 2 if name in free else part.normal
-    rest = others[12:]
-    reduced = np.eye(12, len(others))
-    reduced[:, 12:] = -normal[np.ix_(others[:12], rest)] @ generalised_inverse(normal[np.ix_(rest, rest)])
+    rest = others[poses:]
+    reduced = np.eye(poses, len(others))
+    reduced[:, poses:] = -normal[np.ix_(others[:poses], rest)] @ generalised_inverse(normal[np.ix_(rest, rest)])
     return CameraError(
         slope=reduced @ normal[np.ix_(others, camera)],
         moment=covariance[np.ix_(camera, camera)] + np.outer(error, error),

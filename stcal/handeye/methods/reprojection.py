@@ -1,7 +1,8 @@
 """Reprojection adjustment: X and Z from the corners in the images, with the errors of robot, board and camera."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 from scipy.spatial import KDTree
@@ -15,7 +16,7 @@ from stcal.geometry.rigid import Poses, Rigid
 from stcal.handeye.data.loop import Loop
 from stcal.handeye.data.views import View, Views, resect
 from stcal.handeye.methods.arm import ROUNDS, SETTLED_MM, ArmModel, LinearArm
-from stcal.handeye.methods.bundle import LEAST, Bundle, Corners, adjust
+from stcal.handeye.methods.bundle import LEAST, Bundle, Corners, Problem, adjust
 from stcal.handeye.methods.camera_error import CameraError, of_corners
 from stcal.handeye.methods.noise import Noise
 from stcal.handeye.methods.pose_adjustment import FALSE_ALARM, LEAST_POSES
@@ -28,6 +29,10 @@ NO_PRIOR = 1e-12
 """Information that keeps nothing back, px⁻²."""
 CAMERA_MODEL = "OPENCV"
 """Model of the camera in which is looked for errors of the camera file."""
+UNKNOWN_LENS = intrinsic_basis(CAMERA_MODEL), NO_PRIOR * np.eye(intrinsic_basis(CAMERA_MODEL).shape[1])
+"""Basis of its intrinsics, and what is known of them."""
+CAMERA_GAIN = 5.0
+"""Eight intrinsics that are right gain 8 ± 4 in cost, 1 ± 0.5 each; eight that gain 5 each are wrong."""
 SAME_DIGITS = 6
 """Decimals of a millimetre in which places on the board that are one corner agree."""
 SEEN = 1e-3
@@ -183,14 +188,14 @@ def _adjusted(
         solution = adjust(corners, begin, free)
         corners, state, normal = solution.corners, solution.state, solution.normal
         inverse = generalised_inverse(normal)
-        bad = _contradicting(corners, state, inverse)
+        bad = contradicting(corners, state, inverse)
         if not bad.any() or used.sum() - bad.sum() < LEAST_POSES:
             break
         used[rows[bad]] = False
     at = corners.places()
     sigma_scale = float(np.sqrt(inverse[at["scale"], at["scale"]].item())) if with_scale else None
     sigma = {name: float(value) for name, value in corners.sigma.items() if value}
-    found = _found(corners, state, inverse, base_from_flange, rows, intrinsics is not None)
+    found = found_of(corners, state, inverse, base_from_flange, rows, intrinsics is not None)
     rest = generalised_inverse(normal[12:, 12:])
     own = normal[:12, :12] - normal[:12, 12:] @ rest @ normal[12:, :12]
     return AdjustedViews(
@@ -202,7 +207,7 @@ def _adjusted(
         sigma_scale=sigma_scale,
         sigma=sigma,
         estimated=free,
-        scale_hint=_scale_hint(corners, state),
+        scale_hint=scale_hint(corners, state),
         camera_gain=_camera_gain(corners, state),
         camera_error=of_corners(corners, state, camera, free) if camera is not None and intrinsics is None else None,
         found=found,
@@ -210,9 +215,8 @@ def _adjusted(
     )
 
 
-def resected(pairs_names: tuple[str, ...], views: Views, adjusted: AdjustedViews) -> Poses:
+def resected(pairs_names: tuple[str, ...], views: Views, board: Reprojection) -> Poses:
     """camera_from_board of all views by the adjusted camera and board."""
-    board = adjusted.found
     seen = tuple(View(board.board(view.xyz_board), view.xy_px, view.covariance) for view in views.views)
     return resect(Views(board.camera, seen), pairs_names).camera_from_board
 
@@ -226,10 +230,18 @@ def problem(
     with_scale: bool = False,
     arm: LinearArm | None = None,
     first: Mapping[str, float] = FIRST,
+    rows: np.ndarray | None = None,
+    designed: np.ndarray | None = None,
 ) -> tuple[Corners, tuple[str, ...]]:
-    """The problem, and which groups' σ are to be estimated, from ``first``."""
-    every = np.concatenate([view.xyz_board for view in views.views])
-    designed, corner = np.unique(np.round(every, SAME_DIGITS), axis=0, return_inverse=True)
+    """The problem, and which groups' σ are to be estimated, from ``first``.
+
+    ``rows`` : (v,) which of base_from_flange each view is of, one each in their order where None; ``designed`` :
+    (K, 3) the board's corners, of :func:`board_of`, those of the views where None.
+    """
+    designed = board_of([views]) if designed is None else designed
+    every = np.concatenate([designed, *(view.xyz_board for view in views.views)])
+    corner = np.unique(np.round(every, SAME_DIGITS), axis=0, return_inverse=True)[1].ravel()[len(designed) :]
+    rows = np.arange(len(views)) if rows is None else rows
     sigma, free = {}, []
     for name in ("corner_px", "robot_rad", "robot_mm", "board_mm"):
         value = getattr(noise, name)
@@ -248,8 +260,8 @@ def problem(
         loop.inverted,
         base_from_flange,
         designed,
-        np.repeat(np.arange(len(views)), [len(view) for view in views.views]),
-        corner.ravel(),
+        np.repeat(rows, [len(view) for view in views.views]),
+        corner,
         np.concatenate([view.xy_px for view in views.views]),
         np.concatenate([view.whitening() for view in views.views]),
         robot,
@@ -263,11 +275,17 @@ def problem(
     if arm is not None:
         sigma |= {name: first[name] for name in arm.parts()}
         free += list(arm.parts())
-    factors = dict.fromkeys((name for name, _ in corners.camera_parts()), 1.0)
+    factors = corners.factors()
     return replace(corners, sigma=sigma | factors), (*free, *factors)
 
 
-def _contradicting(corners: Corners, state: Bundle, inverse: np.ndarray) -> np.ndarray:
+def board_of(every: Sequence[Views]) -> np.ndarray:
+    """All corners (K, 3) that any view shows, mm, each once."""
+    seen = [view.xyz_board for views in every for view in views.views]
+    return np.unique(np.round(np.concatenate(seen), SAME_DIGITS), axis=0)
+
+
+def contradicting(corners: Problem, state: Any, inverse: np.ndarray) -> np.ndarray:
     """Poses (m,) of which the robot's error is not by chance: its estimate against the variance that it should have."""
     m = len(corners.base_from_flange)
     at = corners.places()["robot"]
@@ -285,33 +303,38 @@ def _contradicting(corners: Corners, state: Bundle, inverse: np.ndarray) -> np.n
     return squared > 6 * f.ppf(1 - FALSE_ALARM / m, 6, redundancy)
 
 
-def _scale_hint(corners: Corners, state: Bundle) -> tuple[float, float]:
+def scale_hint(corners: Problem, state: Any) -> tuple[float, float]:
     """One step from the solution with the scale among the unknowns."""
-    wider = replace(corners, with_scale=True)
+    wider = corners.with_board_scale()
     linear, at = wider.linear(state), wider.places()["scale"].start
     inverse = generalised_inverse(linear.normal)
     return state.scale - float(inverse[at] @ linear.gradient), float(np.sqrt(inverse[at, at]))
 
 
 def _camera_gain(corners: Corners, state: Bundle) -> float:
-    """Predicted by one step from the solution, free of any prior; about 1 where the camera is right."""
     if corners.basis.shape[1]:
         return 1.0
-    basis = intrinsic_basis(CAMERA_MODEL)
-    q = basis.shape[1]
-    wider = replace(corners, basis=basis, information=np.eye(q) * NO_PRIOR)
-    wider = replace(wider, sigma=wider.sigma | {name: 1.0 for name, _ in wider.camera_parts()})
+    return camera_gain(corners.with_intrinsics(*UNKNOWN_LENS), state)
+
+
+def camera_gain(wider: Problem, state: Any) -> float:
+    """By how much the cost would fall, per parameter of one camera, with intrinsics among the unknowns as of
+    :data:`UNKNOWN_LENS`: predicted by one step from the solution; about 1 where the camera is right."""
     linear = wider.linear(state)
-    return float(linear.gradient @ generalised_inverse(linear.normal) @ linear.gradient) / q
+    return float(linear.gradient @ generalised_inverse(linear.normal) @ linear.gradient) / UNKNOWN_LENS[0].shape[1]
 
 
-def _found(corners, state, inverse, reported: Poses, rows, with_camera: bool) -> Reprojection:
+def found_of(
+    corners: Corners, state: Bundle, inverse: np.ndarray, reported: Poses, rows: np.ndarray, with_camera: bool
+) -> Reprojection:
+    """``rows`` : (m,) which of ``reported`` each pose of the problem is, -1 for one that this camera did not see."""
     at = corners.places()
     white, _ = corners.seen(state)
     residuals = corners.sigma["corner_px"] * np.linalg.solve(corners.weight, white[:, :, None])[:, :, 0]
     true = list(reported)
     for row, pose in zip(rows, state.base_from_flange, strict=True):
-        true[row] = pose
+        if row >= 0:
+            true[row] = pose
     return Reprojection(
         state.camera,
         inverse[at["camera"], at["camera"]] if with_camera else None,

@@ -235,19 +235,19 @@ class HandEyeFile(ResultFile):
                 "format": "stcal handeye 1",
                 "version": stcal.__version__,
                 "where": outcome.where,
-                "verdict": _verdict(judged(outcome)),
+                "verdict": verdict_part(judged(outcome)),
                 "setup": result.setup,
                 "method": result.method,
                 **poses,
                 "covariance": result.covariance,
                 f"{board}_covariance": result.stand_covariance,
-                "board": _board(outcome),
-                "camera": _camera(outcome),
+                "board": board_part(outcome),
+                "camera": camera_part(outcome),
                 "sigma": result.sigma,
                 "estimated": result.estimated,
                 "corner_px_is_factor": outcome.own_sigmas,
                 "rms": dict(zip(RmsResidual.model_fields, result.rms(), strict=True)),
-                "poses": _poses(result),
+                "poses": poses_part(result),
                 "outliers": outcome.outliers(),
                 "left_out": [NamedReason(name=name, reason=reason) for name, reason in outcome.left_out],
                 "held_out": _held_out(outcome.held_out, result.outliers),
@@ -258,19 +258,19 @@ class HandEyeFile(ResultFile):
         )
 
 
-def _verdict(found: Verdict) -> VerdictPart:
+def verdict_part(found: Verdict) -> VerdictPart:
     rows = [FindingRow(**{name: getattr(each, name) for name in FindingRow.model_fields}) for each in found.findings]
     return VerdictPart(word=found.word, sentence=found.sentence(), findings=rows)
 
 
-def _board(outcome: Outcome) -> BoardSize:
+def board_part(outcome: Outcome) -> BoardSize:
     result = outcome.result
     pitch = None if outcome.pitch_mm is None else outcome.pitch_mm * result.scale
     unit = {} if outcome.unit_mm is None else {"unit_mm": outcome.unit_mm * result.scale}
     return BoardSize(scale=result.scale, scale_sigma=result.sigma_scale, pitch_mm=pitch, **unit)
 
 
-def _camera(outcome: Outcome) -> AdjustedCamera | None:
+def camera_part(outcome: Outcome) -> AdjustedCamera | None:
     found = outcome.result.reprojection
     if found is None or found.camera_covariance is None:
         return None
@@ -282,7 +282,7 @@ def _camera(outcome: Outcome) -> AdjustedCamera | None:
     )
 
 
-def _poses(result: HandEye) -> list[PoseRow]:
+def poses_part(result: HandEye) -> list[PoseRow]:
     rows = []
     for i, (name, off) in enumerate(zip(result.names, result.residuals, strict=True)):
         rms = {} if result.reprojection is None else {"corner_rms_px": result.reprojection.rms_px(i)}

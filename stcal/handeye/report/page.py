@@ -12,7 +12,7 @@ from stcal.handeye.report.figures import BAD, GOOD, corner_figure, image_figure,
 from stcal.handeye.report.file import why_out
 from stcal.handeye.report.outcome import ArmFound, Outcome
 from stcal.handeye.report.overlays import overlays
-from stcal.handeye.report.verdict import judged
+from stcal.handeye.report.verdict import Verdict, judged
 from stcal.handeye.result import HandEye
 from stcal.handeye.solve import FACTORS
 from stcal.handeye.validate import Compared
@@ -50,19 +50,19 @@ def outcome_text(outcome: Outcome) -> str:
     result, frames = outcome.result, FRAMES[outcome.result.setup]
     lines = [_headline(outcome), f"verdict: {judged(outcome).sentence()}"]
     for name, pose, covariance in _transforms(result):
-        lines += ["", *text_table([["<" + name, *HEADS[1:]], *_transform_rows(pose, covariance)])]
+        lines += ["", *text_table([["<" + name, *HEADS[1:]], *transform_rows(pose, covariance)])]
     turn, shift = result.rms()
     lines += ["", f"residuals (RMS): {np.degrees(turn):.4f}°, {shift:.3f} mm at the board's origin"]
     if outcome.held_out is not None:
-        lines.append(f"held out ({_splits_text(outcome)}): {_means_text(outcome.held_out.means())}")
+        lines.append(f"held out ({_splits_text(outcome)}): {means_text(outcome.held_out.means())}")
         lines += [f"held out, {text}" for text in _agreeing_text(outcome)]
     if outcome.motions is not None:
         lines += ["", _motions_text(outcome), *text_table(_motion_cells(outcome)), ""]
-    lines += [f"σ of {text}: {value} ({how})" for text, value, how in _sigma_rows(outcome)]
+    lines += [f"σ of {text}: {value} ({how})" for text, value, how in sigma_rows(outcome)]
     if result.sigma_scale is not None:
         lines.append(scale_text(outcome, result.sigma_scale))
     if result.observability is not None:
-        lines.append(_turns_text(result.observability))
+        lines.append(turns_text(result.observability))
     if outcome.choice is not None:
         lines += ["", *text_table(_choice_cells(outcome))]
     if outcome.arm is not None:
@@ -117,7 +117,7 @@ def _transforms(result: HandEye) -> list[tuple[str, Rigid, np.ndarray | None]]:
     return [(*item, covariance) for item, covariance in zip(result.transforms.items(), covariances, strict=True)]
 
 
-def _transform_rows(pose: Rigid, covariance: np.ndarray | None) -> list[list[str]]:
+def transform_rows(pose: Rigid, covariance: np.ndarray | None) -> list[list[str]]:
     """Of x, y, z: translation and rotation vector, each with σ."""
     turn = np.degrees(Rotation.from_matrix(np.array(pose.rotation)).as_rotvec())
     sigma = [None] * 6 if covariance is None else np.sqrt(np.maximum(np.diag(covariance), 0))
@@ -136,10 +136,10 @@ def _agreeing_text(outcome: Outcome) -> list[str]:
     """Errors of the poses alone that agree with one another, where some do not."""
     bad = outcome.result.outliers
     means = outcome.held_out.means(~bad) if bad.any() and outcome.held_out is not None else {}
-    return [f"without the {bad.sum()} left out above: {_means_text(means)}"] if means else []
+    return [f"without the {bad.sum()} left out above: {means_text(means)}"] if means else []
 
 
-def _means_text(means: dict[str, float]) -> str:
+def means_text(means: dict[str, float]) -> str:
     parts = []
     for name, mean in means.items():
         head, unit, digits = ERRORS[name]
@@ -148,7 +148,7 @@ def _means_text(means: dict[str, float]) -> str:
     return ", ".join(parts)
 
 
-def _sigma_rows(outcome: Outcome) -> list[list[str]]:
+def sigma_rows(outcome: Outcome) -> list[list[str]]:
     """What errs, by how much, and how that is known."""
     rows = []
     for name, value in outcome.result.sigma.items():
@@ -160,7 +160,7 @@ def _sigma_rows(outcome: Outcome) -> list[list[str]]:
     return rows
 
 
-def _turns_text(seen: Observability) -> str:
+def turns_text(seen: Observability) -> str:
     turns = ", ".join(f"{t:.1f}°" for t in np.degrees(seen.turns_rad))
     return f"the flange turns between poses by {turns} (RMS) about its principal axes"
 
@@ -224,11 +224,11 @@ def outcome_page(outcome: Outcome) -> str:
         notes=[note for note in outcome.all_notes() if isinstance(note, Aside)],
         heads=HEADS,
         transforms=[
-            (name, _transform_rows(pose, covariance), _matrix_text(pose))
+            (name, transform_rows(pose, covariance), matrix_text(pose))
             for name, pose, covariance in _transforms(result)
         ],
-        sigmas=_sigma_rows(outcome),
-        adjusted=_adjusted(outcome),
+        sigmas=sigma_rows(outcome),
+        adjusted=adjusted(outcome),
         compared=compared,
         splits=_splits_text(outcome),
         choice=_choice_cells(outcome),
@@ -240,17 +240,16 @@ def outcome_page(outcome: Outcome) -> str:
         good=GOOD,
         bad=BAD,
         bars=pose_bars(result),
-        poses=_pose_rows(result),
-        **_verdict(outcome),
-        **_coverage(outcome),
+        poses=pose_rows(result),
+        **verdict_parts(judged(outcome)),
+        **coverage(outcome),
         motions=seen and _motion_rows(seen),
         sigma_deg=seen and np.degrees(seen.sigma_rad),
     )
 
 
-def _verdict(outcome: Outcome) -> dict:
+def verdict_parts(found: Verdict) -> dict:
     """The word, its reasons and remedies, and all that was judged."""
-    found = judged(outcome)
     rows = [
         [each.title, verdict(each.word, VERDICTS[each.word]), each.value or NONE, each.limit or NONE, each.said]
         for each in found.findings
@@ -259,7 +258,7 @@ def _verdict(outcome: Outcome) -> dict:
     return {"word": found.word, "verdict_colour": VERDICTS[found.word], "reasons": reasons, "findings": rows}
 
 
-def _coverage(outcome: Outcome) -> dict:
+def coverage(outcome: Outcome) -> dict:
     """Of the image, of rotations, and the images themselves; None and empty where there is nothing to show."""
     shown, missing = overlays(outcome)
     found: dict = {"image": None, "corners": None, "turns": None, "overlays": shown, "missing": missing}
@@ -285,7 +284,7 @@ def _coverage(outcome: Outcome) -> dict:
     return found
 
 
-def _matrix_text(pose: Rigid) -> str:
+def matrix_text(pose: Rigid) -> str:
     return "\n".join(" ".join(f"{v:14.9f}" for v in row) for row in pose.matrix())
 
 
@@ -312,7 +311,7 @@ def _tiles(outcome: Outcome) -> list[tuple[str, str, str]]:
     return tiles
 
 
-def _adjusted(outcome: Outcome) -> list[list[str]] | None:
+def adjusted(outcome: Outcome) -> list[list[str]] | None:
     """Rows of the camera's parameters where they were adjusted."""
     found = outcome.result.reprojection
     if found is None or found.camera_covariance is None:
@@ -327,7 +326,7 @@ def _adjusted(outcome: Outcome) -> list[list[str]] | None:
     return shown
 
 
-def _pose_rows(result: HandEye) -> list[list[str]]:
+def pose_rows(result: HandEye) -> list[list[str]]:
     turn, shift = (np.linalg.norm(part, axis=1) for part in (result.residuals[:, :3], result.residuals[:, 3:]))
     rows = []
     for i, name in enumerate(result.names):

@@ -6,6 +6,7 @@ the odds of the checks of ``stcal-sfm run``: care is advised for what happens by
 thousand, use advised against for what happens in one of a hundred thousand.
 """
 
+from collections.abc import Iterable
 from dataclasses import dataclass
 from typing import Literal, get_args
 
@@ -68,7 +69,7 @@ class Verdict:
 def judged(outcome: Outcome) -> Verdict:
     """The verdict on a calibration."""
     found = [_of_prediction(outcome), _of_share(outcome), _of_motions(outcome), _of_outliers(outcome)]
-    return Verdict(tuple(each for each in (*found, *_of_notes(outcome)) if each is not None))
+    return Verdict(tuple(each for each in (*found, *of_notes(outcome.all_notes())) if each is not None))
 
 
 def _of_prediction(outcome: Outcome) -> Finding | None:
@@ -160,10 +161,10 @@ def _of_outliers(outcome: Outcome) -> Finding:
     return Finding("Outliers", word, said, str(len(bad)), "0", remedy)
 
 
-def _of_notes(outcome: Outcome) -> list[Finding]:
+def of_notes(notes: Iterable[str]) -> list[Finding]:
     """What was found on the way; what each means, or needs, stands behind its colon."""
     found = []
-    for note in outcome.all_notes():
+    for note in notes:
         if not isinstance(note, Aside):
             said, _, remedy = note.partition(": ")
             found.append(Finding("Note", BAD if isinstance(note, Grave) else CARE, said, remedy=remedy))

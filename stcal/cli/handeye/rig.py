@@ -1,0 +1,81 @@
+"""``stcal handeye rig``: several cameras of one robot, solved together."""
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from stcal.cli.handeye.inputs import LengthUnit, PosesAre, RotationOption
+from stcal.cli.options import MOST_SEED, JsonFile, QuaternionOrder, Quaternions, ReportFile, Workers
+from stcal.cli.terminal import StageProgress, print_each, say, write
+from stcal.io.saving import keep_apart
+
+
+def rig(
+    rig_file: Annotated[
+        Path,
+        typer.Argument(
+            metavar="RIG.toml",
+            help="Read setup, board, the robot's poses, and the images and intrinsics of each camera from this file "
+            "(TOML).",
+        ),
+    ],
+    refine_camera: Annotated[
+        bool, typer.Option("--refine-camera", help="Adjust the intrinsics too, of each camera from its own with σ.")
+    ] = False,
+    with_scale: Annotated[
+        bool, typer.Option("--with-scale", help="Find the board's true size from the robot's motion.")
+    ] = False,
+    rotation: RotationOption = None,
+    length_unit: LengthUnit = None,
+    poses_are: PosesAre = None,
+    quaternions: Quaternions = QuaternionOrder.wxyz,
+    held_out: Annotated[
+        int | None,
+        typer.Option(
+            "--held-out",
+            min=1,
+            max=100_000,
+            help="Hold out so many poses of the robot in each split; a quarter if not given.",
+        ),
+    ] = None,
+    splits: Annotated[
+        int, typer.Option("--splits", min=0, max=100_000, help="Cross-validate over this many splits; 0 for none.")
+    ] = 15,
+    seed: Annotated[int, typer.Option(min=0, max=MOST_SEED, help="Draw the splits with this seed.")] = 0,
+    out: Annotated[
+        Path | None, typer.Option("--out", writable=True, help="Write the result to this file (JSON).")
+    ] = None,
+    workers: Workers = None,
+    json_file: JsonFile = None,
+    report: ReportFile = None,
+) -> None:
+    """Find where several cameras sit on one flange, or in one base, and in each other, from one adjustment."""
+    from stcal.handeye.data.formats.record import Said
+    from stcal.handeye.data.rig_file import read_rig_file
+    from stcal.handeye.report.rig import rig_page, rig_text
+    from stcal.handeye.report.rig_file import HandEyeRigFile
+    from stcal.workflows.handeye import Splits
+    from stcal.workflows.handeye_rig import calibrate_rig
+    from stcal.workflows.handeye_rig_input import read_rig
+
+    files = read_rig_file(rig_file)
+    written = {"--out": out, "--json": json_file, "--report": report}
+    keep_apart([(name, path) for name, path in written.items() if path], files.read())
+    said = Said.of_options(rotation or [], length_unit or [], poses_are or [], None)
+    with StageProgress() as progress:
+        given = read_rig(files, workers, progress, quaternions.value, said)
+        print_each("understood", given.understood)
+        validation = Splits(splits, held_out, seed, workers)
+        outcome = calibrate_rig(given, refine_camera, with_scale, validation, progress)
+    say(rig_text(outcome))
+    for name, what, why in outcome.left_out():
+        say(f"left out {name}: {what}: {why}")
+    print_each("note", outcome.all_notes())
+    for path, content in (
+        (out, lambda: HandEyeRigFile.of(outcome)),
+        (report, lambda: rig_page(outcome)),
+        (json_file, lambda: HandEyeRigFile.of(outcome, whole=True)),
+    ):
+        if path:
+            write(path, content())

@@ -1,0 +1,77 @@
+"""RIG.toml: which files belong to which camera of a rig."""
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated
+
+from pydantic import Field
+
+from stcal.errors import InputError
+from stcal.handeye.data.loop import Setup
+from stcal.io.design import Name
+from stcal.io.toml import Strict, load_toml
+
+WHAT = "rig file"
+FileName = Annotated[str, Field(min_length=1, strict=True)]
+
+
+class _CameraFile(Strict):
+    name: Name
+    images: FileName
+    camera: FileName
+    poses: FileName | None = None
+
+
+class _RigFile(Strict):
+    setup: Setup
+    board: FileName
+    poses: FileName | None = None
+    camera: list[_CameraFile] = Field(min_length=1)
+
+
+@dataclass(frozen=True, slots=True)
+class RigCameraFiles:
+    """``name`` of a camera; ``images`` : folder; ``camera`` : intrinsics; ``poses`` : the robot's, of its images."""
+
+    name: str
+    images: Path
+    camera: Path
+    poses: Path
+
+
+@dataclass(frozen=True, slots=True)
+class RigFiles:
+    """``file`` itself; ``setup``; ``board``; ``cameras`` in their order."""
+
+    file: Path
+    setup: Setup
+    board: Path
+    cameras: tuple[RigCameraFiles, ...]
+
+    def read(self) -> list[tuple[str, Path]]:
+        """Every file and folder that is read, with what it is."""
+        found = [(WHAT, self.file), ("board", self.board)]
+        for each in self.cameras:
+            found += [(f"{each.name}: {key}", getattr(each, key)) for key in ("images", "camera", "poses")]
+        return list(dict(reversed([(path, (what, path)) for what, path in found])).values())
+
+
+def read_rig_file(path: Path) -> RigFiles:
+    """Read; all paths in it are relative to the file's folder.
+
+    Raises
+    ------
+    InputError
+        Not TOML, not as it should be, two cameras of one name, or one without poses of the robot.
+    """
+    content = load_toml(path, _RigFile, WHAT, "give a file with setup, board, poses and a [[camera]] for each camera")
+    folder, cameras = path.parent, []
+    for number, each in enumerate(content.camera, 1):
+        poses = each.poses or content.poses
+        if poses is None:
+            raise InputError(f"{WHAT} {path}: camera {each.name}: no poses of the robot; add `poses`, here or for all")
+        if each.name in [other.name for other in cameras]:
+            raise InputError(f"{WHAT} {path}: camera {number} is called {each.name!r} as another is; one name each")
+        files = (folder / name for name in (each.images, each.camera, poses))
+        cameras.append(RigCameraFiles(each.name, *files))
+    return RigFiles(path, content.setup, folder / content.board, tuple(cameras))

@@ -1,0 +1,1 @@
+"""Several cameras of one robot about one board, solved together."""
