@@ -229,10 +229,10 @@ def problem(
     noise: Noise,
     intrinsics: CameraPrior | None = None,
     with_scale: bool = False,
-    rows: np.ndarray | None = None,
-    designed: np.ndarray | None = None,
     arm: LinearArm | None = None,
     first: Mapping[str, float] = FIRST,
+    rows: np.ndarray | None = None,
+    designed: np.ndarray | None = None,
 ) -> tuple[Corners, tuple[str, ...]]:
     """The problem, and which groups' σ are to be estimated, from ``first``.
 

@@ -164,7 +164,7 @@ def _problem(
     for camera, loop in zip(kept, loops, strict=True):
         at = np.searchsorted(rows, camera.rows)
         prior = camera.prior if refine else None
-        own, names = problem(loop, flange, camera.views, noise, prior, with_scale, at, board)
+        own, names = problem(loop, flange, camera.views, noise, prior, with_scale, rows=at, designed=board)
         each.append(own)
         found = RigCorners((camera.name,), (own,))
         free += [name for name in (*found.sigma, *found.factors()) if name.split(":")[0] in names]

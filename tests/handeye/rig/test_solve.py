@@ -71,7 +71,8 @@ def test_derivatives_of_a_rig():
     for i, camera in enumerate(given.cameras):
         prior = camera_prior(CalibratedCamera.of(camera.views.camera, "OPENCV"))
         loop = Loop.of(given.pairs(i), truth.setup)
-        each.append(problem(loop, given.base_from_flange, camera.views, noise, prior, True, camera.rows, board)[0])
+        flange, own = given.base_from_flange, {"rows": camera.rows, "designed": board}
+        each.append(problem(loop, flange, camera.views, noise, prior, True, **own)[0])
     corners = RigCorners(NAMES[:2], tuple(each))
     cameras = tuple(camera.views.camera for camera in given.cameras)
     state = RigBundle(truth.mount_from_camera, truth.stand_from_board, given.base_from_flange, board, cameras, 1.1)
