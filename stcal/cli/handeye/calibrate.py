@@ -17,6 +17,7 @@ from stcal.cli.handeye.inputs import (
     SetupName,
     SetupOption,
     SourceFile,
+    TimeTolerance,
     source_of,
 )
 from stcal.cli.options import (
@@ -130,6 +131,21 @@ def handeye(
         int, typer.Option("--splits", min=0, max=100_000, help="Cross-validate over this many splits; 0 for none.")
     ] = 15,
     seed: Annotated[int, typer.Option(min=0, max=MOST_SEED, help="Draw the splits with this seed.")] = 0,
+    time_offset: Annotated[
+        bool,
+        typer.Option(
+            "--time-offset",
+            help="Find the offset of the robot's clock from the camera's, of poses by time, and use it.",
+        ),
+    ] = False,
+    image_times: Annotated[
+        Path | None,
+        typer.Option(
+            "--image-times",
+            help="Read the times of the images from this file: image, time_s (CSV); their names if not given.",
+        ),
+    ] = None,
+    time_tolerance: TimeTolerance = 0.02,
     motions_held_out: Annotated[
         int | None,
         typer.Option(
@@ -231,14 +247,17 @@ def handeye(
     from stcal.handeye.report.file import HandEyeFile
     from stcal.handeye.report.page import outcome_page, outcome_text
     from stcal.robot import load_robot, save_robot
-    from stcal.workflows.handeye import AUTO, Splits, calibrate
-    from stcal.workflows.handeye_input import dry_run as understood
-    from stcal.workflows.handeye_input import read_input, setup_of
+    from stcal.workflows.handeye.calibrate import AUTO, Splits, calibrate
+    from stcal.workflows.handeye.inputs import dry_run as understood
+    from stcal.workflows.handeye.inputs import read_input, setup_of
+    from stcal.workflows.handeye.offset import at_offset, with_offset
+    from stcal.workflows.handeye.times import Timing
 
     robot, seen = (_radians(sigma_robot_deg), sigma_robot_mm), (_radians(sigma_camera_deg), sigma_camera_mm)
     noise = Noise(*robot, *seen, sigma_px, sigma_board_mm)
     said = Said.of_options(rotation or [], length_unit or [], poses_are or [], setup and setup.value)
-    pairs = source_of(source, first, second, key, said, quaternions.value)
+    timing = Timing(time_tolerance, image_times, time_offset)
+    pairs = source_of(source, first, second, key, said, quaternions.value, timing)
     folder = isinstance(pairs, Path) and pairs.is_dir()
     _require_fitting(not folder, method, refine_camera, camera_out, with_kinematics is not None)
     _require_arm(folder, method, four_dof, with_kinematics, robot_out)
@@ -248,7 +267,7 @@ def handeye(
     written |= {"--robot-out": robot_out}
     written |= {"--json": json_file, "--report": report}
     read = {"source": source, "--poses": poses, "--camera": camera, "--board": board, "--a": first, "--b": second}
-    read |= {"--with-kinematics": with_kinematics}
+    read |= {"--with-kinematics": with_kinematics, "--image-times": image_times}
     keep_apart(
         [*((name, path) for name, path in written.items() if path), *(("--export", path) for _, path in exports)],
         [(name, path) for name, path in read.items() if path],
@@ -272,10 +291,10 @@ def handeye(
         seed=de_seed,
     )
     if dry_run:
-        say("\n".join(understood(pairs, poses, camera, board, quaternions.value, said, robot_model)))
+        say("\n".join(understood(pairs, poses, camera, board, quaternions.value, said, timing, robot_model)))
         return
     with StageProgress() as progress:
-        given = read_input(pairs, poses, camera, board, workers, progress, quaternions.value, said, robot_model)
+        given = read_input(pairs, poses, camera, board, workers, progress, quaternions.value, said, timing, robot_model)
         for line in given.understood:
             say(line)
         with_scale = with_scale or given.unit_mm is not None
@@ -285,7 +304,10 @@ def handeye(
         validation = Splits(splits, held_out, seed, workers, motions_held_out)
         if method is None and not (refine_camera or with_scale or four_dof):
             method = AUTO
-        outcome = calibrate(given, setup_of(said, given.setup, given.where), method, options, validation, progress)
+        chosen, offset = setup_of(said, given.setup, given.where), None
+        if time_offset:
+            given, options, offset = at_offset(given, chosen, options)
+        outcome = with_offset(calibrate(given, chosen, method, options, validation, progress), offset)
     result = outcome.result
     say(outcome_text(outcome))
     for option, given_, able in (("--with-scale", with_scale, SCALED), ("--refine-camera", refine_camera, SCALED[1:])):
@@ -333,7 +355,7 @@ def _require_fitting(
 ) -> None:
     """Options of the camera and the method go together."""
     from stcal.handeye import METHODS
-    from stcal.workflows.handeye import ALL
+    from stcal.workflows.handeye.calibrate import ALL
 
     if camera_out and not (refine_camera or with_arm):
         raise InputError("--camera-out: only with --refine-camera or --with-kinematics; the camera is as given else")
@@ -398,7 +420,7 @@ def _bounds(option: str, text: str | None, factor: float) -> "Bounds | None":
 def _evolution(method: str | None, **given) -> "EvolutionOptions":
     """Options of differential evolution, those that were given."""
     from stcal.handeye import EvolutionOptions
-    from stcal.workflows.handeye import ALL
+    from stcal.workflows.handeye.calibrate import ALL
 
     given = {name: value for name, value in given.items() if value is not None}
     if given and method not in (ALL, *EVOLVED):

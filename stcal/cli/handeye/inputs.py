@@ -11,7 +11,8 @@ from stcal.cli.options import one_table
 if TYPE_CHECKING:
     from stcal.handeye.data.formats.record import Said
     from stcal.io.quaternions import Order
-    from stcal.workflows.handeye_input import Source
+    from stcal.workflows.handeye.inputs import Source
+    from stcal.workflows.handeye.times import Timing
 
 
 class SetupName(StrEnum):
@@ -76,16 +77,32 @@ PosesAre = Annotated[
         "camera_from_board or board_from_camera; once for each side.",
     ),
 ]
+TimeTolerance = Annotated[
+    float,
+    typer.Option(
+        "--time-tolerance",
+        min=0,
+        max=3600,
+        help="Take the nearest of the robot's poses within this time, s, where none can be interpolated.",
+    ),
+]
 
 
 def source_of(
-    source: Path | None, first: Path | None, second: Path | None, key: str, said: "Said", quaternions: "Order"
+    source: Path | None,
+    first: Path | None,
+    second: Path | None,
+    key: str,
+    said: "Said",
+    quaternions: "Order",
+    timing: "Timing | None" = None,
 ) -> "Source":
     """The file or folder that was named first; or --a and --b joined, whatever their formats."""
-    from stcal.workflows.handeye_input import two_files
+    from stcal.workflows.handeye.inputs import two_files
+    from stcal.workflows.handeye.times import Timing
 
     if source is None and first is not None and second is not None:
-        told = two_files(first, second, key, said, quaternions)
+        told = two_files(first, second, key, said, quaternions, timing or Timing())
         if told is not None:
             return told
     prefixes = ("base_from_flange_", "camera_from_board_")

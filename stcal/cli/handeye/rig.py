@@ -5,7 +5,7 @@ from typing import Annotated
 
 import typer
 
-from stcal.cli.handeye.inputs import LengthUnit, PosesAre, RotationOption
+from stcal.cli.handeye.inputs import LengthUnit, PosesAre, RotationOption, TimeTolerance
 from stcal.cli.options import MOST_SEED, JsonFile, QuaternionOrder, Quaternions, ReportFile, Workers
 from stcal.cli.terminal import StageProgress, print_each, say, write
 from stcal.io.saving import keep_apart
@@ -30,6 +30,7 @@ def rig(
     length_unit: LengthUnit = None,
     poses_are: PosesAre = None,
     quaternions: Quaternions = QuaternionOrder.wxyz,
+    time_tolerance: TimeTolerance = 0.02,
     held_out: Annotated[
         int | None,
         typer.Option(
@@ -55,16 +56,16 @@ def rig(
     from stcal.handeye.data.rig_file import read_rig_file
     from stcal.handeye.report.rig import rig_page, rig_text
     from stcal.handeye.report.rig_file import HandEyeRigFile
-    from stcal.workflows.handeye import Splits
-    from stcal.workflows.handeye_rig import calibrate_rig
-    from stcal.workflows.handeye_rig_input import read_rig
+    from stcal.workflows.handeye.calibrate import Splits
+    from stcal.workflows.handeye.rig import calibrate_rig
+    from stcal.workflows.handeye.rig_inputs import read_rig
 
     files = read_rig_file(rig_file)
     written = {"--out": out, "--json": json_file, "--report": report}
     keep_apart([(name, path) for name, path in written.items() if path], files.read())
     said = Said.of_options(rotation or [], length_unit or [], poses_are or [], None)
     with StageProgress() as progress:
-        given = read_rig(files, workers, progress, quaternions.value, said)
+        given = read_rig(files, workers, progress, quaternions.value, said, time_tolerance)
         print_each("understood", given.understood)
         validation = Splits(splits, held_out, seed, workers)
         outcome = calibrate_rig(given, refine_camera, with_scale, validation, progress)

@@ -3,8 +3,7 @@
 import re
 from collections.abc import Callable, Hashable, Sequence
 from dataclasses import dataclass
-from decimal import Decimal, InvalidOperation
-from pathlib import Path, PurePosixPath
+from pathlib import Path
 
 import numpy as np
 
@@ -14,6 +13,7 @@ from stcal.handeye.data.formats.columns import read_columns
 from stcal.handeye.data.formats.record import FRAMES, Content, Frames, Role, Said, Side
 from stcal.handeye.data.formats.tell import read_content
 from stcal.handeye.data.pairs import HandEyePoses, inverse_covariance
+from stcal.handeye.data.stream import TOLERANCE_S, Stream, Timed, stamps_of, stem_of, taken_at, time_of
 from stcal.io.files import TABLE_BYTES, read_bytes
 from stcal.io.quaternions import Order
 from stcal.io.table import FARTHEST, LENGTHS, Table, read_table
@@ -23,7 +23,6 @@ METRES_UP_TO, MILLIMETRES_FROM = 5.0, 50.0
 from base and camera than 5 mm, and nearer than 50 m."""
 MIXED = 100.0
 """Poses of which the farthest is so many times as far as the nearest are of two units."""
-NANOSECONDS_FROM = Decimal(10) ** 14
 SHOWN = 3
 
 
@@ -56,13 +55,15 @@ class Posed:
 @dataclass(frozen=True, slots=True, eq=False)
 class Told:
     """Pose pairs; ``understood`` : a line for each input; ``setup`` : where a file says so; ``scaled`` : whether the
-    camera's lengths have no unit; ``left_out`` : (name, why)."""
+    camera's lengths have no unit; ``left_out`` : (name, why); ``timed`` : where the robot's poses were taken
+    by time."""
 
     pairs: HandEyePoses
     understood: tuple[str, ...]
     setup: str | None = None
     scaled: bool = False
     left_out: tuple[tuple[str, str], ...] = ()
+    timed: Timed | None = None
 
 
 def read_pairs(path: Path, said: Said, key: str = "image", quaternions: Order = "wxyz") -> Told | None:
@@ -91,9 +92,18 @@ def read_pairs(path: Path, said: Said, key: str = "image", quaternions: Order = 
     return Told(_pairs(robot, camera, rows, rows, names, path.name), _both(robot, camera), content.setup, camera.scaled)
 
 
-def read_two(first: Path, second: Path, said: Said, key: str, quaternions: Order = "wxyz") -> Told | None:
+def read_two(
+    first: Path,
+    second: Path,
+    said: Said,
+    key: str,
+    quaternions: Order = "wxyz",
+    tolerance_s: float = TOLERANCE_S,
+    timed: bool = False,
+) -> Told | None:
     """The robot's poses and the camera's of two files, joined by image or time, or by their order where neither file
-    says any; None where both are the package's own tables.
+    says any; None where both are the package's own tables. Of times that are not equal, and of all where ``timed``, the
+    robot's poses are those at the camera's times, within ``tolerance_s``.
 
     Raises
     ------
@@ -109,13 +119,15 @@ def read_two(first: Path, second: Path, said: Said, key: str, quaternions: Order
         found = content or own_table(path, said, key, quaternions)
         sides.append(settled(_side(found, role, path), role, found, path, said))
     robot, camera = sides
+    setup = next((content.setup for content in contents if content is not None and content.setup), None)
+    if (told := _by_time(robot, camera, setup, f"{first.name} with {second.name}", tolerance_s, timed)) is not None:
+        return told
     rows, how = matched(robot, camera, key)
     notes = () if not how else (f"rows joined {how}",)
     a, b = [i for i, _ in rows], [j for _, j in rows]
     names = tuple(robot.called(i) for i in a)
     left_out = [(robot.called(i), f"in {first.name} alone") for i in sorted(set(range(len(robot))) - set(a))]
     left_out += [(camera.called(j), f"in {second.name} alone") for j in sorted(set(range(len(camera))) - set(b))]
-    setup = next((content.setup for content in contents if content is not None and content.setup), None)
     where = f"{first.name} with {second.name}"
     pairs = _pairs(robot, camera, a, b, names, where)
     return Told(pairs, (*_both(robot, camera), *notes), setup, camera.scaled, tuple(left_out))
@@ -154,6 +166,38 @@ def own_table(path: Path, said: Said, key: str, quaternions: Order) -> Content:
     if found is None:
         raise InputError(f"{table.where}: no poses in its columns; the header is {table.header()}")
     return found
+
+
+def _by_time(
+    robot: Posed, camera: Posed, setup: str | None, where: str, tolerance_s: float, always: bool
+) -> Told | None:
+    """The robot's poses at the camera's times; None where either has none, or, unless ``always``, where all of the
+    camera's are times of the robot."""
+    times = [stamps_of(each.names) if each.names else None for each in (robot, camera)]
+    if times[0] is None or times[1] is None:
+        if always:
+            without = (robot, camera)[times[0] is not None]
+            raise InputError(f"{without.where}: no times of its poses; with --time-offset both files need them")
+        return None
+    if not always and set(times[1]) <= set(times[0]):
+        return None
+    stream = Stream.of(times[0], robot.poses, Path(robot.where).name)
+    seconds = stream.after_origin(times[1])
+    taken = taken_at(stream, seconds, tolerance_s)
+    if not taken.kept.any():
+        raise InputError(f"{camera.where}: no pose has one of the robot: first {camera.names[0]}, {taken.why[0]}")
+    kept = np.flatnonzero(taken.kept)
+    of_camera = None if camera.covariance is None else camera.covariance[kept]
+    names = tuple(camera.names[i] for i in kept)
+    pairs = HandEyePoses(taken.base_from_flange, camera.poses[kept], None, of_camera, names, where)
+    left_out = tuple((camera.names[i], why) for i, why in enumerate(taken.why) if why)
+    dropped = (
+        ("covariances of the robot's poses are not used: they are of other times",)
+        if robot.covariance is not None
+        else ()
+    )
+    lines = (*_both(robot, camera), taken.said, *dropped)
+    return Told(pairs, lines, setup, camera.scaled, left_out, Timed(stream, seconds[kept]))
 
 
 def _side(content: Content, role: Role, path: Path) -> Side:
@@ -292,8 +336,8 @@ def partners(first: Sequence[str], second: Sequence[str]) -> tuple[list[tuple[in
     """
     ways: tuple[tuple[Callable[[str], Hashable | None], str], ...] = (
         (str, ""),
-        (_time, "by their times as numbers"),
-        (_stem, "by names without folder and ending"),
+        (time_of, "by their times as numbers"),
+        (stem_of, "by names without folder and ending"),
         (trailing_number, "by the number at the end of each name, like"),
     )
     for way, how in ways:
@@ -313,23 +357,7 @@ def partners(first: Sequence[str], second: Sequence[str]) -> tuple[list[tuple[in
     return None
 
 
-def _time(name: str) -> Decimal | None:
-    """Seconds; numbers of nanoseconds as seconds too."""
-    try:
-        value = Decimal(_stem(name) if not re.fullmatch(r"[-+\d.eE]+", name) else name)
-    except InvalidOperation:
-        return None
-    if not value.is_finite():
-        return None
-    return value.scaleb(-9) if value >= NANOSECONDS_FROM else value.normalize()
-
-
-def _stem(name: str) -> str:
-    last = PurePosixPath(name.replace("\\", "/")).name
-    return last.rsplit(".", 1)[0] if re.search(r"\.[A-Za-z]\w{1,4}$", last) else last
-
-
 def trailing_number(name: str) -> int | None:
     """Of ``img07.png``: 7; None where the name ends otherwise, or is a time."""
-    found = re.fullmatch(r"(?:.*[^\d.])?(\d{1,9})", _stem(name))
+    found = re.fullmatch(r"(?:.*[^\d.])?(\d{1,9})", stem_of(name))
     return int(found[1]) if found else None

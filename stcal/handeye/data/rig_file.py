@@ -20,6 +20,7 @@ class _CameraFile(Strict):
     images: FileName
     camera: FileName
     poses: FileName | None = None
+    times: FileName | None = None
 
 
 class _RigFile(Strict):
@@ -31,12 +32,14 @@ class _RigFile(Strict):
 
 @dataclass(frozen=True, slots=True)
 class RigCameraFiles:
-    """``name`` of a camera; ``images`` : folder; ``camera`` : intrinsics; ``poses`` : the robot's, of its images."""
+    """``name`` of a camera; ``images`` : folder; ``camera`` : intrinsics; ``poses`` : the robot's, of its images;
+    ``times`` : of its images, where their names are none."""
 
     name: str
     images: Path
     camera: Path
     poses: Path
+    times: Path | None = None
 
 
 @dataclass(frozen=True, slots=True)
@@ -52,7 +55,8 @@ class RigFiles:
         """Every file and folder that is read, with what it is."""
         found = [(WHAT, self.file), ("board", self.board)]
         for each in self.cameras:
-            found += [(f"{each.name}: {key}", getattr(each, key)) for key in ("images", "camera", "poses")]
+            keys = ("images", "camera", "poses", *(("times",) if each.times else ()))
+            found += [(f"{each.name}: {key}", getattr(each, key)) for key in keys]
         return list(dict(reversed([(path, (what, path)) for what, path in found])).values())
 
 
@@ -73,5 +77,5 @@ def read_rig_file(path: Path) -> RigFiles:
         if each.name in [other.name for other in cameras]:
             raise InputError(f"{WHAT} {path}: camera {number} is called {each.name!r} as another is; one name each")
         files = (folder / name for name in (each.images, each.camera, poses))
-        cameras.append(RigCameraFiles(each.name, *files))
+        cameras.append(RigCameraFiles(each.name, *files, times=folder / each.times if each.times else None))
     return RigFiles(path, content.setup, folder / content.board, tuple(cameras))

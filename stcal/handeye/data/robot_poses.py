@@ -18,6 +18,8 @@ from stcal.io.quaternions import Order, require_unit
 from stcal.io.table import LENGTHS, read_table
 
 YAML = (".yaml", ".yml")
+TIME = "time_s"
+"""Column of a stream of poses in place of ``image``."""
 INDUSTRIAL = "poses of ROS-Industrial; base_from_flange by default; quaternions by name; m as in ROS"
 
 
@@ -25,7 +27,8 @@ INDUSTRIAL = "poses of ROS-Industrial; base_from_flange by default; quaternions 
 class RobotPoses:
     """``images`` : name of each; ``base_from_flange`` : m, mm; ``covariance`` : (m, 6, 6) or None; ``places`` : where
     each stands in ``where``, for messages; ``understood`` : what the file was taken for; ``own`` : whether it is a
-    table of the package. Without ``images`` the poses are of the images in their order."""
+    table of the package; ``timed`` : whether ``images`` are times by the name of their column. Without ``images`` the
+    poses are of the images in their order."""
 
     images: tuple[str, ...]
     base_from_flange: Poses
@@ -34,6 +37,7 @@ class RobotPoses:
     where: str
     understood: str = ""
     own: bool = True
+    timed: bool = False
 
     @property
     def file(self) -> str:
@@ -96,7 +100,7 @@ class RobotPoses:
 def read_robot_poses(path: str | Path, quaternions: Order = "wxyz", said: Said | None = None) -> RobotPoses:
     """Read any of :mod:`stcal.handeye.data.formats`.
 
-    Or a CSV file with a column ``image`` and ``base_from_flange_x_mm`` … (or ``flange_from_base_…``).
+    Or a CSV file with a column ``image``, or ``time_s``, and ``base_from_flange_x_mm`` … (or ``flange_from_base_…``).
 
     Or ROS-Industrial's calibration data: a folder of YAML files, one for each image, of the same name, with ``x, y, z``
     in metres and ``qx, qy, qz, qw``; or a YAML list of such files, each a ``pose`` with its ``image``.
@@ -129,12 +133,13 @@ def read_robot_poses(path: str | Path, quaternions: Order = "wxyz", said: Said |
         read = _from_yaml(_listed(path), f"robot poses {path}")
         return replace(read, understood=f"{path.name}: list of {len(read.images)} {INDUSTRIAL}", own=False)
     table = read_table(path, "robot poses", quaternions)
-    images, places = table.text("image"), tuple(f"line {line}" for line in table.lines)
+    timed = "image" not in table and TIME in table
+    images, places = table.text(TIME if timed else "image"), tuple(f"line {line}" for line in table.lines)
     require_each_once(images, places, table.where, "image ")
     poses, covariance = read_side(table, *SIDES[0])
     frame = next(name for name in SIDES[0] if any(column.startswith(f"{name}_") for column in table.columns))
     understood = f"{path.name}: table; {len(images)} poses; {frame} by its columns; {table.unit(f'{frame}_x', LENGTHS)}"
-    return RobotPoses(tuple(images), poses, covariance, places, table.where, understood)
+    return RobotPoses(tuple(images), poses, covariance, places, table.where, understood, timed=timed)
 
 
 def _of_others(path: Path, said: Said, quaternions: Order) -> RobotPoses | None:

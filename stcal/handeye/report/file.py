@@ -129,6 +129,13 @@ class ArmPart(Part):
     plain: HeldOutMeans | None
 
 
+class TimeOffsetPart(Part):
+    seconds: float
+    sigma_s: float
+    speed_mm_s: float
+    speed_rad_s: float
+
+
 class HandEyeFile(ResultFile):
     """Of ``handeye``: mm, rad, px; null where there is no value."""
 
@@ -199,6 +206,12 @@ class HandEyeFile(ResultFile):
         "`sentence` on it, and all that were `tried`: `way` (method, with camera and scale solved for), `splits`, mean "
         "`error_mm` (3-D at the board; of poses, of the board's origin), `reason` why it was given up or fails",
     )
+    time_offset: TimeOffsetPart | None = Field(
+        None,
+        description="with `--time-offset`: `seconds` by which the robot's clock is ahead of the camera's, so that an "
+        "image stamped t was taken at t + `seconds` of the robot's; `sigma_s`, which σ of `X` and `Z` hold; RMS "
+        "`speed_mm_s`, `speed_rad_s` of the flange at the images",
+    )
     observability: SeenTurns | None = Field(
         description="`turns_rad` RMS between poses about the principal `axes_flange`; `sigma_rad`, `sigma_mm` of the "
         "worst direction from poses of a common camera (1 mrad, 0.5 mm)"
@@ -228,6 +241,8 @@ class HandEyeFile(ResultFile):
         more: dict = {} if outcome.motions is None else {"motions_held_out": _motions(outcome.motions)}
         more |= {} if outcome.choice is None else {"choice": _choice(outcome.choice)}
         more |= {} if outcome.arm is None else {"arm": _arm(outcome.arm)}
+        if (offset := outcome.time_offset) is not None:
+            more["time_offset"] = {name: getattr(offset, name) for name in TimeOffsetPart.model_fields}
         more |= {"understood": outcome.understood} if outcome.understood else {}
         more |= {"splits": _splits(outcome.held_out, names), "methods": compared} if whole else {}
         return cls.model_validate(

@@ -10,6 +10,7 @@ from stcal.handeye.data.pairs import HandEyePoses
 from stcal.handeye.data.views import Views
 from stcal.handeye.predict import HeldOutMotions
 from stcal.handeye.result import HandEye
+from stcal.handeye.time_offset import TimeOffset
 from stcal.handeye.validate import Compared, HeldOutPoses
 
 
@@ -75,6 +76,8 @@ class Outcome:
         Of a model without a unit: mm by which the camera's lengths were multiplied before.
     arm : ArmFound, optional
         Where the arm's parameters were solved for too.
+    time_offset : TimeOffset, optional
+        Of the robot's clock from the camera's, where it was solved for; σ of the result hold its own.
     """
 
     where: str
@@ -94,6 +97,7 @@ class Outcome:
     understood: tuple[str, ...] = ()
     unit_mm: float | None = None
     arm: ArmFound | None = None
+    time_offset: TimeOffset | None = None
 
     def sentence(self) -> str:
         """What was solved for, and what that gains; empty where the user said what to solve for."""

@@ -52,6 +52,8 @@ def outcome_text(outcome: Outcome) -> str:
     for name, pose, covariance in _transforms(result):
         lines += ["", *text_table([["<" + name, *HEADS[1:]], *transform_rows(pose, covariance)])]
     turn, shift = result.rms()
+    if outcome.time_offset is not None:
+        lines += ["", outcome.time_offset.in_words()]
     lines += ["", f"residuals (RMS): {np.degrees(turn):.4f}°, {shift:.3f} mm at the board's origin"]
     if outcome.held_out is not None:
         lines.append(f"held out ({_splits_text(outcome)}): {means_text(outcome.held_out.means())}")

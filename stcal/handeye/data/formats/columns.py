@@ -30,7 +30,7 @@ from stcal.io.table import ANGLES, LENGTHS, Table
 TABLE = "table"
 NAMES = (
     *("image", "image_name", "filename", "file", "name", "pose"),
-    *("field.header.stamp", "header.stamp", "header_stamp", "timestamp", "stamp", "%time", "__time", "time"),
+    *("field.header.stamp", "header.stamp", "header_stamp", "timestamp", "stamp", "%time", "__time", "time_s", "time"),
 )
 """Columns that name a row, in order of preference."""
 TRIPLES = (("rx", "ry", "rz"), ("a", "b", "c"), ("w", "p", "r"), ("o", "a", "t"), ("roll", "pitch", "yaw"))

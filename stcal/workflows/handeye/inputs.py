@@ -14,6 +14,7 @@ from stcal.handeye.data.formats.record import Said
 from stcal.handeye.data.inputs import Told, own_told, read_pairs, read_two
 from stcal.handeye.data.loop import SETUPS, Loop, Setup
 from stcal.handeye.data.robot_poses import RobotPoses, read_robot_poses
+from stcal.handeye.data.stream import Timed
 from stcal.handeye.judge.spread import spread_text
 from stcal.handeye.methods import start
 from stcal.io.camera import CameraPrior, camera_prior, read_camera, refinable
@@ -23,9 +24,11 @@ from stcal.io.table import Table
 from stcal.parallel import Progress, one_thread
 from stcal.robot import Robot
 from stcal.workflows.board_views import Board, detect_boards
-from stcal.workflows.handeye_arm import Arm, read_arm
+from stcal.workflows.handeye.arm import Arm, read_arm
+from stcal.workflows.handeye.times import Timing, robot_at_images
 
 NOTHING_SAID = Said()
+WITHOUT_OPTIONS = Timing()
 Source = Path | Table | Told
 
 
@@ -37,7 +40,8 @@ class HandEyeInput:
     ``prior``; ``pitch_mm`` of the board's file; ``left_out`` : (image or row, why); ``understood`` : a line for each
     file that is not a table of the package; ``setup`` : as a file says it; ``unit_mm`` : of a model without a unit,
     about, by which ``pairs`` are multiplied already; ``folder`` : of the images; ``arm`` : at the joint values of the
-    ``pairs``, where its parameters are to be solved for.
+    ``pairs``, where its parameters are to be solved for; ``timed`` : times of the pairs in the robot's stream, where
+    its poses were taken by time.
     """
 
     where: str
@@ -52,9 +56,17 @@ class HandEyeInput:
     unit_mm: float | None = None
     folder: Path | None = None
     arm: Arm | None = None
+    timed: Timed | None = None
 
 
-def two_files(first: Path, second: Path, key: str, said: Said, quaternions: Order = "wxyz") -> Told | None:
+def two_files(
+    first: Path,
+    second: Path,
+    key: str,
+    said: Said,
+    quaternions: Order = "wxyz",
+    timing: Timing = WITHOUT_OPTIONS,
+) -> Told | None:
     """The robot's poses and the camera's, joined; None of two tables of the package's own, which are joined as such.
 
     Raises
@@ -62,7 +74,7 @@ def two_files(first: Path, second: Path, key: str, said: Said, quaternions: Orde
     InputError
         As :func:`~stcal.handeye.data.inputs.read_two`; options that tables do not need.
     """
-    found = read_two(first, second, said, key, quaternions)
+    found = read_two(first, second, said, key, quaternions, timing.tolerance_s, timing.offset)
     if found is None:
         _require_unsaid(said, f"{first}, {second}")
     return found
@@ -78,14 +90,15 @@ def read_input(
     progress: Progress = lambda *_: None,
     quaternions: Order = "wxyz",
     said: Said = NOTHING_SAID,
+    timing: Timing = WITHOUT_OPTIONS,
     robot: Robot | None = None,
 ) -> HandEyeInput:
     """Pose pairs from their file or files; or from a folder of images with the files ``poses``, ``camera`` and
     ``board``.
 
     ``quaternions`` : ``xyzw`` where their columns hold x, y, z, w in the order in which they stand; ``said`` : what
-    files do not say themselves; ``robot`` : at whose joint values, in ``poses``, the images were taken, if its
-    parameters are to be solved for.
+    files do not say themselves; ``timing`` : of poses by time; ``robot`` : at whose joint values, in ``poses``, the
+    images were taken, if its parameters are to be solved for.
 
     Raises
     ------
@@ -96,12 +109,14 @@ def read_input(
         poses, camera, board = _all_three(source, poses, camera, board)
         if robot is None:
             found = read_robot_poses(poses, quaternions, said)
-            return _from_images(source, found, poses, camera, board, workers, progress)
+            return _from_images(source, found, poses, camera, board, workers, progress, timing)
+        _require_by_name(timing)
         found, arm = read_arm(poses, robot, quaternions)
-        return _from_images(source, found, poses, camera, board, workers, progress, arm)
+        return _from_images(source, found, poses, camera, board, workers, progress, None, arm)
     if robot is not None:
         raise InputError("--with-kinematics: only with a folder of images, in which the arm is seen to err")
     _require_no_images(source, poses, camera, board)
+    _require_timed(source, timing)
     if isinstance(source, Table):
         return HandEyeInput(source.where, read_poses(source, quaternions))
     if isinstance(source, Told):
@@ -131,6 +146,28 @@ def _require_no_images(source: Source, poses: Path | None, camera: Path | None, 
         if not isinstance(source, Path):
             what = f"{source.where if isinstance(source, Table) else source.pairs.where} are poses"
         raise InputError(f"{', '.join(extra)}: only with a folder of images; {what}")
+
+
+def _require_by_name(timing: Timing) -> None:
+    if timing.offset or timing.image_times is not None:
+        raise InputError(
+            "--time-offset, --image-times: not with --with-kinematics, whose joint values belong to images by name; "
+            "name the images in the column image"
+        )
+
+
+def _require_timed(source: Source, timing: Timing) -> None:
+    """Options of times go with images, or with poses of both sides in files of their own."""
+    if timing.image_times is not None:
+        raise InputError("--image-times: only with a folder of images; poses have their times beside them")
+    if timing.offset and not (isinstance(source, Told) and source.timed is not None):
+        where = (
+            source.where if isinstance(source, Table) else source if isinstance(source, Path) else source.pairs.where
+        )
+        raise InputError(
+            f"{where}: --time-offset needs the robot's poses as a stream with times; give --a and --b, or images and "
+            "--poses, each with times"
+        )
 
 
 def _require_unsaid(said: Said, where: str) -> None:
@@ -165,6 +202,7 @@ def _from_told(told: Told, said: Said) -> HandEyeInput:
         understood=understood,
         setup=setup if told.setup else None,
         unit_mm=unit,
+        timed=told.timed,
     )
 
 
@@ -184,7 +222,7 @@ def _about_mm(pairs: HandEyePoses, setup: Setup) -> tuple[HandEyePoses, float]:
 class Photographed:
     """What one camera's images show: ``names`` : of those that show the board and have a pose; ``seen`` : the board in
     them; ``rows`` : (k,) their robot poses, of ``base_from_flange``; ``covariance`` of these; ``how`` they were
-    matched; others as :class:`HandEyeInput`."""
+    matched; ``robot`` : its poses by image; others as :class:`HandEyeInput`."""
 
     names: tuple[str, ...]
     seen: Views
@@ -195,10 +233,18 @@ class Photographed:
     prior: CameraPrior
     left_out: tuple[tuple[str, str], ...]
     how: str
+    robot: RobotPoses
+    timed: Timed | None
 
 
 def photographed(
-    source: Path, robot: RobotPoses, camera: Path, design: Board, workers: int | None, progress: Progress
+    source: Path,
+    robot: RobotPoses,
+    camera: Path,
+    design: Board,
+    workers: int | None,
+    progress: Progress,
+    timing: Timing | None = WITHOUT_OPTIONS,
 ) -> Photographed:
     """Corners of the board in all images that have a pose.
 
@@ -209,12 +255,15 @@ def photographed(
     """
     model = read_camera(camera)
     files, skipped = find_images(source)
+    at_images = robot_at_images(robot, [file.name for file in files], timing)
+    robot, late = at_images.robot, dict(at_images.left_out)
+    files = [file for file in files if file.name not in late]
     rows, missing, how = _rows_of_images(robot, files, source)
     with_pose = [file for file in files if file.name in rows]
     found = detect_boards(with_pose, model, design, (), workers, partial(progress, "board"))
     views = found.views()
     left_out = [(each.name, each.reason) for each in (*skipped, *found.skipped)]
-    left_out += _without_partner(files, rows, missing, robot.file)
+    left_out += [*late.items(), *_without_partner(files, rows, missing, robot.file)]
     if not views:
         first = f"{found.skipped[0].name}: {found.skipped[0].reason}"
         raise InputError(f"image folder {source}: the board is in none of {len(with_pose)} images: {first}")
@@ -231,6 +280,8 @@ def photographed(
         prior,
         tuple(left_out),
         how,
+        robot,
+        at_images.timed(tuple(views)),
     )
 
 
@@ -242,11 +293,13 @@ def _from_images(
     board: Path,
     workers: int | None,
     progress: Progress,
+    timing: Timing | None,
     arm: Arm | None = None,
 ) -> HandEyeInput:
     """Pairs of all images that show the board and have a pose."""
     design = load_flat_board(board)
-    found = photographed(source, robot, camera, design, workers, progress)
+    found = photographed(source, robot, camera, design, workers, progress, timing)
+    robot = found.robot
     pairs = pairs_of_views(found.base_from_flange[found.rows], found.seen, found.names, str(source))
     if found.covariance is not None:
         pairs = replace(pairs, base_from_flange_covariance=found.covariance[found.rows])
@@ -262,6 +315,7 @@ def _from_images(
         understood,
         folder=source,
         arm=arm and arm[found.rows],
+        timed=found.timed,
     )
 
 
@@ -300,6 +354,7 @@ def dry_run(
     board: Path | None = None,
     quaternions: Order = "wxyz",
     said: Said = NOTHING_SAID,
+    timing: Timing = WITHOUT_OPTIONS,
     robot: Robot | None = None,
 ) -> list[str]:
     """What is understood of the inputs, line by line, without looking for the board in images.
@@ -310,8 +365,8 @@ def dry_run(
         As :func:`read_input`.
     """
     if isinstance(source, Path) and source.is_dir():
-        return _dry_images(source, *_all_three(source, poses, camera, board), quaternions, said, robot)
-    given = read_input(source, poses, camera, board, quaternions=quaternions, said=said)
+        return _dry_images(source, *_all_three(source, poses, camera, board), quaternions, said, timing, robot)
+    given = read_input(source, poses, camera, board, quaternions=quaternions, said=said, timing=timing)
     lines = list(given.understood) if isinstance(source, Told) or given.understood else own_told(source, quaternions)
     setup = setup_of(said, given.setup, given.where)
     how = "as you say" if said.setup else "as the file says" if given.setup else "by default"
@@ -323,11 +378,24 @@ def dry_run(
 
 
 def _dry_images(
-    source: Path, poses: Path, camera: Path, board: Path, quaternions: Order, said: Said, arm: Robot | None
+    source: Path,
+    poses: Path,
+    camera: Path,
+    board: Path,
+    quaternions: Order,
+    said: Said,
+    timing: Timing,
+    arm: Robot | None,
 ) -> list[str]:
+    """Of a folder of images."""
+    if arm is not None:
+        _require_by_name(timing)
     robot = read_robot_poses(poses, quaternions, said) if arm is None else read_arm(poses, arm, quaternions)[0]
     design, model = load_flat_board(board), read_camera(camera)
     files, skipped = find_images(source)
+    at_images = robot_at_images(robot, [file.name for file in files], None if arm else timing)
+    robot, every = at_images.robot, len(files)
+    files = [file for file in files if file.name not in dict(at_images.left_out)]
     rows, missing, how = _rows_of_images(robot, files, source)
     setup = setup_of(said, None, source.name)
     kind = type(design).__name__.removesuffix("Design").lower()
@@ -336,8 +404,9 @@ def _dry_images(
         f"camera: {camera.name}: {model.width} × {model.height} px, focal length {model.focal[0]:.6g} px",
         f"board: {board.name}: {kind}",
         f"setup: {setup}, {'as you say' if said.setup else 'by default'}",
-        f"images: {len(rows)} of {len(files)} with a pose of the robot; the board was not looked for",
+        f"images: {len(rows)} of {every} with a pose of the robot; the board was not looked for",
         *spread_text(robot.base_from_flange[list(rows.values())], setup),
     ]
-    left_out = [(each.name, each.reason) for each in skipped] + _without_partner(files, rows, missing, poses.name)
+    left_out = [(each.name, each.reason) for each in skipped] + list(at_images.left_out)
+    left_out += _without_partner(files, rows, missing, poses.name)
     return lines + [f"left out {name}: {reason}" for name, reason in left_out]

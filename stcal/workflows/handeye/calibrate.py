@@ -21,8 +21,8 @@ from stcal.handeye.validate import (
     splits,
 )
 from stcal.parallel import Progress
-from stcal.workflows.handeye_arm import with_arm
-from stcal.workflows.handeye_input import HandEyeInput
+from stcal.workflows.handeye.arm import with_arm
+from stcal.workflows.handeye.inputs import HandEyeInput
 
 ALL, AUTO = "all", "auto"
 """In place of a method's name: all of them, compared; the way of solving that predicts best."""

@@ -13,9 +13,11 @@ from stcal.handeye.data.formats.record import Said
 from stcal.handeye.data.rig import RigCamera, RigPoses
 from stcal.handeye.data.rig_file import RigFiles
 from stcal.handeye.data.robot_poses import RobotPoses, read_robot_poses
+from stcal.handeye.data.stream import TOLERANCE_S
 from stcal.io.quaternions import Order
 from stcal.parallel import Progress, one_thread
-from stcal.workflows.handeye_input import Photographed, photographed, pitch_of
+from stcal.workflows.handeye.inputs import Photographed, photographed, pitch_of
+from stcal.workflows.handeye.times import Timing
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -39,6 +41,7 @@ def read_rig(
     progress: Progress = lambda *_: None,
     quaternions: Order = "wxyz",
     said: Said | None = None,
+    tolerance_s: float = TOLERANCE_S,
 ) -> RigInput:
     """The board in all images of all cameras, with the robot's poses.
 
@@ -51,12 +54,13 @@ def read_rig(
     by_file = {each.poses: read_robot_poses(each.poses, quaternions, said) for each in files.cameras}
     robots = [_of_camera(by_file[each.poses], each.images, files) for each in files.cameras]
     for each, robot in zip(files.cameras, robots, strict=True):
+        named, timing = partial(_named, progress, each.name), Timing(tolerance_s, each.times)
         try:
-            seen = photographed(each.images, robot, each.camera, design, workers, partial(_named, progress, each.name))
+            seen = photographed(each.images, robot, each.camera, design, workers, named, timing)
         except InputError as error:
             raise InputError(f"camera {each.name}: {error}") from error
         cameras.append(seen)
-    flange, names, rows = _shared([(robot, seen) for robot, seen in zip(robots, cameras, strict=True)])
+    flange, names, rows = _shared([(seen.robot, seen) for seen in cameras])
     every = tuple(
         RigCamera(each.name, seen.seen, own, seen.names, seen.prior)
         for each, seen, own in zip(files.cameras, cameras, rows, strict=True)
@@ -65,6 +69,8 @@ def read_rig(
     understood = [f"robot: {robot.understood}" for robot in by_file.values()]
     for each, seen in zip(files.cameras, cameras, strict=True):
         understood += [f"{each.name}: images matched {seen.how}"] if seen.how else []
+        if seen.timed is not None:
+            understood.append(f"{each.name}: {seen.robot.understood}")
     shared = np.bincount(np.concatenate(rows), minlength=len(names)) > 1
     if len(every) > 1:
         understood.append(f"{int(shared.sum())} of {len(names)} poses of the robot are of several cameras' images")

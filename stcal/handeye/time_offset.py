@@ -1,0 +1,209 @@
+"""The offset between the robot's clock and the camera's, from poses that were taken while the robot moved.
+
+The trajectory's derivative is a further column of the pose adjustment (as in Kelly & Sukhatme, Int. J. Robotics Res.
+30, 2011, and Furgale, Rehder & Siegwart, IROS 2013, for a camera beside an inertial sensor; here the trajectory is the
+robot's own, and its errors are estimated).
+"""
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from stcal.errors import ConvergenceError, DegenerateError, InputError
+from stcal.geometry.arrays import frozen
+from stcal.geometry.normal_equations import generalised_inverse
+from stcal.geometry.rigid import Poses
+from stcal.handeye.data.loop import Loop, Setup
+from stcal.handeye.data.pairs import HandEyePoses
+from stcal.handeye.data.stream import Stream
+from stcal.handeye.methods import start
+from stcal.handeye.methods.noise import Noise
+from stcal.handeye.methods.pose_adjustment import LoopState, adjust_poses
+from stcal.handeye.result import HandEye
+
+WITHIN_S, SCAN_S = 1.0, 0.05
+"""Offsets that are tried before, and their steps: what a robot does within a step is smooth."""
+MOST_STEP_S = 0.05
+ROUNDS = 30
+SETTLED = 1e-3
+"""Share of σ that a last step may have."""
+WINDOW_S = 0.1
+"""About an image, in which the flange must move …"""
+MOVED = 5.0
+"""… by so many times what samples of the stream err by."""
+MOST_SIGMA_S = 0.1
+"""σ beyond which an offset is not told."""
+LEAST_KEPT = 2 / 3
+"""Share of the images that must lie in the stream with an offset that is tried."""
+LEAST_POSES = 4
+"""Three poses of six numbers leave too little beside thirteen unknowns to tell σ."""
+UNKNOWNS = 12
+"""Of X and Z."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class TimeOffset:
+    """By how much the robot's clock is ahead of the camera's.
+
+    Parameters
+    ----------
+    seconds : float
+        Robot's clock minus camera's: an image stamped t was taken when the robot's clock showed t + ``seconds``.
+    sigma_s : float
+        Its σ, from an adjustment of X, Z and the offset.
+    slope : (12,) array
+        By how much X and Z, (rotation rad, translation mm) of each, change with a second of offset.
+    kept : (m,) bool array
+        Poses whose time lies within the stream with the offset.
+    base_from_flange : Poses
+        Of those kept, at that time, mm.
+    speed_rad_s, speed_mm_s : float
+        Of the flange at the images, RMS.
+    """
+
+    seconds: float
+    sigma_s: float
+    slope: np.ndarray
+    kept: np.ndarray
+    base_from_flange: Poses
+    speed_rad_s: float
+    speed_mm_s: float
+
+    def __post_init__(self):
+        object.__setattr__(self, "slope", frozen(self.slope, (UNKNOWNS,), "slope"))
+        object.__setattr__(self, "kept", frozen(self.kept, (None,), "kept", bool))
+
+    def in_words(self) -> str:
+        """The offset with its sign, and what it rests on."""
+        way = "ahead of" if self.seconds >= 0 else "behind"
+        speed = f"{self.speed_mm_s:.3g} mm/s and {np.degrees(self.speed_rad_s):.3g}°/s"
+        return (
+            f"time offset: {1e3 * self.seconds:.2f} ± {1e3 * self.sigma_s:.2g} ms, robot's clock minus camera's: the "
+            f"robot's is {way} the camera's, an image stamped t was taken at t {'+' if self.seconds >= 0 else '-'} "
+            f"{1e3 * abs(self.seconds):.2f} ms of the robot's; the flange moves by {speed} at the images (RMS)"
+        )
+
+    def carried(self, result: HandEye) -> HandEye:
+        """The result of poses at the offset, with σ that hold the offset's."""
+        shift = self.sigma_s**2 * np.outer(self.slope, self.slope)
+        own, stand = result.covariance, result.stand_covariance
+        own = None if own is None else own + shift[:6, :6]
+        return replace(result, covariance=own, stand_covariance=None if stand is None else stand + shift[6:, 6:])
+
+
+def estimate_offset(
+    pairs: HandEyePoses,
+    stream: Stream,
+    seconds: np.ndarray,
+    setup: Setup = "eye-in-hand",
+    noise: Noise | None = None,
+    with_scale: bool = False,
+) -> TimeOffset:
+    """Offset, X and Z by least squares of the loop's residuals, with σ estimated as by method ``pose``.
+
+    Parameters
+    ----------
+    pairs : HandEyePoses
+        m of them, of which the board's poses are used.
+    stream : Stream
+        The robot's poses by its clock.
+    seconds : (m,) array
+        Times of the pairs after the stream's origin, by the camera's clock, s.
+    setup : {"eye-in-hand", "eye-to-hand"}
+        What carries the camera.
+    noise : Noise, optional
+        What is known of the errors.
+    with_scale : bool
+        The board's size is free.
+
+    Returns
+    -------
+    TimeOffset
+
+    Raises
+    ------
+    InputError
+        Too few poses, or too few of them within the stream.
+    DegenerateError
+        The flange stands still at the images, or its motions do not tell the offset.
+    ConvergenceError
+        No offset is settled upon.
+    """
+    noise = noise or Noise()
+    if len(pairs) < LEAST_POSES:
+        raise InputError(f"{pairs.where}: {len(pairs)} poses, {LEAST_POSES} needed for a time offset; take more")
+    if _inside(stream, seconds).any():
+        _require_motion(stream, seconds)
+    offset = _scanned(pairs, stream, seconds, setup, with_scale)
+    state = None
+    for _ in range(ROUNDS):
+        kept = _inside(stream, seconds + offset)
+        if kept.sum() < LEAST_POSES:
+            raise InputError(f"{stream.where}: {kept.sum()} images within it at an offset of {offset:.3g} s; give more")
+        at = seconds[kept] + offset
+        loop = Loop.of(replace(pairs[kept], base_from_flange=stream.at(at)), setup)
+        state = state or LoopState(*start.robust(loop, with_scale))
+        solution = adjust_poses(loop, state, noise, with_scale)
+        state, speed = solution.state, stream.velocity(at)
+        x, scale = state.mount_from_camera, state.scale
+        count = UNKNOWNS + with_scale
+        by_time = loop.by_robot(x, scale) @ speed[:, :, None]
+        jacobian = np.concatenate([loop.jacobian(x, scale)[:, :, :count], by_time], axis=2)
+        used = np.flatnonzero(~solution.outliers)
+        weighted = np.linalg.solve(solution.covariance[used], jacobian[used])
+        inverse = generalised_inverse(np.einsum("mai,maj->ij", jacobian[used], weighted))
+        sigma = float(np.sqrt(inverse[count, count]))
+        step = -float(inverse[count] @ np.einsum("mai,ma->i", weighted, solution.residuals[used]))
+        if not 0 < sigma < MOST_SIGMA_S:
+            raise DegenerateError(
+                f"{stream.where}: the time offset would have σ {sigma:.2g} s, {MOST_SIGMA_S:g} s allowed: the motions "
+                "at the images do not tell it; leave --time-offset out, or take images while the flange turns and moves"
+            )
+        offset += float(np.clip(step, -MOST_STEP_S, MOST_STEP_S))
+        if abs(step) < SETTLED * sigma:
+            kept = _inside(stream, seconds + offset)
+            turn, way = np.sqrt((speed.reshape(-1, 2, 3) ** 2).sum(2).mean(0))
+            slope = inverse[:UNKNOWNS, count] / inverse[count, count]
+            at = stream.at(seconds[kept] + offset)
+            return TimeOffset(offset, sigma, slope, kept, at, float(turn), float(way))
+    raise ConvergenceError(
+        f"{stream.where}: the time offset does not settle, last {offset:.4g} ± {sigma:.2g} s; check times and poses"
+    )
+
+
+def _inside(stream: Stream, seconds: np.ndarray) -> np.ndarray:
+    """Whether times (m,) lie within the stream."""
+    return (seconds >= 0) & (seconds <= stream.seconds[-1])
+
+
+def _require_motion(stream: Stream, seconds: np.ndarray) -> None:
+    """Refuse a flange that stands still: what its samples err by would pass for motion."""
+    noise, moved = stream.rest(), stream.travel(seconds[_inside(stream, seconds)], WINDOW_S)
+    if any(way > MOVED * max(np.nan_to_num(own), 1e-9) for own, way in zip(noise, moved, strict=True)):
+        return
+    raise DegenerateError(
+        f"{stream.where}: the flange stands still at the images, {moved[1]:.2g} mm and {np.degrees(moved[0]):.2g}° "
+        f"within {WINDOW_S:g} s (RMS), where samples err by {noise[1]:.2g} mm and {np.degrees(noise[0]):.2g}°: no time "
+        "offset can be told; leave --time-offset out, or take images while the robot moves"
+    )
+
+
+def _scanned(pairs: HandEyePoses, stream: Stream, seconds: np.ndarray, setup: Setup, with_scale: bool) -> float:
+    """The offset at which a first solution fits best, to a step of the scan."""
+    best, least = 0.0, np.inf
+    for offset in np.arange(-WITHIN_S, WITHIN_S + SCAN_S / 2, SCAN_S):
+        kept = _inside(stream, seconds + offset)
+        if kept.sum() < max(LEAST_POSES, LEAST_KEPT * len(seconds)):
+            continue
+        loop = Loop.of(replace(pairs[kept], base_from_flange=stream.at(seconds[kept] + offset)), setup)
+        miss = loop.residuals(*start.robust(loop, with_scale)).reshape(-1, 2, 3)
+        cost = float(np.log(np.median(np.linalg.norm(miss, axis=2), axis=0) + 1e-12).sum())
+        if cost < least:
+            best, least = float(offset), cost
+    if not np.isfinite(least):
+        share = _inside(stream, seconds).sum()
+        raise InputError(
+            f"{stream.where}: {share} of {len(seconds)} images lie within its times, {LEAST_KEPT:.0%} needed at some "
+            f"offset up to {WITHIN_S:g} s; give the whole stream, and times of clocks that differ by less"
+        )
+    return best

@@ -1,0 +1,92 @@
+"""Poses by time: interpolated where samples are close, the nearest within a tolerance, and all else said."""
+
+from decimal import Decimal
+
+import numpy as np
+import pytest
+
+from stcal.errors import InputError
+from stcal.geometry.rigid import Poses
+from stcal.handeye.data.stream import Stream, stamps_of, taken_at, time_of
+from stcal.synthetic.measured.handeye import disturbed
+from stcal.synthetic.measured.handeye_stream import trajectory
+
+PHASE = np.array([[0.3, 1.1, 2.0], [0.1, 4.0, 5.0]])
+EVERY = np.arange(0, 10, 0.05)
+AT = np.random.default_rng(0).uniform(0.1, 9.9, 60)
+
+
+def stream(times=EVERY, noise=(0.0, 0.0)) -> Stream:
+    poses = disturbed(np.random.default_rng(1), trajectory(times, PHASE), *noise)
+    return Stream.of([Decimal(repr(round(float(t), 6))) for t in times], poses, "robot.csv")
+
+
+def test_a_cubic_meets_the_trajectory():
+    """Of samples h = 50 ms apart it errs by at most 3/128 h⁴ |y⁗|: y⁗ = 80 mm · 1.3⁴ = 230 mm/s⁴ gives 34 nm, that of
+    rotations by their changing axis too; lines between samples would err by h²/8 |ÿ| = 0.04 mm."""
+    off = np.abs(stream().at(AT).difference(trajectory(AT, PHASE)))
+    assert 1e-9 < off[:, 3:].max() < 4e-5
+    assert off[:, :3].max() < 1e-6
+    assert max(stream().rest()) < 1e-3
+
+
+def test_the_velocity_is_that_of_the_trajectory():
+    step = 1e-5
+    true = trajectory(AT + step, PHASE).difference(trajectory(AT - step, PHASE)) / (2 * step)
+    found = stream().velocity(AT)
+    assert np.abs(found - true)[:, 3:].max() < 0.01 < 50 < np.abs(true[:, 3:]).max()
+    assert np.abs(found - true)[:, :3].max() < 1e-4
+
+
+def test_noise_of_samples_is_told():
+    """196 samples that miss the cubic through their neighbours: σ to 5 %; lengths of three numbers, √3 σ."""
+    turn, shift = stream(noise=(1e-4, 0.05)).rest()
+    assert [turn, shift] == pytest.approx([np.sqrt(3) * 1e-4, np.sqrt(3) * 0.05], rel=0.2)
+
+
+def test_samples_in_any_order_and_at_both_ends():
+    order = np.random.default_rng(2).permutation(len(EVERY))
+    times = [Decimal(repr(round(float(t), 6))) for t in EVERY[order]]
+    found = Stream.of(times, trajectory(EVERY[order], PHASE), "robot.csv")
+    ends = np.array([0.0, 0.02, 9.94, 9.95])
+    assert np.abs(found.at(ends).difference(trajectory(ends, PHASE))).max() < 1e-4
+
+
+def test_what_is_taken_is_said():
+    times = np.concatenate([EVERY[:100], EVERY[120:]])
+    taken = taken_at(stream(times), np.array([0.05, 1.234, 4.96, 5.4, -0.015, 9.98, 12.0]))
+    assert taken.kept.tolist() == [True, True, True, False, True, False, False]
+    for part in ("7 times in 180 samples of robot.csv", "1 at a sample", "1 interpolated", "2 by the nearest sample"):
+        assert part in taken.said
+    assert "3 left out" in taken.said
+    assert taken.why[3] == (
+        "in a gap of 1.05 s of robot.csv, 0.25 s allowed; the nearest sample is 0.45 s away, 0.02 s allowed "
+        "(--time-tolerance)"
+    )
+    assert taken.why[5] == "0.03 s after the samples of robot.csv, 0.02 s allowed (--time-tolerance)"
+    assert taken_at(stream(times), np.array([5.4]), 0.5).kept.all()
+    nearest = taken.base_from_flange[3]
+    assert np.abs(Poses.of([nearest]).difference(trajectory(np.zeros(1), PHASE))).max() < 1e-12
+
+
+@pytest.mark.parametrize(
+    ("names", "times"),
+    [
+        (["a/1689.25.png", "1690.png"], ["1689.25", "1690"]),
+        (["1403636579763555584.png"], ["1403636579.763555584"]),
+        (["1700000000", "1700000001"], ["1700000000", "1700000001"]),
+        (["01.png", "02.png"], None),
+        (["1.5.png", "left.png"], None),
+    ],
+)
+def test_names_that_are_times(names, times):
+    found = stamps_of(names)
+    assert found == (None if times is None else [Decimal(t) for t in times])
+    assert time_of("nan") is None
+
+
+def test_streams_that_are_none():
+    with pytest.raises(InputError, match="1 sample with a time, 2 needed"):
+        Stream.of([Decimal(1)], trajectory(np.zeros(1), PHASE), "robot.csv")
+    with pytest.raises(InputError, match="two samples of the time 1"):
+        Stream.of([Decimal(1), Decimal(2), Decimal(1)], trajectory(np.arange(3.0), PHASE), "robot.csv")
