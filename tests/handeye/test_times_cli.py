@@ -1,0 +1,159 @@
+"""``stcal handeye`` with poses by time: a stream of the robot's, and times of the camera."""
+
+import json
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from stcal.cli.main import main
+from stcal.geometry.rigid import Poses, Rigid
+from stcal.synthetic.measured.handeye_stream import StreamTruth, simulated_stream
+from tests.handeye.rig.photographed import BOARD, write_poses
+
+INPUT, COMPUTATION = 2, 3
+CAMERA = "1 PINHOLE 800 600 1000 1000 406.5 293.5\n"
+
+
+@pytest.fixture
+def command(monkeypatch, capsys):
+    """Exit code, standard output and error."""
+
+    def call(*arguments):
+        monkeypatch.setattr(sys, "argv", ["stcal", "handeye", *map(str, arguments)])
+        with pytest.raises(SystemExit) as end:
+            main()
+        output = capsys.readouterr()
+        return end.value.code or 0, output.out, output.err
+
+    return call
+
+
+def tum(path: Path, times: np.ndarray, poses: Poses) -> Path:
+    rows = []
+    for time, pose, (w, x, y, z) in zip(times, poses, poses.quaternions(), strict=True):
+        place = " ".join(f"{v / 1000:.9f}" for v in pose.translation)
+        rows.append(f"{1700000000 + time:.6f} {place} {x:.12f} {y:.12f} {z:.12f} {w:.12f}")
+    path.write_text("\n".join(rows) + "\n")
+    return path
+
+
+def two_files(folder: Path, truth: StreamTruth, late: float = 0.0) -> list:
+    """``late`` : s that the camera's times are later than they are."""
+    robot = tum(folder / "robot.txt", truth.stream.seconds, truth.stream.base_from_flange)
+    camera = tum(folder / "camera.txt", truth.seconds + late, truth.pairs.camera_from_board)
+    return ["--a", robot, "--b", camera, "--poses-are", "base_from_flange", "--poses-are", "camera_from_board"]
+
+
+def off(data: dict, truth: StreamTruth) -> np.ndarray:
+    found = Poses.of([Rigid.from_matrix(data["flange_from_camera"])])
+    return found.difference(Poses.of([truth.mount_from_camera]))[0]
+
+
+def test_the_offset_is_found_and_used(command, tmp_path):
+    truth = simulated_stream(np.random.default_rng(7), 16)
+    files = two_files(tmp_path, truth)
+    out = tmp_path / "h.json"
+    code, shown, error = command(*files, "--time-offset", "--splits", 0, "--method", "pose", "--out", out)
+    assert code == 0, error
+    found = json.loads(out.read_text())
+    offset = found["time_offset"]
+    assert abs(offset["seconds"] - 0.023) < 3 * offset["sigma_s"] < 2e-3
+    assert "robot's clock minus camera's: the robot's is ahead of the camera's" in shown
+    wrong = off(found, truth)
+    assert wrong @ np.linalg.solve(np.array(found["covariance"]), wrong) < 22.5  # χ² of 6, once in a thousand
+    code, shown, _ = command(*files, "--splits", 0, "--method", "pose", "--out", tmp_path / "plain.json")
+    plain = json.loads((tmp_path / "plain.json").read_text())
+    assert code == 0
+    assert "time_offset" not in plain
+    assert plain["rms"]["translation_mm"] > 5 * found["rms"]["translation_mm"]
+    assert "poses by time: 16 times in 1200 samples of robot.txt: 16 interpolated (cubic; samples 0.02 s apart" in shown
+
+
+def test_what_lies_outside_is_left_out(command, tmp_path):
+    truth = simulated_stream(np.random.default_rng(7), 16, offset_s=0.0)
+    code, shown, _ = command(*two_files(tmp_path, truth, late=4.0), "--dry-run")
+    assert code == 0
+    last = truth.seconds[-1] + 4 - truth.stream.seconds[-1]
+    assert f"{last:.4g} s after the samples of robot.txt, 0.02 s allowed (--time-tolerance)" in shown
+    assert "left out" in shown
+
+
+def test_a_robot_that_stands_still_has_no_offset(command, tmp_path):
+    truth = simulated_stream(np.random.default_rng(5), 12, still=True)
+    far = np.abs(truth.seconds[:, None] - truth.seconds[None]) + 9 * np.eye(len(truth.seconds))
+    alone = np.flatnonzero(far.min(1) > 0.6)
+    kept = StreamTruth(
+        truth.stream, truth.pairs[alone], truth.seconds[alone], 0.0, truth.mount_from_camera, truth.setup
+    )
+    code, _, error = command(*two_files(tmp_path, kept), "--time-offset", "--splits", 0)
+    assert code == COMPUTATION
+    assert "the flange stands still at the images" in error
+
+
+def photographs(folder: Path, names: list[str], times: np.ndarray) -> list:
+    """A folder of images that no one looks at, and a stream with a column time_s."""
+    truth = simulated_stream(np.random.default_rng(3), 4)
+    (folder / "images").mkdir()
+    for name in names:
+        (folder / "images" / name).write_bytes(b"x")
+    poses = {f"{t:.3f}": pose for t, pose in zip(times, truth.stream.base_from_flange, strict=False)}
+    write_poses(folder / "robot.csv", poses, "time_s")
+    (folder / "board.toml").write_text(BOARD)
+    (folder / "cameras.txt").write_text(CAMERA)
+    files = [("--poses", "robot.csv"), ("--camera", "cameras.txt"), ("--board", "board.toml")]
+    return [folder / "images", *(word for option, name in files for word in (option, folder / name))]
+
+
+def test_dry_run_says_what_was_understood_of_times(command, tmp_path):
+    names = ["100.105.png", "100.300.png", "100.6017.png", "200.5.png"]
+    given = photographs(tmp_path, names, 100 + np.arange(40) * 0.02)
+    code, shown, error = command(*given, "--dry-run")
+    assert code == 0, error
+    assert "poses by time: 4 times in 40 samples of robot.csv: 1 at a sample, 2 interpolated" in shown
+    assert "images: 3 of 4 with a pose of the robot" in shown
+    assert "left out 200.5.png: 99.72 s after the samples of robot.csv" in shown
+
+
+def test_times_of_images_in_a_file(command, tmp_path):
+    given = photographs(tmp_path, ["a.png", "b.png", "c.png"], 100 + np.arange(40) * 0.02)
+    times = tmp_path / "times.csv"
+    times.write_text("image,time_s\na,100.105\nb.png,100.3\n")
+    code, shown, error = command(*given, "--dry-run", "--image-times", times)
+    assert code == 0, error
+    assert "1 at a sample, 1 interpolated" in shown
+    assert "left out c.png: no time in" in shown
+    code, _, error = command(*given, "--dry-run")
+    assert code == INPUT
+    assert "image a.png: its name is no time, for poses of the robot by time (robot.csv)" in error
+    times.write_text("image,time_s\na,soon\n")
+    code, _, error = command(*given, "--dry-run", "--image-times", times)
+    assert (code, "time_s of a.png is 'soon', a number of seconds needed" in error) == (INPUT, True)
+    times.write_text("image,time_s\nz,1.5\n")
+    assert "no row is of an image: z" in command(*given, "--dry-run", "--image-times", times)[2]
+
+
+def test_the_nearest_sample_stands_within_the_tolerance(command, tmp_path):
+    given = photographs(tmp_path, ["100.05.png", "102.3.png", "103.9.png"], 100 + np.arange(6) * 1.0)
+    code, shown, error = command(*given, "--dry-run", "--time-tolerance", 0.15)
+    assert code == 0, error
+    assert "2 by the nearest sample, up to 0.1 s away (0.15 s allowed), 1 left out" in shown
+    assert "left out 102.3.png: in a gap of 1 s of robot.csv, 0.25 s allowed; the nearest sample is 0.3 s away" in shown
+    code, _, error = command(*given, "--dry-run", "--time-tolerance", 0.01)
+    assert code == INPUT
+    assert "no image has a pose: 100.05.png" in error
+
+
+@pytest.mark.parametrize(
+    ("options", "said"),
+    [
+        (["--time-offset"], "--time-offset needs the robot's poses as a stream with times"),
+        (["--image-times", "times.csv"], "--image-times: only with a folder of images"),
+    ],
+)
+def test_options_of_times_need_times(command, tmp_path, options, said):
+    write_poses(tmp_path / "poses.csv", {"a": Rigid()})
+    code, _, error = command(tmp_path / "poses.csv", *options)
+    assert code == INPUT
+    assert said in error
