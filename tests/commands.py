@@ -61,13 +61,14 @@ class Call:
 
     ``words`` : in them ``@place`` is an input, a file or folder of the stock; ``>name`` a file that is written, also
     over an earlier one; ``+name`` one that must be new; ``~place`` a copy of the stock's folder to write to;
-    ``seconds`` : processor time that it takes about; ``code`` : exit code.
+    ``seconds`` : processor time that it takes about; ``code`` : exit code; ``also`` : places that its inputs name.
     """
 
     command: str
     words: str
     seconds: float = 0.3
     code: int = 0
+    also: tuple[str, ...] = ()
 
     def split(self) -> list[str]:
         return shlex.split(self.words.replace("~", "\\~"))
@@ -168,7 +169,12 @@ CALLS = (
         3.0,
     ),
     Call("handeye plan", "@handeye/poses.csv --count 2 --seed 1 --out >next.csv --json >all.json"),
-    Call("handeye rig", f"@handeye/rig.toml --splits 0 --out >h.json --workers 1 {_ALL}", 5.0),
+    Call(
+        "handeye rig",
+        f"@handeye/rig.toml --splits 0 --out >h.json --workers 1 {_ALL}",
+        5.0,
+        also=tuple(f"handeye/{name}" for name in ("board.toml", "robot.csv", "cameras.txt", "images", "right")),
+    ),
     Call("locate schedule", "1 100 5"),
     Call("locate capture", "+scenes --simulate @locate/scenes/a/1.png --shortest 0.5 --longest 2 --count 3"),
     Call(

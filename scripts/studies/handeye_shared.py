@@ -20,8 +20,8 @@ from stcal.handeye import HandEyeOptions
 from stcal.handeye.report.file import HandEyeFile
 from stcal.handeye.report.page import outcome_text
 from stcal.io.camera import CalibratedCamera, read_camera, write_cameras_txt
-from stcal.workflows.handeye import ALL, Splits, calibrate
-from stcal.workflows.handeye_input import read_input
+from stcal.workflows.handeye.calibrate import ALL, Splits, calibrate
+from stcal.workflows.handeye.inputs import read_input
 
 CHARUCO = """type = "charuco"
 rows = 7

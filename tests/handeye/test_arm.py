@@ -16,7 +16,7 @@ from stcal.robot import forward, load_robot
 from stcal.robot.kinematics.file import save_robot
 from stcal.synthetic.measured.arms import arm_at
 from stcal.synthetic.measured.handeye import simulated_views
-from stcal.workflows.handeye_arm import Arm
+from stcal.workflows.handeye.arm import Arm
 from tests.boards.drawn import chessboard_mm
 from tests.handeye.photographed import BASE_FROM_BOARD, FLANGE_FROM_CAMERA, PER_MM, looks, photographs
 

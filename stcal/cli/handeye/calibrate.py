@@ -247,10 +247,11 @@ def handeye(
     from stcal.handeye.report.file import HandEyeFile
     from stcal.handeye.report.page import outcome_page, outcome_text
     from stcal.robot import load_robot, save_robot
-    from stcal.workflows.handeye import AUTO, Splits, at_offset, calibrate, with_offset
-    from stcal.workflows.handeye_input import dry_run as understood
-    from stcal.workflows.handeye_input import read_input, setup_of
-    from stcal.workflows.handeye_times import Timing
+    from stcal.workflows.handeye.calibrate import AUTO, Splits, calibrate
+    from stcal.workflows.handeye.inputs import dry_run as understood
+    from stcal.workflows.handeye.inputs import read_input, setup_of
+    from stcal.workflows.handeye.offset import at_offset, with_offset
+    from stcal.workflows.handeye.times import Timing
 
     robot, seen = (_radians(sigma_robot_deg), sigma_robot_mm), (_radians(sigma_camera_deg), sigma_camera_mm)
     noise = Noise(*robot, *seen, sigma_px, sigma_board_mm)
@@ -266,7 +267,7 @@ def handeye(
     written |= {"--robot-out": robot_out}
     written |= {"--json": json_file, "--report": report}
     read = {"source": source, "--poses": poses, "--camera": camera, "--board": board, "--a": first, "--b": second}
-    read |= {"--image-times": image_times, "--with-kinematics": with_kinematics}
+    read |= {"--with-kinematics": with_kinematics, "--image-times": image_times}
     keep_apart(
         [*((name, path) for name, path in written.items() if path), *(("--export", path) for _, path in exports)],
         [(name, path) for name, path in read.items() if path],
@@ -293,8 +294,7 @@ def handeye(
         say("\n".join(understood(pairs, poses, camera, board, quaternions.value, said, timing, robot_model)))
         return
     with StageProgress() as progress:
-        read = (pairs, poses, camera, board, workers, progress, quaternions.value, said, timing, robot_model)
-        given = read_input(*read)
+        given = read_input(pairs, poses, camera, board, workers, progress, quaternions.value, said, timing, robot_model)
         for line in given.understood:
             say(line)
         with_scale = with_scale or given.unit_mm is not None
@@ -355,7 +355,7 @@ def _require_fitting(
 ) -> None:
     """Options of the camera and the method go together."""
     from stcal.handeye import METHODS
-    from stcal.workflows.handeye import ALL
+    from stcal.workflows.handeye.calibrate import ALL
 
     if camera_out and not (refine_camera or with_arm):
         raise InputError("--camera-out: only with --refine-camera or --with-kinematics; the camera is as given else")
@@ -420,7 +420,7 @@ def _bounds(option: str, text: str | None, factor: float) -> "Bounds | None":
 def _evolution(method: str | None, **given) -> "EvolutionOptions":
     """Options of differential evolution, those that were given."""
     from stcal.handeye import EvolutionOptions
-    from stcal.workflows.handeye import ALL
+    from stcal.workflows.handeye.calibrate import ALL
 
     given = {name: value for name, value in given.items() if value is not None}
     if given and method not in (ALL, *EVOLVED):

@@ -11,8 +11,8 @@ from stcal.cli.options import one_table
 if TYPE_CHECKING:
     from stcal.handeye.data.formats.record import Said
     from stcal.io.quaternions import Order
-    from stcal.workflows.handeye_input import Source
-    from stcal.workflows.handeye_times import Timing
+    from stcal.workflows.handeye.inputs import Source
+    from stcal.workflows.handeye.times import Timing
 
 
 class SetupName(StrEnum):
@@ -98,8 +98,8 @@ def source_of(
     timing: "Timing | None" = None,
 ) -> "Source":
     """The file or folder that was named first; or --a and --b joined, whatever their formats."""
-    from stcal.workflows.handeye_input import two_files
-    from stcal.workflows.handeye_times import Timing
+    from stcal.workflows.handeye.inputs import two_files
+    from stcal.workflows.handeye.times import Timing
 
     if source is None and first is not None and second is not None:
         told = two_files(first, second, key, said, quaternions, timing or Timing())

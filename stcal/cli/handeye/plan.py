@@ -61,8 +61,8 @@ def plan(
     from stcal.handeye.data.formats.record import Said
     from stcal.handeye.report.planned import planned_csv, planned_file, planned_text
     from stcal.robot import load_robot
-    from stcal.workflows.handeye_input import read_input, setup_of
-    from stcal.workflows.handeye_plan import plan_next
+    from stcal.workflows.handeye.inputs import read_input, setup_of
+    from stcal.workflows.handeye.plan import plan_next
 
     said = Said.of_options(rotation or [], length_unit or [], poses_are or [], setup and setup.value)
     pairs = source_of(source, first, second, key, said, quaternions.value)

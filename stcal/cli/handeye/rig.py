@@ -56,9 +56,9 @@ def rig(
     from stcal.handeye.data.rig_file import read_rig_file
     from stcal.handeye.report.rig import rig_page, rig_text
     from stcal.handeye.report.rig_file import HandEyeRigFile
-    from stcal.workflows.handeye import Splits
-    from stcal.workflows.handeye_rig import calibrate_rig
-    from stcal.workflows.handeye_rig_input import read_rig
+    from stcal.workflows.handeye.calibrate import Splits
+    from stcal.workflows.handeye.rig import calibrate_rig
+    from stcal.workflows.handeye.rig_inputs import read_rig
 
     files = read_rig_file(rig_file)
     written = {"--out": out, "--json": json_file, "--report": report}

@@ -122,18 +122,18 @@ class ChoicePart(Part):
     tried: list[TriedRow]
 
 
-class TimeOffsetPart(Part):
-    seconds: float
-    sigma_s: float
-    speed_mm_s: float
-    speed_rad_s: float
-
-
 class ArmPart(Part):
     robot: str
     parameters: dict[str, float]
     sigma: dict[str, float]
     plain: HeldOutMeans | None
+
+
+class TimeOffsetPart(Part):
+    seconds: float
+    sigma_s: float
+    speed_mm_s: float
+    speed_rad_s: float
 
 
 class HandEyeFile(ResultFile):
@@ -240,9 +240,9 @@ class HandEyeFile(ResultFile):
         compared = [_method(each, names) for each in outcome.compared]
         more: dict = {} if outcome.motions is None else {"motions_held_out": _motions(outcome.motions)}
         more |= {} if outcome.choice is None else {"choice": _choice(outcome.choice)}
+        more |= {} if outcome.arm is None else {"arm": _arm(outcome.arm)}
         if (offset := outcome.time_offset) is not None:
             more["time_offset"] = {name: getattr(offset, name) for name in TimeOffsetPart.model_fields}
-        more |= {} if outcome.arm is None else {"arm": _arm(outcome.arm)}
         more |= {"understood": outcome.understood} if outcome.understood else {}
         more |= {"splits": _splits(outcome.held_out, names), "methods": compared} if whole else {}
         return cls.model_validate(

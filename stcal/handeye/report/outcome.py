@@ -74,10 +74,10 @@ class Outcome:
         What files of other programs were taken for.
     unit_mm : float, optional
         Of a model without a unit: mm by which the camera's lengths were multiplied before.
-    time_offset : TimeOffset, optional
-        Of the robot's clock from the camera's, where it was solved for; σ of the result hold its own.
     arm : ArmFound, optional
         Where the arm's parameters were solved for too.
+    time_offset : TimeOffset, optional
+        Of the robot's clock from the camera's, where it was solved for; σ of the result hold its own.
     """
 
     where: str
@@ -96,8 +96,8 @@ class Outcome:
     folder: Path | None = None
     understood: tuple[str, ...] = ()
     unit_mm: float | None = None
-    time_offset: TimeOffset | None = None
     arm: ArmFound | None = None
+    time_offset: TimeOffset | None = None
 
     def sentence(self) -> str:
         """What was solved for, and what that gains; empty where the user said what to solve for."""

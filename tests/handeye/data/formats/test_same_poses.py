@@ -7,7 +7,7 @@ import pytest
 
 from stcal.handeye.data.formats.record import Said
 from stcal.synthetic.measured.handeye import simulated
-from stcal.workflows.handeye_input import read_input, two_files
+from stcal.workflows.handeye.inputs import read_input, two_files
 from tests.handeye.written import FORMATS
 
 PAIRS = simulated(np.random.default_rng(5), 7).pairs

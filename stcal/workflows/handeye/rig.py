@@ -12,8 +12,8 @@ from stcal.handeye.rig.solve import RigOptions, alone_or_none, handeye_rig, of_p
 from stcal.handeye.rig.validate import RigHeldOut, cross_validate_rig, widened_by_scatter
 from stcal.handeye.validate import LEAST_LEFT, splits
 from stcal.parallel import Progress
-from stcal.workflows.handeye import Splits
-from stcal.workflows.handeye_rig_input import RigInput
+from stcal.workflows.handeye.calibrate import Splits
+from stcal.workflows.handeye.rig_inputs import RigInput
 
 
 def calibrate_rig(

@@ -41,14 +41,17 @@ class AtImages:
         return Timed(self.stream, np.array([self.seconds[name] for name in names]))
 
 
-def robot_at_images(robot: RobotPoses, names: Sequence[str], timing: Timing) -> AtImages:
-    """Poses of the robot at the times of images, where both have times that are not the same.
+def robot_at_images(robot: RobotPoses, names: Sequence[str], timing: Timing | None) -> AtImages:
+    """Poses of the robot at the times of images, where both have times that are not the same; never where ``timing`` is
+    None, as of joint values, which belong to images by name.
 
     Raises
     ------
     InputError
         No times where an option needs them, or no image within the stream.
     """
+    if timing is None:
+        return AtImages(robot)
     images = _times_of_images(names, timing)
     samples = [time_of(name) for name in robot.images] if robot.timed else stamps_of(robot.images)
     if images is None or samples is None or None in samples:

@@ -24,8 +24,8 @@ from stcal.io.table import Table
 from stcal.parallel import Progress, one_thread
 from stcal.robot import Robot
 from stcal.workflows.board_views import Board, detect_boards
-from stcal.workflows.handeye_arm import Arm, read_arm
-from stcal.workflows.handeye_times import AtImages, Timing, robot_at_images
+from stcal.workflows.handeye.arm import Arm, read_arm
+from stcal.workflows.handeye.times import Timing, robot_at_images
 
 NOTHING_SAID = Said()
 WITHOUT_OPTIONS = Timing()
@@ -39,9 +39,9 @@ class HandEyeInput:
     ``where`` : its files; ``views`` : of the board, where images were given, with its ``symmetries`` and the camera's
     ``prior``; ``pitch_mm`` of the board's file; ``left_out`` : (image or row, why); ``understood`` : a line for each
     file that is not a table of the package; ``setup`` : as a file says it; ``unit_mm`` : of a model without a unit,
-    about, by which ``pairs`` are multiplied already; ``folder`` : of the images; ``timed`` : times of the pairs in the
-    robot's stream, where its poses were taken by time; ``arm`` : at the joint values of the ``pairs``, where its
-    parameters are to be solved for.
+    about, by which ``pairs`` are multiplied already; ``folder`` : of the images; ``arm`` : at the joint values of the
+    ``pairs``, where its parameters are to be solved for; ``timed`` : times of the pairs in the robot's stream, where
+    its poses were taken by time.
     """
 
     where: str
@@ -55,8 +55,8 @@ class HandEyeInput:
     setup: Setup | None = None
     unit_mm: float | None = None
     folder: Path | None = None
-    timed: Timed | None = None
     arm: Arm | None = None
+    timed: Timed | None = None
 
 
 def two_files(
@@ -110,10 +110,9 @@ def read_input(
         if robot is None:
             found = read_robot_poses(poses, quaternions, said)
             return _from_images(source, found, poses, camera, board, workers, progress, timing)
-        if timing.offset or timing.image_times:
-            raise InputError("--time-offset, --image-times: not with --with-kinematics; joint values are by image")
+        _require_by_name(timing)
         found, arm = read_arm(poses, robot, quaternions)
-        return _from_images(source, found, poses, camera, board, workers, progress, timing, arm)
+        return _from_images(source, found, poses, camera, board, workers, progress, None, arm)
     if robot is not None:
         raise InputError("--with-kinematics: only with a folder of images, in which the arm is seen to err")
     _require_no_images(source, poses, camera, board)
@@ -147,6 +146,14 @@ def _require_no_images(source: Source, poses: Path | None, camera: Path | None, 
         if not isinstance(source, Path):
             what = f"{source.where if isinstance(source, Table) else source.pairs.where} are poses"
         raise InputError(f"{', '.join(extra)}: only with a folder of images; {what}")
+
+
+def _require_by_name(timing: Timing) -> None:
+    if timing.offset or timing.image_times is not None:
+        raise InputError(
+            "--time-offset, --image-times: not with --with-kinematics, whose joint values belong to images by name; "
+            "name the images in the column image"
+        )
 
 
 def _require_timed(source: Source, timing: Timing) -> None:
@@ -239,7 +246,7 @@ def photographed(
     progress: Progress,
     timing: Timing | None = WITHOUT_OPTIONS,
 ) -> Photographed:
-    """Corners of the board in all images that have a pose; None of ``timing`` : by their names alone.
+    """Corners of the board in all images that have a pose.
 
     Raises
     ------
@@ -248,9 +255,7 @@ def photographed(
     """
     model = read_camera(camera)
     files, skipped = find_images(source)
-    at_images = AtImages(robot)
-    if timing is not None:
-        at_images = robot_at_images(robot, [file.name for file in files], timing)
+    at_images = robot_at_images(robot, [file.name for file in files], timing)
     robot, late = at_images.robot, dict(at_images.left_out)
     files = [file for file in files if file.name not in late]
     rows, missing, how = _rows_of_images(robot, files, source)
@@ -288,13 +293,12 @@ def _from_images(
     board: Path,
     workers: int | None,
     progress: Progress,
-    timing: Timing,
+    timing: Timing | None,
     arm: Arm | None = None,
 ) -> HandEyeInput:
     """Pairs of all images that show the board and have a pose."""
     design = load_flat_board(board)
-    by_time = timing if arm is None else None
-    found = photographed(source, robot, camera, design, workers, progress, by_time)
+    found = photographed(source, robot, camera, design, workers, progress, timing)
     robot = found.robot
     pairs = pairs_of_views(found.base_from_flange[found.rows], found.seen, found.names, str(source))
     if found.covariance is not None:
@@ -310,8 +314,8 @@ def _from_images(
         found.left_out,
         understood,
         folder=source,
-        timed=found.timed,
         arm=arm and arm[found.rows],
+        timed=found.timed,
     )
 
 
@@ -383,12 +387,13 @@ def _dry_images(
     timing: Timing,
     arm: Robot | None,
 ) -> list[str]:
+    """Of a folder of images."""
+    if arm is not None:
+        _require_by_name(timing)
     robot = read_robot_poses(poses, quaternions, said) if arm is None else read_arm(poses, arm, quaternions)[0]
     design, model = load_flat_board(board), read_camera(camera)
     files, skipped = find_images(source)
-    at_images = AtImages(robot)
-    if arm is None:
-        at_images = robot_at_images(robot, [file.name for file in files], timing)
+    at_images = robot_at_images(robot, [file.name for file in files], None if arm else timing)
     robot, every = at_images.robot, len(files)
     files = [file for file in files if file.name not in dict(at_images.left_out)]
     rows, missing, how = _rows_of_images(robot, files, source)

@@ -5,7 +5,7 @@ from functools import partial
 
 import numpy as np
 
-from stcal.errors import DegenerateError, InputError, StcalError
+from stcal.errors import DegenerateError, StcalError
 from stcal.handeye import HandEyeOptions, handeye
 from stcal.handeye.choose import choose
 from stcal.handeye.data.loop import Setup
@@ -13,7 +13,6 @@ from stcal.handeye.judge.symmetry import repair
 from stcal.handeye.predict import predict_motions
 from stcal.handeye.report.outcome import Outcome
 from stcal.handeye.scatter import widened_by_scatter
-from stcal.handeye.time_offset import TimeOffset, estimate_offset
 from stcal.handeye.validate import (
     LEAST_LEFT,
     better_setup,
@@ -21,9 +20,9 @@ from stcal.handeye.validate import (
     cross_validate,
     splits,
 )
-from stcal.parallel import Progress, one_thread
-from stcal.workflows.handeye_arm import with_arm
-from stcal.workflows.handeye_input import HandEyeInput
+from stcal.parallel import Progress
+from stcal.workflows.handeye.arm import with_arm
+from stcal.workflows.handeye.inputs import HandEyeInput
 
 ALL, AUTO = "all", "auto"
 """In place of a method's name: all of them, compared; the way of solving that predicts best."""
@@ -137,53 +136,3 @@ def _outcome(
         return outcome
     done = partial(progress, "with the arm")
     return with_arm(outcome, given.arm, options, given.prior, rows, validation.workers, done)
-
-
-@one_thread()
-def at_offset(
-    given: HandEyeInput, setup: Setup, options: HandEyeOptions
-) -> tuple[HandEyeInput, HandEyeOptions, TimeOffset]:
-    """The same with the robot's poses at the offset that is found; numberings of a symmetric board are put right.
-
-    Raises
-    ------
-    InputError
-        No times, or a robot of four axes.
-    StcalError
-        As :func:`~stcal.handeye.time_offset.estimate_offset`.
-    """
-    timed = given.timed
-    if timed is None:
-        raise InputError(
-            f"{given.where}: --time-offset needs times of both, of the robot's poses (a column time_s, or TUM) and of "
-            "the images (their names, or --image-times)"
-        )
-    if options.four_dof:
-        raise InputError("--time-offset: not with --four-dof, whose motions do not tell it; leave one of them out")
-    pairs, views, notes = given.pairs, given.views, ()
-    if options.symmetries:
-        mended = repair(pairs, setup, options.symmetries, views)
-        pairs, views, notes = mended.pairs, mended.views, mended.notes()
-    found = estimate_offset(pairs, timed.stream, timed.seconds, setup, options.noise, options.with_scale)
-    kept = np.flatnonzero(found.kept)
-    out = [
-        (name, "outside of the robot's times at the time offset")
-        for name, k in zip(pairs.names, found.kept, strict=True)
-        if not k
-    ]
-    given = replace(
-        given,
-        pairs=replace(pairs[kept], base_from_flange=found.base_from_flange),
-        views=None if views is None else views[kept],
-        symmetries=(),
-        left_out=(*given.left_out, *out),
-        understood=(*given.understood, *notes),
-    )
-    return given, replace(options, symmetries=()), found
-
-
-def with_offset(outcome: Outcome, offset: TimeOffset | None) -> Outcome:
-    """With the offset in the report, and its σ in those of the transforms."""
-    if offset is None:
-        return outcome
-    return replace(outcome, result=offset.carried(outcome.result), time_offset=offset)

@@ -14,7 +14,7 @@ from stcal.parallel import one_thread
 from stcal.robot import Robot, inverse
 from stcal.robot.kinematics.inverse import REACHED
 from stcal.robot.use.compensation import joint_columns
-from stcal.workflows.handeye_input import HandEyeInput
+from stcal.workflows.handeye.inputs import HandEyeInput
 
 LEAST_REACHED = 0.5
 """Share of the poses taken that a robot file must reach to be that robot's."""

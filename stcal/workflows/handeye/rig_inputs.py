@@ -16,8 +16,8 @@ from stcal.handeye.data.robot_poses import RobotPoses, read_robot_poses
 from stcal.handeye.data.stream import TOLERANCE_S
 from stcal.io.quaternions import Order
 from stcal.parallel import Progress, one_thread
-from stcal.workflows.handeye_input import Photographed, photographed, pitch_of
-from stcal.workflows.handeye_times import Timing
+from stcal.workflows.handeye.inputs import Photographed, photographed, pitch_of
+from stcal.workflows.handeye.times import Timing
 
 
 @dataclass(frozen=True, slots=True, eq=False)
