@@ -16,10 +16,11 @@ from stcal.geometry.rigid import Poses, Rigid
 from stcal.handeye.data.loop import Loop
 from stcal.handeye.data.views import View, Views, resect
 from stcal.handeye.methods.arm import ROUNDS, SETTLED_MM, ArmModel, LinearArm
-from stcal.handeye.methods.bundle import LEAST, Bundle, Corners, Problem, adjust
+from stcal.handeye.methods.bundle import Bundle, Corners
 from stcal.handeye.methods.camera_error import CameraError, of_corners
 from stcal.handeye.methods.noise import Noise
 from stcal.handeye.methods.pose_adjustment import FALSE_ALARM, LEAST_POSES
+from stcal.handeye.methods.rounds import LEAST, Problem, adjust
 from stcal.io.camera import CameraPrior, intrinsic_basis
 
 GROSS_RAD, GROSS_SHARE = np.radians(10), 0.2
@@ -183,7 +184,7 @@ def _adjusted(
         rows = np.flatnonzero(used)
         own = None if arm is None else arm[rows]
         given = (loop[rows], base_from_flange[rows], views[rows], noise, intrinsics, with_scale)
-        corners, free = problem(*given, own, sigma)
+        corners, free = problem(*given, arm=own, first=sigma)
         begin = Bundle(x, z, corners.base_from_flange, corners.xyz_board, views.camera, scale, corners.no_step())
         solution = adjust(corners, begin, free)
         corners, state, normal = solution.corners, solution.state, solution.normal

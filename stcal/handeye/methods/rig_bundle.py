@@ -9,10 +9,13 @@ from scipy.sparse import csr_matrix
 from stcal.geometry.camera import Camera
 from stcal.geometry.least_squares import NormalEquations
 from stcal.geometry.rigid import Poses, Rigid
-from stcal.handeye.methods.bundle import Bundle, Corners, Knowledge
+from stcal.handeye.methods.bundle import Bundle, Corners
+from stcal.handeye.methods.rounds import Knowledge
 
 POSE = 6
 """Unknowns of a pose."""
+SHARED = ("scale", "arm", "board", "robot")
+"""Unknowns of all cameras together, in their order; those of an arm are none here."""
 OWN = ("corner_px", "camera")
 """Groups that each camera has of its own begin so."""
 
@@ -60,7 +63,7 @@ class RigCorners:
         """Where the unknowns stand in a step: all X, Z, the intrinsics of all, and what they share."""
         shared = self.each[0].places()
         sizes = {"x": POSE * len(self.each), "z": POSE, "camera": sum(own.basis.shape[1] for own in self.each)}
-        sizes |= {name: shared[name].stop - shared[name].start for name in ("scale", "arm", "board", "robot")}
+        sizes |= {name: shared[name].stop - shared[name].start for name in SHARED}
         ends = np.cumsum([0, *sizes.values()])
         return {name: slice(int(i), int(j)) for name, i, j in zip(sizes, ends[:-1], ends[1:], strict=True)}
 

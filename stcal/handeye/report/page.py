@@ -305,6 +305,9 @@ def _tiles(outcome: Outcome) -> list[tuple[str, str, str]]:
         tiles.append((f"{sigma:.3f} mm", "", "σ of the camera's place, in its worst direction"))
     turn, shift = result.rms()
     tiles.append((f"{shift:.3f} mm", "", f"RMS residual at the board's origin, and {np.degrees(turn):.3f}°"))
+    if (offset := outcome.time_offset) is not None:
+        said = f"robot's clock minus camera's, ± {1e3 * offset.sigma_s:.2g} ms"
+        tiles.append((f"{1e3 * offset.seconds:.2f} ms", "", said))
     if result.sigma_scale is not None:
         found = "" if outcome.pitch_mm is None else f": pitch {outcome.pitch_mm * result.scale:.3f} mm"
         tiles.append(

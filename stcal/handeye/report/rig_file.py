@@ -8,7 +8,7 @@ from pydantic import Field
 
 import stcal
 from stcal.handeye.data.loop import FRAMES, Setup
-from stcal.handeye.methods.bundle import kind
+from stcal.handeye.methods.rounds import kind
 from stcal.handeye.report.file import (
     AdjustedCamera,
     BoardSize,

@@ -20,9 +20,9 @@ from stcal.synthetic.measured.handeye import (
 
 SECONDS = 24.0
 """That the robot moves."""
-TURN_RAD, WAY_MM = np.array([0.5, 0.45, 0.5]), np.array([90.0, 120.0, 80.0])
-TURN_RATE, WAY_RATE = np.array([1.1, 0.9, 0.7]), np.array([0.8, 1.0, 1.3])
-MIDDLE_MM = np.array([400.0, 0.0, 600.0])
+TURN_RAD, WAY_MM = np.array([0.5, 0.45, 0.5]), np.array([90.0, 80.0, 120.0])
+TURN_RATE, WAY_RATE = np.array([1.1, 0.9, 0.7]), np.array([0.8, 1.3, 1.0])
+MIDDLE_MM = np.array([-100.0, -87.5, 500.0])
 SAMPLE = 2e-5, 0.01
 """σ (rad, mm) of what a sample of the stream errs by."""
 
@@ -41,7 +41,7 @@ class StreamTruth:
 
 
 def trajectory(seconds: np.ndarray, phase: np.ndarray) -> Poses:
-    """base_from_flange (k,) of a flange that swings about all axes; ``phase`` : (2, 3)."""
+    """camera_from_board (k,) of a board that swings about all axes; ``phase`` : (2, 3)."""
     turn = TURN_RAD * np.sin(np.outer(seconds, TURN_RATE) + phase[0])
     way = MIDDLE_MM + WAY_MM * np.sin(np.outer(seconds, WAY_RATE) + phase[1])
     return Poses(Rotation.from_rotvec(turn).as_matrix(), way)
@@ -61,16 +61,17 @@ def simulated_stream(
     phase, every = rng.uniform(0, 2 * np.pi, (2, 3)), np.arange(0, SECONDS, spacing_s)
     stamps = np.sort(rng.uniform(0.5, SECONDS - 1.0, count))
 
+    x, z = (FLANGE_FROM_CAMERA, BASE_FROM_BOARD) if setup == "eye-in-hand" else (BASE_FROM_CAMERA, FLANGE_FROM_BOARD)
+
     def moving(seconds: np.ndarray) -> Poses:
-        if not still:
-            return trajectory(seconds, phase)
-        nearest = stamps[np.abs(seconds[:, None] - stamps).argmin(1)]
-        return trajectory(nearest, phase)
+        if still:
+            seconds = stamps[np.abs(seconds[:, None] - stamps).argmin(1)]
+        mount_from_stand = x @ trajectory(seconds, phase) @ z.inverse()
+        return mount_from_stand.inverse() if setup == "eye-in-hand" else mount_from_stand
 
     stream = disturbed(rng, moving(every), *SAMPLE)
     there = moving(stamps if still else stamps + offset_s)
     was = disturbed(rng, there, *robot)
-    x, z = (FLANGE_FROM_CAMERA, BASE_FROM_BOARD) if setup == "eye-in-hand" else (BASE_FROM_CAMERA, FLANGE_FROM_BOARD)
     mount_from_stand = was.inverse() if setup == "eye-in-hand" else was
     seen = disturbed(rng, x.inverse() @ mount_from_stand @ z, *camera)
     times = [Decimal(repr(round(float(t), 6))) for t in every]

@@ -134,4 +134,5 @@ def _require_times(robot: RobotPoses, images: dict[str, Decimal] | None, samples
             "seconds (1689.25.png), or give --image-times"
         )
     if samples is None or not isinstance(samples, list) or None in samples:
-        raise InputError(f"{robot.where}: no times of its poses: {robot.images[:1]}; give a column time_s, or TUM")
+        first = f", but {robot.images[0]} …" if robot.images else ""
+        raise InputError(f"{robot.where}: no times of its poses{first}; give a column time_s, or a TUM trajectory")
