@@ -4,7 +4,16 @@ from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 
-from stcal.boards.file import load_flat_board
+from stcal.boards.design import (
+    AprilGridDesign,
+    AsymmetricCirclesDesign,
+    BoardSet,
+    CharucoDesign,
+    ChessboardDesign,
+    TagLayout,
+)
+from stcal.boards.several import load_boards
+from stcal.design import BoardDesign
 from stcal.errors import DegenerateError, InputError
 from stcal.geometry.rigid import Poses, Rigid
 from stcal.handeye import HandEyePoses, View, Views, pairs_of_views, read_poses
@@ -22,6 +31,16 @@ from stcal.parallel import Progress, one_thread
 from stcal.workflows.board_views import detect_boards
 
 NOTHING_SAID = Said()
+KINDS = {
+    BoardDesign: "dots",
+    ChessboardDesign: "chessboard",
+    CharucoDesign: "ChArUco",
+    TagLayout: "tags",
+    AprilGridDesign: "AprilGrid",
+    AsymmetricCirclesDesign: "asymmetric circles",
+}
+PITCHES = ("pitch_mm", "square_mm", "spacing_mm")
+"""What board files call the distance by which a board's size is stated."""
 Source = Path | Table | Told
 
 
@@ -171,7 +190,7 @@ def _from_images(
     source: Path, robot: RobotPoses, poses: Path, camera: Path, board: Path, workers: int | None, progress: Progress
 ) -> HandEyeInput:
     """Corners of the board in all images that have a pose."""
-    design, model = load_flat_board(board), read_camera(camera)
+    design, model = load_boards(board), read_camera(camera)
     files, skipped = find_images(source)
     rows, missing, how = _rows_of_images(robot, files, source)
     with_pose = [file for file in files if file.name in rows]
@@ -182,15 +201,15 @@ def _from_images(
     if not views:
         first = f"{found.skipped[0].name}: {found.skipped[0].reason}"
         raise InputError(f"image folder {source}: the board is in none of {len(with_pose)} images: {first}")
-    seen = Views(found.camera, tuple(View(v.xyz_board, v.xy_px, v.covariance_px2) for v in views.values()))
+    seen = Views(found.camera, tuple(View(v.xyz_board, v.xy_px, v.covariance_px2, v.normal) for v in views.values()))
     at = [rows[name] for name in views]
     pairs = pairs_of_views(robot.base_from_flange[at], seen, tuple(views), str(source))
     if robot.covariance is not None:
         pairs = replace(pairs, base_from_flange_covariance=robot.covariance[at])
-    pitch = getattr(design, "pitch_mm", getattr(design, "square_mm", None))
+    pitch = next((getattr(design, key) for key in PITCHES if hasattr(design, key)), None)
     prior = camera_prior(refinable(model.calibrated(found.camera.width, found.camera.height)))
     where = f"{source.name}, {poses.name}"
-    understood = _robot_lines(robot, how) if not robot.own else ()
+    understood = (*(_robot_lines(robot, how) if not robot.own else ()), *(f"board: {s}" for s in found.unused()))
     return HandEyeInput(where, pairs, seen, found.symmetries, prior, pitch, tuple(left_out), understood, folder=source)
 
 
@@ -247,11 +266,11 @@ def dry_run(
 
 def _dry_images(source: Path, poses: Path, camera: Path, board: Path, quaternions: Order, said: Said) -> list[str]:
     robot = read_robot_poses(poses, quaternions, said)
-    design, model = load_flat_board(board), read_camera(camera)
+    design, model = load_boards(board), read_camera(camera)
     files, skipped = find_images(source)
     rows, missing, how = _rows_of_images(robot, files, source)
     setup = setup_of(said, None, source.name)
-    kind = type(design).__name__.removesuffix("Design").lower()
+    kind = f"{len(design.boards)} boards" if isinstance(design, BoardSet) else KINDS[type(design)]
     lines = [
         *_robot_lines(robot, how),
         f"camera: {camera.name}: {model.width} × {model.height} px, focal length {model.focal[0]:.6g} px",

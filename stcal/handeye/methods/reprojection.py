@@ -12,7 +12,7 @@ from stcal.geometry.camera import Camera
 from stcal.geometry.normal_equations import generalised_inverse
 from stcal.geometry.rigid import Poses, Rigid
 from stcal.handeye.data.loop import Loop
-from stcal.handeye.data.views import View, Views, resect
+from stcal.handeye.data.views import Views, resect
 from stcal.handeye.methods.bundle import LEAST, Bundle, Corners, adjust
 from stcal.handeye.methods.camera_error import CameraError, of_corners
 from stcal.handeye.methods.noise import Noise
@@ -173,7 +173,7 @@ def adjust_views(
 def resected(pairs_names: tuple[str, ...], views: Views, adjusted: AdjustedViews) -> Poses:
     """camera_from_board of all views by the adjusted camera and board."""
     board = adjusted.found
-    seen = tuple(View(board.board(view.xyz_board), view.xy_px, view.covariance) for view in views.views)
+    seen = tuple(view.moved(board.board(view.xyz_board)) for view in views.views)
     return resect(Views(board.camera, seen), pairs_names).camera_from_board
 
 
