@@ -7,7 +7,7 @@ import cv2
 import numpy as np
 
 from stcal.boards.design import BoardView, CharucoDesign, TagLayout, view_of
-from stcal.boards.edges import corners_from_edges
+from stcal.boards.edges import corners_by_edges, corners_from_edges
 from stcal.geometry.arrays import frozen
 from stcal.geometry.camera import Camera
 from stcal.io.images import grey_8bit
@@ -24,9 +24,12 @@ SATURATED_EDGE_PX = 0.7
 0.9 px farther towards the dark (the mean of a normal density's tail)."""
 SATURATION_POINTS = 8
 """Of each edge."""
-WHITE_GROWN_PX = (3, 5)
-"""Sides of the windows whose largest value takes the place of a pixel: a blurred corner at which two black squares meet
-is black across, and the squares one outline."""
+WHITE_PX = 3
+"""Side of the window whose largest value takes the place of a pixel: a blurred corner at which two black squares meet is
+black across, and the squares have one outline."""
+GROWN_LOOKS = ((2, 4e7), (3, 1e7), (1, 5e8))
+"""How much larger than the image, where that makes at most so many pixels: by a pixel of its own the white grows too
+far into tags of 50 px and less."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -69,15 +72,18 @@ def find_tags(image: np.ndarray, dictionaries: Sequence[str], border_bits: int =
     for name in dict.fromkeys(dictionaries):
         detector = cv2.aruco.ArucoDetector(_dictionary(name), _parameters(name, border_bits))
         for look in _looks(grey, joined):
-            corners, ids, _ = detector.detectMarkers(look)
-            for place, tag in zip(corners, [] if ids is None else ids.ravel(), strict=True):
-                known = found.setdefault((name, int(tag)), [])
-                if look is grey or not any(_inside(place.reshape(4, 2), other) for other in known):
-                    known.append(place.reshape(4, 2))
+            corners, ids, _ = detector.detectMarkers(look.grey)
+            places = look.in_image(np.array(corners, np.float32).reshape(-1, 4, 2))
+            earlier = {tag: list(there) for tag, there in found.items()}
+            for place, tag in zip(places, [] if ids is None else ids.ravel(), strict=True):
+                if not any(_inside(place, other) for other in earlier.get((name, int(tag)), [])):
+                    found.setdefault((name, int(tag)), []).append(place)
     found = _outermost(found)
     once = {tag: places[0] for tag, places in sorted(found.items()) if len(places) == 1}
     cells = np.array([_dictionary(name).markerSize + 2 * border_bits for name, _ in once])
     corners, covariance = _refined(grey, np.array(list(once.values()), float).reshape(-1, 4, 2), cells)
+    if joined:  # places from larger and grown images are off by more
+        corners, covariance = _refined(grey, corners, cells)
     saturated = _saturated(grey, corners, cells)
     # Where some of the white is saturated and some is not, edges shift, and each by something else.
     uneven = SATURATED_EDGE_PX**2 * saturated * (1 - saturated)
@@ -85,11 +91,30 @@ def find_tags(image: np.ndarray, dictionaries: Sequence[str], border_bits: int =
     return Tags(tuple(once), corners, covariance + uneven[:, None, None, None] * np.eye(2), repeated, saturated)
 
 
-def _looks(grey: np.ndarray, joined: bool) -> Iterator[np.ndarray]:
-    """The image, and where tags hang together at their corners, images in which what is white has grown."""
-    yield grey
-    if joined:
-        yield from (cv2.dilate(grey, np.ones((side, side), np.uint8)) for side in WHITE_GROWN_PX)
+@dataclass(frozen=True, slots=True, eq=False)
+class _Look:
+    """An image ``larger`` times as large, in which what is white reaches ``grown_px`` farther, px of its own."""
+
+    grey: np.ndarray
+    larger: int = 1
+    grown_px: float = 0.0
+
+    def in_image(self, corners: np.ndarray) -> np.ndarray:
+        """Corners of tags (n, 4, 2) in the image as it is, px."""
+        if self.grown_px and len(corners):
+            corners = (corners + self.grown_px * corners_by_edges(corners)).astype(np.float32)
+        return corners if self.larger == 1 else ((corners + 0.5) / self.larger - 0.5).astype(np.float32)
+
+
+def _looks(grey: np.ndarray, joined: bool) -> Iterator[_Look]:
+    """The image; where tags hang together at their corners, first those in which what is white has grown."""
+    for larger, most in GROWN_LOOKS if joined else ():
+        if grey.size * larger**2 <= most:
+            how = cv2.INTER_CUBIC
+            large = grey if larger == 1 else cv2.resize(grey, None, fx=larger, fy=larger, interpolation=how)
+            grown = cv2.dilate(large, np.ones((WHITE_PX, WHITE_PX), np.uint8))
+            yield _Look(grown, larger, (WHITE_PX - 1) / 2)
+    yield _Look(grey)
 
 
 def _inside(place: np.ndarray, other: np.ndarray) -> bool:

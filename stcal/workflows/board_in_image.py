@@ -202,8 +202,9 @@ def _find_circles(
 def _turned_only(ids: np.ndarray, board: BoardDesign | AsymmetricCirclesDesign) -> bool:
     """Whether all numberings (k, n) differ by nothing but a turn that leaves the board as it is."""
     xy = board.xy_mm()
+    pitch = board.pitch_mm if isinstance(board, BoardDesign) else board.spacing_mm
     places = [(turn @ np.column_stack([xy, np.zeros(len(xy))]))[:, :2] for turn in (Rigid(), *symmetries(board))]
-    return all(any(np.allclose(xy[own], place[ids[0]], atol=board.pitch_mm / 4) for place in places) for own in ids)
+    return all(any(np.allclose(xy[own], place[ids[0]], atol=pitch / 4) for place in places) for own in ids)
 
 
 def images_of_centres(
