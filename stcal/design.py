@@ -81,10 +81,13 @@ class BoardDesign:
     corner: tuple[int, int] | None = None
     corner_radius_mm: float | None = None
 
+    def cells(self) -> np.ndarray:
+        """Row and column of every dot, (rows·columns, 2), row-major."""
+        return np.column_stack(np.divmod(np.arange(self.rows * self.columns), self.columns))
+
     def xy_mm(self) -> np.ndarray:
         """Grid positions, (rows·columns, 2), row-major, mm."""
-        row, column = np.divmod(np.arange(self.rows * self.columns), self.columns)
-        return self.pitch_mm * np.column_stack([column, row]).astype(float)
+        return self.pitch_mm * self.cells()[:, ::-1].astype(float)
 
     def radii_mm(self) -> np.ndarray:
         """Dot radii, (rows·columns,), row-major, mm."""

@@ -24,6 +24,8 @@ SMOOTHED_SHARE, LEAST_SMOOTHING = 0.05, 0.3
 would keep a corner where it was looked for, goes."""
 FLAGS = cv2.CALIB_CB_NORMALIZE_IMAGE | cv2.CALIB_CB_EXHAUSTIVE | cv2.CALIB_CB_ACCURACY
 OLDER_FLAGS = cv2.CALIB_CB_ADAPTIVE_THRESH | cv2.CALIB_CB_NORMALIZE_IMAGE
+PART, PART_FLAGS = (3, 3), cv2.CALIB_CB_NORMALIZE_IMAGE | cv2.CALIB_CB_LARGER
+"""Fewest inner corners that pass for a part of a chessboard."""
 FIRST_SIDE, LEAST_SIDE = 1600, 300
 """Longer side of the image that is looked at first, and of the smallest, px."""
 
@@ -108,3 +110,18 @@ def _first_is_black(grey: np.ndarray, grid: np.ndarray, board: ChessboardDesign)
     level = grey[y[inside], x[inside]].astype(float)
     even = ((row + column) % 2 == 0)[inside]
     return bool(even.all() or level[even].mean() < level[~even].mean())
+
+
+def why_no_chessboard(image: np.ndarray, board: ChessboardDesign) -> str:
+    """Why :func:`find_chessboard` finds nothing, as far as another number of corners tells."""
+    grey = grey_8bit(image)
+    scale = min(FIRST_SIDE / max(grey.shape), 1.0)
+    small = grey if scale == 1 else cv2.resize(grey, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA)
+    there, _, meta = cv2.findChessboardCornersSBWithMeta(small, PART, PART_FLAGS)
+    inner = f"not all {board.rows}×{board.columns} inner corners of the chessboard"
+    if not there:
+        return f"{inner}, which rows and columns of its file count"
+    rows, columns = sorted(meta.shape[:2])
+    if rows > min(board.rows, board.columns) or columns > max(board.rows, board.columns):
+        return f"{inner}, but {rows}×{columns}; correct rows and columns in its file, which count inner corners"
+    return f"{inner}, but {rows}×{columns}: a part of a plain chessboard has no numbers; show all of it"

@@ -1,26 +1,41 @@
-"""Board files of every kind: dots (``stcal.io.design``), chessboards, ChArUco boards, tag layouts."""
+"""Board files of every kind: dots (``stcal.io.design``), chessboards, ChArUco boards, tags, and Kalibr's."""
 
 import tomllib
 from pathlib import Path
-from typing import Annotated, Literal, Self
+from typing import Annotated, Any, Literal, Self
 
 import cv2
 import numpy as np
+import yaml
 from pydantic import AfterValidator, Field, model_validator
 
-from stcal.boards.design import CharucoDesign, ChessboardDesign, FlatBoard, TagLayout
-from stcal.design import BoardDesign
+from stcal.boards import kalibr
+from stcal.boards.design import (
+    AprilGridDesign,
+    AsymmetricCirclesDesign,
+    CharucoDesign,
+    ChessboardDesign,
+    FlatBoard,
+    TagLayout,
+)
+from stcal.design import BoardDesign, Polarity
 from stcal.errors import InputError
 from stcal.io.covariance import Rows, require_covariance
-from stcal.io.design import Count, load_board
+from stcal.io.design import BoardEntry, Count, board_design, load_board
 from stcal.io.files import SETTINGS_BYTES, read_bytes
 from stcal.io.json import mistake
-from stcal.io.toml import Finite, Positive, Strict, load_toml
+from stcal.io.plain_yaml import load_yaml
+from stcal.io.toml import Finite, Positive, Strict, validated
 
-REMEDY = 'a file with type = "chessboard", "charuco" or "tags" needed, or one of dots, see data_layout.md'
-OF_OTHERS = {"square_mm", "marker_mm", "dictionary", "tag"}
+KINDS = ("circles", "chessboard", "charuco", "tags", "aprilgrid", "asymmetric-circles")
+"""Of flat boards."""
+SET = "boards"
+REMEDY = (
+    'a file with type = "chessboard", "charuco", "tags", "aprilgrid" or "asymmetric-circles" needed, one of dots, or '
+    "one of Kalibr, see data_layout.md"
+)
+OF_OTHERS = {"square_mm", "marker_mm", "dictionary", "tag", "tag_mm", "spacing_mm", "board"}
 """Keys that no board of dots has."""
-KINDS = ("circles", "chessboard", "charuco", "tags")
 
 
 def known_dictionary(name: str) -> str:
@@ -41,6 +56,8 @@ def known_dictionary(name: str) -> str:
 
 
 Dictionary = Annotated[str, AfterValidator(known_dictionary)]
+TagId = Annotated[int, Field(ge=0, strict=True)]
+Few = Annotated[int, Field(ge=1, le=1000, strict=True)]
 
 
 class _Chessboard(Strict):
@@ -60,6 +77,31 @@ class _Charuco(Strict):
     dictionary: Dictionary
     legacy: bool = False
     sigma_mm: Positive = 0.01
+    first_id: TagId = 0
+
+
+class _AprilGrid(Strict):
+    type: Literal["aprilgrid"]
+    rows: Few
+    columns: Few
+    tag_mm: Positive
+    spacing: Annotated[float, Field(gt=0, le=10, strict=True)]
+    border_bits: Annotated[int, Field(ge=1, le=2, strict=True)] | None = None
+    first_id: TagId = 0
+    dictionary: Dictionary = "DICT_APRILTAG_36h11"
+    upright: bool = False
+    sigma_mm: Positive = 0.01
+
+
+class _AsymmetricCircles(Strict):
+    type: Literal["asymmetric-circles"]
+    rows: Count
+    columns: Count
+    spacing_mm: Positive
+    radius_mm: Positive | None = None
+    diameter_mm: Positive | None = None
+    polarity: Polarity
+    sigma_mm: Positive = 0.005
 
 
 class TagEntry(Strict):
@@ -67,7 +109,7 @@ class TagEntry(Strict):
     or neither, when its place is to be found."""
 
     dictionary: Dictionary
-    id: Annotated[int, Field(ge=0, strict=True)]
+    id: TagId
     size_mm: Positive | None = None
     x_mm: Finite | None = None
     y_mm: Finite | None = None
@@ -95,7 +137,7 @@ class TagsFile(Strict):
     type: Literal["tags"]
     name: str = "tags"
     sigma_mm: Annotated[float, Field(ge=0, le=1e3)] = 0.0
-    origin: Annotated[int, Field(ge=0, strict=True)] | None = None
+    origin: TagId | None = None
     sigma_px: Annotated[float, Field(ge=0, le=1e3)] = 0.0
     tag_sigma_px: Annotated[float, Field(ge=0, le=1e3)] = 0.0
     covariance_mm2: list[list[Finite]] | None = None
@@ -126,53 +168,137 @@ class TagsFile(Strict):
 
 
 def load_flat_board(path: str | Path) -> BoardDesign | FlatBoard:
-    """Read a board file of any kind (form: ``data_layout.md``); one without ``type`` is of dots.
+    """Read a file of one board of any kind (form: ``data_layout.md``); one without ``type`` is of dots.
 
     Raises
     ------
     InputError
-        Unreadable, or not as its kind needs it; the message names file, place and reason.
+        Unreadable, not as its kind needs it, or of several boards; the message names file, place and reason.
     """
-    where = f"board file {path}"
-    kind = _kind(path)
+    return design_of(path, board_content(path))
+
+
+def design_of(path: str | Path, content: dict[str, Any] | None) -> BoardDesign | FlatBoard:
+    """The board of a file's content; errors as :func:`load_flat_board`."""
+    if content is None:
+        return load_board(path)  # no TOML: says why
+    if "type" not in content and not OF_OTHERS.isdisjoint(content):
+        raise InputError(f"board file {path}: no type; {REMEDY}")
+    return flat_board(content, f"board file {path}")
+
+
+def flat_board(content: dict[str, Any], where: str) -> BoardDesign | FlatBoard:
+    """The board that keys and values say; errors as :func:`load_flat_board`, beginning with ``where``."""
+    if "target_type" in content:
+        return kalibr.board_of(content, where)
+    kind = content.get("type", "circles")
     if kind == "circles":
-        return load_board(path)
+        return board_design(validated(content, BoardEntry, where), where)
     if kind == "chessboard":
-        data = load_toml(path, _Chessboard, "board file", REMEDY)
+        data = validated(content, _Chessboard, where)
         return ChessboardDesign(data.rows, data.columns, data.square_mm, data.sigma_mm)
     if kind == "charuco":
-        data = load_toml(path, _Charuco, "board file", REMEDY)
-        if data.marker_mm >= data.square_mm:
-            raise InputError(
-                f"{where}: marker_mm {data.marker_mm:g}, under square_mm {data.square_mm:g} needed; are they swapped?"
-            )
-        return CharucoDesign(
-            data.rows,
-            data.columns,
-            data.square_mm,
-            data.marker_mm,
-            data.dictionary,
-            data.legacy,
-            data.sigma_mm,
-        )
+        return _charuco(validated(content, _Charuco, where), where)
     if kind == "tags":
-        data = load_toml(path, TagsFile, "board file", REMEDY)
-        corners = [tag.corners(where) for tag in data.tag]
-        for tag, place in zip(data.tag, corners, strict=True):
-            if place is None:
-                raise InputError(f"{where}: tag {tag.id}: no place; x_mm, y_mm and size_mm, or corners_mm needed")
-        return TagLayout(tuple((tag.dictionary, tag.id) for tag in data.tag), np.array(corners), data.sigma_mm)
+        return _tags(validated(content, TagsFile, where), where)
+    if kind == "aprilgrid":
+        return _aprilgrid(validated(content, _AprilGrid, where), where)
+    if kind == "asymmetric-circles":
+        return _asymmetric(validated(content, _AsymmetricCircles, where), where)
+    if kind == SET:
+        raise InputError(f"{where}: several boards, not flat together; the file of a single board needed here")
     raise InputError(f"{where}: type {kind!r}; one of {', '.join(KINDS)} needed")
 
 
-def _kind(path: str | Path) -> str:
-    """The file's ``type``; dots where it says nothing, or is no TOML: its own loader then says why."""
+def board_content(path: str | Path) -> dict[str, Any] | None:
+    """Keys and values of a board file, TOML or Kalibr's YAML; None where it is neither.
+
+    Raises
+    ------
+    InputError
+        Unreadable.
+    """
     try:
-        content = tomllib.loads(read_bytes(path, SETTINGS_BYTES).decode("utf-8-sig"))
+        text = read_bytes(path, SETTINGS_BYTES).decode("utf-8-sig")
+        return tomllib.loads(text)
     except OSError as error:
         raise InputError(f"board file {path}: {error.strerror or error}; {REMEDY}") from error
+    except UnicodeDecodeError:
+        return None
     except (ValueError, RecursionError):
-        return "circles"
-    if "type" not in content and not OF_OTHERS.isdisjoint(content):
-        raise InputError(f"board file {path}: no type; {REMEDY}")
-    return str(content.get("type", "circles"))
+        return _kalibr_content(text) if "target_type" in text else None
+
+
+def _kalibr_content(text: str) -> dict[str, Any] | None:
+    try:
+        content = load_yaml(text)
+    except (yaml.YAMLError, ValueError, RecursionError):
+        return None
+    return content if isinstance(content, dict) and "target_type" in content else None
+
+
+def _charuco(data: _Charuco, where: str) -> CharucoDesign:
+    if data.marker_mm >= data.square_mm:
+        raise InputError(
+            f"{where}: marker_mm {data.marker_mm:g}, under square_mm {data.square_mm:g} needed; are they swapped?"
+        )
+    board = CharucoDesign(
+        data.rows,
+        data.columns,
+        data.square_mm,
+        data.marker_mm,
+        data.dictionary,
+        data.legacy,
+        data.sigma_mm,
+        data.first_id,
+    )
+    _require_tags(board, where)
+    return board
+
+
+def _tags(data: TagsFile, where: str) -> TagLayout:
+    corners = [tag.corners(where) for tag in data.tag]
+    for tag, place in zip(data.tag, corners, strict=True):
+        if place is None:
+            raise InputError(f"{where}: tag {tag.id}: no place; x_mm, y_mm and size_mm, or corners_mm needed")
+    return TagLayout(tuple((tag.dictionary, tag.id) for tag in data.tag), np.array(corners), data.sigma_mm)
+
+
+def _aprilgrid(data: _AprilGrid, where: str) -> AprilGridDesign:
+    board = AprilGridDesign(
+        data.rows,
+        data.columns,
+        data.tag_mm,
+        data.spacing,
+        data.border_bits,
+        data.first_id,
+        data.dictionary,
+        data.upright,
+        data.sigma_mm,
+    )
+    _require_tags(board, where)
+    return board
+
+
+def _require_tags(board: CharucoDesign | AprilGridDesign, where: str) -> None:
+    """Refuse a board that needs more tags than there are."""
+    ids = board.tag_ids()
+    there = len(cv2.aruco.getPredefinedDictionary(getattr(cv2.aruco, board.dictionary)).bytesList)
+    if ids.stop > there:
+        raise InputError(
+            f"{where}: tags {ids.start} … {ids.stop - 1}, {board.dictionary} has 0 … {there - 1}; correct rows, "
+            "columns, first_id or dictionary"
+        )
+
+
+def _asymmetric(data: _AsymmetricCircles, where: str) -> AsymmetricCirclesDesign:
+    if (data.radius_mm is None) == (data.diameter_mm is None):
+        raise InputError(f"{where}: radius_mm or diameter_mm needed, one of them")
+    radius = data.radius_mm if data.diameter_mm is None else data.diameter_mm / 2
+    most = data.spacing_mm / np.sqrt(2)
+    if radius is None or radius >= most:
+        raise InputError(
+            f"{where}: radius {radius:g} mm, under {most:g} mm needed for circles apart; spacing_mm is half of what "
+            "neighbours in a row are apart"
+        )
+    return AsymmetricCirclesDesign(data.rows, data.columns, data.spacing_mm, radius, data.polarity, data.sigma_mm)

@@ -1,13 +1,13 @@
 """ArUco and AprilTag markers in an image, and the ChArUco boards made of them (through ``cv2.aruco``)."""
 
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
 
 from stcal.boards.design import BoardView, CharucoDesign, TagLayout, view_of
-from stcal.boards.edges import corners_from_edges
+from stcal.boards.edges import corners_by_edges, corners_from_edges
 from stcal.geometry.arrays import frozen
 from stcal.geometry.camera import Camera
 from stcal.io.images import grey_8bit
@@ -24,6 +24,12 @@ SATURATED_EDGE_PX = 0.7
 0.9 px farther towards the dark (the mean of a normal density's tail)."""
 SATURATION_POINTS = 8
 """Of each edge."""
+WHITE_PX = 3
+"""Side of the window whose largest value takes the place of a pixel: a blurred corner at which two black squares meet
+is black across, and the squares have one outline."""
+GROWN_LOOKS = ((2, 4e7), (3, 1e7), (1, 5e8))
+"""How much larger than the image, where that makes at most so many pixels: by a pixel of its own the white grows too
+far into tags of 50 px and less."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -56,24 +62,65 @@ class Tags:
         return np.hypot(EDGE_PX, SATURATED_EDGE_PX * np.asarray(self.saturated))
 
 
-def find_tags(image: np.ndarray, dictionaries: Sequence[str]) -> Tags:
-    """Tags of the dictionaries in a grey image (height, width), corners where their edges meet."""
+def find_tags(image: np.ndarray, dictionaries: Sequence[str], border_bits: int = 1, joined: bool = False) -> Tags:
+    """Tags of the dictionaries in a grey image (height, width), corners where their edges meet.
+
+    ``border_bits`` : width of their black border in cells; ``joined`` : black squares touch their corners.
+    """
     grey = grey_8bit(image)
     found: dict[tuple[str, int], list[np.ndarray]] = {}
     for name in dict.fromkeys(dictionaries):
-        detector = cv2.aruco.ArucoDetector(_dictionary(name), _parameters(name))
-        corners, ids, _ = detector.detectMarkers(grey)
-        for place, tag in zip(corners, [] if ids is None else ids.ravel(), strict=True):
-            found.setdefault((name, int(tag)), []).append(place.reshape(4, 2))
+        detector = cv2.aruco.ArucoDetector(_dictionary(name), _parameters(name, border_bits))
+        for look in _looks(grey, joined):
+            corners, ids, _ = detector.detectMarkers(look.grey)
+            places = look.in_image(np.array(corners, np.float32).reshape(-1, 4, 2))
+            earlier = {tag: list(there) for tag, there in found.items()}
+            for place, tag in zip(places, [] if ids is None else ids.ravel(), strict=True):
+                if not any(_inside(place, other) for other in earlier.get((name, int(tag)), [])):
+                    found.setdefault((name, int(tag)), []).append(place)
     found = _outermost(found)
     once = {tag: places[0] for tag, places in sorted(found.items()) if len(places) == 1}
-    cells = np.array([_dictionary(name).markerSize + 2 for name, _ in once])
+    cells = np.array([_dictionary(name).markerSize + 2 * border_bits for name, _ in once])
     corners, covariance = _refined(grey, np.array(list(once.values()), float).reshape(-1, 4, 2), cells)
+    if joined:  # places from larger and grown images are off by more
+        corners, covariance = _refined(grey, corners, cells)
     saturated = _saturated(grey, corners, cells)
     # Where some of the white is saturated and some is not, edges shift, and each by something else.
     uneven = SATURATED_EDGE_PX**2 * saturated * (1 - saturated)
     repeated = tuple(sorted(tag for tag, places in found.items() if len(places) > 1))
     return Tags(tuple(once), corners, covariance + uneven[:, None, None, None] * np.eye(2), repeated, saturated)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Look:
+    """An image ``larger`` times as large, in which what is white reaches ``grown_px`` farther, px of its own."""
+
+    grey: np.ndarray
+    larger: int = 1
+    grown_px: float = 0.0
+
+    def in_image(self, corners: np.ndarray) -> np.ndarray:
+        """Corners of tags (n, 4, 2) in the image as it is, px."""
+        if self.grown_px and len(corners):
+            corners = (corners + self.grown_px * corners_by_edges(corners)).astype(np.float32)
+        return corners if self.larger == 1 else ((corners + 0.5) / self.larger - 0.5).astype(np.float32)
+
+
+def _looks(grey: np.ndarray, joined: bool) -> Iterator[_Look]:
+    """The image; where tags hang together at their corners, first those in which what is white has grown."""
+    for larger, most in GROWN_LOOKS if joined else ():
+        if grey.size * larger**2 <= most:
+            how = cv2.INTER_CUBIC
+            large = grey if larger == 1 else cv2.resize(grey, None, fx=larger, fy=larger, interpolation=how)
+            grown = cv2.dilate(large, np.ones((WHITE_PX, WHITE_PX), np.uint8))
+            yield _Look(grown, larger, (WHITE_PX - 1) / 2)
+    yield _Look(grey)
+
+
+def _inside(place: np.ndarray, other: np.ndarray) -> bool:
+    """Whether the middle of a tag (4, 2) lies in another."""
+    x, y = place.mean(0).tolist()
+    return cv2.pointPolygonTest(other, (x, y), False) > 0
 
 
 def other_dictionaries(image: np.ndarray, known: Sequence[str]) -> list[tuple[str, int]]:
@@ -93,14 +140,15 @@ def other_dictionaries(image: np.ndarray, known: Sequence[str]) -> list[tuple[st
 
 
 def view_of_tags(image: str, tags: Tags, layout: TagLayout) -> BoardView | None:
-    """The corners of the layout's tags; None where none is seen."""
+    """The corners of the layout's tags; None where none is seen. Tags that are no part of it are passed over."""
     row = {tag: i for i, tag in enumerate(layout.tags)}
     known = [k for k, tag in enumerate(tags.tags) if tag in row]
     if not known:
         return None
     ids = np.concatenate([4 * row[tags.tags[k]] + np.arange(4) for k in known])
     covariance = tags.covariance_px2[known].reshape(-1, 2, 2)
-    return view_of(image, layout, ids, tags.corners_px[known].reshape(-1, 2), covariance)
+    view = view_of(image, layout, ids, tags.corners_px[known].reshape(-1, 2), covariance)
+    return replace(view, unused=tuple(f"tag {tag[1]} is in view more than once" for tag in tags.repeated if tag in row))
 
 
 def find_charuco(image: np.ndarray, name: str, board: CharucoDesign, camera: Camera | None = None) -> BoardView | None:
@@ -111,7 +159,11 @@ def find_charuco(image: np.ndarray, name: str, board: CharucoDesign, camera: Cam
     """
     grey = grey_8bit(image)
     plain = cv2.aruco.CharucoBoard(
-        (board.columns, board.rows), board.square_mm, board.marker_mm, _dictionary(board.dictionary)
+        (board.columns, board.rows),
+        board.square_mm,
+        board.marker_mm,
+        _dictionary(board.dictionary),
+        np.array(board.tag_ids(), np.int32),
     )
     plain.setLegacyPattern(board.legacy)
     how = cv2.aruco.CharucoParameters()
@@ -147,11 +199,12 @@ def _dictionary(name: str):
     return cv2.aruco.getPredefinedDictionary(getattr(cv2.aruco, name))
 
 
-def _parameters(name: str):
+def _parameters(name: str, border_bits: int = 1):
     """Settings of the detector. Its own lose small tags, of whose cells only the middle has its own colour, the rest is
     blurred by their neighbours, and four pixels are too few to find it: of 272 real tags of 19 to 60 px a side they
     read 86 %, these 97 %. Two sizes of threshold window find what three do."""
     how = cv2.aruco.DetectorParameters()
+    how.markerBorderBits = border_bits
     how.perspectiveRemovePixelPerCell = 10
     how.perspectiveRemoveIgnoredMarginPerCell = 0.35
     how.adaptiveThreshWinSizeMin, how.adaptiveThreshWinSizeMax, how.adaptiveThreshWinSizeStep = 5, 25, 20
@@ -165,8 +218,7 @@ def _outermost(found: dict[tuple[str, int], list[np.ndarray]]) -> dict[tuple[str
     flat = [(tag, place, cv2.contourArea(place)) for tag, places in found.items() for place in places]
     kept: dict[tuple[str, int], list[np.ndarray]] = {}
     for tag, place, area in flat:
-        x, y = place.mean(0).tolist()
-        if not any(larger > area and cv2.pointPolygonTest(other, (x, y), False) > 0 for _, other, larger in flat):
+        if not any(larger > area and _inside(place, other) for _, other, larger in flat):
             kept.setdefault(tag, []).append(place)
     return kept
 

@@ -211,8 +211,7 @@ def predicted(result: HandEye, pairs: HandEyePoses, views: Views | None) -> dict
     board = result.reprojection
     camera = views.camera if board is None else board.camera
     seen = [
-        View(scale * view.xyz_board if board is None else board.board(view.xyz_board), view.xy_px, view.covariance)
-        for view in views.views
+        view.moved(scale * view.xyz_board if board is None else board.board(view.xyz_board)) for view in views.views
     ]
     by_view = resect(Views(camera, tuple(seen)), pairs.names).camera_from_board
     off = replace(loop, camera_from_board=by_view).residuals(result.mount_from_camera, result.stand_from_board)
@@ -319,10 +318,11 @@ def compare(
 
 
 def _beside(view: View, camera: Camera, camera_from_board: Rigid) -> float:
-    """Mean distance of the corners from where their rays pierce the plane at their height on the board."""
+    """Mean distance of the corners from where their rays pierce the plane of the board at their height."""
     ray = np.column_stack([camera.normalised_from_pixel(view.xy_px), np.ones(len(view))]) @ camera_from_board.rotation
     eye = camera_from_board.inverse().translation
-    length = (view.xyz_board[:, 2] - eye[2]) / ray[:, 2]
+    normal = view.normals()
+    length = ((view.xyz_board - eye) * normal).sum(1) / (ray * normal).sum(1)
     return float(np.linalg.norm(eye + length[:, None] * ray - view.xyz_board, axis=1).mean())
 
 

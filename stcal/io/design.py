@@ -1,7 +1,7 @@
 """``target.toml`` and ``board.toml``: read with every mistake named, and written with comments to edit."""
 
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Literal
 
 import numpy as np
 from pydantic import AfterValidator, BeforeValidator, Field
@@ -52,7 +52,10 @@ class _CornerFile(Strict):
     radius_mm: Positive
 
 
-class _BoardFile(Strict):
+class BoardEntry(Strict):
+    """A board of dots; ``type`` may say so."""
+
+    type: Literal["circles"] = "circles"
     rows: Count
     columns: Count
     pitch_mm: Positive
@@ -82,8 +85,11 @@ def load_target(path: str | Path) -> TargetDesign:
 
 def load_board(path: str | Path) -> BoardDesign:
     """Read ``board.toml`` (form: ``data_layout.md``); errors as :func:`load_target`."""
-    data = load_toml(path, _BoardFile, "board file", REMEDY)
-    where = f"board file {path}"
+    return board_design(load_toml(path, BoardEntry, "board file", REMEDY), f"board file {path}")
+
+
+def board_design(data: BoardEntry, where: str) -> BoardDesign:
+    """The board of an entry; ``where`` begins what an InputError says."""
     if 2 * data.radius_mm >= data.pitch_mm:
         raise InputError(f"{where}: radius {data.radius_mm:g} mm, under half the pitch {data.pitch_mm:g} mm needed")
     corner = None

@@ -3,11 +3,13 @@
 import json
 import tomllib
 from pathlib import Path
-from typing import Annotated, TypeVar
+from typing import Annotated, Any, TypeVar
 
+import numpy as np
 from pydantic import AfterValidator, BaseModel, ConfigDict, Field, ValidationError
 
 from stcal.errors import InputError
+from stcal.geometry.rigid import UNIT_WITHIN, Poses, Rigid
 from stcal.io.files import SETTINGS_BYTES, read_bytes
 from stcal.io.json import first_mistake
 
@@ -35,6 +37,40 @@ Positive = Annotated[float, Field(gt=0, le=1e6, allow_inf_nan=False, strict=True
 Finite = Annotated[float, Field(ge=-1e6, le=1e6, allow_inf_nan=False, strict=True)]
 
 
+class PoseEntry(Strict):
+    """A place and a unit quaternion; none where nothing is said."""
+
+    x_mm: Finite = 0.0
+    y_mm: Finite = 0.0
+    z_mm: Finite = 0.0
+    qw: Finite = 1.0
+    qx: Finite = 0.0
+    qy: Finite = 0.0
+    qz: Finite = 0.0
+
+    def rigid(self, where: str) -> Rigid:
+        """The transform; ``where`` begins what an InputError says."""
+        wxyz = np.array([self.qw, self.qx, self.qy, self.qz])
+        length = float(np.linalg.norm(wxyz))
+        if abs(length - 1) > UNIT_WITHIN:
+            raise InputError(f"{where}: quaternion of length {length:.4g}, 1 needed; normalise qw, qx, qy, qz")
+        return Poses.from_quaternions([wxyz], [[self.x_mm, self.y_mm, self.z_mm]])[0]
+
+
+def validated(content: Any, model: type[M], where: str) -> M:
+    """What a file holds, by its model.
+
+    Raises
+    ------
+    InputError
+        Not as ``model`` wants it; the message begins with ``where`` and names place and reason.
+    """
+    try:
+        return model.model_validate(content)
+    except ValidationError as error:
+        raise InputError(f"{where}: {first_mistake(error)}") from error
+
+
 def load_toml(path: str | Path, model: type[M], what: str, remedy: str) -> M:
     """Read and validate; ``what`` names the kind of file, ``remedy`` what to do when it is not there.
 
@@ -45,13 +81,12 @@ def load_toml(path: str | Path, model: type[M], what: str, remedy: str) -> M:
     """
     try:
         text = read_bytes(path, SETTINGS_BYTES).decode("utf-8-sig")  # Windows editors put a byte-order mark first
-        return model.model_validate(tomllib.loads(text))
+        content = tomllib.loads(text)
     except OSError as error:
         raise InputError(f"{what} {path}: {error.strerror or error}; {remedy}") from error
-    except ValidationError as error:
-        raise InputError(f"{what} {path}: {first_mistake(error)}") from error
     except (ValueError, RecursionError) as error:  # TOMLDecodeError, UnicodeDecodeError, numbers of 5000 digits
         raise InputError(f"{what} {path}: not valid TOML: {error}") from error
+    return validated(content, model, f"{what} {path}")
 
 
 def toml_string(value: str) -> str:

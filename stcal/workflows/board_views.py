@@ -7,26 +7,15 @@ from images of a board.
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
-import numpy as np
-
-from stcal.boards.chessboard import find_chessboard
-from stcal.boards.design import BoardView, CharucoDesign, ChessboardDesign, FlatBoard, turns
-from stcal.boards.tags import Tags, find_charuco, find_tags, view_of_tags
-from stcal.design import BoardDesign, TargetDesign
-from stcal.errors import InputError, StcalError
+from stcal.boards.design import BoardView
+from stcal.boards.tags import Tags, find_tags
+from stcal.errors import InputError
 from stcal.geometry.camera import Camera
-from stcal.geometry.conic import circle_image_offset
-from stcal.geometry.plane import camera_from_plane, fit_homography, refine_planar_pose
 from stcal.geometry.rigid import Rigid
 from stcal.io.camera import CameraModel
 from stcal.io.images import ImageFile, Skipped, decode
 from stcal.io.spread import run_on_images
-from stcal.sfm.detect.circles.ellipses import EllipseOptions
-from stcal.sfm.detect.image import detect_image
-
-CENTRING_ROUNDS = 3
-"""The pose that the ellipses' centres give is off by less than a thousandth of what they are moved by: two would do."""
-Board = BoardDesign | FlatBoard
+from stcal.workflows.board_in_image import Board, find_board, symmetries
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -53,6 +42,15 @@ class BoardDetections:
     def views(self) -> dict[str, BoardView]:
         """By image, those that show the board."""
         return {detection.name: detection.view for detection in self.images if detection.view is not None}
+
+    def unused(self) -> list[str]:
+        """What images show of the board, or of the boards, and views do not use: a line for each reason."""
+        images: dict[str, list[str]] = {}
+        for name, view in self.views().items():
+            for said in view.unused:
+                images.setdefault(said, []).append(name)
+        of = len(self.views())
+        return [f"{said} (in {len(names)} of {of} images, {names[0]} …)" for said, names in images.items()]
 
 
 def detect_boards(
@@ -96,15 +94,6 @@ def detect_boards(
     return BoardDetections(model.sized(*size), detections, skipped, tuple(symmetries(board)))
 
 
-def symmetries(board: Board) -> list[Rigid]:
-    """Turns after which the board looks the same, as board_from_board; never the identity."""
-    if not isinstance(board, BoardDesign):
-        return board.symmetries()
-    if board.corner is not None:
-        return []
-    return turns(board.xy_mm(), [1, 2, 3] if board.rows == board.columns else [2])
-
-
 def _detect_board(
     file: ImageFile, model: CameraModel, board: Board, dictionaries: tuple[str, ...]
 ) -> BoardDetection | Skipped:
@@ -119,82 +108,8 @@ def _detect_board(
         reason = f"{width}×{height} px, the camera file says {model.width}×{model.height} px; use images as taken"
         return Skipped(file.name, reason, "image_size", f"{width}×{height} px", f"{model.width}×{model.height} px")
     tags = find_tags(image, dictionaries) if dictionaries else None
-    try:
-        view, why = _find(image, file.name, model.sized(width, height), board)
-    except StcalError as error:
-        view, why = None, str(error)
+    view, why = find_board(image, file.name, model.sized(width, height), board)
     return BoardDetection(file.name, (width, height), view, why, tags)
-
-
-def _find(image: np.ndarray, name: str, camera: Camera, board: Board) -> tuple[BoardView | None, str]:
-    """The view of the board, or why there is none."""
-    if isinstance(board, BoardDesign):
-        return _find_dots(image, name, camera, board)
-    if isinstance(board, ChessboardDesign):
-        inner = f"not all {board.rows}×{board.columns} inner corners of the chessboard"
-        return find_chessboard(image, name, board), f"{inner}, which rows and columns of its file count"
-    if isinstance(board, CharucoDesign):
-        view = find_charuco(image, name, board, camera)
-        return view, "" if view else _without_charuco(image, board)
-    tags = find_tags(image, tuple(dict.fromkeys(dictionary for dictionary, _ in board.tags)))
-    return view_of_tags(name, tags, board), "no tag of the layout"
-
-
-def _without_charuco(image: np.ndarray, board: CharucoDesign) -> str:
-    """Why there are no corners, as far as the tags tell."""
-    ids = [tag for _, tag in find_tags(image, (board.dictionary,)).tags]
-    few, count = "fewer than 4 corners of the ChArUco board", board.rows * board.columns // 2
-    if not ids:
-        return f"{few}: no tag of {board.dictionary}"
-    if max(ids) >= count:
-        return f"{few}: tag {max(ids)} of {board.dictionary}, of {count} on a board of {board.rows}×{board.columns}"
-    return (
-        f"{few}, but {len(ids)} of its tags: are rows and columns exchanged, or is it one that OpenCV drew before 4.6 "
-        "(legacy = true)?"
-    )
-
-
-def _find_dots(image: np.ndarray, name: str, camera: Camera, board: BoardDesign) -> tuple[BoardView | None, str]:
-    found = detect_image(image, camera, TargetDesign("none", board.polarity, ()), board, EllipseOptions())
-    if found.repeated:
-        return None, "the board is in view more than once"
-    if found.board is None or not len(found.board.rows):
-        return None, "no board of dots recognised"
-    ids = found.board.numberings @ [board.columns, 1]
-    if not _turned_only(ids, board):
-        return None, "a strip of the board is hidden, so that its dots cannot be numbered; show more of it"
-    centres, xy = found.centres.select(found.board.rows), board.xy_mm()[ids[0]]
-    xyz = np.column_stack([xy, np.zeros(len(xy))])
-    centre_px = images_of_centres(centres.centre_px, xyz, board.radii_mm()[ids[0]], camera)
-    return BoardView(name, ids[0], xyz, centre_px, centres.covariance_px2), ""
-
-
-def _turned_only(ids: np.ndarray, board: BoardDesign) -> bool:
-    """Whether all numberings (k, n) differ by nothing but a turn that leaves the board as it is."""
-    xy = board.xy_mm()
-    places = [(turn @ np.column_stack([xy, np.zeros(len(xy))]))[:, :2] for turn in (Rigid(), *symmetries(board))]
-    return all(any(np.allclose(xy[own], place[ids[0]], atol=board.pitch_mm / 4) for place in places) for own in ids)
-
-
-def images_of_centres(
-    centre_px: np.ndarray, xyz_board: np.ndarray, radius_mm: np.ndarray, camera: Camera
-) -> np.ndarray:
-    """Images (n, 2) of the centres of a flat board's circles, px, from the centres (n, 2) of their ellipses.
-
-    Raises
-    ------
-    DegenerateError
-        Fewer than four circles, or all on a line.
-    """
-    seen = centre_px
-    for _ in range(CENTRING_ROUNDS):
-        normalised = camera.normalised_from_pixel(seen)
-        pose = camera_from_plane(fit_homography(xyz_board[:, :2], normalised))
-        pose = refine_planar_pose(pose, xyz_board[:, :2], normalised)
-        centre = pose @ xyz_board
-        ellipse = circle_image_offset(centre, pose.rotation[:, 2], radius_mm)
-        seen = centre_px - (camera.project(ellipse) - camera.project(centre))
-    return seen
 
 
 def _of_size(each: BoardDetection | Skipped, size: tuple[int, int], first: str) -> BoardDetection | Skipped:

@@ -30,13 +30,19 @@ def sheet_of_dots(xy_mm: np.ndarray, radius_mm: np.ndarray) -> tuple[np.ndarray,
     return sheet, MARGIN_MM
 
 
-def take(sheet: np.ndarray, first_mm: float, camera_from_board: Rigid) -> np.ndarray:
+def take(sheet: np.ndarray, first_mm: float | np.ndarray, camera_from_board: Rigid) -> np.ndarray:
     """What :data:`CAMERA` sees of a sheet on which the board's origin is at (first_mm, first_mm)."""
+    return photograph(sheet, PER_MM, image_from_sheet(first_mm, camera_from_board), (CAMERA.width, CAMERA.height))
+
+
+def image_from_sheet(first_mm: float | np.ndarray, camera_from_board: Rigid) -> np.ndarray:
+    """The homography, from millimetres on the sheet."""
     turn, place = camera_from_board.rotation, camera_from_board.translation
     matrix = np.array([[CAMERA.focal[0], 0, CAMERA.centre[0]], [0, CAMERA.focal[1], CAMERA.centre[1]], [0, 0, 1]])
-    off = np.array([[1, 0, -first_mm], [0, 1, -first_mm], [0, 0, 1]])
+    x, y = np.broadcast_to(first_mm, 2)
+    off = np.array([[1, 0, -x], [0, 1, -y], [0, 0, 1]])
     image = matrix @ np.column_stack([turn[:, :2], place]) @ off
-    return photograph(sheet, PER_MM, image / image[2, 2], (CAMERA.width, CAMERA.height))
+    return image / image[2, 2]
 
 
 def looks(rng: np.random.Generator, count: int, middle_mm: np.ndarray, roll: float) -> Poses:

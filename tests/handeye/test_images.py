@@ -14,7 +14,8 @@ from stcal.geometry.conic import circle_conic, ellipse_of_conic
 from stcal.geometry.rigid import Rigid
 from stcal.io.camera import CameraModel
 from stcal.io.images import find_images
-from stcal.workflows.board_views import detect_boards, images_of_centres, symmetries
+from stcal.workflows.board_in_image import images_of_centres, symmetries
+from stcal.workflows.board_views import detect_boards
 from tests.boards.drawn import chessboard_mm
 from tests.handeye.photographed import (
     CAMERA,

@@ -1,6 +1,6 @@
 """What the camera saw of the board: corners in images, and the board's pose in each by itself."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -13,6 +13,9 @@ from stcal.geometry.rigid import Poses, Rigid, skew
 from stcal.handeye.data.pairs import HandEyePoses
 
 LEAST_CORNERS = 4
+SAME_COSINE, APART = 1 - 1e-9, 0.02
+"""Corners are of one plane where their normals are the same and no gap in height is more than this share of the view's
+extent; the pose only starts from there."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -27,11 +30,14 @@ class View:
         Where they were seen, px, lens distortion in them.
     covariance : (k, 2, 2) array, optional
         Of ``xy_px``, px², known up to a common factor. Without it all weigh alike.
+    normal : (k, 3) array, optional
+        Unit normals of the planes that the corners lie in, of several boards in one frame. Without it, Z of all.
     """
 
     xyz_board: np.ndarray
     xy_px: np.ndarray
     covariance: np.ndarray | None = None
+    normal: np.ndarray | None = None
 
     def __post_init__(self):
         object.__setattr__(self, "xyz_board", frozen(self.xyz_board, (None, 3), "corners on the board"))
@@ -39,9 +45,24 @@ class View:
         object.__setattr__(self, "xy_px", frozen(self.xy_px, (k, 2), "corners in the image"))
         if self.covariance is not None:
             object.__setattr__(self, "covariance", frozen(self.covariance, (k, 2, 2), "covariance of corners"))
+        if self.normal is not None:
+            object.__setattr__(self, "normal", frozen(self.normal, (k, 3), "normals"))
 
     def __len__(self) -> int:
         return len(self.xyz_board)
+
+    def normals(self) -> np.ndarray:
+        """(k, 3) of the planes that the corners lie in."""
+        return np.tile([0.0, 0.0, 1.0], (len(self), 1)) if self.normal is None else self.normal
+
+    def moved(self, xyz_board: np.ndarray) -> "View":
+        """The same corners, elsewhere on the board."""
+        return replace(self, xyz_board=xyz_board)
+
+    def turned(self, turn: Rigid) -> "View":
+        """The same corners after a turn of the board."""
+        normal = None if self.normal is None else self.normal @ turn.rotation.T
+        return replace(self, xyz_board=turn @ self.xyz_board, normal=normal)
 
     def whitening(self) -> np.ndarray:
         """(k, 2, 2): makes the covariance of errors 1."""
@@ -93,7 +114,7 @@ def resect(views: Views, names: tuple[str, ...]) -> Resection:
     Raises
     ------
     DegenerateError
-        Fewer than four corners in a view, or all on a line; the message names the view.
+        Fewer than four corners in a view, or in all its planes, or all on a line; the message names the view.
     """
     poses, normals, cost = [], [], 0.0
     for view, name in zip(views.views, names, strict=True):
@@ -164,15 +185,65 @@ def whitened(view: View, camera: Camera, camera_from_board: Rigid) -> tuple[np.n
 def _pose_of(view: View, camera: Camera, name: str) -> Minimum[Rigid, NormalEquations]:
     if len(view) < LEAST_CORNERS:
         raise DegenerateError(f"{name}: {len(view)} corners of the board, {LEAST_CORNERS} needed; take the image out")
-    try:
-        homography = fit_homography(view.xyz_board[:, :2], camera.normalised_from_pixel(view.xy_px))
-    except DegenerateError as error:
-        raise DegenerateError(f"{name}: the corners seen lie on a line; take the image out") from error
+    starts = _starts(view, camera.normalised_from_pixel(view.xy_px))
+    if not starts:
+        of = (
+            "the corners seen lie"
+            if view.normal is None
+            else "the corners seen of each board are fewer than four or lie"
+        )
+        raise DegenerateError(f"{name}: {of} on a line; take the image out")
 
     def linearise(pose: Rigid) -> NormalEquations:
         if ((view.xyz_board @ pose.rotation[2] + pose.translation[2]) <= 0).any():
             return NormalEquations.impossible(6)
         return NormalEquations.of(*whitened(view, camera, pose))
 
-    found = minimise(camera_from_plane(homography), linearise, perturbed)
-    return found.required(name, "take the image out")
+    found = [minimise(start, linearise, perturbed) for start in starts]
+    best = min(found, key=lambda each: (not each.converged, each.linear.cost))
+    return best.required(name, "take the image out")
+
+
+def _starts(view: View, seen: np.ndarray) -> list[Rigid]:
+    """camera_from_board by the homography of each plane with four corners or more."""
+    starts = []
+    for own, board_from_plane in _planes(view):
+        xyz = board_from_plane.inverse() @ view.xyz_board[own]
+        try:
+            homography = fit_homography(xyz[:, :2], seen[own])
+        except DegenerateError:
+            continue
+        starts.append(camera_from_plane(homography) @ board_from_plane.inverse())
+    return starts
+
+
+def _planes(view: View) -> list[tuple[np.ndarray, Rigid]]:
+    """Rows of the corners of each plane that has enough, and its frame, Z the normal, as board_from_plane.
+
+    Adjusted corners leave their plane by a little: one plane ends where the next corner is far above.
+    """
+    normals, found = view.normals(), []
+    extent = np.linalg.norm(np.ptp(view.xyz_board, axis=0))
+    left = np.ones(len(view), bool)
+    while left.any():
+        normal = normals[left][0]
+        alike = np.flatnonzero(left & (normals @ normal > SAME_COSINE))
+        left[alike] = False
+        height = view.xyz_board[alike] @ normal
+        order = np.argsort(height, kind="stable")
+        steps = np.flatnonzero(np.diff(height[order]) > APART * extent) + 1
+        for part in np.split(order, steps):
+            if len(part) >= LEAST_CORNERS:
+                own = np.sort(alike[part])
+                turn = _turn_to(normal)
+                found.append((own, Rigid(turn, turn @ [0, 0, height[part].mean()])))
+    return found
+
+
+def _turn_to(normal: np.ndarray) -> np.ndarray:
+    """A rotation (3, 3) that takes Z to a unit vector; none where it is Z."""
+    if normal[2] > SAME_COSINE:
+        return np.eye(3)
+    across = np.cross(normal, np.eye(3)[int(np.abs(normal).argmin())])
+    x = across / np.linalg.norm(across)
+    return np.column_stack([x, np.cross(normal, x), normal])

@@ -133,4 +133,4 @@ def _carried(covariance: np.ndarray, seen: Poses, poses: Poses) -> np.ndarray:
 
 def turned_view(view: View, turn: Rigid) -> View:
     """The same corners under the numbers that they have after the turn."""
-    return View(turn.inverse() @ view.xyz_board, view.xy_px, view.covariance)
+    return view.turned(turn.inverse())

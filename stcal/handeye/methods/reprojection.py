@@ -14,7 +14,7 @@ from stcal.geometry.camera import Camera
 from stcal.geometry.normal_equations import generalised_inverse
 from stcal.geometry.rigid import Poses, Rigid
 from stcal.handeye.data.loop import Loop
-from stcal.handeye.data.views import View, Views, resect
+from stcal.handeye.data.views import Views, resect
 from stcal.handeye.methods.arm import ROUNDS, SETTLED_MM, ArmModel, LinearArm
 from stcal.handeye.methods.bundle import Bundle, Corners
 from stcal.handeye.methods.camera_error import CameraError, of_corners
@@ -218,7 +218,7 @@ def _adjusted(
 
 def resected(pairs_names: tuple[str, ...], views: Views, board: Reprojection) -> Poses:
     """camera_from_board of all views by the adjusted camera and board."""
-    seen = tuple(View(board.board(view.xyz_board), view.xy_px, view.covariance) for view in views.views)
+    seen = tuple(view.moved(board.board(view.xyz_board)) for view in views.views)
     return resect(Views(board.camera, seen), pairs_names).camera_from_board
 
 

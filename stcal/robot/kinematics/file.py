@@ -7,9 +7,9 @@ import numpy as np
 from pydantic import Field
 
 from stcal.errors import InputError
-from stcal.geometry.rigid import UNIT_WITHIN, Poses, Rigid
+from stcal.geometry.rigid import Poses, Rigid
 from stcal.io.saving import save
-from stcal.io.toml import Finite, Strict, load_toml, toml_string
+from stcal.io.toml import Finite, PoseEntry, Strict, load_toml, toml_string
 from stcal.robot.kinematics.model import Convention, DHRow, Joint, JointType, Robot
 
 WHAT = "robot file"
@@ -19,24 +19,7 @@ LIMIT_DIGITS = 9
 """Decimals of joint limits, degrees or mm: 125°, not 125.00000000000001."""
 
 
-class _PoseFile(Strict):
-    x_mm: Finite = 0.0
-    y_mm: Finite = 0.0
-    z_mm: Finite = 0.0
-    qw: Finite = 1.0
-    qx: Finite = 0.0
-    qy: Finite = 0.0
-    qz: Finite = 0.0
-
-    def rigid(self, where: str) -> Rigid:
-        wxyz = np.array([self.qw, self.qx, self.qy, self.qz])
-        length = float(np.linalg.norm(wxyz))
-        if abs(length - 1) > UNIT_WITHIN:
-            raise InputError(f"{where}: quaternion of length {length:.4g}, 1 needed; normalise qw, qx, qy, qz")
-        return Poses.from_quaternions([wxyz], [[self.x_mm, self.y_mm, self.z_mm]])[0]
-
-
-class _ToolFile(_PoseFile):
+class _ToolFile(PoseEntry):
     name: str = Field(min_length=1)
 
 
@@ -58,8 +41,8 @@ class _RobotFile(Strict):
     convention: Convention
     joint: list[_JointFile] = Field(min_length=1, max_length=20)
     coupling: list[list[Finite]] | None = None
-    base: _PoseFile = _PoseFile()
-    tool: _PoseFile = _PoseFile()
+    base: PoseEntry = PoseEntry()
+    tool: PoseEntry = PoseEntry()
     target: tuple[_ToolFile, ...] = ()
 
 

@@ -65,7 +65,7 @@ def find_boards(candidates: Candidates, board: BoardDesign, image_corners: np.nd
     readings: list[BoardReading] = []
     for _ in range(MAX_BOARDS):
         cells = _largest_grid(candidates, links, steps, seeds, free, board)
-        if len(cells) < MIN_SHARE * board.rows * board.columns:
+        if len(cells) < MIN_SHARE * len(board.cells()):
             break
         free[list(cells)] = False
         reading = _number(candidates, cells, board, image_corners)
@@ -78,7 +78,7 @@ def find_boards(candidates: Candidates, board: BoardDesign, image_corners: np.nd
 def _largest_grid(candidates: Candidates, links, steps, seeds, free, board: BoardDesign) -> dict[int, tuple[int, int]]:
     """The largest grid grown from any of the seeds; a complete one ends the search."""
     best: dict[int, tuple[int, int]] = {}
-    inside = np.zeros(len(candidates), int)
+    inside, nearly_all = np.zeros(len(candidates), int), NEARLY_ALL * len(board.cells())
     for seed in seeds:
         # A dot that has been in two grids is not likely to start a better third one.
         if not free[seed] or inside[seed] >= 2:
@@ -87,7 +87,7 @@ def _largest_grid(candidates: Candidates, links, steps, seeds, free, board: Boar
         inside[list(cells)] += 1
         if len(cells) > len(best):
             best = cells
-        if len(best) >= NEARLY_ALL * board.rows * board.columns:
+        if len(best) >= nearly_all:
             break
     return best
 
@@ -194,7 +194,7 @@ def _number(candidates: Candidates, cells, board: BoardDesign, image_corners) ->
 
 def needed_dots(board: BoardDesign) -> float:
     """Fewest dots that make a reading of the board."""
-    return max(MIN_SHARE * board.rows * board.columns, MIN_SIDE**2)
+    return max(MIN_SHARE * len(board.cells()), MIN_SIDE**2)
 
 
 def _robust_homography(uv, candidates: Candidates, index) -> np.ndarray | None:
@@ -237,12 +237,15 @@ def _place(
         rotation = rotation @ np.array([[0, -1], [1, 0]])
     turned = uv @ rotation.T
     size = np.array([board.columns, board.rows])
-    all_cells = np.stack(np.meshgrid(np.arange(size[0]), np.arange(size[1])), -1).reshape(-1, 2)
+    all_cells = board.cells()[:, ::-1]
+    has_dot = np.zeros(size[::-1], bool)
+    has_dot[tuple(all_cells[:, ::-1].T)] = True
     large = _large_dots(candidates, uv, index, board, homography)
     placements = []
     for offset in _offsets(turned, size):
         column_row = turned + offset
         inside = ((column_row >= 0) & (column_row < size)).all(1)
+        inside[inside] = has_dot[tuple(column_row[inside, ::-1].T)]
         outside_count = (~inside).sum()
         if outside_count > MAX_UNEXPLAINED:
             continue
@@ -251,8 +254,9 @@ def _place(
             if (large != at_corner)[inside].any():
                 continue
         back = (all_cells - offset) @ rotation
-        missing = np.ones(len(all_cells), bool)
-        missing[column_row[inside] @ [1, board.columns]] = False
+        seen = np.zeros_like(has_dot)
+        seen[tuple(column_row[inside, ::-1].T)] = True
+        missing = ~seen[tuple(all_cells[:, ::-1].T)]
         expected = _inside_image(apply_homography(homography, back[missing]), homography, back[missing], image_corners)
         unexplained = int(expected.sum() + outside_count)
         placements.append(_Placement(unexplained, inside, column_row[:, ::-1], index))

@@ -6,7 +6,16 @@ from pathlib import Path
 
 import numpy as np
 
-from stcal.boards.file import load_flat_board
+from stcal.boards.design import (
+    AprilGridDesign,
+    AsymmetricCirclesDesign,
+    BoardSet,
+    CharucoDesign,
+    ChessboardDesign,
+    TagLayout,
+)
+from stcal.boards.several import load_boards
+from stcal.design import BoardDesign
 from stcal.errors import DegenerateError, InputError
 from stcal.geometry.rigid import Poses, Rigid
 from stcal.handeye import HandEyePoses, View, Views, pairs_of_views, read_poses
@@ -29,6 +38,16 @@ from stcal.workflows.handeye.times import Timing, robot_at_images
 
 NOTHING_SAID = Said()
 WITHOUT_OPTIONS = Timing()
+KINDS = {
+    BoardDesign: "dots",
+    ChessboardDesign: "chessboard",
+    CharucoDesign: "ChArUco",
+    TagLayout: "tags",
+    AprilGridDesign: "AprilGrid",
+    AsymmetricCirclesDesign: "asymmetric circles",
+}
+PITCHES = ("pitch_mm", "square_mm", "spacing_mm")
+"""What board files call the distance by which a board's size is stated."""
 Source = Path | Table | Told
 
 
@@ -222,7 +241,8 @@ def _about_mm(pairs: HandEyePoses, setup: Setup) -> tuple[HandEyePoses, float]:
 class Photographed:
     """What one camera's images show: ``names`` : of those that show the board and have a pose; ``seen`` : the board in
     them; ``rows`` : (k,) their robot poses, of ``base_from_flange``; ``covariance`` of these; ``how`` they were
-    matched; ``robot`` : its poses by image; others as :class:`HandEyeInput`."""
+    matched; ``unused`` : what of the board was seen and not used; ``robot`` : its poses by image; others as
+    :class:`HandEyeInput`."""
 
     names: tuple[str, ...]
     seen: Views
@@ -233,6 +253,7 @@ class Photographed:
     prior: CameraPrior
     left_out: tuple[tuple[str, str], ...]
     how: str
+    unused: tuple[str, ...]
     robot: RobotPoses
     timed: Timed | None
 
@@ -267,7 +288,7 @@ def photographed(
     if not views:
         first = f"{found.skipped[0].name}: {found.skipped[0].reason}"
         raise InputError(f"image folder {source}: the board is in none of {len(with_pose)} images: {first}")
-    seen = Views(found.camera, tuple(View(v.xyz_board, v.xy_px, v.covariance_px2) for v in views.values()))
+    seen = Views(found.camera, tuple(View(v.xyz_board, v.xy_px, v.covariance_px2, v.normal) for v in views.values()))
     at = np.array([rows[name] for name in views])
     prior = camera_prior(refinable(model.calibrated(found.camera.width, found.camera.height)))
     return Photographed(
@@ -280,6 +301,7 @@ def photographed(
         prior,
         tuple(left_out),
         how,
+        tuple(found.unused()),
         robot,
         at_images.timed(tuple(views)),
     )
@@ -297,13 +319,14 @@ def _from_images(
     arm: Arm | None = None,
 ) -> HandEyeInput:
     """Pairs of all images that show the board and have a pose."""
-    design = load_flat_board(board)
+    design = load_boards(board)
     found = photographed(source, robot, camera, design, workers, progress, timing)
     robot = found.robot
     pairs = pairs_of_views(found.base_from_flange[found.rows], found.seen, found.names, str(source))
     if found.covariance is not None:
         pairs = replace(pairs, base_from_flange_covariance=found.covariance[found.rows])
     understood = _robot_lines(robot, found.how) if not robot.own else ()
+    understood += tuple(f"board: {each}" for each in found.unused)
     return HandEyeInput(
         f"{source.name}, {poses.name}",
         pairs,
@@ -321,7 +344,7 @@ def _from_images(
 
 def pitch_of(design: Board) -> float | None:
     """Of dots or squares, mm; None of tags."""
-    return getattr(design, "pitch_mm", getattr(design, "square_mm", None))
+    return next((getattr(design, key) for key in PITCHES if hasattr(design, key)), None)
 
 
 def _rows_of_images(
@@ -391,14 +414,14 @@ def _dry_images(
     if arm is not None:
         _require_by_name(timing)
     robot = read_robot_poses(poses, quaternions, said) if arm is None else read_arm(poses, arm, quaternions)[0]
-    design, model = load_flat_board(board), read_camera(camera)
+    design, model = load_boards(board), read_camera(camera)
     files, skipped = find_images(source)
     at_images = robot_at_images(robot, [file.name for file in files], None if arm else timing)
     robot, every = at_images.robot, len(files)
     files = [file for file in files if file.name not in dict(at_images.left_out)]
     rows, missing, how = _rows_of_images(robot, files, source)
     setup = setup_of(said, None, source.name)
-    kind = type(design).__name__.removesuffix("Design").lower()
+    kind = f"{len(design.boards)} boards" if isinstance(design, BoardSet) else KINDS[type(design)]
     lines = [
         *_robot_lines(robot, how),
         f"camera: {camera.name}: {model.width} × {model.height} px, focal length {model.focal[0]:.6g} px",

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import numpy as np
 
-from stcal.boards.file import load_flat_board
+from stcal.boards.several import load_boards
 from stcal.errors import InputError
 from stcal.geometry.rigid import Poses, Rigid
 from stcal.handeye.data.formats.record import Said
@@ -50,7 +50,7 @@ def read_rig(
     InputError
         What is wrong with a file; the message names the camera.
     """
-    design, cameras = load_flat_board(files.board), []
+    design, cameras = load_boards(files.board), []
     by_file = {each.poses: read_robot_poses(each.poses, quaternions, said) for each in files.cameras}
     robots = [_of_camera(by_file[each.poses], each.images, files) for each in files.cameras]
     for each, robot in zip(files.cameras, robots, strict=True):

@@ -1,0 +1,228 @@
+"""A board in one image, whatever its kind: its view, or the reason why there is none."""
+
+from dataclasses import replace
+
+import numpy as np
+
+from stcal.boards.aprilgrid import find_aprilgrid
+from stcal.boards.chessboard import find_chessboard, why_no_chessboard
+from stcal.boards.design import (
+    AprilGridDesign,
+    AsymmetricCirclesDesign,
+    BoardSet,
+    BoardView,
+    CharucoDesign,
+    ChessboardDesign,
+    FlatBoard,
+    turns,
+)
+from stcal.boards.tags import find_charuco, find_tags, view_of_tags
+from stcal.design import BoardDesign, TargetDesign
+from stcal.errors import StcalError
+from stcal.geometry.camera import Camera
+from stcal.geometry.conic import circle_image_offset
+from stcal.geometry.plane import camera_from_plane, fit_homography, refine_planar_pose
+from stcal.geometry.rigid import Rigid
+from stcal.io.images import grey_8bit
+from stcal.sfm.detect.circles.candidates import Candidates
+from stcal.sfm.detect.circles.ellipses import EllipseOptions, find_ellipses
+from stcal.sfm.detect.image import detect_image
+
+CENTRING_ROUNDS = 3
+"""The pose that the ellipses' centres give is off by less than a thousandth of what they are moved by: two would do."""
+CORNER_SIGMA_PX = 0.1
+"""Of corners whose detector states none, beside boards whose detector does."""
+NEAREST = 6
+"""Outlines about a circle among which its neighbour is."""
+MIN_SHARE = 0.35
+"""Of a board's circles."""
+Board = BoardDesign | FlatBoard | BoardSet
+
+
+def symmetries(board: Board) -> list[Rigid]:
+    """Turns after which the board looks the same, as board_from_board; never the identity."""
+    if not isinstance(board, BoardDesign):
+        return board.symmetries()
+    if board.corner is not None:
+        return []
+    return turns(board.xy_mm(), [1, 2, 3] if board.rows == board.columns else [2])
+
+
+def find_board(image: np.ndarray, name: str, camera: Camera, board: Board) -> tuple[BoardView | None, str]:
+    """The view of the board in a grey image, or why there is none; of a set of boards all that are seen."""
+    if not isinstance(board, BoardSet):
+        return _find_or_why(image, name, camera, board)
+    views, reasons = [], []
+    places = zip(board.names, board.common_from_board, board.first_ids(), strict=True)
+    for part, (own, place, first) in zip(board.boards, places, strict=True):
+        view, why = _find_or_why(image, name, camera, part)
+        if view is None:
+            reasons.append(f"{own}: {why}")
+        else:
+            views.append(_placed(view, own, place, first))
+    if not views:
+        return None, "; ".join(reasons)
+    return _together(name, views, tuple(reasons)), ""
+
+
+def _find_or_why(
+    image: np.ndarray, name: str, camera: Camera, board: BoardDesign | FlatBoard
+) -> tuple[BoardView | None, str]:
+    try:
+        return _find_flat(image, name, camera, board)
+    except StcalError as error:
+        return None, str(error)
+
+
+def _placed(view: BoardView, own: str, common_from_board: Rigid, first: int) -> BoardView:
+    """A view of one board of a set in the frame of the set."""
+    return BoardView(
+        view.image,
+        view.ids + first,
+        common_from_board @ view.xyz_board,
+        view.xy_px,
+        view.covariance_px2,
+        np.tile(common_from_board.rotation[:, 2], (len(view), 1)),
+        tuple(f"{own}: {said}" for said in view.unused),
+    )
+
+
+def _together(name: str, views: list[BoardView], reasons: tuple[str, ...]) -> BoardView:
+    """Views of several boards as one."""
+    covariances = [_covariance_px2(view) for view in views]
+    return BoardView(
+        name,
+        np.concatenate([view.ids for view in views]),
+        np.concatenate([view.xyz_board for view in views]),
+        np.concatenate([view.xy_px for view in views]),
+        np.concatenate(covariances),
+        np.concatenate([view.normal for view in views if view.normal is not None]),
+        (*(said for view in views for said in view.unused), *reasons),
+    )
+
+
+def _covariance_px2(view: BoardView) -> np.ndarray:
+    """Of a board whose detector has no idea of it, as among boards that have one."""
+    if view.covariance_px2 is not None:
+        return view.covariance_px2
+    return np.tile(CORNER_SIGMA_PX**2 * np.eye(2), (len(view), 1, 1))
+
+
+def _find_flat(
+    image: np.ndarray, name: str, camera: Camera, board: BoardDesign | FlatBoard
+) -> tuple[BoardView | None, str]:
+    """The view of a single board, or why there is none."""
+    if isinstance(board, BoardDesign):
+        return _find_dots(image, name, camera, board)
+    if isinstance(board, AsymmetricCirclesDesign):
+        return _find_asymmetric(image, name, camera, board)
+    if isinstance(board, ChessboardDesign):
+        view = find_chessboard(image, name, board)
+        return view, "" if view else why_no_chessboard(image, board)
+    if isinstance(board, CharucoDesign):
+        view = find_charuco(image, name, board, camera)
+        return view, "" if view else _without_charuco(image, board)
+    if isinstance(board, AprilGridDesign):
+        return find_aprilgrid(image, name, board, camera)
+    tags = find_tags(image, tuple(dict.fromkeys(dictionary for dictionary, _ in board.tags)))
+    return view_of_tags(name, tags, board), "no tag of the layout"
+
+
+def _without_charuco(image: np.ndarray, board: CharucoDesign) -> str:
+    """Why there are no corners, as far as the tags tell."""
+    ids = [tag for _, tag in find_tags(image, (board.dictionary,)).tags]
+    few, own = "fewer than 4 corners of the ChArUco board", board.tag_ids()
+    if not ids:
+        return f"{few}: no tag of {board.dictionary}"
+    if others := [tag for tag in ids if tag not in own]:
+        of = f"{len(own)} on a board of {board.rows}×{board.columns}"
+        return f"{few}: tag {max(others)} of {board.dictionary}, of {of}" + (f" from {own[0]}" if own[0] else "")
+    return (
+        f"{few}, but {len(ids)} of its tags: are rows and columns exchanged, or is it one that OpenCV drew before 4.6 "
+        "(legacy = true)?"
+    )
+
+
+def _find_dots(image: np.ndarray, name: str, camera: Camera, board: BoardDesign) -> tuple[BoardView | None, str]:
+    place = np.arange(board.rows * board.columns).reshape(board.rows, board.columns)
+    return _find_circles(image, name, camera, board, board, place)
+
+
+def _find_asymmetric(
+    image: np.ndarray, name: str, camera: Camera, board: AsymmetricCirclesDesign
+) -> tuple[BoardView | None, str]:
+    if board.radius_mm is None:
+        radius = _radius_seen(image, camera, board)
+        if radius is None:
+            return None, f"no {board.polarity} circles"
+        board = replace(board, radius_mm=radius)
+    grid = board.lattice()
+    place = np.full((grid.rows, grid.columns), -1)
+    place[tuple(grid.cells().T)] = np.arange(len(grid.cells()))
+    return _find_circles(image, name, camera, board, grid, place)
+
+
+def _radius_seen(image: np.ndarray, camera: Camera, board: AsymmetricCirclesDesign) -> float | None:
+    """Radius by the distance of neighbours, the median over all circles in the image, mm; None where there are none."""
+    found = Candidates.of(find_ellipses(grey_8bit(image), board.polarity, EllipseOptions()), camera)
+    if len(found) < len(board.xy_mm()) * MIN_SHARE:
+        return None
+    near = found.tree.query(found.xy, k=NEAREST + 1)[1][:, 1:]
+    # Where circles are seen aslant, the one that looks nearest may not be: lengths are in units of the circle's image.
+    apart = np.linalg.solve(found.shape[:, None], (found.xy[near] - found.xy[:, None])[..., None])[..., 0]
+    steps = np.median(np.linalg.norm(apart, axis=2).min(1))
+    return float(np.sqrt(2) * board.spacing_mm / steps)
+
+
+def _find_circles(
+    image: np.ndarray,
+    name: str,
+    camera: Camera,
+    board: BoardDesign | AsymmetricCirclesDesign,
+    grid: BoardDesign,
+    place: np.ndarray,
+) -> tuple[BoardView | None, str]:
+    """``grid`` : the lattice that the circles of the board are found as; ``place`` : (rows, columns) of it, their rows
+    in the board's ``xy_mm``."""
+    what = "board of dots" if grid is board else "asymmetric grid of circles"
+    found = detect_image(image, camera, TargetDesign("none", grid.polarity, ()), grid, EllipseOptions())
+    if found.repeated:
+        return None, "the board is in view more than once"
+    if found.board is None or not len(found.board.rows):
+        return None, f"no {what} recognised"
+    ids = place[tuple(np.moveaxis(found.board.numberings, 2, 0))]
+    if not _turned_only(ids, board):
+        return None, "a strip of the board is hidden, so that its dots cannot be numbered; show more of it"
+    centres, xy = found.centres.select(found.board.rows), board.xy_mm()[ids[0]]
+    xyz = np.column_stack([xy, np.zeros(len(xy))])
+    centre_px = images_of_centres(centres.centre_px, xyz, board.radii_mm()[ids[0]], camera)
+    return BoardView(name, ids[0], xyz, centre_px, centres.covariance_px2), ""
+
+
+def _turned_only(ids: np.ndarray, board: BoardDesign | AsymmetricCirclesDesign) -> bool:
+    """Whether all numberings (k, n) differ by nothing but a turn that leaves the board as it is."""
+    xy = board.xy_mm()
+    pitch = board.pitch_mm if isinstance(board, BoardDesign) else board.spacing_mm
+    places = [(turn @ np.column_stack([xy, np.zeros(len(xy))]))[:, :2] for turn in (Rigid(), *symmetries(board))]
+    return all(any(np.allclose(xy[own], place[ids[0]], atol=pitch / 4) for place in places) for own in ids)
+
+
+def images_of_centres(
+    centre_px: np.ndarray, xyz_board: np.ndarray, radius_mm: np.ndarray, camera: Camera
+) -> np.ndarray:
+    """Images (n, 2) of the centres of a flat board's circles, px, from the centres (n, 2) of their ellipses.
+
+    Raises
+    ------
+    DegenerateError
+        Fewer than four circles, or all on a line.
+    """
+    seen = centre_px
+    for _ in range(CENTRING_ROUNDS):
+        normalised = camera.normalised_from_pixel(seen)
+        pose = camera_from_plane(fit_homography(xyz_board[:, :2], normalised))
+        pose = refine_planar_pose(pose, xyz_board[:, :2], normalised)
+        centre = pose @ xyz_board
+        ellipse = circle_image_offset(centre, pose.rotation[:, 2], radius_mm)
+        seen = centre_px - (camera.project(ellipse) - camera.project(centre))
+    return seen
