@@ -168,12 +168,16 @@ CALLS = (
         "--splits 0 --refine-camera --camera-out >cameras.txt --out >h.json --workers 1",
         3.0,
     ),
+    Call(
+        "handeye",
+        "@handeye/images --poses @handeye/robot.csv --camera @handeye/cameras.txt --board @handeye/boards.toml --dry-run",
+    ),
     Call("handeye plan", "@handeye/poses.csv --count 2 --seed 1 --out >next.csv --json >all.json"),
     Call(
         "handeye rig",
         f"@handeye/rig.toml --splits 0 --out >h.json --workers 1 {_ALL}",
         5.0,
-        also=tuple(f"handeye/{name}" for name in ("board.toml", "robot.csv", "cameras.txt", "images", "right")),
+        also=tuple(f"handeye/{name}" for name in ("checker.yaml", "robot.csv", "cameras.txt", "images", "right")),
     ),
     Call("locate schedule", "1 100 5"),
     Call("locate capture", "+scenes --simulate @locate/scenes/a/1.png --shortest 0.5 --longest 2 --count 3"),

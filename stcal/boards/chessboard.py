@@ -124,4 +124,7 @@ def why_no_chessboard(image: np.ndarray, board: ChessboardDesign) -> str:
     rows, columns = sorted(meta.shape[:2])
     if rows > min(board.rows, board.columns) or columns > max(board.rows, board.columns):
         return f"{inner}, but {rows}×{columns}; correct rows and columns in its file, which count inner corners"
-    return f"{inner}, but {rows}×{columns}: a part of a plain chessboard has no numbers; show all of it"
+    return (
+        f"{inner}, but {rows}×{columns}: a part of a plain chessboard has no numbers; show all of it, or correct rows "
+        "and columns in its file"
+    )

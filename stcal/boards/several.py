@@ -117,9 +117,12 @@ def _alike(first: BoardDesign | FlatBoard, second: BoardDesign | FlatBoard) -> s
     """Why images cannot tell two boards apart, and what to do; empty where they can."""
     if (colour := _circles(first)) and colour == _circles(second):
         return f"both have {colour} circles; one of them bright and one dark, or tags, needed"
-    inner, other = _inner(first), _inner(second)
-    if inner and other and sorted(inner) == sorted(other) and not _has_tags(first, second):
-        return f"both have {inner[0]}×{inner[1]} inner corners; another number of rows or columns, or tags, needed"
+    for whole, part in ((first, second), (second, first)):
+        if isinstance(part, ChessboardDesign) and (inner := _inner(whole)) and _fits(part, inner):
+            return (
+                f"{part.rows}×{part.columns} inner corners are seen in {inner[0]}×{inner[1]} too; one with more rows "
+                "and fewer columns, or tags, needed"
+            )
     if common := sorted(_tags(first) & _tags(second)):
         return f"both have tag {common[0][1]} of {common[0][0]}; other ids (first_id) or another dictionary needed"
     return ""
@@ -136,9 +139,9 @@ def _inner(board: BoardDesign | FlatBoard) -> tuple[int, int] | None:
     return (board.rows - 1, board.columns - 1) if isinstance(board, CharucoDesign) else None
 
 
-def _has_tags(*boards: BoardDesign | FlatBoard) -> bool:
-    """Whether all of them have."""
-    return all(_tags(board) for board in boards)
+def _fits(part: ChessboardDesign, inner: tuple[int, int]) -> bool:
+    """Whether a chessboard is found in a larger one, or among the squares of a ChArUco board."""
+    return all(a <= b for a, b in zip(sorted((part.rows, part.columns)), sorted(inner), strict=True))
 
 
 def _tags(board: BoardDesign | FlatBoard) -> set[tuple[str, int]]:

@@ -70,13 +70,15 @@ class Tried:
     """A candidate with its errors.
 
     ``error_mm`` : on poses held out, (s, k), of the splits that it was tried on; ``reason`` : why it fails, empty where
-    it does not; ``out`` : after how few splits it was surely worse, else 0.
+    it does not; ``out`` : after how few splits it was surely worse, else 0; ``best_mm`` : mean error of the best on
+    those, NaN without.
     """
 
     candidate: Candidate
     error_mm: np.ndarray
     reason: str = ""
     out: int = 0
+    best_mm: float = float("nan")
 
     def mean_mm(self) -> float:
         """Of all errors; NaN without any."""
@@ -113,7 +115,8 @@ class Choice:
 
 @dataclass(eq=False)
 class _Race:
-    """``errors`` : of each candidate that runs, by split number; ``failed`` : reasons by candidate; ``out``."""
+    """``errors`` : of each candidate that runs, by split number; ``failed`` : reasons by candidate; ``out`` : those
+    given up, with the number of splits and the mean error of the best on them, mm."""
 
     pairs: HandEyePoses
     setup: Setup
@@ -125,7 +128,7 @@ class _Race:
     running: list[Candidate]
     errors: dict[Candidate, list[dict[str, np.ndarray]]] = field(default_factory=dict)
     failed: dict[Candidate, str] = field(default_factory=dict)
-    out: dict[Candidate, int] = field(default_factory=dict)
+    out: dict[Candidate, tuple[int, float]] = field(default_factory=dict)
 
     @property
     def measure(self) -> str:
@@ -166,7 +169,7 @@ class _Race:
         for candidate in [each for each in self.running if each != best]:
             mean, error = _difference(self.of(candidate) - self.of(best), seen)
             if mean > WORSE * error:
-                self.out[candidate] = len(seen)
+                self.out[candidate] = len(seen), float(self.of(best).mean())
         self.running = [candidate for candidate in self.running if candidate not in self.out]
 
     def best(self, but: np.ndarray | None = None) -> Candidate:
@@ -257,7 +260,10 @@ def choose(
     for each in race.running:
         if each not in results:
             results[each] = handeye(pairs, setup, each.method, views, each.options(options, prior))
-    tried = tuple(Tried(each, race.of(each), race.failed.get(each, ""), race.out.get(each, 0)) for each in candidates)
+    still = (0, float("nan"))
+    tried = tuple(
+        Tried(each, race.of(each), race.failed.get(each, ""), *race.out.get(each, still)) for each in candidates
+    )
     rivals = {each: results[each] for each in race.running if each != chosen and _as_good(race, each, chosen)}
     result, notes = _widened(widened_by_scatter(results[chosen], held_out), chosen, rivals)
     return Choice(tried, chosen, result, held_out, _sentence(tried, chosen, result, race.measure), notes)

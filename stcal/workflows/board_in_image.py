@@ -14,6 +14,7 @@ from stcal.boards.design import (
     CharucoDesign,
     ChessboardDesign,
     FlatBoard,
+    TagLayout,
     turns,
 )
 from stcal.boards.tags import find_charuco, find_tags, view_of_tags
@@ -37,6 +38,19 @@ NEAREST = 6
 MIN_SHARE = 0.35
 """Of a board's circles."""
 Board = BoardDesign | FlatBoard | BoardSet
+KINDS = {
+    BoardDesign: "dots",
+    ChessboardDesign: "chessboard",
+    CharucoDesign: "ChArUco",
+    TagLayout: "tags",
+    AprilGridDesign: "AprilGrid",
+    AsymmetricCirclesDesign: "asymmetric circles",
+}
+
+
+def kind_of(board: Board) -> str:
+    """What messages call it."""
+    return f"{len(board.boards)} boards" if isinstance(board, BoardSet) else KINDS[type(board)]
 
 
 def symmetries(board: Board) -> list[Rigid]:

@@ -20,6 +20,7 @@ from stcal.sfm.camera.calibrate import CameraCalibration, first_size, judged, re
 from stcal.sfm.camera.intrinsics import adjust_intrinsics
 from stcal.sfm.camera.views import closed_form, start_camera
 from stcal.sfm.data.observations import ImageObservations
+from stcal.workflows.board_in_image import kind_of
 from stcal.workflows.board_views import detect_boards
 
 CORNER_SIGMA_PX = 0.1
@@ -87,14 +88,16 @@ def corner_grid(board: FlatBoard) -> BoardDesign:
     Raises
     ------
     InputError
-        Tags, which are no grid.
+        Another kind, whose points are no grid of squares.
     """
     if isinstance(board, ChessboardDesign):
         rows, columns = board.rows, board.columns
     elif isinstance(board, CharucoDesign):
         rows, columns = board.rows - 1, board.columns - 1
     else:
-        raise InputError("--board: tags; a board of dots, a chessboard or a ChArUco board needed to calibrate a camera")
+        raise InputError(
+            f"--board: {kind_of(board)}; a board of dots, a chessboard or a ChArUco board needed to calibrate a camera"
+        )
     return BoardDesign(rows, columns, board.square_mm, POINT_RADIUS_MM, "bright", board.sigma_mm)
 
 

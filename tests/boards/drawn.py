@@ -38,7 +38,9 @@ def kalibr_tag(tag: int, border: int) -> np.ndarray:
 def aprilgrid_mm(
     board: AprilGridDesign, border: int, squares: bool = True, per_mm: int = 4, margin: float = 20.0
 ) -> tuple[np.ndarray, np.ndarray]:
-    """The sheet as Kalibr's generator makes it, ids from the bottom left, and the board's origin on it, mm."""
+    """The sheet as Kalibr's generator makes it, ids from the bottom left, and the board's origin on it, mm. Cells must
+    be whole pixels."""
+    assert (board.tag_mm * per_mm) % (6 + 2 * border) == 0
     side, gap = board.tag_mm, board.spacing * board.tag_mm
     step = side + gap
     size = np.array([board.columns, board.rows]) * step - gap + 2 * margin

@@ -31,6 +31,24 @@ from tests.locate.drawn_target import CAMERA, LAYOUT, PER_MM, SHEET_MM, photo, s
 SMALL = SceneOptions(seed=3, width=1296, height=864, images_per_group=4, groups=(("1", "2"), ("1", "4")))
 """As the tests' small data set."""
 CHESSBOARD = 'type = "chessboard"\nrows = 6\ncolumns = 8\nsquare_mm = 20\n'
+KALIBR = "target_type: checkerboard\ntargetRows: 6\ntargetCols: 8\nrowSpacingMeters: 0.02\ncolSpacingMeters: 0.02\n"
+BOARDS = """type = "boards"
+[[board]]
+type = "charuco"
+rows = 7
+columns = 5
+square_mm = 30.0
+marker_mm = 20.0
+dictionary = "6x6_250"
+[[board]]
+type = "aprilgrid"
+rows = 3
+columns = 4
+tag_mm = 25.0
+spacing = 0.3
+x_mm = 200.0
+rpy_deg = [0.0, 30.0, 0.0]
+"""
 BOARD_AT_MM = (30, 230)
 """Of the board beside the tags, on the sheet."""
 
@@ -185,7 +203,9 @@ def _rig(folder: Path, seen: Poses) -> None:
         f'\n[[camera]]\nname = "{name}"\nimages = "{images}"\ncamera = "cameras.txt"\n'
         for name, images in (("left", "images"), ("right", "right"))
     )
-    (folder / "rig.toml").write_text(f'setup = "eye-in-hand"\nboard = "board.toml"\nposes = "robot.csv"\n{cameras}')
+    (folder / "checker.yaml").write_text(KALIBR)
+    (folder / "boards.toml").write_text(BOARDS)
+    (folder / "rig.toml").write_text(f'setup = "eye-in-hand"\nboard = "checker.yaml"\nposes = "robot.csv"\n{cameras}')
 
 
 def _tags(folder: Path, rng: np.random.Generator) -> None:

@@ -7,7 +7,14 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from stcal.boards.design import CharucoDesign, ChessboardDesign, TagLayout
+from stcal.boards.design import (
+    AprilGridDesign,
+    AsymmetricCirclesDesign,
+    BoardSet,
+    CharucoDesign,
+    ChessboardDesign,
+    TagLayout,
+)
 from stcal.design import BoardDesign
 from stcal.errors import InputError
 from stcal.geometry.conic import circle_conic, ellipse_of_conic
@@ -16,17 +23,20 @@ from stcal.io.camera import CameraModel
 from stcal.io.images import find_images
 from stcal.workflows.board_in_image import images_of_centres, symmetries
 from stcal.workflows.board_views import detect_boards
-from tests.boards.drawn import chessboard_mm
+from tests.boards.drawn import aprilgrid_mm, chessboard_mm, photograph_of_several
 from tests.handeye.photographed import (
     CAMERA,
     MARGIN_MM,
     PER_MM,
+    image_from_sheet,
     sheet_of_dots,
     take,
 )
 
 MODEL = CameraModel(CAMERA.focal, CAMERA.centre, CAMERA.distortion, "PINHOLE", None, None, "cameras.txt")
 SLANTED = Rigid(Rotation.from_rotvec([0.5, -0.3, 0.2]).as_matrix(), [-60, -50, 420])
+UPWARDS = SLANTED @ Rigid(np.eye(3), [10, 90, 0])
+"""For boards whose origin is at the bottom left."""
 FAMILY = "DICT_APRILTAG_36h11"
 CORNER_PX = 0.12
 """As in the tests of the detectors: what drawing in steps of 1/32 px, blur and noise leave."""
@@ -56,8 +66,14 @@ def tags() -> tuple[TagLayout, np.ndarray, float]:
 
 
 def boards():
-    plain = dots(corner=(0, 0))
+    plain, shifted, grid = (
+        dots(corner=(0, 0)),
+        AsymmetricCirclesDesign(9, 4, 18.0, 6.0, "dark"),
+        AprilGridDesign(3, 4, 25.0, 0.3),
+    )
     return {
+        "asymmetric circles": (shifted, *sheet_of_dots(shifted.xy_mm(), shifted.radii_mm())),
+        "aprilgrid": (grid, *aprilgrid_mm(grid, 2)),
         "dots": (plain, *sheet_of_dots(plain.xy_mm(), plain.radii_mm())),
         "chessboard": (ChessboardDesign(5, 8, 20.0), *chessboard_mm(5, 8, 20.0)),
         "charuco": charuco(),
@@ -65,25 +81,31 @@ def boards():
     }
 
 
-@pytest.mark.parametrize("kind", ["dots", "chessboard", "charuco", "tags"])
+KINDS = ["dots", "chessboard", "charuco", "tags", "asymmetric circles", "aprilgrid"]
+
+
+@pytest.mark.parametrize("kind", KINDS)
 def test_every_board_is_found_where_it_was_drawn(kind, tmp_path):
     board, sheet, first = boards()[kind]
-    cv2.imwrite(str(tmp_path / "a.png"), take(sheet, first, SLANTED))
+    camera_from_board = UPWARDS if kind == "aprilgrid" else SLANTED
+    cv2.imwrite(str(tmp_path / "a.png"), take(sheet, first, camera_from_board))
     cv2.imwrite(str(tmp_path / "blank.png"), np.full((600, 800), 200, np.uint8))
     cv2.imwrite(str(tmp_path / "small.png"), np.full((90, 120), 200, np.uint8))
     (tmp_path / "torn.png").write_bytes((tmp_path / "a.png").read_bytes()[:5000])
     files, _ = find_images(tmp_path)
-    found = detect_boards(files, MODEL, board, (FAMILY,), workers=1)
+    beside = () if kind == "aprilgrid" else (FAMILY,)
+    found = detect_boards(files, MODEL, board, beside, workers=1)
     assert (found.camera.width, found.camera.height) == (800, 600)
     view = found.views()["a.png"]
     assert len(view) == len(board.xy_mm())
-    assert 1e-4 < np.abs(CAMERA.project(SLANTED @ view.xyz_board) - view.xy_px).max() < CORNER_PX
+    assert 1e-4 < np.abs(CAMERA.project(camera_from_board @ view.xyz_board) - view.xy_px).max() < CORNER_PX
     assert {each.name: each.gate for each in found.skipped} == {
         "blank.png": "board",
         "small.png": "image_size",
         "torn.png": "readable",
     }
-    assert [len(each.tags) for each in found.images if each.name == "a.png"] == [3 if kind == "tags" else 0]
+    if beside:
+        assert [len(each.tags) for each in found.images if each.name == "a.png"] == [3 if kind == "tags" else 0]
     assert found.symmetries == ()
 
 
@@ -176,3 +198,50 @@ def test_why_a_charuco_board_is_not_found(tmp_path, changed, reason):
     files, _ = find_images(tmp_path / "images")
     found = detect_boards(files, MODEL, replace(design, **changed), workers=1)
     assert reason in found.skipped[0].reason
+
+
+def test_the_radius_of_circles_may_be_unknown(tmp_path):
+    """As of Kalibr's circle grids: the images tell it, and the eccentricity of steep views is corrected by it."""
+    board, sheet, first = boards()["asymmetric circles"]
+    cv2.imwrite(str(tmp_path / "a.png"), take(sheet, first, SLANTED))
+    found = detect_boards(find_images(tmp_path)[0], MODEL, replace(board, radius_mm=None), workers=1)
+    view = found.views()["a.png"]
+    assert len(view) == 36
+    assert np.abs(CAMERA.project(SLANTED @ view.xyz_board) - view.xy_px).max() < CORNER_PX
+
+
+def test_an_even_number_of_shifted_rows_is_numbered_up_to_its_symmetry(tmp_path):
+    board = AsymmetricCirclesDesign(8, 4, 18.0, 6.0, "dark")
+    sheet, first = sheet_of_dots(board.xy_mm(), board.radii_mm())
+    cv2.imwrite(str(tmp_path / "a.png"), take(sheet, first, SLANTED))
+    found = detect_boards(find_images(tmp_path)[0], MODEL, board, workers=1)
+    assert len(found.symmetries) == 1
+    view = found.views()["a.png"]
+    errors = [
+        np.abs(CAMERA.project(SLANTED @ (turn @ view.xyz_board)) - view.xy_px).max()
+        for turn in (Rigid(), *found.symmetries)
+    ]
+    assert min(errors) < CORNER_PX < 20 < max(errors)
+
+
+def test_several_boards_are_one(tmp_path):
+    """A ChArUco board and an AprilGrid at an angle, in one frame: points of both, with the normals of their planes."""
+    own, sheet, first = charuco()
+    grid = AprilGridDesign(3, 3, 25.0, 0.3)
+    grid_sheet, origin = aprilgrid_mm(grid, 2)
+    common_from_grid = Rigid(Rotation.from_euler("y", 35, degrees=True).as_matrix(), [-135, 105, 15])
+    both = BoardSet(("board 1", "board 2"), (own, grid), (Rigid(), common_from_grid))
+    pose = Rigid(Rotation.from_rotvec([0.2, -0.1, 0.05]).as_matrix(), [-30, -60, 520])
+    drawn = [(grid_sheet, image_from_sheet(origin, pose @ common_from_grid)), (sheet, image_from_sheet(first, pose))]
+    image = photograph_of_several(drawn, PER_MM, (CAMERA.width, CAMERA.height))
+    cv2.imwrite(str(tmp_path / "a.png"), image)
+    found = detect_boards(find_images(tmp_path)[0], MODEL, both, workers=1)
+    view = found.views()["a.png"]
+    assert (len(view), found.unused()) == (len(own.xy_mm()) + len(grid.xy_mm()), [])
+    assert np.abs(CAMERA.project(pose @ view.xyz_board) - view.xy_px).max() < CORNER_PX
+    assert np.allclose(view.normal[[0, -1]], [[0, 0, 1], common_from_grid.rotation[:, 2]])
+    image[:, :320] = 230  # hides the grid
+    cv2.imwrite(str(tmp_path / "a.png"), image)
+    found = detect_boards(find_images(tmp_path)[0], MODEL, both, workers=1)
+    assert len(found.views()["a.png"]) <= len(own.xy_mm())
+    assert found.unused()[0].startswith("board 2: no tag of the AprilGrid")

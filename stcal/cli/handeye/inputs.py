@@ -44,7 +44,11 @@ OwnCamera = Annotated[
 ]
 OwnBoard = Annotated[
     Path | None,
-    typer.Option("--board", help="Read the board from this file: dots, chessboard, ChArUco or tags (TOML)."),
+    typer.Option(
+        "--board",
+        help="Read the board from this file, TOML or Kalibr's YAML: dots, chessboard, ChArUco, AprilGrid, asymmetric "
+        "circles, tags, or several boards.",
+    ),
 ]
 SetupOption = Annotated[
     SetupName | None,

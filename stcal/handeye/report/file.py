@@ -351,7 +351,9 @@ def _arm(found: ArmFound) -> ArmPart:
 
 def why_out(each: Tried) -> str:
     """Why a way of solving was not followed to the end; empty where it was."""
-    return each.reason or (f"surely worse after {each.out} splits" if each.out else "")
+    if each.reason or not each.out:
+        return each.reason
+    return f"surely worse after {each.out} splits, of which the best has {each.best_mm:.3g} mm"
 
 
 def _splits(found: HeldOutPoses | None, names: tuple[str, ...]) -> list[SplitErrors]:

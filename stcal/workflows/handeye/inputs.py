@@ -6,16 +6,7 @@ from pathlib import Path
 
 import numpy as np
 
-from stcal.boards.design import (
-    AprilGridDesign,
-    AsymmetricCirclesDesign,
-    BoardSet,
-    CharucoDesign,
-    ChessboardDesign,
-    TagLayout,
-)
 from stcal.boards.several import load_boards
-from stcal.design import BoardDesign
 from stcal.errors import DegenerateError, InputError
 from stcal.geometry.rigid import Poses, Rigid
 from stcal.handeye import HandEyePoses, View, Views, pairs_of_views, read_poses
@@ -32,20 +23,13 @@ from stcal.io.quaternions import Order
 from stcal.io.table import Table
 from stcal.parallel import Progress, one_thread
 from stcal.robot import Robot
-from stcal.workflows.board_views import Board, detect_boards
+from stcal.workflows.board_in_image import Board, kind_of
+from stcal.workflows.board_views import detect_boards
 from stcal.workflows.handeye.arm import Arm, read_arm
 from stcal.workflows.handeye.times import Timing, robot_at_images
 
 NOTHING_SAID = Said()
 WITHOUT_OPTIONS = Timing()
-KINDS = {
-    BoardDesign: "dots",
-    ChessboardDesign: "chessboard",
-    CharucoDesign: "ChArUco",
-    TagLayout: "tags",
-    AprilGridDesign: "AprilGrid",
-    AsymmetricCirclesDesign: "asymmetric circles",
-}
 PITCHES = ("pitch_mm", "square_mm", "spacing_mm")
 """What board files call the distance by which a board's size is stated."""
 Source = Path | Table | Told
@@ -421,7 +405,7 @@ def _dry_images(
     files = [file for file in files if file.name not in dict(at_images.left_out)]
     rows, missing, how = _rows_of_images(robot, files, source)
     setup = setup_of(said, None, source.name)
-    kind = f"{len(design.boards)} boards" if isinstance(design, BoardSet) else KINDS[type(design)]
+    kind = kind_of(design)
     lines = [
         *_robot_lines(robot, how),
         f"camera: {camera.name}: {model.width} × {model.height} px, focal length {model.focal[0]:.6g} px",

@@ -1,0 +1,100 @@
+"""AprilGrids as Kalibr prints them: every corner where the drawing puts it, whatever the border and the squares."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from stcal.boards.aprilgrid import find_aprilgrid
+from stcal.boards.design import AprilGridDesign
+from stcal.geometry.camera import Camera
+from stcal.geometry.plane import apply_homography
+from tests.boards.drawn import IMAGE_FROM_MM, aprilgrid_mm, photograph
+
+CAMERA = Camera(1200, 900, [1500, 1500], [600, 450], np.zeros(8))
+CORNER_PX = 0.12
+"""As in the tests of the other boards."""
+GRID = AprilGridDesign(3, 4, 30.0, 0.3)
+
+
+def photographed(board: AprilGridDesign, border: int, squares: bool = True) -> tuple[np.ndarray, np.ndarray]:
+    sheet, origin = aprilgrid_mm(board, border, squares)
+    return photograph(sheet, 4, IMAGE_FROM_MM), origin
+
+
+def off_px(view, origin) -> np.ndarray:
+    return apply_homography(IMAGE_FROM_MM, view.xyz_board[:, :2] + origin) - view.xy_px
+
+
+@pytest.mark.parametrize(
+    ("border", "squares", "upright", "stated"),
+    [(2, True, False, None), (1, True, False, None), (1, False, False, 1), (2, True, True, 2)],
+)
+def test_every_corner_is_where_it_was_drawn(border, squares, upright, stated):
+    board = replace(GRID, upright=upright, border_bits=stated)
+    image, origin = photographed(board, border, squares)
+    view, why = find_aprilgrid(image, "a", board, CAMERA)
+    assert (len(view), why, view.unused) == (48, "", ())
+    off = off_px(view, origin)
+    assert np.abs(off).max() < CORNER_PX
+    # squared errors over their covariance, 96 numbers of one noise
+    assert 0.2 < np.einsum("ki,kij,kj->k", off, np.linalg.inv(view.covariance_px2), off).sum() / off.size < 4.0
+
+
+def test_the_frame_is_kalibrs_turned_about_x():
+    """Tag 0 bottom left, ids along the row, then upwards; a tag's corners begin at its bottom right (Kalibr's turn)."""
+    xy = GRID.xy_mm().reshape(3, 4, 4, 2)
+    step = 30.0 * 1.3
+    assert np.allclose(xy[0, 0], [[30, 0], [0, 0], [0, -30], [30, -30]])
+    assert np.allclose(xy[0, 1] - xy[0, 0], [step, 0])
+    assert np.allclose(xy[1, 0] - xy[0, 0], [0, -step])
+
+
+def test_a_border_that_is_not_the_boards_is_said():
+    image, _ = photographed(GRID, 1)
+    view, why = find_aprilgrid(image, "a", replace(GRID, border_bits=2), CAMERA)
+    assert view is None
+    assert "no tag of the AprilGrid: DICT_APRILTAG_36h11, border of 2 cells" in why
+
+
+def test_a_part_is_enough():
+    image, origin = photographed(GRID, 2)
+    hidden = image.copy()
+    hidden[:, :560] = 230
+    view, _ = find_aprilgrid(hidden, "a", GRID, CAMERA)
+    assert 8 <= len(view) < 48
+    assert np.abs(off_px(view, origin)).max() < CORNER_PX
+
+
+@pytest.mark.parametrize(
+    ("changed", "said"),
+    [
+        ({"upright": True}, "turned by half a turn; write upright = false into its file"),
+        ({"columns": 3, "rows": 4}, "12 tags of the AprilGrid, but not where rows, columns and spacing put them"),
+        ({"first_id": 100}, "tag 0 of DICT_APRILTAG_36h11, none of 100 … 111 of the AprilGrid"),
+        ({"dictionary": "DICT_APRILTAG_25h9"}, "no tag of the AprilGrid: DICT_APRILTAG_25h9, border of 1 or 2 cells"),
+    ],
+)
+def test_why_there_is_none(changed, said):
+    image, _ = photographed(GRID, 2)
+    view, why = find_aprilgrid(image, "a", replace(GRID, **changed), CAMERA)
+    assert view is None
+    assert said in why
+
+
+def test_a_stranger_is_named_and_left_out():
+    """A tag beside the board that is none of it, and one of its own on a slip of paper in the wrong place."""
+    board = replace(GRID, rows=2)
+    image, origin = photographed(GRID, 2)  # the third row is none of the board
+    view, _ = find_aprilgrid(image, "a", board, CAMERA)
+    assert len(view) == 32
+    assert view.unused == tuple(f"tag {tag} is none of its 8" for tag in range(8, 12))
+    assert np.abs(off_px(view, origin)).max() < CORNER_PX
+    sheet, (x, y) = aprilgrid_mm(GRID, 2, squares=False)
+    bottom, left = round(4 * y), round(4 * x)
+    slip = sheet[bottom - 120 : bottom, left : left + 120].copy()
+    sheet[bottom - 120 : bottom, left : left + 120] = 255
+    sheet[bottom - 80 : bottom + 40, left - 40 : left + 80] = slip  # 10 mm to the left and down
+    view, _ = find_aprilgrid(photograph(sheet, 4, IMAGE_FROM_MM), "a", GRID, CAMERA)
+    assert view.unused == ("tag 0 lies off the board's plane",)
+    assert len(view) == 44

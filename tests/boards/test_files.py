@@ -1,0 +1,128 @@
+"""Board files of the newer kinds, Kalibr's, and of several boards in one frame."""
+
+import numpy as np
+import pytest
+
+from stcal.boards.design import AprilGridDesign, AsymmetricCirclesDesign, BoardSet, ChessboardDesign
+from stcal.boards.file import load_flat_board
+from stcal.boards.several import load_boards
+from stcal.errors import InputError
+
+APRILGRID = 'type = "aprilgrid"\nrows = 6\ncolumns = 7\ntag_mm = 80.0\nspacing = 0.3\n'
+ASYMMETRIC = (
+    'type = "asymmetric-circles"\nrows = 11\ncolumns = 4\nspacing_mm = 20.0\nradius_mm = 6.0\npolarity = "dark"\n'
+)
+KALIBR = {
+    "aprilgrid": "target_type: 'aprilgrid'\ntagCols: 6\ntagRows: 5\ntagSize: 0.08\ntagSpacing: 0.3\n",
+    "checkerboard": (
+        "target_type: 'checkerboard'\ntargetCols: 7\ntargetRows: 6\nrowSpacingMeters: 0.05\ncolSpacingMeters: 0.05\n"
+    ),
+    "circlegrid": (
+        "target_type: 'circlegrid'\ntargetCols: 4\ntargetRows: 11\nspacingMeters: 0.02\nasymmetricGrid: True\n"
+    ),
+}
+CHARUCO = 'type = "charuco"\nrows = 6\ncolumns = 8\nsquare_mm = 20.0\nmarker_mm = 10.0\ndictionary = "5X5_50"\n'
+IN_A_SET = CHARUCO.replace("type", "[[board]]\ntype")
+BESIDE = "x_mm = 200.0\ny_mm = 0.0\nz_mm = 50.0\nrpy_deg = [0.0, 90.0, 0.0]\n"
+
+
+def written(folder, text, name="board.toml"):
+    path = folder / name
+    path.write_text(text, encoding="utf-8")
+    return path
+
+
+@pytest.mark.parametrize(
+    ("text", "board"),
+    [
+        (APRILGRID, AprilGridDesign(6, 7, 80.0, 0.3)),
+        (ASYMMETRIC, AsymmetricCirclesDesign(11, 4, 20.0, 6.0, "dark")),
+        (
+            ASYMMETRIC.replace("radius_mm = 6.0", "diameter_mm = 12.0"),
+            AsymmetricCirclesDesign(11, 4, 20.0, 6.0, "dark"),
+        ),
+        (KALIBR["aprilgrid"], AprilGridDesign(5, 6, 80.0, 0.3)),
+        (KALIBR["checkerboard"], ChessboardDesign(6, 7, 50.0)),
+        (KALIBR["circlegrid"], AsymmetricCirclesDesign(11, 4, 20.0, None, "dark")),
+    ],
+)
+def test_files_of_every_kind(tmp_path, text, board):
+    assert load_flat_board(written(tmp_path, text)) == load_boards(written(tmp_path, text)) == board
+
+
+def test_opencvs_asymmetric_grid():
+    """Its documented layout: x = (2 j + i mod 2) · spacing, y = i · spacing."""
+    xy = AsymmetricCirclesDesign(11, 4, 20.0, 6.0, "dark").xy_mm()
+    assert np.allclose(xy[[0, 1, 4, 5, 8, 43]], [[0, 0], [40, 0], [20, 20], [60, 20], [0, 40], [120, 200]])
+
+
+@pytest.mark.parametrize(
+    ("text", "said"),
+    [
+        (APRILGRID.replace("80.0", "-1.0"), "tag_mm"),
+        (APRILGRID.replace("rows = 6", "rows = 100"), "tags 0 … 699, DICT_APRILTAG_36h11 has 0 … 586; correct rows"),
+        (APRILGRID + "border_bits = 3\n", "border_bits"),
+        (ASYMMETRIC.replace("radius_mm = 6.0", ""), "radius_mm or diameter_mm needed, one of them"),
+        (ASYMMETRIC.replace("6.0", "15.0"), "radius 15 mm, under 14.1421 mm needed for circles apart"),
+        (KALIBR["aprilgrid"].replace("tagSize: 0.08\n", ""), "tagSize: key missing"),
+        (KALIBR["aprilgrid"].replace("0.08", "800"), "tagSize"),
+        (KALIBR["aprilgrid"].replace("tagRows: 5", "tagRows: 500"), "tags up to 2999, tag36h11 has 0 … 586"),
+        (KALIBR["checkerboard"].replace("colSpacingMeters: 0.05", "colSpacingMeters: 0.04"), "squares needed"),
+        (KALIBR["circlegrid"].replace("True", "False"), "asymmetricGrid false"),
+        (
+            KALIBR["aprilgrid"].replace("aprilgrid", "octagons"),
+            "'octagons'; one of aprilgrid, checkerboard",
+        ),
+        ('type = "boards"\n' + IN_A_SET, "several boards, not flat together; the file of a single board needed"),
+    ],
+)
+def test_mistakes_in_files_are_named(tmp_path, text, said):
+    with pytest.raises(InputError, match="board file") as caught:
+        load_flat_board(written(tmp_path, text))
+    assert said in str(caught.value)
+
+
+def test_several_boards_in_one_frame(tmp_path):
+    """One written out, one in a file of its own, placed by angles, by a quaternion or by a matrix."""
+    written(tmp_path, KALIBR["aprilgrid"], "april.yaml")
+    first = 'type = "boards"\n' + IN_A_SET
+    matrix = "common_from_board = [[0.0,0.0,1.0,200.0],[0.0,1.0,0.0,0.0],[-1.0,0.0,0.0,50.0],[0.0,0.0,0.0,1.0]]\n"
+    root = "0.7071067811865476"
+    quaternion = BESIDE.replace("rpy_deg = [0.0, 90.0, 0.0]", f"qw = {root}\nqx = 0.0\nqy = {root}\nqz = 0.0")
+    places = []
+    for place in (BESIDE, matrix, quaternion):
+        found = load_boards(written(tmp_path, f'{first}[[board]]\nfile = "april.yaml"\n{place}'))
+        assert isinstance(found, BoardSet)
+        assert found.names == ("board 1", "board 2 (april.yaml)")
+        assert found.first_ids() == [0, 35]
+        places.append(found.xyz_mm())
+    assert np.allclose(places[0], places[1])
+    assert np.allclose(places[0], places[2])
+    # corner 0 of tag 0, bottom right in Kalibr's printing: (80, 0) on the grid, Z into it looks along X
+    assert np.allclose(places[0][35], [200, 0, 50 - 80])
+
+
+@pytest.mark.parametrize(
+    ("second", "said"),
+    [
+        (CHARUCO, "board 1 and board 2 look alike: both have tag 0 of DICT_5X5_50; other ids (first_id)"),
+        (CHARUCO + "first_id = 30\n", "tags 30 … 53, DICT_5X5_50 has 0 … 49"),
+        ('type = "chessboard"\nrows = 4\ncolumns = 6\nsquare_mm = 20.0\n', "board 2 looks the same turned"),
+        ('type = "chessboard"\nrows = 4\ncolumns = 5\nsquare_mm = 20.0\n', "4×5 inner corners are seen in 5×7 too"),
+        (
+            'rows = 5\ncolumns = 7\npitch_mm = 9.0\nradius_mm = 2.0\npolarity = "dark"\n',
+            "board 2 looks the same turned",
+        ),
+        ('file = "none.toml"\n', "board 2: board file"),
+        ('file = "b.toml"\nrows = 5\n', "rows beside file"),
+        ("file = 5\n", "file: a string needed"),
+        (APRILGRID + "rpy_deg = [0.0, 1.0]\n", "rpy_deg"),
+        (APRILGRID + "qw = 1.0\nqx = 0.0\nqy = 0.0\nqz = 0.0\nrpy_deg = [0.0, 0.0, 0.0]\n", "rpy_deg and a quaternion"),
+        (APRILGRID + "common_from_board = [[1.0, 0.0], [0.0, 1.0]]\n", "4 rows of 4 numbers needed"),
+    ],
+)
+def test_mistakes_in_sets_are_named(tmp_path, second, said):
+    path = written(tmp_path, f'type = "boards"\n{IN_A_SET}[[board]]\n{second}')
+    with pytest.raises(InputError, match="board file") as caught:
+        load_boards(path)
+    assert said in str(caught.value)
