@@ -170,7 +170,8 @@ CALLS = (
     ),
     Call(
         "handeye",
-        "@handeye/images --poses @handeye/robot.csv --camera @handeye/cameras.txt --board @handeye/boards.toml --dry-run",
+        "@handeye/images --poses @handeye/robot.csv --camera @handeye/cameras.txt --board @handeye/boards.toml "
+        "--dry-run",
     ),
     Call("handeye plan", "@handeye/poses.csv --count 2 --seed 1 --out >next.csv --json >all.json"),
     Call(
