@@ -2,22 +2,25 @@
 
 import csv
 import io
-from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from stcal.errors import InputError
 from stcal.geometry.rigid import Poses
 from stcal.parallel import one_thread
+from stcal.robot.kinematics.damped import reach_mm
 from stcal.robot.kinematics.inverse import LIMIT, ORIENTATION, SINGULAR_POSE, UNREACHABLE, Inverse
 from stcal.robot.kinematics.model import Robot
+from stcal.robot.use.configuration import Stayed, stayed
 from stcal.robot.use.files import CompensationFile
-from stcal.robot.use.plausible import on_targets, out_of_reach, robots_apart
+from stcal.robot.use.plausible import on_targets, out_of_reach, position_misfit_mm, robots_apart
 from stcal.robot.use.targets import Targets, joints_of, poses_of
 
 FAR_RAD = np.radians(1.0)
 """Arms are made to milliradians; a joint that has to move by more than this does so because others cannot."""
+AMPLIFIED = 10.0
+"""A joint that moves by so many times what the pose is off, in rad, does so because the arm is near a singular pose."""
 SAME_TOOL_MM, SAME_TOOL_RAD = 20.0, np.radians(5)
 """By more no tool is off what its drawing says."""
 MEANING = {
@@ -46,6 +49,10 @@ class Compensated:
         nominal robot.
     sliding : (n,) array
         Which joints are prismatic.
+    reach_mm : float
+        Of the arm.
+    beyond : dict of int to str
+        Of rows that only joint values beyond the limits reach: which joints, and where they would be.
     doubts : tuple of str
         Notes on targets that may be meant otherwise, and on tools and arms that are others in the nominal robot.
     """
@@ -57,6 +64,8 @@ class Compensated:
     before_mm: np.ndarray
     before_rad: np.ndarray
     sliding: np.ndarray
+    reach_mm: float
+    beyond: dict[int, str]
     doubts: tuple[str, ...] = ()
 
     def __len__(self) -> int:
@@ -75,43 +84,69 @@ class Compensated:
         if self.nominal is None:
             return []
         moved = np.abs(self.found.q - self.nominal.q)[:, ~self.sliding].max(axis=1, initial=0.0)
+        expected = self.before_rad + self.before_mm / self.reach_mm
         return [
-            f"line {self.targets.lines[i]}: a joint moves by {np.degrees(moved[i]):.1f}°: near a singular pose"
+            f"line {self.targets.lines[i]}: a joint moves by {np.degrees(moved[i]):.1f}°: "
+            + (
+                "near a singular pose"
+                if moved[i] > AMPLIFIED * expected[i]
+                else f"the nominal joint values err by {self.before_mm[i]:.4g} mm and "
+                f"{np.degrees(self.before_rad[i]):.3g}°"
+            )
             for i in np.flatnonzero(self.compared() & (moved > FAR_RAD)).tolist()
         ]
 
     def _not_simply_reached(self) -> list[str]:
         return [
-            f"line {line}: {MEANING[status]}; {mm:.4g} mm and {np.degrees(rad):.4g}° remain"
-            for line, status, mm, rad in zip(
-                self.targets.lines, self.found.status, self.found.error_mm, self.found.error_rad, strict=True
+            f"line {line}: {MEANING[status]}{f' ({self.beyond[i]})' if i in self.beyond else ''}; {mm:.4g} mm and "
+            f"{np.degrees(rad):.4g}° remain"
+            for i, (line, status, mm, rad) in enumerate(
+                zip(self.targets.lines, self.found.status, self.found.error_mm, self.found.error_rad, strict=True)
             )
             if status in MEANING
         ]
 
 
-def _other_tools(identified: Robot, nominal: Robot, used: Sequence[str]) -> tuple[str, ...]:
-    """Where a tool is not nearly the same in both files: commanded poses are of one of them only."""
-    notes = []
-    for name in dict.fromkeys(used):
-        own, other = identified.tool(name), nominal.tool(name)
+def _with_one_tool(identified: Robot, nominal: Robot, targets: Targets) -> tuple[Robot, Robot, tuple[str, ...]]:
+    """Both robots, with the same tools where theirs cannot be: the identified one's, unless joint values beside the
+    poses show that these are of the nominal one's; and what was taken."""
+    apart = {}
+    for name in dict.fromkeys(targets.tools):
+        own, other = identified.tool(name), nominal.tools.get(name)
+        if other is None:
+            apart[name] = "is not in the nominal file"
+            continue
         mm, rad = np.linalg.norm(own.translation - other.translation), (own.inverse() @ other).angle_rad()
         if mm > SAME_TOOL_MM or rad > SAME_TOOL_RAD:
-            notes.append(
-                f"tool {name or 'of the robot files'} differs by {mm:.4g} mm and {np.degrees(rad):.3g}° between "
-                f"{identified.name}'s two files: the commanded poses can be of one of them only; give both files the "
-                "[tool] that they are of"
-            )
-    return tuple(notes)
+            apart[name] = f"differs by {mm:.4g} mm and {np.degrees(rad):.3g}° between the two files"
+    with_own = replace(nominal, tools=dict(nominal.tools) | {name: identified.tools[name] for name in apart})
+    proved = (
+        apart.keys() <= nominal.tools.keys()
+        and targets.poses is not None
+        and targets.q is not None
+        and position_misfit_mm(nominal, targets) < position_misfit_mm(with_own, targets)
+    )
+    taken = "nominal file is taken in both (joint values beside the poses say so)" if proved else None
+    notes = tuple(
+        f"tool {name or 'of the robot files'} {said}: that of the {taken or 'identified file is taken in both'}"
+        for name, said in apart.items()
+    )
+    if proved:
+        return (
+            replace(identified, tools=dict(identified.tools) | {name: nominal.tools[name] for name in apart}),
+            nominal,
+            notes,
+        )
+    return identified, with_own, notes
 
 
 @one_thread()
 def compensate(identified: Robot, targets: Targets, nominal: Robot | None = None) -> Compensated:
     """Joint values for the commanded poses, by the identified robot and beside it by the nominal one.
 
-    Of several branches the one nearest to the nominal joint values, or without a nominal robot to the commanded ones.
-    Where neither is known the first pose gets the one nearest to the middle of the joint limits and every other the one
-    nearest to the pose before.
+    Of several branches the one nearest to the nominal joint values, or without a nominal robot to the commanded ones;
+    never another one because that is beyond a limit. Where neither is known the first pose gets the one nearest to the
+    middle of the joint limits and every other the one nearest to the pose before.
 
     Parameters
     ----------
@@ -131,7 +166,7 @@ def compensate(identified: Robot, targets: Targets, nominal: Robot | None = None
     Raises
     ------
     InputError
-        Joint values without poses need the nominal robot, and that it is the same robot; robots of different joints; an
+        Joint values without poses need the nominal robot; robots of different joints, or too far apart to be one; an
         unknown tool; poses to which their joint values lead in another unit or convention only.
     """
     if nominal is not None and (
@@ -144,24 +179,35 @@ def compensate(identified: Robot, targets: Targets, nominal: Robot | None = None
     if nominal is None:
         return _without_nominal(identified, targets)
     apart = robots_apart(identified, nominal)
-    if apart and targets.poses is None:
-        raise InputError(apart)
-    confirmed, doubts = on_targets(identified if apart else nominal, targets)
+    identified, nominal, others = _with_one_tool(identified, nominal, targets)
+    confirmed, doubts = on_targets(nominal, targets)
     poses = poses_of(nominal, targets, targets.joints()) if targets.poses is None else targets.poses
     before = joints_of(nominal, targets, poses, targets.q)
     off = poses.difference(poses_of(identified, targets, before.q))
     found = joints_of(identified, targets, poses, before.q)
-    doubts += () if confirmed or apart else out_of_reach(identified, targets, found)
+    doubts += () if confirmed else out_of_reach(identified, targets, found)
+    stay = _stayed(identified, targets, poses, before.q, found, before.usable)
     return Compensated(
         targets=targets,
         poses=poses,
-        found=found,
+        found=stay.found,
         nominal=before,
         before_mm=np.linalg.norm(off[:, 3:], axis=1),
         before_rad=np.linalg.norm(off[:, :3], axis=1),
         sliding=identified.prismatic,
-        doubts=((apart,) if apart else ()) + doubts + _other_tools(identified, nominal, targets.tools),
+        reach_mm=reach_mm(identified, targets.tools[0]),
+        beyond=stay.beyond,
+        doubts=((apart,) if apart else ()) + doubts + others,
     )
+
+
+def _stayed(
+    robot: Robot, targets: Targets, poses: Poses, near: np.ndarray, found: Inverse, known: np.ndarray
+) -> Stayed:
+    """Without changes of configuration in the rows whose joint values ``near`` (m, n) are ``known`` to command them."""
+    away = (np.abs(found.q - near)[:, ~robot.prismatic] > FAR_RAD).any(axis=1)
+    rows = np.flatnonzero(known & (away | np.array([status == LIMIT for status in found.status])))
+    return stayed(robot, targets, poses, near, found, rows)
 
 
 def _without_nominal(identified: Robot, targets: Targets) -> Compensated:
@@ -173,14 +219,20 @@ def _without_nominal(identified: Robot, targets: Targets) -> Compensated:
     confirmed, doubts = on_targets(identified, targets)
     found, none = joints_of(identified, targets, targets.poses, targets.q), np.zeros(0)
     doubts += () if confirmed else out_of_reach(identified, targets, found)
+    if confirmed and targets.q is not None:
+        stay = _stayed(identified, targets, targets.poses, targets.q, found, np.ones(len(found), bool))
+    else:
+        stay = Stayed(found, {})
     return Compensated(
         targets=targets,
         poses=targets.poses,
-        found=found,
+        found=stay.found,
         nominal=None,
         before_mm=none,
         before_rad=none,
         sliding=identified.prismatic,
+        reach_mm=reach_mm(identified, targets.tools[0]),
+        beyond=stay.beyond,
         doubts=doubts,
     )
 

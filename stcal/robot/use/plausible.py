@@ -22,6 +22,8 @@ from stcal.robot.use.targets import Targets, joints_of, poses_of, rows_by_tool
 
 UNITS = ("m", "in")
 """What columns of mm may hold; of micrometres no arm would reach anything, and a tenth, of cm, may be meant."""
+USUAL = 0.01
+"""Of the reach: ten times what arms are made to, or all zeros off by half a degree."""
 SAMPLE = 50
 """Joint vectors at which two robots are compared."""
 DOUBTED, LEAST, TRIED = 0.25, 4, 8
@@ -33,11 +35,19 @@ INVERSE = "poses were inverse (base seen from the tool); give the tool in the ba
 
 
 def robots_apart(identified: Robot, nominal: Robot) -> str:
-    """What two files say that cannot be of one robot; empty where they can.
+    """A doubt whether two files are of one robot; empty where they well may be.
 
     Their flanges are compared over the joints' ranges; arms are made to a thousandth of their reach, and files of one
     arm state the same base and flange, whichever tool they have.
+
+    Raises
+    ------
+    InputError
+        They cannot be.
     """
+    identified, nominal = (
+        replace(each, tools={"": Rigid()}, world_from_base=Rigid()) for each in (identified, nominal)
+    )
     rng = np.random.default_rng(0)
     limits = identified.limits()
     half = np.where(identified.prismatic, reach_mm(identified), np.pi)
@@ -46,17 +56,20 @@ def robots_apart(identified: Robot, nominal: Robot) -> str:
         np.where(np.isfinite(limits[:, 1]), limits[:, 1], half),
     )
     q = rng.uniform(low, high, (SAMPLE, len(half)))
-    one, other = (
-        flange_poses(replace(r, world_from_base=Rigid()).chain(), q).translation for r in (identified, nominal)
-    )
+    one, other = (flange_poses(each.chain(), q).translation for each in (identified, nominal))
     apart, reach = _rms(one - other), max(reach_mm(identified), reach_mm(nominal))
-    if apart <= FITS * reach:
+    if apart <= USUAL * reach:
         return ""
-    return (
+    said = (
         f"nominal robot {nominal.name} and identified robot {identified.name} are {apart:.4g} mm apart at the same "
-        f"joint values (RMS), {FITS * reach:.3g} mm allowed, {FITS:.0%} of the reach: files of the same robot needed; "
-        "check units, D-H rows, convention and coupling of both"
+        "joint values (RMS)"
     )
+    if apart > FITS * reach:
+        raise InputError(
+            f"{said}, {FITS * reach:.3g} mm allowed, {FITS:.0%} of the reach: files of the same robot needed; check "
+            "units, D-H rows, convention and coupling of both"
+        )
+    return f"{said}, more than arms are off their drawing ({USUAL:.0%} of the reach): are both files of this robot?"
 
 
 def on_targets(robot: Robot, targets: Targets) -> tuple[bool, tuple[str, ...]]:
@@ -86,6 +99,13 @@ def on_targets(robot: Robot, targets: Targets) -> tuple[bool, tuple[str, ...]]:
         _explain(robot, targets, targets.poses, targets.q, own, reach)
     notes = _elsewhere(targets, targets.poses.difference(reached), reach)
     return not notes, notes + (_near_base(robot, targets, targets.poses) if notes else ())
+
+
+def position_misfit_mm(robot: Robot, targets: Targets) -> float:
+    """By how much (RMS) joint values miss the positions of the poses beside them."""
+    if targets.poses is None:
+        raise InputError(f"{targets.where}: joint values without poses; columns x_mm … qz needed")
+    return _rms(poses_of(robot, targets, targets.joints()).translation - targets.poses.translation)
 
 
 def _rms(shift: np.ndarray) -> float:

@@ -92,13 +92,36 @@ def test_joint_values_beside_poses_choose_the_branch(case):
     assert np.abs(found.q - flipped)[inside].max() < 0.1
 
 
-def test_a_tool_that_the_nominal_file_lacks_is_said(case, capsys, monkeypatch):
-    """Commanded poses are then of another point: 150 mm off, none may be reached."""
+@pytest.mark.parametrize("by", ["poses", "joint values"])
+def test_a_tool_that_the_nominal_file_lacks_is_the_identified_ones(case, by):
+    """Poses are commanded of one tool: as if both files had it."""
+    path = case.write(list(POSE), case.pose_rows()) if by == "poses" else case.write(JOINTS, case.joint_rows())
+    targets = read_targets(path, case.real)
     bare = replace(case.nominal, tools={"": Rigid()})
-    targets = read_targets(case.write(POSE, case.pose_rows()[:2]), case.real)
-    notes = compensate(case.real, targets, bare).notes()
-    assert re.match(r"tool of the robot files differs by 151\.\d mm and 0° between", notes[0])
-    assert not any("differs by" in note for note in compensate(case.real, targets, case.nominal).notes())
+    found = compensate(case.real, targets, bare)
+    assert re.match(r"tool of the robot files differs by 151\.\d mm and 0° between .* taken in both", found.notes()[0])
+    both = compensate(case.real, targets, replace(case.nominal, tools=case.real.tools))
+    assert not any("differs by" in note for note in both.notes())
+    np.testing.assert_allclose(found.found.q, both.found.q, atol=1e-9)
+    nameless = replace(case.nominal, tools={"other": Rigid()})
+    assert (
+        "is not in the nominal file: that of the identified file is taken in both"
+        in compensate(case.real, targets, nameless).notes()[0]
+    )
+
+
+def test_poses_of_the_nominal_files_tool_are_told_by_their_joint_values(case):
+    """Poses of the flange, with the joint values that the controller has there: the identified tool is not theirs."""
+    bare = replace(case.nominal, tools={"": Rigid()})
+    flange = forward(bare, case.q)
+    rows = [pose_cells(p) + q for p, q in zip(flange, case.joint_rows(), strict=True)]
+    found = compensate(case.real, read_targets(case.write([*POSE, *JOINTS], rows), case.real), bare)
+    assert "nominal file is taken in both (joint values beside the poses say so)" in found.notes()[0]
+    reached = forward(replace(case.real, tools={"": Rigid()}), found.found.q)
+    np.testing.assert_allclose(reached.translation, flange.translation, atol=1e-8)
+
+
+def test_poses_of_which_none_is_reached_are_an_error(case, capsys, monkeypatch):
     far = [pose_cells(Rigid(p.rotation, p.translation + np.array([9000, 0, 0]))) for p in case.poses[:1]]
     command = ["stcal", "robot", "compensate", str(case.write(POSE, far)), "--robot", f"{case.folder}/identified.toml"]
     monkeypatch.setattr("sys.argv", command)
@@ -156,6 +179,35 @@ def test_limits_of_the_controller_are_respected(case):
     assert np.abs(result.found.q[0] - case.q[0]).max() <= 1e-5 + 1e-9
     assert 0.1 < result.found.error_mm[0] < result.before_mm[0]
     assert "beyond the limits" in result.notes()[0]
+
+
+@pytest.mark.parametrize("nominal", [True, False])
+def test_a_joint_at_its_limit_does_not_turn_the_wrist_over(case, nominal):
+    """J4 commanded to its limit, beyond which this arm would have to take it: J4 + 180° with the wrist bent the other
+    way is within the limits, and no compensation."""
+    at = np.radians(-150.0)
+    q = case.q.copy()
+    q[:, 3], q[:, 4] = at, np.where(np.abs(q[:, 4]) < 0.3, 0.5, np.abs(q[:, 4]))
+    joints = [replace(j, lower=at, upper=-at) if i == 3 else j for i, j in enumerate(case.nominal.joints)]
+    real, drawn = (replace(robot, joints=tuple(joints)) for robot in (case.real, case.nominal))
+    rows = [p + q for p, q in zip(map(pose_cells, forward(drawn, q)), case.joint_rows(q), strict=True)]
+    result = compensate(real, read_targets(case.write([*POSE, *JOINTS], rows), real), drawn if nominal else None)
+    stopped = np.array([status == "limit" for status in result.found.status])
+    assert stopped.sum() > 10
+    assert np.abs(result.found.q - q).max() < 0.1
+    assert np.allclose(result.found.q[stopped, 3], at, atol=1e-6)
+    told = [note for note in result.notes() if "beyond the limits" in note]
+    assert len(told) == stopped.sum()
+    assert all(re.search(r"\(J4 at -150\.\d+°, limit -150°\)", note) for note in told)
+
+
+def test_far_moves_are_told_from_singular_ones(case):
+    """Zeros off by 2° move joints by as much at any pose."""
+    off = replace(case.nominal, rows=tuple(replace(r, theta=r.theta + np.radians(2.0)) for r in case.nominal.rows))
+    notes = compensate(off, read_targets(case.write(JOINTS, case.joint_rows()[:3]), off), case.nominal).notes()
+    told = [note for note in notes if "a joint moves by" in note]
+    assert len(told) == 3
+    assert any(re.search(r"the nominal joint values err by \d+(\.\d+)? mm and", note) for note in told)
 
 
 def test_a_long_way_near_a_singularity_is_told(case):

@@ -143,13 +143,21 @@ def test_made_arms_are_the_nominal_ones(make):
         assert robots_apart(moved, nominal) == ""
 
 
-def test_a_nominal_robot_of_another_arm_is_said():
+def test_a_nominal_robot_of_another_arm_is_refused():
     nominal = arm(4)
-    off = replace(nominal, rows=tuple(replace(r, d=r.d + 4100 * (i == 3)) for i, r in enumerate(nominal.rows)))
     real = made(nominal, np.random.default_rng(4))
     q, poses = commanded(nominal, 3, 4)
-    says = "mm apart at the same joint values (RMS)"
-    assert says in compensate(real, targets(poses, q), off).notes()[0]
-    with pytest.raises(InputError, match="files of the same robot needed"):
-        compensate(real, Targets("t", [2, 3, 4], ("",) * 3, None, q), off)
-    assert not any(says in note for note in compensate(real, targets(poses, q), nominal).notes())
+    for given in (targets(poses, q), targets(poses), Targets("t", [2, 3, 4], ("",) * 3, None, q)):
+        with pytest.raises(InputError, match=r"mm apart at the same joint values .* files of the same robot needed"):
+            compensate(real, given, arm(5))
+
+
+def test_files_unusually_far_apart_are_said():
+    """Zeros off by 1° in all joints: 2 % of the reach."""
+    nominal = arm(4)
+    off = replace(nominal, rows=tuple(replace(r, theta=r.theta + np.radians(1.0)) for r in nominal.rows))
+    q, poses = commanded(nominal, 3, 4)
+    notes = compensate(off, targets(poses, q), nominal).notes()
+    assert "more than arms are off their drawing (1% of the reach): are both files of this robot?" in notes[0]
+    real = made(nominal, np.random.default_rng(4))
+    assert not any("apart" in note for note in compensate(real, targets(poses, q), nominal).notes())
