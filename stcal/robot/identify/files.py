@@ -18,6 +18,11 @@ class BothErrors(Part):
     identified: Errors
 
 
+class PredictedErrors(Part):
+    same_rows: Errors
+    ranges: Errors
+
+
 class HeldOutErrors(Part):
     folds: int
     repeats: int
@@ -73,6 +78,11 @@ class IdentifiedFile(ResultFile):
     )
     held_out: HeldOutErrors | None = Field(
         description="`folds`, `repeats`, `mean_mm`, `rms_mm`, `max_mm`, `mean_deg`; null where rows are too few"
+    )
+    predicted: PredictedErrors | None = Field(
+        description="σ of the tool's position by the covariance (root of the summed variances of x, y, z): at the "
+        "`same_rows`, and at random joint values over their `ranges`; `mean_mm`, `rms_mm`, `max_mm` each; null of "
+        "distances"
     )
     observability: dict[str, float] = Field(
         description="`O1` … `O5` (Borm & Menq; Driels & Pathre; Nahvi, Hollerbach & Hayward; Nahvi & Hollerbach; Sun & "

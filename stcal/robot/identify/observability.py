@@ -14,6 +14,8 @@ from stcal.robot.kinematics.model import Robot
 SEEN = 1e-9
 """Singular values below this share of the largest are rounding: the parameter is not seen by any pose."""
 
+TOGETHER, MOST_BESIDE = 0.2, 2
+"""Share of a direction's largest motion from which on a parameter moves with it; so many are named beside the first."""
 
 MEANING = {
     "O1": "volume of the ellipsoid of uncertainty (D-optimality)",
@@ -119,3 +121,24 @@ def parameter_scale(robot: Robot, observe: Kind = "position", tools: Iterable[st
     turning = [c < 3 for _, c in chain_parameters(robot.chain())]
     turning += ([True] * (tool_width(observe) - 3) + [False] * 3) * len(tools)
     return np.where(turning, 1 / max(reach_mm(robot, tool) for tool in tools), 1.0)
+
+
+def directions_named(directions: np.ndarray, names: list[str]) -> tuple[str, ...]:
+    """Names of directions (k, d) of k parameters, such as ``J2 y (with tool z)``: each led by a parameter that no other
+    one has, with those that move with it."""
+    lead, reduced = [], directions.copy()
+    for column in range(reduced.shape[1]):
+        free = np.abs(reduced)
+        free[lead] = 0
+        i, j = np.unravel_index(free[:, column:].argmax(), free[:, column:].shape)
+        reduced[:, [column, column + j]] = reduced[:, [column + j, column]]
+        reduced[:, column] /= reduced[i, column]
+        others = np.arange(reduced.shape[1]) != column
+        reduced[:, others] -= np.outer(reduced[:, column], reduced[i, others])
+        lead.append(int(i))
+    found = []
+    for i, own in zip(lead, reduced.T, strict=True):
+        strong = [k for k in np.argsort(-np.abs(own)) if k != i and abs(own[k]) > TOGETHER * np.abs(own).max()]
+        beside = " and ".join(names[k] for k in strong[:MOST_BESIDE]) + (" …" if len(strong) > MOST_BESIDE else "")
+        found.append(f"{names[i]} (with {beside})" if beside else names[i])
+    return tuple(found)

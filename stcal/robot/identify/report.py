@@ -66,10 +66,11 @@ def identified_file(result: Identified, nominal: Robot) -> IdentifiedFile:
         "sigma0": result.sigma0,
         "deviations": result.deviations,
         "errors": {
-            key: dict(zip(("mean_mm", "rms_mm", "max_mm"), _statistics(errors), strict=True))
+            key: _named(_statistics(errors))
             for key, errors in zip(("nominal", "identified"), list(_errors(result).values())[:2], strict=True)
         },
         "held_out": None,
+        "predicted": None,
         "observability": result.observability.values(),
         "rows": [
             {name: {"nominal": b, "identified": v, "sigma": s} for name, b, v, s in zip(DH, *each, strict=True)}
@@ -85,6 +86,9 @@ def identified_file(result: Identified, nominal: Robot) -> IdentifiedFile:
             {"line": _line(result, i), "place": _place(result, i), "error_mm": error} for i, error in result.outliers()
         ],
     }
+    if result.predicted is not None:
+        both = {"same_rows": result.predicted.here_mm, "ranges": result.predicted.ranges_mm}
+        content["predicted"] = {name: _named(_statistics(each)) for name, each in both.items()}
     if held is not None:
         mean, rms, largest = _statistics(held.position_mm)
         content["held_out"] = {
@@ -173,11 +177,18 @@ def _errors(result: Identified) -> dict[str, np.ndarray]:
     found = {"nominal axes, base and tool fitted": result.nominal_mm, "identified, the same rows": result.fitted_mm}
     if result.held_out is not None:
         found[f"held out, {result.held_out.folds} folds"] = result.held_out.position_mm
+    if result.predicted is not None:
+        found["σ, the same rows"] = result.predicted.here_mm
+        found["σ, over the joints' ranges"] = result.predicted.ranges_mm
     return found
 
 
 def _statistics(errors: np.ndarray) -> tuple[float, float, float]:
     return float(np.nanmean(errors)), float(np.sqrt(np.nanmean(errors**2))), float(np.nanmax(errors))
+
+
+def _named(statistics: tuple[float, float, float]) -> dict[str, float]:
+    return dict(zip(("mean_mm", "rms_mm", "max_mm"), statistics, strict=True))
 
 
 def _noise(result: Identified) -> str:

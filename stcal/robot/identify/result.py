@@ -12,6 +12,7 @@ from stcal.robot.identify.adjustment import (
 )
 from stcal.robot.identify.nominal import Deviations, NominalRows
 from stcal.robot.identify.observability import ObservabilityIndices
+from stcal.robot.identify.predicted import Predicted
 from stcal.robot.identify.residuals import (
     Kind,
     Observed,
@@ -115,6 +116,8 @@ class Identified:
         Errors with nominal axes, base and tools fitted.
     held_out : HeldOutRows or None
         Errors of the cross-validation.
+    predicted : Predicted or None
+        σ of the tool's position by the covariance; None of distances.
     dh_sigma : (n, 5) array
         σ of a, alpha, d, theta, beta; mm, rad.
     observability : ObservabilityIndices
@@ -135,6 +138,7 @@ class Identified:
     undetermined: tuple[str, ...]
     nominal_mm: np.ndarray
     held_out: HeldOutRows | None
+    predicted: Predicted | None
     dh_sigma: np.ndarray
     observability: ObservabilityIndices
     deviations: dict[str, float | None]

@@ -21,7 +21,8 @@ from stcal.robot.identify.adjustment import (
 )
 from stcal.robot.identify.consensus import agreeing
 from stcal.robot.identify.nominal import Deviations, NominalRows
-from stcal.robot.identify.observability import ObservabilityIndices, parameter_scale
+from stcal.robot.identify.observability import ObservabilityIndices, directions_named, parameter_scale
+from stcal.robot.identify.predicted import doubts, predicted
 from stcal.robot.identify.residuals import (
     WIDTH,
     Kind,
@@ -58,8 +59,7 @@ OUTLIER_ROUNDS = 5
 """Of leaving errors out; after 1 to 3 the same ones are left out again."""
 MOSTLY_GOOD = 0.5
 """Share of the observations below which nothing is called an error."""
-TOGETHER, MOST_BESIDE = 0.2, 2
-"""Share of a direction's largest motion from which on a parameter moves with it; so many are named beside the first."""
+LEAST_FOLDS = 2
 REPEATS, FEW_ROWS = 5, 300
 """Divisions of the cross-validation of few rows; one does for more."""
 
@@ -114,6 +114,9 @@ def identify(robot: Robot, data: Measurements, options: IdentifyOptions | None =
     undetermined = _undetermined(solution, names, seen, options.partial)
     covariance, rank = _covariance(adjusted, seen), solution.rank() - _place(seen)
     identified = robot_from_chain(solution.state.chain, solution.state.tools, robot)
+    held_out = _cross_validated(robot, seen, adjusted, options)
+    sigma = predicted(solution.state, robot, seen, covariance)
+    tested = held_out is not None or options.folds < LEAST_FOLDS
     return Identified(
         robot=identified,
         seen=seen,
@@ -124,11 +127,15 @@ def identify(robot: Robot, data: Measurements, options: IdentifyOptions | None =
         ranks=_ranks(solution.state, data),
         undetermined=undetermined,
         nominal_mm=position_errors(residuals(first, seen)),
-        held_out=_cross_validated(robot, seen, adjusted, options),
+        held_out=held_out,
+        predicted=sigma,
         dh_sigma=adjusted.rows.sigma(identified, covariance),
         observability=_observability(identified, adjusted, seen, rank),
         deviations=adjusted.deviations.of(adjusted.rows.group[adjusted.rows.free]),
-        notes=data.notes + adjusted.rows.notes(identified) + adjusted.notes,
+        notes=data.notes
+        + adjusted.rows.notes(identified)
+        + adjusted.notes
+        + doubts(sigma, seen, solution.units, covariance, names, tested),
     )
 
 
@@ -224,7 +231,7 @@ def _undetermined(solution: Solution, names: list[str], seen: Observed, partial:
     expected = unseen(seen.kind)
     if (~good).sum() <= expected:
         return ()
-    found = _directions(directions[:, ~good][:, expected:], names)
+    found = directions_named(directions[:, ~good][:, expected:], names)
     if not partial:
         first = ", ".join(found[:4]) + (" …" if len(found) > 4 else "")
         raise DegenerateError(
@@ -233,26 +240,6 @@ def _undetermined(solution: Solution, names: list[str], seen: Observed, partial:
             "--partial"
         )
     return found
-
-
-def _directions(open_ones: np.ndarray, names: list[str]) -> tuple[str, ...]:
-    """Names of directions (k, d): each led by a parameter that no other one has, with those that move with it."""
-    lead, reduced = [], open_ones.copy()
-    for column in range(reduced.shape[1]):
-        free = np.abs(reduced)
-        free[lead] = 0
-        i, j = np.unravel_index(free[:, column:].argmax(), free[:, column:].shape)
-        reduced[:, [column, column + j]] = reduced[:, [column + j, column]]
-        reduced[:, column] /= reduced[i, column]
-        others = np.arange(reduced.shape[1]) != column
-        reduced[:, others] -= np.outer(reduced[:, column], reduced[i, others])
-        lead.append(int(i))
-    found = []
-    for i, own in zip(lead, reduced.T, strict=True):
-        strong = [k for k in np.argsort(-np.abs(own)) if k != i and abs(own[k]) > TOGETHER * np.abs(own).max()]
-        beside = " and ".join(names[k] for k in strong[:MOST_BESIDE]) + (" …" if len(strong) > MOST_BESIDE else "")
-        found.append(f"{names[i]} (with {beside})" if beside else names[i])
-    return tuple(found)
 
 
 def _ranks(state: State, data: Measurements) -> dict[str, int]:
@@ -301,7 +288,7 @@ def _covariance(adjusted: Adjustment, seen: Observed) -> np.ndarray:
 def _cross_validated(robot: Robot, seen: Observed, whole: Adjustment, options: IdentifyOptions) -> HeldOutRows | None:
     """Errors of rows that took no part: of neither the parameters nor (where rows are few) the σ."""
     rows = len(seen)
-    if min(options.folds, rows) < 2:
+    if min(options.folds, rows) < LEAST_FOLDS:
         return None
     repeats = options.repeats or (REPEATS if rows <= FEW_ROWS else 1)
     rng = np.random.default_rng(options.seed)
