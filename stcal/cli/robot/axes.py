@@ -1,0 +1,78 @@
+"""``stcal robot axes``: the axis method."""
+
+import math
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from stcal.cli.options import FirstTable, JsonFile, Key, ReportFile, RobotFile, SecondTable, name_of, one_table
+from stcal.cli.terminal import print_each, say, write
+from stcal.errors import InputError
+
+if TYPE_CHECKING:
+    from stcal.robot.kinematics.measurements import Measurements
+
+
+def axes(
+    robot_file: RobotFile,
+    sweeps: Annotated[
+        Path | None,
+        typer.Argument(help="Read joint values and positions of reflectors in sweeps from this file (CSV)."),
+    ] = None,
+    out: Annotated[
+        Path | None,
+        typer.Option("--out", writable=True, help="Write the robot that the axes make to this file (TOML)."),
+    ] = None,
+    still_deg: Annotated[
+        float,
+        typer.Option(min=1e-9, max=1.0, help="Take joints that change by less than this as standing still, degrees."),
+    ] = 0.0015,
+    orientations: Annotated[
+        str,
+        typer.Option(
+            help="Use measured orientations too, as reflectors so far from the target, mm, where an error of rotation "
+            "is worth one of position; auto, by their stated σ and not without, or off."
+        ),
+    ] = "auto",
+    first: FirstTable = None,
+    second: SecondTable = None,
+    key: Key = "image",
+    json_file: JsonFile = None,
+    report: ReportFile = None,
+) -> None:
+    """Find each joint's axis from sweeps of that joint alone, and the robot that follows (the axis method)."""
+    from stcal.robot.axes.model import robot_from_sweeps
+    from stcal.robot.axes.report import axes_file, axes_page, axes_text
+    from stcal.robot.kinematics.file import load_robot, robot_toml
+    from stcal.robot.kinematics.measurements import read_measurements
+
+    nominal = load_robot(robot_file)
+    source = one_table(sweeps, first, second, key, "SWEEPS")
+    data = read_measurements(source, nominal)
+    length_mm = _length(orientations, data)
+    result = robot_from_sweeps(data, nominal, math.radians(still_deg), length_mm)
+    say(axes_text(result))
+    if length_mm is not None:
+        say(f"orientations: used, as points {length_mm:.0f} mm from the target")
+    elif data.rotations is not None:
+        say("orientations: not used; state σ (cov_… columns), or give --orientations a length")
+    print_each(f"warning: {data.where}", result.notes)
+    if out:
+        write(out, robot_toml(result.robot, [f"Identified by the axis method from {name_of(source)}."]))
+    if json_file:
+        write(json_file, axes_file(result))
+    if report:
+        write(report, axes_page(result, data.where))
+
+
+def _length(text: str, data: "Measurements") -> float | None:
+    """Distance of virtual reflectors, mm; None for positions alone."""
+    from stcal.robot.axes.orientations import length_of
+
+    if text in ("auto", "off"):
+        return length_of(data) if text == "auto" else None
+    try:
+        return float(text)
+    except ValueError as error:
+        raise InputError(f"--orientations {text}: a length in mm, auto or off needed") from error

@@ -1,0 +1,71 @@
+"""``stcal robot design``: measurement poses."""
+
+from enum import StrEnum
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from stcal.cli.options import MOST_SEED, JsonFile, ReportFile, RobotFile
+from stcal.cli.terminal import say, write
+from stcal.errors import InputError
+
+
+class ObservedKind(StrEnum):
+    """What the instrument measures."""
+
+    pose = "pose"
+    position = "position"
+
+
+def design(
+    robot_file: RobotFile,
+    count: Annotated[int, typer.Option(min=1, max=2000, help="Choose this many poses.")] = 40,
+    seed: Annotated[int, typer.Option(min=0, max=MOST_SEED, help="Draw the candidates with this seed.")] = 0,
+    out: Annotated[
+        Path | None, typer.Option("--out", writable=True, help="Write the poses to this file (CSV).")
+    ] = None,
+    observe: Annotated[
+        ObservedKind, typer.Option(help="Plan for an instrument that measures this.")
+    ] = ObservedKind.position,
+    candidates: Annotated[int, typer.Option(min=2, max=100_000, help="Choose from this many random poses.")] = 1000,
+    sigma_mm: Annotated[
+        float, typer.Option("--sigma-mm", help="Assume this σ of measured positions, mm per axis.")
+    ] = 0.05,
+    sigma_rad: Annotated[
+        float, typer.Option("--sigma-rad", help="Assume this σ of measured orientations, rad per axis.")
+    ] = 2e-4,
+    box: Annotated[
+        str | None, typer.Option(help="Keep the tool inside this box, mm in the base: xmin,ymin,zmin,xmax,ymax,zmax.")
+    ] = None,
+    target: Annotated[str, typer.Option(help="Measure the target (tool) of this name.")] = "",
+    json_file: JsonFile = None,
+    report: ReportFile = None,
+) -> None:
+    """Choose measurement poses that show the robot's parameters best."""
+    from stcal.robot.kinematics.file import load_robot
+    from stcal.robot.use import design as stage
+
+    options = stage.DesignOptions(
+        count, seed, observe.value, candidates, sigma_mm, sigma_rad, _box(box) if box else None, target
+    )
+    robot = load_robot(robot_file)
+    result = stage.design(robot, options)
+    say(stage.design_text(result))
+    also = f" and {sigma_rad:g} rad" if observe is ObservedKind.pose else ""
+    say(f"for an instrument whose {observe.value}s have σ {sigma_mm:g} mm{also} per axis (--sigma-mm, --sigma-rad)")
+    if out:
+        write(out, stage.design_csv(result, robot))
+    if json_file:
+        write(json_file, stage.design_file(result))
+    if report:
+        from stcal.robot.use.design_report import design_page
+
+        write(report, design_page(result, robot))
+
+
+def _box(text: str) -> tuple[float, ...]:
+    try:
+        return tuple(float(cell) for cell in text.split(","))
+    except ValueError as error:
+        raise InputError(f"--box {text}: six numbers with commas between needed, in mm") from error

@@ -1,0 +1,102 @@
+"""``stcal robot identify``: kinematics from poses, positions or distances."""
+
+from enum import StrEnum
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from stcal.cli.options import (
+    MOST_SEED,
+    FirstTable,
+    JsonFile,
+    Key,
+    QuaternionOrder,
+    Quaternions,
+    ReportFile,
+    RobotFile,
+    SecondTable,
+    name_of,
+    one_table,
+)
+from stcal.cli.terminal import say, write
+
+
+class Kind(StrEnum):
+    """What is taken of the measurements."""
+
+    pose = "pose"
+    position = "position"
+    distance = "distance"
+
+
+def identify(
+    robot_file: RobotFile,
+    data_file: Annotated[
+        Path | None,
+        typer.Argument(metavar="DATA", help="Read joint values with what was measured there from this file (CSV)."),
+    ] = None,
+    out: Annotated[
+        Path | None, typer.Option("--out", writable=True, help="Write the identified robot to this file (TOML).")
+    ] = None,
+    observe: Annotated[
+        Kind | None, typer.Option(help="Use this of the measurements; the most that was measured if not given.")
+    ] = None,
+    sigma_mm: Annotated[
+        float | None,
+        typer.Option(
+            "--sigma-mm", min=1e-9, max=1e4, help="Set σ of a measured position, mm per axis; estimated if not given."
+        ),
+    ] = None,
+    sigma_rad: Annotated[
+        float | None,
+        typer.Option(
+            "--sigma-rad",
+            min=1e-12,
+            max=4,
+            help="Set σ of a measured orientation, rad per axis; estimated if not given.",
+        ),
+    ] = None,
+    folds: Annotated[
+        int, typer.Option(min=0, max=100_000, help="Cross-validate with this many folds; 0 for none.")
+    ] = 6,
+    seed: Annotated[int, typer.Option(min=0, max=MOST_SEED, help="Divide the rows into folds with this seed.")] = 0,
+    robust: Annotated[
+        bool, typer.Option("--robust/--least-squares", help="Give outliers less weight, or all rows the same.")
+    ] = True,
+    partial: Annotated[
+        bool,
+        typer.Option(
+            "--partial", help="Keep parameters nominal that the data leave open, rather than refuse the data."
+        ),
+    ] = False,
+    quaternions: Quaternions = QuaternionOrder.wxyz,
+    first: FirstTable = None,
+    second: SecondTable = None,
+    key: Key = "image",
+    json_file: JsonFile = None,
+    report: ReportFile = None,
+) -> None:
+    """Identify the kinematics from poses, positions or distances; σ not given are estimated."""
+    from stcal.robot.identify.report import identified_file, identified_page, identified_text
+    from stcal.robot.identify.result import IdentifyOptions
+    from stcal.robot.identify.solve import identify as identified_from
+    from stcal.robot.kinematics.file import load_robot, robot_toml
+    from stcal.robot.kinematics.measurements import read_measurements
+
+    nominal = load_robot(robot_file)
+    source = one_table(data_file, first, second, key, "DATA", quaternions=quaternions.value)
+    data = read_measurements(source, nominal, quaternions.value)
+    kind = observe.value if observe else None
+    options = IdentifyOptions(kind, sigma_mm, sigma_rad, robust, folds, seed=seed, partial=partial)
+    result = identified_from(nominal, data, options)
+    say(identified_text(result, nominal))
+    if out:
+        write(
+            out,
+            robot_toml(result.robot, [f"Identified from {name_of(source)}: {result.rank} parameters."]),
+        )
+    if json_file:
+        write(json_file, identified_file(result, nominal))
+    if report:
+        write(report, identified_page(result, nominal))
