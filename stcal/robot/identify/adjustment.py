@@ -7,7 +7,7 @@ import numpy as np
 
 from stcal.geometry.least_squares import NormalEquations, minimise
 from stcal.geometry.robust import huber_cost, huber_weights, length_limit
-from stcal.robot.identify.residuals import WIDTH, Kind, Observed, State, jacobian, moved, residuals
+from stcal.robot.identify.residuals import WIDTH, Kind, Observed, State, linear, moved, residuals
 
 MAX_STEPS = 100
 SETTLED = 1e-10
@@ -194,13 +194,13 @@ def normal_rank(state: State, seen: Observed, weighting: Weighting) -> int:
 
 def _linearised(state: State, seen: Observed, weighting: Weighting, limit: float) -> tuple[Solution, np.ndarray]:
     """State with its normal matrix, and half the gradient (k,) of the cost."""
-    found, derivative = residuals(state, seen), jacobian(state, seen)
+    found, derivative = linear(state, seen)
     units = parameter_units(derivative)
     white, whitened = weighting.whiten(found, seen), weighting.whiten(derivative, seen)
     weights = huber_weights(np.linalg.norm(white, axis=1), limit)
     flat = whitened.reshape(-1, whitened.shape[2])
     weighted = flat * np.repeat(weights, white.shape[1])[:, None]
-    cost = _cost(found, seen, weighting, limit)
+    cost = float(huber_cost(np.linalg.norm(white, axis=1), limit).sum())
     normal = weighted.T @ flat
     return Solution(state, found, weights, normal, units, cost, np.zeros_like(normal)), -weighted.T @ white.ravel()
 

@@ -14,7 +14,7 @@ from scipy.stats import chi2
 
 from stcal.geometry.robust import ratio_limit
 from stcal.robot.identify.adjustment import Weighting, parameter_units
-from stcal.robot.identify.residuals import Observed, State, jacobian, moved, residuals
+from stcal.robot.identify.residuals import Observed, State, linear, moved
 
 SUBSETS, SEED = 1000, 0
 """Of as few rows as determine all: with a quarter of 40 rows wrong, one in forty of them is clean."""
@@ -79,9 +79,8 @@ def agreeing(state: State, seen: Observed, weighting: Weighting) -> np.ndarray:
     """
     good = every = np.ones(len(seen), bool)
     for step in range(ROUNDS):
-        derivative = jacobian(state, seen)
+        left, derivative = linear(state, seen)
         units = parameter_units(derivative)
-        left = residuals(state, seen)
         if step:
             weighting = _reweighed(weighting, left, seen)
         problem = _Problem(weighting.whiten(left, seen), weighting.whiten(derivative * units, seen))

@@ -99,25 +99,35 @@ def tips(state: State, q: np.ndarray, targets: Sequence[str]) -> Poses:
 
 def residuals(state: State, seen: Observed) -> np.ndarray:
     """Measured minus modelled, (r, 6), (r, 3) or (r, 1): rad and mm in the world's axes."""
-    tip = tips(state, seen.data.q, seen.data.targets)
+    return _beside(tips(state, seen.data.q, seen.data.targets), seen)
+
+
+def jacobian(state: State, seen: Observed) -> np.ndarray:
+    """Derivative of what the model says by :func:`parameter_names`, (r, 6 or 3 or 1, k)."""
+    return linear(state, seen)[1]
+
+
+def linear(state: State, seen: Observed) -> tuple[np.ndarray, np.ndarray]:
+    """:func:`residuals` and :func:`jacobian`."""
+    tip, full = tip_jacobian(state, seen.data.q, seen.data.targets, seen.kind)
+    found = _beside(tip, seen)
+    if seen.kind == "pose":
+        return found, full
+    if seen.kind == "position":
+        return found, full[:, 3:]
+    apart = tip.translation[seen.first] - tip.translation[seen.second]
+    unit = apart / np.maximum(np.linalg.norm(apart, axis=1), 1e-12)[:, None]
+    return found, np.einsum("ri,rik->rk", unit, full[seen.first, 3:] - full[seen.second, 3:])[:, None]
+
+
+def _beside(tip: Poses, seen: Observed) -> np.ndarray:
+    """Measured minus modelled (m,) poses of the tips."""
     if seen.kind == "pose":
         return seen.data.poses().difference(tip)
     if seen.kind == "position":
         return seen.data.points() - tip.translation
     apart = tip.translation[seen.first] - tip.translation[seen.second]
     return (seen.values - np.linalg.norm(apart, axis=1))[:, None]
-
-
-def jacobian(state: State, seen: Observed) -> np.ndarray:
-    """Derivative of what the model says by :func:`parameter_names`, (r, 6 or 3 or 1, k)."""
-    tip, full = tip_jacobian(state, seen.data.q, seen.data.targets, seen.kind)
-    if seen.kind == "pose":
-        return full
-    if seen.kind == "position":
-        return full[:, 3:]
-    apart = tip.translation[seen.first] - tip.translation[seen.second]
-    unit = apart / np.maximum(np.linalg.norm(apart, axis=1), 1e-12)[:, None]
-    return np.einsum("ri,rik->rk", unit, full[seen.first, 3:] - full[seen.second, 3:])[:, None]
 
 
 def tip_jacobian(state: State, q: np.ndarray, targets: Sequence[str], kind: Kind) -> tuple[Poses, np.ndarray]:

@@ -175,19 +175,29 @@ def _weighting(state: State, seen: Observed, options: IdentifyOptions) -> Weight
     return weighting.with_values({n: weighting.value(n) * max(misfit[n], 1.0) for n in estimated})
 
 
-def _adjusted(
-    nominal: Robot, state: State, seen: Observed, options: IdentifyOptions, rows: NominalRows | None = None
-) -> Adjustment:
-    """Solve with the observations that agree, and estimate σ; once more without what are errors and no noise, and with
-    what is none: Huber's weights bound their pull, but let each pull as hard as the worst honest observation, which no
-    covariance knows of."""
-    rows = rows or NominalRows.about(state, parameter_units(jacobian(state, seen)), nominal)
+def _adjusted(robot: Robot, state: State, seen: Observed, options: IdentifyOptions) -> Adjustment:
+    """Solve with the observations that agree, and estimate σ."""
+    rows = NominalRows.about(state, parameter_units(jacobian(state, seen)), robot)
     good = np.ones(len(seen), bool)
     if options.robust:
         good = agreeing(state, seen, _weighting(state, seen, options))
         good |= good.mean() < MOSTLY_GOOD
+    own = seen if good.all() else only_of(seen, good)
+    state, weighting = _by_medians(state, own, options, rows)
+    return _without_errors(state, seen, good, options, (rows, weighting, Deviations()))
+
+
+Known = tuple[NominalRows, Weighting, Deviations]
+"""The nominal dimensions; and where σ of measurements and dimensions start."""
+
+
+def _without_errors(
+    state: State, seen: Observed, good: np.ndarray, options: IdentifyOptions, known: Known
+) -> Adjustment:
+    """Solve, and once more without what are errors and no noise, (r,), and with what is none: Huber's weights bound
+    their pull, but let each pull as hard as the worst honest observation, which no covariance knows of."""
     for _ in range(OUTLIER_ROUNDS + 1):
-        found = _settled(state, seen if good.all() else only_of(seen, good), options, rows)
+        found = _settled(state, seen if good.all() else only_of(seen, good), options, known)
         if not good.all():
             left = residuals(found.solution.state, seen)
             length = np.linalg.norm(found.weighting.whiten(left, seen), axis=1)
@@ -196,6 +206,7 @@ def _adjusted(
         if not _errors_change(found, good):
             return found
         good, state = found.solution.weights >= GROSS, found.solution.state
+        known = (found.rows, found.weighting, found.deviations)
     note = f"which observations are errors still changes after {OUTLIER_ROUNDS} rounds; look at the outliers"
     return replace(found, notes=(*found.notes, note))
 
@@ -206,14 +217,20 @@ def _errors_change(found: Adjustment, good: np.ndarray) -> bool:
     return bool((now != good).any() and now.mean() >= MOSTLY_GOOD)
 
 
-def _settled(state: State, seen: Observed, options: IdentifyOptions, rows: NominalRows) -> Adjustment:
-    """Solve, and estimate σ, in turns."""
-    weighting, deviations = _weighting(state, seen, options), Deviations()
-    for _ in range(VARIANCE_ROUNDS):  # by medians, which outliers do not move, until they stay
-        state = solve(state, seen, weighting, options.robust, rows.held(state, deviations, seen.kind)).state
+def _by_medians(state: State, seen: Observed, options: IdentifyOptions, rows: NominalRows) -> tuple[State, Weighting]:
+    """State, and σ by medians, which outliers do not move, until they stay."""
+    weighting = _weighting(state, seen, options)
+    for _ in range(VARIANCE_ROUNDS):
+        state = solve(state, seen, weighting, options.robust, rows.held(state, Deviations(), seen.kind)).state
         before, weighting = weighting, _weighting(state, seen, options)
         if all(weighting.value(n) > FALLS * before.value(n) for n in weighting.estimated):
             break
+    return state, weighting
+
+
+def _settled(state: State, seen: Observed, options: IdentifyOptions, known: Known) -> Adjustment:
+    """Solve, and estimate σ, in turns."""
+    rows, weighting, deviations = known
     for _ in range(VARIANCE_ROUNDS):
         solution = solve(state, seen, weighting, options.robust, rows.held(state, deviations, seen.kind))
         parts = components(solution, seen, weighting, options.robust, rows, deviations)
@@ -286,32 +303,39 @@ def _covariance(adjusted: Adjustment, seen: Observed) -> np.ndarray:
 
 
 def _cross_validated(robot: Robot, seen: Observed, whole: Adjustment, options: IdentifyOptions) -> HeldOutRows | None:
-    """Errors of rows that took no part: of neither the parameters nor (where rows are few) the σ."""
+    """Errors of rows that took no part: of neither the parameters nor (where rows are few) the σ nor which are errors.
+    Descents start at the solution of all rows: the minimum is the same from everywhere, and near."""
     rows = len(seen)
     if min(options.folds, rows) < LEAST_FOLDS:
         return None
     repeats = options.repeats or (REPEATS if rows <= FEW_ROWS else 1)
     rng = np.random.default_rng(options.seed)
     position, rotation = np.full((repeats, rows), np.nan), np.full((repeats, rows), np.nan)
+    good, known = whole.solution.weights >= GROSS, (whole.rows, whole.weighting, whole.deviations)
+    good |= good.mean() < MOSTLY_GOOD
     for repeat in range(repeats):
         for place in dealt(rows, options.folds, rng):
-            train, test = only_of(seen, np.setdiff1d(np.arange(rows), place)), only_of(seen, place)
+            others = np.setdiff1d(np.arange(rows), place)
+            train, test = only_of(seen, others), only_of(seen, place)
             seeks = unknowns(robot.chain(), len(set(train.data.targets)), seen.kind) - unseen(seen.kind)
             if WIDTH[seen.kind] * len(train) <= seeks:
                 return None
-            begin = start(robot, train.data)
+            state = _of_targets(whole.solution.state, train)
             if rows <= FEW_ROWS:
-                state = _adjusted(robot, begin, train, options, whole.rows).solution.state
+                state = _without_errors(state, train, good[others], options, known).solution.state
             else:
-                state = begin
-                for weighting in (_weighting(begin, train, options), whole.weighting):
-                    held = whole.rows.held(state, whole.deviations, seen.kind)
-                    state = solve(state, train, weighting, options.robust, held).state
-            known = np.array([t in state.tools for t in test.data.targets])
+                held = whole.rows.held(state, whole.deviations, seen.kind)
+                state = solve(state, train, whole.weighting, options.robust, held).state
+            known_tool = np.array([t in state.tools for t in test.data.targets])
             if seen.kind != "distance":
-                test, place = only_of(test, known), place[known]
+                test, place = only_of(test, known_tool), place[known_tool]
             found = residuals(state, test)
             position[repeat, place] = position_errors(found)
             if seen.kind == "pose":
                 rotation[repeat, place] = np.linalg.norm(found[:, :3], axis=1)
     return HeldOutRows(min(options.folds, rows), position, rotation)
+
+
+def _of_targets(state: State, seen: Observed) -> State:
+    """With the tools that ``seen`` shows."""
+    return replace(state, tools={name: tool for name, tool in state.tools.items() if name in seen.data.targets})

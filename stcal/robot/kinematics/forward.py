@@ -125,15 +125,12 @@ def chain_parameters(chain: Chain) -> list[tuple[int, int]]:
 def chain_jacobian(chain: Chain, q: np.ndarray, tip: Poses) -> np.ndarray:
     """Derivative of poses ``tip`` (world_from_tool) by :func:`chain_parameters`, (m, 6, k), in the world's axes."""
     rotation, origin = joint_frames(chain, q)
-    out = np.zeros((len(q), 6, 0))
-    columns = []
-    for i, c in chain_parameters(chain):
-        direction = rotation[i][:, :, c % 3]
-        if c < 3:
-            columns.append(np.hstack([direction, np.cross(direction, tip.translation - origin[i])]))
-        else:
-            columns.append(np.hstack([np.zeros_like(direction), direction]))
-    return np.stack(columns, axis=2) if columns else out
+    joint, component = np.array(chain_parameters(chain)).T
+    direction = rotation[joint, :, :, component % 3]  # (k, m, 3)
+    turning = (component < 3)[:, None, None]
+    swept = np.cross(direction, (tip.translation - origin)[joint])
+    columns = [np.where(turning, direction, 0.0), np.where(turning, swept, direction)]
+    return np.moveaxis(np.concatenate(columns, axis=2), 0, 2)
 
 
 def moved_chain(chain: Chain, step: np.ndarray) -> Chain:
