@@ -30,6 +30,14 @@ class Kind(StrEnum):
     distance = "distance"
 
 
+class Model(StrEnum):
+    """Of the arm."""
+
+    rigid = "rigid"
+    elastic = "elastic"
+    auto = "auto"
+
+
 def identify(
     robot_file: RobotFile,
     data_file: Annotated[
@@ -70,6 +78,13 @@ def identify(
             "--partial", help="Keep parameters nominal that the data leave open, rather than refuse the data."
         ),
     ] = False,
+    model: Annotated[
+        Model,
+        typer.Option(
+            help="Take the arm as rigid, or as elastic: links give way to gravity, gears turn unevenly; auto chooses "
+            "by rows held out."
+        ),
+    ] = Model.rigid,
     quaternions: Quaternions = QuaternionOrder.wxyz,
     first: FirstTable = None,
     second: SecondTable = None,
@@ -88,7 +103,7 @@ def identify(
     source = one_table(data_file, first, second, key, "DATA", quaternions=quaternions.value)
     data = read_measurements(source, nominal, quaternions.value)
     kind = observe.value if observe else None
-    options = IdentifyOptions(kind, sigma_mm, sigma_rad, robust, folds, seed=seed, partial=partial)
+    options = IdentifyOptions(kind, sigma_mm, sigma_rad, robust, folds, seed=seed, partial=partial, model=model.value)
     result = identified_from(nominal, data, options)
     say(identified_text(result, nominal))
     if out:

@@ -22,8 +22,9 @@ ACCEPTED = 1e-4
 weights make every step half as long as it should be, they are many and short."""
 STAYS_MM = 1e-3
 """σ of a movement that the observations never show."""
-LEAST_GAIN = 1e-9
-"""In units of σ²: what measurements without noise still gain by rounding."""
+LEAST_GAIN, LEAST_ELASTIC = 1e-9, 1e-5
+"""In units of σ²: what measurements without noise still gain by rounding; and what is not worth a step where compliance
+and moment, whose products bend, lie in a long valley: no parameter is moved by it by more than 0.003 σ."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -111,8 +112,10 @@ class Solution:
     prior: np.ndarray
 
     def spectrum(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Eigenvalues (k,), directions (k, k) in columns, and which are determined by the data (k,)."""
-        values, directions = np.linalg.eigh(self.normal * self.units[:, None] * self.units)
+        """Of the j parameters of axes and tools: eigenvalues (j,), directions (j, j) in columns, and which the data
+        determine (j,). Of elasticity there is knowledge beforehand."""
+        own = slice(len(self.units) - self.state.elastic_count)
+        values, directions = np.linalg.eigh(self.normal[own, own] * self.units[own, None] * self.units[own])
         return values, directions, values > 1 / USELESS_MM**2
 
     def rank(self) -> int:
@@ -156,7 +159,7 @@ def solve(
         lambda at, step: _Away(moved(at.state, step, seen.kind), at.away + step),
         cost=lambda at: _cost(residuals(at.state, seen), seen, weighting, limit) + float(kept(at.away).cost),
         settled=SETTLED,
-        least_gain=LEAST_GAIN,
+        least_gain=LEAST_ELASTIC if state.elastic else LEAST_GAIN,
         max_steps=MAX_STEPS,
     ).required(f"{seen.data.where}: identification", "check the robot file and the outliers", ACCEPTED)
     return replace(_linearised(found.state.state, seen, weighting, limit)[0], prior=hold)
@@ -178,6 +181,7 @@ def unseen(kind: Kind) -> int:
 def _fixed(solution: Solution, kind: Kind) -> np.ndarray:
     """(k, k) what keeps parameters where they start: hardly at all, but what is never seen does not drift."""
     blind = solution.spectrum()[1][:, : unseen(kind)]
+    blind = np.pad(blind, ((0, solution.state.elastic_count), (0, 0)))
     fixed = np.eye(len(blind)) / USELESS_MM**2 + blind @ blind.T / STAYS_MM**2
     return fixed / solution.units[:, None] / solution.units
 

@@ -38,6 +38,26 @@ class Element(Part):
     sigma: float
 
 
+class ModelsCompared(Part):
+    rigid_mm: float
+    elastic_mm: float
+    gain_mm: float
+    sigma_mm: float
+
+
+class ElasticJoint(Part):
+    axis_rad_per_Nm: float
+    across_rad_per_Nm: float
+    moment_Nm: list[float]
+    periodic_rad: list[float]
+
+
+class ElasticityFound(Part):
+    gravity: list[float]
+    joints: list[ElasticJoint]
+    sigma: list[ElasticJoint]
+
+
 class RowErrors(Part):
     line: int
     error_mm: float
@@ -64,6 +84,15 @@ class IdentifiedFile(ResultFile):
         description="directions kept nominal (`--partial`), each once, by its parameters: `J2 y (with tool z and J1 x)`"
     )
     notes: list[str] = Field(description="rows left out; what is to be known of the rows found")
+    model: Literal["rigid", "elastic"] = Field(description="that was identified")
+    models: ModelsCompared | None = Field(
+        description="where both were tried: RMS errors of held-out rows by both, `rigid_mm` and `elastic_mm`; mean by "
+        "which elastic errs less, `gain_mm`, and its standard error `sigma_mm`"
+    )
+    elasticity: ElasticityFound | None = Field(
+        description="of the elastic model: `gravity` in the base, and for each of the `joints` what stands in the "
+        "robot file, `axis_rad_per_Nm`, `across_rad_per_Nm`, `moment_Nm`, `periodic_rad`; `sigma` of the same"
+    )
     sigma_mm: float | None = Field(
         description="of one coordinate, given or estimated (null where each row has its own)"
     )
@@ -71,7 +100,8 @@ class IdentifiedFile(ResultFile):
     sigma0: float = Field(description="σ₀ by which what was given is multiplied, else 1")
     deviations: dict[str, float | None] = Field(
         description="`length_mm`, `twist_rad`, `zero_rad`: σ of this robot's dimensions about nominal, as estimated; "
-        "null where it has none"
+        "`axis_rad`, `across_rad`: of what links give way by about their joints' axes and across them, at the torque "
+        "that is usual for an arm of this length; `periodic_rad`: of what gears err; null where it has none"
     )
     errors: BothErrors = Field(
         description="`nominal` (with base and tools fitted) and `identified`: `mean_mm`, `rms_mm`, `max_mm`"

@@ -3,8 +3,10 @@
 from dataclasses import asdict, astuple, dataclass
 
 import numpy as np
+from scipy.linalg import block_diag
 
 from stcal.robot.identify.adjustment import Held
+from stcal.robot.identify.elastic import UsualElasticity, usual
 from stcal.robot.identify.residuals import Kind, State, unknowns
 from stcal.robot.kinematics.dh import PARALLEL_RAD, robot_from_chain
 from stcal.robot.kinematics.forward import chain_parameters, moved_chain
@@ -22,16 +24,20 @@ LENGTH, TWIST, ZERO = 0, 1, 2
 
 @dataclass(frozen=True, slots=True)
 class Deviations:
-    """σ of a robot's dimensions about nominal: lengths (mm), twists, and zero positions of joints (rad, mm). The values
-    here are what is expected before the data are seen: some tenths of a millimetre and of a degree."""
+    """σ of a robot's dimensions about nominal: lengths (mm), twists, and zero positions of joints (rad, mm); and of
+    what its links give way by at the usual torque about the joints' axes and across them, and of its gears (rad). The
+    values here are what is expected before the data are seen: some tenths of a millimetre and of a degree."""
 
     length_mm: float = 0.5
     twist_rad: float = 1e-3
     zero_rad: float = 5e-3
+    axis_rad: float = 3e-4
+    across_rad: float = 1e-4
+    periodic_rad: float = 1e-4
 
     def of(self, groups: np.ndarray) -> dict[str, float | None]:
         """By name; None of groups that the robot has no dimensions of."""
-        present = np.isin((LENGTH, TWIST, ZERO), groups)
+        present = np.isin(np.arange(len(astuple(self))), groups)
         return {k: v if there else None for (k, v), there in zip(asdict(self).items(), present, strict=True)}
 
 
@@ -47,7 +53,8 @@ class NominalRows:
     Dimensions are the rows' a, alpha, d, theta, beta, but of coaxial joints the offset along and across the nominal x
     in place of a and theta (its polar form). ``coaxial`` : rows of theta, and of the a that follows it; ``jacobian`` :
     (n, 5, k) by the parameters of the axes (tools move no row), taken once, as it hardly changes over what a factory
-    does; ``free`` : (n, 5) dimensions that parameters move at all; ``group`` : (n, 5) whose σ.
+    does; ``free`` : (n, 5) dimensions that parameters move at all; ``group`` : (n, 5) whose σ;
+    ``elasticity`` : where it is unknown.
     """
 
     nominal: Robot
@@ -55,6 +62,13 @@ class NominalRows:
     jacobian: np.ndarray
     free: np.ndarray
     group: np.ndarray
+    elasticity: UsualElasticity | None = None
+
+    @property
+    def groups(self) -> np.ndarray:
+        """(p,) whose σ each of the observations that :meth:`held` makes has."""
+        own = self.group[self.free]
+        return own if self.elasticity is None else np.append(own, self.elasticity.group)
 
     @classmethod
     def about(cls, state: State, units: np.ndarray, nominal: Robot) -> "NominalRows":
@@ -74,7 +88,8 @@ class NominalRows:
         group = np.tile([LENGTH, TWIST, LENGTH, ZERO, TWIST], (len(jacobian), 1))
         group[nominal.prismatic, 3] = TWIST  # the zero of these is d
         group[[turn for turn, _ in coaxial], 3] = LENGTH
-        return cls(nominal, coaxial, jacobian, np.abs(jacobian * units).max(axis=2) > 1e-9, group)
+        elasticity = usual(nominal.chain()) if state.elastic else None
+        return cls(nominal, coaxial, jacobian, np.abs(jacobian * units).max(axis=2) > 1e-9, group, elasticity)
 
     def held(self, state: State, deviations: Deviations, kind: Kind) -> Held:
         """Linear about ``state``, with the σ of ``deviations``, by all parameters of this kind of observation."""
@@ -82,8 +97,11 @@ class NominalRows:
         away = _dimensions(robot, self.nominal, self.coaxial) - _dimensions(self.nominal, self.nominal, self.coaxial)
         jacobian = self.jacobian[self.free]
         tools = unknowns(state.chain, len(state.tools), kind) - jacobian.shape[1]
-        jacobian = np.pad(jacobian, ((0, 0), (0, tools)))
-        return Held(away[self.free], jacobian, np.array(astuple(deviations))[self.group[self.free]])
+        by, value = np.pad(jacobian, ((0, 0), (0, tools))), away[self.free]
+        if self.elasticity is not None:
+            by = np.asarray(block_diag(by, np.diag(self.elasticity.scale)))
+            value = np.append(value, self.elasticity.away(state.chain))
+        return Held(value, by, np.array([*astuple(deviations), 1.0])[self.groups])
 
     def notes(self, robot: Robot) -> tuple[str, ...]:
         """What is to be known of the rows of ``robot``."""

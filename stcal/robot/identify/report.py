@@ -1,5 +1,7 @@
 """What an identification found, as text, JSON and page."""
 
+from dataclasses import asdict
+
 import numpy as np
 
 from stcal.report.figure import COLOURS, calm, new_figure, uri
@@ -9,13 +11,16 @@ from stcal.robot.identify.files import IdentifiedFile
 from stcal.robot.identify.nominal import dh_values
 from stcal.robot.identify.observability import MEANING
 from stcal.robot.identify.result import Identified
-from stcal.robot.kinematics.model import Robot
+from stcal.robot.kinematics.forward import links, torques
+from stcal.robot.kinematics.model import Elasticity, Robot
 
 DH = ("a", "alpha", "d", "theta", "beta")
 UNITS = ("mm", "deg", "mm", "deg", "deg")
 SHOWN = np.array([1.0, 180 / np.pi, 1.0, 180 / np.pi, 180 / np.pi])
 PLACE = ("x", "y", "z", "rx", "ry", "rz")
 FIRST_OUTLIERS = 10
+MDEG = 1000 * 180 / np.pi
+ELASTIC = ["<joint, mdeg", "gravity", "across axis", "once a turn", "twice a turn"]
 
 
 def identified_text(result: Identified, nominal: Robot) -> str:
@@ -25,6 +30,7 @@ def identified_text(result: Identified, nominal: Robot) -> str:
         f"robot {nominal.name}: {_observations(result)}, {result.rank} parameters determined "
         f"(what these joint values determine: {kinds})",
         _noise(result),
+        *_model(result),
     ]
     errors = [[name, *(number(v, 4) for v in _statistics(each))] for name, each in _errors(result).items()]
     rows = [["joint", *(head for n, u in zip(DH, UNITS, strict=True) for head in (f"{n} {u}", "±"))]]
@@ -35,6 +41,8 @@ def identified_text(result: Identified, nominal: Robot) -> str:
     lines += ["", *text_table([["<error, mm", "mean", "RMS", "max"], *errors], (34, *[7] * 3))]
     lines += ["", *text_table(rows, (6, *[11, 7] * 5))]
     lines += ["", *text_table([["<mm and rotation vector, deg", *PLACE], *placed], (34, *[9] * 6))]
+    if result.elasticity_sigma is not None:
+        lines += ["", *text_table([ELASTIC, *elastic_rows(result)], (16, *[12] * 4))]
     indices = result.observability.values()
     lines += ["", "observability  " + "   ".join(f"{name} {value:.3g}" for name, value in indices.items())]
     outliers = result.outliers()
@@ -61,6 +69,9 @@ def identified_file(result: Identified, nominal: Robot) -> IdentifiedFile:
         "ranks": result.ranks,
         "undetermined": list(result.undetermined),
         "notes": list(result.notes),
+        "model": result.model,
+        "models": None if result.gain is None else asdict(result.gain),
+        "elasticity": _elasticity(result),
         "sigma_mm": None if result.weighting.given else result.weighting.sigma_mm,
         "sigma_rad": result.weighting.sigma_rad if result.seen.kind == "pose" and not result.weighting.given else None,
         "sigma0": result.sigma0,
@@ -111,6 +122,9 @@ def identified_page(result: Identified, nominal: Robot) -> str:
         observations=_observations(result),
         errors=[[name, *(number(v, 4) for v in _statistics(e))] for name, e in _errors(result).items()],
         noise=_noise(result),
+        model=_model(result),
+        elastic=elastic_rows(result),
+        elastic_head=ELASTIC,
         errors_by_row=uri(_figure(result)),
         dh=_rows(result, nominal),
         placed=[[name, *(number(v, 4) for v in pose)] for name, pose in _placed(result.robot).items()],
@@ -124,6 +138,56 @@ def identified_page(result: Identified, nominal: Robot) -> str:
             [_place(result, i), number(error, 3), number(result.weights[i], 2)] for i, error in result.outliers()
         ],
     )
+
+
+def _model(result: Identified) -> list[str]:
+    """What was tried, and what it gains."""
+    gain = result.gain
+    if gain is None:
+        return ["model: elastic"] if result.model == "elastic" else []
+    less, beyond = "less" if gain.gain_mm > 0 else "more", "" if gain.beyond_chance else "not "
+    return [
+        f"model: {result.model}; rows held out err by {gain.rigid_mm:.3g} mm RMS of a rigid arm and "
+        f"{gain.elastic_mm:.3g} of an elastic one, {abs(gain.gain_mm):.2g} ± {gain.sigma_mm:.1g} mm {less} a row, "
+        f"{beyond}beyond chance"
+    ]
+
+
+def elastic_rows(result: Identified) -> list[list[str]]:
+    """Of each joint, what its link gives way by at the torques of the measured rows (RMS), and the amplitudes of its
+    gear, with σ."""
+    elasticity, sigma = result.state.chain.elasticity, result.elasticity_sigma
+    if elasticity is None or sigma is None:
+        return []
+    chain, q = result.state.chain, result.seen.data.q
+    torque = torques(chain, links(chain, q)[0])
+    axis = links(chain, q)[0][..., 2]
+    about = (torque * axis).sum(2)
+    square = (torque**2).sum(2)
+    rms = np.sqrt(np.stack([(about**2).mean(1), (square - about**2).clip(0).mean(1)], axis=1))
+    rows = []
+    for i in range(len(chain)):
+        cells = [(c * t, s * t) for c, s, t in zip(elasticity.compliance[i], sigma.compliance[i], rms[i], strict=True)]
+        for pair in (slice(0, 2), slice(2, 4)):
+            size, each = float(np.linalg.norm(elasticity.periodic[i, pair])), sigma.periodic[i, pair]
+            cells.append((size, float(np.sqrt((each**2).mean()))))
+        rows.append([str(i + 1), *(f"{MDEG * value:.1f} ± {MDEG * s:.1f}" for value, s in cells)])
+    return rows
+
+
+def _elasticity(result: Identified) -> dict | None:
+    """Of the robot file, with σ."""
+    found, sigma = result.robot.elasticity, result.elasticity_sigma
+    if found is None or sigma is None:
+        return None
+
+    def joints(each: Elasticity) -> list[dict]:
+        parts = zip(each.compliance.tolist(), each.moment.tolist(), each.periodic.tolist(), strict=True)
+        return [
+            {"axis_rad_per_Nm": a, "across_rad_per_Nm": b, "moment_Nm": m, "periodic_rad": p} for (a, b), m, p in parts
+        ]
+
+    return {"gravity": found.gravity.tolist(), "joints": joints(found), "sigma": joints(sigma)}
 
 
 def _placed(robot: Robot) -> dict[str, np.ndarray]:
@@ -199,7 +263,10 @@ def _noise(result: Identified) -> str:
         rotation = f", {np.degrees(weighting.sigma_rad):.2g}°" if result.seen.kind == "pose" else ""
         noise = f"σ of a coordinate {weighting.sigma_mm:.3g} mm{rotation}, σ₀ {result.sigma0:.2f}"
     degrees = np.degrees(1.0)
-    kinds = ((" mm in lengths", 1.0), ("° in twists", degrees), ("° in zero positions", degrees))
+    kinds = (
+        *((" mm in lengths", 1.0), ("° in twists", degrees), ("° in zero positions", degrees)),
+        *(("° by gravity about axes", degrees), ("° across them", degrees), ("° by gears", degrees)),
+    )
     found = zip(result.deviations.values(), kinds, strict=True)
     shown = ", ".join(f"{sigma * unit:.2g}{what}" for sigma, (what, unit) in found if sigma is not None)
     return f"{noise}; the robot differs from nominal by σ of {shown}" if shown else noise

@@ -8,7 +8,15 @@ import numpy as np
 
 from stcal.errors import InputError
 from stcal.geometry.rigid import Poses, Rigid
-from stcal.robot.kinematics.forward import chain_jacobian, chain_parameters, flange_poses, moved_chain
+from stcal.robot.kinematics.forward import (
+    chain_jacobian,
+    chain_parameters,
+    elasticity_jacobian,
+    elasticity_values,
+    flange_poses,
+    moved_chain,
+    with_values,
+)
 from stcal.robot.kinematics.measurements import Measurements
 from stcal.robot.kinematics.model import Chain
 
@@ -18,10 +26,17 @@ WIDTH = {"pose": 6, "position": 3, "distance": 1}
 
 @dataclass(frozen=True, slots=True, eq=False)
 class State:
-    """What is identified: the chain, and flange_from_tool by target."""
+    """What is identified: the chain, and flange_from_tool by target; where ``elastic`` the chain's elasticity too, the
+    parameters of which are the last ones."""
 
     chain: Chain
     tools: dict[str, Rigid]
+    elastic: bool = False
+
+    @property
+    def elastic_count(self) -> int:
+        """Parameters of the elasticity."""
+        return 9 * len(self.chain) if self.elastic else 0
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -56,7 +71,7 @@ def tool_width(kind: Kind) -> int:
 
 
 def unknowns(robot_chain: Chain, targets: int, kind: Kind) -> int:
-    """Number of parameters."""
+    """Number of parameters of axes and tools."""
     return len(chain_parameters(robot_chain)) + tool_width(kind) * targets
 
 
@@ -83,7 +98,7 @@ def observed(data: Measurements, kind: Kind | None = None) -> Observed:
 
 
 def parameter_names(state: State, kind: Kind) -> list[str]:
-    """``J2 rx`` … of the axes and ``tool x`` … of the tools; r in rad, the others in mm."""
+    """``J2 rx`` … of the axes and ``tool x`` … of the tools; r in rad, the others in mm; without elasticity."""
     component = ("rx", "ry", "rz", "x", "y", "z")
     tool = component if kind == "pose" else component[3:]
     names = [f"J{i + 1} {component[c]}" for i, c in chain_parameters(state.chain)]
@@ -103,7 +118,7 @@ def residuals(state: State, seen: Observed) -> np.ndarray:
 
 
 def jacobian(state: State, seen: Observed) -> np.ndarray:
-    """Derivative of what the model says by :func:`parameter_names`, (r, 6 or 3 or 1, k)."""
+    """Derivative of what the model says by :func:`parameter_names` and the elasticity, (r, 6 or 3 or 1, k)."""
     return linear(state, seen)[1]
 
 
@@ -131,8 +146,8 @@ def _beside(tip: Poses, seen: Observed) -> np.ndarray:
 
 
 def tip_jacobian(state: State, q: np.ndarray, targets: Sequence[str], kind: Kind) -> tuple[Poses, np.ndarray]:
-    """world_from_tool at joint vectors (m, n), and its derivative (m, 6, k) by :func:`parameter_names`: rotation (rad)
-    over translation (mm), in the world's axes."""
+    """world_from_tool at joint vectors (m, n), and its derivative (m, 6, k) by :func:`parameter_names` and the
+    elasticity: rotation (rad) over translation (mm), in the world's axes."""
     tip = tips(state, q, targets)
     width = tool_width(kind)
     axes_part = chain_jacobian(state.chain, q, tip)
@@ -144,7 +159,10 @@ def tip_jacobian(state: State, q: np.ndarray, targets: Sequence[str], kind: Kind
             tools_part[rows, :3, place : place + 3] = tip.rotation[rows]
             place += 3
         tools_part[rows, 3:, place : place + 3] = tip.rotation[rows]
-    return tip, np.concatenate([axes_part, tools_part], axis=2)
+    parts = [axes_part, tools_part]
+    if state.elastic:
+        parts.append(elasticity_jacobian(state.chain, q, tip))
+    return tip, np.concatenate(parts, axis=2)
 
 
 def moved(state: State, step: np.ndarray, kind: Kind) -> State:
@@ -155,7 +173,11 @@ def moved(state: State, step: np.ndarray, kind: Kind) -> State:
     for t, (name, tool) in enumerate(state.tools.items()):
         own = step[k + width * t : k + width * (t + 1)]
         tools[name] = tool @ Rigid.exp(own if width == 6 else [0, 0, 0, *own])
-    return replace(state, chain=moved_chain(state.chain, step[:k]), tools=tools)
+    chain = moved_chain(state.chain, step[:k])
+    if state.elastic and chain.elasticity is not None:
+        values = elasticity_values(chain.elasticity) + step[-state.elastic_count :]
+        chain = replace(chain, elasticity=with_values(chain.elasticity, values))
+    return replace(state, chain=chain, tools=tools)
 
 
 def only_of(seen: Observed, keep: np.ndarray) -> Observed:

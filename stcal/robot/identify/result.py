@@ -1,6 +1,7 @@
 """What an identification is asked for, and what it answers."""
 
 from dataclasses import dataclass
+from typing import Literal
 
 import numpy as np
 
@@ -19,8 +20,13 @@ from stcal.robot.identify.residuals import (
     State,
 )
 from stcal.robot.identify.variances import Components
-from stcal.robot.kinematics.model import Robot
+from stcal.robot.kinematics.model import Elasticity, Robot
 
+Model = Literal["rigid", "elastic", "auto"]
+LEAST_FOLDS = 2
+BEYOND_CHANCE = 2.5
+"""Standard errors by which one model's errors of held-out rows are to be below the other's. Rows of one fold share what
+their solution errs by, so that a standard error of independent rows is too small: of rigid arms 2 would do for 95 %."""
 OUTLIER_WEIGHT = 0.5
 """Observations of less are named: their residual is over twice Huber's limit."""
 
@@ -45,6 +51,9 @@ class IdentifyOptions:
         Of the divisions.
     partial : bool
         Keep nominal what the data do not determine, in place of refusing them.
+    model : {"rigid", "elastic", "auto"}
+        Whether links give way to gravity and gears turn unevenly; ``auto`` takes what predicts held-out rows better by
+        more than chance, and rigid where neither does.
 
     Raises
     ------
@@ -60,11 +69,16 @@ class IdentifyOptions:
     repeats: int | None = None
     seed: int = 0
     partial: bool = False
+    model: Model = "rigid"
 
     def __post_init__(self):
         for name, value, most in (("sigma_mm", self.sigma_mm, 1e3), ("sigma_rad", self.sigma_rad, 1.0)):
             if value is not None and not 1e-12 <= value <= most:
                 raise InputError(f"{name} is {value:g}; a number above 0, up to {most:g}, needed")
+        if self.model == "auto" and self.folds < LEAST_FOLDS:
+            raise InputError(
+                f"folds is {self.folds}: models are compared by rows held out; {LEAST_FOLDS} or more folds needed"
+            )
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -75,6 +89,31 @@ class HeldOutRows:
     folds: int
     position_mm: np.ndarray
     rotation_rad: np.ndarray
+
+
+@dataclass(frozen=True, slots=True)
+class Gain:
+    """What ``elastic`` predicts rows better by than ``rigid``: RMS errors of held-out rows by both, and the mean of the
+    rows' differences with its standard error, mm."""
+
+    rigid_mm: float
+    elastic_mm: float
+    gain_mm: float
+    sigma_mm: float
+
+    @classmethod
+    def between(cls, rigid: HeldOutRows, elastic: HeldOutRows) -> "Gain":
+        """Of the same rows by both."""
+        both = [np.nanmean(each.position_mm, axis=0) for each in (rigid, elastic)]
+        less = both[0] - both[1]
+        less = less[np.isfinite(less)]
+        before, after = (float(np.sqrt(np.nanmean(each.position_mm**2))) for each in (rigid, elastic))
+        return cls(before, after, float(less.mean()), float(less.std(ddof=1) / np.sqrt(len(less))))
+
+    @property
+    def beyond_chance(self) -> bool:
+        """Whether it is one."""
+        return self.gain_mm > BEYOND_CHANCE * self.sigma_mm
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -123,7 +162,12 @@ class Identified:
     observability : ObservabilityIndices
         Of the parameters that are determined.
     deviations : dict of str to float or None
-        σ of this robot's dimensions about nominal, as the data show them, by name; mm, rad.
+        σ of this robot's dimensions about nominal, as the data show them, by name; mm, rad. Of elasticity: of what
+        links give way by at the usual torque, and of gears, rad.
+    elasticity_sigma : Elasticity or None
+        σ of the robot's elasticity where it was adjusted.
+    gain : Gain or None
+        Where both models were tried.
     notes : tuple of str
         Rows left out, and what is to be known of the result.
     """
@@ -142,11 +186,18 @@ class Identified:
     dh_sigma: np.ndarray
     observability: ObservabilityIndices
     deviations: dict[str, float | None]
+    elasticity_sigma: Elasticity | None
+    gain: Gain | None
     notes: tuple[str, ...]
 
     def __post_init__(self):
         k = len(self.names)
         freeze(self, "covariance", (k, k), "covariance")
+
+    @property
+    def model(self) -> Model:
+        """That was adjusted."""
+        return "elastic" if self.state.elastic else "rigid"
 
     @property
     def state(self) -> State:

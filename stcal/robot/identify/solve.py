@@ -20,6 +20,7 @@ from stcal.robot.identify.adjustment import (
     unseen,
 )
 from stcal.robot.identify.consensus import agreeing
+from stcal.robot.identify.elastic import bending
 from stcal.robot.identify.nominal import Deviations, NominalRows
 from stcal.robot.identify.observability import ObservabilityIndices, directions_named, parameter_scale
 from stcal.robot.identify.predicted import doubts, predicted
@@ -36,12 +37,21 @@ from stcal.robot.identify.residuals import (
     tips,
     unknowns,
 )
-from stcal.robot.identify.result import Adjustment, HeldOutRows, Identified, IdentifyOptions, position_errors
+from stcal.robot.identify.result import (
+    LEAST_FOLDS,
+    Adjustment,
+    Gain,
+    HeldOutRows,
+    Identified,
+    IdentifyOptions,
+    position_errors,
+)
 from stcal.robot.identify.start import start
 from stcal.robot.identify.variances import GROSS, components, estimated
 from stcal.robot.kinematics.dh import robot_from_chain
+from stcal.robot.kinematics.forward import with_values
 from stcal.robot.kinematics.measurements import Measurements
-from stcal.robot.kinematics.model import Robot
+from stcal.robot.kinematics.model import Elasticity, Robot
 
 LEAST_MM, LEAST_RAD = 1e-3, 1e-6
 """σ where none is given begin at the misfit of the nominal robot, but not below this."""
@@ -49,8 +59,10 @@ TYPICAL_MM, TYPICAL_RAD = 0.1, 5e-4
 """Of instruments: what joint values determine is told for these."""
 VARIANCE_ROUNDS = 10
 """Two to four do for most data; a robot without noise needs the most."""
-VARIANCE_SETTLED = 1e-3
-"""Of the logarithm of a σ: a thousandth of it is far below what any data tell of one."""
+VARIANCE_SETTLED, VARIANCE_UNSETTLED = 1e-3, 1e-2
+"""Of the logarithm of a σ: a thousandth of it is far below what any data tell of one; a hundredth is worth a note."""
+FOLD_ROUNDS = 3
+"""Of the σ without some of the rows, from those of all."""
 FALLS = 0.5
 """Medians of residuals that fall by less are near enough for the estimates proper."""
 STILL_RAD, STILL_MM = 1e-5, 1e-2
@@ -59,7 +71,6 @@ OUTLIER_ROUNDS = 5
 """Of leaving errors out; after 1 to 3 the same ones are left out again."""
 MOSTLY_GOOD = 0.5
 """Share of the observations below which nothing is called an error."""
-LEAST_FOLDS = 2
 REPEATS, FEW_ROWS = 5, 300
 """Divisions of the cross-validation of few rows; one does for more."""
 
@@ -108,14 +119,15 @@ def identify(robot: Robot, data: Measurements, options: IdentifyOptions | None =
     _still_joints(robot, data, options.partial)
     first = start(robot, data)
     _enough(seen, first)
-    adjusted = _adjusted(robot, first, seen, options)
+    adjusted, held_out, gain = _modelled(robot, first, seen, options)
     solution = adjusted.solution
     names = parameter_names(solution.state, seen.kind)
     undetermined = _undetermined(solution, names, seen, options.partial)
-    covariance, rank = _covariance(adjusted, seen), solution.rank() - _place(seen)
+    every, rank = _covariance(adjusted, seen), solution.rank() - _place(seen)
+    own = slice(len(names))
+    covariance = every[own, own]
     identified = robot_from_chain(solution.state.chain, solution.state.tools, robot)
-    held_out = _cross_validated(robot, seen, adjusted, options)
-    sigma = predicted(solution.state, robot, seen, covariance)
+    sigma = predicted(solution.state, robot, seen, every)
     tested = held_out is not None or options.folds < LEAST_FOLDS
     return Identified(
         robot=identified,
@@ -131,12 +143,43 @@ def identify(robot: Robot, data: Measurements, options: IdentifyOptions | None =
         predicted=sigma,
         dh_sigma=adjusted.rows.sigma(identified, covariance),
         observability=_observability(identified, adjusted, seen, rank),
-        deviations=adjusted.deviations.of(adjusted.rows.group[adjusted.rows.free]),
+        deviations=adjusted.deviations.of(adjusted.rows.groups),
+        elasticity_sigma=_elasticity_sigma(solution.state, every),
+        gain=gain,
         notes=data.notes
         + adjusted.rows.notes(identified)
         + adjusted.notes
-        + doubts(sigma, seen, solution.units, covariance, names, tested),
+        + doubts(sigma, seen, solution.units[own], covariance, names, tested),
     )
+
+
+def _modelled(
+    robot: Robot, first: State, seen: Observed, options: IdentifyOptions
+) -> tuple[Adjustment, HeldOutRows | None, Gain | None]:
+    """Adjusted by the model that is asked for, or that predicts better by more than chance."""
+    rigid = _adjusted(robot, first, seen, options)
+    if options.model == "rigid":
+        return rigid, _cross_validated(robot, seen, rigid, options), None
+    _undetermined(rigid.solution, parameter_names(first, seen.kind), seen, options.partial)
+    state = bending(rigid.solution.state, robot, rigid.deviations.axis_rad)
+    rows = NominalRows.about(state, parameter_units(jacobian(state, seen)), robot)
+    good = rigid.solution.weights >= GROSS
+    good |= good.mean() < MOSTLY_GOOD
+    elastic = _without_errors(state, seen, good, options, (rows, rigid.weighting, rigid.deviations))
+    held = [_cross_validated(robot, seen, each, options) for each in (rigid, elastic)]
+    if held[0] is None or held[1] is None:
+        return (elastic, None, None) if options.model == "elastic" else (rigid, None, None)
+    gain = Gain.between(held[0], held[1])
+    if options.model == "elastic" or gain.beyond_chance:
+        return elastic, held[1], gain
+    return rigid, held[0], gain
+
+
+def _elasticity_sigma(state: State, covariance: np.ndarray) -> Elasticity | None:
+    """σ of the elasticity by the covariance (k, k) of all parameters."""
+    if not state.elastic or state.chain.elasticity is None:
+        return None
+    return with_values(state.chain.elasticity, np.sqrt(np.diag(covariance))[-state.elastic_count :])
 
 
 def _still_joints(robot: Robot, data: Measurements, partial: bool) -> None:
@@ -192,12 +235,17 @@ Known = tuple[NominalRows, Weighting, Deviations]
 
 
 def _without_errors(
-    state: State, seen: Observed, good: np.ndarray, options: IdentifyOptions, known: Known
+    state: State,
+    seen: Observed,
+    good: np.ndarray,
+    options: IdentifyOptions,
+    known: Known,
+    rounds: int = VARIANCE_ROUNDS,
 ) -> Adjustment:
     """Solve, and once more without what are errors and no noise, (r,), and with what is none: Huber's weights bound
     their pull, but let each pull as hard as the worst honest observation, which no covariance knows of."""
     for _ in range(OUTLIER_ROUNDS + 1):
-        found = _settled(state, seen if good.all() else only_of(seen, good), options, known)
+        found = _settled(state, seen if good.all() else only_of(seen, good), options, known, rounds)
         if not good.all():
             left = residuals(found.solution.state, seen)
             length = np.linalg.norm(found.weighting.whiten(left, seen), axis=1)
@@ -228,18 +276,18 @@ def _by_medians(state: State, seen: Observed, options: IdentifyOptions, rows: No
     return state, weighting
 
 
-def _settled(state: State, seen: Observed, options: IdentifyOptions, known: Known) -> Adjustment:
+def _settled(state: State, seen: Observed, options: IdentifyOptions, known: Known, rounds: int) -> Adjustment:
     """Solve, and estimate σ, in turns."""
     rows, weighting, deviations = known
-    for _ in range(VARIANCE_ROUNDS):
+    for _ in range(rounds):
         solution = solve(state, seen, weighting, options.robust, rows.held(state, deviations, seen.kind))
         parts = components(solution, seen, weighting, options.robust, rows, deviations)
         new_weighting, new_deviations, change = estimated(parts, rows, weighting, deviations)
         if change < VARIANCE_SETTLED:
             return Adjustment(solution, weighting, deviations, rows, parts)
         state, weighting, deviations = solution.state, new_weighting, new_deviations
-    note = f"the σ still change by {np.expm1(change):.2%} after {VARIANCE_ROUNDS} rounds of estimating them"
-    return Adjustment(solution, weighting, deviations, rows, parts, (note,))
+    note = f"the σ still change by {np.expm1(change):.2%} after {rounds} rounds of estimating them"
+    return Adjustment(solution, weighting, deviations, rows, parts, (note,) if change > VARIANCE_UNSETTLED else ())
 
 
 def _undetermined(solution: Solution, names: list[str], seen: Observed, partial: bool) -> tuple[str, ...]:
@@ -272,7 +320,8 @@ def _ranks(state: State, data: Measurements) -> dict[str, int]:
 
 def _observability(robot: Robot, adjusted: Adjustment, seen: Observed, rank: int) -> ObservabilityIndices:
     state, weighting = adjusted.solution.state, adjusted.weighting
-    rows = weighting.whiten(jacobian(state, seen), seen) * parameter_scale(robot, seen.kind, state.tools)
+    scale = parameter_scale(robot, seen.kind, state.tools)
+    rows = weighting.whiten(jacobian(state, seen)[:, :, : len(scale)], seen) * scale
     if seen.frameless:  # without what a motion of all points makes
         at = seen.data.points() - seen.data.points().mean(0)
         motions = np.concatenate([-skew(at) / np.linalg.norm(at), np.tile(np.eye(3), (len(at), 1, 1))], axis=2)
@@ -298,6 +347,7 @@ def _covariance(adjusted: Adjustment, seen: Observed) -> np.ndarray:
         return covariance
     units = adjusted.solution.units
     blind = adjusted.solution.spectrum()[1][:, : unseen(seen.kind)]
+    blind = np.pad(blind, ((0, len(units) - len(blind)), (0, 0)))
     kept = (np.eye(len(units)) - blind @ blind.T) * units[:, None] / units
     return kept @ covariance @ kept.T
 
@@ -322,7 +372,7 @@ def _cross_validated(robot: Robot, seen: Observed, whole: Adjustment, options: I
                 return None
             state = _of_targets(whole.solution.state, train)
             if rows <= FEW_ROWS:
-                state = _without_errors(state, train, good[others], options, known).solution.state
+                state = _without_errors(state, train, good[others], options, known, FOLD_ROUNDS).solution.state
             else:
                 held = whole.rows.held(state, whole.deviations, seen.kind)
                 state = solve(state, train, whole.weighting, options.robust, held).state

@@ -15,6 +15,7 @@ from scipy.special import chdtr, chdtrc
 from stcal.geometry.least_squares import NormalEquations
 from stcal.geometry.variances import Parts
 from stcal.robot.identify.adjustment import USELESS_MM, Solution, Weighting, huber_limit
+from stcal.robot.identify.elastic import MOMENT
 from stcal.robot.identify.nominal import DOUBT, Deviations, NominalRows
 from stcal.robot.identify.residuals import WIDTH, Kind, Observed, jacobian
 
@@ -28,6 +29,8 @@ GROSS = 0.5
 """Observations of less weight are errors, not noise (normal ones never are so far out), and say nothing of σ."""
 NODES, NODE_WEIGHTS = np.sqrt(3.0) * np.array([0.0, -1.0, 1.0]), np.array([4.0, 1.0, 1.0]) / 6
 """Gauss-Hermite of three points for a standard normal distribution."""
+MOST_PRODUCT = 5
+"""Dimensions: 243 points; of rigid arms there are no more."""
 STEP = 1e-4
 """Of the second derivatives, in log σ."""
 
@@ -50,12 +53,10 @@ class Components:
     def covariance(self, best: np.ndarray) -> np.ndarray:
         """(k, k) covariance of the parameters about the estimate at ``best`` (p,)."""
         root = self._root(best)
-        width = root.shape[1]
-        index = np.indices((len(NODES),) * width).reshape(width, len(NODES) ** width).T
-        z = NODES[index]
+        z, rule = _rule(root.shape[1])
         log_density, _, step, inverse = self.parts.at(best + z @ root.T)
         middle = self.parts.at(best[None])
-        log_weight = np.log(NODE_WEIGHTS[index]).sum(1) + log_density - middle[0] + 0.5 * (z**2).sum(1)
+        log_weight = np.log(rule) + log_density - middle[0] + 0.5 * (z**2).sum(1)
         weight = np.exp(log_weight - log_weight.max())
         weight /= weight.sum()
         shift = step - middle[2]
@@ -75,6 +76,16 @@ class Components:
         root = np.zeros((len(best), len(free)))
         root[free] = directions / np.sqrt(values)
         return root
+
+
+def _rule(width: int) -> tuple[np.ndarray, np.ndarray]:
+    """Points (m, width) and weights (m,) of a standard normal distribution; of many dimensions those of the cubature of
+    degree three alone (Arasaratnam & Haykin, IEEE Trans. Automatic Control 54, 2009)."""
+    if width > MOST_PRODUCT:
+        away = np.sqrt(width) * np.eye(width)
+        return np.vstack([away, -away]), np.full(2 * width, 0.5 / width)
+    index = np.indices((len(NODES),) * width).reshape(width, len(NODES) ** width).T
+    return NODES[index], NODE_WEIGHTS[index].prod(1)
 
 
 def components(
@@ -98,12 +109,13 @@ def components(
             fixed = fixed + _linear(white, derivative, columns, weight - scaled)
         else:
             fixed = fixed + _linear(white, derivative, columns, weight)
-    held, group = rows.held(solution.state, deviations, seen.kind), rows.group[rows.free]
+    held, group = rows.held(solution.state, deviations, seen.kind), rows.groups
+    e, j = held.value / held.sigma, held.jacobian * units / held.sigma[:, None]
+    fixed = fixed + NormalEquations.of(e[group == MOMENT], j[group == MOMENT])
     for g, (sigma, expected) in enumerate(zip(astuple(deviations), astuple(Deviations()), strict=True)):
         mine = group == g
-        e, j = held.value[mine] / sigma, held.jacobian[mine] * units / sigma
         if mine.any():
-            parts.append((NormalEquations.of(e, j), mine.sum(), np.log(expected / sigma), DOUBT, -np.inf))
+            parts.append((NormalEquations.of(e[mine], j[mine]), mine.sum(), np.log(expected / sigma), DOUBT, -np.inf))
     each, *known = zip(*parts, strict=True)
     count, expected, doubt, least = (np.array(values, float) for values in known)
     return Components(Parts(NormalEquations.stacked(each), count, fixed, expected, doubt), least, units)
@@ -124,7 +136,7 @@ def estimated(parts: Components, rows: NominalRows, weighting: Weighting, deviat
     names = [name for name in ("factor", "rad", "mm") if name in weighting.estimated]
     new = {name: weighting.value(name) * np.exp(x) for name, x in zip(names, best, strict=False)}
     sigma = np.array(astuple(deviations))
-    sigma[np.unique(rows.group[rows.free])] *= np.exp(best[len(names) :])
+    sigma[np.intersect1d(rows.groups, np.arange(len(sigma)))] *= np.exp(best[len(names) :])
     return weighting.with_values(new), Deviations(*sigma.tolist()), float(np.abs(best).max())
 
 

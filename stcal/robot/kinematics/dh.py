@@ -6,7 +6,8 @@ from dataclasses import replace
 import numpy as np
 
 from stcal.geometry.rigid import Rigid
-from stcal.robot.kinematics.model import Chain, DHRow, Robot, about_z, across, along
+from stcal.robot.kinematics.forward import joint_frames
+from stcal.robot.kinematics.model import Chain, DHRow, Elasticity, Robot, about_z, across, along
 
 PARALLEL_RAD = np.radians(1.0)
 """Below this the foot of the common normal is far away and moves by metres with micro-radians: Hayati's β instead."""
@@ -46,12 +47,27 @@ def robot_from_chain(chain: Chain, tools: Mapping[str, Rigid], nominal: Robot) -
         base = base @ across(rows[0]).inverse()
     nominal_end = along(rows[-1]) if not standard else along(rows[-1]) @ across(rows[-1])
     flange = nominal_end.inverse() @ passed @ chain.last_from_flange
-    return replace(
+    robot = replace(
         nominal,
         rows=tuple(rows),
         world_from_base=base,
         tools={name: flange @ tool for name, tool in tools.items()},
+        elasticity=None,
     )
+    return replace(robot, elasticity=_elasticity(robot, chain))
+
+
+def _elasticity(robot: Robot, chain: Chain) -> Elasticity | None:
+    """That of ``chain`` in the frames of ``robot``, which are turned about the joints' axes, and slid along them: by so
+    little, or of so stiff an arm, that what it gives way by stays."""
+    elasticity = chain.elasticity
+    if elasticity is None:
+        return None
+    zero = np.zeros((1, len(chain)))
+    rigid = replace(chain, elasticity=None)
+    turn = np.swapaxes(joint_frames(robot.chain(), zero)[0], 2, 3) @ joint_frames(rigid, zero)[0]
+    gravity = robot.world_from_base.rotation.T @ chain.rotation[0] @ elasticity.gravity
+    return replace(elasticity, moment=(turn[:, 0] @ elasticity.moment[:, :, None])[:, :, 0], gravity=gravity)
 
 
 def _row_between(gap: Rigid, nominal: DHRow, to_prismatic: bool) -> DHRow:

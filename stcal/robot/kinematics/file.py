@@ -10,7 +10,7 @@ from stcal.errors import InputError
 from stcal.geometry.rigid import Poses, Rigid
 from stcal.io.saving import save
 from stcal.io.toml import Finite, PoseEntry, Strict, load_toml, toml_string
-from stcal.robot.kinematics.model import Convention, DHRow, Joint, JointType, Robot
+from stcal.robot.kinematics.model import Convention, DHRow, Elasticity, Joint, JointType, Robot
 
 WHAT = "robot file"
 REMEDY = "`stcal robot init FILE` writes one to edit"
@@ -36,6 +36,26 @@ class _JointFile(Strict):
     max_mm: Finite | None = None
 
 
+class _ElasticityFile(Strict):
+    gravity: tuple[Finite, Finite, Finite] = (0.0, 0.0, -1.0)
+    axis_rad_per_Nm: list[Finite] | None = None
+    across_rad_per_Nm: list[Finite] | None = None
+    moment_Nm: list[tuple[Finite, Finite, Finite]] | None = None
+    periodic_rad: list[tuple[Finite, Finite, Finite, Finite]] | None = None
+
+    def elasticity(self, count: int, where: str) -> Elasticity:
+        """Of ``count`` joints."""
+        for key, values in self:
+            if isinstance(values, list) and len(values) != count:
+                raise InputError(f"{where}: {key} has {len(values)} entries, {count} needed, one for each joint")
+        none = np.zeros(count)
+        compliance = np.column_stack([self.axis_rad_per_Nm or none, self.across_rad_per_Nm or none])
+        moment = np.array(self.moment_Nm or np.zeros((count, 3)))
+        return Elasticity(
+            compliance, moment, np.array(self.periodic_rad or np.zeros((count, 4))), np.array(self.gravity)
+        )
+
+
 class _RobotFile(Strict):
     name: str = "robot"
     convention: Convention
@@ -44,6 +64,7 @@ class _RobotFile(Strict):
     base: PoseEntry = PoseEntry()
     tool: PoseEntry = PoseEntry()
     target: tuple[_ToolFile, ...] = ()
+    elasticity: _ElasticityFile | None = None
 
 
 def load_robot(path: str | Path) -> Robot:
@@ -83,7 +104,8 @@ def load_robot(path: str | Path) -> Robot:
     tools = {"": data.tool.rigid(f"{where}: tool")}
     tools |= {t.name: t.rigid(f"{where}: target {t.name}") for t in data.target}
     base = data.base.rigid(f"{where}: base")
-    return Robot(data.name, data.convention, tuple(rows), tuple(joints), np.array(coupling), base, tools)
+    elasticity = data.elasticity and data.elasticity.elasticity(n, f"{where}: elasticity")
+    return Robot(data.name, data.convention, tuple(rows), tuple(joints), np.array(coupling), base, tools, elasticity)
 
 
 def _joint(j: _JointFile, where: str) -> Joint:
@@ -121,7 +143,7 @@ def robot_toml(robot: Robot, comments: Sequence[str] = ()) -> str:
         f'convention = "{robot.convention}"  # {_FORM[robot.convention]}; angles in degrees, lengths in mm',
     ]
     if (robot.coupling != np.eye(len(robot.rows))).any():
-        rows = ", ".join(f"[{', '.join(_number(v) for v in row)}]" for row in robot.coupling)
+        rows = ", ".join(_numbers(row) for row in robot.coupling)
         lines += ["# kinematic joint values from the controller's", f"coupling = [{rows}]"]
     for row, joint in zip(robot.rows, robot.joints, strict=True):
         lines += ["", "[[joint]]", f'type = "{joint.type}"']
@@ -140,7 +162,26 @@ def robot_toml(robot: Robot, comments: Sequence[str] = ()) -> str:
     for name, tool in robot.tools.items():
         if name:
             lines += ["", "[[target]]", f"name = {toml_string(name)}", *_pose_lines(tool)]
+    if robot.elasticity is not None:
+        lines += ["", *_elasticity_lines(robot.elasticity)]
     return "\n".join(lines) + "\n"
+
+
+def _elasticity_lines(elasticity: Elasticity) -> list[str]:
+    axis, across = elasticity.compliance.T
+    return [
+        "[elasticity]  # one entry for each joint; compliance about its axis and across it",
+        f"gravity = {_numbers(elasticity.gravity)}  # in the base",
+        f"axis_rad_per_Nm = {_numbers(axis)}",
+        f"across_rad_per_Nm = {_numbers(across)}",
+        f"moment_Nm = [{', '.join(_numbers(row) for row in elasticity.moment)}]",
+        "# of sin q, cos q, sin 2q, cos 2q",
+        f"periodic_rad = [{', '.join(_numbers(row) for row in elasticity.periodic)}]",
+    ]
+
+
+def _numbers(values: np.ndarray) -> str:
+    return f"[{', '.join(_number(value) for value in values)}]"
 
 
 def save_robot(path: str | Path, robot: Robot, comments: Sequence[str] = ()) -> None:

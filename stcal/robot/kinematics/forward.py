@@ -7,8 +7,8 @@ from numpy.typing import ArrayLike
 from scipy.spatial.transform import Rotation
 
 from stcal.errors import InputError
-from stcal.geometry.rigid import Poses, Rigid
-from stcal.robot.kinematics.model import Chain, Robot
+from stcal.geometry.rigid import Poses, Rigid, skew
+from stcal.robot.kinematics.model import Chain, Elasticity, Robot
 
 CHUNK = 8192
 """Joint vectors at a time: their frames, 96 bytes each, stay in a processor's cache of a megabyte."""
@@ -73,7 +73,7 @@ def flange_poses(chain: Chain, q: np.ndarray) -> Poses:
     rotation, translation = np.empty((len(q), 3, 3)), np.empty((len(q), 3))
     for start in range(0, len(q), CHUNK):
         part = slice(start, start + CHUNK)
-        axes, origin = _walk(chain, q[part] @ chain.coupling.T)
+        axes, origin = _walk(chain, q[part])
         end = chain.last_from_flange
         rotation[part] = np.einsum("cjm,ck->mjk", axes, end.rotation)
         translation[part] = (origin + np.einsum("cjm,c->jm", axes, end.translation)).T
@@ -88,13 +88,58 @@ def joint_frames(chain: Chain, q: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     def keep(i: int, axes: np.ndarray, place: np.ndarray) -> None:
         rotation[i], origin[i] = np.moveaxis(axes, 2, 0).swapaxes(1, 2), place.T
 
-    _walk(chain, q @ chain.coupling.T, keep)
+    _walk(chain, q, keep)
     return rotation, origin
+
+
+def links(chain: Chain, q: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """world_from_link of each link as its joint has moved it: rotations (n, m, 3, 3) and origins (n, m, 3)."""
+    rotation, origin = joint_frames(chain, q)
+    angle = np.where(chain.prismatic, 0.0, q @ chain.coupling.T).T[:, :, None]
+    x, y, z = np.moveaxis(rotation, 3, 0)
+    c, s = np.cos(angle), np.sin(angle)
+    return np.stack([x * c + y * s, y * c - x * s, z], axis=3), origin
+
+
+def torques(chain: Chain, rotation: np.ndarray) -> np.ndarray:
+    """(n, m, 3) N m of gravity about each joint, in the world's axes; ``rotation`` (n, m, 3, 3): of :func:`links`."""
+    elasticity = _elasticity(chain)
+    carried = np.cumsum((rotation @ elasticity.moment[:, None, :, None])[::-1, :, :, 0], axis=0)[::-1]
+    return np.cross(carried, chain.rotation[0] @ elasticity.gravity)
+
+
+def waves(chain: Chain, q: np.ndarray) -> np.ndarray:
+    """(4, n, m) of sin, cos of the joints' angles and of their doubles; 0 of prismatic joints."""
+    angle = (q @ chain.coupling.T).T
+    found = np.array([np.sin(angle), np.cos(angle), np.sin(2 * angle), np.cos(2 * angle)])
+    return np.where(chain.prismatic[:, None], 0.0, found)
+
+
+def deflections(chain: Chain, q: np.ndarray) -> np.ndarray:
+    """(n, m, 3) rad by which each link gives way, in its own frame: by the torques on the arm as if it were rigid,
+    which differ from those on the bent one by as little as it bends."""
+    elasticity = _elasticity(chain)
+    rotation, _ = links(replace(chain, elasticity=None), q)
+    torque = np.einsum("imkc,imk->imc", rotation, torques(chain, rotation))
+    axis, across = elasticity.compliance.T
+    turn = torque * np.stack([across, across, axis], axis=1)[:, None]
+    turn[:, :, 2] += np.einsum("ik,kim->im", elasticity.periodic, waves(chain, q))
+    return turn
+
+
+def _elasticity(chain: Chain) -> Elasticity:
+    if chain.elasticity is None:
+        raise InputError("the robot is rigid; elasticity needed")
+    return chain.elasticity
 
 
 def _walk(chain: Chain, q: np.ndarray, visit=None) -> tuple[np.ndarray, np.ndarray]:
     """Axes (3 axes, 3 components, m) and origin (3, m) after the last joint; ``visit`` sees each frame unmoved."""
     m = len(q)
+    give = None
+    if chain.elasticity is not None:
+        give = Rotation.from_rotvec(deflections(chain, q).reshape(-1, 3)).as_matrix().reshape(len(chain), m, 3, 3)
+    q = q @ chain.coupling.T
     axes = np.repeat(np.eye(3)[:, :, None], m, axis=2)
     origin = np.zeros((3, m))
     for i in range(len(chain)):
@@ -108,6 +153,8 @@ def _walk(chain: Chain, q: np.ndarray, visit=None) -> tuple[np.ndarray, np.ndarr
             c, s = np.cos(q[:, i]), np.sin(q[:, i])
             x, y = axes[0] * c + axes[1] * s, axes[1] * c - axes[0] * s
             axes = np.stack([x, y, axes[2]])
+        if give is not None:
+            axes = np.einsum("kjm,mkc->cjm", axes, give[i])
     return axes, origin
 
 
@@ -131,6 +178,42 @@ def chain_jacobian(chain: Chain, q: np.ndarray, tip: Poses) -> np.ndarray:
     swept = np.cross(direction, (tip.translation - origin)[joint])
     columns = [np.where(turning, direction, 0.0), np.where(turning, swept, direction)]
     return np.moveaxis(np.concatenate(columns, axis=2), 0, 2)
+
+
+def elasticity_jacobian(chain: Chain, q: np.ndarray, tip: Poses) -> np.ndarray:
+    """Derivative of poses ``tip`` (world_from_tool) by :func:`elasticity_values`, (m, 6, 9 n), in the world's axes."""
+    elasticity = _elasticity(chain)
+    rotation, origin = links(replace(chain, elasticity=None), q)
+    torque, z = torques(chain, rotation), rotation[..., 2]
+    about = z * (z * torque).sum(2)[:, :, None]
+    periodic = z * waves(chain, q)[..., None]  # (4, n, m, 3)
+    lever = tip.translation - origin
+    axis, across = elasticity.compliance.T[:, :, None, None, None]
+    gives = across * np.eye(3) + (axis - across) * z[..., :, None] * z[..., None, :]  # (n, m, 3, 3)
+    moved = np.cumsum(np.concatenate([gives, -skew(lever) @ gives], axis=2), axis=0)
+    pulled = np.cross(rotation, (chain.rotation[0] @ elasticity.gravity)[:, None], axisa=2, axisb=0, axisc=2)
+    by_moment = np.moveaxis(moved @ pulled, 3, 1).reshape(-1, len(q), 6)
+    turned = np.concatenate([np.stack([about, torque - about], axis=1), np.moveaxis(periodic, 0, 1)], axis=1)
+    by_turn = np.concatenate([turned, np.cross(turned, lever[:, None])], axis=3)  # (n, 6, m, 6)
+    parts = [by_turn[:, :2].reshape(-1, len(q), 6), by_moment, by_turn[:, 2:].reshape(-1, len(q), 6)]
+    return np.moveaxis(np.concatenate(parts), 0, 2)
+
+
+def elasticity_values(elasticity: Elasticity) -> np.ndarray:
+    """(9 n,) compliance, moment and periodic of all joints, each row by row."""
+    return np.concatenate([elasticity.compliance.ravel(), elasticity.moment.ravel(), elasticity.periodic.ravel()])
+
+
+def with_values(elasticity: Elasticity, values: np.ndarray) -> Elasticity:
+    """With other :func:`elasticity_values`, (9 n,)."""
+    n = len(elasticity.moment)
+    compliance, moment, periodic = np.split(values, [2 * n, 5 * n])
+    return replace(
+        elasticity,
+        compliance=compliance.reshape(n, 2),
+        moment=moment.reshape(n, 3),
+        periodic=periodic.reshape(n, 4),
+    )
 
 
 def moved_chain(chain: Chain, step: np.ndarray) -> Chain:

@@ -5,7 +5,7 @@ joint turns about z or moves along it, and a fixed transform from the last joint
 """
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Literal
 
 import numpy as np
@@ -70,6 +70,47 @@ class Joint:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
+class Elasticity:
+    """What turns the links of n joints by a little more than the joints do: gravity, and gears.
+
+    What joint i carries pulls with the torque T = M × g about its place, M being the sum of the moments of its link and
+    of all links after it, each as it is turned. The link gives way by the rotation c T, with one c about the joint's
+    axis and another across it. Gears add an angle with one and two periods a turn of the joint.
+
+    Parameters
+    ----------
+    compliance : (n, 2) array
+        rad/(N m): about the joint's axis, and across it.
+    moment : (n, 3) array
+        N m: weight of the link times the vector from the joint to its centre of mass, what follows being put at the
+        next joint; in the frame of the joint that has moved. Of compliance and moment, poses show the products alone.
+    periodic : (n, 4) array
+        rad: of sin q, cos q, sin 2q, cos 2q of revolute joints.
+    gravity : (3,) array
+        Its direction, of length 1: in the base of a robot, in the first joint's frame of a :class:`Chain`.
+
+    Raises
+    ------
+    InputError
+        Arrays of other shapes; a direction that is 0.
+    """
+
+    compliance: np.ndarray
+    moment: np.ndarray
+    periodic: np.ndarray
+    gravity: np.ndarray
+
+    def __post_init__(self):
+        n = len(self.compliance)
+        for name, shape in (("compliance", (n, 2)), ("moment", (n, 3)), ("periodic", (n, 4)), ("gravity", (3,))):
+            object.__setattr__(self, name, frozen(getattr(self, name), shape, f"elasticity: {name}"))
+        length = float(np.linalg.norm(self.gravity))
+        if length == 0:
+            raise InputError("elasticity: gravity is [0, 0, 0]; a direction in the base needed, such as [0, 0, -1]")
+        object.__setattr__(self, "gravity", frozen(self.gravity / length, (3,), "elasticity: gravity"))
+
+
+@dataclass(frozen=True, slots=True, eq=False)
 class Robot:
     """A serial arm of n joints.
 
@@ -89,6 +130,8 @@ class Robot:
         Base in the frame of the measuring instrument, mm.
     tools : mapping of str to Rigid
         flange_from_tool by name, mm; ``""`` is the one meant where none is named.
+    elasticity : Elasticity, optional
+        Rigid if not given.
 
     Raises
     ------
@@ -103,6 +146,7 @@ class Robot:
     coupling: np.ndarray = None  # pyright: ignore[reportAssignmentType]  # made below: its size is that of the rows
     world_from_base: Rigid = field(default_factory=lambda: Rigid())
     tools: Mapping[str, Rigid] = field(default_factory=lambda: {"": Rigid()})
+    elasticity: Elasticity | None = None
 
     def __post_init__(self):
         n = len(self.rows)
@@ -114,6 +158,10 @@ class Robot:
         object.__setattr__(self, "coupling", frozen(coupling, (n, n), f"robot {self.name}: coupling"))
         if np.linalg.cond(self.coupling) > 1e6:
             raise InputError(f"robot {self.name}: the coupling matrix cannot be inverted; a regular matrix needed")
+        if self.elasticity is not None and len(self.elasticity.moment) != n:
+            raise InputError(
+                f"robot {self.name}: elasticity of {len(self.elasticity.moment)} joints, {n} needed, as many as rows"
+            )
 
     @property
     def prismatic(self) -> np.ndarray:
@@ -142,7 +190,11 @@ class Robot:
             else:
                 gaps.append(along(row) @ across(row))
         rotation, translation = np.array([g.rotation for g in gaps]), np.array([g.translation for g in gaps])
-        return Chain(rotation[:n], translation[:n], gaps[n], self.prismatic, self.coupling)
+        elasticity = self.elasticity
+        if elasticity is not None:
+            first = self.world_from_base.inverse() @ gaps[0]
+            elasticity = replace(elasticity, gravity=first.rotation.T @ elasticity.gravity)
+        return Chain(rotation[:n], translation[:n], gaps[n], self.prismatic, self.coupling, elasticity)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -151,7 +203,7 @@ class Chain:
 
     ``rotation``, ``translation`` : (n, 3, 3), (n, 3) of each joint's frame in the one before (the first: in the world);
     ``last_from_flange`` : flange in the frame of the last joint; ``prismatic`` : (n,); ``coupling`` : (n, n).
-    Joint values turn about, or move along, z of the joint's frame.
+    Joint values turn about, or move along, z of the joint's frame; ``elasticity`` : what links give way by.
     """
 
     rotation: np.ndarray
@@ -159,6 +211,7 @@ class Chain:
     last_from_flange: Rigid
     prismatic: np.ndarray
     coupling: np.ndarray
+    elasticity: Elasticity | None = None
 
     def __post_init__(self):
         n = len(self.prismatic)

@@ -1,20 +1,22 @@
 """Simulated arms as they leave the factory, and what an instrument sees of them."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import astuple, dataclass, replace
 
 import numpy as np
 from scipy.spatial.transform import Rotation
 
 from stcal.errors import ConvergenceError
 from stcal.geometry.rigid import Poses, Rigid
+from stcal.robot.identify.elastic import DOWN, usual
+from stcal.robot.identify.nominal import Deviations
 from stcal.robot.identify.residuals import State, tips
 from stcal.robot.kinematics.dh import robot_from_chain
 from stcal.robot.kinematics.example import mh80
-from stcal.robot.kinematics.forward import chain_parameters, flange_poses, jacobian, moved_chain
+from stcal.robot.kinematics.forward import chain_parameters, flange_poses, jacobian, moved_chain, with_values
 from stcal.robot.kinematics.inverse import inverse
 from stcal.robot.kinematics.measurements import Measurements
-from stcal.robot.kinematics.model import Joint, Robot
+from stcal.robot.kinematics.model import Elasticity, Joint, Robot
 
 STEPS, REACHED = 50, 1e-9
 """Of Newton's steps to a pose; rad and mm at which it is reached."""
@@ -30,6 +32,16 @@ def made(robot: Robot, rng: np.random.Generator, sigma_mm: float = 0.3, sigma_ra
     rows = [found.rows[0]]
     rows += [replace(row, theta=row.theta + rng.normal(0, sigma_rad)) for row in found.rows[1:]]
     return replace(found, rows=tuple(rows), tools=dict(robot.tools))
+
+
+def elastic(robot: Robot, rng: np.random.Generator, share: float = 1.0) -> Robot:
+    """The robot with links that give way to gravity, and gears, by normal numbers of ``share`` times the usual σ."""
+    known, n = usual(robot.chain()), len(robot.rows)
+    sigma = np.array([*share * np.array(astuple(Deviations())), 1.0])[known.group]
+    values = known.expected + rng.normal(0, sigma) / known.scale
+    compliance, rest = np.abs(values[: 2 * n]), values[2 * n :]
+    none = Elasticity(np.zeros((n, 2)), np.zeros((n, 3)), np.zeros((n, 4)), DOWN)
+    return replace(robot, elasticity=with_values(none, np.append(compliance, rest)))
 
 
 def joint_vectors(robot: Robot, count: int, rng: np.random.Generator, share: float = 0.6) -> np.ndarray:

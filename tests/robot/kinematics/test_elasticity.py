@@ -1,0 +1,125 @@
+"""What links give way by: derivatives, files, D-H rows, and the way back from poses to joint values."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from stcal.errors import InputError
+from stcal.geometry.rigid import Poses, Rigid
+from stcal.robot import forward, inverse
+from stcal.robot.kinematics.dh import robot_from_chain
+from stcal.robot.kinematics.example import mh80
+from stcal.robot.kinematics.file import load_robot, robot_toml
+from stcal.robot.kinematics.forward import (
+    chain_parameters,
+    elasticity_jacobian,
+    elasticity_values,
+    flange_poses,
+    links,
+    moved_chain,
+    with_values,
+)
+from stcal.robot.kinematics.model import Elasticity, Robot
+from stcal.synthetic.measured.arms import joint_vectors
+
+TOOL = Rigid.exp([0.1, 0.2, 0.3, 50, 60, 70])
+
+
+def bent(scale: float = 1.0) -> Robot:
+    """An arm that stands askew, with half a millimetre of deflection at ``scale`` 1."""
+    rng = np.random.default_rng(0)
+    compliance, moment, periodic = rng.normal(size=(6, 2)), rng.normal(size=(6, 3)), rng.normal(size=(6, 4))
+    elasticity = Elasticity(1e-6 * scale * compliance, 100 * moment, 1e-4 * scale * periodic, np.array([0.1, 0.2, -2]))
+    return replace(mh80(), world_from_base=Rigid.exp([0.3, -0.5, 0.2, 100, 200, 300]), elasticity=elasticity)
+
+
+def vectors(robot: Robot, count: int = 20) -> np.ndarray:
+    return joint_vectors(robot, count, np.random.default_rng(1))
+
+
+def test_a_weight_at_the_end_of_a_level_arm_turns_the_shoulder_by_its_torque():
+    """Joint 2 of the example is level; 1000 N m about it at 1e-6 rad/(N m) lower a point 1 m in front of it by 1 mm."""
+    compliance, moment = np.zeros((6, 2)), np.zeros((6, 3))
+    compliance[1, 0] = 1e-6
+    q, rigid = np.zeros((1, 6)), mh80()
+    flange = flange_poses(rigid.chain(), q)
+    shoulder = np.array([rigid.rows[0].a, 0.0, rigid.rows[0].d])
+    reach = flange.translation[0] - shoulder
+    moment[1] = 1000 * links(rigid.chain(), q)[0][1, 0].T @ [1.0, 0.0, 0.0]
+    robot = replace(rigid, elasticity=Elasticity(compliance, moment, np.zeros((6, 4)), np.array([0.0, 0.0, -1.0])))
+    moved = flange_poses(robot.chain(), q).translation[0] - flange.translation[0]
+    assert moved == pytest.approx([1e-3 * reach[2], 0.0, -1e-3 * reach[0]], abs=2e-3)
+
+
+def test_derivatives_are_those_of_small_changes():
+    """At a ten-thousandth of usual deflections: the difference grows with them, as the bent arm's torques are those of
+    the rigid one."""
+    chain = bent(1e-4).chain()
+    q, values = vectors(bent()), elasticity_values(chain.elasticity)
+
+    def tips(moved) -> Poses:
+        return flange_poses(replace(chain, elasticity=with_values(chain.elasticity, moved)), q) @ TOOL
+
+    found = elasticity_jacobian(chain, q, tips(values))
+    for k, value in enumerate(values):
+        step = np.zeros(len(values))
+        step[k] = max(1e-3 * abs(value), 1e-10)
+        expected = tips(values + step).difference(tips(values - step)) / (2 * step[k])
+        size = np.abs(expected).max()
+        assert np.abs(found[:, :, k] - expected).max() < 1e-4 * size + 1e-4
+
+
+def test_rows_of_an_adjusted_chain_keep_its_deflections():
+    """Axes off by 1 mm and 1 mrad: frames turn and slide by as little, deflections of 0.2 mm change by under 1 µm."""
+    robot, rng = bent(), np.random.default_rng(2)
+    chain = robot.chain()
+    step = np.array([rng.normal(0, 1e-3 if c < 3 else 1.0) for _, c in chain_parameters(chain)])
+    moved = moved_chain(chain, step)
+    rows = robot_from_chain(moved, {"": TOOL}, robot)
+    q = vectors(robot)
+    reached = (flange_poses(moved, q) @ TOOL).difference(flange_poses(rows.chain(), q) @ rows.tools[""])
+    rigid = flange_poses(moved, q).difference(flange_poses(replace(moved, elasticity=None), q))
+    assert np.abs(rigid[:, 3:]).max() > 0.2
+    assert np.abs(reached[:, 3:]).max() < 1e-3
+    assert np.abs(reached[:, :3]).max() < 1e-12
+
+
+def test_a_file_reads_back_the_same(tmp_path):
+    path = tmp_path / "robot.toml"
+    path.write_text(robot_toml(bent()))
+    q = vectors(bent())
+    assert np.abs(forward(load_robot(path), q).difference(forward(bent(), q))).max() < 1e-9
+
+
+def test_gravity_alone_is_a_rigid_arm(tmp_path):
+    path = tmp_path / "robot.toml"
+    path.write_text(robot_toml(mh80()) + "\n[elasticity]\ngravity = [0, 1, 0]\n")
+    robot = load_robot(path)
+    assert robot.elasticity.gravity == pytest.approx([0, 1, 0])
+    q = vectors(robot)
+    assert np.abs(forward(robot, q).difference(forward(mh80(), q))).max() < 1e-9
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("gravity = [0, 0, 0]", "gravity is [0, 0, 0]"),
+        ("axis_rad_per_Nm = [1e-6]", "elasticity: axis_rad_per_Nm has 1 entries, 6 needed"),
+        ("stiffness = 3", "stiffness"),
+    ],
+)
+def test_mistakes_in_a_file_are_named(tmp_path, text, message):
+    path = tmp_path / "robot.toml"
+    path.write_text(f"{robot_toml(mh80())}\n[elasticity]\n{text}\n")
+    with pytest.raises(InputError) as error:
+        load_robot(path)
+    assert message in str(error.value)
+
+
+def test_joint_values_reach_a_pose_of_a_bent_arm():
+    robot = bent()
+    wanted = forward(robot, vectors(robot))
+    found = inverse(robot, wanted)
+    off = forward(robot, found.q).difference(wanted)
+    assert np.abs(off[:, 3:]).max() < 1e-8
