@@ -7,6 +7,7 @@ Driessen, Data Mining and Knowledge Discovery 12, 2006), and what the solution o
 uncertainty, makes unlikely is called an error.
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -27,6 +28,7 @@ HELD = 1e-4
 leaves open stays nominal within a hundred times the noise."""
 FALSE_ALARM = 1e-3
 """Probability that of all rows of a good set one is called wrong."""
+TINY = 1e-300
 ROUNDS, SEARCHES = 6, 2
 """Of linear solutions, the third of which is as good as exact; and searches, the second with σ of positions and
 orientations that the first one's solution leaves."""
@@ -52,17 +54,20 @@ class _Problem:
         held = (share @ normal).reshape(-1, k, k) + HELD * np.eye(k)
         return np.linalg.solve(held, (share @ pull)[:, :, None])[:, :, 0]
 
+    def left(self, steps: np.ndarray) -> np.ndarray:
+        """(s, r, w) what steps (s, k) leave."""
+        r, w, k = self.slope.shape
+        return (self.white.ravel() - steps @ self.slope.reshape(r * w, k).T).reshape(-1, r, w)
+
     def squares(self, steps: np.ndarray) -> np.ndarray:
         """Squared lengths (s, r) of what steps (s, k) leave."""
-        r, w, k = self.slope.shape
-        left = self.white.ravel() - steps @ self.slope.reshape(r * w, k).T
-        return (left.reshape(-1, r, w) ** 2).sum(2)
+        return (self.left(steps) ** 2).sum(2)
 
     def leverage(self, good: np.ndarray) -> np.ndarray:
-        """(r,) variance of a row's prediction by the good ones (r,), mean over its coordinates, in units of σ²."""
+        """(r, w) variance of a row's prediction by the good ones (r,), in units of σ²."""
         own = self.slope[good].reshape(-1, self.slope.shape[2])
         inverse = np.linalg.inv(own.T @ own + HELD * np.eye(own.shape[1]))
-        return np.einsum("rwa,ab,rwb->r", self.slope, inverse, self.slope) / self.slope.shape[1]
+        return ((self.slope @ inverse) * self.slope).sum(2)
 
 
 def agreeing(state: State, seen: Observed, weighting: Weighting) -> np.ndarray:
@@ -90,7 +95,8 @@ def agreeing(state: State, seen: Observed, weighting: Weighting) -> np.ndarray:
             return every
         before = good
         searched = step < SEARCHES
-        good = _tested(problem, _trimmed(problem, half) if searched else good, half if searched else None)
+        begin = _trimmed(problem, half) if searched else good
+        good = _tested(problem, begin, half if searched else None, list(weighting.columns(w).values()))
         state = moved(state, units * problem.solved(good[None])[0], seen.kind)
         if not searched and (good == before).all():
             break
@@ -135,23 +141,30 @@ def _smallest(squares: np.ndarray, wanted: int) -> np.ndarray:
     return masks
 
 
-def _tested(problem: _Problem, good: np.ndarray, half: int | None) -> np.ndarray:
-    """The rows that are within chance of the solution of the good ones, over again until they stay; ``half`` : how many
-    are good because they are the smallest."""
+def _tested(problem: _Problem, good: np.ndarray, half: int | None, kinds: Sequence[slice]) -> np.ndarray:
+    """The rows that are within chance of the solution of the good ones, over again until they stay.
+
+    ``half`` : how many are good because they are the smallest; ``kinds`` : columns of one σ each, which the good rows
+    tell: by one for both, positions of a small σ pass with what orientations of a large one allow.
+    """
     r, w, _ = problem.slope.shape
     for _ in range(STEPS):
-        squares = problem.squares(problem.solved(good[None]))[0]
+        squares = problem.left(problem.solved(good[None]))[0] ** 2
         leverage = problem.leverage(good)
-        redundancy = w * good.sum() - w * leverage[good].sum()
+        redundancy = w * good.sum() - leverage[good].sum()
         if redundancy < 1:
             return np.ones(r, bool)
-        variance = squares[good].sum() / redundancy
+        share = 1.0
         if half is not None:  # the mean of the smallest squares of so many
             limit = chi2.ppf(half / r, w)
-            variance /= chi2.cdf(limit, w + 2) / (half / r)
-            half = None
-        expected = w * variance * np.where(good, np.maximum(1 - leverage, 1e-3), 1 + leverage)
-        new = squares <= expected * ratio_limit(FALSE_ALARM / r, w, redundancy)
+            share, half = chi2.cdf(limit, w + 2) / (half / r), None
+        length = np.zeros(r)
+        for own in kinds:
+            left_over = max(squares[good, own].size - leverage[good, own].sum(), 1.0)
+            variance = max(squares[good, own].sum(), TINY) / left_over / share
+            apart = leverage[:, own].mean(1)
+            length += squares[:, own].sum(1) / variance / np.where(good, np.maximum(1 - apart, 1e-3), 1 + apart)
+        new = length <= w * ratio_limit(FALSE_ALARM / r, w, redundancy)
         if (new == good).all():
             break
         good = new
