@@ -20,11 +20,13 @@ All parameters are held to where they start by this σ, which nothing feels that
 ACCEPTED = 1e-4
 """In units of σ²: what a step may still promise when there have been enough. Along a flat direction, where Huber's
 weights make every step half as long as it should be, they are many and short."""
+ACCEPTED_ELASTIC = 0.05
+"""The same along bent valleys: 0.2 σ of what is hardly known."""
 STAYS_MM = 1e-3
 """σ of a movement that the observations never show."""
-LEAST_GAIN, LEAST_ELASTIC = 1e-9, 1e-5
-"""In units of σ²: what measurements without noise still gain by rounding; and what is not worth a step where compliance
-and moment, whose products bend, lie in a long valley: no parameter is moved by it by more than 0.003 σ."""
+LEAST_GAIN, LEAST_ELASTIC = 1e-9, 1e-3
+"""In units of σ²: what measurements without noise still gain by rounding; and what is not worth a step along the bent
+valleys of products of compliance and moment: no parameter is moved by it by more than 0.03 σ."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -153,6 +155,7 @@ def solve(
         found, gradient = _linearised(at.state, seen, weighting, limit)
         return NormalEquations(found.cost, found.normal, gradient) + kept(at.away)
 
+    accepted = ACCEPTED_ELASTIC if state.elastic else ACCEPTED
     found = minimise(
         _Away(state, np.zeros(len(hold))),
         linearise,
@@ -161,7 +164,7 @@ def solve(
         settled=SETTLED,
         least_gain=LEAST_ELASTIC if state.elastic else LEAST_GAIN,
         max_steps=MAX_STEPS,
-    ).required(f"{seen.data.where}: identification", "check the robot file and the outliers", ACCEPTED)
+    ).required(f"{seen.data.where}: identification", "check the robot file and the outliers", accepted)
     return replace(_linearised(found.state.state, seen, weighting, limit)[0], prior=hold)
 
 

@@ -1,0 +1,133 @@
+"""Elastic arms in ``stcal robot identify``: simulated arms as they leave the factory, measured over their ranges.
+
+.venv/bin/python scripts/studies/elastic_study.py [--draws 200] [--only TEXT]
+
+Each line is a kind of observation, a number of rows, and by how much links give way and gears err, in usual σ (0.017°
+at the usual torque about the axes, 0.006° across them, 0.006° of the gears). ``elastic taken`` : draws in which
+``auto`` did. RMS errors of positions at 50 new joint vectors, mm: ``rigid`` and ``elastic`` identified, and of
+``auto``. ``bound`` : RMS error of the elastic one over what the noise and these σ allow the best estimate (posterior
+covariance at the true arm, σ known). ``calibration`` : root of the mean square of its errors over their σ, as predicted.
+"""
+
+import argparse
+from dataclasses import dataclass, replace
+from functools import partial
+
+import numpy as np
+
+from stcal.geometry.rigid import Rigid
+from stcal.parallel import one_thread
+from stcal.robot.identify.adjustment import parameter_units
+from stcal.robot.identify.nominal import Deviations, NominalRows
+from stcal.robot.identify.residuals import State, jacobian, observed, tip_jacobian, tips
+from stcal.robot.identify.result import Identified, IdentifyOptions
+from stcal.robot.identify.solve import identify
+from stcal.robot.kinematics.example import mh80
+from stcal.robot.kinematics.model import Robot
+from stcal.synthetic.measured.arms import elastic, joint_vectors, made, measured, placed
+from stcal.workflows.cluster import executor_of
+
+NEW_POSES = 50
+SIGMA_MM, SIGMA_RAD = 0.05, 2e-4
+MADE = Deviations(length_mm=0.3, twist_rad=5e-4, zero_rad=7e-4)
+"""About what :func:`made` does to dimensions."""
+
+
+@dataclass(frozen=True)
+class Case:
+    """``kind`` of observations, ``rows``, and ``share`` of usual elasticity."""
+
+    kind: str
+    rows: int
+    share: float
+
+    def title(self) -> str:
+        """First cells of its line."""
+        return f"{self.kind} | {self.rows} | {self.share:g}"
+
+
+CASES = (
+    *(Case("position", rows, share) for share in (0.0, 0.5, 1.0, 3.0) for rows in (50, 100)),
+    *(Case("pose", 50, share) for share in (0.0, 1.0)),
+)
+
+
+def draw(case: Case, seed: int) -> tuple[bool, np.ndarray, np.ndarray]:
+    """Whether ``auto`` took the elastic one; mean squares of errors, mm², by rigid, elastic, auto and what is possible;
+    and of errors over σ, by the elastic one."""
+    rng = np.random.default_rng([CASES.index(case), seed])
+    tool = Rigid.exp(rng.normal(0, 0.5, 6) * [1, 1, 1, 200, 200, 200])
+    true = placed(made(mh80(), rng), Rigid.exp(rng.normal(0, 1, 6) * [1, 1, 1, 1000, 1000, 1000]), {"": tool})
+    if case.share:
+        true = elastic(true, rng, case.share)
+    data = measured(true, joint_vectors(true, case.rows, rng), rng, SIGMA_MM, SIGMA_RAD)
+    if case.kind == "position":
+        data = replace(data, rotations=None)
+    q = joint_vectors(true, NEW_POSES, rng)
+    found = {model: identify(mh80(), data, IdentifyOptions(model=model, folds=0)) for model in ("rigid", "elastic")}
+    found["auto"] = identify(mh80(), data, IdentifyOptions(model="auto", repeats=1))
+    squares = [(errors(each, true, q) ** 2).sum(1).mean() for each in found.values()]
+    least = possible(true, data, case, q)
+    normal = errors(found["elastic"], true, q) ** 2 / variances(found["elastic"], q)
+    return found["auto"].model == "elastic", np.array([*squares, least]), normal.mean()
+
+
+def errors(found: Identified, true: Robot, q: np.ndarray) -> np.ndarray:
+    """(m, 3) of positions in the instrument's frame, mm."""
+    really = tips(State(true.chain(), dict(true.tools)), q, ("",) * len(q))
+    return tips(found.state, q, ("",) * len(q)).translation - really.translation
+
+
+def variances(found: Identified, q: np.ndarray) -> np.ndarray:
+    """(m, 3) by its covariance, mm²."""
+    place = tip_jacobian(found.state, q, ("",) * len(q), found.seen.kind)[1][:, 3:]
+    adjusted = found.adjustment
+    covariance = adjusted.parts.covariance(np.zeros(len(adjusted.parts.least)))
+    return np.einsum("rik,kl,ril->ri", place, covariance, place)
+
+
+def possible(true: Robot, data, case: Case, q: np.ndarray) -> float:
+    """Mean square error, mm², of the best estimate: σ known, linear about the true arm."""
+    state = State(true.chain(), dict(true.tools), elastic=bool(case.share))
+    seen = observed(data)
+    derivative = jacobian(state, seen)
+    rows = NominalRows.about(state, parameter_units(derivative), mh80())
+    usual = Deviations()
+    known = replace(
+        MADE,
+        axis_rad=case.share * usual.axis_rad,
+        across_rad=case.share * usual.across_rad,
+        periodic_rad=case.share * usual.periodic_rad,
+    )
+    sigma = np.repeat([SIGMA_RAD, SIGMA_MM], 3)[-derivative.shape[1] :]
+    white = (derivative / sigma[:, None]).reshape(-1, derivative.shape[2])
+    held = rows.held(state, known, seen.kind)
+    units = parameter_units(derivative)
+    normal = (white.T @ white + held.normal()) * units[:, None] * units
+    covariance = np.linalg.pinv(normal, hermitian=True) * units[:, None] * units
+    place = tip_jacobian(state, q, ("",) * len(q), seen.kind)[1][:, 3:]
+    return float(np.einsum("rik,kl,ril->r", place, covariance, place).mean())
+
+
+@one_thread()
+def main() -> None:
+    """Run all cases; print."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--draws", type=int, default=200)
+    parser.add_argument("--only", default="", metavar="TEXT", help="cases whose lines begin so")
+    parser.add_argument("--scheduler", metavar="ADDRESS", help="hand the draws to this Dask cluster")
+    arguments = parser.parse_args()
+    print(f"{arguments.draws} draws each, simulated\n")
+    print("| observed | rows | usual σ × | elastic taken | rigid, mm | elastic, mm | auto, mm | bound | calibration |")
+    print("|---" * 9 + "|")
+    with executor_of(arguments.scheduler) as pool:
+        for case in (each for each in CASES if each.title().startswith(arguments.only)):
+            taken, squares, normal = zip(*pool.map(partial(draw, case), range(arguments.draws)), strict=True)
+            rms = np.sqrt(np.mean(squares, axis=0))
+            cells = [str(sum(taken)), *(f"{value:.3f}" for value in rms[:3])]
+            cells += [f"{rms[1] / rms[3]:.2f}", f"{np.sqrt(np.mean(normal)):.2f}"]
+            print(f"| {case.title()} | {' | '.join(cells)} |", flush=True)
+
+
+if __name__ == "__main__":
+    main()
