@@ -6,7 +6,8 @@ Each line is a kind of observation, a number of rows, and by how much links give
 at the usual torque about the axes, 0.006° across them, 0.006° of the gears). ``elastic taken`` : draws in which
 ``auto`` did. RMS errors of positions at 50 new joint vectors, mm: ``rigid`` and ``elastic`` identified, and of
 ``auto``. ``bound`` : RMS error of the elastic one over what the noise and these σ allow the best estimate (posterior
-covariance at the true arm, σ known). ``calibration`` : root of the mean square of its errors over their σ, as predicted.
+covariance at the true arm, σ known). ``calibration`` : root of the mean square of its errors over their σ, as
+predicted.
 """
 
 import argparse

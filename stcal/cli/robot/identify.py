@@ -78,6 +78,13 @@ def identify(
             "--partial", help="Keep parameters nominal that the data leave open, rather than refuse the data."
         ),
     ] = False,
+    adjust: Annotated[
+        str,
+        typer.Option(
+            metavar="WHAT",
+            help="Adjust base and tools (base,tool), also zero positions of joints (zeros), or their geometry, or all.",
+        ),
+    ] = "all",
     model: Annotated[
         Model,
         typer.Option(
@@ -93,6 +100,7 @@ def identify(
     report: ReportFile = None,
 ) -> None:
     """Identify the kinematics from poses, positions or distances; σ not given are estimated."""
+    from stcal.robot.identify.nominal import adjusted
     from stcal.robot.identify.report import identified_file, identified_page, identified_text
     from stcal.robot.identify.result import IdentifyOptions
     from stcal.robot.identify.solve import identify as identified_from
@@ -103,7 +111,9 @@ def identify(
     source = one_table(data_file, first, second, key, "DATA", quaternions=quaternions.value)
     data = read_measurements(source, nominal, quaternions.value)
     kind = observe.value if observe else None
-    options = IdentifyOptions(kind, sigma_mm, sigma_rad, robust, folds, seed=seed, partial=partial, model=model.value)
+    options = IdentifyOptions(
+        kind, sigma_mm, sigma_rad, robust, folds, seed=seed, partial=partial, model=model.value, adjust=adjusted(adjust)
+    )
     result = identified_from(nominal, data, options)
     say(identified_text(result, nominal))
     if out:

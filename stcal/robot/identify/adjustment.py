@@ -84,11 +84,18 @@ def _decorrelated(values: np.ndarray, common: np.ndarray) -> np.ndarray:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Held:
-    """Knowledge from elsewhere, linear about a state: ``value + jacobian @ step``, (p,), is 0 with σ ``sigma``."""
+    """Knowledge from elsewhere, linear about a state: ``value + jacobian @ step``, (p,), is 0 with σ ``sigma``;
+    ``fixed`` : (p,) which of it are conditions, of a σ that nothing feels."""
 
     value: np.ndarray
     jacobian: np.ndarray
     sigma: np.ndarray
+    fixed: np.ndarray
+
+    def conditions(self) -> np.ndarray:
+        """(k, k) of these alone."""
+        own = self.jacobian[self.fixed] / self.sigma[self.fixed, None]
+        return own.T @ own
 
     def normal(self) -> np.ndarray:
         """(k, k)"""
@@ -103,7 +110,8 @@ class Held:
 class Solution:
     """``state`` : adjusted; ``residuals`` : (r, w) rad, mm; ``weights`` : (r,) Huber's; ``normal`` : (k, k) whitened
     and weighted, of the observations alone; ``prior`` : (k, k) of what was held; ``units`` : (k,) that make each
-    parameter a movement of the tool of about 1 mm; ``cost`` : Huber's."""
+    parameter a movement of the tool of about 1 mm; ``cost`` : Huber's; ``conditions`` : (k, k) of them, and ``count``
+    how many."""
 
     state: State
     residuals: np.ndarray
@@ -112,17 +120,20 @@ class Solution:
     units: np.ndarray
     cost: float
     prior: np.ndarray
+    conditions: np.ndarray
+    count: int = 0
 
     def spectrum(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Of the j parameters of axes and tools: eigenvalues (j,), directions (j, j) in columns, and which the data
-        determine (j,). Of elasticity there is knowledge beforehand."""
+        determine (j,), or conditions. Of elasticity there is knowledge beforehand."""
         own = slice(len(self.units) - self.state.elastic_count)
-        values, directions = np.linalg.eigh(self.normal[own, own] * self.units[own, None] * self.units[own])
+        known = self.normal[own, own] + self.conditions[own, own]
+        values, directions = np.linalg.eigh(known * self.units[own, None] * self.units[own])
         return values, directions, values > 1 / USELESS_MM**2
 
     def rank(self) -> int:
         """Directions that the data determine."""
-        return int(self.spectrum()[2].sum())
+        return int(self.spectrum()[2].sum()) - self.count
 
     def inverse(self) -> np.ndarray:
         """(k, k) covariance of the parameters at unit weight."""
@@ -145,8 +156,10 @@ def solve(
     limit = huber_limit(seen.kind) if robust else np.inf
     first = _linearised(state, seen, weighting, limit)[0]
     hold, pull = _fixed(first, seen.kind), np.zeros(len(first.units))
+    conditions, count = np.zeros_like(hold), 0
     if held is not None:
         hold, pull = hold + held.normal(), held.pull()
+        conditions, count = held.conditions(), int(held.fixed.sum())
 
     def kept(away: np.ndarray) -> NormalEquations:
         return NormalEquations(float(away @ (hold @ away + 2 * pull)), hold, hold @ away + pull)
@@ -165,7 +178,8 @@ def solve(
         least_gain=LEAST_ELASTIC if state.elastic else LEAST_GAIN,
         max_steps=MAX_STEPS,
     ).required(f"{seen.data.where}: identification", "check the robot file and the outliers", accepted)
-    return replace(_linearised(found.state.state, seen, weighting, limit)[0], prior=hold)
+    solution = _linearised(found.state.state, seen, weighting, limit)[0]
+    return replace(solution, prior=hold, conditions=conditions, count=count)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -209,7 +223,8 @@ def _linearised(state: State, seen: Observed, weighting: Weighting, limit: float
     weighted = flat * np.repeat(weights, white.shape[1])[:, None]
     cost = float(huber_cost(np.linalg.norm(white, axis=1), limit).sum())
     normal = weighted.T @ flat
-    return Solution(state, found, weights, normal, units, cost, np.zeros_like(normal)), -weighted.T @ white.ravel()
+    none = np.zeros_like(normal)
+    return Solution(state, found, weights, normal, units, cost, none, none), -weighted.T @ white.ravel()
 
 
 def parameter_units(derivative: np.ndarray) -> np.ndarray:

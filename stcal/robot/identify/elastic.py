@@ -14,7 +14,7 @@ from stcal.robot.kinematics.forward import elasticity_values
 from stcal.robot.kinematics.model import Chain, Elasticity, Robot
 
 AXIS, ACROSS, PERIODIC, MOMENT = 3, 4, 5, 6
-"""Groups of σ, after those of the dimensions; that of moments is not estimated."""
+"""Groups of σ, after those of the dimensions; that of moments, and those after it, are not estimated."""
 MASS_KG = 100.0
 """Of an arm of one metre, growing with the square of its length, from the first link to the last falling to nothing:
 0.6 m 25 kg, 1.2 m 116, 2.1 m 550 are sold. Compliances make up for what it is wrong by, so that 3 times is no harm."""

@@ -38,6 +38,12 @@ class Element(Part):
     sigma: float
 
 
+class FixedDimension(Part):
+    joint: int
+    dimension: str
+    reason: str | None
+
+
 class ModelsCompared(Part):
     rigid_mm: float
     elastic_mm: float
@@ -84,6 +90,13 @@ class IdentifiedFile(ResultFile):
         description="directions kept nominal (`--partial`), each once, by its parameters: `J2 y (with tool z and J1 x)`"
     )
     notes: list[str] = Field(description="rows left out; what is to be known of the rows found")
+    fixed: list[FixedDimension] = Field(
+        description="dimensions that were not adjusted (`--adjust`, or `fixed` in the robot file): `joint`, "
+        "`dimension`, and the file's `reason`"
+    )
+    all_held_out_rms_mm: float | None = Field(
+        description="RMS error of held-out rows were all adjusted; null where all are, or rows are too few"
+    )
     model: Literal["rigid", "elastic"] = Field(description="that was identified")
     models: ModelsCompared | None = Field(
         description="where both were tried: RMS errors of held-out rows by both, `rigid_mm` and `elastic_mm`; mean by "

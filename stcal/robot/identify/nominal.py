@@ -1,10 +1,13 @@
 """What the nominal D-H rows are worth: dimensions as made differ from the drawing by σ that the data show."""
 
+from collections.abc import Mapping
 from dataclasses import asdict, astuple, dataclass
+from typing import Literal
 
 import numpy as np
 from scipy.linalg import block_diag
 
+from stcal.errors import InputError
 from stcal.robot.identify.adjustment import Held
 from stcal.robot.identify.elastic import UsualElasticity, usual
 from stcal.robot.identify.residuals import Kind, State, unknowns
@@ -20,6 +23,34 @@ COAXIAL_MM = 100.0
 """Of parallel axes closer than this an error of length across them turns θ by more than zero positions err (0.5 mm over
 5 mrad)."""
 LENGTH, TWIST, ZERO = 0, 1, 2
+FIXED_LENGTH, FIXED_ANGLE = 7, 8
+FIXED_MM, FIXED_RAD = 1e-4, 1e-7
+"""σ of dimensions that are not adjusted: a ten-thousandth of a millimetre at 1 m."""
+Adjusted = Literal["all", "geometry", "zeros", "base,tool"]
+KEPT: Mapping[Adjusted, tuple[int, ...]] = {
+    "all": (),
+    "geometry": (ZERO,),
+    "zeros": (LENGTH, TWIST),
+    "base,tool": (LENGTH, TWIST, ZERO),
+}
+"""Groups of dimensions that stay nominal; base and tools are always adjusted."""
+DIMENSIONS = ("a", "alpha", "d", "theta", "beta")
+
+
+def adjusted(text: str) -> Adjusted:
+    """Of names with commas between them: base and tool are always meant.
+
+    Raises
+    ------
+    InputError
+        Another name.
+    """
+    words = {word.strip() for word in text.split(",")}
+    if not words <= {"base", "tool", "zeros", "geometry", "all"}:
+        raise InputError(f"--adjust {text}: base,tool, zeros, geometry or all needed")
+    if "all" in words or {"zeros", "geometry"} <= words:
+        return "all"
+    return "zeros" if "zeros" in words else "geometry" if "geometry" in words else "base,tool"
 
 
 @dataclass(frozen=True, slots=True)
@@ -71,8 +102,9 @@ class NominalRows:
         return own if self.elasticity is None else np.append(own, self.elasticity.group)
 
     @classmethod
-    def about(cls, state: State, units: np.ndarray, nominal: Robot) -> "NominalRows":
-        """With the derivatives at ``state``, where ``units`` (k,) of the parameters move the tool by 1 mm."""
+    def about(cls, state: State, units: np.ndarray, nominal: Robot, adjust: Adjusted = "all") -> "NominalRows":
+        """With the derivatives at ``state``, where ``units`` (k,) of the parameters move the tool by 1 mm; dimensions
+        that ``adjust`` or the robot file keep are conditions."""
         coaxial = _coaxial(nominal)
 
         def values(step: np.ndarray) -> np.ndarray:
@@ -88,6 +120,9 @@ class NominalRows:
         group = np.tile([LENGTH, TWIST, LENGTH, ZERO, TWIST], (len(jacobian), 1))
         group[nominal.prismatic, 3] = TWIST  # the zero of these is d
         group[[turn for turn, _ in coaxial], 3] = LENGTH
+        kept = np.isin(group, KEPT[adjust])
+        kept |= [[name in joint.fixed for name in DIMENSIONS] for joint in nominal.joints]
+        group[kept] = np.where(group[kept] == LENGTH, FIXED_LENGTH, FIXED_ANGLE)
         elasticity = usual(nominal.chain()) if state.elastic else None
         return cls(nominal, coaxial, jacobian, np.abs(jacobian * units).max(axis=2) > 1e-9, group, elasticity)
 
@@ -101,11 +136,23 @@ class NominalRows:
         if self.elasticity is not None:
             by = np.asarray(block_diag(by, np.diag(self.elasticity.scale)))
             value = np.append(value, self.elasticity.away(state.chain))
-        return Held(value, by, np.array([*astuple(deviations), 1.0])[self.groups])
+        sigma = np.array([*astuple(deviations), 1.0, FIXED_MM, FIXED_RAD])[self.groups]
+        return Held(value, by, sigma, self.groups >= FIXED_LENGTH)
+
+    @property
+    def fixed(self) -> np.ndarray:
+        """(n, 5) dimensions that could be adjusted, and are not."""
+        return (self.group >= FIXED_LENGTH) & self.free
 
     def notes(self, robot: Robot) -> tuple[str, ...]:
         """What is to be known of the rows of ``robot``."""
-        return tuple(
+        reasons = [
+            f"{name} of row {i} ({reason})"
+            for i, joint in enumerate(self.nominal.joints, 1)
+            for name, reason in joint.fixed.items()
+        ]
+        fixed = (f"kept as the robot file has them: {', '.join(reasons)}",) if reasons else ()
+        return fixed + tuple(
             f"joints {turn + 1} and {turn + 2} lie nearly on one line: theta of row {turn + 1} is the direction of the "
             f"{robot.rows[reach].a:.3g} mm between them, not a zero position"
             for turn, reach in self.coaxial
@@ -121,7 +168,8 @@ class NominalRows:
             jacobian[reach, 0] = np.cos(angle) * along + np.sin(angle) * across
             offset = max(abs(robot.rows[reach].a), 1e-9)
             jacobian[turn, 3] = (np.cos(angle) * across - np.sin(angle) * along) / offset
-        return np.sqrt(np.einsum("njk,kl,njl->nj", jacobian, covariance, jacobian).clip(0))
+        sigma = np.sqrt(np.einsum("njk,kl,njl->nj", jacobian, covariance, jacobian).clip(0))
+        return np.where(self.fixed, 0.0, sigma)
 
 
 def _dimensions(robot: Robot, nominal: Robot, coaxial: tuple[tuple[int, int], ...]) -> np.ndarray:

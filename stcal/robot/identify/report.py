@@ -8,13 +8,13 @@ from stcal.report.figure import COLOURS, calm, new_figure, uri
 from stcal.report.page import render
 from stcal.report.text import NONE, number, text_table
 from stcal.robot.identify.files import IdentifiedFile
-from stcal.robot.identify.nominal import dh_values
+from stcal.robot.identify.nominal import DIMENSIONS, dh_values
 from stcal.robot.identify.observability import MEANING
 from stcal.robot.identify.result import Identified
 from stcal.robot.kinematics.forward import links, torques
 from stcal.robot.kinematics.model import Elasticity, Robot
 
-DH = ("a", "alpha", "d", "theta", "beta")
+DH = DIMENSIONS
 UNITS = ("mm", "deg", "mm", "deg", "deg")
 SHOWN = np.array([1.0, 180 / np.pi, 1.0, 180 / np.pi, 180 / np.pi])
 PLACE = ("x", "y", "z", "rx", "ry", "rz")
@@ -30,6 +30,7 @@ def identified_text(result: Identified, nominal: Robot) -> str:
         f"robot {nominal.name}: {_observations(result)}, {result.rank} parameters determined "
         f"(what these joint values determine: {kinds})",
         _noise(result),
+        *_price(result),
         *_model(result),
     ]
     errors = [[name, *(number(v, 4) for v in _statistics(each))] for name, each in _errors(result).items()]
@@ -69,6 +70,11 @@ def identified_file(result: Identified, nominal: Robot) -> IdentifiedFile:
         "ranks": result.ranks,
         "undetermined": list(result.undetermined),
         "notes": list(result.notes),
+        "fixed": [
+            {"joint": i + 1, "dimension": DIMENSIONS[k], "reason": nominal.joints[i].fixed.get(DIMENSIONS[k])}
+            for i, k in np.argwhere(result.adjustment.rows.fixed).tolist()
+        ],
+        "all_held_out_rms_mm": result.all_held_out and _statistics(result.all_held_out.position_mm)[1],
         "model": result.model,
         "models": None if result.gain is None else asdict(result.gain),
         "elasticity": _elasticity(result),
@@ -122,7 +128,7 @@ def identified_page(result: Identified, nominal: Robot) -> str:
         observations=_observations(result),
         errors=[[name, *(number(v, 4) for v in _statistics(e))] for name, e in _errors(result).items()],
         noise=_noise(result),
-        model=_model(result),
+        model=[*_price(result), *_model(result)],
         elastic=elastic_rows(result),
         elastic_head=ELASTIC,
         errors_by_row=uri(_figure(result)),
@@ -138,6 +144,18 @@ def identified_page(result: Identified, nominal: Robot) -> str:
             [_place(result, i), number(error, 3), number(result.weights[i], 2)] for i, error in result.outliers()
         ],
     )
+
+
+def _price(result: Identified) -> list[str]:
+    """What is kept as it was, and what that costs."""
+    rows = result.adjustment.rows
+    if not rows.fixed.any():
+        return []
+    said = f"adjusted: base, tools and {int((rows.free & ~rows.fixed).sum())} of {int(rows.free.sum())} dimensions"
+    if result.held_out is None or result.all_held_out is None:
+        return [said]
+    own, every = (_statistics(each.position_mm)[1] for each in (result.held_out, result.all_held_out))
+    return [f"{said}; rows held out err by {own:.3g} mm RMS, by {every:.3g} were all dimensions adjusted"]
 
 
 def _model(result: Identified) -> list[str]:

@@ -11,7 +11,7 @@ from stcal.robot.identify.adjustment import (
     Solution,
     Weighting,
 )
-from stcal.robot.identify.nominal import Deviations, NominalRows
+from stcal.robot.identify.nominal import Adjusted, Deviations, NominalRows
 from stcal.robot.identify.observability import ObservabilityIndices
 from stcal.robot.identify.predicted import Predicted
 from stcal.robot.identify.residuals import (
@@ -51,6 +51,9 @@ class IdentifyOptions:
         Of the divisions.
     partial : bool
         Keep nominal what the data do not determine, in place of refusing them.
+    adjust : {"all", "geometry", "zeros", "base,tool"}
+        Dimensions to adjust beside base and tools: all, all but the joints' zero positions, these alone, or none. What
+        the robot file calls fixed stays in any case.
     model : {"rigid", "elastic", "auto"}
         Whether links give way to gravity and gears turn unevenly; ``auto`` takes what predicts held-out rows better by
         more than chance, and rigid where neither does.
@@ -70,6 +73,7 @@ class IdentifyOptions:
     seed: int = 0
     partial: bool = False
     model: Model = "rigid"
+    adjust: Adjusted = "all"
 
     def __post_init__(self):
         for name, value, most in (("sigma_mm", self.sigma_mm, 1e3), ("sigma_rad", self.sigma_rad, 1.0)):
@@ -168,6 +172,8 @@ class Identified:
         σ of the robot's elasticity where it was adjusted.
     gain : Gain or None
         Where both models were tried.
+    all_held_out : HeldOutRows or None
+        Errors of the cross-validation with all dimensions adjusted, where some are kept.
     notes : tuple of str
         Rows left out, and what is to be known of the result.
     """
@@ -188,6 +194,7 @@ class Identified:
     deviations: dict[str, float | None]
     elasticity_sigma: Elasticity | None
     gain: Gain | None
+    all_held_out: HeldOutRows | None
     notes: tuple[str, ...]
 
     def __post_init__(self):

@@ -118,8 +118,9 @@ def identify(robot: Robot, data: Measurements, options: IdentifyOptions | None =
     seen = observed(data, options.observe)
     _still_joints(robot, data, options.partial)
     first = start(robot, data)
-    _enough(seen, first)
-    adjusted, held_out, gain = _modelled(robot, first, seen, options)
+    rows = NominalRows.about(first, parameter_units(jacobian(first, seen)), robot, options.adjust)
+    _enough(seen, first, rows)
+    adjusted, held_out, gain = _modelled(robot, first, seen, options, rows)
     solution = adjusted.solution
     names = parameter_names(solution.state, seen.kind)
     undetermined = _undetermined(solution, names, seen, options.partial)
@@ -146,6 +147,7 @@ def identify(robot: Robot, data: Measurements, options: IdentifyOptions | None =
         deviations=adjusted.deviations.of(adjusted.rows.groups),
         elasticity_sigma=_elasticity_sigma(solution.state, every),
         gain=gain,
+        all_held_out=_with_all(robot, first, seen, options) if rows.fixed.any() else None,
         notes=data.notes
         + adjusted.rows.notes(identified)
         + adjusted.notes
@@ -154,15 +156,15 @@ def identify(robot: Robot, data: Measurements, options: IdentifyOptions | None =
 
 
 def _modelled(
-    robot: Robot, first: State, seen: Observed, options: IdentifyOptions
+    robot: Robot, first: State, seen: Observed, options: IdentifyOptions, rows: NominalRows
 ) -> tuple[Adjustment, HeldOutRows | None, Gain | None]:
     """Adjusted by the model that is asked for, or that predicts better by more than chance."""
-    rigid = _adjusted(robot, first, seen, options)
+    rigid = _adjusted(first, seen, options, rows)
     if options.model == "rigid":
         return rigid, _cross_validated(robot, seen, rigid, options), None
     _undetermined(rigid.solution, parameter_names(first, seen.kind), seen, options.partial)
     state = bending(rigid.solution.state, robot, rigid.deviations.axis_rad)
-    rows = NominalRows.about(state, parameter_units(jacobian(state, seen)), robot)
+    rows = NominalRows.about(state, parameter_units(jacobian(state, seen)), robot, options.adjust)
     good = rigid.solution.weights >= GROSS
     good |= good.mean() < MOSTLY_GOOD
     elastic = _without_errors(state, seen, good, options, (rows, rigid.weighting, rigid.deviations))
@@ -193,8 +195,8 @@ def _still_joints(robot: Robot, data: Measurements, partial: bool) -> None:
             )
 
 
-def _enough(seen: Observed, state: State) -> None:
-    seeks = len(parameter_names(state, seen.kind)) - unseen(seen.kind)
+def _enough(seen: Observed, state: State, rows: NominalRows) -> None:
+    seeks = len(parameter_names(state, seen.kind)) - unseen(seen.kind) - int(rows.fixed.sum())
     numbers = WIDTH[seen.kind] * len(seen)
     if numbers <= seeks:
         needed = seeks // WIDTH[seen.kind] + 1
@@ -218,9 +220,15 @@ def _weighting(state: State, seen: Observed, options: IdentifyOptions) -> Weight
     return weighting.with_values({n: weighting.value(n) * max(misfit[n], 1.0) for n in estimated})
 
 
-def _adjusted(robot: Robot, state: State, seen: Observed, options: IdentifyOptions) -> Adjustment:
+def _with_all(robot: Robot, first: State, seen: Observed, options: IdentifyOptions) -> HeldOutRows | None:
+    """Held-out errors of a rigid arm of which all dimensions are adjusted."""
+    free = replace(robot, joints=tuple(replace(joint, fixed={}) for joint in robot.joints))
+    rows = NominalRows.about(first, parameter_units(jacobian(first, seen)), free)
+    return _cross_validated(robot, seen, _adjusted(first, seen, options, rows), options)
+
+
+def _adjusted(state: State, seen: Observed, options: IdentifyOptions, rows: NominalRows) -> Adjustment:
     """Solve with the observations that agree, and estimate σ."""
-    rows = NominalRows.about(state, parameter_units(jacobian(state, seen)), robot)
     good = np.ones(len(seen), bool)
     if options.robust:
         good = agreeing(state, seen, _weighting(state, seen, options))
@@ -300,7 +308,8 @@ def _undetermined(solution: Solution, names: list[str], seen: Observed, partial:
     if not partial:
         first = ", ".join(found[:4]) + (" …" if len(found) > 4 else "")
         raise DegenerateError(
-            f"{seen.data.where}: the data determine {solution.rank()} of {len(names) - expected} parameters, open are "
+            f"{seen.data.where}: the data determine {solution.rank()} of {len(names) - expected - solution.count} "
+            "parameters, open are "
             f"{first}; measure more varied poses (`stcal robot design`), or keep the nominal values of these with "
             "--partial"
         )
@@ -368,6 +377,7 @@ def _cross_validated(robot: Robot, seen: Observed, whole: Adjustment, options: I
             others = np.setdiff1d(np.arange(rows), place)
             train, test = only_of(seen, others), only_of(seen, place)
             seeks = unknowns(robot.chain(), len(set(train.data.targets)), seen.kind) - unseen(seen.kind)
+            seeks -= whole.solution.count
             if WIDTH[seen.kind] * len(train) <= seeks:
                 return None
             state = _of_targets(whole.solution.state, train)

@@ -111,7 +111,7 @@ def components(
             fixed = fixed + _linear(white, derivative, columns, weight)
     held, group = rows.held(solution.state, deviations, seen.kind), rows.groups
     e, j = held.value / held.sigma, held.jacobian * units / held.sigma[:, None]
-    fixed = fixed + NormalEquations.of(e[group == MOMENT], j[group == MOMENT])
+    fixed = fixed + NormalEquations.of(e[group >= MOMENT], j[group >= MOMENT])
     for g, (sigma, expected) in enumerate(zip(astuple(deviations), astuple(Deviations()), strict=True)):
         mine = group == g
         if mine.any():

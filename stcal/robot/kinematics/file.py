@@ -2,6 +2,7 @@
 
 from collections.abc import Sequence
 from pathlib import Path
+from typing import Literal
 
 import numpy as np
 from pydantic import Field
@@ -34,6 +35,7 @@ class _JointFile(Strict):
     max_deg: Finite | None = None
     min_mm: Finite | None = None
     max_mm: Finite | None = None
+    fixed: dict[Literal["a_mm", "alpha_deg", "d_mm", "theta_deg", "beta_deg"], str] = Field(default_factory=dict)
 
 
 class _ElasticityFile(Strict):
@@ -118,7 +120,10 @@ def _joint(j: _JointFile, where: str) -> Joint:
         raise InputError(f"{where}: min_{mine} {lower:g} is not below max_{mine} {upper:g}; swap or correct them")
     unit = np.pi / 180 if mine == "deg" else 1.0
     return Joint(
-        j.type, -np.inf if lower is None else float(lower * unit), np.inf if upper is None else float(upper * unit)
+        j.type,
+        -np.inf if lower is None else float(lower * unit),
+        np.inf if upper is None else float(upper * unit),
+        {key.partition("_")[0]: reason for key, reason in j.fixed.items()},
     )
 
 
@@ -157,6 +162,9 @@ def robot_toml(robot: Robot, comments: Sequence[str] = ()) -> str:
             for end, value in (("min", joint.lower), ("max", joint.upper))
             if np.isfinite(value)
         ]
+        if joint.fixed:
+            reasons = (f"{_KEYS[name]} = {toml_string(reason)}" for name, reason in joint.fixed.items())
+            lines.append(f"fixed = {{ {', '.join(reasons)} }}")
     lines += ["", "[base]  # of the robot, in the frame of the instrument", *_pose_lines(robot.world_from_base)]
     lines += ["", "[tool]  # in the frame of the flange", *_pose_lines(robot.tools.get("", Rigid()))]
     for name, tool in robot.tools.items():
@@ -208,6 +216,9 @@ _FORM = {
     "standard": "Rz(theta + q) Tz(d) Tx(a) Rx(alpha) Ry(beta)",
     "modified": "Rx(alpha) Tx(a) Ry(beta) Rz(theta + q) Tz(d)",
 }
+
+
+_KEYS = {"a": "a_mm", "alpha": "alpha_deg", "d": "d_mm", "theta": "theta_deg", "beta": "beta_deg"}
 
 
 def _pose_lines(pose: Rigid) -> list[str]:

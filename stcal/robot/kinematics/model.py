@@ -62,11 +62,14 @@ class Joint:
         Whether it turns about its axis or slides along it.
     lower, upper : float
         Limits of the controller's value, rad or mm; unlimited where not given.
+    fixed : mapping of str to str
+        Dimensions of the joint's row, by the names of :class:`DHRow`, that no identification changes, and why.
     """
 
     type: JointType = "revolute"
     lower: float = -np.inf
     upper: float = np.inf
+    fixed: Mapping[str, str] = field(default_factory=dict, hash=False)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
