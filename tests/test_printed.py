@@ -18,7 +18,6 @@ NOT_YET = {
     "README.md: 51 positions model mean, mm std, mm max, mm mean",  # reproduce_robot.py
     "README.md: poses accepted ambiguous wrong branch off by > 5°",  # locate_study.py
     "README.md: method poses error / bound error / σ",  # handeye_study.py
-    "README.md: first population median worst within 0.1 % within",  # reproduce_handeye.py
     "README.md: trial published as published + centres of blurred",  # reproduce_paper.py
     "README.md: face as published + centres of blurred edges + ec",
     "README.md: face position, µm predicted σ, µm rotation, mdeg",
