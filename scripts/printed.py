@@ -12,6 +12,7 @@ import re
 import shlex
 import subprocess
 import sys
+import tempfile
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -22,6 +23,8 @@ MARK = re.compile(r"<!-- printed by: (.+?) -->")
 FIRST = re.compile(r"# (.+), at commit ([0-9a-f]{7,40})(, .+)?")
 FIGURE = re.compile(r"[-+±]?\d+(?:\.\d+)?")
 DECIMAL = re.compile(r"\d\.\d")
+TEMPORARY = re.compile(re.escape(tempfile.gettempdir()) + r"/[^/\s]+")
+"""A folder made for one run; … where it was printed."""
 LEAST_DECIMALS = 5
 """In a block without a language, so that it is one of figures; examples of commands have fewer."""
 LEAST_CELLS = 4
@@ -148,8 +151,9 @@ def _alike(one: str, two: str, digits: float) -> bool:
 def run(command: str) -> list[str]:
     """What the command prints now."""
     script, *arguments = shlex.split(command)
-    words = [sys.executable, str(ROOT / script), *arguments]
-    return subprocess.run(words, capture_output=True, text=True, check=True, cwd=ROOT).stdout.splitlines()
+    words = [*([sys.executable] if script.endswith(".py") else []), str(ROOT / script), *arguments]
+    printed = subprocess.run(words, capture_output=True, text=True, check=True, cwd=ROOT).stdout
+    return TEMPORARY.sub("…", printed).splitlines()
 
 
 def main() -> None:

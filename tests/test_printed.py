@@ -1,6 +1,7 @@
 """Figures of the documents are those that their scripts printed, cell by cell, and the scripts print them still."""
 
 import shlex
+import tempfile
 
 import pytest
 
@@ -14,13 +15,9 @@ FACTS: set[str] = set()
 data_layout.md holds formats and options, which tests/test_documents.py compares with the code."""
 
 NOT_YET = {
-    "README.md: simulated photographs of the reference target: 4",  # scripts/demo
-    "README.md: clean, cross-check with the native COLMAP:",  # scripts/studies/measure_shared.py
     "README.md: 51 positions model mean, mm std, mm max, mm mean",  # reproduce_robot.py
     "README.md: poses accepted ambiguous wrong branch off by > 5°",  # locate_study.py
     "README.md: method poses error / bound error / σ",  # handeye_study.py
-    "README.md: first population median worst within 0.1 % within",  # reproduce_handeye.py
-    "README.md: clean, corrected, joint adjustment: 24 of 24 imag",  # measure_shared.py
     "README.md: trial published as published + centres of blurred",  # reproduce_paper.py
     "README.md: face as published + centres of blurred edges + ec",
     "README.md: face position, µm predicted σ, µm rotation, mdeg",
@@ -121,3 +118,10 @@ def test_a_stored_file_says_command_and_commit(tmp_path, monkeypatch):
     path.write_text("# scripts/some.py --only two, at commit 5a02514\n1 2\n")
     with pytest.raises(ValueError, match="needed"):
         printed.stored("scripts/some.py --only one")
+
+
+def test_a_program_is_run_and_its_temporary_folder_is_not_named(tmp_path, monkeypatch):
+    monkeypatch.setattr(printed, "ROOT", tmp_path)
+    (tmp_path / "some").write_text(f'#!/bin/sh\necho "faces:  {tempfile.gettempdir()}/demo-x1/run/$1.json"\n')
+    (tmp_path / "some").chmod(0o755)
+    assert printed.run("some faces") == ["faces:  …/run/faces.json"]
