@@ -63,7 +63,10 @@ class IdentifiedFile(ResultFile):
     undetermined: list[str] = Field(
         description="directions kept nominal (`--partial`), each once, by its parameters: `J2 y (with tool z and J1 x)`"
     )
-    notes: list[str] = Field(description="rows left out; what is to be known of the rows found")
+    notes: list[str] = Field(
+        description="rows left out, columns that were not read, angles by their convention; what is to be known of the "
+        "rows found"
+    )
     sigma_mm: float | None = Field(
         description="of one coordinate, given or estimated (null where each row has its own)"
     )
