@@ -79,6 +79,14 @@ Quaternions = Annotated[
         help="Take quaternions as their columns are named, wxyz, or in the order in which these stand, xyzw.",
     ),
 ]
+Rotation = Annotated[
+    str | None,
+    typer.Option(
+        "--rotation",
+        help="Read angles of unnamed convention like this: kuka-abc, fanuc-wpr, ur-rotvec, yaskawa …, rotvec, xyz "
+        "(fixed axes), ZYX (turned axes).",
+    ),
+]
 MinDiameter = Annotated[
     float | None,
     typer.Option(

@@ -6,7 +6,17 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from stcal.cli.options import FirstTable, JsonFile, Key, ReportFile, RobotFile, SecondTable, name_of, one_table
+from stcal.cli.options import (
+    FirstTable,
+    JsonFile,
+    Key,
+    ReportFile,
+    RobotFile,
+    Rotation,
+    SecondTable,
+    name_of,
+    one_table,
+)
 from stcal.cli.terminal import print_each, say, write
 from stcal.errors import InputError
 
@@ -35,6 +45,7 @@ def axes(
             "is worth one of position; auto, by their stated σ and not without, or off."
         ),
     ] = "auto",
+    rotation: Rotation = None,
     first: FirstTable = None,
     second: SecondTable = None,
     key: Key = "image",
@@ -49,7 +60,7 @@ def axes(
 
     nominal = load_robot(robot_file)
     source = one_table(sweeps, first, second, key, "SWEEPS")
-    data = read_measurements(source, nominal)
+    data = read_measurements(source, nominal, rotation=rotation)
     length_mm = _length(orientations, data)
     result = robot_from_sweeps(data, nominal, math.radians(still_deg), length_mm)
     say(axes_text(result))

@@ -12,6 +12,7 @@ from stcal.cli.options import (
     QuaternionOrder,
     Quaternions,
     ReportFile,
+    Rotation,
     SecondTable,
     one_table,
 )
@@ -34,6 +35,7 @@ def compensate(
         ),
     ] = None,
     quaternions: Quaternions = QuaternionOrder.wxyz,
+    rotation: Rotation = None,
     first: FirstTable = None,
     second: SecondTable = None,
     key: Key = "pose",
@@ -47,11 +49,12 @@ def compensate(
 
     identified = load_robot(robot_file)
     source = one_table(targets, first, second, key, "TARGETS", quaternions=quaternions.value)
-    wanted = read_targets(source, identified, quaternions.value)
+    wanted = read_targets(source, identified, quaternions.value, rotation)
     result = stage.compensate(identified, wanted, load_robot(nominal) if nominal else None)
     say(stage.compensated_text(result, identified))
     for line in stage.compensated_summary(result):
         say(line)
+    print_each(f"note: {wanted.where}", wanted.notes)
     print_each(f"warning: {wanted.where}", result.notes())
     if out:
         write(out, stage.compensated_csv(result, identified))

@@ -15,6 +15,7 @@ from stcal.cli.options import (
     Quaternions,
     ReportFile,
     RobotFile,
+    Rotation,
     SecondTable,
     name_of,
     one_table,
@@ -93,6 +94,7 @@ def identify(
         ),
     ] = Model.rigid,
     quaternions: Quaternions = QuaternionOrder.wxyz,
+    rotation: Rotation = None,
     first: FirstTable = None,
     second: SecondTable = None,
     key: Key = "image",
@@ -109,7 +111,7 @@ def identify(
 
     nominal = load_robot(robot_file)
     source = one_table(data_file, first, second, key, "DATA", quaternions=quaternions.value)
-    data = read_measurements(source, nominal, quaternions.value)
+    data = read_measurements(source, nominal, quaternions.value, rotation)
     kind = observe.value if observe else None
     options = IdentifyOptions(
         kind, sigma_mm, sigma_rad, robust, folds, seed=seed, partial=partial, model=model.value, adjust=adjusted(adjust)

@@ -42,6 +42,7 @@ def verify(
     source = tables if isinstance(tables, Path) else stack(tables, [path.stem for path in seconds or ()], {"pose": key})
     result = stage.verify(stage.read_measured(source))
     say(stage.verified_text(result))
+    print_each("note", result.notes)
     print_each("warning", result.warnings())
     if plot:
         from stcal.robot.use.report import figure_bytes, verification_figure

@@ -106,5 +106,6 @@ class AxesFile(ResultFile):
         "without them, signed as `a`"
     )
     notes: list[str] = Field(
-        description="rows left out as grossly wrong, reflectors too close to an axis, arcs too short"
+        description="rows left out as grossly wrong, reflectors too close to an axis, arcs too short; columns that "
+        "were not read, angles by their convention"
     )

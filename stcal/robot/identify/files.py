@@ -89,7 +89,10 @@ class IdentifiedFile(ResultFile):
     undetermined: list[str] = Field(
         description="directions kept nominal (`--partial`), each once, by its parameters: `J2 y (with tool z and J1 x)`"
     )
-    notes: list[str] = Field(description="rows left out; what is to be known of the rows found")
+    notes: list[str] = Field(
+        description="rows left out, columns that were not read, angles by their convention; what is to be known of the "
+        "rows found"
+    )
     fixed: list[FixedDimension] = Field(
         description="dimensions that were not adjusted (`--adjust`, or `fixed` in the robot file): `joint`, "
         "`dimension`, and the file's `reason`"

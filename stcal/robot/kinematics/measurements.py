@@ -11,6 +11,7 @@ from stcal.geometry.arrays import Array, freeze
 from stcal.geometry.rigid import Poses
 from stcal.io.quaternions import Order
 from stcal.io.table import ANGLES, LENGTHS, Table, read_table
+from stcal.robot.kinematics.columns import oriented, unread
 from stcal.robot.kinematics.damped import reach_mm
 from stcal.robot.kinematics.model import Robot
 
@@ -21,6 +22,7 @@ MAX_TURNS = 4
 """Joint values beyond so many turns are degrees in a column of radians."""
 LONGEST_TOOL_MM = 10_000.0
 """What a target may be from the flange, beyond all that the arm reaches: no tool is as long."""
+ORIENTATION = "columns qw, qx, qy, qz, or angles like w_deg, p_deg, r_deg,"
 FARTHEST = {"mm": 1e7, "rad": 100 * 2 * np.pi}
 """10 km and a hundred turns: what is beyond is no length and no joint value."""
 
@@ -53,7 +55,7 @@ class Measurements:
     from_row : (m,) array of int, optional
         Row, from 0, at whose position each distance starts.
     notes : tuple of str
-        On rows of the file that are not here.
+        On rows of the file that are not here, columns that were not read, and angles by their convention.
 
     Raises
     ------
@@ -118,7 +120,7 @@ class Measurements:
     def poses(self) -> Poses:
         """world_from_tool as measured."""
         if self.rotations is None:
-            raise InputError(f"{self.where}: positions without orientation; columns qw, qx, qy, qz needed")
+            raise InputError(f"{self.where}: positions without orientation; {ORIENTATION} needed")
         return Poses(self.rotations, self.points())
 
     def lengths(self) -> tuple[np.ndarray, np.ndarray]:
@@ -128,11 +130,13 @@ class Measurements:
         return self.distances, self.from_row
 
 
-def read_measurements(path: str | Path | Table, robot: Robot, quaternions: Order = "wxyz") -> Measurements:
+def read_measurements(
+    path: str | Path | Table, robot: Robot, quaternions: Order = "wxyz", rotation: str | None = None
+) -> Measurements:
     """Read joint values with positions, poses or distances.
 
     Poses of which their ``status`` says that another one fits the image as well, and copies of a row, are left out with
-    a note.
+    a note; columns that are not read are named in one.
 
     Parameters
     ----------
@@ -142,6 +146,8 @@ def read_measurements(path: str | Path | Table, robot: Robot, quaternions: Order
         Whose joints moved: their number and types, and the reach that positions are checked against.
     quaternions : {"wxyz", "xyzw"}
         As their columns are named, or x, y, z, w in the order in which these stand.
+    rotation : str, optional
+        Convention of angles whose columns do not say it: ``kuka-abc``, ``ZYX-deg``, ``rotvec`` … (``data_layout.md``).
 
     Returns
     -------
@@ -151,15 +157,17 @@ def read_measurements(path: str | Path | Table, robot: Robot, quaternions: Order
     Raises
     ------
     InputError
-        Missing columns, bad rows, joint values of another unit or number than the robot's; the message names the line.
+        Missing columns, bad rows, joint values of another unit or number than the robot's, angles whose convention is
+        open; the message names the line.
     """
     table = read_table(path, WHAT, quaternions)
     q = joint_values(table, robot)
     targets = targets_of(table)
     if table.has("x", LENGTHS):
-        data = Measurements(table.where, table.lines, q, targets, table.points())
-        if table.has_rotation():
-            poses, covariance = table.poses(), table.pose_covariances()
+        poses, columns, said = oriented(table, rotation)
+        data = Measurements(table.where, table.lines, q, targets, table.points(), notes=said + unread(table, columns))
+        if poses is not None:
+            covariance = table.pose_covariances()
             data = replace(
                 data, rotations=poses.rotation, covariance=covariance, common=table.common_errors(covariance)
             )
@@ -173,7 +181,10 @@ def read_measurements(path: str | Path | Table, robot: Robot, quaternions: Order
         )
     distances = table.quantity("distance", LENGTHS)
     within(table, "distance", distances, "mm")
-    return Measurements(table.where, table.lines, q, targets, distances=distances, from_row=_from_rows(table))
+    if rotation is not None:
+        raise InputError(f"{table.where}: --rotation {rotation}, but distances have no orientation; leave it out")
+    rows, notes = _from_rows(table), unread(table)
+    return Measurements(table.where, table.lines, q, targets, distances=distances, from_row=rows, notes=notes)
 
 
 def targets_of(table: Table) -> tuple[str, ...]:
@@ -226,7 +237,7 @@ def _usable(data: Measurements, table: Table) -> Measurements:
     keep = ~(undecided | copies)
     if not keep.any():
         raise InputError(f"{data.where}: {notes[0]}")
-    return replace(data[keep], notes=tuple(notes)) if notes else data
+    return replace(data[keep], notes=(*notes, *data.notes)) if notes else data
 
 
 def joint_values(table: Table, robot: Robot) -> np.ndarray:

@@ -308,7 +308,13 @@ def compensation_file(result: Compensated, robot: Robot) -> CompensationFile:
         rows.append(row)
     counts = {status: result.found.status.count(status) for status in dict.fromkeys(result.found.status)}
     return CompensationFile.model_validate(
-        {"format": "stcal compensation 1", "robot": robot.name, "counts": counts, "poses": rows}
+        {
+            "format": "stcal compensation 1",
+            "robot": robot.name,
+            "counts": counts,
+            "poses": rows,
+            "notes": [*result.targets.notes, *result.notes()],
+        }
     )
 
 

@@ -36,6 +36,10 @@ class CompensationFile(ResultFile):
         "`joints` (by column name, null where not reached), `error_mm`, `error_rad`, and with `--nominal` "
         "`nominal_status`, `nominal_joints`, `nominal_error_mm`, `nominal_error_rad`"
     )
+    notes: list[str] = Field(
+        description="columns that were not read, angles by their convention, and the warnings: doubts of targets and "
+        "robots, and rows that are not simply reached"
+    )
 
 
 class ErrorReduction(Part):
@@ -72,6 +76,7 @@ class VerificationFile(ResultFile):
     )
     missing: dict[BySet, list[str]] = Field(description="poses that a set lacks")
     warnings: list[str] = Field(description="what to look at")
+    notes: list[str] = Field(description="columns that were not read")
 
 
 class DesignFile(ResultFile):

@@ -74,7 +74,7 @@ def compensation_page(result: Compensated, robot: Robot) -> str:
         counts=", ".join(f"{s} {result.found.status.count(s)}" for s in dict.fromkeys(result.found.status)),
         summary=compensated_summary(result),
         before=_before_plot(result) if result.compared().any() else "",
-        notes=result.notes(),
+        notes=[*result.targets.notes, *result.notes()],
         most_rows=MOST_ROWS,
         named=any(result.targets.tools),
         joints=[name.replace("_", " ") for name in joint_columns(robot)],

@@ -11,9 +11,10 @@ from stcal.geometry.arrays import freeze
 from stcal.geometry.rigid import Poses
 from stcal.io.quaternions import Order
 from stcal.io.table import LENGTHS, Table, read_table
+from stcal.robot.kinematics.columns import oriented, unread
 from stcal.robot.kinematics.forward import forward
 from stcal.robot.kinematics.inverse import Inverse, inverse
-from stcal.robot.kinematics.measurements import joint_values, targets_of, within
+from stcal.robot.kinematics.measurements import ORIENTATION, joint_values, targets_of, within
 from stcal.robot.kinematics.model import Robot
 
 WHAT = "targets"
@@ -39,6 +40,8 @@ class Targets:
         Commanded joint values, or those whose branch is wanted, rad or mm.
     names : dict
         Of the columns :data:`NAMES` that are there, (m,) each.
+    notes : tuple of str
+        On columns that were not read, and angles by their convention.
     """
 
     where: str
@@ -47,6 +50,7 @@ class Targets:
     poses: Poses | None
     q: np.ndarray | None
     names: dict[str, tuple[str, ...]] = field(default_factory=dict)
+    notes: tuple[str, ...] = ()
 
     def __post_init__(self):
         if self.q is not None:
@@ -64,6 +68,7 @@ class Targets:
             None if self.poses is None else self.poses[rows],
             None if self.q is None else self.q[rows],
             {column: tuple(own[i] for i in rows) for column, own in self.names.items()},
+            self.notes,
         )
 
     def joints(self) -> np.ndarray:
@@ -73,7 +78,9 @@ class Targets:
         return self.q
 
 
-def read_targets(path: str | Path | Table, robot: Robot, quaternions: Order = "wxyz") -> Targets:
+def read_targets(
+    path: str | Path | Table, robot: Robot, quaternions: Order = "wxyz", rotation: str | None = None
+) -> Targets:
     """Read commanded poses, or joint values that command them.
 
     Parameters
@@ -84,6 +91,8 @@ def read_targets(path: str | Path | Table, robot: Robot, quaternions: Order = "w
         Whose tools they are of; its joints, where joint values are given.
     quaternions : {"wxyz", "xyzw"}
         As their columns are named, or x, y, z, w in the order in which these stand.
+    rotation : str, optional
+        Convention of angles whose columns do not say it, as of :func:`read_measurements`.
 
     Returns
     -------
@@ -93,7 +102,8 @@ def read_targets(path: str | Path | Table, robot: Robot, quaternions: Order = "w
     Raises
     ------
     InputError
-        Neither poses nor joint values, positions without orientation, bad rows; the message names the line.
+        Neither poses nor joint values, positions without orientation, angles whose convention is open, bad rows; the
+        message names the line.
     """
     table = read_table(path, WHAT, quaternions)
     has_joints = any(name.startswith("q1_") for name in table.columns)
@@ -103,8 +113,11 @@ def read_targets(path: str | Path | Table, robot: Robot, quaternions: Order = "w
             f"{table.where}: neither poses x_mm … qz nor joint values q1_deg …; commanded poses are needed; "
             f"the header is {table.header()}"
         )
-    if has_poses and not table.has_rotation():
-        raise InputError(f"{table.where}: positions without orientation; columns qw, qx, qy, qz needed")
+    poses, columns, said = oriented(table, rotation) if has_poses else (None, (), ())
+    if rotation is not None and not has_poses:
+        raise InputError(f"{table.where}: --rotation {rotation}, but no positions with angles; leave it out")
+    if has_poses and poses is None:
+        raise InputError(f"{table.where}: positions without orientation; {ORIENTATION} needed")
     tools = targets_of(table)
     for line, tool in zip(table.lines, tools, strict=True):
         if tool not in robot.tools:
@@ -112,7 +125,6 @@ def read_targets(path: str | Path | Table, robot: Robot, quaternions: Order = "w
             raise InputError(
                 f"{table.where}: line {line}: target {tool!r} is not in robot {robot.name}; there are {known}"
             )
-    poses = table.poses() if has_poses else None
     if poses is not None:
         within(table, "position", poses.translation, "mm")
     return Targets(
@@ -122,6 +134,7 @@ def read_targets(path: str | Path | Table, robot: Robot, quaternions: Order = "w
         poses,
         joint_values(table, robot) if has_joints else None,
         {column: tuple(table.text(column)) for column in NAMES if column in table},
+        said + unread(table, columns),
     )
 
 

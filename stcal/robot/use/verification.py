@@ -14,6 +14,7 @@ from stcal.errors import InputError
 from stcal.geometry.arrays import frozen
 from stcal.io.table import Table, read_table
 from stcal.report.text import number, text_table
+from stcal.robot.kinematics.columns import unread
 from stcal.robot.kinematics.measurements import within
 from stcal.robot.use.files import VerificationFile
 
@@ -30,7 +31,7 @@ SCALE_WITHIN = 0.01
 @dataclass(frozen=True, slots=True, eq=False)
 class MeasuredPoses:
     """Rows of a file. ``sets``, ``names`` : (m,) set and pose of each; ``commanded``, ``measured`` : (m, 3) mm, each in
-    a frame of its own."""
+    a frame of its own; ``notes`` : on columns that were not read."""
 
     where: str
     lines: Sequence[int]
@@ -38,6 +39,7 @@ class MeasuredPoses:
     names: tuple[str, ...]
     commanded: np.ndarray
     measured: np.ndarray
+    notes: tuple[str, ...] = ()
 
     def __post_init__(self):
         m = len(self.lines)
@@ -89,7 +91,7 @@ class Verification:
     """Sets over the poses that all of them have.
 
     ``poses`` : names, the first being the one that distances start from; ``sets`` : in order of the file; ``missing`` :
-    by set the poses that it lacks, which are left out of all.
+    by set the poses that it lacks, which are left out of all; ``notes`` : on columns that were not read.
     """
 
     where: str
@@ -97,6 +99,7 @@ class Verification:
     distance_mm: np.ndarray
     sets: tuple[SetResult, ...]
     missing: dict[str, tuple[str, ...]]
+    notes: tuple[str, ...] = ()
 
     def reduction(self, index: int) -> dict[str, float]:
         """By how many per cent each figure of set ``index`` is below the first set's."""
@@ -136,7 +139,8 @@ def read_measured(path: str | Path | Table) -> MeasuredPoses:
     within(table, "commanded position", commanded, "mm")
     within(table, "position", measured, "mm")
     sets = tuple(table.text("set")) if "set" in table else ("measured",) * len(table)
-    return MeasuredPoses(table.where, table.lines, sets, _names(table, sets, commanded), commanded, measured)
+    names = _names(table, sets, commanded)
+    return MeasuredPoses(table.where, table.lines, sets, names, commanded, measured, unread(table))
 
 
 def _names(table: Table, sets: tuple[str, ...], commanded: np.ndarray) -> tuple[str, ...]:
@@ -206,7 +210,8 @@ def verify(data: MeasuredPoses) -> Verification:
             )
     sets = tuple(_set_result(data, group, own) for group, own in index.items())
     at = data.commanded[first]
-    return Verification(data.where, tuple(common), np.linalg.norm(at[1:] - at[0], axis=1), sets, missing)
+    distances = np.linalg.norm(at[1:] - at[0], axis=1)
+    return Verification(data.where, tuple(common), distances, sets, missing, data.notes)
 
 
 def _set_result(data: MeasuredPoses, name: str, rows: np.ndarray) -> SetResult:
@@ -269,6 +274,7 @@ def verification_file(result: Verification) -> VerificationFile:
             "sets": sets,
             "missing": {name: list(poses) for name, poses in result.missing.items()},
             "warnings": result.warnings(),
+            "notes": list(result.notes),
         }
     )
 

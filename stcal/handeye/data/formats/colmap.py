@@ -7,8 +7,9 @@ from pathlib import Path
 import numpy as np
 
 from stcal.errors import InputError
-from stcal.handeye.data.formats.record import Content, Frames, Side, of_quaternions, require_each_once, require_finite
+from stcal.handeye.data.formats.record import Content, Frames, Side, require_each_once
 from stcal.io.files import MODEL_BYTES, read_bytes
+from stcal.io.poses.rotations import of_quaternions, require_finite
 
 TEXT, BINARY = "images.txt", "images.bin"
 _IMAGE = re.compile(r"\d+(?:\s+\S+){7}\s+\d+\s+\S.*")

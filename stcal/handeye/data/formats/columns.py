@@ -18,14 +18,12 @@ from stcal.handeye.data.formats.record import (
     Said,
     Side,
     Unit,
-    of_quaternions,
-    proper,
     require_each_once,
 )
-from stcal.handeye.data.formats.rotations import ROTATION_VECTOR, Convention, rotations, said_convention
-from stcal.handeye.data.formats.single import ROS, turned_values
-from stcal.io.quaternions import COLUMNS as QUATERNION
-from stcal.io.table import ANGLES, LENGTHS, Table
+from stcal.handeye.data.formats.single import ROS
+from stcal.io.poses.columns import find_column, places_of, read_rotations
+from stcal.io.poses.rotations import of_quaternions
+from stcal.io.table import LENGTHS, Table
 
 TABLE = "table"
 NAMES = (
@@ -33,10 +31,7 @@ NAMES = (
     *("field.header.stamp", "header.stamp", "header_stamp", "timestamp", "stamp", "%time", "__time", "time_s", "time"),
 )
 """Columns that name a row, in order of preference."""
-TRIPLES = (("rx", "ry", "rz"), ("a", "b", "c"), ("w", "p", "r"), ("o", "a", "t"), ("roll", "pitch", "yaw"))
-BY_AXIS = (("rx", "ry", "rz"), ("roll", "pitch", "yaw"))
 _MESSAGE = re.compile(r"(?P<of>.*?)[./_]?(?:position|translation)[./_]x", re.IGNORECASE)
-_EULER = re.compile(r"euler_([xyz]{3}|[XYZ]{3})_1_(deg|rad)")
 _STAMP = (("secs", "nsecs"), ("sec", "nanosec"))
 
 
@@ -96,12 +91,8 @@ def _cells(text: str, column: str, table: Table) -> tuple[str, ...]:
     cells = list(csv.reader(rows))
     at = [name.strip() for name in cells[0]].index(column)
     found = tuple(row[at].strip() for row in cells[1:])
-    require_each_once(found, _places(table), table.where)
+    require_each_once(found, places_of(table), table.where)
     return found
-
-
-def _places(table: Table) -> tuple[str, ...]:
-    return tuple(f"line {line}" for line in table.lines)
 
 
 @dataclass(frozen=True, slots=True)
@@ -142,7 +133,7 @@ def _of_messages(table: Table, messages: Sequence[_Message], names: tuple[str, .
             said_by: list[Role | None] = [role_of(word) for word in re.split(r"[./]+", each.of) if word]
             role = next((found for found in said_by if found is not None), None)
         frames = Frames(FRAMES[role][0], f"by the topic {each.of}", False) if role else None
-        places = _places(table)
+        places = places_of(table)
         rotation = of_quaternions(np.column_stack([table.numbers(c) for c in each.turn]), places, table.where)
         at = np.column_stack([table.numbers(c) for c in each.place])
         sides.append(Side(rotation, at, places, "quaternions x, y, z, w by name", ROS, frames, names))
@@ -165,98 +156,25 @@ def _side(table: Table, prefix: str, frames: Frames | None, names: tuple[str, ..
     if place is None:
         return None
     at, unit = place
-    turned = _rotation(table, prefix, said)
+    turned = read_rotations(table, prefix, said.rotation)
     if turned is None:
         return None
-    rotation, words = turned
     covariance = table.pose_covariances(prefix)
-    return Side(rotation, at, _places(table), words, unit, frames, names, covariance=covariance)
-
-
-def _find(table: Table, prefix: str, name: str) -> str | None:
-    """A column by its name, in capital letters too."""
-    return next((c for c in (f"{prefix}{name}", f"{prefix}{name.upper()}") if c in table), None)
+    return Side(turned.rotation, at, places_of(table), turned.words, unit, frames, names, covariance=covariance)
 
 
 def _place(table: Table, prefix: str) -> tuple[np.ndarray, Unit | None] | None:
     for form in ("{}", "t{}", "p{}", "pos_{}", "{}_pos"):
         for unit in LENGTHS:
-            columns = [_find(table, prefix, f"{form.format(axis)}_{unit}") for axis in "xyz"]
+            columns = [find_column(table, prefix, f"{form.format(axis)}_{unit}") for axis in "xyz"]
             found = [column for column in columns if column is not None]
             if len(found) == len("xyz"):
                 values = np.column_stack([table.numbers(column) for column in found])
                 return values, Unit(unit, "by the columns", True)
             if found and form == "{}":
                 raise InputError(f"{table.where}: {', '.join(found)} alone; x, y and z in one unit needed")
-        columns = [_find(table, prefix, form.format(axis)) for axis in "xyz"]
+        columns = [find_column(table, prefix, form.format(axis)) for axis in "xyz"]
         found = [column for column in columns if column is not None]
         if len(found) == len("xyz"):
             return np.column_stack([table.numbers(column) for column in found]), None
     return None
-
-
-def _rotation(table: Table, prefix: str, said: Said) -> tuple[np.ndarray, str] | None:
-    """Rotations (m, 3, 3), and how they are written; None where there are none."""
-    places, where = _places(table), table.where
-    if f"{prefix}qw" in table or f"{prefix}qx" in table:
-        table.has_rotation(prefix)
-        standing = [c for c in table.columns if c in {prefix + q for q in QUATERNION}]
-        by_order = table.quaternions != "wxyz"
-        columns = [standing[3], *standing[:3]] if by_order else [prefix + q for q in QUATERNION]
-        words = "quaternions x, y, z, w by the order of their columns" if by_order else "quaternions by name"
-        return of_quaternions(np.column_stack([table.numbers(c) for c in columns]), places, where), words
-    for unit in ANGLES:
-        columns = [f"{prefix}rotvec_{axis}_{unit}" for axis in "xyz"]
-        if (values := _all(table, columns)) is not None:
-            return rotations(values, Convention(ROTATION_VECTOR, unit), places, where)
-    for column in table.columns:
-        if column.startswith(prefix) and (euler := _EULER.fullmatch(column.removeprefix(prefix))):
-            values = _all(table, [f"{prefix}euler_{euler[1]}_{i}_{euler[2]}" for i in (1, 2, 3)])
-            if values is not None:
-                return rotations(values, Convention(euler[1], euler[2]), places, where)
-    matrix = [f"{prefix}r{i}{j}" for i in (1, 2, 3) for j in (1, 2, 3)]
-    if (values := _all(table, matrix)) is not None:
-        return proper(values.reshape(-1, 3, 3), places, where), "3×3 matrices"
-    return _said_rotation(table, prefix, said)
-
-
-def _all(table: Table, columns: list[str]) -> np.ndarray | None:
-    """(m, k) of columns; None where one of them is missing from the first on, an error where a later one is."""
-    there = [column for column in columns if column in table]
-    if not there:
-        return None
-    if len(there) < len(columns):
-        missing = next(column for column in columns if column not in table)
-        raise InputError(f"{table.where}: {', '.join(there)} without {missing}; all {len(columns)} needed")
-    return np.column_stack([table.numbers(column) for column in columns])
-
-
-def _said_rotation(table: Table, prefix: str, said: Said) -> tuple[np.ndarray, str] | None:
-    """Angles in columns whose convention only the user knows."""
-    places, where = _places(table), table.where
-    for triple in TRIPLES:
-        for unit in (*ANGLES, ""):
-            columns = [_find(table, prefix, f"{name}_{unit}" if unit else name) for name in triple]
-            found = [column for column in columns if column is not None]
-            if len(found) < len(triple):
-                continue
-            what = ", ".join(triple) if triple in BY_AXIS else "".join(triple)
-            convention = said_convention(said, what, where)
-            if unit and convention.unit not in ("", unit) and "-" in (said.rotation or "") and _own_unit(said):
-                raise InputError(f"{where}: {found[0]} and --rotation {said.rotation} are of two units; correct one")
-            convention = Convention(convention.order, unit or convention.unit)
-            values = np.column_stack([table.numbers(column) for column in found])
-            rotation, words = rotations(values, convention, places, where, triple in BY_AXIS)
-            return rotation, f"{', '.join(found)} as {words}"
-    columns = [_find(table, prefix, f"q{i}") for i in (1, 2, 3, 4)]
-    found = [column for column in columns if column is not None]
-    if len(found) == len(columns):
-        values = np.column_stack([table.numbers(column) for column in found])
-        rotation, words = turned_values(values, said, "q1, q2, q3, q4", places, where)
-        return rotation, words
-    return None
-
-
-def _own_unit(said: Said) -> bool:
-    """Whether the user wrote a unit, and not a robot's name that has one."""
-    return (said.rotation or "").endswith(tuple(f"-{unit}" for unit in ANGLES))

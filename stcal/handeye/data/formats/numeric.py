@@ -7,18 +7,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from stcal.errors import InputError
-from stcal.handeye.data.formats.record import (
-    MATRICES,
-    Content,
-    Said,
-    Side,
-    Unit,
-    of_matrices,
-    of_quaternions,
-    require_each_once,
-    require_finite,
-)
-from stcal.handeye.data.formats.single import turned_values
+from stcal.handeye.data.formats.record import MATRICES, Content, Said, Side, Unit, of_matrices, require_each_once
+from stcal.io.poses.rotations import of_quaternions, require_finite, turned_values
 
 _SEPARATORS = re.compile(r"[\s,;]+")
 _BRACKETS = str.maketrans("[]()", "    ")
@@ -82,7 +72,7 @@ def read_numbers(text: str, said: Said, where: str) -> Content | None:
     if width == MATRIX:
         rotation, translation = of_matrices(values.reshape(-1, 4, 4), places, where)
         return Content("4×4 matrices, a row each", (Side(rotation, translation, places, MATRICES, names=names),))
-    rotation, words = turned_values(values[:, 3:], said, "the numbers after x, y, z", places, where)
+    rotation, words = turned_values(values[:, 3:], said.rotation, "the numbers after x, y, z", places, where)
     return Content("rows of numbers", (Side(rotation, values[:, :3], places, words, names=names),))
 
 

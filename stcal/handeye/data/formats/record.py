@@ -8,8 +8,7 @@ import numpy as np
 
 from stcal.errors import InputError
 from stcal.geometry.arrays import frozen
-from stcal.geometry.rigid import UNIT_WITHIN, Poses
-from stcal.io.quaternions import require_unit
+from stcal.io.poses.rotations import proper, require_finite
 from stcal.io.table import LENGTHS
 
 Role = Literal["robot", "camera"]
@@ -114,7 +113,7 @@ class Content:
 class Said:
     """What the user says of files that do not say it themselves.
 
-    ``rotation`` : a name of :data:`.rotations.ALIASES` or an order of axes; ``length_unit`` : one of
+    ``rotation`` : a name of :data:`stcal.io.poses.rotations.ALIASES` or an order of axes; ``length_unit`` : one of
     :data:`stcal.io.table.LENGTHS`; ``frames`` : names of :data:`EVERY_FRAME`, at most one of each role; ``setup`` ;
     ``own`` : rotation and unit of one role's poses, where they differ.
     """
@@ -185,47 +184,6 @@ class Said:
         return next((name for name in self.frames if name in FRAMES[role]), None)
 
 
-def proper(rotation: np.ndarray, places: Sequence[str], where: str) -> np.ndarray:
-    """Matrices (m, 3, 3) brought onto rotations, from the few digits with which files state them.
-
-    Raises
-    ------
-    InputError
-        One that is no rotation: which, by how much, and what it looks like.
-    """
-    require_finite(rotation, places, where)
-    u, size, vt = np.linalg.svd(rotation)
-    off = np.abs(size - 1).max(axis=1)
-    with np.errstate(over="ignore", invalid="ignore"):  # of what is refused by its size
-        determinant = np.linalg.det(rotation)
-    bad = np.flatnonzero((off > UNIT_WITHIN) | (determinant < 0))
-    if len(bad):
-        i = bad[0]
-        more = f" (and {len(bad) - 1} more)" if len(bad) > 1 else ""
-        if off[i] <= UNIT_WITHIN:
-            what = "a reflection, determinant −1; a rotation, +1, needed: change the sign of one axis"
-        else:
-            what = (
-                f"not a rotation: its axes are stretched by {size[i].min():.4g} to {size[i].max():.4g}, "
-                f"1 ± {UNIT_WITHIN:g} needed; correct it, or write more digits"
-            )
-        raise InputError(f"{where}: {places[i]}: the 3×3 part is {what}{more}")
-    return u @ vt
-
-
-def of_quaternions(wxyz: np.ndarray, places: Sequence[str], where: str) -> np.ndarray:
-    """Rotations (m, 3, 3) of (m, 4).
-
-    Raises
-    ------
-    InputError
-        One that is not of unit length.
-    """
-    require_finite(wxyz, places, where)
-    require_unit(wxyz, places.__getitem__, where, "correct it")
-    return np.array(Poses.from_quaternions(wxyz, np.zeros((len(wxyz), 3))).rotation)
-
-
 def of_matrices(matrices: np.ndarray, places: Sequence[str], where: str) -> tuple[np.ndarray, np.ndarray]:
     """Rotations and translations of homogeneous matrices (m, 4, 4).
 
@@ -242,14 +200,6 @@ def of_matrices(matrices: np.ndarray, places: Sequence[str], where: str) -> tupl
         row = " ".join(f"{v:g}" for v in matrices[i, 3])
         raise InputError(f"{where}: {places[i]}: last row {row}, 0 0 0 1 needed{turned}; correct it")
     return proper(matrices[:, :3, :3], places, where), matrices[:, :3, 3]
-
-
-def require_finite(values: np.ndarray, places: Sequence[str], where: str) -> None:
-    """Refuse what is no number."""
-    bad = np.flatnonzero(~np.isfinite(values.reshape(len(values), -1)).all(axis=1))
-    if len(bad):
-        more = f" (and {len(bad) - 1} more)" if len(bad) > 1 else ""
-        raise InputError(f"{where}: {places[bad[0]]}: a value that is not finite, numbers needed{more}; take it out")
 
 
 def require_each_once(names: Sequence[str], places: Sequence[str], where: str, kind: str = "") -> None:

@@ -7,13 +7,15 @@ from typing import Any
 import numpy as np
 
 from stcal.errors import InputError
-from stcal.handeye.data.formats.record import MATRICES, Said, Unit, of_matrices, of_quaternions, proper, require_finite
-from stcal.handeye.data.formats.rotations import (
-    QUATERNIONS,
+from stcal.handeye.data.formats.record import MATRICES, Said, Unit, of_matrices
+from stcal.io.poses.rotations import (
     ROTATION_VECTOR,
     Convention,
+    of_quaternions,
+    proper,
+    require_finite,
     rotations,
-    said_convention,
+    turned_values,
 )
 
 PLACE_KEYS = ("translation", "position", "t", "tvec", "trans", "xyz")
@@ -124,20 +126,9 @@ def _of_array(array: np.ndarray, said: Said, place: str, where: str) -> One | No
         return One(rotation[0], translation[0], MATRICES)
     if array.shape in ((6,), (7,)):
         require_finite(array[None], (place,), where)
-        rotation, turned = turned_values(array[None, 3:], said, "the numbers after x, y, z", (place,), where)
+        rotation, turned = turned_values(array[None, 3:], said.rotation, "the numbers after x, y, z", (place,), where)
         return One(rotation[0], array[:3], turned)
     return None
-
-
-def turned_values(
-    values: np.ndarray, said: Said, what: str, places: tuple[str, ...], where: str
-) -> tuple[np.ndarray, str]:
-    """Rotations (m, 3, 3) of (m, 3) or (m, 4) numbers whose convention only the user knows, and how they were read."""
-    convention = said_convention(said, what, where, values.shape[1])
-    if convention.order in QUATERNIONS:
-        order = [0, 1, 2, 3] if convention.order == "wxyz" else [3, 0, 1, 2]
-        return of_quaternions(values[:, order], places, where), convention.words()
-    return rotations(values, convention, places, where)
 
 
 def _of_parts(value: Mapping, said: Said, place: str, where: str) -> One | None:
@@ -169,7 +160,7 @@ def _of_parts(value: Mapping, said: Said, place: str, where: str) -> One | None:
     if turn_key == "rvec":
         rotation, turned = rotations(values, Convention(ROTATION_VECTOR, "rad"), (place,), where)
     else:
-        rotation, turned = turned_values(values, said, turn_key, (place,), where)
+        rotation, turned = turned_values(values, said.rotation, turn_key, (place,), where)
     return One(rotation[0], translation.ravel(), turned, unit, form)
 
 

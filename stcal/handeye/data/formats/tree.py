@@ -17,12 +17,10 @@ from stcal.handeye.data.formats.record import (
     Said,
     Side,
     of_matrices,
-    proper,
     require_each_once,
-    require_finite,
 )
-from stcal.handeye.data.formats.rotations import ROTATION_VECTOR, Convention, rotations
-from stcal.handeye.data.formats.single import ROS, One, name_in, numbers, one, turned_values
+from stcal.handeye.data.formats.single import ROS, One, name_in, numbers, one
+from stcal.io.poses.rotations import ROTATION_VECTOR, Convention, proper, require_finite, rotations, turned_values
 
 HOLDERS = ("poses", "data", "samples", "pairs", "frames", "transforms", "measurements", "captures", "robot_poses")
 """Keys under which the list of poses may stand."""
@@ -165,7 +163,7 @@ def _of_parts(parts: dict[str, Any], said: Said, where: str, frames: Frames) -> 
     if turn.shape[1] == 3 and keys[0].lower().startswith("r"):  # OpenCV takes rotation vectors in place of matrices
         rotation, words = rotations(turn, Convention(ROTATION_VECTOR, "rad"), places, where)
     else:
-        rotation, words = turned_values(turn, said, keys[0], places, where)
+        rotation, words = turned_values(turn, said.rotation, keys[0], places, where)
     return Side(rotation, at, places, words, frames=frames)
 
 
@@ -261,7 +259,7 @@ def _side_of(value: Any, said: Said, where: str, frames: Frames | None) -> Side 
     if array.ndim == 2 and array.shape[1] in (6, 7):
         places = tuple(f"pose {i}" for i in range(1, len(array) + 1))
         require_finite(array, places, where)
-        turned, words = turned_values(array[:, 3:], said, "the numbers after x, y, z", places, where)
+        turned, words = turned_values(array[:, 3:], said.rotation, "the numbers after x, y, z", places, where)
         return Side(turned, array[:, :3], places, words, frames=frames)
     if array.ndim != 3 or array.shape[1:] != (4, 4):
         return None

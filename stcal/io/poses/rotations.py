@@ -1,13 +1,15 @@
-"""Three numbers that state a rotation: in which convention, and in which unit."""
+"""Numbers that state a rotation: in which convention, and in which unit."""
 
 import re
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 from scipy.spatial.transform import Rotation
 
 from stcal.errors import InputError
-from stcal.handeye.data.formats.record import Said, require_finite
+from stcal.geometry.rigid import UNIT_WITHIN, Poses
+from stcal.io.quaternions import require_unit
 from stcal.io.table import ANGLES
 
 ROTATION_VECTOR = "rotvec"
@@ -81,22 +83,22 @@ def convention_of(name: str) -> Convention:
     return Convention(order, unit)
 
 
-def said_convention(said: Said, what: str, where: str, count: int = 3) -> Convention:
-    """That of ``--rotation``; ``what`` : the names of the columns, or what stands in their place.
+def said_convention(rotation: str | None, what: str, where: str, count: int = 3) -> Convention:
+    """That of ``--rotation``, ``rotation``; ``what`` : the names of the columns, or what stands in their place.
 
     Raises
     ------
     InputError
         Not given, or of another number of values.
     """
-    if said.rotation is None:
+    if rotation is None:
         likely = LIKELY["quaternions"] if count == len("wxyz") else LIKELY.get(what, "kuka-abc, ur-rotvec, xyz or ZYX")
         form = "quaternions" if count == len("wxyz") else "Euler angles in any order of axes or rotation vectors"
         raise InputError(f"{where}: {what} may be {form}; give --rotation, like {likely}")
-    found = convention_of(said.rotation)
+    found = convention_of(rotation)
     if found.count != count:
         raise InputError(
-            f"{where}: {what} are {count} numbers, --rotation {said.rotation} is of {found.count}; correct the option"
+            f"{where}: {what} are {count} numbers, --rotation {rotation} is of {found.count}; correct the option"
         )
     return found
 
@@ -131,3 +133,63 @@ def rotations(
         angles = angles[:, ["xyz".index(axis) for axis in convention.order.lower()]]
         words += ", each about the axis of its name"
     return Rotation.from_euler(convention.order, angles).as_matrix(), words
+
+
+def turned_values(
+    values: np.ndarray, rotation: str | None, what: str, places: tuple[str, ...], where: str
+) -> tuple[np.ndarray, str]:
+    """Rotations (m, 3, 3) of (m, 3) or (m, 4) numbers whose convention only the user knows, and how they were read."""
+    convention = said_convention(rotation, what, where, values.shape[1])
+    if convention.order in QUATERNIONS:
+        order = [0, 1, 2, 3] if convention.order == "wxyz" else [3, 0, 1, 2]
+        return of_quaternions(values[:, order], places, where), convention.words()
+    return rotations(values, convention, places, where)
+
+
+def proper(rotation: np.ndarray, places: Sequence[str], where: str) -> np.ndarray:
+    """Matrices (m, 3, 3) brought onto rotations, from the few digits with which files state them.
+
+    Raises
+    ------
+    InputError
+        One that is no rotation: which, by how much, and what it looks like.
+    """
+    require_finite(rotation, places, where)
+    u, size, vt = np.linalg.svd(rotation)
+    off = np.abs(size - 1).max(axis=1)
+    with np.errstate(over="ignore", invalid="ignore"):  # of what is refused by its size
+        determinant = np.linalg.det(rotation)
+    bad = np.flatnonzero((off > UNIT_WITHIN) | (determinant < 0))
+    if len(bad):
+        i = bad[0]
+        more = f" (and {len(bad) - 1} more)" if len(bad) > 1 else ""
+        if off[i] <= UNIT_WITHIN:
+            what = "a reflection, determinant −1; a rotation, +1, needed: change the sign of one axis"
+        else:
+            what = (
+                f"not a rotation: its axes are stretched by {size[i].min():.4g} to {size[i].max():.4g}, "
+                f"1 ± {UNIT_WITHIN:g} needed; correct it, or write more digits"
+            )
+        raise InputError(f"{where}: {places[i]}: the 3×3 part is {what}{more}")
+    return u @ vt
+
+
+def of_quaternions(wxyz: np.ndarray, places: Sequence[str], where: str) -> np.ndarray:
+    """Rotations (m, 3, 3) of (m, 4).
+
+    Raises
+    ------
+    InputError
+        One that is not of unit length.
+    """
+    require_finite(wxyz, places, where)
+    require_unit(wxyz, places.__getitem__, where, "correct it")
+    return np.array(Poses.from_quaternions(wxyz, np.zeros((len(wxyz), 3))).rotation)
+
+
+def require_finite(values: np.ndarray, places: Sequence[str], where: str) -> None:
+    """Refuse what is no number."""
+    bad = np.flatnonzero(~np.isfinite(values.reshape(len(values), -1)).all(axis=1))
+    if len(bad):
+        more = f" (and {len(bad) - 1} more)" if len(bad) > 1 else ""
+        raise InputError(f"{where}: {places[bad[0]]}: a value that is not finite, numbers needed{more}; take it out")

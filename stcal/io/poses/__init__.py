@@ -1,0 +1,1 @@
+"""Rotations as other programs and controllers of robots write them."""

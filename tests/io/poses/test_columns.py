@@ -1,0 +1,68 @@
+"""Rotations in columns: the conventions of controllers by their own formulas, and which names leave them open."""
+
+import re
+
+import numpy as np
+import pytest
+
+from stcal.errors import InputError
+from stcal.io.poses.columns import read_rotations
+from stcal.io.table import Table
+
+
+def about(axis: str, degrees: float) -> np.ndarray:
+    c, s = np.cos(np.radians(degrees)), np.sin(np.radians(degrees))
+    i, j = {"x": (1, 2), "y": (2, 0), "z": (0, 1)}[axis]
+    turn = np.eye(3)
+    turn[i, i] = turn[j, j] = c
+    turn[i, j], turn[j, i] = -s, s
+    return turn
+
+
+def read(header: str, *values: float, rotation: str | None = None):
+    columns = {name: np.array([value]) for name, value in zip(header.split(","), values, strict=True)}
+    return read_rotations(Table("table", columns, [2]), rotation=rotation)
+
+
+FANUC = about("z", 30) @ about("y", 20) @ about("x", 10)
+"""Rz(R) Ry(P) Rx(W), FANUC's and Yaskawa's manuals; Rz(A) Ry(B) Rx(C), KUKA's."""
+AXIS = np.array([0.3, -0.4, 1.2])
+
+
+@pytest.mark.parametrize(
+    ("header", "values", "rotation", "expected"),
+    [
+        ("w_deg,p_deg,r_deg", (10, 20, 30), None, FANUC),
+        ("W_DEG,P_DEG,R_DEG", (10, 20, 30), "yaskawa", FANUC),
+        ("a_deg,b_deg,c_deg", (30, 20, 10), None, FANUC),
+        ("a_deg,b_deg,c_deg", (10, 20, 30), "mitsubishi-abc", FANUC),
+        ("roll_deg,pitch_deg,yaw_deg", (10, 20, 30), None, FANUC),
+        ("rpy_roll_rad,rpy_pitch_rad,rpy_yaw_rad", np.radians([10, 20, 30]), None, FANUC),
+        ("o_deg,a_deg,t_deg", (10, 20, 30), None, about("z", 10) @ about("y", 20) @ about("z", 30)),
+        ("rx_deg,ry_deg,rz_deg", (10, 20, 30), "yaskawa", FANUC),
+        ("rx_deg,ry_deg,rz_deg", (10, 20, 30), "staubli", about("x", 10) @ about("y", 20) @ about("z", 30)),
+        ("rx,ry,rz", (100, 20, 30), "ZYX", about("z", 30) @ about("y", 20) @ about("x", 100)),
+        ("rx_rad,ry_rad,rz_rad", (0, 0, np.radians(40)), None, about("z", 40)),
+        ("rotvec_x_deg,rotvec_y_deg,rotvec_z_deg", (0, -40, 0), None, about("y", -40)),
+    ],
+)
+def test_conventions(header, values, rotation, expected):
+    found = read(header, *values, rotation=rotation)
+    assert np.abs(found.rotation[0] - expected).max() < 1e-12  # rounding
+    assert found.columns == tuple(header.split(","))
+
+
+@pytest.mark.parametrize(
+    ("header", "words"),
+    [
+        ("rx_deg,ry_deg,rz_deg", "rx, ry, rz may be Euler angles in any order of axes or rotation vectors; give --rot"),
+        ("rx,ry,rz", "give --rotation, like ur-rotvec, yaskawa"),
+        ("w_rad,p_rad,r_rad", "wpr may be"),
+        ("a,b,c", "abc may be"),
+        ("roll,pitch,yaw", "roll, pitch, yaw may be"),
+    ],
+)
+def test_names_that_leave_it_open(header, words):
+    with pytest.raises(InputError, match=re.escape(words)):
+        read(header, 10, 20, 30)
+    assert read(header.rpartition(",")[0], 10, 20) is None
