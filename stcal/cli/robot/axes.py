@@ -61,6 +61,10 @@ def axes(
     nominal = load_robot(robot_file)
     source = one_table(sweeps, first, second, key, "SWEEPS")
     data = read_measurements(source, nominal, rotation=rotation)
+    if len(set(data.stations)) > 1:
+        raise InputError(
+            f"{data.where}: stations {', '.join(data.by_station())}; sweeps are seen from one, so give one at a time"
+        )
     length_mm = _length(orientations, data)
     result = robot_from_sweeps(data, nominal, math.radians(still_deg), length_mm)
     say(axes_text(result))

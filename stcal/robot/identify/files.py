@@ -100,6 +100,10 @@ class IdentifiedFile(ResultFile):
     all_held_out_rms_mm: float | None = Field(
         description="RMS error of held-out rows were all adjusted; null where all are, or rows are too few"
     )
+    stations: dict[str, Matrix] = Field(
+        description="first_from_station by name, 4 × 4, mm: column `station`; the base is in the frame of the first, "
+        "that of most rows; one without a name where there is no column"
+    )
     model: Literal["rigid", "elastic"] = Field(description="that was identified")
     models: ModelsCompared | None = Field(
         description="where both were tried: RMS errors of held-out rows by both, `rigid_mm` and `elastic_mm`; mean by "

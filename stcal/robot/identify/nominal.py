@@ -10,7 +10,7 @@ from scipy.linalg import block_diag
 from stcal.errors import InputError
 from stcal.robot.identify.adjustment import Held
 from stcal.robot.identify.elastic import UsualElasticity, usual
-from stcal.robot.identify.residuals import Kind, State, unknowns
+from stcal.robot.identify.residuals import Kind, State, parameter_names
 from stcal.robot.kinematics.dh import PARALLEL_RAD, robot_from_chain
 from stcal.robot.kinematics.forward import chain_parameters, moved_chain
 from stcal.robot.kinematics.model import Robot
@@ -131,8 +131,8 @@ class NominalRows:
         robot = robot_from_chain(state.chain, state.tools, self.nominal)
         away = _dimensions(robot, self.nominal, self.coaxial) - _dimensions(self.nominal, self.nominal, self.coaxial)
         jacobian = self.jacobian[self.free]
-        tools = unknowns(state.chain, len(state.tools), kind) - jacobian.shape[1]
-        by, value = np.pad(jacobian, ((0, 0), (0, tools))), away[self.free]
+        others = len(parameter_names(state, kind)) - jacobian.shape[1]
+        by, value = np.pad(jacobian, ((0, 0), (0, others))), away[self.free]
         if self.elasticity is not None:
             by = np.asarray(block_diag(by, np.diag(self.elasticity.scale)))
             value = np.append(value, self.elasticity.away(state.chain))

@@ -38,7 +38,7 @@ def identified_text(result: Identified, nominal: Robot) -> str:
     values, sigma = dh_values(result.robot) * SHOWN, result.dh_sigma * SHOWN
     for i, each in enumerate(zip(values, sigma, strict=True), 1):
         rows.append([str(i), *(cell for v, s in zip(*each, strict=True) for cell in (number(v, 4), _sigma(s)))])
-    placed = [[name, *(number(v, 4) for v in pose)] for name, pose in _placed(result.robot).items()]
+    placed = [[name, *(number(v, 4) for v in pose)] for name, pose in _placed(result).items()]
     lines += ["", *text_table([["<error, mm", "mean", "RMS", "max"], *errors], (34, *[7] * 3))]
     lines += ["", *text_table(rows, (6, *[11, 7] * 5))]
     lines += ["", *text_table([["<mm and rotation vector, deg", *PLACE], *placed], (34, *[9] * 6))]
@@ -75,6 +75,7 @@ def identified_file(result: Identified, nominal: Robot) -> IdentifiedFile:
             for i, k in np.argwhere(result.adjustment.rows.fixed).tolist()
         ],
         "all_held_out_rms_mm": result.all_held_out and _statistics(result.all_held_out.position_mm)[1],
+        "stations": {name: pose.inverse().matrix() for name, pose in result.state.stations.items()},
         "model": result.model,
         "models": None if result.gain is None else asdict(result.gain),
         "elasticity": _elasticity(result),
@@ -133,7 +134,7 @@ def identified_page(result: Identified, nominal: Robot) -> str:
         elastic_head=ELASTIC,
         errors_by_row=uri(_figure(result)),
         dh=_rows(result, nominal),
-        placed=[[name, *(number(v, 4) for v in pose)] for name, pose in _placed(result.robot).items()],
+        placed=[[name, *(number(v, 4) for v in pose)] for name, pose in _placed(result).items()],
         kinds=", ".join(f"{kind}s {rank}" for kind, rank in result.ranks.items()),
         sigma=[
             [name, f"{1000 * np.degrees(s):.3f} mdeg" if " r" in name else f"{1000 * s:.1f} µm"]
@@ -208,9 +209,13 @@ def _elasticity(result: Identified) -> dict | None:
     return {"gravity": found.gravity.tolist(), "joints": joints(found), "sigma": joints(sigma)}
 
 
-def _placed(robot: Robot) -> dict[str, np.ndarray]:
-    """Base and tools: translation, mm, and rotation vector, deg, (6,)."""
-    poses = {"base in the instrument's frame": robot.world_from_base}
+def _placed(result: Identified) -> dict[str, np.ndarray]:
+    """Base, tools and stations: translation, mm, and rotation vector, deg, (6,)."""
+    robot, (first, *others) = result.robot, result.state.stations
+    poses = {
+        f"base in the frame of station {first}" if others else "base in the instrument's frame": robot.world_from_base
+    }
+    poses |= {f"station {name} in that of {first}": result.state.stations[name].inverse() for name in others}
     poses |= {f"tool {name} in the flange's frame".replace("  ", " "): tool for name, tool in robot.tools.items()}
     return {name: np.append(pose.translation, np.degrees(pose.log()[:3])) for name, pose in poses.items()}
 

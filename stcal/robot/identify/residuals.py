@@ -1,13 +1,13 @@
 """What measurements say about a robot: residuals, and their derivatives by the minimal parameters."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import Literal
 
 import numpy as np
 
 from stcal.errors import InputError
-from stcal.geometry.rigid import Poses, Rigid
+from stcal.geometry.rigid import Poses, Rigid, skew
 from stcal.robot.kinematics.forward import (
     chain_jacobian,
     chain_parameters,
@@ -27,11 +27,12 @@ WIDTH = {"pose": 6, "position": 3, "distance": 1}
 @dataclass(frozen=True, slots=True, eq=False)
 class State:
     """What is identified: the chain, and flange_from_tool by target; where ``elastic`` the chain's elasticity too, the
-    parameters of which are the last ones."""
+    parameters of which are the last ones; and station_from_world by station, the first of which is the world."""
 
     chain: Chain
     tools: dict[str, Rigid]
     elastic: bool = False
+    stations: dict[str, Rigid] = field(default_factory=lambda: {"": Rigid()})
 
     @property
     def elastic_count(self) -> int:
@@ -70,11 +71,6 @@ def tool_width(kind: Kind) -> int:
     return 6 if kind == "pose" else 3
 
 
-def unknowns(robot_chain: Chain, targets: int, kind: Kind) -> int:
-    """Number of parameters of axes and tools."""
-    return len(chain_parameters(robot_chain)) + tool_width(kind) * targets
-
-
 def observed(data: Measurements, kind: Kind | None = None) -> Observed:
     """The measurements as ``kind``, or as the most that they hold.
 
@@ -98,11 +94,13 @@ def observed(data: Measurements, kind: Kind | None = None) -> Observed:
 
 
 def parameter_names(state: State, kind: Kind) -> list[str]:
-    """``J2 rx`` … of the axes and ``tool x`` … of the tools; r in rad, the others in mm; without elasticity."""
+    """``J2 rx`` … of the axes, ``tool x`` … of the tools, and ``station B rx`` … of stations but the first; r in rad,
+    the others in mm; without elasticity."""
     component = ("rx", "ry", "rz", "x", "y", "z")
     tool = component if kind == "pose" else component[3:]
     names = [f"J{i + 1} {component[c]}" for i, c in chain_parameters(state.chain)]
-    return names + [f"tool {name} {c}".replace("  ", " ") for name in state.tools for c in tool]
+    names += [f"tool {name} {c}".replace("  ", " ") for name in state.tools for c in tool]
+    return names + [f"station {name} {c}" for name in list(state.stations)[1:] for c in component]
 
 
 def tips(state: State, q: np.ndarray, targets: Sequence[str]) -> Poses:
@@ -113,8 +111,9 @@ def tips(state: State, q: np.ndarray, targets: Sequence[str]) -> Poses:
 
 
 def residuals(state: State, seen: Observed) -> np.ndarray:
-    """Measured minus modelled, (r, 6), (r, 3) or (r, 1): rad and mm in the world's axes."""
-    return _beside(tips(state, seen.data.q, seen.data.targets), seen)
+    """Measured minus modelled, (r, 6), (r, 3) or (r, 1): rad and mm in the axes of the row's station."""
+    tip = tips(state, seen.data.q, seen.data.targets)
+    return _beside(_stations(state, seen.data.stations) @ tip if len(state.stations) > 1 else tip, seen)
 
 
 def jacobian(state: State, seen: Observed) -> np.ndarray:
@@ -125,6 +124,10 @@ def jacobian(state: State, seen: Observed) -> np.ndarray:
 def linear(state: State, seen: Observed) -> tuple[np.ndarray, np.ndarray]:
     """:func:`residuals` and :func:`jacobian`."""
     tip, full = tip_jacobian(state, seen.data.q, seen.data.targets, seen.kind)
+    if len(state.stations) > 1:
+        station, full = _stations(state, seen.data.stations), _by_station(state, seen, tip, full)
+        tip, turn = station @ tip, station.rotation[:, None]
+        full = (turn @ full.reshape(len(full), 2, 3, -1)).reshape(full.shape)
     found = _beside(tip, seen)
     if seen.kind == "pose":
         return found, full
@@ -133,6 +136,24 @@ def linear(state: State, seen: Observed) -> tuple[np.ndarray, np.ndarray]:
     apart = tip.translation[seen.first] - tip.translation[seen.second]
     unit = apart / np.maximum(np.linalg.norm(apart, axis=1), 1e-12)[:, None]
     return found, np.einsum("ri,rik->rk", unit, full[seen.first, 3:] - full[seen.second, 3:])[:, None]
+
+
+def _stations(state: State, names: Sequence[str]) -> Poses:
+    """station_from_world of each row."""
+    place = {name: i for i, name in enumerate(state.stations)}
+    return Poses.of(state.stations.values())[[place[name] for name in names]]
+
+
+def _by_station(state: State, seen: Observed, tip: Poses, full: np.ndarray) -> np.ndarray:
+    """The derivative with columns of the stations, as small motions of the world."""
+    full, names = full.copy(), np.array(seen.data.stations)
+    own = len(parameter_names(state, seen.kind)) - 6 * (len(state.stations) - 1)
+    for s, name in enumerate(list(state.stations)[1:]):
+        rows, place = names == name, own + 6 * s
+        full[rows, :3, place : place + 3] = np.eye(3)
+        full[rows, 3:, place : place + 3] = -skew(tip.translation[rows])
+        full[rows, 3:, place + 3 : place + 6] = np.eye(3)
+    return full
 
 
 def _beside(tip: Poses, seen: Observed) -> np.ndarray:
@@ -147,7 +168,7 @@ def _beside(tip: Poses, seen: Observed) -> np.ndarray:
 
 def tip_jacobian(state: State, q: np.ndarray, targets: Sequence[str], kind: Kind) -> tuple[Poses, np.ndarray]:
     """world_from_tool at joint vectors (m, n), and its derivative (m, 6, k) by :func:`parameter_names` and the
-    elasticity: rotation (rad) over translation (mm), in the world's axes."""
+    elasticity: rotation (rad) over translation (mm), in the world's axes, where stations move nothing."""
     tip = tips(state, q, targets)
     width = tool_width(kind)
     axes_part = chain_jacobian(state.chain, q, tip)
@@ -159,7 +180,7 @@ def tip_jacobian(state: State, q: np.ndarray, targets: Sequence[str], kind: Kind
             tools_part[rows, :3, place : place + 3] = tip.rotation[rows]
             place += 3
         tools_part[rows, 3:, place : place + 3] = tip.rotation[rows]
-    parts = [axes_part, tools_part]
+    parts = [axes_part, tools_part, np.zeros((len(tip), 6, 6 * (len(state.stations) - 1)))]
     if state.elastic:
         parts.append(elasticity_jacobian(state.chain, q, tip))
     return tip, np.concatenate(parts, axis=2)
@@ -173,11 +194,14 @@ def moved(state: State, step: np.ndarray, kind: Kind) -> State:
     for t, (name, tool) in enumerate(state.tools.items()):
         own = step[k + width * t : k + width * (t + 1)]
         tools[name] = tool @ Rigid.exp(own if width == 6 else [0, 0, 0, *own])
-    chain = moved_chain(state.chain, step[:k])
+    stations, k = dict(state.stations), k + width * len(tools)
+    for s, name in enumerate(list(stations)[1:]):
+        stations[name] = stations[name] @ Rigid.exp(step[k + 6 * s : k + 6 * s + 6])
+    chain = moved_chain(state.chain, step[: len(chain_parameters(state.chain))])
     if state.elastic and chain.elasticity is not None:
         values = elasticity_values(chain.elasticity) + step[-state.elastic_count :]
         chain = replace(chain, elasticity=with_values(chain.elasticity, values))
-    return replace(state, chain=chain, tools=tools)
+    return replace(state, chain=chain, tools=tools, stations=stations)
 
 
 def only_of(seen: Observed, keep: np.ndarray) -> Observed:

@@ -35,7 +35,6 @@ from stcal.robot.identify.residuals import (
     parameter_names,
     residuals,
     tips,
-    unknowns,
 )
 from stcal.robot.identify.result import (
     LEAST_FOLDS,
@@ -319,7 +318,9 @@ def _undetermined(solution: Solution, names: list[str], seen: Observed, partial:
 def _ranks(state: State, data: Measurements) -> dict[str, int]:
     """Parameters that poses, positions and distances at these joint values determine, whichever were measured."""
     tip = tips(state, data.q, data.targets)
-    exact = Measurements(data.where, data.lines, data.q, data.targets, tip.translation, tip.rotation)
+    exact = Measurements(
+        data.where, data.lines, data.q, data.targets, tip.translation, tip.rotation, stations=data.stations
+    )
     ranks, weighting = {}, Weighting(TYPICAL_MM, TYPICAL_RAD)
     for kind in get_args(Kind):
         seen = observed(exact, kind)
@@ -331,10 +332,14 @@ def _observability(robot: Robot, adjusted: Adjustment, seen: Observed, rank: int
     state, weighting = adjusted.solution.state, adjusted.weighting
     scale = parameter_scale(robot, seen.kind, state.tools)
     rows = weighting.whiten(jacobian(state, seen)[:, :, : len(scale)], seen) * scale
-    if seen.frameless:  # without what a motion of all points makes
-        at = seen.data.points() - seen.data.points().mean(0)
-        motions = np.concatenate([-skew(at) / np.linalg.norm(at), np.tile(np.eye(3), (len(at), 1, 1))], axis=2)
-        u, s, _ = np.linalg.svd(weighting.whiten(motions, seen).reshape(-1, 6), full_matrices=False)
+    if seen.frameless:  # without what a motion of all points of a station makes
+        each = []
+        for own in seen.data.by_station().values():
+            at = (seen.data.points() - seen.data.points()[own].mean(0)) * own[:, None]
+            shift = np.eye(3) * own[:, None, None]
+            each.append(np.concatenate([-skew(at) / np.linalg.norm(at), shift], axis=2))
+        motions = np.concatenate(each, axis=2)
+        u, s, _ = np.linalg.svd(weighting.whiten(motions, seen).reshape(-1, motions.shape[2]), full_matrices=False)
         u, flat = u[:, s > 1e-9 * s[0]], rows.reshape(-1, rows.shape[2])
         rows = (flat - u @ (u.T @ flat)).reshape(rows.shape)
     return ObservabilityIndices.of_jacobian(rows, rank)
@@ -344,9 +349,11 @@ def _place(seen: Observed) -> int:
     """Directions in which positions that count by their distances can be moved together: 6 (5 of points on a line)."""
     if not seen.frameless:
         return 0
-    at = seen.data.points() - seen.data.points().mean(0)
-    turns = np.linalg.matrix_rank(skew(at).reshape(-1, 3), tol=STILL_MM)
-    return 3 + int(turns)
+    directions = 0
+    for rows in seen.data.by_station().values():
+        at = seen.data.points()[rows] - seen.data.points()[rows].mean(0)
+        directions += 3 + int(np.linalg.matrix_rank(skew(at).reshape(-1, 3), tol=STILL_MM))
+    return directions
 
 
 def _covariance(adjusted: Adjustment, seen: Observed) -> np.ndarray:
@@ -370,25 +377,25 @@ def _cross_validated(robot: Robot, seen: Observed, whole: Adjustment, options: I
     repeats = options.repeats or (REPEATS if rows <= FEW_ROWS else 1)
     rng = np.random.default_rng(options.seed)
     position, rotation = np.full((repeats, rows), np.nan), np.full((repeats, rows), np.nan)
-    good, known = whole.solution.weights >= GROSS, (whole.rows, whole.weighting, whole.deviations)
+    good, begin = whole.solution.weights >= GROSS, (whole.rows, whole.weighting, whole.deviations)
     good |= good.mean() < MOSTLY_GOOD
     for repeat in range(repeats):
         for place in dealt(rows, options.folds, rng):
             others = np.setdiff1d(np.arange(rows), place)
             train, test = only_of(seen, others), only_of(seen, place)
-            seeks = unknowns(robot.chain(), len(set(train.data.targets)), seen.kind) - unseen(seen.kind)
-            seeks -= whole.solution.count
+            state = _of_targets(whole.solution.state, train)
+            seeks = len(parameter_names(state, seen.kind)) - unseen(seen.kind) - whole.solution.count
             if WIDTH[seen.kind] * len(train) <= seeks:
                 return None
-            state = _of_targets(whole.solution.state, train)
             if rows <= FEW_ROWS:
-                state = _without_errors(state, train, good[others], options, known, FOLD_ROUNDS).solution.state
+                state = _without_errors(state, train, good[others], options, begin, FOLD_ROUNDS).solution.state
             else:
                 held = whole.rows.held(state, whole.deviations, seen.kind)
                 state = solve(state, train, whole.weighting, options.robust, held).state
-            known_tool = np.array([t in state.tools for t in test.data.targets])
             if seen.kind != "distance":
-                test, place = only_of(test, known_tool), place[known_tool]
+                named = zip(test.data.targets, test.data.stations, strict=True)
+                known = np.array([target in state.tools and station in state.stations for target, station in named])
+                test, place = only_of(test, known), place[known]
             found = residuals(state, test)
             position[repeat, place] = position_errors(found)
             if seen.kind == "pose":
@@ -397,5 +404,8 @@ def _cross_validated(robot: Robot, seen: Observed, whole: Adjustment, options: I
 
 
 def _of_targets(state: State, seen: Observed) -> State:
-    """With the tools that ``seen`` shows."""
-    return replace(state, tools={name: tool for name, tool in state.tools.items() if name in seen.data.targets})
+    """With the tools and stations that ``seen`` shows."""
+    tools = {name: tool for name, tool in state.tools.items() if name in seen.data.targets}
+    first = next(iter(state.stations))
+    stations = {name: each for name, each in state.stations.items() if name in {first, *seen.data.stations}}
+    return replace(state, tools=tools, stations=stations)

@@ -12,7 +12,7 @@ from stcal.geometry.least_squares import NormalEquations, minimise, perturbed
 from stcal.geometry.rigid import Poses, Rigid, skew
 from stcal.io.quaternions import EXPLAINS
 from stcal.robot.identify.adjustment import USELESS_MM
-from stcal.robot.identify.residuals import State, observed, residuals
+from stcal.robot.identify.residuals import State, observed, residuals, tips
 from stcal.robot.kinematics.damped import reach_mm
 from stcal.robot.kinematics.fit import FITS, require_convention
 from stcal.robot.kinematics.forward import flange_poses
@@ -40,6 +40,8 @@ def start(robot: Robot, data: Measurements) -> State:
     DegenerateError
         A target never moved, or only along a line.
     """
+    if data.positions is not None and len(set(data.stations)) > 1:
+        return _with_stations(robot, data)
     _moves(data)
     tools = {name: robot.tools.get(name, robot.tools.get("", Rigid())) for name in sorted(set(data.targets))}
     state, misfit = _placed(robot, data, tools)
@@ -49,7 +51,35 @@ def start(robot: Robot, data: Measurements) -> State:
     if data.rotations is not None:
         flange = flange_poses(state.chain, data.q).rotation
         require_convention(data.where, data.targets, flange, data.rotations)
-    return state
+    return replace(state, stations={data.stations[0]: Rigid()})
+
+
+def _with_stations(robot: Robot, data: Measurements) -> State:
+    """By the rows of the station that has most; the others where these positions put them."""
+    (first, most), *others = data.by_station().items()
+    state = start(robot, data[most])
+    known = robot.tools.get("", Rigid())
+    tools = {name: state.tools.get(name, robot.tools.get(name, known)) for name in sorted(set(data.targets))}
+    state = replace(state, tools=tools)
+    stations = dict(state.stations)
+    for name, own in others:
+        part = data[own]
+        try:
+            station = align_rigid(part.points(), tips(state, part.q, part.targets).translation)
+        except DegenerateError as error:
+            raise DegenerateError(
+                f"{data.where}: station {name}: {own.sum()} positions do not show where it stands; 3 or more off one "
+                "line needed, or leave them out"
+            ) from error
+        off = part.points() - (station @ tips(state, part.q, part.targets)).translation
+        misfit, extent = float(np.sqrt((off**2).sum(1).mean())), _extent(part)
+        if misfit > FITS * extent:
+            raise InputError(
+                f"{data.where}: station {name}: its rows miss the robot by {misfit:.3g} mm RMS as the rows of station "
+                f"{first} place it, {FITS:.0%} of their spread of {extent:.3g} mm allowed; check column station"
+            )
+        stations[name] = station
+    return replace(state, stations=stations)
 
 
 def _extent(data: Measurements) -> float:

@@ -54,6 +54,8 @@ class Measurements:
         Where only these were measured, mm.
     from_row : (m,) array of int, optional
         Row, from 0, at whose position each distance starts.
+    stations : tuple of str
+        (m,) names of where the instrument stood: positions are in a frame of each; one where not given.
     notes : tuple of str
         On rows of the file that are not here, columns that were not read, and angles by their convention.
 
@@ -73,11 +75,13 @@ class Measurements:
     common: np.ndarray | None = None
     distances: np.ndarray | None = None
     from_row: np.ndarray | None = None
+    stations: tuple[str, ...] = ()
     notes: tuple[str, ...] = ()
 
     def __post_init__(self):
         m = len(self.q)
         freeze(self, "q", (m, None), "joint values")
+        object.__setattr__(self, "stations", self.stations or ("",) * m)
         shapes = {"positions": (3,), "rotations": (3, 3), "covariance": (6, 6), "common": (6, None)}
         for name, shape in shapes.items():
             if getattr(self, name) is not None:
@@ -100,8 +104,15 @@ class Measurements:
             lines=[self.lines[i] for i in rows],
             q=self.q[rows],
             targets=tuple(self.targets[i] for i in rows),
+            stations=tuple(self.stations[i] for i in rows),
             **{name: None if values is None else values[rows] for name, values in optional.items()},
         )
+
+    def by_station(self) -> dict[str, np.ndarray]:
+        """(m,) which rows each station has; that of most rows first."""
+        names = np.array(self.stations)
+        found = {name: names == name for name in dict.fromkeys(self.stations)}
+        return dict(sorted(found.items(), key=lambda item: -item[1].sum()))
 
     def own_covariance(self) -> np.ndarray:
         """(m, 6, 6) of what each pose errs by itself."""
@@ -166,13 +177,16 @@ def read_measurements(
     if table.has("x", LENGTHS):
         poses, columns, said = oriented(table, rotation)
         data = Measurements(table.where, table.lines, q, targets, table.points(), notes=said + unread(table, columns))
+        if "station" in table:
+            data = replace(data, stations=tuple(table.text("station")))
         if poses is not None:
             covariance = table.pose_covariances()
             data = replace(
                 data, rotations=poses.rotation, covariance=covariance, common=table.common_errors(covariance)
             )
         within(table, "position", data.points(), "mm")
-        _in_reach(data, robot)
+        for rows in data.by_station().values():
+            _in_reach(data[rows], robot)
         return _usable(data, table)
     if not table.has("distance", LENGTHS):
         raise InputError(
