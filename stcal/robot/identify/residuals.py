@@ -111,13 +111,19 @@ def residuals(state: State, seen: Observed) -> np.ndarray:
 def jacobian(state: State, seen: Observed) -> np.ndarray:
     """Derivative of what the model says by :func:`parameter_names`, (r, 6 or 3 or 1, k)."""
     tip, full = tip_jacobian(state, seen.data.q, seen.data.targets, seen.kind)
+    return as_seen(seen, tip, full)
+
+
+def as_seen(seen: Observed, tip: Poses, moves: np.ndarray) -> np.ndarray:
+    """What observations see, (r, 6 or 3 or 1, k), of motions of the tools (m, 6, k) at ``tip``: rad over mm, in the
+    world's axes."""
     if seen.kind == "pose":
-        return full
+        return moves
     if seen.kind == "position":
-        return full[:, 3:]
+        return moves[:, 3:]
     apart = tip.translation[seen.first] - tip.translation[seen.second]
     unit = apart / np.maximum(np.linalg.norm(apart, axis=1), 1e-12)[:, None]
-    return np.einsum("ri,rik->rk", unit, full[seen.first, 3:] - full[seen.second, 3:])[:, None]
+    return np.einsum("ri,rik->rk", unit, moves[seen.first, 3:] - moves[seen.second, 3:])[:, None]
 
 
 def tip_jacobian(state: State, q: np.ndarray, targets: Sequence[str], kind: Kind) -> tuple[Poses, np.ndarray]:
