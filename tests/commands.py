@@ -150,6 +150,11 @@ CALLS = (
     Call("robot identify", f"@robot/poses.csv --robot @robot/robot.toml --folds 2 --out >r.toml {_ALL}", 4.0),
     Call("robot identify", "@robot/sweeps.csv --robot @robot/robot.toml --observe distance --partial --folds 0", 1.0),
     Call(
+        "robot evaluate",
+        f"@robot/poses.csv --robot @robot/robot.toml --robot @robot/made.toml --out >rows.csv {_ALL}",
+        2.0,
+    ),
+    Call(
         "robot compensate",
         f"@robot/targets.csv --robot @robot/made.toml --nominal @robot/robot.toml --out >joints.csv {_ALL}",
         1.2,

@@ -76,6 +76,22 @@ class OutlierMeasurementRow(Part):
     error_mm: float
 
 
+class PlacedPart(Part):
+    name: str
+    pose: Matrix
+    sigma: list[float | None] | None
+
+
+class FoundLeft(Part):
+    what: str
+    joint: int
+    turns: int
+    effect_mm: float
+    effect_rad: float
+    share: float
+    p: float
+
+
 class IdentifiedFile(ResultFile):
     """Of ``identify``."""
 
@@ -143,11 +159,20 @@ class IdentifiedFile(ResultFile):
     rows: list[dict[str, Element]] = Field(
         description="for each joint `a`, `d` (mm), `alpha`, `theta`, `beta` (rad): `nominal`, `identified`, `sigma`"
     )
+    placed: list[PlacedPart] = Field(
+        description="base and tools: `name`, `pose` (4×4, mm), `sigma` of rotation (rad, about the outer frame's axes) "
+        "and translation (mm), as far as it is determined"
+    )
     parameter_names: list[str] = Field(
         description="small motions of each joint's frame (`J2 rx`: rad, `J2 x`: mm) and of the tools"
     )
     covariance: Matrix = Field(description="of these; of distances singular: 0 along what they never show")
     residuals: list[RowErrors] = Field(description="`line`, `error_mm`, `weight`")
+    left: list[FoundLeft] | None = Field(
+        description="what the residuals go with, the strongest first: `what` in words, `joint` and `turns` (0: none), "
+        "`effect_mm`, `effect_rad` (amplitude where it turns, else RMS), `share` of their squares, `p` times the "
+        "number of tests; null where rows are too few to tell"
+    )
     outliers: list[OutlierMeasurementRow] = Field(
         description="those of less than half weight: `line`, `place`, `error_mm`"
     )

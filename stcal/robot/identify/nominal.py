@@ -1,16 +1,18 @@
-"""What the nominal D-H rows are worth: dimensions as made differ from the drawing by σ that the data show."""
+"""What the nominal D-H rows are worth: dimensions as made differ from the drawing by σ that the data show; and base and
+tools beside them."""
 
 from collections.abc import Mapping
-from dataclasses import asdict, astuple, dataclass
+from dataclasses import asdict, astuple, dataclass, replace
 from typing import Literal
 
 import numpy as np
 from scipy.linalg import block_diag
 
 from stcal.errors import InputError
+from stcal.geometry.rigid import Poses, Rigid
 from stcal.robot.identify.adjustment import Held
 from stcal.robot.identify.elastic import UsualElasticity, usual
-from stcal.robot.identify.residuals import Kind, State, parameter_names
+from stcal.robot.identify.residuals import Kind, State, moved, parameter_names
 from stcal.robot.kinematics.dh import PARALLEL_RAD, robot_from_chain
 from stcal.robot.kinematics.forward import chain_parameters, moved_chain
 from stcal.robot.kinematics.model import Robot
@@ -191,3 +193,67 @@ def _coaxial(nominal: Robot) -> tuple[tuple[int, int], ...]:
         if parallel and abs(row.a) < COAXIAL_MM and not nominal.prismatic[i]:
             found.append((i - 1, reach))
     return tuple(found)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Placed:
+    """Base in the instrument's frame, a tool in the flange's, or a station in the first one's: ``pose``, and σ (6,) of
+    its rotation (rad, about the outer frame's axes) and translation (mm); nan of what was not fitted."""
+
+    name: str
+    pose: Rigid
+    sigma: np.ndarray
+
+    def sigma_or_none(self) -> list[float | None] | None:
+        """For programs."""
+        return None if np.isnan(self.sigma).all() else [None if np.isnan(s) else float(s) for s in self.sigma]
+
+
+def base_name() -> str:
+    """For tables."""
+    return "base in the instrument's frame"
+
+
+def tool_name(name: str) -> str:
+    """For tables."""
+    return f"tool {name} in the flange's frame".replace("  ", " ")
+
+
+def placed(state: State, kind: Kind, covariance: np.ndarray, units: np.ndarray, nominal: Robot) -> tuple[Placed, ...]:
+    """Base and tools of the robot file that ``state`` makes, and stations.
+
+    Parameters
+    ----------
+    state : State
+        As identified.
+    kind : {"pose", "position", "distance"}
+        Of the observations: positions tell no orientation of a tool, distances no base.
+    covariance : (k, k) array
+        Of the parameters but elasticity.
+    units : (k,) array
+        That make each parameter a movement of the tool of about 1 mm.
+    nominal : Robot
+        From which the file's form is.
+    """
+
+    def poses(at: State) -> Poses:
+        robot = robot_from_chain(at.chain, at.tools, nominal)
+        stations = [each.inverse() for each in list(at.stations.values())[1:]]
+        return Poses.of([robot.world_from_base, *robot.tools.values(), *stations])
+
+    state = replace(state, elastic=False)
+    derivative = np.zeros((len(state.tools) + len(state.stations), 6, len(units)))
+    for k, unit in enumerate(units):
+        step = np.zeros(len(units))
+        step[k] = DIFFERENCE_MM * unit
+        ahead, behind = poses(moved(state, step, kind)), poses(moved(state, -step, kind))
+        derivative[:, :, k] = ahead.difference(behind) / (2 * step[k])
+    sigma = np.sqrt(np.einsum("pik,kl,pil->pi", derivative, covariance, derivative).clip(0))
+    if kind != "pose":
+        sigma[1 : 1 + len(state.tools), :3] = np.nan
+    if kind == "distance":
+        sigma[0] = np.nan
+    first, *others = state.stations
+    base = f"base in the frame of station {first}" if others else base_name()
+    names = [base, *map(tool_name, state.tools), *(f"station {name} in that of {first}" for name in others)]
+    return tuple(Placed(*each) for each in zip(names, poses(state), sigma, strict=True))

@@ -1,5 +1,6 @@
 """What an identification found, as text, JSON and page."""
 
+from collections.abc import Iterable
 from dataclasses import asdict
 
 import numpy as np
@@ -7,10 +8,11 @@ import numpy as np
 from stcal.report.figure import COLOURS, calm, new_figure, uri
 from stcal.report.page import render
 from stcal.report.text import NONE, number, text_table
+from stcal.robot.identify.drawings import Drawn, joints_figure, space_picture
 from stcal.robot.identify.files import IdentifiedFile
-from stcal.robot.identify.nominal import DIMENSIONS, dh_values
+from stcal.robot.identify.nominal import DIMENSIONS, Placed, dh_values
 from stcal.robot.identify.observability import MEANING
-from stcal.robot.identify.result import Identified
+from stcal.robot.identify.result import OUTLIER_WEIGHT, Identified
 from stcal.robot.kinematics.forward import links, torques
 from stcal.robot.kinematics.model import Elasticity, Robot
 
@@ -38,7 +40,7 @@ def identified_text(result: Identified, nominal: Robot) -> str:
     values, sigma = dh_values(result.robot) * SHOWN, result.dh_sigma * SHOWN
     for i, each in enumerate(zip(values, sigma, strict=True), 1):
         rows.append([str(i), *(cell for v, s in zip(*each, strict=True) for cell in (number(v, 4), _sigma(s)))])
-    placed = [[name, *(number(v, 4) for v in pose)] for name, pose in _placed(result).items()]
+    placed = [line for each in result.placed for line in _placed(each)]
     lines += ["", *text_table([["<error, mm", "mean", "RMS", "max"], *errors], (34, *[7] * 3))]
     lines += ["", *text_table(rows, (6, *[11, 7] * 5))]
     lines += ["", *text_table([["<mm and rotation vector, deg", *PLACE], *placed], (34, *[9] * 6))]
@@ -94,12 +96,14 @@ def identified_file(result: Identified, nominal: Robot) -> IdentifiedFile:
             {name: {"nominal": b, "identified": v, "sigma": s} for name, b, v, s in zip(DH, *each, strict=True)}
             for each in zip(before.tolist(), values.tolist(), result.dh_sigma.tolist(), strict=True)
         ],
+        "placed": placed_parts(result.placed),
         "parameter_names": list(result.names),
         "covariance": result.covariance,
         "residuals": [
             {"line": _line(result, i), "error_mm": float(e), "weight": float(w)}
             for i, (e, w) in enumerate(zip(result.fitted_mm, result.weights, strict=True))
         ],
+        "left": result.left,
         "outliers": [
             {"line": _line(result, i), "place": _place(result, i), "error_mm": error} for i, error in result.outliers()
         ],
@@ -122,6 +126,8 @@ def identified_file(result: Identified, nominal: Robot) -> IdentifiedFile:
 
 def identified_page(result: Identified, nominal: Robot) -> str:
     """The report page."""
+    good = result.weights >= OUTLIER_WEIGHT
+    drawn = Drawn(result.state, result.robot.world_from_base, result.seen, result.residuals, good)
     return render(
         "robot/identify/page.html.jinja",
         robot=nominal.name,
@@ -134,7 +140,11 @@ def identified_page(result: Identified, nominal: Robot) -> str:
         elastic_head=ELASTIC,
         errors_by_row=uri(_figure(result)),
         dh=_rows(result, nominal),
-        placed=[[name, *(number(v, 4) for v in pose)] for name, pose in _placed(result).items()],
+        placed=[placed_cells(each) for each in result.placed],
+        left=[each.sentence() for each in result.left or ()],
+        told=result.left is not None,
+        residuals_by_joint=uri(joints_figure(drawn, result.left or ())),
+        residuals_in_space=space_picture(drawn) if result.seen.kind != "distance" else None,
         kinds=", ".join(f"{kind}s {rank}" for kind, rank in result.ranks.items()),
         sigma=[
             [name, f"{1000 * np.degrees(s):.3f} mdeg" if " r" in name else f"{1000 * s:.1f} µm"]
@@ -209,15 +219,28 @@ def _elasticity(result: Identified) -> dict | None:
     return {"gravity": found.gravity.tolist(), "joints": joints(found), "sigma": joints(sigma)}
 
 
-def _placed(result: Identified) -> dict[str, np.ndarray]:
-    """Base, tools and stations: translation, mm, and rotation vector, deg, (6,)."""
-    robot, (first, *others) = result.robot, result.state.stations
-    poses = {
-        f"base in the frame of station {first}" if others else "base in the instrument's frame": robot.world_from_base
-    }
-    poses |= {f"station {name} in that of {first}": result.state.stations[name].inverse() for name in others}
-    poses |= {f"tool {name} in the flange's frame".replace("  ", " "): tool for name, tool in robot.tools.items()}
-    return {name: np.append(pose.translation, np.degrees(pose.log()[:3])) for name, pose in poses.items()}
+def _placed(each: Placed) -> list[list[str]]:
+    """Translation, mm, and rotation vector, deg; σ in a line of their own."""
+    values, sigma = _shown(each)
+    lines = [[each.name, *(number(v, 4) for v in values)]]
+    return lines if np.isnan(sigma).all() else [*lines, ["  σ", *(number(s, 4) for s in sigma)]]
+
+
+def _shown(each: Placed) -> tuple[np.ndarray, np.ndarray]:
+    """Translation, mm, and rotation vector, deg, (6,); and σ of shifts along, and turns about, the axes (6,)."""
+    values = np.append(each.pose.translation, np.degrees(each.pose.log()[:3]))
+    return values, np.append(each.sigma[3:], np.degrees(each.sigma[:3]))
+
+
+def placed_cells(each: Placed) -> list[str]:
+    """Name, and value ± σ of translation, mm, and rotation vector, deg, for a page."""
+    found = [number(v, 4) + (f" ± {s:.4f}" if np.isfinite(s) else "") for v, s in zip(*_shown(each), strict=True)]
+    return [each.name.partition(" in the")[0], *found]
+
+
+def placed_parts(placed: Iterable[Placed]) -> list[dict]:
+    """For result files."""
+    return [{"name": each.name, "pose": each.pose.matrix(), "sigma": each.sigma_or_none()} for each in placed]
 
 
 def _rows(result: Identified, nominal: Robot) -> list[tuple[list, list]]:

@@ -112,8 +112,7 @@ def tips(state: State, q: np.ndarray, targets: Sequence[str]) -> Poses:
 
 def residuals(state: State, seen: Observed) -> np.ndarray:
     """Measured minus modelled, (r, 6), (r, 3) or (r, 1): rad and mm in the axes of the row's station."""
-    tip = tips(state, seen.data.q, seen.data.targets)
-    return _beside(_stations(state, seen.data.stations) @ tip if len(state.stations) > 1 else tip, seen)
+    return _beside(state, tips(state, seen.data.q, seen.data.targets), seen)
 
 
 def jacobian(state: State, seen: Observed) -> np.ndarray:
@@ -125,17 +124,23 @@ def linear(state: State, seen: Observed) -> tuple[np.ndarray, np.ndarray]:
     """:func:`residuals` and :func:`jacobian`."""
     tip, full = tip_jacobian(state, seen.data.q, seen.data.targets, seen.kind)
     if len(state.stations) > 1:
-        station, full = _stations(state, seen.data.stations), _by_station(state, seen, tip, full)
-        tip, turn = station @ tip, station.rotation[:, None]
-        full = (turn @ full.reshape(len(full), 2, 3, -1)).reshape(full.shape)
-    found = _beside(tip, seen)
+        full = _by_station(state, seen, tip, full)
+    return _beside(state, tip, seen), as_seen(state, seen, tip, full)
+
+
+def as_seen(state: State, seen: Observed, tip: Poses, moves: np.ndarray) -> np.ndarray:
+    """What observations see, (r, 6 or 3 or 1, k), of motions of the tools (m, 6, k) at ``tip``: rad over mm, in the
+    world's axes; seen in those of the row's station."""
+    if len(state.stations) > 1:
+        turn = _stations(state, seen.data.stations).rotation[:, None]
+        moves = (turn @ moves.reshape(len(moves), 2, 3, -1)).reshape(moves.shape)
     if seen.kind == "pose":
-        return found, full
+        return moves
     if seen.kind == "position":
-        return found, full[:, 3:]
+        return moves[:, 3:]
     apart = tip.translation[seen.first] - tip.translation[seen.second]
     unit = apart / np.maximum(np.linalg.norm(apart, axis=1), 1e-12)[:, None]
-    return found, np.einsum("ri,rik->rk", unit, full[seen.first, 3:] - full[seen.second, 3:])[:, None]
+    return np.einsum("ri,rik->rk", unit, moves[seen.first, 3:] - moves[seen.second, 3:])[:, None]
 
 
 def _stations(state: State, names: Sequence[str]) -> Poses:
@@ -156,8 +161,10 @@ def _by_station(state: State, seen: Observed, tip: Poses, full: np.ndarray) -> n
     return full
 
 
-def _beside(tip: Poses, seen: Observed) -> np.ndarray:
+def _beside(state: State, tip: Poses, seen: Observed) -> np.ndarray:
     """Measured minus modelled (m,) poses of the tips."""
+    if len(state.stations) > 1:
+        tip = _stations(state, seen.data.stations) @ tip
     if seen.kind == "pose":
         return seen.data.poses().difference(tip)
     if seen.kind == "position":

@@ -11,7 +11,8 @@ from stcal.robot.identify.adjustment import (
     Solution,
     Weighting,
 )
-from stcal.robot.identify.nominal import Adjusted, Deviations, NominalRows
+from stcal.robot.identify.left import Finding
+from stcal.robot.identify.nominal import Adjusted, Deviations, NominalRows, Placed
 from stcal.robot.identify.observability import ObservabilityIndices
 from stcal.robot.identify.predicted import Predicted
 from stcal.robot.identify.residuals import (
@@ -161,6 +162,10 @@ class Identified:
         Errors of the cross-validation.
     predicted : Predicted or None
         σ of the tool's position by the covariance; None of distances.
+    placed : tuple of Placed
+        Base and tools of the robot, with σ.
+    left : tuple of Finding or None
+        What the residuals go with; None where observations are too few to tell.
     dh_sigma : (n, 5) array
         σ of a, alpha, d, theta, beta; mm, rad.
     observability : ObservabilityIndices
@@ -189,6 +194,8 @@ class Identified:
     nominal_mm: np.ndarray
     held_out: HeldOutRows | None
     predicted: Predicted | None
+    placed: tuple[Placed, ...]
+    left: tuple[Finding, ...] | None
     dh_sigma: np.ndarray
     observability: ObservabilityIndices
     deviations: dict[str, float | None]

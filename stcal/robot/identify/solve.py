@@ -21,7 +21,8 @@ from stcal.robot.identify.adjustment import (
 )
 from stcal.robot.identify.consensus import agreeing
 from stcal.robot.identify.elastic import bending
-from stcal.robot.identify.nominal import Deviations, NominalRows
+from stcal.robot.identify.left import left
+from stcal.robot.identify.nominal import Deviations, NominalRows, placed
 from stcal.robot.identify.observability import ObservabilityIndices, directions_named, parameter_scale
 from stcal.robot.identify.predicted import doubts, predicted
 from stcal.robot.identify.residuals import (
@@ -128,6 +129,14 @@ def identify(robot: Robot, data: Measurements, options: IdentifyOptions | None =
     covariance = every[own, own]
     identified = robot_from_chain(solution.state.chain, solution.state.tools, robot)
     sigma = predicted(solution.state, robot, seen, every)
+    found = left(
+        solution.state,
+        identified.world_from_base,
+        seen,
+        adjusted.weighting,
+        jacobian(solution.state, seen),
+        solution.weights,
+    )
     tested = held_out is not None or options.folds < LEAST_FOLDS
     return Identified(
         robot=identified,
@@ -141,6 +150,8 @@ def identify(robot: Robot, data: Measurements, options: IdentifyOptions | None =
         nominal_mm=position_errors(residuals(first, seen)),
         held_out=held_out,
         predicted=sigma,
+        placed=placed(solution.state, seen.kind, covariance, solution.units[own], robot),
+        left=found,
         dh_sigma=adjusted.rows.sigma(identified, covariance),
         observability=_observability(identified, adjusted, seen, rank),
         deviations=adjusted.deviations.of(adjusted.rows.groups),
@@ -150,7 +161,8 @@ def identify(robot: Robot, data: Measurements, options: IdentifyOptions | None =
         notes=data.notes
         + adjusted.rows.notes(identified)
         + adjusted.notes
-        + doubts(sigma, seen, solution.units[own], covariance, names, tested),
+        + doubts(sigma, seen, solution.units[own], covariance, names, tested)
+        + tuple(each.sentence() for each in found or ()),
     )
 
 

@@ -2,6 +2,7 @@
 
 from collections.abc import Iterator
 from dataclasses import replace
+from typing import Literal
 
 import numpy as np
 from scipy.optimize import least_squares
@@ -19,6 +20,8 @@ from stcal.robot.kinematics.forward import flange_poses
 from stcal.robot.kinematics.measurements import Measurements
 from stcal.robot.kinematics.model import Robot
 
+Fit = frozenset[Literal["base", "tool"]]
+BOTH: Fit = frozenset(("base", "tool"))
 ROUNDS = 500
 REGULAR = 1e-10
 """Damping that keeps what these positions leave open, as of a tool that never turned, where it is."""
@@ -30,8 +33,17 @@ AROUND = 0.1
 """Of the arm's reach: how far from the given point of the tool distances are tried too."""
 
 
-def start(robot: Robot, data: Measurements) -> State:
+def start(robot: Robot, data: Measurements, fit: Fit = BOTH) -> State:
     """The nominal chain where the instrument stands, with tools that fit the measurements best.
+
+    Parameters
+    ----------
+    robot : Robot
+        Its axes are taken as they are; and base and tools, unless they are fitted.
+    data : Measurements
+        What the instrument saw.
+    fit : frozenset of {"base", "tool"}
+        What is fitted to it; all if not given.
 
     Raises
     ------
@@ -43,10 +55,20 @@ def start(robot: Robot, data: Measurements) -> State:
     if data.positions is not None and len(set(data.stations)) > 1:
         return _with_stations(robot, data)
     _moves(data)
-    tools = {name: robot.tools.get(name, robot.tools.get("", Rigid())) for name in sorted(set(data.targets))}
-    state, misfit = _placed(robot, data, tools)
+    named = sorted(set(data.targets))
+    if "tool" in fit:
+        tools = {name: robot.tools.get(name, robot.tools.get("", Rigid())) for name in named}
+    else:
+        tools = {name: robot.tool(name) for name in named}
+    state, misfit = _placed(robot, data, tools, fit)
     extent = _extent(data)
     if misfit > FITS * extent:
+        if fit != BOTH and _placed(robot, data, tools)[1] <= FITS * extent:
+            raise InputError(
+                f"{data.where}: robot {robot.name} as its file stands misses the measurements by {misfit:.3g} mm RMS, "
+                f"{FITS:.0%} of their spread of {extent:.3g} mm allowed; it fits with base and tool fitted to them "
+                "(base-tool)"
+            )
         _explain(robot, data, tools, misfit, extent)
     if data.rotations is not None:
         flange = flange_poses(state.chain, data.q).rotation
@@ -104,7 +126,7 @@ def _moves(data: Measurements) -> None:
             )
 
 
-def _placed(robot: Robot, data: Measurements, tools: dict[str, Rigid]) -> tuple[State, float]:
+def _placed(robot: Robot, data: Measurements, tools: dict[str, Rigid], fit: Fit = BOTH) -> tuple[State, float]:
     """Base and tool points by least squares, tool orientations after them; and the RMS misfit, mm."""
     chain = replace(robot, world_from_base=Rigid()).chain()
     flange = flange_poses(chain, data.q)
@@ -112,11 +134,13 @@ def _placed(robot: Robot, data: Measurements, tools: dict[str, Rigid]) -> tuple[
     rows = np.array([names.index(t) for t in data.targets])
     points = np.array([tools[name].translation for name in names])
     if data.positions is None:  # distances see neither base nor where the instrument stands
-        points, misfit = _points_of_distances(robot, flange, data, rows, points)
+        points, misfit = _points_of_distances(robot, flange, data, rows, points, "tool" in fit)
         return State(chain, {name: Rigid(tools[name].rotation, points[k]) for k, name in enumerate(names)}), misfit
-    _off_a_line(data)
-    base, points, misfit = _base_and_points(data.where, flange, data.positions, rows, points)
-    if data.rotations is not None:
+    if "base" in fit:
+        _off_a_line(data)
+    given = None if "base" in fit else robot.world_from_base
+    base, points, misfit = _base_and_points(data.where, flange, data.positions, rows, points, given, "tool" in fit)
+    if data.rotations is not None and "tool" in fit:
         seen = base.inverse() @ data.poses()
         turns = np.swapaxes(flange.rotation, 1, 2) @ seen.rotation
         for k, name in enumerate(names):
@@ -137,10 +161,20 @@ def _off_a_line(data: Measurements) -> None:
         )
 
 
-def _base_and_points(where: str, flange: Poses, positions: np.ndarray, rows: np.ndarray, points: np.ndarray):
-    """Base and tool points by least squares, from the alignment with the points given; and RMS misfit, mm."""
+def _base_and_points(
+    where: str,
+    flange: Poses,
+    positions: np.ndarray,
+    rows: np.ndarray,
+    points: np.ndarray,
+    given: Rigid | None = None,
+    fit_points: bool = True,
+):
+    """Base, unless it is ``given``, and tool points by least squares, from the alignment with the points given; and RMS
+    misfit, mm."""
+    free = np.array([given is None] * 6 + [fit_points] * points.size)
     try:
-        base = align_rigid(positions, flange @ points[rows])
+        base = given or align_rigid(positions, flange @ points[rows])
     except DegenerateError as error:
         raise DegenerateError(
             f"{where}: by the robot file all joint values put the target on one line, so that it is not seen how the "
@@ -154,9 +188,11 @@ def _base_and_points(where: str, flange: Poses, positions: np.ndarray, rows: np.
         seen = flange @ at[1][rows]
         turned = np.where(moving, (at[0].rotation @ flange.rotation)[:, :, None], 0.0).reshape(len(rows), 3, -1)
         by = np.concatenate([-skew(seen @ at[0].rotation.T), np.tile(np.eye(3), (len(rows), 1, 1)), turned], axis=2)
-        own = NormalEquations.of((at[0] @ seen - positions).ravel(), by.reshape(-1, by.shape[2]))
+        own = NormalEquations.of((at[0] @ seen - positions).ravel(), free * by.reshape(-1, by.shape[2]))
         return own + NormalEquations(float(at[2] @ (held * at[2])), np.diag(held), held * at[2])
 
+    if not free.any():
+        return base, points, float(np.sqrt(((base @ (flange @ points[rows]) - positions) ** 2).sum(1).mean()))
     found = minimise(
         (base, points, np.zeros(len(held))),
         linearise,
@@ -172,7 +208,9 @@ def _base_and_points(where: str, flange: Poses, positions: np.ndarray, rows: np.
     return base, points, float(np.sqrt((misfit**2).mean()))
 
 
-def _points_of_distances(robot: Robot, flange: Poses, data: Measurements, rows: np.ndarray, points: np.ndarray):
+def _points_of_distances(
+    robot: Robot, flange: Poses, data: Measurements, rows: np.ndarray, points: np.ndarray, fit_points: bool
+):
     """Tool points by least squares, from those given and from others around the flange; and RMS misfit, mm."""
 
     def errors(moved: np.ndarray) -> np.ndarray:
@@ -180,6 +218,8 @@ def _points_of_distances(robot: Robot, flange: Poses, data: Measurements, rows: 
         return distances - np.linalg.norm(tip - tip[from_row], axis=1)
 
     distances, from_row = data.lengths()
+    if not fit_points:
+        return points, float(np.sqrt((errors(points.ravel()) ** 2).mean()))
     reach = max(reach_mm(robot, tool) for tool in robot.tools)
     around = AROUND * reach * np.vstack([np.zeros((1, 3)), np.eye(3), -np.eye(3)])
     # A start, settled or not: the adjustment goes on from here, and says when it does not converge.

@@ -1,0 +1,299 @@
+"""How far several robot files are off on measurements that they were not made from, row by row, and by what."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from typing import Literal
+
+import numpy as np
+from scipy.stats import t as t_distribution
+
+from stcal.errors import DegenerateError, InputError
+from stcal.geometry.rigid import Rigid, skew
+from stcal.geometry.robust import length_limit, robust_sigma
+from stcal.robot.identify.adjustment import Weighting
+from stcal.robot.identify.left import LEAST_FREEDOM, Finding, left
+from stcal.robot.identify.nominal import Placed, base_name, tool_name
+from stcal.robot.identify.residuals import (
+    WIDTH,
+    Observed,
+    State,
+    as_seen,
+    jacobian,
+    observed,
+    only_of,
+    parameter_names,
+    residuals,
+    tips,
+)
+from stcal.robot.identify.result import position_errors
+from stcal.robot.identify.start import Fit, start
+from stcal.robot.kinematics.measurements import Measurements
+from stcal.robot.kinematics.model import Robot
+
+Refit = Literal["none", "base", "tool", "base-tool"]
+FALSE_ALARM, SURELY = 1e-3, 1.5
+"""Probability that one row of a set of normal errors is longer than the limit of which ``SURELY`` times makes an error
+certain: what a model leaves has longer tails than noise. 8 σ of 50 positions."""
+LEAST_MM = 1e-3
+"""Shorter errors are never wrong: no instrument tells them."""
+ROUNDS = 5
+"""Of fitting without wrong rows; one or two do."""
+UNSEEN = 1e-12
+"""Share of what each parameter is seen by alone; of a direction that is seen less, σ is huge."""
+CHANCE = 0.05
+"""Probability of calling one of equal robots better."""
+
+
+@dataclass(frozen=True, slots=True)
+class Figures:
+    """Of the errors of so many rows; mm, or rad of orientations."""
+
+    rows: int
+    mean: float
+    median: float
+    rms: float
+    p95: float
+    max: float
+
+    @classmethod
+    def of(cls, errors: np.ndarray) -> "Figures":
+        rms, p95 = np.sqrt((errors**2).mean()), np.percentile(errors, 95)
+        return cls(len(errors), *(float(v) for v in (errors.mean(), np.median(errors), rms, p95, errors.max())))
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Evaluated:
+    """One robot on the r observations.
+
+    Parameters
+    ----------
+    robot : Robot
+        With base and tools as fitted.
+    state : State
+        Its chain and tools.
+    residuals : (r, 3) or (r, 1) array
+        Measured minus modelled position in the base's axes, or distance; mm.
+    rotation_rad : (r,) array
+        Errors of orientations; empty where none were measured.
+    placed : tuple of Placed
+        Base and tools.
+    left : tuple of Finding or None
+        What the residuals go with; None where rows are too few to tell.
+    beyond : tuple of Finding or None
+        The same of what would be left by all parameters of the kinematics fitted to these rows.
+    """
+
+    robot: Robot
+    state: State
+    residuals: np.ndarray
+    rotation_rad: np.ndarray
+    placed: tuple[Placed, ...]
+    left: tuple[Finding, ...] | None
+    beyond: tuple[Finding, ...] | None
+
+    @property
+    def errors_mm(self) -> np.ndarray:
+        """(r,)"""
+        return position_errors(self.residuals)
+
+
+@dataclass(frozen=True, slots=True)
+class Difference:
+    """Mean error of ``worse`` less that of ``better`` on the same rows, its σ, and the probability of as much by
+    chance, times the number of comparisons."""
+
+    better: str
+    worse: str
+    mm: float
+    sigma_mm: float
+    p: float
+
+    @property
+    def real(self) -> bool:
+        return self.p < CHANCE
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Evaluation:
+    """Robots on one set of measurements.
+
+    Parameters
+    ----------
+    refit : str
+        What was fitted of each robot: base, tool, both or nothing.
+    seen : Observed
+        The r observations: positions or distances.
+    robots : tuple of Evaluated
+        In the order given.
+    wrong : (r,) array of bool
+        Rows that no robot explains: surely wrong, and nothing was fitted to them.
+    differences : tuple of Difference
+        The robot of least mean error against each other one, in order of their means.
+    """
+
+    refit: Refit
+    seen: Observed
+    robots: tuple[Evaluated, ...]
+    wrong: np.ndarray
+    differences: tuple[Difference, ...]
+
+    @property
+    def best(self) -> str:
+        """Name of the robot that is better than all others by more than chance; empty where none is."""
+        return self.differences[0].better if self.differences and all(d.real for d in self.differences) else ""
+
+    def line(self, row: int) -> int:
+        """Of the file."""
+        return int(self.seen.data.lines[self.seen.first[row]])
+
+
+def evaluate(robots: Mapping[str, Robot], data: Measurements, refit: Refit = "base-tool") -> Evaluation:
+    """Errors of robots on measurements, base and tools fitted or not.
+
+    Parameters
+    ----------
+    robots : mapping of str to Robot
+        By the names that they are to have; mm, rad.
+    data : Measurements
+        Joint values with what was measured there, in the instrument's frame.
+    refit : {"none", "base", "tool", "base-tool"}
+        What is fitted by least squares with each robot's own axes; the rest is as its file has it.
+
+    Returns
+    -------
+    Evaluation
+        Errors by row, which robot is better, and what residuals go with; mm, in the axes of each robot's base.
+
+    Raises
+    ------
+    InputError
+        A robot of other joints, or that does not fit the data; a tool that it does not have.
+    DegenerateError
+        Too few rows for what is fitted, or positions that do not show it.
+    """
+    fit: Fit = frozenset(part for part in ("base", "tool") if part in refit.split("-"))
+    named = {name: replace(robot, name=name) for name, robot in robots.items()}
+    for name, robot in named.items():
+        if len(robot.rows) != data.q.shape[1]:
+            raise InputError(f"{data.where}: {data.q.shape[1]} joint values, robot {name} has {len(robot.rows)} joints")
+    seen = observed(data, None if data.positions is None else "position")
+    _enough(seen, fit)
+    states, wrong = _fitted(list(named.values()), data, seen, fit)
+    found = tuple(
+        _evaluated(robot, state, seen, fit, wrong) for robot, state in zip(named.values(), states, strict=True)
+    )
+    return Evaluation(refit, seen, found, wrong, _differences(found, ~wrong))
+
+
+def _parameters(seen: Observed, fit: Fit) -> int:
+    base = 6 if "base" in fit and seen.kind != "distance" else 0
+    return base + (3 * len(set(seen.data.targets)) if "tool" in fit else 0)
+
+
+def _enough(seen: Observed, fit: Fit) -> None:
+    numbers, seeks = WIDTH[seen.kind] * len(seen), _parameters(seen, fit)
+    if numbers <= seeks:
+        raise DegenerateError(
+            f"{seen.data.where}: {len(seen)} {seen.kind}s give {numbers} numbers for {seeks} parameters of "
+            f"{' and '.join(sorted(fit))}; {seeks // WIDTH[seen.kind] + 1} or more needed, or fit less (--refit)"
+        )
+
+
+def _fitted(robots: list[Robot], data: Measurements, seen: Observed, fit: Fit) -> tuple[list[State], np.ndarray]:
+    """States of all robots, and which rows (r,) no robot explains; to those nothing is fitted, but distances, which
+    refer to one another, are all used."""
+    wrong = np.zeros(len(seen), bool)
+    freedom = WIDTH[seen.kind] * len(seen) - _parameters(seen, fit)
+    for _ in range(ROUNDS):
+        kept = data if seen.kind == "distance" else data[~wrong]
+        states = [start(robot, kept, fit) for robot in robots]
+        errors = np.array([position_errors(residuals(state, seen)) for state in states])
+        share = freedom / WIDTH[seen.kind] / len(seen)
+        sigma = min(robust_sigma(each[~wrong], WIDTH[seen.kind], share) for each in errors)
+        limit = SURELY * sigma * length_limit(WIDTH[seen.kind], FALSE_ALARM / len(seen))
+        now = errors.min(0) > max(limit, LEAST_MM)
+        if freedom < LEAST_FREEDOM or (now == wrong).all() or set(_targets(seen, ~now)) < set(_targets(seen)):
+            break
+        wrong = now
+    return states, wrong
+
+
+def _targets(seen: Observed, among: np.ndarray | slice = slice(None)) -> list[str]:
+    return np.array(seen.data.targets, object)[seen.first[among]].tolist()
+
+
+def _evaluated(robot: Robot, state: State, seen: Observed, fit: Fit, wrong: np.ndarray) -> Evaluated:
+    base = state.chain.gap(0) @ replace(robot, world_from_base=Rigid()).chain().gap(0).inverse()
+    found = residuals(state, seen)
+    rotation = np.zeros(0)
+    if seen.data.rotations is not None:
+        whole = observed(seen.data, "pose")
+        rotation = np.linalg.norm(residuals(state, whole)[:, :3], axis=1)
+    good = only_of(seen, np.flatnonzero(~wrong))
+    fitted = _derivatives(state, base, good, fit)
+    one, full = Weighting(1.0, 1.0), jacobian(state, good)
+    seeks = np.concatenate([fitted, full], axis=2)
+    in_base = found @ base.rotation if found.shape[1] == 3 else found
+    placed = _placed(state, base, residuals(state, good), fitted, fit, seen.kind != "distance")
+    return Evaluated(
+        replace(robot, world_from_base=base, tools=state.tools),
+        state,
+        in_base,
+        rotation,
+        placed,
+        left(state, base, good, one, fitted),
+        left(state, base, good, one, seeks),
+    )
+
+
+def _derivatives(state: State, base: Rigid, seen: Observed, fit: Fit) -> np.ndarray:
+    """(r, w, k) by the base, turns about its origin over shifts, and by the tools' points."""
+    parts = [np.zeros((len(seen), WIDTH[seen.kind], 0))]
+    tip = tips(state, seen.data.q, seen.data.targets)
+    if "base" in fit and seen.kind != "distance":
+        moves = np.zeros((len(tip), 6, 6))
+        moves[:, :3, :3] = moves[:, 3:, 3:] = np.eye(3)
+        moves[:, 3:, :3] = -skew(tip.translation - base.translation)
+        parts.append(as_seen(state, seen, tip, moves))
+    if "tool" in fit:
+        own = [name.startswith("tool") for name in parameter_names(state, seen.kind)]
+        parts.append(jacobian(state, seen)[:, :, own])
+    return np.concatenate(parts, axis=2)
+
+
+def _placed(
+    state: State, base: Rigid, found: np.ndarray, fitted: np.ndarray, fit: Fit, with_base: bool
+) -> tuple[Placed, ...]:
+    """With σ by the residuals ``found`` (r, w) and the derivatives ``fitted`` (r, w, k)."""
+    flat, k = fitted.reshape(found.size, -1), fitted.shape[2]
+    size = np.maximum(np.linalg.norm(flat, axis=0), 1e-300)
+    seen, directions = np.linalg.eigh((flat / size).T @ (flat / size))
+    inverse = directions / np.maximum(seen, UNSEEN) @ directions.T / size / size[:, None]
+    covariance = found.ravel() @ found.ravel() / max(found.size - k, 1) * inverse
+    at, placed = 0, []
+    if with_base:
+        sigma = np.full(6, np.nan)
+        if "base" in fit:
+            sigma, at = np.sqrt(np.diag(covariance)[:6]), 6
+        placed.append(Placed(base_name(), base, sigma))
+    for name, tool in state.tools.items():
+        sigma = np.full(6, np.nan)
+        if "tool" in fit:
+            own = tool.rotation @ covariance[at : at + 3, at : at + 3] @ tool.rotation.T
+            sigma[3:], at = np.sqrt(np.diag(own)), at + 3
+        placed.append(Placed(tool_name(name), tool, sigma))
+    return tuple(placed)
+
+
+def _differences(robots: tuple[Evaluated, ...], good: np.ndarray) -> tuple[Difference, ...]:
+    """Paired: rows that are hard for one are hard for the others, which their differences do not feel."""
+    order = sorted(robots, key=lambda each: each.errors_mm[good].mean())
+    better, found = order[0], []
+    for worse in order[1:]:
+        apart = (worse.errors_mm - better.errors_mm)[good]
+        mean, sigma = float(apart.mean()), float(apart.std(ddof=1) / np.sqrt(len(apart))) if len(apart) > 1 else np.inf
+        p = 2 * t_distribution.sf(mean / sigma, len(apart) - 1) if 0 < sigma < np.inf else float(mean == 0 or sigma > 0)
+        found.append(
+            Difference(better.robot.name, worse.robot.name, mean, sigma, float(min(1.0, (len(order) - 1) * p)))
+        )
+    return tuple(found)
