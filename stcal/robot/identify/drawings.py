@@ -112,7 +112,7 @@ def space_picture(shown: Drawn) -> dict[str, str]:
                 "headwidth": 3.5,
                 "headlength": 4,
             }
-            axes.quiver(*start.T, *way.T, color=own, width=0.004 * crowded, **style)
+            axes.quiver(*start.T, *way.T, color=own, **style)
             axes.plot(*start.T, ".", color=own, ms=3)
         plane(axes, f"{'xyz'[i]} of the base, mm", f"{'xyz'[j]} of the base, mm", 0.04)
         axes.plot([low[0], low[0] + scale * bar], [low[1], low[1]], color=INK, lw=2, solid_capstyle="butt")

@@ -104,7 +104,7 @@ def _wrong(result: Evaluation) -> list[str]:
     more = f" and {len(at) - MOST_WRONG} more" if len(at) > MOST_WRONG else ""
     fitted = "" if result.refit == "none" or result.seen.kind == "distance" else "; nothing is fitted to them"
     return [
-        f"no robot explains, with the least error that one leaves: {named}{more}{fitted}; wrong, or what all models lack"
+        f"no robot explains, with the least error that one leaves: {named}{more}{fitted}; wrong, or all models lack it"
     ]
 
 
@@ -258,7 +258,7 @@ def _colour(result: Evaluation, each: Evaluated) -> str:
 
 
 def _errors(axes, result: Evaluation, at: dict[int, np.ndarray], label: str) -> None:
-    """Errors of all robots over ``at`` (by the robot's place), unexplained rows ringed; logarithmic where it is needed."""
+    """Errors of all robots over ``at`` (by the robot's place), unexplained rows ringed; logarithmic where needed."""
     every = np.concatenate([each.errors_mm for each in result.robots])
     few = len(result.wrong) <= 200
     for k, each in enumerate(result.robots):

@@ -57,7 +57,7 @@ class EvaluationFile(ResultFile):
     observed: str = Field(description="positions or distances")
     lines: list[int] = Field(description="of the data file, of each row")
     wrong: list[int] = Field(
-        description="lines that no robot explains (wrong, or something that all models lack); nothing was fitted to them"
+        description="lines that no robot explains (wrong, or something all models lack); nothing was fitted to them"
     )
     best: str | None = Field(description="the robot that is better than all others by more than chance; null: none is")
     robots: list[EvaluatedRobot] = Field(
