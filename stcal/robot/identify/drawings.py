@@ -13,6 +13,8 @@ from stcal.robot.kinematics.forward import joint_frames
 
 ARROW_SHARE, LONGEST_SHARE = 0.12, 0.3
 """Of the picture's side: a typical residual, and the longest that is drawn."""
+FEW_ARROWS = 60
+"""More are drawn shorter and thinner."""
 LEAST_MOTION = 1e-6
 """Of the largest: a joint that moves the tool by less does not move it."""
 FEW = 200
@@ -89,10 +91,11 @@ def space_picture(shown: Drawn) -> dict[str, str]:
     found = shown.residuals[:, -3:] @ base_from_world.rotation.T
     length = np.linalg.norm(found, axis=1)
     side = float(np.ptp(place, axis=0).max()) or 1.0
-    scale = round_below(ARROW_SHARE * side / max(float(np.sqrt((length[good] ** 2).mean())), 1e-12))
+    crowded = min(1.0, FEW_ARROWS / len(place)) ** (1 / 3)
+    scale = round_below(ARROW_SHARE * crowded * side / max(float(np.sqrt((length[good] ** 2).mean())), 1e-12))
     cut = np.minimum(1, LONGEST_SHARE * side / np.maximum(scale * length, 1e-300))
     ends = place + scale * found * cut[:, None]
-    bar = round_below(1.5 * ARROW_SHARE * side / scale)
+    bar = round_below(1.5 * ARROW_SHARE * crowded * side / scale)
     figure = new_figure(9, 4.4)
     for k, (i, j) in enumerate(((0, 1), (0, 2))):
         axes = figure.add_axes((0.075 + 0.5 * k, 0.12, 0.42, 0.85))
@@ -101,7 +104,14 @@ def space_picture(shown: Drawn) -> dict[str, str]:
         axes.plot(*np.vstack([every, low]).T, " ")  # all of it is within the limits
         for mask, own in ((good, colour), (~good, COLOURS[1] if colour != COLOURS[1] else COLOURS[0])):
             start, way = place[mask][:, [i, j]], (ends - place)[mask][:, [i, j]]
-            style = {"angles": "xy", "scale_units": "xy", "scale": 1, "width": 0.004, "headwidth": 3.5, "headlength": 4}
+            style = {
+                "angles": "xy",
+                "scale_units": "xy",
+                "scale": 1,
+                "width": 0.004 * crowded,
+                "headwidth": 3.5,
+                "headlength": 4,
+            }
             axes.quiver(*start.T, *way.T, color=own, **style)
             axes.plot(*start.T, ".", color=own, ms=3)
         plane(axes, f"{'xyz'[i]} of the base, mm", f"{'xyz'[j]} of the base, mm", 0.04)
@@ -109,7 +119,7 @@ def space_picture(shown: Drawn) -> dict[str, str]:
         axes.annotate(f"{bar:g} mm", low, (0, 4), textcoords="offset points", fontsize=SMALL, color=INK)
     caption = f"Residuals (measured minus modelled), {scale:g} times, from above and from the side"
     if not good.all():
-        caption += f"; in the other colour: {(~good).sum()} wrong rows"
+        caption += f"; in the other colour: {(~good).sum()} that are not fitted"
     if (cut < 1).any():
         caption += f"; cut, as they are too long: {(cut < 1).sum()}"
     return {"picture": uri(figure), "caption": caption}

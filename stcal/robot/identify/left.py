@@ -12,7 +12,7 @@ from scipy.stats import f as f_distribution
 
 from stcal.geometry.rigid import Rigid
 from stcal.robot.identify.adjustment import Weighting
-from stcal.robot.identify.residuals import Observed, State, as_seen, residuals, tips
+from stcal.robot.identify.residuals import WIDTH, Observed, State, as_seen, residuals, tips
 from stcal.robot.identify.variances import GROSS
 from stcal.robot.kinematics.forward import joint_frames
 
@@ -26,6 +26,8 @@ LEAST_FREEDOM = 10
 """Numbers beyond the parameters, fewer of which tell nothing."""
 NEW, SAME = 1e-3, 1e-9
 """Share of a motion that the parameters must not take up themselves; and what rounding leaves of one."""
+SHARED = 4
+"""Distances from one position, from which on its own error counts as a parameter."""
 TURNS = {1: "once a turn", 2: "twice a turn"}
 
 
@@ -104,6 +106,7 @@ def left(
     def white(values: np.ndarray) -> np.ndarray:
         return root * weighting.whiten(values, seen)
 
+    explained = np.concatenate([explained, _shared(state, seen)], axis=2)
     known = _basis(_unit(white(explained).reshape(found.size, -1)), SAME)
     before = white(found[..., None]).ravel()
     rest = before - known @ (known.T @ before)
@@ -184,6 +187,18 @@ def _basis(values: np.ndarray, least: float) -> np.ndarray:
     """(N, c) orthonormal, of directions in which columns of length 1 differ by more than ``least``."""
     u, s, _ = np.linalg.svd(values, full_matrices=False)
     return u[:, s > least]
+
+
+def _shared(state: State, seen: Observed) -> np.ndarray:
+    """(r, w, c) shifts of positions from which several distances start: their error is in all of these, as if it went
+    with place."""
+    starts = [row for row in np.unique(seen.second) if (seen.second == row).sum() >= SHARED]
+    if seen.kind != "distance" or not starts:
+        return np.zeros((len(seen), WIDTH[seen.kind], 0))
+    place = tips(state, seen.data.q, seen.data.targets).translation
+    away = place[seen.first] - place[seen.second]
+    away /= np.maximum(np.linalg.norm(away, axis=1), 1e-12)[:, None]
+    return np.concatenate([away * (seen.second == row)[:, None] for row in starts], axis=1)[:, None]
 
 
 def _candidates(state: State, seen: Observed, world_from_base: Rigid) -> list[_Candidate]:

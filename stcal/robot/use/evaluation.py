@@ -126,7 +126,7 @@ class Evaluation:
     robots : tuple of Evaluated
         In the order given.
     wrong : (r,) array of bool
-        Rows that no robot explains: surely wrong, and nothing was fitted to them.
+        Rows that no robot explains: wrong, or something that all models lack; nothing was fitted to them.
     differences : tuple of Difference
         The robot of least mean error against each other one, in order of their means.
     """

@@ -62,7 +62,7 @@ def _table(result: Evaluation) -> list[list[str]]:
     rows = [["<error, mm", *HEADS, *(("orientation, deg: RMS", "max") if turned else ())]]
     parts = {"": np.ones(len(result.wrong), bool)}
     if result.wrong.any():
-        parts[", without wrong rows"] = ~result.wrong
+        parts[", without unexplained"] = ~result.wrong
     for each in result.robots:
         for said, among in parts.items():
             figures = Figures.of(each.errors_mm[among])
@@ -75,7 +75,7 @@ def _table(result: Evaluation) -> list[list[str]]:
 
 
 def notes(result: Evaluation) -> list[str]:
-    """Which robot is better, which rows are wrong, and what residuals go with."""
+    """Which robot is better, which rows no robot explains, and what residuals go with."""
     return [
         *_verdicts(result),
         *_wrong(result),
@@ -103,7 +103,9 @@ def _wrong(result: Evaluation) -> list[str]:
     named = ", ".join(f"line {result.line(i)} ({least[i]:.3g} mm)" for i in at[:MOST_WRONG].tolist())
     more = f" and {len(at) - MOST_WRONG} more" if len(at) > MOST_WRONG else ""
     fitted = "" if result.refit == "none" or result.seen.kind == "distance" else "; nothing is fitted to them"
-    return [f"wrong for every robot, with the least error that one leaves: {named}{more}{fitted}"]
+    return [
+        f"no robot explains, with the least error that one leaves: {named}{more}{fitted}; wrong, or all models lack it"
+    ]
 
 
 def left_lines(each: Evaluated) -> list[str]:
@@ -256,7 +258,7 @@ def _colour(result: Evaluation, each: Evaluated) -> str:
 
 
 def _errors(axes, result: Evaluation, at: dict[int, np.ndarray], label: str) -> None:
-    """Errors of all robots over ``at`` (by the robot's place), wrong rows ringed; logarithmic where it is needed."""
+    """Errors of all robots over ``at`` (by the robot's place), unexplained rows ringed; logarithmic where needed."""
     every = np.concatenate([each.errors_mm for each in result.robots])
     few = len(result.wrong) <= 200
     for k, each in enumerate(result.robots):
@@ -291,7 +293,7 @@ def _legend(figure, result: Evaluation) -> None:
         Line2D([], [], marker="o", ls="", ms=4, color=_colour(result, e), label=e.robot.name) for e in result.robots
     ]
     if result.wrong.any():
-        marks.append(Line2D([], [], marker="o", ls="", ms=7, mfc="none", mec=INK, label="wrong for every robot"))
+        marks.append(Line2D([], [], marker="o", ls="", ms=7, mfc="none", mec=INK, label="no robot explains"))
     place = {"loc": "upper left", "bbox_to_anchor": (0.06, 1), "ncols": 6}
     figure.legend(handles=marks, fontsize=SMALL + 0.5, frameon=False, **place)
 

@@ -56,7 +56,9 @@ class EvaluationFile(ResultFile):
     refit: str = Field(description="what was fitted: `none`, `base`, `tool` or `base-tool`")
     observed: str = Field(description="positions or distances")
     lines: list[int] = Field(description="of the data file, of each row")
-    wrong: list[int] = Field(description="lines that no robot explains; nothing was fitted to them")
+    wrong: list[int] = Field(
+        description="lines that no robot explains (wrong, or something all models lack); nothing was fitted to them"
+    )
     best: str | None = Field(description="the robot that is better than all others by more than chance; null: none is")
     robots: list[EvaluatedRobot] = Field(
         description="`name`, and of their errors `position_mm` (of distances for those) of all rows, `good_mm` without "

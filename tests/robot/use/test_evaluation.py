@@ -1,0 +1,286 @@
+"""Robot files on measurements that they were not made from."""
+
+import json
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from stcal.errors import DegenerateError, InputError
+from stcal.geometry.rigid import Rigid
+from stcal.robot.identify.result import IdentifyOptions
+from stcal.robot.identify.solve import identify
+from stcal.robot.kinematics.example import mh80
+from stcal.robot.kinematics.file import robot_toml
+from stcal.robot.kinematics.measurements import Measurements, read_measurements
+from stcal.robot.kinematics.model import DHRow, Joint, Robot
+from stcal.robot.use.evaluation import Figures, evaluate
+from stcal.robot.use.evaluation_report import evaluated_csv, evaluated_text, evaluation_file, evaluation_page, names_of
+from stcal.robot.use.verification import read_measured, verify
+from stcal.synthetic.measured.arms import joint_vectors, made, measured, placed
+from tests.robot.identify.test_solve import rokae
+
+BASE, TOOL = Rigid.exp([0.1, -0.05, 2.1, 2500.0, -900.0, 400.0]), Rigid.exp([0, 0.1, 0, 220, 60, 150])
+SIGMA_MM = 0.05
+
+
+def arm(seed: int = 0) -> Robot:
+    return placed(made(mh80(), np.random.default_rng(seed)), BASE, {"": TOOL})
+
+
+def seen(robot: Robot, seed: int, count: int = 40, poses: bool = False, **noise) -> Measurements:
+    rng = np.random.default_rng(1000 + seed)
+    data = measured(robot, joint_vectors(robot, count, rng), rng, **{"sigma_mm": SIGMA_MM} | noise)
+    return data if poses else replace(data, rotations=None)
+
+
+def by_distances(data: Measurements) -> Measurements:
+    lengths, m = np.linalg.norm(data.points() - data.points()[0], axis=1), len(data)
+    return Measurements("distances", data.lines, data.q, data.targets, distances=lengths, from_row=np.zeros(m, int))
+
+
+@pytest.fixture(scope="module")
+def pair():
+    """Nominal and true arm on 60 new poses; the true one elsewhere, with another tool."""
+    true = arm()
+    nominal = replace(mh80(), tools={"": TOOL})
+    elsewhere = placed(true, Rigid.exp([0, 0, 1, 100, 200, 300]), {"": Rigid.exp([0, 0, 0, 0, 0, 100])})
+    return evaluate({"nominal": nominal, "true": elsewhere}, seen(true, 1, 60, poses=True))
+
+
+def test_figures_by_hand():
+    true = arm()
+    data = seen(true, 2, sigma_mm=0.0)
+    off = np.zeros((40, 3))
+    off[:, 0] = 0.1 * np.arange(40)
+    away = off @ BASE.rotation.T  # along x of the base
+    [found] = evaluate({"a": true}, replace(data, positions=data.points() + away), "none").robots
+    assert found.residuals == pytest.approx(off, abs=1e-9)
+    figures = Figures.of(found.errors_mm)
+    assert figures.rows == 40
+    assert figures.mean == pytest.approx(1.95)
+    assert figures.median == pytest.approx(1.95)
+    assert figures.rms == pytest.approx(np.sqrt(0.01 * (39 * 40 * 79 / 6) / 40))
+    assert figures.p95 == pytest.approx(0.95 * 3.9)
+    assert figures.max == pytest.approx(3.9)
+
+
+def test_base_and_tool_are_fitted_by_the_robots_own_axes(pair):
+    nominal, true = pair.robots
+    # noise of three coordinates, less what 9 parameters take up of 180
+    assert Figures.of(true.errors_mm).rms == pytest.approx(SIGMA_MM * np.sqrt(3 * (1 - 9 / 180)), rel=0.15)
+    assert Figures.of(nominal.errors_mm).rms > 0.3
+    assert Figures.of(true.rotation_rad).rms == pytest.approx(2e-4 * np.sqrt(3), rel=0.2)
+    base, tool = true.placed
+    for each, pose in ((base, BASE), (tool, TOOL)):
+        off = each.pose.translation - pose.translation
+        assert (np.abs(off) < 4.5 * each.sigma[3:]).all()
+        assert (each.sigma[3:] < 0.1).all()
+    turned = (base.pose @ BASE.inverse()).log()[:3]
+    assert (np.abs(turned) < 4.5 * base.sigma[:3]).all()
+
+
+@pytest.mark.parametrize("wrong", ["base", "tool"])
+def test_only_what_is_asked_for_is_fitted(wrong):
+    """In place within a degree and 5 mm, one of the two is taken from its file."""
+    true = arm()
+    small = Rigid.exp([0.01, 0, 0.01, 5, 0, -5])
+    robot = placed(true, BASE @ small if wrong == "base" else BASE, {"": TOOL @ small if wrong == "tool" else TOOL})
+    data = seen(true, 3)
+    rms = {refit: Figures.of(evaluate({"a": robot}, data, refit).robots[0].errors_mm).rms for refit in REFITS}
+    for refit, found in rms.items():
+        if wrong in refit:
+            assert found == pytest.approx(SIGMA_MM * np.sqrt(3), rel=0.25)
+        else:
+            assert 1 < found < 40
+    fixed = evaluate({"a": robot}, data, "tool" if wrong == "base" else "base").robots[0]
+    if wrong == "base":
+        assert fixed.robot.world_from_base.matrix() == pytest.approx(robot.world_from_base.matrix())
+    else:
+        assert fixed.robot.tools[""].matrix() == pytest.approx(robot.tools[""].matrix())
+
+
+REFITS = ("none", "base", "tool", "base-tool")
+
+
+def test_the_better_robot_is_named_with_its_error(pair):
+    [difference] = pair.differences
+    assert (difference.better, difference.worse) == ("true", "nominal")
+    assert pair.best == "true"
+    errors = [each.errors_mm for each in pair.robots]
+    assert difference.mm == pytest.approx((errors[0] - errors[1]).mean())
+    assert difference.sigma_mm == pytest.approx((errors[0] - errors[1]).std(ddof=1) / np.sqrt(60))
+    assert "true is better than nominal: mean error " in evaluated_text(pair)
+
+
+def test_equal_robots_are_told_apart_seldom():
+    """Files that are off alike, by chance: at 5 %, of 60 pairs more than eight once in 200 runs."""
+    true, named = arm(), 0
+    for seed in range(60):
+        robots = {str(k): made(true, np.random.default_rng(10 * seed + k), 0.02, 2e-5) for k in (1, 2)}
+        result = evaluate(robots, seen(true, seed, 25, sigma_mm=0.2), "base-tool")
+        named += bool(result.best)
+    assert named <= 8
+    same = evaluate({"a": true, "b": true}, seen(true, 1))
+    assert same.best == ""
+    assert "a and b differ by no more than chance" in evaluated_text(same)
+
+
+def test_wrong_rows_are_named_and_not_fitted_to():
+    true, data = arm(), seen(arm(), 4)
+    positions = data.points().copy()
+    positions[[7, 20]] += [[0, 30.0, 0], [5.0, 0, 0]]
+    result = evaluate({"nominal": replace(mh80(), tools={"": TOOL}), "true": true}, replace(data, positions=positions))
+    assert [result.line(i) for i in np.flatnonzero(result.wrong)] == [9, 22]
+    clean = evaluate({"true": true}, data[~result.wrong]).robots[0]
+    own = result.robots[1]
+    assert own.errors_mm[~result.wrong] == pytest.approx(clean.errors_mm, abs=1e-6)
+    assert own.errors_mm[7] == pytest.approx(30, abs=0.5)
+    text = evaluated_text(result)
+    assert "no robot explains, with the least error that one leaves: line 9 (" in text
+    assert "line 22 (" in text
+    plain, robust = (line.split() for line in text.splitlines() if line.startswith(("true  ", "true, ")))
+    assert plain[1] == "40"
+    assert robust[3] == "38"
+    assert float(plain[4]) > 3 > 0.2 > float(robust[6])
+
+
+def test_clean_rows_are_hardly_ever_wrong():
+    robots = [arm(seed) for seed in range(40)]
+    assert sum(evaluate({"a": robot}, seen(robot, seed)).wrong.sum() for seed, robot in enumerate(robots)) == 0
+
+
+def test_what_a_file_leaves_is_said_and_whether_identification_takes_it_up():
+    true = arm()
+    rows = list(true.rows)
+    rows[2] = replace(rows[2], theta=rows[2].theta + 1e-3)
+    shifted = replace(true, rows=tuple(rows))
+    [found] = evaluate({"a": shifted}, seen(true, 5, 60)).robots
+    assert [each.what for each in found.left][:1] == ["the zero of joint 3"]
+    assert found.beyond == ()
+    text = evaluated_text(evaluate({"a": shifted}, seen(true, 5, 60)))
+    assert "a: residuals go with the zero of joint 3: " in text
+    assert "a: parameters identified from these rows would leave nothing of that to be seen" in text
+    [clean] = evaluate({"a": true}, seen(true, 5, 60)).robots
+    assert clean.left == ()
+
+
+def test_the_identified_robot_is_better_on_the_other_half():
+    true, nominal = arm(), mh80()
+    robot = identify(nominal, seen(true, 6, 40), IdentifyOptions(folds=0)).robot
+    result = evaluate({"nominal": nominal, "identified": robot}, seen(true, 7, 40))
+    assert result.best == "identified"
+    assert Figures.of(result.robots[1].errors_mm).rms < 0.15
+
+
+@pytest.mark.parametrize("refit", REFITS)
+def test_distances_have_their_own_errors(refit):
+    true = arm()
+    data = by_distances(seen(true, 8, 50))
+    result = evaluate({"a": true, "nominal": replace(mh80(), tools={"": TOOL})}, data, refit)
+    assert len(result.wrong) == 49
+    # two positions, the first in all: σ of one distance is √2 times a coordinate's
+    assert 0.6 * SIGMA_MM < Figures.of(result.robots[0].errors_mm).rms < 2 * SIGMA_MM
+    assert result.best == "a"
+    assert "49 distances" in evaluated_text(result)
+    assert "by distance" not in evaluation_page(result)
+
+
+def test_another_arm_is_refused_in_one_line():
+    data = seen(arm(), 9)
+    other = Robot(
+        "other", "standard", (DHRow(0, np.pi / 2, 300, 0), DHRow(400, 0, 0, 0), DHRow(350, 0, 0, 0)), (Joint(),) * 3
+    )
+    with pytest.raises(InputError, match=r"6 joint values, robot b has 3 joints"):
+        evaluate({"a": arm(), "b": other}, data)
+    rows = tuple(replace(row, alpha=-row.alpha) for row in mh80().rows)
+    with pytest.raises(InputError, match=r"robot b misses the measurements by .* mm RMS, 5% of their spread"):
+        evaluate({"a": arm(), "b": replace(mh80(), rows=rows)}, data)
+    with pytest.raises(InputError, match=r"robot a as its file stands misses .*; it fits with base and tool fitted"):
+        evaluate({"a": mh80()}, data, "none")
+    with pytest.raises(InputError, match=r"robot a: no tool 'ball'"):
+        evaluate({"a": arm()}, replace(data, targets=("ball",) * 40), "base")
+    with pytest.raises(DegenerateError, match=r"3 positions give 9 numbers for 9 parameters of base and tool"):
+        evaluate({"a": arm()}, data[:3])
+
+
+def test_files_are_called_by_their_names():
+    assert names_of([Path("a/robot.toml"), Path("a/made.toml")]) == ["robot", "made"]
+    assert names_of([Path("a/robot.toml"), Path("b/robot.toml")]) == ["a/robot.toml", "b/robot.toml"]
+    with pytest.raises(InputError, match="given twice"):
+        names_of([Path("a.toml"), Path("a.toml")])
+
+
+def test_identify_and_verify_read_what_was_written(tmp_path):
+    true = arm()
+    data = seen(true, 10, 40, poses=True)
+    (tmp_path / "rows.csv").write_text(evaluated_csv(evaluate({"my robot": true}, data)))
+    again = read_measurements(tmp_path / "rows.csv", true)
+    assert again.q == pytest.approx(data.q, abs=1e-10)
+    assert again.points() == pytest.approx(data.points(), abs=1e-6)
+    assert again.poses().difference(data.poses()) == pytest.approx(np.zeros((40, 6)), abs=1e-6)
+    verified = verify(read_measured(tmp_path / "rows.csv")).sets[0]
+    assert 0.5 * SIGMA_MM < verified.mean_mm < 3 * SIGMA_MM
+    header = (tmp_path / "rows.csv").read_text().splitlines()[0]
+    assert header.endswith(
+        "my_robot_residual_x_mm,my_robot_residual_y_mm,my_robot_residual_z_mm,my_robot_error_mm,my_robot_error_deg"
+    )
+    distances = by_distances(data)
+    (tmp_path / "d.csv").write_text(evaluated_csv(evaluate({"a": true, "b": mh80()}, distances, "tool")))
+    read = read_measurements(tmp_path / "d.csv", true)
+    assert read.lengths()[0] == pytest.approx(distances.lengths()[0], abs=1e-6)
+    assert (read.lengths()[1] == 0).all()
+
+
+def test_residuals_in_the_base_do_not_depend_on_where_the_instrument_stands():
+    true, data = arm(), seen(arm(), 11)
+    moved = Rigid.exp([0.5, -1, 2, 1000, 0, -300])
+    there = replace(data, positions=moved @ data.points())
+    one, other = (evaluate({"a": true}, each).robots[0].residuals for each in (data, there))
+    assert one == pytest.approx(other, abs=1e-6)
+
+
+def test_file_and_page(pair):
+    content = evaluation_file(pair).content()
+    json.dumps(content, allow_nan=False)
+    assert content["best"] == "true"
+    assert content["robots"][1]["position_mm"]["rms"] == pytest.approx(Figures.of(pair.robots[1].errors_mm).rms)
+    assert np.shape(content["robots"][0]["residuals"]) == (60, 3)
+    page = evaluation_page(pair)
+    assert "true is better than nominal" in page
+    for said in ("Error of each row", "Residuals by joint", "Residuals in space", "outwards from the base"):
+        assert said in page
+
+
+def test_command(tmp_path, stcal_robot):
+    true, data = arm(), seen(arm(), 12, 40, poses=True)
+    (tmp_path / "true.toml").write_text(robot_toml(true))
+    (tmp_path / "nominal.toml").write_text(robot_toml(mh80()))
+    (tmp_path / "data.csv").write_text(evaluated_csv(evaluate({"a": true}, data)))
+    files = [tmp_path / "r.csv", tmp_path / "r.json", tmp_path / "r.html"]
+    robots = ["--robot", tmp_path / "nominal.toml", "--robot", tmp_path / "true.toml"]
+    written = ["--out", files[0], "--json", files[1], "--report", files[2]]
+    code, out, err = stcal_robot("evaluate", tmp_path / "data.csv", *robots, *written)
+    assert (code, err) == (0, "")
+    assert "40 poses; base and tool fitted by each robot's own axes" in out
+    assert "true is better than nominal" in out
+    assert all(file.stat().st_size > 1000 for file in files)
+    code, out, err = stcal_robot("evaluate", tmp_path / "data.csv", *robots[:2], "--refit", "none")
+    assert code == 2
+    assert err.count("\n") == 1
+    assert "robot nominal as its file stands misses the measurements" in err
+
+
+@pytest.mark.slow
+def test_rokae_on_the_half_that_was_not_identified_from(shared_data, tmp_path):
+    robot, text = rokae(shared_data("rokae_tracker/data"))
+    (tmp_path / "rokae.csv").write_text(text)
+    data = read_measurements(tmp_path / "rokae.csv", robot)
+    half = np.random.default_rng(1).permutation(30)
+    identified = identify(robot, data[np.sort(half[:15])], IdentifyOptions(folds=0)).robot
+    result = evaluate({"nominal": robot, "identified": identified}, data[np.sort(half[15:])])
+    assert result.best == "identified"
+    nominal, own = (Figures.of(each.errors_mm).mean for each in result.robots)
+    assert 1.4 < nominal < 2.2
+    assert 0.05 < own < 0.15
