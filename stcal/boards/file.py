@@ -21,7 +21,7 @@ from stcal.boards.design import (
 from stcal.design import BoardDesign, Polarity
 from stcal.errors import InputError
 from stcal.io.covariance import Rows, require_covariance
-from stcal.io.design import BoardEntry, Count, board_design, load_board
+from stcal.io.design import BoardEntry, Count, Squares, board_design, load_board
 from stcal.io.files import SETTINGS_BYTES, read_bytes
 from stcal.io.json import mistake
 from stcal.io.plain_yaml import load_yaml
@@ -34,6 +34,10 @@ REMEDY = (
     'a file with type = "chessboard", "charuco", "tags", "aprilgrid" or "asymmetric-circles" needed, one of dots, or '
     "one of Kalibr, see data_layout.md"
 )
+MOST_MARKER = 0.99
+"""Side of a ChArUco tag over that of its square: a tag needs white around it to be seen."""
+LEAST_AREA = 1e-6
+"""Of a tag, over its longest side squared: less is a line."""
 OF_OTHERS = {"square_mm", "marker_mm", "dictionary", "tag", "tag_mm", "spacing_mm", "board"}
 """Keys that no board of dots has."""
 
@@ -62,16 +66,16 @@ Few = Annotated[int, Field(ge=1, le=1000, strict=True)]
 
 class _Chessboard(Strict):
     type: Literal["chessboard"]
-    rows: Count
-    columns: Count
+    rows: Squares
+    columns: Squares
     square_mm: Positive
     sigma_mm: Positive = 0.01
 
 
 class _Charuco(Strict):
     type: Literal["charuco"]
-    rows: Count
-    columns: Count
+    rows: Squares
+    columns: Squares
     square_mm: Positive
     marker_mm: Positive
     dictionary: Dictionary
@@ -238,9 +242,10 @@ def _kalibr_content(text: str) -> dict[str, Any] | None:
 
 
 def _charuco(data: _Charuco, where: str) -> CharucoDesign:
-    if data.marker_mm >= data.square_mm:
+    if data.marker_mm > MOST_MARKER * data.square_mm:
         raise InputError(
-            f"{where}: marker_mm {data.marker_mm:g}, under square_mm {data.square_mm:g} needed; are they swapped?"
+            f"{where}: marker_mm {data.marker_mm:g}, under {MOST_MARKER:g} of square_mm {data.square_mm:g} needed; "
+            "are they swapped?"
         )
     board = CharucoDesign(
         data.rows,
@@ -259,9 +264,28 @@ def _charuco(data: _Charuco, where: str) -> CharucoDesign:
 def _tags(data: TagsFile, where: str) -> TagLayout:
     corners = [tag.corners(where) for tag in data.tag]
     for tag, place in zip(data.tag, corners, strict=True):
+        own = f"{where}: tag {tag.id}"
         if place is None:
-            raise InputError(f"{where}: tag {tag.id}: no place; x_mm, y_mm and size_mm, or corners_mm needed")
-    return TagLayout(tuple((tag.dictionary, tag.id) for tag in data.tag), np.array(corners), data.sigma_mm)
+            raise InputError(f"{own}: no place; x_mm, y_mm and size_mm, or corners_mm needed")
+        if tag.id >= (there := _tags_of(tag.dictionary)):
+            raise InputError(f"{own}: {tag.dictionary} has 0 … {there - 1}; correct id or dictionary")
+        _require_convex(place, own)
+    try:
+        return TagLayout(tuple((tag.dictionary, tag.id) for tag in data.tag), np.array(corners), data.sigma_mm)
+    except InputError as error:
+        raise InputError(f"{where}: {error}") from error
+
+
+def _require_convex(corners: np.ndarray, where: str) -> None:
+    """Refuse corners (4, 2) of a tag that are not in order around it, clockwise with Y downwards, as printed."""
+    side = np.roll(corners, -1, axis=0) - corners
+    following = np.roll(side, -1, axis=0)
+    turn = side[:, 0] * following[:, 1] - side[:, 1] * following[:, 0]
+    if turn.min() <= LEAST_AREA * (side**2).sum(1).max():
+        raise InputError(
+            f"{where}: corners_mm turn the other way, cross or lie on a line; top left, top right, bottom right, "
+            "bottom left as printed needed, Y downwards"
+        )
 
 
 def _aprilgrid(data: _AprilGrid, where: str) -> AprilGridDesign:
@@ -283,12 +307,16 @@ def _aprilgrid(data: _AprilGrid, where: str) -> AprilGridDesign:
 def _require_tags(board: CharucoDesign | AprilGridDesign, where: str) -> None:
     """Refuse a board that needs more tags than there are."""
     ids = board.tag_ids()
-    there = len(cv2.aruco.getPredefinedDictionary(getattr(cv2.aruco, board.dictionary)).bytesList)
-    if ids.stop > there:
+    if ids.stop > (there := _tags_of(board.dictionary)):
         raise InputError(
             f"{where}: tags {ids.start} … {ids.stop - 1}, {board.dictionary} has 0 … {there - 1}; correct rows, "
             "columns, first_id or dictionary"
         )
+
+
+def _tags_of(dictionary: str) -> int:
+    """How many there are."""
+    return len(cv2.aruco.getPredefinedDictionary(getattr(cv2.aruco, dictionary)).bytesList)
 
 
 def _asymmetric(data: _AsymmetricCircles, where: str) -> AsymmetricCirclesDesign:

@@ -7,7 +7,7 @@ from pydantic import Field
 
 from stcal.boards.design import AprilGridDesign, AsymmetricCirclesDesign, ChessboardDesign
 from stcal.errors import InputError
-from stcal.io.design import Count
+from stcal.io.design import Count, Squares
 from stcal.io.toml import Positive, Strict, validated
 
 METRE_MM = 1000.0
@@ -33,8 +33,8 @@ class _AprilGrid(Strict):
 
 class _Checkerboard(Strict):
     target_type: Literal["checkerboard"]
-    targetCols: Count
-    targetRows: Count
+    targetCols: Squares
+    targetRows: Squares
     rowSpacingMeters: Metres
     colSpacingMeters: Metres
 

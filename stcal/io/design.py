@@ -17,6 +17,8 @@ MIN_SINE = 0.02
 
 
 Count = Annotated[int, Field(ge=2, le=1000, strict=True)]
+Squares = Annotated[int, Field(ge=3, le=1000, strict=True)]
+"""Of a row of a chessboard: fewer inner corners are not recognised as one, fewer squares have all corners on a line."""
 Index = Annotated[int, Field(ge=0, strict=True)]
 Name = Annotated[
     str,

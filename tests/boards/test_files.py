@@ -22,6 +22,8 @@ KALIBR = {
     ),
 }
 CHARUCO = 'type = "charuco"\nrows = 6\ncolumns = 8\nsquare_mm = 20.0\nmarker_mm = 10.0\ndictionary = "5X5_50"\n'
+TAG = 'type = "tags"\n[[tag]]\ndictionary = "4X4_50"\nid = 1\nsize_mm = 9\nx_mm = 0\ny_mm = 0\n'
+CORNERS = 'type = "tags"\n[[tag]]\ndictionary = "4X4_50"\nid = 1\ncorners_mm = [{}]\n'
 IN_A_SET = CHARUCO.replace("type", "[[board]]\ntype")
 BESIDE = "x_mm = 200.0\ny_mm = 0.0\nz_mm = 50.0\nrpy_deg = [0.0, 90.0, 0.0]\n"
 
@@ -73,6 +75,15 @@ def test_opencvs_asymmetric_grid():
             KALIBR["aprilgrid"].replace("aprilgrid", "octagons"),
             "'octagons'; one of aprilgrid, checkerboard",
         ),
+        (KALIBR["checkerboard"].replace("targetRows: 6", "targetRows: 2"), "targetRows: 2: input should be greater"),
+        ('type = "chessboard"\nrows = 2\ncolumns = 6\nsquare_mm = 20.0\n', "rows: 2: input should be greater"),
+        (CHARUCO.replace("rows = 6", "rows = 2"), "rows: 2: input should be greater"),
+        (CHARUCO.replace("10.0", "19.9999999"), "marker_mm 20, under 0.99 of square_mm 20 needed"),
+        (TAG.replace("id = 1", "id = 50"), "tag 50: DICT_4X4_50 has 0 … 49; correct id or dictionary"),
+        (TAG + TAG.removeprefix('type = "tags"\n'), "tag layout: tag 1 of DICT_4X4_50 occurs twice"),
+        (CORNERS.format("[0, 0], [0, 9], [9, 9], [9, 0]"), "tag 1: corners_mm turn the other way"),
+        (CORNERS.format("[0, 0], [9, 9], [9, 0], [0, 9]"), "tag 1: corners_mm turn the other way, cross"),
+        (CORNERS.format("[0, 0], [9, 0], [12, 0], [3, 0]"), "cross or lie on a line; top left"),
         ('type = "boards"\n' + IN_A_SET, "several boards, not flat together; the file of a single board needed"),
     ],
 )
