@@ -21,7 +21,6 @@ NOT_YET = {
     "README.md: trial published as published + centres of blurred",  # reproduce_paper.py
     "README.md: face as published + centres of blurred edges + ec",
     "README.md: face position, µm predicted σ, µm rotation, mdeg",
-    "README.md: 200 runs each, 0.02 px noise, 4 groups of 6 image",  # uncertainty_study.py
     "README.md: 40 images of [5184, 3456] px, 150 MB, 2 workers,",  # bench_run.py, times
     "README.md: images pairs mapped pairs matched ms an image gra",  # scale_study.py
 }

@@ -1,9 +1,10 @@
 """How good ``stcal locate`` is: real photographs of a ChArUco board whose tags are the target and whose chessboard
 corners are the truth, the same exposed again in simulated light, simulated corners, and the time of it.
 
-.venv/bin/python scripts/studies/locate_study.py SET [--part poses|subsets|exposures|covariance|time] [--most 200]
+.venv/bin/python scripts/studies/locate_study.py [../shared/data/charuco_handeye/test_set_charuco]
+    [--part subsets|exposures|covariance|time] [--only GATE] [--most 200]
 
-SET is a folder with ``images/`` of a 7×5 board of DICT_6X6_250 (squares of 36.195 mm, tags of 18.256 mm) and
+The folder holds ``images/`` of a 7×5 board of DICT_6X6_250 (squares of 36.195 mm, tags of 18.256 mm) and
 ``cal_data.yaml`` with its intrinsics. Even images calibrate the layout, odd ones are located; then the other way round.
 """
 
@@ -40,6 +41,7 @@ BOARD = CharucoDesign(7, 5, 36.195, 18.256, "DICT_6X6_250")
 TAGS = 17
 ORIGIN = 8
 TIMES = np.geomspace(1 / 16, 16, 5)
+PARTS = ("subsets", "exposures", "covariance", "time")
 
 
 def charuco_plan() -> LayoutPlan:
@@ -69,40 +71,32 @@ def halves(images: CalibrationImages) -> list[tuple[list[int], list[int]]]:
     return [(even, odd), (odd, even)]
 
 
-def poses(images: CalibrationImages) -> None:
-    print("real images, all tags seen: layout from one half, poses in the other, against the chessboard corners")
-    for chosen, held_out in halves(images):
-        calibrated = half_calibrated(images, charuco_plan(), chosen)
-        trials = list(subset_trials(images, held_out, calibrated, None))
-        print(f"  {_line(trials)}")
-
-
-def subsets(images: CalibrationImages, most: int | None) -> None:
-    print("real images, subsets of tags (all, or so many of each size and image: --most)")
+def subsets(images: CalibrationImages, only: str, most: int | None) -> None:
+    print("real images, against the chessboard corners; subsets: all, or so many of each size and image (--most)\n")
+    print("| gate | tags | poses | accepted | ambiguous | wrong branch | off by > 5° | mean of the accepted | worst |")
+    print("|---|---|---|---|---|---|---|---|---|")
     gates = {"verdict": VerdictOptions(), "odds of the other 1:100": VerdictOptions(flip_odds=1e-2)}
     gates["the patent's gate"] = PatentOptions()
+    calibrated = [(half_calibrated(images, charuco_plan(), chosen), others) for chosen, others in halves(images)]
     for name, options in gates.items():
-        for size in (1, 2, 3, 4):
+        if not name.startswith(only):
+            continue
+        for size in (None, 4, 3, 2, 1):
             trials: list[PoseTrial] = []
-            for chosen, held_out in halves(images):
-                calibrated = half_calibrated(images, charuco_plan(), chosen)
-                trials += subset_trials(images, held_out, calibrated, size, options, most)
-            print(f"  {name:<24} {size} tags  {_line(trials)}")
+            for half, others in calibrated:
+                trials += subset_trials(images, others, half, size, options, most)
+            print(f"| {name} | {f'any {size}' if size else 'all'} | {_cells(trials)} |", flush=True)
 
 
-def _line(trials: Sequence[PoseTrial]) -> str:
-    count = len(trials)
+def _cells(trials: Sequence[PoseTrial]) -> str:
     used = [t for t in trials if t.decision == "accept"]
     ambiguous = sum(t.decision == "ambiguous" for t in trials)
     flipped, far = sum(t.flipped for t in used), sum(t.error_rad > np.radians(5) for t in used)
-    text = f"{count:6d} poses, {len(used):6d} accepted, {ambiguous:5d} ambiguous; "
+    text = f"{len(trials)} | {len(used)} | {ambiguous} | {flipped} | {far} | "
     if not used:
-        return text + "none to judge"
+        return text + "– | –"
     rad, mm = np.array([(t.error_rad, t.error_mm) for t in used]).T
-    return (
-        text + f"accepted wrong branch {flipped}, off by over 5° {far} ({100 * max(flipped, far) / len(used):.2f} %); "
-        f"mean {np.degrees(rad.mean()):.3f}° {mm.mean():.2f} mm, worst {np.degrees(rad.max()):.2f}° {mm.max():.1f} mm"
-    )
+    return text + f"{np.degrees(rad.mean()):.2f}°, {mm.mean():.2f} mm | {np.degrees(rad.max()):.1f}°, {mm.max():.1f} mm"
 
 
 def relit(photograph: np.ndarray, tags: Tags, seed: int, stops: float = 8.0) -> list[np.ndarray]:
@@ -206,18 +200,18 @@ def timing(folder: Path, images: CalibrationImages, rounds: int = 5) -> None:
 @one_thread()
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.split("\n\n")[0])
-    parser.add_argument("folder", type=Path)
-    parser.add_argument("--part", choices=["poses", "subsets", "exposures", "covariance", "time"])
+    default = Path(__file__).resolve().parents[3] / "shared" / "data" / "charuco_handeye" / "test_set_charuco"
+    parser.add_argument("folder", type=Path, nargs="?", default=default)
+    parser.add_argument("--part", choices=PARTS)
+    parser.add_argument("--only", default="", metavar="TEXT", help="of the subsets, gates that begin so")
     parser.add_argument("--most", type=int)
     arguments = parser.parse_args()
-    chosen = [arguments.part] if arguments.part else ["poses", "subsets", "exposures", "covariance", "time"]
-    images = None if chosen == ["covariance"] else charuco_images(arguments.folder)
+    chosen = [arguments.part] if arguments.part else PARTS
+    images = None if arguments.part == "covariance" else charuco_images(arguments.folder)
     for part in chosen:
         match part:
-            case "poses":
-                poses(images)
             case "subsets":
-                subsets(images, arguments.most)
+                subsets(images, arguments.only, arguments.most)
             case "exposures":
                 exposures(arguments.folder, images)
             case "covariance":
