@@ -146,6 +146,7 @@ CALLS = (
         1.5,
     ),
     Call("robot init", "+robot.toml"),
+    Call("robot convert", "@robot/made.toml >robot.urdf"),
     Call("robot axes", f"@robot/sweeps.csv --robot @robot/robot.toml --out >axes.toml {_ALL}", 2.0),
     Call(
         "robot identify",

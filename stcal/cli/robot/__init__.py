@@ -3,7 +3,7 @@
 import typer
 
 from stcal.cli.help import PLAIN, Commands
-from stcal.cli.robot import axes, compensate, design, identify, init, verify
+from stcal.cli.robot import axes, compensate, convert, design, identify, init, verify
 
 app = typer.Typer(
     name="stcal robot",
@@ -11,5 +11,14 @@ app = typer.Typer(
     cls=Commands,
     **PLAIN,
 )
-for command in (init.init, axes.axes, identify.identify, compensate.compensate, verify.verify, design.design):
+COMMANDS = (
+    init.init,
+    axes.axes,
+    identify.identify,
+    compensate.compensate,
+    verify.verify,
+    design.design,
+    convert.convert,
+)
+for command in COMMANDS:
     app.command()(command)
