@@ -146,8 +146,13 @@ CALLS = (
         1.5,
     ),
     Call("robot init", "+robot.toml"),
+    Call("robot convert", "@robot/made.toml >robot.urdf"),
     Call("robot axes", f"@robot/sweeps.csv --robot @robot/robot.toml --out >axes.toml {_ALL}", 2.0),
-    Call("robot identify", f"@robot/poses.csv --robot @robot/robot.toml --folds 2 --out >r.toml {_ALL}", 4.0),
+    Call(
+        "robot identify",
+        f"@robot/poses.csv --robot @robot/robot.toml --folds 2 --out >r.toml --offsets >offsets.csv {_ALL}",
+        4.0,
+    ),
     Call("robot identify", "@robot/sweeps.csv --robot @robot/robot.toml --observe distance --partial --folds 0", 1.0),
     Call(
         "robot evaluate",

@@ -147,6 +147,18 @@ def several_tables(
     return [each.table for each in joined]
 
 
+def exports_of(words: Sequence[str], require_form: Callable[[str], None]) -> list[tuple[str, Path]]:
+    """(form, file) of each FORM=FILE of --export."""
+    found = []
+    for word in words:
+        form, _, path = word.partition("=")
+        require_form(form)
+        if not path:
+            raise InputError(f"--export {word}: no file; give {form}=FILE")
+        found.append((form, Path(path)))
+    return found
+
+
 def name_of(source: "Path | Table") -> str:
     """Of what :func:`one_table` returned, without its folder."""
     return source.name if isinstance(source, Path) else source.where

@@ -4,6 +4,8 @@ import io
 import math
 from collections.abc import Iterable, Sequence
 
+from stcal.io.poses.text import fixed
+
 NONE = "–"
 WIDEST = 10_000
 """Characters of a line: none is ever wrapped, whatever the terminal."""
@@ -13,8 +15,7 @@ def number(value: float | None, digits: int) -> str:
     """Fixed digits; a dash where there is no value, and no minus before zero."""
     if value is None or not math.isfinite(value):
         return NONE
-    text = f"{value:.{digits}f}"
-    return text.lstrip("-") if not text.strip("-0.") else text
+    return fixed(value, digits)
 
 
 def cells(row: dict, spec: str) -> list:

@@ -30,6 +30,7 @@ from stcal.cli.options import (
     ReportFile,
     SecondTable,
     Workers,
+    exports_of,
 )
 from stcal.cli.terminal import StageProgress, print_each, say, write
 from stcal.errors import InputError
@@ -243,7 +244,7 @@ def handeye(
     """Find where a camera sits on a robot's flange, or in its base, and how well that is known."""
     from stcal.handeye import HandEyeOptions, Noise
     from stcal.handeye.data.formats.record import Said
-    from stcal.handeye.report.export import exported, opencv_yaml, ros_yaml, urdf_joint
+    from stcal.handeye.report.export import exported, opencv_yaml, require_form, ros_yaml, urdf_joint
     from stcal.handeye.report.file import HandEyeFile
     from stcal.handeye.report.page import outcome_page, outcome_text
     from stcal.robot import load_robot, save_robot
@@ -262,7 +263,7 @@ def handeye(
     _require_fitting(not folder, method, refine_camera, camera_out, with_kinematics is not None)
     _require_arm(folder, method, four_dof, with_kinematics, robot_out)
     robot_model = load_robot(with_kinematics) if with_kinematics else None
-    exports = _exports(export or [])
+    exports = exports_of(export or [], require_form)
     written = {"--out": out, "--ros": ros, "--urdf": urdf, "--opencv": opencv, "--camera-out": camera_out}
     written |= {"--robot-out": robot_out}
     written |= {"--json": json_file, "--report": report}
@@ -365,20 +366,6 @@ def _require_fitting(
         raise InputError(f"--camera-out: {method} does not adjust the camera; leave --method out")
     if method not in (None, ALL, *METHODS):
         raise InputError(f"--method {method}: unknown; {ALL} or one of {', '.join(METHODS)} needed")
-
-
-def _exports(words: list[str]) -> list[tuple[str, Path]]:
-    """(form, file) of each FORM=FILE."""
-    from stcal.handeye.report.export import require_form
-
-    found = []
-    for word in words:
-        form, _, path = word.partition("=")
-        require_form(form)
-        if not path:
-            raise InputError(f"--export {word}: no file; give {form}=FILE")
-        found.append((form, Path(path)))
-    return found
 
 
 def _require_frames(

@@ -3,7 +3,7 @@
 import typer
 
 from stcal.cli.help import PLAIN, Commands
-from stcal.cli.robot import axes, compensate, design, evaluate, identify, init, verify
+from stcal.cli.robot import axes, compensate, convert, design, evaluate, identify, init, verify
 
 app = typer.Typer(
     name="stcal robot",
@@ -19,6 +19,7 @@ COMMANDS = (
     compensate.compensate,
     verify.verify,
     design.design,
+    convert.convert,
 )
 for command in COMMANDS:
     app.command()(command)

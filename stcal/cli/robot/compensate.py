@@ -1,5 +1,6 @@
 """``stcal robot compensate``: joint values that reach what was commanded."""
 
+from enum import StrEnum
 from pathlib import Path
 from typing import Annotated
 
@@ -14,10 +15,19 @@ from stcal.cli.options import (
     ReportFile,
     Rotation,
     SecondTable,
+    exports_of,
     one_table,
 )
 from stcal.cli.terminal import print_each, say, write
-from stcal.errors import DegenerateError
+from stcal.errors import DegenerateError, InputError
+from stcal.io.saving import keep_apart
+
+
+class ExportAs(StrEnum):
+    """What files of controllers hold."""
+
+    joints = "joints"
+    poses = "poses"
 
 
 def compensate(
@@ -34,6 +44,30 @@ def compensate(
             "--out", writable=True, help="Write joint values to send, with status and errors, to this file (CSV)."
         ),
     ] = None,
+    export: Annotated[
+        list[str] | None,
+        typer.Option(
+            "--export",
+            metavar="FORM=FILE",
+            help="Write the points that are reached to this file, again for each further one; forms: yaskawa (JBI), "
+            "fanuc (LS), kuka (dat), abb (mod), ur (script).",
+        ),
+    ] = None,
+    export_as: Annotated[
+        ExportAs,
+        typer.Option(
+            "--export-as",
+            help="Write joint values, or the poses of the nominal robot there, which the controller is told for them.",
+        ),
+    ] = ExportAs.joints,
+    pulses_per_deg: Annotated[
+        str | None,
+        typer.Option(
+            "--pulses-per-deg",
+            help="Write joint values for yaskawa by these pulses per degree of each joint, with commas between; poses "
+            "if not given.",
+        ),
+    ] = None,
     quaternions: Quaternions = QuaternionOrder.wxyz,
     rotation: Rotation = None,
     first: FirstTable = None,
@@ -43,10 +77,18 @@ def compensate(
     report: ReportFile = None,
 ) -> None:
     """Compute joint values that really reach commanded poses, beside the nominal ones."""
+    from stcal.robot.export import exported, require_form
     from stcal.robot.kinematics.file import load_robot
     from stcal.robot.use import compensation as stage
     from stcal.robot.use.targets import read_targets
 
+    exports, pulses = exports_of(export or [], require_form), _pulses(pulses_per_deg)
+    read = {"TARGETS": targets, "--robot": robot_file, "--nominal": nominal, "--a": first, "--b": second}
+    written = {"--out": out, "--json": json_file, "--report": report}
+    keep_apart(
+        [*((name, path) for name, path in written.items() if path), *(("--export", path) for _, path in exports)],
+        [(name, path) for name, path in read.items() if path],
+    )
     identified = load_robot(robot_file)
     source = one_table(targets, first, second, key, "TARGETS", quaternions=quaternions.value)
     wanted = read_targets(source, identified, quaternions.value, rotation)
@@ -64,5 +106,16 @@ def compensate(
         from stcal.robot.use.report import compensation_page
 
         write(report, compensation_page(result, identified))
+    for form, path in exports if result.found.usable.any() else ():
+        made = exported(result, identified, form, path, export_as.value, pulses)
+        write(path, made.text)
+        print_each("note", made.notes)
     if not result.found.usable.any():
         raise DegenerateError(f"{wanted.where}: none of {len(result)} poses is reached; see the warnings above")
+
+
+def _pulses(text: str | None) -> list[float] | None:
+    try:
+        return None if text is None else [float(cell) for cell in text.split(",")]
+    except ValueError as error:
+        raise InputError(f"--pulses-per-deg {text}: numbers with commas between needed, one for each joint") from error

@@ -48,6 +48,12 @@ def identify(
     out: Annotated[
         Path | None, typer.Option("--out", writable=True, help="Write the identified robot to this file (TOML).")
     ] = None,
+    offsets: Annotated[
+        Path | None,
+        typer.Option(
+            "--offsets", writable=True, help="Write mastering offsets and differences of D-H values to this file (CSV)."
+        ),
+    ] = None,
     observe: Annotated[
         Kind | None, typer.Option(help="Use this of the measurements; the most that was measured if not given.")
     ] = None,
@@ -123,6 +129,10 @@ def identify(
             out,
             robot_toml(result.robot, [f"Identified from {name_of(source)}: {result.rank} parameters."]),
         )
+    if offsets:
+        from stcal.robot.export.offsets import offsets_csv
+
+        write(offsets, offsets_csv(result, nominal))
     if json_file:
         write(json_file, identified_file(result, nominal))
     if report:

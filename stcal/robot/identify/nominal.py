@@ -162,16 +162,21 @@ class NominalRows:
 
     def sigma(self, robot: Robot, covariance: np.ndarray) -> np.ndarray:
         """(n, 5) σ of the rows of ``robot`` (a, alpha, d, theta, beta) from the parameters' covariance (k, k)."""
-        jacobian, k = self.jacobian.copy(), self.jacobian.shape[2]
-        covariance = covariance[:k, :k]
+        jacobian = self.by_parameters(robot)
+        covariance = covariance[: jacobian.shape[2], : jacobian.shape[2]]
+        sigma = np.sqrt(np.einsum("njk,kl,njl->nj", jacobian, covariance, jacobian).clip(0))
+        return np.where(self.fixed, 0.0, sigma)
+
+    def by_parameters(self, robot: Robot) -> np.ndarray:
+        """(n, 5, k) derivatives of the rows of ``robot``, of a, alpha, d, theta, beta."""
+        jacobian = self.jacobian.copy()
         for turn, reach in self.coaxial:
             angle = robot.rows[turn].theta - self.nominal.rows[turn].theta
             along, across = self.jacobian[reach, 0], self.jacobian[turn, 3]
             jacobian[reach, 0] = np.cos(angle) * along + np.sin(angle) * across
             offset = max(abs(robot.rows[reach].a), 1e-9)
             jacobian[turn, 3] = (np.cos(angle) * across - np.sin(angle) * along) / offset
-        sigma = np.sqrt(np.einsum("njk,kl,njl->nj", jacobian, covariance, jacobian).clip(0))
-        return np.where(self.fixed, 0.0, sigma)
+        return jacobian
 
 
 def _dimensions(robot: Robot, nominal: Robot, coaxial: tuple[tuple[int, int], ...]) -> np.ndarray:

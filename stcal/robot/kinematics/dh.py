@@ -7,12 +7,27 @@ import numpy as np
 
 from stcal.geometry.rigid import Rigid
 from stcal.robot.kinematics.forward import joint_frames
-from stcal.robot.kinematics.model import Chain, DHRow, Elasticity, Robot, about_z, across, along
+from stcal.robot.kinematics.model import (
+    Chain,
+    Convention,
+    DHRow,
+    Elasticity,
+    Joint,
+    Robot,
+    about_z,
+    across,
+    along,
+)
 
 PARALLEL_RAD = np.radians(1.0)
 """Below this the foot of the common normal is far away and moves by metres with micro-radians: Hayati's β instead."""
 SAME_AXIS_MM = 1e-10
 """Parallel axes closer than this are one line, as of a SCARA's spindle: any θ does, the nominal one is kept."""
+
+ROUNDING, ROUNDING_MM = 1e-12, 1e-9
+"""What products of a dozen transforms leave of an equality."""
+NOTHING_MM, NOTHING_RAD = 1e-12, 1e-14
+"""By which no tool is moved by 1e-10 mm."""
 
 
 def robot_from_chain(chain: Chain, tools: Mapping[str, Rigid], nominal: Robot) -> Robot:
@@ -102,3 +117,66 @@ def _row_between(gap: Rigid, nominal: DHRow, to_prismatic: bool) -> DHRow:
 def _near(angle: float, nominal: float) -> float:
     """The same angle in the turn around the nominal one."""
     return angle + 2 * np.pi * round((nominal - angle) / (2 * np.pi))
+
+
+def robot_between(
+    chain: Chain, tools: Mapping[str, Rigid], name: str, convention: Convention, joints: tuple[Joint, ...]
+) -> Robot:
+    """A robot of these axes and tools (flange_from_tool) that has no nominal one.
+
+    Its first row begins at the chain's base, and its last ends at the chain's flange, where a row can; else the base,
+    and the tools, take what is left.
+    """
+    bare = Robot(name, convention, (DHRow(0.0, 0.0, 0.0, 0.0),) * len(chain), joints, chain.coupling)
+    hints = list(bare.rows)
+    found = _with_ends(chain, tools, bare)
+    for i in range(len(hints) - 1):  # of the two x axes along each common normal the one within 90° of the last
+        if abs(found.rows[i].theta) > np.pi / 2 + ROUNDING:
+            k = i if convention == "standard" else i + 1
+            hints[k] = DHRow(-found.rows[k].a, -found.rows[k].alpha, 0.0, 0.0)
+            found = _with_ends(chain, tools, replace(bare, rows=tuple(hints)))
+    rows = [DHRow(_length(r.a), _angle(r.alpha), _length(r.d), _angle(r.theta), _angle(r.beta)) for r in found.rows]
+    return replace(found, rows=tuple(rows))
+
+
+def _with_ends(chain: Chain, tools: Mapping[str, Rigid], nominal: Robot) -> Robot:
+    """With a first row from the chain's base and a last one to its flange, where there are such."""
+    rows, modified = list(nominal.rows), nominal.convention == "modified"
+    bare = robot_from_chain(chain, {"": Rigid()}, nominal)
+    if (end := _row_of(bare.tool(), modified=False, across_too=not modified)) is not None:
+        rows[-1] = end if not modified else replace(rows[-1], d=end.d, theta=end.theta)
+    if len(rows) > 1 and (begin := _row_of(bare.world_from_base, modified, across_too=modified)) is not None:
+        rows[0] = begin if modified else replace(rows[0], d=begin.d, theta=begin.theta)
+    found = robot_from_chain(chain, tools, replace(nominal, rows=tuple(rows)))
+    base = found.world_from_base
+    at_base = np.abs(base.translation).max() < ROUNDING_MM and np.abs(base.rotation - np.eye(3)).max() < ROUNDING
+    return replace(found, world_from_base=Rigid()) if at_base else found
+
+
+def _row_of(pose: Rigid, modified: bool, across_too: bool) -> DHRow | None:
+    """The row without β that makes this pose, alone or as its part along the axis; None where none does."""
+    r, p = pose.rotation, pose.translation
+    if not across_too:
+        row = DHRow(0.0, 0.0, float(p[2]), float(np.arctan2(r[1, 0], r[0, 0])))
+    elif modified:
+        alpha = float(np.arctan2(-r[1, 2], r[2, 2]))
+        d = float(r[1, 2] * p[1] + r[2, 2] * p[2])
+        row = DHRow(float(p[0]), alpha, d, float(np.arctan2(-r[0, 1], r[0, 0])))
+    else:
+        theta = float(np.arctan2(r[1, 0], r[0, 0]))
+        a = float(np.cos(theta) * p[0] + np.sin(theta) * p[1])
+        row = DHRow(a, float(np.arctan2(r[2, 1], r[2, 2])), float(p[2]), theta)
+    made = across(row) @ along(row) if modified else along(row) @ across(row)
+    fits = np.abs(made.rotation - r).max() < ROUNDING and np.abs(made.translation - p).max() < ROUNDING_MM
+    return row if fits else None
+
+
+def _length(value: float) -> float:
+    """0 where rounding left something."""
+    return 0.0 if abs(value) < NOTHING_MM else value
+
+
+def _angle(value: float) -> float:
+    """Whole right angles where rounding left something."""
+    right = np.pi / 2 * round(value / (np.pi / 2))
+    return right if abs(value - right) < NOTHING_RAD else value

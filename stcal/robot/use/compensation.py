@@ -55,6 +55,8 @@ class Compensated:
         Of rows that only joint values beyond the limits reach: which joints, and where they would be.
     doubts : tuple of str
         Notes on targets that may be meant otherwise, and on tools and arms that are others in the nominal robot.
+    controller : Robot or None
+        The nominal robot, with the tools that were taken.
     """
 
     targets: Targets
@@ -67,6 +69,7 @@ class Compensated:
     reach_mm: float
     beyond: dict[int, str]
     doubts: tuple[str, ...] = ()
+    controller: Robot | None = None
 
     def __len__(self) -> int:
         return len(self.found)
@@ -198,6 +201,7 @@ def compensate(identified: Robot, targets: Targets, nominal: Robot | None = None
         reach_mm=reach_mm(identified, targets.tools[0]),
         beyond=stay.beyond,
         doubts=((apart,) if apart else ()) + doubts + others,
+        controller=nominal,
     )
 
 

@@ -13,12 +13,13 @@ from stcal.handeye.report.export.frames import (
     Static,
     frame_names,
     require_frame_names,
-    roll_pitch_yaw,
     tree,
 )
 from stcal.handeye.report.export.opencv import opencv_yaml, read_zivid, zivid_yaml
 from stcal.handeye.report.export.ros import ros_yaml, urdf_joint
 from stcal.handeye.result import HandEye
+from stcal.io.poses.controllers import ABB, FANUC, KUKA, UR
+from stcal.io.poses.text import program_name
 
 __all__ = [
     "FORMS",
@@ -30,7 +31,6 @@ __all__ = [
     "opencv_yaml",
     "require_form",
     "require_frame_names",
-    "roll_pitch_yaw",
     "ros_yaml",
     "tree",
     "urdf_joint",
@@ -59,10 +59,10 @@ ROS_FORMS = {
 """With names of frames, and the camera's link on demand."""
 FORMS = ROS_FORMS | {
     "zivid": Form(lambda result, *_: zivid_yaml(result), read_zivid),
-    "kuka": Form(lambda result, _, name: robots.kuka_dat(result, robots.program_name(name)), robots.read_kuka),
-    "abb": Form(lambda result, _, name: robots.abb_module(result, robots.program_name(name)), robots.read_abb),
-    "ur": Form(lambda result, *_: robots.ur_script(result), robots.read_ur),
-    "fanuc": Form(lambda result, _, name: robots.fanuc_program(result, robots.program_name(name)), robots.read_fanuc),
+    "kuka": Form(lambda result, _, name: robots.kuka_dat(result, program_name(name)), KUKA.first),
+    "abb": Form(lambda result, _, name: robots.abb_module(result, program_name(name)), ABB.first),
+    "ur": Form(lambda result, *_: robots.ur_script(result), UR.first),
+    "fanuc": Form(lambda result, _, name: robots.fanuc_program(result, program_name(name)), FANUC.first),
 }
 """By the word of ``--export``."""
 

@@ -11,9 +11,8 @@ from stcal.errors import InputError
 from stcal.geometry.rigid import Rigid
 from stcal.handeye.data.loop import FRAMES, Setup
 from stcal.handeye.result import HandEye
+from stcal.io.poses.controllers import METRE_MM
 
-METRE_MM = 1000.0
-"""ROS, URDF and Universal Robots have metres."""
 CAMERA_FRAME = "camera_optical_frame"
 """What ROS calls a frame whose Z looks along the line of sight and X to the right, as ours does."""
 CAMERA_LINK = "camera_link"
@@ -92,24 +91,6 @@ def said_of(result: HandEye) -> list[str]:
     lines.append(f"sigma along x y z of the {frames.mount}: {shift} mm; about them: {turn} deg")
     lines.append(f"covariance, rotation about x y z (rad), then shift along x y z (mm), axes of the {frames.mount}:")
     return lines + ["  " + " ".join(f"{v:.6e}" for v in row) for row in result.covariance]
-
-
-def roll_pitch_yaw(pose: Rigid) -> np.ndarray:
-    """(3,) rad, about the fixed axes X, Y, Z, in this order.
-
-    At a pitch of ±90° roll and yaw are one turn. The roll is what the other two leave, so that the rotation is right to
-    the last digits there and beside it, where angles taken from single elements lose half of theirs.
-    """
-    r = pose.rotation
-    pitch = np.arctan2(-r[2, 0], np.hypot(r[0, 0], r[1, 0]))
-    yaw = np.arctan2(r[1, 0], r[0, 0])
-    left = from_roll_pitch_yaw([0.0, pitch, yaw]).T @ r
-    return np.array([np.arctan2(left[2, 1], left[1, 1]), pitch, yaw])
-
-
-def from_roll_pitch_yaw(angles) -> np.ndarray:
-    """The rotation (3, 3)."""
-    return Rotation.from_euler("xyz", angles).as_matrix()
 
 
 def metres(pose: Rigid) -> list[float]:

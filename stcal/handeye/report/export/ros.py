@@ -16,19 +16,17 @@ from stcal.errors import InputError
 from stcal.geometry.rigid import Poses, Rigid
 from stcal.handeye.data.loop import FRAMES
 from stcal.handeye.report.export.frames import (
-    METRE_MM,
     CameraFrame,
     Static,
-    from_roll_pitch_yaw,
     metres,
     pose_of_metres,
-    roll_pitch_yaw,
     said_of,
     tree,
     xyzw,
 )
 from stcal.handeye.result import HandEye
 from stcal.io.plain_yaml import load_yaml
+from stcal.io.poses.controllers import METRE_MM, from_roll_pitch_yaw, roll_pitch_yaw
 from stcal.report.text import number
 
 ARGUMENTS = ("--x", "--y", "--z", "--qx", "--qy", "--qz", "--qw")

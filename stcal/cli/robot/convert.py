@@ -1,0 +1,74 @@
+"""``stcal robot convert``: robot files and URDF."""
+
+from enum import StrEnum
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from stcal.cli.terminal import print_each, say, write
+from stcal.errors import InputError
+
+XML = (".urdf", ".xml")
+
+
+class ConventionName(StrEnum):
+    """Of Denavit–Hartenberg rows."""
+
+    standard = "standard"
+    modified = "modified"
+
+
+def convert(
+    source: Annotated[
+        Path, typer.Argument(metavar="A", help="Read the robot from this file: a robot file (TOML), or URDF.")
+    ],
+    out: Annotated[
+        Path, typer.Argument(metavar="B", writable=True, help="Write the other of both to this file: .toml or .urdf.")
+    ],
+    from_link: Annotated[
+        str, typer.Option("--from-link", help="Begin at this link of a URDF; at its root if not given.")
+    ] = "",
+    to_link: Annotated[
+        str, typer.Option("--to-link", help="End at this link of a URDF; at the only one that can be if not given.")
+    ] = "",
+    convention: Annotated[
+        ConventionName, typer.Option(help="Write rows of Denavit and Hartenberg in this convention.")
+    ] = ConventionName.standard,
+) -> None:
+    """Write a robot file as URDF, or the chain between two links of a URDF as a robot file."""
+    from stcal.robot.kinematics.file import load_robot, robot_toml
+    from stcal.robot.kinematics.urdf import coupled, load_urdf, require_same_poses, robot_urdf
+
+    if out.suffix.lower() not in (*XML, ".toml"):
+        raise InputError(f"{out}: a name ending in .urdf or .toml needed")
+    if _is_xml(source) == (out.suffix.lower() in XML):
+        raise InputError(
+            f"{source}, {out}: both are {'URDF' if _is_xml(source) else 'robot files'}; one of each needed"
+        )
+    if _is_xml(source):
+        found = load_urdf(source, from_link, to_link, convention.value)
+        joints = ", ".join(found.joints)
+        say(f"robot {found.robot.name}: {len(found.joints)} joints from {found.from_link} to {found.to_link}: {joints}")
+        print_each(f"note: {source}", found.notes)
+        write(out, robot_toml(found.robot, [f"From {source.name}, {found.from_link} to {found.to_link}: {joints}."]))
+        return
+    if from_link or to_link or convention is not ConventionName.standard:
+        raise InputError("--from-link, --to-link, --convention: only of a URDF that is read; leave them out")
+    robot = load_robot(source)
+    text = robot_urdf(robot)
+    require_same_poses(robot, text)
+    say(f"robot {robot.name}: {len(robot.rows)} joints from base_link to flange, and {len(robot.tools)} tools")
+    if coupled(robot):
+        say("note: URDF has no coupling; its joint values are the coupling times the controller's, with wider limits")
+    write(out, text)
+
+
+def _is_xml(path: Path) -> bool:
+    if path.suffix.lower() in (*XML, ".toml"):
+        return path.suffix.lower() in XML
+    try:
+        with path.open("rb") as file:
+            return file.read(200).lstrip(b"\xef\xbb\xbf \t\r\n").startswith(b"<")
+    except OSError as error:
+        raise InputError(f"{path}: {error.strerror or error}; check the path") from error

@@ -1,0 +1,161 @@
+"""Compensated points in the files of controllers, each read back as it is made."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Literal
+
+import numpy as np
+
+import stcal
+from stcal.errors import InputError, StcalError
+from stcal.geometry.rigid import Poses
+from stcal.io.poses.controllers import MM_DIGITS, YASKAWA_MM_DIGITS
+from stcal.io.poses.text import ascii_text, program_name
+from stcal.robot.export.files import FORMS, Points
+from stcal.robot.kinematics.model import Robot
+from stcal.robot.use.compensation import Compensated
+from stcal.robot.use.targets import poses_of
+
+As = Literal["joints", "poses"]
+SAME_MM, SAME_RAD = 10.0**-MM_DIGITS, 1e-9
+"""Poses read back are off by no more than the digits printed; Yaskawa's have fewer."""
+YASKAWA_SAME_MM, YASKAWA_SAME_RAD = 10.0**-YASKAWA_MM_DIGITS, 5e-6
+SHOWN = 6
+"""Lines that are named in a note."""
+
+
+@dataclass(frozen=True, slots=True)
+class Exported:
+    """``text`` of the file; ``notes`` : what stands in it, and what does not."""
+
+    text: str
+    notes: tuple[str, ...]
+
+
+def require_form(form: str) -> None:
+    """Refuse a form that is none.
+
+    Raises
+    ------
+    InputError
+        With those there are.
+    """
+    if form not in FORMS:
+        raise InputError(f"--export {form}: unknown; one of {', '.join(FORMS)} needed")
+
+
+def exported(
+    result: Compensated,
+    robot: Robot,
+    form: str,
+    path: Path,
+    wanted: As = "joints",
+    pulses_per_deg: Sequence[float] | None = None,
+) -> Exported:
+    """The points that are reached, as a controller reads them.
+
+    Parameters
+    ----------
+    result : Compensated
+    robot : Robot
+        Whose joint values these are.
+    form : str
+        Of :data:`~stcal.robot.export.files.FORMS`.
+    path : Path
+        The file; controllers have its name, without its ending, inside too.
+    wanted : {"joints", "poses"}
+        Joint values, or the poses that the controller, which knows the nominal robot, has to be told for them.
+    pulses_per_deg : sequence of float, optional
+        Of each joint, for Yaskawa's joint values; without them its file has poses.
+
+    Raises
+    ------
+    InputError
+        No such form, no row reached, joints that the controller has no place for, poses without a nominal robot or of
+        several tools, or pulses of another number.
+    """
+    require_form(form)
+    where, own = f"--export {form}={path}", FORMS[form]
+    rows = np.flatnonzero(result.found.usable)
+    if not len(rows):
+        raise InputError(f"{where}: none of {len(result)} rows is reached; nothing to write")
+    if pulses_per_deg is not None and form == "yaskawa":
+        _require_pulses(pulses_per_deg, robot, where)
+    notes = []
+    if form == "yaskawa" and wanted == "joints" and pulses_per_deg is None:
+        wanted = "poses"
+        notes.append("poses: joint values are pulses there; give --pulses-per-deg for these")
+    points = _points(result, robot, rows, program_name(path.stem), pulses_per_deg)
+    head = [f"stcal {stcal.__version__}: robot {robot.name}, {len(rows)} of {len(result)} points"]
+    if wanted == "poses":
+        poses, said = _poses(result, rows, where)
+        points, head = points.with_poses(poses), [*head, said]
+        notes.append(f"{said}; {own.unknown}")
+    else:
+        reason = own.refuses(points)
+        if reason:
+            raise InputError(f"{where}: {reason}; joint values of robot {robot.name} do not fit")
+        head.append("joint values that the controller must be told")
+    gone = np.flatnonzero(~result.found.usable)
+    if len(gone):
+        named = ", ".join(str(result.targets.lines[i]) for i in gone[:SHOWN]) + (", …" if len(gone) > SHOWN else "")
+        notes.append(f"left out, as they are not reached: line{'s' * (len(gone) > 1)} {named}")
+        head.append(f"left out, as they are not reached: {len(gone)} lines, the first {result.targets.lines[gone[0]]}")
+    text = own.write(points, [ascii_text(line) for line in head])
+    if not _same(own.read(text), points, form):
+        raise StcalError(f"{where}: the file does not give the points back; use another form")
+    return Exported(text, tuple(f"{where}: {note}" for note in [f"{len(rows)} points, {wanted}", *notes]))
+
+
+def _points(
+    result: Compensated, robot: Robot, rows: np.ndarray, name: str, pulses_per_deg: Sequence[float] | None
+) -> Points:
+    targets, labels = result.targets, []
+    for i in rows:
+        more = [f"{column} {own[i]}" for column, own in targets.names.items()]
+        more += [f"target {targets.tools[i]}"] if targets.tools[i] else []
+        labels.append(ascii_text(", ".join([f"line {targets.lines[i]}", *more])))
+    pulses = None if pulses_per_deg is None else tuple(pulses_per_deg)
+    joints = np.where(robot.prismatic, result.found.q[rows], np.degrees(result.found.q[rows]))
+    return Points(name, tuple(labels), joints, robot.prismatic, None, pulses)
+
+
+def _poses(result: Compensated, rows: np.ndarray, where: str) -> tuple[Poses, str]:
+    """Of the nominal robot at the compensated joint values; and of which tool they are."""
+    if result.controller is None:
+        raise InputError(
+            f"{where}: poses of compensated points are those of the nominal robot; give its file with --nominal, or "
+            "joint values with --export-as joints"
+        )
+    targets = result.targets[rows]
+    if len(names := sorted(set(targets.tools))) > 1:
+        raise InputError(
+            f"{where}: poses of {len(names)} tools, {', '.join(map(repr, names))}; a file for each, or --export-as "
+            "joints, needed"
+        )
+    x, y, z = result.controller.tool(names[0]).translation
+    said = f"poses in the robot's base, of the tool at {x:.3f}, {y:.3f}, {z:.3f} mm on the flange"
+    return poses_of(result.controller, targets, result.found.q[rows]), said
+
+
+def _require_pulses(pulses: Sequence[float], robot: Robot, where: str) -> None:
+    if len(pulses) != len(robot.rows) or not all(np.isfinite(p) and p != 0 for p in pulses):
+        raise InputError(
+            f"{where}: --pulses-per-deg has {len(pulses)} numbers; {len(robot.rows)}, one for each joint, not 0, needed"
+        )
+
+
+def _same(found: Poses | np.ndarray, points: Points, form: str) -> bool:
+    """Whether a file that was read back has these points."""
+    if isinstance(found, Poses) != (points.poses is not None):
+        return False
+    if isinstance(found, Poses) and points.poses is not None:
+        mm, rad = (YASKAWA_SAME_MM, YASKAWA_SAME_RAD) if form == "yaskawa" else (SAME_MM, SAME_RAD)
+        if len(found) != len(points.poses):
+            return False
+        off = found.difference(points.poses)
+        return bool(np.abs(off[:, 3:]).max() <= mm and np.abs(off[:, :3]).max() <= rad)
+    values, digit = FORMS[form].values(points)
+    found = np.asarray(found)
+    return found.shape == values.shape and bool(np.abs(found - values).max() <= 0.51 * digit)

@@ -1,0 +1,213 @@
+"""Points as files of controllers hold them: Yaskawa JBI, FANUC LS, KUKA dat, ABB mod, URScript.
+
+Joint values in degrees, and mm of prismatic joints; pulses for Yaskawa, rad for Universal Robots.
+"""
+
+import re
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from datetime import datetime
+
+import numpy as np
+
+from stcal.geometry.rigid import Poses
+from stcal.io.poses.controllers import ABB, DEG_DIGITS, FANUC, KUKA, NUMBER, UNIT_DIGITS, UR, YASKAWA, PoseText
+from stcal.io.poses.text import fixed, joined, without_comments
+
+REMARK = 32
+"""Characters of a remark in a FANUC program, and of a JBI file's."""
+NOTHING = "9E9,9E9,9E9,9E9,9E9,9E9"
+"""ABB's external axes that are not there."""
+QUARTER_DEG = 90.0
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Points:
+    """``name`` of the program; ``labels`` : of m points, for comments; ``joints`` : (m, n) deg or mm; ``sliding`` : of
+    each joint; ``poses`` : m, in place of joint values, or None; ``pulses_per_deg`` : (n,) or None."""
+
+    name: str
+    labels: tuple[str, ...]
+    joints: np.ndarray
+    sliding: np.ndarray
+    poses: Poses | None = None
+    pulses_per_deg: tuple[float, ...] | None = None
+
+    def __len__(self) -> int:
+        return len(self.labels)
+
+    def with_poses(self, poses: Poses) -> "Points":
+        """To be written as these."""
+        return replace(self, poses=poses)
+
+
+@dataclass(frozen=True, slots=True)
+class Form:
+    """A controller's file.
+
+    ``write`` : text of points, below lines of comment; ``pose`` : how it writes these; ``axes`` : joint values in a
+    text; ``values`` : (m, n) of these in the file's unit, and their last digit; ``refuses`` : why joint values cannot
+    be written, or ""; ``unknown`` : what is not told of a pose.
+    """
+
+    write: Callable[[Points, Sequence[str]], str]
+    pose: PoseText
+    axes: re.Pattern[str]
+    refuses: Callable[[Points], str]
+    unknown: str
+    values: Callable[[Points], tuple[np.ndarray, float]] = lambda points: (points.joints, 10.0**-DEG_DIGITS)
+
+    def read(self, text: str) -> Poses | np.ndarray:
+        """Poses, or joint values (m, n) as they are written."""
+        poses = self.pose.read(text)
+        if poses:
+            return Poses.of(poses)
+        found = self.axes.finditer(without_comments(text))
+        return np.array([[float(v) for v in re.findall(r"(?<![\w.])-?\d+(?:\.\d+)?", each[1])] for each in found])
+
+
+def most(count: int) -> Callable[[Points], str]:
+    """A controller that has so many joints or fewer."""
+
+    def refuses(points: Points) -> str:
+        n = points.joints.shape[1]
+        return f"{n} joints, {count} or fewer are possible" if n > count else ""
+
+    return refuses
+
+
+def _six_turning(points: Points) -> str:
+    n, sliding = points.joints.shape[1], int(points.sliding.sum())
+    return "" if n == 6 and not sliding else f"{n} joints, {sliding} prismatic; six that turn needed"
+
+
+def _turning(points: Points) -> str:
+    sliding = int(points.sliding.sum())
+    return f"{sliding} prismatic joints have no pulses per degree; give poses" if sliding else most(8)(points)
+
+
+def _kuka(points: Points, head: Sequence[str]) -> str:
+    lines = ["&ACCESS RVP", f"DEFDAT {points.name} PUBLIC", *(f"; {line}" for line in head)]
+    for i, label in enumerate(points.labels):
+        if points.poses is None:
+            axes = ",".join(f"A{k} {fixed(v, DEG_DIGITS)}" for k, v in enumerate(points.joints[i], 1))
+            frame = f"DECL GLOBAL E6AXIS XP{i + 1}={{{axes}}}"
+        else:
+            frame = f"DECL GLOBAL E6POS XP{i + 1}={{{KUKA.write(points.poses[i])}}}"
+        lines += [f"; {label}", frame]
+    return "\n".join([*lines, "ENDDAT"]) + "\n"
+
+
+def _abb(points: Points, head: Sequence[str]) -> str:
+    lines = [f"MODULE {points.name}", *(f"  ! {line}" for line in head)]
+    for i, label in enumerate(points.labels):
+        own = points.joints[i]
+        if points.poses is None:
+            six = joined(np.pad(own, (0, 6 - len(own))), DEG_DIGITS)
+            frame = f"jointtarget p{i + 1}:=[[{six}],[{NOTHING}]]"
+        else:
+            quarters = ",".join(str(int(v)) for v in np.floor(_of_six(own, (0, 3, 5)) / QUARTER_DEG))
+            frame = f"robtarget p{i + 1}:=[{ABB.write(points.poses[i])},[{quarters},0],[{NOTHING}]]"
+        lines += [f"  ! {label}", f"  CONST {frame};"]
+    return "\n".join([*lines, "ENDMODULE"]) + "\n"
+
+
+def _of_six(joints: np.ndarray, which: tuple[int, ...]) -> np.ndarray:
+    """Values of some joints; 0 of those that an arm does not have."""
+    return np.pad(joints, (0, max(0, 6 - len(joints))))[list(which)]
+
+
+def _abb_values(points: Points) -> tuple[np.ndarray, float]:
+    return np.pad(points.joints, ((0, 0), (0, 6 - points.joints.shape[1]))), 10.0**-DEG_DIGITS
+
+
+def _ur(points: Points, head: Sequence[str]) -> str:
+    lines = [f"# {line}" for line in head]
+    for i, label in enumerate(points.labels):
+        if points.poses is None:
+            value = f"[{joined(np.radians(points.joints[i]), UNIT_DIGITS, ', ')}]"
+        else:
+            value = UR.write(points.poses[i])
+        lines += [f"# {label}", f"p{i + 1} = {value}"]
+    return "\n".join(lines) + "\n"
+
+
+def _fanuc(points: Points, head: Sequence[str]) -> str:
+    remarks = [*head, *(f"P[{i}] {label}" for i, label in enumerate(points.labels, 1))]
+    lines = [f"/PROG  {points.name}", "/ATTR", 'COMMENT = "stcal compensate";', "/MN"]
+    lines += [f"   {k}:  !{remark[:REMARK]} ;" for k, remark in enumerate(remarks, 1)]
+    lines.append("/POS")
+    for i in range(len(points)):
+        if points.poses is None:
+            axes = [
+                f"J{k} = {fixed(v, DEG_DIGITS)} {' mm' if slides else 'deg'}"
+                for k, (v, slides) in enumerate(zip(points.joints[i], points.sliding, strict=True), 1)
+            ]
+            rows = [",\t".join(axes[k : k + 3]) for k in range(0, len(axes), 3)]
+            body = ["\tUF : 0, UT : 1,", "\t" + ",\n\t".join(rows)]
+        else:
+            body = ["\tUF : 0, UT : 1,\t\tCONFIG : 'N U T, 0, 0, 0',", FANUC.write(points.poses[i])]
+        lines += [f"P[{i + 1}]{{", "   GP1:", *body, "};"]
+    return "\n".join([*lines, "/END"]) + "\n"
+
+
+def _yaskawa_values(points: Points) -> tuple[np.ndarray, float]:
+    return np.round(points.joints * np.array(points.pulses_per_deg)), 1.0
+
+
+def _yaskawa(points: Points, head: Sequence[str]) -> str:
+    lines = ["/JOB", f"//NAME {points.name}", "//POS", f"///NPOS {len(points)},0,0,0,0,0", "///TOOL 0"]
+    if points.poses is None:
+        lines += ["///POSTYPE PULSE", "///PULSE"]
+        values = [",".join(str(int(v)) for v in row) for row in _yaskawa_values(points)[0]]
+    else:
+        lines += ["///POSTYPE ROBOT", "///RECTAN", "///RCONF 0,0,0,0,0,0,0,0"]
+        values = [YASKAWA.write(pose) for pose in points.poses]
+    lines += [f"C{i:05d}={value}" for i, value in enumerate(values)]
+    lines += ["//INST", f"///DATE {datetime.now():%Y/%m/%d %H:%M}", "///ATTR SC,RW", "///GROUP1 RB1", "NOP"]
+    remarks = [*head, *(f"C{i:05d} {label}" for i, label in enumerate(points.labels))]
+    return "\r\n".join([*lines, *(f"'{remark[:REMARK]}" for remark in remarks), "END"]) + "\r\n"
+
+
+_JOINT = NUMBER[1:-1]
+FORMS = {
+    "yaskawa": Form(
+        _yaskawa,
+        YASKAWA,
+        re.compile(r"^C\d+=(-?\d+(?:,-?\d+)*)$", re.MULTILINE),
+        _turning,
+        "set ///TOOL, and ///RCONF for the configuration of the arm, which a pose does not tell",
+        _yaskawa_values,
+    ),
+    "fanuc": Form(
+        _fanuc,
+        FANUC,
+        re.compile(r"^P\[\d+\]\{\n.*\n.*\n((?:\tJ.*\n)+)\};", re.MULTILINE),
+        most(9),
+        "set UT for the tool, and CONFIG for the configuration of the arm, which a pose does not tell",
+    ),
+    "kuka": Form(
+        _kuka,
+        KUKA,
+        re.compile(r"E6AXIS \w+=\{(.*)\}"),
+        most(6),
+        "without S and T: set $TOOL and $BASE; the arm stays in its configuration",
+    ),
+    "abb": Form(
+        _abb,
+        ABB,
+        re.compile(r"jointtarget \w+:=\[\[(.*?)\]"),
+        most(6),
+        "cf1, cf4, cf6 are of the joint values, cfx is 0: correct it, or move with ConfJ\\Off and ConfL\\Off",
+        _abb_values,
+    ),
+    "ur": Form(
+        _ur,
+        UR,
+        re.compile(rf"^\w+ = \[({_JOINT}(?:, {_JOINT})*)\]", re.MULTILINE),
+        _six_turning,
+        "set the TCP; inverse kinematics takes the configuration nearest to the arm's",
+        lambda points: (np.radians(points.joints), 10.0**-UNIT_DIGITS),
+    ),
+}
+"""By the word of ``--export``."""

@@ -1,0 +1,56 @@
+"""What differs from the nominal robot, as controllers take it: D-H values, and the joints' zeros."""
+
+import csv
+import io
+
+import numpy as np
+
+from stcal.io.poses.text import fixed
+from stcal.robot.identify.nominal import dh_values
+from stcal.robot.identify.report import DH, SHOWN, UNITS
+from stcal.robot.identify.result import Identified
+from stcal.robot.kinematics.model import Robot
+
+HEAD = ("joint", "parameter", "nominal", "identified", "difference", "sigma", "unit", "determined")
+DIGITS = {"mm": 6, "deg": 9}
+ZERO = "zero"
+LENGTH_AT, ANGLE_AT = DH.index("d"), DH.index("theta")
+
+
+def zeros(result: Identified, nominal: Robot) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """What the controller's joint values should be where they are 0 now, and their σ, (n,) rad or mm; (n,) which of
+    them the data tell.
+
+    The identified rows have θ + Δ, or d + Δ of prismatic joints, where the nominal ones have θ; with the coupling C the
+    joints turn by C q. Nominal rows do the same with q + C⁻¹ Δ.
+    """
+    at = np.where(nominal.prismatic, LENGTH_AT, ANGLE_AT)
+    each, back = np.arange(len(at)), np.linalg.inv(nominal.coupling)
+    change = back @ (dh_values(result.robot) - dh_values(nominal))[each, at]
+    jacobian = back @ result.adjustment.rows.by_parameters(result.robot)[each, at]
+    k = jacobian.shape[1]
+    sigma = np.sqrt(np.einsum("nk,kl,nl->n", jacobian, result.covariance[:k, :k], jacobian).clip(0))
+    open_ = result.dh_sigma[each, at] == 0
+    open_[[turn for turn, _ in result.adjustment.rows.coaxial]] = True
+    return change, sigma, (np.abs(back) > 0) @ open_ == 0
+
+
+def offsets_csv(result: Identified, nominal: Robot) -> str:
+    """The table of ``--offsets`` (form: ``data_layout.md``)."""
+    before, values, sigma = dh_values(nominal) * SHOWN, dh_values(result.robot) * SHOWN, result.dh_sigma * SHOWN
+    change, change_sigma, known = zeros(result, nominal)
+    stream = io.StringIO()
+    writer = csv.writer(stream, lineterminator="\n")
+    writer.writerow(HEAD)
+
+    def row(joint: int, name: str, old: float, new: float, deviation: float, unit: str, told: bool) -> None:
+        shown = [fixed(v, DIGITS[unit]) for v in (old, new, new - old)]
+        own = fixed(deviation, DIGITS[unit]) if told else ""
+        writer.writerow([joint, name, *shown, own, unit, "yes" if told else "no"])
+
+    for i, slides in enumerate(nominal.prismatic):
+        for name, unit, old, new, deviation in zip(DH, UNITS, before[i], values[i], sigma[i], strict=True):
+            row(i + 1, name, old, new, deviation, unit, deviation > 0)
+        factor, unit = (1.0, "mm") if slides else (float(np.degrees(1.0)), "deg")
+        row(i + 1, ZERO, 0.0, factor * change[i], factor * change_sigma[i], unit, bool(known[i]))
+    return stream.getvalue()

@@ -1,0 +1,409 @@
+"""Robots as URDF: the chain of joints between two links, in metres and rad; all else in a file is passed over."""
+
+import xml.etree.ElementTree as ElementTree
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+
+from stcal.errors import InputError, StcalError
+from stcal.geometry.rigid import Poses, Rigid
+from stcal.io.files import SETTINGS_BYTES, read_bytes
+from stcal.io.poses.controllers import METRE_MM, from_roll_pitch_yaw, roll_pitch_yaw
+from stcal.robot.kinematics.dh import robot_between
+from stcal.robot.kinematics.forward import flange_poses
+from stcal.robot.kinematics.model import Chain, Convention, Joint, JointType, Robot
+
+WHAT = "URDF"
+WORLD, BASE, FLANGE, TOOL, TOOL0 = "world", "base_link", "flange", "tool", "tool0"
+"""Names of links; other tools are ``tool_NAME``."""
+UNLIMITED = 1e6
+"""rad or m: a limit beyond is none; URDF has no half of one."""
+SAME_MM, SAME_RAD = 1e-9, 1e-12
+"""By less the rows lead where the joints do."""
+MOVING: dict[str, JointType] = {"revolute": "revolute", "continuous": "revolute", "prismatic": "prismatic"}
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class UrdfRobot:
+    """A robot of a URDF.
+
+    Parameters
+    ----------
+    robot : Robot
+        mm, rad; joint values are those of the URDF's joints.
+    joints : tuple of str
+        Their names.
+    from_link, to_link : str
+        Between which it was read.
+    notes : tuple of str
+        What was not said there, or passed over.
+    """
+
+    robot: Robot
+    joints: tuple[str, ...]
+    from_link: str
+    to_link: str
+    notes: tuple[str, ...]
+
+
+def robot_urdf(robot: Robot) -> str:
+    """The text of a URDF: links ``world``, ``base_link``, ``link_1`` …, ``flange``, ``tool`` and ``tool_NAME``.
+
+    Joint values are the kinematic ones: where the controller couples joints, the coupling times its values, and limits
+    are the widest that its limits allow.
+
+    Parameters
+    ----------
+    robot : Robot
+        What to write.
+
+    Returns
+    -------
+    str
+        XML, in metres and rad; every number reads back to the same double but for the last bit.
+
+    Raises
+    ------
+    InputError
+        An elastic robot.
+    """
+    if robot.elasticity is not None:
+        raise InputError(
+            f"robot {robot.name}: a URDF has no place for its elasticity; remove [elasticity] for the axes alone, or "
+            "export compensated points (`stcal robot compensate --export`)"
+        )
+    chain = replace(robot, world_from_base=Rigid()).chain()
+    root = ElementTree.Element("robot", name=robot.name)
+    root.append(ElementTree.Comment(" effort and velocity are not known: 0 "))
+    if coupled(robot):
+        root.append(
+            ElementTree.Comment(" joint values are kinematic: the coupling of the robot file times the controller's ")
+        )
+    ElementTree.SubElement(root, "link", name=WORLD)
+    _fixed(root, WORLD, BASE, robot.world_from_base)
+    low, high = _limits(robot)
+    above = BASE
+    for i, joint in enumerate(robot.joints):
+        unit = METRE_MM if joint.type == "prismatic" else 1.0
+        limited = np.isfinite([low[i], high[i]]).any()
+        kind = "continuous" if joint.type == "revolute" and not limited else joint.type
+        element = _joint(root, f"joint_{i + 1}", kind, above, f"link_{i + 1}", chain.gap(i))
+        ElementTree.SubElement(element, "axis", xyz="0 0 1")
+        if kind != "continuous":
+            ends = {"lower": max(low[i] / unit, -UNLIMITED), "upper": min(high[i] / unit, UNLIMITED)}
+            shown = {end: repr(float(value)) for end, value in ends.items()}
+            ElementTree.SubElement(element, "limit", shown | {"effort": "0", "velocity": "0"})
+        above = f"link_{i + 1}"
+    _fixed(root, above, FLANGE, chain.last_from_flange)
+    for name, tool in robot.tools.items():
+        _fixed(root, FLANGE, f"{TOOL}_{name}" if name else TOOL, tool)
+    ElementTree.indent(root)
+    return f'<?xml version="1.0"?>\n{ElementTree.tostring(root, encoding="unicode")}\n'
+
+
+def coupled(robot: Robot) -> bool:
+    """Whether the controller's joint values are not the kinematic ones."""
+    return bool((robot.coupling != np.eye(len(robot.rows))).any())
+
+
+def _limits(robot: Robot) -> tuple[np.ndarray, np.ndarray]:
+    """(n,) lowest and highest kinematic joint values."""
+    if not coupled(robot):
+        low, high = robot.limits().T
+        return low, high
+    ends = np.where(robot.coupling[..., None] == 0, 0.0, robot.coupling[..., None] * robot.limits()[None])
+    return ends.min(axis=2).sum(axis=1), ends.max(axis=2).sum(axis=1)
+
+
+def _joint(
+    root: ElementTree.Element, name: str, kind: str, parent: str, child: str, pose: Rigid
+) -> ElementTree.Element:
+    ElementTree.SubElement(root, "link", name=child)
+    element = ElementTree.SubElement(root, "joint", name=name, type=kind)
+    ElementTree.SubElement(element, "parent", link=parent)
+    ElementTree.SubElement(element, "child", link=child)
+    place, turn = ([repr(float(v)) for v in part] for part in (pose.translation / METRE_MM, roll_pitch_yaw(pose)))
+    ElementTree.SubElement(element, "origin", xyz=" ".join(place), rpy=" ".join(turn))
+    return element
+
+
+def _fixed(root: ElementTree.Element, parent: str, child: str, pose: Rigid) -> None:
+    _joint(root, f"{parent}_to_{child}", "fixed", parent, child, pose)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _UrdfJoint:
+    """``parent_from_child`` with the joint at 0; ``axis`` : (3,) of length 1, in the child; ``limit`` : rad or mm."""
+
+    name: str
+    kind: str
+    parent: str
+    child: str
+    parent_from_child: Rigid
+    axis: np.ndarray
+    limit: tuple[float, float] | None
+    mimics: str
+
+
+def load_urdf(
+    path: str | Path, from_link: str = "", to_link: str = "", convention: Convention = "standard"
+) -> UrdfRobot:
+    """Read the chain of joints between two links of a URDF.
+
+    Parameters
+    ----------
+    path : str or Path
+        URDF; a xacro file must be expanded before.
+    from_link : str
+        The base; the root if not given. Where the root is called ``world`` and holds a link by a fixed joint, this link
+        is the base, and the joint where it stands.
+    to_link : str
+        The tool; if not given the only link without children behind the last joint, ``tool0``, or ``tool`` and
+        ``tool_NAME`` as :func:`robot_urdf` writes them.
+    convention : {"standard", "modified"}
+        Of the Denavit–Hartenberg rows.
+
+    Returns
+    -------
+    UrdfRobot
+        Its robot's flange is the link ``flange`` where a row can end there, else the frame of the last joint.
+
+    Raises
+    ------
+    InputError
+        Unreadable, no URDF, no such links or none between them that moves, joints that move otherwise or mimic others,
+        several links that may be the tool.
+    """
+    where = f"{WHAT} {path}"
+    try:
+        content = read_bytes(path, SETTINGS_BYTES)
+    except OSError as error:
+        raise InputError(f"{where}: {error.strerror or error}; check the path") from error
+    return read_urdf(content, where, from_link, to_link, convention)
+
+
+def read_urdf(
+    content: bytes, where: str, from_link: str = "", to_link: str = "", convention: Convention = "standard"
+) -> UrdfRobot:
+    """As :func:`load_urdf`, of a file's content."""
+    root = _parsed(content, where)
+    elements = root.findall("joint")
+    joints = {joint.child: joint for joint in (_read_joint(each, where) for each in elements)}
+    if len(joints) < len(elements):
+        raise InputError(f"{where}: a link is the child of two joints; a tree needed")
+    links = [link.get("name", "") for link in root.findall("link")]
+    links = list(dict.fromkeys([*links, *joints, *(joint.parent for joint in joints.values())]))
+    for option, name in (("--from-link", from_link), ("--to-link", to_link)):
+        if name and name not in links:
+            raise InputError(f"{where}: {option} {name}: no such link; there are {_few(links)}")
+    start = from_link or _root(joints, links, where)
+    ends = {"": to_link} if to_link else _tools(joints, start, where)
+    paths = {name: _path(joints, start, end, where) for name, end in ends.items()}
+    first, world = paths[""], Rigid()
+    _require_chain(first, start, ends[""], where)
+    if not from_link and start == WORLD and first[0].kind == "fixed":
+        world, start = first[0].parent_from_child, first[0].child
+        paths = {name: path[1:] for name, path in paths.items()}
+    robot = _robot_of(paths, root.get("name") or "robot", convention)
+    moving = [joint for joint in first if joint.kind != "fixed"]
+    notes = tuple(f"joint {j.name} has no limits" for j in moving if j.limit is None and j.kind != "continuous")
+    robot = replace(robot, world_from_base=world @ robot.world_from_base)
+    return UrdfRobot(robot, tuple(j.name for j in moving), start, ", ".join(ends.values()), notes)
+
+
+def require_same_poses(robot: Robot, text: str) -> None:
+    """Refuse a text of :func:`robot_urdf` that does not lead every tool where the robot does.
+
+    Raises
+    ------
+    StcalError
+        By how much it does not.
+    """
+    found = read_urdf(text.encode(), WHAT, convention=robot.convention).robot
+    q = _values(len(robot.rows))
+    for name, tool in robot.tools.items():
+        chain, other = robot.chain(), found.chain()
+        wanted = flange_poses(replace(chain, last_from_flange=chain.last_from_flange @ tool), q)
+        end = other.last_from_flange @ found.tool(name)
+        _require_near(flange_poses(replace(other, last_from_flange=end), q @ robot.coupling.T), wanted)
+
+
+def _values(n: int) -> np.ndarray:
+    """(8, n) joint values, rad or mm, fixed."""
+    return np.random.default_rng(0).uniform(-3, 3, (8, n))
+
+
+def _require_near(found: Poses, wanted: Poses) -> None:
+    off = np.abs(found.difference(wanted)).max(axis=0)
+    far = max(SAME_MM, 1e-12 * float(np.abs(wanted.translation).max()))
+    if off[3:].max() > far or off[:3].max() > SAME_RAD:
+        raise StcalError(
+            f"{WHAT}: the rows lead elsewhere, by {off[3:].max():.2g} mm and {off[:3].max():.2g} rad; {far:.2g} mm and "
+            f"{SAME_RAD:g} rad allowed"
+        )
+
+
+def _require_chain(path: list[_UrdfJoint], start: str, end: str, where: str) -> None:
+    moving = [joint for joint in path if joint.kind != "fixed"]
+    if not moving:
+        raise InputError(f"{where}: no joint from {start} to {end} moves; other --from-link or --to-link needed")
+    for joint in moving:
+        if joint.kind not in MOVING:
+            raise InputError(f"{where}: joint {joint.name} is {joint.kind}; fixed, {', '.join(MOVING)} are read")
+        if joint.mimics:
+            raise InputError(f"{where}: joint {joint.name} mimics {joint.mimics}; joints of their own needed")
+
+
+def _robot_of(paths: dict[str, list[_UrdfJoint]], name: str, convention: Convention) -> Robot:
+    """Of the paths from one link to each tool, ``""`` among them; they part behind the last joint that moves."""
+    moving = [joint for joint in paths[""] if joint.kind != "fixed"]
+    gaps, passed = [], Rigid()
+    for joint in paths[""]:
+        passed = passed @ joint.parent_from_child
+        if joint.kind != "fixed":
+            turn = _z_to(joint.axis)
+            gaps.append(passed @ turn)
+            passed = turn.inverse()
+    back = _z_to(moving[-1].axis).inverse()
+    behind = {tool: path[[j.name for j in path].index(moving[-1].name) + 1 :] for tool, path in paths.items()}
+    children = [joint.child for joint in behind[""]]
+    flange = back @ _along(behind[""][: children.index(FLANGE) + 1]) if FLANGE in children else Rigid()
+    tools = {tool: flange.inverse() @ back @ _along(path) for tool, path in behind.items()}
+    joints = tuple(_limited(joint) for joint in moving)
+    rotation, translation = np.array([g.rotation for g in gaps]), np.array([g.translation for g in gaps])
+    sliding = np.array([joint.type == "prismatic" for joint in joints])
+    chain = Chain(rotation, translation, flange, sliding, np.eye(len(gaps)))
+    robot, q = robot_between(chain, tools, name, convention, joints), _values(len(gaps))
+    found = robot.chain()
+    for each, tool in tools.items():
+        ends = found.last_from_flange @ robot.tools[each], flange @ tool
+        own, wanted = (replace(c, last_from_flange=e) for c, e in zip((found, chain), ends, strict=True))
+        _require_near(flange_poses(own, q), flange_poses(wanted, q))
+    return robot
+
+
+def _along(path: list[_UrdfJoint]) -> Rigid:
+    """Of fixed joints in a row."""
+    found = Rigid()
+    for joint in path:
+        found = found @ joint.parent_from_child
+    return found
+
+
+def _limited(joint: _UrdfJoint) -> Joint:
+    kind = MOVING[joint.kind]
+    most = UNLIMITED * (METRE_MM if kind == "prismatic" else 1.0)
+    low, high = joint.limit or (-np.inf, np.inf)
+    return Joint(kind, low if low > -most else -np.inf, high if high < most else np.inf)
+
+
+def _parsed(content: bytes, where: str) -> ElementTree.Element:
+    if b"<!ENTITY" in content:
+        raise InputError(f"{where}: defines entities of XML; write their values out")
+    try:
+        root = ElementTree.fromstring(content)
+    except (ElementTree.ParseError, ValueError, LookupError) as error:
+        raise InputError(f"{where}: not XML ({error}); correct it") from error
+    if root.tag != "robot":
+        raise InputError(f"{where}: begins with <{root.tag}>, <robot> needed")
+    if any("xacro" in str(element.tag) for element in root.iter()):
+        raise InputError(f"{where}: has macros of xacro; expand it first: xacro FILE > robot.urdf")
+    return root
+
+
+def _read_joint(element: ElementTree.Element, where: str) -> _UrdfJoint:
+    name, kind = element.get("name", ""), element.get("type", "")
+    where = f"{where}: joint {name}"
+    parts = {part.tag: part.attrib for part in element}
+    parent, child = parts.get("parent", {}).get("link"), parts.get("child", {}).get("link")
+    if not (name and parent and child):
+        raise InputError(f"{where}: its name, parent or child is missing; all three needed")
+    origin = parts.get("origin", {})
+    place, turn = _three(origin.get("xyz", "0 0 0"), where), _three(origin.get("rpy", "0 0 0"), where)
+    axis = _three(parts.get("axis", {}).get("xyz", "1 0 0"), where)
+    length = float(np.linalg.norm(axis))
+    if not length > 1e-9:
+        raise InputError(f"{where}: its axis has no direction; correct it")
+    limit, unit = None, METRE_MM if kind == "prismatic" else 1.0
+    if "limit" in parts and kind != "continuous":
+        ends = _three(" ".join([*(parts["limit"].get(end, "0") for end in ("lower", "upper")), "0"]), where)[:2]
+        if ends[0] > ends[1]:
+            raise InputError(f"{where}: lower limit {ends[0]:g} is above upper {ends[1]:g}; swap or correct them")
+        if ends[0] < ends[1]:
+            limit = (float(ends[0] * unit), float(ends[1] * unit))
+    mimics = parts.get("mimic", {}).get("joint", "")
+    pose = Rigid(from_roll_pitch_yaw(turn), METRE_MM * place)
+    return _UrdfJoint(name, kind, parent, child, pose, axis / length, limit, mimics)
+
+
+def _three(text: str, where: str) -> np.ndarray:
+    try:
+        values = np.array([float(word) for word in text.split()])
+    except ValueError:
+        values = np.zeros(0)
+    if values.shape != (3,) or not np.isfinite(values).all() or np.abs(values).max() > UNLIMITED:
+        raise InputError(f"{where}: {text!r}: finite numbers up to {UNLIMITED:g} needed")
+    return values
+
+
+def _z_to(axis: np.ndarray) -> Rigid:
+    """A turn that brings z to the axis; none, or half a turn about x, where it is z or −z."""
+    x, y, z = axis
+    across = float(np.hypot(x, y))
+    if across == 0.0:
+        return Rigid() if z > 0 else Rigid(np.diag([1.0, -1.0, -1.0]), np.zeros(3))
+    return Rigid.exp([*(np.arctan2(across, z) * np.array([-y, x, 0.0]) / across), 0.0, 0.0, 0.0])
+
+
+def _root(joints: dict[str, _UrdfJoint], links: list[str], where: str) -> str:
+    roots = [link for link in links if link not in joints]
+    if len(roots) != 1:
+        raise InputError(f"{where}: {len(roots)} links are no joint's child; one root needed, or --from-link")
+    return roots[0]
+
+
+def _tools(joints: dict[str, _UrdfJoint], start: str, where: str) -> dict[str, str]:
+    """Links by names of tools, behind the last joint that moves."""
+    below: dict[str, list[_UrdfJoint]] = {}
+    for joint in joints.values():
+        below.setdefault(joint.parent, []).append(joint)
+    last, pending, branches = start, [start], []
+    while pending:
+        link = pending.pop()
+        moving = [joint for joint in below.get(link, ()) if joint.kind != "fixed"]
+        pending += [joint.child for joint in below.get(link, ()) if joint.kind == "fixed"]
+        branches += moving
+        if not pending and len(branches) == 1:
+            last = branches.pop().child
+            pending = [last]
+    behind, pending = [last], [last]
+    while pending:
+        found = [joint.child for joint in below.get(pending.pop(), ()) if joint.kind == "fixed"]
+        behind, pending = behind + found, pending + found
+    ends = [link for link in behind if link not in below]
+    if len(ends) == 1 and not branches:
+        return {"": ends[0]}
+    if not branches and TOOL in ends:
+        named = {link.removeprefix(f"{TOOL}_"): link for link in ends if link.startswith(f"{TOOL}_")}
+        return {"": TOOL, **named}
+    if not branches and TOOL0 in ends:
+        return {"": TOOL0}
+    every = [link for link in joints if link not in below] if branches else ends
+    raise InputError(f"{where}: several links may be the tool; give --to-link, one of {_few(every)}")
+
+
+def _path(joints: dict[str, _UrdfJoint], start: str, end: str, where: str) -> list[_UrdfJoint]:
+    found: list[_UrdfJoint] = []
+    while end != start:
+        if end not in joints or len(found) > len(joints):
+            raise InputError(
+                f"{where}: no joints lead from link {start} to the tool; other --from-link, --to-link needed"
+            )
+        found.append(joints[end])
+        end = joints[end].parent
+    return found[::-1]
+
+
+def _few(names: list[str], most: int = 12) -> str:
+    return ", ".join(names[:most]) + (f" and {len(names) - most} more" if len(names) > most else "")

@@ -1,0 +1,230 @@
+"""URDF: poses kept both ways, and files as other programs write them by URDF's own rules."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from stcal.errors import InputError, StcalError
+from stcal.geometry.rigid import Rigid
+from stcal.robot.kinematics.example import mh80
+from stcal.robot.kinematics.file import load_robot, robot_toml
+from stcal.robot.kinematics.forward import forward
+from stcal.robot.kinematics.model import DHRow, Elasticity, Joint, Robot
+from stcal.robot.kinematics.urdf import load_urdf, require_same_poses, robot_urdf
+
+TOOLS = {"": Rigid.exp([0.1, 0.2, -0.3, 10, 20, 150]), "ball": Rigid.exp([0, 0.5, 0, -40, 0, 90])}
+WORLD = Rigid.exp([0.1, 0.2, 0.3, 1000, -500, 200])
+
+
+def turned(rows, seed: int = 0, **more) -> Robot:
+    """With a tool and a base, and rows a little off right angles."""
+    rng = np.random.default_rng(seed)
+    rows = tuple(
+        DHRow(
+            r.a + rng.normal(), r.alpha + 0.01 * rng.normal(), r.d + rng.normal(), r.theta + 0.01 * rng.normal(), r.beta
+        )
+        for r in rows
+    )
+    return replace(mh80(), rows=rows, tools=TOOLS, world_from_base=WORLD, **more)
+
+
+EXAMPLE = replace(mh80(), tools=TOOLS, world_from_base=WORLD)
+SLIDE = Joint("prismatic", -100.0, 2000.0)
+ROBOTS = {
+    "example": EXAMPLE,
+    "made": turned(mh80().rows),
+    "modified": turned(mh80().rows, 1, convention="modified"),
+    "prismatic": turned(mh80().rows, 2, joints=(*mh80().joints[:2], SLIDE, *mh80().joints[3:])),
+    "on a track": turned(mh80().rows, 3, joints=(SLIDE, *mh80().joints[1:])),
+    "beta": replace(EXAMPLE, rows=tuple(replace(r, beta=0.003 if i == 1 else 0.0) for i, r in enumerate(EXAMPLE.rows))),
+}
+
+
+def values(robot: Robot, m: int = 50) -> np.ndarray:
+    return np.random.default_rng(9).uniform(-3, 3, (m, len(robot.rows))) * np.where(robot.prismatic, 300, 1)
+
+
+def world_poses(robot: Robot, q: np.ndarray, tool: str):
+    return robot.world_from_base @ forward(robot, q, tool)
+
+
+@pytest.mark.parametrize("name", ROBOTS)
+@pytest.mark.parametrize("convention", ["standard", "modified"])
+def test_there_and_back(name, convention, tmp_path):
+    robot = ROBOTS[name]
+    (tmp_path / "a.urdf").write_text(robot_urdf(robot))
+    found = load_urdf(tmp_path / "a.urdf", convention=convention)
+    (tmp_path / "b.toml").write_text(robot_toml(found.robot))
+    q = values(robot)
+    for back in (found.robot, load_robot(tmp_path / "b.toml")):
+        assert back.convention == convention
+        for tool in TOOLS:
+            off = world_poses(back, q, tool).difference(world_poses(robot, q, tool))
+            assert np.abs(off[:, 3:]).max() < 1e-9
+            assert np.abs(off[:, :3]).max() < 1e-12
+    np.testing.assert_allclose(found.robot.limits(), robot.limits(), rtol=1e-12)
+    assert found.joints == tuple(f"joint_{i}" for i in range(1, 7))
+    assert found.notes == ()
+    require_same_poses(robot, robot_urdf(robot))
+
+
+def test_the_example_comes_back_as_it_was(tmp_path):
+    (tmp_path / "a.urdf").write_text(robot_urdf(EXAMPLE))
+    found = load_urdf(tmp_path / "a.urdf").robot
+    q = values(EXAMPLE)
+    assert np.abs(forward(found, q).difference(forward(EXAMPLE, q))[:, 3:]).max() < 1e-9  # from the base
+    for row, own in zip(found.rows, EXAMPLE.rows, strict=True):
+        assert [row.a, row.d] == pytest.approx([own.a, own.d], abs=1e-9)
+        assert [row.alpha, row.theta] == pytest.approx([own.alpha, own.theta], abs=1e-12)
+    assert np.abs(found.tools["ball"].matrix() - TOOLS["ball"].matrix()).max() < 1e-9
+
+
+def test_coupled_joints_are_kinematic_ones(tmp_path):
+    coupling = np.eye(6)
+    coupling[2, 1] = 1.0
+    robot = replace(EXAMPLE, coupling=coupling)
+    (tmp_path / "a.urdf").write_text(robot_urdf(robot))
+    found = load_urdf(tmp_path / "a.urdf").robot
+    q = values(robot)
+    off = forward(found, q @ coupling.T).difference(forward(robot, q))
+    assert np.abs(off[:, 3:]).max() < 1e-9
+    low, high = np.degrees(found.limits()[2])
+    assert (low, high) == pytest.approx((-90 - 80, 155 + 90))
+
+
+def test_a_text_that_leads_elsewhere_is_refused():
+    text = robot_urdf(EXAMPLE)
+    assert text.count('xyz="0.145 0.0 0.54"') == 1
+    with pytest.raises(StcalError, match=r"the rows lead elsewhere, by 0\.0\d+ mm"):
+        require_same_poses(EXAMPLE, text.replace('xyz="0.145 0.0 0.54"', 'xyz="0.14501 0.0 0.54"'))
+
+
+OTHER = """<?xml version="1.0" ?>
+<!-- expanded by hand -->
+<robot name="two_arm" xmlns:xacro="http://www.ros.org/wiki/xacro">
+  <material name="grey"><color rgba="0.5 0.5 0.5 1"/></material>
+  <link name="base_link"><visual><geometry><mesh filename="package://a/b.stl"/></geometry></visual></link>
+  <link name="base"/>
+  <joint name="base_link-base" type="fixed"><parent link="base_link"/><child link="base"/></joint>
+  <joint type="revolute" name="a1">
+    <origin rpy="0 0 0.3" xyz="0 0 0.45"/><parent link="base_link"/><child link="l1"/>
+    <axis xyz="0 0 -1"/><limit effort="0" lower="-2.9670" upper="2.9670" velocity="3.1"/>
+    <dynamics damping="1"/>
+  </joint>
+  <link name="l1"/>
+  <joint name="a2" type="continuous"><origin xyz="0.15 0.02 0" rpy="0.1 0 0"/><parent link="l1"/><child link="l2"/>
+    <axis xyz="0 1 0"/></joint>
+  <link name="l2"/>
+  <joint name="slide" type="prismatic"><origin xyz="0.59 0 0" rpy="0 1.5708 0"/><parent link="l2"/><child link="l3"/>
+    <axis xyz="2 0 1"/><limit effort="1" lower="0" upper="0.25" velocity="1"/></joint>
+  <link name="l3"/>
+  <joint name="mount" type="fixed"><origin xyz="0.01 0.02 0.03"/><parent link="l3"/><child link="plate"/></joint>
+  <link name="plate"/>
+  <joint name="a4" type="revolute"><parent link="plate"/><child link="l4"/><axis xyz="1 0 0"/></joint>
+  <link name="l4"/>
+  <joint name="l4-flange" type="fixed"><origin xyz="0.1 0 0"/><parent link="l4"/><child link="flange"/></joint>
+  <link name="flange"/>
+  <joint name="to-tool0" type="fixed"><origin rpy="0 1.5707963 0"/><parent link="flange"/><child link="tool0"/></joint>
+  <link name="tool0"/>
+</robot>
+"""
+
+
+def urdf_pose(q: np.ndarray) -> np.ndarray:
+    """base_from_tool0 of OTHER, 4×4, mm: products of its numbers by URDF's rules, R = Rz(yaw) Ry(pitch) Rx(roll)."""
+
+    def origin(xyz, rpy) -> np.ndarray:
+        found = np.eye(4)
+        turns = [Rotation.from_rotvec(a * e).as_matrix() for a, e in zip(rpy, np.eye(3), strict=True)]
+        found[:3, :3], found[:3, 3] = turns[2] @ turns[1] @ turns[0], 1000 * np.array(xyz)
+        return found
+
+    def turn(axis, angle) -> np.ndarray:
+        found = np.eye(4)
+        found[:3, :3] = Rotation.from_rotvec(angle * np.array(axis, float)).as_matrix()
+        return found
+
+    slide = np.eye(4)
+    slide[:3, 3] = q[2] * np.array([2, 0, 1]) / np.sqrt(5)
+    return (
+        origin((0, 0, 0.45), (0, 0, 0.3)) @ turn((0, 0, -1), q[0])
+        @ origin((0.15, 0.02, 0), (0.1, 0, 0)) @ turn((0, 1, 0), q[1])
+        @ origin((0.59, 0, 0), (0, 1.5708, 0)) @ slide
+        @ origin((0.01, 0.02, 0.03), (0, 0, 0)) @ turn((1, 0, 0), q[3])
+        @ origin((0.1, 0, 0), (0, 0, 0)) @ origin((0, 0, 0), (0, 1.5707963, 0))
+    )  # fmt: skip
+
+
+@pytest.mark.parametrize("convention", ["standard", "modified"])
+def test_a_file_of_another_program(tmp_path, convention):
+    path = tmp_path / "other.urdf"
+    path.write_text(OTHER)
+    found = load_urdf(path, convention=convention)
+    assert (found.joints, found.from_link, found.to_link) == (("a1", "a2", "slide", "a4"), "base_link", "tool0")
+    assert found.notes == ("joint a4 has no limits",)
+    assert found.robot.prismatic.tolist() == [False, False, True, False]
+    limits = [[-2.967, 2.967], [-np.inf, np.inf], [0, 250], [-np.inf, np.inf]]
+    np.testing.assert_allclose(found.robot.limits(), limits, rtol=1e-12)
+    q = values(found.robot, 20)
+    for pose, each in zip(world_poses(found.robot, q, ""), q, strict=True):
+        assert np.abs(pose.matrix() - urdf_pose(each)).max() < 1e-9
+    part = load_urdf(path, "l1", "plate", convention)
+    assert part.joints == ("a2", "slide")
+
+
+GRIP = 'child link="hand"/></joint><joint name="j" type="fixed"><parent link="l4"/><child link="grip"/></joint>'
+
+
+@pytest.mark.parametrize(
+    ("change", "options", "words"),
+    [
+        (("<robot", "<robots"), {}, "not XML"),
+        (('type="continuous"', 'type="floating"'), {}, "joint a2 is floating; fixed, revolute, continuous, prismatic"),
+        (('<axis xyz="0 1 0"/>', '<axis xyz="0 0 0"/>'), {}, "joint a2: its axis has no direction"),
+        (('<axis xyz="0 1 0"/>', '<axis xyz="0 1"/>'), {}, "joint a2: '0 1': finite numbers"),
+        (('<axis xyz="0 1 0"/>', '<axis xyz="0 1 0"/><mimic joint="a1"/>'), {}, "joint a2 mimics a1"),
+        (('child link="l4"', 'child link="l1"'), {}, "child of two joints"),
+        (('lower="-2.9670"', 'lower="3"'), {}, "lower limit 3 is above upper 2.967"),
+        (("", ""), {"to_link": "hand"}, "--to-link hand: no such link; there are base_link, base,"),
+        (("", ""), {"from_link": "l4", "to_link": "l1"}, "no joints lead from link l4"),
+        (("", ""), {"to_link": "base"}, "no joint from base_link to base moves"),
+        (('child link="tool0"/></joint>', GRIP), {"from_link": "base_link"}, "give --to-link, one of grip, hand"),
+        (('<parent link="l3"/>', '<parent link="l1"/>'), {}, "several links may be the tool; give --to-link, one of"),
+        (("</robot>", "<xacro:if/></robot>"), {}, "has macros of xacro; expand it first"),
+        (("<!-- expanded by hand -->", '<!DOCTYPE r [<!ENTITY a "b">]>'), {}, "defines entities of XML"),
+    ],
+)  # fmt: skip
+def test_mistakes_are_named(tmp_path, change, options, words):
+    path = tmp_path / "other.urdf"
+    path.write_text(OTHER.replace(*change, 1))
+    with pytest.raises(InputError) as caught:
+        load_urdf(path, **options)
+    assert words in str(caught.value)
+    assert str(caught.value).startswith(f"URDF {path}: ")
+
+
+def test_command_line(stcal_robot, tmp_path):
+    toml, urdf, again = (tmp_path / name for name in ("a.toml", "a.urdf", "b.toml"))
+    stcal_robot("init", toml)
+    code, out, _ = stcal_robot("convert", toml, urdf)
+    assert (code, "robot MH80: 6 joints from base_link to flange, and 1 tools" in out) == (0, True)
+    code, out, _ = stcal_robot("convert", urdf, again)
+    assert code == 0
+    assert "6 joints from base_link to tool: joint_1, joint_2" in out
+    q = values(mh80())
+    assert np.abs(forward(load_robot(again), q).difference(forward(mh80(), q))).max() < 1e-9
+    for words, told in (
+        ((toml, again), "both are robot files; one of each needed"),
+        ((toml, tmp_path / "c.txt"), "a name ending in .urdf or .toml needed"),
+        ((toml, urdf, "--to-link", "a"), "only of a URDF that is read"),
+    ):
+        code, _, error = stcal_robot("convert", *words)
+        assert (code, told in error) == (2, True)
+
+
+def test_an_elastic_robot_has_no_urdf():
+    none = Elasticity(np.zeros((6, 2)), np.zeros((6, 3)), np.zeros((6, 4)), np.array([0, 0, -1.0]))
+    with pytest.raises(InputError, match="a URDF has no place for its elasticity"):
+        robot_urdf(replace(EXAMPLE, elasticity=none))
