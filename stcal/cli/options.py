@@ -111,6 +111,16 @@ SecondTable = Annotated[
 Key = Annotated[str, typer.Option("--key", help="Match rows of --a and --b by this column.")]
 
 
+ColumnsFile = Annotated[
+    Path | None,
+    typer.Option(
+        "--columns",
+        help="Read the measurements, of --a and --b those of --b, with the columns, delimiter and lines to skip of "
+        "this file (TOML).",
+    ),
+]
+
+
 def one_table(
     given: Path | None,
     first: Path | None,
@@ -119,10 +129,11 @@ def one_table(
     what: str,
     prefixes: tuple[str, str] = ("", ""),
     quaternions: "Order" = "wxyz",
+    columns: Path | None = None,
 ) -> "Path | Table":
     """The file that was named first; or --a and --b joined, with what was left out printed."""
-    tables = several_tables(given, first, [second] if second else [], key, what, prefixes, quaternions)
-    return tables if isinstance(tables, Path) else tables[0]
+    tables = several_tables(given, first, [second] if second else [], key, what, prefixes, quaternions, columns)
+    return tables[0] if isinstance(tables, list) else tables
 
 
 def several_tables(
@@ -133,16 +144,21 @@ def several_tables(
     what: str,
     prefixes: tuple[str, str] = ("", ""),
     quaternions: "Order" = "wxyz",
-) -> "Path | list[Table]":
+    columns: Path | None = None,
+) -> "Path | Table | list[Table]":
     """The file that was named first; or --a joined with each --b, with what was left out printed."""
     if (given is None) == (first is None) or (first is None) != (not seconds):
         raise InputError(f"{what}: one file, or --a and --b with --key, needed")
     if given is not None:
-        return given
+        if columns is None:
+            return given
+        from stcal.io.poses.mapped import read_mapped
+
+        return read_mapped(given, columns, what, quaternions)
     from stcal.cli.terminal import print_each
     from stcal.io.join import join
 
-    joined = [join(str(first), str(second), key, prefixes, quaternions) for second in seconds]
+    joined = [join(str(first), str(second), key, prefixes, quaternions, columns) for second in seconds]
     print_each("note", (note for each in joined for note in each.notes))
     return [each.table for each in joined]
 

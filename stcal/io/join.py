@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 
 from stcal.errors import InputError
+from stcal.io.poses.mapped import read_mapped
 from stcal.io.quaternions import Order
 from stcal.io.table import COVARIANCE, LENGTHS, POSE, Table, read_table
 
@@ -24,7 +25,12 @@ class Joined:
 
 
 def join(
-    a: str | Path, b: str | Path, key: str, prefixes: tuple[str, str] = ("", ""), quaternions: Order = "wxyz"
+    a: str | Path,
+    b: str | Path,
+    key: str,
+    prefixes: tuple[str, str] = ("", ""),
+    quaternions: Order = "wxyz",
+    columns: str | Path | None = None,
 ) -> Joined:
     """Rows of two CSV files whose ``key`` is the same.
 
@@ -39,6 +45,8 @@ def join(
         have it; other columns keep their names, those of ``a`` where both have one.
     quaternions
         As of :func:`~stcal.io.table.read_table`.
+    columns
+        Map of the columns of ``b``, as of :func:`~stcal.io.poses.mapped.read_mapped`.
 
     Returns
     -------
@@ -50,7 +58,8 @@ def join(
     InputError
         A file that is none, no such column, a key twice, none in common, or one column for both.
     """
-    tables = [read_table(path, "table", quaternions) for path in (a, b)]
+    second = read_mapped(b, columns, "table", quaternions) if columns else read_table(b, "table", quaternions)
+    tables = [read_table(a, "table", quaternions), second]
     places = [_places(table, key) for table in tables]
     common = [name for name in places[0] if name in places[1]]
     if not common:
@@ -59,17 +68,17 @@ def join(
             f"{a}, {b}: no {key} in common: {first[0]} … in the one, {first[1]} … in the other; correct them, or give "
             "another --key"
         )
-    columns: dict[str, list[str] | np.ndarray] = {}
+    joined: dict[str, list[str] | np.ndarray] = {}
     for table, own, prefix in zip(tables, places, prefixes, strict=True):
         rows = [own[name] for name in common]
         for name, values in table.columns.items():
             posed = bool(_OF_POSES.fullmatch(name))
             new = prefix + name if posed else name
-            if new in columns and posed:
+            if new in joined and posed:
                 raise InputError(
                     f"{a}, {b}: both have {name}; positions or poses of one of them alone can be read here"
                 )
-            columns.setdefault(new, values[rows] if isinstance(values, np.ndarray) else [values[i] for i in rows])
+            joined.setdefault(new, values[rows] if isinstance(values, np.ndarray) else [values[i] for i in rows])
     lines = [tables[0].lines[places[0][name]] for name in common]
     notes = []
     for path, own, other in ((a, places[0], places[1]), (b, places[1], places[0])):
@@ -78,7 +87,7 @@ def join(
             more = ", …" if len(alone) > SHOWN else ""
             notes.append(f"{len(alone)} rows of {path} have no partner: {key} {', '.join(alone[:SHOWN])}{more}")
     where = f"{Path(a).name} with {Path(b).name}"
-    return Joined(Table(where, columns, lines, tables[0].quaternions), tuple(notes))
+    return Joined(Table(where, joined, lines, tables[0].quaternions), tuple(notes))
 
 
 def stack(tables: Sequence[Table], names: Sequence[str], called: dict[str, str], column: str = "set") -> Table:

@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from stcal.cli.options import (
+    ColumnsFile,
     FirstTable,
     JsonFile,
     Key,
@@ -49,6 +50,7 @@ def axes(
     first: FirstTable = None,
     second: SecondTable = None,
     key: Key = "image",
+    columns: ColumnsFile = None,
     json_file: JsonFile = None,
     report: ReportFile = None,
 ) -> None:
@@ -59,7 +61,7 @@ def axes(
     from stcal.robot.kinematics.measurements import read_measurements
 
     nominal = load_robot(robot_file)
-    source = one_table(sweeps, first, second, key, "SWEEPS")
+    source = one_table(sweeps, first, second, key, "SWEEPS", columns=columns)
     data = read_measurements(source, nominal, rotation=rotation)
     if len(set(data.stations)) > 1:
         raise InputError(

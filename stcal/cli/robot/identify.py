@@ -8,6 +8,7 @@ import typer
 
 from stcal.cli.options import (
     MOST_SEED,
+    ColumnsFile,
     FirstTable,
     JsonFile,
     Key,
@@ -104,6 +105,7 @@ def identify(
     first: FirstTable = None,
     second: SecondTable = None,
     key: Key = "image",
+    columns: ColumnsFile = None,
     json_file: JsonFile = None,
     report: ReportFile = None,
 ) -> None:
@@ -116,7 +118,7 @@ def identify(
     from stcal.robot.kinematics.measurements import read_measurements
 
     nominal = load_robot(robot_file)
-    source = one_table(data_file, first, second, key, "DATA", quaternions=quaternions.value)
+    source = one_table(data_file, first, second, key, "DATA", quaternions=quaternions.value, columns=columns)
     data = read_measurements(source, nominal, quaternions.value, rotation)
     kind = observe.value if observe else None
     options = IdentifyOptions(

@@ -5,7 +5,7 @@ from typing import Annotated
 
 import typer
 
-from stcal.cli.options import FirstTable, JsonFile, Key, ReportFile, several_tables
+from stcal.cli.options import ColumnsFile, FirstTable, JsonFile, Key, ReportFile, several_tables
 from stcal.cli.terminal import print_each, say, write
 from stcal.errors import InputError
 
@@ -29,6 +29,7 @@ def verify(
         ),
     ] = None,
     key: Key = "pose",
+    columns: ColumnsFile = None,
     json_file: JsonFile = None,
     report: ReportFile = None,
 ) -> None:
@@ -38,8 +39,10 @@ def verify(
 
     if plot and plot.suffix.lower() not in (".png", ".svg"):
         raise InputError(f"--plot {plot}: a name ending in .png or .svg needed")
-    tables = several_tables(measured, first, seconds or [], key, "MEASURED", ("commanded_", ""))
-    source = tables if isinstance(tables, Path) else stack(tables, [path.stem for path in seconds or ()], {"pose": key})
+    tables = several_tables(measured, first, seconds or [], key, "MEASURED", ("commanded_", ""), columns=columns)
+    source = (
+        tables if not isinstance(tables, list) else stack(tables, [path.stem for path in seconds or ()], {"pose": key})
+    )
     result = stage.verify(stage.read_measured(source))
     say(stage.verified_text(result))
     print_each("note", result.notes)

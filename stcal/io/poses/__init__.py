@@ -1,1 +1,1 @@
-"""Rotations as other programs and controllers of robots write them."""
+"""Poses, rotations and tables as other programs, instruments and controllers of robots write them."""
