@@ -147,8 +147,8 @@ class IdentifiedFile(ResultFile):
     )
     predicted: PredictedErrors | None = Field(
         description="σ of the tool's position by the covariance (root of the summed variances of x, y, z): at the "
-        "`same_rows`, and at random joint values over their `ranges`; `mean_mm`, `rms_mm`, `max_mm` each; null of "
-        "distances"
+        "`same_rows`, and at random joint values over their `ranges`, there with what residuals go with (`left`); "
+        "`mean_mm`, `rms_mm`, `max_mm` each; null of distances"
     )
     observability: dict[str, float] = Field(
         description="`O1` … `O5` (Borm & Menq; Driels & Pathre; Nahvi, Hollerbach & Hayward; Nahvi & Hollerbach; Sun & "

@@ -3,11 +3,13 @@
 Few rows, or rows of a small part of the joints' ranges, fit well and tell little: the covariance knows by how much.
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
 
 from stcal.geometry.rigid import Rigid
+from stcal.robot.identify.left import Finding
 from stcal.robot.identify.observability import directions_named
 from stcal.robot.identify.residuals import WIDTH, Observed, State, tip_jacobian
 from stcal.robot.kinematics.damped import reach_mm
@@ -70,6 +72,24 @@ def _over_ranges(robot: Robot, count: int) -> np.ndarray:
     half = np.where(robot.prismatic, reach_mm(replace(robot, tools={"": Rigid()})), np.pi)
     low, high = np.where(np.isfinite(low), low, -half), np.where(np.isfinite(high), high, half)
     return np.random.default_rng(SEED).uniform(low, high, (count, len(half)))
+
+
+def widened(found: Predicted | None, left: Sequence[Finding]) -> tuple[Predicted | None, tuple[str, ...]]:
+    """With what residuals go with in the σ over the ranges, and what is to be said of it.
+
+    The rows show by how much the model fails among them; the covariance, which takes the model as true, does not know
+    of it, and values identified from other rows differ by more than it says.
+    """
+    if found is None or not left:
+        return found, ()
+    each = np.array([finding.effect_mm / (np.sqrt(2) if finding.turns else 1.0) for finding in left])
+    size = float(np.sqrt((each**2).sum()))
+    wider = replace(found, ranges_mm=np.hypot(found.ranges_mm, size))
+    return wider, (
+        f"σ hold for these rows, and for places like theirs: the model leaves {size:.2g} mm RMS that goes with what is "
+        f"named above; over the joints' ranges the tool's position is known to {_rms(wider.ranges_mm):.2g} mm (σ, with "
+        "that in it)",
+    )
 
 
 def doubts(

@@ -24,7 +24,7 @@ from stcal.robot.identify.elastic import bending
 from stcal.robot.identify.left import left
 from stcal.robot.identify.nominal import Deviations, NominalRows, placed
 from stcal.robot.identify.observability import ObservabilityIndices, directions_named, parameter_scale
-from stcal.robot.identify.predicted import doubts, predicted
+from stcal.robot.identify.predicted import doubts, predicted, widened
 from stcal.robot.identify.residuals import (
     WIDTH,
     Kind,
@@ -71,6 +71,7 @@ OUTLIER_ROUNDS = 5
 """Of leaving errors out; after 1 to 3 the same ones are left out again."""
 MOSTLY_GOOD = 0.5
 """Share of the observations below which nothing is called an error."""
+TRY_ELASTIC = "gravity and gears may explain it: --model auto tries whether they predict rows held out better"
 REPEATS, FEW_ROWS = 5, 300
 """Divisions of the cross-validation of few rows; one does for more."""
 
@@ -137,6 +138,7 @@ def identify(robot: Robot, data: Measurements, options: IdentifyOptions | None =
         jacobian(solution.state, seen),
         solution.weights,
     )
+    wider, hold = widened(sigma, found or ())
     tested = held_out is not None or options.folds < LEAST_FOLDS
     return Identified(
         robot=identified,
@@ -149,7 +151,7 @@ def identify(robot: Robot, data: Measurements, options: IdentifyOptions | None =
         undetermined=undetermined,
         nominal_mm=position_errors(residuals(first, seen)),
         held_out=held_out,
-        predicted=sigma,
+        predicted=wider,
         placed=placed(solution.state, seen.kind, covariance, solution.units[own], robot),
         left=found,
         dh_sigma=adjusted.rows.sigma(identified, covariance),
@@ -162,7 +164,9 @@ def identify(robot: Robot, data: Measurements, options: IdentifyOptions | None =
         + adjusted.rows.notes(identified)
         + adjusted.notes
         + doubts(sigma, seen, solution.units[own], covariance, names, tested)
-        + tuple(each.sentence() for each in found or ()),
+        + tuple(each.sentence() for each in found or ())
+        + hold
+        + ((TRY_ELASTIC,) if hold and not solution.state.elastic else ()),
     )
 
 

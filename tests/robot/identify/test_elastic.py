@@ -89,3 +89,20 @@ def test_wrong_rows_are_named_beside_elasticity():
 def test_without_folds_nothing_can_be_chosen():
     with pytest.raises(InputError, match="2 or more folds needed"):
         IdentifyOptions(model="auto", folds=0)
+
+
+def rms(values: np.ndarray) -> float:
+    return float(np.sqrt((values**2).mean()))
+
+
+def test_sigma_elsewhere_hold_what_a_rigid_model_leaves():
+    """By the covariance alone 0.1 mm; the arm errs by twice that."""
+    true, data = drawn(100, 0)
+    rigid = identify(mh80(), data, IdentifyOptions(folds=0))
+    assert any(note.startswith("σ hold for these rows, and for places like theirs") for note in rigid.notes)
+    assert "--model auto" in rigid.notes[-1]
+    alone = identify(mh80(), drawn(100, 0, 0.0)[1], IdentifyOptions(folds=0))
+    assert not any(note.startswith("σ hold for these rows") for note in alone.notes)
+    assert rms(rigid.predicted.ranges_mm) > 1.5 * rms(alone.predicted.ranges_mm)
+    # what goes with the three strongest causes, of more
+    assert elsewhere(rigid, true) < 1.5 * rms(rigid.predicted.ranges_mm)
