@@ -16,7 +16,6 @@ data_layout.md holds formats and options, which tests/test_documents.py compares
 
 NOT_YET = {
     "README.md: 51 positions model mean, mm std, mm max, mm mean",  # reproduce_robot.py
-    "README.md: poses accepted ambiguous wrong branch off by > 5°",  # locate_study.py
     "README.md: method poses error / bound error / σ",  # handeye_study.py
     "README.md: trial published as published + centres of blurred",  # reproduce_paper.py
     "README.md: face as published + centres of blurred edges + ec",
