@@ -15,8 +15,6 @@ FACTS: set[str] = set()
 data_layout.md holds formats and options, which tests/test_documents.py compares with the code."""
 
 NOT_YET = {
-    "README.md: 51 positions model mean, mm std, mm max, mm mean",  # reproduce_robot.py
-    "README.md: poses accepted ambiguous wrong branch off by > 5°",  # locate_study.py
     "README.md: method poses error / bound error / σ",  # handeye_study.py
     "README.md: trial published as published + centres of blurred",  # reproduce_paper.py
     "README.md: face as published + centres of blurred edges + ec",
