@@ -14,6 +14,11 @@ class ArcRow(Part):
     height_mm: float | None
 
 
+class OffRow(Part):
+    line: int
+    error_mm: float
+
+
 class AxisRow(Part):
     joint: int
     direction: Vector3
@@ -28,6 +33,7 @@ class AxisRow(Part):
     span_mm: float | None = None
     span_rad: float | None = None
     arcs: list[ArcRow]
+    outliers: list[OffRow]
 
 
 class DhRow(Part):
@@ -82,7 +88,7 @@ class AxesFile(ResultFile):
         "frame (prismatic: rx, ry) by the noise of its own sweeps; residuals of the points used: `residual_rms_mm` of "
         "a coordinate, `residual_length_mean_mm` and `residual_length_rms_mm` of the vectors (radial, axial); "
         "`sigma_mm` of a coordinate, `dof`; `span_rad` or `span_mm`; `arcs` with `target`, `points`, `radius_mm`, "
-        "`height_mm`"
+        "`height_mm`; `outliers`: rows off their arcs and left out, `line` and `error_mm`"
     )
     covariance: Matrix = Field(
         description="of all axes together, in the order of `axes`, with what each inherits from those before"

@@ -1,5 +1,6 @@
 """From the axes of all joints to a robot: Denavit–Hartenberg rows, tools, what they are worth, what to refuse."""
 
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from itertools import pairwise
 
@@ -18,6 +19,8 @@ from stcal.robot.kinematics.dh import PARALLEL_RAD, robot_from_chain
 from stcal.robot.kinematics.measurements import Measurements
 from stcal.robot.kinematics.model import Chain, Robot
 
+FEW = 3
+"""Outliers of a joint that are named one by one."""
 USABLE_MM = 1.0
 """σ of a common normal's length or foot beyond which the Denavit–Hartenberg value is refused: arms repeat to 0.1 mm."""
 STEP_RAD, STEP_MM = 1e-7, 1e-4
@@ -87,8 +90,8 @@ class AxesResult:
     ``fits`` : one for each joint, with the joints before it at zero; ``covariance`` : (p, p) of all axes together, 4 or
     2 each in their own frames, with what each inherits from the unwinding of those before; ``robot`` : its rows, base
     and tools; ``row_sigma`` : (n, 5) of a, alpha, d, theta, beta (mm, rad), 0 where the nominal value is kept;
-    ``tool_spread_mm`` : RMS of each reflector about its place on the flange; ``chain`` : the axes; ``notes`` : what was
-    passed over.
+    ``tool_spread_mm`` : RMS of each reflector about its place on the flange; ``chain`` : the axes; ``off`` : of each
+    axis, lines of rows that are off their arcs and were left out, mm; ``notes`` : what was passed over.
     """
 
     fits: tuple[AxisFit, ...]
@@ -99,6 +102,7 @@ class AxesResult:
     tool_spread_mm: dict[str, float]
     pairs: tuple[Pair, ...]
     without_one: LeaveOneOut
+    off: tuple[Mapping[int, float], ...]
     notes: tuple[str, ...]
 
     def __post_init__(self):
@@ -181,6 +185,7 @@ def robot_from_sweeps(
         tool_spread_mm=spread,
         pairs=pairs,
         without_one=_leave_one_out(data, fits, nominal),
+        off=tuple({int(data.lines[row]): size for row, size in off_mm(fit).items()} for fit in fits),
         notes=tuple(notes),
     )
 
@@ -393,6 +398,31 @@ def _instants(data: Measurements) -> list[list[int]]:
     return list(instants.values())
 
 
+def off_mm(fit: AxisFit) -> dict[int, float]:
+    """How far each outlier (its row) is off its arc, the farthest first."""
+    found = {}
+    for row in fit.outliers:
+        here = (fit.rows == row) & (fit.weights == 0)
+        found[int(row)] = float(np.linalg.norm(fit.residuals[here], axis=1).max())
+    return dict(sorted(found.items(), key=lambda item: -item[1]))
+
+
+def _outliers_said(data: Measurements, fit: AxisFit) -> list[str]:
+    """One line for each of a few outliers, one for all of many."""
+    off, limit = off_mm(fit), f"{GROSS:g} σ is {GROSS * fit.sigma_mm:.2g} mm; left out"
+    if len(off) <= FEW:
+        return [
+            f"line {data.lines[row]}, {called(data.targets[row])}: {size:.3g} mm off its arc about joint "
+            f"{fit.joint + 1}, {limit}"
+            for row, size in off.items()
+        ]
+    first = ", ".join(f"{data.lines[row]} ({size:.3g} mm)" for row, size in list(off.items())[:FEW])
+    return [
+        f"joint {fit.joint + 1}: {len(off)} of {len(set(fit.rows.tolist()))} rows are off their arcs, {limit}; the "
+        f"farthest are lines {first}; all are in --json"
+    ]
+
+
 def _notes(data: Measurements, fits: list[AxisFit], robot: Robot, nominal: Robot) -> list[str]:
     notes = [
         f"joint {fit.joint + 1}: the weights of its points still change after {REWEIGHTINGS} rounds; look at them"
@@ -400,13 +430,7 @@ def _notes(data: Measurements, fits: list[AxisFit], robot: Robot, nominal: Robot
         if not fit.settled
     ]
     for fit in fits:
-        for row in fit.outliers:
-            here = (fit.rows == row) & (fit.weights == 0)
-            off = np.linalg.norm(fit.residuals[here], axis=1).max()
-            notes.append(
-                f"line {data.lines[row]}, {called(data.targets[row])}: {off:.3g} mm off its arc about joint "
-                f"{fit.joint + 1}, {GROSS:g} σ is {GROSS * fit.sigma_mm:.2g} mm; left out"
-            )
+        notes += _outliers_said(data, fit)
         for arc in fit.near:
             notes.append(
                 f"line {data.lines[arc.rows[0]]}, {called(arc.target)}: too close to the axis of joint "

@@ -1,5 +1,7 @@
 """The axis method's result for the terminal, for programs, and as a page."""
 
+from collections.abc import Mapping
+
 import numpy as np
 
 import stcal
@@ -105,7 +107,7 @@ def axes_file(result: AxesResult) -> AxesFile:
             "format": "stcal axes 1",
             "version": stcal.__version__,
             "robot": robot_toml(result.robot),
-            "axes": [_axis_json(fit) for fit in result.fits],
+            "axes": [_axis_json(fit, off) for fit, off in zip(result.fits, result.off, strict=True)],
             "covariance": result.covariance,
             "rows": [
                 {f"{key}{_unit(key)}": getattr(row, key) for key in ROW_VALUES}
@@ -142,7 +144,7 @@ def _known(value: float) -> float | None:
     return float(value) if np.isfinite(value) else None
 
 
-def _axis_json(fit: AxisFit) -> dict:
+def _axis_json(fit: AxisFit, off: Mapping[int, float]) -> dict:
     length = fit.lengths()
     return {
         "joint": fit.joint + 1,
@@ -160,6 +162,7 @@ def _axis_json(fit: AxisFit) -> dict:
             {"target": arc.target, "points": len(arc.rows), "radius_mm": _known(r), "height_mm": _known(h)}
             for arc, r, h in zip(fit.arcs, fit.radii, fit.heights, strict=True)
         ],
+        "outliers": [{"line": line, "error_mm": size} for line, size in off.items()],
     }
 
 

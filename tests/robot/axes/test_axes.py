@@ -14,6 +14,7 @@ from stcal.geometry.rigid import Rigid
 from stcal.robot.axes.checks import _shape
 from stcal.robot.axes.model import fit_axes, pairs_of, robot_from_sweeps
 from stcal.robot.axes.orientations import length_of
+from stcal.robot.axes.report import axes_file
 from stcal.robot.axes.sweeps import find_arcs
 from stcal.robot.kinematics.example import mh80
 from stcal.robot.kinematics.file import load_robot, robot_toml
@@ -200,6 +201,21 @@ def test_a_gross_error_is_named_and_left_out(off_mm):
 
 
 @pytest.mark.slow
+def test_many_errors_of_a_joint_are_said_in_one_line():
+    nominal = mh80()
+    data = measured(arm(nominal), sweep_values(nominal, 12), SIGMA, 7)
+    rows = [set(fit.rows.tolist()) for fit in robot_from_sweeps(data, nominal).fits]
+    wrong = sorted(rows[2] - set().union(*rows[:2], *rows[3:]))[1::5]
+    positions = np.array(data.positions)
+    positions[wrong] += np.arange(1, len(wrong) + 1)[:, None] * [2.0, -1.0, 2.0]
+    result = robot_from_sweeps(moved(data, positions), nominal)
+    assert len(wrong) > 3
+    assert len(result.notes) == 1
+    assert result.notes[0].startswith(f"joint 3: {len(wrong)} of {len(rows[2])} rows are off their arcs")
+    assert list(result.off[2]) == [data.lines[row] for row in reversed(wrong)]
+    assert axes_file(result).axes[2].outliers[0].line == data.lines[wrong[-1]]
+
+
 def test_a_reflector_on_the_axis_says_nothing_and_breaks_nothing():
     nominal = mh80()
     true = replace(arm(nominal), tools=TOOLS | {"D": Rigid(np.eye(3), [0.01, 0, 300])})
