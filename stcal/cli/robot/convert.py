@@ -30,13 +30,18 @@ def convert(
         str, typer.Option("--from-link", help="Begin at this link of a URDF; at its root if not given.")
     ] = "",
     to_link: Annotated[
-        str, typer.Option("--to-link", help="End at this link of a URDF; at the only one that can be if not given.")
-    ] = "",
+        list[str] | None,
+        typer.Option(
+            "--to-link",
+            help="End at this link of a URDF; at the only one that can be if not given. Repeat it for the hands of "
+            "several arms on a trunk.",
+        ),
+    ] = None,
     convention: Annotated[
         ConventionName, typer.Option(help="Write rows of Denavit and Hartenberg in this convention.")
     ] = ConventionName.standard,
 ) -> None:
-    """Write a robot file as URDF, or the chain between two links of a URDF as a robot file."""
+    """Write a robot file as URDF, or the joints between links of a URDF as a robot file."""
     from stcal.robot.kinematics.file import load_robot, robot_toml
     from stcal.robot.kinematics.urdf import coupled, load_urdf, require_same_poses, robot_urdf
 
@@ -47,7 +52,7 @@ def convert(
             f"{source}, {out}: both are {'URDF' if _is_xml(source) else 'robot files'}; one of each needed"
         )
     if _is_xml(source):
-        found = load_urdf(source, from_link, to_link, convention.value)
+        found = load_urdf(source, from_link, to_link or "", convention.value)
         joints = ", ".join(found.joints)
         say(f"robot {found.robot.name}: {len(found.joints)} joints from {found.from_link} to {found.to_link}: {joints}")
         print_each(f"note: {source}", found.notes)
@@ -58,7 +63,8 @@ def convert(
     robot = load_robot(source)
     text = robot_urdf(robot)
     require_same_poses(robot, text)
-    say(f"robot {robot.name}: {len(robot.rows)} joints from base_link to flange, and {len(robot.tools)} tools")
+    ends = f"flange, and {len(robot.tools)} tools" if robot.tree is None else f"{len(robot.tools)} tools on branches"
+    say(f"robot {robot.name}: {len(robot.rows)} joints from base_link to {ends}")
     if coupled(robot):
         say("note: URDF has no coupling; its joint values are the coupling times the controller's, with wider limits")
     write(out, text)

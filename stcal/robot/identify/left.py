@@ -208,9 +208,12 @@ def _candidates(state: State, seen: Observed, world_from_base: Rigid) -> list[_C
     base, place = world_from_base.rotation, world_from_base.inverse() @ tip.translation
     along = np.concatenate([np.zeros((3, 3)), base])  # motions along the base's axes
     values = data.q @ chain.coupling.T
+    carries = chain.carries(data.targets)
     found = []
 
     def add(what: str, motions: np.ndarray, joint: int = 0, turns: int = 0) -> None:
+        if joint:
+            motions = motions * carries[joint - 1, :, None, None]
         found.append(_Candidate(what, joint, turns, as_seen(state, seen, tip, motions)))
 
     for i, (z, origin) in enumerate(zip(turned[..., 2], origins, strict=True)):

@@ -195,15 +195,17 @@ def _coaxial(nominal: Robot) -> tuple[tuple[int, int], ...]:
         reach = i - 1 if nominal.convention == "standard" else i
         row = nominal.rows[reach]
         parallel = abs(np.cos(row.alpha) * np.cos(row.beta)) > np.cos(PARALLEL_RAD)
-        if parallel and abs(row.a) < COAXIAL_MM and not nominal.prismatic[i]:
+        follows = nominal.tree is None or i not in nominal.tree.mounts
+        if follows and parallel and abs(row.a) < COAXIAL_MM and not nominal.prismatic[i]:
             found.append((i - 1, reach))
     return tuple(found)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Placed:
-    """Base in the instrument's frame, a tool in the flange's, or a station in the first one's: ``pose``, and σ (6,) of
-    its rotation (rad, about the outer frame's axes) and translation (mm); nan of what was not fitted."""
+    """Base in the instrument's frame, a tool in the flange's, a station in the first one's, or where a branch begins:
+    ``pose``, and σ (6,) of its rotation (rad, about the outer frame's axes) and translation (mm); nan of what was not
+    fitted."""
 
     name: str
     pose: Rigid
@@ -225,7 +227,7 @@ def tool_name(name: str) -> str:
 
 
 def placed(state: State, kind: Kind, covariance: np.ndarray, units: np.ndarray, nominal: Robot) -> tuple[Placed, ...]:
-    """Base and tools of the robot file that ``state`` makes, and stations.
+    """Base and tools of the robot file that ``state`` makes, stations, and where branches of a tree begin.
 
     Parameters
     ----------
@@ -244,10 +246,12 @@ def placed(state: State, kind: Kind, covariance: np.ndarray, units: np.ndarray, 
     def poses(at: State) -> Poses:
         robot = robot_from_chain(at.chain, at.tools, nominal)
         stations = [each.inverse() for each in list(at.stations.values())[1:]]
-        return Poses.of([robot.world_from_base, *robot.tools.values(), *stations])
+        mounts = [] if robot.tree is None else [pose for _, pose in robot.tree.mounts.values()]
+        return Poses.of([robot.world_from_base, *robot.tools.values(), *stations, *mounts])
 
     state = replace(state, elastic=False)
-    derivative = np.zeros((len(state.tools) + len(state.stations), 6, len(units)))
+    here = poses(state)
+    derivative = np.zeros((len(here), 6, len(units)))
     for k, unit in enumerate(units):
         step = np.zeros(len(units))
         step[k] = DIFFERENCE_MM * unit
@@ -261,4 +265,9 @@ def placed(state: State, kind: Kind, covariance: np.ndarray, units: np.ndarray, 
     first, *others = state.stations
     base = f"base in the frame of station {first}" if others else base_name()
     names = [base, *map(tool_name, state.tools), *(f"station {name} in that of {first}" for name in others)]
-    return tuple(Placed(*each) for each in zip(names, poses(state), sigma, strict=True))
+    if nominal.tree is not None:
+        names += [
+            f"mount of joint {i + 1} behind {'the base' if after < 0 else f'joint {after + 1}'}"
+            for i, (after, _) in nominal.tree.mounts.items()
+        ]
+    return tuple(Placed(*each) for each in zip(names, here, sigma, strict=True))

@@ -9,11 +9,11 @@ import numpy as np
 from stcal.errors import InputError
 from stcal.geometry.rigid import Poses, Rigid, skew
 from stcal.robot.kinematics.forward import (
+    carried_poses,
     chain_jacobian,
     chain_parameters,
     elasticity_jacobian,
     elasticity_values,
-    flange_poses,
     moved_chain,
     with_values,
 )
@@ -107,7 +107,7 @@ def tips(state: State, q: np.ndarray, targets: Sequence[str]) -> Poses:
     """world_from_tool at joint vectors (m, n), with the tool of each."""
     place = {name: i for i, name in enumerate(state.tools)}
     tool = Poses.of(state.tools.values())
-    return flange_poses(state.chain, q) @ tool[[place[t] for t in targets]]
+    return carried_poses(state.chain, q, targets) @ tool[[place[t] for t in targets]]
 
 
 def residuals(state: State, seen: Observed) -> np.ndarray:
@@ -179,6 +179,9 @@ def tip_jacobian(state: State, q: np.ndarray, targets: Sequence[str], kind: Kind
     tip = tips(state, q, targets)
     width = tool_width(kind)
     axes_part = chain_jacobian(state.chain, q, tip)
+    if state.chain.grown is not None:
+        joint = [i for i, _ in chain_parameters(state.chain)]
+        axes_part = axes_part * state.chain.carries(targets)[joint].T[:, None]
     tools_part = np.zeros((len(tip), 6, width * len(state.tools)))
     names = np.array(targets)
     for t, name in enumerate(state.tools):

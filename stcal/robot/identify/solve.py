@@ -5,7 +5,7 @@ from typing import get_args
 
 import numpy as np
 
-from stcal.errors import DegenerateError
+from stcal.errors import DegenerateError, InputError
 from stcal.geometry.rigid import skew
 from stcal.geometry.robust import huber_weights
 from stcal.held_out import dealt
@@ -116,6 +116,11 @@ def identify(robot: Robot, data: Measurements, options: IdentifyOptions | None =
     1996.
     """
     options = options or IdentifyOptions()
+    if robot.tree is not None and options.model != "rigid":
+        raise InputError(
+            f"robot {robot.name}: --model {options.model}, but it is a tree, whose branches load each other; --model "
+            "rigid, or a robot file of one arm"
+        )
     seen = observed(data, options.observe)
     _still_joints(robot, data, options.partial)
     first = start(robot, data)

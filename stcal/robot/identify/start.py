@@ -16,7 +16,7 @@ from stcal.robot.identify.adjustment import USELESS_MM
 from stcal.robot.identify.residuals import State, observed, residuals, tips
 from stcal.robot.kinematics.damped import reach_mm
 from stcal.robot.kinematics.fit import FITS, require_convention
-from stcal.robot.kinematics.forward import flange_poses
+from stcal.robot.kinematics.forward import carried_poses
 from stcal.robot.kinematics.measurements import Measurements
 from stcal.robot.kinematics.model import Robot
 
@@ -56,6 +56,8 @@ def start(robot: Robot, data: Measurements, fit: Fit = BOTH) -> State:
         return _with_stations(robot, data)
     _moves(data)
     named = sorted(set(data.targets))
+    if robot.tree is not None:
+        _carried(robot, data, named)
     if "tool" in fit:
         tools = {name: robot.tools.get(name, robot.tools.get("", Rigid())) for name in named}
     else:
@@ -71,9 +73,21 @@ def start(robot: Robot, data: Measurements, fit: Fit = BOTH) -> State:
             )
         _explain(robot, data, tools, misfit, extent)
     if data.rotations is not None:
-        flange = flange_poses(state.chain, data.q).rotation
+        flange = carried_poses(state.chain, data.q, data.targets).rotation
         require_convention(data.where, data.targets, flange, data.rotations)
     return replace(state, stations={data.stations[0]: Rigid()})
+
+
+def _carried(robot: Robot, data: Measurements, named: list[str]) -> None:
+    """Every target of a tree is known to be on a branch."""
+    assert robot.tree is not None
+    missing = [name for name in named if name not in robot.tree.carriers]
+    if missing:
+        target = f"target {missing[0]}" if missing[0] else "the tool of rows without a target"
+        raise InputError(
+            f"{data.where}: robot {robot.name} is a tree, and its file does not say which joint carries {target}; give "
+            + ("it a [[target]] with joint" if missing[0] else "[tool] joint")
+        )
 
 
 def _with_stations(robot: Robot, data: Measurements) -> State:
@@ -129,7 +143,7 @@ def _moves(data: Measurements) -> None:
 def _placed(robot: Robot, data: Measurements, tools: dict[str, Rigid], fit: Fit = BOTH) -> tuple[State, float]:
     """Base and tool points by least squares, tool orientations after them; and the RMS misfit, mm."""
     chain = replace(robot, world_from_base=Rigid()).chain()
-    flange = flange_poses(chain, data.q)
+    flange = carried_poses(chain, data.q, data.targets)
     names = list(tools)
     rows = np.array([names.index(t) for t in data.targets])
     points = np.array([tools[name].translation for name in names])

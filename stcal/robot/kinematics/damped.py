@@ -56,7 +56,8 @@ class InverseProblem:
 
     @property
     def under_actuated(self) -> bool:
-        return len(self.unit) < 6
+        chain = self.robot.chain()
+        return len(chain.branch(chain.carrier(self.tool))) < 6
 
     def clipped(self, q: np.ndarray) -> np.ndarray:
         return np.clip(q, *self.bounds.T)
@@ -74,7 +75,8 @@ class InverseProblem:
 
 def reach_mm(robot: Robot, tool: str = "") -> float:
     """No point of the tool's origin is further from the first joint: the lengths of all links, and travels, added."""
-    chain = robot.chain()
+    whole = robot.chain()
+    chain = whole.branch(whole.carrier(tool))
     end = chain.last_from_flange @ robot.tool(tool)
     travel = np.abs(robot.limits()[robot.prismatic])
     links = np.linalg.norm(chain.translation[1:], axis=1).sum() + np.linalg.norm(end.translation)

@@ -40,34 +40,49 @@ def robot_from_chain(chain: Chain, tools: Mapping[str, Rigid], nominal: Robot) -
     n = len(chain)
     rows = list(nominal.rows)
     standard = nominal.convention == "standard"
-    first = Rigid()
-    passed = Rigid()  # what a joint lets through to the next: a turn and a slide about its axis (any, if prismatic)
-    for i in range(1, n):
-        gap = passed @ chain.gap(i)
+    mounts = {} if nominal.tree is None else nominal.tree.mounts
+    begins = {0, *mounts}
+    first = dict.fromkeys(begins, Rigid())
+    passed = [Rigid()] * n  # what a joint lets through: a turn and a slide about its axis (any, if prismatic)
+    for i in sorted(set(range(n)) - begins):
+        gap = passed[i - 1] @ chain.gap(i)
         before = rows[i - 1]
         after = before if standard else rows[i]
         wanted = DHRow(after.a, after.alpha, before.d, before.theta, after.beta)
         found = _row_between(gap, wanted, bool(chain.prismatic[i]))
-        passed = (along(found) @ across(found)).inverse() @ gap
-        if i == 1:  # the base takes what differs from the nominal first row
-            first = Rigid(about_z(found.theta - before.theta), [0.0, 0.0, found.d - before.d])
+        passed[i] = (along(found) @ across(found)).inverse() @ gap
+        if i - 1 in begins:  # base or mount takes what differs from the nominal first row
+            first[i - 1] = Rigid(about_z(found.theta - before.theta), [0.0, 0.0, found.d - before.d])
+            passed[i - 1] = first[i - 1].inverse()
             found = replace(found, theta=before.theta, d=before.d)
         if standard:
             rows[i - 1] = found
         else:
             rows[i - 1] = replace(before, theta=found.theta, d=found.d)
             rows[i] = replace(after, a=found.a, alpha=found.alpha, beta=found.beta)
-    base = chain.gap(0) @ first
-    if not standard:
-        base = base @ across(rows[0]).inverse()
-    nominal_end = along(rows[-1]) if not standard else along(rows[-1]) @ across(rows[-1])
-    flange = nominal_end.inverse() @ passed @ chain.last_from_flange
+
+    def begin(i: int) -> Rigid:
+        """Where the first row of a branch begins in the frame that its carrier's row ends in."""
+        place = chain.gap(i) @ first[i]
+        return place if standard else place @ across(rows[i]).inverse()
+
+    def end(i: int) -> Rigid:
+        """Joint i as in ``chain`` in the frame that its row ends in."""
+        nominal_end = along(rows[i]) @ across(rows[i]) if standard else along(rows[i])
+        return nominal_end.inverse() @ passed[i]
+
+    ends = [chain.last_from_flange] * n if chain.grown is None else chain.grown.ends
+    base, tree = begin(0), nominal.tree
+    if tree is not None:
+        before = {i: end(after) if after >= 0 else base.inverse() for i, (after, _) in mounts.items()}
+        tree = replace(tree, mounts={i: (after, before[i] @ begin(i)) for i, (after, _) in mounts.items()})
     robot = replace(
         nominal,
         rows=tuple(rows),
         world_from_base=base,
-        tools={name: flange @ tool for name, tool in tools.items()},
+        tools={name: end(k := chain.carrier(name)) @ ends[k] @ tool for name, tool in tools.items()},
         elasticity=None,
+        tree=tree,
     )
     return replace(robot, elasticity=_elasticity(robot, chain))
 

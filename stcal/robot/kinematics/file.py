@@ -11,16 +11,22 @@ from stcal.errors import InputError
 from stcal.geometry.rigid import Poses, Rigid
 from stcal.io.saving import save
 from stcal.io.toml import Finite, PoseEntry, Strict, load_toml, toml_string
-from stcal.robot.kinematics.model import Convention, DHRow, Elasticity, Joint, JointType, Robot
+from stcal.robot.kinematics.model import Convention, DHRow, Elasticity, Joint, JointType, Robot, Tree
 
 WHAT = "robot file"
 REMEDY = "`stcal robot init FILE` writes one to edit"
 POSE_KEYS = ("x_mm", "y_mm", "z_mm", "qw", "qx", "qy", "qz")
+MOST_JOINTS = 60
+"""Of a humanoid with hands."""
 LIMIT_DIGITS = 9
 """Decimals of joint limits, degrees or mm: 125°, not 125.00000000000001."""
 
 
-class _ToolFile(PoseEntry):
+class _CarriedFile(PoseEntry):
+    joint: int | None = None
+
+
+class _ToolFile(_CarriedFile):
     name: str = Field(min_length=1)
 
 
@@ -36,6 +42,8 @@ class _JointFile(Strict):
     min_mm: Finite | None = None
     max_mm: Finite | None = None
     fixed: dict[Literal["a_mm", "alpha_deg", "d_mm", "theta_deg", "beta_deg"], str] = Field(default_factory=dict)
+    after: int | None = None
+    mount: PoseEntry | None = None
 
 
 class _ElasticityFile(Strict):
@@ -61,10 +69,10 @@ class _ElasticityFile(Strict):
 class _RobotFile(Strict):
     name: str = "robot"
     convention: Convention
-    joint: list[_JointFile] = Field(min_length=1, max_length=20)
+    joint: list[_JointFile] = Field(min_length=1, max_length=MOST_JOINTS)
     coupling: list[list[Finite]] | None = None
     base: PoseEntry = PoseEntry()
-    tool: PoseEntry = PoseEntry()
+    tool: _CarriedFile = _CarriedFile()
     target: tuple[_ToolFile, ...] = ()
     elasticity: _ElasticityFile | None = None
 
@@ -107,7 +115,36 @@ def load_robot(path: str | Path) -> Robot:
     tools |= {t.name: t.rigid(f"{where}: target {t.name}") for t in data.target}
     base = data.base.rigid(f"{where}: base")
     elasticity = data.elasticity and data.elasticity.elasticity(n, f"{where}: elasticity")
-    return Robot(data.name, data.convention, tuple(rows), tuple(joints), np.array(coupling), base, tools, elasticity)
+    tree = _tree(data, where)
+    arm = tuple(rows), tuple(joints), np.array(coupling)
+    return Robot(data.name, data.convention, *arm, base, tools, elasticity, tree)
+
+
+def _tree(data: _RobotFile, where: str) -> Tree | None:
+    """What keys ``after``, ``mount`` and ``joint`` say; None where there are none."""
+    n = len(data.joint)
+    mounts = {}
+    for i, joint in enumerate(data.joint):
+        if joint.after is None and joint.mount is not None:
+            raise InputError(
+                f"{where}: joint {i + 1}: mount without after; the number of the joint that carries it needed"
+            )
+        if joint.after is not None:
+            if not 0 <= joint.after <= i:
+                raise InputError(f"{where}: joint {i + 1}: after is {joint.after}, 0 (the base) … {i} needed")
+            mounts[i] = joint.after - 1, (joint.mount or PoseEntry()).rigid(f"{where}: joint {i + 1}: mount")
+    if 0 in mounts:
+        raise InputError(
+            f"{where}: joint 1: after is for joints that begin another branch; leave it out, and give base"
+        )
+    carriers = {}
+    for name, each in [("", data.tool), *((t.name, t) for t in data.target)]:
+        if each.joint is not None:
+            if not 1 <= each.joint <= n:
+                what = f"target {name}" if name else "tool"
+                raise InputError(f"{where}: {what}: joint is {each.joint}, 1 … {n} needed")
+            carriers[name] = each.joint - 1
+    return Tree(mounts, carriers) if mounts or carriers else None
 
 
 def _joint(j: _JointFile, where: str) -> Joint:
@@ -150,7 +187,8 @@ def robot_toml(robot: Robot, comments: Sequence[str] = ()) -> str:
     if (robot.coupling != np.eye(len(robot.rows))).any():
         rows = ", ".join(_numbers(row) for row in robot.coupling)
         lines += ["# kinematic joint values from the controller's", f"coupling = [{rows}]"]
-    for row, joint in zip(robot.rows, robot.joints, strict=True):
+    mounts, carriers = ({}, {}) if robot.tree is None else (robot.tree.mounts, robot.tree.carriers)
+    for i, (row, joint) in enumerate(zip(robot.rows, robot.joints, strict=True)):
         lines += ["", "[[joint]]", f'type = "{joint.type}"']
         lines += [f"a_mm = {_number(row.a)}", f"alpha_deg = {_number(np.degrees(row.alpha))}"]
         lines += [f"d_mm = {_number(row.d)}", f"theta_deg = {_number(np.degrees(row.theta))}"]
@@ -165,11 +203,15 @@ def robot_toml(robot: Robot, comments: Sequence[str] = ()) -> str:
         if joint.fixed:
             reasons = (f"{_KEYS[name]} = {toml_string(reason)}" for name, reason in joint.fixed.items())
             lines.append(f"fixed = {{ {', '.join(reasons)} }}")
+        if i in mounts:
+            after, pose = mounts[i]
+            lines += [f"after = {after + 1}", f"mount = {{ {', '.join(_pose_lines(pose))} }}"]
     lines += ["", "[base]  # of the robot, in the frame of the instrument", *_pose_lines(robot.world_from_base)]
-    lines += ["", "[tool]  # in the frame of the flange", *_pose_lines(robot.tools.get("", Rigid()))]
-    for name, tool in robot.tools.items():
+    lines += ["", "[tool]  # in the frame of the flange"]
+    for name, tool in {"": robot.tools.get("", Rigid()), **robot.tools}.items():
         if name:
-            lines += ["", "[[target]]", f"name = {toml_string(name)}", *_pose_lines(tool)]
+            lines += ["", "[[target]]", f"name = {toml_string(name)}"]
+        lines += [*_pose_lines(tool), *([f"joint = {carriers[name] + 1}"] if name in carriers else [])]
     if robot.elasticity is not None:
         lines += ["", *_elasticity_lines(robot.elasticity)]
     return "\n".join(lines) + "\n"

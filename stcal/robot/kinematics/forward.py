@@ -1,5 +1,6 @@
 """Forward kinematics of many joint vectors at once, and its derivatives by joint values and by the chain."""
 
+from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -69,7 +70,15 @@ def jacobian(robot: Robot, q: ArrayLike, tool: str = "") -> np.ndarray:
 
 
 def flange_poses(chain: Chain, q: np.ndarray) -> Poses:
-    """world_from_flange of joint vectors (m, n)."""
+    """world_from_flange of joint vectors (m, n).
+
+    Raises
+    ------
+    InputError
+        The joints are a tree, which has no one flange.
+    """
+    if chain.grown is not None:
+        raise InputError("the robot is a tree of joints, which has no one flange; a robot file of one arm needed")
     rotation, translation = np.empty((len(q), 3, 3)), np.empty((len(q), 3))
     for start in range(0, len(q), CHUNK):
         part = slice(start, start + CHUNK)
@@ -77,6 +86,19 @@ def flange_poses(chain: Chain, q: np.ndarray) -> Poses:
         end = chain.last_from_flange
         rotation[part] = np.einsum("cjm,ck->mjk", axes, end.rotation)
         translation[part] = (origin + np.einsum("cjm,c->jm", axes, end.translation)).T
+    return Poses(rotation, translation)
+
+
+def carried_poses(chain: Chain, q: np.ndarray, targets: Sequence[str]) -> Poses:
+    """world_from_flange, the flange being that of the joint that carries each row's target, of joint vectors (m, n)."""
+    if chain.grown is None:
+        return flange_poses(chain, q)
+    carrier = np.array([chain.carrier(name) for name in targets])
+    rotation, translation = np.empty((len(q), 3, 3)), np.empty((len(q), 3))
+    for each in np.unique(carrier):
+        rows = carrier == each
+        found = flange_poses(chain.branch(int(each)), q[rows])
+        rotation[rows], translation[rows] = found.rotation, found.translation
     return Poses(rotation, translation)
 
 
@@ -142,7 +164,10 @@ def _walk(chain: Chain, q: np.ndarray, visit=None) -> tuple[np.ndarray, np.ndarr
     q = q @ chain.coupling.T
     axes = np.repeat(np.eye(3)[:, :, None], m, axis=2)
     origin = np.zeros((3, m))
+    moved = {-1: (axes, origin)}  # by the joints that carry others than the next one
     for i in range(len(chain)):
+        if chain.after(i) != i - 1:
+            axes, origin = moved[chain.after(i)]
         origin = origin + np.tensordot(chain.translation[i], axes, 1)
         axes = (chain.rotation[i].T @ axes.reshape(3, -1)).reshape(3, 3, m)
         if visit is not None:
@@ -155,6 +180,8 @@ def _walk(chain: Chain, q: np.ndarray, visit=None) -> tuple[np.ndarray, np.ndarr
             axes = np.stack([x, y, axes[2]])
         if give is not None:
             axes = np.einsum("kjm,mkc->cjm", axes, give[i])
+        if chain.grown is not None:
+            moved[i] = axes, origin
     return axes, origin
 
 
@@ -234,6 +261,7 @@ def _orthogonal(rotation: np.ndarray) -> np.ndarray:
 def _from_base_to_tool(robot: Robot, tool: str) -> Chain:
     """The chain without the world, with the tool in the flange's place."""
     chain = replace(robot, world_from_base=Rigid()).chain()
+    chain = chain.branch(chain.carrier(tool))
     return replace(chain, last_from_flange=chain.last_from_flange @ robot.tool(tool))
 
 

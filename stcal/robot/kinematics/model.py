@@ -4,7 +4,7 @@ Both conventions and Hayati's extension are one chain: a fixed transform to the 
 joint turns about z or moves along it, and a fixed transform from the last joint to the flange.
 """
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Literal
 
@@ -114,8 +114,50 @@ class Elasticity:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
+class Tree:
+    """Which joint carries which, of a robot with several arms on one trunk.
+
+    Parameters
+    ----------
+    mounts : mapping of int to (int, Rigid)
+        By the joint, from 0, that begins a branch: the joint that carries it (−1: the base), and where the branch's
+        first row begins in the frame that the carrier's row ends in, mm. Every other joint is carried by the one
+        before it.
+    carriers : mapping of str to int
+        By tool the joint, from 0, that carries it; the last one where a tool is not named.
+
+    Raises
+    ------
+    InputError
+        A branch that is carried by a joint that does not come before it.
+    """
+
+    mounts: Mapping[int, tuple[int, Rigid]]
+    carriers: Mapping[str, int]
+
+    def __post_init__(self):
+        for joint, (after, _) in self.mounts.items():
+            if not -1 <= after < joint:
+                raise InputError(
+                    f"joint {joint + 1} is carried by joint {after + 1}; 0 (the base) or one that comes before needed"
+                )
+
+    def after(self, joint: int) -> int:
+        """The joint that carries ``joint``; −1 for the base."""
+        return self.mounts[joint][0] if joint in self.mounts else joint - 1
+
+    def path(self, joint: int) -> tuple[int, ...]:
+        """Joints from the base to ``joint``."""
+        found = []
+        while joint >= 0:
+            found.append(joint)
+            joint = self.after(joint)
+        return tuple(reversed(found))
+
+
+@dataclass(frozen=True, slots=True, eq=False)
 class Robot:
-    """A serial arm of n joints.
+    """An arm of n joints, one after the other, or a tree of such arms.
 
     Parameters
     ----------
@@ -135,11 +177,14 @@ class Robot:
         flange_from_tool by name, mm; ``""`` is the one meant where none is named.
     elasticity : Elasticity, optional
         Rigid if not given.
+    tree : Tree, optional
+        Every joint is carried by the one before it, and tools by the last one, if not given.
 
     Raises
     ------
     InputError
-        Rows and joints differ in number, or there are none; a coupling matrix of another shape, or a singular one.
+        Rows and joints differ in number, or there are none; a coupling matrix of another shape, or a singular one;
+        elasticity of a tree.
     """
 
     name: str
@@ -150,6 +195,7 @@ class Robot:
     world_from_base: Rigid = field(default_factory=lambda: Rigid())
     tools: Mapping[str, Rigid] = field(default_factory=lambda: {"": Rigid()})
     elasticity: Elasticity | None = None
+    tree: Tree | None = None
 
     def __post_init__(self):
         n = len(self.rows)
@@ -164,6 +210,10 @@ class Robot:
         if self.elasticity is not None and len(self.elasticity.moment) != n:
             raise InputError(
                 f"robot {self.name}: elasticity of {len(self.elasticity.moment)} joints, {n} needed, as many as rows"
+            )
+        if self.elasticity is not None and self.tree is not None:
+            raise InputError(
+                f"robot {self.name}: elasticity of a tree, whose branches load each other, is not known; leave it out"
             )
 
     @property
@@ -184,29 +234,43 @@ class Robot:
 
     def chain(self) -> "Chain":
         """The fixed transforms in order."""
-        n = len(self.rows)
-        gaps = [self.world_from_base]
+        gaps, ends = [], []
         for i, row in enumerate(self.rows):
-            if self.convention == "modified":
-                gaps[i] = gaps[i] @ across(row)
-                gaps.append(along(row))
-            else:
-                gaps.append(along(row) @ across(row))
+            modified = self.convention == "modified"
+            after, mount = self.carrier(i)
+            before = self.world_from_base if after < 0 else ends[after]
+            gaps.append(before @ mount @ across(row) if modified else before @ mount)
+            ends.append(along(row) if modified else along(row) @ across(row))
         rotation, translation = np.array([g.rotation for g in gaps]), np.array([g.translation for g in gaps])
         elasticity = self.elasticity
         if elasticity is not None:
             first = self.world_from_base.inverse() @ gaps[0]
             elasticity = replace(elasticity, gravity=first.rotation.T @ elasticity.gravity)
-        return Chain(rotation[:n], translation[:n], gaps[n], self.prismatic, self.coupling, elasticity)
+        grown = None if self.tree is None else Grown(self.tree, tuple(ends))
+        return Chain(rotation, translation, ends[-1], self.prismatic, self.coupling, elasticity, grown)
+
+    def carrier(self, joint: int) -> tuple[int, Rigid]:
+        """The joint, from 0, that carries another (−1: the base), and where the other's row begins behind its row."""
+        found = None if self.tree is None else self.tree.mounts.get(joint)
+        return found or (joint - 1, Rigid())
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Grown:
+    """A tree of joints: ``tree``; and ``ends`` : (n,) where each joint's row ends, in the frame of the joint."""
+
+    tree: Tree
+    ends: tuple[Rigid, ...]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Chain:
-    """Fixed transforms of a serial arm: everything that calibration changes.
+    """Fixed transforms of an arm: everything that calibration changes.
 
-    ``rotation``, ``translation`` : (n, 3, 3), (n, 3) of each joint's frame in the one before (the first: in the world);
-    ``last_from_flange`` : flange in the frame of the last joint; ``prismatic`` : (n,); ``coupling`` : (n, n).
-    Joint values turn about, or move along, z of the joint's frame; ``elasticity`` : what links give way by.
+    ``rotation``, ``translation`` : (n, 3, 3), (n, 3) of each joint's frame in that of the joint that carries it (the
+    first: in the world); ``last_from_flange`` : flange in the frame of the last joint; ``prismatic`` : (n,);
+    ``coupling`` : (n, N), of all N values of the controller. Joint values turn about, or move along, z of the joint's
+    frame; ``elasticity`` : what links give way by; ``grown`` : where joints are a tree.
     """
 
     rotation: np.ndarray
@@ -215,20 +279,45 @@ class Chain:
     prismatic: np.ndarray
     coupling: np.ndarray
     elasticity: Elasticity | None = None
+    grown: Grown | None = None
 
     def __post_init__(self):
         n = len(self.prismatic)
         object.__setattr__(self, "rotation", frozen(self.rotation, (n, 3, 3), "chain"))
         object.__setattr__(self, "translation", frozen(self.translation, (n, 3), "chain"))
         object.__setattr__(self, "prismatic", frozen(self.prismatic, (n,), "chain", bool))
-        object.__setattr__(self, "coupling", frozen(self.coupling, (n, n), "coupling"))
+        object.__setattr__(self, "coupling", frozen(self.coupling, (n, None), "coupling"))
 
     def __len__(self) -> int:
         return len(self.prismatic)
 
     def gap(self, i: int) -> Rigid:
-        """Frame of joint ``i`` in the one before."""
+        """Frame of joint ``i`` in that of the joint that carries it."""
         return Rigid(self.rotation[i], self.translation[i])
+
+    def after(self, i: int) -> int:
+        """The joint that carries joint ``i``; −1 for the world."""
+        return i - 1 if self.grown is None else self.grown.tree.after(i)
+
+    def carrier(self, target: str) -> int:
+        """The joint that carries a target."""
+        last = len(self) - 1
+        return last if self.grown is None else self.grown.tree.carriers.get(target, last)
+
+    def carries(self, targets: Sequence[str]) -> np.ndarray:
+        """(n, m) whether each joint moves each of the targets."""
+        if self.grown is None:
+            return np.ones((len(self), len(targets)), bool)
+        found = {name: np.isin(np.arange(len(self)), self.grown.tree.path(self.carrier(name))) for name in set(targets)}
+        return np.array([found[name] for name in targets]).reshape(-1, len(self)).T
+
+    def branch(self, carrier: int) -> "Chain":
+        """The joints from the world to ``carrier``, one after the other, and the end of its row as flange."""
+        if self.grown is None:
+            return self
+        rows = list(self.grown.tree.path(carrier))
+        end = self.grown.ends[carrier]
+        return Chain(self.rotation[rows], self.translation[rows], end, self.prismatic[rows], self.coupling[rows])
 
 
 def about_z(angle: float) -> np.ndarray:

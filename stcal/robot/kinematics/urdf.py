@@ -1,6 +1,8 @@
-"""Robots as URDF: the chain of joints between two links, in metres and rad; all else in a file is passed over."""
+"""Robots as URDF: the joints between a link and another, or several others, in metres and rad; all else in a file is
+passed over."""
 
 import xml.etree.ElementTree as ElementTree
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -10,9 +12,9 @@ from stcal.errors import InputError, StcalError
 from stcal.geometry.rigid import Poses, Rigid
 from stcal.io.files import SETTINGS_BYTES, read_bytes
 from stcal.io.poses.controllers import METRE_MM, from_roll_pitch_yaw, roll_pitch_yaw
-from stcal.robot.kinematics.dh import robot_between
-from stcal.robot.kinematics.forward import flange_poses
-from stcal.robot.kinematics.model import Chain, Convention, Joint, JointType, Robot
+from stcal.robot.kinematics.dh import robot_between, robot_from_chain
+from stcal.robot.kinematics.forward import carried_poses, flange_poses, forward
+from stcal.robot.kinematics.model import Chain, Convention, DHRow, Grown, Joint, JointType, Robot, Tree
 
 WHAT = "URDF"
 WORLD, BASE, FLANGE, TOOL, TOOL0 = "world", "base_link", "flange", "tool", "tool0"
@@ -48,7 +50,8 @@ class UrdfRobot:
 
 
 def robot_urdf(robot: Robot) -> str:
-    """The text of a URDF: links ``world``, ``base_link``, ``link_1`` …, ``flange``, ``tool`` and ``tool_NAME``.
+    """The text of a URDF: links ``world``, ``base_link``, ``link_1`` …, ``flange``, ``tool`` and ``tool_NAME``; without
+    ``flange`` of a tree, the tools of which are fixed to the links that carry them.
 
     Joint values are the kinematic ones: where the controller couples joints, the coupling times its values, and limits
     are the widest that its limits allow.
@@ -83,23 +86,37 @@ def robot_urdf(robot: Robot) -> str:
     ElementTree.SubElement(root, "link", name=WORLD)
     _fixed(root, WORLD, BASE, robot.world_from_base)
     low, high = _limits(robot)
-    above = BASE
     for i, joint in enumerate(robot.joints):
         unit = METRE_MM if joint.type == "prismatic" else 1.0
         limited = np.isfinite([low[i], high[i]]).any()
         kind = "continuous" if joint.type == "revolute" and not limited else joint.type
-        element = _joint(root, f"joint_{i + 1}", kind, above, f"link_{i + 1}", chain.gap(i))
+        above = f"link_{chain.after(i) + 1}" if chain.after(i) >= 0 else BASE
+        element = _joint(root, joint_name(i), kind, above, f"link_{i + 1}", chain.gap(i))
         ElementTree.SubElement(element, "axis", xyz="0 0 1")
         if kind != "continuous":
             ends = {"lower": max(low[i] / unit, -UNLIMITED), "upper": min(high[i] / unit, UNLIMITED)}
             shown = {end: repr(float(value)) for end, value in ends.items()}
             ElementTree.SubElement(element, "limit", shown | {"effort": "0", "velocity": "0"})
-        above = f"link_{i + 1}"
-    _fixed(root, above, FLANGE, chain.last_from_flange)
+    if chain.grown is None:
+        _fixed(root, f"link_{len(chain)}", FLANGE, chain.last_from_flange)
     for name, tool in robot.tools.items():
-        _fixed(root, FLANGE, f"{TOOL}_{name}" if name else TOOL, tool)
+        if chain.grown is None:
+            _fixed(root, FLANGE, link_of(name), tool)
+        else:
+            carrier = chain.carrier(name)
+            _fixed(root, f"link_{carrier + 1}", link_of(name), chain.grown.ends[carrier] @ tool)
     ElementTree.indent(root)
     return f'<?xml version="1.0"?>\n{ElementTree.tostring(root, encoding="unicode")}\n'
+
+
+def link_of(tool: str) -> str:
+    """Name of a tool's link."""
+    return f"{TOOL}_{tool}" if tool else TOOL
+
+
+def joint_name(i: int) -> str:
+    """Of a joint, from 0."""
+    return f"joint_{i + 1}"
 
 
 def coupled(robot: Robot) -> bool:
@@ -147,9 +164,9 @@ class _UrdfJoint:
 
 
 def load_urdf(
-    path: str | Path, from_link: str = "", to_link: str = "", convention: Convention = "standard"
+    path: str | Path, from_link: str = "", to_link: str | Sequence[str] = "", convention: Convention = "standard"
 ) -> UrdfRobot:
-    """Read the chain of joints between two links of a URDF.
+    """Read the chain of joints between two links of a URDF, or the tree of those to several links.
 
     Parameters
     ----------
@@ -158,9 +175,9 @@ def load_urdf(
     from_link : str
         The base; the root if not given. Where the root is called ``world`` and holds a link by a fixed joint, this link
         is the base, and the joint where it stands.
-    to_link : str
+    to_link : str or sequence of str
         The tool; if not given the only link without children behind the last joint, ``tool0``, or ``tool`` and
-        ``tool_NAME`` as :func:`robot_urdf` writes them.
+        ``tool_NAME`` as :func:`robot_urdf` writes them. Several are tools called like the links, on branches of a tree.
     convention : {"standard", "modified"}
         Of the Denavit–Hartenberg rows.
 
@@ -184,7 +201,11 @@ def load_urdf(
 
 
 def read_urdf(
-    content: bytes, where: str, from_link: str = "", to_link: str = "", convention: Convention = "standard"
+    content: bytes,
+    where: str,
+    from_link: str = "",
+    to_link: str | Sequence[str] = "",
+    convention: Convention = "standard",
 ) -> UrdfRobot:
     """As :func:`load_urdf`, of a file's content."""
     root = _parsed(content, where)
@@ -194,19 +215,22 @@ def read_urdf(
         raise InputError(f"{where}: a link is the child of two joints; a tree needed")
     links = [link.get("name", "") for link in root.findall("link")]
     links = list(dict.fromkeys([*links, *joints, *(joint.parent for joint in joints.values())]))
-    for option, name in (("--from-link", from_link), ("--to-link", to_link)):
+    given = [to_link] if isinstance(to_link, str) else list(to_link)
+    for option, name in (("--from-link", from_link), *(("--to-link", name) for name in given)):
         if name and name not in links:
             raise InputError(f"{where}: {option} {name}: no such link; there are {_few(links)}")
     start = from_link or _root(joints, links, where)
-    ends = {"": to_link} if to_link else _tools(joints, start, where)
+    ends = {name if given[1:] else "": name for name in given} if any(given) else _tools(joints, start, where)
     paths = {name: _path(joints, start, end, where) for name, end in ends.items()}
-    first, world = paths[""], Rigid()
-    _require_chain(first, start, ends[""], where)
+    for name, path in paths.items():
+        _require_chain(path, start, ends[name], where)
+    first, world = next(iter(paths.values())), Rigid()
     if not from_link and start == WORLD and first[0].kind == "fixed":
         world, start = first[0].parent_from_child, first[0].child
         paths = {name: path[1:] for name, path in paths.items()}
-    robot = _robot_of(paths, root.get("name") or "robot", convention)
-    moving = [joint for joint in first if joint.kind != "fixed"]
+    name = root.get("name") or "robot"
+    robot = _robot_of(paths, name, convention) if "" in paths else _tree_of(paths, name, convention)
+    moving = list({joint.name: joint for path in paths.values() for joint in path if joint.kind != "fixed"}.values())
     notes = tuple(f"joint {j.name} has no limits" for j in moving if j.limit is None and j.kind != "continuous")
     robot = replace(robot, world_from_base=world @ robot.world_from_base)
     return UrdfRobot(robot, tuple(j.name for j in moving), start, ", ".join(ends.values()), notes)
@@ -220,8 +244,16 @@ def require_same_poses(robot: Robot, text: str) -> None:
     StcalError
         By how much it does not.
     """
-    found = read_urdf(text.encode(), WHAT, convention=robot.convention).robot
     q = _values(len(robot.rows))
+    if robot.tree is not None:
+        links = [link_of(name) for name in robot.tools]
+        read = read_urdf(text.encode(), WHAT, BASE, links, robot.convention)
+        found, names = read.robot, [joint_name(i) for i in range(len(robot.rows))]
+        kinematic = (q @ robot.coupling.T)[:, [names.index(name) for name in read.joints]]
+        for name in robot.tools:
+            _require_near(found.world_from_base @ forward(found, kinematic, link_of(name)), forward(robot, q, name))
+        return
+    found = read_urdf(text.encode(), WHAT, convention=robot.convention).robot
     for name, tool in robot.tools.items():
         chain, other = robot.chain(), found.chain()
         wanted = flange_poses(replace(chain, last_from_flange=chain.last_from_flange @ tool), q)
@@ -280,6 +312,36 @@ def _robot_of(paths: dict[str, list[_UrdfJoint]], name: str, convention: Convent
         ends = found.last_from_flange @ robot.tools[each], flange @ tool
         own, wanted = (replace(c, last_from_flange=e) for c, e in zip((found, chain), ends, strict=True))
         _require_near(flange_poses(own, q), flange_poses(wanted, q))
+    return robot
+
+
+def _tree_of(paths: dict[str, list[_UrdfJoint]], name: str, convention: Convention) -> Robot:
+    """Of the paths from one link to tools on several branches."""
+    place: dict[str, int] = {}
+    moving, gaps, mounts, carriers, tools = [], [], {}, {}, {}
+    for tool, path in paths.items():
+        last, passed = -1, Rigid()
+        for joint in path:
+            passed = passed @ joint.parent_from_child
+            if joint.kind == "fixed":
+                continue
+            turn = _z_to(joint.axis)
+            if joint.name not in place:
+                place[joint.name] = i = len(moving)
+                moving.append(joint)
+                gaps.append(passed @ turn)
+                if last != i - 1:
+                    mounts[i] = last, Rigid()
+            last, passed = place[joint.name], turn.inverse()
+        carriers[tool], tools[tool] = last, passed
+    joints, n = tuple(_limited(joint) for joint in moving), len(moving)
+    bare = Robot(name, convention, (DHRow(0, 0, 0, 0),) * n, joints, tools=tools, tree=Tree(mounts, carriers))
+    rotation, translation = np.array([g.rotation for g in gaps]), np.array([g.translation for g in gaps])
+    grown = Grown(Tree(mounts, carriers), (Rigid(),) * n)
+    chain = Chain(rotation, translation, Rigid(), bare.prismatic, np.eye(n), grown=grown)
+    robot, q = robot_from_chain(chain, tools, bare), _values(n)
+    for tool, pose in tools.items():
+        _require_near(robot.world_from_base @ forward(robot, q, tool), carried_poses(chain, q, [tool] * len(q)) @ pose)
     return robot
 
 

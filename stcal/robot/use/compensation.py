@@ -172,12 +172,10 @@ def compensate(identified: Robot, targets: Targets, nominal: Robot | None = None
         Joint values without poses need the nominal robot; robots of different joints, or too far apart to be one; an
         unknown tool; poses to which their joint values lead in another unit or convention only.
     """
-    if nominal is not None and (
-        len(nominal.rows) != len(identified.rows) or (nominal.prismatic != identified.prismatic).any()
-    ):
+    if nominal is not None and _built(nominal) != _built(identified):
         raise InputError(
-            f"nominal robot {nominal.name} and identified robot {identified.name}: joints of different number or type; "
-            "files of the same robot needed"
+            f"nominal robot {nominal.name} and identified robot {identified.name}: joints of different number, type or "
+            "order; files of the same robot needed"
         )
     if nominal is None:
         return _without_nominal(identified, targets)
@@ -212,6 +210,11 @@ def _stayed(
     away = (np.abs(found.q - near)[:, ~robot.prismatic] > FAR_RAD).any(axis=1)
     rows = np.flatnonzero(known & (away | np.array([status == LIMIT for status in found.status])))
     return stayed(robot, targets, poses, near, found, rows)
+
+
+def _built(robot: Robot) -> list[tuple[str, int]]:
+    """Of each joint its type and the joint that carries it."""
+    return [(joint.type, robot.carrier(i)[0]) for i, joint in enumerate(robot.joints)]
 
 
 def _without_nominal(identified: Robot, targets: Targets) -> Compensated:

@@ -15,7 +15,7 @@ from stcal.io.quaternions import EXPLAINS, READINGS
 from stcal.io.table import LENGTHS, UNIT_WORDS
 from stcal.robot.kinematics.damped import reach_mm
 from stcal.robot.kinematics.fit import FITS, TURNED_RAD, require_convention
-from stcal.robot.kinematics.forward import flange_poses
+from stcal.robot.kinematics.forward import forward
 from stcal.robot.kinematics.inverse import Inverse
 from stcal.robot.kinematics.model import Robot
 from stcal.robot.use.targets import Targets, joints_of, poses_of, rows_by_tool
@@ -45,19 +45,18 @@ def robots_apart(identified: Robot, nominal: Robot) -> str:
     InputError
         They cannot be.
     """
-    identified, nominal = (
-        replace(each, tools={"": Rigid()}, world_from_base=Rigid()) for each in (identified, nominal)
-    )
+    ends = [""] if identified.tree is None else list(identified.tree.carriers)
+    identified, nominal = (replace(each, tools=dict.fromkeys(ends, Rigid())) for each in (identified, nominal))
     rng = np.random.default_rng(0)
     limits = identified.limits()
-    half = np.where(identified.prismatic, reach_mm(identified), np.pi)
+    half = np.where(identified.prismatic, reach_mm(identified, ends[0]), np.pi)
     low, high = (
         np.where(np.isfinite(limits[:, 0]), limits[:, 0], -half),
         np.where(np.isfinite(limits[:, 1]), limits[:, 1], half),
     )
     q = rng.uniform(low, high, (SAMPLE, len(half)))
-    one, other = (flange_poses(each.chain(), q).translation for each in (identified, nominal))
-    apart, reach = _rms(one - other), max(reach_mm(identified), reach_mm(nominal))
+    off = [forward(identified, q, end).translation - forward(nominal, q, end).translation for end in ends]
+    apart, reach = max(map(_rms, off)), max(reach_mm(each, end) for each in (identified, nominal) for end in ends)
     if apart <= USUAL * reach:
         return ""
     said = (

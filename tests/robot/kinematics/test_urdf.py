@@ -13,6 +13,8 @@ from stcal.robot.kinematics.file import load_robot, robot_toml
 from stcal.robot.kinematics.forward import forward
 from stcal.robot.kinematics.model import DHRow, Elasticity, Joint, Robot
 from stcal.robot.kinematics.urdf import load_urdf, require_same_poses, robot_urdf
+from stcal.synthetic.measured.arms import joint_vectors
+from tests.robot.trees import two_arms
 
 TOOLS = {"": Rigid.exp([0.1, 0.2, -0.3, 10, 20, 150]), "ball": Rigid.exp([0, 0.5, 0, -40, 0, 90])}
 WORLD = Rigid.exp([0.1, 0.2, 0.3, 1000, -500, 200])
@@ -228,3 +230,18 @@ def test_an_elastic_robot_has_no_urdf():
     none = Elasticity(np.zeros((6, 2)), np.zeros((6, 3)), np.zeros((6, 4)), np.array([0, 0, -1.0]))
     with pytest.raises(InputError, match="a URDF has no place for its elasticity"):
         robot_urdf(replace(EXAMPLE, elasticity=none))
+
+
+@pytest.mark.parametrize("convention", ["standard", "modified"])
+def test_two_arms_come_back_from_a_urdf(tmp_path, convention):
+    robot = two_arms(convention)
+    text = robot_urdf(robot)
+    require_same_poses(robot, text)
+    (tmp_path / "a.urdf").write_text(text)
+    found = load_urdf(tmp_path / "a.urdf", "", ["tool_left", "tool_right"], convention).robot
+    assert len(found.rows) == 14
+    assert sorted(found.tree.mounts) == [8]
+    q = joint_vectors(robot, 5, np.random.default_rng(0))
+    for name in ("left", "right"):
+        wanted = robot.world_from_base @ forward(robot, q, name)
+        assert np.abs((found.world_from_base @ forward(found, q, f"tool_{name}")).difference(wanted)).max() < 1e-9
