@@ -155,11 +155,13 @@ def solve(
     """
     limit = huber_limit(seen.kind) if robust else np.inf
     first = _linearised(state, seen, weighting, limit)[0]
-    hold, pull = _fixed(first, seen.kind), np.zeros(len(first.units))
-    conditions, count = np.zeros_like(hold), 0
+    known, pull = _fixed(first, first.spectrum()[1][:, : unseen(seen.kind)]), np.zeros(len(first.units))
+    conditions, count = np.zeros_like(known), 0
     if held is not None:
-        hold, pull = hold + held.normal(), held.pull()
+        known, pull = known + held.normal(), held.pull()
         conditions, count = held.conditions(), int(held.fixed.sum())
+    _, directions, good = replace(first, conditions=conditions).spectrum()
+    hold = known + _fixed(first, directions[:, ~good])  # along open ones valleys bend, and lead far
 
     def kept(away: np.ndarray) -> NormalEquations:
         return NormalEquations(float(away @ (hold @ away + 2 * pull)), hold, hold @ away + pull)
@@ -179,7 +181,7 @@ def solve(
         max_steps=MAX_STEPS,
     ).required(f"{seen.data.where}: identification", "check the robot file and the outliers", accepted)
     solution = _linearised(found.state.state, seen, weighting, limit)[0]
-    return replace(solution, prior=hold, conditions=conditions, count=count)
+    return replace(solution, prior=known, conditions=conditions, count=count)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -195,11 +197,10 @@ def unseen(kind: Kind) -> int:
     return 6 if kind == "distance" else 0
 
 
-def _fixed(solution: Solution, kind: Kind) -> np.ndarray:
-    """(k, k) what keeps parameters where they start: hardly at all, but what is never seen does not drift."""
-    blind = solution.spectrum()[1][:, : unseen(kind)]
-    blind = np.pad(blind, ((0, solution.state.elastic_count), (0, 0)))
-    fixed = np.eye(len(blind)) / USELESS_MM**2 + blind @ blind.T / STAYS_MM**2
+def _fixed(solution: Solution, directions: np.ndarray) -> np.ndarray:
+    """(k, k) what keeps parameters where they start: hardly at all, but along ``directions`` (j, d) of them firmly."""
+    kept = np.pad(directions, ((0, solution.state.elastic_count), (0, 0)))
+    fixed = np.eye(len(kept)) / USELESS_MM**2 + kept @ kept.T / STAYS_MM**2
     return fixed / solution.units[:, None] / solution.units
 
 
