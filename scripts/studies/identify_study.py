@@ -7,8 +7,8 @@ Prints for every case two normalised squared errors, eᵀC⁻¹e over its degree
 standard error; their expectation is 1. ``predicted`` : of the tool's position at 50 new joint vectors (where distances
 were measured, of its distance from the first of them); ``parameters`` : of all that the data determine. Among the
 last lines are sets with one measurement in twenty off by 2 mm; positions at one orientation, of which new ones are
-predicted too (``partial``; the robot file has the tool to 5 mm); rows of an instrument that stood at two places; and a robot with two arms on a torso and
-three markers.
+predicted too (``partial``; the robot file has the tool to 5 mm); rows of an instrument that stood at two places; and a
+robot with two arms on a torso and three markers.
 """
 
 import argparse
