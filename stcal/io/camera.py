@@ -33,7 +33,7 @@ MAX_SIDE_PX = 1_000_000
 DISTORTION_COUNTS = (0, 4, 5, 8, 12, 14)
 """Numbers of distortion coefficients that OpenCV knows."""
 
-# Places of COLMAP's parameters in fx, fy, cx, cy, k1, k2, p1, p2, k3, k4, k5, k6.
+# Places of COLMAP's parameters in fx, fy, cx, cy, k1, k2, p1, p2, k3, k4, k5, k6, s1, s2, s3, s4.
 _COLMAP_LAYOUT = {
     "SIMPLE_PINHOLE": [(0, 1), 2, 3],
     "PINHOLE": [0, 1, 2, 3],
@@ -41,10 +41,16 @@ _COLMAP_LAYOUT = {
     "RADIAL": [(0, 1), 2, 3, 4, 5],
     "OPENCV": list(range(8)),
     "FULL_OPENCV": list(range(12)),
+    "SIMPLE_RADIAL_FISHEYE": [(0, 1), 2, 3, 4],
+    "RADIAL_FISHEYE": [(0, 1), 2, 3, 4, 5],
+    "OPENCV_FISHEYE": [0, 1, 2, 3, 4, 5, 8, 9],
+    "THIN_PRISM_FISHEYE": [0, 1, 2, 3, 4, 5, 6, 7, 8, 9, 12, 14],
 }
 COLMAP_MODELS = tuple(_COLMAP_LAYOUT)
 """Camera models that stcal supports."""
-PARAMETER_NAMES = ("fx", "fy", "cx", "cy", "k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6")
+PARAMETER_NAMES = ("fx", "fy", "cx", "cy", "k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6", "s1", "s2", "s3", "s4")
+FISHEYE = "FISHEYE"
+"""In the names of COLMAP's equidistant models."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -68,7 +74,8 @@ class CameraModel:
 
     def sized(self, width: int, height: int) -> Camera:
         """The camera; a size that the file does not state is taken from the arguments."""
-        return Camera(self.width or width, self.height or height, self.focal, self.centre, self.distortion)
+        size = self.width or width, self.height or height
+        return Camera(*size, self.focal, self.centre, self.distortion, FISHEYE in self.colmap_model)
 
     def calibrated(self, width: int, height: int) -> "CalibratedCamera":
         """The same with its model and covariance."""
@@ -104,9 +111,8 @@ class CalibratedCamera(Camera):
     @classmethod
     def of(cls, camera: Camera, colmap_model: str, covariance: np.ndarray | None = None) -> "CalibratedCamera":
         """``camera`` with its model and covariance."""
-        return cls(
-            camera.width, camera.height, camera.focal, camera.centre, camera.distortion, colmap_model, covariance
-        )
+        lens = camera.focal, camera.centre, camera.distortion, FISHEYE in colmap_model
+        return cls(camera.width, camera.height, *lens, colmap_model, covariance)
 
     def colmap_params(self) -> list[float]:
         """Parameters in COLMAP's order and pixel origin."""
@@ -131,7 +137,7 @@ PRIOR_CENTRE = 2e-3
 PRIOR_RADIAL = 0.01
 """… of k1 … k6 (and a tenth of each) …"""
 PRIOR_TANGENTIAL = 1e-3
-"""… and of p1, p2: what a calibration of some weeks ago, or of another copy of the lens, is worth."""
+"""… and of p1, p2, s1 … s4: what a calibration of some weeks ago, or of another copy of the lens, is worth."""
 
 
 def camera_prior(camera: CalibratedCamera) -> CameraPrior:
@@ -139,7 +145,7 @@ def camera_prior(camera: CalibratedCamera) -> CameraPrior:
     if camera.covariance is not None:
         return CameraPrior(camera.colmap_model, camera.covariance)
     radial = np.maximum(PRIOR_RADIAL, 0.1 * np.abs(camera.distortion))
-    radial[2:4] = PRIOR_TANGENTIAL
+    radial[[2, 3, 8, 9, 10, 11]] = PRIOR_TANGENTIAL
     flat = np.concatenate([PRIOR_FOCAL * camera.focal, [PRIOR_CENTRE * camera.width] * 2, radial])
     first = intrinsic_basis(camera.colmap_model).argmax(0)
     return CameraPrior(camera.colmap_model, np.diag(flat[first] ** 2))
@@ -154,7 +160,7 @@ def refinable(camera: CalibratedCamera) -> CalibratedCamera:
 
 
 def intrinsic_basis(colmap_model: str) -> np.ndarray:
-    """Derivative (12, q) of fx, fy, cx, cy, k1, k2, p1, p2, k3 … k6 by the q parameters of a COLMAP model."""
+    """Derivative (16, q) of fx, fy, cx, cy, k1, k2, p1, p2, k3 … k6, s1 … s4 by the q parameters of a COLMAP model."""
     layout = _COLMAP_LAYOUT[colmap_model]
     basis = np.zeros((len(PARAMETER_NAMES), len(layout)))
     for column, place in enumerate(layout):
@@ -248,6 +254,7 @@ def _require_sigmas(sigma: np.ndarray, correlation: np.ndarray, names: list[str]
 
 
 def _model(flat: np.ndarray, colmap_model: str, width, height, path: Path) -> CameraModel:
+    flat = np.pad(flat, (0, len(PARAMETER_NAMES) - len(flat)))
     if not np.isfinite(flat).all():
         raise InputError(f"camera file {path}: a camera parameter is not a finite number; correct it")
     if (far := np.abs(flat).max()) > FARTHEST:
@@ -291,7 +298,7 @@ def camera_from_colmap(colmap_model: str, width: float, height: float, params, s
     layout = _COLMAP_LAYOUT[colmap_model]
     if len(params) != len(layout):
         raise InputError(f"camera file {source}: {len(params)} parameters for {colmap_model}, {len(layout)} needed")
-    flat = np.zeros(12)
+    flat = np.zeros(len(PARAMETER_NAMES))
     for place, value in zip(layout, params, strict=True):
         flat[list(place) if isinstance(place, tuple) else place] = value
     flat[2:4] -= COLMAP_PIXEL_ORIGIN

@@ -9,6 +9,7 @@ import numpy as np
 from stcal.design import BoardDesign, FaceDesign, TargetDesign, reference_board, reference_target
 from stcal.errors import DegenerateError, InputError
 from stcal.geometry.arrays import frozen
+from stcal.geometry.camera import Camera
 from stcal.geometry.rigid import Rigid
 from stcal.io.camera import CalibratedCamera
 from stcal.labels import CircleLabel
@@ -210,7 +211,8 @@ def _made_camera(options: SceneOptions, rng) -> CalibratedCamera:
     distortion = np.zeros(8)
     distortion[: len(options.distortion)] = options.distortion
     model = "FULL_OPENCV" if distortion[4:].any() else "OPENCV" if distortion.any() else "PINHOLE"
-    return CalibratedCamera(options.width, options.height, np.array([focal, focal]), centre, distortion, model)
+    camera = Camera(options.width, options.height, np.array([focal, focal]), centre, distortion)
+    return CalibratedCamera.of(camera, model)
 
 
 def _default_groups(target: TargetDesign, target_from_face: dict[str, Rigid]) -> list[tuple[str, str]]:

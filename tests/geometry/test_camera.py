@@ -154,3 +154,67 @@ def test_camera_refuses(change, message):
     good = {"width": WIDTH, "height": HEIGHT, "focal": [1e3, 1e3], "centre": [0, 0], "distortion": np.zeros(8)}
     with pytest.raises(InputError, match=message):
         Camera(**(good | change))
+
+
+FISHEYES = st.tuples(small, small, small, small).map(lambda c: np.array(c) * [0.05, 0.01, 2e-3, 5e-4])
+wide = st.lists(st.tuples(st.floats(-3, 3), st.floats(-3, 3)), min_size=1, max_size=8).map(np.array)
+"""Up to 77° from the axis."""
+
+
+def fisheye_of(k, p=(0.0, 0.0), s=(0.0, 0.0)) -> Camera:
+    distortion = [*k[:2], *p, *k[2:], 0, 0, s[0], 0, s[1], 0]
+    return Camera(WIDTH, HEIGHT, [2000.0, 1990.0], [2600.0, 1700.0], np.array(distortion), True)
+
+
+@given(FISHEYES, wide, st.floats(100, 5000))
+def test_equidistant_projection_is_opencvs(k, xy, depth_mm):
+    camera = fisheye_of(k)
+    xyz = np.column_stack([xy, np.ones(len(xy))]) * depth_mm
+    expected = cv2.fisheye.projectPoints(xyz[:, None], np.zeros(3), np.zeros(3), matrix_of(camera), k)[0][:, 0]
+    np.testing.assert_allclose(camera.project(xyz), expected, atol=1e-9)
+    np.testing.assert_allclose(camera.normalised_from_pixel(expected), xy, atol=1e-9)  # 20 times steeper at 77°
+
+
+@given(st.lists(small, min_size=4, max_size=4), normalised)
+def test_thin_prisms_are_opencvs(s, xy):
+    distortion = np.concatenate([[-0.1, 0.03, 1e-3, -2e-3, 0.01, 0.02, 0, 0], 5e-3 * np.array(s)])
+    camera = Camera(WIDTH, HEIGHT, [5580.0, 5570.0], [2600.0, 1700.0], distortion)
+    xyz = np.column_stack([xy, np.ones(len(xy))])
+    expected = cv2.projectPoints(xyz, np.zeros(3), np.zeros(3), matrix_of(camera), distortion)[0].reshape(-1, 2)
+    np.testing.assert_allclose(camera.project(xyz), expected, atol=1e-9)
+    np.testing.assert_allclose(camera.normalised_from_pixel(expected), xy, atol=1e-11)
+
+
+CAMERAS = {
+    "prisms": Camera(
+        WIDTH, HEIGHT, [5580, 5570], [2600, 1700], [-0.1, 0.03, 1e-3, -2e-3, 0.01, 0.02, 0, 0, 2e-3, -1e-3, 1e-3, 5e-4]
+    ),
+    "equidistant": fisheye_of([0.02, -0.01, 3e-3, -1e-3], (1e-3, -2e-3), (1.5e-3, -7e-4)),
+}
+
+
+@pytest.mark.parametrize("name", CAMERAS)
+def test_derivatives_of_wide_lenses_are_those_of_differences(name):
+    camera = CAMERAS[name]
+    xy = np.random.default_rng(0).uniform(-0.5, 0.5, (50, 2)) * (4 if camera.fisheye else 1)
+    xy[0] = 0, 1e-5  # where the angle's series is taken
+    moved = [camera.distort(xy + sign * step) for step in 1e-6 * np.eye(2) for sign in (1, -1)]
+    by_difference = np.stack([moved[0] - moved[1], moved[2] - moved[3]], axis=-1) / 2e-6
+    np.testing.assert_allclose(camera.distort_jacobian(xy)[1], by_difference, atol=1e-9)
+    jacobian, parameters = camera.parameter_jacobian(xy), camera.parameters()
+    unused = {10, 11, 13, 15} if camera.fisheye else set()
+    for k in sorted(set(range(16)) - unused):
+        step = np.zeros(16)
+        step[k] = 1e-3 if k < 4 else 1e-6
+        ahead, behind = (camera.with_parameters(parameters + sign * step) for sign in (1, -1))
+        by_difference = (ahead.pixel_from_normalised(xy) - behind.pixel_from_normalised(xy)) / (2 * step[k])
+        np.testing.assert_allclose(jacobian[:, :, k], by_difference, atol=1e-5 * max(np.abs(by_difference).max(), 1))
+
+
+def test_beyond_a_right_angle_is_refused():
+    camera = fisheye_of([0.0, 0.0, 0.0, 0.0])
+    assert np.isfinite(camera.normalised_from_pixel([2600.0 + 2000 * np.radians(88), 1700.0])).all()
+    with pytest.raises(ConvergenceError, match=r"is 90\.0° from the axis, less than 89° needed"):
+        camera.normalised_from_pixel([2600.0 + 2000 * np.radians(90), 1700.0])
+    with pytest.raises(InputError, match="k5, k6, s2 or s4 of an equidistant camera"):
+        Camera(10, 10, [9, 9], [4, 4], [0, 0, 0, 0, 0, 0, 1, 0], True)

@@ -28,6 +28,18 @@ COLMAP_CASES = {
         [1000, 1100],
         [0.1, -0.2, 3e-3, -4e-3, 0.05, 0.06, 0.07, 0.08],
     ),
+    "SIMPLE_RADIAL_FISHEYE": ([1000, 500.5, 400.5, 0.1], [1000, 1000], [0.1]),
+    "RADIAL_FISHEYE": ([1000, 500.5, 400.5, 0.1, -0.2], [1000, 1000], [0.1, -0.2]),
+    "OPENCV_FISHEYE": (
+        [1000, 1100, 500.5, 400.5, 0.1, -0.2, 3e-3, -4e-3],
+        [1000, 1100],
+        [0.1, -0.2, 0, 0, 3e-3, -4e-3],
+    ),
+    "THIN_PRISM_FISHEYE": (
+        [1000, 1100, 500.5, 400.5, 0.1, -0.2, 3e-3, -4e-3, 0.05, 0.06, 0.007, 0.008],
+        [1000, 1100],
+        [0.1, -0.2, 3e-3, -4e-3, 0.05, 0.06, 0, 0, 0.007, 0, 0.008],
+    ),
 }
 
 ROS = """\
@@ -65,7 +77,7 @@ BOMB = "a: &a [x,x,x,x,x,x,x,x,x]\n" + "".join(
 
 
 def padded(distortion) -> list[float]:
-    return [*distortion, *[0.0] * (8 - len(distortion))]
+    return [*distortion, *[0.0] * (12 - len(distortion))]
 
 
 def read(tmp_path, content: str | bytes, name="camera.txt"):
@@ -105,10 +117,9 @@ def test_projection_agrees_with_pycolmap(tmp_path, name):
 )
 def test_cameras_txt_round_trip(tmp_path_factory, name, lengths, ratio, coefficients):
     _, focal, distortion = COLMAP_CASES[name]
-    k = np.array(coefficients)
-    k[len(distortion) :] = 0
+    k = np.where(padded(distortion), [*coefficients, *coefficients[:4]], 0.0)
     fx, fy = lengths[0], lengths[0] * (1 if focal[0] == focal[1] else ratio)
-    camera = Camera(6000, 4000, [fx, fy], lengths[1:], k)
+    camera = Camera(6000, 4000, [fx, fy], lengths[1:], k, "FISHEYE" in name)
     path = tmp_path_factory.mktemp("round") / "cameras.txt"
     write_cameras_txt(path, CalibratedCamera.of(camera, name))
     found = read_camera(path)
@@ -197,7 +208,7 @@ def test_ros_industrial(tmp_path):
 
 def test_no_distortion_key_is_no_distortion(tmp_path):
     model = read(tmp_path, f"camera_matrix: {K}\n")
-    np.testing.assert_array_equal(model.distortion, np.zeros(8))
+    np.testing.assert_array_equal(model.distortion, np.zeros(12))
 
 
 def test_a_size_that_the_file_does_not_state_is_the_images(tmp_path):
@@ -254,7 +265,7 @@ WRONG = {
     "a photograph": (b"\xff\xd8\xff\xe0\x00\x10JFIF", "not a text file"),
     "UTF-16": ("1 PINHOLE 10 10 1 1 1 1".encode("utf-16"), "not a text file"),
     "COLMAP: two cameras": ("1 PINHOLE 9 9 1 1 1 1\n2 PINHOLE 9 9 1 1 1 1\n", "2 cameras, 1 needed"),
-    "COLMAP: fisheye": ("1 OPENCV_FISHEYE 9 9 1 1 1 1 0 0 0 0", "OPENCV_FISHEYE is not supported; use one of SIMPLE_"),
+    "COLMAP: field of view": ("1 FOV 9 9 1 1 1 1 1", "FOV is not supported; use one of SIMPLE_"),
     "COLMAP: too few": ("1 PINHOLE 9 9 1 1 1", "3 parameters for PINHOLE, 4 needed"),
     "COLMAP: far too few": ("1 SIMPLE_PINHOLE 9 9 1", "1 parameters for SIMPLE_PINHOLE, 3 needed"),
     "COLMAP: too many": ("1 SIMPLE_PINHOLE 9 9 1 1 1 1", "4 parameters for SIMPLE_PINHOLE, 3 needed"),

@@ -43,7 +43,7 @@ class Corners:
 
     ``inverted`` : eye-to-hand; ``base_from_flange`` : m, as reported; ``xyz_board`` : (K, 3) as designed; ``view``,
     ``corner`` : (n,) of each measurement; ``xy_px`` : (n, 2); ``weight`` : (n, 2, 2) whitening at σ 1; ``robot`` :
-    (m, 6, 6) whitening in place of σ, or None; ``sigma`` : of each group, 0 where exact; ``basis`` : (12, q) of the
+    (m, 6, 6) whitening in place of σ, or None; ``sigma`` : of each group, 0 where exact; ``basis`` : (16, q) of the
     intrinsics solved for, ``information`` : (q, q) about ``camera``, over the square of factors;
     ``with_scale``; ``arm`` : whose parameters are solved for, by which ``base_from_flange`` was computed, or None.
     """
@@ -226,7 +226,7 @@ class Corners:
 def camera_parts(basis: np.ndarray, information: np.ndarray) -> list[tuple[str, np.ndarray]]:
     """Intrinsics whose knowledge may be wrong by a factor of its own: kinds, or all where they are correlated.
 
-    ``basis`` : (12, q) of the intrinsics; ``information`` : (q, q) about them.
+    ``basis`` : (16, q) of the intrinsics; ``information`` : (q, q) about them.
     """
     first = basis.argmax(0)
     if np.count_nonzero(information - np.diag(np.diag(information))):

@@ -255,7 +255,7 @@ def problem(
     if loop.robot_covariance is not None:
         robot = np.linalg.inv(np.linalg.cholesky(loop.robot_covariance))
         free = [name for name in free if not name.startswith("robot")]
-    basis = np.zeros((12, 0)) if intrinsics is None else intrinsic_basis(intrinsics.colmap_model)
+    basis = np.zeros((16, 0)) if intrinsics is None else intrinsic_basis(intrinsics.colmap_model)
     information = np.zeros((0, 0)) if intrinsics is None else np.linalg.inv(intrinsics.covariance)
     corners = Corners(
         loop.inverted,

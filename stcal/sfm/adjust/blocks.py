@@ -22,7 +22,7 @@ class Shared:
     """What all groups share.
 
     ``xyz_model`` : (c, 3) circles, mm; ``shape_mm`` : (d, 3) deviation of the dots from the design that all groups
-    have in common, board frame; ``camera`` ; ``basis`` : (12, q) derivative of the camera's parameters by those that
+    have in common, board frame; ``camera`` ; ``basis`` : (16, q) derivative of the camera's parameters by those that
     are adjusted.
     """
 

@@ -145,8 +145,8 @@ def covariance_of(
 
 
 def basis_of(prior: CameraPrior | None) -> np.ndarray:
-    """Derivative (12, q) of a camera's parameters by those that are adjusted."""
-    return intrinsic_basis(prior.colmap_model) if prior else np.zeros((12, 0))
+    """Derivative (16, q) of a camera's parameters by those that are adjusted."""
+    return intrinsic_basis(prior.colmap_model) if prior else np.zeros((16, 0))
 
 
 def photographs_of(
@@ -161,7 +161,7 @@ def photographs_of(
 class Extensible:
     """What :func:`covariance_of` gives of the circles, ready for one more view, however many images it rests on.
 
-    ``camera`` ; ``basis`` : (12, q) derivative of its parameters by those that are adjusted; ``covariance_mm2`` :
+    ``camera`` ; ``basis`` : (16, q) derivative of its parameters by those that are adjusted; ``covariance_mm2`` :
     (3c, 3c) of the circles; ``points`` by group: (3p + q, 3p + q) of its points and the intrinsics; ``to_circles`` by
     group: (3p + q, 3c).
     """

@@ -133,7 +133,8 @@ def vague_prior(camera: Camera, colmap_model: str) -> np.ndarray:
     reach = float(np.hypot(camera.width, camera.height) / 2 / camera.focal.mean())
     radial = reach ** -np.array([2.0, 4, 6])
     tangential = [0.1 / reach] * 2
-    flat = np.concatenate([camera.focal, [side / 4] * 2, radial[:2], tangential, radial[2:], radial])
+    prism = [tangential[0], 0.1 / reach**3] * 2
+    flat = np.concatenate([camera.focal, [side / 4] * 2, radial[:2], tangential, radial[2:], radial, prism])
     return np.diag(flat[intrinsic_basis(colmap_model).argmax(0)] ** 2)
 
 

@@ -8,7 +8,7 @@ from scipy.special import bdtrc, chdtri
 from stcal.geometry.camera import Camera
 from stcal.geometry.rigid import skew
 from stcal.geometry.robust import ratio_limit, robust_sigma
-from stcal.io.camera import CalibratedCamera, CameraPrior, intrinsic_basis
+from stcal.io.camera import PARAMETER_NAMES, CalibratedCamera, CameraPrior, intrinsic_basis
 from stcal.labels import CircleLabel
 from stcal.sfm.adjust.calibration import Calibration
 from stcal.sfm.adjust.network import Network, solve_score
@@ -28,7 +28,6 @@ UNEVEN_BY_CHANCE = 0.01
 FIELD_DEGREE = 3
 FIELD_FLOOR_PX = 0.002
 """σ of a field that any centring leaves: the pixel raster, JPEG's blocks and light from one side do not average out."""
-CAMERA_PARAMETERS = ("fx", "fy", "cx", "cy", "k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6")
 
 
 def camera_check(
@@ -54,6 +53,7 @@ def camera_check(
         names = _names(prior.colmap_model)
     else:
         tested = "FULL_OPENCV" if camera.colmap_model == "FULL_OPENCV" else "OPENCV"
+        tested = "THIN_PRISM_FISHEYE" if camera.fisheye else tested
         normal, right = summed(networks, lambda n: _by_intrinsics(n, calibration.camera, tested))
         test = solve_score(normal, right)
         estimate, sigma, names = test.estimate, np.sqrt(np.diag(test.covariance)), _names(tested)
@@ -71,7 +71,7 @@ def camera_check(
 
 def _names(colmap_model: str) -> list[str]:
     basis = intrinsic_basis(colmap_model)
-    return [CAMERA_PARAMETERS[i] for i in basis.argmax(0)]
+    return [PARAMETER_NAMES[i] for i in basis.argmax(0)]
 
 
 def _by_intrinsics(network: Network, camera: Camera, colmap_model: str) -> np.ndarray:

@@ -38,7 +38,7 @@ def report_of(result: RunResult) -> ReportFile:
                 "size_px": [result.camera.width, result.camera.height],
                 "focal_px": result.calibration.camera.focal,
                 "centre_px": result.calibration.camera.centre,
-                "distortion": result.calibration.camera.distortion,
+                "distortion": result.calibration.camera.coefficients(),
             },
             "summary": {
                 "files": len(result.detection.images) + len(result.detection.skipped),

@@ -59,7 +59,7 @@ def two_arms(convention: Convention = "standard") -> Robot:
     tree = Tree({2: (1, LEFT), 8: (1, RIGHT)}, {"left": 7, "right": 13, "elbow": 4})
     base = Rigid.exp([0.1, 0.2, 0.9, 1500, -300, 200])
     rows, joints = (*torso, *arm_rows, *arm_rows), (*wide, *arm.joints, *arm.joints)
-    return Robot("torso", arm.convention, rows, joints, None, base, tools, tree=tree)
+    return Robot("torso", arm.convention, rows, joints, world_from_base=base, tools=tools, tree=tree)
 
 
 def joint_vectors(robot: Robot, count: int, rng: np.random.Generator, share: float = 0.6) -> np.ndarray:
