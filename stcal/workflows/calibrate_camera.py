@@ -67,7 +67,7 @@ def calibrate_camera_by_corners(
     grid = corner_grid(board)
     progress = progress or (lambda *_: None)
     files, other = find_images(images)
-    camera = start_camera(*first_size(files))
+    camera = start_camera(*first_size(files), colmap_model)
     rounds = 2 if isinstance(board, CharucoDesign) else 1  # a ChArUco board's corners are found by the camera
     for done in range(1, rounds + 1):
         model = CameraModel(camera.focal, camera.centre, camera.distortion, colmap_model, None, None, "the images")

@@ -105,7 +105,7 @@ def calibrate_camera(
         raise InputError(f"camera model {colmap_model}: not supported; use one of {', '.join(COLMAP_MODELS)}")
     progress = progress or (lambda *_: None)
     files, other = find_images(images)
-    camera = start_camera(*first_size(files))
+    camera = start_camera(*first_size(files), colmap_model)
     before: Intrinsics | None = None
     settled = False
     with tempfile.TemporaryDirectory(prefix="stcal-camera-") as cache:

@@ -9,29 +9,34 @@ from stcal.design import BoardDesign
 from stcal.geometry.camera import Camera
 from stcal.geometry.plane import apply_homography, camera_from_plane, fit_homography, refine_planar_pose
 from stcal.geometry.rigid import Rigid
+from stcal.io.camera import FISHEYE
 from stcal.labels import DotLabel
 from stcal.sfm.data.observations import ImageObservations, by_group
 from stcal.sfm.detect.files import DetectedImage
 
-START_FOCAL = 1.2
-"""In longer image sides: between a wide-angle and a portrait lens."""
+START_FOCAL, FISHEYE_FOCAL = 1.2, 0.45
+"""In longer image sides: between a wide-angle and a portrait lens; and of equidistant lenses 127° across."""
 FOCAL_LIMITS = (0.2, 50.0)
 """In longer image sides; what the closed form gives outside of them is noise."""
 SETTLING_PASSES = 3
 
 
-def start_camera(width: int, height: int) -> Camera:
+def start_camera(width: int, height: int, colmap_model: str) -> Camera:
     """A lens of middling focal length without distortion, principal point in the middle."""
-    focal = START_FOCAL * max(width, height)
-    return Camera(width, height, [focal, focal], [(width - 1) / 2, (height - 1) / 2], np.zeros(8))
+    fisheye = FISHEYE in colmap_model
+    focal = (FISHEYE_FOCAL if fisheye else START_FOCAL) * max(width, height)
+    return Camera(width, height, [focal, focal], [(width - 1) / 2, (height - 1) / 2], np.zeros(8), fisheye)
 
 
 def closed_form(observations: Sequence[ImageObservations], board: BoardDesign, camera: Camera) -> Camera:
-    """``camera`` with the focal length that the boards' homographies ask for; unchanged where they ask for none.
+    """``camera`` with the focal length that the boards' homographies ask for; unchanged where they ask for none, and of
+    equidistant lenses, whose rays turn with the focal length.
 
     Zhang (2000), sec. 3.1, with square pixels and known principal point: the two axes of each board are orthogonal
     and equally long, which is linear in 1/f². Lens distortion of ``camera`` is removed first.
     """
+    if camera.fisheye:
+        return camera
     along, known = [], []
     for image in observations:
         h = _homography(image, board, camera)

@@ -56,7 +56,7 @@ def views_of(rng, count=12, noise_px=0.02, tilt_deg=35.0, camera=TRUE, made=None
 
 
 def calibrated(views, model="OPENCV"):
-    start = closed_form(views, BOARD, start_camera(TRUE.width, TRUE.height))
+    start = closed_form(views, BOARD, start_camera(TRUE.width, TRUE.height, "OPENCV"))
     return adjust_intrinsics(views, BOARD, start, model)
 
 
