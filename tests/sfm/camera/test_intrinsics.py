@@ -135,7 +135,7 @@ def test_rational_model_knows_projections_though_not_its_coefficients():
 def test_closed_form_finds_the_focal_length():
     # Exact but for the eccentricity of the dots, and the principal point 6 px off the middle; then with distortion.
     pinhole = replace(TRUE, focal=[2790.0, 2790.0], distortion=np.zeros(8))
-    start = start_camera(TRUE.width, TRUE.height)
+    start = start_camera(TRUE.width, TRUE.height, "OPENCV")
     for camera, tolerance in ((pinhole, 5e-3), (TRUE, 0.05)):
         found = closed_form(views_of(np.random.default_rng(9), noise_px=1e-3, camera=camera), BOARD, start).focal
         assert found == pytest.approx([2790, 2790], rel=tolerance)
