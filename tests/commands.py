@@ -164,6 +164,12 @@ CALLS = (
         f"@robot/targets.csv --robot @robot/made.toml --nominal @robot/robot.toml --out >joints.csv {_ALL}",
         1.2,
     ),
+    Call(
+        "robot from-photos",
+        "@data/images --camera @data/cameras.txt --faces @run/faces.json --joints @held.csv --robot @robot/robot.toml "
+        f"{_DESIGNS} --partial --targets @robot/targets.csv --out +arm --workers 1",
+        6.0,
+    ),
     Call("robot verify", f"@robot/verify.csv --plot >errors.svg {_ALL}", 0.5),
     Call("robot design", f"--robot @robot/robot.toml --count 20 --candidates 60 --out >poses.csv {_ALL}", 1.5),
     Call(

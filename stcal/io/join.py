@@ -25,8 +25,8 @@ class Joined:
 
 
 def join(
-    a: str | Path,
-    b: str | Path,
+    a: str | Path | Table,
+    b: str | Path | Table,
     key: str,
     prefixes: tuple[str, str] = ("", ""),
     quaternions: Order = "wxyz",
@@ -37,7 +37,7 @@ def join(
     Parameters
     ----------
     a, b
-        Files with a column ``key``, each value once.
+        Files with a column ``key``, each value once; or what was read from them.
     key
         Name of the column.
     prefixes
@@ -58,8 +58,12 @@ def join(
     InputError
         A file that is none, no such column, a key twice, none in common, or one column for both.
     """
-    second = read_mapped(b, columns, "table", quaternions) if columns else read_table(b, "table", quaternions)
+    if columns and not isinstance(b, Table):
+        second = read_mapped(b, columns, "table", quaternions)
+    else:
+        second = read_table(b, "table", quaternions)
     tables = [read_table(a, "table", quaternions), second]
+    a, b = (each.where if isinstance(each, Table) else each for each in (a, b))
     places = [_places(table, key) for table in tables]
     common = [name for name in places[0] if name in places[1]]
     if not common:

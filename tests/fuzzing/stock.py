@@ -16,6 +16,7 @@ from stcal.locate.data.layout import layout_toml
 from stcal.robot.kinematics.example import mh80
 from stcal.robot.kinematics.file import robot_toml
 from stcal.robot.kinematics.forward import forward
+from stcal.robot.kinematics.inverse import inverse
 from stcal.sfm.interop.export_model import export_model
 from stcal.sfm.pipeline import RunOptions, run
 from stcal.sfm.run.marker import MarkerFile, digest_of
@@ -49,6 +50,8 @@ spacing = 0.3
 x_mm = 200.0
 rpy_deg = [0.0, 30.0, 0.0]
 """
+HOLDS = np.radians([10.0, 20.0, -15.0, 30.0, -50.0, 40.0])
+"""Joint values of an arm at the first photograph."""
 BOARD_AT_MM = (30, 230)
 """Of the board beside the tags, on the sheet."""
 
@@ -70,6 +73,7 @@ def make_stock(folder: Path, dataset: Path | None = None, finished: Path | None 
     _cameras(folder)
     rng = np.random.default_rng(7)
     _robots(folder / "robot", rng)
+    _held(folder)
     _handeye(folder / "handeye", rng)
     _tags(folder / "locate", rng)
     _register(folder / "register", rng)
@@ -164,6 +168,22 @@ def _robots(folder: Path, rng: np.random.Generator) -> None:
         for c in commanded
     ]
     write_rows(folder / "verify.csv", ["set", *(f"commanded_{c}" for c in POSE[:3]), *POSE[:3]], rows)
+
+
+def _held(folder: Path) -> None:
+    """Joint values of an arm that holds the target as the data set's photographs show it."""
+    groups = json.loads((folder / "data/truth.json").read_text())["groups"]
+    shown = [
+        (name, Rigid.from_matrix(np.array(each["camera_from_target"])))
+        for own in groups.values()
+        for name, each in own["images"].items()
+    ]
+    base_from_camera = forward(mh80(), HOLDS)[0] @ shown[0][1].inverse()
+    poses = Poses.of(base_from_camera @ pose for _, pose in shown)
+    found = inverse(mh80(), poses, np.tile(HOLDS, (len(poses), 1)))
+    assert found.usable.all()
+    rows = [[name, *q] for (name, _), q in zip(shown, np.degrees(found.q).tolist(), strict=True)]
+    write_rows(folder / "held.csv", ["image", *(f"q{i}_deg" for i in range(1, 7))], rows)
 
 
 def _handeye(folder: Path, rng: np.random.Generator) -> None:

@@ -3,7 +3,7 @@
 import typer
 
 from stcal.cli.help import PLAIN, Commands
-from stcal.cli.robot import axes, compensate, convert, design, evaluate, identify, init, verify
+from stcal.cli.robot import axes, compensate, convert, design, evaluate, from_photos, identify, init, verify
 
 app = typer.Typer(
     name="stcal robot",
@@ -20,6 +20,7 @@ COMMANDS = (
     verify.verify,
     design.design,
     convert.convert,
+    from_photos.from_photos,
 )
 for command in COMMANDS:
     app.command()(command)

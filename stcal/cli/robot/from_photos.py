@@ -1,0 +1,76 @@
+"""``stcal robot from-photos``: from photographs of the target on an arm to joint values, in one command."""
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from stcal.cli.options import CameraFile, RobotFile, TargetFile, Workers, load_ahead
+from stcal.cli.robot.identify import Model
+from stcal.cli.terminal import StageProgress, print_each, say
+
+
+def from_photos(
+    images: Annotated[
+        Path, typer.Argument(metavar="VIEWS", help="Read the photographs of this folder and of its subfolders.")
+    ],
+    camera: CameraFile,
+    faces: Annotated[Path, typer.Option("--faces", help="Read the calibrated target from this faces.json.")],
+    joints: Annotated[
+        Path,
+        typer.Option("--joints", help="Read the joint values of each photograph from this file, by --key (CSV)."),
+    ],
+    robot_file: RobotFile,
+    out: Annotated[Path, typer.Option("--out", help="Write all results to this new folder.")],
+    targets: Annotated[
+        Path | None,
+        typer.Option(
+            "--targets", help="Compute joint values for the poses of this file, or in place of its joint values (CSV)."
+        ),
+    ] = None,
+    target: TargetFile = None,
+    board: Annotated[
+        Path | None,
+        typer.Option("--board", help="Tell the dots of the board of this board.toml apart, if it is in view."),
+    ] = None,
+    model: Annotated[
+        Model, typer.Option(help="Take the arm as rigid, or as elastic; auto chooses by rows held out.")
+    ] = Model.rigid,
+    partial: Annotated[
+        bool, typer.Option("--partial", help="Keep parameters nominal that the photographs leave open.")
+    ] = False,
+    key: Annotated[str, typer.Option("--key", help="Match photographs and joint values by this column.")] = "image",
+    workers: Workers = None,
+) -> None:
+    """Measure the target on an arm in photographs, find axes and kinematics, and compensate targets: one folder."""
+    load_ahead(workers)
+    from stcal.io.camera import read_camera
+    from stcal.io.design import load_board, target_of
+    from stcal.robot.identify.result import IdentifyOptions
+    from stcal.robot.kinematics.file import load_robot
+    from stcal.sfm.measure.images import MeasureOptions
+    from stcal.sfm.measure.target import read_target
+    from stcal.workflows import from_photos as work
+
+    work.require_new_folder(out, images)
+    design = target_of(target)
+    with StageProgress() as progress:
+        result = work.from_photos(
+            images,
+            read_camera(camera),
+            read_target(faces, design),
+            design,
+            joints,
+            load_robot(robot_file),
+            targets,
+            load_board(board) if board else None,
+            key,
+            MeasureOptions(workers=workers),
+            IdentifyOptions(model=model.value, partial=partial),
+            progress,
+        )
+    print_each("note", result.notes)
+    for line in work.story(result):
+        say(line)
+    work.save_folder(out, result.files())
+    say(f"report: {out / 'report.html'}")
