@@ -21,6 +21,8 @@ NEAR_AXIS = 10.0
 """Radii below so many σ of a point are of no use: noise bends them by σ²/2r, a twentieth of σ here."""
 ROUNDING = 1e-12
 """Relative size of what rounding leaves of coordinates."""
+STANDS_STILL_MM = 1.0
+"""Sweeps move a reflector by more, unless it is on the axis."""
 WEAK_RAD = 0.02
 """σ of a direction beyond which an axis is not known: its covariance rests on small angles."""
 MOTION = np.radians(2.0)
@@ -76,6 +78,24 @@ class AxisFit:
         """Rows that are left out as grossly wrong."""
         return np.unique(self.rows[self.weights == 0])
 
+    def influence(self, points: np.ndarray) -> np.ndarray:
+        """(k, p) by which the axis changes without each of the ``points`` (k, 3), mm, that it was fitted to: linear."""
+        axes, prismatic = self.world_from_axis.rotation, len(self.gain) == 2
+        across = np.broadcast_to(axes.T[:2], (len(points), 2, 3)).copy()
+        if not prismatic:
+            local = (points - self.world_from_axis.translation) @ axes
+            outward = local[:, :2] / np.maximum(np.linalg.norm(local[:, :2], axis=1), TINY)[:, None]
+            across[:, 0], across[:, 1] = outward @ axes[:, :2].T, axes[:, 2]
+        step = np.einsum("pkc,kvc->kpv", self.gain, across)  # of the axis, by the residuals
+        weight = np.maximum(self.weights, TINY)
+        normal = np.linalg.inv(np.einsum("kpv,kqv,k->pq", step, step, 1 / weight))
+        lever = np.einsum("kpv,pq,kqu,k->kvu", step, normal, step, 1 / weight)
+        counts = [len(arc.rows) for arc in self.arcs]
+        sums = np.add.reduceat(self.weights, np.cumsum([0, *counts[:-1]]))
+        lever += (self.weights / np.maximum(np.repeat(sums, counts), TINY))[:, None, None] * np.eye(2)
+        without = np.linalg.solve(np.eye(2) - lever, self.residuals[:, :, None])
+        return -(step @ without)[:, :, 0]
+
     def lengths(self) -> np.ndarray:
         """(k',) lengths of the residuals of the points used, mm."""
         return np.linalg.norm(self.residuals[self.weights > 0], axis=1)
@@ -112,14 +132,14 @@ def fit_axis(points: np.ndarray, moved: np.ndarray, arcs: list[Arc], prismatic: 
         raise DegenerateError(_on_axis(where, size.max()))
     use = list(np.flatnonzero(size >= FIRST_SIZE * size.max()))
     fit = _AxisFitting(points, [arcs[i] for i in use], prismatic, where)
-    fit.solve()
+    fit.solve(moved)
     if not prismatic:
         small = [i for i in range(len(arcs)) if i not in use]
         more = [i for i in small if fit.radius_of(points[arcs[i].rows]) > NEAR_AXIS * fit.sigma()]
         if more:
             use = sorted(use + more)
             fit = _AxisFitting(points, [arcs[i] for i in use], prismatic, where, fit.frame)
-            fit.solve()
+            fit.solve(moved)
     fit.orient(moved)
     return fit.result(moved, tuple(arc for i, arc in enumerate(arcs) if i not in use))
 
@@ -157,15 +177,15 @@ class _AxisFitting:
         self.size = max(_spread(points[arc.rows]) for arc in arcs)
         self.floor = ROUNDING * max(np.abs(self.points).max(), self.size)
 
-    def solve(self) -> None:
-        """Start, Huber's iteration, gross points out, until nothing changes."""
+    def solve(self, moved: np.ndarray) -> None:
+        """Start, Huber's iteration, gross points out, until nothing changes; ``moved`` : (m,) values of the joint."""
         if self.redundancy() < 1:
             raise DegenerateError(
                 f"{self.where}: {len(self.rows)} positions on {len(self.arcs)} arcs leave no redundancy; another "
                 "position or a second reflector needed"
             )
         if not self.started:
-            self.start()
+            self.start(moved[self.rows])
             self.weights = self.huber()  # before the first step, which a gross error would lead astray
         for gross in (np.inf, GROSS):
             for _ in range(REWEIGHTINGS):
@@ -181,21 +201,23 @@ class _AxisFitting:
         self.descend()
         self.require_known()
 
-    def start(self) -> None:
-        """The axis from all points; where some stand out, from all but one (of many points: but a few), such that the
-        median residual is least. The weights say which were used."""
-        groups = min(len(self.rows), STARTS)
+    def start(self, moved: np.ndarray) -> None:
+        """The axis from all points; where some stand out, from all but one (of many points: but a few), or but those of
+        one value of the joint, (k,), such that the median residual is least. The weights say which were used."""
+        count = len(self.rows)
+        value = np.unique(moved, return_inverse=True)[1]
+        points, values = (np.arange(n) % min(n, STARTS) for n in (count, value.max() + 1))
+        sets = [np.ones(count), *(points != out for out in np.unique(points))]
+        sets += [values[value] != out for out in np.unique(values) if value.max() > 1]
         least = np.inf
-        for out in range(-1, groups):
-            self.weights = np.ones(len(self.rows))
-            if out >= 0:
-                self.weights[out::groups] = 0
+        for i, kept in enumerate(sets):
+            self.weights = np.asarray(kept, float)
             self.frame = self.linear_start()
             length = np.linalg.norm(self.residuals(), axis=1)
             if np.median(length) < least:
                 least, best = np.median(length), (self.frame, self.weights)
             quiet = length.max() <= min(GROSS * self.robust_sigma(length), QUIET * self.size)
-            if out < 0 and quiet:
+            if i == 0 and quiet:
                 break
         self.frame, self.weights = best
 
@@ -330,6 +352,11 @@ class _AxisFitting:
         sigma = self.sigma() * np.linalg.norm(self.gain(), axis=2)
         direction, place = np.linalg.norm(sigma[:2]), np.linalg.norm(sigma[2:])
         if direction > WEAK_RAD or place > WEAK_RAD * self.size * 10:
+            if self.size < STANDS_STILL_MM:
+                raise DegenerateError(
+                    f"{self.where}: its reflectors stay within {self.size:.3g} mm of one place while its values "
+                    "change; did it move, was every position read anew? if so, put a reflector off its axis"
+                )
             raise DegenerateError(
                 f"{self.where}: σ of the direction of its axis is {np.degrees(direction):.2g}° and of its place "
                 f"{place:.2g} mm, {np.degrees(WEAK_RAD):.1f}° and {WEAK_RAD * self.size * 10:.2g} mm needed; {LONGER}"

@@ -7,7 +7,7 @@ from itertools import pairwise
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from stcal.errors import ConvergenceError, DegenerateError
+from stcal.errors import ConvergenceError, DegenerateError, InputError
 from stcal.geometry.arrays import Array, freeze
 from stcal.geometry.rigid import Rigid
 from stcal.parallel import one_thread
@@ -19,6 +19,9 @@ from stcal.robot.kinematics.dh import PARALLEL_RAD, robot_from_chain
 from stcal.robot.kinematics.measurements import Measurements
 from stcal.robot.kinematics.model import Chain, Robot
 
+REFITTED = 200
+"""Rows of the sweeps up to which every one is left out by fitting again; of more by influence: of 600 rows the spread
+is 1 to 4 % less so."""
 FEW = 3
 """Outliers of a joint that are named one by one."""
 USABLE_MM = 1.0
@@ -154,9 +157,13 @@ def robot_from_sweeps(
     """
     virtual = None if length_mm is None else virtual_reflectors(data, length_mm)
     data = data if virtual is None else virtual.data
+    if nominal.tree is not None:
+        raise InputError(
+            f"robot {nominal.name} is a tree of joints; the axis method takes one arm at a time: give its file"
+        )
     arcs, notes = find_arcs(data, nominal, still_rad)
     notes = [*data.notes, *notes]
-    fits, covariance, unwound = fit_axes(data, nominal, arcs, virtual)
+    fits, covariance, unwound, passed = fit_axes(data, nominal, arcs, virtual)
     frames = [fit.world_from_axis for fit in fits]
     require_like_nominal(data.where, frames, nominal)
     axes = _chain(frames, nominal)
@@ -184,7 +191,7 @@ def robot_from_sweeps(
         row_sigma=row_sigma,
         tool_spread_mm=spread,
         pairs=pairs,
-        without_one=_leave_one_out(data, fits, nominal),
+        without_one=_leave_one_out(data, fits, nominal, passed),
         off=tuple({int(data.lines[row]): size for row, size in off_mm(fit).items()} for fit in fits),
         notes=tuple(notes),
     )
@@ -192,15 +199,16 @@ def robot_from_sweeps(
 
 def fit_axes(
     data: Measurements, robot: Robot, arcs: list[Arc], virtual: VirtualReflectors | None = None
-) -> tuple[list[AxisFit], np.ndarray, np.ndarray]:
-    """Fits in order, each on points with the joints before unwound; covariance of all; points with all unwound.
+) -> tuple[list[AxisFit], np.ndarray, np.ndarray, list[list[np.ndarray]]]:
+    """Fits in order, each on points with the joints before unwound; covariance of all; points with all unwound; and of
+    each axis the derivatives by those before it.
 
     The covariance counts a row once, however many sweeps it belongs to, and a pose once for all its reflectors.
     """
     kinematic = data.q @ robot.coupling.T
     points, m = np.array(data.points()), len(data)
     turned = np.broadcast_to(np.eye(3), (m, 3, 3))  # what unwinding has turned the noise by
-    fits, response, inherited = [], [], []
+    fits, response, inherited, passed = [], [], [], []
     for j, sliding in enumerate(robot.prismatic):
         own = [arc for arc in arcs if arc.joint == j]
         fit = fit_axis(points, kinematic[:, j], own, bool(sliding), f"{data.where}: joint {j + 1}")
@@ -208,8 +216,9 @@ def fit_axes(
         to_noise = np.zeros((len(fit.gain), m, 3))
         own_noise = fit.sigma_mm * np.einsum("pkc,kcd->kpd", fit.gain, turned[fit.rows])
         np.add.at(to_noise.swapaxes(0, 1), fit.rows, own_noise)  # a row may belong to several arcs
-        for before, jacobian in zip(response, inherited, strict=True):
-            to_noise += np.einsum("pq,qmc->pmc", np.einsum("pkc,kcq->pq", fit.gain, jacobian[fit.rows]), before)
+        passed.append([np.einsum("pkc,kcq->pq", fit.gain, jacobian[fit.rows]) for jacobian in inherited])
+        for before, by in zip(response, passed[-1], strict=True):
+            to_noise += np.einsum("pq,qmc->pmc", by, before)
         turn, after = _unwound(fit.world_from_axis, points, kinematic[:, j], bool(sliding))
         inherited = [turn @ jacobian for jacobian in inherited]
         inherited.append(_unwinding_jacobian(fit.world_from_axis, points, after, turn, len(fit.gain)))
@@ -218,7 +227,7 @@ def fit_axes(
         points, turned = after, turn @ turned
     rows = np.concatenate(response)
     stacked = rows.reshape(-1, 3 * m) if virtual is None else virtual.by_pose(rows)
-    return fits, stacked @ stacked.T, points
+    return fits, stacked @ stacked.T, points, passed
 
 
 def _unwound(axis: Rigid, points: np.ndarray, value: np.ndarray, sliding: bool) -> tuple[np.ndarray, np.ndarray]:
@@ -363,29 +372,62 @@ def _lengths(angle: float, value: np.ndarray, sigma: np.ndarray, size: float) ->
     return known | {"refused": "; ".join(reasons)}
 
 
-def _leave_one_out(data: Measurements, fits: list[AxisFit], nominal: Robot) -> LeaveOneOut:
+def _leave_one_out(
+    data: Measurements, fits: list[AxisFit], nominal: Robot, passed: list[list[np.ndarray]]
+) -> LeaveOneOut:
     """All axes again without each row; what comes after a changed axis is unwound and fitted again."""
     kinematic = data.q @ nominal.coupling.T
     start = [np.array(data.points())]
     for j, fit in enumerate(fits):
         start.append(_unwound(fit.world_from_axis, start[-1], kinematic[:, j], bool(nominal.prismatic[j]))[1])
-    lines, values = [], []
-    for rows in _instants(data):
-        first = next((j for j, fit in enumerate(fits) if np.isin(fit.rows, rows).any()), None)
-        if first is None:
-            continue
-        frames, points = [fit.world_from_axis for fit in fits[:first]], start[first]
-        try:
-            for j in range(first, len(fits)):
-                frames.append(refit_axis(fits[j], points, np.array(rows)))
-                points = _unwound(frames[j], points, kinematic[:, j], bool(nominal.prismatic[j]))[1]
-            found = _pair_values(frames, nominal).reshape(-1, 6)
-        except (DegenerateError, ConvergenceError):
-            found = np.full((len(fits) - 1, 6), np.nan)
-        lines.append(int(data.lines[rows[0]]))
-        values.append(found)
-    stacked = np.array(values)
-    return LeaveOneOut(tuple(lines), stacked[:, :, 3], stacked[:, :, 4])
+    used = np.unique(np.concatenate([fit.rows for fit in fits]))
+    instants = [rows for rows in _instants(data) if np.isin(rows, used).any()]
+    if len(instants) > REFITTED:
+        values = _by_influence(instants, fits, start, passed, nominal)
+    else:
+        values = np.array([_refitted(rows, fits, start, kinematic, nominal) for rows in instants])
+    lines = tuple(int(data.lines[rows[0]]) for rows in instants)
+    return LeaveOneOut(lines, values[:, :, 3], values[:, :, 4])
+
+
+def _refitted(
+    rows: list[int], fits: list[AxisFit], start: list[np.ndarray], kinematic: np.ndarray, nominal: Robot
+) -> np.ndarray:
+    """(n − 1, 6) of the pairs without these rows; nan where the rest determines no axis."""
+    first = next(j for j, fit in enumerate(fits) if np.isin(fit.rows, rows).any())
+    frames, points = [fit.world_from_axis for fit in fits[:first]], start[first]
+    try:
+        for j in range(first, len(fits)):
+            frames.append(refit_axis(fits[j], points, np.array(rows)))
+            points = _unwound(frames[j], points, kinematic[:, j], bool(nominal.prismatic[j]))[1]
+        return _pair_values(frames, nominal).reshape(-1, 6)
+    except (DegenerateError, ConvergenceError):
+        return np.full((len(fits) - 1, 6), np.nan)
+
+
+def _by_influence(
+    instants: list[list[int]],
+    fits: list[AxisFit],
+    start: list[np.ndarray],
+    passed: list[list[np.ndarray]],
+    nominal: Robot,
+) -> np.ndarray:
+    """(r, n − 1, 6) of the pairs without each instant's rows, linear in what these change: a row left out is one whose
+    residual is that by the others (Cook & Weisberg 1982, "Residuals and Influence in Regression")."""
+    number = np.zeros(len(start[0]), int)
+    for i, rows in enumerate(instants):
+        number[rows] = i
+    changes = []
+    for fit, points, by in zip(fits, start, passed, strict=False):
+        own = np.zeros((len(instants), len(fit.gain)))
+        np.add.at(own, number[fit.rows], fit.influence(points[fit.rows]))
+        for before, derivative in zip(changes, by, strict=True):
+            own += before @ derivative.T
+        changes.append(own)
+    frames = [fit.world_from_axis for fit in fits]
+    here = _pair_values(frames, nominal)
+    slope = _jacobian(lambda f: _pair_values(f, nominal), frames, nominal)
+    return (here + np.concatenate(changes, axis=1) @ slope.T).reshape(len(instants), -1, 6)
 
 
 def _instants(data: Measurements) -> list[list[int]]:
@@ -436,6 +478,7 @@ def _notes(data: Measurements, fits: list[AxisFit], robot: Robot, nominal: Robot
                 f"line {data.lines[arc.rows[0]]}, {called(arc.target)}: too close to the axis of joint "
                 f"{fit.joint + 1} to tell of it; its arc is not used"
             )
+    notes += _alone(data, fits)
     for i, (row, wanted) in enumerate(zip(robot.rows, nominal.rows, strict=True)):
         after = robot.rows[i if robot.convention == "standard" else min(i + 1, len(fits) - 1)]
         one_line = abs(np.sin(after.alpha)) < np.sin(PARALLEL_RAD) and abs(after.a) < ONE_LINE_MM
@@ -443,5 +486,20 @@ def _notes(data: Measurements, fits: list[AxisFit], robot: Robot, nominal: Robot
             notes.append(
                 f"joint {i + 1}: theta is {np.degrees(row.theta):.2f}°, {np.degrees(wanted.theta):.2f}° in the robot "
                 "file: its zero position is elsewhere"
+            )
+    return notes
+
+
+def _alone(data: Measurements, fits: list[AxisFit]) -> list[str]:
+    """Of reflectors that are on no arc."""
+    swept = {data.targets[row] for fit in fits for row in fit.rows.tolist()}
+    notes = []
+    for name in dict.fromkeys(data.targets):
+        if name not in swept:
+            rows = [i for i, target in enumerate(data.targets) if target == name]
+            what = called(name) if name else "rows without a target, beside rows with one"
+            notes.append(
+                f"line {data.lines[rows[0]]}: {what}: on no arc of any joint ({len(rows)} rows), so that its place on "
+                "the flange rests on these alone; name it as the others, or leave it out"
             )
     return notes

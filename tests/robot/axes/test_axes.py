@@ -21,7 +21,7 @@ from stcal.robot.kinematics.file import load_robot, robot_toml
 from stcal.robot.kinematics.forward import flange_poses, forward, joint_frames
 from stcal.robot.kinematics.measurements import Measurements, read_measurements
 from stcal.robot.kinematics.model import DHRow, Joint, Robot
-from stcal.synthetic.measured.arms import joint_vectors, made, placed
+from stcal.synthetic.measured.arms import joint_vectors, made, placed, two_arms
 
 SIGMA = 0.03
 WORLD = Rigid.exp([0.1, -0.05, 2.1, 2500.0, -900.0, 400.0])
@@ -134,7 +134,7 @@ def test_errors_of_the_axes_are_as_large_as_their_covariance(name, rests):
     arcs, _ = find_arcs(measured(true, q), nominal)
     squares, freedom, coordinates = [], 0, []
     for seed in range(100):
-        fits, covariance, _ = fit_axes(measured(true, q, SIGMA, seed), nominal, arcs)
+        fits, covariance, *_ = fit_axes(measured(true, q, SIGMA, seed), nominal, arcs)
         error = np.concatenate(
             [axis_error(f.world_from_axis, z[i], origin[i], nominal.prismatic[i]) for i, f in enumerate(fits)]
         )
@@ -154,11 +154,11 @@ def test_errors_of_pairs_are_as_large_as_their_sigma():
     true = arm(nominal)
     q = sweep_values(true, 7)
     arcs, _ = find_arcs(measured(true, q), nominal)
-    fits, covariance, _ = fit_axes(measured(true, q), nominal, arcs)
+    fits, covariance, *_ = fit_axes(measured(true, q), nominal, arcs)
     wanted = pairs_of([f.world_from_axis for f in fits], covariance, nominal)
     scores = []
     for seed in range(60):
-        fits, covariance, _ = fit_axes(measured(true, q, SIGMA, seed), nominal, arcs)
+        fits, covariance, *_ = fit_axes(measured(true, q, SIGMA, seed), nominal, arcs)
         pairs = pairs_of([f.world_from_axis for f in fits], covariance, nominal)
         for one, two in zip(pairs[:3], wanted[:3], strict=True):  # the others cross: the sign of 0 is not kept
             scores.append(
@@ -183,6 +183,61 @@ def test_leaving_out_a_row_is_fitting_without_it(instants):
         sigma = np.array([p.distance_sigma for p in whole.pairs])
         assert (np.abs(found - [p.distance for p in again.pairs]) < 0.1 * sigma).all()
         assert np.abs(found - [p.distance for p in whole.pairs]).max() > 1e-4
+
+
+def test_influence_is_leaving_out(monkeypatch):
+    """Of 240 instants: linear, which neglects the square of what a row at an arc's end weighs."""
+    nominal = mh80()
+    data = measured(arm(nominal), sweep_values(nominal, 40), SIGMA, 2)
+    monkeypatch.setattr("stcal.robot.axes.model.REFITTED", 1000)
+    exact = robot_from_sweeps(data, nominal).without_one
+    monkeypatch.setattr("stcal.robot.axes.model.REFITTED", 0)
+    linear = robot_from_sweeps(data, nominal).without_one
+    assert linear.lines == exact.lines
+    change = exact.distance - np.median(exact.distance, axis=0)
+    off = np.sqrt(((linear.distance - exact.distance) ** 2).mean(0) / (change**2).mean(0))
+    assert off.max() < 0.1
+
+
+SWEEP = 9
+"""Positions of each joint's; three reflectors at each, after the first instant."""
+
+
+def rows_of(joint: int) -> slice:
+    """Of the sweep of a joint, from 0."""
+    return slice(3 * (1 + SWEEP * joint), 3 * (1 + SWEEP * (joint + 1)))
+
+
+def test_a_value_in_another_joints_column_is_named_not_the_axis():
+    data = measured(arm(mh80()), sweep_values(mh80(), SWEEP), SIGMA, 2)
+    q, wrong = np.array(data.q), slice(rows_of(2).start + 21, rows_of(2).start + 24)
+    q[wrong, 3], q[wrong, 2] = q[wrong, 2], q[0, 2]
+    found = robot_from_sweeps(replace(data, q=q), mh80())
+    assert {line for off in found.off for line in off} == set(data.lines[wrong])
+    clean = robot_from_sweeps(data, mh80())
+    assert [row.d for row in found.robot.rows] == pytest.approx([row.d for row in clean.robot.rows], abs=0.2)
+
+
+def test_a_sweep_that_stands_still_is_said():
+    data = measured(arm(mh80()), sweep_values(mh80(), SWEEP), SIGMA, 2)
+    positions, own = np.array(data.positions), rows_of(3)
+    again = np.tile(data.positions[:3], (SWEEP, 1))
+    positions[own] = again + np.random.default_rng(0).normal(0, SIGMA, again.shape)
+    with pytest.raises(DegenerateError, match=r"joint 4: its reflectors stay within 0\.\d+ mm .* did it move"):
+        robot_from_sweeps(replace(data, positions=positions), mh80())
+
+
+def test_a_row_without_a_target_is_named():
+    data = measured(arm(mh80()), sweep_values(mh80(), SWEEP), SIGMA, 2)
+    names = list(data.targets)
+    names[40] = ""
+    notes = robot_from_sweeps(replace(data, targets=tuple(names)), mh80()).notes
+    assert any(f"line {data.lines[40]}: rows without a target, beside rows with one" in note for note in notes)
+
+
+def test_a_tree_is_refused():
+    with pytest.raises(InputError, match="is a tree of joints; the axis method takes one arm at a time"):
+        robot_from_sweeps(measured(arm(mh80()), sweep_values(mh80(), 6), SIGMA, 2), two_arms())
 
 
 @pytest.mark.slow
