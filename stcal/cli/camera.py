@@ -33,7 +33,8 @@ def calibrate_camera(
     model: Annotated[
         str,
         typer.Option(
-            help="Fit this model of COLMAP: SIMPLE_PINHOLE, PINHOLE, SIMPLE_RADIAL, RADIAL, OPENCV or FULL_OPENCV."
+            help="Fit this model of COLMAP: SIMPLE_PINHOLE, PINHOLE, SIMPLE_RADIAL, RADIAL, OPENCV, FULL_OPENCV; of "
+            "wide lenses SIMPLE_RADIAL_FISHEYE, RADIAL_FISHEYE, OPENCV_FISHEYE, THIN_PRISM_FISHEYE."
         ),
     ] = "OPENCV",
     json_file: Annotated[

@@ -40,6 +40,14 @@ def simulate(
     images: Annotated[int, typer.Option("--images", min=2, max=500, help="Render this many images in each group.")] = 6,
     distance: Annotated[float, typer.Option(min=200, max=1e5, help="Place the camera at this distance, mm.")] = 1000.0,
     spread: Annotated[float, typer.Option(min=2, max=80, help="Spread the views by ± this, degrees.")] = 40.0,
+    fisheye: Annotated[
+        float | None,
+        typer.Option(
+            min=60,
+            max=170,
+            help="Use an equidistant lens of this field over the diagonal, degrees, that looks past the target.",
+        ),
+    ] = None,
     noise: Annotated[float, typer.Option(min=0, max=0.2, help="Add noise of this fraction of full scale.")] = 0.01,
     blur: Annotated[float, typer.Option(min=0, max=10, help="Blur by this standard deviation, px.")] = 0.7,
     clutter: Annotated[bool, typer.Option("--clutter/--clean", help="Add lamps, discs and a checkered wall.")] = False,
@@ -56,6 +64,7 @@ def simulate(
     from stcal.synthetic.render import RenderOptions
     from stcal.synthetic.scene import SceneOptions, make_scene
     from stcal.synthetic.scene import second_design as other
+    from stcal.synthetic.wide import seen_wide, wide_options
 
     options = SceneOptions(
         seed=seed,
@@ -65,7 +74,9 @@ def simulate(
         spread_deg=spread,
         images_per_group=images,
     )
+    options = options if fisheye is None else wide_options(options)
     scene = make_scene(options, *other()) if second_design else make_scene(options)
+    scene = scene if fisheye is None else seen_wide(scene, fisheye, seed)
     rendering = RenderOptions(noise=noise, blur_px=blur, clutter=clutter, bit_depth=16 if sixteen_bit else 8, seed=seed)
     kind = "png" if png or sixteen_bit else "jpg"
     with StageProgress() as progress:

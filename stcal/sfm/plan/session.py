@@ -8,7 +8,7 @@ import numpy as np
 from stcal.design import BoardDesign, TargetDesign
 from stcal.errors import DegenerateError, InputError
 from stcal.geometry.rigid import Rigid
-from stcal.io.camera import CameraModel, camera_prior, refinable
+from stcal.io.camera import FISHEYE, CameraModel, camera_prior, refinable
 from stcal.parallel import one_thread
 from stcal.sfm.adjust.chain import CalibratedTarget
 from stcal.sfm.data.model import MetricModel
@@ -198,7 +198,8 @@ def _scene(options: PlanOptions, target: TargetDesign, board: BoardDesign, nomin
         height=height,
     )
     if file is not None:
-        focal_px, distortion = float(np.sqrt(file.focal.prod())), tuple(file.distortion)
+        focal_px = float(np.sqrt(file.focal.prod()))
+        distortion = () if FISHEYE in file.colmap_model else tuple(file.distortion[:8])
         shape = replace(shape, width=file.width, height=file.height, focal_px=focal_px, distortion=distortion)
     scene = make_scene(shape, target, replace(board, sigma_mm=0.0), nominal)
     return scene if file is None else replace(scene, camera=file.calibrated(0, 0))
