@@ -8,7 +8,7 @@ from typing import Any, NoReturn
 import typer
 
 import stcal
-from stcal.cli import camera, capture, colmap, handeye, locate, measure, register, robot, sfm, simulate
+from stcal.cli import camera, cameras, capture, colmap, handeye, locate, measure, register, robot, sfm, simulate
 from stcal.cli.entry import NO_MEMORY, lacks_memory
 from stcal.cli.help import PLAIN, Commands
 from stcal.cli.options import protect_inputs
@@ -37,6 +37,7 @@ sfm.app.add_typer(measure.app)
 app.add_typer(sfm.app, name="sfm")
 app.add_typer(robot.app, name="robot")
 app.add_typer(locate.app, name="locate")
+app.add_typer(cameras.app, name="camera")
 app.add_typer(handeye.app)
 app.command("register")(register.register)
 protect_inputs(app)

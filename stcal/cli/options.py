@@ -21,7 +21,10 @@ if TYPE_CHECKING:
 Images = Annotated[Path, typer.Argument(help="Read the images of this folder: IMAGES/<group>/*.jpg, png, tif, bmp.")]
 Run = Annotated[Path, typer.Argument(metavar="RUN", help="Read the finished run in this folder.")]
 CameraFile = Annotated[
-    Path, typer.Option("--camera", help="Read the intrinsics from this file: COLMAP cameras.txt, OpenCV or ROS.")
+    Path,
+    typer.Option(
+        "--camera", help="Read the intrinsics from this file: COLMAP, OpenCV, ROS, Kalibr, mrcal or Metashape."
+    ),
 ]
 TargetFile = Annotated[
     Path | None,

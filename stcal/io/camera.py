@@ -1,6 +1,8 @@
-"""Camera files: COLMAP's ``cameras.txt``, OpenCV's YAML and XML, ROS ``camera_info``; each with its pixel origin."""
+"""Camera files: COLMAP's ``cameras.txt``, OpenCV's YAML and XML, ROS ``camera_info``; each with its pixel origin. Those
+of other programs are in :mod:`stcal.io.cameras.forms`."""
 
 import re
+import struct
 import xml.etree.ElementTree as ElementTree
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -30,6 +32,8 @@ FARTHEST = 1e12
 MAX_SIDE_PX = 1_000_000
 """Longest image side that a camera file may state, px."""
 
+EQUIDISTANT = ("equidistant", "fisheye", "kannala_brandt")
+"""Names of ``distortion_model`` for OpenCV's fisheye."""
 DISTORTION_COUNTS = (0, 4, 5, 8, 12, 14)
 """Numbers of distortion coefficients that OpenCV knows."""
 
@@ -114,6 +118,11 @@ class CalibratedCamera(Camera):
         lens = camera.focal, camera.centre, camera.distortion, FISHEYE in colmap_model
         return cls(camera.width, camera.height, *lens, colmap_model, covariance)
 
+    @staticmethod
+    def colmap_layout(colmap_model: str) -> list:
+        """Places of the parameters of a COLMAP model in :meth:`Camera.parameters`; of f those of fx and fy."""
+        return _COLMAP_LAYOUT[colmap_model]
+
     def colmap_params(self) -> list[float]:
         """Parameters in COLMAP's order and pixel origin."""
         flat = self.parameters()
@@ -174,32 +183,57 @@ def parameter_names(colmap_model: str) -> list[str]:
     return ["f" if isinstance(place, tuple) else PARAMETER_NAMES[place] for place in layout]
 
 
-def read_camera(path: str | Path) -> CameraModel:
+def read_camera(path: str | Path, name: str = "") -> CameraModel:
     """Read a camera file of any supported kind, told apart by content.
+
+    Parameters
+    ----------
+    path : str or Path
+        COLMAP, OpenCV, ROS, ROS-Industrial, Kalibr, mrcal or Metashape (``data_layout.md``).
+    name : str
+        Of the camera in files of several.
 
     Raises
     ------
     InputError
         Missing or malformed file, more than one camera, or a camera model that stcal does not support.
     """
+    from stcal.io.cameras import forms  # which makes models of this module
+
     path = Path(path)
     try:
-        text = read_bytes(path, SETTINGS_BYTES).decode("utf-8-sig")
+        content = read_bytes(path, SETTINGS_BYTES)
     except OSError as error:
         raise InputError(f"camera file {path}: {error.strerror or error}; give a readable file") from error
-    except ValueError as error:  # not UTF-8, or a NUL in the name
+    except ValueError as error:  # a NUL in the name
+        raise InputError(f"camera file {path}: not a text file; give cameras.txt, or OpenCV's YAML or XML") from error
+    if content[:8] == struct.pack("<Q", content[0] if content else 0) and b"\0" in content:
+        return forms.from_colmap_binary(content, name, str(path))
+    try:
+        text = content.decode("utf-8-sig")
+    except ValueError as error:
         raise InputError(f"camera file {path}: not a text file; give cameras.txt, or OpenCV's YAML or XML") from error
     try:
         if text.lstrip().startswith("<"):
-            return _from_opencv(_xml_values(text), path)
+            root = ElementTree.fromstring(text)
+            return (
+                forms.from_metashape(root, str(path))
+                if root.tag == "calibration"
+                else _from_opencv(_xml_values(root), path)
+            )
+        if "lensmodel" in text and text.lstrip().startswith(("{", "#")):
+            return forms.from_mrcal(text, str(path))
         rows = [line.split() for line in text.splitlines() if line.strip() and not line.lstrip().startswith("#")]
         if rows and len(rows[0]) >= 5 and re.fullmatch(r"[A-Z][A-Z0-9_]+", rows[0][1]):
             model = _from_colmap(rows, path)
             return replace(model, covariance=_stated_covariance(text, parameter_names(rows[0][1]), path))
-        return _from_opencv(_yaml_values(text), path)
+        values = _yaml_values(text)
+        if any(isinstance(each, dict) and "camera_model" in each for each in values.values()):
+            return forms.from_kalibr(values, name, str(path))
+        return _from_opencv(values, path)
     except InputError:
         raise
-    except (ElementTree.ParseError, yaml.YAMLError, ValueError, TypeError, RecursionError) as error:
+    except (KeyError, ElementTree.ParseError, yaml.YAMLError, ValueError, TypeError, RecursionError) as error:
         reason = " ".join(str(error).split())[:150]
         raise InputError(
             f"camera file {path}: neither COLMAP's cameras.txt nor OpenCV's YAML or XML ({reason}); check its form"
@@ -208,6 +242,11 @@ def read_camera(path: str | Path) -> CameraModel:
 
 def write_cameras_txt(path: str | Path, camera: CalibratedCamera) -> None:
     """Write ``cameras.txt`` with one camera of id 1; σ and correlations of its parameters as comments."""
+    save(Path(path), cameras_txt(camera))
+
+
+def cameras_txt(camera: CalibratedCamera) -> str:
+    """The text of :func:`write_cameras_txt`."""
     params, covariance = " ".join(map(repr, camera.colmap_params())), camera.covariance
     lines = ["# CAMERA_ID, MODEL, WIDTH, HEIGHT, PARAMS[] (centre of the first pixel at 0.5, 0.5)"]
     if covariance is not None:
@@ -216,7 +255,7 @@ def write_cameras_txt(path: str | Path, camera: CalibratedCamera) -> None:
         lines.append(f"{SIGMA} {' '.join(repr(float(s)) for s in sigma)}")
         lines += [f"{CORRELATION} {' '.join(repr(float(c)) for c in row)}" for row in correlation]
     lines.append(f"1 {camera.colmap_model} {camera.width} {camera.height} {params}")
-    save(Path(path), "\n".join(lines) + "\n")
+    return "\n".join(lines) + "\n"
 
 
 def _stated_covariance(text: str, names: list[str], path: Path) -> np.ndarray | None:
@@ -322,9 +361,55 @@ def _from_opencv(values: dict, path: Path) -> CameraModel:
     if not abs(matrix[0, 1]) <= 1e-9 * abs(matrix[0, 0]) and np.isfinite(matrix[0, 0]):
         raise InputError(f"camera file {path}: skew {matrix[0, 1]:g} is not supported; calibrate without skew")
     model = values.get("distortion_model", "plumb_bob")
-    if model not in ("plumb_bob", "rational_polynomial"):
-        raise InputError(f"camera file {path}: distortion model {model!r} is not supported; use plumb_bob")
     given = np.asarray(values.get("distortion_coefficients", []), float).ravel()
+    lens = [matrix[0, 0], matrix[1, 1], matrix[0, 2], matrix[1, 2]]
+    # A missing size, or 0, is one the file does not state.
+    sides = [values.get(f"image_{side}") for side in ("width", "height")]
+    if any(isinstance(side, bool) for side in sides):
+        raise InputError(f"camera file {path}: image_width and image_height are {sides}; numbers of pixels needed")
+    if model not in ("plumb_bob", "rational_polynomial", *EQUIDISTANT):
+        raise InputError(f"camera file {path}: distortion model {model!r} is not supported; use plumb_bob")
+    width, height = (float(side or 0) for side in sides)
+    return camera_from_opencv(lens, given, model in EQUIDISTANT, width, height, path)
+
+
+def camera_from_opencv(
+    lens,
+    given: np.ndarray,
+    fisheye: bool,
+    width: float,
+    height: float,
+    path: str | Path,
+    tangential: bool = False,
+) -> CameraModel:
+    """The camera of fx, fy, cx, cy and OpenCV's coefficients.
+
+    Parameters
+    ----------
+    lens : sequence of 4 float
+        px, pixel origin of OpenCV.
+    given : (k,) array
+        k1, k2, p1, p2, k3 …; of an equidistant camera k1 to k4, or with ``tangential`` k1, k2, p1, p2, k3, k4.
+    fisheye, tangential : bool
+        Equidistant; and which of both.
+    width, height : float
+        px; 0 where the file states none.
+    path : str or Path
+        For messages.
+
+    Raises
+    ------
+    InputError
+        Coefficients of another number, or that no model here has; impossible values.
+    """
+    path, size = Path(path), (width or None, height or None)
+    if fisheye:
+        if len(given) not in ((6,) if tangential else (0, 4)):
+            raise InputError(f"camera file {path}: {len(given)} coefficients of an equidistant lens; k1 to k4 needed")
+        distortion = np.zeros(12)
+        distortion[[0, 1, 2, 3, 4, 5] if tangential else [0, 1, 4, 5][: len(given)]] = given
+        kind = "THIN_PRISM_FISHEYE" if distortion[2:4].any() else "OPENCV_FISHEYE"
+        return _model(np.concatenate([lens, distortion]), kind, *size, path)
     if given[8:].any():
         raise InputError(f"camera file {path}: {len(given)} distortion coefficients, at most 8 are supported")
     if len(given) not in DISTORTION_COUNTS:
@@ -335,13 +420,7 @@ def _from_opencv(values: dict, path: Path) -> CameraModel:
     distortion = np.zeros(8)
     distortion[: min(len(given), 8)] = given[:8]
     kind = "FULL_OPENCV" if distortion[4:].any() else "OPENCV" if distortion.any() else "PINHOLE"
-    # A missing size, or 0, is one the file does not state.
-    sides = [values.get(f"image_{side}") for side in ("width", "height")]
-    if any(isinstance(side, bool) for side in sides):
-        raise InputError(f"camera file {path}: image_width and image_height are {sides}; numbers of pixels needed")
-    width, height = (float(side or 0) or None for side in sides)
-    flat = np.concatenate([[matrix[0, 0], matrix[1, 1], matrix[0, 2], matrix[1, 2]], distortion])
-    return _model(flat, kind, width, height, path)
+    return _model(np.concatenate([lens, distortion]), kind, *size, path)
 
 
 def _from_industrial(values: dict, path: Path) -> CameraModel:
@@ -360,9 +439,9 @@ def _yaml_values(text: str) -> dict:
     return {k: v["data"] if isinstance(v, dict) and "data" in v else v for k, v in values.items()}
 
 
-def _xml_values(text: str) -> dict:
+def _xml_values(root: ElementTree.Element) -> dict:
     values = {}
-    for node in ElementTree.fromstring(text):
+    for node in root:
         data = node.find("data")
         if data is not None:
             values[node.tag] = [float(word) for word in (data.text or "").split()]

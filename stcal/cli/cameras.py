@@ -1,0 +1,125 @@
+"""``stcal camera``: camera files of other programs, shown, converted and compared."""
+
+from enum import StrEnum
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from stcal.cli.help import PLAIN, Commands
+from stcal.cli.terminal import print_each, say, write
+from stcal.errors import InputError
+from stcal.io.camera import CalibratedCamera
+
+app = typer.Typer(
+    name="stcal camera",
+    help="Show, convert and compare camera files of this and other programs.",
+    cls=Commands,
+    **PLAIN,
+)
+
+
+class Form(StrEnum):
+    """Of a camera file."""
+
+    colmap = "colmap"
+    colmap_bin = "colmap-bin"
+    opencv = "opencv"
+    ros = "ros"
+    kalibr = "kalibr"
+    mrcal = "mrcal"
+    metashape = "metashape"
+
+
+NameOption = Annotated[
+    str, typer.Option("--name", help="Choose this camera of a file of several, such as cam1; and write this name.")
+]
+SizeOption = Annotated[
+    str,
+    typer.Option("--size", metavar="WxH", help="Take images of this size, px, where the file states none."),
+]
+PlotFile = Annotated[
+    Path | None, typer.Option("--plot", writable=True, help="Draw a picture into this file (PNG or SVG).")
+]
+
+
+@app.command()
+def convert(
+    source: Annotated[Path, typer.Argument(metavar="A", help="Read the camera from this file, of any form.")],
+    out: Annotated[Path, typer.Argument(metavar="B", writable=True, help="Write the camera to this file.")],
+    form: Annotated[
+        Form | None,
+        typer.Option(
+            "--form",
+            help="Write this form; if not given that of B's suffix: .txt colmap, .bin colmap-bin, .yaml opencv, "
+            ".cameramodel mrcal, .xml metashape.",
+        ),
+    ] = None,
+    name: NameOption = "",
+    size: SizeOption = "",
+) -> None:
+    """Convert a camera file to the form of another program, and say what that has no place for."""
+    from stcal.io.cameras.forms import SUFFIXES, written
+
+    kind = form.value if form else SUFFIXES.get(out.suffix.lower())
+    if kind is None:
+        raise InputError(
+            f"{out}: no form of suffix {out.suffix or 'none'}; give --form, or one of {', '.join(SUFFIXES)}"
+        )
+    camera = _camera(source, name, size)
+    made = written(camera, kind, name or "cam0")
+    say(f"{source}: {camera.colmap_model}, {camera.width}×{camera.height} px; written as {kind}")
+    print_each(f"note: not in {kind}", made.lost)
+    write(out, made.content)
+
+
+@app.command()
+def show(
+    source: Annotated[Path, typer.Argument(metavar="A", help="Read the camera from this file, of any form.")],
+    name: NameOption = "",
+    size: SizeOption = "",
+    plot: PlotFile = None,
+) -> None:
+    """Print a camera's parameters with σ, its field of view, and how far the lens moves points."""
+    from stcal.report.camera import distortion_figure, shown
+    from stcal.report.figure import save
+
+    camera = _camera(source, name, size)
+    say("\n".join(shown(camera)))
+    if plot:
+        save(distortion_figure(camera), plot)
+        say(f"picture: {plot}")
+
+
+@app.command()
+def compare(
+    first: Annotated[Path, typer.Argument(metavar="A", help="Read a camera from this file, of any form.")],
+    second: Annotated[Path, typer.Argument(metavar="B", help="Read the camera to compare from this file.")],
+    name: NameOption = "",
+    size: SizeOption = "",
+    plot: PlotFile = None,
+) -> None:
+    """Compare two cameras: how many pixels apart they see the same ray, after the turn that brings them nearest."""
+    from stcal.io.cameras.difference import camera_difference
+    from stcal.report.camera import comparison_figure, comparison_text
+    from stcal.report.figure import save
+
+    one, two = _camera(first, name, size), _camera(second, name, size)
+    found = camera_difference(one, two)
+    say("\n".join(comparison_text(found)))
+    if plot:
+        save(comparison_figure(found), plot)
+        say(f"picture: {plot}")
+
+
+def _camera(path: Path, name: str, size: str) -> CalibratedCamera:
+    from stcal.io.camera import read_camera
+
+    model = read_camera(path, name)
+    given = size.lower().split("x") if size else ["0", "0"]
+    if len(given) != 2 or not all(side.isdigit() for side in given):
+        raise InputError(f"--size {size}: two numbers with x between needed, such as 1920x1080")
+    width, height = model.width or int(given[0]), model.height or int(given[1])
+    if not (width and height):
+        raise InputError(f"camera file {path}: states no image size; give it with --size WxH")
+    return model.calibrated(width, height)

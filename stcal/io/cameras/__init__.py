@@ -1,0 +1,1 @@
+"""Cameras of other programs, and how far two are apart."""

@@ -1,0 +1,89 @@
+"""How far apart two cameras see the same rays, after the turn that brings them nearest."""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from stcal.errors import ConvergenceError, DegenerateError, InputError
+from stcal.geometry.align import align_rigid
+from stcal.geometry.camera import Camera
+from stcal.geometry.rigid import Rigid
+
+CELLS = 24
+"""Points along the shorter side."""
+STEPS, STEP_RAD = 10, 1e-6
+LEAST_POINTS = 10
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class CameraDifference:
+    """``pixels`` : (r, c, 2) of the first camera; ``apart`` : (r, c, 2) px by which the second sees their rays
+    elsewhere, nan where one of them sees none; ``second_from_first`` : the turn."""
+
+    pixels: np.ndarray
+    apart: np.ndarray
+    second_from_first: Rigid
+
+    def lengths(self) -> np.ndarray:
+        """(r, c) px."""
+        return np.linalg.norm(self.apart, axis=2)
+
+
+def camera_difference(one: Camera, two: Camera) -> CameraDifference:
+    """Pixels of the second camera for the rays of the first one's, over its image.
+
+    The two see the same if their images differ by a turn of the camera: a principal point and a turn are alike.
+
+    Parameters
+    ----------
+    one, two : Camera
+        Of one image size.
+
+    Raises
+    ------
+    InputError
+        Two sizes.
+    DegenerateError
+        Nearly no pixel has a ray in both.
+    """
+    if (one.width, one.height) != (two.width, two.height):
+        raise InputError(
+            f"cameras of {one.width}×{one.height} and {two.width}×{two.height} px; files of one image size needed"
+        )
+    pixels = image_grid(one)
+    flat = pixels.reshape(-1, 2)
+    first, second = rays(one, flat), rays(two, flat)
+    good = np.isfinite(first).all(1) & np.isfinite(second).all(1)
+    if good.sum() < LEAST_POINTS:
+        raise DegenerateError(f"{good.sum()} of {len(flat)} pixels have a ray in both cameras, {LEAST_POINTS} needed")
+    unit = [ray / np.linalg.norm(ray, axis=1)[:, None] for ray in (first[good], second[good])]
+    turn = Rigid(align_rigid(unit[1], unit[0]).rotation, np.zeros(3))
+    for _ in range(STEPS):
+        here = two.project(turn @ first[good]) - flat[good]
+        moved = [Rigid.exp([*step, 0, 0, 0]) @ turn for step in STEP_RAD * np.eye(3)]
+        slope = np.stack([two.project(each @ first[good]) - flat[good] - here for each in moved], axis=2) / STEP_RAD
+        step = -np.linalg.lstsq(slope.reshape(-1, 3), here.ravel())[0]
+        turn = Rigid.exp([*step, 0, 0, 0]) @ turn
+        if np.abs(step).max() < STEP_RAD**2:
+            break
+    apart = np.full(flat.shape, np.nan)
+    apart[good] = two.project(turn @ first[good]) - flat[good]
+    return CameraDifference(pixels, apart.reshape(pixels.shape), turn)
+
+
+def image_grid(camera: Camera) -> np.ndarray:
+    """(r, c, 2) pixels over the image, its edges among them."""
+    count = max(round(CELLS * camera.width / camera.height), 2), CELLS
+    x, y = (np.linspace(-0.5, side - 0.5, n) for side, n in zip((camera.width, camera.height), count, strict=True))
+    return np.stack(np.meshgrid(x, y), axis=-1)
+
+
+def rays(camera: Camera, pixels: np.ndarray) -> np.ndarray:
+    """(n, 3) with z = 1 of pixels (n, 2); nan where the lens has none."""
+    try:
+        return np.column_stack([camera.normalised_from_pixel(pixels), np.ones(len(pixels))])
+    except ConvergenceError:
+        if len(pixels) == 1:
+            return np.full((1, 3), np.nan)
+        half = len(pixels) // 2
+        return np.concatenate([rays(camera, pixels[:half]), rays(camera, pixels[half:])])

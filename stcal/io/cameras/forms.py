@@ -1,0 +1,298 @@
+"""Cameras of other programs: Kalibr, mrcal, Metashape, COLMAP's ``cameras.bin``; and each form written.
+
+Pixel origins: (0, 0) is the centre of the first pixel in OpenCV, ROS, Kalibr and mrcal, (0.5, 0.5) in COLMAP and
+Metashape, whose principal point is counted from the middle of the image.
+"""
+
+import ast
+import struct
+import xml.etree.ElementTree as ElementTree
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+
+import numpy as np
+
+from stcal.errors import InputError
+from stcal.io.camera import (
+    COLMAP_PIXEL_ORIGIN,
+    CalibratedCamera,
+    CameraModel,
+    camera_from_colmap,
+    camera_from_opencv,
+    cameras_txt,
+)
+
+FORMS = ("colmap", "colmap-bin", "opencv", "ros", "kalibr", "mrcal", "metashape")
+SUFFIXES = {
+    ".txt": "colmap",
+    ".bin": "colmap-bin",
+    ".yaml": "opencv",
+    ".yml": "opencv",
+    ".cameramodel": "mrcal",
+    ".xml": "metashape",
+}
+"""Form that a name asks for."""
+NUMBERS = {
+    "SIMPLE_PINHOLE": 0,
+    "PINHOLE": 1,
+    "SIMPLE_RADIAL": 2,
+    "RADIAL": 3,
+    "OPENCV": 4,
+    "OPENCV_FISHEYE": 5,
+    "FULL_OPENCV": 6,
+    "SIMPLE_RADIAL_FISHEYE": 8,
+    "RADIAL_FISHEYE": 9,
+    "THIN_PRISM_FISHEYE": 10,
+}
+"""Of COLMAP's models in its binary files."""
+MRCAL = {"LENSMODEL_PINHOLE": 0, "LENSMODEL_OPENCV4": 4, "LENSMODEL_OPENCV5": 5, "LENSMODEL_OPENCV8": 8}
+"""Coefficients of mrcal's models that are OpenCV's."""
+METASHAPE = ("f", "cx", "cy", "b1", "b2", "k1", "k2", "k3", "k4", "p1", "p2")
+
+
+@dataclass(frozen=True, slots=True)
+class Written:
+    """``content`` of a file, and ``lost`` : what it has no place for."""
+
+    content: str | bytes
+    lost: tuple[str, ...]
+
+
+def from_kalibr(values: Mapping, choice: str, source: str) -> CameraModel:
+    """A camera of ``camchain.yaml``: pinhole with radtan, equidistant or no distortion.
+
+    Raises
+    ------
+    InputError
+        Several cameras and no choice, an unknown one, another model.
+    """
+    names = [name for name, each in values.items() if isinstance(each, dict) and "camera_model" in each]
+    name = choice or (names[0] if len(names) == 1 else "")
+    if name not in names:
+        asked = f"no camera {choice}" if choice else f"{len(names)} cameras, one needed"
+        raise InputError(
+            f"camera file {source}: {asked}; choose of {', '.join(names)} with `stcal camera convert --name`"
+        )
+    own = values[name]
+    lens, distortion = own.get("camera_model"), own.get("distortion_model", "none")
+    if lens != "pinhole" or distortion not in ("radtan", "equidistant", "none"):
+        raise InputError(
+            f"camera file {source}: {name}: {lens} with {distortion}; pinhole with radtan, equidistant or none is read"
+        )
+    fx, fy, cx, cy = np.array(own["intrinsics"], float).tolist()
+    width, height = (float(side) for side in own.get("resolution", (0, 0)))
+    given = np.array(own.get("distortion_coeffs", []), float)
+    coefficients = given if distortion != "none" else np.zeros(0)
+    return camera_from_opencv([fx, fy, cx, cy], coefficients, distortion == "equidistant", width, height, source)
+
+
+def from_mrcal(text: str, source: str) -> CameraModel:
+    """A ``.cameramodel`` whose lens model is OpenCV's.
+
+    Raises
+    ------
+    InputError
+        No such file, or another lens model.
+    """
+    try:
+        values = ast.literal_eval(text.strip())
+        lens, numbers = values["lensmodel"], [float(v) for v in values["intrinsics"]]
+        width, height = (float(v) for v in values["imagersize"])
+    except (SyntaxError, ValueError, TypeError, KeyError, RecursionError, MemoryError) as error:
+        reason = " ".join(str(error).split())[:100]
+        raise InputError(f"camera file {source}: not mrcal's form ({reason}); write it anew with mrcal") from error
+    if lens not in MRCAL or len(numbers) != 4 + MRCAL[lens]:
+        raise InputError(
+            f"camera file {source}: {lens} with {len(numbers)} intrinsics; {', '.join(MRCAL)} are read: "
+            "mrcal-convert-lensmodel makes one of another"
+        )
+    return camera_from_opencv(numbers[:4], np.array(numbers[4:]), False, width, height, source)
+
+
+def from_metashape(root: ElementTree.Element, source: str) -> CameraModel:
+    """A ``<calibration>`` of Metashape: frame or fisheye, without skew.
+
+    Raises
+    ------
+    InputError
+        Another projection, values that have no place in OpenCV's model, or none where they must be.
+    """
+    texts = {child.tag: (child.text or "").strip() for child in root}
+    kind = texts.get("projection", "frame")
+    if kind not in ("frame", "fisheye", "equidistant_fisheye"):
+        raise InputError(f"camera file {source}: projection {kind}; frame and fisheye are read")
+    v = {name: float(texts.get(name, 0) or 0) for name in METASHAPE}
+    width, height = float(texts["width"]), float(texts["height"])
+    if v["b2"] or (v["k4"] and kind == "frame"):
+        name = "b2" if v["b2"] else "k4"
+        raise InputError(
+            f"camera file {source}: {name} is {v[name]:g}, without place in OpenCV's model; fit without it"
+        )
+    centre = width / 2 + v["cx"] - COLMAP_PIXEL_ORIGIN, height / 2 + v["cy"] - COLMAP_PIXEL_ORIGIN
+    distortion = np.array([v["k1"], v["k2"], v["p2"], v["p1"], v["k3"], v["k4"]])
+    lens = [v["f"] + v["b1"], v["f"], *centre]
+    if kind == "frame":
+        return camera_from_opencv(lens, distortion[:5], False, width, height, source)
+    return camera_from_opencv(lens, distortion, True, width, height, source, tangential=True)
+
+
+def from_colmap_binary(content: bytes, choice: str, source: str) -> CameraModel:
+    """The camera of ``cameras.bin``, or that of the number ``choice``.
+
+    Raises
+    ------
+    InputError
+        Not of that form, several and no choice, or a model that is not supported.
+    """
+    try:
+        (count,) = struct.unpack_from("<Q", content, 0)
+        at, cameras = 8, {}
+        for _ in range(min(count, len(content) // 24)):
+            number, kind, width, height = struct.unpack_from("<IiQQ", content, at)
+            model = next(name for name, own in NUMBERS.items() if own == kind)
+            length = _lengths()[model]
+            cameras[str(number)] = model, width, height, struct.unpack_from(f"<{length}d", content, at + 24)
+            at += 24 + 8 * length
+    except (struct.error, StopIteration) as error:
+        raise InputError(f"camera file {source}: neither text nor a cameras.bin of known models; check it") from error
+    if at != len(content) or not cameras:
+        raise InputError(f"camera file {source}: neither text nor COLMAP's cameras.bin; check it")
+    if choice not in cameras and (choice or len(cameras) > 1):
+        raise InputError(f"camera file {source}: {len(cameras)} cameras; choose of {', '.join(cameras)} with --name")
+    model, width, height, params = cameras[choice or next(iter(cameras))]
+    return camera_from_colmap(model, width, height, params, source)
+
+
+def _lengths() -> dict[str, int]:
+    return {name: len(CalibratedCamera.colmap_layout(name)) for name in NUMBERS}
+
+
+def written(camera: CalibratedCamera, form: str, name: str) -> Written:
+    """The file of a camera.
+
+    Parameters
+    ----------
+    camera : CalibratedCamera
+        To write.
+    form : str
+        One of :data:`FORMS`.
+    name : str
+        Of the camera, where the form has a place.
+
+    Raises
+    ------
+    InputError
+        A lens that the form cannot hold, with the form that can.
+    """
+    writers: dict[str, Callable[[CalibratedCamera, str], str | bytes]] = {
+        "colmap": lambda own, _: cameras_txt(own),
+        "colmap-bin": _colmap_binary,
+        "opencv": _opencv,
+        "ros": _ros,
+        "kalibr": _kalibr,
+        "mrcal": _mrcal,
+        "metashape": _metashape,
+    }
+    lost = []
+    if camera.covariance is not None and form != "colmap":
+        lost.append("σ and correlations of the parameters")
+    return Written(writers[form](camera, name), tuple(lost))
+
+
+def _refuse(camera: CalibratedCamera, form: str, why: str) -> InputError:
+    return InputError(f"{form} has no place for {why} of {camera.colmap_model}; write --form colmap")
+
+
+def _colmap_binary(camera: CalibratedCamera, _: str) -> bytes:
+    params = camera.colmap_params()
+    head = struct.pack("<QIiQQ", 1, 1, NUMBERS[camera.colmap_model], camera.width, camera.height)
+    return head + struct.pack(f"<{len(params)}d", *params)
+
+
+def _fisheye_four(camera: CalibratedCamera, form: str) -> list[float]:
+    """k1 … k4 of an equidistant camera that has nothing else."""
+    rest = [*camera.distortion[2:4], *camera.distortion[8:]]
+    if any(rest):
+        raise _refuse(camera, form, "p1, p2 and prisms")
+    return [float(camera.distortion[i]) for i in (0, 1, 4, 5)]
+
+
+def _coefficients(camera: CalibratedCamera) -> list[float]:
+    """5 or 8 of the perspective ones, as few as hold the lens."""
+    count = 8 if camera.distortion[5:8].any() else 5
+    return [float(k) for k in camera.distortion[:count]]
+
+
+def _matrix(camera: CalibratedCamera) -> list[float]:
+    (fx, fy), (cx, cy) = camera.focal.tolist(), camera.centre.tolist()
+    return [fx, 0.0, cx, 0.0, fy, cy, 0.0, 0.0, 1.0]
+
+
+def _opencv(camera: CalibratedCamera, _: str) -> str:
+    values = _fisheye_four(camera, "opencv") if camera.fisheye else _coefficients(camera)
+    node = "!!opencv-matrix\n   rows: {}\n   cols: {}\n   dt: d\n   data: {}\n"
+    kind = "distortion_model: equidistant\n" if camera.fisheye else ""
+    return (
+        f"%YAML:1.0\n---\nimage_width: {camera.width}\nimage_height: {camera.height}\n"
+        f"camera_matrix: {node.format(3, 3, _matrix(camera))}{kind}"
+        f"distortion_coefficients: {node.format(1, len(values), values)}"
+    )
+
+
+def _ros(camera: CalibratedCamera, name: str) -> str:
+    values = _fisheye_four(camera, "ros") if camera.fisheye else _coefficients(camera)
+    kind = "equidistant" if camera.fisheye else "rational_polynomial" if len(values) == 8 else "plumb_bob"
+    k = _matrix(camera)
+    p = [*k[:3], 0.0, *k[3:6], 0.0, *k[6:], 0.0]
+    eye = [1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0]
+
+    def node(rows: int, data: list[float]) -> str:
+        return f"\n  rows: {rows}\n  cols: {len(data) // rows}\n  data: {data}\n"
+
+    return (
+        f"image_width: {camera.width}\nimage_height: {camera.height}\ncamera_name: {name}\n"
+        f"camera_matrix:{node(3, k)}distortion_model: {kind}\ndistortion_coefficients:{node(1, values)}"
+        f"rectification_matrix:{node(3, eye)}projection_matrix:{node(3, p)}"
+    )
+
+
+def _kalibr(camera: CalibratedCamera, name: str) -> str:
+    if camera.fisheye:
+        kind, values = "equidistant", _fisheye_four(camera, "kalibr")
+    else:
+        kind, values = "radtan", [float(k) for k in camera.distortion[:4]]
+        if camera.distortion[4:].any():
+            raise _refuse(camera, "kalibr", "more than k1, k2, p1, p2")
+    lens = [*camera.focal.tolist(), *camera.centre.tolist()]
+    return (
+        f"{name}:\n  camera_model: pinhole\n  intrinsics: {lens}\n  distortion_model: {kind}\n"
+        f"  distortion_coeffs: {values}\n  resolution: [{camera.width}, {camera.height}]\n"
+    )
+
+
+def _mrcal(camera: CalibratedCamera, _: str) -> str:
+    if camera.fisheye:
+        raise _refuse(camera, "mrcal", "the equidistant projection")
+    values = _coefficients(camera) if camera.distortion.any() else []
+    values = values[:4] if len(values) == 5 and not values[4] else values
+    lens = next(name for name, count in MRCAL.items() if count == len(values))
+    numbers = [*camera.focal.tolist(), *camera.centre.tolist(), *values]
+    return (
+        f"{{\n    'lensmodel': '{lens}',\n    'intrinsics': {numbers},\n    'extrinsics': [0, 0, 0, 0, 0, 0],\n"
+        f"    'imagersize': [{camera.width}, {camera.height}]\n}}\n"
+    )
+
+
+def _metashape(camera: CalibratedCamera, _: str) -> str:
+    k1, k2, p1, p2, k3, k4, *rest = camera.distortion.tolist()
+    if any(rest) or (k4 and not camera.fisheye):
+        raise _refuse(camera, "metashape", "k4 to k6 and prisms")
+    (fx, fy), (cx, cy) = camera.focal.tolist(), camera.centre.tolist()
+    centre = cx + COLMAP_PIXEL_ORIGIN - camera.width / 2, cy + COLMAP_PIXEL_ORIGIN - camera.height / 2
+    values = dict(zip(METASHAPE, (fy, *centre, fx - fy, 0.0, k1, k2, k3, k4, p2, p1), strict=True))
+    root = ElementTree.Element("calibration")
+    parts = {"projection": "fisheye" if camera.fisheye else "frame", "width": camera.width, "height": camera.height}
+    for tag, value in (parts | values).items():
+        ElementTree.SubElement(root, tag).text = str(value) if tag in parts else repr(float(value))
+    ElementTree.indent(root)
+    return f'<?xml version="1.0" encoding="UTF-8"?>\n{ElementTree.tostring(root, encoding="unicode")}\n'

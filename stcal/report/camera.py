@@ -1,0 +1,107 @@
+"""Cameras shown and compared: text and pictures."""
+
+import numpy as np
+
+from stcal.geometry.camera import Camera
+from stcal.io.camera import CalibratedCamera, parameter_names
+from stcal.io.cameras.difference import CameraDifference, image_grid, rays
+from stcal.report.figure import INK, SMALL, calm, new_figure
+from stcal.report.text import NONE, text_table
+
+LENGTHS = ("f", "fx", "fy", "cx", "cy")
+
+
+def shown(camera: CalibratedCamera) -> list[str]:
+    """Model, parameters with σ (OpenCV's pixel origin), field of view, and what the lens moves."""
+    names, values = parameter_names(camera.colmap_model), camera.colmap_params()
+    sigma = None if camera.covariance is None else np.sqrt(np.diag(camera.covariance))
+    rows = [["<parameter", "value", "±"]]
+    for i, (name, value) in enumerate(zip(names, values, strict=True)):
+        own = value - 0.5 if name in ("cx", "cy") else value
+        digits = 4 if name in LENGTHS else 7
+        rows.append([name, f"{own:.{digits}f}", NONE if sigma is None else f"{sigma[i]:.{digits}f}"])
+    lines = [f"{camera.colmap_model}, {camera.width}×{camera.height} px; first pixel's centre at (0, 0)"]
+    lines += text_table(rows, (10, 14, 12))
+    wide = [field_deg(camera, *ends) for ends in _ends(camera)]
+    fields = ["–" if np.isnan(angle) else f"{angle:.2f}°" for angle in wide]
+    lines.append(f"field of view: {fields[0]} across, {fields[1]} up, {fields[2]} over the diagonal")
+    moved = moved_px(camera)[1]
+    if np.isnan(moved).any():
+        share = np.isnan(moved).any(axis=2).mean()
+        lines.append(
+            f"warning: {share:.1%} of the image has no ray: the distortion folds over there, or leads beyond 89°"
+        )
+    lines.append(f"the lens moves points by up to {np.nanmax(np.linalg.norm(moved, axis=2)):.2f} px")
+    return lines
+
+
+def _ends(camera: Camera) -> list[tuple[tuple[float, float], tuple[float, float]]]:
+    """Opposite pixels: left and right, top and bottom, corners."""
+    right, low = camera.width - 0.5, camera.height - 0.5
+    x, y = camera.centre
+    return [((-0.5, y), (right, y)), ((x, -0.5), (x, low)), ((-0.5, -0.5), (right, low))]
+
+
+def field_deg(camera: Camera, one: tuple[float, float], two: tuple[float, float]) -> float:
+    """Angle between the rays of two pixels; nan where there is none."""
+    unit = [ray / np.linalg.norm(ray) for ray in rays(camera, np.array([one, two]))]
+    return float(np.degrees(np.arctan2(np.linalg.norm(np.cross(*unit)), unit[0] @ unit[1])))
+
+
+def moved_px(camera: Camera) -> tuple[np.ndarray, np.ndarray]:
+    """(r, c, 2) pixels over the image, and by how much the lens moves what is seen there: against the same focal
+    lengths without distortion, and of equidistant cameras with equal steps of angle."""
+    pixels = image_grid(camera)
+    seen = rays(camera, pixels.reshape(-1, 2))
+    ideal = Camera(camera.width, camera.height, camera.focal, camera.centre, np.zeros(12), camera.fisheye)
+    with np.errstate(invalid="ignore"):
+        return pixels, pixels - ideal.pixel_from_normalised(seen[:, :2]).reshape(pixels.shape)
+
+
+def distortion_figure(camera: Camera):
+    """Where the lens moves points to, and by how much."""
+    pixels, moved = moved_px(camera)
+    return _field(pixels, moved, "moved by the lens, px")
+
+
+def comparison_text(found: CameraDifference) -> list[str]:
+    """The figures of a comparison."""
+    length = found.lengths()
+    turn = np.degrees(found.second_from_first.log()[:3])
+    rows, columns = length.shape
+    middle = length[rows // 4 : -(rows // 4), columns // 4 : -(columns // 4)]
+    corners = length[[0, 0, -1, -1], [0, -1, 0, -1]]
+    lines = [
+        f"apart: {np.sqrt(np.nanmean(length**2)):.4f} px RMS over the image, {np.nanmax(length):.4f} px at most; "
+        f"{np.sqrt(np.nanmean(middle**2)):.4f} px RMS in its middle half",
+        f"corners: {', '.join(NONE if np.isnan(v) else f'{v:.4f}' for v in corners)} px",
+        f"the second camera is turned by {np.linalg.norm(turn):.5f}° ({', '.join(f'{v:.5f}' for v in turn)})",
+    ]
+    if np.isnan(length).any():
+        lines.append(f"{np.isnan(length).mean():.1%} of the image has no ray in one of both, and is left out")
+    return lines
+
+
+def comparison_figure(found: CameraDifference):
+    """By how much, and to where, the second camera sees rays elsewhere."""
+    return _field(found.pixels, found.apart, "second camera, px apart")
+
+
+def _field(pixels: np.ndarray, moved: np.ndarray, what: str):
+    """Lengths as colours, directions as arrows."""
+    figure = new_figure(7.0, 0.9 + 5.6 * np.ptp(pixels[..., 1]) / np.ptp(pixels[..., 0]))
+    axes = figure.add_subplot()
+    length = np.linalg.norm(moved, axis=2)
+    shades = axes.pcolormesh(pixels[0, :, 0], pixels[:, 0, 1], length, cmap="viridis", shading="gouraud", vmin=0)
+    every = (slice(1, None, 3), slice(1, None, 3))
+    x, y = pixels[every].reshape(-1, 2).T
+    u, v = (moved[every] / np.maximum(length[every], 1e-12)[..., None]).reshape(-1, 2).T
+    axes.quiver(x, y, u, v, angles="xy", color="white", alpha=0.8, width=0.0022, scale=38)
+    axes.set(xlim=(pixels[0, 0, 0], pixels[0, -1, 0]), ylim=(pixels[-1, 0, 1], pixels[0, 0, 1]), aspect="equal")
+    axes.set_xlabel("x, px", fontsize=SMALL + 1, color=INK)
+    axes.set_ylabel("y, px", fontsize=SMALL + 1, color=INK)
+    bar = figure.colorbar(shades, ax=axes, shrink=0.85)
+    bar.set_label(what, fontsize=SMALL + 1, color=INK)
+    bar.ax.tick_params(labelsize=SMALL)
+    calm(axes)
+    return figure

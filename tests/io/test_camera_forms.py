@@ -1,0 +1,148 @@
+"""Cameras of other programs: each form read back, and their projections by the formulas of their documents."""
+
+import numpy as np
+import pycolmap
+import pytest
+
+from stcal.errors import InputError
+from stcal.geometry.camera import Camera
+from stcal.io.camera import CalibratedCamera, read_camera
+from stcal.io.cameras.forms import FORMS, SUFFIXES, written
+
+LENSES = {
+    "PINHOLE": [],
+    "OPENCV": [-0.1, 0.03, 1e-3, -2e-3],
+    "FULL_OPENCV": [-0.1, 0.03, 1e-3, -2e-3, 0.01, 0.02, -0.01, 0.003],
+    "OPENCV_FISHEYE": [0.02, -0.01, 0, 0, 3e-3, -1e-3],
+    "THIN_PRISM_FISHEYE": [0.02, -0.01, 1e-3, -2e-3, 3e-3, -1e-3, 0, 0, 1e-3, 0, -1e-3],
+}
+SUFFIX = {form: suffix for suffix, form in reversed(SUFFIXES.items())} | {"ros": ".yaml", "kalibr": ".yaml"}
+REFUSED = {
+    "OPENCV": (),
+    "PINHOLE": (),
+    "FULL_OPENCV": ("kalibr", "metashape"),
+    "OPENCV_FISHEYE": ("mrcal",),
+    "THIN_PRISM_FISHEYE": ("opencv", "ros", "kalibr", "mrcal", "metashape"),
+}
+"""Forms that cannot hold a lens."""
+
+
+def camera_of(model: str) -> CalibratedCamera:
+    distortion = np.pad(np.array(LENSES[model], float), (0, 12 - len(LENSES[model])))
+    camera = Camera(1280, 961, [812.25, 809.5], [640.125, 478.0625], distortion, "FISHEYE" in model)
+    return CalibratedCamera.of(camera, model)
+
+
+@pytest.mark.parametrize("model", LENSES)
+@pytest.mark.parametrize("form", FORMS)
+def test_what_is_written_reads_back(tmp_path, form, model):
+    camera = camera_of(model)
+    path = tmp_path / f"camera{SUFFIX[form]}"
+    if form in REFUSED[model]:
+        with pytest.raises(InputError, match=f"{form} has no place for .* of {model}; write --form colmap"):
+            written(camera, form, "cam0")
+        return
+    content = written(camera, form, "cam0").content
+    path.write_bytes(content if isinstance(content, bytes) else content.encode())
+    found = read_camera(path).calibrated(1280, 961)
+    assert (found.width, found.height, found.fisheye) == (1280, 961, camera.fisheye)
+    # sums and differences of half the image's size round in the last place
+    np.testing.assert_allclose(found.parameters(), camera.parameters(), rtol=1e-14, atol=1e-12)
+
+
+def test_colmap_reads_the_binary_file(tmp_path):
+    for model in LENSES:
+        (tmp_path / "cameras.bin").write_bytes(written(camera_of(model), "colmap-bin", "").content)
+        for name in ("images.bin", "points3D.bin"):
+            (tmp_path / name).write_bytes(bytes(8))
+        (found,) = pycolmap.Reconstruction(tmp_path).cameras.values()
+        assert found.model.name == model
+        assert list(found.params) == camera_of(model).colmap_params()
+
+
+KALIBR = """cam0:
+  camera_model: pinhole
+  intrinsics: [461.629, 460.152, 362.680, 246.049]
+  distortion_model: radtan
+  distortion_coeffs: [-0.27695497, 0.06712482, 0.00087538, 0.00011556]
+  resolution: [752, 480]
+cam1:
+  camera_model: pinhole
+  intrinsics: [457.587, 456.134, 379.999, 255.238]
+  distortion_model: equidistant
+  distortion_coeffs: [-0.01, 0.02, -0.003, 0.0004]
+  resolution: [752, 480]
+"""
+
+
+def test_a_camera_of_a_chain_is_chosen(tmp_path):
+    path = tmp_path / "camchain.yaml"
+    path.write_text(KALIBR)
+    assert read_camera(path, "cam0").colmap_model == "OPENCV"
+    second = read_camera(path, "cam1")
+    assert second.colmap_model == "OPENCV_FISHEYE"
+    np.testing.assert_array_equal(second.distortion[[0, 1, 4, 5]], [-0.01, 0.02, -0.003, 0.0004])
+    with pytest.raises(InputError, match=r"2 cameras, one needed; choose of cam0, cam1 with `stcal camera convert"):
+        read_camera(path)
+    path.write_text(KALIBR.replace("pinhole", "omni"))
+    with pytest.raises(InputError, match="cam0: omni with radtan; pinhole with radtan, equidistant or none is read"):
+        read_camera(path, "cam0")
+
+
+METASHAPE = """<?xml version="1.0" encoding="UTF-8"?>
+<calibration>
+  <projection>{kind}</projection><width>5184</width><height>3456</height>
+  <f>4000.5</f><cx>12.25</cx><cy>-8.5</cy><b1>1.5</b1>
+  <k1>-0.05</k1><k2>0.02</k2><k3>-0.003</k3><p1>0.0004</p1><p2>-0.0007</p2>
+</calibration>
+"""
+
+
+@pytest.mark.parametrize("kind", ["frame", "fisheye"])
+def test_metashape_projects_by_its_own_formula(tmp_path, kind):
+    """Metashape's manual, appendix D: u = w/2 + cx + x' (f + b1), p1 beside r² + 2 x²; the first pixel is at 0.5."""
+    (tmp_path / "c.xml").write_text(METASHAPE.format(kind=kind))
+    camera = read_camera(tmp_path / "c.xml").sized(0, 0)
+    x, y = np.array([[0.3, -0.2], [0.1, 0.35]]).T
+    expected = []
+    for a, b in zip(x, y, strict=True):
+        r = np.hypot(a, b)
+        share = np.arctan(r) / r if kind == "fisheye" else 1.0
+        a, b = a * share, b * share
+        r2 = a * a + b * b
+        radial = 1 - 0.05 * r2 + 0.02 * r2**2 - 0.003 * r2**3
+        moved_x = a * radial + 0.0004 * (r2 + 2 * a * a) - 2 * 0.0007 * a * b
+        moved_y = b * radial - 0.0007 * (r2 + 2 * b * b) + 2 * 0.0004 * a * b
+        expected.append([5184 / 2 + 12.25 + moved_x * 4002.0 - 0.5, 3456 / 2 - 8.5 + moved_y * 4000.5 - 0.5])
+    np.testing.assert_allclose(camera.project(np.column_stack([x, y, np.ones(2)])), expected, atol=1e-9)
+
+
+def test_mrcal_is_read_with_its_comments(tmp_path):
+    (tmp_path / "c.cameramodel").write_text(
+        "# written by hand\n{\n    'lensmodel':  'LENSMODEL_OPENCV8',\n    # fx,fy,cx,cy,distortion0,distortion1,...\n"
+        "    'intrinsics': [ 1761.18, 1761.25, 1965.7, 1087.5, -0.01, 0.2, -0.0001, 0.0001, 0.05, 0.4, 0.2, 0.01, ],\n"
+        "    'extrinsics': [ 0, 0, 0, 0, 0, 0 ],\n    'imagersize': [ 4000, 2200 ],\n}\n"
+    )
+    camera = read_camera(tmp_path / "c.cameramodel")
+    assert (camera.colmap_model, camera.width, camera.height) == ("FULL_OPENCV", 4000, 2200)
+    np.testing.assert_array_equal(camera.centre, [1965.7, 1087.5])
+
+
+@pytest.mark.parametrize(
+    ("name", "content", "message"),
+    [
+        ("c.cameramodel", "{'lensmodel': 'LENSMODEL_SPLINED_STEREOGRAPHIC', 'intrinsics': [1], 'imagersize': [1, 1]}",
+         "SPLINED_STEREOGRAPHIC with 1 intrinsics; LENSMODEL_PINHOLE"),
+        ("c.cameramodel", "{'lensmodel': __import__('os')}", "not mrcal's form"),
+        ("c.xml", METASHAPE.format(kind="spherical"), "projection spherical; frame and fisheye are read"),
+        ("c.xml", METASHAPE.format(kind="frame").replace("<b1>", "<b2>0.1</b2><b1>"), "b2 is 0.1, without place"),
+        ("c.xml", "<calibration><width>3</width></calibration>", "neither COLMAP's cameras.txt nor"),
+        ("cameras.bin", b"\x01" + bytes(7) + b"\x01" + bytes(30), "neither text nor a cameras.bin of known models"),
+        ("cameras.bin", b"\x02" + bytes(7), "neither text nor"),
+    ],
+)  # fmt: skip
+def test_a_wrong_file_is_named(tmp_path, name, content, message):
+    path = tmp_path / name
+    path.write_bytes(content if isinstance(content, bytes) else content.encode())
+    with pytest.raises(InputError, match=message):
+        read_camera(path)

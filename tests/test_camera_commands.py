@@ -1,0 +1,78 @@
+"""``stcal camera``: files of other programs shown, converted and compared."""
+
+import re
+
+import numpy as np
+import pytest
+from typer.testing import CliRunner
+
+from stcal.cli.cameras import app
+from stcal.errors import InputError
+from stcal.geometry.camera import Camera
+from stcal.io.camera import CalibratedCamera, read_camera, write_cameras_txt
+from stcal.io.cameras.difference import camera_difference
+
+CAMERA = Camera(1280, 960, [900.0, 905.0], [640.0, 475.0], [-0.1, 0.03, 1e-3, -2e-3, 0, 0, 0, 0])
+
+
+@pytest.fixture
+def folder(tmp_path):
+    sigma = np.array([0.1, 0.1, 0.2, 0.2, 1e-4, 1e-3, 1e-5, 1e-5])
+    write_cameras_txt(tmp_path / "a.txt", CalibratedCamera.of(CAMERA, "OPENCV", np.diag(sigma**2)))
+    return tmp_path
+
+
+def call(*words):
+    result = CliRunner().invoke(app, list(map(str, words)), catch_exceptions=False)
+    assert result.exit_code == 0
+    return result.output
+
+
+def test_a_camera_goes_to_kalibr_and_back(folder):
+    said = call("convert", folder / "a.txt", folder / "chain.yaml", "--form", "kalibr", "--name", "cam3")
+    assert "note: not in kalibr: σ and correlations of the parameters" in said
+    assert (folder / "chain.yaml").read_text().startswith("cam3:")
+    call("convert", folder / "chain.yaml", folder / "b.txt")
+    assert read_camera(folder / "b.txt").calibrated(0, 0).same_as(CAMERA)
+
+
+def test_a_size_that_the_file_does_not_state_is_asked_for(folder):
+    (folder / "i.yaml").write_text("intrinsics:\n  fx: 900\n  fy: 905\n  cx: 640\n  cy: 475\n")
+    with pytest.raises(InputError, match="states no image size; give it with --size WxH"):
+        call("show", folder / "i.yaml")
+    assert "1280×960" in call("show", folder / "i.yaml", "--size", "1280x960")
+    with pytest.raises(InputError, match="--size 12: two numbers with x between needed"):
+        call("show", folder / "i.yaml", "--size", "12")
+    with pytest.raises(InputError, match=r"no form of suffix \.json; give --form"):
+        call("convert", folder / "a.txt", folder / "b.json")
+
+
+def test_what_is_shown_is_the_cameras(folder):
+    """Field of view of a lens without distortion: 2 atan(640 / 900) across."""
+    plain = Camera(1280, 960, [900.0, 900.0], [639.5, 479.5], np.zeros(8))
+    write_cameras_txt(folder / "p.txt", CalibratedCamera.of(plain, "PINHOLE"))
+    said = call("show", folder / "p.txt", "--plot", folder / "p.png")
+    assert f"field of view: {2 * np.degrees(np.arctan(640 / 900)):.2f}° across" in said
+    assert "moves points by up to 0.00 px" in said
+    assert (folder / "p.png").stat().st_size > 5000
+    assert re.search(r"cx +640\.0000 +0\.2000", call("show", folder / "a.txt"))
+
+
+def test_a_principal_point_is_mostly_a_turn_and_a_focal_length_is_not():
+    other = Camera(1280, 960, CAMERA.focal * 1.001, CAMERA.centre, CAMERA.distortion)
+    assert camera_difference(CAMERA, CAMERA).lengths().max() < 1e-9
+    found = camera_difference(CAMERA, other)
+    # a thousandth of the way from the middle, to 720 px in the corner; p1, p2 and the turn take a part of it
+    assert np.nanmax(found.lengths()) == pytest.approx(0.001 * np.hypot(640, 480), rel=0.1)
+    shifted = Camera(1280, 960, CAMERA.focal, CAMERA.centre + np.array([5.0, 0.0]), CAMERA.distortion)
+    moved = camera_difference(CAMERA, shifted)
+    assert np.nanmax(moved.lengths()) < 2.5  # mostly a turn
+    assert moved.second_from_first.angle_rad() == pytest.approx(5 / 900, rel=0.2)
+
+
+def test_cameras_of_two_sizes_are_refused(folder):
+    write_cameras_txt(
+        folder / "b.txt", CalibratedCamera.of(Camera(640, 480, [450, 450], [320, 240], np.zeros(8)), "PINHOLE")
+    )
+    with pytest.raises(InputError, match="1280×960 and 640×480 px; files of one image size needed"):
+        call("compare", folder / "a.txt", folder / "b.txt")
