@@ -107,7 +107,7 @@ def _of_runs(folder: Path) -> None:
 def _cameras(folder: Path) -> None:
     """The data set's camera in every form that is read."""
     given = read_camera(folder / "data/cameras.txt").calibrated(SMALL.width, SMALL.height)
-    (fx, fy), (cx, cy) = given.focal, given.centre
+    (fx, fy), (cx, cy) = given.focal.tolist(), given.centre.tolist()
     forms = folder / "cameras"
     forms.mkdir()
     matrix = [fx, 0.0, cx, 0.0, fy, cy, 0.0, 0.0, 1.0]

@@ -140,7 +140,7 @@ def test_intrinsics_that_are_wrong_are_named(factor, i):
     truth = simulated_rig(np.random.default_rng(3), 12, "eye-in-hand", 2, ROBOT, PX, BOARD)
     lens = truth.given.cameras[i].views.camera
     wrong = Views(
-        lens.with_parameters(lens.parameters() * np.r_[factor, factor, np.ones(10)]), truth.given.cameras[i].views.views
+        lens.with_parameters(lens.parameters() * np.r_[factor, factor, np.ones(14)]), truth.given.cameras[i].views.views
     )
     notes = handeye_rig(with_views(truth.given, i, wrong), "eye-in-hand").all_notes()
     assert [note.partition(":")[0] for note in notes if NOT_FIT in note] == [NAMES[i]]

@@ -24,7 +24,7 @@ def group(labels_only):
 def test_without_cameras_it_is_the_schur_complement_of_the_full_equations(group, intrinsics):
     """Points and the camera's parameters remain; a step of these brings the cameras' own along."""
     model, camera = group
-    basis = np.eye(12)[:, :intrinsics]
+    basis = np.eye(16)[:, :intrinsics]
     normal, right, away = blocks.without_cameras(model, camera, basis, np.inf)
     jacobian = dense.jacobian(model, camera)
     if intrinsics:

@@ -42,7 +42,7 @@ def test_wrong_intrinsics_are_refined(sets, groups):
         scene = make_scene(SceneOptions(seed=seed, images_per_group=6 if groups is None else 4, groups=groups))
         observations = observe(scene, NOISE_PX, np.random.default_rng(seed))
         true = scene.camera
-        k1 = np.array([0.01 * true.distortion[0], *[0] * 7])
+        k1 = np.array([0.01 * true.distortion[0], *[0] * 11])
         centre = true.centre + np.array([2, 2])
         wrong = replace(true, focal=1.0003 * true.focal, centre=centre, distortion=true.distortion + k1)
         cases = ((true, False), (wrong, True), (wrong, False))
