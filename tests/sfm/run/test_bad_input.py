@@ -397,7 +397,7 @@ CAMERAS = {
     "empty": ("", ("neither COLMAP's cameras.txt nor OpenCV's YAML or XML", "check its form")),
     "prose": ("a camera, no doubt", ("neither COLMAP's cameras.txt", "check its form")),
     "two cameras": ("1 PINHOLE 9 9 1 1 1 1\n2 PINHOLE 9 9 1 1 1 1", ("2 cameras, 1 needed",)),
-    "fisheye": ("1 OPENCV_FISHEYE 9 9 1 1 1 1 0 0 0 0", ("OPENCV_FISHEYE is not supported; use one of",)),
+    "field of view": ("1 FOV 9 9 1 1 1 1 1", ("FOV is not supported; use one of",)),
     "no number": ("1 PINHOLE 1296 864 f f 1 1", ("'f'; numbers needed",)),
 }
 
