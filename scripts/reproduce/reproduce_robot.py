@@ -19,7 +19,6 @@ from pathlib import Path
 import matplotlib as mpl
 import numpy as np
 
-from stcal.geometry.align import align_rigid
 from stcal.geometry.rigid import Poses, Rigid
 from stcal.labels import parse_label
 from stcal.parallel import one_thread
@@ -257,14 +256,8 @@ def photograph(arm: Arm, target: TargetCircles, q: np.ndarray, rng: np.random.Ge
 
 def by_axes(data: Measurements, target: TargetCircles) -> Robot:
     """The axis method on the middles of the faces, which every pose carries along."""
-    middles = {face: plane.translation for face, plane in target.target_from_plane.items()}
-    poses = data.poses()
-    points = np.stack([poses @ middle for middle in middles.values()], axis=1).reshape(-1, 3)
-    q = np.repeat(data.q, len(middles), axis=0)
-    swept = Measurements(data.where, range(2, len(q) + 2), q, tuple(middles) * len(data), points)
-    found = robot_from_sweeps(swept, rig().nominal).robot
-    places = np.array([found.tool(face).translation for face in middles])
-    return replace(found, tools={"": align_rigid(places, np.array(list(middles.values())))})
+    middles = np.array([plane.translation for plane in target.target_from_plane.values()])
+    return robot_from_sweeps(data, rig().nominal, places=middles).robot
 
 
 def squared_error(found: Identified, arm: Arm, q: np.ndarray) -> float:

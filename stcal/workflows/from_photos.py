@@ -21,7 +21,7 @@ from stcal.report.figure import COLOURS, calm, new_figure, uri
 from stcal.report.page import render
 from stcal.report.text import number
 from stcal.robot.axes.model import AxesResult, robot_from_sweeps
-from stcal.robot.axes.orientations import length_of
+from stcal.robot.axes.orientations import length_of, ring
 from stcal.robot.axes.report import axes_file, axes_page
 from stcal.robot.axes.sweeps import find_arcs
 from stcal.robot.identify.report import identified_file, identified_page
@@ -204,7 +204,8 @@ def _axes(data: Measurements, nominal: Robot) -> tuple[AxesResult | None, str]:
     try:
         arcs, _ = find_arcs(data, nominal)
         rows = np.unique(np.concatenate([arc.rows for arc in arcs]))
-        return robot_from_sweeps(data[rows], nominal, length_mm=length_of(data)), ""
+        length_mm = length_of(data)
+        return robot_from_sweeps(data[rows], nominal, places=None if length_mm is None else ring(length_mm)), ""
     except (InputError, DegenerateError) as error:
         return None, str(error).removeprefix(f"{data.where}: ")
 

@@ -56,6 +56,7 @@ def axes(
 ) -> None:
     """Find each joint's axis from sweeps of that joint alone, and the robot that follows (the axis method)."""
     from stcal.robot.axes.model import robot_from_sweeps
+    from stcal.robot.axes.orientations import ring
     from stcal.robot.axes.report import axes_file, axes_page, axes_text
     from stcal.robot.kinematics.file import load_robot, robot_toml
     from stcal.robot.kinematics.measurements import read_measurements
@@ -68,7 +69,7 @@ def axes(
             f"{data.where}: stations {', '.join(data.by_station())}; sweeps are seen from one, so give one at a time"
         )
     length_mm = _length(orientations, data)
-    result = robot_from_sweeps(data, nominal, math.radians(still_deg), length_mm)
+    result = robot_from_sweeps(data, nominal, math.radians(still_deg), None if length_mm is None else ring(length_mm))
     say(axes_text(result))
     if length_mm is not None:
         say(f"orientations: used, as points {length_mm:.0f} mm from the target")

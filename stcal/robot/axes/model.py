@@ -115,7 +115,7 @@ class AxesResult:
 
 @one_thread()
 def robot_from_sweeps(
-    data: Measurements, nominal: Robot, still_rad: float = STILL_RAD, length_mm: float | None = None
+    data: Measurements, nominal: Robot, still_rad: float = STILL_RAD, places: np.ndarray | None = None
 ) -> AxesResult:
     """The axis method: axes, robot, and how far to trust them.
 
@@ -130,9 +130,9 @@ def robot_from_sweeps(
         Convention, joint types, coupling, and about how the arm is built.
     still_rad : float
         Revolute joints stand still within this.
-    length_mm : float, optional
-        Take orientations too, by three virtual reflectors at this distance from each pose's origin: where an error of
-        rotation moves a point as much as one of position. Positions alone where None.
+    places : (k, 3) array, optional
+        Take orientations too, by virtual reflectors at these places of the target's frame, mm, k ≥ 3 and not in line:
+        those of :func:`~stcal.robot.axes.orientations.ring`, or points of a real target. Positions alone where None.
 
     Returns
     -------
@@ -155,7 +155,7 @@ def robot_from_sweeps(
     Ginés, "Uncertainty estimation in robot kinematic calibration", Robotics and Computer-Integrated Manufacturing 29,
     2013.
     """
-    virtual = None if length_mm is None else virtual_reflectors(data, length_mm)
+    virtual = None if places is None else virtual_reflectors(data, places)
     data = data if virtual is None else virtual.data
     if nominal.tree is not None:
         raise InputError(

@@ -1,4 +1,4 @@
-"""Orientations in sweeps: a pose is three virtual reflectors about its origin, which the axis method takes like others.
+"""Orientations in sweeps: a pose is several virtual reflectors, which the axis method takes like others.
 
 Zhang & Wei (2017) measure poses of their target, of which the axis method as usually written takes positions alone.
 """
@@ -21,22 +21,24 @@ UNIT_PLACES = np.column_stack([np.cos(ANGLES), np.sin(ANGLES), np.zeros(3)])
 
 @dataclass(frozen=True, slots=True, eq=False)
 class VirtualReflectors:
-    """``data`` : three rows for each of m poses; ``length_mm`` : of the reflectors from the origin; ``pose`` : (3m,)
-    number of the pose of each row; ``lever`` : (3m, 3) unit vectors from the origin, instrument's frame."""
+    """``data`` : k rows for each of m poses; ``places`` : (k, 3) of the reflectors, target's frame, mm; ``pose`` :
+    (km,) number of the pose of each row; ``lever`` : (km, 3) from their mean, of RMS length 1, instrument's frame."""
 
     data: Measurements
-    length_mm: float
+    places: Array
     pose: Array
     lever: Array
 
     def __post_init__(self):
+        freeze(self, "places", (None, 3), "places")
         freeze(self, "pose", (len(self.data),), "poses", int)
         freeze(self, "lever", (len(self.data), 3), "levers")
 
     def by_pose(self, response: np.ndarray) -> np.ndarray:
-        """(p, 6 m) response to the poses' own noise of that (p, 3m, 3) to the noise of rows taken for independent.
+        """(p, 6 m) response to the poses' own noise of that (p, km, 3) to the noise of rows taken for independent.
 
-        A pose errs by a translation and by a rotation that moves a reflector as much: √(1 + ⅔) of it together.
+        A pose errs by a translation of the reflectors' mean and by a rotation that moves them as much (RMS):
+        √(1 + ⅔) of it together.
         """
         by_row = np.concatenate([np.broadcast_to(np.eye(3), (len(self.lever), 3, 3)), -skew(self.lever)], axis=2)
         shared = np.zeros((len(response), int(self.pose.max()) + 1, 6))
@@ -49,9 +51,9 @@ class VirtualReflectors:
         for name in dict.fromkeys(self.data.targets):
             target, _, number = name.rpartition(SEPARATOR)
             if number == "1":
-                own = [f"{target}{SEPARATOR}{i + 1}" for i in range(3)]
+                own = [f"{target}{SEPARATOR}{i + 1}" for i in range(len(self.places))]
                 xyz = np.array([places[each].translation for each in own])
-                tools[target] = align_rigid(xyz, self.length_mm * UNIT_PLACES)
+                tools[target] = align_rigid(xyz, self.places)
                 spread[target] = float(np.sqrt(np.mean([spread_mm[each] ** 2 for each in own])))
         return tools, spread
 
@@ -70,33 +72,45 @@ def length_of(data: Measurements) -> float | None:
     return float(np.clip(np.median(np.sqrt(position / rotation)), SHORTEST_MM, LONGEST_MM))
 
 
-def virtual_reflectors(data: Measurements, length_mm: float) -> VirtualReflectors:
-    """Three reflectors for each pose, at ``length_mm`` from its origin: where an error of rotation is worth one of
-    position.
+def ring(length_mm: float) -> np.ndarray:
+    """(3, 3) places at ``length_mm`` from the target's origin, where an error of rotation is worth one of position.
 
     Raises
     ------
     InputError
-        No orientations, or a length out of range.
+        A length out of range.
+    """
+    if not SHORTEST_MM <= length_mm <= LONGEST_MM:
+        raise InputError(f"--orientations {length_mm:g}: {SHORTEST_MM:g} to {LONGEST_MM:g} mm needed, auto or off")
+    return length_mm * UNIT_PLACES
+
+
+def virtual_reflectors(data: Measurements, places: np.ndarray) -> VirtualReflectors:
+    """Reflectors that each pose carries along at ``places`` (k, 3) of its target, mm; k ≥ 3, not in line.
+
+    Raises
+    ------
+    InputError
+        No orientations.
     """
     if data.rotations is None or data.positions is None:
         raise InputError(
             f"{data.where}: no orientations; columns of a rotation needed for --orientations, or leave it out"
         )
-    if not SHORTEST_MM <= length_mm <= LONGEST_MM:
-        raise InputError(f"--orientations {length_mm:g}: {SHORTEST_MM:g} to {LONGEST_MM:g} mm needed, auto or off")
-    m = len(data)
-    lever = np.einsum("mij,kj->mki", data.rotations, UNIT_PLACES).reshape(-1, 3)
-    row = np.repeat(np.arange(m), 3)
+    m, k = len(data), len(places)
+    about = places - places.mean(axis=0)
+    lever = about / np.sqrt((about**2).sum(axis=1).mean())
+    carried, lever = (np.einsum("mij,kj->mki", data.rotations, each).reshape(-1, 3) for each in (places, lever))
+    row = np.repeat(np.arange(m), k)
     at = row.tolist()
     own = replace(
         data,
         lines=[data.lines[i] for i in at],
         q=data.q[row],
-        targets=tuple(f"{data.targets[i]}{SEPARATOR}{k % 3 + 1}" for k, i in enumerate(at)),
-        positions=np.asarray(data.positions)[row] + length_mm * lever,
+        targets=tuple(f"{data.targets[i]}{SEPARATOR}{n % k + 1}" for n, i in enumerate(at)),
+        positions=np.asarray(data.positions)[row] + carried,
         rotations=None,
         covariance=None,
         common=None,
     )
-    return VirtualReflectors(own, length_mm, row, lever)
+    return VirtualReflectors(own, places, row, lever)

@@ -13,7 +13,7 @@ from stcal.errors import DegenerateError, InputError
 from stcal.geometry.rigid import Rigid
 from stcal.robot.axes.checks import _shape
 from stcal.robot.axes.model import fit_axes, pairs_of, robot_from_sweeps
-from stcal.robot.axes.orientations import length_of
+from stcal.robot.axes.orientations import length_of, ring
 from stcal.robot.axes.report import axes_file
 from stcal.robot.axes.sweeps import find_arcs
 from stcal.robot.kinematics.example import mh80
@@ -437,6 +437,12 @@ def test_axes_that_are_parallel_but_for_the_smallest_number_are_compared_in_sile
 # --- orientations ---
 
 LENGTH_MM = 150.0
+UNEVEN = np.array([[120.0, 0, 0], [-120, 0, 0], [0, 160, -40], [0, -160, -40], [0, 0, 80]])
+"""Middles of faces, say, about their mean."""
+PLACES = {
+    "ring": ring(LENGTH_MM),
+    "uneven": UNEVEN * LENGTH_MM / np.sqrt((UNEVEN**2).sum(axis=1).mean()),
+}
 
 
 def posed(robot: Robot, q: np.ndarray, sigma: float = 0.0, seed: int = 0) -> Measurements:
@@ -452,11 +458,12 @@ def posed(robot: Robot, q: np.ndarray, sigma: float = 0.0, seed: int = 0) -> Mea
     )
 
 
-def test_orientations_give_the_pose_of_the_target_too():
+@pytest.mark.parametrize("places", [ring(LENGTH_MM), np.add(UNEVEN, [30.0, 50, -100])], ids=PLACES)
+def test_orientations_give_the_pose_of_the_target_too(places):
     nominal = mh80()
     true = arm(nominal)
     true = replace(true, tools={"A": Rigid.exp([0.3, -0.2, 0.5, 180, 20, 150])})
-    result = robot_from_sweeps(posed(true, sweep_values(true, rests=2)), nominal, length_mm=LENGTH_MM)
+    result = robot_from_sweeps(posed(true, sweep_values(true, rests=2)), nominal, places=places)
     assert list(result.robot.tools) == ["A"]
     q = joint_vectors(nominal, 20, np.random.default_rng(3))
     there = true.world_from_base @ forward(true, q, "A")
@@ -471,15 +478,16 @@ def test_the_length_is_that_at_which_both_errors_are_alike():
     assert length_of(data) == pytest.approx(LENGTH_MM)
     assert length_of(replace(data, covariance=None)) is None
     with pytest.raises(InputError, match="no orientations"):
-        robot_from_sweeps(measured(true, sweep_values(true, 3)), mh80(), length_mm=100.0)
+        robot_from_sweeps(measured(true, sweep_values(true, 3)), mh80(), places=ring(100.0))
     with pytest.raises(InputError, match=r"--orientations 0\.1: 1 to 10000 mm needed"):
-        robot_from_sweeps(data, mh80(), length_mm=0.1)
+        robot_from_sweeps(data, mh80(), places=ring(0.1))
 
 
 @pytest.mark.slow
-def test_orientations_help_and_their_covariance_is_true():
+@pytest.mark.parametrize("places", PLACES.values(), ids=PLACES)
+def test_orientations_help_and_their_covariance_is_true(places):
     """40 trials of 6 axes of 4 parameters: the mean square over σ² scatters by √(2/960) = 5 %, and by more since axes
-    share what the unwinding passes on. Three points that share the errors of a pose are not taken for independent."""
+    share what the unwinding passes on. Points that share the errors of a pose are not taken for independent."""
     nominal = mh80()
     true = arm(nominal)
     z, origin = true_axes(true)
@@ -487,7 +495,7 @@ def test_orientations_help_and_their_covariance_is_true():
     squares, sizes = [], []
     for seed in range(40):
         data = posed(true, q, SIGMA, seed)
-        found = [robot_from_sweeps(data, nominal, length_mm=length) for length in (LENGTH_MM, None)]
+        found = [robot_from_sweeps(data, nominal, places=used) for used in (places, None)]
         errors = [
             np.concatenate([axis_error(f.world_from_axis, z[j], origin[j], False) for j, f in enumerate(r.fits)])
             for r in found
