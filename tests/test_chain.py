@@ -52,8 +52,8 @@ class Cell:
         seen = self.scene.groups[self.group].camera_from_target[0]
         self.camera_from_base = seen @ (forward(self.real, REST)[0] @ self.flange_from_target).inverse()
 
-    def call(self, words):
-        """Run a command; ``{}`` in ``words`` is this folder. What it printed."""
+    def call(self, words, code=0):
+        """Run a command that ends with ``code``; ``{}`` in ``words`` is this folder. What it printed, or said of it."""
         before = sys.argv
         sys.argv = words.format(self.root).split()
         self.capsys.readouterr()
@@ -63,8 +63,8 @@ class Cell:
         finally:
             sys.argv = before
         shown = self.capsys.readouterr()
-        assert ended.value.code == 0, shown.err
-        return shown.out
+        assert ended.value.code == code, shown.err
+        return shown.err if code else shown.out
 
     def write(self, name, header, rows):
         with (self.root / name).open("w", newline="") as file:
@@ -201,7 +201,16 @@ def test_photographs_to_joint_values_in_one_command(cell):
     cell.write("targets.csv", JOINTS, np.degrees(wanted).tolist())
     words = "stcal robot from-photos {0}/views/images --camera {0}/views/cameras.txt --faces {0}/run/faces.json "
     words += "--target {0}/views/target.toml --board {0}/views/board.toml --joints {0}/joints.csv "
-    said = cell.call(words + "--robot {0}/robot.toml --targets {0}/targets.csv --out {0}/done")
+    words += "--robot {0}/robot.toml --targets {0}/targets.csv --out {0}/done"
+    faces = json.loads((root / "run/faces.json").read_text())
+    for centre in faces["circles"].values():
+        centre[0] *= 1.3
+    (root / "other.json").write_text(json.dumps(faces))
+    refused = cell.call(words.replace("run/faces.json", "other.json"), 2)
+    assert "off that of target" in refused
+    assert "0.5 mm allowed; give the target.toml of that run" in refused
+    assert not (root / "done").exists()
+    said = cell.call(words)
     assert "1 rows of the photographs have no partner" in said
     assert "every joint is swept by itself" in said
     out = root / "done"

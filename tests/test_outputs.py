@@ -18,6 +18,7 @@ FOLDERS = {
     ("simulate", "folder"),
     ("demo", "out"),
     ("watch", "out"),
+    ("from_photos", "out"),
 }
 FOLDERS |= {("export_model", "out"), ("capture", "out"), ("capture", "images")}
 """New ones, which replace nothing, or those of `tests/sfm/run/test_transaction.py`."""

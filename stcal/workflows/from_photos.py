@@ -5,18 +5,20 @@ by itself.
 """
 
 import tempfile
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
 
 from stcal.design import BoardDesign, TargetDesign
-from stcal.errors import DegenerateError, InputError
+from stcal.errors import InputError, StcalError
+from stcal.geometry.rigid import Rigid
 from stcal.io.camera import CameraModel
+from stcal.io.images import find_images
 from stcal.io.join import join
 from stcal.io.saving import json_text, real_place, save
-from stcal.io.table import Table, read_table
+from stcal.io.table import POSE, Table, read_table
 from stcal.report.figure import COLOURS, calm, new_figure, uri
 from stcal.report.page import render
 from stcal.report.text import number
@@ -24,11 +26,12 @@ from stcal.robot.axes.model import AxesResult, robot_from_sweeps
 from stcal.robot.axes.orientations import length_of, ring
 from stcal.robot.axes.report import axes_file, axes_page
 from stcal.robot.axes.sweeps import find_arcs
+from stcal.robot.identify.predicted import predicted_at
 from stcal.robot.identify.report import identified_file, identified_page
 from stcal.robot.identify.result import Identified, IdentifyOptions
 from stcal.robot.identify.solve import identify
 from stcal.robot.kinematics.file import robot_toml
-from stcal.robot.kinematics.measurements import Measurements, read_measurements
+from stcal.robot.kinematics.measurements import Measurements, joint_values, read_measurements, targets_of
 from stcal.robot.kinematics.model import Robot
 from stcal.robot.use.compensation import (
     Compensated,
@@ -39,9 +42,9 @@ from stcal.robot.use.compensation import (
 )
 from stcal.robot.use.evaluation import Figures, evaluate
 from stcal.robot.use.report import compensation_page
-from stcal.robot.use.targets import read_targets
+from stcal.robot.use.targets import Targets, read_targets
 from stcal.sfm.measure.images import MeasureOptions, MeasureResult, measure
-from stcal.sfm.measure.output import poses_csv, poses_file, summary
+from stcal.sfm.measure.output import IMAGE, poses_csv, poses_file, summary
 from stcal.sfm.measure.report import measure_page
 from stcal.sfm.measure.target import TargetCircles
 
@@ -53,7 +56,8 @@ PAGES = {
     "identified.html": "Identification of the arm",
     "compensated.html": "Joint values for the targets",
 }
-MOST_NOTES = 20
+MOST_NOTES, MOST_TARGETS = 20, 20
+PHOTOGRAPHS = "the photographs"
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -95,6 +99,21 @@ class FromPhotos:
     compensated: Compensated | None
     errors: dict[str, Figures]
     notes: tuple[str, ...]
+
+    def sigma_mm(self) -> np.ndarray:
+        """(t,) predicted σ of the tool's position at the targets, mm; nan where not reached, or of unmeasured tools."""
+        found, sigma = self.compensated, self.identified.predicted
+        if found is None or sigma is None:
+            return np.zeros(0)
+        at = predicted_at(sigma, self.identified.state, "pose", found.found.q, found.targets.tools)
+        return np.where(found.found.usable, at, np.nan)
+
+    def moves(self) -> np.ndarray:
+        """(t, n) joint values to send less those of the arm as drawn, rad or mm; nan where one of both is none."""
+        found = self.compensated
+        if found is None or found.nominal is None:
+            return np.zeros((0, len(self.nominal.rows)))
+        return np.where(found.compared()[:, None], found.found.q - found.nominal.q, np.nan)
 
     def files(self) -> dict[str, str]:
         """By name, all that is written."""
@@ -166,13 +185,46 @@ def from_photos(
     StcalError
         One of its kinds, of the step that failed, with a one-line message that says what to do.
     """
-    wanted = None if targets is None else read_targets(targets, nominal)  # before the work: both may be refused
-    values = read_table(joints, "joints")
+    # before the work, as both may be refused
+    values = read_joints(joints, key, [each.name for each in find_images(images)[0]], nominal)
+    carried = dict.fromkeys(targets_of(values), Rigid())
+    wanted = None if targets is None else read_targets(targets, replace(nominal, tools=carried))
     measured = measure(images, camera, target, design, board, measure_options, progress)
+    return from_measured(str(images), measured, values, nominal, wanted, options)
+
+
+def read_joints(path: str | Path, key: str, photographs: Sequence[str], nominal: Robot) -> Table:
+    """Joint values with the name of each one's photograph in the column ``image``, in place of ``key``.
+
+    Raises
+    ------
+    InputError
+        No such column, none of the photographs, one twice, poses beside the joint values, or not those of the robot.
+    """
+    values, nowhere = read_table(path, "joints"), np.zeros(len(photographs))
+    files = Table(PHOTOGRAPHS, {key: list(photographs)} | dict.fromkeys(POSE, nowhere), range(len(photographs)))
+    join(files, values, key)
+    joint_values(values, nominal)
+    own = {name: column for name, column in values.columns.items() if name not in (key, IMAGE)}
+    return replace(values, columns={IMAGE: values.text(key)} | own, rows=())
+
+
+def from_measured(
+    images: str,
+    measured: MeasureResult,
+    values: Table,
+    nominal: Robot,
+    wanted: Targets | None = None,
+    options: IdentifyOptions | None = None,
+) -> FromPhotos:
+    """The steps after the photographs are measured; arguments and errors as of :func:`from_photos`.
+
+    ``values`` : as of :func:`read_joints`; ``wanted`` : what to compensate.
+    """
     with tempfile.TemporaryDirectory(prefix="stcal-photos-") as folder:
         own = Path(folder) / POSES
         save(own, poses_csv(measured)[0])
-        joined = join(replace(read_table(own, "poses"), where="the photographs"), values, key)
+        joined = join(replace(read_table(own, "poses"), where=PHOTOGRAPHS), values, IMAGE)
     data = read_measurements(joined.table, nominal)
     axes, without = _axes(data, nominal)
     found = identify(nominal, data, options)
@@ -186,7 +238,7 @@ def from_photos(
         held = found.held_out.position_mm[:, good]
         errors[f"identified, {found.held_out.folds} folds held out"] = Figures.of(held[np.isfinite(held)])
     return FromPhotos(
-        str(images),
+        images,
         measured,
         nominal,
         data,
@@ -206,12 +258,12 @@ def _axes(data: Measurements, nominal: Robot) -> tuple[AxesResult | None, str]:
         rows = np.unique(np.concatenate([arc.rows for arc in arcs]))
         length_mm = length_of(data)
         return robot_from_sweeps(data[rows], nominal, places=None if length_mm is None else ring(length_mm)), ""
-    except (InputError, DegenerateError) as error:
+    except StcalError as error:  # a step that can be done without
         return None, str(error).removeprefix(f"{data.where}: ")
 
 
 def require_new_folder(out: Path, images: Path) -> None:
-    """Refuse, before the work, a place that holds anything, or that lies among the photographs.
+    """Refuse, before the work, a place that holds anything, that lies among the photographs or cannot be written.
 
     Raises
     ------
@@ -222,6 +274,11 @@ def require_new_folder(out: Path, images: Path) -> None:
         raise InputError(f"--out {out}: is not a new or empty folder; give another place")
     if real_place(images) in (real_place(out), *real_place(out).parents):
         raise InputError(f"--out {out}: lies in the folder of the photographs {images}; give another place")
+    above = next(each for each in out.absolute().parents if each.exists())
+    try:
+        tempfile.TemporaryDirectory(prefix=f".{out.name}-", dir=above).cleanup()
+    except OSError as error:
+        raise InputError(f"--out {out}: cannot be written: {error.strerror or error}; give another place") from error
 
 
 def save_folder(out: Path, files: dict[str, str]) -> None:
@@ -260,7 +317,35 @@ def story(result: FromPhotos) -> list[str]:
     )
     if result.compensated is not None:
         said += [line[0].lower() + line[1:] for line in compensated_summary(result.compensated)]
+        said += _at_targets(result)
     return said
+
+
+def _at_targets(result: FromPhotos) -> list[str]:
+    """What the identified arm is expected to err by there, and how far the joints move."""
+    said, sigma, moves = [], result.sigma_mm(), result.moves()
+    known, moved = sigma[np.isfinite(sigma)], moves[np.isfinite(moves).all(axis=1)]
+    here = result.identified.predicted
+    if len(known) and here is not None:
+        said.append(
+            f"predicted σ of the tool's position there: {known.min():.2g} to {known.max():.2g} mm; at the measured "
+            f"rows {np.sqrt((here.here_mm**2).mean()):.2g} mm RMS"
+        )
+    if len(moved):
+        most = _shown(result, np.abs(moved).max(axis=0))
+        each = [f"{number(v, 4)}{unit}" for v, unit in zip(most, _units(result), strict=True)]
+        said.append(f"joints move by up to {', '.join(each)}")
+    return said
+
+
+def _units(result: FromPhotos) -> list[str]:
+    """Of each joint's values, as shown."""
+    return [" mm" if sliding else "°" for sliding in result.nominal.prismatic]
+
+
+def _shown(result: FromPhotos, values: np.ndarray) -> np.ndarray:
+    """Joint values (…, n) in those."""
+    return np.where(result.nominal.prismatic, values, np.degrees(values))
 
 
 def from_photos_page(result: FromPhotos, names: tuple[str, ...]) -> str:
@@ -273,7 +358,9 @@ def from_photos_page(result: FromPhotos, names: tuple[str, ...]) -> str:
         (number(last.rms, 3), "mm RMS", list(result.errors)[-1]),
     ]
     if before is not None:
-        tiles.append((number(float(np.sqrt((before**2).mean())), 3), "mm RMS", "taken away at the targets"))
+        tiles.append(
+            (number(float(np.sqrt((before**2).mean())), 3), "mm RMS", "taken away at the targets, base included")
+        )
     notes = [
         *result.notes,
         *(f"{each.name}: {each.reason}" for each in result.measured.left_out),
@@ -291,11 +378,30 @@ def from_photos_page(result: FromPhotos, names: tuple[str, ...]) -> str:
             for name, each in result.errors.items()
         ],
         drawn=uri(_figure(result)),
+        heads=[f"J{i}, {unit.strip()}" for i, unit in enumerate(_units(result), 1)],
+        targets=_target_rows(result),
+        more_targets=0 if found is None else max(len(found) - MOST_TARGETS, 0),
         pages=[(name, PAGES[name]) for name in names if name in PAGES],
         files=[name for name in names if not name.endswith(".html")],
         notes=notes[:MOST_NOTES],
         more=max(len(notes) - MOST_NOTES, 0),
     )
+
+
+def _target_rows(result: FromPhotos) -> list[list[str]]:
+    """Of each target what its nominal joint values err by, the predicted σ, and by how much the joints move."""
+    found = result.compensated
+    if found is None:
+        return []
+    moves, sigma = _shown(result, result.moves()), result.sigma_mm()
+    return [
+        [
+            str(found.targets.lines[i]),
+            found.found.status[i],
+            *(number(float(v), 4) for v in (found.before_mm[i], sigma[i], *moves[i])),
+        ]
+        for i in range(min(MOST_TARGETS, len(found)))
+    ]
 
 
 def _figure(result: FromPhotos):

@@ -21,7 +21,14 @@ def from_photos(
         typer.Option("--joints", help="Read the joint values of each photograph from this file, by --key (CSV)."),
     ],
     robot_file: RobotFile,
-    out: Annotated[Path, typer.Option("--out", help="Write all results to this new folder.")],
+    out: Annotated[
+        Path,
+        typer.Option(
+            "--out",
+            help="Write all results to this new folder; for more options give its poses.csv with the joint values to "
+            "robot axes and identify, its identified.toml to robot compensate.",
+        ),
+    ],
     targets: Annotated[
         Path | None,
         typer.Option(

@@ -11,7 +11,7 @@ import numpy as np
 from stcal.geometry.rigid import Rigid
 from stcal.robot.identify.left import Finding
 from stcal.robot.identify.observability import directions_named
-from stcal.robot.identify.residuals import WIDTH, Observed, State, tip_jacobian
+from stcal.robot.identify.residuals import WIDTH, Kind, Observed, State, tip_jacobian
 from stcal.robot.kinematics.damped import reach_mm
 from stcal.robot.kinematics.model import Robot
 
@@ -29,11 +29,14 @@ class Predicted:
     """σ of the tool's position, mm (root of the summed variances of x, y, z), by the covariance of the parameters.
 
     ``here_mm`` : (m,) at the joint values that were measured; ``ranges_mm`` : (s,) at random ones over the joints'
-    ranges (± half a turn, or the reach, where unlimited).
+    ranges (± half a turn, or the reach, where unlimited), with ``left_mm`` in it, RMS of what residuals go with;
+    ``covariance`` : (k, k) of all parameters, those of elasticity too, rad and mm.
     """
 
     here_mm: np.ndarray
     ranges_mm: np.ndarray
+    covariance: np.ndarray
+    left_mm: float = 0.0
 
     def elsewhere(self) -> float:
         """σ over the ranges in units of that at the measured rows (RMS)."""
@@ -59,11 +62,37 @@ def predicted(state: State, robot: Robot, seen: Observed, covariance: np.ndarray
     names = list(dict.fromkeys(seen.data.targets))
     target = max(names, key=seen.data.targets.count)
 
-    def sigma(q: np.ndarray, targets: tuple[str, ...]) -> np.ndarray:
-        place = tip_jacobian(state, q, targets, seen.kind)[1][:, 3:]
-        return np.sqrt(np.einsum("rik,kl,ril->r", place, covariance, place))
+    here = _sigma(state, seen.data.q, seen.data.targets, seen.kind, covariance)
+    ranges = _sigma(state, _over_ranges(robot, SAMPLES), (target,) * SAMPLES, seen.kind, covariance)
+    return Predicted(here, ranges, covariance)
 
-    return Predicted(sigma(seen.data.q, seen.data.targets), sigma(_over_ranges(robot, SAMPLES), (target,) * SAMPLES))
+
+def _sigma(state: State, q: np.ndarray, targets: Sequence[str], kind: Kind, covariance: np.ndarray) -> np.ndarray:
+    """(r,) at joint values (r, n), mm."""
+    place = tip_jacobian(state, q, targets, kind)[1][:, 3:]
+    return np.sqrt(np.einsum("rik,kl,ril->r", place, covariance, place))
+
+
+def predicted_at(found: Predicted, state: State, kind: Kind, q: np.ndarray, targets: Sequence[str]) -> np.ndarray:
+    """(r,) σ of the tool's position at joint values (r, n) that were not measured, mm, with what residuals go with; nan
+    of tools that were not measured.
+
+    Parameters
+    ----------
+    found : Predicted
+        Of the identification.
+    state, kind
+        As identified, and from what.
+    q : (r, n) array
+        Joint values, rad and mm.
+    targets : (r,) sequence of str
+        The tool of each.
+    """
+    sigma, known = np.full(len(q), np.nan), np.array([name in state.tools for name in targets], bool)
+    if known.any():
+        own = [name for name in targets if name in state.tools]
+        sigma[known] = np.hypot(_sigma(state, q[known], own, kind, found.covariance), found.left_mm)
+    return sigma
 
 
 def _over_ranges(robot: Robot, count: int) -> np.ndarray:
@@ -84,7 +113,7 @@ def widened(found: Predicted | None, left: Sequence[Finding]) -> tuple[Predicted
         return found, ()
     each = np.array([finding.effect_mm / (np.sqrt(2) if finding.turns else 1.0) for finding in left])
     size = float(np.sqrt((each**2).sum()))
-    wider = replace(found, ranges_mm=np.hypot(found.ranges_mm, size))
+    wider = replace(found, ranges_mm=np.hypot(found.ranges_mm, size), left_mm=size)
     return wider, (
         f"σ hold for these rows, and for places like theirs: the model leaves {size:.2g} mm RMS that goes with what is "
         f"named above; over the joints' ranges the tool's position is known to {_rms(wider.ranges_mm):.2g} mm (σ, with "

@@ -1,0 +1,312 @@
+"""From poses of the target in photographs to joint values: simulated poses, no pixels; with photographs in
+``tests/test_chain.py``."""
+
+import csv
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from stcal.errors import ConvergenceError, DegenerateError, InputError
+from stcal.geometry.rigid import Poses, Rigid
+from stcal.io.images import Skipped
+from stcal.io.table import Table, pose_cells, read_table
+from stcal.robot.identify.result import IdentifyOptions
+from stcal.robot.kinematics.example import mh80
+from stcal.robot.kinematics.forward import forward
+from stcal.robot.use.targets import Targets
+from stcal.sfm.measure.common_errors import common_errors
+from stcal.sfm.measure.images import MeasuredImage, MeasureResult
+from stcal.sfm.measure.pose import pose_from_circles
+from stcal.synthetic.measured.arms import made
+from stcal.synthetic.measured.image_poses import known_target, see
+from stcal.synthetic.scene import SceneOptions, make_scene
+from stcal.workflows import from_photos as work
+
+JOINTS = [f"q{i}_deg" for i in range(1, 7)]
+REST = np.radians([10.0, 20.0, -15.0, 30.0, -50.0, 40.0])
+REACH = np.radians([8.0, 7.0, 9.0, 22.0, 22.0, 30.0])
+NOISE_PX = 0.02
+SWEEPS = np.array([REST + REACH[j] * np.eye(6)[j] * t for j in range(6) for t in np.linspace(-1, 1, 7)])
+
+
+class Cell:
+    """A camera that stands still before an arm with the target on its flange."""
+
+    def __init__(self, seed=4):
+        self.rng = np.random.default_rng(seed)
+        self.scene = make_scene(SceneOptions(images_per_group=6, seed=3))
+        self.real = made(mh80(), self.rng, 0.5, 1e-3)
+        self.flange_from_target = Rigid.exp([0.3, -0.2, 0.5, 20, -30, 110])
+        seen = next(iter(self.scene.groups.values())).camera_from_target[0]
+        self.camera_from_base = seen @ (forward(self.real, REST)[0] @ self.flange_from_target).inverse()
+        self.target = known_target(self.scene, NOISE_PX).measured(self.rng)
+
+    def about(self, count):
+        """Random joint values (count, 6), rad."""
+        return REST + 0.6 * REACH * self.rng.uniform(-1, 1, (count, 6))
+
+    def poses(self, q) -> Poses:
+        """camera_from_target, true."""
+        return self.camera_from_base @ (forward(self.real, q) @ self.flange_from_target)
+
+    def measured(self, q) -> MeasureResult:
+        """As the camera measures it at joint values (m, 6), rad."""
+        images, left_out = [], []
+        for i, pose in enumerate(self.poses(q)):
+            image, name = (
+                see(self.scene, pose, tuple(self.scene.target_from_face), NOISE_PX, self.rng),
+                f"a/{i:03d}.png",
+            )
+            try:
+                found = pose_from_circles(
+                    image.labels, image.centre_px, image.covariance_px2, self.target, self.scene.camera
+                )
+                images.append(MeasuredImage(name, found))
+            except DegenerateError as error:
+                left_out.append(Skipped(name, str(error)))
+        common = common_errors([each.pose for each in images], self.target, None)
+        return MeasureResult(tuple(images), tuple(left_out), (), 1.0, True, common)
+
+    def missed(self, result: work.FromPhotos) -> float:
+        """Mean square of where the arm is sent less where it is said to be, over that of the predicted σ."""
+        q, robot = result.compensated.found.q, result.identified.robot
+        off = self.poses(q).difference(robot.world_from_base @ forward(robot, q))[:, 3:]
+        return (off**2).sum(axis=1).mean() / (result.sigma_mm() ** 2).mean()
+
+
+def joint_table(q, names=None) -> Table:
+    names = [f"a/{i:03d}.png" for i in range(len(q))] if names is None else names
+    return Table("log.csv", {"image": names} | dict(zip(JOINTS, np.degrees(q).T, strict=True)), range(2, len(q) + 2))
+
+
+def wanted(q) -> Targets:
+    return Targets("targets.csv", range(2, len(q) + 2), ("",) * len(q), None, q)
+
+
+@pytest.fixture(scope="module")
+def cell():
+    return Cell()
+
+
+@pytest.fixture(scope="module")
+def swept(cell):
+    """Sweeps and 30 other poses; the last has no joint values, and one row of the log no photograph."""
+    q = np.concatenate([SWEEPS, cell.about(30)])
+    names = [*(f"a/{i:03d}.png" for i in range(len(q) - 1)), "a/lost.png"]
+    return work.from_measured("views", cell.measured(q), joint_table(q, names), mh80(), wanted(cell.about(12)))
+
+
+def test_each_model_errs_less_than_the_one_before(swept):
+    drawn, axes, same, held = (figures.rms for figures in swept.errors.values())
+    assert drawn > 5 * held  # 0.5 mm and 1 mrad, of which base and tool take up a part
+    assert axes < drawn / 2
+    assert 0.5 * same < held < 1.5 * same  # 30 parameters of 71 poses: √((426 + 30) / (426 - 30)) is 1.07
+    assert len(swept.data) == len(SWEEPS) + 29
+
+
+def test_rows_and_photographs_without_partner_are_named_with_their_number(swept):
+    alone = [note for note in swept.notes if "no partner" in note]
+    assert [note.split(" rows")[0] for note in alone] == ["1", "1"]
+    assert "a/071.png" in alone[0]
+    assert "a/lost.png" in alone[1]
+
+
+@pytest.mark.slow
+def test_the_sigma_at_the_targets_is_that_of_the_errors_there():
+    """Of 20 arms. All targets of an arm share the target's depth, which errs most: the mean is about that of 20 squares
+    of normal numbers, 1 ± 0.32."""
+    missed = []
+    for seed in range(20):
+        cell = Cell(seed)
+        q = np.concatenate([SWEEPS, cell.about(30)])
+        found = work.from_measured(
+            "views", cell.measured(q), joint_table(q), mh80(), wanted(cell.about(12)), IdentifyOptions(folds=0)
+        )
+        missed.append(cell.missed(found))
+    assert 0.3 < np.mean(missed) < 2
+
+
+def test_targets_among_the_rows_are_known_as_these_are(cell, swept):
+    here = swept.identified.predicted.here_mm
+    assert 0.8 < np.median(swept.sigma_mm()) / np.median(here) < 1.25  # 0.97 to 1.06 of 20 arms
+    assert cell.missed(swept) < 9
+
+
+def test_the_story_tells_errors_sigma_and_moves(swept):
+    story = work.story(swept)
+    moves = np.abs(np.degrees(swept.moves())).max(axis=0)
+    assert f"joints move by up to {', '.join(f'{v:.4f}°' for v in moves)}" in story
+    assert any("axis method" in line and line.startswith("every joint is swept") for line in story)
+    sigma = swept.sigma_mm()
+    assert any(f"{sigma.min():.2g} to {sigma.max():.2g} mm" in line for line in story)
+    page = swept.files()["report.html"]
+    for line in swept.compensated.targets.lines:
+        assert f'<th scope="row">{line}</th>' in page
+    assert "\N{GREEK CAPITAL LETTER SIGMA}" not in page
+
+
+def test_files_are_read_by_the_next_step(tmp_path, swept):
+    work.save_folder(tmp_path / "arm", swept.files())
+    steps = {"poses": "csv", "axes": "toml", "identified": "toml", "compensated": "csv"}
+    names = {f"{step}.{kind}" for step, own in steps.items() for kind in (own, "json", "html")}
+    assert {path.name for path in (tmp_path / "arm").iterdir()} == names | {"report.html"}
+    assert [path.name for path in tmp_path.iterdir()] == ["arm"]
+    sent = read_table(tmp_path / "arm/compensated.csv", "joint values")
+    q = np.column_stack([sent.quantity(f"q{i}", {"deg": np.pi / 180}) for i in range(1, 7)])
+    np.testing.assert_allclose(q, swept.compensated.found.q, atol=1e-10)  # nine decimals of a degree
+
+
+def test_without_sweeps_the_axis_method_is_left_out_with_its_reason(cell):
+    q = cell.about(40)
+    found = work.from_measured("views", cell.measured(q), joint_table(q), mh80())
+    assert found.axes is None
+    assert "joint 1, 2, 3, 4, 5, 6 is never swept" in found.without_axes
+    assert any(found.without_axes in line for line in work.story(found))
+    assert set(found.files()) == {
+        *(
+            f"{step}.{kind}"
+            for step, own in (("poses", "csv"), ("identified", "toml"))
+            for kind in (own, "json", "html")
+        ),
+        "report.html",
+    }
+    assert found.errors["as drawn"].rms > 5 * found.errors["identified, the same rows"].rms
+
+
+def test_an_axis_that_is_not_found_does_not_end_the_rest(cell, monkeypatch):
+    def unsettled(*_, **__):
+        raise ConvergenceError("joint 2: no minimum; measure a longer sweep")
+
+    monkeypatch.setattr(work, "robot_from_sweeps", unsettled)
+    q = np.concatenate([SWEEPS, cell.about(5)])
+    found = work.from_measured("views", cell.measured(q), joint_table(q), mh80())
+    assert found.axes is None
+    assert "the axis method was left out: joint 2: no minimum; measure a longer sweep" in work.story(found)
+    assert found.identified.rank == 30
+
+
+# --- what is refused, before any photograph is measured ---
+
+
+@pytest.fixture
+def given(tmp_path, monkeypatch):
+    """Inputs; measuring would fail the test."""
+    (tmp_path / "views/a").mkdir(parents=True)
+    for i in range(8):
+        (tmp_path / f"views/a/{i:03d}.png").write_bytes(b"")
+
+    def unwanted(*_):
+        raise AssertionError("measured")
+
+    monkeypatch.setattr(work, "measure", unwanted)
+
+    def call(header, rows, robot=None, key="image", images="views", targets=None):
+        with (tmp_path / "log.csv").open("w", newline="") as file:
+            csv.writer(file).writerows([header, *rows])
+        robot = mh80() if robot is None else robot
+        work.from_photos(tmp_path / images, None, None, None, tmp_path / "log.csv", robot, targets, key=key)
+
+    return call
+
+
+def rows_of(names=None):
+    names = [f"a/{i:03d}.png" for i in range(8)] if names is None else names
+    return [[name, *map(float, range(i, i + 6))] for i, name in enumerate(names)]
+
+
+def five_joints():
+    nominal = mh80()
+    return replace(nominal, joints=nominal.joints[:5], rows=nominal.rows[:5], coupling=np.eye(5))
+
+
+def seven_joints():
+    nominal = mh80()
+    joints, rows = (*nominal.joints, nominal.joints[0]), (*nominal.rows, nominal.rows[0])
+    return replace(nominal, joints=joints, rows=rows, coupling=np.eye(7))
+
+
+def test_the_inputs_of_these_tests_are_taken(given):
+    with pytest.raises(AssertionError, match="measured"):
+        given(["image", *JOINTS], rows_of())
+    with pytest.raises(AssertionError, match="measured"):
+        given(["photo", *JOINTS], rows_of(), key="photo")
+
+
+def test_a_folder_without_photographs(given, tmp_path):
+    (tmp_path / "empty").mkdir()
+    with pytest.raises(InputError, match="no image, one of jpg"):
+        given(["image", *JOINTS], rows_of(), images="empty")
+
+
+def test_no_names_in_common(given):
+    with pytest.raises(InputError, match=r"no image in common: a/000\.png … in the one, b/0\.png … in the other"):
+        given(["image", *JOINTS], rows_of([f"b/{i}.png" for i in range(8)]))
+
+
+def test_no_such_key(given):
+    with pytest.raises(InputError, match=r"log\.csv: no column photo; .* give another --key"):
+        given(["image", *JOINTS], rows_of(), key="photo")
+
+
+def test_a_photograph_twice(given):
+    with pytest.raises(InputError, match=r"line 3: image a/000\.png stands on line 2 too"):
+        given(["image", *JOINTS], rows_of(["a/000.png"] * 2))
+
+
+def test_a_robot_of_fewer_joints(given):
+    with pytest.raises(InputError, match=r"log\.csv: a column q6_…, but robot MH80 has 5 joints"):
+        given(["image", *JOINTS], rows_of(), five_joints())
+
+
+def test_a_robot_of_more_joints(given):
+    with pytest.raises(InputError, match=r"log\.csv: no such column, q7_rad or q7_deg needed; .*q6_deg"):
+        given(["image", *JOINTS], rows_of(), seven_joints())
+
+
+def test_targets_of_a_tool_that_is_not_photographed(given):
+    nominal = replace(mh80(), tools={"": Rigid(), "gripper": Rigid()})
+    q = np.zeros((1, 6)).T
+    targets = Table("targets.csv", {"target": ["gripper"]} | dict(zip(JOINTS, q, strict=True)), [2])
+    with pytest.raises(InputError, match=r"targets\.csv: line 2: target 'gripper' is not in robot MH80; there are ''"):
+        given(["image", *JOINTS], rows_of(), nominal, targets=targets)
+
+
+def test_poses_beside_the_joint_values(given):
+    head = ["x_mm", "y_mm", "z_mm", "qw", "qx", "qy", "qz"]
+    with pytest.raises(InputError, match="both have x_mm"):
+        given(["image", *JOINTS, *head], [[*row, *pose_cells(Rigid())] for row in rows_of()])
+
+
+def test_joint_values_by_another_column_are_those_of_the_photographs(tmp_path):
+    """A column ``image`` beside the one of ``--key`` means something else."""
+    rows = [[f"a/{i}.png", f"other-{i}", *range(6)] for i in range(3)]
+    with (tmp_path / "log.csv").open("w", newline="") as file:
+        csv.writer(file).writerows([["photo", "image", *JOINTS], *rows])
+    found = work.read_joints(tmp_path / "log.csv", "photo", ["a/1.png", "a/2.png"], mh80())
+    assert found.text("image") == ["a/0.png", "a/1.png", "a/2.png"]
+    assert "photo" not in found
+
+
+@pytest.mark.parametrize("place", ["views", "views/a/new", "full", "file.toml", "file.toml/new"])
+def test_a_place_that_cannot_be_filled(tmp_path, place):
+    (tmp_path / "views/a").mkdir(parents=True)
+    (tmp_path / "views/a/1.png").write_bytes(b"")
+    (tmp_path / "full").mkdir()
+    (tmp_path / "full/identified.toml").write_text("mine")
+    (tmp_path / "file.toml").write_text("robot")
+    before = sorted(tmp_path.rglob("*"))
+    with pytest.raises(InputError, match="give another place"):
+        work.require_new_folder(tmp_path / place, tmp_path / "views")
+    assert sorted(tmp_path.rglob("*")) == before
+
+
+def test_a_new_place_is_taken_and_left_as_it_is(tmp_path):
+    work.require_new_folder(tmp_path / "new/deep", tmp_path / "views")
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_all_files_are_written_or_none(tmp_path):
+    with pytest.raises((InputError, OSError)):
+        work.save_folder(tmp_path / "arm", {"poses.csv": "a", "n" * 300: "too long a name"})
+    assert list(tmp_path.iterdir()) == []
