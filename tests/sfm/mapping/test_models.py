@@ -507,9 +507,9 @@ def test_two_cameras(saved, model):
 
 def test_a_camera_model_that_stcal_has_not(saved, model):
     model.cameras[1] = pycolmap.Camera(
-        camera_id=1, model="OPENCV_FISHEYE", width=1296, height=864, params=[1393.0, 1393, 648, 432, 0, 0, 0, 0]
+        camera_id=1, model="FOV", width=1296, height=864, params=[1393.0, 1393, 648, 432, 0.1]
     )
-    with pytest.raises(InputError, match="OPENCV_FISHEYE is not supported; use one of"):
+    with pytest.raises(InputError, match="FOV is not supported; use one of"):
         read(model.as_binary(), saved)
 
 
