@@ -57,7 +57,8 @@ def test_a_case_of_every_command_and_kind_of_file_is_judged(stock, tmp_path):
 @pytest.mark.parametrize("part", range(PARTS))
 def test_whatever_comes_in_is_judged(stock, tmp_path, part):
     found = spoiled(stock, tmp_path / "case", range(part, CASES, PARTS))
-    assert len({each.command for each in found}) > len(COMMANDS) // 2
+    # by their shares 50 cases are of 23 ± 2 of 39 commands
+    assert len({each.command for each in found}) > 2 * len(COMMANDS) // 5
 
 
 QUICK = [
