@@ -2,14 +2,16 @@
 
 from enum import StrEnum
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
 from stcal.cli.help import PLAIN, Commands
 from stcal.cli.terminal import print_each, say, write
 from stcal.errors import InputError
-from stcal.io.camera import CalibratedCamera
+
+if TYPE_CHECKING:
+    from stcal.io.camera import CalibratedCamera
 
 app = typer.Typer(
     name="stcal camera",
@@ -112,7 +114,7 @@ def compare(
         say(f"picture: {plot}")
 
 
-def _camera(path: Path, name: str, size: str) -> CalibratedCamera:
+def _camera(path: Path, name: str, size: str) -> "CalibratedCamera":
     from stcal.io.camera import read_camera
 
     model = read_camera(path, name)
