@@ -14,7 +14,7 @@ from tests.fuzzing.mutations import BY_SUFFIX
 from tests.fuzzing.pool import mistaken, went_through
 from tests.fuzzing.stock import make_stock
 
-SEED, CASES, PARTS = 20, 300, 6
+SEED, CASES, PARTS = 20, 360, 6
 
 
 @pytest.fixture(scope="module")
@@ -57,8 +57,7 @@ def test_a_case_of_every_command_and_kind_of_file_is_judged(stock, tmp_path):
 @pytest.mark.parametrize("part", range(PARTS))
 def test_whatever_comes_in_is_judged(stock, tmp_path, part):
     found = spoiled(stock, tmp_path / "case", range(part, CASES, PARTS))
-    # by their shares 50 cases are of 23 ± 2 of 39 commands
-    assert len({each.command for each in found}) > 2 * len(COMMANDS) // 5
+    assert len({each.command for each in found}) > len(COMMANDS) // 2
 
 
 QUICK = [

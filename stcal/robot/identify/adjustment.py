@@ -155,13 +155,14 @@ def solve(
     """
     limit = huber_limit(seen.kind) if robust else np.inf
     first = _linearised(state, seen, weighting, limit)[0]
-    known, pull = _fixed(first, first.spectrum()[1][:, : unseen(seen.kind)]), np.zeros(len(first.units))
-    conditions, count = np.zeros_like(known), 0
+    elsewhere, pull = np.zeros_like(first.normal), np.zeros(len(first.units))
+    conditions, count = np.zeros_like(first.normal), 0
     if held is not None:
-        known, pull = known + held.normal(), held.pull()
+        elsewhere, pull = held.normal(), held.pull()
         conditions, count = held.conditions(), int(held.fixed.sum())
     _, directions, good = replace(first, conditions=conditions).spectrum()
-    hold = known + _fixed(first, directions[:, ~good])  # along open ones valleys bend, and lead far
+    known = elsewhere + _fixed(first, directions[:, : unseen(seen.kind)])
+    hold = elsewhere + _fixed(first, directions[:, ~good])  # along open ones valleys bend, and lead far
 
     def kept(away: np.ndarray) -> NormalEquations:
         return NormalEquations(float(away @ (hold @ away + 2 * pull)), hold, hold @ away + pull)
