@@ -168,7 +168,7 @@ def find_charuco(image: np.ndarray, name: str, board: CharucoDesign, camera: Cam
     plain.setLegacyPattern(board.legacy)
     how = cv2.aruco.CharucoParameters()
     how.minMarkers, how.tryRefineMarkers = 1, True
-    if camera is not None and not camera.fisheye:
+    if camera is not None and not camera.fisheye:  # OpenCV projects its corners by a perspective lens
         how.cameraMatrix = np.array(
             [[camera.focal[0], 0, camera.centre[0]], [0, camera.focal[1], camera.centre[1]], [0, 0, 1]]
         )

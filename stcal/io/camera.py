@@ -118,11 +118,6 @@ class CalibratedCamera(Camera):
         lens = camera.focal, camera.centre, camera.distortion, FISHEYE in colmap_model
         return cls(camera.width, camera.height, *lens, colmap_model, covariance)
 
-    @staticmethod
-    def colmap_layout(colmap_model: str) -> list:
-        """Places of the parameters of a COLMAP model in :meth:`Camera.parameters`; of f those of fx and fy."""
-        return _COLMAP_LAYOUT[colmap_model]
-
     def colmap_params(self) -> list[float]:
         """Parameters in COLMAP's order and pixel origin."""
         flat = self.parameters()
@@ -221,9 +216,9 @@ def read_camera(path: str | Path, name: str = "") -> CameraModel:
                 if root.tag == "calibration"
                 else _from_opencv(_xml_values(root), path)
             )
-        if "lensmodel" in text and text.lstrip().startswith(("{", "#")):
-            return forms.from_mrcal(text, str(path))
         rows = [line.split() for line in text.splitlines() if line.strip() and not line.lstrip().startswith("#")]
+        if rows and rows[0][0].startswith("{") and "lensmodel" in text:
+            return forms.from_mrcal(text, str(path))
         if rows and len(rows[0]) >= 5 and re.fullmatch(r"[A-Z][A-Z0-9_]+", rows[0][1]):
             model = _from_colmap(rows, path)
             return replace(model, covariance=_stated_covariance(text, parameter_names(rows[0][1]), path))

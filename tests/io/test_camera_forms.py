@@ -4,10 +4,11 @@ import numpy as np
 import pycolmap
 import pytest
 
+from stcal.cli.cameras import Form
 from stcal.errors import InputError
 from stcal.geometry.camera import Camera
 from stcal.io.camera import CalibratedCamera, read_camera
-from stcal.io.cameras.forms import FORMS, SUFFIXES, written
+from stcal.io.cameras.forms import SUFFIXES, WRITERS, written
 
 LENSES = {
     "PINHOLE": [],
@@ -34,7 +35,7 @@ def camera_of(model: str) -> CalibratedCamera:
 
 
 @pytest.mark.parametrize("model", LENSES)
-@pytest.mark.parametrize("form", FORMS)
+@pytest.mark.parametrize("form", WRITERS)
 def test_what_is_written_reads_back(tmp_path, form, model):
     camera = camera_of(model)
     path = tmp_path / f"camera{SUFFIX[form]}"
@@ -50,9 +51,25 @@ def test_what_is_written_reads_back(tmp_path, form, model):
     np.testing.assert_allclose(found.parameters(), camera.parameters(), rtol=1e-14, atol=1e-12)
 
 
+def test_the_command_knows_every_form():
+    assert [form.value for form in Form] == list(WRITERS)
+
+
+@pytest.mark.parametrize("name", ["", "a: b", "0", "left\n", "é", "../cam"])
+def test_a_name_that_a_file_may_not_hold_is_refused(name):
+    with pytest.raises(InputError, match="camera name"):
+        written(camera_of("PINHOLE"), "kalibr", name)
+
+
+def test_a_comment_does_not_tell_the_form(tmp_path):
+    text = "# as the lensmodel of mrcal\n1 PINHOLE 1280 961 812.25 809.5 640.125 478.0625\n"
+    (tmp_path / "cameras.txt").write_text(text)
+    assert read_camera(tmp_path / "cameras.txt").colmap_model == "PINHOLE"
+
+
 def test_colmap_reads_the_binary_file(tmp_path):
     for model in LENSES:
-        (tmp_path / "cameras.bin").write_bytes(written(camera_of(model), "colmap-bin", "").content)
+        (tmp_path / "cameras.bin").write_bytes(written(camera_of(model), "colmap-bin", "cam0").content)
         for name in ("images.bin", "points3D.bin"):
             (tmp_path / name).write_bytes(bytes(8))
         (found,) = pycolmap.Reconstruction(tmp_path).cameras.values()

@@ -21,7 +21,7 @@ from stcal.handeye.methods.camera_error import CameraError, of_corners
 from stcal.handeye.methods.noise import Noise
 from stcal.handeye.methods.pose_adjustment import FALSE_ALARM, LEAST_POSES
 from stcal.handeye.methods.rounds import LEAST, Problem, adjust
-from stcal.io.camera import CameraPrior, intrinsic_basis
+from stcal.io.camera import PARAMETER_NAMES, CameraPrior, intrinsic_basis
 
 GROSS_RAD, GROSS_SHARE = np.radians(10), 0.2
 """A pose that misses by more (rotation; translation in shares of the distance) is wrong from the start: no error of the
@@ -255,7 +255,7 @@ def problem(
     if loop.robot_covariance is not None:
         robot = np.linalg.inv(np.linalg.cholesky(loop.robot_covariance))
         free = [name for name in free if not name.startswith("robot")]
-    basis = np.zeros((16, 0)) if intrinsics is None else intrinsic_basis(intrinsics.colmap_model)
+    basis = np.zeros((len(PARAMETER_NAMES), 0)) if intrinsics is None else intrinsic_basis(intrinsics.colmap_model)
     information = np.zeros((0, 0)) if intrinsics is None else np.linalg.inv(intrinsics.covariance)
     corners = Corners(
         loop.inverted,

@@ -161,7 +161,7 @@ class HandEyeFile(ResultFile):
     )
     camera: AdjustedCamera | None = Field(
         description="with `--refine-camera`: COLMAP `model`; `parameters` fx, fy, cx, cy, k1, k2, p1, p2, k3 … k6, "
-        "OpenCV pixel origin; `sigma` of those of the model"
+        "s1 … s4, OpenCV pixel origin; `sigma` of those of the model"
     )
     sigma: dict[str, float] = Field(
         description="`robot_rad`, `robot_mm`, `camera_rad`, `camera_mm`, `corner_px`, `board_mm` as far as the method "

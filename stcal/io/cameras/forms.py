@@ -5,6 +5,7 @@ Metashape, whose principal point is counted from the middle of the image.
 """
 
 import ast
+import re
 import struct
 import xml.etree.ElementTree as ElementTree
 from collections.abc import Callable, Mapping
@@ -20,9 +21,9 @@ from stcal.io.camera import (
     camera_from_colmap,
     camera_from_opencv,
     cameras_txt,
+    parameter_names,
 )
 
-FORMS = ("colmap", "colmap-bin", "opencv", "ros", "kalibr", "mrcal", "metashape")
 SUFFIXES = {
     ".txt": "colmap",
     ".bin": "colmap-bin",
@@ -150,7 +151,7 @@ def from_colmap_binary(content: bytes, choice: str, source: str) -> CameraModel:
         for _ in range(min(count, len(content) // 24)):
             number, kind, width, height = struct.unpack_from("<IiQQ", content, at)
             model = next(name for name, own in NUMBERS.items() if own == kind)
-            length = _lengths()[model]
+            length = len(parameter_names(model))
             cameras[str(number)] = model, width, height, struct.unpack_from(f"<{length}d", content, at + 24)
             at += 24 + 8 * length
     except (struct.error, StopIteration) as error:
@@ -163,10 +164,6 @@ def from_colmap_binary(content: bytes, choice: str, source: str) -> CameraModel:
     return camera_from_colmap(model, width, height, params, source)
 
 
-def _lengths() -> dict[str, int]:
-    return {name: len(CalibratedCamera.colmap_layout(name)) for name in NUMBERS}
-
-
 def written(camera: CalibratedCamera, form: str, name: str) -> Written:
     """The file of a camera.
 
@@ -175,28 +172,21 @@ def written(camera: CalibratedCamera, form: str, name: str) -> Written:
     camera : CalibratedCamera
         To write.
     form : str
-        One of :data:`FORMS`.
+        One of :data:`WRITERS`.
     name : str
         Of the camera, where the form has a place.
 
     Raises
     ------
     InputError
-        A lens that the form cannot hold, with the form that can.
+        A lens that the form cannot hold, with the form that can; a name that is no word.
     """
-    writers: dict[str, Callable[[CalibratedCamera, str], str | bytes]] = {
-        "colmap": lambda own, _: cameras_txt(own),
-        "colmap-bin": _colmap_binary,
-        "opencv": _opencv,
-        "ros": _ros,
-        "kalibr": _kalibr,
-        "mrcal": _mrcal,
-        "metashape": _metashape,
-    }
+    if not re.fullmatch(r"[A-Za-z]\w*", name, re.ASCII):
+        raise InputError(f"camera name {name}: letters, digits and _ needed, a letter first, such as cam0")
     lost = []
     if camera.covariance is not None and form != "colmap":
         lost.append("σ and correlations of the parameters")
-    return Written(writers[form](camera, name), tuple(lost))
+    return Written(WRITERS[form](camera, name), tuple(lost))
 
 
 def _refuse(camera: CalibratedCamera, form: str, why: str) -> InputError:
@@ -296,3 +286,15 @@ def _metashape(camera: CalibratedCamera, _: str) -> str:
         ElementTree.SubElement(root, tag).text = str(value) if tag in parts else repr(float(value))
     ElementTree.indent(root)
     return f'<?xml version="1.0" encoding="UTF-8"?>\n{ElementTree.tostring(root, encoding="unicode")}\n'
+
+
+WRITERS: Mapping[str, Callable[[CalibratedCamera, str], str | bytes]] = {
+    "colmap": lambda camera, _: cameras_txt(camera),
+    "colmap-bin": _colmap_binary,
+    "opencv": _opencv,
+    "ros": _ros,
+    "kalibr": _kalibr,
+    "mrcal": _mrcal,
+    "metashape": _metashape,
+}
+"""Of a camera called so, by form."""

@@ -19,7 +19,7 @@ from stcal.geometry.least_squares import minimise
 from stcal.geometry.normal_equations import constrained_inverse
 from stcal.geometry.rigid import Rigid
 from stcal.geometry.robust import HUBER, robust_sigma
-from stcal.io.camera import CameraPrior, intrinsic_basis
+from stcal.io.camera import PARAMETER_NAMES, CameraPrior, intrinsic_basis
 from stcal.labels import CircleLabel, DotLabel, dot_cells
 from stcal.sfm.adjust import dots_first
 from stcal.sfm.adjust.blocks import Block, Shared, normalised, robust_weights, rows_of_view, without_cameras
@@ -146,7 +146,7 @@ def covariance_of(
 
 def basis_of(prior: CameraPrior | None) -> np.ndarray:
     """Derivative (16, q) of a camera's parameters by those that are adjusted."""
-    return intrinsic_basis(prior.colmap_model) if prior else np.zeros((16, 0))
+    return intrinsic_basis(prior.colmap_model) if prior else np.zeros((len(PARAMETER_NAMES), 0))
 
 
 def photographs_of(

@@ -220,7 +220,7 @@ class ReportFile(ResultFile):
     options: ReportOptions = Field(description="`solve`, `frame`, `eccentricity`, `max_pair_angle_deg`")
     camera: ReportCamera = Field(
         description="COLMAP `model`, `size_px`, `focal_px`, `centre_px` (OpenCV pixel origin), `distortion` k1, k2, "
-        "p1, p2, k3 … k6"
+        "p1, p2, k3 … k6, and s1 … s4 of a lens with thin prisms"
     )
     summary: Summary = Field(
         description="counts: `files` (skipped ones included), `images`, `images_mapped`, `groups`, `faces`, "
