@@ -40,7 +40,7 @@ INSIDE = {
         ("interop", "diagnose", "plan"),
         (".",),
     ),
-    "robot": (("kinematics",), ("identify", "axes"), ("use",), ("export",), (".",)),
+    "robot": (("kinematics",), ("identify", "axes", "urdf"), ("use",), ("export",), (".",)),
     "register": (("core",), ("judge", "workspace"), (".",), ("report",)),
     "handeye": (("data",), ("methods",), ("judge",), (".",), ("rig",), ("report",)),
     "locate": (("data",), ("pose", "calibrate"), (".",), ("report",)),

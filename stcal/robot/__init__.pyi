@@ -14,9 +14,9 @@ from .kinematics.measurements import read_measurements as read_measurements
 from .kinematics.model import DHRow as DHRow
 from .kinematics.model import Joint as Joint
 from .kinematics.model import Robot as Robot
-from .kinematics.urdf import UrdfRobot as UrdfRobot
-from .kinematics.urdf import load_urdf as load_urdf
-from .kinematics.urdf import robot_urdf as robot_urdf
+from .urdf.read import UrdfRobot as UrdfRobot
+from .urdf.read import load_urdf as load_urdf
+from .urdf.write import robot_urdf as robot_urdf
 from .use.compensation import compensate as compensate
 from .use.design import DesignOptions as DesignOptions
 from .use.design import design as design

@@ -21,7 +21,10 @@ from stcal.sfm.measure.pose import pose_from_circles
 from stcal.synthetic.measured.arms import made
 from stcal.synthetic.measured.image_poses import known_target, see
 from stcal.synthetic.scene import SceneOptions, make_scene
-from stcal.workflows import from_photos as work
+from stcal.workflows.from_photos import run as work
+from stcal.workflows.from_photos.output import files_of, require_new_folder, save_folder
+from stcal.workflows.from_photos.report import story
+from stcal.workflows.from_photos.result import FromPhotos
 
 JOINTS = [f"q{i}_deg" for i in range(1, 7)]
 REST = np.radians([10.0, 20.0, -15.0, 30.0, -50.0, 40.0])
@@ -68,7 +71,7 @@ class Cell:
         common = common_errors([each.pose for each in images], self.target, None)
         return MeasureResult(tuple(images), tuple(left_out), (), 1.0, True, common)
 
-    def missed(self, result: work.FromPhotos) -> float:
+    def missed(self, result: FromPhotos) -> float:
         """Mean square of where the arm is sent less where it is said to be, over that of the predicted σ."""
         q, robot = result.compensated.found.q, result.identified.robot
         off = self.poses(q).difference(robot.world_from_base @ forward(robot, q))[:, 3:]
@@ -134,20 +137,20 @@ def test_targets_among_the_rows_are_known_as_these_are(cell, swept):
 
 
 def test_the_story_tells_errors_sigma_and_moves(swept):
-    story = work.story(swept)
+    said = story(swept)
     moves = np.abs(np.degrees(swept.moves())).max(axis=0)
-    assert f"joints move by up to {', '.join(f'{v:.4f}°' for v in moves)}" in story
-    assert any("axis method" in line and line.startswith("every joint is swept") for line in story)
+    assert f"joints move by up to {', '.join(f'{v:.4f}°' for v in moves)}" in said
+    assert any("axis method" in line and line.startswith("every joint is swept") for line in said)
     sigma = swept.sigma_mm()
-    assert any(f"{sigma.min():.2g} to {sigma.max():.2g} mm" in line for line in story)
-    page = swept.files()["report.html"]
+    assert any(f"{sigma.min():.2g} to {sigma.max():.2g} mm" in line for line in said)
+    page = files_of(swept)["report.html"]
     for line in swept.compensated.targets.lines:
         assert f'<th scope="row">{line}</th>' in page
     assert "\N{GREEK CAPITAL LETTER SIGMA}" not in page
 
 
 def test_files_are_read_by_the_next_step(tmp_path, swept):
-    work.save_folder(tmp_path / "arm", swept.files())
+    save_folder(tmp_path / "arm", files_of(swept))
     steps = {"poses": "csv", "axes": "toml", "identified": "toml", "compensated": "csv"}
     names = {f"{step}.{kind}" for step, own in steps.items() for kind in (own, "json", "html")}
     assert {path.name for path in (tmp_path / "arm").iterdir()} == names | {"report.html"}
@@ -162,8 +165,8 @@ def test_without_sweeps_the_axis_method_is_left_out_with_its_reason(cell):
     found = work.from_measured("views", cell.measured(q), joint_table(q), mh80())
     assert found.axes is None
     assert "joint 1, 2, 3, 4, 5, 6 is never swept" in found.without_axes
-    assert any(found.without_axes in line for line in work.story(found))
-    assert set(found.files()) == {
+    assert any(found.without_axes in line for line in story(found))
+    assert set(files_of(found)) == {
         *(
             f"{step}.{kind}"
             for step, own in (("poses", "csv"), ("identified", "toml"))
@@ -182,7 +185,7 @@ def test_an_axis_that_is_not_found_does_not_end_the_rest(cell, monkeypatch):
     q = np.concatenate([SWEEPS, cell.about(5)])
     found = work.from_measured("views", cell.measured(q), joint_table(q), mh80())
     assert found.axes is None
-    assert "the axis method was left out: joint 2: no minimum; measure a longer sweep" in work.story(found)
+    assert "the axis method was left out: joint 2: no minimum; measure a longer sweep" in story(found)
     assert found.identified.rank == 30
 
 
@@ -297,16 +300,16 @@ def test_a_place_that_cannot_be_filled(tmp_path, place):
     (tmp_path / "file.toml").write_text("robot")
     before = sorted(tmp_path.rglob("*"))
     with pytest.raises(InputError, match="give another place"):
-        work.require_new_folder(tmp_path / place, tmp_path / "views")
+        require_new_folder(tmp_path / place, tmp_path / "views")
     assert sorted(tmp_path.rglob("*")) == before
 
 
 def test_a_new_place_is_taken_and_left_as_it_is(tmp_path):
-    work.require_new_folder(tmp_path / "new/deep", tmp_path / "views")
+    require_new_folder(tmp_path / "new/deep", tmp_path / "views")
     assert list(tmp_path.iterdir()) == []
 
 
 def test_all_files_are_written_or_none(tmp_path):
     with pytest.raises((InputError, OSError)):
-        work.save_folder(tmp_path / "arm", {"poses.csv": "a", "n" * 300: "too long a name"})
+        save_folder(tmp_path / "arm", {"poses.csv": "a", "n" * 300: "too long a name"})
     assert list(tmp_path.iterdir()) == []

@@ -43,7 +43,8 @@ def convert(
 ) -> None:
     """Write a robot file as URDF, or the joints between links of a URDF as a robot file."""
     from stcal.robot.kinematics.file import load_robot, robot_toml
-    from stcal.robot.kinematics.urdf import coupled, load_urdf, require_same_poses, robot_urdf
+    from stcal.robot.urdf.read import load_urdf
+    from stcal.robot.urdf.write import coupled, require_same_poses, robot_urdf
 
     if out.suffix.lower() not in (*XML, ".toml"):
         raise InputError(f"{out}: a name ending in .urdf or .toml needed")

@@ -57,12 +57,14 @@ def from_photos(
     from stcal.robot.kinematics.file import load_robot
     from stcal.sfm.measure.images import MeasureOptions
     from stcal.sfm.measure.target import read_target
-    from stcal.workflows import from_photos as work
+    from stcal.workflows.from_photos.output import files_of, require_new_folder, save_folder
+    from stcal.workflows.from_photos.report import story
+    from stcal.workflows.from_photos.run import from_photos
 
-    work.require_new_folder(out, images)
+    require_new_folder(out, images)
     design = target_of(target)
     with StageProgress() as progress:
-        result = work.from_photos(
+        result = from_photos(
             images,
             read_camera(camera),
             read_target(faces, design),
@@ -77,7 +79,7 @@ def from_photos(
             progress,
         )
     print_each("note", result.notes)
-    for line in work.story(result):
+    for line in story(result):
         say(line)
-    work.save_folder(out, result.files())
+    save_folder(out, files_of(result))
     say(f"report: {out / 'report.html'}")

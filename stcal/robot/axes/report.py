@@ -10,7 +10,8 @@ from stcal.report.page import render
 from stcal.report.text import number, text_table
 from stcal.robot.axes.files import AxesFile
 from stcal.robot.axes.fit import AxisFit
-from stcal.robot.axes.model import ROW_VALUES, AxesResult, Pair
+from stcal.robot.axes.model import ROW_VALUES, AxesResult
+from stcal.robot.axes.pairs import Pair
 from stcal.robot.axes.sweeps import called
 from stcal.robot.kinematics.file import robot_toml
 

@@ -1,5 +1,4 @@
-"""Robots as URDF: the joints between a link and another, or several others, in metres and rad; all else in a file is
-passed over."""
+"""A robot of a URDF: the joints between a link and another, or several others; all else in a file is passed over."""
 
 import xml.etree.ElementTree as ElementTree
 from collections.abc import Sequence
@@ -11,19 +10,22 @@ import numpy as np
 from stcal.errors import InputError, StcalError
 from stcal.geometry.rigid import Poses, Rigid
 from stcal.io.files import SETTINGS_BYTES, read_bytes
-from stcal.io.poses.controllers import METRE_MM, from_roll_pitch_yaw, roll_pitch_yaw
+from stcal.io.poses.controllers import METRE_MM, from_roll_pitch_yaw
 from stcal.robot.kinematics.dh import robot_between, robot_from_chain
 from stcal.robot.kinematics.forward import carried_poses, flange_poses, forward
-from stcal.robot.kinematics.model import Chain, Convention, DHRow, Grown, Joint, JointType, Robot, Tree
+from stcal.robot.kinematics.model import Chain, Convention, DHRow, Grown, Joint, Robot, Tree
+from stcal.robot.urdf.names import (
+    FLANGE,
+    MOVING,
+    TOOL,
+    TOOL0,
+    UNLIMITED,
+    WHAT,
+    WORLD,
+)
 
-WHAT = "URDF"
-WORLD, BASE, FLANGE, TOOL, TOOL0 = "world", "base_link", "flange", "tool", "tool0"
-"""Names of links; other tools are ``tool_NAME``."""
-UNLIMITED = 1e6
-"""rad or m: a limit beyond is none; URDF has no half of one."""
 SAME_MM, SAME_RAD = 1e-9, 1e-12
 """By less the rows lead where the joints do."""
-MOVING: dict[str, JointType] = {"revolute": "revolute", "continuous": "revolute", "prismatic": "prismatic"}
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -47,106 +49,6 @@ class UrdfRobot:
     from_link: str
     to_link: str
     notes: tuple[str, ...]
-
-
-def robot_urdf(robot: Robot) -> str:
-    """The text of a URDF: links ``world``, ``base_link``, ``link_1`` …, ``flange``, ``tool`` and ``tool_NAME``; without
-    ``flange`` of a tree, the tools of which are fixed to the links that carry them.
-
-    Joint values are the kinematic ones: where the controller couples joints, the coupling times its values, and limits
-    are the widest that its limits allow.
-
-    Parameters
-    ----------
-    robot : Robot
-        What to write.
-
-    Returns
-    -------
-    str
-        XML, in metres and rad; every number reads back to the same double but for the last bit.
-
-    Raises
-    ------
-    InputError
-        An elastic robot.
-    """
-    if robot.elasticity is not None:
-        raise InputError(
-            f"robot {robot.name}: a URDF has no place for its elasticity; remove [elasticity] for the axes alone, or "
-            "export compensated points (`stcal robot compensate --export`)"
-        )
-    chain = replace(robot, world_from_base=Rigid()).chain()
-    root = ElementTree.Element("robot", name=robot.name)
-    root.append(ElementTree.Comment(" effort and velocity are not known: 0 "))
-    if coupled(robot):
-        root.append(
-            ElementTree.Comment(" joint values are kinematic: the coupling of the robot file times the controller's ")
-        )
-    ElementTree.SubElement(root, "link", name=WORLD)
-    _fixed(root, WORLD, BASE, robot.world_from_base)
-    low, high = _limits(robot)
-    for i, joint in enumerate(robot.joints):
-        unit = METRE_MM if joint.type == "prismatic" else 1.0
-        limited = np.isfinite([low[i], high[i]]).any()
-        kind = "continuous" if joint.type == "revolute" and not limited else joint.type
-        above = f"link_{chain.after(i) + 1}" if chain.after(i) >= 0 else BASE
-        element = _joint(root, joint_name(i), kind, above, f"link_{i + 1}", chain.gap(i))
-        ElementTree.SubElement(element, "axis", xyz="0 0 1")
-        if kind != "continuous":
-            ends = {"lower": max(low[i] / unit, -UNLIMITED), "upper": min(high[i] / unit, UNLIMITED)}
-            shown = {end: repr(float(value)) for end, value in ends.items()}
-            ElementTree.SubElement(element, "limit", shown | {"effort": "0", "velocity": "0"})
-    if chain.grown is None:
-        _fixed(root, f"link_{len(chain)}", FLANGE, chain.last_from_flange)
-    for name, tool in robot.tools.items():
-        if chain.grown is None:
-            _fixed(root, FLANGE, link_of(name), tool)
-        else:
-            carrier = chain.carrier(name)
-            _fixed(root, f"link_{carrier + 1}", link_of(name), chain.grown.ends[carrier] @ tool)
-    ElementTree.indent(root)
-    return f'<?xml version="1.0"?>\n{ElementTree.tostring(root, encoding="unicode")}\n'
-
-
-def link_of(tool: str) -> str:
-    """Name of a tool's link."""
-    return f"{TOOL}_{tool}" if tool else TOOL
-
-
-def joint_name(i: int) -> str:
-    """Of a joint, from 0."""
-    return f"joint_{i + 1}"
-
-
-def coupled(robot: Robot) -> bool:
-    """Whether the controller's joint values are not the kinematic ones."""
-    return bool((robot.coupling != np.eye(len(robot.rows))).any())
-
-
-def _limits(robot: Robot) -> tuple[np.ndarray, np.ndarray]:
-    """(n,) lowest and highest kinematic joint values."""
-    if not coupled(robot):
-        low, high = robot.limits().T
-        return low, high
-    ends = np.where(robot.coupling[..., None] == 0, 0.0, robot.coupling[..., None] * robot.limits()[None])
-    return ends.min(axis=2).sum(axis=1), ends.max(axis=2).sum(axis=1)
-
-
-def _joint(
-    root: ElementTree.Element, name: str, kind: str, parent: str, child: str, pose: Rigid
-) -> ElementTree.Element:
-    ElementTree.SubElement(root, "link", name=child)
-    element = ElementTree.SubElement(root, "joint", name=name, type=kind)
-    ElementTree.SubElement(element, "parent", link=parent)
-    ElementTree.SubElement(element, "child", link=child)
-    place, turn = ([repr(float(v)) for v in part] for part in (pose.translation / METRE_MM, roll_pitch_yaw(pose)))
-    ElementTree.SubElement(element, "origin", xyz=" ".join(place), rpy=" ".join(turn))
-    return element
-
-
-def _fixed(root: ElementTree.Element, parent: str, child: str, pose: Rigid) -> None:
-    _joint(root, f"{parent}_to_{child}", "fixed", parent, child, pose)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -236,37 +138,12 @@ def read_urdf(
     return UrdfRobot(robot, tuple(j.name for j in moving), start, ", ".join(ends.values()), notes)
 
 
-def require_same_poses(robot: Robot, text: str) -> None:
-    """Refuse a text of :func:`robot_urdf` that does not lead every tool where the robot does.
-
-    Raises
-    ------
-    StcalError
-        By how much it does not.
-    """
-    q = _values(len(robot.rows))
-    if robot.tree is not None:
-        links = [link_of(name) for name in robot.tools]
-        read = read_urdf(text.encode(), WHAT, BASE, links, robot.convention)
-        found, names = read.robot, [joint_name(i) for i in range(len(robot.rows))]
-        kinematic = (q @ robot.coupling.T)[:, [names.index(name) for name in read.joints]]
-        for name in robot.tools:
-            _require_near(found.world_from_base @ forward(found, kinematic, link_of(name)), forward(robot, q, name))
-        return
-    found = read_urdf(text.encode(), WHAT, convention=robot.convention).robot
-    for name, tool in robot.tools.items():
-        chain, other = robot.chain(), found.chain()
-        wanted = flange_poses(replace(chain, last_from_flange=chain.last_from_flange @ tool), q)
-        end = other.last_from_flange @ found.tool(name)
-        _require_near(flange_poses(replace(other, last_from_flange=end), q @ robot.coupling.T), wanted)
-
-
-def _values(n: int) -> np.ndarray:
+def fixed_values(n: int) -> np.ndarray:
     """(8, n) joint values, rad or mm, fixed."""
     return np.random.default_rng(0).uniform(-3, 3, (8, n))
 
 
-def _require_near(found: Poses, wanted: Poses) -> None:
+def require_near(found: Poses, wanted: Poses) -> None:
     off = np.abs(found.difference(wanted)).max(axis=0)
     far = max(SAME_MM, 1e-12 * float(np.abs(wanted.translation).max()))
     if off[3:].max() > far or off[:3].max() > SAME_RAD:
@@ -306,12 +183,12 @@ def _robot_of(paths: dict[str, list[_UrdfJoint]], name: str, convention: Convent
     rotation, translation = np.array([g.rotation for g in gaps]), np.array([g.translation for g in gaps])
     sliding = np.array([joint.type == "prismatic" for joint in joints])
     chain = Chain(rotation, translation, flange, sliding, np.eye(len(gaps)))
-    robot, q = robot_between(chain, tools, name, convention, joints), _values(len(gaps))
+    robot, q = robot_between(chain, tools, name, convention, joints), fixed_values(len(gaps))
     found = robot.chain()
     for each, tool in tools.items():
         ends = found.last_from_flange @ robot.tools[each], flange @ tool
         own, wanted = (replace(c, last_from_flange=e) for c, e in zip((found, chain), ends, strict=True))
-        _require_near(flange_poses(own, q), flange_poses(wanted, q))
+        require_near(flange_poses(own, q), flange_poses(wanted, q))
     return robot
 
 
@@ -339,9 +216,9 @@ def _tree_of(paths: dict[str, list[_UrdfJoint]], name: str, convention: Conventi
     rotation, translation = np.array([g.rotation for g in gaps]), np.array([g.translation for g in gaps])
     grown = Grown(Tree(mounts, carriers), (Rigid(),) * n)
     chain = Chain(rotation, translation, Rigid(), bare.prismatic, np.eye(n), grown=grown)
-    robot, q = robot_from_chain(chain, tools, bare), _values(n)
+    robot, q = robot_from_chain(chain, tools, bare), fixed_values(n)
     for tool, pose in tools.items():
-        _require_near(robot.world_from_base @ forward(robot, q, tool), carried_poses(chain, q, [tool] * len(q)) @ pose)
+        require_near(robot.world_from_base @ forward(robot, q, tool), carried_poses(chain, q, [tool] * len(q)) @ pose)
     return robot
 
 

@@ -1,0 +1,1 @@
+"""Robots as URDF, in metres and rad."""

@@ -1,0 +1,137 @@
+"""The text of a URDF, and that it leads where the robot does."""
+
+import xml.etree.ElementTree as ElementTree
+from dataclasses import replace
+
+import numpy as np
+
+from stcal.errors import InputError
+from stcal.geometry.rigid import Rigid
+from stcal.io.poses.controllers import METRE_MM, roll_pitch_yaw
+from stcal.robot.kinematics.forward import flange_poses, forward
+from stcal.robot.kinematics.model import Robot
+from stcal.robot.urdf.names import (
+    BASE,
+    FLANGE,
+    UNLIMITED,
+    WHAT,
+    WORLD,
+    joint_name,
+    link_of,
+)
+from stcal.robot.urdf.read import fixed_values, read_urdf, require_near
+
+
+def robot_urdf(robot: Robot) -> str:
+    """The text of a URDF: links ``world``, ``base_link``, ``link_1`` …, ``flange``, ``tool`` and ``tool_NAME``; without
+    ``flange`` of a tree, the tools of which are fixed to the links that carry them.
+
+    Joint values are the kinematic ones: where the controller couples joints, the coupling times its values, and limits
+    are the widest that its limits allow.
+
+    Parameters
+    ----------
+    robot : Robot
+        What to write.
+
+    Returns
+    -------
+    str
+        XML, in metres and rad; every number reads back to the same double but for the last bit.
+
+    Raises
+    ------
+    InputError
+        An elastic robot.
+    """
+    if robot.elasticity is not None:
+        raise InputError(
+            f"robot {robot.name}: a URDF has no place for its elasticity; remove [elasticity] for the axes alone, or "
+            "export compensated points (`stcal robot compensate --export`)"
+        )
+    chain = replace(robot, world_from_base=Rigid()).chain()
+    root = ElementTree.Element("robot", name=robot.name)
+    root.append(ElementTree.Comment(" effort and velocity are not known: 0 "))
+    if coupled(robot):
+        root.append(
+            ElementTree.Comment(" joint values are kinematic: the coupling of the robot file times the controller's ")
+        )
+    ElementTree.SubElement(root, "link", name=WORLD)
+    _fixed(root, WORLD, BASE, robot.world_from_base)
+    low, high = _limits(robot)
+    for i, joint in enumerate(robot.joints):
+        unit = METRE_MM if joint.type == "prismatic" else 1.0
+        limited = np.isfinite([low[i], high[i]]).any()
+        kind = "continuous" if joint.type == "revolute" and not limited else joint.type
+        above = f"link_{chain.after(i) + 1}" if chain.after(i) >= 0 else BASE
+        element = _joint(root, joint_name(i), kind, above, f"link_{i + 1}", chain.gap(i))
+        ElementTree.SubElement(element, "axis", xyz="0 0 1")
+        if kind != "continuous":
+            ends = {"lower": max(low[i] / unit, -UNLIMITED), "upper": min(high[i] / unit, UNLIMITED)}
+            shown = {end: repr(float(value)) for end, value in ends.items()}
+            ElementTree.SubElement(element, "limit", shown | {"effort": "0", "velocity": "0"})
+    if chain.grown is None:
+        _fixed(root, f"link_{len(chain)}", FLANGE, chain.last_from_flange)
+    for name, tool in robot.tools.items():
+        if chain.grown is None:
+            _fixed(root, FLANGE, link_of(name), tool)
+        else:
+            carrier = chain.carrier(name)
+            _fixed(root, f"link_{carrier + 1}", link_of(name), chain.grown.ends[carrier] @ tool)
+    ElementTree.indent(root)
+    return f'<?xml version="1.0"?>\n{ElementTree.tostring(root, encoding="unicode")}\n'
+
+
+def coupled(robot: Robot) -> bool:
+    """Whether the controller's joint values are not the kinematic ones."""
+    return bool((robot.coupling != np.eye(len(robot.rows))).any())
+
+
+def _limits(robot: Robot) -> tuple[np.ndarray, np.ndarray]:
+    """(n,) lowest and highest kinematic joint values."""
+    if not coupled(robot):
+        low, high = robot.limits().T
+        return low, high
+    ends = np.where(robot.coupling[..., None] == 0, 0.0, robot.coupling[..., None] * robot.limits()[None])
+    return ends.min(axis=2).sum(axis=1), ends.max(axis=2).sum(axis=1)
+
+
+def _joint(
+    root: ElementTree.Element, name: str, kind: str, parent: str, child: str, pose: Rigid
+) -> ElementTree.Element:
+    ElementTree.SubElement(root, "link", name=child)
+    element = ElementTree.SubElement(root, "joint", name=name, type=kind)
+    ElementTree.SubElement(element, "parent", link=parent)
+    ElementTree.SubElement(element, "child", link=child)
+    place, turn = ([repr(float(v)) for v in part] for part in (pose.translation / METRE_MM, roll_pitch_yaw(pose)))
+    ElementTree.SubElement(element, "origin", xyz=" ".join(place), rpy=" ".join(turn))
+    return element
+
+
+def _fixed(root: ElementTree.Element, parent: str, child: str, pose: Rigid) -> None:
+    _joint(root, f"{parent}_to_{child}", "fixed", parent, child, pose)
+
+
+def require_same_poses(robot: Robot, text: str) -> None:
+    """Refuse a text of :func:`robot_urdf` that does not lead every tool where the robot does.
+
+    Raises
+    ------
+    StcalError
+        By how much it does not.
+    """
+    q = fixed_values(len(robot.rows))
+    if robot.tree is not None:
+        links = [link_of(name) for name in robot.tools]
+        read = read_urdf(text.encode(), WHAT, BASE, links, robot.convention)
+        found, names = read.robot, [joint_name(i) for i in range(len(robot.rows))]
+        kinematic = (q @ robot.coupling.T)[:, [names.index(name) for name in read.joints]]
+        for name in robot.tools:
+            require_near(found.world_from_base @ forward(found, kinematic, link_of(name)), forward(robot, q, name))
+        return
+    found = read_urdf(text.encode(), WHAT, convention=robot.convention).robot
+    for name, tool in robot.tools.items():
+        chain, other = robot.chain(), found.chain()
+        wanted = flange_poses(replace(chain, last_from_flange=chain.last_from_flange @ tool), q)
+        end = other.last_from_flange @ found.tool(name)
+        require_near(flange_poses(replace(other, last_from_flange=end), q @ robot.coupling.T), wanted)
