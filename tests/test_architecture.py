@@ -53,10 +53,10 @@ FRONTS = {f"{system}/__init__.py" for system in INSIDE}
 """May hand on everything of their system."""
 LIBRARIES = {
     "pycolmap": ("sfm/mapping", "sfm/interop"),
-    "sqlite3": ("sfm/mapping", "sfm/interop"),
+    "sqlite3": ("sfm/mapping", "sfm/interop", "io/cameras/foreign.py"),
     "cv2": (
         *("io/images.py", "boards", "sfm/detect", "sfm/diagnose", "synthetic"),
-        *("io/device.py", "handeye/methods/closed_form.py", "sfm/mapping/pairs.py"),
+        *("io/device.py", "io/cameras/foreign.py", "handeye/methods/closed_form.py", "sfm/mapping/pairs.py"),
     ),
 }
 """Library: folders or files that may use it. ``cv2`` where pixels are, and in two places for a method of its own."""

@@ -24,7 +24,7 @@ NOT_YET = {
 }
 """Printed by scripts that take long and whose output is not stored yet; to become fewer."""
 
-QUICK = {"register_shared": "hilti_stationing", "reproduce_registration": None}
+QUICK = {"register_shared": "hilti_stationing", "reproduce_registration": None, "camera_formats": None}
 """Commands of about half a minute, and the data set that they are run on, which is not part of the repository."""
 
 

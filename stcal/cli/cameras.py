@@ -115,13 +115,20 @@ def compare(
 
 
 def _camera(path: Path, name: str, size: str) -> "CalibratedCamera":
-    from stcal.io.camera import read_camera
+    from stcal.io.camera import CameraModel
+    from stcal.io.cameras.fit import fit_lens
+    from stcal.io.cameras.read import read_lens
+    from stcal.report.camera import fitted_text
 
-    model = read_camera(path, name)
+    lens = read_lens(path, name)
     given = size.lower().split("x") if size else ["0", "0"]
     if len(given) != 2 or not all(side.isdigit() for side in given):
         raise InputError(f"--size {size}: two numbers with x between needed, such as 1920x1080")
-    width, height = model.width or int(given[0]), model.height or int(given[1])
+    width, height = lens.width or int(given[0]), lens.height or int(given[1])
     if not (width and height):
         raise InputError(f"camera file {path}: states no image size; give it with --size WxH")
-    return model.calibrated(width, height)
+    if isinstance(lens, CameraModel):
+        return lens.calibrated(width, height)
+    found = fit_lens(lens, width, height)
+    print_each("note", fitted_text(lens.called, found))
+    return found.camera

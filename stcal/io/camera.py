@@ -1,20 +1,13 @@
 """Camera files: COLMAP's ``cameras.txt``, OpenCV's YAML and XML, ROS ``camera_info``; each with its pixel origin. Those
 of other programs are in :mod:`stcal.io.cameras.forms`."""
 
-import re
-import struct
-import xml.etree.ElementTree as ElementTree
 from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
-import yaml
 
 from stcal.errors import InputError
 from stcal.geometry.camera import Camera
-from stcal.io.covariance import Rows, require_covariance
-from stcal.io.files import SETTINGS_BYTES, read_bytes
-from stcal.io.plain_yaml import load_yaml
 from stcal.io.saving import save
 
 COLMAP_PIXEL_ORIGIN = 0.5
@@ -191,48 +184,17 @@ def read_camera(path: str | Path, name: str = "") -> CameraModel:
     Raises
     ------
     InputError
-        Missing or malformed file, more than one camera, or a camera model that stcal does not support.
+        Missing or malformed file, more than one camera, or a lens that no model here holds.
     """
-    from stcal.io.cameras import forms  # which makes models of this module
+    from stcal.io.cameras.read import read_lens  # which makes models of this module
 
-    path = Path(path)
-    try:
-        content = read_bytes(path, SETTINGS_BYTES)
-    except OSError as error:
-        raise InputError(f"camera file {path}: {error.strerror or error}; give a readable file") from error
-    except ValueError as error:  # a NUL in the name
-        raise InputError(f"camera file {path}: not a text file; give cameras.txt, or OpenCV's YAML or XML") from error
-    if content[:8] == struct.pack("<Q", content[0] if content else 0) and b"\0" in content:
-        return forms.from_colmap_binary(content, name, str(path))
-    try:
-        text = content.decode("utf-8-sig")
-    except ValueError as error:
-        raise InputError(f"camera file {path}: not a text file; give cameras.txt, or OpenCV's YAML or XML") from error
-    try:
-        if text.lstrip().startswith("<"):
-            root = ElementTree.fromstring(text)
-            return (
-                forms.from_metashape(root, str(path))
-                if root.tag == "calibration"
-                else _from_opencv(_xml_values(root), path)
-            )
-        rows = [line.split() for line in text.splitlines() if line.strip() and not line.lstrip().startswith("#")]
-        if rows and rows[0][0].startswith("{") and "lensmodel" in text:
-            return forms.from_mrcal(text, str(path))
-        if rows and len(rows[0]) >= 5 and re.fullmatch(r"[A-Z][A-Z0-9_]+", rows[0][1]):
-            model = _from_colmap(rows, path)
-            return replace(model, covariance=_stated_covariance(text, parameter_names(rows[0][1]), path))
-        values = _yaml_values(text)
-        if any(isinstance(each, dict) and "camera_model" in each for each in values.values()):
-            return forms.from_kalibr(values, name, str(path))
-        return _from_opencv(values, path)
-    except InputError:
-        raise
-    except (KeyError, ElementTree.ParseError, yaml.YAMLError, ValueError, TypeError, RecursionError) as error:
-        reason = " ".join(str(error).split())[:150]
-        raise InputError(
-            f"camera file {path}: neither COLMAP's cameras.txt nor OpenCV's YAML or XML ({reason}); check its form"
-        ) from error
+    lens = read_lens(path, name)
+    if isinstance(lens, CameraModel):
+        return lens
+    raise InputError(
+        f"camera file {path}: {lens.called} is none of {', '.join(COLMAP_MODELS)}; fit one of them to it with "
+        "`stcal camera convert`"
+    )
 
 
 def write_cameras_txt(path: str | Path, camera: CalibratedCamera) -> None:
@@ -253,41 +215,7 @@ def cameras_txt(camera: CalibratedCamera) -> str:
     return "\n".join(lines) + "\n"
 
 
-def _stated_covariance(text: str, names: list[str], path: Path) -> np.ndarray | None:
-    """Covariance (q, q) of the comments that :func:`write_cameras_txt` makes; None without them."""
-    stated = {
-        key: [line.split()[2:] for line in text.splitlines() if line.startswith(key)] for key in (SIGMA, CORRELATION)
-    }
-    if not any(stated.values()):
-        return None
-    count = len(names)
-    try:
-        if len(stated[SIGMA]) != 1 or [len(row) for row in stated[CORRELATION]] != [count] * count:
-            raise InputError(f"a line of {count} σ and {count}×{count} correlations needed")
-        sigma, correlation = np.array(stated[SIGMA][0], float), np.array(stated[CORRELATION], float)
-        if len(sigma) != count:
-            raise InputError(f"{len(sigma)} σ, {count} needed")
-        _require_sigmas(sigma, correlation, names)
-        covariance = correlation * np.outer(sigma, sigma)
-        require_covariance(covariance, count, Rows(tuple(names)), definite=True)
-    except (InputError, ValueError) as error:
-        raise InputError(
-            f"camera file {path}: SIGMA and CORRELATION state no covariance of its parameters: {error}; write it "
-            "again, or remove these comments"
-        ) from error
-    return covariance
-
-
-def _require_sigmas(sigma: np.ndarray, correlation: np.ndarray, names: list[str]) -> None:
-    """What their product does not show: a sign, and a scale."""
-    for name, own, self_correlation in zip(names, sigma, np.diagonal(correlation), strict=True):
-        if not 0 < own <= MAX_SIDE_PX:
-            raise InputError(f"σ of {name} is {own:g}, a positive number up to {MAX_SIDE_PX} needed")
-        if not abs(self_correlation - 1) <= SQUARE_WITHIN:
-            raise InputError(f"correlation of {name} with itself is {self_correlation:g}, 1 needed")
-
-
-def _model(flat: np.ndarray, colmap_model: str, width, height, path: Path) -> CameraModel:
+def camera_model(flat: np.ndarray, colmap_model: str, width, height, path: Path) -> CameraModel:
     flat = np.pad(flat, (0, len(PARAMETER_NAMES) - len(flat)))
     if not np.isfinite(flat).all():
         raise InputError(f"camera file {path}: a camera parameter is not a finite number; correct it")
@@ -305,17 +233,6 @@ def _model(flat: np.ndarray, colmap_model: str, width, height, path: Path) -> Ca
             raise InputError(f"camera file {path}: image side {side:g} px; a whole number in 1…{MAX_SIDE_PX} needed")
     width, height = (None if side is None else int(side) for side in (width, height))
     return CameraModel(flat[:2], flat[2:4], flat[4:], colmap_model, width, height, str(path))
-
-
-def _from_colmap(rows: list[list[str]], path: Path) -> CameraModel:
-    if len(rows) != 1:
-        raise InputError(f"camera file {path}: {len(rows)} cameras, 1 needed; leave the one that took the images")
-    _, name, width, height, *params = rows[0]
-    try:
-        numbers = [float(value) for value in (width, height, *params)]
-    except ValueError as error:
-        raise InputError(f"camera file {path}: {' '.join(str(error).split())[:150]}; numbers needed") from error
-    return camera_from_colmap(name, numbers[0], numbers[1], numbers[2:], path)
 
 
 def camera_from_colmap(colmap_model: str, width: float, height: float, params, source: str | Path) -> CameraModel:
@@ -336,36 +253,7 @@ def camera_from_colmap(colmap_model: str, width: float, height: float, params, s
     for place, value in zip(layout, params, strict=True):
         flat[list(place) if isinstance(place, tuple) else place] = value
     flat[2:4] -= COLMAP_PIXEL_ORIGIN
-    return _model(flat, colmap_model, width, height, Path(source))
-
-
-def _from_opencv(values: dict, path: Path) -> CameraModel:
-    names = {"K": "camera_matrix", "cameraMatrix": "camera_matrix", "D": "distortion_coefficients"}
-    names |= {"distCoeffs": "distortion_coefficients", "dist_coeffs": "distortion_coefficients"}
-    values = {names.get(key, key): value for key, value in values.items()}
-    if "camera_matrix" not in values:
-        if isinstance(values.get("intrinsics"), dict):
-            return _from_industrial(values["intrinsics"], path)
-        raise InputError(f"camera file {path}: no camera_matrix; write it with cv2.FileStorage or as ROS camera_info")
-    matrix = np.asarray(values["camera_matrix"], float)
-    if matrix.size != 9:
-        raise InputError(f"camera file {path}: camera_matrix of {matrix.size} numbers; 3×3 needed")
-    matrix = matrix.reshape(3, 3)
-    if (matrix[[1, 2, 2, 2], [0, 0, 1, 2]] != [0, 0, 0, 1]).any():
-        raise InputError(f"camera file {path}: camera_matrix is not [fx 0 cx; 0 fy cy; 0 0 1]; is it transposed?")
-    if not abs(matrix[0, 1]) <= 1e-9 * abs(matrix[0, 0]) and np.isfinite(matrix[0, 0]):
-        raise InputError(f"camera file {path}: skew {matrix[0, 1]:g} is not supported; calibrate without skew")
-    model = values.get("distortion_model", "plumb_bob")
-    given = np.asarray(values.get("distortion_coefficients", []), float).ravel()
-    lens = [matrix[0, 0], matrix[1, 1], matrix[0, 2], matrix[1, 2]]
-    # A missing size, or 0, is one the file does not state.
-    sides = [values.get(f"image_{side}") for side in ("width", "height")]
-    if any(isinstance(side, bool) for side in sides):
-        raise InputError(f"camera file {path}: image_width and image_height are {sides}; numbers of pixels needed")
-    if model not in ("plumb_bob", "rational_polynomial", *EQUIDISTANT):
-        raise InputError(f"camera file {path}: distortion model {model!r} is not supported; use plumb_bob")
-    width, height = (float(side or 0) for side in sides)
-    return camera_from_opencv(lens, given, model in EQUIDISTANT, width, height, path)
+    return camera_model(flat, colmap_model, width, height, Path(source))
 
 
 def camera_from_opencv(
@@ -404,7 +292,7 @@ def camera_from_opencv(
         distortion = np.zeros(12)
         distortion[[0, 1, 2, 3, 4, 5] if tangential else [0, 1, 4, 5][: len(given)]] = given
         kind = "THIN_PRISM_FISHEYE" if distortion[2:4].any() else "OPENCV_FISHEYE"
-        return _model(np.concatenate([lens, distortion]), kind, *size, path)
+        return camera_model(np.concatenate([lens, distortion]), kind, *size, path)
     if given[8:].any():
         raise InputError(f"camera file {path}: {len(given)} distortion coefficients, at most 8 are supported")
     if len(given) not in DISTORTION_COUNTS:
@@ -415,31 +303,4 @@ def camera_from_opencv(
     distortion = np.zeros(8)
     distortion[: min(len(given), 8)] = given[:8]
     kind = "FULL_OPENCV" if distortion[4:].any() else "OPENCV" if distortion.any() else "PINHOLE"
-    return _model(np.concatenate([lens, distortion]), kind, *size, path)
-
-
-def _from_industrial(values: dict, path: Path) -> CameraModel:
-    """ROS-Industrial's: the form has no place for the distortion, which may be there all the same."""
-    missing = [key for key in PARAMETER_NAMES[:4] if key not in values]
-    if missing:
-        raise InputError(f"camera file {path}: intrinsics without {', '.join(missing)}; fx, fy, cx, cy needed")
-    flat = np.concatenate([np.array([values[key] for key in PARAMETER_NAMES[:4]], float), np.zeros(8)])
-    return _model(flat, "OPENCV", None, None, path)
-
-
-def _yaml_values(text: str) -> dict:
-    values = load_yaml(text)
-    if not isinstance(values, dict):
-        raise ValueError("no keys")
-    return {k: v["data"] if isinstance(v, dict) and "data" in v else v for k, v in values.items()}
-
-
-def _xml_values(root: ElementTree.Element) -> dict:
-    values = {}
-    for node in root:
-        data = node.find("data")
-        if data is not None:
-            values[node.tag] = [float(word) for word in (data.text or "").split()]
-        elif node.text and not len(node):
-            values[node.tag] = node.text.strip().strip('"')
-    return values
+    return camera_model(np.concatenate([lens, distortion]), kind, *size, path)

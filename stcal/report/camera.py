@@ -5,9 +5,12 @@ import numpy as np
 from stcal.geometry.camera import Camera
 from stcal.io.camera import CalibratedCamera, parameter_names
 from stcal.io.cameras.difference import CameraDifference, image_grid, rays
+from stcal.io.cameras.fit import FittedLens
 from stcal.report.figure import INK, SMALL, calm, new_figure
 from stcal.report.text import NONE, text_table
 
+POOR_PX = 0.05
+"""Off by more, a fitted lens is what limits centres, known to some hundredths of a pixel."""
 LENGTHS = ("f", "fx", "fy", "cx", "cy")
 
 
@@ -33,6 +36,21 @@ def shown(camera: CalibratedCamera) -> list[str]:
         )
     lines.append(f"the lens moves points by up to {np.nanmax(np.linalg.norm(moved, axis=2)):.2f} px")
     return lines
+
+
+def fitted_text(called: str, found: FittedLens) -> list[str]:
+    """What a fitted lens is worth."""
+    said = [
+        f"{called} has no place here: {found.camera.colmap_model} fitted to it is {found.rms_px:.2g} px RMS off over "
+        f"the image, {found.most_px:.2g} px at most"
+    ]
+    if found.most_px > POOR_PX:
+        said.append(
+            f"a fit more than {POOR_PX:g} px off is a start only: refine it (`--refine-camera`), or calibrate anew"
+        )
+    if found.share < 1:
+        said.append(f"in {1 - found.share:.0%} of the directions the image reaches beyond 89° from the axis: unused")
+    return said
 
 
 def _ends(camera: Camera) -> list[tuple[tuple[float, float], tuple[float, float]]]:

@@ -18,10 +18,19 @@ from stcal.io.camera import (
     COLMAP_PIXEL_ORIGIN,
     CalibratedCamera,
     CameraModel,
-    camera_from_colmap,
     camera_from_opencv,
     cameras_txt,
     parameter_names,
+)
+from stcal.io.cameras.foreign import (
+    COLMAP_FOREIGN,
+    NUMBERS,
+    ForeignLens,
+    of_colmap,
+    of_kalibr,
+    of_opencv,
+    of_splines,
+    one_of,
 )
 
 SUFFIXES = {
@@ -33,21 +42,9 @@ SUFFIXES = {
     ".xml": "metashape",
 }
 """Form that a name asks for."""
-NUMBERS = {
-    "SIMPLE_PINHOLE": 0,
-    "PINHOLE": 1,
-    "SIMPLE_RADIAL": 2,
-    "RADIAL": 3,
-    "OPENCV": 4,
-    "OPENCV_FISHEYE": 5,
-    "FULL_OPENCV": 6,
-    "SIMPLE_RADIAL_FISHEYE": 8,
-    "RADIAL_FISHEYE": 9,
-    "THIN_PRISM_FISHEYE": 10,
-}
-"""Of COLMAP's models in its binary files."""
-MRCAL = {"LENSMODEL_PINHOLE": 0, "LENSMODEL_OPENCV4": 4, "LENSMODEL_OPENCV5": 5, "LENSMODEL_OPENCV8": 8}
+MRCAL = {f"LENSMODEL_{name}": count for name, count in (("PINHOLE", 0), *((f"OPENCV{n}", n) for n in (4, 5, 8, 12)))}
 """Coefficients of mrcal's models that are OpenCV's."""
+KALIBR = ("pinhole", "omni", "eucm", "ds")
 METASHAPE = ("f", "cx", "cy", "b1", "b2", "k1", "k2", "k3", "k4", "p1", "p2")
 
 
@@ -59,27 +56,24 @@ class Written:
     lost: tuple[str, ...]
 
 
-def from_kalibr(values: Mapping, choice: str, source: str) -> CameraModel:
-    """A camera of ``camchain.yaml``: pinhole with radtan, equidistant or no distortion.
+def from_kalibr(values: Mapping, choice: str, source: str) -> CameraModel | ForeignLens:
+    """A camera of ``camchain.yaml``.
 
     Raises
     ------
     InputError
         Several cameras and no choice, an unknown one, another model.
     """
-    names = [name for name, each in values.items() if isinstance(each, dict) and "camera_model" in each]
-    name = choice or (names[0] if len(names) == 1 else "")
-    if name not in names:
-        asked = f"no camera {choice}" if choice else f"{len(names)} cameras, one needed"
-        raise InputError(
-            f"camera file {source}: {asked}; choose of {', '.join(names)} with `stcal camera convert --name`"
-        )
-    own = values[name]
+    cameras = {str(name): each for name, each in values.items() if isinstance(each, dict) and "camera_model" in each}
+    own = cameras[one_of(list(cameras), choice, source)]
     lens, distortion = own.get("camera_model"), own.get("distortion_model", "none")
-    if lens != "pinhole" or distortion not in ("radtan", "equidistant", "none"):
+    if lens not in KALIBR or distortion not in ("radtan", "equidistant", "fov", "none"):
         raise InputError(
-            f"camera file {source}: {name}: {lens} with {distortion}; pinhole with radtan, equidistant or none is read"
+            f"camera file {source}: {lens} with {distortion}; {', '.join(KALIBR)} with radtan, equidistant, fov or "
+            "none are read"
         )
+    if lens != "pinhole" or distortion == "fov":
+        return of_kalibr(lens, distortion, own, source)
     fx, fy, cx, cy = np.array(own["intrinsics"], float).tolist()
     width, height = (float(side) for side in own.get("resolution", (0, 0)))
     given = np.array(own.get("distortion_coeffs", []), float)
@@ -87,8 +81,8 @@ def from_kalibr(values: Mapping, choice: str, source: str) -> CameraModel:
     return camera_from_opencv([fx, fy, cx, cy], coefficients, distortion == "equidistant", width, height, source)
 
 
-def from_mrcal(text: str, source: str) -> CameraModel:
-    """A ``.cameramodel`` whose lens model is OpenCV's.
+def from_mrcal(text: str, source: str) -> CameraModel | ForeignLens:
+    """A ``.cameramodel`` whose lens model is OpenCV's, or splined.
 
     Raises
     ------
@@ -102,12 +96,14 @@ def from_mrcal(text: str, source: str) -> CameraModel:
     except (SyntaxError, ValueError, TypeError, KeyError, RecursionError, MemoryError) as error:
         reason = " ".join(str(error).split())[:100]
         raise InputError(f"camera file {source}: not mrcal's form ({reason}); write it anew with mrcal") from error
+    if str(lens).startswith("LENSMODEL_SPLINED"):
+        return of_splines(lens, numbers, width, height, source)
     if lens not in MRCAL or len(numbers) != 4 + MRCAL[lens]:
         raise InputError(
-            f"camera file {source}: {lens} with {len(numbers)} intrinsics; {', '.join(MRCAL)} are read: "
-            "mrcal-convert-lensmodel makes one of another"
+            f"camera file {source}: {lens} with {len(numbers)} intrinsics; {', '.join(MRCAL)} and splined ones are "
+            "read: mrcal-convert-lensmodel makes one of another"
         )
-    return camera_from_opencv(numbers[:4], np.array(numbers[4:]), False, width, height, source)
+    return of_opencv(numbers[:4], np.array(numbers[4:]), width, height, source)
 
 
 def from_metashape(root: ElementTree.Element, source: str) -> CameraModel:
@@ -137,7 +133,7 @@ def from_metashape(root: ElementTree.Element, source: str) -> CameraModel:
     return camera_from_opencv(lens, distortion, True, width, height, source, tangential=True)
 
 
-def from_colmap_binary(content: bytes, choice: str, source: str) -> CameraModel:
+def from_colmap_binary(content: bytes, choice: str, source: str) -> CameraModel | ForeignLens:
     """The camera of ``cameras.bin``, or that of the number ``choice``.
 
     Raises
@@ -150,18 +146,16 @@ def from_colmap_binary(content: bytes, choice: str, source: str) -> CameraModel:
         at, cameras = 8, {}
         for _ in range(min(count, len(content) // 24)):
             number, kind, width, height = struct.unpack_from("<IiQQ", content, at)
-            model = next(name for name, own in NUMBERS.items() if own == kind)
-            length = len(parameter_names(model))
+            model = NUMBERS[kind]
+            length = COLMAP_FOREIGN[model][1] if model in COLMAP_FOREIGN else len(parameter_names(model))
             cameras[str(number)] = model, width, height, struct.unpack_from(f"<{length}d", content, at + 24)
             at += 24 + 8 * length
-    except (struct.error, StopIteration) as error:
+    except (struct.error, KeyError) as error:
         raise InputError(f"camera file {source}: neither text nor a cameras.bin of known models; check it") from error
     if at != len(content) or not cameras:
         raise InputError(f"camera file {source}: neither text nor COLMAP's cameras.bin; check it")
-    if choice not in cameras and (choice or len(cameras) > 1):
-        raise InputError(f"camera file {source}: {len(cameras)} cameras; choose of {', '.join(cameras)} with --name")
-    model, width, height, params = cameras[choice or next(iter(cameras))]
-    return camera_from_colmap(model, width, height, params, source)
+    model, width, height, params = cameras[one_of(list(cameras), choice if choice.isdigit() else "", source)]
+    return of_colmap(model, width, height, params, source)
 
 
 def written(camera: CalibratedCamera, form: str, name: str) -> Written:
@@ -195,7 +189,8 @@ def _refuse(camera: CalibratedCamera, form: str, why: str) -> InputError:
 
 def _colmap_binary(camera: CalibratedCamera, _: str) -> bytes:
     params = camera.colmap_params()
-    head = struct.pack("<QIiQQ", 1, 1, NUMBERS[camera.colmap_model], camera.width, camera.height)
+    number = next(number for number, name in NUMBERS.items() if name == camera.colmap_model)
+    head = struct.pack("<QIiQQ", 1, 1, number, camera.width, camera.height)
     return head + struct.pack(f"<{len(params)}d", *params)
 
 

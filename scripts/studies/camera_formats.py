@@ -1,0 +1,126 @@
+"""What each form of camera files holds: every lens is written, read back and compared, and lenses of other programs are
+fitted.
+
+.venv/bin/python scripts/studies/camera_formats.py
+"""
+
+import tempfile
+from pathlib import Path
+
+import numpy as np
+
+from stcal.errors import InputError
+from stcal.geometry.camera import Camera
+from stcal.io.camera import CalibratedCamera, parameter_names
+from stcal.io.cameras.fit import fit_lens
+from stcal.io.cameras.foreign import ForeignLens
+from stcal.io.cameras.forms import WRITERS, written
+from stcal.io.cameras.read import read_lens
+
+WIDTH, HEIGHT = 1280, 961
+LENSES = {
+    "perspective": ("PINHOLE", []),
+    "k1 k2 p1 p2": ("OPENCV", [-0.1, 0.03, 1e-3, -2e-3]),
+    "k1 … k6": ("FULL_OPENCV", [-0.1, 0.03, 1e-3, -2e-3, 0.01, 0.02, -0.01, 0.003]),
+    "equidistant k1 … k4": ("OPENCV_FISHEYE", [0.02, -0.01, 0, 0, 3e-3, -1e-3]),
+    "equidistant with prisms": (
+        "THIN_PRISM_FISHEYE",
+        [0.02, -0.01, 1e-3, -2e-3, 3e-3, -1e-3, 0, 0, 1e-3, 0, -1e-3],
+    ),
+}
+SUFFIX = {"colmap": ".txt", "colmap-bin": ".bin", "mrcal": ".cameramodel", "metashape": ".xml"}
+EXACT_PX = 1e-9
+TRIED = (
+    ("COLMAP", "FOV", "1 FOV {0} {1} 812 809 640 478 0.9"),
+    ("COLMAP", "DIVISION", "1 DIVISION {0} {1} 812 809 640 478 -0.2"),
+    ("COLMAP", "EUCM", "1 EUCM {0} {1} 812 809 640 478 0.6 1.1"),
+    (
+        "COLMAP",
+        "RAD_TAN_THIN_PRISM_FISHEYE",
+        "1 RAD_TAN_THIN_PRISM_FISHEYE {0} {1} 812 809 640 478 0.02 -0.01 0.003 -0.002 0.001 -0.0003 0.001 -0.002 0.001 "
+        "-0.0002 0.0005 0.0001",
+    ),
+    (
+        "OpenCV",
+        "thin prisms",
+        "image_width: {0}\nimage_height: {1}\ncamera_matrix: [812, 0, 640, 0, 809, 478, 0, 0, 1]\n"
+        "distortion_coefficients: [-0.1, 0.03, 0.001, -0.002, 0.01, 0, 0, 0, 0.001, -0.0002, -0.001, 0.0001]",
+    ),
+    (
+        "OpenCV",
+        "tilted sensor",
+        "image_width: {0}\nimage_height: {1}\ncamera_matrix: [812, 0, 640, 0, 809, 478, 0, 0, 1]\n"
+        "distortion_coefficients: [-0.1, 0.03, 0.001, -0.002, 0.01, 0, 0, 0, 0, 0, 0, 0, 0.002, -0.003]",
+    ),
+    (
+        "Kalibr",
+        "omni, radtan",
+        "cam0:\n  camera_model: omni\n  intrinsics: [1.2, 1400, 1402, 640, 478]\n  distortion_model: radtan\n"
+        "  distortion_coeffs: [-0.2, 0.1, 0.001, -0.001]\n  resolution: [{0}, {1}]",
+    ),
+    (
+        "Kalibr",
+        "ds",
+        "cam0:\n  camera_model: ds\n  intrinsics: [-0.2, 0.55, 420, 421, 640, 478]\n  distortion_model: none\n"
+        "  resolution: [{0}, {1}]",
+    ),
+)
+"""Program, model, and the file of a lens of it."""
+
+
+def camera_of(model: str, k: list[float]) -> CalibratedCamera:
+    camera = Camera(
+        WIDTH, HEIGHT, [812.25, 809.5], [640.125, 478.0625], np.pad(k, (0, 12 - len(k))), "FISHEYE" in model
+    )
+    q = len(parameter_names(model))
+    return CalibratedCamera.of(camera, model, np.diag(np.full(q, 1e-4)))
+
+
+def off_px(one: Camera, two: Camera) -> float:
+    xy = np.stack(np.meshgrid(np.linspace(-0.7, 0.7, 15), np.linspace(-0.5, 0.5, 11)), axis=-1).reshape(-1, 2)
+    return float(np.abs(one.pixel_from_normalised(xy) - two.pixel_from_normalised(xy)).max())
+
+
+def held(form: str, folder: Path) -> list[str]:
+    """Cells of a form: what comes back exactly, what is refused, and what is lost."""
+    back, refused, lost = [], [], set()
+    for name, (model, k) in LENSES.items():
+        camera = camera_of(model, k)
+        try:
+            made = written(camera, form, "cam0")
+        except InputError:
+            refused.append(name)
+            continue
+        content = made.content if isinstance(made.content, bytes) else made.content.encode()
+        path = folder / f"camera{SUFFIX.get(form, '.yaml')}"
+        path.write_bytes(content)
+        read = read_lens(path)
+        assert not isinstance(read, ForeignLens)
+        worst = off_px(camera, read.sized(0, 0))
+        back.append(name if worst < EXACT_PX else f"{name} ({worst:.2g} px off)")
+        if read.covariance is None:
+            lost.update(made.lost)
+        if (read.width, read.height) != (WIDTH, HEIGHT):
+            lost.add("size")
+    return ["all" if back == list(LENSES) else "; ".join(back), "; ".join(refused) or "–", "; ".join(sorted(lost)) or "–"]
+
+
+def main() -> None:
+    print("| `--form` | read back exactly | refused | lost |")
+    print("|---|---|---|---|")
+    with tempfile.TemporaryDirectory() as scratch:
+        folder = Path(scratch)
+        for form in WRITERS:
+            print(f"| `{form}` | {' | '.join(held(form, folder))} |")
+        print("\n| program | lens | fitted | px RMS | px at most |")
+        print("|---|---|---|---|---|")
+        for program, name, text in TRIED:
+            (folder / "camera").write_text(text.format(WIDTH, HEIGHT))
+            lens = read_lens(folder / "camera")
+            assert isinstance(lens, ForeignLens)
+            found = fit_lens(lens, WIDTH, HEIGHT)
+            print(f"| {program} | {name} | {found.camera.colmap_model} | {found.rms_px:.4f} | {found.most_px:.3f} |")
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,130 @@
+"""A lens of ours fitted to one that no model here holds, and how far the two are apart."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.optimize import least_squares
+
+from stcal.errors import InputError
+from stcal.geometry.camera import WIDEST_RAD, Camera
+from stcal.io.camera import FISHEYE, CalibratedCamera, intrinsic_basis, parameter_names
+from stcal.io.cameras.foreign import ForeignLens
+
+CANDIDATES = ("OPENCV", "FULL_OPENCV", "OPENCV_FISHEYE", "THIN_PRISM_FISHEYE")
+"""From few parameters to many, perspective and equidistant."""
+AS_GOOD_PX = 1e-3
+"""By which more parameters must be nearer to be taken."""
+AZIMUTHS, RADII, STEPS = 72, 40, 1000
+"""Rays: directions about the axis, places along each, and steps in which the edge is looked for."""
+BEYOND = 0.01
+"""Of the image's size: rays are followed so far over its edge, so that all of it lies between them."""
+FAR_PX = 1e6
+"""Where a lens that is tried has no pixel."""
+MOST_STEPS, SETTLED = 200, 1e-14
+HALF = 0.5
+"""By more of it no focal length shrinks."""
+SMALL = 1e-6
+"""Steps about the axis for the focal lengths."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class FittedLens:
+    """``camera`` : the fitted one; ``rms_px``, ``most_px`` : how far it is off over the image; ``share`` : of the
+    directions about the axis in which the image ends within 89° of the axis."""
+
+    camera: CalibratedCamera
+    rms_px: float
+    most_px: float
+    share: float
+
+
+def fit_lens(lens: ForeignLens, width: int, height: int) -> FittedLens:
+    """The model of ours that is nearest to a lens over the image.
+
+    Parameters
+    ----------
+    lens : ForeignLens
+        To be fitted.
+    width, height : int
+        Image size, px.
+
+    Raises
+    ------
+    InputError
+        The lens projects nearly no ray into the image.
+    """
+    rays, pixels, share = _rays(lens, width, height)
+    best = None
+    for model in CANDIDATES:
+        camera = _fitted(model, rays, pixels, lens, (width, height))
+        off = np.linalg.norm(camera.project(rays) - pixels, axis=1)
+        if best is None or not off.max() > best.most_px - AS_GOOD_PX:
+            best = FittedLens(camera, float(np.sqrt((off**2).mean())), float(off.max()), share)
+    assert best is not None
+    return best
+
+
+def _rays(lens: ForeignLens, width: int, height: int) -> tuple[np.ndarray, np.ndarray, float]:
+    """Rays (n, 3) with z = 1 that the image sees, evenly over it, their pixels (n, 2), and the share as above."""
+    angle = np.linspace(0, WIDEST_RAD, STEPS + 1)[1:]
+    far = np.array([width, height]) * BEYOND
+    centre = lens.project(np.array([[0.0, 0.0, 1.0]]))[0]
+    corners = np.array([[0, 0], [1, 0], [0, 1], [1, 1]]) * [width, height] - 0.5 - centre
+    around = np.concatenate([np.linspace(0, 2 * np.pi, AZIMUTHS, endpoint=False), np.arctan2(*corners.T[::-1])])
+    rays, pixels, ends = [], [], 0
+    for side in around:
+        own = np.column_stack([np.cos(side) * np.tan(angle), np.sin(side) * np.tan(angle), np.ones(STEPS)])
+        seen = lens.project(own)
+        radius = np.linalg.norm(seen - centre, axis=1)
+        inside = ((seen >= -0.5 - far) & (seen <= np.array([width, height]) - 0.5 + far)).all(axis=1)
+        grows = np.diff(radius, prepend=0) > 0  # beyond, the distortion folds over
+        good = np.logical_and.accumulate(inside & grows)
+        count = int(good.sum())
+        ends += count < STEPS and bool(grows[count])
+        if count:
+            at = np.searchsorted(radius[:count], np.linspace(0, radius[count - 1], RADII + 1)[1:])
+            rays.append(own[np.unique(np.minimum(at, count - 1))])
+            pixels.append(seen[np.unique(np.minimum(at, count - 1))])
+    if sum(map(len, rays)) < AZIMUTHS:
+        raise InputError(
+            f"camera file {lens.source}: {lens.called} projects nearly nothing into {width}×{height} px; check it"
+        )
+    return np.concatenate(rays), np.concatenate(pixels), ends / len(around)
+
+
+def _fitted(
+    model: str, rays: np.ndarray, pixels: np.ndarray, lens: ForeignLens, size: tuple[int, int]
+) -> CalibratedCamera:
+    """Least squares over the image: places farther out stand for more of it."""
+    about = lens.project(np.array([[0, 0, 1], [SMALL, 0, 1], [0, SMALL, 1]]))
+    focal = np.linalg.norm(about[1:] - about[0], axis=1) / SMALL
+    start = Camera(*size, focal, about[0], np.zeros(12), FISHEYE in model)
+    weight = np.sqrt(np.linalg.norm(pixels - about[0], axis=1, keepdims=True) / max(size))
+    basis = intrinsic_basis(model)
+    names = parameter_names(model)
+    scale = np.array([focal[0] if name in ("fx", "fy", "cx", "cy") else 1.0 for name in names])
+
+    def camera_at(x: np.ndarray) -> Camera:
+        return start.with_parameters(start.parameters() + basis @ (x * scale))
+
+    def off(x: np.ndarray) -> np.ndarray:
+        with np.errstate(all="ignore"):
+            away = weight * (camera_at(x).project(rays) - pixels)
+        return np.nan_to_num(away, nan=FAR_PX, posinf=FAR_PX, neginf=-FAR_PX).ravel()
+
+    def slope(x: np.ndarray) -> np.ndarray:
+        by = camera_at(x).parameter_jacobian(rays[:, :2]) @ basis * scale
+        return (weight[:, :, None] * by).reshape(-1, len(names))
+
+    found = least_squares(
+        off,
+        np.zeros(len(names)),
+        slope,  # pyright: ignore[reportArgumentType]
+        bounds=(np.where(scale == 1, -np.inf, -HALF), np.inf),
+        x_scale="jac",
+        max_nfev=MOST_STEPS,
+        xtol=SETTLED,
+        ftol=SETTLED,
+        gtol=SETTLED,
+    )
+    return CalibratedCamera.of(camera_at(found.x), model)

@@ -1,0 +1,272 @@
+"""Lenses that no model here holds: how they project, so that one of ours can be fitted to them."""
+
+import re
+import sqlite3
+from collections.abc import Callable
+from contextlib import closing
+from dataclasses import dataclass
+from pathlib import Path
+
+import cv2
+import numpy as np
+from scipy.ndimage import map_coordinates
+
+from stcal.errors import InputError
+from stcal.io.camera import COLMAP_PIXEL_ORIGIN, CameraModel, camera_from_colmap, camera_from_opencv
+
+COLMAP_FOREIGN = {
+    "FOV": (7, 5),
+    "RAD_TAN_THIN_PRISM_FISHEYE": (11, 16),
+    "SIMPLE_DIVISION": (12, 4),
+    "DIVISION": (13, 5),
+    "SIMPLE_FISHEYE": (14, 3),
+    "FISHEYE": (15, 4),
+    "EUCM": (16, 6),
+}
+"""COLMAP's models that are none of ours: their numbers in binary files, and how many parameters they have."""
+SPLINED = re.compile(r"LENSMODEL_SPLINED_STEREOGRAPHIC_order=([23])_Nx=(\d+)_Ny=(\d+)_fov_x_deg=(\d+)")
+"""mrcal's name of it, with its configuration."""
+NUMBERS = {
+    **dict(
+        enumerate(("SIMPLE_PINHOLE", "PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV", "OPENCV_FISHEYE", "FULL_OPENCV"))
+    ),
+    **{8: "SIMPLE_RADIAL_FISHEYE", 9: "RADIAL_FISHEYE", 10: "THIN_PRISM_FISHEYE"},
+    **{number: name for name, (number, _) in COLMAP_FOREIGN.items()},
+}
+"""Names of COLMAP's models by their numbers in binary files and databases."""
+MARGIN = {2: 1, 3: 2}
+"""Intervals of a spline of this order that lie beyond the stated field."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class ForeignLens:
+    """A lens by its projection alone.
+
+    ``called`` : its model; ``project`` : pixels (n, 2) of rays (n, 3), z > 0, centre of the first pixel at (0, 0);
+    ``width``, ``height`` : px, or None where the file states none; ``source`` : the file.
+    """
+
+    called: str
+    project: Callable[[np.ndarray], np.ndarray]
+    width: int | None
+    height: int | None
+    source: str
+
+
+def of_colmap(model: str, width: float, height: float, params, source: str) -> CameraModel | ForeignLens:
+    """The camera of any of COLMAP's models but EQUIRECTANGULAR; ``params`` in its order and pixel origin.
+
+    Raises
+    ------
+    InputError
+        An unknown model, a wrong number of parameters, or impossible values.
+
+    References
+    ----------
+    COLMAP 4, ``sensor/models.h``. A. Fitzgibbon, "Simultaneous linear estimation of multiple view geometry and lens
+    distortion", CVPR 2001 (DIVISION). J. Engel et al., "Project Aria", 2023 (RAD_TAN_THIN_PRISM_FISHEYE).
+    """
+    numbers = [float(value) for value in params]
+    if model not in COLMAP_FOREIGN:
+        return camera_from_colmap(model, width, height, numbers, source)
+    _, count = COLMAP_FOREIGN[model]
+    if len(numbers) != count:
+        raise InputError(f"camera file {source}: {len(numbers)} parameters for {model}, {count} needed")
+    double = model.startswith("SIMPLE_")
+    focal, rest = (numbers[:1] * 2, numbers[1:]) if double else (numbers[:2], numbers[2:])
+    if model in ("SIMPLE_FISHEYE", "FISHEYE"):  # without distortion
+        return camera_from_colmap("OPENCV_FISHEYE", width, height, [*focal, *rest, 0, 0, 0, 0], source)
+    camera_from_colmap("PINHOLE", width, height, [*focal, *rest[:2]], source)  # which refuses impossible values
+    own, centre = np.array(rest[2:]), np.array(rest[:2]) - COLMAP_PIXEL_ORIGIN
+    if not np.isfinite(own).all():
+        raise InputError(f"camera file {source}: a camera parameter is not a finite number; correct it")
+
+    def project(rays: np.ndarray) -> np.ndarray:
+        with np.errstate(all="ignore"):
+            return centre + np.array(focal) * _colmap_normalised(rays, model.removeprefix("SIMPLE_"), own)
+
+    return ForeignLens(f"COLMAP's {model}", project, int(width), int(height), source)
+
+
+def _colmap_normalised(rays: np.ndarray, model: str, own: np.ndarray) -> np.ndarray:
+    """(n, 2)"""
+    if model == "EUCM":
+        return _on_plane(rays, "eucm", own)
+    xy = rays[:, :2] / rays[:, 2:]
+    if model == "FOV":
+        return _scaled(xy, "fov", own)
+    r2 = (xy**2).sum(axis=1)
+    if model == "DIVISION":  # ideal = distorted / (1 + k r²)
+        return xy * (2 / (1 + np.sqrt(1 - 4 * own[0] * r2)))[:, None]
+    k, p, s = own[:6], own[6:8], own[8:]
+    angle = np.arctan(np.sqrt(r2))
+    even = angle[:, None] ** (2 * np.arange(1, 7))
+    xy = xy * (np.where(r2 > 0, angle / np.where(r2 > 0, np.sqrt(r2), 1), 1) * (1 + even @ k))[:, None]
+    r2 = (xy**2).sum(axis=1)[:, None]
+    return xy + 2 * xy * (xy @ p)[:, None] + p * r2 + s[[0, 2]] * r2 + s[[1, 3]] * r2**2
+
+
+def of_database(path: Path, choice: str) -> CameraModel | ForeignLens:
+    """The camera of a COLMAP database, or that of the number ``choice``; the file is only read.
+
+    Raises
+    ------
+    InputError
+        No cameras, several and no choice, or a model that is not known.
+    """
+    try:
+        with closing(sqlite3.connect(f"{path.resolve().as_uri()}?mode=ro", uri=True)) as database:
+            rows = database.execute("SELECT camera_id, model, width, height, params FROM cameras").fetchall()
+        cameras = {str(number): (NUMBERS[model], *rest) for number, model, *rest in rows}
+        model, width, height, params = cameras[one_of(list(cameras), choice if choice.isdigit() else "", str(path))]
+        return of_colmap(model, width, height, np.frombuffer(params, "<f8"), str(path))
+    except (sqlite3.Error, KeyError, ValueError, TypeError) as error:
+        reason = " ".join(str(error).split())[:100]
+        raise InputError(f"camera file {path}: no database of COLMAP ({reason}); check it") from error
+
+
+def one_of(names: list[str], choice: str, source: str) -> str:
+    """The camera ``choice`` of a file, or its only one.
+
+    Raises
+    ------
+    InputError
+        None, an unknown one, or several and no choice.
+    """
+    if not names:
+        raise InputError(f"camera file {source}: no camera in it, one needed")
+    if choice not in names and (choice or len(names) > 1):
+        asked = f"no camera {choice}" if choice else f"{len(names)} cameras, one needed"
+        shown = ", ".join(names[:12]) + (" …" if len(names) > 12 else "")
+        raise InputError(f"camera file {source}: {asked}; choose of {shown} with `stcal camera convert --name`")
+    return choice or names[0]
+
+
+def of_opencv(lens, given: np.ndarray, width: float, height: float, source: str) -> CameraModel | ForeignLens:
+    """The perspective camera of fx, fy, cx, cy and OpenCV's coefficients, thin prisms and a tilted sensor among them.
+
+    Raises
+    ------
+    InputError
+        Coefficients of another number; impossible values.
+    """
+    if len(given) not in (12, 14) or not given[8:].any():
+        return camera_from_opencv(lens, given, False, width, height, source)
+    camera_from_opencv(lens, given[:8], False, width, height, source)  # which refuses impossible values
+    if not np.isfinite(given).all():
+        raise InputError(f"camera file {source}: a camera parameter is not a finite number; correct it")
+    fx, fy, cx, cy = lens
+    matrix, still = np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1]]), np.zeros(3)
+
+    def project(rays: np.ndarray) -> np.ndarray:
+        return cv2.projectPoints(np.array(rays, float), still, still, matrix, given)[0].reshape(-1, 2)
+
+    tilted = len(given) == 14 and given[12:].any()
+    called = "OpenCV's lens with a tilted sensor" if tilted else "OpenCV's lens with thin prisms"
+    return ForeignLens(called, project, int(width) or None, int(height) or None, source)
+
+
+def of_kalibr(lens: str, distortion: str, values: dict, source: str) -> ForeignLens:
+    """Kalibr's omni, eucm and ds with radtan, equidistant, fov or no distortion.
+
+    Raises
+    ------
+    InputError
+        Numbers missing, or impossible ones.
+
+    References
+    ----------
+    C. Mei, P. Rives, "Single View Point Omnidirectional Camera Calibration from Planar Grids", ICRA 2007. B. Khomutenko
+    et al., "An Enhanced Unified Camera Model", RA-L 2016. V. Usenko et al., "The Double Sphere Camera Model", 3DV 2018.
+    F. Devernay, O. Faugeras, "Straight lines have to be straight", Machine Vision and Applications 13, 2001.
+    """
+    first = {"omni": 1, "eucm": 2, "ds": 2, "pinhole": 0}[lens]
+    count = {"radtan": 4, "equidistant": 4, "fov": 1, "none": 0}[distortion]
+    numbers = np.array(values["intrinsics"], float)
+    own = np.array(values.get("distortion_coeffs", []) if count else [], float)
+    if numbers.shape != (first + 4,) or own.shape != (count,) or not np.isfinite([*numbers, *own]).all():
+        raise InputError(
+            f"camera file {source}: {lens} with {distortion} has {first + 4} intrinsics and {count} coefficients, "
+            f"finite numbers; {numbers.size} and {own.size} found"
+        )
+    shape, focal, centre = numbers[:first], numbers[first : first + 2], numbers[first + 2 :]
+    if (focal <= 0).any():
+        raise InputError(f"camera file {source}: focal length {focal.tolist()}; positive numbers needed")
+    width, height = (int(side) for side in values.get("resolution", (0, 0)))
+
+    def project(rays: np.ndarray) -> np.ndarray:
+        with np.errstate(all="ignore"):
+            return centre + focal * _kalibr_distorted(_on_plane(rays, lens, shape), distortion, own)
+
+    return ForeignLens(f"Kalibr's {lens} with {distortion}", project, width or None, height or None, source)
+
+
+def _on_plane(rays: np.ndarray, lens: str, shape: np.ndarray) -> np.ndarray:
+    """(n, 2) normalised coordinates; nan where a ray has none."""
+    z, length = rays[:, 2], np.linalg.norm(rays, axis=1)
+    if lens == "omni":
+        below = z + shape[0] * length
+    elif lens == "eucm":
+        alpha, beta = shape
+        below = alpha * np.sqrt(beta * (rays[:, :2] ** 2).sum(axis=1) + z**2) + (1 - alpha) * z
+    elif lens == "ds":
+        xi, alpha = shape
+        deep = xi * length + z
+        below = alpha * np.sqrt((rays[:, :2] ** 2).sum(axis=1) + deep**2) + (1 - alpha) * deep
+    else:
+        below = z
+    return rays[:, :2] / np.where(below > 0, below, np.nan)[:, None]
+
+
+def _kalibr_distorted(xy: np.ndarray, kind: str, k: np.ndarray) -> np.ndarray:
+    if kind != "radtan":
+        return _scaled(xy, kind, k)
+    (x, y), r2 = xy.T, (xy**2).sum(axis=1)
+    radial = xy * (1 + k[0] * r2 + k[1] * r2**2)[:, None]
+    tangential = [2 * k[2] * x * y + k[3] * (r2 + 2 * x * x), k[2] * (r2 + 2 * y * y) + 2 * k[3] * x * y]
+    return radial + np.column_stack(tangential)
+
+
+def _scaled(xy: np.ndarray, kind: str, k: np.ndarray) -> np.ndarray:
+    """Distorted along the radius: equidistant, by the field of view, or not."""
+    r = np.maximum(np.sqrt((xy**2).sum(axis=1)), 1e-12)  # where all of them are straight lines
+    if kind == "fov":
+        return xy * (np.arctan(2 * r * np.tan(k[0] / 2)) / (k[0] * r))[:, None]
+    if kind == "equidistant":
+        angle = np.arctan(r)
+        return xy * (angle * (1 + angle[:, None] ** (2 * np.arange(1, 5)) @ k) / r)[:, None]
+    return xy
+
+
+def of_splines(name: str, numbers: list[float], width: float, height: float, source: str) -> ForeignLens:
+    """mrcal's splined stereographic lens: ``u = 2 tan(θ / 2)`` along the ray, moved by a B-spline of u, times f.
+
+    Raises
+    ------
+    InputError
+        Numbers missing.
+    """
+    found = SPLINED.fullmatch(name)
+    if found is None:
+        raise InputError(f"camera file {source}: {name[:80]} is not splined in mrcal's words; write it anew with mrcal")
+    order, columns, rows, wide = (int(word) for word in found.groups())
+    if columns <= MARGIN[order] + 1 or len(numbers) != 4 + 2 * columns * rows or not 0 < wide < 360:
+        raise InputError(
+            f"camera file {source}: {len(numbers)} intrinsics of {columns}×{rows} points; "
+            f"{4 + 2 * columns * rows} needed"
+        )
+    focal, centre = np.array(numbers[:2]), np.array(numbers[2:4])
+    control = np.array(numbers[4:]).reshape(rows, columns, 2)
+    per_u = (columns - 1 - MARGIN[order]) / (4 * np.tan(np.radians(wide) / 4))
+    middle = np.array([(columns - 1) / 2, (rows - 1) / 2])
+
+    def project(rays: np.ndarray) -> np.ndarray:
+        u = 2 * rays[:, :2] / (np.linalg.norm(rays, axis=1) + rays[:, 2])[:, None]
+        at = (u * per_u + middle).T[::-1]
+        moved = [
+            map_coordinates(c, at, order=order, prefilter=False, mode="nearest") for c in np.moveaxis(control, 2, 0)
+        ]
+        return centre + focal * (u + np.column_stack(moved))
+
+    called = f"mrcal's splines of {columns}×{rows} points"
+    return ForeignLens(called, project, int(width), int(height), source)

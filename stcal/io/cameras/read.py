@@ -1,0 +1,189 @@
+"""A camera file of any kind, told by its content."""
+
+import re
+import struct
+import xml.etree.ElementTree as ElementTree
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import yaml
+
+from stcal.errors import InputError
+from stcal.io.camera import (
+    CORRELATION,
+    EQUIDISTANT,
+    MAX_SIDE_PX,
+    PARAMETER_NAMES,
+    SIGMA,
+    SQUARE_WITHIN,
+    CameraModel,
+    camera_from_opencv,
+    camera_model,
+    parameter_names,
+)
+from stcal.io.cameras import forms
+from stcal.io.cameras.foreign import ForeignLens, of_colmap, of_database, of_opencv, one_of
+from stcal.io.covariance import Rows, require_covariance
+from stcal.io.files import SETTINGS_BYTES, read_bytes
+from stcal.io.plain_yaml import load_yaml
+
+SQLITE = b"SQLite format 3\0"
+"""First bytes of a database."""
+
+
+def read_lens(path: str | Path, name: str = "") -> CameraModel | ForeignLens:
+    """The lens of a camera file; arguments and errors as of :func:`stcal.io.camera.read_camera`, but lenses that no
+    model here holds are lenses too."""
+    path = Path(path)
+    try:
+        database = path.is_file() and _starts_with(path, SQLITE)
+        content = b"" if database else read_bytes(path, SETTINGS_BYTES)
+    except OSError as error:
+        raise InputError(f"camera file {path}: {error.strerror or error}; give a readable file") from error
+    except ValueError as error:  # a NUL in the name
+        raise InputError(f"camera file {path}: not a text file; give cameras.txt, or OpenCV's YAML or XML") from error
+    if database:
+        return of_database(path, name)
+    if content[:8] == struct.pack("<Q", content[0] if content else 0) and b"\0" in content:
+        return forms.from_colmap_binary(content, name, str(path))
+    try:
+        text = content.decode("utf-8-sig")
+    except ValueError as error:
+        raise InputError(f"camera file {path}: not a text file; give cameras.txt, or OpenCV's YAML or XML") from error
+    try:
+        if text.lstrip().startswith("<"):
+            root = ElementTree.fromstring(text)
+            return (
+                forms.from_metashape(root, str(path))
+                if root.tag == "calibration"
+                else _from_opencv(_xml_values(root), path)
+            )
+        rows = [line.split() for line in text.splitlines() if line.strip() and not line.lstrip().startswith("#")]
+        if rows and rows[0][0].startswith("{") and "lensmodel" in text:
+            return forms.from_mrcal(text, str(path))
+        if rows and len(rows[0]) >= 5 and re.fullmatch(r"[A-Z][A-Z0-9_]+", rows[0][1]):
+            lens = _from_colmap(rows, name, path)
+            if isinstance(lens, ForeignLens):
+                return lens
+            return replace(lens, covariance=_stated_covariance(text, parameter_names(lens.colmap_model), path))
+        values = _yaml_values(text)
+        if any(isinstance(each, dict) and "camera_model" in each for each in values.values()):
+            return forms.from_kalibr(values, name, str(path))
+        return _from_opencv(values, path)
+    except InputError:
+        raise
+    except (KeyError, ElementTree.ParseError, yaml.YAMLError, ValueError, TypeError, RecursionError) as error:
+        reason = " ".join(str(error).split())[:150]
+        raise InputError(
+            f"camera file {path}: neither COLMAP's cameras.txt nor OpenCV's YAML or XML ({reason}); check its form"
+        ) from error
+
+
+def _stated_covariance(text: str, names: list[str], path: Path) -> np.ndarray | None:
+    """Covariance (q, q) of the comments that :func:`write_cameras_txt` makes; None without them."""
+    stated = {
+        key: [line.split()[2:] for line in text.splitlines() if line.startswith(key)] for key in (SIGMA, CORRELATION)
+    }
+    if not any(stated.values()):
+        return None
+    count = len(names)
+    try:
+        if len(stated[SIGMA]) != 1 or [len(row) for row in stated[CORRELATION]] != [count] * count:
+            raise InputError(f"a line of {count} σ and {count}×{count} correlations needed")
+        sigma, correlation = np.array(stated[SIGMA][0], float), np.array(stated[CORRELATION], float)
+        if len(sigma) != count:
+            raise InputError(f"{len(sigma)} σ, {count} needed")
+        _require_sigmas(sigma, correlation, names)
+        covariance = correlation * np.outer(sigma, sigma)
+        require_covariance(covariance, count, Rows(tuple(names)), definite=True)
+    except (InputError, ValueError) as error:
+        raise InputError(
+            f"camera file {path}: SIGMA and CORRELATION state no covariance of its parameters: {error}; write it "
+            "again, or remove these comments"
+        ) from error
+    return covariance
+
+
+def _require_sigmas(sigma: np.ndarray, correlation: np.ndarray, names: list[str]) -> None:
+    """What their product does not show: a sign, and a scale."""
+    for name, own, self_correlation in zip(names, sigma, np.diagonal(correlation), strict=True):
+        if not 0 < own <= MAX_SIDE_PX:
+            raise InputError(f"σ of {name} is {own:g}, a positive number up to {MAX_SIDE_PX} needed")
+        if not abs(self_correlation - 1) <= SQUARE_WITHIN:
+            raise InputError(f"correlation of {name} with itself is {self_correlation:g}, 1 needed")
+
+
+def _starts_with(path: Path, head: bytes) -> bool:
+    with open(path, "rb") as stream:
+        return stream.read(len(head)) == head
+
+
+def _from_colmap(rows: list[list[str]], name: str, path: Path) -> CameraModel | ForeignLens:
+    cameras = {row[0]: row[1:] for row in rows}
+    if len(cameras) < len(rows):
+        raise InputError(f"camera file {path}: two cameras of one number; correct it")
+    model, *values = cameras[one_of(list(cameras), name if name.isdigit() else "", str(path))]
+    try:
+        width, height, *params = (float(value) for value in values)
+    except ValueError as error:
+        raise InputError(f"camera file {path}: {' '.join(str(error).split())[:150]}; numbers needed") from error
+    return of_colmap(model, width, height, params, str(path))
+
+
+def _from_opencv(values: dict, path: Path) -> CameraModel | ForeignLens:
+    names = {"K": "camera_matrix", "cameraMatrix": "camera_matrix", "D": "distortion_coefficients"}
+    names |= {"distCoeffs": "distortion_coefficients", "dist_coeffs": "distortion_coefficients"}
+    values = {names.get(key, key): value for key, value in values.items()}
+    if "camera_matrix" not in values:
+        if isinstance(values.get("intrinsics"), dict):
+            return _from_industrial(values["intrinsics"], path)
+        raise InputError(f"camera file {path}: no camera_matrix; write it with cv2.FileStorage or as ROS camera_info")
+    matrix = np.asarray(values["camera_matrix"], float)
+    if matrix.size != 9:
+        raise InputError(f"camera file {path}: camera_matrix of {matrix.size} numbers; 3×3 needed")
+    matrix = matrix.reshape(3, 3)
+    if (matrix[[1, 2, 2, 2], [0, 0, 1, 2]] != [0, 0, 0, 1]).any():
+        raise InputError(f"camera file {path}: camera_matrix is not [fx 0 cx; 0 fy cy; 0 0 1]; is it transposed?")
+    if not abs(matrix[0, 1]) <= 1e-9 * abs(matrix[0, 0]) and np.isfinite(matrix[0, 0]):
+        raise InputError(f"camera file {path}: skew {matrix[0, 1]:g} is not supported; calibrate without skew")
+    model = values.get("distortion_model", "plumb_bob")
+    given = np.asarray(values.get("distortion_coefficients", []), float).ravel()
+    lens = [matrix[0, 0], matrix[1, 1], matrix[0, 2], matrix[1, 2]]
+    # A missing size, or 0, is one the file does not state.
+    sides = [values.get(f"image_{side}") for side in ("width", "height")]
+    if any(isinstance(side, bool) for side in sides):
+        raise InputError(f"camera file {path}: image_width and image_height are {sides}; numbers of pixels needed")
+    if model not in ("plumb_bob", "rational_polynomial", *EQUIDISTANT):
+        raise InputError(f"camera file {path}: distortion model {model!r} is not supported; use plumb_bob")
+    width, height = (float(side or 0) for side in sides)
+    if model in EQUIDISTANT:
+        return camera_from_opencv(lens, given, True, width, height, path)
+    return of_opencv(lens, given, width, height, str(path))
+
+
+def _from_industrial(values: dict, path: Path) -> CameraModel:
+    """ROS-Industrial's: the form has no place for the distortion, which may be there all the same."""
+    missing = [key for key in PARAMETER_NAMES[:4] if key not in values]
+    if missing:
+        raise InputError(f"camera file {path}: intrinsics without {', '.join(missing)}; fx, fy, cx, cy needed")
+    flat = np.concatenate([np.array([values[key] for key in PARAMETER_NAMES[:4]], float), np.zeros(8)])
+    return camera_model(flat, "OPENCV", None, None, path)
+
+
+def _yaml_values(text: str) -> dict:
+    values = load_yaml(text)
+    if not isinstance(values, dict):
+        raise ValueError("no keys")
+    return {k: v["data"] if isinstance(v, dict) and "data" in v else v for k, v in values.items()}
+
+
+def _xml_values(root: ElementTree.Element) -> dict:
+    values = {}
+    for node in root:
+        data = node.find("data")
+        if data is not None:
+            values[node.tag] = [float(word) for word in (data.text or "").split()]
+        elif node.text and not len(node):
+            values[node.tag] = node.text.strip().strip('"')
+    return values

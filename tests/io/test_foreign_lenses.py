@@ -1,0 +1,215 @@
+"""Lenses that no model here holds: their projections as other programs have them, and what a fit is worth."""
+
+import sqlite3
+
+import cv2
+import numpy as np
+import pycolmap
+import pytest
+
+from stcal.errors import InputError
+from stcal.io.camera import read_camera
+from stcal.io.cameras.fit import fit_lens
+from stcal.io.cameras.foreign import COLMAP_FOREIGN, ForeignLens
+from stcal.io.cameras.read import read_lens
+
+WIDTH, HEIGHT = 1280, 961
+COLMAP = {
+    "FOV": [0.9],
+    "RAD_TAN_THIN_PRISM_FISHEYE": [0.02, -0.01, 3e-3, -2e-3, 1e-3, -3e-4, 1e-3, -2e-3, 1e-3, -2e-4, 5e-4, 1e-4],
+    "SIMPLE_DIVISION": [-0.2],
+    "DIVISION": [-0.2],
+    "SIMPLE_FISHEYE": [],
+    "FISHEYE": [],
+    "EUCM": [0.6, 1.1],
+}
+"""What follows the principal point."""
+TILTED = [-0.1, 0.03, 1e-3, -2e-3, 0.01, 0.02, -0.01, 0.003, 1e-3, -2e-4, -1e-3, 1e-4, 0.02, -0.03]
+KALIBR = "cam0:\n  camera_model: {}\n  intrinsics: {}\n  distortion_model: {}\n  distortion_coeffs: {}\n"
+
+
+def rays() -> np.ndarray:
+    """(50, 3), the axis first."""
+    xy = np.random.default_rng(1).uniform(-0.7, 0.7, (50, 2))
+    xy[0] = 0
+    return np.column_stack([xy, np.ones(50)])
+
+
+def colmap_params(model: str) -> list[float]:
+    focal = [812.25] if model.startswith("SIMPLE_") else [812.25, 809.5]
+    return [*focal, 640.625, 478.5, *COLMAP[model]]
+
+
+def lens_of(tmp_path, model: str):
+    line = " ".join(map(repr, colmap_params(model)))
+    (tmp_path / "cameras.txt").write_text(f"7 {model} {WIDTH} {HEIGHT} {line}\n")
+    return read_lens(tmp_path / "cameras.txt")
+
+
+@pytest.mark.parametrize("model", COLMAP_FOREIGN)
+def test_colmap_projects_the_same(tmp_path, model):
+    camera = pycolmap.Camera(model=model, width=WIDTH, height=HEIGHT, params=colmap_params(model))
+    wanted = np.array([camera.img_from_cam(ray) for ray in rays()]) - 0.5
+    lens = lens_of(tmp_path, model)
+    project = lens.project if isinstance(lens, ForeignLens) else lens.sized(0, 0).project
+    np.testing.assert_allclose(project(rays()), wanted, atol=1e-10)
+    assert int(pycolmap.CameraModelId.__members__[model]) == COLMAP_FOREIGN[model][0]
+
+
+@pytest.mark.parametrize("model", ["FOV", "OPENCV"])
+def test_the_camera_of_a_database_is_read(tmp_path, model):
+    path = tmp_path / "database.db"
+    params = colmap_params("FOV") if model == "FOV" else [812.25, 809.5, 640.625, 478.5, -0.1, 0.03, 1e-3, -2e-3]
+    cameras = [pycolmap.Camera(model=model, width=WIDTH, height=HEIGHT, params=params) for _ in range(2)]
+    with pycolmap.Database.open(path) as database:
+        for camera in cameras:
+            database.write_camera(camera)
+    before = path.read_bytes()
+    with pytest.raises(InputError, match=r"2 cameras, one needed; choose of 1, 2 with `stcal camera convert --name"):
+        read_lens(path)
+    lens = read_lens(path, "2")
+    project = lens.project if isinstance(lens, ForeignLens) else lens.sized(0, 0).project
+    wanted = np.array([cameras[1].img_from_cam(ray) for ray in rays()]) - 0.5
+    np.testing.assert_allclose(project(rays()), wanted, atol=1e-10)
+    assert path.read_bytes() == before
+
+
+def test_a_database_of_something_else_is_refused(tmp_path):
+    path = tmp_path / "other.db"
+    with sqlite3.connect(path) as database:
+        database.execute("CREATE TABLE cameras (camera_id, model, width, height, params)")
+    with pytest.raises(InputError, match="no camera in it"):
+        read_lens(path)
+    with sqlite3.connect(path) as database:
+        database.execute("INSERT INTO cameras VALUES (1, 4, 10, 10, 'words')")
+    with pytest.raises(InputError, match="no database of COLMAP"):
+        read_lens(path)
+    with sqlite3.connect(path) as database:
+        database.execute("DROP TABLE cameras")
+    with pytest.raises(InputError, match=r"no database of COLMAP .no such table: cameras"):
+        read_lens(path)
+
+
+@pytest.mark.parametrize("count", [12, 14])
+def test_opencv_projects_the_same(tmp_path, count):
+    matrix = [812.25, 0, 640.125, 0, 809.5, 478.0625, 0, 0, 1]
+    (tmp_path / "c.yaml").write_text(
+        f"image_width: {WIDTH}\nimage_height: {HEIGHT}\ncamera_matrix: {matrix}\n"
+        f"distortion_coefficients: {TILTED[:count]}\n"
+    )
+    lens = read_lens(tmp_path / "c.yaml")
+    k = np.reshape(matrix, (3, 3))
+    wanted = cv2.projectPoints(rays(), np.zeros(3), np.zeros(3), k, np.array(TILTED[:count]))[0].reshape(-1, 2)
+    np.testing.assert_allclose(lens.project(rays()), wanted, atol=1e-10)
+    assert ("tilted" in lens.called) == (count == 14)
+
+
+def kalibr(tmp_path, lens: str, shape: list[float], distortion: str = "none", k: tuple[float, ...] = ()) -> ForeignLens:
+    (tmp_path / "chain.yaml").write_text(KALIBR.format(lens, [*shape, 400.5, 402.0, 640, 478], distortion, list(k)))
+    return read_lens(tmp_path / "chain.yaml")
+
+
+def test_kalibrs_lenses_project_by_their_papers(tmp_path):
+    """Mei & Rives 2007: ξ = 0 is perspective, ξ = 1 stereographic; double sphere with α = ½, ξ = 0 is stereographic
+    too, and with α = 0 Mei's of ξ; the enhanced unified lens is COLMAP's EUCM."""
+    r = rays()
+    focal, centre = np.array([400.5, 402.0]), np.array([640.0, 478.0])
+    angle, side = np.arctan(np.hypot(*r[:, :2].T)), r[:, :2] / np.maximum(np.hypot(*r[:, :2].T), 1e-15)[:, None]
+    stereographic = np.tan(angle / 2)[:, None] * side
+    np.testing.assert_allclose(kalibr(tmp_path, "omni", [0.0]).project(r), centre + focal * r[:, :2], atol=1e-10)
+    np.testing.assert_allclose(kalibr(tmp_path, "omni", [1.0]).project(r), centre + focal * stereographic, atol=1e-10)
+    np.testing.assert_allclose(
+        kalibr(tmp_path, "ds", [0.0, 0.5]).project(r), centre + 2 * focal * stereographic, atol=1e-10
+    )
+    omni, sphere = kalibr(tmp_path, "omni", [0.3]), kalibr(tmp_path, "ds", [0.3, 0.0])
+    np.testing.assert_allclose(sphere.project(r), omni.project(r), atol=1e-10)
+    camera = pycolmap.Camera(model="EUCM", width=WIDTH, height=HEIGHT, params=[*focal, *centre + 0.5, 0.6, 1.1])
+    wanted = np.array([camera.img_from_cam(ray) for ray in r]) - 0.5
+    np.testing.assert_allclose(kalibr(tmp_path, "eucm", [0.6, 1.1]).project(r), wanted, atol=1e-10)
+
+
+@pytest.mark.parametrize(
+    ("distortion", "k", "model", "params"),
+    [
+        ("radtan", (-0.2, 0.05, 1e-3, -2e-3), "OPENCV", (-0.2, 0.05, 1e-3, -2e-3)),
+        ("equidistant", (-0.01, 0.02, -3e-3, 4e-4), "OPENCV_FISHEYE", (-0.01, 0.02, -3e-3, 4e-4)),
+        ("fov", (0.9,), "FOV", (0.9,)),
+    ],
+)
+def test_kalibrs_distortions_are_colmaps(tmp_path, distortion, k, model, params):
+    camera = pycolmap.Camera(model=model, width=WIDTH, height=HEIGHT, params=[400.5, 402.0, 640.5, 478.5, *params])
+    wanted = np.array([camera.img_from_cam(ray) for ray in rays()]) - 0.5
+    np.testing.assert_allclose(kalibr(tmp_path, "omni", [0.0], distortion, k).project(rays()), wanted, atol=1e-10)
+
+
+MRCAL = {
+    2: [[1113.4803160427805, 983.9378017015669], [1554.5433686283736, 314.9491916110986],
+        [56.08894951279456, 1323.6188180048284]],
+    3: [[1114.99498397871, 985.0624887742252], [1549.7328831186853, 311.58902073923093],
+        [56.72249785371844, 1322.0796389340078]],
+}  # fmt: skip
+"""``mrcal.project`` (2.2) of three rays, by the spline's order."""
+
+
+@pytest.mark.parametrize("order", MRCAL)
+def test_mrcals_splines_project_as_mrcal_does(tmp_path, order):
+    numbers = [1200, 1205, 999.5, 749.5, *np.round(0.02 * np.sin(np.arange(176)), 6).tolist()]
+    name = f"LENSMODEL_SPLINED_STEREOGRAPHIC_order={order}_Nx=11_Ny=8_fov_x_deg=120"
+    text = f"{{'lensmodel': '{name}', 'intrinsics': {numbers}, 'imagersize': [2000, 1500]}}"
+    (tmp_path / "c.cameramodel").write_text(text)
+    lens = read_lens(tmp_path / "c.cameramodel")
+    found = lens.project(np.array([[0.1, 0.2, 1], [0.5, -0.4, 1], [-1, 0.6, 1]]))
+    np.testing.assert_allclose(found, MRCAL[order], atol=1e-9)
+    (tmp_path / "c.cameramodel").write_text(text.replace("1205,", ""))
+    with pytest.raises(InputError, match="179 intrinsics of 11×8 points; 180 needed"):
+        read_lens(tmp_path / "c.cameramodel")
+
+
+@pytest.mark.parametrize(
+    ("model", "most_px"),
+    [("FOV", 1e-4), ("RAD_TAN_THIN_PRISM_FISHEYE", 0.1), ("DIVISION", 1e-4), ("EUCM", 1e-3)],
+)
+def test_a_fit_is_off_by_no_more_than_it_says(tmp_path, model, most_px):
+    """The models differ in form; how near they come was measured."""
+    lens = lens_of(tmp_path, model)
+    found = fit_lens(lens, WIDTH, HEIGHT)
+    xy = np.random.default_rng(2).uniform(-1.5, 1.5, (4000, 2))
+    fresh = np.column_stack([xy, np.ones(len(xy))])
+    pixels = lens.project(fresh)
+    inside = ((pixels > 0) & (pixels < [WIDTH - 1, HEIGHT - 1])).all(axis=1)
+    off = np.linalg.norm(found.camera.project(fresh[inside]) - pixels[inside], axis=1)
+    assert inside.sum() > 300
+    assert off.max() <= 1.05 * found.most_px + 1e-6
+    assert found.most_px < most_px
+    assert found.share == 1
+
+
+def test_a_lens_that_none_of_ours_is_like_says_so(tmp_path):
+    """A double sphere of 220°: the image reaches beyond what a model here sees."""
+    (tmp_path / "chain.yaml").write_text(KALIBR.format("ds", [-0.2, 0.6, 200.0, 200.0, 640, 478], "none", []))
+    lens = read_lens(tmp_path / "chain.yaml")
+    assert fit_lens(lens, WIDTH, HEIGHT).share < 0.5
+
+
+def test_other_commands_ask_for_the_conversion(tmp_path):
+    lens_of(tmp_path, "FOV")
+    with pytest.raises(InputError, match=r"COLMAP's FOV is none of .*; fit one of them to it with `stcal camera"):
+        read_camera(tmp_path / "cameras.txt")
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("1 FOV 9 9 1 1 1 1", "4 parameters for FOV, 5 needed"),
+        ("1 FOV 9 9 -1 1 1 1 1", "focal length -1, 1 px"),
+        ("1 FOV 9 9 1 1 1 1 nan", "not a finite number"),
+        ("1 EQUIRECTANGULAR 9 9 9 9", "EQUIRECTANGULAR is not supported; use one of"),
+        ("1 PINHOLE 9 9 1 1 1 1\n1 PINHOLE 9 9 1 1 1 1", "two cameras of one number"),
+        (KALIBR.format("omni", [1, 2, 3], "none", []), "omni with none has 5 intrinsics and 0 coefficients"),
+        (KALIBR.format("ds", [0, 0, -1, 1, 1, 1], "none", []), "focal length .-1.0, 1.0.; positive"),
+    ],
+)  # fmt: skip
+def test_a_wrong_lens_is_named(tmp_path, text, message):
+    (tmp_path / "camera").write_text(text)
+    with pytest.raises(InputError, match=message):
+        read_lens(tmp_path / "camera")
