@@ -102,7 +102,11 @@ def held(form: str, folder: Path) -> list[str]:
             lost.update(made.lost)
         if (read.width, read.height) != (WIDTH, HEIGHT):
             lost.add("size")
-    return ["all" if back == list(LENSES) else "; ".join(back), "; ".join(refused) or "–", "; ".join(sorted(lost)) or "–"]
+    return [
+        "all" if back == list(LENSES) else "; ".join(back),
+        "; ".join(refused) or "–",
+        "; ".join(sorted(lost)) or "–",
+    ]
 
 
 def main() -> None:

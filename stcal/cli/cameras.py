@@ -117,9 +117,14 @@ def compare(
 def _camera(path: Path, name: str, size: str) -> "CalibratedCamera":
     from stcal.io.camera import CameraModel
     from stcal.io.cameras.fit import fit_lens
+    from stcal.io.cameras.photograph import camera_of_photograph, is_photograph
     from stcal.io.cameras.read import read_lens
-    from stcal.report.camera import fitted_text
+    from stcal.report.camera import exif_text, fitted_text
 
+    if is_photograph(path):
+        taken = camera_of_photograph(path)
+        print_each("note", [exif_text(taken.told)])
+        return taken.camera
     lens = read_lens(path, name)
     given = size.lower().split("x") if size else ["0", "0"]
     if len(given) != 2 or not all(side.isdigit() for side in given):

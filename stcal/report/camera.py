@@ -6,6 +6,7 @@ from stcal.geometry.camera import Camera
 from stcal.io.camera import CalibratedCamera, parameter_names
 from stcal.io.cameras.difference import CameraDifference, image_grid, rays
 from stcal.io.cameras.fit import FittedLens
+from stcal.io.cameras.photograph import SIGMA_FOCAL
 from stcal.report.figure import INK, SMALL, calm, new_figure
 from stcal.report.text import NONE, text_table
 
@@ -36,6 +37,14 @@ def shown(camera: CalibratedCamera) -> list[str]:
         )
     lines.append(f"the lens moves points by up to {np.nanmax(np.linalg.norm(moved, axis=2)):.2f} px")
     return lines
+
+
+def exif_text(told: str) -> str:
+    """What a camera of a photograph's EXIF is worth."""
+    return (
+        f"from EXIF: {told}; f to {SIGMA_FOCAL:.0%}, distortion unknown: a start for `run --refine-camera`, not for "
+        "measuring"
+    )
 
 
 def fitted_text(called: str, found: FittedLens) -> list[str]:

@@ -1,0 +1,67 @@
+"""The camera that a photograph's EXIF tells, beside what COLMAP makes of it."""
+
+import numpy as np
+import pycolmap
+import pytest
+from PIL import ExifTags, Image
+
+from stcal.errors import InputError
+from stcal.io.cameras.photograph import SIGMA_FOCAL, camera_of_photograph, is_photograph
+
+
+def photograph(path, **entries):
+    exif = Image.Exif()
+    exif[ExifTags.Base.Make] = "any"
+    own = exif.get_ifd(ExifTags.IFD.Exif)
+    for name, value in entries.items():
+        own[getattr(ExifTags.Base, name)] = value
+    Image.new("L", (1200, 800)).save(path, exif=exif)
+    return path
+
+
+PLANE = {"FocalLength": 35.0, "FocalPlaneXResolution": 500.0, "FocalPlaneResolutionUnit": 3}
+"""24 mm across 1200 px."""
+BIGGER = PLANE | {"FocalPlaneXResolution": 2500.0, "ExifImageWidth": 6000, "ExifImageHeight": 4000}
+ENTRIES = {
+    "35 mm film": ({"FocalLengthIn35mmFilm": 28}, 28 / 36 * 1200),
+    "pixels": (PLANE, 35 / 24 * 1200),
+    "pixels of a larger image": (BIGGER, 35 / 24 * 1200),
+    "inches": (PLANE | {"FocalPlaneXResolution": 1270.0, "FocalPlaneResolutionUnit": 2}, 35 / 24 * 1200),
+}
+
+
+@pytest.mark.parametrize("case", ENTRIES)
+@pytest.mark.parametrize("suffix", [".jpg", ".png"])
+def test_the_focal_length_is_that_of_exif(tmp_path, case, suffix):
+    entries, focal_px = ENTRIES[case]
+    path = photograph(tmp_path / f"p{suffix}", **entries)
+    assert is_photograph(path)
+    camera = camera_of_photograph(path).camera
+    np.testing.assert_allclose(camera.focal, focal_px, rtol=1e-4)
+    np.testing.assert_array_equal(camera.centre, [599.5, 399.5])
+    sigma = np.sqrt(np.diag(camera.covariance))
+    np.testing.assert_allclose(sigma[:2], SIGMA_FOCAL * focal_px, rtol=1e-3)
+    assert np.linalg.eigvalsh(camera.covariance).min() > 0
+
+
+def test_colmap_finds_the_same(tmp_path):
+    path = photograph(tmp_path / "p.jpg", FocalLengthIn35mmFilm=28)
+    wanted = pycolmap.infer_camera_from_image(path)
+    assert wanted.has_prior_focal_length
+    np.testing.assert_allclose(camera_of_photograph(path).camera.focal, wanted.mean_focal_length(), rtol=1e-3)
+
+
+@pytest.mark.parametrize(
+    ("entries", "content", "message"),
+    [
+        ({}, None, "without focal length in its EXIF"),
+        ({"FocalLengthIn35mmFilm": 0}, None, "without focal length in its EXIF"),
+        ({"FocalLength": 35.0}, None, "without focal length in its EXIF"),
+        (None, b"\xff\xd8\xff\xe0\x00\x10JFIF", "no photograph that can be read"),
+    ],
+)
+def test_a_photograph_that_tells_nothing_is_refused(tmp_path, entries, content, message):
+    path = tmp_path / "p.jpg"
+    path.write_bytes(content) if content else photograph(path, **entries)
+    with pytest.raises(InputError, match=message):
+        camera_of_photograph(path)
