@@ -14,7 +14,8 @@ from stcal.errors import InputError
 from stcal.geometry.rigid import Rigid
 from stcal.handeye import HandEye
 from stcal.handeye.report.export import FORMS, ROS_FORMS, exported, opencv_yaml, ros_yaml, tree, urdf_joint
-from stcal.handeye.report.export.ros import read_ros, read_urdf
+from stcal.handeye.report.export.ros import read_urdf
+from stcal.io.poses.static import read_messages
 from stcal.io.poses.text import program_name
 
 angle, length = st.floats(-3.1, 3.1), st.floats(-3000, 3000)
@@ -122,7 +123,7 @@ def test_the_link_has_the_optical_frame_in_it(form):
     assert len(found) == (1 if form.startswith("easy") else 2)
 
 
-@pytest.mark.parametrize(("write", "read"), [(ros_yaml, read_ros), (urdf_joint, read_urdf)])
+@pytest.mark.parametrize(("write", "read"), [(ros_yaml, read_messages), (urdf_joint, read_urdf)])
 def test_the_link_in_ros_and_urdf(write, read):
     pose = Rigid.exp([0.3, -2, 1, 12.5, -900, 3])
     first, fixed = read(write(result_of(pose), camera_frame="link"))

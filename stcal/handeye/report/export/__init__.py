@@ -10,7 +10,6 @@ from stcal.geometry.rigid import Rigid
 from stcal.handeye.report.export import robots, ros
 from stcal.handeye.report.export.frames import (
     CameraFrame,
-    Static,
     frame_names,
     require_frame_names,
     tree,
@@ -19,6 +18,7 @@ from stcal.handeye.report.export.opencv import opencv_yaml, read_zivid, zivid_ya
 from stcal.handeye.report.export.ros import ros_yaml, urdf_joint
 from stcal.handeye.result import HandEye
 from stcal.io.poses.controllers import ABB, FANUC, KUKA, UR
+from stcal.io.poses.static import Static
 from stcal.io.poses.text import program_name
 
 __all__ = [

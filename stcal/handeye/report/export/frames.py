@@ -1,17 +1,15 @@
 """Frames of an exported transform: their names, ROS's two frames of a camera, and what is said of the result."""
 
-from dataclasses import dataclass
 from typing import Literal
 
 import numpy as np
-from scipy.spatial.transform import Rotation
 
 import stcal
 from stcal.errors import InputError
 from stcal.geometry.rigid import Rigid
 from stcal.handeye.data.loop import FRAMES, Setup
 from stcal.handeye.result import HandEye
-from stcal.io.poses.controllers import METRE_MM
+from stcal.io.poses.static import Static
 
 CAMERA_FRAME = "camera_optical_frame"
 """What ROS calls a frame whose Z looks along the line of sight and X to the right, as ours does."""
@@ -20,15 +18,6 @@ CAMERA_LINK = "camera_link"
 LINK_FROM_OPTICAL = Rigid([[0, 0, 1], [-1, 0, 0], [0, -1, 0]], [0, 0, 0])
 """Of one origin: REP 103, suffix frames."""
 CameraFrame = Literal["optical", "link"]
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class Static:
-    """A fixed transform of a tree of frames, ``parent_from_child``."""
-
-    parent: str
-    child: str
-    pose: Rigid
 
 
 def tree(result: HandEye, parent: str = "", child: str = "", camera_frame: CameraFrame = "optical") -> list[Static]:
@@ -91,19 +80,3 @@ def said_of(result: HandEye) -> list[str]:
     lines.append(f"sigma along x y z of the {frames.mount}: {shift} mm; about them: {turn} deg")
     lines.append(f"covariance, rotation about x y z (rad), then shift along x y z (mm), axes of the {frames.mount}:")
     return lines + ["  " + " ".join(f"{v:.6e}" for v in row) for row in result.covariance]
-
-
-def metres(pose: Rigid) -> list[float]:
-    """Its translation."""
-    return [float(v) / METRE_MM for v in pose.translation]
-
-
-def xyzw(pose: Rigid) -> list[float]:
-    """Its quaternion, in the order of ROS, w ≥ 0."""
-    return [float(v) for v in Rotation.from_matrix(np.array(pose.rotation)).as_quat(canonical=True)]
-
-
-def pose_of_metres(translation_m, quaternion_xyzw) -> Rigid:
-    """Back from these."""
-    turn = Rotation.from_quat([float(v) for v in quaternion_xyzw]).as_matrix()
-    return Rigid(turn, [METRE_MM * float(v) for v in translation_m])

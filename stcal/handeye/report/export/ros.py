@@ -9,24 +9,15 @@ import shlex
 import xml.etree.ElementTree as ElementTree
 from xml.sax.saxutils import quoteattr
 
-import numpy as np
 import yaml
 
 from stcal.errors import InputError
-from stcal.geometry.rigid import Poses, Rigid
+from stcal.geometry.rigid import Rigid
 from stcal.handeye.data.loop import FRAMES
-from stcal.handeye.report.export.frames import (
-    CameraFrame,
-    Static,
-    metres,
-    pose_of_metres,
-    said_of,
-    tree,
-    xyzw,
-)
+from stcal.handeye.report.export.frames import CameraFrame, said_of, tree
 from stcal.handeye.result import HandEye
 from stcal.io.plain_yaml import load_yaml
-from stcal.io.poses.controllers import METRE_MM, from_roll_pitch_yaw, roll_pitch_yaw
+from stcal.io.poses.static import Static, fixed_joint, messages, metres, pose_of_metres, static_of_joint, xyzw
 from stcal.report.text import number
 
 ARGUMENTS = ("--x", "--y", "--z", "--qx", "--qy", "--qz", "--qw")
@@ -42,32 +33,7 @@ def ros_yaml(result: HandEye, parent: str = "", child: str = "", camera_frame: C
     ``parent``, ``child``, ``camera_frame`` : as of :func:`~stcal.handeye.report.export.frames.tree`; a document for
     each of its transforms.
     """
-    return "---\n".join(
-        yaml.safe_dump(_message(each), sort_keys=False, allow_unicode=True)
-        for each in tree(result, parent, child, camera_frame)
-    )
-
-
-def read_ros(text: str) -> list[Static]:
-    """Back from :func:`ros_yaml`."""
-    found = []
-    for document in yaml.safe_load_all(text):
-        own = document["transform"]
-        pose = pose_of_metres([own["translation"][c] for c in "xyz"], [own["rotation"][c] for c in "xyzw"])
-        found.append(Static(document["header"]["frame_id"], document["child_frame_id"], pose))
-    return found
-
-
-def _message(each: Static) -> dict:
-    w, x, y, z = (float(v) for v in Poses.of([each.pose]).quaternions()[0])
-    return {
-        "header": {"frame_id": each.parent},
-        "child_frame_id": each.child,
-        "transform": {
-            "translation": dict(zip("xyz", metres(each.pose), strict=True)),
-            "rotation": {"x": x, "y": y, "z": z, "w": w},
-        },
-    }
+    return messages(tree(result, parent, child, camera_frame))
 
 
 def urdf_joint(result: HandEye, parent: str = "", child: str = "", camera_frame: CameraFrame = "optical") -> str:
@@ -76,7 +42,7 @@ def urdf_joint(result: HandEye, parent: str = "", child: str = "", camera_frame:
     Of ``camera_frame`` ``link`` two joints with the links that they lead to, in a ``robot`` that xacro includes.
     """
     transforms = tree(result, parent, child, camera_frame)
-    joints = [_joint(each) for each in transforms]
+    joints = [fixed_joint(each) for each in transforms]
     if len(joints) == 1:
         return joints[0]
     links = [f"<link name={quoteattr(each.child)}/>\n" for each in transforms]
@@ -86,27 +52,7 @@ def urdf_joint(result: HandEye, parent: str = "", child: str = "", camera_frame:
 def read_urdf(text: str) -> list[Static]:
     """Back from :func:`urdf_joint`."""
     root = ElementTree.fromstring(text)
-    return [_static_of_joint(joint) for joint in ([root] if root.tag == "joint" else root.findall("joint"))]
-
-
-def _joint(each: Static) -> str:
-    name = quoteattr(f"{each.parent}_to_{each.child}")
-    origin = " ".join(repr(v) for v in metres(each.pose))
-    angles = " ".join(repr(float(v)) for v in roll_pitch_yaw(each.pose))
-    return (
-        f'<joint name={name} type="fixed">\n'
-        f"  <parent link={quoteattr(each.parent)}/>\n"
-        f"  <child link={quoteattr(each.child)}/>\n"
-        f'  <origin xyz="{origin}" rpy="{angles}"/>\n'
-        "</joint>\n"
-    )
-
-
-def _static_of_joint(joint: ElementTree.Element) -> Static:
-    parts = {part.tag: part.attrib for part in joint}
-    place, angles = ([float(v) for v in parts["origin"][key].split()] for key in ("xyz", "rpy"))
-    pose = Rigid(from_roll_pitch_yaw(angles), METRE_MM * np.array(place))
-    return Static(parts["parent"]["link"], parts["child"]["link"], pose)
+    return [static_of_joint(joint) for joint in ([root] if root.tag == "joint" else root.findall("joint"))]
 
 
 def ros2_commands(result: HandEye, transforms: list[Static]) -> str:
