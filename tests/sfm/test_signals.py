@@ -8,6 +8,7 @@ import time
 import pytest
 
 SFM = (sys.executable, "-P", "-c", "from stcal.cli.entry import main_sfm; main_sfm()")
+SFM_SAYING_ON = (*SFM[:-1], "from stcal.cli.entry import main_sfm; print('on', flush=True); main_sfm()")
 ENDS = [(signal.SIGTERM, "terminated", 143), (signal.SIGINT, "interrupted", 130)]
 PROGRESS = ("detect: ", "overlays: ", "map: ", "faces: ", "check: ", "report: ")
 
@@ -84,7 +85,8 @@ def test_during_a_run(small_set, number, said, code, seconds):
     before = (small.out / "faces.json").read_bytes()
     for path in (small.out / "cache").glob("*.npz"):
         path.unlink()
-    process = subprocess.Popen(command, stdout=-1, stderr=-1, text=True)
+    process = subprocess.Popen([*SFM_SAYING_ON, *command[len(SFM) :]], stdout=-1, stderr=-1, text=True)
+    assert process.stdout.readline() == "on\n"  # until then a signal ends Python itself, with 1 and its own words
     time.sleep(seconds)
     code_found, lines = ended(process, number)
     if code_found != 0:  # a fast machine may be through

@@ -134,9 +134,9 @@ def one_of(names: list[str], choice: str, source: str) -> str:
         None, an unknown one, or several and no choice.
     """
     if not names:
-        raise InputError(f"camera file {source}: no camera in it, one needed")
+        raise InputError(f"camera file {source}: no camera in it, 1 needed")
     if choice not in names and (choice or len(names) > 1):
-        asked = f"no camera {choice}" if choice else f"{len(names)} cameras, one needed"
+        asked = f"no camera {choice}" if choice else f"{len(names)} cameras, 1 needed"
         shown = ", ".join(names[:12]) + (" …" if len(names) > 12 else "")
         raise InputError(f"camera file {source}: {asked}; choose of {shown} with `stcal camera convert --name`")
     return choice or names[0]
