@@ -264,7 +264,7 @@ WRONG = {
     "binary": (bytes(range(256)), "not a text file"),
     "a photograph": (b"\xff\xd8\xff\xe0\x00\x10JFIF", "not a text file"),
     "UTF-16": ("1 PINHOLE 10 10 1 1 1 1".encode("utf-16"), "not a text file"),
-    "COLMAP: two cameras": ("1 PINHOLE 9 9 1 1 1 1\n2 PINHOLE 9 9 1 1 1 1\n", "2 cameras, one needed; choose of 1, 2"),
+    "COLMAP: two cameras": ("1 PINHOLE 9 9 1 1 1 1\n2 PINHOLE 9 9 1 1 1 1\n", "2 cameras, 1 needed; choose of 1, 2"),
     "COLMAP: field of view": ("1 FOV 9 9 1 1 1 1 1", "COLMAP's FOV is none of SIMPLE_"),
     "COLMAP: too few": ("1 PINHOLE 9 9 1 1 1", "3 parameters for PINHOLE, 4 needed"),
     "COLMAP: far too few": ("1 SIMPLE_PINHOLE 9 9 1", "1 parameters for SIMPLE_PINHOLE, 3 needed"),

@@ -99,7 +99,7 @@ def test_a_camera_of_a_chain_is_chosen(tmp_path):
     second = read_camera(path, "cam1")
     assert second.colmap_model == "OPENCV_FISHEYE"
     np.testing.assert_array_equal(second.distortion[[0, 1, 4, 5]], [-0.01, 0.02, -0.003, 0.0004])
-    with pytest.raises(InputError, match=r"2 cameras, one needed; choose of cam0, cam1 with `stcal camera convert"):
+    with pytest.raises(InputError, match=r"2 cameras, 1 needed; choose of cam0, cam1 with `stcal camera convert"):
         read_camera(path)
     path.write_text(KALIBR.replace("pinhole", "catadioptric"))
     with pytest.raises(InputError, match="catadioptric with radtan; pinhole, omni, eucm, ds with radtan"):

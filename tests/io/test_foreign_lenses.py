@@ -65,7 +65,7 @@ def test_the_camera_of_a_database_is_read(tmp_path, model):
         for camera in cameras:
             database.write_camera(camera)
     before = path.read_bytes()
-    with pytest.raises(InputError, match=r"2 cameras, one needed; choose of 1, 2 with `stcal camera convert --name"):
+    with pytest.raises(InputError, match=r"2 cameras, 1 needed; choose of 1, 2 with `stcal camera convert --name"):
         read_lens(path)
     lens = read_lens(path, "2")
     project = lens.project if isinstance(lens, ForeignLens) else lens.sized(0, 0).project

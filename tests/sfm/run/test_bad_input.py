@@ -396,8 +396,11 @@ CAMERAS = {
     "missing": (None, ("No such file", "give a readable file")),
     "empty": ("", ("neither COLMAP's cameras.txt nor OpenCV's YAML or XML", "check its form")),
     "prose": ("a camera, no doubt", ("neither COLMAP's cameras.txt", "check its form")),
-    "two cameras": ("1 PINHOLE 9 9 1 1 1 1\n2 PINHOLE 9 9 1 1 1 1", ("2 cameras, 1 needed; choose of 1, 2 with `stcal camera convert --name`",)),
-    "field of view": ("1 FOV 9 9 1 1 1 1 1", ("COLMAP's FOV", "OPENCV_FISHEYE", "fit one of them to it with `stcal camera convert`")),
+    "two cameras": (
+        "1 PINHOLE 9 9 1 1 1 1\n2 PINHOLE 9 9 1 1 1 1",
+        ("2 cameras, 1 needed; choose of 1, 2 with `stcal camera",),
+    ),
+    "field of view": ("1 FOV 9 9 1 1 1 1 1", ("COLMAP's FOV", "fit one of them to it with `stcal camera convert`")),
     "no number": ("1 PINHOLE 1296 864 f f 1 1", ("'f'; numbers needed",)),
 }
 
