@@ -1,7 +1,11 @@
-"""Fixed transforms of a tree of frames as ROS has them: messages, and joints of URDF; lengths in metres."""
+"""Fixed transforms of a tree of frames as ROS has them: messages, joints of URDF, and programs that publish them;
+lengths in metres."""
 
+import ast
+import json
+import shlex
 import xml.etree.ElementTree as ElementTree
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from xml.sax.saxutils import quoteattr
 
@@ -9,8 +13,15 @@ import numpy as np
 import yaml
 from scipy.spatial.transform import Rotation
 
+from stcal.errors import InputError
 from stcal.geometry.rigid import Poses, Rigid
 from stcal.io.poses.controllers import METRE_MM, from_roll_pitch_yaw, roll_pitch_yaw
+from stcal.io.poses.text import fixed
+
+ARGUMENTS = ("--x", "--y", "--z", "--qx", "--qy", "--qz", "--qw")
+"""Of ROS 2's ``static_transform_publisher``."""
+METRE_DIGITS, QUATERNION_DIGITS = 12, 15
+"""Of arguments, written without exponents: 10⁻⁹ mm."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -85,3 +96,88 @@ def static_of_joint(joint: ElementTree.Element) -> Static:
     place, angles = ([float(v) for v in parts["origin"][key].split()] for key in ("xyz", "rpy"))
     pose = Rigid(from_roll_pitch_yaw(angles), METRE_MM * np.array(place))
     return Static(parts["parent"]["link"], parts["child"]["link"], pose)
+
+
+def ros2_commands(statics: Sequence[Static], said: Iterable[str] = ()) -> str:
+    """A shell script of ``ros2 run tf2_ros static_transform_publisher``, a call for each transform; all but the last go
+    on in the background."""
+    calls = [shlex.join(["ros2", "run", "tf2_ros", "static_transform_publisher", *_arguments(t)]) for t in statics]
+    head = ["#!/bin/sh", *(f"# {line}" for line in said)]
+    return "\n".join(head) + "\n" + " &\n".join(calls) + "\n"
+
+
+def read_ros2_commands(text: str) -> list[Static]:
+    """Back from :func:`ros2_commands`."""
+    calls = [line.removesuffix("&") for line in text.splitlines() if line.startswith("ros2 ")]
+    return [_static_of_arguments(shlex.split(call)[4:]) for call in calls]
+
+
+def ros1_launch(statics: Sequence[Static], said: Iterable[str] = ()) -> str:
+    """A launch file of ROS 1, as MoveIt's calibration plugin writes it.
+
+    Raises
+    ------
+    InputError
+        A name with white space, at which ``roslaunch`` would split it.
+    """
+    lines = ["<launch>", *(f"  <!-- {line} -->" for line in said)]
+    for each in statics:
+        names = each.parent, each.child
+        if spaced := [name for name in names if name.split() != [name]]:
+            raise InputError(f"frames: {spaced[0]!r} has white space, at which roslaunch splits; give another name")
+        words = [
+            *plain_numbers(metres(each.pose), METRE_DIGITS),
+            *plain_numbers(xyzw(each.pose), QUATERNION_DIGITS),
+            *names,
+        ]
+        node = f"{each.child}_broadcaster".replace("/", "_")
+        lines.append(f'  <node pkg="tf2_ros" type="static_transform_publisher" name={quoteattr(node)}')
+        lines.append(f"      args={quoteattr(' '.join(words))} />")
+    return "\n".join(lines) + "\n</launch>\n"
+
+
+def read_ros1_launch(text: str) -> list[Static]:
+    """Back from :func:`ros1_launch`."""
+    found = []
+    for node in ElementTree.fromstring(text).findall("node"):
+        words = node.attrib["args"].split()
+        found.append(Static(words[7], words[8], pose_of_metres(words[:3], words[3:7])))
+    return found
+
+
+def ros2_launch(statics: Sequence[Static], said: Iterable[str] = ()) -> str:
+    """A launch file of ROS 2, as MoveIt 2's calibration plugin writes it."""
+    lines = [f"# {line}" for line in said]
+    lines += ["from launch import LaunchDescription", "from launch_ros.actions import Node", "", ""]
+    lines += ["def generate_launch_description() -> LaunchDescription:", "    nodes = ["]
+    for each in statics:
+        lines += ["        Node(", '            package="tf2_ros",']
+        lines += ['            executable="static_transform_publisher",', '            output="log",']
+        lines += ["            arguments=["]
+        lines += [f"                {json.dumps(word, ensure_ascii=False)}," for word in _arguments(each)]
+        lines += ["            ],", "        ),"]
+    return "\n".join([*lines, "    ]", "    return LaunchDescription(nodes)"]) + "\n"
+
+
+def read_ros2_launch(text: str) -> list[Static]:
+    """Back from :func:`ros2_launch`."""
+    words = [node.value for node in ast.walk(ast.parse(text)) if isinstance(node, ast.keyword) and node.arg]
+    lists = [ast.literal_eval(node) for node in words if isinstance(node, ast.List)]
+    return [_static_of_arguments(each) for each in lists]
+
+
+def _arguments(each: Static) -> list[str]:
+    values = [*plain_numbers(metres(each.pose), METRE_DIGITS), *plain_numbers(xyzw(each.pose), QUATERNION_DIGITS)]
+    pairs = [("--frame-id", each.parent), ("--child-frame-id", each.child), *zip(ARGUMENTS, values, strict=True)]
+    return [word for pair in pairs for word in pair]
+
+
+def _static_of_arguments(words: list[str]) -> Static:
+    given = dict(zip(words[::2], words[1::2], strict=True))
+    values = [given[name] for name in ARGUMENTS]
+    return Static(given["--frame-id"], given["--child-frame-id"], pose_of_metres(values[:3], values[3:]))
+
+
+def plain_numbers(values, digits: int) -> list[str]:
+    """Their texts without exponents, and without a minus before zero."""
+    return [fixed(v, digits) for v in values]

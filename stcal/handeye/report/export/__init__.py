@@ -12,13 +12,22 @@ from stcal.handeye.report.export.frames import (
     CameraFrame,
     frame_names,
     require_frame_names,
+    said_of,
     tree,
 )
 from stcal.handeye.report.export.opencv import opencv_yaml, read_zivid, zivid_yaml
 from stcal.handeye.report.export.ros import ros_yaml, urdf_joint
 from stcal.handeye.result import HandEye
 from stcal.io.poses.controllers import ABB, FANUC, KUKA, UR
-from stcal.io.poses.static import Static
+from stcal.io.poses.static import (
+    Static,
+    read_ros1_launch,
+    read_ros2_commands,
+    read_ros2_launch,
+    ros1_launch,
+    ros2_commands,
+    ros2_launch,
+)
 from stcal.io.poses.text import program_name
 
 __all__ = [
@@ -50,9 +59,9 @@ class Form:
 
 
 ROS_FORMS = {
-    "ros2": Form(lambda result, transforms, _: ros.ros2_commands(result, transforms), ros.read_ros2),
-    "moveit": Form(lambda result, transforms, _: ros.moveit_launch(result, transforms), ros.read_moveit),
-    "moveit2": Form(lambda result, transforms, _: ros.moveit2_launch(result, transforms), ros.read_moveit2),
+    "ros2": Form(lambda result, transforms, _: ros2_commands(transforms, said_of(result)), read_ros2_commands),
+    "moveit": Form(lambda result, transforms, _: ros1_launch(transforms, said_of(result)), read_ros1_launch),
+    "moveit2": Form(lambda result, transforms, _: ros2_launch(transforms, said_of(result)), read_ros2_launch),
     "easy-handeye": Form(ros.easy_handeye, ros.read_easy_handeye),
     "easy-handeye2": Form(ros.easy_handeye2, ros.read_easy_handeye2),
 }

@@ -3,27 +3,27 @@
 Each file has a reader here, by the rules of the program that takes it.
 """
 
-import ast
-import json
-import shlex
 import xml.etree.ElementTree as ElementTree
 from xml.sax.saxutils import quoteattr
 
 import yaml
 
-from stcal.errors import InputError
 from stcal.geometry.rigid import Rigid
 from stcal.handeye.data.loop import FRAMES
 from stcal.handeye.report.export.frames import CameraFrame, said_of, tree
 from stcal.handeye.result import HandEye
 from stcal.io.plain_yaml import load_yaml
-from stcal.io.poses.static import Static, fixed_joint, messages, metres, pose_of_metres, static_of_joint, xyzw
-from stcal.report.text import number
+from stcal.io.poses.static import (
+    Static,
+    fixed_joint,
+    messages,
+    metres,
+    plain_numbers,
+    pose_of_metres,
+    static_of_joint,
+    xyzw,
+)
 
-ARGUMENTS = ("--x", "--y", "--z", "--qx", "--qy", "--qz", "--qw")
-"""Of ROS 2's ``static_transform_publisher``."""
-METRE_DIGITS, QUATERNION_DIGITS = 12, 15
-"""Of arguments, written without exponents: 10⁻⁹ mm."""
 IN_HAND = "eye-in-hand"
 
 
@@ -53,70 +53,6 @@ def read_urdf(text: str) -> list[Static]:
     """Back from :func:`urdf_joint`."""
     root = ElementTree.fromstring(text)
     return [static_of_joint(joint) for joint in ([root] if root.tag == "joint" else root.findall("joint"))]
-
-
-def ros2_commands(result: HandEye, transforms: list[Static]) -> str:
-    """A shell script of ``ros2 run tf2_ros static_transform_publisher``, a call for each transform; all but the last go
-    on in the background."""
-    calls = [shlex.join(["ros2", "run", "tf2_ros", "static_transform_publisher", *_arguments(t)]) for t in transforms]
-    head = ["#!/bin/sh", *(f"# {line}" for line in said_of(result))]
-    return "\n".join(head) + "\n" + " &\n".join(calls) + "\n"
-
-
-def read_ros2(text: str) -> list[Static]:
-    """Back from :func:`ros2_commands`."""
-    calls = [line.removesuffix("&") for line in text.splitlines() if line.startswith("ros2 ")]
-    return [_static_of_arguments(shlex.split(call)[4:]) for call in calls]
-
-
-def moveit_launch(result: HandEye, transforms: list[Static]) -> str:
-    """The launch file that MoveIt's calibration plugin writes in ROS 1.
-
-    Raises
-    ------
-    InputError
-        A name with white space, at which ``roslaunch`` would split it.
-    """
-    lines = ["<launch>", *(f"  <!-- {line} -->" for line in said_of(result))]
-    for each in transforms:
-        names = each.parent, each.child
-        if spaced := [name for name in names if name.split() != [name]]:
-            raise InputError(f"frames: {spaced[0]!r} has white space, at which roslaunch splits; give another name")
-        words = [*_fixed(metres(each.pose), METRE_DIGITS), *_fixed(xyzw(each.pose), QUATERNION_DIGITS), *names]
-        node = f"{each.child}_broadcaster".replace("/", "_")
-        lines.append(f'  <node pkg="tf2_ros" type="static_transform_publisher" name={quoteattr(node)}')
-        lines.append(f"      args={quoteattr(' '.join(words))} />")
-    return "\n".join(lines) + "\n</launch>\n"
-
-
-def read_moveit(text: str) -> list[Static]:
-    """Back from :func:`moveit_launch`."""
-    found = []
-    for node in ElementTree.fromstring(text).findall("node"):
-        words = node.attrib["args"].split()
-        found.append(Static(words[7], words[8], pose_of_metres(words[:3], words[3:7])))
-    return found
-
-
-def moveit2_launch(result: HandEye, transforms: list[Static]) -> str:
-    """The launch file that MoveIt 2's calibration plugin writes."""
-    lines = [f"# {line}" for line in said_of(result)]
-    lines += ["from launch import LaunchDescription", "from launch_ros.actions import Node", "", ""]
-    lines += ["def generate_launch_description() -> LaunchDescription:", "    nodes = ["]
-    for each in transforms:
-        lines += ["        Node(", '            package="tf2_ros",']
-        lines += ['            executable="static_transform_publisher",', '            output="log",']
-        lines += ["            arguments=["]
-        lines += [f"                {json.dumps(word, ensure_ascii=False)}," for word in _arguments(each)]
-        lines += ["            ],", "        ),"]
-    return "\n".join([*lines, "    ]", "    return LaunchDescription(nodes)"]) + "\n"
-
-
-def read_moveit2(text: str) -> list[Static]:
-    """Back from :func:`moveit2_launch`."""
-    words = [node.value for node in ast.walk(ast.parse(text)) if isinstance(node, ast.keyword) and node.arg]
-    lists = [ast.literal_eval(node) for node in words if isinstance(node, ast.List)]
-    return [_static_of_arguments(each) for each in lists]
 
 
 def easy_handeye(result: HandEye, transforms: list[Static], name: str) -> str:
@@ -194,22 +130,6 @@ def _static_of_frames(frames: dict, in_hand: bool, pose: Rigid) -> Static:
 def _commented_yaml(result: HandEye, transforms: list[Static], content: dict) -> str:
     lines = said_of(result)
     for each in transforms[1:]:
-        words = " ".join(_fixed(xyzw(each.pose), 3))
+        words = " ".join(plain_numbers(xyzw(each.pose), 3))
         lines.append(f"{each.child} is not in this file: in {each.parent} at 0 0 0, quaternion x y z w {words}")
     return "".join(f"# {line}\n" for line in lines) + yaml.safe_dump(content, sort_keys=False, allow_unicode=True)
-
-
-def _arguments(each: Static) -> list[str]:
-    values = [*_fixed(metres(each.pose), METRE_DIGITS), *_fixed(xyzw(each.pose), QUATERNION_DIGITS)]
-    pairs = [("--frame-id", each.parent), ("--child-frame-id", each.child), *zip(ARGUMENTS, values, strict=True)]
-    return [word for pair in pairs for word in pair]
-
-
-def _static_of_arguments(words: list[str]) -> Static:
-    given = dict(zip(words[::2], words[1::2], strict=True))
-    values = [given[name] for name in ARGUMENTS]
-    return Static(given["--frame-id"], given["--child-frame-id"], pose_of_metres(values[:3], values[3:]))
-
-
-def _fixed(values, digits: int) -> list[str]:
-    return [number(v, digits) for v in values]
