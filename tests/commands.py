@@ -116,6 +116,12 @@ CALLS = (
     Call("sfm export-database", "@run +copy.db --schema 4.2"),
     *(Call("sfm export-model", f"@run +model --format {kind}") for kind in ("colmap-bin", "colmap-txt", "ply", "nvm")),
     Call("sfm export-model", "@run +model --format bundler"),
+    *(
+        Call("sfm export", f"@run +box.{suffix} --name box")
+        for suffix in ("urdf", "xacro", "yaml", "yml", "csv", "ply")
+    ),
+    *(Call("sfm export", f"@run +box.{suffix}") for suffix in ("dxf", "gltf", "glb", "rrd")),
+    Call("sfm export", "@run +box.txt --form ros2"),
     Call("sfm crosscheck", "@run --colmap @no-colmap", code=2),
     Call("sfm faces", "@run/models --run @run --out +faces.json", 1.0),
     Call("sfm faces", "@model-txt --run @run --out +faces.json", 1.0),

@@ -72,6 +72,36 @@ def export_model(
     say(model_text(written, kind))
 
 
+@app.command(name="export")
+def export_run(
+    run: Run,
+    out: Annotated[
+        Path,
+        typer.Argument(
+            metavar="FILE",
+            writable=True,
+            help="Write this new file; its suffix tells the form: .urdf, .xacro, .yaml (tf2), .py and .launch (ROS 2 "
+            "and 1), .yml (OpenCV), .csv, .ply, .dxf, .gltf, .glb or .rrd (Rerun).",
+        ),
+    ],
+    form: Annotated[
+        str,
+        typer.Option(
+            help="Take this form whatever the suffix: urdf, xacro, tf2, ros2, ros1, opencv, csv, ply, dxf, gltf, glb "
+            "or rerun."
+        ),
+    ] = "",
+    name: Annotated[
+        str, typer.Option(help="Name the target frame; faces are NAME_FACE, circles NAME_FACE_CIRCLE.")
+    ] = "target",
+) -> None:
+    """Write faces and circles, with σ and cameras where the form holds them, for robots, drawings and viewers."""
+    from stcal.sfm.interop.export import export_run as export
+    from stcal.sfm.interop.text import export_text
+
+    say(export_text(export(run, out, form, name)))
+
+
 @app.command()
 def crosscheck(
     run: Run,

@@ -3,6 +3,7 @@ more than any memory holds."""
 
 import re
 
+import numpy as np
 import yaml
 
 
@@ -31,3 +32,16 @@ def load_yaml(text: str):
         Not YAML, or with aliases.
     """
     return yaml.load(re.sub(r"\A\s*%YAML:?\s*[\d.]+\s*\n", "", text), _Loader)
+
+
+def opencv_matrix(name: str, values: np.ndarray) -> list[str]:
+    """Lines of a matrix as ``cv2.FileStorage`` writes it, with numbers that read back as they are."""
+    rows, columns = values.shape
+    numbers = ",\n       ".join(", ".join(repr(float(v)) for v in row) for row in values)
+    return [
+        f"{name}: !!opencv-matrix",
+        f"   rows: {rows}",
+        f"   cols: {columns}",
+        "   dt: d",
+        f"   data: [ {numbers} ]",
+    ]

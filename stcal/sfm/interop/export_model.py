@@ -11,11 +11,11 @@ from typing import Literal, get_args
 
 import numpy as np
 
-from stcal.design import TargetDesign
 from stcal.errors import InputError
 from stcal.labels import DotLabel, Label
 from stcal.sfm.adjust.file import FacesFile
-from stcal.sfm.interop.fit import View, adjusted_camera, report_of_model, require_fit
+from stcal.sfm.interop.export.content import BOARD_RGB, colours
+from stcal.sfm.interop.fit import ReportOfModel, View, require_fit
 from stcal.sfm.mapping.colmap import pycolmap
 from stcal.sfm.mapping.database import colmap_camera, from_colmap_px
 from stcal.sfm.mapping.models import (
@@ -31,17 +31,6 @@ ModelFormat = Literal["colmap-bin", "colmap-txt", "ply", "nvm", "bundler"]
 FOLDERS = ("colmap-bin", "colmap-txt", "bundler")
 """Formats of several files: OUT is a folder; that of the others is a file, with ``OUT.labels.csv`` beside it."""
 TARGET_MODEL = "target_model"
-BOARD_RGB = (150, 150, 150)
-FACES_RGB = (
-    (230, 159, 0),
-    (86, 180, 233),
-    (0, 158, 115),
-    (240, 228, 66),
-    (0, 114, 178),
-    (213, 94, 0),
-    (204, 121, 167),
-)
-"""By the face's place in the design, over again after the last: Okabe and Ito's palette, for the colour-blind too."""
 LABEL_COLUMNS = ["point", "group", "label", "x_mm", "y_mm", "z_mm", "sigma_x_um", "sigma_y_um", "sigma_z_um"]
 
 
@@ -97,8 +86,8 @@ def export_model(run: str | Path, out: str | Path, kind: str) -> ExportedModel:
     labels = out / "labels.csv" if kind in FOLDERS else out.with_name(f"{out.name}.labels.csv")
     _require_free(out, labels, kind)
     saved = load_run(run)
-    report = report_of_model(saved)
-    saved = replace(saved, camera=adjusted_camera(saved, report))
+    report = saved.report_as(ReportOfModel)
+    saved = replace(saved, camera=saved.adjusted_camera(report.camera))
     reconstruction, points = _labelled_points(saved)
     require_fit(saved.folder / TARGET_MODEL, _views(saved, reconstruction, points), saved.camera, report)
     ideal = kind in ("nvm", "bundler")
@@ -161,7 +150,7 @@ def _labelled_points(run: SavedRun) -> tuple[pycolmap.Reconstruction, list[_Poin
         i = place[image.name]
         image_of[image_id] = run.observations[i]
         require_keypoints(path, image, run.observations[i].labels, run.corrected_px[i])
-    rgb = _colours(run.target)
+    rgb = colours(run)
     points = []
     for point_id, point in sorted(reconstruction.points3D.items()):
         views = tuple((element.image_id, element.point2D_idx) for element in point.track.elements)
@@ -192,10 +181,6 @@ def _views(run: SavedRun, reconstruction: pycolmap.Reconstruction, points: Seque
         pose = pose_of_image(run.folder / TARGET_MODEL, image)
         views[image.name] = View(pose, [point.label for point, _ in own], xyz, from_colmap_px(xy))
     return views
-
-
-def _colours(target: TargetDesign) -> dict[str, tuple[int, int, int]]:
-    return {face.id: FACES_RGB[i % len(FACES_RGB)] for i, face in enumerate(target.faces)}
 
 
 def _labels_csv(points: Sequence[_Point], faces: FacesFile, kind: str) -> str:

@@ -9,11 +9,9 @@ import numpy as np
 from stcal.errors import InputError
 from stcal.geometry.camera import Camera
 from stcal.geometry.rigid import Rigid
-from stcal.io.camera import CalibratedCamera
-from stcal.io.json import Part, checked
+from stcal.io.json import Part
 from stcal.labels import Label
 from stcal.sfm.run.report import CameraInSpace, ImageResiduals, ReportCamera
-from stcal.sfm.run.saved import SavedRun
 
 ROUNDING = 1e-6
 """Of a residual, relative, …"""
@@ -54,30 +52,6 @@ class View:
         with np.errstate(all="ignore"):
             off = np.linalg.norm(camera.project(inside) - self.xy_px, axis=1)
         return np.where((inside[:, 2] > 0) & np.isfinite(off), off, np.inf)
-
-
-def report_of_model(run: SavedRun) -> ReportOfModel:
-    """Of a run's ``report.json``.
-
-    Raises
-    ------
-    InputError
-        It lacks what this version writes.
-    """
-    try:
-        return checked(run.report, ReportOfModel)
-    except InputError as error:
-        path = run.folder / "report.json"
-        raise InputError(f"{path}: damaged, or of another version ({error}); run it again") from error
-
-
-def adjusted_camera(run: SavedRun, report: ReportOfModel) -> CalibratedCamera:
-    """The camera of the run's final model: as refined where it was, else as given."""
-    if not run.options.refine_camera:
-        return run.camera
-    own = report.camera
-    camera = Camera(run.camera.width, run.camera.height, own.focal_px, own.centre_px, own.distortion)
-    return CalibratedCamera.of(camera, run.camera.colmap_model)
 
 
 def require_fit(path: Path, views: Mapping[str, View], camera: Camera, report: ReportOfModel) -> None:

@@ -3,6 +3,7 @@
 from stcal.report.text import number, text_table
 from stcal.sfm.adjust.calibration import Calibration
 from stcal.sfm.interop.crosscheck import face_differences
+from stcal.sfm.interop.export import FORMS, ExportedRun
 from stcal.sfm.interop.export_database import Exported
 from stcal.sfm.interop.export_model import ExportedModel
 from stcal.sfm.run.saved import SavedRun
@@ -31,6 +32,20 @@ def model_text(written: ExportedModel, kind: str) -> str:
             "the photographs to it to match"
         )
     return "\n".join(lines)
+
+
+def export_text(written: ExportedRun) -> str:
+    """What is in the file, and what of the run is not."""
+    content = written.content
+    lines = [
+        f"{len(content.faces)} faces and {len(content.circles)} circles, frame {content.root}, as {written.form}: "
+        f"{written.path}"
+    ]
+    if not content.covariances:
+        lines.append(f"no σ: the run was solved by {content.run.faces.solve}, which states none; run it with joint")
+    if lost := FORMS[written.form].lost:
+        lines.append(f"not in it: {lost}")
+    return "\n".join([*lines, *written.notes])
 
 
 def faces_text(calibration: Calibration, run: SavedRun) -> str:

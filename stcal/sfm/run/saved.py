@@ -6,6 +6,7 @@ from collections.abc import Collection, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
+from typing import TypeVar
 
 import numpy as np
 
@@ -17,7 +18,7 @@ from stcal.io.camera import CalibratedCamera, read_camera
 from stcal.io.covariance import OF_PIXEL, first_fault
 from stcal.io.design import load_board, load_target
 from stcal.io.files import TABLE_BYTES, read_bytes
-from stcal.io.json import checked, read_json
+from stcal.io.json import Part, checked, read_json
 from stcal.io.saving import BOARD, CAMERA, RUN_MARKER, TARGET
 from stcal.sfm.adjust.file import FacesFile
 from stcal.sfm.data.observations import ImageObservations, by_group
@@ -25,10 +26,11 @@ from stcal.sfm.detect.circles.ellipses import EllipseOptions
 from stcal.sfm.mapping.pairs import PairOptions
 from stcal.sfm.run.marker import MarkerFile
 from stcal.sfm.run.options import RunOptions
-from stcal.sfm.run.report import ReportRead
+from stcal.sfm.run.report import ReportCamera, ReportRead
 from stcal.sfm.run.transaction import complete_interrupted
 
 AGAIN = "run it again"
+ReportPart = TypeVar("ReportPart", bound=Part)
 COVARIANCE = ("var_x_px2", "cov_xy_px2", "var_y_px2")
 
 
@@ -60,6 +62,27 @@ class SavedRun:
     def groups(self) -> dict[str, list[ImageObservations]]:
         """Observations by group, in order."""
         return by_group(self.observations)
+
+    def report_as(self, part: type[ReportPart]) -> ReportPart:
+        """What of ``report.json`` a command needs.
+
+        Raises
+        ------
+        InputError
+            It lacks what this version writes.
+        """
+        try:
+            return checked(self.report, part)
+        except InputError as error:
+            path = self.folder / "report.json"
+            raise InputError(f"{path}: damaged, or of another version ({error}); run it again") from error
+
+    def adjusted_camera(self, own: ReportCamera) -> CalibratedCamera:
+        """The camera of the run's final model: as refined where it was, else as given; ``own`` : the report's."""
+        if not self.options.refine_camera:
+            return self.camera
+        camera = Camera(self.camera.width, self.camera.height, own.focal_px, own.centre_px, own.distortion)
+        return CalibratedCamera.of(camera, self.camera.colmap_model)
 
 
 def load_run(folder: str | Path) -> SavedRun:

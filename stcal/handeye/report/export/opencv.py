@@ -1,12 +1,11 @@
 """Matrices of a hand-eye calibration as YAML: of OpenCV's FileStorage, and of Zivid's SDK."""
 
-import numpy as np
 import yaml
 
 from stcal.geometry.rigid import Rigid
 from stcal.handeye.report.export.frames import said_of
 from stcal.handeye.result import HandEye
-from stcal.io.plain_yaml import load_yaml
+from stcal.io.plain_yaml import load_yaml, opencv_matrix
 
 
 def opencv_yaml(result: HandEye) -> str:
@@ -14,9 +13,9 @@ def opencv_yaml(result: HandEye) -> str:
     covariances = (result.covariance, result.stand_covariance)
     lines = ["%YAML:1.0", "---", f'setup: "{result.setup}"', f'method: "{result.method}"', 'unit: "mm"']
     for (name, pose), covariance in zip(result.transforms.items(), covariances, strict=True):
-        lines += _matrix(name, pose.matrix())
+        lines += opencv_matrix(name, pose.matrix())
         if covariance is not None:
-            lines += _matrix(f"{name}_covariance", covariance)
+            lines += opencv_matrix(f"{name}_covariance", covariance)
     return "\n".join(lines) + "\n"
 
 
@@ -33,15 +32,3 @@ def zivid_yaml(result: HandEye) -> str:
 def read_zivid(text: str) -> Rigid:
     """Back from it."""
     return Rigid.from_matrix(load_yaml(text)["FloatMatrix"]["Data"])
-
-
-def _matrix(name: str, values: np.ndarray) -> list[str]:
-    rows, columns = values.shape
-    numbers = ",\n       ".join(", ".join(repr(float(v)) for v in row) for row in values)
-    return [
-        f"{name}: !!opencv-matrix",
-        f"   rows: {rows}",
-        f"   cols: {columns}",
-        "   dt: d",
-        f"   data: [ {numbers} ]",
-    ]

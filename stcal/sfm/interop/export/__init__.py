@@ -1,0 +1,109 @@
+"""A finished run in files of other programs: robots' software, drawings, viewers, tables."""
+
+import os
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+
+from stcal.errors import InputError
+from stcal.io.saving import save
+from stcal.sfm.interop.export import gltf, robots, solids, tables
+from stcal.sfm.interop.export.content import Content, content_of
+from stcal.sfm.interop.export.recording import write_rrd
+from stcal.sfm.run.saved import load_run
+
+ROOT = "target"
+"""Name of the target frame where none is given."""
+RERUN = "rerun"
+
+
+@dataclass(frozen=True, slots=True)
+class Form:
+    """``suffix`` : of its files; ``write`` : their content, None where a library writes the file itself; ``lost`` :
+    what of faces, circles, σ and cameras they do not hold."""
+
+    suffix: str
+    write: Callable[[Content], str | bytes] | None
+    lost: str
+
+
+FORMS = {
+    "urdf": Form(".urdf", robots.urdf, "cameras, σ of circles; σ of faces is in comments"),
+    "xacro": Form(".xacro", robots.xacro, "cameras, σ of circles; σ of faces is in comments"),
+    "tf2": Form(".yaml", robots.tf2, "cameras, radii, σ of circles; σ of faces is in comments"),
+    "ros2": Form(".py", robots.launch_ros2, "cameras, radii, σ of circles; σ of faces is in comments"),
+    "ros1": Form(".launch", robots.launch_ros1, "cameras, radii, σ of circles; σ of faces is in comments"),
+    "opencv": Form(".yml", tables.opencv, "cameras"),
+    "csv": Form(".csv", tables.table, "cameras, correlations"),
+    "ply": Form(".ply", solids.ply, "σ of circles, the lens's distortion; σ of faces is in comments"),
+    "dxf": Form(".dxf", solids.dxf, "cameras, correlations; σ is in extended data"),
+    "gltf": Form(".gltf", gltf.gltf, "the lens's distortion but as numbers in extras"),
+    "glb": Form(".glb", gltf.glb, "the lens's distortion but as numbers in extras"),
+    RERUN: Form(".rrd", None, "the lens's distortion; covariances but as ellipsoids"),
+}
+"""By the word of ``--form``."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class ExportedRun:
+    """What was written: ``path``, ``form``, counts, and ``notes`` on what is missing."""
+
+    path: Path
+    form: str
+    content: Content
+    notes: list[str]
+
+
+def export_run(run: str | Path, path: str | Path, form: str = "", name: str = ROOT) -> ExportedRun:
+    """Write faces and circles, and where the form holds them σ, cameras and photographs, to a new file.
+
+    Parameters
+    ----------
+    run : path
+        A finished run's folder.
+    path : path
+        Of a new file; its suffix tells the form.
+    form : str
+        Of :data:`FORMS`, where the suffix shall not.
+    name : str
+        Of the target frame; the others' names begin with it.
+
+    Raises
+    ------
+    InputError
+        Not a finished run, a file that exists, no known form, a library that is not installed, or a bad name.
+    """
+    path = Path(path)
+    form = form or form_of(path)
+    if form not in FORMS:
+        raise InputError(f"--form {form}: unknown; one of {', '.join(FORMS)} needed")
+    if os.path.lexists(path):
+        raise InputError(f"{path}: exists, and nothing is overwritten; give a new file")
+    if not path.parent.is_dir():
+        raise InputError(f"{path}: no folder {path.parent}; make it, or give another place")
+    content = content_of(load_run(run), name)
+    write = FORMS[form].write
+    if write is not None:
+        save(path, write(content))
+        return ExportedRun(path, form, content, [])
+    partial = path.with_name(f"{path.name}.{os.getpid()}.partial")
+    try:
+        notes = write_rrd(content, partial)
+        os.replace(partial, path)
+    finally:
+        partial.unlink(missing_ok=True)
+    return ExportedRun(path, form, content, notes)
+
+
+def form_of(path: Path) -> str:
+    """By its suffix.
+
+    Raises
+    ------
+    InputError
+        None of ours.
+    """
+    suffixes = {form.suffix: name for name, form in FORMS.items()}
+    if path.suffix.lower() not in suffixes:
+        raise InputError(f"{path}: suffix {path.suffix or 'missing'}; one of {', '.join(suffixes)} needed, or --form")
+    return suffixes[path.suffix.lower()]

@@ -1,0 +1,191 @@
+"""What of a finished run goes to other programs: faces, circles, cameras and their σ; target frame, mm."""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+import stcal
+from stcal.errors import InputError
+from stcal.geometry.rigid import Rigid
+from stcal.io.camera import CalibratedCamera
+from stcal.io.json import Part
+from stcal.io.poses.static import Static
+from stcal.labels import CircleLabel, parse_label
+from stcal.report.text import number
+from stcal.sfm.run.report import ReportCamera, Space
+from stcal.sfm.run.saved import SavedRun
+
+FACES_RGB = (
+    (230, 159, 0),
+    (86, 180, 233),
+    (0, 158, 115),
+    (240, 228, 66),
+    (0, 114, 178),
+    (213, 94, 0),
+    (204, 121, 167),
+)
+"""By the face's place in the design, over again after the last: Okabe and Ito's palette, for the colour-blind too."""
+BOARD_RGB = (150, 150, 150)
+
+
+class _Report(Part):
+    """What of ``report.json`` is needed."""
+
+    camera: ReportCamera
+    scene: Space
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Photograph:
+    """A mapped one: its name, its group, and where its camera stands."""
+
+    name: str
+    group: str
+    target_from_camera: Rigid
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Circle:
+    """A circle of the target: centre ``xyz_mm`` (3,), and its ``covariance_mm2`` (3, 3), target frame, or None."""
+
+    label: CircleLabel
+    xyz_mm: np.ndarray
+    radius_mm: float
+    covariance_mm2: np.ndarray | None
+
+    @property
+    def sigma_mm(self) -> np.ndarray | None:
+        """Of x, y, z."""
+        return None if self.covariance_mm2 is None else np.sqrt(np.diag(self.covariance_mm2))
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Content:
+    """What a file is made of.
+
+    ``root`` : name of the target frame; ``camera`` : as the run refined it; ``faces`` : target_from_face;
+    ``covariances`` : of those, 6×6, empty where the run states none; ``photographs`` : of the run, in its order;
+    ``boards`` : dots by group, (n, 3); ``rgb`` : by face.
+    """
+
+    root: str
+    run: SavedRun
+    camera: CalibratedCamera
+    faces: dict[str, Rigid]
+    covariances: dict[str, np.ndarray]
+    circles: tuple[Circle, ...]
+    photographs: tuple[Photograph, ...]
+    boards: dict[str, np.ndarray]
+    rgb: dict[str, tuple[int, int, int]]
+
+    def of_face(self, face: str) -> list[Circle]:
+        """Its circles, in the order of the design."""
+        return [circle for circle in self.circles if circle.label.face == face]
+
+    def face_frame(self, face: str) -> str:
+        """Name of its frame."""
+        return f"{self.root}_{face}"
+
+    def circle_frame(self, label: CircleLabel) -> str:
+        """Name of a frame at its centre, with the face's axes."""
+        return f"{self.root}_{label.face}_{label.circle}"
+
+    def statics(self) -> list[Static]:
+        """Frames of faces in the target's, and of circles in the faces'."""
+        found = []
+        for face, pose in self.faces.items():
+            found.append(Static(self.root, self.face_frame(face), pose))
+            for circle in self.of_face(face):
+                own = Rigid(np.eye(3), pose.inverse() @ circle.xyz_mm)
+                found.append(Static(self.face_frame(face), self.circle_frame(circle.label), own))
+        return found
+
+    def face_sigma(self, face: str) -> tuple[np.ndarray, np.ndarray] | None:
+        """σ of its rotation, rad, and of its position, mm, about and along x, y, z of the target frame."""
+        if face not in self.covariances:
+            return None
+        sigma = np.sqrt(np.maximum(np.diag(self.covariances[face]), 0))  # that of the reference is 0 up to rounding
+        return sigma[:3], sigma[3:]
+
+    def said(self) -> list[str]:
+        """Lines for comments: where it is from, and σ of every face."""
+        faces = self.run.faces
+        lines = [
+            f"stcal {stcal.__version__}: target {self.run.target.name}, {len(self.faces)} faces, "
+            f"{len(self.circles)} circles, {len(self.photographs)} photographs",
+            f"frame {self.root}: that of face {faces.reference_face} ({faces.frame}); "
+            f"{self.root}_FACE: of a face; {self.root}_FACE_CIRCLE: at a circle's centre, axes of its face",
+        ]
+        if not self.covariances:
+            return [*lines, f"no sigma: solved by {faces.solve}, which states none"]
+        for face in self.faces:
+            turn, shift = self.face_sigma(face) or (np.zeros(3), np.zeros(3))
+            um = " ".join(number(1e3 * v, 2) for v in shift)
+            mdeg = " ".join(number(1e3 * v, 3) for v in np.degrees(turn))
+            own = "reference" if face == faces.reference_face else f"sigma x y z {um} um, about x y z {mdeg} mdeg"
+            lines.append(f"face {face}: {own}")
+        return lines
+
+
+def content_of(run: SavedRun, root: str) -> Content:
+    """What a run holds, under the name of its target frame.
+
+    Raises
+    ------
+    InputError
+        The name is none, two frames would have the same one, or the run's report is of another version.
+    """
+    if not root.isprintable() or root.split() != [root]:
+        raise InputError(f"--name {root!r}: a word of visible characters without spaces needed")
+    report = run.report_as(_Report)
+    faces, scene = run.faces, report.scene
+    circles = tuple(
+        Circle(
+            parse_label(label),  # type: ignore[arg-type]
+            np.array(xyz, float),
+            faces.radius_mm[label],
+            np.array(faces.circle_covariance_mm2[label]) if label in faces.circle_covariance_mm2 else None,
+        )
+        for label, xyz in faces.circles.items()
+    )
+    photographs = [
+        Photograph(each.image, each.group, Rigid(np.array(each.axes).T, each.position_mm)) for each in scene.cameras
+    ]
+    content = Content(
+        root=root,
+        run=run,
+        camera=run.adjusted_camera(report.camera),
+        faces=faces.poses(),
+        covariances={face: np.array(c) for face, c in faces.target_from_face_covariance.items()},
+        circles=circles,
+        photographs=tuple(photographs),
+        boards={group: np.array(xyz, float).reshape(-1, 3) for group, xyz in scene.boards.items()},
+        rgb=colours(run),
+    )
+    names = [root, *(each.child for each in content.statics())]
+    twice = sorted({name for name in names if names.count(name) > 1})
+    if twice:
+        raise InputError(f"frames: {twice[0]} is the name of two; rename a face or a circle of the target")
+    return content
+
+
+def colours(run: SavedRun) -> dict[str, tuple[int, int, int]]:
+    """By face."""
+    return {face.id: FACES_RGB[i % len(FACES_RGB)] for i, face in enumerate(run.target.faces)}
+
+
+def ellipsoid(circle: Circle, target_from_face: Rigid) -> tuple[np.ndarray, np.ndarray]:
+    """σ (3,) of its centre along its own axes, the columns (3, 3) in the face's frame; for one with a covariance."""
+    turn = np.array(target_from_face.rotation)
+    values, axes = np.linalg.eigh(turn.T @ np.array(circle.covariance_mm2) @ turn)
+    return np.sqrt(np.maximum(values, 0)), axes * [np.sign(np.linalg.det(axes)), 1, 1]
+
+
+def exaggeration(content: Content) -> float:
+    """By which σ is drawn larger: a power of ten with which the balls are no larger than the circles."""
+    known = [(circle, circle.sigma_mm) for circle in content.circles]
+    sigma = [float(np.linalg.norm(own)) for _, own in known if own is not None]
+    if not sigma or max(sigma) == 0:
+        return 1.0
+    radius = float(np.median([circle.radius_mm for circle, own in known if own is not None]))
+    return 10.0 ** np.floor(np.log10(radius / np.median(sigma)))

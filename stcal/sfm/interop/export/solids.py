@@ -1,0 +1,128 @@
+"""Circles as discs: triangles for viewers (PLY), circles and points for drawings and coordinate measuring (DXF)."""
+
+import io
+
+import numpy as np
+
+from stcal.errors import InputError
+from stcal.sfm.interop.export.content import BOARD_RGB, Content, Photograph
+
+EDGES = 48
+"""Of a disc: its triangles leave out 0.3 % of its area."""
+ACI = 1
+"""First colour of a DXF layer where its reader knows no true colours."""
+CAMERA_SHARE = 0.06
+"""Depth of a camera's pyramid in parts of the scene's extent."""
+
+
+def disc(radius_mm: float) -> tuple[np.ndarray, np.ndarray]:
+    """Points (EDGES + 1, 3), the middle first, and triangles (EDGES, 3), seen from +Z against the clock."""
+    angle = 2 * np.pi * np.arange(EDGES) / EDGES
+    rim = radius_mm * np.column_stack([np.cos(angle), np.sin(angle), np.zeros(EDGES)])
+    around = 1 + np.arange(EDGES)
+    return np.vstack([np.zeros(3), rim]), np.column_stack([np.zeros(EDGES, int), around, 1 + around % EDGES])
+
+
+def discs(content: Content, face: str) -> tuple[np.ndarray, np.ndarray]:
+    """Of a face's circles: points and triangles, target frame, mm."""
+    points, triangles, before = [], [], 0
+    for circle in content.of_face(face):
+        own, around = disc(circle.radius_mm)
+        points.append(own @ content.faces[face].rotation.T + circle.xyz_mm)
+        triangles.append(around + before)
+        before += len(own)
+    return np.vstack([np.empty((0, 3)), *points]), np.vstack([np.empty((0, 3), int), *triangles])
+
+
+def camera_depth_mm(content: Content) -> float:
+    """Of the pyramids that show cameras."""
+    places = [circle.xyz_mm for circle in content.circles]
+    places += [each.target_from_camera.translation for each in content.photographs]
+    return CAMERA_SHARE * float(np.ptp(np.array(places), axis=0).max())
+
+
+def pyramid(content: Content, photograph: Photograph, depth_mm: float) -> np.ndarray:
+    """Projection centre and the image's corners at that depth as a camera without distortion sees them, (5, 3)."""
+    camera = content.camera
+    corners = [[-0.5, -0.5], [camera.width - 0.5, -0.5], [camera.width - 0.5, camera.height - 0.5]]
+    corners += [[-0.5, camera.height - 0.5]]
+    ideal = (np.array(corners) - camera.centre) / camera.focal
+    rays = np.column_stack([ideal, np.ones(4)]) * depth_mm
+    return photograph.target_from_camera @ np.vstack([np.zeros(3), rays])
+
+
+def ply(content: Content) -> str:
+    """Text PLY in double precision: discs in the faces' colours, cameras as grey pyramids; labels as comments."""
+    points, triangles, rgb, comments, before = [], [], [], [], 0
+    for face in content.faces:
+        own, around = discs(content, face)
+        for place, circle in enumerate(content.of_face(face)):
+            comments.append(f"vertex {before + place * (EDGES + 1)}: centre of {circle.label}")
+        points.append(own)
+        triangles.append(around + before)
+        rgb += [content.rgb[face]] * len(own)
+        before += len(own)
+    depth = camera_depth_mm(content)
+    sides = np.array([[0, 1, 2], [0, 2, 3], [0, 3, 4], [0, 4, 1]])
+    for photograph in content.photographs:
+        comments.append(f"vertex {before}: projection centre of {photograph.name}")
+        points.append(pyramid(content, photograph, depth))
+        triangles.append(sides + before)
+        rgb += [BOARD_RGB] * 5
+        before += 5
+    header = ["ply", "format ascii 1.0"]
+    header += [f"comment {line}" for line in (*content.said(), "mm", *comments)]
+    header += [f"element vertex {before}", *(f"property double {axis}" for axis in "xyz")]
+    header += [f"property uchar {name}" for name in ("red", "green", "blue")]
+    corners = np.vstack(triangles)
+    header += [f"element face {len(corners)}", "property list uchar int vertex_indices", "end_header"]
+    rows = [" ".join(map(repr, [*p, *c])) for p, c in zip(np.vstack(points).tolist(), rgb, strict=True)]
+    return "\n".join([*header, *rows, *(f"3 {a} {b} {c}" for a, b, c in corners.tolist()), ""])
+
+
+def dxf(content: Content) -> str:
+    """DXF R2010 in mm: a layer for each face with a CIRCLE and a POINT for each circle, and one with their labels.
+
+    Raises
+    ------
+    InputError
+        ``stcal[cad]`` is not installed.
+    """
+    try:
+        from ezdxf import units
+        from ezdxf.colors import rgb2int
+        from ezdxf.filemanagement import new
+        from ezdxf.math import OCS, Vec3
+    except ImportError as error:
+        raise InputError("DXF: needs ezdxf; install stcal[cad]") from error
+    drawing = new("R2010", units=units.MM)
+    space = drawing.modelspace()
+    drawing.appids.add("STCAL")
+    drawing.layers.add("LABELS", color=8)
+    for place, (face, pose) in enumerate(content.faces.items()):
+        layer = f"FACE_{place + 1}"
+        drawing.layers.add(layer, color=ACI + place % 6, true_color=rgb2int(content.rgb[face]))
+        drawing.layers.get(layer).description = f"face {face}"
+        normal = Vec3(pose.rotation[:, 2])
+        plane = OCS(normal)
+        for circle in content.of_face(face):
+            named = [(1000, str(circle.label))]
+            if circle.sigma_mm is not None:
+                named += [(1000, "sigma x y z, mm"), *((1040, float(v)) for v in circle.sigma_mm)]
+            centre = Vec3(circle.xyz_mm)
+            own = {"layer": layer}
+            drawn = space.add_circle(plane.from_wcs(centre), circle.radius_mm, dxfattribs=own | {"extrusion": normal})
+            point = space.add_point(centre, dxfattribs=own)
+            for entity in (drawn, point):
+                entity.set_xdata("STCAL", named)
+            text = space.add_text(
+                str(circle.label),
+                height=0.6 * circle.radius_mm,
+                dxfattribs={"layer": "LABELS", "extrusion": normal},
+            )
+            text.set_placement(plane.from_wcs(centre))
+    for line in content.said():
+        drawing.header.custom_vars.append("stcal", line)
+    stream = io.StringIO()
+    drawing.write(stream)
+    return stream.getvalue()
