@@ -18,7 +18,7 @@ from pathlib import Path
 
 ROOT = Path(__file__).resolve().parents[1]
 PRINTED = ROOT / "docs" / "printed"
-DOCUMENTS = ("README.md", "docs/cluster.md", "docs/sources.md", "docs/robots.md", "docs/cameras.md")
+DOCUMENTS = ("README.md", "docs/cluster.md", "docs/sources.md", "docs/robots.md", "docs/cameras.md", "docs/service.md")
 MARK = re.compile(r"<!-- printed by: (.+?) -->")
 FIRST = re.compile(r"# (.+), at commit ([0-9a-f]{7,40})(, .+)?")
 FIGURE = re.compile(r"[-+±]?\d+(?:\.\d+)?")

@@ -31,6 +31,7 @@ ONE_THREAD = ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS", "OPE
 LOADED_ONCE = "stcal.sfm.pipeline"
 """Module that is loaded before processes are forked, with all that it imports."""
 _limited = threading.Lock()
+_one_starts = threading.Lock()
 
 
 def counted(progress: Progress, stage: str, total: int) -> Callable[[object], None]:
@@ -186,6 +187,63 @@ def _load(*modules: str) -> None:
 
 
 _kept: ContextVar[_Processes | None] = ContextVar("kept processes", default=None)
+
+
+class OwnProcess:
+    """One process that holds what it has begun with, such as a tracker, from call to call; a new one takes its place
+    when it ends from outside.
+
+    Parameters
+    ----------
+    begin : callable
+        Called with ``arguments`` in the process before all else.
+    """
+
+    def __init__(self, begin: Callable[..., object], *arguments):
+        self._begin = (begin, *arguments)
+        self._guard = threading.Lock()
+        self._pool: ProcessPoolExecutor | None = None
+
+    def call(self, function: Callable[..., R], *arguments) -> R:
+        """Result of the function there, after those of calls before.
+
+        Raises
+        ------
+        BrokenExecutor
+            The process ended meanwhile; the next call starts another.
+        """
+        with self._guard:
+            if self._pool is None:
+                with _as_processes_start():
+                    self._pool = ProcessPoolExecutor(1, _context(), initializer=_begin_own, initargs=self._begin)
+                    pool, future = self._pool, self._pool.submit(function, *arguments)
+            else:
+                pool, future = self._pool, self._pool.submit(function, *arguments)
+        try:
+            return future.result()
+        except BrokenExecutor:
+            with self._guard:
+                if self._pool is pool:
+                    self._pool = None
+            raise
+
+    def close(self) -> None:
+        """End the process; calls that wait are given up."""
+        with self._guard:
+            pool, self._pool = self._pool, None
+        if pool is not None:
+            pool.shutdown(wait=False, cancel_futures=True)
+
+
+def _begin_own(begin: Callable[..., object], *arguments) -> None:
+    _follow_parent()
+    begin(*arguments)
+
+
+@contextlib.contextmanager
+def _as_processes_start() -> Iterator[None]:
+    with _one_starts, _plain_main(), _deaf_to_interrupts():
+        yield
 
 
 def load_ahead(workers: int | None = None) -> None:

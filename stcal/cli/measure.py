@@ -1,5 +1,8 @@
 """``stcal-sfm measure``: the calibrated target at work."""
 
+import os
+import sys
+from dataclasses import replace
 from pathlib import Path
 from typing import Annotated
 
@@ -26,9 +29,11 @@ app = typer.Typer()
 
 @app.command()
 def measure(
-    images: Annotated[Path, typer.Argument(help="Read the images of this folder and of its subfolders.")],
     camera: CameraFile,
     faces: Annotated[Path, typer.Option("--faces", help="Read the calibrated target from this faces.json.")],
+    images: Annotated[
+        Path | None, typer.Argument(help="Read the images of this folder and of its subfolders; none with --serve.")
+    ] = None,
     target: TargetFile = None,
     out: Annotated[
         Path, typer.Option("--out", writable=True, help="Write the table of poses to this file (CSV).")
@@ -78,8 +83,38 @@ def measure(
     workers: Workers = None,
     scheduler: Scheduler = None,
     send_images: SendImages = False,
+    serve: Annotated[
+        bool,
+        typer.Option(
+            "--serve", help="Answer images that programs send over HTTP, POST /measure, with a JSON each, until Ctrl-C."
+        ),
+    ] = False,
+    host: Annotated[
+        str, typer.Option(help="Listen at this address with --serve; other machines reach 0.0.0.0.")
+    ] = "127.0.0.1",
+    port: Annotated[
+        int, typer.Option(min=0, max=65535, help="Listen at this port with --serve; at a free one with 0.")
+    ] = 8765,
+    max_megabytes: Annotated[
+        float, typer.Option("--max-megabytes", min=0.01, max=2000, help="Refuse larger image files with --serve.")
+    ] = 64.0,
 ) -> None:
     """Measure the pose of a calibrated target in each image, from whatever faces it shows, with its 6×6 covariance."""
+    if serve:
+        alone = {"IMAGES": images, "--json": json_file, "--report": report, "--joints": joints}
+        alone |= {
+            "--previous": previous,
+            "--sequence": sequence,
+            "--scheduler": scheduler,
+            "--send-images": send_images,
+        }
+        if given := [name for name, value in alone.items() if value]:
+            raise InputError(f"--serve and {given[0]}: images come over HTTP, one answer each; leave {given[0]} out")
+        ellipses = ellipse_options(min_diameter, max_diameter)
+        _serve(camera, faces, target, board, sigma_factor, ellipses, (host, port, max_megabytes, workers))
+        return
+    if images is None:
+        raise InputError("IMAGES: missing; give the folder of images, or --serve")
     load_ahead(workers)
     from stcal.io.camera import read_camera
     from stcal.io.design import load_board, target_of
@@ -112,3 +147,37 @@ def measure(
         from stcal.sfm.measure.report import measure_page
 
         write(report, measure_page(result, str(images)), "report")
+
+
+def _serve(camera, faces, target, board, sigma_factor, ellipses, listen) -> None:
+    from stcal.io.camera import read_camera
+    from stcal.io.design import load_board, target_of
+    from stcal.sfm.measure.pose import PoseOptions
+    from stcal.sfm.measure.serve import MeasureServer, ServeOptions, counts_text, serve
+    from stcal.sfm.measure.service import MeasureService, Setting
+    from stcal.sfm.measure.target import read_target
+
+    host, port, max_megabytes, workers = listen
+    workers = workers or os.cpu_count() or 1
+    known = replace(read_target(faces, design := target_of(target)), design=design)
+    setting = Setting(
+        known,
+        read_camera(camera),
+        load_board(board) if board else None,
+        PoseOptions(sigma_factor=sigma_factor),
+        ellipses,
+    )
+    servers: list[MeasureServer] = []
+
+    def ready(server: MeasureServer) -> None:
+        servers.append(server)
+        if not server.local:
+            say(f"warning: every machine that reaches {host} can send images; nothing is encrypted")
+        say(f"answering POST {server.url}/measure, {workers} processes, files up to {max_megabytes:g} MB")
+        sys.stdout.flush()
+
+    try:
+        serve(MeasureService(setting, workers), ServeOptions(host, port, max_megabytes), ready)
+    finally:
+        for server in servers:
+            say(counts_text(server.counts))

@@ -6,13 +6,16 @@ import re
 import tempfile
 import threading
 import unicodedata
+import warnings
 import zlib
 from collections.abc import Iterator
 from dataclasses import dataclass, field, replace
+from io import BytesIO
 from pathlib import Path, PurePosixPath, PureWindowsPath
 
 import cv2
 import numpy as np
+from PIL import Image
 
 from stcal.errors import InputError
 from stcal.io.files import IMAGE_BYTES, read_bytes
@@ -165,6 +168,25 @@ def decode(data: bytes, name: str) -> np.ndarray:
     if image.dtype not in (np.uint8, np.uint16):
         raise InputError(f"{name}: pixels of type {image.dtype}; 8 or 16 bit needed")
     return image
+
+
+def stated_size(data: bytes, name: str) -> tuple[int, int]:
+    """Width and height, px, as the head of an image file states them, before anything is decoded.
+
+    Raises
+    ------
+    InputError
+        Not an image, or one of more pixels than any camera's.
+    """
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", Image.DecompressionBombWarning)
+            with Image.open(BytesIO(data)) as image:
+                return image.size
+    except Image.DecompressionBombError as error:
+        raise InputError(f"{name}: more pixels than any camera has; send it as the camera took it") from error
+    except Exception as error:  # what is no image fails in many ways
+        raise InputError(f"{name}: not readable as an image; convert it to {', '.join(SUFFIXES)}") from error
 
 
 def grey_8bit(image: np.ndarray) -> np.ndarray:

@@ -177,9 +177,9 @@ def measure_labelled(
             pose = measured_pose(image, camera, target, options.pose, prior)
             if options.previous and before is not None and isinstance(pose, TargetPose):
                 pose = resolved(pose, before.camera_from_target)
-            found.append(_outcome(image.name, pose, ()))
+            found.append(outcome(image.name, pose, ()))
             before = pose if isinstance(pose, TargetPose) and pose.status != "ambiguous" else None
-    return _result(found, target, options, prior)
+    return result_of(found, target, options, prior)
 
 
 def follow_files(
@@ -206,7 +206,7 @@ def follow_files(
         for file in jobs[i][0]:
             step(file.name)
     prior = None if camera_model.covariance is None else CameraPrior(camera_model.colmap_model, camera_model.covariance)
-    result = _result([each for found, _ in followed for each in found], target, options, prior)
+    result = result_of([each for found, _ in followed for each in found], target, options, prior)
     return replace(result, searched=sum(searched for _, searched in followed))
 
 
@@ -235,17 +235,17 @@ def _follow_folder(
             found.append(Skipped(file.name, str(error), "distortion"))
             continue
         searched += tracker.searched
-        found.append(_outcome(file.name, pose, seen.notes))
+        found.append(outcome(file.name, pose, seen.notes))
     return found, searched
 
 
-def _outcome(name: str, pose: TargetPose | StcalError, notes: tuple[str, ...]) -> MeasuredImage | Skipped:
+def outcome(name: str, pose: TargetPose | StcalError, notes: tuple[str, ...]) -> MeasuredImage | Skipped:
     if isinstance(pose, StcalError):
         return Skipped(name, str(pose).removeprefix(f"{name}: "), "pose")
     return MeasuredImage(name, pose, notes)
 
 
-def _result(found: Sequence[MeasuredImage | Skipped], target: TargetCircles, options, prior) -> MeasureResult:
+def result_of(found: Sequence[MeasuredImage | Skipped], target: TargetCircles, options, prior) -> MeasureResult:
     measured = tuple(each for each in found if isinstance(each, MeasuredImage))
     left_out = tuple(each for each in found if isinstance(each, Skipped))
     factor = target.sigma_factor if options.pose.sigma_factor is None else options.pose.sigma_factor

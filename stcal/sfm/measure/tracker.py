@@ -69,6 +69,9 @@ class Tracker:
         What was seen and left out in the last image, and why.
     searched : bool
         Whether the last image was searched as a whole.
+    recent : tuple of Rigid
+        camera_from_target of the one or two images before, from which the next is predicted; none before the first and
+        after a cut. Where they are put back, another tracker of the same target goes on.
 
     Raises
     ------
@@ -93,12 +96,12 @@ class Tracker:
         self.notes: tuple[str, ...] = ()
         self.searched = False
         self._planes = _target_from_face(target, self.design)
-        self._before: list[Rigid] = []
+        self.recent: tuple[Rigid, ...] = ()
         self._threads = ThreadpoolController()  # looked up once: it takes 2 ms
 
     def forget(self) -> None:
         """Search the next image as a whole, as after a cut."""
-        self._before = []
+        self.recent = ()
 
     def locate(self, image: np.ndarray, name: str = "image") -> TargetPose:
         """camera_from_target in the next image.
@@ -134,16 +137,16 @@ class Tracker:
     def observe(self, image: np.ndarray, name: str = "image") -> tuple[LabelledImage, TargetPose | StcalError]:
         """The labelled circles of the next image, and its pose or why there is none; see :meth:`locate`."""
         camera = self._camera_of(image, name)
-        found = self._follow(image, camera, name) if self._before else None
+        found = self._follow(image, camera, name) if self.recent else None
         self.searched = found is None
         seen, pose = found or self._search(image, camera, name)
         if isinstance(pose, StcalError):
             self.forget()
             return seen, pose
-        if self._before:
-            pose = resolved(pose, self._before[-1])
-        one_before = [] if self.searched else self._before[-1:]  # no motion is known across a search
-        self._before = [*one_before, pose.camera_from_target] if pose.status != "ambiguous" else []
+        if self.recent:
+            pose = resolved(pose, self.recent[-1])
+        one_before = () if self.searched else self.recent[-1:]  # no motion is known across a search
+        self.recent = (*one_before, pose.camera_from_target) if pose.status != "ambiguous" else ()
         return seen, pose
 
     def _camera_of(self, image: np.ndarray, name: str) -> Camera:
@@ -168,8 +171,8 @@ class Tracker:
 
     def _follow(self, image: np.ndarray, camera: Camera, name: str) -> tuple[LabelledImage, TargetPose] | None:
         """None where the target is not near its predicted place."""
-        last = self._before[-1]
-        expected = last @ self._before[0].inverse() @ last if len(self._before) == 2 else last
+        last = self.recent[-1]
+        expected = last @ self.recent[0].inverse() @ last if len(self.recent) == 2 else last
         predicted = self._predicted(expected, camera, (), MAX_TRIED_TILT_RAD)
         if len(predicted.labels) < MIN_FOUND:
             return None

@@ -1,0 +1,207 @@
+#!/usr/bin/env python
+"""Load `stcal-sfm measure --serve` with four clients: three follow the target, one sends rubbish.
+
+The clients are processes of this script that send simulated photographs of 2 megapixels, a sequence each, at an even
+rate over connections that stay open; the fourth sends what is no photograph, what is too large, what ends too early and
+broken requests, as many a second as each of the others. Lost is what gets no answer, or another image's. Memory is that
+of the server and its processes, pages that they share counted once, at the tenth and at the last part of the time.
+"""
+
+import argparse
+import http.client
+import json
+import multiprocessing
+import os
+import random
+import re
+import signal
+import socket
+import subprocess
+import sys
+import tempfile
+import time
+from pathlib import Path
+
+import cv2
+import numpy as np
+
+from stcal.io.saving import json_text
+from stcal.sfm.adjust.chain import CalibratedTarget
+from stcal.sfm.adjust.file import FacesFile
+from stcal.sfm.adjust.options import AdjustOptions
+from stcal.synthetic.dataset import write_dataset
+from stcal.synthetic.film import filmed
+from stcal.synthetic.scene import SceneOptions, make_scene
+
+FRAMES = 40
+"""Of a client's film, sent forth and back."""
+SIZE = 1728, 1152
+CLIENTS = 3
+PATIENCE_S = 30.0
+LATE_START_S = 1.0
+TARGET_SIGMA_MM = 0.002
+
+
+def film(folder: Path, client: int) -> list[tuple[str, bytes]]:
+    """Name and content of a client's photographs; another view and motion for each."""
+    scene = filmed(make_scene(SceneOptions(width=SIZE[0], height=SIZE[1])), "12", FRAMES, seed=client, view=client)
+    if not (folder / "truth.json").exists():
+        write_dataset(folder, scene, image_format="jpg")
+    return [(path.name, path.read_bytes()) for path in sorted((folder / "images" / "12").iterdir())]
+
+
+def write_faces(path: Path) -> None:
+    """The target as it is, with a σ of its circles like that of a run."""
+    scene = make_scene(SceneOptions(width=SIZE[0], height=SIZE[1]))
+    circles = scene.circles_target
+    target = CalibratedTarget(
+        reference_face=scene.target.faces[0].id,
+        target_from_face=scene.target_from_face,
+        circles=circles,
+        target_from_group={},
+        scale_sigma=1e-5,
+        circle_covariance={label: TARGET_SIGMA_MM**2 * np.eye(3) for label in circles},
+        covariance_mm2=TARGET_SIGMA_MM**2 * np.eye(3 * len(circles)),
+    )
+    path.write_text(
+        json_text(FacesFile.of(target, scene.target, AdjustOptions(target.reference_face), 1.0)), encoding="utf-8"
+    )
+
+
+def due(start: float, rate: float, i: int) -> float:
+    """Wait until the i-th image's time; that time."""
+    at = start + i / rate
+    time.sleep(max(0.0, at - time.time()))
+    return at
+
+
+def follow(client: int, port: int, frames: list, start: float, seconds: float, rate: float) -> dict:
+    """Send photographs at a rate; latencies in s from when each was due, and what was lost or refused."""
+    line = http.client.HTTPConnection("127.0.0.1", port, timeout=PATIENCE_S)
+    order = [*range(len(frames)), *range(len(frames) - 2, 0, -1)]
+    latencies, lost, refused, none, i = [], 0, 0, 0, 0
+    while (at := due(start, rate, i)) < start + seconds:
+        name, data = frames[order[i % len(order)]]
+        name = f"client{client}/{i}/{name}"
+        try:
+            line.request("POST", f"/measure?name={name}&sequence=client{client}", body=data)
+            answer = line.getresponse()
+            content = json.loads(answer.read())
+            if answer.status == 200:
+                lost += content["images"][0]["image"] != name
+            else:
+                refused += answer.status in (400, 500, 503)
+                none += answer.status == 422
+        except (OSError, http.client.HTTPException, ValueError):
+            lost += 1
+            line.close()
+        latencies.append(time.time() - at)
+        i += 1
+    return {"sent": i, "latencies": latencies, "lost": lost, "refused": refused, "without": none}
+
+
+def rubbish(port: int, frames: list, start: float, seconds: float, rate: float) -> dict:
+    """What no server should meet; every request that is one gets an answer that is no pose."""
+    rng = random.Random(1)
+    photograph = frames[0][1]
+    kinds = ["noise", "cut", "too large", "broken", "left", "other size", "empty"]
+    lost, i = 0, 0
+    while due(start, rate, i) < start + seconds:
+        kind = kinds[i % len(kinds)]
+        body = {
+            "noise": rng.randbytes(200_000),
+            "cut": photograph[: len(photograph) // 2],
+            "too large": b"",
+            "other size": OTHER_SIZE,
+            "empty": b"",
+        }.get(kind, b"")
+        length = 10**12 if kind == "too large" else len(body)
+        head = f"POST /measure HTTP/1.1\r\nHost: x\r\nContent-Length: {length}\r\n\r\n".encode()
+        try:
+            with socket.create_connection(("127.0.0.1", port), timeout=PATIENCE_S) as line:
+                if kind == "left":  # in the middle of its own photograph
+                    line.sendall(head.replace(b"Content-Length: 0", b"Content-Length: 500000") + photograph[:1000])
+                else:
+                    line.sendall(rng.randbytes(300) + b"\r\n\r\n" if kind == "broken" else head + body)
+                    line.shutdown(socket.SHUT_WR)
+                    answer = line.recv(1 << 16)
+                    lost += kind != "broken" and not answer.startswith(b"HTTP/1.1 4")
+        except OSError:
+            lost += 1
+        i += 1
+    return {"sent": i, "lost": lost}
+
+
+def run_client(answers, function, *arguments) -> None:
+    """In a process of its own."""
+    answers.put(function(*arguments))
+
+
+def memory_mb(pid: int) -> float:
+    """Of a process and all that it started (``Pss``)."""
+    sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
+    from bench_run import proportional
+
+    return proportional(pid) / 1e6
+
+
+def main() -> None:
+    """Render, serve, send, print."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--seconds", type=float, default=60.0)
+    parser.add_argument("--rate", type=float, default=50.0, help="images a second of all clients, rubbish included")
+    parser.add_argument("--workers", type=int, default=os.cpu_count())
+    parser.add_argument("--keep", type=Path, help="render to this folder, or take what is there")
+    options = parser.parse_args()
+    with tempfile.TemporaryDirectory() as scratch:
+        folder = options.keep or Path(scratch)
+        films = [film(folder / f"client{i}", i) for i in range(CLIENTS)]
+        write_faces(folder / "faces.json")
+        words = ["measure", "--serve", "--port", 0, "--workers", options.workers, "--faces", folder / "faces.json"]
+        words += ["--camera", folder / "client0" / "cameras.txt"]
+        program = [sys.executable, "-P", "-c", "from stcal.cli.entry import main_sfm; main_sfm()", *map(str, words)]
+        with subprocess.Popen(program, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True) as server:
+            port = int(re.search(r":(\d+)/measure", server.stdout.readline()).group(1))
+            report(options, films, port, server.pid)
+            server.send_signal(signal.SIGINT)
+            print("\n".join(server.stdout.read().split("\n")[:1]))
+
+
+def report(options, films: list, port: int, pid: int) -> None:
+    """Send for the time, and print what came of it."""
+    context = multiprocessing.get_context("fork")
+    answers = [context.SimpleQueue() for _ in range(CLIENTS + 1)]
+    start, rate = time.time() + LATE_START_S, options.rate / (CLIENTS + 1)
+    jobs = [(follow, i, port, films[i], start, options.seconds, rate) for i in range(CLIENTS)]
+    jobs.append((rubbish, port, films[0], start, options.seconds, rate))
+    clients = [context.Process(target=run_client, args=(q, *job)) for q, job in zip(answers, jobs, strict=True)]
+    for client in clients:
+        client.start()
+    time.sleep(max(0, start + options.seconds / 10 - time.time()))
+    early = memory_mb(pid)
+    time.sleep(max(0, start + 0.95 * options.seconds - time.time()))
+    late = memory_mb(pid)
+    found = [queue.get() for queue in answers]
+    took = time.time() - start
+    for client in clients:
+        client.join()
+    latency = 1e3 * np.concatenate([each["latencies"] for each in found[:CLIENTS]])
+    sent = sum(each["sent"] for each in found)
+    counts = {key: sum(each[key] for each in found[:CLIENTS]) for key in ("refused", "without")}
+    megabytes = [np.mean([len(data) for _, data in each]) / 1e6 for each in films]
+    print(
+        f"{SIZE[0]}×{SIZE[1]} px, files of {', '.join(f'{v:.2f}' for v in megabytes)} MB, {options.workers} processes"
+    )
+    print(f"asked for {options.rate:g} a second for {options.seconds:g} s: {sent} sent, {sent / took:.1f} a second")
+    print(f"photographs: {sent - found[-1]['sent']}, rubbish: {found[-1]['sent']}")
+    print(f"lost answers: {sum(each['lost'] for each in found)}; refused photographs: {counts['refused']}; ", end="")
+    print(f"without a pose: {counts['without']}")
+    parts = [np.percentile(latency, p) for p in (50, 95, 100)]
+    print("from due to answered, ms: median {:.0f}, 95 % {:.0f}, most {:.0f}".format(*parts))
+    print(f"memory: {early:.0f} MB, at the end {late:.0f} MB")
+
+
+OTHER_SIZE = cv2.imencode(".png", np.zeros((480, 640), np.uint8))[1].tobytes()
+
+if __name__ == "__main__":
+    main()
