@@ -96,7 +96,8 @@ def measure(
         int, typer.Option(min=0, max=65535, help="Listen at this port with --serve; at a free one with 0.")
     ] = 8765,
     max_megabytes: Annotated[
-        float, typer.Option("--max-megabytes", min=0.01, max=2000, help="Refuse larger image files with --serve.")
+        float,
+        typer.Option("--max-megabytes", min=0.01, max=2000, help="Accept image files up to this size with --serve."),
     ] = 64.0,
 ) -> None:
     """Measure the pose of a calibrated target in each image, from whatever faces it shows, with its 6×6 covariance."""
