@@ -5,8 +5,8 @@ from typing import Annotated
 
 import typer
 
-from stcal.cli.options import TargetFile, Workers
-from stcal.cli.terminal import StageProgress, say
+from stcal.cli.options import ReportFile, TargetFile, Workers
+from stcal.cli.terminal import StageProgress, say, write
 from stcal.errors import InputError
 from stcal.io.saving import json_text, save
 
@@ -34,7 +34,8 @@ def calibrate_camera(
         str,
         typer.Option(
             help="Fit this model of COLMAP: SIMPLE_PINHOLE, PINHOLE, SIMPLE_RADIAL, RADIAL, OPENCV, FULL_OPENCV; of "
-            "wide lenses SIMPLE_RADIAL_FISHEYE, RADIAL_FISHEYE, OPENCV_FISHEYE, THIN_PRISM_FISHEYE."
+            "wide lenses SIMPLE_RADIAL_FISHEYE, RADIAL_FISHEYE, OPENCV_FISHEYE, THIN_PRISM_FISHEYE; or `auto`: the "
+            "simplest that foretells held-out views as well as the best."
         ),
     ] = "OPENCV",
     json_file: Annotated[
@@ -43,6 +44,7 @@ def calibrate_camera(
             "--json", writable=True, help="Write figures and checks to this file (JSON); beside --out if not given."
         ),
     ] = None,
+    report: ReportFile = None,
     workers: Workers = None,
 ) -> None:
     """Calibrate the camera from views of the board, without any start: cameras.txt with σ and correlations, for run."""
@@ -64,9 +66,14 @@ def calibrate_camera(
             result = calibrate(images, target_design, board_design, model, workers=workers, progress=progress)
         else:
             result = calibrate_camera_by_corners(images, board_design, model, workers, progress)
-    write_cameras_txt(out, CalibratedCamera.of(result.intrinsics.camera, model, result.intrinsics.covariance))
+    own = result.intrinsics
+    write_cameras_txt(out, CalibratedCamera.of(own.camera, own.colmap_model, own.covariance))
     summary = CalibrationFile.of(result)
     json_file = json_file or out.with_suffix(".json")
     save(json_file, json_text(summary))
     say(calibration_text(result, summary))
     say(f"camera file: {out}\nfigures and checks: {json_file}")
+    if report:
+        from stcal.sfm.camera.report import calibration_page
+
+        write(report, calibration_page(result, summary, str(images)), "report")

@@ -12,11 +12,20 @@ import numpy as np
 from stcal.boards.design import BoardView, CharucoDesign, ChessboardDesign, FlatBoard
 from stcal.design import BoardDesign
 from stcal.errors import InputError
-from stcal.io.camera import COLMAP_MODELS, CameraModel
+from stcal.io.camera import CameraModel
 from stcal.io.images import ImageFile, find_images
 from stcal.labels import DotLabel
 from stcal.parallel import Progress, one_thread
-from stcal.sfm.camera.calibrate import CameraCalibration, first_size, judged, require_determined, require_views
+from stcal.sfm.camera.calibrate import (
+    CameraCalibration,
+    first_size,
+    judged,
+    of_chosen_model,
+    require_determined,
+    require_model,
+    require_views,
+)
+from stcal.sfm.camera.held_out import AUTO
 from stcal.sfm.camera.intrinsics import adjust_intrinsics
 from stcal.sfm.camera.views import closed_form, start_camera
 from stcal.sfm.data.observations import ImageObservations
@@ -46,7 +55,7 @@ def calibrate_camera_by_corners(
     board
         The board, mm, with the σ of its corners.
     colmap_model
-        COLMAP's camera model to adjust, such as ``OPENCV``.
+        COLMAP's camera model to adjust, such as ``OPENCV``, or ``auto``.
     workers
         Processes; one per core where None.
     progress
@@ -62,9 +71,12 @@ def calibrate_camera_by_corners(
     StcalError
         One of its kinds, with a one-line message that says what to do.
     """
-    if colmap_model not in COLMAP_MODELS:
-        raise InputError(f"camera model {colmap_model}: not supported; use one of {', '.join(COLMAP_MODELS)}")
     grid = corner_grid(board)
+    if colmap_model == AUTO:
+        return of_chosen_model(
+            lambda model: calibrate_camera_by_corners(images, board, model, workers, progress), grid, workers
+        )
+    require_model(colmap_model)
     progress = progress or (lambda *_: None)
     files, other = find_images(images)
     camera = start_camera(*first_size(files), colmap_model)

@@ -1,19 +1,20 @@
 """Calibrate a camera from photographs of the dot board, nothing known: the calls in order, and what they found."""
 
 import tempfile
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
 
 from stcal.design import BoardDesign, TargetDesign
-from stcal.errors import DegenerateError, DetectionError, InputError
+from stcal.errors import ConvergenceError, DegenerateError, DetectionError, InputError, StcalError
 from stcal.geometry.camera import Camera
 from stcal.io.camera import COLMAP_MODELS, CameraModel
 from stcal.io.files import IMAGE_BYTES, read_bytes
 from stcal.io.images import ImageFile, Skipped, decode, find_images
 from stcal.parallel import Progress, counted, one_thread
+from stcal.sfm.camera.held_out import AUTO, Candidate, HeldOut, choose_model, held_out
 from stcal.sfm.camera.intrinsics import Intrinsics, adjust_intrinsics, model_parameters
 from stcal.sfm.camera.trust import (
     MIN_REACH,
@@ -30,6 +31,7 @@ from stcal.sfm.detect.circles.ellipses import EllipseOptions
 from stcal.sfm.detect.files import DetectionResult, detect_files
 
 MIN_VIEWS = 3
+PERSPECTIVE, WIDE = "OPENCV", "OPENCV_FISHEYE"
 MAX_ROUNDS = 5
 SETTLED_SIGMAS = 0.1
 """Detection rounds end when the next one would move no parameter by more than this, in its σ."""
@@ -46,6 +48,7 @@ CORNERS = ("top left", "top right", "bottom left", "bottom right")
 class CameraCalibration:
     """``intrinsics`` with covariance; ``views`` that it rests on; ``skipped`` files and images without a board, and
     why; ``rounds`` of detection; ``projection`` σ over the image; ``split`` None with fewer than six views;
+    ``held_out`` None with fewer than four; ``candidates`` : lens models that were tried, empty where one was given;
     ``warnings`` : what makes the result worse than its σ may say, and what to do."""
 
     intrinsics: Intrinsics
@@ -54,7 +57,9 @@ class CameraCalibration:
     rounds: int
     projection: ProjectionSigma
     split: SplitHalf | None
+    held_out: HeldOut | None
     warnings: tuple[str, ...]
+    candidates: tuple[Candidate, ...] = ()
 
 
 @one_thread()
@@ -82,7 +87,8 @@ def calibrate_camera(
     board : BoardDesign
         The dot board, mm, with the σ of its dots.
     colmap_model : str
-        COLMAP's camera model to adjust, such as ``OPENCV``.
+        COLMAP's camera model to adjust, such as ``OPENCV``; or ``auto``, the simplest that foretells held-out views as
+        well as the best of all.
     ellipses : EllipseOptions, optional
         Of detection; the defaults where None.
     workers : int, optional
@@ -101,8 +107,11 @@ def calibrate_camera(
     StcalError
         One of its kinds, with a one-line message that says what to do.
     """
-    if colmap_model not in COLMAP_MODELS:
-        raise InputError(f"camera model {colmap_model}: not supported; use one of {', '.join(COLMAP_MODELS)}")
+    if colmap_model == AUTO:
+        return of_chosen_model(
+            lambda model: calibrate_camera(images, target, board, model, ellipses, workers, progress), board, workers
+        )
+    require_model(colmap_model)
     progress = progress or (lambda *_: None)
     files, other = find_images(images)
     camera = start_camera(*first_size(files), colmap_model)
@@ -127,6 +136,37 @@ def calibrate_camera(
     return judged(result, views, skipped, rounds, settled, board)
 
 
+def require_model(colmap_model: str) -> None:
+    """Refuse a lens model that is none of ours.
+
+    Raises
+    ------
+    InputError
+        With those there are.
+    """
+    if colmap_model not in COLMAP_MODELS:
+        raise InputError(f"camera model {colmap_model}: not supported; use one of {', '.join(COLMAP_MODELS)} or {AUTO}")
+
+
+def of_chosen_model(
+    calibrate: Callable[[str], CameraCalibration], board: BoardDesign, workers: int | None
+) -> CameraCalibration:
+    """A calibration with the model that held-out views choose; ``calibrate`` : with a model's name.
+
+    Views are found with the usual perspective lens, or where that does not fit, with the usual wide one.
+    """
+    try:
+        first = calibrate(PERSPECTIVE)
+    except (DegenerateError, ConvergenceError, DetectionError) as error:
+        try:
+            first = calibrate(WIDE)
+        except (DegenerateError, ConvergenceError, DetectionError):
+            raise error from None
+    chosen, candidates = choose_model(first.views, board, first.intrinsics, workers)
+    result = first if chosen == first.intrinsics.colmap_model else calibrate(chosen)
+    return replace(result, candidates=candidates)
+
+
 def judged(
     result: Intrinsics,
     views: Sequence[ImageObservations],
@@ -139,7 +179,12 @@ def judged(
     projection = projection_sigma(result)
     split = split_half(result, views, board)
     warnings = [*_of_rounds(result, settled), *_warnings(result, projection, split, board)]
-    return CameraCalibration(result, tuple(views), skipped, rounds, projection, split, tuple(warnings))
+    try:
+        foretold = held_out(views, board, result.camera, result.colmap_model)
+    except StcalError as error:
+        foretold = None
+        warnings.append(f"no views could be held out, as the others alone are too few: {error}")
+    return CameraCalibration(result, tuple(views), skipped, rounds, projection, split, foretold, tuple(warnings))
 
 
 def first_size(files: list[ImageFile]) -> tuple[int, int]:

@@ -1,6 +1,7 @@
 """What ``calibrate-camera`` writes beside the camera file."""
 
 from collections.abc import Iterator
+from dataclasses import asdict
 from typing import Annotated, Literal
 
 import numpy as np
@@ -39,6 +40,20 @@ class Halves(Part):
     sigma: dict[str, float]
     largest_px: float
     largest_sigma_px: float
+
+
+class HeldOutViews(Part):
+    rms_px: float
+    folds: int
+
+
+class LensModel(Part):
+    model: str
+    parameters: int
+    rms_px: float | None
+    worse: float | None
+    worse_sigma: float | None
+    why: str
 
 
 class BoardViewRow(Part):
@@ -84,6 +99,16 @@ class CalibrationFile(ResultFile):
         "(p < 0.0001), `p_value`, `difference` and its `sigma` by parameter, `largest_px` difference of a projection "
         "over the image, `largest_sigma_px` per axis there; null with fewer than six views"
     )
+    held_out: HeldOutViews | None = Field(
+        None,
+        description="each view foretold by a calibration without it, in `folds` parts: `rms_px` per coordinate; null "
+        "with fewer than four views",
+    )
+    models: list[LensModel] = Field(
+        [],
+        description="with `--model auto`: `model`, `parameters` it has, `rms_px` of held-out views, `worse` than the "
+        "best by so much in the mean square (σ²) and its standard error `worse_sigma`; `why` it could not be tried",
+    )
     images: list[BoardViewRow] = Field(
         description="`image`, `dots`, `tilt_deg` of the board against the image plane, `rms_px`"
     )
@@ -124,6 +149,9 @@ class CalibrationFile(ResultFile):
                 largest_px=split.largest_px,
                 largest_sigma_px=split.largest_sigma_px,
             ),
+            held_out=calibration.held_out
+            and HeldOutViews(rms_px=calibration.held_out.rms_px(), folds=calibration.held_out.folds),
+            models=[LensModel.model_validate(asdict(each)) for each in calibration.candidates],
             images=list(_views(result)),
             outliers=list(_outliers(result)),
             left_out=[NamedReason(name=each.name, reason=each.reason) for each in calibration.skipped],

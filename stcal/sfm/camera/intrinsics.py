@@ -203,14 +203,14 @@ def _start_state(views, camera_of_view, board: BoardDesign, start: Camera) -> _S
     for folder, members in by_group(views).items():
         labels = tuple(sorted({label for v in members for label in v.labels}))
         for k in sorted({camera_of[v.name] for v in members}):
-            models.append(_model(folder, labels, [v for v in members if camera_of[v.name] == k], board, start))
+            models.append(model_of_views(folder, labels, [v for v in members if camera_of[v.name] == k], board, start))
             folders.append(folder)
             which.append(k)
     return _State(tuple(models), tuple(folders), tuple(which), (start,) * (max(which) + 1))
 
 
-def _model(folder: str, labels: tuple[Label, ...], views, board: BoardDesign, camera: Camera) -> MetricModel:
-    """The views of a folder around its board, which stands still."""
+def model_of_views(folder: str, labels: tuple[Label, ...], views, board: BoardDesign, camera: Camera) -> MetricModel:
+    """The views of a folder around its board, which stands still, at its design's places."""
     place = {label: i for i, label in enumerate(labels)}
     rows = [(i, place[label], k) for i, v in enumerate(views) for k, label in enumerate(v.labels)]
     image_index, point_index, keypoint = np.array(rows).T

@@ -2,8 +2,19 @@
 
 import numpy as np
 
+from stcal.report.text import number, text_table
 from stcal.sfm.camera.calibrate import CameraCalibration
 from stcal.sfm.camera.file import CalibrationFile
+
+
+def models_table(summary: CalibrationFile) -> list[str]:
+    """How lens models foretell held-out views; the chosen one has a star."""
+    rows = [["<", "<lens model", "parameters", "held out px", "worse σ²", "±", "<"]]
+    for each in summary.models:
+        star = "*" if each.model == summary.model else ""
+        numbers = [number(each.rms_px, 4), number(each.worse, 4), number(each.worse_sigma, 4)]
+        rows.append([star, each.model, str(each.parameters), *numbers, each.why])
+    return text_table(rows)
 
 
 def calibration_text(result: CameraCalibration, summary: CalibrationFile) -> str:
@@ -24,6 +35,16 @@ def calibration_text(result: CameraCalibration, summary: CalibrationFile) -> str
         f"σ of a projection: {np.median(result.projection.sigma_px):.4f} px median over the image, "
         f"{result.projection.corner_sigma_px.max():.4f} px in the worst corner"
     )
+    if result.held_out is not None:
+        lines.append(
+            f"views held out, {result.held_out.folds} parts: residual RMS {result.held_out.rms_px():.4f} px after "
+            "their poses were fitted"
+        )
+    if summary.models:
+        lines += [
+            f"--model auto: {summary.model}, the simplest that foretells them as well as the best",
+            *models_table(summary),
+        ]
     if split := result.split:
         lines.append(
             f"split-half check: {split.verdict}; p = {split.p_value:.2g}, largest difference {split.largest_px:.4f} px "
