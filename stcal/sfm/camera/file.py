@@ -86,7 +86,8 @@ class CalibrationFile(ResultFile):
         description="by which residuals exceed the centres' own σ (not below 1); σ are scaled by it"
     )
     dot_sigma_factor: float = Field(
-        description="by which dots exceed the `sigma_mm` of the board file (not below 1); σ are scaled by it"
+        description="by which dots are farther from the grid than the `sigma_mm` of the board file says, but for bends "
+        "of a board that is not flat (below 1: nearer); it is in all σ"
     )
     redundancy: int = Field(description="degrees of freedom")
     rounds: int = Field(description="of detection")

@@ -1,7 +1,8 @@
 """Intrinsics from views of the dot board: one adjustment over intrinsics, board poses and the board's own shape.
 
 Every image has its own pose of the board. The dots of a folder's images are those of one board in one state: their
-places are unknowns, and the design is an observation of them with the board's σ; scale does not matter here. The
+places are unknowns, and the design is an observation of them with the board's σ; scale does not matter here. That the
+board is bowed or twisted as a whole, by far more than its dots are off, is left free where the images show it. The
 image of a *circle* is the model. σ of the centres and of the dots are estimated too (variance components).
 """
 
@@ -9,6 +10,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
+from scipy.special import chdtrc
 
 from stcal.design import BoardDesign
 from stcal.errors import ConvergenceError
@@ -37,10 +39,18 @@ CREEPING_PX = 1e-3
 """Moves below this after all steps are along a direction that hardly changes the images: its σ says so."""
 START_DAMPING = 1e-3
 MAX_ROUNDS = 20
+FLAT_AFTER = 2
+"""Rounds after which σ are known well enough to tell which boards are flat."""
 SETTLED_FACTOR = 0.005
 """Rounds end when no variance component moves by more than this …"""
 SETTLED_SHIFT_PX = 1e-5
 """… and no eccentricity by more than this."""
+BOW_SHARE = 0.005
+"""σ of a board's bends at its edge, in parts of its extent: a millimetre on 200 mm, more than any that is in use."""
+BENT_P = 1e-3
+"""Bends that chance makes in more than one flat board of a thousand are none: to leave them free costs accuracy."""
+LEAST_DOTS = 0.1
+"""Dots may be nearer to the grid than the board file says, but none is exact."""
 MIN_BOARD_REDUNDANCY = 20.0
 """Below that the dots' residuals do not tell their σ, and the stated one stands."""
 
@@ -48,7 +58,7 @@ MIN_BOARD_REDUNDANCY = 20.0
 @dataclass(frozen=True, slots=True)
 class SigmaFactors:
     """By how much residuals exceed the σ that the centres came with (``centres``) and that the board file states
-    for the dots (``dots``, not below 1)."""
+    for the dots (``dots``)."""
 
     centres: float = 1.0
     dots: float = 1.0
@@ -103,13 +113,53 @@ class _State:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
+class _Design:
+    """Where a folder's dots are by design, ``places`` (n, 3) mm, and how they may be off.
+
+    ``bow`` : (3n, m) orthonormal, the second-order bends of the board out of its plane; ``bow_sigma_mm`` : of the
+    amplitude along each. All else is off by the board's σ, independently.
+    """
+
+    places: np.ndarray
+    bow: np.ndarray
+    bow_sigma_mm: float
+
+    @classmethod
+    def of(cls, places: np.ndarray) -> "_Design":
+        """Bends of the places' own extent."""
+        xy = places[:, :2] - places[:, :2].mean(axis=0)
+        extent = max(float(np.ptp(xy, axis=0).max()), 1e-9)
+        x, y = 2 * xy.T / extent
+        flat = np.linalg.qr(np.column_stack([np.ones_like(x), x, y]))[0]
+        bends = np.column_stack([x * x, x * y, y * y])
+        bends -= flat @ (flat.T @ bends)
+        u, size, _ = np.linalg.svd(bends, full_matrices=False)
+        u = u[:, size > 1e-3 * np.sqrt(len(x))]  # fewer where the dots that are seen lie along a line
+        bow = np.zeros((3 * len(places), u.shape[1]))
+        bow[2::3] = u
+        return cls(places, bow, BOW_SHARE * extent * float(np.sqrt(len(places))))
+
+    def weight(self, sigma_mm: float) -> np.ndarray:
+        """Inverse covariance (3n, 3n) of the dots' places."""
+        bent = 1 / (sigma_mm**2 + self.bow_sigma_mm**2)
+        return np.eye(len(self.bow)) / sigma_mm**2 - (1 / sigma_mm**2 - bent) * (self.bow @ self.bow.T)
+
+    def costs(self, xyz: np.ndarray, sigma_mm: float) -> tuple[float, float]:
+        """χ² of places (n, 3): of the board's σ, and of its bends."""
+        gap = (xyz - self.places).ravel()
+        bends = self.bow.T @ gap
+        own = float(gap @ gap - bends @ bends) / sigma_mm**2
+        return own, float(bends @ bends) / (sigma_mm**2 + self.bow_sigma_mm**2)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
 class _Setting:
     """What stays the same in one minimisation. ``weight`` : (q, q) of the vague prior about ``start``."""
 
     basis: np.ndarray
     weight: np.ndarray
     start: Camera
-    design: dict[str, np.ndarray]
+    design: dict[str, _Design]
     sigma_mm: float
     huber: float
 
@@ -164,12 +214,14 @@ def adjust_intrinsics(
     basis = intrinsic_basis(colmap_model)
     state = _start_state(views, camera_of_view or [0] * len(views), board, start)
     own = [m.covariance_px2 for m in state.models]
-    design = {f: board.places_mm(m.labels) for f, m in zip(state.folder, state.models, strict=True)}
+    design = {f: _Design.of(board.places_mm(m.labels)) for f, m in zip(state.folder, state.models, strict=True)}
     weight = np.linalg.inv(vague_prior(start, colmap_model))
     setting = _Setting(basis, weight, start, design, board.sigma_mm, np.inf)
     known, factors = factors, factors or SigmaFactors()
-    settled = False
-    for _ in range(MAX_ROUNDS):
+    last: _Normal | None = None
+    for done in range(MAX_ROUNDS):
+        if last is not None and done == FLAT_AFTER:
+            setting = replace(setting, design=last.with_flat_boards())
         before = state
         state = _weighted(state, own, factors, board)
         shifted = max(np.abs(a.shift_px - b.shift_px).max() for a, b in zip(state.models, before.models, strict=True))
@@ -180,9 +232,10 @@ def adjust_intrinsics(
         updated = known or _updated_factors(state, setting, last.dots_left, factors)
         change = max(abs(updated.centres / factors.centres - 1), abs(updated.dots / factors.dots - 1))
         factors = updated
-        settled = bool(change < SETTLED_FACTOR and shifted < SETTLED_SHIFT_PX)
+        settled = bool(done >= FLAT_AFTER and change < SETTLED_FACTOR and shifted < SETTLED_SHIFT_PX)
         if settled:
             break
+    assert last is not None
     covariance = np.linalg.inv(last.normal)
     return Intrinsics(
         cameras=state.cameras,
@@ -264,7 +317,7 @@ def _updated_factors(state: _State, setting: _Setting, dots_left: float, factors
     image_left = _image_redundancy(state, setting.basis.shape[1]) - dots_left
     dots = factors.dots
     if dots_left > MIN_BOARD_REDUNDANCY:
-        dots = max(1.0, dots * sigma_factor(_dots_cost(state, setting), dots_left))
+        dots = max(LEAST_DOTS, dots * sigma_factor(_dots_costs(state, setting)[0], dots_left))
     return SigmaFactors(factors.centres * sigma_factor(image, image_left), dots)
 
 
@@ -276,13 +329,19 @@ def _boards(state: _State) -> dict[str, list[int]]:
     return members
 
 
-def _dots_cost(state: _State, setting: _Setting) -> float:
-    gaps = [state.models[rows[0]].xyz_model - setting.design[folder] for folder, rows in _boards(state).items()]
-    return sum(float((gap**2).sum()) for gap in gaps) / setting.sigma_mm**2
+def _dots_costs(state: _State, setting: _Setting) -> np.ndarray:
+    """χ² of the dots' places: of the board's σ, and of its bends."""
+    return np.sum(
+        [
+            setting.design[folder].costs(state.models[rows[0]].xyz_model, setting.sigma_mm)
+            for folder, rows in _boards(state).items()
+        ],
+        axis=0,
+    )
 
 
 def _cost(state: _State, setting: _Setting) -> float:
-    cost = _dots_cost(state, setting)
+    cost = float(_dots_costs(state, setting).sum())
     for camera in state.cameras:
         away = setting.away(camera)
         cost += float(away @ setting.weight @ away)
@@ -312,7 +371,8 @@ class _Normal:
         right = -np.concatenate([setting.weight @ setting.away(camera) for camera in state.cameras])
         boards, poses = [], []
         for folder, rows in _boards(state).items():
-            p = 3 * len(setting.design[folder])
+            design = setting.design[folder]
+            p = design.places.size
             full, full_right = np.zeros((p + c * q, p + c * q)), np.zeros(p + c * q)
             for i in rows:
                 k = state.camera_of[i]
@@ -323,17 +383,33 @@ class _Normal:
                 full[np.ix_(place, place)] += part
                 full_right[place] += part_right
                 poses.append(away)
-            gap = state.models[rows[0]].xyz_model - setting.design[folder]
-            full[np.arange(p), np.arange(p)] += 1 / setting.sigma_mm**2
-            full_right[:p] -= gap.ravel() / setting.sigma_mm**2
+            own = design.weight(setting.sigma_mm)
+            full[:p, :p] += own
+            full_right[:p] -= own @ (state.models[rows[0]].xyz_model - design.places).ravel()
             dots = reduce(full[None, :p, :p], full_right[None, :p], full[None, :p, p:])
             normal += full[p:, p:] - dots.normal
             right += full_right[p:] - dots.right
             boards.append(dots)
         covariance = np.linalg.inv(normal)
-        taken = [np.trace(b.inverse[0]) + np.sum((b.from_kept[0] @ covariance) * b.from_kept[0]) for b in boards]
-        dots_left = sum(b.step.size - t / setting.sigma_mm**2 for b, t in zip(boards, taken, strict=True))
+        dots_left = sum(
+            _left_of(board, covariance, setting.design[folder].bow, setting.sigma_mm)
+            for board, folder in zip(boards, _boards(state), strict=True)
+        )
         return cls(_cost(state, setting), state, setting, normal, right, tuple(boards), tuple(poses), float(dots_left))
+
+    def with_flat_boards(self) -> dict[str, _Design]:
+        """The designs, without bends of the boards whose bends may be chance."""
+        covariance = np.linalg.inv(self.normal)
+        found = {}
+        for board, (folder, rows) in zip(self.boards, _boards(self.state).items(), strict=True):
+            design = self.setting.design[folder]
+            bends = design.bow.T @ (self.state.models[rows[0]].xyz_model - design.places).ravel()
+            bent = board.from_kept[0].T @ design.bow
+            spread = design.bow.T @ board.inverse[0] @ design.bow + bent.T @ covariance @ bent
+            spread += self.setting.sigma_mm**2 * np.eye(len(bends))
+            chance = chdtrc(max(len(bends), 1), float(bends @ np.linalg.solve(spread, bends)))
+            found[folder] = design if chance < BENT_P else replace(design, bow=design.bow[:, :0])
+        return found
 
     def step(self, damping: float | np.ndarray) -> tuple[np.ndarray, float]:
         """Of the intrinsics, then of the dots of each board, then of the poses of each model."""
@@ -356,6 +432,15 @@ class _Normal:
             for a, b, k in zip(self.state.models, new.models, self.state.camera_of, strict=True)
         ]
         return float(max(moves))
+
+
+def _left_of(board: Reduction, covariance: np.ndarray, bow: np.ndarray, sigma_mm: float) -> float:
+    """Redundancy of the observations of a board's dots, but for its bends; ``covariance`` : of the intrinsics."""
+    inverse, from_kept = board.inverse[0], board.from_kept[0]
+    bent = from_kept.T @ bow
+    taken = np.trace(inverse) + np.sum((from_kept @ covariance) * from_kept)
+    taken -= np.sum(bow * (inverse @ bow)) + np.sum((covariance @ bent) * bent)
+    return board.step.size - bow.shape[1] - float(taken) / sigma_mm**2
 
 
 def _minimise(state: _State, setting: _Setting) -> _Normal:
@@ -385,7 +470,7 @@ def _moved(state: _State, setting: _Setting, step: np.ndarray) -> _State:
     q, models = setting.basis.shape[1], list(state.models)
     own, rest = np.split(step, [q * len(state.cameras)])
     boards = _boards(state)
-    sizes = [3 * len(setting.design[folder]) for folder in boards]
+    sizes = [setting.design[folder].places.size for folder in boards]
     *dots, rest = np.split(rest, np.cumsum(sizes))
     order = [i for rows in boards.values() for i in rows]
     poses = dict(zip(order, np.split(rest, np.cumsum([6 * len(models[i].images) for i in order])[:-1]), strict=True))

@@ -299,3 +299,31 @@ def test_impossible_options(stcal_sfm, small_dataset, monkeypatch, more, message
     code, _, printed = stcal_sfm("calibrate-camera", "images", "--out", "new.txt", *more)
     assert code == 2
     assert message in printed
+
+
+def bowed(rng, bow_mm: float) -> np.ndarray:
+    """The board's dots, off at random as the design says, and bent like a dish, by that at its corners."""
+    xy = BOARD.xy_mm() - BOARD.xy_mm().mean(axis=0)
+    made = np.column_stack([BOARD.xy_mm(), np.zeros(63)]) + BOARD.sigma_mm * rng.standard_normal((63, 3))
+    made[:, 2] += bow_mm * (xy**2).sum(axis=1) / (xy**2).sum(axis=1).max()
+    return made
+
+
+@pytest.mark.parametrize("bow_mm", [0.0, 0.3])
+def test_a_bend_of_the_board_is_none_of_its_dots(bow_mm):
+    """χ² of 8 parameters stays below 26 (p = 0.001); the factor of 3 · 63 dots scatters by 5 %."""
+    rng = np.random.default_rng(3)
+    result = calibrated(views_of(rng, made=bowed(rng, bow_mm)))
+    e = error(result)
+    assert e @ np.linalg.solve(result.covariance, e) < 26
+    assert 0.75 < result.factors.dots < 1.25
+    ((model,),) = (result.models,)
+    bent = model.xyz_model[:, 2]
+    assert np.ptp(bent) == pytest.approx(bow_mm, abs=0.06)  # six σ of the dots at random, two at each end
+
+
+def test_dots_nearer_to_the_grid_than_stated_are_told():
+    rng = np.random.default_rng(4)
+    made = np.column_stack([BOARD.xy_mm(), np.zeros(63)]) + 0.4 * BOARD.sigma_mm * rng.standard_normal((63, 3))
+    result = calibrated(views_of(rng, count=20, made=made))
+    assert 0.2 < result.factors.dots < 0.6
