@@ -28,7 +28,7 @@ LENSES = {
         [0.02, -0.01, 1e-3, -2e-3, 3e-3, -1e-3, 0, 0, 1e-3, 0, -1e-3],
     ),
 }
-SUFFIX = {"colmap": ".txt", "colmap-bin": ".bin", "mrcal": ".cameramodel", "metashape": ".xml"}
+SUFFIX = {"colmap": ".txt", "colmap-bin": ".bin", "mrcal": ".cameramodel", "metashape": ".xml", "matlab": ".mat"}
 EXACT_PX = 1e-9
 TRIED = (
     ("COLMAP", "FOV", "1 FOV {0} {1} 812 809 640 478 0.9"),
@@ -96,12 +96,12 @@ def held(form: str, folder: Path) -> list[str]:
         path.write_bytes(content)
         read = read_lens(path)
         assert not isinstance(read, ForeignLens)
-        worst = off_px(camera, read.sized(0, 0))
+        worst = off_px(camera, read.sized(camera.width, camera.height))
         back.append(name if worst < EXACT_PX else f"{name} ({worst:.2g} px off)")
         if read.covariance is None:
             lost.update(made.lost)
         if (read.width, read.height) != (WIDTH, HEIGHT):
-            lost.add("size")
+            lost.add("the image's size")
     return [
         "all" if back == list(LENSES) else "; ".join(back),
         "; ".join(refused) or "–",

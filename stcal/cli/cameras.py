@@ -31,6 +31,8 @@ class Form(StrEnum):
     kalibr = "kalibr"
     mrcal = "mrcal"
     metashape = "metashape"
+    matlab = "matlab"
+    zhang = "zhang"
 
 
 NameOption = Annotated[
@@ -54,7 +56,7 @@ def convert(
         typer.Option(
             "--form",
             help="Write this form; if not given that of B's suffix: .txt colmap, .bin colmap-bin, .yaml opencv, "
-            ".cameramodel mrcal, .xml metashape.",
+            ".cameramodel mrcal, .xml metashape, .mat matlab.",
         ),
     ] = None,
     name: NameOption = "",

@@ -23,7 +23,7 @@ Run = Annotated[Path, typer.Argument(metavar="RUN", help="Read the finished run 
 CameraFile = Annotated[
     Path,
     typer.Option(
-        "--camera", help="Read the intrinsics from this file: COLMAP, OpenCV, ROS, Kalibr, mrcal or Metashape."
+        "--camera", help="Read the intrinsics from this file: COLMAP, OpenCV, ROS, Kalibr, mrcal, Metashape or MATLAB."
     ),
 ]
 TargetFile = Annotated[

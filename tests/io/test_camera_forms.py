@@ -17,13 +17,17 @@ LENSES = {
     "OPENCV_FISHEYE": [0.02, -0.01, 0, 0, 3e-3, -1e-3],
     "THIN_PRISM_FISHEYE": [0.02, -0.01, 1e-3, -2e-3, 3e-3, -1e-3, 0, 0, 1e-3, 0, -1e-3],
 }
-SUFFIX = {form: suffix for suffix, form in reversed(SUFFIXES.items())} | {"ros": ".yaml", "kalibr": ".yaml"}
+SUFFIX = {form: suffix for suffix, form in reversed(SUFFIXES.items())} | {
+    "ros": ".yaml",
+    "kalibr": ".yaml",
+    "zhang": ".txt",
+}
 REFUSED = {
-    "OPENCV": (),
+    "OPENCV": ("zhang",),
     "PINHOLE": (),
-    "FULL_OPENCV": ("kalibr", "metashape"),
-    "OPENCV_FISHEYE": ("mrcal",),
-    "THIN_PRISM_FISHEYE": ("opencv", "ros", "kalibr", "mrcal", "metashape"),
+    "FULL_OPENCV": ("kalibr", "metashape", "matlab", "zhang"),
+    "OPENCV_FISHEYE": ("mrcal", "matlab", "zhang"),
+    "THIN_PRISM_FISHEYE": ("opencv", "ros", "kalibr", "mrcal", "metashape", "matlab", "zhang"),
 }
 """Forms that cannot hold a lens."""
 

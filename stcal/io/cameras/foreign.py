@@ -12,6 +12,7 @@ import numpy as np
 from scipy.ndimage import map_coordinates
 
 from stcal.errors import InputError
+from stcal.geometry.camera import Camera
 from stcal.io.camera import COLMAP_PIXEL_ORIGIN, CameraModel, camera_from_colmap, camera_from_opencv
 
 COLMAP_FOREIGN = {
@@ -34,6 +35,8 @@ NUMBERS = {
     **{number: name for name, (number, _) in COLMAP_FOREIGN.items()},
 }
 """Names of COLMAP's models by their numbers in binary files and databases."""
+SQUARE = 1e-9
+"""Skew over focal length that is none."""
 MARGIN = {2: 1, 3: 2}
 """Intervals of a spline of this order that lie beyond the stated field."""
 
@@ -164,6 +167,32 @@ def of_opencv(lens, given: np.ndarray, width: float, height: float, source: str)
     tilted = len(given) == 14 and given[12:].any()
     called = "OpenCV's lens with a tilted sensor" if tilted else "OpenCV's lens with thin prisms"
     return ForeignLens(called, project, int(width) or None, int(height) or None, source)
+
+
+def of_skewed(
+    lens, skew: float, given: np.ndarray, width: float, height: float, source: str
+) -> CameraModel | ForeignLens:
+    """The perspective camera of fx, fy, cx, cy and OpenCV's coefficients; a foreign lens where its axes are skewed by
+    ``skew`` px: u = fx x + skew y + cx.
+
+    Raises
+    ------
+    InputError
+        Coefficients of another number; impossible values.
+    """
+    camera = camera_from_opencv(lens, given, False, width, height, source)
+    if not np.isfinite(skew):
+        raise InputError(f"camera file {source}: a camera parameter is not a finite number; correct it")
+    if abs(skew) <= SQUARE * abs(camera.focal[0]):
+        return camera
+    (fx, fy), (cx, cy) = camera.focal, camera.centre
+    matrix, flat = np.array([[fx, skew, cx], [0, fy, cy]]), Camera(1, 1, [1, 1], [0, 0], camera.distortion)
+
+    def project(rays: np.ndarray) -> np.ndarray:
+        distorted = flat.distort(rays[:, :2] / rays[:, 2:])
+        return np.column_stack([distorted, np.ones(len(distorted))]) @ matrix.T
+
+    return ForeignLens("a lens with skewed axes", project, camera.width, camera.height, source)
 
 
 def of_kalibr(lens: str, distortion: str, values: dict, source: str) -> ForeignLens:

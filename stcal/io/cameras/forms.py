@@ -32,6 +32,7 @@ from stcal.io.cameras.foreign import (
     of_splines,
     one_of,
 )
+from stcal.io.cameras.matlab import mat, zhang
 
 SUFFIXES = {
     ".txt": "colmap",
@@ -40,6 +41,7 @@ SUFFIXES = {
     ".yml": "opencv",
     ".cameramodel": "mrcal",
     ".xml": "metashape",
+    ".mat": "matlab",
 }
 """Form that a name asks for."""
 MRCAL = {f"LENSMODEL_{name}": count for name, count in (("PINHOLE", 0), *((f"OPENCV{n}", n) for n in (4, 5, 8, 12)))}
@@ -177,7 +179,7 @@ def written(camera: CalibratedCamera, form: str, name: str) -> Written:
     """
     if not re.fullmatch(r"[A-Za-z]\w*", name, re.ASCII):
         raise InputError(f"camera name {name}: letters, digits and _ needed, a letter first, such as cam0")
-    lost = []
+    lost = ["the image's size"] if form == "zhang" else []
     if camera.covariance is not None and form != "colmap":
         lost.append("σ and correlations of the parameters")
     return Written(WRITERS[form](camera, name), tuple(lost))
@@ -291,5 +293,7 @@ WRITERS: Mapping[str, Callable[[CalibratedCamera, str], str | bytes]] = {
     "kalibr": _kalibr,
     "mrcal": _mrcal,
     "metashape": _metashape,
+    "matlab": mat,
+    "zhang": zhang,
 }
 """Of a camera called so, by form."""

@@ -22,7 +22,7 @@ from stcal.io.camera import (
     camera_model,
     parameter_names,
 )
-from stcal.io.cameras import forms
+from stcal.io.cameras import forms, matlab
 from stcal.io.cameras.foreign import ForeignLens, of_colmap, of_database, of_opencv, one_of
 from stcal.io.covariance import Rows, require_covariance
 from stcal.io.files import SETTINGS_BYTES, read_bytes
@@ -45,6 +45,8 @@ def read_lens(path: str | Path, name: str = "") -> CameraModel | ForeignLens:
         raise InputError(f"camera file {path}: not a text file; give cameras.txt, or OpenCV's YAML or XML") from error
     if database:
         return of_database(path, name)
+    if matlab.is_mat(content):
+        return matlab.from_mat(content, name, str(path))
     if content[:8] == struct.pack("<Q", content[0] if content else 0) and b"\0" in content:
         return forms.from_colmap_binary(content, name, str(path))
     try:
@@ -67,7 +69,11 @@ def read_lens(path: str | Path, name: str = "") -> CameraModel | ForeignLens:
             if isinstance(lens, ForeignLens):
                 return lens
             return replace(lens, covariance=_stated_covariance(text, parameter_names(lens.colmap_model), path))
+        if matlab.is_zhang(rows):
+            return matlab.from_zhang(rows, str(path))
         values = _yaml_values(text)
+        if matlab.STRUCTURE in values or "MappingCoefficients" in values:
+            return matlab.from_structure(values, str(path))
         if any(isinstance(each, dict) and "camera_model" in each for each in values.values()):
             return forms.from_kalibr(values, name, str(path))
         return _from_opencv(values, path)

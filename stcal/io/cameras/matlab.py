@@ -1,0 +1,196 @@
+"""Cameras of MATLAB: structures of its Computer Vision Toolbox, and the files of Bouguet's toolbox.
+
+The toolbox counts pixels from (1, 1), the centre of the first; Bouguet's from (0, 0), as OpenCV does.
+"""
+
+import io
+import warnings
+from collections.abc import Mapping
+from dataclasses import replace
+
+import numpy as np
+from scipy.io import loadmat, savemat
+from scipy.io.matlab import MatReadError, MatReadWarning, MatWriteWarning
+
+from stcal.errors import InputError
+from stcal.io.camera import CalibratedCamera, CameraModel
+from stcal.io.cameras.foreign import ForeignLens, of_skewed, one_of
+
+HEADS = (b"MATLAB 5.0 MAT-file", b"MATLAB 7.3 MAT-file")
+PIXEL_ORIGIN = 1.0
+STRUCTURE = "RadialDistortion"
+"""Field of every structure that ``toStruct`` makes of a camera."""
+BOUGUET = ("fc", "cc", "kc")
+BOUGUET_SIGMAS = 3.0
+"""Its ``…_error`` are three times σ (vision.caltech.edu/bouguetj/calib_doc, "Description of the calibration
+parameters")."""
+HEAD_BYTES = 116
+"""Of text that begins a file; scipy puts the time there."""
+
+
+def is_mat(content: bytes) -> bool:
+    """Whether a file begins as MATLAB's do."""
+    return content.startswith(HEADS)
+
+
+def from_mat(content: bytes, choice: str, source: str) -> CameraModel | ForeignLens:
+    """A camera of a ``.mat`` file; ``choice`` : of several, by the variable's name.
+
+    Raises
+    ------
+    InputError
+        Version 7.3, which is HDF5; objects in place of structures; no camera, or several and no choice.
+    """
+    if content.startswith(HEADS[1]):
+        raise InputError(f"camera file {source}: of MATLAB 7.3 (HDF5); save it with '-v7'")
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", MatReadWarning)
+            values = loadmat(io.BytesIO(content), simplify_cells=True)
+    except (MatReadError, ValueError, TypeError, NotImplementedError, OSError, IndexError, KeyError) as error:
+        reason = " ".join(str(error).split())[:150]
+        raise InputError(f"camera file {source}: not readable as a .mat file ({reason}); save it again") from error
+    if all(name in values for name in BOUGUET):
+        return _from_bouguet(values, source)
+    found = dict(_structures({key: each for key, each in values.items() if not key.startswith("__")}, ""))
+    if not found:
+        raise InputError(
+            f"camera file {source}: no structure of a camera; save toStruct(cameraParams), since objects of MATLAB "
+            "can be read by MATLAB alone"
+        )
+    return from_structure(found[one_of(list(found), choice, source)], source)
+
+
+def from_structure(values: Mapping, source: str) -> CameraModel | ForeignLens:
+    """The camera of what ``toStruct`` makes of ``cameraParameters`` or ``cameraIntrinsics``, as a structure or as JSON.
+
+    Raises
+    ------
+    InputError
+        A fisheye lens; a field that is missing.
+    """
+    if "MappingCoefficients" in values:
+        raise InputError(f"camera file {source}: MATLAB's fisheye model is not supported; calibrate with another")
+    matrix = _numbers(values, "K", source)
+    if matrix is None:
+        turned = _numbers(values, "IntrinsicMatrix", source)  # with the principal point in its last row
+        matrix = None if turned is None else turned.reshape(3, 3).T
+    if matrix is not None:
+        (fx, skew, cx), (_, fy, cy) = matrix.reshape(3, 3)[:2]
+    else:
+        focal, centre = (_numbers(values, key, source, 2) for key in ("FocalLength", "PrincipalPoint"))
+        if focal is None or centre is None:
+            raise InputError(f"camera file {source}: no K, IntrinsicMatrix or FocalLength; save toStruct(cameraParams)")
+        (fx, fy), (cx, cy), own = focal, centre, _numbers(values, "Skew", source, 1)
+        skew = 0.0 if own is None else own[0]
+    size = _numbers(values, "ImageSize", source)
+    height, width = (0.0, 0.0) if size is None or not size.size else size[:2]
+    radial = _numbers(values, STRUCTURE, source)
+    tangential = _numbers(values, "TangentialDistortion", source, 2)
+    k = [0.0, 0.0] if radial is None else [*radial, 0.0, 0.0][: max(len(radial), 2)]
+    p = [0.0, 0.0] if tangential is None else tangential
+    lens = [fx, fy, cx - PIXEL_ORIGIN, cy - PIXEL_ORIGIN]
+    return of_skewed(lens, float(skew), np.array([*k[:2], *p, *k[2:]], float), float(width), float(height), source)
+
+
+def _structures(values: Mapping, where: str):
+    """(name, structure) of every camera, however deep."""
+    if STRUCTURE in values or "MappingCoefficients" in values:
+        yield where or "camera", values
+        return
+    for key, each in values.items():
+        if isinstance(each, Mapping):
+            yield from _structures(each, f"{where}.{key}" if where else str(key))
+
+
+def _numbers(values: Mapping, key: str, source: str, count: int = 0) -> np.ndarray | None:
+    if values.get(key) is None:
+        return None
+    try:
+        found = np.asarray(values[key], float)
+    except (TypeError, ValueError) as error:
+        raise InputError(f"camera file {source}: {key} is no list of numbers; save it again") from error
+    if (count and found.size != count) or (key in ("K", "IntrinsicMatrix") and found.size != 9):
+        raise InputError(f"camera file {source}: {key} of {found.size} numbers; {count or 9} needed")
+    return found.ravel() if key not in ("K", "IntrinsicMatrix") else found
+
+
+def _known(values: Mapping, key: str, source: str, count: int) -> np.ndarray:
+    found = _numbers(values, key, source, count)
+    if found is None:
+        raise InputError(f"camera file {source}: {key} is empty; {count} numbers needed")
+    return found
+
+
+def _from_bouguet(values: Mapping, source: str) -> CameraModel | ForeignLens:
+    focal, centre, k = (_known(values, key, source, n) for key, n in zip(BOUGUET, (2, 2, 5), strict=True))
+    width, height = (float(np.asarray(values.get(key, 0)).sum()) for key in ("nx", "ny"))
+    skew = float(np.asarray(values.get("alpha_c", 0.0)).sum()) * focal[0]
+    lens = of_skewed([*focal, *centre], skew, k, width, height, source)
+    if isinstance(lens, ForeignLens) or lens.colmap_model != "OPENCV":
+        return lens
+    if not all(f"{key}_error" in values for key in BOUGUET):
+        return lens
+    errors = [_known(values, f"{key}_error", source, n) for key, n in zip(BOUGUET, (2, 2, 5), strict=True)]
+    sigma = np.concatenate(errors)[:8] / BOUGUET_SIGMAS
+    return replace(lens, covariance=np.diag(sigma**2)) if (sigma > 0).all() and np.isfinite(sigma).all() else lens
+
+
+def mat(camera: CalibratedCamera, name: str) -> bytes:
+    """A structure with the fields of ``cameraIntrinsics`` and of ``toStruct(cameraParams)``."""
+    k = camera.distortion
+    if camera.fisheye or k[5:].any():
+        raise InputError(
+            f"matlab has no place for {'the equidistant projection' if camera.fisheye else 'more than k1, k2, k3'} of "
+            f"{camera.colmap_model}; write --form colmap"
+        )
+    (fx, fy), (cx, cy) = camera.focal, camera.centre + PIXEL_ORIGIN
+    matrix = np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1]])
+    radial = [k[0], k[1], k[4]] if k[4] else [k[0], k[1]]
+    own = {
+        "FocalLength": [fx, fy],
+        "PrincipalPoint": [cx, cy],
+        "ImageSize": [float(camera.height), float(camera.width)],
+        "RadialDistortion": radial,
+        "TangentialDistortion": [k[2], k[3]],
+        "Skew": 0.0,
+        "K": matrix,
+        "IntrinsicMatrix": matrix.T,
+    }
+    stream = io.BytesIO()
+    with warnings.catch_warnings():
+        warnings.simplefilter("error", MatWriteWarning)
+        savemat(stream, {name: own}, oned_as="row")
+    content = stream.getvalue()
+    return HEADS[0] + b", written by stcal".ljust(HEAD_BYTES - len(HEADS[0])) + content[HEAD_BYTES:]
+
+
+def is_zhang(rows: list[list[str]]) -> bool:
+    """Whether lines are those of Zhang's calibration: five words, two, and then rows of three; none a key."""
+    counts = [len(row) for row in rows]
+    return counts[:2] == [5, 2] and set(counts[2:]) <= {3} and not any(":" in word for word in rows[0] + rows[1])
+
+
+def from_zhang(rows: list[list[str]], source: str) -> CameraModel | ForeignLens:
+    """α, c, β, u0, v0, then k1, k2, then poses, which are passed over (Zhang 2000; the file of his page).
+
+    Raises
+    ------
+    InputError
+        What is no number.
+    """
+    try:
+        (fx, skew, fy, cx, cy), (k1, k2) = ([float(word) for word in row] for row in rows[:2])
+    except ValueError as error:
+        raise InputError(f"camera file {source}: {' '.join(str(error).split())[:150]}; numbers needed") from error
+    return of_skewed([fx, fy, cx, cy], skew, np.array([k1, k2, 0.0, 0.0]), 0.0, 0.0, source)
+
+
+def zhang(camera: CalibratedCamera, _: str) -> str:
+    """Zhang's five numbers, and k1, k2."""
+    if camera.fisheye or camera.distortion[2:].any():
+        what = "the equidistant projection" if camera.fisheye else "more than k1, k2"
+        raise InputError(f"zhang has no place for {what} of {camera.colmap_model}; write --form colmap")
+    (fx, fy), (cx, cy) = camera.focal.tolist(), camera.centre.tolist()
+    k1, k2 = camera.distortion[:2].tolist()
+    return f"{fx!r} 0 {fy!r} {cx!r} {cy!r}\n\n{k1!r} {k2!r}\n"

@@ -1,0 +1,184 @@
+"""Cameras of MATLAB's toolbox, of Bouguet's, and of Zhang's page; against the formulas of their documents."""
+
+import json
+
+import numpy as np
+import pytest
+from scipy.io import savemat
+
+from stcal.errors import InputError
+from stcal.io.camera import read_camera
+from stcal.io.cameras.fit import fit_lens
+from stcal.io.cameras.foreign import ForeignLens
+from stcal.io.cameras.forms import written
+from stcal.io.cameras.read import read_lens
+from tests.io.test_camera_forms import camera_of
+
+STRUCTURE = {
+    "RadialDistortion": [-0.28, 0.07],
+    "TangentialDistortion": [1e-4, -2e-4],
+    "ImageSize": [712.0, 1072.0],
+    "IntrinsicMatrix": [[714.19, 0, 0], [0, 710.38, 0], [563.6481, 355.7254, 1.0]],
+    "NumRadialDistortionCoefficients": 2,
+}
+"""Fields of ``toStruct(cameraParams)``; the matrix is turned, and counts from 1."""
+RAYS = np.array([[0.0, 0, 1], [0.4, -0.2, 1], [-0.3, 0.25, 1.5]])
+
+
+def matlab_px(rays: np.ndarray, own: dict, k3: float = 0.0) -> np.ndarray:
+    """As the documents of ``cameraParameters`` have it, in its pixels."""
+    x, y = rays[:, 0] / rays[:, 2], rays[:, 1] / rays[:, 2]
+    k1, k2 = own["RadialDistortion"][:2]
+    p1, p2 = own["TangentialDistortion"]
+    r2 = x * x + y * y
+    radial = 1 + k1 * r2 + k2 * r2**2 + k3 * r2**3
+    u = x * radial + 2 * p1 * x * y + p2 * (r2 + 2 * x * x)
+    v = y * radial + p1 * (r2 + 2 * y * y) + 2 * p2 * x * y
+    return np.column_stack([u, v, np.ones(len(u))]) @ np.array(own["IntrinsicMatrix"])[:, :2]
+
+
+def saved(path, variables):
+    savemat(path, variables, oned_as="row")
+    return path
+
+
+@pytest.mark.parametrize("form", ["struct", "json", "K", "lengths"])
+def test_a_structure_projects_as_matlab_says(tmp_path, form):
+    own = {key: value for key, value in STRUCTURE.items() if form in ("struct", "json") or key != "IntrinsicMatrix"}
+    matrix = np.array(STRUCTURE["IntrinsicMatrix"]).T
+    if form == "K":
+        own["K"] = matrix
+    elif form == "lengths":
+        own |= {"FocalLength": [matrix[0, 0], matrix[1, 1]], "PrincipalPoint": matrix[:2, 2], "Skew": 0.0}
+    if form == "json":
+        path = tmp_path / "camera.json"
+        path.write_text(json.dumps(own), encoding="utf-8")
+    else:
+        path = saved(tmp_path / "camera.mat", {"s": own})
+    camera = read_camera(path).calibrated(0, 0)
+    assert (camera.width, camera.height) == (1072, 712)
+    np.testing.assert_allclose(camera.project(RAYS) + 1, matlab_px(RAYS, STRUCTURE), atol=1e-10)
+
+
+def test_a_third_radial_coefficient(tmp_path):
+    own = STRUCTURE | {"RadialDistortion": [-0.28, 0.07, -0.01]}
+    camera = read_camera(saved(tmp_path / "camera.mat", {"cameraParams": own})).calibrated(0, 0)
+    np.testing.assert_allclose(camera.project(RAYS) + 1, matlab_px(RAYS, own, -0.01), atol=1e-10)
+
+
+def test_a_camera_of_a_pair_is_chosen_by_name(tmp_path):
+    other = STRUCTURE | {"RadialDistortion": [0.1, 0.0]}
+    path = saved(tmp_path / "pair.mat", {"stereoParams": {"CameraParameters1": STRUCTURE, "CameraParameters2": other}})
+    with pytest.raises(InputError, match=r"2 cameras, 1 needed; choose of stereoParams\.CameraParameters1, "):
+        read_camera(path)
+    assert read_camera(path, "stereoParams.CameraParameters2").distortion[0] == 0.1
+
+
+def test_skewed_axes_are_fitted(tmp_path):
+    matrix = np.array(STRUCTURE["IntrinsicMatrix"])
+    matrix[1, 0] = 3.0
+    path = saved(tmp_path / "skew.mat", {"s": STRUCTURE | {"IntrinsicMatrix": matrix}})
+    lens = read_lens(path)
+    assert isinstance(lens, ForeignLens)
+    np.testing.assert_allclose(
+        lens.project(RAYS) + 1, matlab_px(RAYS, STRUCTURE | {"IntrinsicMatrix": matrix}), atol=1e-10
+    )
+    found = fit_lens(lens, 1072, 712)
+    assert 0 < found.rms_px < 1.0  # 3 px over half the height, less what a turn of the camera takes
+    with pytest.raises(InputError, match="skewed axes"):
+        read_camera(path)
+
+
+BOUGUET = {
+    "fc": [657.39536, 657.76309],
+    "cc": [302.98372, 242.61688],
+    "alpha_c": 0.0,
+    "kc": [-0.25584, 0.12758, -0.00021, 0.00003, 0.0],
+    "fc_error": [0.34691, 0.37120],
+    "cc_error": [0.70488, 0.64467],
+    "kc_error": [0.00271, 0.01075, 0.00015, 0.00014, 0.0],
+    "nx": 640.0,
+    "ny": 480.0,
+}
+"""The example of the toolbox's page, vision.caltech.edu/bouguetj/calib_doc/htmls/example.html."""
+
+
+def test_bouguets_results_with_their_sigmas(tmp_path):
+    model = read_camera(saved(tmp_path / "Calib_Results.mat", BOUGUET))
+    camera = model.calibrated(0, 0)
+    assert (camera.width, camera.height, model.colmap_model) == (640, 480, "OPENCV")
+    np.testing.assert_allclose(camera.centre, BOUGUET["cc"])
+    np.testing.assert_allclose(camera.distortion[:4], BOUGUET["kc"][:4])
+    errors = [*BOUGUET["fc_error"], *BOUGUET["cc_error"], *BOUGUET["kc_error"][:4]]
+    np.testing.assert_allclose(np.sqrt(np.diag(model.covariance)), np.array(errors) / 3)
+
+
+def test_bouguets_results_without_sigmas(tmp_path):
+    own = {key: value for key, value in BOUGUET.items() if not key.endswith("_error")}
+    assert read_camera(saved(tmp_path / "Calib_Results.mat", own)).covariance is None
+
+
+ZHANG = """832.5 0 832.53 303.959 206.585
+
+-0.228601 0.190353
+
+0.992759 -0.026319 0.117201
+0.0139247 0.994339 0.105341
+-0.11931 -0.102947 0.987505
+-3.84019 3.65164 12.791
+"""
+"""As on the page of his method, but for its skew of 0.204494."""
+
+
+def test_zhangs_numbers(tmp_path):
+    (tmp_path / "camera.txt").write_text(ZHANG)
+    model = read_camera(tmp_path / "camera.txt")
+    assert (model.width, model.height) == (None, None)
+    x, y = RAYS[:, 0] / RAYS[:, 2], RAYS[:, 1] / RAYS[:, 2]
+    radial = 1 - 0.228601 * (x * x + y * y) + 0.190353 * (x * x + y * y) ** 2
+    wanted = np.column_stack([832.5 * x * radial + 303.959, 832.53 * y * radial + 206.585])
+    np.testing.assert_allclose(model.sized(640, 480).project(RAYS), wanted, atol=1e-10)
+
+
+def test_zhangs_skew_is_fitted(tmp_path):
+    (tmp_path / "camera.txt").write_text(ZHANG.replace("832.5 0 ", "832.5 0.204494 "))
+    lens = read_lens(tmp_path / "camera.txt")
+    assert fit_lens(lens, 640, 480).rms_px < 0.05
+
+
+@pytest.mark.parametrize(
+    ("variables", "said"),
+    [
+        ({"a": 1.0}, r"no structure of a camera; save toStruct\(cameraParams\)"),
+        ({"s": {"RadialDistortion": [0.1, 0.2]}}, "no K, IntrinsicMatrix or FocalLength"),
+        ({"s": STRUCTURE | {"IntrinsicMatrix": np.eye(2)}}, "IntrinsicMatrix of 4 numbers; 9 needed"),
+        ({"s": STRUCTURE | {"IntrinsicMatrix": "no"}}, "IntrinsicMatrix is no list of numbers"),
+        ({"s": STRUCTURE | {"TangentialDistortion": [1.0]}}, "TangentialDistortion of 1 numbers; 2 needed"),
+        ({"s": STRUCTURE | {"IntrinsicMatrix": np.diag([np.nan, 1, 1])}}, "not a finite number|focal"),
+        ({"s": {"MappingCoefficients": [1.0, 2, 3, 4]}}, "fisheye model is not supported"),
+        ({"fc": [1.0, 2], "cc": [], "kc": [0.0] * 5}, "cc of 0 numbers; 2 needed"),
+    ],
+)
+def test_what_is_no_camera_is_named(tmp_path, variables, said):
+    with pytest.raises(InputError, match=said):
+        read_camera(saved(tmp_path / "camera.mat", variables))
+
+
+@pytest.mark.parametrize("cut", [20, 130, 200, 400])
+def test_a_file_that_is_cut(tmp_path, cut):
+    path = saved(tmp_path / "camera.mat", {"s": STRUCTURE})
+    path.write_bytes(path.read_bytes()[:cut])
+    with pytest.raises(InputError, match=r"camera file .*camera.mat"):
+        read_camera(path)
+
+
+def test_hdf5_is_named(tmp_path):
+    (tmp_path / "camera.mat").write_bytes(b"MATLAB 7.3 MAT-file, Platform: GLNXA64".ljust(512))
+    with pytest.raises(InputError, match=r"of MATLAB 7\.3 \(HDF5\); save it with '-v7'"):
+        read_camera(tmp_path / "camera.mat")
+
+
+def test_the_same_camera_gives_the_same_bytes():
+    first, second = (written(camera_of("OPENCV"), "matlab", "cam0").content for _ in range(2))
+    assert first == second
+    assert first.startswith(b"MATLAB 5.0 MAT-file, written by stcal")
