@@ -302,9 +302,14 @@ def _entry(path: str, folder: Path) -> str:
     return Path(path).relative_to(folder).parts[0]
 
 
+BINARY = (".mat", ".bin")
+
+
 def broken(path: Path) -> str:
     """Why a result file is none; empty where it is one."""
     try:
+        if path.suffix in BINARY:
+            return "" if path.stat().st_size else "empty"
         text = path.read_text(encoding="utf-8")
         if path.suffix == ".json":
             json.loads(text, parse_constant=_no_number)

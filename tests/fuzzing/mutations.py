@@ -336,6 +336,8 @@ BY_SUFFIX: dict[str, tuple[Mutation, ...]] = {
     ".yaml": (text_number, text_number, text_line, yaml_form, yaml_form, *TEXT),
     ".xml": (text_number, text_number, text_line, xml_form, *TEXT),
     ".bin": (binary_number,) * 4,
+    ".mat": (binary_number,) * 4,
+    ".cameramodel": (text_number, text_number, text_line, *TEXT),
     ".db": (database_row,) * 4,
     ".jpg": (image_pixels, image_form, image_name),
     ".png": (image_pixels, image_form, image_name),

@@ -11,6 +11,7 @@ import numpy as np
 
 from stcal.geometry.rigid import Poses, Rigid
 from stcal.io.camera import CalibratedCamera, read_camera, write_cameras_txt
+from stcal.io.cameras.forms import written
 from stcal.io.table import POSE, pose_cells
 from stcal.locate.data.layout import layout_toml
 from stcal.robot.kinematics.example import mh80
@@ -135,6 +136,17 @@ def _cameras(folder: Path) -> None:
     rng = np.random.default_rng(1)
     spread = rng.normal(size=(len(given.colmap_params()), 40)) * 1e-3
     write_cameras_txt(forms / "sigma.txt", replace(given, covariance=spread @ spread.T))
+    plain = CalibratedCamera.of(replace(given, distortion=np.zeros(12)), "PINHOLE")
+    for name, form in (
+        ("cameras.bin", "colmap-bin"),
+        ("camchain.yaml", "kalibr"),
+        ("camera.cameramodel", "mrcal"),
+        ("metashape.xml", "metashape"),
+        ("matlab.mat", "matlab"),
+        ("zhang.txt", "zhang"),
+    ):
+        content = written(plain if form == "zhang" else given, form, "cam0").content
+        (forms / name).write_bytes(content if isinstance(content, bytes) else content.encode())
 
 
 def _robots(folder: Path, rng: np.random.Generator) -> None:

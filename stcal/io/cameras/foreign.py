@@ -181,8 +181,8 @@ def of_skewed(
         Coefficients of another number; impossible values.
     """
     camera = camera_from_opencv(lens, given, False, width, height, source)
-    if not np.isfinite(skew):
-        raise InputError(f"camera file {source}: a camera parameter is not a finite number; correct it")
+    if not abs(skew) < abs(camera.focal[0]):
+        raise InputError(f"camera file {source}: skew {skew:g} px, less than fx needed; correct it")
     if abs(skew) <= SQUARE * abs(camera.focal[0]):
         return camera
     (fx, fy), (cx, cy) = camera.focal, camera.centre
