@@ -7,7 +7,7 @@ import pytest
 
 from stcal.cli.main import MESSAGE_CHARACTERS
 from tests.commands import CALLS, COMMANDS, options_of
-from tests.fuzzing.cases import Judged, chosen, judged
+from tests.fuzzing.cases import BRIEF_S, Judged, chosen, judged
 from tests.fuzzing.judged import EARLIER, OUT, Outcome, failures, hashes, in_process, lay_out
 from tests.fuzzing.mistakes import MISTAKES, call_of
 from tests.fuzzing.mutations import BY_SUFFIX
@@ -53,11 +53,16 @@ def test_a_case_of_every_command_and_kind_of_file_is_judged(stock, tmp_path):
     assert len(found) < 2 * len(first)
 
 
+def test_the_cases_are_of_every_command_but_long_ones():
+    left_out = set(COMMANDS) - {command for _, command in shortest_first()}
+    assert [c.command for c in CALLS if c.command in left_out and c.seconds <= BRIEF_S] == []
+    assert len(left_out) < len(COMMANDS) // 4
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("part", range(PARTS))
 def test_whatever_comes_in_is_judged(stock, tmp_path, part):
-    found = spoiled(stock, tmp_path / "case", range(part, CASES, PARTS))
-    assert len({each.command for each in found}) > len(COMMANDS) // 2
+    assert len(spoiled(stock, tmp_path / "case", range(part, CASES, PARTS))) == CASES // PARTS
 
 
 QUICK = [
