@@ -1,4 +1,4 @@
-"""The tables of data_layout.md for result files, made from their models.
+"""The tables of docs/reference/files/ for result files, made from their models.
 
 .venv/bin/python scripts/data_layout.py [--check]
 
@@ -19,7 +19,7 @@ from typing import Annotated, Any, Literal, Union, get_args, get_origin
 
 from stcal.io.json import Part, Shape
 
-DOCUMENT = Path(__file__).resolve().parents[1] / "data_layout.md"
+FILES = Path(__file__).resolve().parents[1] / "docs" / "reference" / "files"
 BLOCK = re.compile(r"(<!-- made by scripts/data_layout\.py: (\w+) -->\n)(.*?)(<!-- end -->)", re.DOTALL)
 MODULES = (
     "stcal.sfm.adjust.file",
@@ -124,6 +124,11 @@ def words(annotation: Any) -> str:
     return WORDS[annotation]
 
 
+def documents() -> list[Path]:
+    """Pages with such tables, and without."""
+    return sorted(FILES.glob("*.md"))
+
+
 def made_anew(text: str) -> tuple[str, list[str]]:
     """The document with its tables as the models have them, and the names of those that were different."""
     known, differing = models(), []
@@ -131,7 +136,7 @@ def made_anew(text: str) -> tuple[str, list[str]]:
     def made(match: re.Match) -> str:
         begin, name, old, end = match.groups()
         if name not in known:
-            raise SystemExit(f"{DOCUMENT.name}: no model {name}; add its module to {Path(__file__).name}")
+            raise SystemExit(f"no model {name}; add its module to {Path(__file__).name}")
         new = table(known[name])
         if new != old:
             differing.append(name)
@@ -145,11 +150,12 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--check", action="store_true", help="compare only, and name the tables that differ")
     check = parser.parse_args().check
-    text, differing = made_anew(DOCUMENT.read_text(encoding="utf-8"))
-    if not check:
-        DOCUMENT.write_text(text, encoding="utf-8")
-    elif differing:
-        sys.exit(f"{DOCUMENT.name}: not as the models say: {', '.join(differing)}; run scripts/data_layout.py")
+    for document in documents():
+        text, differing = made_anew(document.read_text(encoding="utf-8"))
+        if not check:
+            document.write_text(text, encoding="utf-8")
+        elif differing:
+            sys.exit(f"{document.name}: not as the models say: {', '.join(differing)}; run scripts/data_layout.py")
 
 
 if __name__ == "__main__":

@@ -12,7 +12,7 @@ BLOCKS = printed.of_documents()
 
 FACTS: set[str] = set()
 """Tables of figures that are written by hand. Those of docs/sources.md are words beside figures and count as none;
-data_layout.md holds formats and options, which tests/test_documents.py compares with the code."""
+docs/reference holds formats and options, which tests/test_documents.py compares with the code."""
 
 NOT_YET = {
     "README.md: method poses error / bound error / σ",  # handeye_study.py

@@ -87,7 +87,9 @@ class SceneRow(Part):
         "(null where others show more tags), `candidate`, `kept`, and of candidates `errors_px` of both poses, `det_j` "
         "(1/mm²), `camera_from_obj` and `twin`; `same_pose`: both poses are one; what was `assumed`",
     )
-    delta_chi2: Finite = Field(None, description="this and all below as in [measure](#out-what-measure-writes)")
+    delta_chi2: Finite = Field(
+        None, description="this and all below as in [measure](measure.md#out-what-measure-writes)"
+    )
     rms_px: float | None = Field(None, description="of the residuals, per coordinate")
     chi2: float | None = Field(None, description="of the residuals")
     dof: int | None = Field(None, description="their degrees of freedom")
