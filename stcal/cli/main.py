@@ -8,7 +8,7 @@ from typing import Any, NoReturn
 import typer
 
 import stcal
-from stcal.cli import camera, cameras, capture, colmap, handeye, locate, measure, register, robot, sfm, simulate
+from stcal.cli import cameras, handeye, locate, register, robot, sfm
 from stcal.cli.entry import NO_MEMORY, lacks_memory
 from stcal.cli.help import PLAIN, Commands
 from stcal.cli.options import protect_inputs
@@ -29,11 +29,6 @@ app = typer.Typer(
     cls=Commands,
     **PLAIN,
 )
-sfm.app.add_typer(simulate.app)
-sfm.app.add_typer(colmap.app)
-sfm.app.add_typer(capture.app)
-sfm.app.add_typer(camera.app)
-sfm.app.add_typer(measure.app)
 app.add_typer(sfm.app, name="sfm")
 app.add_typer(robot.app, name="robot")
 app.add_typer(locate.app, name="locate")

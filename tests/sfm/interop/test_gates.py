@@ -191,7 +191,7 @@ def test_limits_in_words():
 
 
 def test_the_command(small_run, stcal_sfm, tmp_path, monkeypatch):
-    monkeypatch.setattr("stcal.cli.colmap.SHOWN_PAIRS", 2)
+    monkeypatch.setattr("stcal.cli.sfm.colmap.SHOWN_PAIRS", 2)
     before = sorted(path.stat().st_mtime_ns for path in small_run.rglob("*"))
     code, out, _ = stcal_sfm("pairs", small_run, "--json", tmp_path / "pairs.json")
     assert code == 0

@@ -1,4 +1,4 @@
-"""``stcal-sfm``: from images to the calibrated target."""
+"""``run``, ``detect``, ``verify``: from images to the calibrated target."""
 
 from enum import StrEnum
 from pathlib import Path
@@ -6,7 +6,6 @@ from typing import Annotated
 
 import typer
 
-from stcal.cli.help import PLAIN, Commands
 from stcal.cli.options import (
     BoardFile,
     CameraFile,
@@ -26,12 +25,7 @@ from stcal.cli.options import (
 from stcal.cli.terminal import StageProgress, say, write
 from stcal.errors import InputError
 
-app = typer.Typer(
-    name="stcal-sfm",
-    help="Calibrate a target from a folder of images. Any command takes --debug for a traceback.",
-    cls=Commands,
-    **PLAIN,
-)
+app = typer.Typer()
 
 
 class Frame(StrEnum):

@@ -1,0 +1,15 @@
+"""``stcal-sfm``: from images to the calibrated target, and all that goes with it."""
+
+import typer
+
+from stcal.cli.help import PLAIN, Commands
+from stcal.cli.sfm import camera, capture, colmap, measure, run, simulate
+
+app = typer.Typer(
+    name="stcal-sfm",
+    help="Calibrate a target from a folder of images. Any command takes --debug for a traceback.",
+    cls=Commands,
+    **PLAIN,
+)
+for part in (run, simulate, colmap, capture, camera, measure):
+    app.add_typer(part.app)
