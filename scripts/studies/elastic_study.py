@@ -103,9 +103,9 @@ def possible(true: Robot, data, case: Case, q: np.ndarray) -> float:
     sigma = np.repeat([SIGMA_RAD, SIGMA_MM], 3)[-derivative.shape[1] :]
     white = (derivative / sigma[:, None]).reshape(-1, derivative.shape[2])
     held = rows.held(state, known, seen.kind)
-    units = parameter_units(derivative)
-    normal = (white.T @ white + held.normal()) * units[:, None] * units
-    covariance = np.linalg.pinv(normal, hermitian=True) * units[:, None] * units
+    normal = white.T @ white + held.normal()
+    units = 1 / np.sqrt(np.diag(normal))  # by what is seen and held of each: moments span ten decades of others
+    covariance = np.linalg.pinv(normal * units[:, None] * units, hermitian=True) * units[:, None] * units
     place = tip_jacobian(state, q, ("",) * len(q), seen.kind)[1][:, 3:]
     return float(np.einsum("rik,kl,ril->r", place, covariance, place).mean())
 
