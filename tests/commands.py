@@ -175,7 +175,7 @@ CALLS = (
     ),
     Call(
         "robot compensate",
-        f"@robot/targets.csv --robot @robot/made.toml --nominal @robot/robot.toml --out >joints.csv {_ALL}",
+        f"@robot/targets.csv --robot @robot/made.toml --nominal @robot/robot.toml --payload-kg 12 --out >joints.csv {_ALL}",
         1.2,
     ),
     Call(

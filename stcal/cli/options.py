@@ -90,6 +90,14 @@ Rotation = Annotated[
         "(fixed axes), ZYX (turned axes).",
     ),
 ]
+PayloadKg = Annotated[
+    float | None,
+    typer.Option(
+        "--payload-kg",
+        help="Take this mass at the flange in all rows, where no column payload_kg says it; by default the robot "
+        "file's.",
+    ),
+]
 MinDiameter = Annotated[
     float | None,
     typer.Option(

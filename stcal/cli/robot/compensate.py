@@ -10,6 +10,7 @@ from stcal.cli.options import (
     FirstTable,
     JsonFile,
     Key,
+    PayloadKg,
     QuaternionOrder,
     Quaternions,
     ReportFile,
@@ -70,6 +71,7 @@ def compensate(
     ] = None,
     quaternions: Quaternions = QuaternionOrder.wxyz,
     rotation: Rotation = None,
+    payload_kg: PayloadKg = None,
     first: FirstTable = None,
     second: SecondTable = None,
     key: Key = "pose",
@@ -91,7 +93,7 @@ def compensate(
     )
     identified = load_robot(robot_file)
     source = one_table(targets, first, second, key, "TARGETS", quaternions=quaternions.value)
-    wanted = read_targets(source, identified, quaternions.value, rotation)
+    wanted = read_targets(source, identified, quaternions.value, rotation, payload_kg)
     result = stage.compensate(identified, wanted, load_robot(nominal) if nominal else None)
     say(stage.compensated_text(result, identified))
     for line in stage.compensated_summary(result):

@@ -10,7 +10,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from stcal.robot.identify.residuals import State
-from stcal.robot.kinematics.forward import elasticity_values
+from stcal.robot.kinematics.forward import GRAVITY_M_S2, elasticity_values
 from stcal.robot.kinematics.model import Chain, Elasticity, Robot
 
 AXIS, ACROSS, PERIODIC, MOMENT = 3, 4, 5, 6
@@ -21,7 +21,6 @@ MASS_KG = 100.0
 BESIDE = 0.15
 """Of the arm's length: a link's centre of mass is so far from the middle of its two joints, each way."""
 DOWN = np.array([0.0, 0.0, -1.0])
-GRAVITY_M_S2 = 9.80665
 SOME = 0.1
 """Share of a σ at which compliances start: at 0 moments would move nothing."""
 

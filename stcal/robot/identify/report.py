@@ -189,8 +189,9 @@ def elastic_rows(result: Identified) -> list[list[str]]:
     if elasticity is None or sigma is None:
         return []
     chain, q = result.state.chain, result.seen.data.q
-    torque = torques(chain, links(chain, q)[0])
-    axis = links(chain, q)[0][..., 2]
+    rotation, origin = links(chain, q)
+    torque = torques(chain, q, rotation, origin)
+    axis = rotation[..., 2]
     about = (torque * axis).sum(2)
     square = (torque**2).sum(2)
     rms = np.sqrt(np.stack([(about**2).mean(1), (square - about**2).clip(0).mean(1)], axis=1))

@@ -84,10 +84,10 @@ def robot_from_chain(chain: Chain, tools: Mapping[str, Rigid], nominal: Robot) -
         elasticity=None,
         tree=tree,
     )
-    return replace(robot, elasticity=_elasticity(robot, chain))
+    return replace(robot, elasticity=_elasticity(robot, chain, end(n - 1)))
 
 
-def _elasticity(robot: Robot, chain: Chain) -> Elasticity | None:
+def _elasticity(robot: Robot, chain: Chain, flange_from_last: Rigid) -> Elasticity | None:
     """That of ``chain`` in the frames of ``robot``, which are turned about the joints' axes, and slid along them: by so
     little, or of so stiff an arm, that what it gives way by stays."""
     elasticity = chain.elasticity
@@ -97,7 +97,9 @@ def _elasticity(robot: Robot, chain: Chain) -> Elasticity | None:
     rigid = replace(chain, elasticity=None)
     turn = np.swapaxes(joint_frames(robot.chain(), zero)[0], 2, 3) @ joint_frames(rigid, zero)[0]
     gravity = robot.world_from_base.rotation.T @ chain.rotation[0] @ elasticity.gravity
-    return replace(elasticity, moment=(turn[:, 0] @ elasticity.moment[:, :, None])[:, :, 0], gravity=gravity)
+    moment = (turn[:, 0] @ elasticity.moment[:, :, None])[:, :, 0]
+    centre = flange_from_last @ elasticity.payload_centre
+    return replace(elasticity, moment=moment, gravity=gravity, payload_centre=centre)
 
 
 def _row_between(gap: Rigid, nominal: DHRow, to_prismatic: bool) -> DHRow:

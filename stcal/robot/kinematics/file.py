@@ -11,6 +11,7 @@ from stcal.errors import InputError
 from stcal.geometry.rigid import Poses, Rigid
 from stcal.io.saving import save
 from stcal.io.toml import Finite, PoseEntry, Strict, load_toml, toml_string
+from stcal.robot.kinematics.conditions import MOST_KG
 from stcal.robot.kinematics.model import Convention, DHRow, Elasticity, Joint, JointType, Robot, Tree
 
 WHAT = "robot file"
@@ -52,6 +53,8 @@ class _ElasticityFile(Strict):
     across_rad_per_Nm: list[Finite] | None = None
     moment_Nm: list[tuple[Finite, Finite, Finite]] | None = None
     periodic_rad: list[tuple[Finite, Finite, Finite, Finite]] | None = None
+    payload_kg: Finite = 0.0
+    payload_centre_mm: tuple[Finite, Finite, Finite] = (0.0, 0.0, 0.0)
 
     def elasticity(self, count: int, where: str) -> Elasticity:
         """Of ``count`` joints."""
@@ -61,9 +64,11 @@ class _ElasticityFile(Strict):
         none = np.zeros(count)
         compliance = np.column_stack([self.axis_rad_per_Nm or none, self.across_rad_per_Nm or none])
         moment = np.array(self.moment_Nm or np.zeros((count, 3)))
-        return Elasticity(
-            compliance, moment, np.array(self.periodic_rad or np.zeros((count, 4))), np.array(self.gravity)
-        )
+        periodic = np.array(self.periodic_rad or np.zeros((count, 4)))
+        if not 0 <= self.payload_kg <= MOST_KG:
+            raise InputError(f"{where}: payload_kg is {self.payload_kg:g}; 0 … {MOST_KG:g} needed")
+        centre = np.array(self.payload_centre_mm)
+        return Elasticity(compliance, moment, periodic, np.array(self.gravity), self.payload_kg, centre)
 
 
 class _RobotFile(Strict):
@@ -219,6 +224,12 @@ def robot_toml(robot: Robot, comments: Sequence[str] = ()) -> str:
 
 def _elasticity_lines(elasticity: Elasticity) -> list[str]:
     axis, across = elasticity.compliance.T
+    load = []
+    if elasticity.payload_kg or elasticity.payload_centre.any():
+        load = [
+            f"payload_kg = {_number(elasticity.payload_kg)}",
+            f"payload_centre_mm = {_numbers(elasticity.payload_centre)}  # in the frame of the flange",
+        ]
     return [
         "[elasticity]  # one entry for each joint; compliance about its axis and across it",
         f"gravity = {_numbers(elasticity.gravity)}  # in the base",
@@ -227,6 +238,7 @@ def _elasticity_lines(elasticity: Elasticity) -> list[str]:
         f"moment_Nm = [{', '.join(_numbers(row) for row in elasticity.moment)}]",
         "# of sin q, cos q, sin 2q, cos 2q",
         f"periodic_rad = [{', '.join(_numbers(row) for row in elasticity.periodic)}]",
+        *load,
     ]
 
 

@@ -9,13 +9,15 @@ from scipy.spatial.transform import Rotation
 
 from stcal.errors import InputError
 from stcal.geometry.rigid import Poses, Rigid, skew
+from stcal.robot.kinematics.conditions import USUAL, Conditions, loaded
 from stcal.robot.kinematics.model import Chain, Elasticity, Robot
 
+GRAVITY_M_S2 = 9.80665
 CHUNK = 8192
 """Joint vectors at a time: their frames, 96 bytes each, stay in a processor's cache of a megabyte."""
 
 
-def forward(robot: Robot, q: ArrayLike, tool: str = "") -> Poses:
+def forward(robot: Robot, q: ArrayLike, tool: str = "", payload_kg: ArrayLike | None = None) -> Poses:
     """base_from_tool of each joint vector.
 
     Parameters
@@ -26,6 +28,8 @@ def forward(robot: Robot, q: ArrayLike, tool: str = "") -> Poses:
         Values of the controller, rad or mm.
     tool : str
         Name of the tool.
+    payload_kg : float or (m,) array, optional
+        Mass at the flange; that of the robot if not given.
 
     Returns
     -------
@@ -35,9 +39,10 @@ def forward(robot: Robot, q: ArrayLike, tool: str = "") -> Poses:
     Raises
     ------
     InputError
-        Joint values of another shape or not finite; an unknown tool.
+        Joint values of another shape or not finite; an unknown tool; a mass that no arm carries.
     """
-    return flange_poses(_from_base_to_tool(robot, tool), _joint_vectors(q, len(robot.rows)))
+    values = _joint_vectors(q, len(robot.rows))
+    return flange_poses(_from_base_to_tool(robot, tool), values, loaded(payload_kg, len(values)))
 
 
 def jacobian(robot: Robot, q: ArrayLike, tool: str = "") -> np.ndarray:
@@ -69,7 +74,7 @@ def jacobian(robot: Robot, q: ArrayLike, tool: str = "") -> np.ndarray:
     return np.moveaxis(columns, 0, 2) @ chain.coupling
 
 
-def flange_poses(chain: Chain, q: np.ndarray) -> Poses:
+def flange_poses(chain: Chain, q: np.ndarray, conditions: Conditions = USUAL) -> Poses:
     """world_from_flange of joint vectors (m, n).
 
     Raises
@@ -82,17 +87,17 @@ def flange_poses(chain: Chain, q: np.ndarray) -> Poses:
     rotation, translation = np.empty((len(q), 3, 3)), np.empty((len(q), 3))
     for start in range(0, len(q), CHUNK):
         part = slice(start, start + CHUNK)
-        axes, origin = _walk(chain, q[part])
+        axes, origin = _walk(chain, q[part], conditions[part])
         end = chain.last_from_flange
         rotation[part] = np.einsum("cjm,ck->mjk", axes, end.rotation)
         translation[part] = (origin + np.einsum("cjm,c->jm", axes, end.translation)).T
     return Poses(rotation, translation)
 
 
-def carried_poses(chain: Chain, q: np.ndarray, targets: Sequence[str]) -> Poses:
+def carried_poses(chain: Chain, q: np.ndarray, targets: Sequence[str], conditions: Conditions = USUAL) -> Poses:
     """world_from_flange, the flange being that of the joint that carries each row's target, of joint vectors (m, n)."""
     if chain.grown is None:
-        return flange_poses(chain, q)
+        return flange_poses(chain, q, conditions)
     carrier = np.array([chain.carrier(name) for name in targets])
     rotation, translation = np.empty((len(q), 3, 3)), np.empty((len(q), 3))
     for each in np.unique(carrier):
@@ -102,7 +107,7 @@ def carried_poses(chain: Chain, q: np.ndarray, targets: Sequence[str]) -> Poses:
     return Poses(rotation, translation)
 
 
-def joint_frames(chain: Chain, q: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def joint_frames(chain: Chain, q: np.ndarray, conditions: Conditions = USUAL) -> tuple[np.ndarray, np.ndarray]:
     """world_from_joint of each joint before it moves: rotations (n, m, 3, 3) and origins (n, m, 3)."""
     n, m = len(chain), len(q)
     rotation, origin = np.empty((n, m, 3, 3)), np.empty((n, m, 3))
@@ -110,7 +115,7 @@ def joint_frames(chain: Chain, q: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     def keep(i: int, axes: np.ndarray, place: np.ndarray) -> None:
         rotation[i], origin[i] = np.moveaxis(axes, 2, 0).swapaxes(1, 2), place.T
 
-    _walk(chain, q, keep)
+    _walk(chain, q, conditions, keep)
     return rotation, origin
 
 
@@ -123,10 +128,21 @@ def links(chain: Chain, q: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     return np.stack([x * c + y * s, y * c - x * s, z], axis=3), origin
 
 
-def torques(chain: Chain, rotation: np.ndarray) -> np.ndarray:
-    """(n, m, 3) N m of gravity about each joint, in the world's axes; ``rotation`` (n, m, 3, 3): of :func:`links`."""
+def torques(
+    chain: Chain, q: np.ndarray, rotation: np.ndarray, origin: np.ndarray, conditions: Conditions = USUAL
+) -> np.ndarray:
+    """(n, m, 3) N m of gravity about each joint, in the world's axes; ``rotation`` (n, m, 3, 3), ``origin`` (n, m, 3):
+    of :func:`links` at joint vectors (m, n)."""
     elasticity = _elasticity(chain)
     carried = np.cumsum((rotation @ elasticity.moment[:, None, :, None])[::-1, :, :, 0], axis=0)[::-1]
+    mass = conditions.payload_kg
+    if mass is None:
+        mass = np.full(len(q), elasticity.payload_kg)
+    if mass.any():
+        place = origin[-1] + rotation[-1] @ elasticity.payload_centre
+        if chain.prismatic[-1]:
+            place = place + rotation[-1, :, :, 2] * (q @ chain.coupling[-1])[:, None]
+        carried = carried + 1e-3 * GRAVITY_M_S2 * mass[:, None] * (place - origin)
     return np.cross(carried, chain.rotation[0] @ elasticity.gravity)
 
 
@@ -137,12 +153,12 @@ def waves(chain: Chain, q: np.ndarray) -> np.ndarray:
     return np.where(chain.prismatic[:, None], 0.0, found)
 
 
-def deflections(chain: Chain, q: np.ndarray) -> np.ndarray:
+def deflections(chain: Chain, q: np.ndarray, conditions: Conditions = USUAL) -> np.ndarray:
     """(n, m, 3) rad by which each link gives way, in its own frame: by the torques on the arm as if it were rigid,
     which differ from those on the bent one by as little as it bends."""
     elasticity = _elasticity(chain)
-    rotation, _ = links(replace(chain, elasticity=None), q)
-    torque = np.einsum("imkc,imk->imc", rotation, torques(chain, rotation))
+    rotation, origin = links(replace(chain, elasticity=None), q)
+    torque = np.einsum("imkc,imk->imc", rotation, torques(chain, q, rotation, origin, conditions))
     axis, across = elasticity.compliance.T
     turn = torque * np.stack([across, across, axis], axis=1)[:, None]
     turn[:, :, 2] += np.einsum("ik,kim->im", elasticity.periodic, waves(chain, q))
@@ -155,12 +171,13 @@ def _elasticity(chain: Chain) -> Elasticity:
     return chain.elasticity
 
 
-def _walk(chain: Chain, q: np.ndarray, visit=None) -> tuple[np.ndarray, np.ndarray]:
+def _walk(chain: Chain, q: np.ndarray, conditions: Conditions = USUAL, visit=None) -> tuple[np.ndarray, np.ndarray]:
     """Axes (3 axes, 3 components, m) and origin (3, m) after the last joint; ``visit`` sees each frame unmoved."""
     m = len(q)
     give = None
     if chain.elasticity is not None:
-        give = Rotation.from_rotvec(deflections(chain, q).reshape(-1, 3)).as_matrix().reshape(len(chain), m, 3, 3)
+        give = Rotation.from_rotvec(deflections(chain, q, conditions).reshape(-1, 3)).as_matrix()
+        give = give.reshape(len(chain), m, 3, 3)
     q = q @ chain.coupling.T
     axes = np.repeat(np.eye(3)[:, :, None], m, axis=2)
     origin = np.zeros((3, m))
@@ -196,9 +213,9 @@ def chain_parameters(chain: Chain) -> list[tuple[int, int]]:
     return [(i, c) for i in range(len(chain)) for c in ((0, 1) if chain.prismatic[i] else (0, 1, 3, 4))]
 
 
-def chain_jacobian(chain: Chain, q: np.ndarray, tip: Poses) -> np.ndarray:
+def chain_jacobian(chain: Chain, q: np.ndarray, tip: Poses, conditions: Conditions = USUAL) -> np.ndarray:
     """Derivative of poses ``tip`` (world_from_tool) by :func:`chain_parameters`, (m, 6, k), in the world's axes."""
-    rotation, origin = joint_frames(chain, q)
+    rotation, origin = joint_frames(chain, q, conditions)
     joint, component = np.array(chain_parameters(chain)).T
     direction = rotation[joint, :, :, component % 3]  # (k, m, 3)
     turning = (component < 3)[:, None, None]
@@ -207,11 +224,11 @@ def chain_jacobian(chain: Chain, q: np.ndarray, tip: Poses) -> np.ndarray:
     return np.moveaxis(np.concatenate(columns, axis=2), 0, 2)
 
 
-def elasticity_jacobian(chain: Chain, q: np.ndarray, tip: Poses) -> np.ndarray:
+def elasticity_jacobian(chain: Chain, q: np.ndarray, tip: Poses, conditions: Conditions = USUAL) -> np.ndarray:
     """Derivative of poses ``tip`` (world_from_tool) by :func:`elasticity_values`, (m, 6, 9 n), in the world's axes."""
     elasticity = _elasticity(chain)
     rotation, origin = links(replace(chain, elasticity=None), q)
-    torque, z = torques(chain, rotation), rotation[..., 2]
+    torque, z = torques(chain, q, rotation, origin, conditions), rotation[..., 2]
     about = z * (z * torque).sum(2)[:, :, None]
     periodic = z * waves(chain, q)[..., None]  # (4, n, m, 3)
     lever = tip.translation - origin

@@ -79,7 +79,9 @@ class Inverse:
         return np.array([s in (REACHED, SINGULAR_POSE, ORIENTATION) for s in self.status], bool)
 
 
-def inverse(robot: Robot, poses: Poses, near: ArrayLike | None = None, tool: str = "") -> Inverse:
+def inverse(
+    robot: Robot, poses: Poses, near: ArrayLike | None = None, tool: str = "", payload_kg: float | None = None
+) -> Inverse:
     """Joint vectors q that bring the tool to ``poses``: forward(robot, q) = base_from_tool.
 
     Of all branches and turns within the joint limits, the one nearest to ``near`` (Euclidean distance, rad, prismatic
@@ -99,6 +101,8 @@ def inverse(robot: Robot, poses: Poses, near: ArrayLike | None = None, tool: str
         of the limits (0 where unlimited), and every other the one nearest to that of the pose before.
     tool : str
         Name of the tool.
+    payload_kg : float, optional
+        Mass at the flange; that of the robot if not given.
 
     Returns
     -------
@@ -108,7 +112,8 @@ def inverse(robot: Robot, poses: Poses, near: ArrayLike | None = None, tool: str
     Raises
     ------
     InputError
-        ``near`` of another shape or not finite; a robot of more than six joints without ``near``; an unknown tool.
+        ``near`` of another shape or not finite; a robot of more than six joints without ``near``; an unknown tool;
+        a mass that no arm carries.
 
     References
     ----------
@@ -116,7 +121,7 @@ def inverse(robot: Robot, poses: Poses, near: ArrayLike | None = None, tool: str
     assumption", Computing 74, 2005.
     """
     m, n = len(poses), len(robot.rows)
-    problem = InverseProblem.of(robot, tool)
+    problem = InverseProblem.of(robot if payload_kg is None else robot.loaded(payload_kg), tool)
     if near is None:
         return _in_sequence(problem, poses)
     near = np.asarray(near, float)

@@ -13,6 +13,7 @@ import numpy as np
 from stcal.errors import InputError
 from stcal.geometry.arrays import frozen
 from stcal.geometry.rigid import Rigid
+from stcal.robot.kinematics.conditions import loaded
 
 Convention = Literal["standard", "modified"]
 JointType = Literal["revolute", "prismatic"]
@@ -78,7 +79,8 @@ class Elasticity:
 
     What joint i carries pulls with the torque T = M × g about its place, M being the sum of the moments of its link and
     of all links after it, each as it is turned. The link gives way by the rotation c T, with one c about the joint's
-    axis and another across it. Gears add an angle with one and two periods a turn of the joint.
+    axis and another across it. Gears add an angle with one and two periods a turn of the joint. A payload is a mass at
+    a place of the flange, and pulls with its weight at that place beside M.
 
     Parameters
     ----------
@@ -91,21 +93,29 @@ class Elasticity:
         rad: of sin q, cos q, sin 2q, cos 2q of revolute joints.
     gravity : (3,) array
         Its direction, of length 1: in the base of a robot, in the first joint's frame of a :class:`Chain`.
+    payload_kg : float
+        Mass that is carried where nothing else is said of joint vectors.
+    payload_centre : (3,) array
+        Its centre, mm: in the flange's frame of a robot, in the last joint's, as it has moved, of a :class:`Chain`.
 
     Raises
     ------
     InputError
-        Arrays of other shapes; a direction that is 0.
+        Arrays of other shapes; a direction that is 0; a mass below 0, or beyond all that arms carry.
     """
 
     compliance: np.ndarray
     moment: np.ndarray
     periodic: np.ndarray
     gravity: np.ndarray
+    payload_kg: float = 0.0
+    payload_centre: np.ndarray = field(default_factory=lambda: np.zeros(3))
 
     def __post_init__(self):
         n = len(self.compliance)
-        for name, shape in (("compliance", (n, 2)), ("moment", (n, 3)), ("periodic", (n, 4)), ("gravity", (3,))):
+        shapes = {"compliance": (n, 2), "moment": (n, 3), "periodic": (n, 4), "gravity": (3,), "payload_centre": (3,)}
+        loaded(self.payload_kg, 1)
+        for name, shape in shapes.items():
             object.__setattr__(self, name, frozen(getattr(self, name), shape, f"elasticity: {name}"))
         length = float(np.linalg.norm(self.gravity))
         if length == 0:
@@ -232,6 +242,19 @@ class Robot:
             raise InputError(f"robot {self.name}: no tool {name!r}; there are {known}")
         return self.tools[name]
 
+    def loaded(self, payload_kg: float) -> "Robot":
+        """The robot with another mass at its flange, kg, which a rigid one gives no way to.
+
+        Raises
+        ------
+        InputError
+            A mass below 0, or beyond all that arms carry.
+        """
+        loaded(payload_kg, 1)
+        if self.elasticity is None:
+            return self
+        return replace(self, elasticity=replace(self.elasticity, payload_kg=float(payload_kg)))
+
     def chain(self) -> "Chain":
         """The fixed transforms in order."""
         gaps, ends = [], []
@@ -245,7 +268,8 @@ class Robot:
         elasticity = self.elasticity
         if elasticity is not None:
             first = self.world_from_base.inverse() @ gaps[0]
-            elasticity = replace(elasticity, gravity=first.rotation.T @ elasticity.gravity)
+            centre = ends[-1] @ elasticity.payload_centre
+            elasticity = replace(elasticity, gravity=first.rotation.T @ elasticity.gravity, payload_centre=centre)
         grown = None if self.tree is None else Grown(self.tree, tuple(ends))
         return Chain(rotation, translation, ends[-1], self.prismatic, self.coupling, elasticity, grown)
 

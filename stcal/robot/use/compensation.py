@@ -179,7 +179,7 @@ def compensate(identified: Robot, targets: Targets, nominal: Robot | None = None
         )
     if nominal is None:
         return _without_nominal(identified, targets)
-    apart = robots_apart(identified, nominal)
+    apart, rigid = robots_apart(identified, nominal), _rigid(identified, targets)
     identified, nominal, others = _with_one_tool(identified, nominal, targets)
     confirmed, doubts = on_targets(nominal, targets)
     poses = poses_of(nominal, targets, targets.joints()) if targets.poses is None else targets.poses
@@ -198,7 +198,7 @@ def compensate(identified: Robot, targets: Targets, nominal: Robot | None = None
         sliding=identified.prismatic,
         reach_mm=reach_mm(identified, targets.tools[0]),
         beyond=stay.beyond,
-        doubts=((apart,) if apart else ()) + doubts + others,
+        doubts=((apart,) if apart else ()) + doubts + others + rigid,
         controller=nominal,
     )
 
@@ -215,6 +215,11 @@ def _stayed(
 def _built(robot: Robot) -> list[tuple[str, int]]:
     """Of each joint its type and the joint that carries it."""
     return [(joint.type, robot.carrier(i)[0]) for i, joint in enumerate(robot.joints)]
+
+
+def _rigid(robot: Robot, targets: Targets) -> tuple[str, ...]:
+    """A note where the robot knows nothing of what a load does."""
+    return targets.conditions.ignored(f"robot {robot.name}") if robot.elasticity is None else ()
 
 
 def _without_nominal(identified: Robot, targets: Targets) -> Compensated:
@@ -240,7 +245,7 @@ def _without_nominal(identified: Robot, targets: Targets) -> Compensated:
         sliding=identified.prismatic,
         reach_mm=reach_mm(identified, targets.tools[0]),
         beyond=stay.beyond,
-        doubts=doubts,
+        doubts=doubts + _rigid(identified, targets),
     )
 
 
@@ -291,7 +296,7 @@ def compensation_file(result: Compensated, robot: Robot) -> CompensationFile:
     def joints(found: Inverse, i: int) -> dict | None:
         return dict(zip(columns, (found.q[i] * unit).tolist(), strict=True)) if found.usable[i] else None
 
-    rows = []
+    rows, mass = [], result.targets.conditions.payload_kg
     quaternions = result.poses.quaternions()
     for i, line in enumerate(result.targets.lines):
         row = {
@@ -303,6 +308,7 @@ def compensation_file(result: Compensated, robot: Robot) -> CompensationFile:
             "joints": joints(result.found, i),
             "error_mm": float(result.found.error_mm[i]),
             "error_rad": float(result.found.error_rad[i]),
+            "payload_kg": None if mass is None else float(mass[i]),
         }
         if result.nominal:
             usable = bool(result.nominal.usable[i])

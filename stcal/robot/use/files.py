@@ -79,6 +79,7 @@ class CompensatedPose(Part):
     joints: dict[str, float] | None
     error_mm: float
     error_rad: float
+    payload_kg: float | None = None
     nominal_status: str = ""
     nominal_joints: dict[str, float] | None = None
     nominal_error_mm: float | None = None
@@ -93,7 +94,8 @@ class CompensationFile(ResultFile):
     counts: dict[ByStatus, int] = Field(description="number of poses")
     poses: list[CompensatedPose] = Field(
         description="the columns above: `line`, `target`, `commanded_mm`, `commanded_quaternion` (w first), `status`, "
-        "`joints` (by column name, null where not reached), `error_mm`, `error_rad`, and with `--nominal` "
+        "`joints` (by column name, null where not reached), `error_mm`, `error_rad`, `payload_kg` (null: as the robot "
+        "file has it), and with `--nominal` "
         "`nominal_status`, `nominal_joints`, `nominal_error_mm`, `nominal_error_rad`"
     )
     notes: list[str] = Field(

@@ -12,13 +12,14 @@ from stcal.geometry.rigid import Poses
 from stcal.io.quaternions import Order
 from stcal.io.table import LENGTHS, Table, read_table
 from stcal.robot.kinematics.columns import oriented, unread
+from stcal.robot.kinematics.conditions import PAYLOAD, USUAL, Conditions, read_conditions
 from stcal.robot.kinematics.forward import forward
 from stcal.robot.kinematics.inverse import Inverse, inverse
 from stcal.robot.kinematics.measurements import ORIENTATION, joint_values, targets_of, within
 from stcal.robot.kinematics.model import Robot
 
 WHAT = "targets"
-NAMES = ("pose", "image", "name", "scene")
+NAMES = ("pose", "image", "name", "scene", PAYLOAD)
 """Columns that say which pose a row is of, where they are there: kept in what is computed of it."""
 
 
@@ -42,6 +43,8 @@ class Targets:
         Of the columns :data:`NAMES` that are there, (m,) each.
     notes : tuple of str
         On columns that were not read, and angles by their convention.
+    conditions : Conditions
+        What the flange carries.
     """
 
     where: str
@@ -51,6 +54,7 @@ class Targets:
     q: np.ndarray | None
     names: dict[str, tuple[str, ...]] = field(default_factory=dict)
     notes: tuple[str, ...] = ()
+    conditions: Conditions = USUAL
 
     def __post_init__(self):
         if self.q is not None:
@@ -69,6 +73,7 @@ class Targets:
             None if self.q is None else self.q[rows],
             {column: tuple(own[i] for i in rows) for column, own in self.names.items()},
             self.notes,
+            self.conditions[rows],
         )
 
     def joints(self) -> np.ndarray:
@@ -79,7 +84,11 @@ class Targets:
 
 
 def read_targets(
-    path: str | Path | Table, robot: Robot, quaternions: Order = "wxyz", rotation: str | None = None
+    path: str | Path | Table,
+    robot: Robot,
+    quaternions: Order = "wxyz",
+    rotation: str | None = None,
+    payload_kg: float | None = None,
 ) -> Targets:
     """Read commanded poses, or joint values that command them.
 
@@ -93,6 +102,8 @@ def read_targets(
         As their columns are named, or x, y, z, w in the order in which these stand.
     rotation : str, optional
         Convention of angles whose columns do not say it, as of :func:`read_measurements`.
+    payload_kg : float, optional
+        Mass at the flange in all rows, where no column ``payload_kg`` says it.
 
     Returns
     -------
@@ -102,8 +113,8 @@ def read_targets(
     Raises
     ------
     InputError
-        Neither poses nor joint values, positions without orientation, angles whose convention is open, bad rows; the
-        message names the line.
+        Neither poses nor joint values, positions without orientation, angles whose convention is open, bad rows, masses
+        that no arm carries; the message names the line.
     """
     table = read_table(path, WHAT, quaternions)
     has_joints = any(name.startswith("q1_") for name in table.columns)
@@ -134,7 +145,8 @@ def read_targets(
         poses,
         joint_values(table, robot) if has_joints else None,
         {column: tuple(table.text(column)) for column in NAMES if column in table},
-        said + unread(table, columns),
+        said + unread(table, (*columns, PAYLOAD)),
+        read_conditions(table, payload_kg),
     )
 
 
@@ -144,11 +156,23 @@ def rows_by_tool(targets: Targets) -> list[tuple[str, np.ndarray]]:
     return [(name, np.flatnonzero(names == name)) for name in dict.fromkeys(targets.tools)]
 
 
+def rows_alike(targets: Targets) -> list[tuple[str, float | None, np.ndarray]]:
+    """Names of tools and masses at the flange (None: the robot's), each two with their rows."""
+    mass = targets.conditions.payload_kg
+    if mass is None:
+        return [(name, None, rows) for name, rows in rows_by_tool(targets)]
+    return [
+        (name, value, rows[mass[rows] == value])
+        for name, rows in rows_by_tool(targets)
+        for value in np.unique(mass[rows]).tolist()
+    ]
+
+
 def poses_of(robot: Robot, targets: Targets, q: np.ndarray) -> Poses:
-    """base_from_tool of joint values (m, n), with each row's tool."""
+    """base_from_tool of joint values (m, n), with each row's tool and load."""
     rotation, translation = np.empty((len(q), 3, 3)), np.empty((len(q), 3))
-    for name, rows in rows_by_tool(targets):
-        part = forward(robot, q[rows], name)
+    for name, mass, rows in rows_alike(targets):
+        part = forward(robot, q[rows], name, mass)
         rotation[rows], translation[rows] = part.rotation, part.translation
     return Poses(rotation, translation)
 
@@ -158,8 +182,8 @@ def joints_of(robot: Robot, targets: Targets, poses: Poses, near: np.ndarray | N
     m = len(poses)
     q, status = np.empty((m, len(robot.rows))), np.empty(m, object)
     error_mm, error_rad = np.empty(m), np.empty(m)
-    for name, rows in rows_by_tool(targets):
-        part = inverse(robot, poses[rows], None if near is None else near[rows], name)
+    for name, mass, rows in rows_alike(targets):
+        part = inverse(robot, poses[rows], None if near is None else near[rows], name, mass)
         q[rows], status[rows] = part.q, part.status
         error_mm[rows], error_rad[rows] = part.error_mm, part.error_rad
     return Inverse(q, tuple(status), error_mm, error_rad)

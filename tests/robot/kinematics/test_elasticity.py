@@ -8,6 +8,7 @@ import pytest
 from stcal.errors import InputError
 from stcal.geometry.rigid import Poses, Rigid
 from stcal.robot import forward, inverse
+from stcal.robot.kinematics.conditions import loaded
 from stcal.robot.kinematics.dh import robot_from_chain
 from stcal.robot.kinematics.example import mh80
 from stcal.robot.kinematics.file import load_robot, robot_toml
@@ -107,6 +108,9 @@ def test_gravity_alone_is_a_rigid_arm(tmp_path):
         ("gravity = [0, 0, 0]", "gravity is [0, 0, 0]"),
         ("axis_rad_per_Nm = [1e-6]", "elasticity: axis_rad_per_Nm has 1 entries, 6 needed"),
         ("stiffness = 3", "stiffness"),
+        ("payload_kg = -1", "elasticity: payload_kg is -1; 0 … 10000 needed"),
+        ("payload_kg = nan", "payload_kg"),
+        ("payload_centre_mm = [1, 2]", "payload_centre_mm"),
     ],
 )
 def test_mistakes_in_a_file_are_named(tmp_path, text, message):
@@ -123,3 +127,72 @@ def test_joint_values_reach_a_pose_of_a_bent_arm():
     found = inverse(robot, wanted)
     off = forward(robot, found.q).difference(wanted)
     assert np.abs(off[:, 3:]).max() < 1e-8
+
+
+def test_a_payload_pulls_with_its_weight_at_its_lever():
+    """50 kg at the flange, about joint 2 of the level arm: 50 · 9.80665 N times the flange's distance before it."""
+    compliance = np.zeros((6, 2))
+    compliance[1, 0] = 1e-6
+    q, rigid = np.zeros((1, 6)), mh80()
+    level = Elasticity(compliance, np.zeros((6, 3)), np.zeros((6, 4)), np.array([0.0, 0.0, -1.0]))
+    robot = replace(rigid, elasticity=level)
+    place = forward(rigid, q).translation[0]
+    reach = place - [rigid.rows[0].a, 0.0, rigid.rows[0].d]
+    turn = 1e-6 * 50 * 9.80665 * reach[0] * 1e-3
+    moved = forward(robot, q, payload_kg=50).translation[0] - place
+    assert moved == pytest.approx([turn * reach[2], 0.0, -turn * reach[0]], abs=2e-3)
+    assert np.abs(forward(robot.loaded(50), q).difference(forward(robot, q, payload_kg=50))).max() == 0
+    assert np.abs(forward(robot, q).translation[0] - place).max() == 0
+
+
+def test_a_payload_is_what_moments_of_all_links_with_it_are():
+    robot, centre, mass = bent(), np.array([30.0, -50.0, 120.0]), 40.0
+    robot = replace(robot, elasticity=replace(robot.elasticity, payload_centre=centre))
+    chain = robot.chain()
+    levers = np.vstack([chain.translation[1:], chain.last_from_flange @ centre])
+    moment = robot.elasticity.moment + 1e-3 * 9.80665 * mass * levers
+    heavier = replace(robot, elasticity=replace(robot.elasticity, moment=moment))
+    q = vectors(robot)
+    off = forward(robot, q, payload_kg=mass).difference(forward(heavier, q))
+    assert np.abs(off).max() < 1e-9
+    assert np.abs(forward(robot, q, payload_kg=mass).difference(forward(robot, q))[:, 3:]).max() > 0.01
+
+
+def test_each_row_has_its_own_payload_and_the_way_back_knows_it():
+    robot = replace(bent(), elasticity=replace(bent().elasticity, payload_centre=np.array([0.0, 20.0, 90.0])))
+    q, mass = vectors(robot), np.repeat([0.0, 60.0], 10)
+    both = forward(robot, q, payload_kg=mass)
+    for value, rows in ((0.0, slice(0, 10)), (60.0, slice(10, 20))):
+        assert np.abs(both[rows].difference(forward(robot, q[rows], payload_kg=value))).max() < 1e-12
+        found = inverse(robot, both[rows], q[rows], payload_kg=value)
+        assert np.abs(found.q - q[rows]).max() < 1e-9
+
+
+def test_a_payload_is_in_the_file_and_in_rows_made_of_a_chain(tmp_path):
+    robot = replace(bent(), elasticity=replace(bent().elasticity, payload_kg=12.5, payload_centre=np.ones(3)))
+    path = tmp_path / "robot.toml"
+    path.write_text(robot_toml(robot))
+    again, q = load_robot(path), vectors(robot)
+    assert again.elasticity.payload_kg == 12.5
+    assert np.abs(forward(again, q).difference(forward(robot, q))).max() < 1e-9
+    step = np.random.default_rng(3).normal(0, 1e-3, len(chain_parameters(robot.chain())))
+    moved = moved_chain(robot.chain(), step)
+    found = robot_from_chain(moved, {"": TOOL}, robot)
+    shift = np.linalg.norm(found.chain().elasticity.payload_centre - moved.elasticity.payload_centre)
+    assert 0 < shift < 1e-2  # the last joint's frame turns and slides about its axis by what was adjusted
+    heavy = loaded(60.0, len(q))
+    sag = flange_poses(moved, q, heavy).translation - flange_poses(moved, q).translation
+    again = flange_poses(found.chain(), q, heavy).translation - flange_poses(found.chain(), q).translation
+    assert np.abs(again - sag).max() < 0.01 * np.abs(sag).max()
+
+
+@pytest.mark.parametrize("mass", [-1.0, np.nan, 2e4, [1.0, 2.0]])
+def test_masses_that_cannot_be_are_refused(mass):
+    robot = bent()
+    with pytest.raises(InputError, match="payload"):
+        forward(robot, vectors(robot), payload_kg=mass)
+
+
+def test_a_rigid_arm_gives_way_to_no_payload():
+    q = vectors(mh80())
+    assert np.abs(forward(mh80(), q, payload_kg=80).difference(forward(mh80(), q))).max() == 0

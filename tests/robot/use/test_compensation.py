@@ -19,7 +19,7 @@ from stcal.robot.kinematics.forward import forward
 from stcal.robot.kinematics.model import Joint
 from stcal.robot.use.compensation import compensate, compensated_csv, compensation_file
 from stcal.robot.use.targets import read_targets
-from stcal.synthetic.measured.arms import joint_vectors, made
+from stcal.synthetic.measured.arms import elastic, joint_vectors, made
 
 JOINTS = [f"q{i}_deg" for i in range(1, 7)]
 FEW = 6
@@ -263,3 +263,47 @@ def test_command_line_names_mistakes_in_one_line(case, monkeypatch, capsys):
     assert code == 2
     assert error.startswith("error: targets ")
     assert len(error.splitlines()) == 1
+
+
+def loaded_rows(case, mass):
+    rows = [[*row, f"{m:g}"] for row, m in zip(case.pose_rows(), mass, strict=True)]
+    return read_targets(case.write([*POSE, "payload_kg"], rows), case.real)
+
+
+def test_each_row_is_compensated_for_its_payload(tmp_path):
+    case = Case(tmp_path)
+    bent = elastic(case.real, np.random.default_rng(4))
+    mass = np.tile([0.0, 80.0], 10)
+    result = compensate(bent, loaded_rows(case, mass), case.nominal)
+    assert set(result.found.status) == {"reached"}
+    reached = forward(bent, result.found.q, payload_kg=mass)
+    assert np.abs(case.poses.difference(reached)[:, 3:]).max() < 1e-8
+    assert np.linalg.norm(case.poses.difference(forward(bent, result.found.q))[1::2, 3:], axis=1).min() > 0.02
+    table = list(csv.DictReader(compensated_csv(result, bent).splitlines()))
+    assert [row["payload_kg"] for row in table[:2]] == ["0", "80"]
+    assert [row.payload_kg for row in compensation_file(result, bent).poses[:2]] == [0.0, 80.0]
+
+
+def test_a_payload_of_a_rigid_robot_is_said_to_do_nothing(tmp_path):
+    case = Case(tmp_path)
+    case.write([*POSE], case.pose_rows()[:FEW])
+    targets = read_targets(tmp_path / "targets.csv", case.real, payload_kg=20)
+    (note,) = compensate(case.real, targets, case.nominal).doubts
+    assert "is rigid, payload_kg moves nothing" in note
+
+
+@pytest.mark.parametrize(
+    ("cell", "option", "message"),
+    [
+        ("-2", None, "line 2: payload_kg is -2; 0 … 10000 needed"),
+        ("nan", None, "payload_kg is 'nan'"),
+        ("1e6", None, "payload_kg is 1e+06"),
+        ("2", 3.0, "a column payload_kg, and --payload-kg 3; leave one of them out"),
+    ],
+)
+def test_payloads_that_cannot_be_are_refused(tmp_path, cell, option, message):
+    case = Case(tmp_path)
+    path = case.write([*POSE, "payload_kg"], [[*case.pose_rows()[0], cell]])
+    with pytest.raises(InputError) as error:
+        read_targets(path, case.real, payload_kg=option)
+    assert message in str(error.value)
