@@ -18,7 +18,15 @@ from pathlib import Path
 
 ROOT = Path(__file__).resolve().parents[1]
 PRINTED = ROOT / "docs" / "printed"
-DOCUMENTS = ("README.md", "docs/cluster.md", "docs/sources.md", "docs/robots.md", "docs/cameras.md", "docs/service.md")
+DOCUMENTS = (
+    "README.md",
+    *sorted(
+        str(path.relative_to(ROOT))
+        for path in (ROOT / "docs").rglob("*.md")
+        if ROOT / "docs" / "reference" not in path.parents
+    ),
+)
+"""All but docs/reference, which holds formats and options."""
 MARK = re.compile(r"<!-- printed by: (.+?) -->")
 FIRST = re.compile(r"# (.+), at commit ([0-9a-f]{7,40})(, .+)?")
 FIGURE = re.compile(r"[-+±]?\d+(?:\.\d+)?")
@@ -47,7 +55,7 @@ class Block:
     @property
     def name(self) -> str:
         """What names it in lists: the document and the words of its first row."""
-        return f"{self.document}: {' '.join(' '.join(self.rows[0]).split())}"[:60].strip()
+        return f"{self.document}: {' '.join(' '.join(self.rows[0]).split())}"[:80].strip()
 
 
 def cells_of(line: str) -> tuple[str, ...]:

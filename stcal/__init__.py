@@ -1,7 +1,7 @@
 """stcal: calibration of stereo targets from photographs of a single camera, and the use of them.
 
-See :func:`stcal.sfm.run` for the main job and ``README.md`` for conventions. Each system is a package, loaded when it
-is first used.
+See :func:`stcal.sfm.run` for the main job and ``docs/explanation/conventions.md`` for conventions. Each system is a
+package, loaded when it is first used.
 """
 
 from importlib import import_module

@@ -1,15 +1,18 @@
 """The documents know every option of every command."""
 
+import re
 from pathlib import Path
 
 import pytest
 from typer.main import get_command
 
+import stcal
 from stcal.cli.main import app
 from tests.scripts import load_script
 
 ROOT = Path(__file__).resolve().parents[1]
-DOCUMENTS = (ROOT / "README.md", ROOT / "data_layout.md", *sorted((ROOT / "docs" / "reference").rglob("*.md")))
+DOCUMENTS = (ROOT / "README.md", ROOT / "data_layout.md", *sorted((ROOT / "docs").rglob("*.md")))
+LINK = re.compile(r"\]\(([^)\s]+)\)")
 
 
 def commands(command, path=()):
@@ -69,3 +72,15 @@ def test_a_table_that_differs_is_named():
     assert changed != text
     again, differing = layout.made_anew(changed)
     assert (again, differing) == (text, ["FacesFile"])
+
+
+@pytest.mark.parametrize("document", DOCUMENTS, ids=lambda path: str(path.relative_to(ROOT)))
+def test_links_of_documents_lead_to_files(document):
+    links = [link.partition("#")[0] for link in LINK.findall(document.read_text(encoding="utf-8"))]
+    paths = [link for link in links if link and not link.startswith("http")]
+    assert [link for link in paths if not (document.parent / link).exists()] == []
+
+
+def test_first_page_is_short_and_the_version_is_one():
+    assert len((ROOT / "README.md").read_text(encoding="utf-8").splitlines()) < 180
+    assert f"\nversion: {stcal.__version__}\n" in (ROOT / "CITATION.cff").read_text(encoding="utf-8")

@@ -15,12 +15,12 @@ FACTS: set[str] = set()
 docs/reference holds formats and options, which tests/test_documents.py compares with the code."""
 
 NOT_YET = {
-    "README.md: method poses error / bound error / σ",  # handeye_study.py
-    "README.md: trial published as published + centres of blurred",  # reproduce_paper.py
-    "README.md: face as published + centres of blurred edges + ec",
-    "README.md: face position, µm predicted σ, µm rotation, mdeg",
-    "README.md: 40 images of [5184, 3456] px, 150 MB, 2 workers,",  # bench_run.py, times
-    "README.md: images pairs mapped pairs matched ms an image gra",  # scale_study.py
+    "docs/accuracy/hand-eye.md: method poses error / bound error / σ",  # handeye_study.py
+    "docs/accuracy/published.md: trial published as published + centres of blurred ed",  # reproduce_paper.py
+    "docs/accuracy/published.md: face as published + centres of blurred edges + eccen",
+    "docs/accuracy/published.md: face position, µm predicted σ, µm rotation, mdeg",
+    "docs/accuracy/time.md: 40 images of [5184, 3456] px, 150 MB, 2 workers, 5 rounds",  # bench_run.py, times
+    "docs/accuracy/time.md: images pairs mapped pairs matched ms an image graph + map",  # scale_study.py
 }
 """Printed by scripts that take long and whose output is not stored yet; to become fewer."""
 

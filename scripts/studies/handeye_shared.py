@@ -1,4 +1,4 @@
-"""Hand-eye calibration of two real data sets, as `stcal handeye` does it: the figures of the README.
+"""Hand-eye calibration of two real data sets, as `stcal handeye` does it: the figures of docs/accuracy.
 
 .venv/bin/python scripts/studies/handeye_shared.py [../shared/data]
 

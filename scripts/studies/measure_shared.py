@@ -1,4 +1,4 @@
-"""The figures of the README on the rendered data sets beside the repository: errors, labels found, the control, and
+"""The figures of docs/accuracy on the rendered data sets beside the repository: errors, labels found, the control, and
 the cross-check with the native COLMAP where that is installed.
 
 .venv/bin/python scripts/studies/measure_shared.py [../shared/data/stereo_target]

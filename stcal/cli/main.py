@@ -12,7 +12,7 @@ from stcal.cli import cameras, handeye, locate, register, robot, sfm
 from stcal.cli.entry import NO_MEMORY, lacks_memory
 from stcal.cli.help import PLAIN, Commands
 from stcal.cli.options import protect_inputs
-from stcal.cli.terminal import printable
+from stcal.cli.terminal import printable, say
 from stcal.errors import StcalError
 
 INTERRUPTED, TERMINATED = 130, 143
@@ -42,9 +42,18 @@ protect_inputs(app)
 @app.callback(invoke_without_command=True)
 def _version(
     version: bool = typer.Option(False, "--version", help="Print the version and exit."),
+    versions: bool = typer.Option(False, "--versions", help="Print versions of all that it is built on, and exit."),
 ) -> None:
     if version:
         print(stcal.__version__)
+        raise typer.Exit
+    if versions:
+        from stcal.workflows.versions import environment
+
+        found = environment()
+        width = max(map(len, found))
+        for name, each in found.items():
+            say(f"{name:{width}}  {each}")
         raise typer.Exit
 
 

@@ -1,4 +1,4 @@
-"""The study behind the README's figures: one trial of each of its methods."""
+"""The study behind the figures of docs/accuracy: one trial of each of its methods."""
 
 import pytest
 

@@ -1,4 +1,4 @@
-"""The simulated experiment of Liu et al. (2017): what the README's table says, for one robot."""
+"""The simulated experiment of Liu et al. (2017): what the table of docs/accuracy says, for one robot."""
 
 import numpy as np
 import pytest

@@ -74,13 +74,13 @@ def test_files_for_the_command(script, data, tmp_path):
     np.testing.assert_allclose(forward(read, q).translation, values[:, :3], atol=1e-3)
 
 
-def test_the_readme_has_what_the_script_prints(script, data, capsys):
+def test_the_page_has_what_the_script_prints(script, data, capsys):
     """Every row of the table of stations, to the last digit that is shown, where another processor rounds alike."""
     _, stations, robot = data
     script.print_tables(stations, robot)
     printed = {cells[1]: cells[2:] for cells in _rows(capsys.readouterr().out) if cells[1] in stations}
-    readme = (Path(script.__file__).parents[2] / "README.md").read_text(encoding="utf-8")
-    shown = {cells[1]: cells[2:] for cells in _rows(readme) if cells[1] in stations}
+    page = (Path(script.__file__).parents[2] / "docs" / "accuracy" / "registration.md").read_text(encoding="utf-8")
+    shown = {cells[1]: cells[2:] for cells in _rows(page) if cells[1] in stations}
     assert sorted(shown) == sorted(printed) == sorted(stations)
     for name, cells in printed.items():
         for a, b in zip(cells, shown[name], strict=True):

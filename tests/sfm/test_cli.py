@@ -3,10 +3,13 @@
 import json
 import sys
 
+import numpy as np
 import pytest
 
+import stcal
 from stcal.cli.main import main, main_sfm
 from stcal.io.design import load_board, load_target
+from stcal.workflows import versions
 
 
 @pytest.fixture
@@ -96,3 +99,18 @@ def test_the_demo_ends_within_its_own_sigma(command, tmp_path):
     comparison = compare(tmp_path / "demo" / "run", tmp_path / "demo" / "data" / "truth.json").content()
     for face_id in ("2", "3", "4", "5"):
         assert 0.1 < comparison["faces"][face_id]["normalised_error"] < 2.0
+
+
+def test_versions_for_reports_of_faults(command, monkeypatch):
+    """Also where COLMAP is not there, or a library does not load."""
+    code, out, _ = command("--versions", entry=main)
+    found = dict(line.split(maxsplit=1) for line in out.splitlines() if not line.startswith("native"))
+    assert code == 0
+    assert found["stcal"] == stcal.__version__
+    assert found["NumPy"] == np.__version__
+    assert found["pycolmap"].startswith("4.2")
+    monkeypatch.setenv("PATH", "")
+    monkeypatch.setitem(versions.LIBRARIES, "OpenCV", "no_such_module")
+    again = command("--versions")[1]
+    assert "native colmap  not found" in again
+    assert "OpenCV         does not load: No module named 'no_such_module'" in again

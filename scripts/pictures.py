@@ -1,0 +1,102 @@
+"""The pictures of README.md and docs/: what is found in the sample photographs, and the report's page.
+
+.venv/bin/python scripts/pictures.py [NAME …] [--out FOLDER]
+
+Calibrates `tests/data/sample`, whose photographs another program rendered, and writes `docs/pictures/`. `report` needs
+Chromium on the PATH, as its page is photographed in the browser.
+"""
+
+import argparse
+import csv
+import shutil
+import subprocess
+import tempfile
+from collections.abc import Callable
+from pathlib import Path
+
+from PIL import Image
+
+from stcal.sfm import run
+
+ROOT = Path(__file__).resolve().parents[1]
+SAMPLE = ROOT / "tests" / "data" / "sample"
+FOUND_IN = "12/IMG_1001.jpg"
+"""Three faces and the board, turned."""
+MARGIN_PX = 45
+HALF_WIDTH_PX = 760
+PAGE_PX = (1280, 1240)
+BROWSERS = ("chromium", "chromium-browser", "google-chrome", "chrome")
+
+
+def found(result: Path, out: Path) -> None:
+    """A photograph, and beside it what was found there: the overlay of the run, cut to the circles."""
+    photograph, overlay = Image.open(SAMPLE / "images" / FOUND_IN), Image.open(result / "overlays" / f"{FOUND_IN}.jpg")
+    box = box_of_circles(result / "detections.csv", FOUND_IN, photograph.size)
+    halves = [cut(image, box, photograph.width) for image in (photograph.convert("RGB"), overlay)]
+    side_by_side = Image.new("RGB", (2 * HALF_WIDTH_PX + 8, halves[0].height), "white")
+    for k, half in enumerate(halves):
+        side_by_side.paste(half, (k * (HALF_WIDTH_PX + 8), 0))
+    side_by_side.save(out / "found.jpg", quality=88)
+
+
+def box_of_circles(detections: Path, image: str, size: tuple[int, int]) -> tuple[float, float, float, float]:
+    """What holds all labelled circles of an image with a margin: left, top, right, bottom, px of the photograph."""
+    with detections.open(encoding="utf-8", newline="") as file:
+        rows = [row for row in csv.DictReader(file) if row["image"] == image and row["label"]]
+    x, y = ([float(row[key]) for row in rows] for key in ("x_px", "y_px"))
+    return (
+        max(min(x) - MARGIN_PX, 0),
+        max(min(y) - MARGIN_PX, 0),
+        min(max(x) + MARGIN_PX, size[0]),
+        min(max(y) + MARGIN_PX, size[1]),
+    )
+
+
+def cut(image: Image.Image, box: tuple[float, float, float, float], width: int) -> Image.Image:
+    """That part of an image, whatever its own size, of a photograph ``width`` px wide; ``HALF_WIDTH_PX`` wide."""
+    scale = image.width / width
+    height = round(HALF_WIDTH_PX * (box[3] - box[1]) / (box[2] - box[0]))
+    scaled = (box[0] * scale, box[1] * scale, box[2] * scale, box[3] * scale)
+    return image.resize((HALF_WIDTH_PX, height), Image.Resampling.LANCZOS, box=scaled)
+
+
+def report(result: Path, out: Path) -> None:
+    """The first screen of the report."""
+    photograph_page(result / "report.html", out / "report.png")
+
+
+def photograph_page(page: Path, out: Path, size: tuple[int, int] = PAGE_PX) -> None:
+    """A page as a browser shows it, in few colours.
+
+    Raises
+    ------
+    SystemExit
+        There is no browser.
+    """
+    browser = next((found for name in BROWSERS if (found := shutil.which(name))), None)
+    if browser is None:
+        raise SystemExit(f"no browser on the PATH ({', '.join(BROWSERS)} were looked for); install Chromium")
+    words = ["--headless", "--no-sandbox", "--disable-gpu", "--hide-scrollbars", f"--screenshot={out}"]
+    window = f"--window-size={size[0]},{size[1]}"
+    subprocess.run([browser, *words, window, page.resolve().as_uri()], check=True, capture_output=True)
+    Image.open(out).convert("RGB").quantize(128).save(out, optimize=True)
+
+
+PICTURES: dict[str, Callable[[Path, Path], None]] = {"found": found, "report": report}
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("names", nargs="*", metavar="NAME", help=f"{', '.join(PICTURES)}; all if none is given")
+    parser.add_argument("--out", type=Path, default=ROOT / "docs" / "pictures")
+    arguments = parser.parse_args()
+    arguments.out.mkdir(parents=True, exist_ok=True)
+    with tempfile.TemporaryDirectory() as folder:
+        result = Path(folder) / "result"
+        run(SAMPLE / "images", SAMPLE / "cameras.txt", result)
+        for name in arguments.names or PICTURES:
+            PICTURES[name](result, arguments.out)
+
+
+if __name__ == "__main__":
+    main()
