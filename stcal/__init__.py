@@ -19,3 +19,7 @@ def __getattr__(name: str):
     if name not in __all__:
         raise AttributeError(f"module stcal has no attribute {name}")
     return import_module(f"stcal.{name}")
+
+
+def __dir__() -> list[str]:
+    return sorted({*globals(), *__all__})

@@ -24,7 +24,7 @@ LAYERS = (
     ("sfm", "robot", "register", "handeye", "locate"),
     ("synthetic/measured",),
     ("workflows",),
-    ("cli",),
+    ("cli", "__main__"),
 )
 """From below; a folder imports its own layer and those below it. ``design`` lies below ``io``, whose readers make
 designs. ``synthetic`` knows no system, which must not be tested on its own view of the world; ``synthetic/measured``

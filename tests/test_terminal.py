@@ -1,15 +1,24 @@
 """What commands print is text: a terminal obeys nothing of it."""
 
+import inspect
+import io
+import json
 import re
 import subprocess
 import sys
 from pathlib import Path
+from typing import get_args
 
 import pytest
+from typer.models import ParameterInfo
+from typer.testing import CliRunner
 
 import stcal
 from stcal.cli import terminal
 from stcal.cli.entry import lacks_memory
+from stcal.cli.main import app, main
+from tests.commands import COMMANDS
+from tests.outcome import INPUT, assert_error
 
 CLI = Path(stcal.__file__).parent / "cli"
 
@@ -97,3 +106,84 @@ def test_text_that_nothing_takes_is_one_line(words):
     assert found.returncode == 2
     assert found.stderr.startswith("error: No space left on device; ")
     assert found.stderr.count("\n") == 1
+
+
+# --- how the program is called ---
+
+
+def test_the_package_is_the_program():
+    words = [sys.executable, "-P", "-m", "stcal"]
+    assert subprocess.run([*words, "--version"], capture_output=True, text=True, check=True).stdout.strip() == (
+        stcal.__version__
+    )
+
+
+@pytest.mark.parametrize("words", ["", *COMMANDS])
+def test_h_is_help(words):
+    """Of the program, of each group and of each command; the same text as with the whole word."""
+    short, long = (CliRunner().invoke(app, [*words.split(), option]) for option in ("-h", "--help"))
+    assert (short.exit_code, short.output) == (0, long.output)
+    assert short.output.startswith("Usage: ")
+    assert re.search(r"-h, --help +Show this message and exit\.", short.output)
+
+
+# --- a file to standard output ---
+
+
+@pytest.fixture
+def program(monkeypatch, capsys):
+    """What a command came to: (exit code, standard output, standard error)."""
+
+    def call(*words):
+        monkeypatch.setattr("sys.argv", ["stcal", *map(str, words)])
+        with pytest.raises(SystemExit) as end:
+            main()
+        return end.value.code, *capsys.readouterr()
+
+    return call
+
+
+def test_json_goes_to_standard_output_alone(program, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    nominal = tmp_path / "robot.toml"
+    assert program("robot", "init", nominal)[0] == 0
+    words = ["robot", "design", "--robot", nominal, "--count", "16", "--candidates", "40", "--out", "q.csv"]
+    _, said, _ = program(*words, "--json", "design.json")
+    code, out, err = program(*words, "--json", "-")
+    assert code == 0
+    assert json.loads(out) == json.loads((tmp_path / "design.json").read_text(encoding="utf-8"))
+    assert err.splitlines() == said.replace("written: design.json\n", "").splitlines()
+    assert not (tmp_path / "-").exists()
+
+
+def test_only_json_goes_to_standard_output(program, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    nominal = tmp_path / "robot.toml"
+    program("robot", "init", nominal)
+    words = ["robot", "design", "--robot", nominal, "--count", "16", "--candidates", "40"]
+    outcome = program(*words, "--out", "-")
+    assert_error(outcome, INPUT, "--out -: only --json writes to standard output; give the name of a file")
+    assert not (tmp_path / "-").exists()
+
+
+def test_every_json_option_says_so():
+    """``--json`` means the same wherever it stands."""
+    for name, command in COMMANDS.items():
+        for parameter in inspect.signature(command, eval_str=True).parameters.values():
+            info = next(each for each in get_args(parameter.annotation) if isinstance(each, ParameterInfo))
+            if "--json" in (info.default, *(info.param_decls or ())):
+                assert "to standard output with `-`" in (info.help or ""), name
+                assert parameter.name in command.outputs  # type: ignore[attr-defined]
+
+
+@pytest.mark.parametrize(
+    ("encoding", "shown"), [("utf-8", "12 µm \\u202e\\u009b"), ("ascii", "12 \\u00b5m \\u202e\\u009b")]
+)
+def test_json_on_a_terminal_is_printable_and_the_same(monkeypatch, encoding, shown):
+    raw = io.BytesIO()
+    monkeypatch.setattr("sys.stdout", io.TextIOWrapper(raw, encoding=encoding))
+    with terminal.said_apart():
+        terminal.write(terminal.STANDARD_OUTPUT, {"note": "12 µm \u202e\x9b"})
+    text = raw.getvalue().decode(encoding)
+    assert json.loads(text) == {"note": "12 µm \u202e\x9b"}
+    assert shown in text

@@ -88,7 +88,7 @@ def _program() -> ModuleType:
 def _require_address_space() -> None:
     """End where a limit of the system (`ulimit -v`) is below what loading takes: C libraries end the process then
     without a word, or hang. Help and version load none of them."""
-    if sys.platform == "win32" or {"--help", "--version"} & set(sys.argv):
+    if sys.platform == "win32" or {"-h", "--help", "--version"} & set(sys.argv):
         return
     import resource
 

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Annotated, get_args
 
 import typer
 
+from stcal.cli.terminal import STANDARD_OUTPUT, print_each, said_apart
 from stcal.errors import InputError
 from stcal.io.saving import keep_apart
 
@@ -42,7 +43,10 @@ RobotFile = Annotated[
 ]
 LayoutFile = Annotated[Path, typer.Option("--layout", help="Read the target's tags from this file (TOML).")]
 JsonFile = Annotated[
-    Path | None, typer.Option("--json", writable=True, help="Also write everything to this file (JSON).")
+    Path | None,
+    typer.Option(
+        "--json", writable=True, help="Also write everything to this file (JSON); to standard output with `-`."
+    ),
 ]
 ReportFile = Annotated[
     Path | None,
@@ -166,7 +170,6 @@ def several_tables(
         from stcal.io.poses.mapped import read_mapped
 
         return read_mapped(given, columns, what, quaternions)
-    from stcal.cli.terminal import print_each
     from stcal.io.join import join
 
     joined = [join(str(first), str(second), key, prefixes, quaternions, columns) for second in seconds]
@@ -220,7 +223,7 @@ def ellipse_options(min_diameter: float | None, max_diameter: float) -> "Ellipse
 
 def protect_inputs(application: typer.Typer) -> None:
     """Let no command of an application write over what it was given to read: every path among its parameters is an
-    input, but those whose option says that it is ``writable``."""
+    input, but those whose option says that it is ``writable``. Standard output is that of ``--json -`` alone."""
     for command in application.registered_commands:
         if command.callback is not None:
             command.callback = _protected(command.callback)
@@ -249,8 +252,13 @@ def _protected(command: Callable) -> Callable:
             if isinstance(path, Path)
         ]
         written, read = ([(words[n], p) for n, p in paths if (n in outputs) == own] for own in (True, False))
-        keep_apart(written, read)
-        return command(**given)
+        alone = [option for option, path in written if path == STANDARD_OUTPUT]
+        for option in alone:
+            if option != "--json":
+                raise InputError(f"{option} -: only --json writes to standard output; give the name of a file")
+        keep_apart([each for each in written if each[1] != STANDARD_OUTPUT], read)
+        with said_apart() if alone else nullcontext():
+            return command(**given)
 
     checked.outputs = frozenset(outputs)  # type: ignore[attr-defined]
     return checked

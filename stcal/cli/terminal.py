@@ -1,12 +1,16 @@
 """What commands say: results, in characters that a terminal prints and does not obey; progress of long work, on
-standard error; and the files they write."""
+standard error; and the files they write, one of them to standard output where it is asked for there."""
 
+import json
+import re
 import sys
 import time
 import unicodedata
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
+from contextlib import contextmanager, redirect_stdout
+from contextvars import ContextVar
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, TextIO
 
 from stcal.io import saving
 
@@ -14,6 +18,10 @@ if TYPE_CHECKING:
     from rich.progress import TaskID
 
 LINE_EVERY_S = 5.0
+STANDARD_OUTPUT = Path("-")
+"""In place of a JSON file's name."""
+_taker: ContextVar[TextIO | None] = ContextVar("_taker", default=None)
+"""Standard output while a file goes there."""
 
 
 class StageProgress:
@@ -68,10 +76,31 @@ def say(*values: object, sep: str = " ", end: str = "\n") -> None:
     print(printable(sep.join(map(str, values))), end=end)
 
 
+@contextmanager
+def said_apart() -> Iterator[None]:
+    """Keep standard output for the file that goes there; all that is said goes to standard error meanwhile."""
+    token = _taker.set(sys.stdout)
+    try:
+        with redirect_stdout(sys.stderr):
+            yield
+    finally:
+        _taker.reset(token)
+
+
 def write(path: Path, content, said: str = "written") -> None:
-    """Save text, bytes, or a dict or result file as JSON, and say so."""
+    """Save text, bytes, or a dict or result file as JSON, and say so; or give JSON to standard output, ``-``."""
+    if path == STANDARD_OUTPUT and (taker := _taker.get()) is not None:
+        taker.write(_escaped(saving.json_text(content), taker.encoding or "ascii"))
+        taker.flush()
+        return
     saving.save(path, content if isinstance(content, str | bytes) else saving.json_text(content))
     say(f"{said}: {path}")
+
+
+def _escaped(text: str, encoding: str) -> str:
+    """JSON whose strings have ``\\u....`` in place of what a terminal would obey, or what the encoding has not."""
+    whole = encoding.lower().replace("-", "") == "utf8"
+    return re.sub(r"[^ -~\n]", lambda c: c[0] if whole and c[0].isprintable() else json.dumps(c[0])[1:-1], text)
 
 
 def print_each(said: str, lines: Iterable[object]) -> None:

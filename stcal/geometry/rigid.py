@@ -200,6 +200,12 @@ class Poses:
             raise InputError(f"quaternion {off.argmax() + 1}: length off 1 by {off.max():.3g}, {UNIT_WITHIN:g} allowed")
         return cls(Rotation.from_quat(wxyz[:, [1, 2, 3, 0]]).as_matrix(), translation)
 
+    def matrix(self) -> np.ndarray:
+        """Homogeneous matrices, (m, 4, 4)."""
+        m = np.tile(np.eye(4), (len(self), 1, 1))
+        m[:, :3, :3], m[:, :3, 3] = self.rotation, self.translation
+        return m
+
     def quaternions(self) -> np.ndarray:
         """(m, 4), w first and not negative."""
         return Rotation.from_matrix(np.array(self.rotation)).as_quat(canonical=True)[:, [3, 0, 1, 2]]

@@ -11,7 +11,7 @@ Lengths in mm, angles in rad, joint values (m, n) as the controller has them::
     print(found.rank, found.held_out.position_mm.mean(), found.covariance.shape)
     robot.save_robot("identified.toml", found.robot)
 
-    base_from_tool = robot.forward(found.robot, data.q)  # m poses at once
+    base_from_tool = robot.forward(found.robot, data.q)  # m poses at once; .matrix() is (m, 4, 4)
     jacobian = robot.jacobian(found.robot, data.q)  # (m, 6, n)
     solved = robot.inverse(found.robot, base_from_tool, data.q)  # solved.q, solved.status
     targets = robot.read_targets("targets.csv", nominal)

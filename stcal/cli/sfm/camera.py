@@ -8,7 +8,6 @@ import typer
 from stcal.cli.options import ReportFile, TargetFile, Workers
 from stcal.cli.terminal import StageProgress, say, write
 from stcal.errors import InputError
-from stcal.io.saving import json_text, save
 
 app = typer.Typer()
 
@@ -41,7 +40,10 @@ def calibrate_camera(
     json_file: Annotated[
         Path | None,
         typer.Option(
-            "--json", writable=True, help="Write figures and checks to this file (JSON); beside --out if not given."
+            "--json",
+            writable=True,
+            help="Write figures and checks to this file (JSON); to standard output with `-`; beside --out if not "
+            "given.",
         ),
     ] = None,
     report: ReportFile = None,
@@ -70,9 +72,9 @@ def calibrate_camera(
     write_cameras_txt(out, CalibratedCamera.of(own.camera, own.colmap_model, own.covariance))
     summary = CalibrationFile.of(result)
     json_file = json_file or out.with_suffix(".json")
-    save(json_file, json_text(summary))
     say(calibration_text(result, summary))
-    say(f"camera file: {out}\nfigures and checks: {json_file}")
+    say(f"camera file: {out}")
+    write(json_file, summary, "figures and checks")
     if report:
         from stcal.sfm.camera.report import calibration_page
 

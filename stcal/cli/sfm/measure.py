@@ -43,7 +43,8 @@ def measure(
         typer.Option(
             "--json",
             writable=True,
-            help="Also write everything to this file, both solutions of an undecided image too (JSON).",
+            help="Also write everything to this file, both solutions of an undecided image too (JSON); to standard "
+            "output with `-`.",
         ),
     ] = None,
     report: ReportFile = None,

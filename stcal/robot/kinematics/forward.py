@@ -34,7 +34,7 @@ def forward(robot: Robot, q: ArrayLike, tool: str = "", payload_kg: ArrayLike | 
     Returns
     -------
     Poses
-        m transforms, mm.
+        m transforms, mm; one for a single joint vector. ``.matrix()`` has them as (m, 4, 4), ``[i].matrix()`` one.
 
     Raises
     ------

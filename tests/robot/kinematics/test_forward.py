@@ -125,6 +125,16 @@ def test_rows_of_a_moved_chain_make_its_poses(seed, convention):
     assert np.abs(apart[:, :3]).max() < 1e-12
 
 
+def test_poses_have_matrices():
+    """One joint vector or many: products of the matrices are those of the transforms."""
+    q = joint_vectors(mh80(), 5, np.random.default_rng(1))
+    many, one = forward(mh80(), q), forward(mh80(), q[2])
+    assert many.matrix().shape == (5, 4, 4)
+    assert one.matrix().shape == (1, 4, 4)
+    assert (one[0].matrix() == many.matrix()[2]).all()
+    np.testing.assert_allclose(many.matrix() @ many.inverse().matrix(), np.tile(np.eye(4), (5, 1, 1)), atol=1e-12)
+
+
 def test_many_are_the_same_as_one_by_one():
     robot = mh80()
     q = joint_vectors(robot, CHUNK + 5, np.random.default_rng(0))
