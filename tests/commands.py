@@ -112,6 +112,8 @@ CALLS = (
     Call("sfm compare", "@run @data/truth.json --json >errors.json"),
     Call("sfm compare", "@run/faces.json @data/truth.json --json >errors.json"),
     Call("sfm verify", "@run"),
+    Call("sfm report", "~run --pdf", 5.0),
+    Call("sfm report", "@run --out >page.html", 3.0),
     Call("sfm export-database", "@run +copy.db --schema 3.8"),
     Call("sfm export-database", "@run +copy.db --schema 4.2"),
     *(Call("sfm export-model", f"@run +model --format {kind}") for kind in ("colmap-bin", "colmap-txt", "ply", "nvm")),

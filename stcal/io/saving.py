@@ -13,11 +13,14 @@ RUN_MARKER = "stcal-run.json"
 """Tells a run's folder from others."""
 CAMERA, TARGET, BOARD = "cameras.txt", "target.toml", "board.toml"
 """Copies of what a run was given."""
+REPORT_PDF = "report.pdf"
+"""Of a run's report.html, where one was asked for."""
 RUN_ENTRIES = (
     RUN_MARKER,
     "faces.json",
     "report.json",
     "report.html",
+    REPORT_PDF,
     "labels.csv",
     "detections.csv",
     "database.db",
@@ -32,7 +35,7 @@ RUN_ENTRIES = (
 UNFINISHED, ADDED, READY, CACHE = "unfinished", "added", "ready", "cache"
 """Folders in it: of a run that is going on, of files that a command adds to a finished one, of results about to take
 their places, of what later runs take up."""
-NEVER_READ = (".csv", ".json", ".html", ".svg")
+NEVER_READ = (".csv", ".json", ".html", ".pdf", ".svg")
 """Suffixes of outputs; but for a run's entries, what commands read from a folder are images, YAML poses, and COLMAP's
 models and databases."""
 

@@ -24,6 +24,7 @@ from stcal.cli.options import (
 )
 from stcal.cli.terminal import StageProgress, say, write
 from stcal.errors import InputError
+from stcal.io.saving import keep_apart
 
 app = typer.Typer()
 
@@ -220,6 +221,23 @@ def verify(run: Run, out: JsonFile = None) -> None:
     if out:
         write(out, result, "as JSON")
     require_whole(result)
+
+
+@app.command()
+def report(
+    run: Run,
+    pdf: Annotated[bool, typer.Option("--pdf", help="Also write the page as PDF, beside it (stcal[pdf]).")] = False,
+    out: Annotated[
+        Path | None,
+        typer.Option("--out", writable=True, help="Write the page to this file (HTML), not into the run's folder."),
+    ] = None,
+) -> None:
+    """Write the report of a finished run again, from the files in its folder: the page, and a PDF of it."""
+    from stcal.sfm.run.folder import report_again
+
+    if pdf and out is not None:
+        keep_apart([("--pdf", out.with_suffix(".pdf"))], [("RUN", run)])
+    say(report_again(run, pdf, out).text())
 
 
 def _flatness(text: str) -> float | None:

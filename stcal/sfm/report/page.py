@@ -26,7 +26,7 @@ SOLVES = {
 FRAMES = {"plane": "plane: Z from the plane of all circles", "three-point": "three-point: from three circles"}
 
 
-def report_html(report: dict, overlays: dict[str, bytes], reload_s: int | None = None) -> str:
+def report_html(report: dict, overlays: dict[str, bytes], reload_s: int | None = None, gone: int = 0) -> str:
     """The page.
 
     Parameters
@@ -34,6 +34,7 @@ def report_html(report: dict, overlays: dict[str, bytes], reload_s: int | None =
     report : what :func:`stcal.sfm.run.output.report_of` made
     overlays : JPEG by image name
     reload_s : the page loads itself anew so often; never where None
+    gone : overlays that are no longer in the run's folder
     """
     colours = figures.group_colours([group["name"] for group in report["groups"]])
     boards, views, bars = _drawn(report, colours)
@@ -62,7 +63,8 @@ def report_html(report: dict, overlays: dict[str, bytes], reload_s: int | None =
         **({"compared": comparison_cells(report["comparison"])} if "comparison" in report else {}),
         **({"cross": crosscheck_values(report["crosscheck"])} if "crosscheck" in report else {}),
         overlays=_overlays(report, overlays),
-        rest=len(report["images"]) - len(overlays),
+        rest=len(report["images"]) - len(overlays) - gone,
+        gone=gone,
     )
 
 

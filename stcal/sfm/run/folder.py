@@ -5,6 +5,7 @@ import hashlib
 import os
 from collections.abc import Iterator, Mapping
 from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -13,8 +14,10 @@ from stcal.design import TargetDesign
 from stcal.errors import InputError
 from stcal.io.camera import CalibratedCamera, write_cameras_txt
 from stcal.io.design import board_toml, target_toml
-from stcal.io.saving import BOARD, CAMERA, TARGET, json_text, save
+from stcal.io.json import checked, read_json
+from stcal.io.saving import BOARD, CAMERA, RUN_MARKER, TARGET, json_text, save
 from stcal.parallel import Progress
+from stcal.report.pdf import pdf_of, require_pdf
 from stcal.sfm.adjust.file import FacesFile
 from stcal.sfm.data.model import GroupModel
 from stcal.sfm.data.observations import ImageObservations
@@ -25,8 +28,10 @@ from stcal.sfm.mapping.database import image_ids, labels_csv, write_database
 from stcal.sfm.mapping.models import write_model
 from stcal.sfm.report.page import report_html, shown_overlays
 from stcal.sfm.run.output import report_of
+from stcal.sfm.run.report import ReportFile
 from stcal.sfm.run.result import RunResult
 from stcal.sfm.run.saved import SavedRun
+from stcal.sfm.run.transaction import added_results, complete_interrupted
 
 LONGEST_NAME = 200
 """Bytes of an image's name in that of its overlay; file systems take 255, with what is added while it is written."""
@@ -111,6 +116,69 @@ def write_report(out: Path, report: dict, run: Path, reload_s: int | None = None
     page = _report_page(run, report, reload_s)
     save(out / "report.json", json_text(report))
     save(out / "report.html", page)
+
+
+@dataclass(frozen=True, slots=True)
+class ReportAgain:
+    """``files`` : page and PDF that were written; ``gone`` : overlays that the folder no longer holds, so that the page
+    is without them."""
+
+    files: tuple[Path, ...]
+    gone: int
+
+    def text(self) -> str:
+        """For the terminal."""
+        told = [f"{self.gone} overlays are no longer in the folder: the report is without them"] if self.gone else []
+        return "\n".join([*told, *(f"report: {path}" for path in self.files)])
+
+
+def report_again(run: Path, pdf: bool, out: Path | None = None) -> ReportAgain:
+    """Make the page of a finished run anew from its ``report.json`` and its overlays, and a PDF of it.
+
+    Parameters
+    ----------
+    run : the run's folder
+    pdf : whether to make the PDF too
+    out : file for the page, the PDF beside it; where None, those in the folder are replaced
+
+    Raises
+    ------
+    InputError
+        Not a finished run, a damaged file in it, a file that cannot be written, or no WeasyPrint.
+    """
+    if not (run / RUN_MARKER).is_file():
+        raise InputError(f"run {run}: not a run's folder (no {RUN_MARKER}); give the --out of a finished run")
+    if out is not None and out.suffix.lower() == ".pdf":
+        raise InputError(f"--out {out}: the page is HTML; give {out.with_suffix('.html')}, and --pdf for {out.name}")
+    if pdf:
+        require_pdf()
+    if out is not None:
+        complete_interrupted(run)
+        files, gone = _page_and_pdf(run, pdf, out)
+        return ReportAgain(files, gone)
+    with added_results(run) as stage:
+        files, gone = _page_and_pdf(run, pdf, stage / "report.html")
+    return ReportAgain(tuple(run / path.name for path in files), gone)
+
+
+def _page_and_pdf(run: Path, pdf: bool, out: Path) -> tuple[tuple[Path, ...], int]:
+    """Files, and how many overlays are gone."""
+    path = run / "report.json"
+    report = read_json(path, "run", "run it again")
+    try:
+        checked(report, ReportFile)
+    except InputError as error:
+        raise InputError(f"{path}: damaged, or of another version ({error}); run it again") from error
+    shown = shown_overlays(report)
+    overlays = {name: there.read_bytes() for name in shown if (there := overlay_path(run, name)).is_file()}
+    gone = len(shown) - len(overlays)
+    page = report_html(report, overlays, gone=gone)
+    made: list[tuple[Path, bytes]] = [(out, page.encode())]
+    if pdf:
+        made.append((out.with_suffix(".pdf"), pdf_of(page)))
+    for file, content in made:
+        save(file, content)
+    return tuple(file for file, _ in made), gone
 
 
 def _report_page(run: Path, report: dict, reload_s: int | None = None) -> bytes:

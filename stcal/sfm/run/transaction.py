@@ -17,7 +17,18 @@ import filelock
 
 from stcal.errors import InputError, StcalError
 from stcal.io.json import read_result
-from stcal.io.saving import ADDED, CACHE, READY, RUN_ENTRIES, RUN_MARKER, UNFINISHED, json_text, real_place, save
+from stcal.io.saving import (
+    ADDED,
+    CACHE,
+    READY,
+    REPORT_PDF,
+    RUN_ENTRIES,
+    RUN_MARKER,
+    UNFINISHED,
+    json_text,
+    real_place,
+    save,
+)
 from stcal.sfm.run.marker import MarkerFile, digest_of, files_below
 
 COMPARISON = "compare.json"
@@ -79,6 +90,7 @@ def added_results(out: Path) -> Iterator[Path]:
     """A folder for files that are added to a finished run, or that replace some of its own.
 
     At the end of the block they take their places, and the marker has their hashes. No other command writes meanwhile.
+    The PDF of a report that is replaced goes with it.
 
     Raises
     ------
@@ -93,10 +105,13 @@ def added_results(out: Path) -> Iterator[Path]:
         try:
             yield stage
             marker = read_result(out / RUN_MARKER, MarkerFile, "run", "run it again")
+            gone = {REPORT_PDF} if (stage / "report.html").exists() else set()
             if marker.sha256 is not None:  # of a version that kept none
-                marker = marker.sealed(marker.sha256 | _digests(stage))
+                others = {name: digest for name, digest in marker.sha256.items() if name not in gone}
+                marker = marker.sealed(others | _digests(stage))
             with _writable(out):
-                _exchange(stage, out, marker, [name for name in RESULTS if os.path.lexists(out / name)])
+                kept = [name for name in RESULTS if name not in gone and os.path.lexists(out / name)]
+                _exchange(stage, out, marker, kept)
         finally:
             remove(stage)
 

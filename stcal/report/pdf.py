@@ -1,0 +1,46 @@
+"""A page of the package as PDF, for print and for files: by WeasyPrint, from the page alone and without network."""
+
+import io
+
+from stcal.errors import InputError
+
+NEEDED = 'PDF: needs WeasyPrint, which is not installed; pip install "stcal[pdf]"'
+NO_PANGO = (
+    "PDF: WeasyPrint does not find a library of the system ({reason}); install Pango, as with `apt-get install "
+    "libpango-1.0-0 libpangoft2-1.0-0`"
+)
+
+
+def pdf_of(page: str) -> bytes:
+    """The page as its style sheet prints it: A4, with numbers; the same bytes for the same page.
+
+    Parameters
+    ----------
+    page : HTML with all that it shows inside; what it would load from elsewhere is left out
+
+    Raises
+    ------
+    InputError
+        WeasyPrint, or Pango of which it makes use, is not installed.
+    """
+    try:
+        from weasyprint import HTML
+        from weasyprint.urls import URLFetcher
+    except ImportError as error:
+        raise InputError(NEEDED) from error
+    except OSError as error:
+        raise InputError(NO_PANGO.format(reason=str(error).splitlines()[0])) from error
+    stream = io.BytesIO()
+    HTML(string=page, url_fetcher=URLFetcher(allowed_protocols=["data"])).write_pdf(stream)
+    return stream.getvalue()
+
+
+def require_pdf() -> None:
+    """Refuse, before the work, where no PDF can be made.
+
+    Raises
+    ------
+    InputError
+        What is missing, and how to get it.
+    """
+    pdf_of("<p></p>")

@@ -1,0 +1,73 @@
+"""Pages printed: what poppler reads of the PDF."""
+
+import shutil
+import subprocess
+import sys
+
+import pytest
+
+from stcal.errors import InputError
+from stcal.report.page import environment
+from stcal.report.pdf import pdf_of
+
+pytestmark = pytest.mark.skipif(shutil.which("pdftotext") is None, reason="poppler-utils is not installed")
+PAGE = """
+{% extends "report/templates/base.html.jinja" %}
+{% set title = "a title" %}
+{% set sections = [("one", "First"), ("two", "Second")] %}
+{% block banner %}{{ heading("The <target>", "counts") }}{% endblock %}
+{% block one %}
+{{ table(["<Name", "Value"], rows) }}
+{{ fold("Hidden", table(["<Name"], [["folded away"]])) }}
+<button>press me</button><script>never shown</script>
+<img src="http://192.0.2.1/from-elsewhere.png" alt="left out">
+{% endblock %}
+{% block two %}<p>{{ long }}</p>{% endblock %}
+"""
+
+
+def page(rows: int) -> str:
+    own = [[f"row {i}", i] for i in range(rows)]
+    return environment().from_string(PAGE).render(rows=own, long="word " * 100)
+
+
+def words(pdf: bytes, command: str = "pdftotext", *options: str) -> str:
+    made = subprocess.run([command, *options, "-", *["-"] * (command == "pdftotext")], input=pdf, capture_output=True)
+    assert made.returncode == 0, made.stderr
+    return made.stdout.decode()
+
+
+def test_a_page_is_printed_on_a4_with_numbers_and_its_title():
+    pdf = pdf_of(page(150))
+    text = words(pdf, "pdftotext", "-layout").split("\f")[:-1]
+    assert "595.276 x 841.89 pts (A4)" in words(pdf, "pdfinfo")
+    assert len(text) >= 3
+    for i, each in enumerate(text, 1):
+        foot = each.rstrip().splitlines()[-1].replace(" ", "")
+        assert foot == f"The<target>{i}/{len(text)}"
+    assert all("Name" in each for each in text[1:3])  # heads of a table again on each sheet
+
+
+def test_what_paper_cannot_do_is_not_printed():
+    text = words(pdf_of(page(3)))
+    assert "Hidden (folded: see the page on screen)" in text
+    for gone in ("folded away", "press me", "never shown", "Contents"):
+        assert gone not in text
+
+
+def test_a_heading_does_not_end_a_sheet():
+    """Wherever the second section begins, its first lines are on the sheet of its heading."""
+    for rows in range(20, 60, 3):
+        sheets = words(pdf_of(page(rows))).split("\f")
+        (own,) = [sheet for sheet in sheets if "Second" in sheet]
+        assert own.split("Second", 1)[1].split().count("word") >= 20, rows
+
+
+def test_the_same_page_gives_the_same_bytes():
+    assert pdf_of(page(5)) == pdf_of(page(5))
+
+
+def test_without_the_library_one_line_says_how_to_get_it(monkeypatch):
+    monkeypatch.setitem(sys.modules, "weasyprint", None)
+    with pytest.raises(InputError, match=r'^PDF: needs WeasyPrint, .* pip install "stcal\[pdf\]"$'):
+        pdf_of(page(1))

@@ -1,0 +1,72 @@
+"""``report``: the page of a finished run made again, and its PDF."""
+
+import json
+import shutil
+
+import pytest
+
+from stcal.io.saving import RUN_MARKER
+from stcal.sfm.run import folder
+from stcal.sfm.run.transaction import added_results
+from stcal.sfm.run.verify import verify
+from tests.outcome import INPUT, assert_error
+
+
+@pytest.fixture
+def own(small_run, tmp_path):
+    """A copy of the small run to write to."""
+    return shutil.copytree(small_run, tmp_path / "run", ignore=shutil.ignore_patterns("cache"))
+
+
+def test_the_same_files_make_the_same_page(own, small_run, stcal_sfm, monkeypatch):
+    monkeypatch.setattr(folder, "pdf_of", lambda page: page[:15].encode())
+    (own / "report.html").write_text("spoilt")
+    assert not verify(own).whole
+    code, out, _ = stcal_sfm("report", own, "--pdf")
+    assert (code, out) == (0, f"report: {own}/report.html\nreport: {own}/report.pdf\n")
+    assert (own / "report.html").read_bytes() == (small_run / "report.html").read_bytes()
+    assert (own / "report.pdf").read_bytes() == b"<!DOCTYPE html>"
+    assert verify(own).whole
+
+
+def test_a_pdf_goes_with_the_page_that_it_was_made_of(own, stcal_sfm, monkeypatch):
+    monkeypatch.setattr(folder, "pdf_of", lambda page: b"%PDF")
+    assert stcal_sfm("report", own, "--pdf")[0] == 0
+    with added_results(own) as stage:
+        (stage / "report.html").write_text("another")
+    assert not (own / "report.pdf").exists()
+    assert verify(own).whole
+
+
+def test_into_a_file_of_ones_own(own, tmp_path, stcal_sfm):
+    before = (own / RUN_MARKER).read_bytes()
+    code, out, _ = stcal_sfm("report", own, "--pdf", "--out", tmp_path / "for the lab.html")
+    assert (code, out) == (0, f"report: {tmp_path}/for the lab.html\nreport: {tmp_path}/for the lab.pdf\n")
+    assert (tmp_path / "for the lab.html").read_bytes() == (own / "report.html").read_bytes()
+    assert (tmp_path / "for the lab.pdf").read_bytes().startswith(b"%PDF")
+    assert (own / RUN_MARKER).read_bytes() == before
+    assert not (own / "report.pdf").exists()
+
+
+def test_photographs_that_are_gone_are_counted(own, tmp_path, stcal_sfm):
+    shutil.rmtree(own / "overlays" / "12")
+    code, out, _ = stcal_sfm("report", own, "--out", tmp_path / "page.html")
+    assert code == 0
+    assert out.startswith("4 overlays are no longer in the folder: the report is without them\n")
+    page = (tmp_path / "page.html").read_text()
+    assert "4 photographs are not shown: their overlays were no longer in the run" in page
+    assert page.count('alt="Overlay of 14/') == 4
+    assert "Overlay of 12/" not in page
+
+
+def test_what_cannot_be_made_is_said_in_one_line(own, tmp_path, stcal_sfm):
+    assert_error(stcal_sfm("report", tmp_path), INPUT, "not a run's folder", "give the --out of a finished run")
+    assert_error(stcal_sfm("report", own, "--out", tmp_path / "a.pdf"), INPUT, "a.html, and --pdf for a.pdf")
+    assert_error(stcal_sfm("report", own, "--out", own / "report.html"), INPUT, "is a file of run", "give another name")
+    content = json.loads((own / "report.json").read_text())
+    del content["faces"]
+    (own / "report.json").write_text(json.dumps(content))
+    assert_error(
+        stcal_sfm("report", own), INPUT, "report.json: damaged, or of another version", "faces", "run it again"
+    )
+    assert (own / "report.html").exists()
