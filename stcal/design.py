@@ -9,6 +9,7 @@ import numpy as np
 
 from stcal.errors import InputError
 from stcal.geometry.arrays import Array, freeze
+from stcal.geometry.rigid import Rigid
 from stcal.labels import CircleLabel, DotLabel, Label, dot_cells
 
 Polarity = Literal["bright", "dark"]
@@ -19,7 +20,9 @@ class FaceDesign:
     """One face: circles in the face frame (origin circle at 0, X through the x circle, Z out of the box).
 
     ``ids`` : n circle ids; ``xy_mm`` : (n, 2); ``radius_mm`` : (n,);
-    ``origin``, ``x``, ``y`` : ids of the circles that define the frame.
+    ``origin``, ``x``, ``y`` : ids of the circles that define the frame;
+    ``rough_target_from_face`` : where the face is about to be, in any frame that all faces share, or None where the
+    design does not say. For plans and simulations: a calibration does not use it.
     """
 
     id: str
@@ -29,6 +32,7 @@ class FaceDesign:
     origin: str
     x: str
     y: str
+    rough_target_from_face: Rigid | None = None
 
     def __post_init__(self):
         freeze(self, "xy_mm", (len(self.ids), 2), f"face {self.id}: circles")
@@ -54,6 +58,10 @@ class TargetDesign:
                 return face
         known = ", ".join(face.id for face in self.faces)
         raise InputError(f"target {self.name}: no face {face_id}; the design has {known}, choose one of them")
+
+    def rough_poses(self) -> dict[str, Rigid]:
+        """Rough pose by face id, of the faces that have one."""
+        return {face.id: face.rough_target_from_face for face in self.faces if face.rough_target_from_face is not None}
 
     def radius_of(self) -> dict[CircleLabel, float]:
         """Radius in mm by label."""
@@ -116,15 +124,28 @@ def _dot_labels(rows: int, columns: int) -> tuple[DotLabel, ...]:
 
 
 def reference_target() -> TargetDesign:
-    """The reference design: five faces of seven big and three small circles (after Zhang & Wei 2017, fig. 1)."""
+    """The reference design: five faces of seven big and three small circles (after Zhang & Wei 2017, fig. 1).
+
+    Rough poses: target frame = frame of face 1; close to table 2 of Zhang & Wei (2017) where that is consistent.
+    """
     common = {"1": (0, 0), "2": (40, 0), "3": (80, 0), "4": (0, 40), "5": (0, 80), "6": (40, 40), "7": (80, 80)}
     small = {"a": (20, 0), "b": (0, 20)}
     naming = {"1": (94.142, 65.858), "2": (100, 80), "3": (60, 80), "4": (80, 100), "5": (80, 60)}
+    x, y, z = np.eye(3)
+    rough = {
+        "1": ((x, y, z), (0, 0, 0)),
+        "2": ((-z, y, x), (138.4, 0, -58.0)),
+        "3": ((-x, y, -z), (78.6, 0, -198.4)),
+        "4": ((z, y, -x), (-58.4, 0, -138.4)),
+        "5": ((x, z, -y), (0, -46.0, -138.4)),
+    }
     faces = []
     for face_id, xy_c in naming.items():
         places = common | small | {"c": xy_c}
         radius = [8.0 if circle in common else 4.0 for circle in places]
-        faces.append(FaceDesign(face_id, tuple(places), list(places.values()), radius, "1", "3", "5"))
+        axes, place = rough[face_id]
+        pose = Rigid(np.column_stack(axes), place)
+        faces.append(FaceDesign(face_id, tuple(places), list(places.values()), radius, "1", "3", "5", pose))
     return TargetDesign("reference target", "bright", tuple(faces))
 
 

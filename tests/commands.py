@@ -177,7 +177,8 @@ CALLS = (
     ),
     Call(
         "robot compensate",
-        f"@robot/targets.csv --robot @robot/made.toml --nominal @robot/robot.toml --payload-kg 12 --out >joints.csv {_ALL}",
+        "@robot/targets.csv --robot @robot/made.toml --nominal @robot/robot.toml --payload-kg 12 --out >joints.csv "
+        f"{_ALL}",
         1.2,
     ),
     Call(

@@ -8,14 +8,22 @@ from pydantic import AfterValidator, BeforeValidator, Field
 
 from stcal.design import BoardDesign, FaceDesign, Polarity, TargetDesign, reference_board, reference_target
 from stcal.errors import InputError
+from stcal.geometry.rigid import Rigid
 from stcal.io.toml import Finite, Positive, Strict, load_toml, toml_string
 from stcal.labels import BOARD
 
 REMEDY = "`stcal-sfm init DIR` writes one"
+ROUGH_KEYS = "rough_pose = { origin_mm, x, normal }"
+"""What a face of a target file may say of where it is."""
 MIN_SINE = 0.02
 """Smallest sine of the angle between the X and Y circles as seen from the origin circle."""
 
 
+MIN_DIRECTION = 1e-6
+MAX_SKEW_DEG = 5.0
+"""By which X and normal of a rough pose may miss a right angle."""
+
+Vector = tuple[Finite, Finite, Finite]
 Count = Annotated[int, Field(ge=2, le=1000, strict=True)]
 Squares = Annotated[int, Field(ge=3, le=1000, strict=True)]
 """Of a row of a chessboard: fewer inner corners are not recognised as one, fewer squares have all corners on a line."""
@@ -34,11 +42,20 @@ class _CircleFile(Strict):
     radius_mm: Positive
 
 
+class _RoughPoseFile(Strict):
+    """Of a face's drawing, in a frame that all faces share."""
+
+    origin_mm: Vector
+    x: Vector
+    normal: Vector
+
+
 class _FaceFile(Strict):
     id: Name
     origin: Name
     x: Name
     y: Name
+    rough_pose: _RoughPoseFile | None = None
     circles: list[_CircleFile] = Field(min_length=4)
 
 
@@ -161,7 +178,34 @@ def _face(face: _FaceFile, where: str) -> FaceDesign:
             "give positions as seen from outside with y up"
         )
     face_from_drawing = np.array([axis, [-axis[1], axis[0]]])
-    return FaceDesign(face.id, tuple(ids), (xy - origin) @ face_from_drawing.T, radius, face.origin, face.x, face.y)
+    rough = None
+    if face.rough_pose is not None:
+        drawing_from_face = np.eye(3)
+        drawing_from_face[:2, :2] = face_from_drawing.T
+        rough = _rough_pose(face.rough_pose, where) @ Rigid(drawing_from_face, np.append(origin, 0.0))
+    xy_face = (xy - origin) @ face_from_drawing.T
+    return FaceDesign(face.id, tuple(ids), xy_face, radius, face.origin, face.x, face.y, rough)
+
+
+def _rough_pose(pose: _RoughPoseFile, where: str) -> Rigid:
+    """target_from_drawing; X is turned to a right angle with the normal."""
+    directions = []
+    for key in ("x", "normal"):
+        direction = np.array(getattr(pose, key))
+        length = float(np.linalg.norm(direction))
+        if length < MIN_DIRECTION:
+            raise InputError(f"{where}: rough_pose: {key} {list(getattr(pose, key))}; a direction needed, not zero")
+        directions.append(direction / length)
+    x, z = directions
+    angle = float(np.degrees(np.arccos(np.clip(x @ z, -1, 1))))
+    if abs(angle - 90) > MAX_SKEW_DEG:
+        raise InputError(
+            f"{where}: rough_pose: {angle:.0f}° between x and normal, 90° needed (to {MAX_SKEW_DEG:g}°); x is the "
+            "direction of the drawing's X along the face, normal points out of it"
+        )
+    x = x - (x @ z) * z
+    x /= np.linalg.norm(x)
+    return Rigid(np.column_stack([x, np.cross(z, x), z]), pose.origin_mm)
 
 
 def target_toml(target: TargetDesign) -> str:
@@ -181,6 +225,7 @@ def target_toml(target: TargetDesign) -> str:
             f"origin = {toml_string(face.origin)}",
             f"x = {toml_string(face.x)}",
             f"y = {toml_string(face.y)}",
+            *_rough_lines(face.rough_target_from_face),
             "circles = [",
         ]
         lines += [
@@ -189,6 +234,20 @@ def target_toml(target: TargetDesign) -> str:
         ]
         lines += ["]"]
     return "\n".join(lines) + "\n"
+
+
+def _rough_lines(pose: Rigid | None) -> list[str]:
+    about = [
+        "# Where the drawing's (0, 0) is, its X and the outward normal, to a few mm and degrees, in a frame that all",
+        "# faces share: for `plan` and `simulate`; a calibration does not use it.",
+    ]
+    if pose is None:
+        return [*about, "# rough_pose = { origin_mm = [0.0, 0.0, 0.0], x = [1.0, 0.0, 0.0], normal = [0.0, 0.0, 1.0] }"]
+    place, x, normal = (
+        f"[{', '.join(map(_number, values))}]"
+        for values in (pose.translation, pose.rotation[:, 0], pose.rotation[:, 2])
+    )
+    return [*about, f"rough_pose = {{ origin_mm = {place}, x = {x}, normal = {normal} }}"]
 
 
 def board_toml(board: BoardDesign) -> str:

@@ -1,8 +1,10 @@
 """Designs to simulate: where the faces of the reference target nominally are, and a second, quite different target."""
 
+from dataclasses import replace
+
 import numpy as np
 
-from stcal.design import BoardDesign, FaceDesign, TargetDesign
+from stcal.design import BoardDesign, FaceDesign, TargetDesign, reference_target
 from stcal.geometry.rigid import Rigid
 
 REFERENCE_GROUPS = (("1", "2"), ("1", "4"), ("1", "5"), ("2", "3"))
@@ -10,20 +12,8 @@ REFERENCE_GROUPS = (("1", "2"), ("1", "4"), ("1", "5"), ("2", "3"))
 
 
 def nominal_target_from_face() -> dict[str, Rigid]:
-    """Nominal face poses of the reference design, target frame = frame of face 1, mm.
-
-    Close to table 2 of Zhang & Wei (2017) where that is consistent. For simulation only: the calibration
-    does not use them.
-    """
-    x, y, z = np.eye(3)
-    poses = {
-        "1": ((x, y, z), (0, 0, 0)),
-        "2": ((-z, y, x), (138.4, 0, -58.0)),
-        "3": ((-x, y, -z), (78.6, 0, -198.4)),
-        "4": ((z, y, -x), (-58.4, 0, -138.4)),
-        "5": ((x, z, -y), (0, -46.0, -138.4)),
-    }
-    return {face: Rigid(np.column_stack(axes), origin) for face, (axes, origin) in poses.items()}
+    """Nominal face poses of the reference design, target frame = frame of face 1, mm."""
+    return reference_target().rough_poses()
 
 
 # Drawings of the second design: id, x, y, radius in mm, in a drawing frame with the origin in a corner of the face.
@@ -80,8 +70,8 @@ def second_design() -> tuple[TargetDesign, BoardDesign, dict[str, Rigid]]:
         middle = np.array([50.0, 50.0, 0.0])
         rotation = np.column_stack(axes)
         cube_from_drawing = Rigid(rotation, rotation @ ([0, 0, _EDGE_MM / 2] - middle))
-        faces.append(face)
         poses[face_id] = cube_from_drawing @ drawing_from_face
+        faces.append(replace(face, rough_target_from_face=poses[face_id]))
     target = TargetDesign("second target", "dark", tuple(faces))
     return target, BoardDesign(6, 8, 20.0, 5.0, "dark", 0.005, (0, 7), 7.5), poses
 

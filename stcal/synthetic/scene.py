@@ -1,6 +1,6 @@
 """A scene with known truth: the target and the board as really made, where they stand, and the cameras."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import lru_cache
 from itertools import combinations
 
@@ -11,7 +11,7 @@ from stcal.errors import DegenerateError, InputError
 from stcal.geometry.arrays import frozen
 from stcal.geometry.camera import Camera
 from stcal.geometry.rigid import Rigid
-from stcal.io.camera import CalibratedCamera
+from stcal.io.camera import FISHEYE, CalibratedCamera, CameraModel
 from stcal.labels import CircleLabel
 from stcal.synthetic.designs import REFERENCE_GROUPS, nominal_target_from_face, second_design, three_point_frame
 from stcal.synthetic.placement import GroupShape, place_group, viewing_axes
@@ -147,7 +147,7 @@ def make_scene(
     board : BoardDesign, optional
         Default: the reference board.
     nominal : dict of Rigid, optional
-        Nominal pose of every face in one common frame, by face id; needed unless ``target`` is the reference design.
+        Nominal pose of every face in one common frame, by face id; default: the rough poses of ``target``.
 
     Raises
     ------
@@ -157,10 +157,9 @@ def make_scene(
         The faces do not bound a convex body, or a group cannot be photographed.
     """
     options = options or SceneOptions()
-    if target is None:
-        target, nominal = reference_target(), nominal or nominal_target_from_face()
-    board = board or reference_board()
-    missing = [face.id for face in target.faces if face.id not in (nominal or {})]
+    target, board = target or reference_target(), board or reference_board()
+    nominal = nominal or target.rough_poses()
+    missing = [face.id for face in target.faces if face.id not in nominal]
     if missing:
         raise InputError(f"scene: no nominal pose of face {missing[0]}; give one pose per face")
     rng = np.random.default_rng(options.seed)
@@ -174,6 +173,14 @@ def make_scene(
             raise InputError(f"scene: group {group.name} occurs twice; give different pairs")
         groups[group.name] = group
     return Scene(target, board, camera, target_from_face, circles, groups, options.seed)
+
+
+def seen_by(options: SceneOptions, file: CameraModel) -> SceneOptions:
+    """Options by which views are placed for the camera of a file, which states its image size: its size and focal
+    length, and its distortion where the lens is no equidistant one."""
+    focal_px = float(np.sqrt(file.focal.prod()))
+    distortion = () if FISHEYE in file.colmap_model else tuple(file.distortion[:8])
+    return replace(options, width=file.width, height=file.height, focal_px=focal_px, distortion=distortion)
 
 
 def group_name(pair: tuple[str, str]) -> str:
@@ -216,12 +223,19 @@ def _made_camera(options: SceneOptions, rng) -> CalibratedCamera:
 
 
 def _default_groups(target: TargetDesign, target_from_face: dict[str, Rigid]) -> list[tuple[str, str]]:
-    known = set(target_from_face)
-    if known == {face for pair in REFERENCE_GROUPS for face in pair}:
-        return list(REFERENCE_GROUPS)
     pairs = combinations([face.id for face in target.faces], 2)
     normal = {face: pose.rotation[:, 2] for face, pose in target_from_face.items()}
-    return [(a, b) for a, b in pairs if np.cos(np.radians(120)) <= normal[a] @ normal[b] <= np.cos(np.radians(20))]
+    seen = [(a, b) for a, b in pairs if np.cos(np.radians(120)) <= normal[a] @ normal[b] <= np.cos(np.radians(20))]
+    if set(target_from_face) == {face for pair in REFERENCE_GROUPS for face in pair} and set(REFERENCE_GROUPS) <= {
+        *seen
+    }:
+        return list(REFERENCE_GROUPS)
+    if not seen:
+        raise DegenerateError(
+            f"scene: no two faces of target {target.name} are 20° to 120° apart, so that one photograph shows both; "
+            "check the rough poses, or add a face"
+        )
+    return seen
 
 
 def _made_group(pair, target, board, camera, target_from_face, circles, options, rng) -> Group:
@@ -276,5 +290,5 @@ def _check_convex(target: TargetDesign, target_from_face: dict[str, Rigid]) -> N
             if height > CONVEX_TOLERANCE_MM:
                 raise DegenerateError(
                     f"scene: face {face.id} reaches {height:.0f} mm in front of face {front.id} and may cover it; "
-                    "simulated targets must be convex, check the nominal poses"
+                    "simulated targets must be convex, check the rough poses"
                 )

@@ -30,6 +30,10 @@ def corner(row=0, column=0, radius_mm=11.0) -> str:
     return f"[corner]\nrow = {row}\ncolumn = {column}\nradius_mm = {radius_mm}\n"
 
 
+def rough(x: str, normal: str) -> str:
+    return f'y = "3"\nrough_pose = {{ origin_mm = [7, 8, 9], x = {x}, normal = {normal} }}'
+
+
 def target_of(tmp_path, content: str | bytes) -> TargetDesign:
     path = tmp_path / "target.toml"
     path.write_bytes(content.encode() if isinstance(content, str) else content)
@@ -54,6 +58,9 @@ def assert_same_target(found: TargetDesign, expected: TargetDesign):
         assert (one.ids, one.origin, one.x, one.y) == (other.ids, other.origin, other.x, other.y)
         np.testing.assert_allclose(one.xy_mm, other.xy_mm, rtol=0, atol=2 * ROUNDED_MM)
         np.testing.assert_allclose(one.radius_mm, other.radius_mm, rtol=0, atol=ROUNDED_MM)
+        np.testing.assert_allclose(
+            one.rough_target_from_face.matrix(), other.rough_target_from_face.matrix(), atol=2 * ROUNDED_MM
+        )
 
 
 def test_reference_target_round_trip(tmp_path):
@@ -155,6 +162,25 @@ def test_a_frame_just_inside_the_smallest_angle_is_taken(tmp_path):
         target_of(tmp_path, bent(0.99 * MIN_SINE))
 
 
+def test_a_rough_pose_is_of_the_drawing_wherever_its_origin_is(tmp_path):
+    # The drawing's X points along -y and its normal along +x, so its Y along -z; drawn from a corner at (-100, -50).
+    moved = CIRCLES.replace("x_mm = 0", "x_mm = 100").replace("x_mm = 40", "x_mm = 140")
+    moved = moved.replace("y_mm = 0", "y_mm = 50").replace("y_mm = 40", "y_mm = 90")
+    text = TARGET.replace(CIRCLES, moved).replace('y = "3"', rough("[0.03, -2, 0]", "[1, 0, 0]"))
+    face = target_of(tmp_path, text).faces[0]
+    assert face.xy_mm[3] == pytest.approx([40, 40])
+    pose = face.rough_target_from_face
+    assert pose @ np.zeros(3) == pytest.approx([7, 8 - 100, 9 - 50])
+    assert pose @ np.array([40.0, 40, 0]) == pytest.approx([7, 8 - 140, 9 - 90])
+
+
+def test_a_target_without_rough_poses_has_the_key_in_a_comment(tmp_path):
+    text = target_toml(target_of(tmp_path, TARGET))
+    assert target_of(tmp_path, text).rough_poses() == {}
+    uncommented = text.replace("# rough_pose", "rough_pose")
+    assert target_of(tmp_path, uncommented).rough_poses()["1"].matrix() == pytest.approx(np.eye(4))
+
+
 def test_no_negative_zero_is_written():
     face = FaceDesign("f", ("1", "2", "3", "4"), [[-0.0, 0], [40, -1e-12], [0, 40], [40, 40]], [5.0] * 4, "1", "2", "3")
     assert "-0.0" not in target_toml(TargetDesign("t", "dark", (face,)))
@@ -214,6 +240,13 @@ WRONG_TARGETS = {
     "left-handed": (changed("x_mm = 0, y_mm = 40", "x_mm = 0, y_mm = -40"), "turns clockwise seen from outside"),
     "left-handed by exchange": (changed('x = "2"\ny = "3"', 'x = "3"\ny = "2"'), "through 3 and 2 turns clockwise"),
     "a board": (BOARD, "face: key missing"),
+    "rough pose without normal": (changed('y = "3"', 'y = "3"\nrough_pose = { origin_mm = [0, 0, 0], x = [1, 0, 0] }'),
+                                  "face.1.rough_pose.normal: key missing"),
+    "rough pose with a zero": (changed('y = "3"', rough("[0, 0, 0]", "[0, 0, 1]")),
+                               "face 1: rough_pose: x [0.0, 0.0, 0.0]; a direction needed"),
+    "rough pose of two numbers": (changed('y = "3"', rough("[1, 0]", "[0, 0, 1]")), "rough_pose.x"),
+    "rough pose askew": (changed('y = "3"', rough("[1, 0, 1]", "[0, 0, 1]")),
+                         "face 1: rough_pose: 45° between x and normal, 90° needed (to 5°)"),
 }
 WRONG_BOARDS = {
     "empty": ("", "rows: key missing; add it (and 4 more)"),

@@ -8,6 +8,7 @@ import pytest
 
 import stcal
 from stcal.cli.main import main, main_sfm
+from stcal.io.camera import read_camera
 from stcal.io.design import load_board, load_target
 from stcal.workflows import versions
 
@@ -54,6 +55,120 @@ def test_simulate_and_compare(command, small_dataset, small_run, tmp_path):
     assert code == 0
     assert "2" in text
     assert 0 < json.loads((tmp_path / "errors.json").read_text())["worst"]["translation_um"] < 60
+
+
+def circles_toml(rows) -> str:
+    return ",\n".join(f'{{ id = "{i}", x_mm = {x}, y_mm = {y}, radius_mm = {r} }}' for i, x, y, r in rows)
+
+
+WEDGE = f"""
+name = "wedge"
+polarity = "bright"
+[[face]]
+id = "roof"
+origin = "1"
+x = "2"
+y = "3"
+rough_pose = {{ origin_mm = [0, 0, 0], x = [1, 0, 0], normal = [0, 0, 1] }}
+circles = [{
+    circles_toml(
+        [
+            (1, 10, 10, 6),
+            (2, 85, 12, 6),
+            (3, 14, 80, 6),
+            (4, 60, 84, 6),
+            (5, 45, 38, 6),
+            (6, 30, 62, 3.5),
+            (7, 68, 58, 3.5),
+            (8, 30, 18, 3.5),
+        ]
+    )
+}]
+[[face]]
+id = "flank"
+origin = "1"
+x = "2"
+y = "3"
+rough_pose = {{ origin_mm = [116, 0, -12], x = [0.64, 0, -0.77], normal = [0.77, 0, 0.64] }}
+circles = [{
+    circles_toml(
+        [
+            (1, 20, 18, 6),
+            (2, 70, 10, 6),
+            (3, 12, 60, 6),
+            (4, 82, 80, 6),
+            (5, 40, 82, 3.5),
+            (6, 52, 40, 3.5),
+            (7, 84, 36, 3.5),
+            (8, 30, 40, 3.5),
+        ]
+    )
+}]
+"""
+"""Of two faces at 50°, as a user writes them."""
+
+
+@pytest.fixture
+def wedge(command, tmp_path):
+    """init, and its two files edited."""
+    folder = tmp_path / "design"
+    assert command("init", folder)[0] == 0
+    (folder / "target.toml").write_text(WEDGE)
+    board = (folder / "board.toml").read_text()
+    board = (
+        board.replace("rows = 7", "rows = 6").replace("columns = 9", "columns = 8").replace("# [corner]", "[corner]")
+    )
+    board = board.replace("# row", "row").replace("# column", "column").replace("# radius_mm", "radius_mm")
+    (folder / "board.toml").write_text(board)
+    return "--target", folder / "target.toml", "--board", folder / "board.toml"
+
+
+def test_a_design_of_ones_own_is_planned_before_any_photograph(command, wedge):
+    code, out, _ = command("plan", *wedge, "--images", 3, "--width", 1200)
+    assert code == 0
+    assert "flank" in out
+
+
+@pytest.mark.slow
+def test_init_edit_simulate_run_compare(command, wedge, tmp_path):
+    data, one = tmp_path / "data", ("--workers", 1)
+    code, text, _ = command(
+        "simulate", data, *wedge, "--groups", "roof-flank", "--width", 1296, "--images", 5, "--distance", 800, *one
+    )
+    assert code == 0
+    assert "5 images in 1 groups" in text
+    code, text, _ = command(
+        "run", data / "images", *wedge, *one, "--camera", data / "cameras.txt", "--out", tmp_path / "run"
+    )
+    assert code == 0
+    code, text, _ = command("compare", tmp_path / "run", data / "truth.json", "--json", tmp_path / "errors.json")
+    assert code == 0
+    errors = json.loads((tmp_path / "errors.json").read_text())
+    # √(eᵀC⁻¹e/6) of a true covariance exceeds 2 about once in 2000 draws (χ² with 6 degrees of freedom).
+    assert 0.1 < errors["faces"]["flank"]["normalised_error"] < 2.0
+
+
+def test_simulate_with_the_camera_of_a_file(command, wedge, tmp_path):
+    camera = tmp_path / "cameras.txt"
+    camera.write_text("1 SIMPLE_RADIAL 400 300 430 203 148 -0.05\n")
+    call = "simulate", tmp_path / "data", *wedge, "--camera", camera, "--images", 2, "--workers", 1
+    code, text, _ = command(*call)
+    assert code == 0
+    assert "2 images in 1 groups" in text
+    written, given = (read_camera(path).calibrated(0, 0) for path in (tmp_path / "data" / "cameras.txt", camera))
+    assert written.colmap_params() == given.colmap_params()
+    code, _, err = command(*call, "--fisheye", 100)
+    assert code == 2
+    assert "two cameras" in err
+
+
+def test_simulate_says_which_faces_have_no_place(command, wedge, tmp_path):
+    lines = wedge[1].read_text().splitlines()
+    lines.remove(next(line for line in lines if line.startswith("rough_pose = { origin_mm = [116")))
+    wedge[1].write_text("\n".join(lines))
+    code, _, err = command("simulate", tmp_path / "data", *wedge)
+    assert code == 2
+    assert "does not say where face flank is; add rough_pose = { origin_mm, x, normal }" in err
 
 
 @pytest.mark.slow

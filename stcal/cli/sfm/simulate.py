@@ -1,16 +1,21 @@
 """``stcal-sfm``: designs to edit, simulated data sets, and runs against a known truth."""
 
 import tempfile
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from stcal.cli.options import MOST_SEED, JsonFile, Workers
+from stcal.cli.options import MOST_SEED, BoardFile, JsonFile, TargetFile, Workers
 from stcal.cli.terminal import StageProgress, say, write
 from stcal.errors import InputError
 from stcal.io.saving import RUN_MARKER, json_text, real_place, save
+
+if TYPE_CHECKING:
+    from stcal.design import BoardDesign, TargetDesign
+    from stcal.synthetic.scene import Scene, SceneOptions
 
 app = typer.Typer()
 
@@ -51,6 +56,15 @@ def simulate(
     noise: Annotated[float, typer.Option(min=0, max=0.2, help="Add noise of this fraction of full scale.")] = 0.01,
     blur: Annotated[float, typer.Option(min=0, max=10, help="Blur by this standard deviation, px.")] = 0.7,
     clutter: Annotated[bool, typer.Option("--clutter/--clean", help="Add lamps, discs and a checkered wall.")] = False,
+    target: TargetFile = None,
+    board: BoardFile = None,
+    groups: Annotated[
+        str | None,
+        typer.Option(help="Photograph these pairs of faces together, such as 12,14; all that show together if none."),
+    ] = None,
+    camera: Annotated[
+        Path | None, typer.Option("--camera", help="Render with the camera of this file, in place of --width.")
+    ] = None,
     second_design: Annotated[
         bool, typer.Option("--second-design", help="Use three faces, dark on white, and another board.")
     ] = False,
@@ -59,12 +73,11 @@ def simulate(
     seed: Annotated[int, typer.Option(min=0, max=MOST_SEED, help="Draw everything random with this seed.")] = 0,
     workers: Workers = None,
 ) -> None:
-    """Write a simulated data set with known truth: images, cameras.txt, target.toml, board.toml, truth.json."""
+    """Write a simulated data set with known truth, of the reference design or one's own: images, cameras.txt,
+    target.toml, board.toml, truth.json."""
     from stcal.synthetic.dataset import write_dataset
     from stcal.synthetic.render import RenderOptions
-    from stcal.synthetic.scene import SceneOptions, make_scene
-    from stcal.synthetic.scene import second_design as other
-    from stcal.synthetic.wide import seen_wide, wide_options
+    from stcal.synthetic.scene import SceneOptions
 
     options = SceneOptions(
         seed=seed,
@@ -74,15 +87,54 @@ def simulate(
         spread_deg=spread,
         images_per_group=images,
     )
-    options = options if fisheye is None else wide_options(options)
-    scene = make_scene(options, *other()) if second_design else make_scene(options)
-    scene = scene if fisheye is None else seen_wide(scene, fisheye, seed)
+    if second_design and (target or board):
+        raise InputError("--second-design and --target or --board: two designs; give one of them")
+    scene = _scene(options, _designs(target, board, second_design), groups, camera, fisheye)
     rendering = RenderOptions(noise=noise, blur_px=blur, clutter=clutter, bit_depth=16 if sixteen_bit else 8, seed=seed)
     kind = "png" if png or sixteen_bit else "jpg"
     with StageProgress() as progress:
         step = partial(progress, "render")
         paths = write_dataset(folder, scene, rendering, image_format=kind, workers=workers, progress=step)
     say(f"{len(paths)} images in {len(scene.groups)} groups: {folder}")
+
+
+def _designs(target: Path | None, board: Path | None, second_design: bool) -> "tuple[TargetDesign, BoardDesign]":
+    """Those of files, of the reference, or the second ones."""
+    from stcal.io.design import board_of, target_of
+    from stcal.synthetic.scene import second_design as other
+
+    return other()[:2] if second_design else (target_of(target), board_of(board))
+
+
+def _scene(
+    options: "SceneOptions",
+    designs: "tuple[TargetDesign, BoardDesign]",
+    groups: str | None,
+    camera: Path | None,
+    fisheye: float | None,
+) -> "Scene":
+    """The designs, with faces at their rough poses, before the camera of a file or one that the options describe."""
+    from stcal.io.camera import read_camera
+    from stcal.sfm.plan.nominal import nominal_poses
+    from stcal.sfm.plan.session import pairs_of_faces
+    from stcal.synthetic.scene import make_scene, seen_by
+    from stcal.synthetic.wide import seen_wide, wide_options
+
+    target, board = designs
+    poses = nominal_poses(target, None)
+    if groups:
+        options = replace(options, groups=pairs_of_faces(groups, target))
+    if camera is None:
+        options = options if fisheye is None else wide_options(options)
+        scene = make_scene(options, target, board, poses)
+        return scene if fisheye is None else seen_wide(scene, fisheye, options.seed)
+    if fisheye is not None:
+        raise InputError(f"--camera {camera} and --fisheye {fisheye:g}: two cameras; give one of them")
+    file = read_camera(camera)
+    if not (file.width and file.height):
+        raise InputError(f"camera file {camera} states no image size; add it to the file")
+    scene = make_scene(seen_by(options, file), target, board, poses)
+    return replace(scene, camera=file.calibrated(0, 0))
 
 
 @app.command()

@@ -1,4 +1,4 @@
-"""Where the faces of a target are before it is photographed: of the reference design, or from an earlier run."""
+"""Where the faces of a target are before it is photographed: as its design says, or from an earlier run."""
 
 from pathlib import Path
 
@@ -7,26 +7,29 @@ import numpy as np
 from stcal.design import TargetDesign, reference_target
 from stcal.errors import InputError
 from stcal.geometry.rigid import Rigid
+from stcal.io.design import ROUGH_KEYS
 from stcal.io.json import read_result
 from stcal.sfm.adjust.file import FacePoses
-from stcal.synthetic.scene import nominal_target_from_face
 
 
 def nominal_poses(target: TargetDesign, faces: Path | None) -> dict[str, Rigid]:
-    """Pose of every face in one frame; ``faces`` : a ``faces.json``, or None for the reference design.
+    """Pose of every face in one frame; ``faces`` : a ``faces.json``, or None for the rough poses of the design.
 
     Raises
     ------
     InputError
-        Another design without a ``faces.json``, a file that is none, or one that lacks a face.
+        A face without rough pose and no ``faces.json``, a file that is none, or one that lacks a face.
     """
     if faces is None:
-        if not _is_reference(target):
+        rough = target.rough_poses()
+        if not rough and _is_reference(target):  # of files from before there were rough poses
+            return reference_target().rough_poses()
+        if missing := [face.id for face in target.faces if face.id not in rough]:
             raise InputError(
-                f"target {target.name}: the design does not say where its faces are; give --faces, the faces.json of "
-                "an earlier run, be it a rough one"
+                f"target {target.name}: the design does not say where {_faces(missing)}; add {ROUGH_KEYS} to each "
+                "[[face]] of the target file, be it rough, or to `plan` give --faces, the faces.json of an earlier run"
             )
-        return nominal_target_from_face()
+        return rough
     poses = read_result(faces, FacePoses, "faces", "give RUN/faces.json, the faces.json of a run").poses()
     missing = [face.id for face in target.faces if face.id not in poses]
     if missing:
@@ -34,6 +37,10 @@ def nominal_poses(target: TargetDesign, faces: Path | None) -> dict[str, Rigid]:
             f"{faces}: no face {missing[0]} of target {target.name}; give a run that shows all of its faces"
         )
     return {face.id: poses[face.id] for face in target.faces}
+
+
+def _faces(ids: list[str]) -> str:
+    return f"face {ids[0]} is" if len(ids) == 1 else f"faces {', '.join(ids[:-1])} and {ids[-1]} are"
 
 
 def _is_reference(target: TargetDesign) -> bool:

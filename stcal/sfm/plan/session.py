@@ -8,14 +8,14 @@ import numpy as np
 from stcal.design import BoardDesign, TargetDesign
 from stcal.errors import DegenerateError, InputError
 from stcal.geometry.rigid import Rigid
-from stcal.io.camera import FISHEYE, CameraModel, camera_prior, refinable
+from stcal.io.camera import CameraModel, camera_prior, refinable
 from stcal.parallel import one_thread
 from stcal.sfm.adjust.chain import CalibratedTarget
 from stcal.sfm.data.model import MetricModel
 from stcal.sfm.plan.forecast import ONE_PLATE, CentreNoise, Forecast, Setup, forecast, variance_shares, without_sources
 from stcal.sfm.plan.simulated import observe, true_models
 from stcal.sfm.run.options import RunOptions
-from stcal.synthetic.scene import Scene, SceneOptions, group_name, make_scene
+from stcal.synthetic.scene import Scene, SceneOptions, group_name, make_scene, seen_by
 
 SPREADS_DEG = (80.0, 70.0, 60.0, 50.0, 40.0)
 """Tried from the largest down: the tilts that a view may have keep the views closer together than that."""
@@ -198,9 +198,7 @@ def _scene(options: PlanOptions, target: TargetDesign, board: BoardDesign, nomin
         height=height,
     )
     if file is not None:
-        focal_px = float(np.sqrt(file.focal.prod()))
-        distortion = () if FISHEYE in file.colmap_model else tuple(file.distortion[:8])
-        shape = replace(shape, width=file.width, height=file.height, focal_px=focal_px, distortion=distortion)
+        shape = seen_by(shape, file)
     scene = make_scene(shape, target, replace(board, sigma_mm=0.0), nominal)
     return scene if file is None else replace(scene, camera=file.calibrated(0, 0))
 

@@ -449,7 +449,7 @@ def test_plan_out_of_reach(stcal_sfm):
 @pytest.mark.parametrize(
     ("faces", "message"),
     [
-        (None, "does not say where its faces are; give --faces"),
+        (None, r"where faces top, left and right are; add rough_pose = \{ origin_mm, x, normal \} .* give --faces"),
         ("nothing", "not JSON"),
         ('{"unit": "m", "target_from_face": {}}', "unit: 'm'"),
         ('{"target_from_face": {}}', "no face top of target"),
@@ -459,6 +459,7 @@ def test_plan_of_another_design_needs_its_faces(faces, message, tmp_path):
     from stcal.sfm.plan.nominal import nominal_poses
 
     target, _, _ = second_design()
+    target = replace(target, faces=tuple(replace(face, rough_target_from_face=None) for face in target.faces))
     path = tmp_path / "faces.json"
     if faces is not None:
         path.write_text(faces)
