@@ -84,3 +84,11 @@ def test_links_of_documents_lead_to_files(document):
 def test_first_page_is_short_and_the_version_is_one():
     assert len((ROOT / "README.md").read_text(encoding="utf-8").splitlines()) < 180
     assert f"\nversion: {stcal.__version__}\n" in (ROOT / "CITATION.cff").read_text(encoding="utf-8")
+
+
+def test_the_page_of_checks_has_each_check_by_its_key():
+    page = (ROOT / "docs" / "howto" / "checks.md").read_text(encoding="utf-8")
+    told = set(re.findall(r"^\| [^|]+\(`([\w-]+)`\)", page, re.MULTILINE))
+    sources = "\n".join(path.read_text(encoding="utf-8") for path in (ROOT / "stcal" / "sfm" / "checks").glob("*.py"))
+    made = set(re.findall(r'(?:judge|key = |key, title = |impossible)\(?"([a-z-]+)"', sources))
+    assert told == made
