@@ -1,7 +1,8 @@
 """The exception tree.
 
 Every message is one line: what, where, measured, needed, what to do. The command line prints it and
-exits with the class's ``exit_code`` (2: the input is at fault; 3: the computation could not deliver).
+exits with the class's ``exit_code`` (2: the input is at fault; 3: the computation could not deliver; 4: what it
+delivered failed its checks, and that was asked for).
 """
 
 
@@ -35,3 +36,9 @@ class DegenerateError(StcalError):
 
 class ConvergenceError(StcalError):
     """An iteration did not reach its tolerance."""
+
+
+class ChecksFailed(StcalError):
+    """The result is there, and did not pass its own checks."""
+
+    exit_code = 4

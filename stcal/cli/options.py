@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Annotated, get_args
 import typer
 
 from stcal.cli.terminal import STANDARD_OUTPUT, print_each, said_apart
-from stcal.errors import InputError
+from stcal.errors import ChecksFailed, InputError
 from stcal.io.saving import keep_apart
 
 if TYPE_CHECKING:
@@ -51,6 +51,18 @@ JsonFile = Annotated[
 ReportFile = Annotated[
     Path | None,
     typer.Option("--report", writable=True, help="Also write a page with tables and plots to this file (HTML)."),
+]
+Exclude = Annotated[
+    list[str] | None,
+    typer.Option(
+        "--exclude",
+        metavar="IMAGE",
+        help="Take this image out, by its name in results, such as 12/IMG_1003.jpg; again for each further one.",
+    ),
+]
+Strict = Annotated[
+    bool,
+    typer.Option("--strict", help="End with exit code 4 where a check has failed; results are written all the same."),
 ]
 MOST_SEED = 2**63 - 1
 """Of 64 bits with a sign, as other programs read it in result files."""
@@ -203,6 +215,16 @@ def handed_over(scheduler: str | None, send_images: bool) -> AbstractContextMana
     from stcal.workflows.cluster import dask_cluster
 
     return dask_cluster(scheduler, send_images)
+
+
+def require_passed(strict: bool, failed: Sequence[str], report: Path | None = None) -> None:
+    """With ``--strict``: end as failed where checks have, which are named; results stand."""
+    if strict and failed:
+        more = f" and {len(failed) - 2} more" if len(failed) > 2 else ""
+        where = f"; see {report}" if report else ""
+        raise ChecksFailed(
+            f"--strict: failed: {', '.join(failed[:2])}{more}; results are written, do not use them{where}"
+        )
 
 
 def load_ahead(workers: int | None) -> None:

@@ -8,7 +8,7 @@ import threading
 import unicodedata
 import warnings
 import zlib
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from io import BytesIO
 from pathlib import Path, PurePosixPath, PureWindowsPath
@@ -22,6 +22,7 @@ from stcal.io.files import IMAGE_BYTES, read_bytes
 from stcal.io.saving import RUN_MARKER
 
 SUFFIXES = (".jpg", ".jpeg", ".png", ".tif", ".tiff", ".bmp")
+EXCLUDED = "taken out with --exclude"
 TOP_GROUP = "."
 """Name of the group that images lying directly in the folder form."""
 
@@ -110,6 +111,31 @@ def find_images(folder: str | Path) -> tuple[list[ImageFile], list[Skipped]]:
             f"put them into {root}/<group>/"
         )
     return files, skipped
+
+
+def chosen_images(folder: str | Path, exclude: Sequence[str] = ()) -> tuple[list[ImageFile], list[Skipped]]:
+    """What :func:`find_images` finds, with those taken out that are named: by their name in results
+    (``12/IMG_1003.jpg``), or by their path.
+
+    Raises
+    ------
+    InputError
+        As of :func:`find_images`; there is no image of a name, or no other image.
+    """
+    files, skipped = find_images(folder)
+    out: set[str] = set()
+    for word in exclude:
+        found = {file.name for file in files if word == file.name or Path(word).absolute() == file.path.absolute()}
+        if not found:
+            raise InputError(
+                f"--exclude {word}: no such image in {folder}; give its name as results have it, such as "
+                f"{files[0].name}"
+            )
+        out |= found
+    kept = [file for file in files if file.name not in out]
+    if not kept:
+        raise InputError(f"image folder {folder}: --exclude takes out all {len(files)} images; leave some in")
+    return kept, [*skipped, *(Skipped(f.name, EXCLUDED, "excluded") for f in files if f.name in out)]
 
 
 def _sort_in(path: Path, name: str, group: str, files: list, skipped: list) -> None:

@@ -7,7 +7,7 @@ from stcal.design import BoardDesign, TargetDesign
 from stcal.errors import StcalError
 from stcal.io.camera import CameraModel, camera_prior, read_camera, refinable
 from stcal.io.design import board_of, target_of
-from stcal.io.images import find_images
+from stcal.io.images import chosen_images
 from stcal.io.saving import save
 from stcal.parallel import Progress, counted, kept_processes, load_in_processes, one_thread
 from stcal.sfm.adjust.calibration import calibrate, calibrate_board
@@ -74,9 +74,10 @@ def run(
     progress = progress or (lambda *_: None)
     model = camera if isinstance(camera, CameraModel) else read_camera(camera)
     given = {"images": images, "--camera": camera, "--target": target, "--board": board}
-    find_images(images)
+    options = options or RunOptions()
+    chosen_images(images, options.exclude)
     designs = target_of(target), board_of(board)
-    options = (options or RunOptions()).settled(designs[0])
+    options = options.settled(designs[0])
     if options.compare:
         require_comparable(options.adjustment(designs[0]))
     with kept_processes(options.workers), run_folder(out, MarkerFile.of(images, options), given) as folder:
@@ -217,7 +218,7 @@ def _labelled(
     progress: Progress,
 ) -> tuple[DetectionResult, list[LabelledImage]]:
     """Detection and labels, by the rules that the options ask for."""
-    files, other = find_images(images)
+    files, other = chosen_images(images, options.exclude)
     step = counted(progress, "detect", len(files))
     published = options.solve == "paper"
     if published:

@@ -533,3 +533,24 @@ def test_what_is_no_bounds_of_differential_evolution(command, tmp_path, words, s
     path = poses_file(tmp_path / "poses.csv", simulated(np.random.default_rng(3), 6))
     code, _, error = command(path, *words)
     assert (code, said in error) == (INPUT, True)
+
+
+def test_strict_ends_as_failed_where_use_is_advised_against(command, tmp_path):
+    """Five of sixteen poses are other rows'; without the option exit code 0, and with it for good poses too."""
+    truth = simulated(np.random.default_rng(5), 16, **NOISE)
+
+    def exchange(rows):
+        robot = [row[: len(POSE)] for row in rows]
+        for i in range(5):
+            rows[i][: len(POSE)] = robot[(i + 1) % 5]
+
+    bad = poses_file(tmp_path / "bad.csv", truth, exchange)
+    good = poses_file(tmp_path / "good.csv", truth)
+    assert command(good, "--splits", 4, "--strict")[0] == 0
+    code, out, err = command(bad, "--splits", 4)
+    assert code == 0
+    assert "verdict: do not use" in out
+    code, _, err = command(bad, "--splits", 4, "--strict", "--out", tmp_path / "h.json")
+    assert code == 4
+    assert err.splitlines()[-1].startswith("error: --strict: failed: ")
+    assert (tmp_path / "h.json").exists()

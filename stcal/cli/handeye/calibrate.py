@@ -29,8 +29,10 @@ from stcal.cli.options import (
     Quaternions,
     ReportFile,
     SecondTable,
+    Strict,
     Workers,
     exports_of,
+    require_passed,
 )
 from stcal.cli.terminal import StageProgress, print_each, say, write
 from stcal.errors import InputError
@@ -240,6 +242,7 @@ def handeye(
     workers: Workers = None,
     json_file: JsonFile = None,
     report: ReportFile = None,
+    strict: Strict = False,
 ) -> None:
     """Find where a camera sits on a robot's flange, or in its base, and how well that is known."""
     from stcal.handeye import HandEyeOptions, Noise
@@ -247,6 +250,7 @@ def handeye(
     from stcal.handeye.report.export import exported, opencv_yaml, require_form, ros_yaml, urdf_joint
     from stcal.handeye.report.file import HandEyeFile
     from stcal.handeye.report.page import outcome_page, outcome_text
+    from stcal.handeye.report.verdict import judged
     from stcal.robot import load_robot, save_robot
     from stcal.workflows.handeye.calibrate import AUTO, Splits, calibrate
     from stcal.workflows.handeye.inputs import dry_run as understood
@@ -335,6 +339,7 @@ def handeye(
         say(f"written: {robot_out}")
     if json_file:
         write(json_file, HandEyeFile.of(outcome, whole=True))
+    require_passed(strict, judged(outcome).failed(), report)
 
 
 def _require_arm(

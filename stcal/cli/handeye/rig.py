@@ -6,7 +6,16 @@ from typing import Annotated
 import typer
 
 from stcal.cli.handeye.inputs import LengthUnit, PosesAre, RotationOption, TimeTolerance
-from stcal.cli.options import MOST_SEED, JsonFile, QuaternionOrder, Quaternions, ReportFile, Workers
+from stcal.cli.options import (
+    MOST_SEED,
+    JsonFile,
+    QuaternionOrder,
+    Quaternions,
+    ReportFile,
+    Strict,
+    Workers,
+    require_passed,
+)
 from stcal.cli.terminal import StageProgress, print_each, say, write
 from stcal.io.saving import keep_apart
 
@@ -50,12 +59,14 @@ def rig(
     workers: Workers = None,
     json_file: JsonFile = None,
     report: ReportFile = None,
+    strict: Strict = False,
 ) -> None:
     """Find where several cameras sit on one flange, or in one base, and in each other, from one adjustment."""
     from stcal.handeye.data.formats.record import Said
     from stcal.handeye.data.rig_file import read_rig_file
     from stcal.handeye.report.rig import rig_page, rig_text
     from stcal.handeye.report.rig_file import HandEyeRigFile
+    from stcal.handeye.report.rig_outcome import rig_judged
     from stcal.workflows.handeye.calibrate import Splits
     from stcal.workflows.handeye.rig import calibrate_rig
     from stcal.workflows.handeye.rig_inputs import read_rig
@@ -80,3 +91,4 @@ def rig(
     ):
         if path:
             write(path, content())
+    require_passed(strict, rig_judged(outcome).failed(), report)

@@ -5,7 +5,7 @@ from typing import Annotated
 
 import typer
 
-from stcal.cli.options import ReportFile, TargetFile, Workers
+from stcal.cli.options import ReportFile, Strict, TargetFile, Workers, require_passed
 from stcal.cli.terminal import StageProgress, say, write
 from stcal.errors import InputError
 
@@ -47,6 +47,7 @@ def calibrate_camera(
         ),
     ] = None,
     report: ReportFile = None,
+    strict: Strict = False,
     workers: Workers = None,
 ) -> None:
     """Calibrate the camera from views of the board, without any start: cameras.txt with σ and correlations, for run."""
@@ -79,3 +80,5 @@ def calibrate_camera(
         from stcal.sfm.camera.report import calibration_page
 
         write(report, calibration_page(result, summary, str(images)), "report")
+    failed = result.split is not None and result.split.verdict == "failed"
+    require_passed(strict, ["split-half check"] if failed else [], report)

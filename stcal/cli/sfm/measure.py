@@ -15,11 +15,13 @@ from stcal.cli.options import (
     ReportFile,
     Scheduler,
     SendImages,
+    Strict,
     TargetFile,
     Workers,
     ellipse_options,
     handed_over,
     load_ahead,
+    require_passed,
 )
 from stcal.cli.terminal import StageProgress, print_each, say, write
 from stcal.errors import InputError
@@ -79,6 +81,7 @@ def measure(
             help="Multiply the centres' σ by this; by the factor of faces.json if not given.",
         ),
     ] = None,
+    strict: Strict = False,
     min_diameter: MinDiameter = None,
     max_diameter: MaxDiameter = 450.0,
     workers: Workers = None,
@@ -109,6 +112,7 @@ def measure(
             "--sequence": sequence,
             "--scheduler": scheduler,
             "--send-images": send_images,
+            "--strict": strict,
         }
         if given := [name for name, value in alone.items() if value]:
             raise InputError(f"--serve and {given[0]}: images come over HTTP, one answer each; leave {given[0]} out")
@@ -123,7 +127,7 @@ def measure(
     from stcal.io.table import read_table
     from stcal.sfm.measure import images as work
     from stcal.sfm.measure import output
-    from stcal.sfm.measure.pose import PoseOptions
+    from stcal.sfm.measure.pose import PoseOptions, fit_verdict
     from stcal.sfm.measure.target import read_target
 
     for path in (out, json_file, report):
@@ -149,6 +153,8 @@ def measure(
         from stcal.sfm.measure.report import measure_page
 
         write(report, measure_page(result, str(images)), "report")
+    failed = [each.name for each in result.images if fit_verdict(each.pose) == "failed"]
+    require_passed(strict, [f"χ² of {name}" for name in failed], report)
 
 
 def _serve(camera, faces, target, board, sigma_factor, ellipses, listen) -> None:

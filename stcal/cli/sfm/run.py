@@ -9,6 +9,7 @@ import typer
 from stcal.cli.options import (
     BoardFile,
     CameraFile,
+    Exclude,
     Images,
     JsonFile,
     MaxDiameter,
@@ -16,11 +17,13 @@ from stcal.cli.options import (
     Run,
     Scheduler,
     SendImages,
+    Strict,
     TargetFile,
     Workers,
     ellipse_options,
     handed_over,
     load_ahead,
+    require_passed,
 )
 from stcal.cli.terminal import StageProgress, say, write
 from stcal.errors import InputError
@@ -125,6 +128,8 @@ def run(
             "sparse above 80 images if not given."
         ),
     ] = None,
+    exclude: Exclude = None,
+    strict: Strict = False,
     min_diameter: MinDiameter = None,
     max_diameter: MaxDiameter = 450.0,
     workers: Workers = None,
@@ -153,10 +158,13 @@ def run(
         pairs=PairOptions(None if max_angle is None else float(np.radians(max_angle))),
         ellipses=ellipse_options(min_diameter, max_diameter),
         workers=workers,
+        exclude=tuple(exclude or ()),
     )
     with handed_over(scheduler, send_images), StageProgress() as progress:
         result = pipeline.run(images, camera, out, target, board, options, progress)
     say(run_text(result))
+    failed = [check.title for check in result.checks if check.verdict == "failed"]
+    require_passed(strict, failed, result.out / "report.html")
 
 
 @app.command()
@@ -171,6 +179,7 @@ def detect(
     solve: Annotated[
         Solve | None, typer.Option(help="Detect as `run` does with the same option: paper, by the published rules.")
     ] = None,
+    exclude: Exclude = None,
     min_diameter: MinDiameter = None,
     max_diameter: MaxDiameter = 450.0,
     workers: Workers = None,
@@ -181,7 +190,7 @@ def detect(
     load_ahead(workers)
     from stcal.io.camera import read_camera
     from stcal.io.design import board_of, target_of
-    from stcal.io.images import find_images
+    from stcal.io.images import chosen_images
     from stcal.sfm import pipeline
     from stcal.sfm.run.marker import MarkerFile
     from stcal.sfm.run.options import RunOptions
@@ -195,10 +204,11 @@ def detect(
         solve=solve.value if solve is not None else None,
         ellipses=ellipse_options(min_diameter, max_diameter),
         workers=workers,
+        exclude=tuple(exclude or ()),
     )
     if (out / "faces.json").exists():
         raise InputError(f"output folder {out}: holds a finished calibration; give another folder with --out")
-    find_images(images)
+    chosen_images(images, options.exclude)
     given = {"images": images, "--camera": camera, "--target": target, "--board": board}
     with (
         handed_over(scheduler, send_images),

@@ -61,6 +61,10 @@ class Verdict:
         doubts = [each for each in self.findings if each.word != GOOD]
         return sorted(doubts, key=lambda each: each.word != BAD) or list(self.findings)
 
+    def failed(self) -> list[str]:
+        """What use is advised against for."""
+        return [each.said for each in self.findings if each.word == BAD]
+
     def sentence(self) -> str:
         """The word and its reasons, in one line."""
         return f"{self.word}: {'; '.join(each.said for each in self.reasons())}"

@@ -1,6 +1,7 @@
 """Checks of images, labels and camera, from the residuals of the free networks: no board, no design is believed."""
 
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 
 import numpy as np
 from scipy.special import bdtrc, chdtri
@@ -12,7 +13,7 @@ from stcal.io.camera import PARAMETER_NAMES, CalibratedCamera, CameraPrior, intr
 from stcal.labels import CircleLabel
 from stcal.sfm.adjust.calibration import Calibration
 from stcal.sfm.adjust.network import Network, solve_score
-from stcal.sfm.checks.verdict import SUSPICIOUS, Check, Measured, Trial, judge
+from stcal.sfm.checks.verdict import SUSPICIOUS, Check, Measured, Trial, judge, without_image
 from stcal.sfm.data.observations import ImageObservations
 
 MIN_CIRCLES = 3
@@ -142,10 +143,11 @@ def image_check(networks: Sequence[Network]) -> Check:
             trials.append(
                 Trial(name, float(np.sqrt(ratio)), "×", ratio * round(redundancy[i]), round(redundancy[i]), rest)
             )
+    check = judge("image-residuals", "Residuals of each image against its group", trials, "images", "")
     remedy = (
         "a blurred image, or one in which something stood elsewhere: look at its overlay, take it out and run again"
     )
-    return judge("image-residuals", "Residuals of each image against its group", trials, "images", remedy)
+    return _take_out(check, remedy)
 
 
 def sharpness_check(networks: Sequence[Network], blur_px: dict[str, float]) -> Check:
@@ -230,6 +232,11 @@ def moved_check(networks: Sequence[Network]) -> Check:
                 trials.append(Trial(name, shift_um, "µm", test.statistic, test.freedom, redundancy - test.freedom))
     remedy = (
         "in these images the target stood elsewhere against the board than in the others of the group: sort the images "
-        "into groups between which nothing moved, or take the group again"
+        "into groups between which nothing moved, or take the group again; of a single one, run without it"
     )
-    return judge("moved", "Target against board, image by image", trials, "images", remedy)
+    return _take_out(judge("moved", "Target against board, image by image", trials, "images", ""), remedy)
+
+
+def _take_out(check: Check, remedy: str) -> Check:
+    """With the remedy and the option that takes out the worst image named, where there is one."""
+    return replace(check, remedy=f"{remedy}: {without_image(check.names[0])}") if check.names else check

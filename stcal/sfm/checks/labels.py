@@ -10,7 +10,7 @@ import numpy as np
 from stcal.geometry.camera import Camera
 from stcal.labels import Label
 from stcal.sfm.adjust.network import Network
-from stcal.sfm.checks.verdict import SHOWN, Check, Measured, Trial, judge
+from stcal.sfm.checks.verdict import SHOWN, Check, Measured, Trial, judge, without_image
 from stcal.sfm.data.model import Outlier
 from stcal.sfm.data.observations import ImageObservations
 
@@ -42,7 +42,8 @@ def labels_check(
         verdict = "failed"
         reason = f"{len(outliers)} left out, {MANY} or more of image {', '.join(lost)}"
         remedy = (
-            "in these images the target stood elsewhere against the board, or they are of another group: take them out"
+            "in these images the target stood elsewhere against the board, or they are of another group: take them "
+            f"out, the first with {without_image(lost[0])}"
         )
     if swapped:
         verdict = "failed"

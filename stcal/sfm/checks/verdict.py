@@ -5,6 +5,7 @@ things tested (Bonferroni), gives the verdict. A report makes some fifteen check
 honest run in seventy shows something suspicious, and one in seven thousand a failure.
 """
 
+import shlex
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Literal
@@ -13,11 +14,13 @@ import numpy as np
 from scipy.special import fdtrc
 
 from stcal.geometry.robust import ratio_limit
+from stcal.sfm.report.checks import ORDER
 
 Verdict = Literal["passed", "suspicious", "failed", "not possible"]
 SUSPICIOUS = 1e-3
 FAILED = 1e-5
 """Probability, over all things that one check tests, of as much or more by chance."""
+BY_CHANCE = f"a check is suspicious by chance in one run in {1 / SUSPICIOUS:,.0f}, failed in one in {1 / FAILED:,.0f}"
 KNOWN = 1e9
 """Degrees of freedom of a σ that is stated, not estimated."""
 SHOWN = 8
@@ -106,6 +109,17 @@ def judge(key: str, title: str, trials: Sequence[Trial], what: str, remedy: str,
         reason = f"{largest}" if count == 1 else f"{count} {what} within chance, largest {largest}"
     names = tuple(trials[i].name for i in found)
     return Check(key, title, verdict, reason, measured, count, names, remedy if found else "")
+
+
+def without_image(name: str) -> str:
+    """The option that takes an image out of a run; one at a time, the worst, as it may be why others stand out."""
+    return f"--exclude {shlex.quote(name)}"
+
+
+def ranked(checks: Sequence[Check], images: frozenset[str]) -> list[Check]:
+    """The order in which to read them: the worst first, and of the failed ones those that name an image, which may be
+    why the others fail."""
+    return sorted(checks, key=lambda check: (ORDER.index(check.verdict), images.isdisjoint(check.names)))
 
 
 def impossible(key: str, title: str, reason: str, remedy: str) -> Check:

@@ -41,7 +41,7 @@ CAUSES = {
     "merged": "it runs into something bright beside it: move or cover that, or photograph it from elsewhere",
     "cut": "only a part of it shows: uncover it, or photograph it from elsewhere",
 }
-TRIFLES = ("views", "hidden", "note", "copy", "file_type", "folder")
+TRIFLES = ("views", "hidden", "note", "copy", "file_type", "folder", "excluded")
 """Gates of what can hardly be helped, or needs no help."""
 MAX_LABELS = 12
 MAX_LINES = 40

@@ -47,6 +47,8 @@ class RunOptions:
         The board alone was photographed: λ and its residuals are the answer. Where not, it is found out.
     compare : {"paper"}, optional
         Solve the same photographs as published too, and step by step from there, for the report.
+    exclude : tuple of str
+        Images that are not used, by their names in results, such as ``12/IMG_1003.jpg``.
 
     Raises
     ------
@@ -66,6 +68,7 @@ class RunOptions:
     refine_camera: bool = False
     board_only: bool = False
     compare: Compare | None = None
+    exclude: tuple[str, ...] = ()
 
     def __post_init__(self):
         if self.compare not in (None, *get_args(Compare)):

@@ -8,7 +8,7 @@ import numpy as np
 from stcal.io.images import Skipped
 from stcal.labels import DotLabel
 from stcal.report.text import text_table
-from stcal.sfm.checks.verdict import Check
+from stcal.sfm.checks.verdict import BY_CHANCE, Check, ranked
 from stcal.sfm.detect.files import DetectionResult
 from stcal.sfm.detect.labels import LabelledImage
 from stcal.sfm.report.checks import count_verdicts
@@ -41,7 +41,10 @@ def run_text(result: RunResult) -> str:
     reused = sum(image.reused for image in result.detection.images)
     if reused:
         lines.append(f"detections kept from an earlier run: {reused} of {len(result.detection.images)}")
-    lines += [*(_faces(result) if result.target.target_from_face else _boards(result)), *_checks(result.checks)]
+    lines += [
+        *(_faces(result) if result.target.target_from_face else _boards(result)),
+        *_checks(result.checks, frozenset(image.name for image in result.observations())),
+    ]
     if result.comparison is not None:
         lines += _compared(result.comparison)
     if result.target.target_from_face:
@@ -135,10 +138,12 @@ def _boards(result: RunResult) -> Iterator[str]:
     yield from (f"  {line}" for line in text_table(rows))
 
 
-def _checks(checks: Sequence[Check]) -> Iterator[str]:
-    """How many checks came out how, and those that did not pass."""
+def _checks(checks: Sequence[Check], images: frozenset[str]) -> Iterator[str]:
+    """How many checks came out how, and those that did not pass, the worst first."""
     yield f"checks: {count_verdicts([check.verdict for check in checks])}"
-    for check in checks:
+    if any(check.verdict in ("failed", "suspicious") for check in checks):
+        yield f"  ({BY_CHANCE})"
+    for check in ranked(checks, images):
         if check.verdict != "passed":
             remedy = f"; {check.remedy}" if check.remedy else ""
             yield f"  {check.verdict}: {check.title}: {check.reason}{remedy}"

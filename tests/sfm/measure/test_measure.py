@@ -554,3 +554,13 @@ def test_a_face_that_was_not_calibrated_is_left_out(scene, known):
         "a", ".", (), np.zeros((0, 2)), np.zeros((0, 2)), np.zeros((0, 2, 2)), np.zeros((0, 2, 2))
     )
     assert measure_labelled([empty], scene.camera, truth).left_out[0].reason == NO_FACE
+
+
+def test_strict_ends_as_failed_where_residuals_are_beyond_their_sigma(small_dataset, small_run, stcal_sfm, tmp_path):
+    """σ stated a hundred times too small; with their own σ the same images pass."""
+    words = command(small_dataset, small_run, tmp_path, "--strict")
+    assert stcal_sfm(*words)[0] == 0
+    code, _, err = stcal_sfm(*words, "--sigma-factor", 0.01)
+    assert code == 4
+    assert "error: --strict: failed: χ² of " in err
+    assert (tmp_path / "poses.csv").exists()

@@ -32,6 +32,7 @@ OTHER = RunOptions(
     ellipses=EllipseOptions(min_diameter_px=7.5, max_diameter_px=321.0, min_axis_ratio=0.23, min_contrast=0.07),
     workers=3,
     flatness_mm=0.3,
+    exclude=("12/a.jpg", "b.jpg"),
 )
 SPECIAL = ("refine_camera", "compare", "board_only")
 """No value is a default but those that only the joint adjustment knows, and that of runs without faces."""
@@ -237,6 +238,11 @@ WRONG = {
         "stcal-run.json",
         lambda c: c["options"]["pairs"].update(max_angle_rad=[1]),
         "max_angle_rad [1]: a single value needed",
+    ),
+    "names that are none": (
+        "stcal-run.json",
+        lambda c: c["options"].update(exclude=[7]),
+        "options: exclude [7]: a list of names needed",
     ),
     "a circle not finite": ("faces.json", lambda c: c["circles"].update({"2:1": [1, 2, np.nan]}), "circles.2:1: "),
 }
