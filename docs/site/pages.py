@@ -1,0 +1,107 @@
+"""Pages of the site that are made from the program: its commands with their options, and its public interface."""
+
+import inspect
+import re
+from collections.abc import Iterator
+from importlib import import_module
+from typing import Any
+
+from typer.main import get_command
+
+from stcal.cli.help import PLAIN
+from stcal.cli.main import app
+
+SYSTEMS = {
+    "sfm": "Targets",
+    "robot": "Robots",
+    "register": "Registration",
+    "handeye": "Hand-eye",
+    "locate": "Targets of tags",
+}
+"""Packages whose ``__all__`` is the public interface."""
+BESIDE = {
+    "stcal.geometry.rigid": ("Rigid",),
+    "stcal.io.camera": ("CameraModel", "read_camera"),
+    "stcal.io.design": ("load_target", "load_board"),
+    "stcal.errors": None,
+}
+"""Names that results and arguments are made of; all that a module defines where None."""
+
+
+def commands() -> Iterator[tuple[str, str]]:
+    """(name of the page, text) of each group of commands, and of their list."""
+    root: Any = get_command(app)
+    single = {name: each for name, each in root.commands.items() if not hasattr(each, "commands")}
+    groups = {name: each for name, each in root.commands.items() if hasattr(each, "commands")}
+    rows = ["# Commands", "", "Made from the program; `--help` of each says the same.", ""]
+    for name, group in groups.items():
+        words = f"stcal {name}" if name != "sfm" else "stcal-sfm"
+        text = [f"# {words}", "", str(group.help or "").strip(), ""]
+        rows += [f"- [{words}]({name}.md): {', '.join(f'`{each}`' for each in group.commands)}"]
+        for each, command in group.commands.items():
+            text += command_text(f"{words} {each}", command)
+        yield name, "\n".join(text) + "\n"
+    for name in sorted({each.split()[0] for each in single}):
+        own = {each: command for each, command in single.items() if each.split()[0] == name}
+        rows += [f"- [stcal {name}]({name}.md): {', '.join(f'`{each}`' for each in own)}"]
+        text = [f"# stcal {name}", ""]
+        for each, command in own.items():
+            text += command_text(f"stcal {each}", command)
+        yield name, "\n".join(text) + "\n"
+    yield "index", "\n".join(rows) + "\n"
+
+
+def command_text(words: str, command: Any) -> list[str]:
+    """Heading, help, and a table of arguments and options."""
+    context = command.make_context(words, [], resilient_parsing=True, **PLAIN["context_settings"])
+    usage = " ".join(command.collect_usage_pieces(context))
+    text = [f"## {words}", "", inspect.cleandoc(command.help or ""), "", "```", f"{words} {usage}", "```", ""]
+    records = [each.get_help_record(context) for each in command.params if each.name != "help"]
+    rows = [f"| `{cell(names)}` | {plain(meaning)} |" for names, meaning in filter(None, records)]
+    return [*text, "| argument or option | meaning |", "|---|---|", *rows, ""]
+
+
+def cell(text: str) -> str:
+    """In a table."""
+    return " ".join(text.split()).replace("|", "\\|")
+
+
+def plain(text: str) -> str:
+    """In a table, with nothing in it that Markdown would obey."""
+    return re.sub(r"([*_<>\[\]])", r"\\\1", cell(text))
+
+
+def interface() -> Iterator[tuple[str, str]]:
+    """(name of the page, text) of each package, and of their list."""
+    listed = [f"{system}.rst" for system in SYSTEMS] + ["beside.rst"]
+    for system, title in SYSTEMS.items():
+        module = import_module(f"stcal.{system}")
+        yield system, package(f"stcal.{system}", title, list(module.__all__))
+    text = ["What they are made of", "=====================", ""]
+    for name, own in BESIDE.items():
+        module = import_module(name)
+        names = own or [each for each, value in vars(module).items() if getattr(value, "__module__", "") == name]
+        text += [f"``{name}``", "-" * (len(name) + 4), "", *directives(name, list(names))]
+    yield "beside", "\n".join(text) + "\n"
+    toc = "".join(f"   {each.removesuffix('.rst')}\n" for each in listed)
+    yield "index", f"Python interface\n================\n\nMade from the docstrings.\n\n.. toctree::\n\n{toc}"
+
+
+def package(name: str, title: str, names: list[str]) -> str:
+    """The page of one system."""
+    head = f"{title}: ``{name}``"
+    return "\n".join([head, "=" * len(head), "", f".. module:: {name}", "", *directives(name, names)]) + "\n"
+
+
+def directives(module: str, names: list[str]) -> list[str]:
+    """Of autodoc, for functions, classes and constants."""
+    text = [f".. currentmodule:: {module}", ""]
+    for name in names:
+        value = getattr(import_module(module), name)
+        if inspect.isclass(value):
+            text += [f".. autoclass:: {name}", "   :members:", ""]
+        elif callable(value):
+            text += [f".. autofunction:: {name}", ""]
+        else:
+            text += [f".. autodata:: {name}", "   :no-value:", ""]
+    return text
