@@ -31,6 +31,7 @@ MODULES = (
     "stcal.synthetic.truth",
     "stcal.sfm.camera.file",
     "stcal.sfm.plan.file",
+    "stcal.sfm.budget.file",
     "stcal.sfm.interop.file",
     "stcal.sfm.diagnose.file",
     "stcal.handeye.report.file",

@@ -72,12 +72,29 @@ class TargetDesign:
         }
 
 
+@dataclass(frozen=True, slots=True)
+class StatedSize:
+    """What is stated of a body's size besides its drawing; None where nothing is. Only the uncertainty budget uses it.
+
+    ``pitch_sigma_ppm`` : relative standard uncertainty of the pitch that all dots share; ``expansion_ppm_per_k`` :
+    coefficient of linear thermal expansion with its σ; ``temperature_c`` : of the body in the photographs with its σ;
+    ``reference_temperature_c`` : at which its size is stated, or is to be (ISO 1: 20 °C).
+    """
+
+    pitch_sigma_ppm: float | None = None
+    expansion_ppm_per_k: float | None = None
+    expansion_sigma_ppm_per_k: float | None = None
+    temperature_c: float | None = None
+    temperature_sigma_k: float | None = None
+    reference_temperature_c: float | None = None
+
+
 @dataclass(frozen=True, slots=True, eq=False)
 class BoardDesign:
     """A rectangular grid of dots; X along a row, Y down the columns, Z into the board, origin at dot (0, 0).
 
     ``corner`` : (row, column) of the one larger dot, with ``corner_radius_mm``, or None for a plain board.
-    ``sigma_mm`` : standard deviation of the dots' positions about the grid, per axis.
+    ``sigma_mm`` : standard deviation of the dots' positions about the grid, per axis; ``stated`` : of its size.
     """
 
     rows: int
@@ -88,6 +105,7 @@ class BoardDesign:
     sigma_mm: float
     corner: tuple[int, int] | None = None
     corner_radius_mm: float | None = None
+    stated: StatedSize = StatedSize()
 
     def cells(self) -> np.ndarray:
         """Row and column of every dot, (rows·columns, 2), row-major."""

@@ -37,7 +37,7 @@ INSIDE = {
         ("adjust",),
         ("checks", "camera", "measure"),
         ("run",),
-        ("interop", "diagnose", "plan"),
+        ("interop", "diagnose", "plan", "budget"),
         (".",),
     ),
     "robot": (("kinematics",), ("identify", "axes", "urdf"), ("use",), ("export",), (".",)),

@@ -1,12 +1,21 @@
 """``target.toml`` and ``board.toml``: read with every mistake named, and written with comments to edit."""
 
+from dataclasses import fields
 from pathlib import Path
 from typing import Annotated, Literal
 
 import numpy as np
 from pydantic import AfterValidator, BeforeValidator, Field
 
-from stcal.design import BoardDesign, FaceDesign, Polarity, TargetDesign, reference_board, reference_target
+from stcal.design import (
+    BoardDesign,
+    FaceDesign,
+    Polarity,
+    StatedSize,
+    TargetDesign,
+    reference_board,
+    reference_target,
+)
 from stcal.errors import InputError
 from stcal.geometry.rigid import Rigid
 from stcal.io.toml import Finite, Positive, Strict, load_toml, toml_string
@@ -71,7 +80,34 @@ class _CornerFile(Strict):
     radius_mm: Positive
 
 
-class BoardEntry(Strict):
+Ppm = Annotated[float, Field(ge=0, le=1e5, allow_inf_nan=False, strict=True)]
+Expansion = Annotated[float, Field(ge=-100, le=1000, allow_inf_nan=False, strict=True)]
+Celsius = Annotated[float, Field(ge=-273.15, le=2000, allow_inf_nan=False, strict=True)]
+Kelvin = Annotated[float, Field(ge=0, le=100, allow_inf_nan=False, strict=True)]
+
+
+class SizeEntry(Strict):
+    """Keys of :class:`StatedSize` but the pitch: of any body."""
+
+    expansion_ppm_per_k: Expansion | None = None
+    expansion_sigma_ppm_per_k: Ppm | None = None
+    temperature_c: Celsius | None = None
+    temperature_sigma_k: Kelvin | None = None
+    reference_temperature_c: Celsius | None = None
+
+    def stated(self) -> StatedSize:
+        """As the budget takes it."""
+        own = {each.name: getattr(self, each.name, None) for each in fields(StatedSize)}
+        return StatedSize(**{key: None if value is None else float(value) for key, value in own.items()})
+
+
+class BoardSizeEntry(SizeEntry):
+    """Keys of :class:`StatedSize`."""
+
+    pitch_sigma_ppm: Ppm | None = None
+
+
+class BoardEntry(BoardSizeEntry):
     """A board of dots; ``type`` may say so."""
 
     type: Literal["circles"] = "circles"
@@ -130,6 +166,7 @@ def board_design(data: BoardEntry, where: str) -> BoardDesign:
         data.sigma_mm,
         corner,
         data.corner.radius_mm if data.corner else None,
+        data.stated(),
     )
 
 
@@ -255,6 +292,7 @@ def board_toml(board: BoardDesign) -> str:
     corner = board.corner or (0, 0)
     corner_radius = board.corner_radius_mm or 1.5 * board.radius_mm
     off = "" if board.corner else "# "
+    sizes = [(each.name, getattr(board.stated, each.name)) for each in fields(StatedSize)]
     return (
         "\n".join(
             [
@@ -265,6 +303,7 @@ def board_toml(board: BoardDesign) -> str:
                 f"radius_mm = {_number(board.radius_mm)}",
                 f'polarity = "{board.polarity}"  # dots are "bright" or "dark" against the board',
                 f"sigma_mm = {_number(board.sigma_mm)}  # standard deviation of the dots' positions, per axis",
+                *(f"{key} = {_number(value)}" for key, value in sizes if value is not None),
                 "",
                 "# One larger dot in a corner of the grid tells the orientation; without it the board looks the",
                 "# same after half a turn, which a run settles by comparing the images of a group.",

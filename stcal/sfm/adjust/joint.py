@@ -90,6 +90,21 @@ class JointResult:
         return self.last_move_px < SETTLED_PX
 
 
+@dataclass(frozen=True, slots=True, eq=False)
+class Adjusted:
+    """Groups and what they share at the minimum, the setting that they were weighed by, and by how much the next whole
+    step would still move a projection, px."""
+
+    blocks: tuple[Block, ...]
+    shared: Shared
+    setting: Setting
+    move_px: float
+
+    def result(self) -> JointResult:
+        """With covariances."""
+        return _result(list(self.blocks), self.shared, self.setting, self.move_px)
+
+
 def adjust_jointly(
     models: Sequence[MetricModel],
     board: BoardDesign,
@@ -98,28 +113,45 @@ def adjust_jointly(
     prior: CameraPrior | None = None,
     start: Camera | None = None,
 ) -> JointResult:
+    """:func:`adjusted`, and the covariances at its minimum."""
+    return adjusted(models, board, camera, flatness_mm, prior, start).result()
+
+
+def adjusted(
+    models: Sequence[MetricModel],
+    board: BoardDesign,
+    camera: Camera,
+    flatness_mm: float | None = None,
+    prior: CameraPrior | None = None,
+    start: Camera | None = None,
+    common: float | None = None,
+) -> Adjusted:
     """Adjust metric models that share one frame, all observations weighted by their σ.
 
     ``flatness_mm`` : σ of a circle's distance from the plane of its face, None for no such knowledge; ``prior`` : the
-    intrinsics of ``camera`` are observations with this covariance and are adjusted, from ``start``; fixed where None.
+    intrinsics of ``camera`` are observations with this covariance and are adjusted, from ``start``; fixed where None;
+    ``common`` : share of the board's variance that all groups have in common; where it is given, no residual loses
+    weight, so that the answer is linear in the observations.
 
     Whether the board kept its shape between the groups (one plate) or not (a film, a screen) is estimated from its
-    dots: first every group has its own deviations from the design, and where these agree a common shape follows.
+    dots where ``common`` is None: first every group has its own deviations from the design, and where these agree a
+    common shape follows.
 
     Raises
     ------
     ConvergenceError
         No minimum is reached.
     """
-    blocks, shared, setting = _start(models, board, camera, flatness_mm, prior)
+    blocks, shared, setting = _start(models, board, camera, flatness_mm, prior, common or 0.0)
     shared = replace(shared, camera=start or camera)
-    setting = replace(setting, huber=HUBER * _robust_sigma(blocks, shared.camera))
+    if common is None:
+        setting = replace(setting, huber=HUBER * _robust_sigma(blocks, shared.camera))
     blocks, shared, move = _minimise(blocks, shared, setting)
-    common = _common_share(blocks, board)
-    if common > 0:
-        blocks, setting = _with_common(blocks, setting, common)
+    share = _common_share(blocks, board) if common is None else 0.0
+    if share > 0:
+        blocks, setting = _with_common(blocks, setting, share)
         blocks, shared, move = _minimise(blocks, shared, setting)
-    return _result(blocks, shared, setting, move)
+    return Adjusted(tuple(blocks), shared, setting, move)
 
 
 def covariance_of(

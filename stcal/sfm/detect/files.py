@@ -125,7 +125,8 @@ def _fingerprint(
     def plain(value):
         return value.tolist() if isinstance(value, np.ndarray) else str(value)
 
-    parts = [CACHE_VERSION, asdict(camera), asdict(target), asdict(board) if board else None, asdict(options)]
+    dots = {key: value for key, value in asdict(board).items() if key != "stated"} if board else None
+    parts = [CACHE_VERSION, asdict(camera), asdict(target), dots, asdict(options)]
     parts += [detector.__name__] if detector else []
     return hashlib.sha256(json.dumps(parts, default=plain, sort_keys=True).encode()).hexdigest()
 

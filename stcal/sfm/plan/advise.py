@@ -7,17 +7,10 @@ from itertools import combinations
 import numpy as np
 
 from stcal.errors import DegenerateError
-from stcal.geometry.rigid import Rigid
-from stcal.io.camera import camera_prior
-from stcal.labels import circle_labels
 from stcal.parallel import Progress, kept_processes, one_thread, run_briefly
 from stcal.sfm.adjust.blocks import rows_of_view
-from stcal.sfm.adjust.calibration import with_sigma
-from stcal.sfm.adjust.chain import CalibratedTarget
-from stcal.sfm.adjust.joint import JointResult, adjust_jointly, basis_of, photographs_of
+from stcal.sfm.adjust.joint import JointResult, basis_of, photographs_of
 from stcal.sfm.data.model import MetricModel
-from stcal.sfm.mapping.database import image_ids
-from stcal.sfm.mapping.models import read_model
 from stcal.sfm.plan.forecast import (
     CentreNoise,
     Forecast,
@@ -31,6 +24,7 @@ from stcal.sfm.plan.forecast import (
 )
 from stcal.sfm.plan.simulated import observe, true_models
 from stcal.sfm.plan.views import PlannedView, candidates, known_scene
+from stcal.sfm.run.adjusted import adjusted_run
 from stcal.sfm.run.saved import SavedRun
 from stcal.synthetic.placement import GroupShape, place_group, viewing_axes
 from stcal.synthetic.scene import Group, Scene, group_name
@@ -103,24 +97,16 @@ def known_of(run: SavedRun) -> Known:
     InputError
         The run's ``target_model`` is missing or damaged.
     """
-    read = read_model(run.folder / "target_model", run.observations, image_ids(run.observations), run.corrected_px)
-    models = [with_sigma(model, run.report["summary"]["sigma_factor"]) for model in read.in_mm()]
-    start = CalibratedTarget(
-        run.faces.reference_face,
-        run.faces.poses(),
-        dict(zip(circle_labels(run.faces.circles), run.faces.circles.values(), strict=True)),
-        {model.group: Rigid() for model in models},
-    )
-    prior = camera_prior(run.camera) if run.options.refine_camera else None
-    joint = adjust_jointly(models, run.board, run.camera, run.options.flatness_mm, prior, read.camera)
+    again = adjusted_run(run)
+    joint = again.state.result()
     setup = Setup(
         target=run.target,
         board=run.board,
         camera=joint.camera,
-        start=start,
+        start=again.start,
         frame=run.faces.frame,
         flatness_mm=run.options.flatness_mm,
-        prior=prior,
+        prior=again.prior,
         common=joint.board_common,
         sigma0=joint.sigma0,
     )

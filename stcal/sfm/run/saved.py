@@ -40,7 +40,8 @@ class SavedRun:
 
     ``images`` : the folder of photographs as the run was given it; ``observations`` : of all images, in the database's
     order, without the shapes of the ellipses (zero); ``corrected_px`` : by image, (n, 2), what the database holds;
-    ``faces``, ``report`` : ``faces.json``, and the content of ``report.json``.
+    ``faces``, ``report`` : ``faces.json``, and the content of ``report.json``; ``sha256`` : hashes of its files by path
+    below the folder, as the run left them.
     """
 
     folder: Path
@@ -53,6 +54,7 @@ class SavedRun:
     corrected_px: tuple[np.ndarray, ...]
     faces: FacesFile
     report: dict
+    sha256: dict[str, str]
 
     @property
     def database(self) -> Path:
@@ -140,6 +142,7 @@ def load_run(folder: str | Path) -> SavedRun:
         corrected_px=corrected,
         faces=result,
         report=report,
+        sha256=own.sha256 or {},
     )
 
 

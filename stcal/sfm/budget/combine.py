@@ -1,0 +1,229 @@
+"""From the sources to combined and expanded uncertainties of faces and of the target's largest distances."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from itertools import combinations, combinations_with_replacement
+from typing import Literal
+
+import numpy as np
+
+from stcal.errors import InputError
+from stcal.geometry.arrays import frozen
+from stcal.io.camera import CalibratedCamera
+from stcal.labels import CircleLabel
+from stcal.sfm.adjust.contributions import Contributions, contributions_of
+from stcal.sfm.adjust.joint import JointResult
+from stcal.sfm.adjust.uncertainty import Derivatives, derivatives
+from stcal.sfm.budget.sources import Source, correction, sources_of
+from stcal.sfm.budget.statement import Statement, statement_of
+from stcal.sfm.data.model import MetricModel
+from stcal.sfm.run.adjusted import adjusted_run
+from stcal.sfm.run.saved import SavedRun
+
+COVERAGE_FACTOR = 2.0
+LONGEST = 5
+"""Distances that a budget has."""
+DRAWS = 100_000
+"""Of the coverage (JCGM 101:2008)."""
+Kind = Literal["position", "rotation", "distance"]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Measurand:
+    """What the budget is of: a face's position or rotation in the target frame (3 numbers, of which the uncertainty is
+    the root of the summed variances), or a distance between two circles.
+
+    ``name`` : the face, or ``a – b``; ``length_mm`` of distances; ``jacobian`` : (r, 3c) by the circles, mm or rad;
+    ``designed`` : (r, d) by the frame circles that were not mapped.
+    """
+
+    kind: Kind
+    name: str
+    circles: tuple[CircleLabel, ...]
+    length_mm: float | None
+    jacobian: np.ndarray
+    designed: np.ndarray
+
+    def __post_init__(self):
+        object.__setattr__(self, "jacobian", frozen(self.jacobian, (None, None), f"{self.name}: jacobian"))
+        object.__setattr__(self, "designed", frozen(self.designed, (None, None), f"{self.name}: designed"))
+
+    def covariance(self, source: Source, designed_sigma_mm: float) -> np.ndarray:
+        """(r, r) by one source; ``designed_sigma_mm`` counts for that of the placed circles alone."""
+        if source.key == PLACED:
+            return designed_sigma_mm**2 * self.designed @ self.designed.T
+        return self.jacobian @ source.covariance_mm2 @ self.jacobian.T
+
+
+PLACED = "placed_circles"
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Row:
+    """The uncertainty of one measurand, mm or rad: ``contributions`` by key of the source, ``standard`` combined,
+    ``expanded`` with k = 2, ``coverage`` of that, simulated; ``freedom`` : effective degrees of freedom
+    (Welch–Satterthwaite, JCGM 100 G.4)."""
+
+    measurand: Measurand
+    contributions: dict[str, float]
+    covariance: np.ndarray
+    standard: float
+    expanded: float
+    coverage: float
+    freedom: float
+
+    def share(self, key: str) -> float:
+        """Of the variance."""
+        return (self.contributions[key] / self.standard) ** 2 if self.standard else 0.0
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class View:
+    """Photographs of a group: how many, and the largest angle between two of their axes, rad."""
+
+    group: str
+    images: int
+    spread_rad: float
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Budget:
+    """``correction`` : relative, of lengths, for stated expansion; it is not applied to the run's result."""
+
+    joint: JointResult
+    reference_face: str
+    sources: tuple[Source, ...]
+    rows: tuple[Row, ...]
+    views: tuple[View, ...]
+    statement: Statement
+    correction: float
+
+    def of_kind(self, kind: Kind) -> list[Row]:
+        """Rows of one kind."""
+        return [row for row in self.rows if row.measurand.kind == kind]
+
+
+def budget_of_run(run: SavedRun, statement: Statement | None = None) -> Budget:
+    """The budget of a finished run.
+
+    Parameters
+    ----------
+    run : SavedRun
+        Solved jointly: a chain states no covariance.
+    statement : Statement, optional
+        Of sizes, temperatures and fields; what ``board.toml`` states where None.
+
+    Raises
+    ------
+    InputError
+        Another solve, or a folder that lacks files.
+    """
+    if run.faces.solve != "joint" or not run.faces.eccentricity:
+        raise InputError(
+            f"run {run.folder}: solved by {run.faces.solve}, which states no covariance; run again with --solve joint"
+        )
+    again = adjusted_run(run)
+    found = contributions_of(again.state)
+    own = derivatives(found.joint, again.start, run.target, run.faces.frame)
+    rows = statement or statement_of(run.board.stated)
+    camera, refined = run.camera, run.options.refine_camera
+    return budget(found, own, camera, run.board, run.options.flatness_mm, refined, rows, run.faces.reference_face)
+
+
+def budget(
+    found: Contributions,
+    own: Derivatives,
+    camera: CalibratedCamera,
+    board,
+    flatness_mm: float | None,
+    refined: bool,
+    statement: Statement,
+    reference_face: str,
+) -> Budget:
+    """Of an adjustment; arguments as of :func:`stcal.sfm.budget.sources.sources_of`."""
+    sources = sources_of(found, camera, board, flatness_mm, refined, statement)
+    if own.circles_designed.shape[2]:
+        sources += (_placed(own),)
+    rng = np.random.default_rng(0)
+    rows = [
+        _row(each, sources, own.designed_sigma_mm, found.joint.redundancy, rng)
+        for each in measurands(found.joint, own, reference_face)
+    ]
+    views = tuple(_view(model) for model in found.joint.models)
+    return Budget(found.joint, reference_face, sources, tuple(rows), views, statement, correction(statement))
+
+
+def _placed(own: Derivatives) -> Source:
+    words = "not mapped; their places are the design's, off by as much as the mapped ones are"
+    size = own.circles.shape[-1]
+    sigma = 1e3 * own.designed_sigma_mm
+    return Source(
+        PLACED, "frame circles placed", "A", "estimated", words, sigma, "µm", np.zeros((size, size))
+    )  # it moves faces, not circles
+
+
+def measurands(joint: JointResult, own: Derivatives, reference_face: str) -> list[Measurand]:
+    """Positions and rotations of all faces but the reference, and the longest distances."""
+    others = [face for face in own.target_from_face if face != reference_face]
+    found = []
+    kinds: tuple[tuple[Kind, slice], ...] = (("position", slice(3, 6)), ("rotation", slice(0, 3)))
+    for kind, rows in kinds:
+        found += [
+            Measurand(kind, face, (), None, own.faces[face][rows], own.face_designed[face][rows]) for face in others
+        ]
+    return found + [distance(joint, a, b) for a, b in longest(joint.labels, joint.xyz_model)]
+
+
+def longest(labels: Sequence[CircleLabel], xyz: np.ndarray) -> list[tuple[int, int]]:
+    """The two circles farthest apart of every two faces, and of each; of these pairs the longest."""
+    faces: dict[str, list[int]] = {}
+    for i, label in enumerate(labels):
+        faces.setdefault(label.face, []).append(i)
+    pairs = []
+    for a, b in combinations_with_replacement(faces, 2):
+        ends = combinations(faces[a], 2) if a == b else ((i, j) for i in faces[a] for j in faces[b])
+        pairs.append(max(ends, key=lambda pair: float(np.linalg.norm(xyz[pair[0]] - xyz[pair[1]]))))
+    return sorted(pairs, key=lambda pair: -float(np.linalg.norm(xyz[pair[0]] - xyz[pair[1]])))[:LONGEST]
+
+
+def distance(joint: JointResult, i: int, j: int) -> Measurand:
+    """Between two circles."""
+    way = joint.xyz_model[j] - joint.xyz_model[i]
+    length = float(np.linalg.norm(way))
+    jacobian = np.zeros((1, joint.xyz_model.size))
+    jacobian[0, 3 * j : 3 * j + 3] = way / length
+    jacobian[0, 3 * i : 3 * i + 3] = -way / length
+    ends = joint.labels[i], joint.labels[j]
+    return Measurand("distance", f"{ends[0]} – {ends[1]}", ends, length, jacobian, np.zeros((1, 0)))
+
+
+def _row(
+    measurand: Measurand, sources: Sequence[Source], designed_sigma_mm: float, redundancy: int, rng: np.random.Generator
+) -> Row:
+    parts = {each.key: measurand.covariance(each, designed_sigma_mm) for each in sources}
+    covariance = np.sum(list(parts.values()), axis=0)
+    variance = float(np.trace(covariance))
+    estimated = sum(float(np.trace(parts[each.key])) for each in sources if each.evaluation == "A")
+    standard = float(np.sqrt(variance))
+    return Row(
+        measurand,
+        {key: float(np.sqrt(max(np.trace(each), 0.0))) for key, each in parts.items()},
+        covariance,
+        standard,
+        COVERAGE_FACTOR * standard,
+        _coverage(covariance, COVERAGE_FACTOR * standard, rng),
+        max(redundancy, 1) * (variance / estimated) ** 2 if estimated else np.inf,
+    )
+
+
+def _coverage(covariance: np.ndarray, expanded: float, rng: np.random.Generator) -> float:
+    """Share of simulated errors that are not longer than the expanded uncertainty."""
+    values, vectors = np.linalg.eigh(covariance)
+    errors = rng.standard_normal((DRAWS, len(values))) * np.sqrt(np.maximum(values, 0.0)) @ vectors.T
+    return float((np.linalg.norm(errors, axis=1) <= expanded).mean())
+
+
+def _view(model: MetricModel) -> View:
+    axes = np.array([pose.rotation[2] for pose in model.camera_from_model])
+    spread = float(np.arccos(np.clip((axes @ axes.T).min(), -1, 1)))
+    return View(model.group, len(model.images), spread)

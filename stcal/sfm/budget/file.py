@@ -1,0 +1,230 @@
+"""What ``budget`` writes with ``--json``, and what its page and PDF show."""
+
+import math
+from dataclasses import asdict
+from typing import Any, Literal
+
+import numpy as np
+from pydantic import Field
+
+import stcal
+from stcal.io.json import ByName, Finite, Part, ResultFile
+from stcal.io.saving import RUN_MARKER
+from stcal.sfm.budget.combine import COVERAGE_FACTOR, Budget, Row
+from stcal.sfm.budget.sources import Source
+from stcal.sfm.run.saved import SavedRun
+from stcal.sfm.run.verify import VerifyFile
+
+MICRO = 1e3
+MILLIDEGREES = 1e3 * float(np.degrees(1.0))
+PPM = 1e6
+
+
+class RunOfBudget(Part):
+    folder: str
+    images: str
+    target: str
+    version: str
+    sha256: str
+    faces_sha256: str
+    changed: list[str]
+
+
+class SourceRow(Part):
+    key: str
+    title: str
+    evaluation: Literal["A", "B"]
+    origin: Literal["estimated", "stated", "assumed", "not stated"]
+    sigma: float | None
+    unit: str
+    words: str
+
+
+class ViewsRow(Part):
+    group: str
+    images: int
+    spread_deg: float
+
+
+class Uncertainty(Part):
+    """Of one measurand."""
+
+    contributions: dict[str, float]
+    sensitivities: dict[str, float]
+    standard: float
+    expanded: float
+    coverage: float
+    degrees_of_freedom: Finite
+
+
+class FaceUncertainty(Part):
+    position_um: Uncertainty
+    position_xyz_um: list[float]
+    rotation_mdeg: Uncertainty
+    rotation_xyz_mdeg: list[float]
+
+
+class DistanceUncertainty(Part):
+    circles: list[str]
+    length_mm: float
+    corrected_mm: float
+    distance_um: Uncertainty
+
+
+class StatedRow(Part):
+    body: Literal["board", "target"]
+    key: str
+    value: float
+    origin: str
+
+
+class BudgetFile(ResultFile):
+    """Of ``budget``."""
+
+    format: Literal["stcal budget 1"] = Field(description="the file's form and its version")
+    version: str = Field(description="of stcal")
+    run: RunOfBudget = Field(
+        description="`folder`, `images` (its photographs), name of the `target`, `version` of stcal that made it, "
+        "`sha256` of its `stcal-run.json` (which has the hashes of all other files) and `faces_sha256` of "
+        "`faces.json`; `changed`: files that are not as the run left them"
+    )
+    fields: dict[ByName, str] = Field(
+        description="`instrument`, `operator`, `date`, `traceability` and others, as given; empty where not"
+    )
+    reference_face: str = Field(description="its frame is the target frame, and has no uncertainty")
+    coverage_factor: float = Field(description="k of the expanded uncertainties")
+    sigma0: float = Field(description="residuals of the adjustment over the σ of all observations; scales these")
+    redundancy: int = Field(description="degrees of freedom of the adjustment")
+    views: list[ViewsRow] = Field(
+        description="of each `group`: `images`, and `spread_deg`, the largest angle between two camera axes"
+    )
+    sources: list[SourceRow] = Field(
+        description="inputs: `key`, `title`; `evaluation` of type A or B (JCGM 100, 4.2, 4.3); `origin`: `estimated` "
+        "from this run, `stated` by the user, `assumed` where none is stated, or `not stated`: taken as exact; "
+        "standard uncertainty `sigma` in `unit`, null where it is not one number; `words` on where it comes from"
+    )
+    stated: list[StatedRow] = Field(
+        description="sizes and temperatures: `body`, `key`, `value`, and the file of `origin`"
+    )
+    correction_ppm: float = Field(
+        description="by which lengths of the run are to be enlarged for the stated expansion; the run did not apply it"
+    )
+    faces: dict[ByName, FaceUncertainty] = Field(
+        description="against the reference face: `position_um` (root of the summed variances of x, y, z) and "
+        "`rotation_mdeg` likewise, each with `contributions` by key of the source, `sensitivities` (contribution over "
+        "`sigma` of the source), combined `standard` and `expanded` uncertainty, `coverage` of the latter by "
+        "simulation, and effective `degrees_of_freedom`, null for infinitely many; combined standard "
+        "uncertainties of x, y, z: `position_xyz_um`, `rotation_xyz_mdeg`"
+    )
+    distances: list[DistanceUncertainty] = Field(
+        description="the longest between two faces' `circles`: `length_mm` of the run, `corrected_mm` with "
+        "`correction_ppm`, and `distance_um` with `contributions`, `sensitivities`, `standard`, `expanded`, "
+        "`coverage`, `degrees_of_freedom` as of faces"
+    )
+    notes: list[str] = Field(description="what is not in the combined uncertainty, or not known")
+
+    @classmethod
+    def of(cls, budget: Budget, run: SavedRun, verified: VerifyFile) -> "BudgetFile":
+        """The file of a run's budget; ``verified`` : what became of its files."""
+        return cls.model_validate(_content(budget, run, verified))
+
+
+def _content(budget: Budget, run: SavedRun, verified: VerifyFile) -> dict[str, Any]:
+    stated = budget.statement
+    return {
+        "format": "stcal budget 1",
+        "version": stcal.__version__,
+        "run": {
+            "folder": str(run.folder),
+            "images": str(run.images),
+            "target": run.target.name,
+            "version": verified.version,
+            "sha256": run.sha256.get(RUN_MARKER, ""),
+            "faces_sha256": run.sha256.get("faces.json", ""),
+            "changed": [*verified.missing, *verified.changed, *verified.added],
+        },
+        "fields": stated.fields,
+        "reference_face": budget.reference_face,
+        "coverage_factor": COVERAGE_FACTOR,
+        "sigma0": budget.joint.sigma0,
+        "redundancy": budget.joint.redundancy,
+        "views": [
+            {"group": each.group, "images": each.images, "spread_deg": float(np.degrees(each.spread_rad))}
+            for each in budget.views
+        ],
+        "sources": [_source(each) for each in budget.sources],
+        "stated": [
+            {"body": body, "key": key, "value": value, "origin": stated.origin[body, key]}
+            for body, size in (("board", stated.board), ("target", stated.target))
+            for key, value in asdict(size).items()
+            if value is not None
+        ],
+        "correction_ppm": PPM * budget.correction,
+        "faces": _faces(budget),
+        "distances": [_distance(row, budget) for row in budget.of_kind("distance")],
+        "notes": notes_of(budget, verified),
+    }
+
+
+def _source(source: Source) -> SourceRow:
+    return SourceRow(**{key: getattr(source, key) for key in SourceRow.model_fields})
+
+
+def _faces(budget: Budget) -> dict[str, dict]:
+    rotations = {row.measurand.name: row for row in budget.of_kind("rotation")}
+    found = {}
+    for row in budget.of_kind("position"):
+        other = rotations[row.measurand.name]
+        found[row.measurand.name] = {
+            "position_um": _uncertainty(row, budget, MICRO),
+            "position_xyz_um": (MICRO * np.sqrt(np.diag(row.covariance))).tolist(),
+            "rotation_mdeg": _uncertainty(other, budget, MILLIDEGREES),
+            "rotation_xyz_mdeg": (MILLIDEGREES * np.sqrt(np.diag(other.covariance))).tolist(),
+        }
+    return found
+
+
+def _distance(row: Row, budget: Budget) -> dict:
+    length = row.measurand.length_mm
+    assert length is not None, "of distances only"
+    return {
+        "circles": list(row.measurand.circles),
+        "length_mm": length,
+        "corrected_mm": length * (1 + budget.correction),
+        "distance_um": _uncertainty(row, budget, MICRO),
+    }
+
+
+def _uncertainty(row: Row, budget: Budget, unit: float) -> dict:
+    parts = {key: unit * each for key, each in row.contributions.items()}
+    return {
+        "contributions": parts,
+        "sensitivities": {each.key: parts[each.key] / each.sigma for each in budget.sources if each.sigma},
+        "standard": unit * row.standard,
+        "expanded": unit * row.expanded,
+        "coverage": row.coverage,
+        "degrees_of_freedom": row.freedom if math.isfinite(row.freedom) else None,
+    }
+
+
+def notes_of(budget: Budget, verified: VerifyFile) -> list[str]:
+    """What a reader must know that no number says."""
+    unknown = [each.title for each in budget.sources if each.origin == "not stated"]
+    found = []
+    if unknown:
+        found.append(
+            f"taken as exact, since nothing is stated of them: {', '.join(unknown)}; the uncertainties hold as far as "
+            "these are"
+        )
+    if budget.correction:
+        found.append(
+            f"the stated expansion makes lengths {PPM * budget.correction:+.1f} ppm larger than the run has them; "
+            "it is not applied to faces.json: correct them, or the expanded uncertainties do not hold"
+        )
+    if faults := verified.faults():
+        found.append(f"the run's folder is not as the run left it: {'; '.join(faults)}")
+    found.append(
+        "the reference face's frame is the target frame and carries no uncertainty; what its own circles do not know "
+        "is in the other faces"
+    )
+    return found

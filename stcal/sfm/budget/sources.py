@@ -1,0 +1,173 @@
+"""Inputs of the measurement, what is known of each, and what its uncertainty does to the circles."""
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+
+from stcal.design import BoardDesign, StatedSize
+from stcal.geometry.arrays import frozen
+from stcal.io.camera import CalibratedCamera, intrinsic_basis
+from stcal.sfm.adjust.contributions import BOARD, CIRCLES, DOTS, FLATNESS, INTRINSICS, Contributions
+from stcal.sfm.budget.statement import Statement
+
+Origin = Literal["estimated", "stated", "assumed", "not stated"]
+PPM = 1e-6
+REFERENCE_C = 20.0
+"""ISO 1:2022, where nothing else is stated."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Source:
+    """A row of the budget.
+
+    ``key`` in files; ``title`` in tables; ``evaluation`` : type A (statistics of this run) or B (other knowledge);
+    ``origin`` of the input's σ, and ``words`` on it; ``sigma`` in ``unit``, None where it is not one number;
+    ``covariance_mm2`` : (3c, 3c) of the circles by this input alone.
+    """
+
+    key: str
+    title: str
+    evaluation: Literal["A", "B"]
+    origin: Origin
+    words: str
+    sigma: float | None
+    unit: str
+    covariance_mm2: np.ndarray
+
+    def __post_init__(self):
+        object.__setattr__(self, "covariance_mm2", frozen(self.covariance_mm2, (None, None), f"{self.key}: covariance"))
+
+
+def sources_of(
+    found: Contributions,
+    camera: CalibratedCamera,
+    board: BoardDesign,
+    flatness_mm: float | None,
+    refined: bool,
+    statement: Statement,
+) -> tuple[Source, ...]:
+    """All rows, those with nothing known too: what is left out is to be seen.
+
+    ``camera`` : as given to the run, with the covariance that its file states; ``refined`` : whether its intrinsics
+    were adjusted.
+    """
+    none = np.zeros_like(found.joint.covariance_mm2)
+    common = found.joint.board_common
+    shape = f"{100 * common:.0f} % of it common to all groups" if common else "each group its own"
+    by_dots = f"sigma_mm of board.toml × σ₀ {found.joint.sigma0:.3f}; {shape}"
+    rows = [
+        Source(
+            "circle_centres",
+            "centres of circles",
+            "A",
+            "estimated",
+            "residuals; RMS per axis",
+            found.centre_sigma_px[CIRCLES],
+            "px",
+            found.covariance_mm2[CIRCLES],
+        ),
+        Source(
+            "dot_centres",
+            "centres of dots",
+            "A",
+            "estimated",
+            "residuals; RMS per axis",
+            found.centre_sigma_px[DOTS],
+            "px",
+            found.covariance_mm2[DOTS],
+        ),
+        Source(
+            "board_dots",
+            "places of dots",
+            "B",
+            "stated",
+            by_dots,
+            1e3 * board.sigma_mm * found.joint.sigma0,
+            "µm",
+            found.covariance_mm2[BOARD],
+        ),
+        _flatness(found, flatness_mm),
+        _intrinsics(found, camera, refined),
+        _scale(found.by_scale, none, statement),
+    ]
+    grown = found.joint.xyz_model - found.joint.xyz_model.mean(0)
+    for what, stated, effect in (
+        ("board", statement.board, found.by_scale),
+        ("target", statement.target, grown.ravel()),
+    ):
+        rows += _temperature(what, stated, effect, statement)
+    return tuple(rows)
+
+
+def _flatness(found: Contributions, flatness_mm: float | None) -> Source:
+    words = f"--flatness of the run × σ₀ {found.joint.sigma0:.3f}"
+    if flatness_mm is None:
+        words = "--flatness off: faces need not be flat"
+    sigma = None if flatness_mm is None else 1e3 * flatness_mm * found.joint.sigma0
+    origin: Origin = "not stated" if flatness_mm is None else "stated"
+    return Source("flatness", "flatness of faces", "B", origin, words, sigma, "µm", found.covariance_mm2[FLATNESS])
+
+
+def _intrinsics(found: Contributions, camera: CalibratedCamera, refined: bool) -> Source:
+    stated = camera.covariance is not None
+    origin: Origin = "stated" if stated else "assumed" if refined else "not stated"
+    if refined:
+        words = "adjusted; σ before that " + ("of the camera file" if stated else "of a calibration of some age")
+        return _camera_row(origin, words, found.covariance_mm2[INTRINSICS])
+    if camera.covariance is None:
+        words = "fixed; no σ in the camera file"
+        return _camera_row(origin, words, np.zeros_like(found.joint.covariance_mm2))
+    effect = found.by_intrinsics @ intrinsic_basis(camera.colmap_model)
+    return _camera_row(origin, "fixed; σ of the camera file", effect @ camera.covariance @ effect.T)
+
+
+def _camera_row(origin: Origin, words: str, covariance: np.ndarray) -> Source:
+    return Source("intrinsics", "intrinsics", "B", origin, words, None, "", covariance)
+
+
+def _scale(by_scale: np.ndarray, none: np.ndarray, statement: Statement) -> Source:
+    sigma = statement.board.pitch_sigma_ppm
+    if sigma is None:
+        return Source("board_pitch", "board's pitch", "B", "not stated", "no pitch_sigma_ppm", None, "ppm", none)
+    words = f"pitch_sigma_ppm of {statement.origin['board', 'pitch_sigma_ppm']}"
+    covariance = (sigma * PPM) ** 2 * np.outer(by_scale, by_scale)
+    return Source("board_pitch", "board's pitch", "B", "stated", words, sigma, "ppm", covariance)
+
+
+def _temperature(what: str, stated: StatedSize, effect: np.ndarray, statement: Statement) -> Iterator[Source]:
+    """Two rows: of the temperature, and of the coefficient; ``effect`` : (3c,) by a relative change of size."""
+    none = np.zeros((len(effect), len(effect)))
+    away = warmer_k(stated)
+    for key, title, sigma, by, unit in (
+        ("temperature", f"{what}'s temperature", stated.temperature_sigma_k, stated.expansion_ppm_per_k, "K"),
+        ("expansion", f"{what}'s expansion", stated.expansion_sigma_ppm_per_k, away, "ppm/K"),
+    ):
+        name = "temperature_sigma_k" if key == "temperature" else "expansion_sigma_ppm_per_k"
+        if by is None or sigma is None:
+            needed = ("expansion_ppm_per_k" if key == "temperature" else "temperature_c") if by is None else name
+            yield Source(f"{what}_{key}", title, "B", "not stated", f"no {needed}", None, unit, none)
+        else:
+            words = f"{name} of {statement.origin[what, name]}"
+            covariance = (sigma * by * PPM) ** 2 * np.outer(effect, effect)
+            yield Source(f"{what}_{key}", title, "B", "stated", words, sigma, unit, covariance)
+
+
+def warmer_k(stated: StatedSize) -> float | None:
+    """Temperature in the photographs less the reference temperature."""
+    if stated.temperature_c is None:
+        return None
+    reference = stated.reference_temperature_c
+    return stated.temperature_c - (REFERENCE_C if reference is None else reference)
+
+
+def correction(statement: Statement) -> float:
+    """By which lengths are to be multiplied, less 1, for the expansion that is stated: the board's grid is that much
+    larger than its file says, and the target that much larger than at its own reference temperature."""
+    total = 0.0
+    for sign, stated in ((1, statement.board), (-1, statement.target)):
+        away = warmer_k(stated)
+        if away is not None and stated.expansion_ppm_per_k is not None:
+            total += sign * stated.expansion_ppm_per_k * PPM * away
+    return total

@@ -1,0 +1,60 @@
+"""The budget as text for people."""
+
+from collections.abc import Sequence
+
+from stcal.report.text import text_table
+from stcal.sfm.budget.file import BudgetFile, SourceRow, Uncertainty
+
+
+def budget_text(file: BudgetFile) -> str:
+    """Inputs, then a table each for positions, rotations and distances, then notes."""
+    images = sum(each.images for each in file.views)
+    groups = ", ".join(f"{each.group}: {each.images} over {each.spread_deg:.0f}°" for each in file.views)
+    lines = [
+        f"uncertainty budget of {file.run.folder}: {file.run.target}, {images} images ({groups})",
+        *(f"{name}: {value}" for name, value in file.fields.items() if value),
+        "",
+        *_inputs(file.sources),
+    ]
+    faces, lengths = file.faces, file.distances
+    for title, columns in (
+        (f"position, µm, against face {file.reference_face}", {f: each.position_um for f, each in faces.items()}),
+        (f"rotation, mdeg, against face {file.reference_face}", {f: each.rotation_mdeg for f, each in faces.items()}),
+        ("longest distances, µm", {_name(each.circles): each.distance_um for each in lengths}),
+    ):
+        lines += ["", *_table(title, columns, file)]
+    lines += [f"{_name(each.circles)}: {_length(each, file)}" for each in lengths]
+    return "\n".join([*lines, "", *(f"note: {note}" for note in file.notes)])
+
+
+def _name(circles: Sequence[str]) -> str:
+    return "–".join(circles)
+
+
+def _length(row, file: BudgetFile) -> str:
+    own = f"{row.length_mm:.4f} mm"
+    return f"{own}, corrected {row.corrected_mm:.4f} mm" if file.correction_ppm else own
+
+
+def _inputs(sources: Sequence[SourceRow]) -> list[str]:
+    rows = [("<input", "u", "<", "<type", "<σ is", "<from")]
+    for each in sources:
+        sigma = "–" if each.sigma is None else f"{each.sigma:.3g}"
+        unit = "" if each.sigma is None else each.unit
+        rows.append((each.title, sigma, unit, each.evaluation, each.origin, each.words))
+    return text_table(rows)
+
+
+def _table(title: str, columns: dict[str, Uncertainty], file: BudgetFile) -> list[str]:
+    """Contributions by input, combined and expanded uncertainty; a column for each measurand."""
+    rows = [(f"<{title}", *columns)]
+    for each in file.sources:
+        if each.origin != "not stated" or any(u.contributions[each.key] for u in columns.values()):
+            rows.append((each.title, *(f"{u.contributions[each.key]:.2f}" for u in columns.values())))
+    k = file.coverage_factor
+    rows += [
+        ("combined standard uncertainty u", *(f"{u.standard:.2f}" for u in columns.values())),
+        (f"expanded uncertainty U, k = {k:g}", *(f"{u.expanded:.2f}" for u in columns.values())),
+        ("coverage of U, simulated, %", *(f"{100 * u.coverage:.1f}" for u in columns.values())),
+    ]
+    return text_table(rows)

@@ -1,0 +1,73 @@
+"""The adjustment's covariance taken apart, against what small changes of the inputs do."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from stcal.geometry.normal_equations import free_motions
+from stcal.io.camera import CameraPrior
+from stcal.sfm.adjust.contributions import OBSERVED, contributions_of
+from stcal.sfm.adjust.joint import adjusted
+from stcal.synthetic.scene import SceneOptions, make_scene
+
+FLATNESS_MM = 0.02
+SIGMAS = np.array([1.5, 1.5, 1.0, 1.0, 5e-4, 2e-3, 5e-5, 5e-5])
+"""Of fx, fy, cx, cy (px), k1, k2, p1, p2."""
+
+
+@pytest.fixture(scope="module")
+def case(labels_only):
+    scene = make_scene(
+        SceneOptions(seed=9, width=1296, height=864, images_per_group=4, groups=(("1", "2"), ("1", "4")))
+    )
+    models = labels_only.models(scene, labels_only.observations(scene, 0.01, np.random.default_rng(2)))
+    return models, scene
+
+
+def state_of(case, refined=False, common=None, board=None, camera=None):
+    models, scene = case
+    prior = CameraPrior(scene.camera.colmap_model, np.diag(SIGMAS**2)) if refined else None
+    return adjusted(models, board or scene.board, camera or scene.camera, FLATNESS_MM, prior, common=common)
+
+
+def shift(case, changed, common) -> np.ndarray:
+    """What the circles do, less their motion as one."""
+    before = state_of(case, common=common).shared.xyz_model
+    free = free_motions(before, scale=False)
+    moved = (changed.shared.xyz_model - before).ravel()
+    return moved - free @ (free.T @ moved)
+
+
+@pytest.mark.parametrize(("refined", "common"), [(False, None), (True, None), (False, 0.6)])
+def test_the_parts_are_covariances_and_their_sum_is_the_adjustments_own(case, refined, common):
+    found = contributions_of(state_of(case, refined, common))
+    whole = found.joint.covariance_mm2
+    assert list(found.covariance_mm2) == list(OBSERVED)
+    for kind, part in found.covariance_mm2.items():
+        least, most = np.linalg.eigvalsh(part)[[0, -1]]
+        assert least > -1e-9 * np.abs(whole).max(), kind
+        assert (most > 1e-4 * np.abs(whole).max()) == (kind != "intrinsics" or refined), kind
+    np.testing.assert_allclose(sum(found.covariance_mm2.values()), whole, atol=1e-7 * np.abs(whole).max())
+
+
+@pytest.mark.parametrize("common", [0.0, 0.6])
+def test_a_wider_pitch_moves_the_circles_as_foretold(case, common):
+    found = contributions_of(state_of(case, common=common))
+    board = case[1].board
+    wider = state_of(case, common=common, board=replace(board, pitch_mm=board.pitch_mm * (1 + 1e-5)))
+    np.testing.assert_allclose(shift(case, wider, common), 1e-5 * found.by_scale, atol=1e-6)
+    xyz = found.joint.xyz_model - found.joint.xyz_model.mean(0)
+    np.testing.assert_allclose(found.by_scale, xyz.ravel(), atol=1e-3 * np.abs(xyz).max())
+
+
+def test_another_camera_moves_the_circles_as_foretold(case):
+    """The error is the adjusted circle less the true one: what the camera was wrongly given more."""
+    found = contributions_of(state_of(case, common=0.0))
+    away = np.zeros(16)
+    away[[0, 2, 4]] = 0.1, 0.05, 1e-5
+    camera = case[1].camera
+    other = state_of(case, common=0.0, camera=camera.with_parameters(camera.parameters() + away))
+    moved = shift(case, other, 0.0)
+    assert np.abs(moved).max() > 1e-3
+    np.testing.assert_allclose(moved, -found.by_intrinsics @ away, atol=1e-3 * np.abs(moved).max())

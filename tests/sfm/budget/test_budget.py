@@ -1,0 +1,187 @@
+"""The uncertainty budget of a small run: sums, statements, and what it refuses."""
+
+import json
+import shutil
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from stcal.design import StatedSize
+from stcal.io.design import board_toml, load_board
+from stcal.sfm.budget.combine import budget_of_run, longest
+from stcal.sfm.budget.sources import correction
+from stcal.sfm.budget.statement import FIELDS, statement_of
+from stcal.sfm.run.saved import load_run
+from tests.outcome import INPUT, assert_error
+
+STATEMENT = """
+[fields]
+operator = "A. Smith"
+[board]
+pitch_sigma_ppm = 10.0
+expansion_ppm_per_k = 8.0
+expansion_sigma_ppm_per_k = 0.5
+temperature_c = 24.0
+temperature_sigma_k = 0.5
+[target]
+expansion_ppm_per_k = 23.0
+expansion_sigma_ppm_per_k = 1.0
+temperature_c = 22.0
+temperature_sigma_k = 1.0
+"""
+
+
+@pytest.fixture(scope="module")
+def saved(small_run):
+    return load_run(small_run)
+
+
+@pytest.fixture(scope="module")
+def plain(saved):
+    return budget_of_run(saved)
+
+
+@pytest.fixture
+def stated(saved, tmp_path):
+    path = tmp_path / "lab.toml"
+    path.write_text(STATEMENT)
+    return statement_of(saved.board.stated, path, ["date=2026-03-01"])
+
+
+def test_with_nothing_stated_it_is_the_runs_own_covariance(saved, plain):
+    """The run is read from files, so to their digits and the adjustment's last step."""
+    assert {row.measurand.name for row in plain.of_kind("position")} == {"2", "4", "5"}
+    for row in plain.of_kind("position"):
+        own = saved.faces.target_from_face_covariance[row.measurand.name]
+        np.testing.assert_allclose(row.covariance, own[3:, 3:], rtol=0, atol=1e-3 * np.abs(own[3:, 3:]).max())
+    for row in plain.of_kind("rotation"):
+        own = saved.faces.target_from_face_covariance[row.measurand.name]
+        np.testing.assert_allclose(row.covariance, own[:3, :3], rtol=0, atol=1e-3 * np.abs(own[:3, :3]).max())
+
+
+def test_contributions_add_up_as_squares(plain):
+    assert len(plain.rows) == 3 + 3 + 5
+    for row in plain.rows:
+        assert min(row.contributions.values()) >= 0
+        assert sum(row.share(key) for key in row.contributions) == pytest.approx(1)
+        assert np.hypot.reduce(list(row.contributions.values())) == pytest.approx(row.standard)
+        assert row.expanded == 2 * row.standard
+        # 95.45 % for one number, up to 99.3 % for three alike; of 100 000 draws.
+        assert 0.952 < row.coverage < 0.995
+
+
+def test_what_is_stated_adds_its_part(saved, plain, stated):
+    """A length of L mm: pitch 10 ppm; α u(T) = 8 · 0.5 and 23 · 1 ppm; u(α) ΔT = 0.5 · 4 and 1 · 2 ppm."""
+    found = budget_of_run(saved, stated)
+    ppm = {
+        "board_pitch": 10.0,
+        "board_temperature": 4.0,
+        "board_expansion": 2.0,
+        "target_temperature": 23.0,
+        "target_expansion": 2.0,
+    }
+    for before, after in zip(plain.of_kind("distance"), found.of_kind("distance"), strict=True):
+        length = after.measurand.length_mm
+        own = {key: 1e6 * after.contributions[key] / length for key in ppm}
+        assert own == pytest.approx(ppm, rel=2e-3)  # a face that must be flat takes part of a change of scale
+        added = sum((each * 1e-6 * length) ** 2 for each in own.values())
+        assert after.standard == pytest.approx(np.sqrt(before.standard**2 + added), rel=1e-6)
+    origins = {each.key: each.origin for each in found.sources}
+    assert {origins[key] for key in ppm} == {"stated"}
+    assert {each.origin for each in plain.sources if each.key in ppm} == {"not stated"}
+    assert origins["circle_centres"] == "estimated"
+    assert found.correction == pytest.approx(1e-6 * (8 * 4 - 23 * 2))
+
+
+def test_a_statement_goes_before_the_boards_own(saved, tmp_path):
+    path = tmp_path / "lab.toml"
+    path.write_text("[board]\ntemperature_c = 24\n")
+    own = StatedSize(expansion_ppm_per_k=8.0, temperature_c=30.0)
+    found = statement_of(own, path, ["operator=B", "serial = 12"])
+    assert (found.board.expansion_ppm_per_k, found.board.temperature_c) == (8.0, 24.0)
+    assert found.origin["board", "temperature_c"] == str(path)
+    assert found.origin["board", "expansion_ppm_per_k"] == "board.toml"
+    assert found.fields == dict.fromkeys(FIELDS, "") | {"operator": "B", "serial": "12"}
+    assert correction(found) == pytest.approx(32e-6)
+
+
+def test_a_board_file_keeps_what_is_stated(saved, tmp_path):
+    size = StatedSize(12.0, 8.5, 0.5, 23.25, 0.5, 22.0)
+    path = tmp_path / "board.toml"
+    path.write_text(board_toml(replace(saved.board, stated=size)))
+    assert load_board(path).stated == size
+
+
+def test_the_longest_distances_are_of_different_pairs_of_faces():
+    labels = [replace_label(face, circle) for face in "12" for circle in "ab"]
+    xyz = np.array([[0, 0, 0], [1, 0, 0], [0, 5, 0], [0, 7, 0.0]])
+    assert longest(labels, xyz) == [(1, 3), (2, 3), (0, 1)]
+
+
+def replace_label(face, circle):
+    from stcal.labels import CircleLabel
+
+    return CircleLabel(face, circle)
+
+
+def test_command(stcal_sfm, small_run, tmp_path):
+    path, out = tmp_path / "lab.toml", tmp_path / "budget.json"
+    path.write_text(STATEMENT)
+    code, text, _ = stcal_sfm("budget", small_run, "--statement", path, "--field", "instrument=X 5", "--json", out)
+    assert code == 0
+    assert "operator: A. Smith\n" in text
+    assert "instrument: X 5\n" in text
+    assert "note: taken as exact, since nothing is stated of them: intrinsics;" in text
+    assert "-14.0 ppm" in text
+    file = json.loads(out.read_text())
+    marker = json.loads((small_run / "stcal-run.json").read_text())["sha256"]
+    assert (file["run"]["sha256"], file["run"]["faces_sha256"]) == (marker["stcal-run.json"], marker["faces.json"])
+    assert file["run"]["changed"] == []
+    origin = {each["key"]: each["origin"] for each in file["sources"]}
+    assert origin["intrinsics"] == "not stated"
+    first = file["distances"][0]
+    assert first["corrected_mm"] == pytest.approx(first["length_mm"] * (1 - 14e-6), abs=1e-9)
+    own = first["distance_um"]
+    assert own["sensitivities"]["board_pitch"] == pytest.approx(1e-3 * first["length_mm"], rel=2e-3)
+    assert own["expanded"] == pytest.approx(2 * own["standard"])
+    row = next(line for line in text.splitlines() if line.startswith("combined standard uncertainty u"))
+    assert row.split()[-1] == f"{file['faces']['5']['position_um']['standard']:.2f}"
+
+
+def test_a_changed_run_is_named(stcal_sfm, small_run, tmp_path):
+    copy = tmp_path / "run"
+    shutil.copytree(small_run, copy)
+    (copy / "report.html").write_text("x")
+    code, text, _ = stcal_sfm("budget", copy)
+    assert code == 0
+    assert "note: the run's folder is not as the run left it: 1 changed (report.html)" in text
+
+
+@pytest.mark.parametrize(
+    ("content", "words"),
+    [
+        ("[board]\npitch_sigma_ppm = -1\n", "board.pitch_sigma_ppm: -1:"),
+        ("[target]\npitch_sigma_ppm = 1\n", "target.pitch_sigma_ppm: unknown key"),
+        ("[fields]\noperator = 3\n", "fields.operator: 3:"),
+        ("operator = 'x'\n", "operator: unknown key"),
+    ],
+)
+def test_statements_that_are_none(stcal_sfm, small_run, tmp_path, content, words):
+    path = tmp_path / "lab.toml"
+    path.write_text(content)
+    assert_error(stcal_sfm("budget", small_run, "--statement", path), INPUT, str(path), words)
+
+
+def test_fields_that_are_none(stcal_sfm, small_run):
+    assert_error(stcal_sfm("budget", small_run, "--field", "operator"), INPUT, "NAME=VALUE needed")
+    twice = ("--field", "a=1", "--field", "a=2")
+    assert_error(stcal_sfm("budget", small_run, *twice), INPUT, "--field a: given twice")
+
+
+def test_a_chain_has_no_budget(stcal_sfm, small_run, tmp_path):
+    copy = tmp_path / "run"
+    shutil.copytree(small_run, copy)
+    faces = json.loads((copy / "faces.json").read_text())
+    (copy / "faces.json").write_text(json.dumps(faces | {"solve": "chain"}))
+    assert_error(stcal_sfm("budget", copy), INPUT, "solved by chain, which states no covariance", "--solve joint")
