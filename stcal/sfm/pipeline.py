@@ -88,8 +88,7 @@ def run(
         progress("check", 0, 1)
         result = replace(result, checks=run_checks(result.evidence(camera_prior(result.camera))))
         progress("check", 1, 1)
-        write_run(result, folder.stage, progress, reload_s)
-    return result
+        return replace(result, judgement=write_run(result, folder.stage, progress, reload_s))
 
 
 def _calibrated(

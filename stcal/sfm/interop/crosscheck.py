@@ -37,6 +37,7 @@ from stcal.sfm.mapping.models import (
     read_model,
     write_reconstruction,
 )
+from stcal.sfm.report.judgement import judged
 from stcal.sfm.run.crosscheck import (
     CameraDifference,
     Crosscheck,
@@ -75,7 +76,7 @@ def crosscheck_run(
         if read_json(saved.folder / "report.json", "", AGAIN) != saved.report:
             raise InputError(f"run {saved.folder}: other results took their place meanwhile; cross-check it again")
         check = crosscheck(saved, colmap, tolerances, timeout_s, progress)
-        write_report(stage, saved.report | {"crosscheck": check.model_dump()}, saved.folder)
+        write_report(stage, judged(saved.report | {"crosscheck": check.model_dump()}), saved.folder)
     return check
 
 

@@ -2,6 +2,7 @@
 
 from stcal.report.page import verdict
 from stcal.report.text import NONE, number
+from stcal.sfm.report.judgement import CHANCE
 
 COLOURS = {"passed": "#1b7837", "suspicious": "#b26a00", "failed": "#b3261e", "not possible": "#556270"}
 ORDER = ("failed", "suspicious", "passed", "not possible")
@@ -34,7 +35,7 @@ def checks_values(checks: list[dict]) -> dict:
         for m in check["measured"]
     ]
     verdicts = count_verdicts([check["verdict"] for check in checks])
-    return {"verdicts": verdicts, "check_rows": rows, "measured": measured}
+    return {"verdicts": verdicts, "check_rows": rows, "measured": measured, "chance": CHANCE}
 
 
 def _number(measured: dict) -> list[str]:

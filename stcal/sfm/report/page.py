@@ -9,9 +9,10 @@ from stcal.parallel import run_briefly
 from stcal.report.page import render, swatch
 from stcal.report.text import NONE, cells, join, number
 from stcal.sfm.report import figures
-from stcal.sfm.report.checks import checks_values
+from stcal.sfm.report.checks import COLOURS, checks_values
 from stcal.sfm.report.comparison import comparison_cells
 from stcal.sfm.report.crosscheck import crosscheck_values
+from stcal.sfm.report.judgement import Judgement, judgement_of
 
 SIDES = {-58: "", 122: ", from the other side"}
 """Azimuths from which target and cameras are drawn."""
@@ -23,6 +24,8 @@ SOLVES = {
     "chain": "chain: group by group, then combined",
     "paper": "paper: as published by Zhang & Wei (2017), for comparison",
 }
+VERDICTS = {"yes": "passed", "with care": "suspicious", "no": "failed"}
+"""Verdict of the checks whose colour a judgement has."""
 FRAMES = {"plane": "plane: Z from the plane of all circles", "three-point": "three-point: from three circles"}
 
 
@@ -44,6 +47,7 @@ def report_html(report: dict, overlays: dict[str, bytes], reload_s: int | None =
         reload_s=reload_s,
         colours=colours,
         factor=_factor_in_words(report["summary"]["sigma_factor"]),
+        judgement=_judgement(report),
         headline=_headline(report),
         settings=_settings(report),
         worst_values=_worst_values(report),
@@ -116,6 +120,12 @@ def _worst_chain(report: dict, key: str) -> tuple[float, str] | None:
         if len(chains) > 1
         for chain in chains
     )
+
+
+def _judgement(report: dict) -> dict:
+    """Colour and sentences; made anew for a report of a version that had none."""
+    found = Judgement.model_validate(report.get("judgement") or judgement_of(report).model_dump())
+    return {"colour": COLOURS[VERDICTS[found.verdict]], "answers": found.answers()}
 
 
 def _headline(report: dict) -> list[tuple[str, str, str]]:

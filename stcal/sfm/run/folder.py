@@ -26,6 +26,7 @@ from stcal.sfm.detect.labels import LabelledImage
 from stcal.sfm.detect.overlay import draw_overlay
 from stcal.sfm.mapping.database import image_ids, labels_csv, write_database
 from stcal.sfm.mapping.models import write_model
+from stcal.sfm.report.judgement import Judgement, judged
 from stcal.sfm.report.page import report_html, shown_overlays
 from stcal.sfm.run.output import report_of
 from stcal.sfm.run.report import ReportFile
@@ -85,9 +86,9 @@ def overlay_path(out: Path, name: str) -> Path:
     return out / "overlays" / f"{group}{slash}{own}.jpg"
 
 
-def write_run(result: RunResult, out: Path, progress: Progress, reload_s: int | None = None) -> None:
+def write_run(result: RunResult, out: Path, progress: Progress, reload_s: int | None = None) -> Judgement:
     """The database with corrected centres, models, faces and report, into a folder that holds the overlays; the report
-    loads itself anew every ``reload_s`` seconds."""
+    loads itself anew every ``reload_s`` seconds. Returns what the report says in words."""
     observations = result.observations()
     ids = image_ids(observations)
     models = {s.model.group: s.model for s in result.solutions}
@@ -102,13 +103,14 @@ def write_run(result: RunResult, out: Path, progress: Progress, reload_s: int | 
     write_cameras_txt(out / CAMERA, result.camera)
     save(out / TARGET, target_toml(result.target_design))
     save(out / BOARD, board_toml(result.board_design))
-    report = report_of(result).content()
+    report = judged(report_of(result).content())
     if result.target.target_from_face:  # none of the board alone
         options, factor = result.options.adjustment(result.target_design), result.calibration.sigma_factor
         faces = FacesFile.of(result.target, result.target_design, options, factor)
         save(out / "faces.json", json_text(faces.content()))
     write_report(out, report, out, reload_s)
     progress("report", 1, 1)
+    return Judgement.model_validate(report["judgement"])
 
 
 def write_report(out: Path, report: dict, run: Path, reload_s: int | None = None) -> None:

@@ -9,6 +9,7 @@ from stcal.io.json import ByFace, ByGroup, ByLabel, Matrix3, Pair, Part, Points,
 from stcal.sfm.adjust.faces import FrameKind
 from stcal.sfm.adjust.options import Solve
 from stcal.sfm.checks.verdict import Verdict
+from stcal.sfm.report.judgement import Judgement
 from stcal.sfm.run.comparison import Comparison
 from stcal.sfm.run.crosscheck import Crosscheck
 
@@ -269,6 +270,9 @@ class ReportFile(ResultFile):
     scene: Space = Field(
         description="target frame, mm: `cameras`: `image`, `group`, `position_mm`, `axes` (rows X, Y, Z of the "
         "camera); `boards` group → mapped dots; `circles` label → `[x, y, z]`"
+    )
+    judgement: Judgement | None = Field(
+        None, description="the summary in words, by the rules [below](#judgement); absent of an earlier version"
     )
     comparison: Comparison | None = Field(None, description="only of a run with `--compare paper`")
     crosscheck: Crosscheck | None = Field(None, description="only after `crosscheck`, with")

@@ -15,6 +15,7 @@ from stcal.sfm.data.observations import ImageObservations
 from stcal.sfm.detect.files import DetectionResult
 from stcal.sfm.detect.labels import LabelledImage
 from stcal.sfm.mapping.graph import ImageGraph
+from stcal.sfm.report.judgement import Judgement
 from stcal.sfm.run.comparison import Comparison
 from stcal.sfm.run.options import RunOptions
 from stcal.sfm.run.solve import GroupSolution
@@ -52,6 +53,8 @@ class RunResult:
         In the order of the report.
     comparison : Comparison, optional
         With the published method, where it was asked for.
+    judgement : Judgement, optional
+        The report in words, once it is made.
     """
 
     out: Path
@@ -68,6 +71,7 @@ class RunResult:
     notes: tuple[str, ...]
     checks: tuple[Check, ...] = ()
     comparison: Comparison | None = None
+    judgement: Judgement | None = None
 
     @property
     def target(self):

@@ -47,6 +47,8 @@ def run_text(result: RunResult) -> str:
     ]
     if result.comparison is not None:
         lines += _compared(result.comparison)
+    if result.judgement is not None:
+        lines += [f"{question} {answer}" for question, answer in result.judgement.answers()]
     if result.target.target_from_face:
         lines.append(f"faces:  {result.out / 'faces.json'}")
     return "\n".join([*lines, f"report: {result.out / 'report.html'}"])

@@ -121,6 +121,7 @@ def make(sigma: bool = True, eccentricity: bool = True) -> dict:
             "residual_rms_px": 0.0037931,
             "centre_sigma_rms_px": 0.0044,
             "sigma_factor": 1.494,
+            "scale_sigma_ppm": 6.4 if sigma else None,
             "sigma0": 0.9312 if sigma else None,
             "redundancy": 17 if sigma else None,
             "last_move_px": 3.14e-8 if sigma else None,

@@ -4,9 +4,12 @@ import json
 import shutil
 
 import pytest
+from markupsafe import escape
 
 from stcal.io.saving import RUN_MARKER
+from stcal.sfm.report.judgement import Judgement
 from stcal.sfm.run import folder
+from stcal.sfm.run.text import run_text
 from stcal.sfm.run.transaction import added_results
 from stcal.sfm.run.verify import verify
 from tests.outcome import INPUT, assert_error
@@ -70,3 +73,13 @@ def test_what_cannot_be_made_is_said_in_one_line(own, tmp_path, stcal_sfm):
         stcal_sfm("report", own), INPUT, "report.json: damaged, or of another version", "faces", "run it again"
     )
     assert (own / "report.html").exists()
+
+
+def test_terminal_file_and_page_have_the_same_judgement(small_result, small_run):
+    stored = Judgement.model_validate(json.loads((small_run / "report.json").read_text())["judgement"])
+    assert stored == small_result.judgement
+    page, terminal = (small_run / "report.html").read_text(), run_text(small_result).splitlines()
+    assert len(stored.answers()) == 4
+    for question, answer in stored.answers():
+        assert f"{question} {answer}" in terminal
+        assert f"<dt>{question}</dt><dd>{escape(answer)}</dd>" in page

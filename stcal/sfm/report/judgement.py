@@ -1,0 +1,235 @@
+"""The report in four sentences: may I use it, how good is it, what limits it, what to do next.
+
+The rules are those of ``docs/reference/files/run.md`` (Judgement); they look at nothing but the content of
+``report.json``, so that everyone can follow them.
+"""
+
+import math
+from dataclasses import dataclass
+from statistics import median
+from typing import Literal
+
+from pydantic import Field
+
+from stcal.io.json import Part
+from stcal.report.text import join, number
+
+CHANCE = "'Suspicious' happens by chance in one run in 1,000, 'failed' in one in 100,000."
+"""Of one check; the limits are those of ``stcal.sfm.checks.verdict``."""
+TESTS_OF_CHANCE = 1000
+TAIL = 2.0
+"""A face with a σ so many times the median of the others limits the result by itself."""
+SHARE_OF_SCALE = 0.5
+"""Of the variance of the worst face: with more, the board's σ limit the result, not the photographs."""
+QUESTIONS = {
+    "use": "May I use it?",
+    "quality": "How good is it?",
+    "limit": "What limits it?",
+    "next": "What to do next?",
+}
+Use = Literal["yes", "with care", "no"]
+
+
+class Judgement(Part):
+    """``judgement`` of ``report.json``."""
+
+    verdict: Use = Field(description="`yes`; `with care`; `no`")
+    use: str = Field(description="may I use it, in words")
+    quality: str = Field(description="how good is it: largest σ of position and rotation, and of the size")
+    limit: str = Field(description="what limits it")
+    next: str = Field(description="what to do next")
+    position_sigma_um: float | None = Field(
+        description="largest σ of a face's position along an axis; null without covariances, as the next three"
+    )
+    position_face: str | None = Field(description="face that it is of")
+    rotation_sigma_mdeg: float | None = Field(description="largest σ of a face's rotation about an axis")
+    rotation_face: str | None = Field(description="face that it is of")
+
+    def answers(self) -> list[tuple[str, str]]:
+        """Question and answer, in order."""
+        return [(question, getattr(self, key)) for key, question in QUESTIONS.items()]
+
+
+@dataclass(frozen=True, slots=True)
+class _Cause:
+    """What limits a result and what to do about it."""
+
+    limit: str
+    remedy: str
+
+
+def judged(report: dict) -> dict:
+    """The content of ``report.json`` with its judgement made anew."""
+    return report | {"judgement": judgement_of(report).model_dump()}
+
+
+def judgement_of(report: dict) -> Judgement:
+    """The judgement of a run.
+
+    Parameters
+    ----------
+    report : content of ``report.json``
+    """
+    verdict, use = _use(report)
+    cause = _control(report) or _by_checks(report) or _by_sigma(report)
+    position, rotation = (_largest(report, key) for key in ("translation_sigma_um", "rotation_sigma_mdeg"))
+    return Judgement(
+        verdict=verdict,
+        use=use,
+        quality=_quality(report, position, rotation),
+        limit=cause.limit,
+        next=" ".join([cause.remedy, *_more(report, verdict)]),
+        position_sigma_um=position and position[0],
+        position_face=position and position[1],
+        rotation_sigma_mdeg=rotation and rotation[0],
+        rotation_face=rotation and rotation[1],
+    )
+
+
+# --- may I use it -----------------------------------------------------------------------------------------------------
+
+
+def _use(report: dict) -> tuple[Use, str]:
+    checks = report.get("checks", [])
+    counts = {v: sum(c["verdict"] == v for c in checks) for v in ("failed", "suspicious", "passed", "not possible")}
+    if not report["faces"]:
+        return "no", "No: there is no face in it, λ and residuals of the board alone."
+    if _control(report):
+        return "no", "No: it was made for comparison, and its faces are biased by tens of µm."
+    made = len(checks) - counts["not possible"]
+    if n := counts["failed"]:
+        return "no", f"No: {n} of {made} checks failed, the first: {_first(report, 'failed')['title']}."
+    if different := report.get("crosscheck", {}).get("differences"):
+        return "with care", f"With care: the native COLMAP comes to other faces ({different[0]})."
+    if n := counts["suspicious"]:
+        told = f"{n} of {made} checks {'is' if n == 1 else 'are'} suspicious, the first: "
+        by_chance = f"one sound run in {round(TESTS_OF_CHANCE / made)} has such a check by chance"
+        return "with care", f"With care: {told}{_first(report, 'suspicious')['title']}; {by_chance}."
+    if report["summary"]["sigma0"] is None:
+        return (
+            "with care",
+            "With care: groups were solved one by one; there are no σ, and fewer checks.",
+        )
+    passed = f"{counts['passed']} checks passed" if counts["passed"] else "nothing was checked"
+    open_ = f", {counts['not possible']} were not possible" if counts["not possible"] else ""
+    return "yes", f"Yes: {passed}{open_}."
+
+
+def _first(report: dict, verdict: str) -> dict:
+    """Of the checks with this verdict, the first that names an image, which can be looked at, or else the first."""
+    images = {image["name"] for image in report["images"]}
+    own = [check for check in report.get("checks", []) if check["verdict"] == verdict]
+    naming = [check for check in own if any(name in images for name in check["names"])]
+    return [*naming, *own][0]
+
+
+# --- how good ---------------------------------------------------------------------------------------------------------
+
+
+def _quality(report: dict, position: tuple[float, str] | None, rotation: tuple[float, str] | None) -> str:
+    if not report["faces"]:
+        worst = max((group["scale"]["board_rms_um"] for group in report["groups"]), default=0.0)
+        return f"The board's dots are within {number(worst, 1)} µm RMS of their design."
+    if len(report["faces"]) == 1:
+        return "There is one face, which is the target frame itself; σ of its circles are in faces.json."
+    if position is None or rotation is None:
+        ways = [chain for chains in report["chains"].values() if len(chains) > 1 for chain in chains]
+        if not ways:
+            return "There are no σ, and no face is reached in two ways that could be compared."
+        apart, turned = (max(way[key] for way in ways) for key in ("translation_um", "rotation_mdeg"))
+        return (
+            f"There are no σ; ways to the same face through different groups are up to {number(apart, 1)} µm and "
+            f"{number(turned, 2)} mdeg off their mean."
+        )
+    size = report["summary"]["scale_sigma_ppm"]
+    scale = "" if size is None else f", the size to {number(size, 1)} ppm"
+    return (
+        f"Faces are known against face {report['reference_face']} to {number(position[0], 1)} µm (face {position[1]}) "
+        f"and {number(rotation[0], 2)} mdeg (face {rotation[1]}) at worst, one σ along and about an axis{scale}; that "
+        "holds where the intrinsics and the board's pitch are as stated."
+    )
+
+
+def _largest(report: dict, key: str) -> tuple[float, str] | None:
+    """(largest over the axes, face) of the worst face."""
+    others = {name: face for name, face in report["faces"].items() if name != report["reference_face"]}
+    return max(((max(f[key]), name) for name, f in others.items() if f[key] is not None), default=None)
+
+
+# --- what limits it, what next ----------------------------------------------------------------------------------------
+
+
+def _control(report: dict) -> _Cause | None:
+    """Results that are made for comparison."""
+    options = report["options"]
+    if not report["faces"]:
+        return _Cause(
+            f"No face of the target was recognised in {report['summary']['images']} images.",
+            "Look at the overlays; where a face is in view, give its design with --target.",
+        )
+    if options["solve"] == "paper":
+        return _Cause("The published method: contours, alike in weight, without the eccentricity of circles.",
+                      "Run it without --solve paper.")  # fmt: skip
+    if not options["eccentricity"]:
+        return _Cause("The eccentricity of circles is left in.", "Run it without --no-eccentricity.")
+    return None
+
+
+def _by_checks(report: dict) -> _Cause | None:
+    """The first of the worst checks."""
+    verdicts = {check["verdict"] for check in report.get("checks", [])}
+    for verdict in ("failed", "suspicious"):
+        if verdict in verdicts:
+            check = _first(report, verdict)
+            remedy = check["remedy"] or "look at what the check names"
+            return _Cause(f"{check['title']}: {check['reason']}.", f"{remedy[0].upper()}{remedy[1:]}.")
+    if different := report.get("crosscheck", {}).get("differences"):
+        return _Cause(f"The native COLMAP differs: {different[0]}.", "Look at the cross-check: which of both is right?")
+    return None
+
+
+def _by_sigma(report: dict) -> _Cause:
+    """The board, one face, or all of the photographs."""
+    spread = {
+        name: math.hypot(*face["translation_sigma_um"])
+        for name, face in report["faces"].items()
+        if name != report["reference_face"] and face["translation_sigma_um"] is not None
+    }
+    if len(report["faces"]) == 1:
+        return _Cause("There is one face only, which nothing links.", "Photograph it together with others.")
+    if not spread:
+        return _Cause("What limits it cannot be told without σ.", "Run it with --solve joint.")
+    worst = max(spread, key=lambda name: spread[name])
+    face = report["faces"][worst]
+    size = 1e-3 * (report["summary"]["scale_sigma_ppm"] or 0.0) * math.hypot(*face["translation_mm"])
+    if size**2 > SHARE_OF_SCALE * spread[worst] ** 2:
+        return _Cause(
+            f"The board: σ of the size make {number(size, 1)} of the {number(spread[worst], 1)} µm of face {worst}.",
+            "More photographs hardly help: measure the board's dots, or take a better plate, and state its σ.",
+        )
+    others = [value for name, value in spread.items() if name != worst]
+    if others and spread[worst] > TAIL * median(others):
+        return _Cause(
+            f"Face {worst}: {number(spread[worst], 1)} µm where the others have {number(median(others), 1)} µm; "
+            f"{face['images']} images show it, of group {join(face['groups'])}.",
+            f"Add images that show face {worst}; `stcal-sfm advise RUN` says from where.",
+        )
+    summary = report["summary"]
+    return _Cause(
+        f"The centring of circles, {number(summary['residual_rms_px'], 4)} px in {summary['images_mapped']} images; no "
+        "face stands out, and the board does not limit it.",
+        "Nothing has to be done; four times the images would halve σ, and `stcal-sfm advise RUN` says which do most.",
+    )
+
+
+def _more(report: dict, verdict: Use) -> list[str]:
+    """What goes beyond the limit: faces that are missing, checks that could not be made."""
+    told = []
+    if report["faces"] and (missing := report["summary"]["faces_not_seen"]):
+        told.append(f"Photograph face {join(missing)} together with one of the others: not seen in any image.")
+    open_ = [c for c in report.get("checks", []) if c["verdict"] == "not possible" and c["remedy"]]
+    if verdict == "yes" and open_:
+        remedy = open_[0]["remedy"].removeprefix("to be able to make it, ")
+        same = sum(check["remedy"] == open_[0]["remedy"] for check in open_)
+        told.append(f"For {same} more check{'s' * (same > 1)}: {remedy}.")
+    return told

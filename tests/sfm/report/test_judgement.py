@@ -1,0 +1,154 @@
+"""The report in four sentences."""
+
+import copy
+
+import pytest
+
+from stcal.report.page import environment
+from stcal.sfm.checks.verdict import FAILED, SUSPICIOUS
+from stcal.sfm.report.judgement import CHANCE, TESTS_OF_CHANCE, judged, judgement_of
+from stcal.sfm.report.page import report_html
+from tests.sfm.report.test_report import make
+
+
+def check(key: str, verdict: str, names: tuple[str, ...] = (), remedy: str = "") -> dict:
+    return {
+        "key": key,
+        "title": f"Check {key}",
+        "verdict": verdict,
+        "reason": f"because of {key}",
+        "measured": [],
+        "tested": 3,
+        "names": list(names),
+        "remedy": remedy,
+    }
+
+
+def report(*checks: dict, **sigma_um: list[float]) -> dict:
+    """Of faces 1 to 4, 300 mm apart, with σ by ``f2`` …, all checks passed where none is given."""
+    made = make()
+    two = made["faces"]["2"]
+    for name in ("2", "3", "4"):
+        own = sigma_um.get(f"f{name}", [2.0, 2.0, 1.0])
+        made["faces"][name] = copy.deepcopy(two) | {"translation_sigma_um": own, "translation_mm": [300.0, 0.0, 0.0]}
+    made["faces"]["1"] |= {"translation_sigma_um": [0.0] * 3, "rotation_sigma_mdeg": [0.0] * 3}
+    made["summary"] |= {"scale_sigma_ppm": 2.0, "faces": 4}
+    made["checks"] = list(checks) or [check(f"c{i}", "passed") for i in range(17)]
+    return made
+
+
+def test_all_is_well():
+    found = judgement_of(report(f3=[3.04, 1.0, 1.0]))
+    assert found.verdict == "yes"
+    assert found.use == "Yes: 17 checks passed."
+    assert (found.position_face, found.position_sigma_um) == ("3", 3.04)
+    assert (found.rotation_face, found.rotation_sigma_mdeg) == ("4", 0.723)
+    assert found.quality.startswith("Faces are known against face 1 to 3.0 µm (face 3) and 0.72 mdeg (face 4) at worst")
+    assert "the size to 2.0 ppm" in found.quality
+    assert found.limit.startswith("The centring of circles, 0.0038 px in 2 images")
+    assert found.next.startswith("Nothing has to be done")
+
+
+def test_a_failed_check_forbids_the_use_and_its_remedy_is_next():
+    found = judgement_of(
+        report(
+            check("a", "suspicious", remedy="wait"), check("b", "failed", remedy="take it out"), check("c", "passed")
+        )
+    )
+    assert found.verdict == "no"
+    assert found.use == "No: 1 of 3 checks failed, the first: Check b."
+    assert found.limit == "Check b: because of b."
+    assert found.next == "Take it out."
+
+
+def test_the_check_that_names_an_image_comes_first():
+    found = judgement_of(
+        report(check("a", "failed", ("face 2",), "x"), check("b", "failed", ("a/1.jpg",), "look at it"))
+    )
+    assert found.use == "No: 2 of 2 checks failed, the first: Check b."
+    assert found.next == "Look at it."
+
+
+def test_a_suspicious_check_says_how_often_chance_makes_one():
+    others = [check(f"c{i}", "passed") for i in range(16)]
+    found = judgement_of(report(check("a", "suspicious", remedy="repeat it"), *others, check("d", "not possible")))
+    assert found.verdict == "with care"
+    assert found.use == (
+        "With care: 1 of 17 checks is suspicious, the first: Check a; one sound run in 59 has such a check by chance."
+    )
+
+
+def test_the_face_that_stands_out_limits():
+    limit, remedy = (getattr(judgement_of(report(f4=[6.0, 3.0, 2.0])), key) for key in ("limit", "next"))
+    assert limit == "Face 4: 7.0 µm where the others have 3.0 µm; 2 images show it, of group a."
+    assert remedy.startswith("Add images that show face 4;")
+    assert judgement_of(report(f4=[5.0, 2.0, 2.0])).limit.startswith("The centring")  # 5.7 µm: less than twice 3.0
+
+
+def test_the_board_limits_where_its_share_is_more_than_half():
+    own = report()
+    own["summary"]["scale_sigma_ppm"] = 7.5  # 2.25 µm over 300 mm; 3.0 µm / √2 = 2.12 µm
+    assert judgement_of(own).limit == "The board: σ of the size make 2.2 of the 3.0 µm of face 2."
+    own["summary"]["scale_sigma_ppm"] = 7.0  # 2.1 µm
+    assert judgement_of(own).limit.startswith("The centring")
+
+
+def test_results_for_comparison_are_not_for_use():
+    own = report()
+    own["options"] |= {"solve": "paper", "eccentricity": False}
+    assert judgement_of(own).use.startswith("No: it was made for comparison")
+    assert judgement_of(own).next == "Run it without --solve paper."
+    own["options"]["solve"] = "chain"
+    assert judgement_of(own).next == "Run it without --no-eccentricity."
+
+
+def test_without_sigma():
+    own = make(sigma=False)
+    found = judgement_of(own)
+    assert found.verdict == "with care"
+    assert (found.position_sigma_um, found.position_face) == (None, None)
+    assert found.quality == "There are no σ, and no face is reached in two ways that could be compared."
+    assert found.next == "Run it with --solve joint."
+    (way,) = own["chains"]["2"]
+    own["chains"]["2"] = [way, way | {"translation_um": 20.04}]
+    assert "up to 20.0 µm and 7.25 mdeg off" in judgement_of(own).quality
+
+
+def test_the_board_alone_and_one_face():
+    own = report()
+    own["faces"] = {}
+    found = judgement_of(own)
+    assert (found.verdict, found.position_face) == ("no", None)
+    assert found.quality == "The board's dots are within 3.6 µm RMS of their design."
+    assert found.next.startswith("Look at the overlays;")
+    own["faces"] = {"1": report()["faces"]["1"]}
+    assert judgement_of(own).limit == "There is one face only, which nothing links."
+
+
+def test_a_difference_from_the_native_program_calls_for_care():
+    found = judgement_of(report() | {"crosscheck": {"differences": ["face 2 is 9 µm off"]}})
+    assert found.verdict == "with care"
+    assert found.limit == "The native COLMAP differs: face 2 is 9 µm off."
+
+
+def test_what_is_missing_is_said_too():
+    own = report(*[check(key, "not possible", remedy="to be able to make it, add a group") for key in "ab"])
+    own["summary"]["faces_not_seen"] = ["5", "6"]
+    told = judgement_of(own)
+    assert told.use == "Yes: nothing was checked, 2 were not possible."
+    assert "Photograph face 5, 6 together with one of the others: not seen in any image." in told.next
+    assert told.next.endswith("For 2 more checks: add a group.")
+
+
+@pytest.mark.parametrize("stored", [True, False])
+def test_the_page_has_the_same_sentences(stored):
+    own = report()
+    page = report_html(judged(own) if stored else own, {})
+    answers = environment().globals["answers"](judgement_of(own).answers(), "#1b7837")
+    assert str(answers) in page
+    assert CHANCE.replace("'", "&#39;") in page
+
+
+def test_how_often_chance_does_it_is_that_of_the_checks():
+    assert pytest.approx(1 / SUSPICIOUS) == TESTS_OF_CHANCE
+    assert f"{round(1 / SUSPICIOUS):,}, 'failed' in one in {round(1 / FAILED):,}." in CHANCE
