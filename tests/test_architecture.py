@@ -20,7 +20,7 @@ LAYERS = (
     ("design", "labels"),
     ("io",),
     ("boards", "report"),
-    ("synthetic",),
+    ("synthetic", "drawing"),
     ("sfm", "robot", "register", "handeye", "locate"),
     ("synthetic/measured",),
     ("workflows",),

@@ -70,7 +70,7 @@ def find_tags(image: np.ndarray, dictionaries: Sequence[str], border_bits: int =
     grey = grey_8bit(image)
     found: dict[tuple[str, int], list[np.ndarray]] = {}
     for name in dict.fromkeys(dictionaries):
-        detector = cv2.aruco.ArucoDetector(_dictionary(name), _parameters(name, border_bits))
+        detector = cv2.aruco.ArucoDetector(dictionary_of(name), _parameters(name, border_bits))
         for look in _looks(grey, joined):
             corners, ids, _ = detector.detectMarkers(look.grey)
             places = look.in_image(np.array(corners, np.float32).reshape(-1, 4, 2))
@@ -80,7 +80,7 @@ def find_tags(image: np.ndarray, dictionaries: Sequence[str], border_bits: int =
                     found.setdefault((name, int(tag)), []).append(place)
     found = _outermost(found)
     once = {tag: places[0] for tag, places in sorted(found.items()) if len(places) == 1}
-    cells = np.array([_dictionary(name).markerSize + 2 * border_bits for name, _ in once])
+    cells = np.array([dictionary_of(name).markerSize + 2 * border_bits for name, _ in once])
     corners, covariance = _refined(grey, np.array(list(once.values()), float).reshape(-1, 4, 2), cells)
     if joined:  # places from larger and grown images are off by more
         corners, covariance = _refined(grey, corners, cells)
@@ -132,7 +132,7 @@ def other_dictionaries(image: np.ndarray, known: Sequence[str]) -> list[tuple[st
     names = [name for name in names if name.upper() == name or name.upper() not in names]
     counts = []
     for name in names:
-        dictionary = _dictionary(name)
+        dictionary = dictionary_of(name)
         _, ids, _ = cv2.aruco.ArucoDetector(dictionary, _parameters(name)).detectMarkers(grey)
         if ids is not None:
             counts.append((-len(ids), len(dictionary.bytesList), name))
@@ -162,7 +162,7 @@ def find_charuco(image: np.ndarray, name: str, board: CharucoDesign, camera: Cam
         (board.columns, board.rows),
         board.square_mm,
         board.marker_mm,
-        _dictionary(board.dictionary),
+        dictionary_of(board.dictionary),
         np.array(board.tag_ids(), np.int32),
     )
     plain.setLegacyPattern(board.legacy)
@@ -195,7 +195,8 @@ def _refined_inner(grey: np.ndarray, corners: np.ndarray, board: CharucoDesign) 
     return np.array(found).reshape(-1, 2).astype(float)
 
 
-def _dictionary(name: str):
+def dictionary_of(name: str):
+    """Of ``cv2.aruco``, by its name there."""
     return cv2.aruco.getPredefinedDictionary(getattr(cv2.aruco, name))
 
 

@@ -1,10 +1,8 @@
 """Circles as discs: triangles for viewers (PLY), circles and points for drawings and coordinate measuring (DXF)."""
 
-import io
-
 import numpy as np
 
-from stcal.errors import InputError
+from stcal.drawing.dxf import dxf_text, new_drawing
 from stcal.sfm.interop.export.content import BOARD_RGB, Content, Photograph
 
 EDGES = 48
@@ -88,14 +86,10 @@ def dxf(content: Content) -> str:
     InputError
         ``stcal[cad]`` is not installed.
     """
-    try:
-        from ezdxf import units
-        from ezdxf.colors import rgb2int
-        from ezdxf.filemanagement import new
-        from ezdxf.math import OCS, Vec3
-    except ImportError as error:
-        raise InputError("DXF: needs ezdxf; install stcal[cad]") from error
-    drawing = new("R2010", units=units.MM)
+    drawing = new_drawing()
+    from ezdxf.colors import rgb2int
+    from ezdxf.math import OCS, Vec3
+
     space = drawing.modelspace()
     drawing.appids.add("STCAL")
     drawing.layers.add("LABELS", color=8)
@@ -123,6 +117,4 @@ def dxf(content: Content) -> str:
             text.set_placement(plane.from_wcs(centre))
     for line in content.said():
         drawing.header.custom_vars.append("stcal", line)
-    stream = io.StringIO()
-    drawing.write(stream)
-    return stream.getvalue()
+    return dxf_text(drawing)

@@ -1,0 +1,116 @@
+"""What of a board of squares or tags is black, as closed lines in mm: what a printer, a laser or a mill needs.
+
+Cells are joined to areas, as viewers draw hairlines between squares that touch.
+"""
+
+import cv2
+import numpy as np
+
+from stcal.boards.design import AprilGridDesign, CharucoDesign, ChessboardDesign, TagLayout
+from stcal.boards.tags import dictionary_of
+
+SquaresOrTags = ChessboardDesign | CharucoDesign | TagLayout | AprilGridDesign
+UNKNOWN_BITS = 2
+"""Border of an AprilGrid whose file does not say it: Kalibr's."""
+
+
+def black_areas(board: SquaresOrTags) -> list[list[np.ndarray]]:
+    """Areas of closed lines (k, 2), mm in the board's frame; lines within lines are holes, turned the other way."""
+    if isinstance(board, ChessboardDesign):
+        return _squares(board.rows + 1, board.columns + 1, board.square_mm, 0, -board.square_mm)
+    if isinstance(board, CharucoDesign):
+        first = int(board.legacy and board.rows % 2 == 0)
+        squares = _squares(board.rows, board.columns, board.square_mm, first, 0.0)
+        return squares + [_tag(board.dictionary, *tag, 1) for tag in zip(board.tag_ids(), _charuco(board), strict=True)]
+    if isinstance(board, AprilGridDesign):
+        bits = board.border_bits or UNKNOWN_BITS
+        layout = board.layout()
+        tags = [_tag(name, tag, at, bits) for (name, tag), at in zip(layout.tags, layout.corners_mm, strict=True)]
+        return tags + _between(board)
+    return [_tag(name, tag, at, 1) for (name, tag), at in zip(board.tags, board.corners_mm, strict=True)]
+
+
+def clear_mm(board: SquaresOrTags) -> float:
+    """White that detectors need around it: a square, or two cells of the smallest tag."""
+    if isinstance(board, ChessboardDesign | CharucoDesign):
+        return board.square_mm
+    if isinstance(board, AprilGridDesign):
+        return board.tag_mm / 4
+    sides = np.linalg.norm(board.corners_mm - np.roll(board.corners_mm, 1, axis=1), axis=2)
+    return float(sides.max()) / 4
+
+
+def outlines(black: np.ndarray) -> list[np.ndarray]:
+    """Closed lines around the black cells of a mask (rows, columns): corners (k, 2), column and row, the black on the
+    right where rows go down. Areas that touch at a corner alone stay two."""
+    padded = np.pad(black, 1)
+    after: dict[tuple[int, int], list[tuple[int, int]]] = {}
+    for row, column in np.argwhere(black).tolist():
+        corners = [(column, row), (column + 1, row), (column + 1, row + 1), (column, row + 1)]
+        beside = [padded[row, column + 1], padded[row + 1, column + 2], padded[row + 2, column + 1]]
+        beside.append(padded[row + 1, column])
+        for k in range(4):
+            if not beside[k]:
+                after.setdefault(corners[k], []).append(corners[(k + 1) % 4])
+    found = []
+    while after:
+        here = start = next(iter(after))
+        step, line = (0, 0), []
+        while True:
+            ends = after[here]
+            right = (here[0] - step[1], here[1] + step[0])
+            end = ends.pop(ends.index(right) if right in ends else 0)
+            if not ends:
+                del after[here]
+            turned = (end[0] - here[0], end[1] - here[1])
+            if turned != step:
+                line.append(here)
+            here, step = end, turned
+            if here == start:
+                break
+        first = (line[1][0] - line[0][0], line[1][1] - line[0][1])
+        if first[0] * step[1] == first[1] * step[0]:  # begun in the middle of an edge
+            line = line[1:]
+        found.append(np.array(line))
+    return found
+
+
+def _squares(rows: int, columns: int, side: float, first: int, origin: float) -> list[list[np.ndarray]]:
+    """Black squares one by one; square (0, 0) begins at ``origin``, and is black where ``first`` is 0."""
+    row, column = np.divmod(np.arange(rows * columns), columns)
+    black = (row + column) % 2 == first
+    corners = np.array([[0, 0], [1, 0], [1, 1], [0, 1]])
+    return [[side * (at + corners) + origin] for at in np.column_stack([column, row])[black]]
+
+
+def _charuco(board: CharucoDesign) -> np.ndarray:
+    """Corners of its tags, (n, 4, 2), mm: in the middle of the white squares."""
+    first = int(board.legacy and board.rows % 2 == 0)
+    row, column = np.divmod(np.arange(board.rows * board.columns), board.columns)
+    white = (row + column) % 2 != first
+    at = board.square_mm * np.column_stack([column, row])[white] + (board.square_mm - board.marker_mm) / 2
+    count = len(board.tag_ids())  # the last of an odd number of squares may be white without a tag
+    return at[:count, None] + board.marker_mm * np.array([[0, 0], [1, 0], [1, 1], [0, 1]])
+
+
+def _tag(name: str, tag: int, corners: np.ndarray, border_bits: int) -> list[np.ndarray]:
+    """Lines around the black cells of a tag whose corners (4, 2), as printed from top left, lie there."""
+    dictionary = dictionary_of(name)
+    cells = dictionary.markerSize + 2 * border_bits
+    black = cv2.aruco.generateImageMarker(dictionary, tag, cells, borderBits=border_bits) == 0
+    lines = []
+    for line in outlines(black):
+        u, v = (line / cells).T[:, :, None]
+        top = (1 - u) * corners[0] + u * corners[1]
+        lines.append((1 - v) * top + v * ((1 - u) * corners[3] + u * corners[2]))
+    return lines
+
+
+def _between(board: AprilGridDesign) -> list[list[np.ndarray]]:
+    """The small squares at the tags' corners."""
+    gap = board.spacing * board.tag_mm
+    step = board.tag_mm + gap
+    places = [
+        (column * step - gap, -row * step) for row in range(board.rows + 1) for column in range(board.columns + 1)
+    ]
+    return [[np.array(at) + gap * np.array([[0, 0], [1, 0], [1, 1], [0, 1]])] for at in places]

@@ -1,0 +1,117 @@
+"""What is drawn: a plate for each face of a target, a sheet for each board."""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from stcal.boards.cells import SquaresOrTags, black_areas, clear_mm
+from stcal.boards.design import (
+    AprilGridDesign,
+    AsymmetricCirclesDesign,
+    BoardSet,
+    CharucoDesign,
+    ChessboardDesign,
+    FlatBoard,
+)
+from stcal.design import BoardDesign, FaceDesign, Polarity, TargetDesign
+from stcal.drawing.shapes import Area, Disc, Shape, extent, said_mm
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Part:
+    """A flat piece, seen from the side that is photographed, Y upwards.
+
+    ``name``; ``outline`` : (k, 2) where it is cut; ``shapes`` : what it shows; ``spans`` : lengths within it that are
+    written beside it, as (axis, from, to, words); ``table`` : rows of words, the first of them the heads.
+    """
+
+    name: str
+    outline: np.ndarray
+    shapes: tuple[Shape, ...]
+    spans: tuple[tuple[int, float, float, str], ...] = ()
+    table: tuple[tuple[str, ...], ...] = ()
+
+    def pattern(self) -> list[Shape]:
+        """What it shows but for the ground."""
+        return [shape for shape in self.shapes if shape.layer == "PATTERN"]
+
+
+def target_parts(target: TargetDesign, margin_mm: float) -> list[Part]:
+    """A plate for each face, ``margin_mm`` beyond the rims of its circles."""
+    return [face_part(face, target.polarity, margin_mm) for face in target.faces]
+
+
+def face_part(face: FaceDesign, polarity: Polarity, margin_mm: float) -> Part:
+    """The plate of a face, in the face's frame."""
+    shapes = _discs(face.xy_mm, face.radius_mm, face.labels(), polarity)
+    head = ("circle", "x", "y", "diameter")
+    rows = [
+        (circle, said_mm(x), said_mm(y), said_mm(2 * r))
+        for circle, (x, y), r in zip(face.ids, face.xy_mm.tolist(), face.radius_mm.tolist(), strict=True)
+    ]
+    frame = (f"mm from circle {face.origin},", f"X through {face.x}", "", "")
+    return _part(f"face {face.id}", shapes, polarity, margin_mm, table=(frame, head, *rows))
+
+
+def board_parts(board: BoardDesign | FlatBoard | BoardSet, margin_mm: float) -> list[Part]:
+    """The sheet of a board, or of each board of a set; at least ``margin_mm`` around it."""
+    if isinstance(board, BoardSet):
+        return [board_part(each, name, margin_mm) for name, each in zip(board.names, board.boards, strict=True)]
+    return [board_part(board, "board", margin_mm)]
+
+
+def board_part(board: BoardDesign | FlatBoard, name: str, margin_mm: float) -> Part:
+    """The sheet of a board; its Y, which goes down, is turned round."""
+    if isinstance(board, BoardDesign | AsymmetricCirclesDesign):
+        return _dots(board, name, margin_mm)
+    areas = [Area(tuple(line * [1, -1] for line in lines), "black") for lines in black_areas(board)]
+    said, spans = _squares_said(board)
+    return _part(f"{name}: {said}", areas, "dark", max(margin_mm, clear_mm(board)), spans)
+
+
+def _dots(board: BoardDesign | AsymmetricCirclesDesign, name: str, margin_mm: float) -> Part:
+    xy, radii = board.xy_mm() * [1, -1], board.radii_mm()
+    names = board.labels() if isinstance(board, BoardDesign) else [""] * len(xy)
+    pitch = board.pitch_mm if isinstance(board, BoardDesign) else board.spacing_mm
+    spans = []
+    for axis in (0, 1):
+        low, high = float(xy[:, axis].min()), float(xy[:, axis].max())
+        spans.append((axis, low, high, f"{round((high - low) / pitch)} × {said_mm(pitch)} = {said_mm(high - low)}"))
+    sizes = " and ".join(said_mm(2 * radius) for radius in sorted(set(radii.tolist())))
+    said = f"{name}: {board.rows} × {board.columns} dots, diameter {sizes} mm"
+    return _part(said, _discs(xy, radii, names, board.polarity), board.polarity, margin_mm, tuple(spans))
+
+
+def _squares_said(board: SquaresOrTags) -> tuple[str, tuple[tuple[int, float, float, str], ...]]:
+    """What it is, and the lengths to check."""
+    if isinstance(board, ChessboardDesign):
+        columns, rows, first = board.columns - 1, board.rows - 1, 0.0
+        said = f"chessboard, {board.rows} × {board.columns} inner corners"
+    elif isinstance(board, CharucoDesign):
+        columns, rows, first = board.columns - 2, board.rows - 2, board.square_mm
+        said = (
+            f"ChArUco, {board.rows} × {board.columns} squares, tags {said_mm(board.marker_mm)} mm, {board.dictionary}"
+        )
+    elif isinstance(board, AprilGridDesign):
+        step = board.tag_mm * (1 + board.spacing)
+        words = f"{said_mm(board.tag_mm)}, step {said_mm(step)}"
+        said = f"AprilGrid, {board.rows} × {board.columns} tags of {said_mm(board.tag_mm)} mm, {board.dictionary}"
+        return said, ((0, 0.0, board.tag_mm, words), (1, 0.0, board.tag_mm, words))
+    else:
+        return f"{len(board.tags)} tags", ()
+    side = board.square_mm
+    across = (0, first, first + side * columns, f"{columns} × {said_mm(side)} = {said_mm(side * columns)}")
+    return said, (across, (1, -first - side * rows, -first, f"{rows} × {said_mm(side)} = {said_mm(side * rows)}"))
+
+
+def _discs(xy, radii, names, polarity: Polarity) -> list[Shape]:
+    ink = "black" if polarity == "dark" else "white"
+    rows = zip(xy.tolist(), radii.tolist(), names, strict=True)
+    return [Disc(x, y, radius, ink, name=str(name)) for (x, y), radius, name in rows]
+
+
+def _part(name: str, pattern, polarity: Polarity, margin_mm: float, spans=(), table=()) -> Part:
+    (left, below), (right, above) = extent(pattern) + margin_mm * np.array([[-1.0], [1.0]])
+    outline = np.array([[left, below], [right, below], [right, above], [left, above]])
+    ground = [Area((outline,), "black", "GROUND")] if polarity == "bright" else []
+    return Part(name, outline, (*ground, *pattern), spans, table)

@@ -1,0 +1,201 @@
+"""Pages of drawings: as large as what they show, or of a paper, over several of which a part is split."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from itertools import product
+
+import numpy as np
+
+from stcal.drawing.dimensions import LETTERS, framed, scale_bars, table
+from stcal.drawing.parts import Part
+from stcal.drawing.shapes import Line, Shape, Text, extent, moved
+from stcal.errors import InputError
+
+PAPERS = {
+    "A5": (148.0, 210.0),
+    "A4": (210.0, 297.0),
+    "A3": (297.0, 420.0),
+    "A2": (420.0, 594.0),
+    "A1": (594.0, 841.0),
+    "A0": (841.0, 1189.0),
+    "Letter": (215.9, 279.4),
+    "Legal": (215.9, 355.6),
+    "Tabloid": (279.4, 431.8),
+}
+"""Width and height, mm."""
+EDGE = 8.0
+"""That printers leave white, mm."""
+SIDE, FOOT = 10.0, 14.0
+"""For the scale bars and what is written beside them, mm."""
+FURNITURE = np.array([2 * EDGE + SIDE, 2 * EDGE + FOOT])
+"""Of a page's width and height, what is not for parts."""
+OVERLAP = 10.0
+"""Of neighbouring sheets, mm."""
+CROSS = 2.5
+"""Half the length of a registration mark, mm."""
+CLEAR = 1.0
+"""From a seam to the circles and squares that it runs between, mm."""
+BETWEEN = 12.0
+"""Parts on one sheet, mm."""
+MOST_SHEETS = 500
+MOST_MM = 5000.0
+"""Side of a page: PDF knows none that are larger."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Placed:
+    """Shapes in the sheet's frame, drawn within ``clip`` (2, 2) where it is given."""
+
+    shapes: tuple[Shape, ...]
+    clip: np.ndarray | None = None
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Sheet:
+    """A page, origin below on the left."""
+
+    title: str
+    width: float
+    height: float
+    placed: tuple[Placed, ...]
+
+    def shapes(self) -> list[Shape]:
+        """All of them."""
+        return [shape for each in self.placed for shape in each.shapes]
+
+
+def one_sheet(parts: Sequence[Part], title: str) -> Sheet:
+    """All parts on one sheet that is as large as they need."""
+    drawn = [[*framed(part), *table(part, below=False)] for part in parts]
+    boxes = [extent(shapes) for shapes in drawn]
+    widest = max(np.sqrt(sum(np.prod(box[1] - box[0] + BETWEEN) for box in boxes)), *(np.ptp(b, 0)[0] for b in boxes))
+    placed: list[Shape] = []
+    x, top, lowest = 0.0, 0.0, 0.0
+    for shapes, box in zip(drawn, boxes, strict=True):
+        width, height = (box[1] - box[0]).tolist()
+        if x > 0 and x + width > widest:
+            x, top = 0.0, lowest - BETWEEN
+        placed += [moved(shape, x - float(box[0, 0]), top - float(box[1, 1])) for shape in shapes]
+        x, lowest = x + width + BETWEEN, min(lowest, top - height)
+    box = extent(placed)
+    width, height = (np.ptp(box, 0) + FURNITURE).tolist()
+    shift = [EDGE + SIDE - float(box[0, 0]), EDGE + FOOT - float(box[0, 1])]
+    return _sheet(title, width, height, tuple(moved(shape, *shift) for shape in placed))
+
+
+def paper_sheets(parts: Sequence[Part], paper: str, title: str) -> list[Sheet]:
+    """Each part on sheets of a paper, as few of them as may be.
+
+    Raises
+    ------
+    InputError
+        Far too many.
+    """
+    split = [min(_ways(part, paper), key=lambda way: way.count()) for part in parts]
+    total = sum(way.count() for way in split)
+    if total > MOST_SHEETS:
+        raise InputError(f"--paper {paper}: {total} sheets, at most {MOST_SHEETS}; take a larger paper, or none")
+    return [
+        sheet
+        for part, way in zip(parts, split, strict=True)
+        for sheet in _tiles(way, f"{title}, {part.name}" if len(parts) > 1 else title)
+    ]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Way:
+    """A part on a paper: what is drawn, its extent, the paper's size, and the seams along X and Y."""
+
+    shapes: list[Shape]
+    box: np.ndarray
+    size: tuple[float, float]
+    seams: tuple[list[float], list[float]]
+
+    def count(self) -> int:
+        """Of sheets."""
+        return (len(self.seams[0]) + 1) * (len(self.seams[1]) + 1)
+
+
+def _ways(part: Part, paper: str) -> list[_Way]:
+    """Upright and across, its table beside and below."""
+    ways = []
+    taken = np.array([shape.box() for shape in part.pattern()])
+    for below, turned in product((True, False), (False, True)):
+        width, height = PAPERS[paper]
+        size = (height, width) if turned else (width, height)
+        shapes = [*framed(part), *table(part, below)]
+        box = extent(shapes)
+        room = np.array(size) - FURNITURE
+        across, down = (
+            seams_between(float(box[0, k]), float(box[1, k]), float(room[k]), taken[:, :, k]) for k in (0, 1)
+        )
+        ways.append(_Way(shapes, box, size, (across, down)))
+    return ways
+
+
+def seams_between(low: float, high: float, room: float, taken: np.ndarray) -> list[float]:
+    """Places where a length is split so that no piece, with half the overlap on either side, is longer than ``room``;
+    between what is ``taken`` (n, 2) where half a piece has such a place."""
+    seams, start = [], low
+    while high - start > room:
+        last = place = start + room - OVERLAP / 2
+        while place > start + room / 2:
+            hit = taken[(taken[:, 0] < place + CLEAR) & (taken[:, 1] > place - CLEAR)]
+            if not len(hit):
+                break
+            place = min(float(hit[:, 0].min()) - CLEAR, place - 1e-6)
+        seams.append(place if place > start + room / 2 else last)
+        start = seams[-1] - OVERLAP / 2
+    return seams
+
+
+def _tiles(way: _Way, title: str) -> list[Sheet]:
+    if way.count() == 1:
+        shift = [EDGE + SIDE - float(way.box[0, 0]), way.size[1] - EDGE - float(way.box[1, 1])]
+        return [_sheet(title, *way.size, tuple(moved(shape, *shift) for shape in way.shapes))]
+    pieces = [_pieces(float(way.box[0, k]), float(way.box[1, k]), way.seams[k]) for k in (0, 1)]
+    shapes = [*way.shapes, *_registration(way)]
+    boxes = [shape.box() for shape in shapes]
+    sheets = []
+    for row, (below, above) in enumerate(reversed(pieces[1]), 1):
+        for column, (left, right) in enumerate(pieces[0], 1):
+            shift = [EDGE + SIDE - left, EDGE + FOOT - below]
+            clip = np.array([[left, below], [right, above]])
+            inside = [
+                s for s, b in zip(shapes, boxes, strict=True) if (b[0] <= clip[1]).all() and (b[1] >= clip[0]).all()
+            ]
+            own = tuple(moved(shape, *shift) for shape in inside)
+            place = f"sheet {len(sheets) + 1} of {way.count()}: row {row}, column {column}"
+            sheets.append(_sheet(f"{title}; {place}", *way.size, own, clip + shift))
+    return sheets
+
+
+def _pieces(low: float, high: float, seams: list[float]) -> list[tuple[float, float]]:
+    """From where to where each goes."""
+    begins = [low, *(seam - OVERLAP / 2 for seam in seams)]
+    return list(zip(begins, [*(seam + OVERLAP / 2 for seam in seams), high], strict=True))
+
+
+def _registration(way: _Way) -> list[Shape]:
+    """Crosses where seams meet one another and the border; on both sheets that meet there."""
+    places = []
+    for k in (0, 1):
+        others = [way.box[0, 1 - k] + CROSS, *way.seams[1 - k], way.box[1, 1 - k] - CROSS]
+        places += [(seam, other)[:: 1 - 2 * k] for seam in way.seams[k] for other in others]
+    marks: list[Shape] = []
+    for x, y in dict.fromkeys(places):
+        for step in ([CROSS, 0.0], [0.0, CROSS]):
+            ends = np.array([[x, y]]) + np.array([[-1.0], [1.0]]) * step
+            marks.append(Line(ends, "DIMENSIONS", "white", 0.6))
+            marks.append(Line(ends, "DIMENSIONS", "black", 0.1))
+    return marks
+
+
+def _sheet(title: str, width: float, height: float, shapes: tuple[Shape, ...], clip=None) -> Sheet:
+    """With its scale bars and its title."""
+    bars = [moved(shape, EDGE, EDGE) for shape in scale_bars(width - 2 * EDGE, height - 2 * EDGE)]
+    said = "1:1: print at 100 %, not fitted to the page, and measure the bars"
+    if clip is not None:
+        said += "; cut one of two sheets from cross to cross and lay it on the other's crosses"
+    words = [Text(EDGE + SIDE, EDGE + 10.0, title, LETTERS), Text(EDGE + SIDE, EDGE + 7.0, said, 1.6)]
+    return Sheet(title, width, height, (Placed(shapes, clip), Placed((*bars, *words))))

@@ -1,0 +1,210 @@
+"""Lengths in files are exact, sheets of a paper cover what is split over them, and what cannot be drawn is refused."""
+
+import importlib
+import re
+import sys
+from itertools import pairwise
+from xml.etree import ElementTree
+
+import numpy as np
+import pytest
+
+from stcal.boards.cells import outlines
+from stcal.design import reference_board, reference_target
+from stcal.drawing.draw import SUFFIXES, draw
+from stcal.drawing.parts import board_parts
+from stcal.drawing.pdf import POINT_MM, pdf
+from stcal.drawing.shapes import Disc, Line
+from stcal.drawing.sheets import EDGE, FOOT, FURNITURE, OVERLAP, PAPERS, SIDE, paper_sheets, seams_between
+from stcal.errors import InputError
+from stcal.io.design import board_toml, target_toml
+
+SVG = "{http://www.w3.org/2000/svg}"
+DIGITS = 1e-6
+"""Half a nanometre either way is rounded off in SVG."""
+
+
+@pytest.fixture
+def files(tmp_path):
+    (tmp_path / "target.toml").write_text(target_toml(reference_target()))
+    (tmp_path / "board.toml").write_text(board_toml(reference_board()))
+    return tmp_path
+
+
+def assert_is_the_target(circles: dict[str, tuple[np.ndarray, float]]):
+    """Each face's circles keep their places to one another, Y upwards, and their radii."""
+    target = reference_target()
+    assert set(circles) == set(target.radius_of())
+    for face in target.faces:
+        xy = np.array([circles[label][0] for label in face.labels()])
+        np.testing.assert_allclose(xy - xy[0], face.xy_mm - face.xy_mm[0], atol=DIGITS)
+        np.testing.assert_allclose([circles[label][1] for label in face.labels()], face.radius_mm, atol=DIGITS)
+
+
+def test_svg_has_the_target_in_mm(files):
+    drawn = draw(files / "target.toml", files / "target.svg")
+    root = ElementTree.parse(drawn.path).getroot()
+    width, height = float(root.get("width", "").removesuffix("mm")), float(root.get("height", "").removesuffix("mm"))
+    assert root.get("viewBox") == f"0 0 {width:g} {height:g}"
+    circles = {}
+    for each in root.iter(f"{SVG}circle"):
+        x, y, radius = (float(each.get(key, "")) for key in ("cx", "cy", "r"))
+        assert radius < x < width - radius
+        circles[each.get("data-label")] = (np.array([x, -y]), radius)
+    assert_is_the_target(circles)
+
+
+def test_dxf_has_the_target_in_mm(files):
+    ezdxf = importlib.import_module("ezdxf")
+    drawing = ezdxf.readfile(draw(files / "target.toml", files / "target.dxf").path)
+    assert not drawing.audit().errors
+    assert drawing.header["$INSUNITS"] == ezdxf.units.MM
+    circles = {}
+    for each in drawing.modelspace().query('CIRCLE[layer=="PATTERN"]'):
+        ink, label = [tag.value for tag in each.get_xdata("STCAL")[-2:]]
+        assert ink == "white"
+        circles[label] = (np.array(each.dxf.center)[:2], each.dxf.radius)
+    assert_is_the_target(circles)
+    plates = drawing.modelspace().query('LWPOLYLINE[layer=="CUT"]')
+    assert sum(line.closed for line in plates) == len(reference_target().faces)
+
+
+def test_dxf_has_black_areas_as_closed_lines(files):
+    (files / "board.toml").write_text('type = "chessboard"\nrows = 3\ncolumns = 4\nsquare_mm = 12.5\n')
+    drawing = importlib.import_module("ezdxf").readfile(draw(files / "board.toml", files / "board.dxf").path)
+    squares = drawing.modelspace().query('LWPOLYLINE[layer=="PATTERN"]')
+    assert len(squares) == 10
+    for square in squares:
+        assert square.closed
+        xy = np.array(square.get_points("xy"))
+        np.testing.assert_allclose(np.linalg.norm(xy - np.roll(xy, 1, axis=0), axis=1), 12.5)
+
+
+def test_pages_of_a_pdf_have_the_size_of_the_paper(files):
+    for paper in ("Letter",):
+        drawn = draw(files / "target.toml", files / f"{paper}.pdf", paper.lower())
+        sizes = re.findall(rb"/MediaBox \[ 0 0 ([\d.]+) ([\d.]+) \]", drawn.path.read_bytes())
+        assert len(sizes) == len(drawn.sheets) == 5
+        for sheet, size in zip(drawn.sheets, sizes, strict=True):
+            np.testing.assert_allclose(np.array(size, float) * POINT_MM, [sheet.width, sheet.height], atol=1e-3)
+            assert sorted([sheet.width, sheet.height]) == sorted(PAPERS[paper])
+
+
+def test_a_pdf_is_the_same_again():
+    sheets = paper_sheets(board_parts(reference_board(), 10.0), "A4", "board")
+    assert pdf(sheets) == pdf(sheets)
+
+
+def test_sheets_cover_the_board_and_seams_run_between_dots():
+    """Each dot is whole on a sheet, at its place against the others: a sheet's shift is that of all on it."""
+    (part,) = board_parts(reference_board(), 10.0)
+    sheets = paper_sheets([part], "A5", "board")
+    assert len(sheets) == 6
+    place = {s.name: np.array([s.x, s.y]) for s in part.shapes if isinstance(s, Disc)}
+    whole, covered = set(), 0.0
+    for sheet in sheets:
+        (tile, furniture) = sheet.placed
+        assert tile.clip is not None
+        assert furniture.clip is None
+        low, high = tile.clip
+        assert (low >= [EDGE + SIDE - 1e-9, EDGE + FOOT - 1e-9]).all()
+        assert (high <= np.array([sheet.width, sheet.height]) - EDGE + 1e-9).all()
+        discs = [s for s in tile.shapes if isinstance(s, Disc)]
+        shifts = np.array([[s.x, s.y] - place[s.name] for s in discs])
+        np.testing.assert_allclose(shifts - shifts[0], 0, atol=1e-9)
+        inner = [low + OVERLAP / 2 - 1e-9, high - OVERLAP / 2 + 1e-9]  # what is left when cut along the seams
+        for disc in discs:
+            box = disc.box()
+            if (box[0] >= low).all() and (box[1] <= high).all():
+                whole.add(disc.name)
+            cut = ((box[0] < inner[0]) & (box[1] > inner[0])) | ((box[0] < inner[1]) & (box[1] > inner[1]))
+            assert not cut.any(), disc.name
+        marks = [s for s in tile.shapes if isinstance(s, Line) and s.ink == "white"]
+        assert len(marks) >= 6  # both strokes of at least three crosses
+        covered += np.prod(high - low)
+    assert whole == set(place)
+    box = sheets[0].width * sheets[0].height
+    assert covered < len(sheets) * box
+
+
+@pytest.mark.parametrize("taken", [np.zeros((0, 2)), np.array([[40.0, 60.0], [90.0, 101.0]])])
+def test_seams_leave_no_gap(taken):
+    seams = seams_between(0.0, 250.0, 100.0, taken)
+    ends = [0.0, *seams, 250.0]
+    pieces = [(a - OVERLAP / 2 * (a > 0), b + OVERLAP / 2 * (b < 250)) for a, b in pairwise(ends)]
+    assert max(b - a for a, b in pieces) <= 100.0
+    assert not any(low < seam < high for seam in seams for low, high in taken.tolist())
+    assert len(seams) == 2
+
+
+def test_what_fits_a_page_is_not_split():
+    room = np.array(PAPERS["A4"]) - FURNITURE
+    assert seams_between(0.0, float(room[0]), float(room[0]), np.zeros((0, 2))) == []
+
+
+def test_outlines_of_cells_have_holes_and_stay_apart_at_corners():
+    ring = np.ones((3, 3), bool)
+    ring[1, 1] = False
+    assert sorted(len(line) for line in outlines(ring)) == [4, 4]
+    assert [len(line) for line in outlines(np.eye(2, dtype=bool))] == [4, 4]
+    rng = np.random.default_rng(1)
+    for _ in range(20):
+        cells = rng.random((5, 6)) < 0.5
+        areas = []
+        for line in outlines(cells):
+            x, y = line.T
+            areas.append((x * np.roll(y, -1) - np.roll(x, -1) * y).sum() / 2)
+        assert sum(areas) == cells.sum()
+
+
+@pytest.mark.parametrize(
+    ("name", "paper", "said"),
+    [
+        ("a.png", "", r"suffix \.png; one of \.pdf, \.svg, \.dxf needed"),
+        ("a", "", "suffix missing"),
+        ("a.pdf", "A9", "--paper A9: unknown; one of A5, "),
+        ("a.dxf", "A4", "--paper A4: a DXF is no page"),
+        ("a.svg", "A4", "2 sheets, an SVG holds one"),
+        ("board.svg", "", "exists, and nothing is overwritten"),
+    ],
+)
+def test_what_cannot_be_drawn_is_refused(files, name, paper, said):
+    (files / "board.svg").write_text("mine")
+    with pytest.raises(InputError, match=said):
+        draw(files / "board.toml", files / name, paper)
+    assert (files / "board.svg").read_text() == "mine"
+    assert len(list(files.iterdir())) == 3
+
+
+def test_far_too_many_sheets_are_refused(files):
+    (files / "board.toml").write_text('type = "chessboard"\nrows = 60\ncolumns = 60\nsquare_mm = 100\n')
+    with pytest.raises(InputError, match=r"--paper A4: \d+ sheets, at most 500"):
+        draw(files / "board.toml", files / "board.pdf")
+    with pytest.raises(InputError, match=r"page of \d+ mm, at most 5000 mm in a PDF"):
+        draw(files / "board.toml", files / "board.pdf", "own")
+
+
+def test_circles_without_a_radius_are_refused(files):
+    (files / "grid.yaml").write_text(
+        "target_type: circlegrid\ntargetCols: 4\ntargetRows: 5\nspacingMeters: 0.02\nasymmetricGrid: true\n"
+    )
+    with pytest.raises(InputError, match="no radius; radius_mm needed"):
+        draw(files / "grid.yaml", files / "grid.pdf")
+
+
+def test_dxf_names_the_library_that_is_missing(files, monkeypatch):
+    monkeypatch.setitem(sys.modules, "ezdxf", None)
+    with pytest.raises(InputError, match=r"install stcal\[cad\]$"):
+        draw(files / "board.toml", files / "board.dxf")
+
+
+def test_boards_of_a_set_are_drawn_one_by_one(files):
+    (files / "boards.toml").write_text(
+        'type = "boards"\n[[board]]\ntype = "chessboard"\nrows = 4\ncolumns = 5\nsquare_mm = 10\n'
+        '[[board]]\ntype = "charuco"\nrows = 3\ncolumns = 3\nsquare_mm = 20\nmarker_mm = 15\ndictionary = "4X4_50"\n'
+        "x_mm = 100\n"
+    )
+    drawn = draw(files / "boards.toml", files / "boards.pdf")
+    assert [part.name.split(":")[0] for part in drawn.parts] == ["board 1", "board 2"]
+    assert len(drawn.sheets) == 2
+    assert {path.suffix for path in files.glob("boards.*")} & set(SUFFIXES) == {".pdf"}
