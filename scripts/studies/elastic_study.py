@@ -1,6 +1,6 @@
 """Elastic arms in ``stcal robot identify``: simulated arms as they leave the factory, measured over their ranges.
 
-.venv/bin/python scripts/studies/elastic_study.py [--draws 200] [--only TEXT]
+.venv/bin/python scripts/studies/elastic_study.py [--draws 200] [--only TEXT] [--payload]
 
 Each line is a kind of observation, a number of rows, and by how much links give way and gears err, in usual σ (0.017°
 at the usual torque about the axes, 0.006° across them, 0.006° of the gears). ``elastic taken`` : draws in which
@@ -8,6 +8,11 @@ at the usual torque about the axes, 0.006° across them, 0.006° of the gears). 
 ``auto``. ``bound`` : RMS error of the elastic one over what the noise and these σ allow the best estimate (posterior
 covariance at the true arm, σ known). ``calibration`` : root of the mean square of its errors over their σ, as
 predicted.
+
+``--payload`` : other rows carry other masses at the flange, and arms are heavier than usual by a factor of σ 0.5; new
+joint vectors carry 0 … 100 kg. ``unknown`` : identified without the masses, and asked without; ``known``, ``bound``,
+``calibration`` as above, with them. ``axis`` : root of the mean square of the compliances' errors about the joints'
+axes over their σ.
 """
 
 import argparse
@@ -19,11 +24,14 @@ import numpy as np
 from stcal.geometry.rigid import Rigid
 from stcal.parallel import one_thread
 from stcal.robot.identify.adjustment import parameter_units
+from stcal.robot.identify.elastic import HEAVIER
 from stcal.robot.identify.nominal import Deviations, NominalRows
 from stcal.robot.identify.residuals import State, jacobian, observed, tip_jacobian, tips
 from stcal.robot.identify.result import Identified, IdentifyOptions
 from stcal.robot.identify.solve import identify
+from stcal.robot.kinematics.conditions import USUAL, Conditions
 from stcal.robot.kinematics.example import mh80
+from stcal.robot.kinematics.measurements import Measurements
 from stcal.robot.kinematics.model import Robot
 from stcal.synthetic.measured.arms import elastic, joint_vectors, made, measured, placed
 from stcal.workflows.cluster import executor_of
@@ -41,16 +49,26 @@ class Case:
     kind: str
     rows: int
     share: float
+    payloads: tuple[float, ...] = ()
 
     def title(self) -> str:
         """First cells of its line."""
-        return f"{self.kind} | {self.rows} | {self.share:g}"
+        last = " and ".join(f"{mass:g}" for mass in self.payloads) or f"{self.share:g}"
+        return f"{self.kind} | {self.rows} | {last}"
 
 
 CASES = (
     *(Case("position", rows, share) for share in (0.0, 0.5, 1.0, 3.0) for rows in (50, 100)),
     *(Case("pose", 50, share) for share in (0.0, 1.0)),
 )
+LOADED = (
+    *(Case("position", rows, 1.0, masses) for masses in ((0, 60), (60,)) for rows in (60, 120)),
+    Case("pose", 60, 1.0, (0, 60)),
+)
+MOST_KG = 100.0
+"""That new joint vectors carry."""
+CENTRE = np.array([20.0, -30.0, 150.0])
+"""Of the payload, mm, in the flange's frame."""
 
 
 def draw(case: Case, seed: int) -> tuple[bool, np.ndarray, np.ndarray]:
@@ -73,26 +91,57 @@ def draw(case: Case, seed: int) -> tuple[bool, np.ndarray, np.ndarray]:
     return found["auto"].model == "elastic", np.array([*squares, least]), normal.mean()
 
 
-def errors(found: Identified, true: Robot, q: np.ndarray) -> np.ndarray:
-    """(m, 3) of positions in the instrument's frame, mm."""
-    really = tips(State(true.chain(), dict(true.tools)), q, ("",) * len(q))
-    return tips(found.state, q, ("",) * len(q)).translation - really.translation
+def draw_loaded(case: Case, seed: int) -> tuple[np.ndarray, np.ndarray]:
+    """Mean squares of errors, mm², without and with known masses, and of what is possible; and of errors over σ, of
+    positions, and of the compliances about the axes."""
+    rng = np.random.default_rng([100 + LOADED.index(case), seed])
+    tool = Rigid.exp(rng.normal(0, 0.5, 6) * [1, 1, 1, 200, 200, 200])
+    true = placed(made(mh80(), rng), Rigid.exp(rng.normal(0, 1, 6) * [1, 1, 1, 1000, 1000, 1000]), {"": tool})
+    true = elastic(true, rng, case.share, max(rng.normal(1, HEAVIER), 0.2))
+    assert true.elasticity is not None
+    true = replace(true, elasticity=replace(true.elasticity, payload_centre=CENTRE))
+    nominal = replace(mh80(), elasticity=replace(true.elasticity, compliance=np.zeros((6, 2))))
+    mass = np.resize(case.payloads, case.rows)
+    data = measured(true, joint_vectors(true, case.rows, rng), rng, SIGMA_MM, SIGMA_RAD, payload_kg=mass)
+    if case.kind == "position":
+        data = replace(data, rotations=None)
+    q, carried = joint_vectors(true, NEW_POSES, rng), Conditions(rng.uniform(0, MOST_KG, NEW_POSES))
+    options = IdentifyOptions(model="elastic", folds=0)
+    known = identify(nominal, data, options)
+    unknown = identify(nominal, replace(data, conditions=USUAL), options)
+    off = errors(known, true, q, carried)
+    squares = [(errors(unknown, true, q, carried, USUAL) ** 2).sum(1).mean(), (off**2).sum(1).mean()]
+    found, sigma = known.robot.elasticity, known.elasticity_sigma
+    assert found is not None
+    assert sigma is not None
+    axis = ((found.compliance - true.elasticity.compliance) / sigma.compliance)[:, 0] ** 2
+    normal = [(off**2 / variances(known, q, carried)).mean(), axis.mean()]
+    return np.array([*squares, possible(true, data, case, q, carried)]), np.array(normal)
 
 
-def variances(found: Identified, q: np.ndarray) -> np.ndarray:
+def errors(
+    found: Identified, true: Robot, q: np.ndarray, carried: Conditions = USUAL, told: Conditions | None = None
+) -> np.ndarray:
+    """(m, 3) of positions in the instrument's frame, mm; ``told`` : what is said to be carried, if not ``carried``."""
+    really = tips(State(true.chain(), dict(true.tools)), q, ("",) * len(q), carried)
+    believed = carried if told is None else told
+    return tips(found.state, q, ("",) * len(q), believed).translation - really.translation
+
+
+def variances(found: Identified, q: np.ndarray, carried: Conditions = USUAL) -> np.ndarray:
     """(m, 3) by its covariance, mm²."""
-    place = tip_jacobian(found.state, q, ("",) * len(q), found.seen.kind)[1][:, 3:]
+    place = tip_jacobian(found.state, q, ("",) * len(q), found.seen.kind, carried)[1][:, 3:]
     adjusted = found.adjustment
     covariance = adjusted.parts.covariance(np.zeros(len(adjusted.parts.least)))
     return np.einsum("rik,kl,ril->ri", place, covariance, place)
 
 
-def possible(true: Robot, data, case: Case, q: np.ndarray) -> float:
+def possible(true: Robot, data: Measurements, case: Case, q: np.ndarray, carried: Conditions = USUAL) -> float:
     """Mean square error, mm², of the best estimate: σ known, linear about the true arm."""
     state = State(true.chain(), dict(true.tools), elastic=bool(case.share))
     seen = observed(data)
     derivative = jacobian(state, seen)
-    rows = NominalRows.about(state, parameter_units(derivative), mh80())
+    rows = NominalRows.about(state, parameter_units(derivative), mh80(), carried=data.conditions.loaded)
     usual = Deviations()
     known = replace(
         MADE,
@@ -106,7 +155,7 @@ def possible(true: Robot, data, case: Case, q: np.ndarray) -> float:
     normal = white.T @ white + held.normal()
     units = 1 / np.sqrt(np.diag(normal))  # by what is seen and held of each: moments span ten decades of others
     covariance = np.linalg.pinv(normal * units[:, None] * units, hermitian=True) * units[:, None] * units
-    place = tip_jacobian(state, q, ("",) * len(q), seen.kind)[1][:, 3:]
+    place = tip_jacobian(state, q, ("",) * len(q), seen.kind, carried)[1][:, 3:]
     return float(np.einsum("rik,kl,ril->r", place, covariance, place).mean())
 
 
@@ -117,8 +166,12 @@ def main() -> None:
     parser.add_argument("--draws", type=int, default=200)
     parser.add_argument("--only", default="", metavar="TEXT", help="cases whose lines begin so")
     parser.add_argument("--scheduler", metavar="ADDRESS", help="hand the draws to this Dask cluster")
+    parser.add_argument("--payload", action="store_true", help="the cases with payloads")
     arguments = parser.parse_args()
     print(f"{arguments.draws} draws each, simulated\n")
+    if arguments.payload:
+        payloads(arguments)
+        return
     print("| observed | rows | usual σ × | elastic taken | rigid, mm | elastic, mm | auto, mm | bound | calibration |")
     print("|---" * 9 + "|")
     with executor_of(arguments.scheduler) as pool:
@@ -128,6 +181,20 @@ def main() -> None:
             cells = [str(sum(taken)), *(f"{value:.3f}" for value in rms[:3])]
             cells += [f"{rms[1] / rms[3]:.2f}", f"{np.sqrt(np.mean(normal)):.2f}"]
             print(f"| {case.title()} | {' | '.join(cells)} |", flush=True)
+
+
+def payloads(arguments: argparse.Namespace) -> None:
+    """Run the cases with payloads; print."""
+    print("| observed | rows | payloads, kg | unknown, mm | known, mm | bound | calibration | axis |")
+    print("|---" * 8 + "|")
+    with executor_of(arguments.scheduler) as pool:
+        for case in (each for each in LOADED if each.title().startswith(arguments.only)):
+            squares, normal = zip(*pool.map(partial(draw_loaded, case), range(arguments.draws)), strict=True)
+            rms, calibration = np.sqrt(np.mean(squares, axis=0)), np.sqrt(np.mean(normal, axis=0))
+            cells = [*(f"{value:.3f}" for value in rms[:2]), f"{rms[1] / rms[2]:.2f}"]
+            print(
+                f"| {case.title()} | {' | '.join([*cells, *(f'{value:.2f}' for value in calibration)])} |", flush=True
+            )
 
 
 if __name__ == "__main__":

@@ -10,6 +10,7 @@ from stcal.cli.options import (
     FirstTable,
     JsonFile,
     Key,
+    PayloadKg,
     QuaternionOrder,
     Quaternions,
     ReportFile,
@@ -44,6 +45,7 @@ def evaluate(
         Path | None, typer.Option("--out", writable=True, help="Write the residuals of each row to this file (CSV).")
     ] = None,
     quaternions: Quaternions = QuaternionOrder.wxyz,
+    payload_kg: PayloadKg = None,
     first: FirstTable = None,
     second: SecondTable = None,
     key: Key = "image",
@@ -58,7 +60,9 @@ def evaluate(
 
     robots = dict(zip(shown.names_of(robot_files), map(load_robot, robot_files), strict=True))
     source = one_table(data_file, first, second, key, "DATA", quaternions=quaternions.value)
-    data = [read_measurements(source, robot, quaternions.value) for robot in robots.values()]  # within reach of each
+    data = [  # within reach of each
+        read_measurements(source, robot, quaternions.value, payload_kg=payload_kg) for robot in robots.values()
+    ]
     result = evaluated(robots, data[0], refit.value)
     say(shown.evaluated_text(result))
     print_each("note", data[0].notes)

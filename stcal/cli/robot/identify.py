@@ -12,6 +12,7 @@ from stcal.cli.options import (
     FirstTable,
     JsonFile,
     Key,
+    PayloadKg,
     QuaternionOrder,
     Quaternions,
     ReportFile,
@@ -102,6 +103,7 @@ def identify(
     ] = Model.rigid,
     quaternions: Quaternions = QuaternionOrder.wxyz,
     rotation: Rotation = None,
+    payload_kg: PayloadKg = None,
     first: FirstTable = None,
     second: SecondTable = None,
     key: Key = "image",
@@ -119,7 +121,7 @@ def identify(
 
     nominal = load_robot(robot_file)
     source = one_table(data_file, first, second, key, "DATA", quaternions=quaternions.value, columns=columns)
-    data = read_measurements(source, nominal, quaternions.value, rotation)
+    data = read_measurements(source, nominal, quaternions.value, rotation, payload_kg)
     kind = observe.value if observe else None
     options = IdentifyOptions(
         kind, sigma_mm, sigma_rad, robust, folds, seed=seed, partial=partial, model=model.value, adjust=adjusted(adjust)

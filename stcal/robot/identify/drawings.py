@@ -8,7 +8,7 @@ import numpy as np
 from stcal.geometry.rigid import Poses, Rigid
 from stcal.report.figure import COLOURS, INK, SMALL, calm, new_figure, plane, round_below, uri
 from stcal.robot.identify.left import Finding
-from stcal.robot.identify.residuals import Observed, State, as_seen, tips
+from stcal.robot.identify.residuals import Observed, State, as_seen, tips_of
 from stcal.robot.kinematics.forward import joint_frames
 
 ARROW_SHARE, LONGEST_SHARE = 0.12, 0.3
@@ -35,7 +35,7 @@ class Drawn:
 
     def tips(self) -> Poses:
         """world_from_tool of the rows of the file."""
-        return tips(self.state, self.seen.data.q, self.seen.data.targets)
+        return tips_of(self.state, self.seen.data)
 
 
 def joints_figure(shown: Drawn, findings: Iterable[Finding]):
@@ -43,7 +43,7 @@ def joints_figure(shown: Drawn, findings: Iterable[Finding]):
     it."""
     seen, chain, tip = shown.seen, shown.state.chain, shown.tips()
     data = seen.data
-    turned, origins = joint_frames(chain, data.q)
+    turned, origins = joint_frames(chain, data.q, data.conditions)
     values, n = data.q @ chain.coupling.T, len(chain)
     found = shown.residuals[:, -3:]
     across = min(n, 3)

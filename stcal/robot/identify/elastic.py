@@ -10,6 +10,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from stcal.robot.identify.residuals import State
+from stcal.robot.kinematics.conditions import USUAL, Conditions
 from stcal.robot.kinematics.forward import GRAVITY_M_S2, elasticity_values
 from stcal.robot.kinematics.model import Chain, Elasticity, Robot
 
@@ -20,6 +21,9 @@ MASS_KG = 100.0
 0.6 m 25 kg, 1.2 m 116, 2.1 m 550 are sold. Compliances make up for what it is wrong by, so that 3 times is no harm."""
 BESIDE = 0.15
 """Of the arm's length: a link's centre of mass is so far from the middle of its two joints, each way."""
+HEAVIER = 0.5
+"""σ of the factor by which an arm is heavier than usual. Without loads nothing shows it, and compliances make up for
+it; beside the torques of masses that are known compliances have a scale."""
 DOWN = np.array([0.0, 0.0, -1.0])
 SOME = 0.1
 """Share of a σ at which compliances start: at 0 moments would move nothing."""
@@ -28,40 +32,69 @@ SOME = 0.1
 @dataclass(frozen=True, slots=True, eq=False)
 class UsualElasticity:
     """``expected``, ``scale`` : (9 n,) what each of :func:`elasticity_values` is expected to be, and what makes it rad
-    at the joint's usual torque, or a share of the usual moment; ``group`` : (9 n,) whose σ."""
+    at the joint's usual torque, or a share of the usual moment; ``group`` : (9 n,) whose σ; ``factor_sigma`` : of a
+    factor that all moments have in common."""
 
     expected: np.ndarray
     scale: np.ndarray
     group: np.ndarray
+    factor_sigma: float = 0.0
 
     def away(self, chain: Chain) -> np.ndarray:
         """(9 n,) from what is expected, rad or shares."""
         assert chain.elasticity is not None
-        return (elasticity_values(chain.elasticity) - self.expected) * self.scale
+        return self._apart((elasticity_values(chain.elasticity) - self.expected) * self.scale)
+
+    def jacobian(self) -> np.ndarray:
+        """(9 n, 9 n) of :meth:`away` by the values."""
+        return self._apart(np.diag(self.scale))
+
+    def _apart(self, shares: np.ndarray) -> np.ndarray:
+        """Shares (9 n, …), independent with σ 1: moments err by these and, all together, by the factor. The inverse
+        root of their covariance 1 + σ² m mᵀ is shorter along m, the usual moments, and as it was across."""
+        if not self.factor_sigma:
+            return shares
+        along = np.where(self.group == MOMENT, self.expected * self.scale, 0.0)
+        size = np.linalg.norm(along)
+        along = along / size
+        less = 1 - 1 / np.sqrt(1 + (self.factor_sigma * size) ** 2)
+        return shares - less * np.multiply.outer(along, along @ shares)
 
 
-def usual(chain: Chain) -> UsualElasticity:
-    """Of an arm with these dimensions."""
+def usual(chain: Chain, carried: bool = False) -> UsualElasticity:
+    """Of an arm with these dimensions; known loads are ``carried``, which show how heavy it is itself."""
     n = len(chain)
     moment, beside = _moments(chain)
     torque = np.cumsum((np.linalg.norm(moment, axis=1) + beside)[::-1])[::-1]
     expected = np.concatenate([np.zeros(2 * n), moment.ravel(), np.zeros(4 * n)])
     scale = np.concatenate([np.repeat(torque, 2), np.repeat(1 / beside, 3), np.ones(4 * n)])
     group = np.concatenate([np.tile([AXIS, ACROSS], n), np.full(3 * n, MOMENT), np.full(4 * n, PERIODIC)])
-    return UsualElasticity(expected, scale, group)
+    return UsualElasticity(expected, scale, group, HEAVIER if carried else 0.0)
 
 
-def bending(state: State, robot: Robot, deflection_rad: float) -> State:
+def carries(chain: Chain, conditions: Conditions) -> bool:
+    """Whether the masses that rows carried, or that of the chain where they say nothing, are any."""
+    if conditions.payload_kg is None:
+        return chain.elasticity is not None and chain.elasticity.payload_kg > 0
+    return conditions.loaded
+
+
+def bending(state: State, robot: Robot, deflection_rad: float, conditions: Conditions = USUAL) -> State:
     """The state with elasticity to be adjusted: as the robot file has it, or hardly any, and gravity down from the
-    base."""
-    if robot.elasticity is not None and robot.elasticity.compliance.any():
-        return replace(state, elastic=True)
-    n, known = len(state.chain), usual(state.chain)
-    compliance = SOME * deflection_rad / known.scale[: 2 * n].reshape(n, 2)
-    moment = known.expected[2 * n : 5 * n].reshape(n, 3)
-    gravity = DOWN if robot.elasticity is None else robot.elasticity.gravity
-    bent = replace(robot, elasticity=Elasticity(compliance, moment, np.zeros((n, 4)), gravity)).chain()
-    return replace(state, chain=replace(state.chain, elasticity=bent.elasticity), elastic=True)
+    base; with the mass that all rows carried, if it was one."""
+    elasticity = state.chain.elasticity
+    if elasticity is None or not elasticity.compliance.any():
+        n, known = len(state.chain), usual(state.chain)
+        compliance = SOME * deflection_rad / known.scale[: 2 * n].reshape(n, 2)
+        moment = known.expected[2 * n : 5 * n].reshape(n, 3)
+        stated = robot.elasticity or Elasticity(compliance, moment, np.zeros((n, 4)), DOWN)
+        bent = replace(stated, compliance=compliance, moment=moment, periodic=np.zeros((n, 4)))
+        elasticity = replace(robot, elasticity=bent).chain().elasticity
+        assert elasticity is not None
+    mass = conditions.payload_kg
+    if mass is not None and np.ptp(mass) == 0:
+        elasticity = replace(elasticity, payload_kg=float(mass[0]))
+    return replace(state, chain=replace(state.chain, elasticity=elasticity), elastic=True)
 
 
 def _moments(chain: Chain) -> tuple[np.ndarray, np.ndarray]:

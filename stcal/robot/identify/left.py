@@ -12,7 +12,7 @@ from scipy.stats import f as f_distribution
 
 from stcal.geometry.rigid import Rigid
 from stcal.robot.identify.adjustment import Weighting
-from stcal.robot.identify.residuals import WIDTH, Observed, State, as_seen, residuals, tips
+from stcal.robot.identify.residuals import WIDTH, Observed, State, as_seen, residuals, tips_of
 from stcal.robot.identify.variances import GROSS
 from stcal.robot.kinematics.forward import joint_frames
 
@@ -195,7 +195,7 @@ def _shared(state: State, seen: Observed) -> np.ndarray:
     starts = [row for row in np.unique(seen.second) if (seen.second == row).sum() >= SHARED]
     if seen.kind != "distance" or not starts:
         return np.zeros((len(seen), WIDTH[seen.kind], 0))
-    place = tips(state, seen.data.q, seen.data.targets).translation
+    place = tips_of(state, seen.data).translation
     away = place[seen.first] - place[seen.second]
     away /= np.maximum(np.linalg.norm(away, axis=1), 1e-12)[:, None]
     return np.concatenate([away * (seen.second == row)[:, None] for row in starts], axis=1)[:, None]
@@ -203,8 +203,8 @@ def _shared(state: State, seen: Observed) -> np.ndarray:
 
 def _candidates(state: State, seen: Observed, world_from_base: Rigid) -> list[_Candidate]:
     chain, data = state.chain, seen.data
-    tip = tips(state, data.q, data.targets)
-    turned, origins = joint_frames(chain, data.q)
+    tip = tips_of(state, data)
+    turned, origins = joint_frames(chain, data.q, data.conditions)
     base, place = world_from_base.rotation, world_from_base.inverse() @ tip.translation
     along = np.concatenate([np.zeros((3, 3)), base])  # motions along the base's axes
     values = data.q @ chain.coupling.T

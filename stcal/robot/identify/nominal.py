@@ -104,9 +104,11 @@ class NominalRows:
         return own if self.elasticity is None else np.append(own, self.elasticity.group)
 
     @classmethod
-    def about(cls, state: State, units: np.ndarray, nominal: Robot, adjust: Adjusted = "all") -> "NominalRows":
+    def about(
+        cls, state: State, units: np.ndarray, nominal: Robot, adjust: Adjusted = "all", carried: bool = False
+    ) -> "NominalRows":
         """With the derivatives at ``state``, where ``units`` (k,) of the parameters move the tool by 1 mm; dimensions
-        that ``adjust`` or the robot file keep are conditions."""
+        that ``adjust`` or the robot file keep are conditions; known loads were ``carried``."""
         coaxial = _coaxial(nominal)
 
         def values(step: np.ndarray) -> np.ndarray:
@@ -125,7 +127,7 @@ class NominalRows:
         kept = np.isin(group, KEPT[adjust])
         kept |= [[name in joint.fixed for name in DIMENSIONS] for joint in nominal.joints]
         group[kept] = np.where(group[kept] == LENGTH, FIXED_LENGTH, FIXED_ANGLE)
-        elasticity = usual(nominal.chain()) if state.elastic else None
+        elasticity = usual(nominal.chain(), carried) if state.elastic else None
         return cls(nominal, coaxial, jacobian, np.abs(jacobian * units).max(axis=2) > 1e-9, group, elasticity)
 
     def held(self, state: State, deviations: Deviations, kind: Kind) -> Held:
@@ -136,7 +138,7 @@ class NominalRows:
         others = len(parameter_names(state, kind)) - jacobian.shape[1]
         by, value = np.pad(jacobian, ((0, 0), (0, others))), away[self.free]
         if self.elasticity is not None:
-            by = np.asarray(block_diag(by, np.diag(self.elasticity.scale)))
+            by = np.asarray(block_diag(by, self.elasticity.jacobian()))
             value = np.append(value, self.elasticity.away(state.chain))
         sigma = np.array([*astuple(deviations), 1.0, FIXED_MM, FIXED_RAD])[self.groups]
         return Held(value, by, sigma, self.groups >= FIXED_LENGTH)

@@ -12,6 +12,7 @@ from stcal.geometry.rigid import Rigid
 from stcal.robot.identify.left import Finding
 from stcal.robot.identify.observability import directions_named
 from stcal.robot.identify.residuals import WIDTH, Kind, Observed, State, tip_jacobian
+from stcal.robot.kinematics.conditions import USUAL, Conditions
 from stcal.robot.kinematics.damped import reach_mm
 from stcal.robot.kinematics.model import Robot
 
@@ -62,14 +63,21 @@ def predicted(state: State, robot: Robot, seen: Observed, covariance: np.ndarray
     names = list(dict.fromkeys(seen.data.targets))
     target = max(names, key=seen.data.targets.count)
 
-    here = _sigma(state, seen.data.q, seen.data.targets, seen.kind, covariance)
+    here = _sigma(state, seen.data.q, seen.data.targets, seen.kind, covariance, seen.data.conditions)
     ranges = _sigma(state, _over_ranges(robot, SAMPLES), (target,) * SAMPLES, seen.kind, covariance)
     return Predicted(here, ranges, covariance)
 
 
-def _sigma(state: State, q: np.ndarray, targets: Sequence[str], kind: Kind, covariance: np.ndarray) -> np.ndarray:
+def _sigma(
+    state: State,
+    q: np.ndarray,
+    targets: Sequence[str],
+    kind: Kind,
+    covariance: np.ndarray,
+    conditions: Conditions = USUAL,
+) -> np.ndarray:
     """(r,) at joint values (r, n), mm."""
-    place = tip_jacobian(state, q, targets, kind)[1][:, 3:]
+    place = tip_jacobian(state, q, targets, kind, conditions)[1][:, 3:]
     return np.sqrt(np.einsum("rik,kl,ril->r", place, covariance, place))
 
 

@@ -189,8 +189,9 @@ def elastic_rows(result: Identified) -> list[list[str]]:
     if elasticity is None or sigma is None:
         return []
     chain, q = result.state.chain, result.seen.data.q
-    rotation, origin = links(chain, q)
-    torque = torques(chain, q, rotation, origin)
+    conditions = result.seen.data.conditions
+    rotation, origin = links(chain, q, conditions)
+    torque = torques(chain, q, rotation, origin, conditions)
     axis = rotation[..., 2]
     about = (torque * axis).sum(2)
     square = (torque**2).sum(2)

@@ -8,6 +8,7 @@ import numpy as np
 
 from stcal.errors import InputError
 from stcal.geometry.rigid import Poses, Rigid, skew
+from stcal.robot.kinematics.conditions import USUAL, Conditions
 from stcal.robot.kinematics.forward import (
     carried_poses,
     chain_jacobian,
@@ -103,16 +104,21 @@ def parameter_names(state: State, kind: Kind) -> list[str]:
     return names + [f"station {name} {c}" for name in list(state.stations)[1:] for c in component]
 
 
-def tips(state: State, q: np.ndarray, targets: Sequence[str]) -> Poses:
-    """world_from_tool at joint vectors (m, n), with the tool of each."""
+def tips(state: State, q: np.ndarray, targets: Sequence[str], conditions: Conditions = USUAL) -> Poses:
+    """world_from_tool at joint vectors (m, n), with the tool and the load of each."""
     place = {name: i for i, name in enumerate(state.tools)}
     tool = Poses.of(state.tools.values())
-    return carried_poses(state.chain, q, targets) @ tool[[place[t] for t in targets]]
+    return carried_poses(state.chain, q, targets, conditions) @ tool[[place[t] for t in targets]]
+
+
+def tips_of(state: State, data: Measurements) -> Poses:
+    """world_from_tool of m measurements."""
+    return tips(state, data.q, data.targets, data.conditions)
 
 
 def residuals(state: State, seen: Observed) -> np.ndarray:
     """Measured minus modelled, (r, 6), (r, 3) or (r, 1): rad and mm in the axes of the row's station."""
-    return _beside(state, tips(state, seen.data.q, seen.data.targets), seen)
+    return _beside(state, tips_of(state, seen.data), seen)
 
 
 def jacobian(state: State, seen: Observed) -> np.ndarray:
@@ -122,7 +128,7 @@ def jacobian(state: State, seen: Observed) -> np.ndarray:
 
 def linear(state: State, seen: Observed) -> tuple[np.ndarray, np.ndarray]:
     """:func:`residuals` and :func:`jacobian`."""
-    tip, full = tip_jacobian(state, seen.data.q, seen.data.targets, seen.kind)
+    tip, full = tip_jacobian(state, seen.data.q, seen.data.targets, seen.kind, seen.data.conditions)
     if len(state.stations) > 1:
         full = _by_station(state, seen, tip, full)
     return _beside(state, tip, seen), as_seen(state, seen, tip, full)
@@ -173,12 +179,14 @@ def _beside(state: State, tip: Poses, seen: Observed) -> np.ndarray:
     return (seen.values - np.linalg.norm(apart, axis=1))[:, None]
 
 
-def tip_jacobian(state: State, q: np.ndarray, targets: Sequence[str], kind: Kind) -> tuple[Poses, np.ndarray]:
+def tip_jacobian(
+    state: State, q: np.ndarray, targets: Sequence[str], kind: Kind, conditions: Conditions = USUAL
+) -> tuple[Poses, np.ndarray]:
     """world_from_tool at joint vectors (m, n), and its derivative (m, 6, k) by :func:`parameter_names` and the
     elasticity: rotation (rad) over translation (mm), in the world's axes, where stations move nothing."""
-    tip = tips(state, q, targets)
+    tip = tips(state, q, targets, conditions)
     width = tool_width(kind)
-    axes_part = chain_jacobian(state.chain, q, tip)
+    axes_part = chain_jacobian(state.chain, q, tip, conditions)
     if state.chain.grown is not None:
         joint = [i for i, _ in chain_parameters(state.chain)]
         axes_part = axes_part * state.chain.carries(targets)[joint].T[:, None]
@@ -192,7 +200,7 @@ def tip_jacobian(state: State, q: np.ndarray, targets: Sequence[str], kind: Kind
         tools_part[rows, 3:, place : place + 3] = tip.rotation[rows]
     parts = [axes_part, tools_part, np.zeros((len(tip), 6, 6 * (len(state.stations) - 1)))]
     if state.elastic:
-        parts.append(elasticity_jacobian(state.chain, q, tip))
+        parts.append(elasticity_jacobian(state.chain, q, tip, conditions))
     return tip, np.concatenate(parts, axis=2)
 
 

@@ -20,7 +20,7 @@ from stcal.robot.identify.adjustment import (
     unseen,
 )
 from stcal.robot.identify.consensus import agreeing
-from stcal.robot.identify.elastic import bending
+from stcal.robot.identify.elastic import bending, carries
 from stcal.robot.identify.left import left
 from stcal.robot.identify.nominal import Deviations, NominalRows, placed
 from stcal.robot.identify.observability import ObservabilityIndices, directions_named, parameter_scale
@@ -35,7 +35,7 @@ from stcal.robot.identify.residuals import (
     only_of,
     parameter_names,
     residuals,
-    tips,
+    tips_of,
 )
 from stcal.robot.identify.result import (
     LEAST_FOLDS,
@@ -171,7 +171,8 @@ def identify(robot: Robot, data: Measurements, options: IdentifyOptions | None =
         + doubts(sigma, seen, solution.units[own], covariance, names, tested)
         + tuple(each.sentence() for each in found or ())
         + hold
-        + ((TRY_ELASTIC,) if hold and not solution.state.elastic else ()),
+        + ((TRY_ELASTIC,) if hold and not solution.state.elastic else ())
+        + (data.conditions.ignored("the arm as identified") if identified.elasticity is None else ()),
     )
 
 
@@ -183,8 +184,10 @@ def _modelled(
     if options.model == "rigid":
         return rigid, _cross_validated(robot, seen, rigid, options), None
     _undetermined(rigid.solution, parameter_names(first, seen.kind), seen, options.partial)
-    state = bending(rigid.solution.state, robot, rigid.deviations.axis_rad)
-    rows = NominalRows.about(state, parameter_units(jacobian(state, seen)), robot, options.adjust)
+    conditions = seen.data.conditions
+    state = bending(rigid.solution.state, robot, rigid.deviations.axis_rad, conditions)
+    carried, units = carries(state.chain, conditions), parameter_units(jacobian(state, seen))
+    rows = NominalRows.about(state, units, robot, options.adjust, carried)
     good = rigid.solution.weights >= GROSS
     good |= good.mean() < MOSTLY_GOOD
     elastic = _without_errors(state, seen, good, options, (rows, rigid.weighting, rigid.deviations))
@@ -338,9 +341,16 @@ def _undetermined(solution: Solution, names: list[str], seen: Observed, partial:
 
 def _ranks(state: State, data: Measurements) -> dict[str, int]:
     """Parameters that poses, positions and distances at these joint values determine, whichever were measured."""
-    tip = tips(state, data.q, data.targets)
+    tip = tips_of(state, data)
     exact = Measurements(
-        data.where, data.lines, data.q, data.targets, tip.translation, tip.rotation, stations=data.stations
+        data.where,
+        data.lines,
+        data.q,
+        data.targets,
+        tip.translation,
+        tip.rotation,
+        stations=data.stations,
+        conditions=data.conditions,
     )
     ranks, weighting = {}, Weighting(TYPICAL_MM, TYPICAL_RAD)
     for kind in get_args(Kind):

@@ -13,7 +13,7 @@ from stcal.geometry.least_squares import NormalEquations, minimise, perturbed
 from stcal.geometry.rigid import Poses, Rigid, skew
 from stcal.io.quaternions import EXPLAINS
 from stcal.robot.identify.adjustment import USELESS_MM
-from stcal.robot.identify.residuals import State, observed, residuals, tips
+from stcal.robot.identify.residuals import State, observed, residuals, tips_of
 from stcal.robot.kinematics.damped import reach_mm
 from stcal.robot.kinematics.fit import FITS, require_convention
 from stcal.robot.kinematics.forward import carried_poses
@@ -73,7 +73,7 @@ def start(robot: Robot, data: Measurements, fit: Fit = BOTH) -> State:
             )
         _explain(robot, data, tools, misfit, extent)
     if data.rotations is not None:
-        flange = carried_poses(state.chain, data.q, data.targets).rotation
+        flange = carried_poses(state.chain, data.q, data.targets, data.conditions).rotation
         require_convention(data.where, data.targets, flange, data.rotations)
     return replace(state, stations={data.stations[0]: Rigid()})
 
@@ -101,13 +101,13 @@ def _with_stations(robot: Robot, data: Measurements) -> State:
     for name, own in others:
         part = data[own]
         try:
-            station = align_rigid(part.points(), tips(state, part.q, part.targets).translation)
+            station = align_rigid(part.points(), tips_of(state, part).translation)
         except DegenerateError as error:
             raise DegenerateError(
                 f"{data.where}: station {name}: {own.sum()} positions do not show where it stands; 3 or more off one "
                 "line needed, or leave them out"
             ) from error
-        off = part.points() - (station @ tips(state, part.q, part.targets)).translation
+        off = part.points() - (station @ tips_of(state, part)).translation
         misfit, extent = float(np.sqrt((off**2).sum(1).mean())), _extent(part)
         if misfit > FITS * extent:
             raise InputError(
@@ -143,7 +143,7 @@ def _moves(data: Measurements) -> None:
 def _placed(robot: Robot, data: Measurements, tools: dict[str, Rigid], fit: Fit = BOTH) -> tuple[State, float]:
     """Base and tool points by least squares, tool orientations after them; and the RMS misfit, mm."""
     chain = replace(robot, world_from_base=Rigid()).chain()
-    flange = carried_poses(chain, data.q, data.targets)
+    flange = carried_poses(chain, data.q, data.targets, data.conditions)
     names = list(tools)
     rows = np.array([names.index(t) for t in data.targets])
     points = np.array([tools[name].translation for name in names])

@@ -84,12 +84,12 @@ def robot_from_chain(chain: Chain, tools: Mapping[str, Rigid], nominal: Robot) -
         elasticity=None,
         tree=tree,
     )
-    return replace(robot, elasticity=_elasticity(robot, chain, end(n - 1)))
+    return replace(robot, elasticity=_elasticity(robot, chain, nominal))
 
 
-def _elasticity(robot: Robot, chain: Chain, flange_from_last: Rigid) -> Elasticity | None:
+def _elasticity(robot: Robot, chain: Chain, nominal: Robot) -> Elasticity | None:
     """That of ``chain`` in the frames of ``robot``, which are turned about the joints' axes, and slid along them: by so
-    little, or of so stiff an arm, that what it gives way by stays."""
+    little, or of so stiff an arm, that what it gives way by stays; loads are where ``nominal`` says."""
     elasticity = chain.elasticity
     if elasticity is None:
         return None
@@ -98,7 +98,7 @@ def _elasticity(robot: Robot, chain: Chain, flange_from_last: Rigid) -> Elastici
     turn = np.swapaxes(joint_frames(robot.chain(), zero)[0], 2, 3) @ joint_frames(rigid, zero)[0]
     gravity = robot.world_from_base.rotation.T @ chain.rotation[0] @ elasticity.gravity
     moment = (turn[:, 0] @ elasticity.moment[:, :, None])[:, :, 0]
-    centre = flange_from_last @ elasticity.payload_centre
+    centre = np.zeros(3) if nominal.elasticity is None else nominal.elasticity.payload_centre
     return replace(elasticity, moment=moment, gravity=gravity, payload_centre=centre)
 
 

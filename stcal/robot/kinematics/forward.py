@@ -119,9 +119,9 @@ def joint_frames(chain: Chain, q: np.ndarray, conditions: Conditions = USUAL) ->
     return rotation, origin
 
 
-def links(chain: Chain, q: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def links(chain: Chain, q: np.ndarray, conditions: Conditions = USUAL) -> tuple[np.ndarray, np.ndarray]:
     """world_from_link of each link as its joint has moved it: rotations (n, m, 3, 3) and origins (n, m, 3)."""
-    rotation, origin = joint_frames(chain, q)
+    rotation, origin = joint_frames(chain, q, conditions)
     angle = np.where(chain.prismatic, 0.0, q @ chain.coupling.T).T[:, :, None]
     x, y, z = np.moveaxis(rotation, 3, 0)
     c, s = np.cos(angle), np.sin(angle)

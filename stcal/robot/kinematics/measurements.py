@@ -12,6 +12,7 @@ from stcal.geometry.rigid import Poses
 from stcal.io.quaternions import Order
 from stcal.io.table import ANGLES, LENGTHS, Table, read_table
 from stcal.robot.kinematics.columns import oriented, unread
+from stcal.robot.kinematics.conditions import PAYLOAD, USUAL, Conditions, read_conditions
 from stcal.robot.kinematics.damped import reach_mm
 from stcal.robot.kinematics.model import Robot
 
@@ -58,6 +59,8 @@ class Measurements:
         (m,) names of where the instrument stood: positions are in a frame of each; one where not given.
     notes : tuple of str
         On rows of the file that are not here, columns that were not read, and angles by their convention.
+    conditions : Conditions
+        What the flange carried.
 
     Raises
     ------
@@ -77,6 +80,7 @@ class Measurements:
     from_row: np.ndarray | None = None
     stations: tuple[str, ...] = ()
     notes: tuple[str, ...] = ()
+    conditions: Conditions = USUAL
 
     def __post_init__(self):
         m = len(self.q)
@@ -105,6 +109,7 @@ class Measurements:
             q=self.q[rows],
             targets=tuple(self.targets[i] for i in rows),
             stations=tuple(self.stations[i] for i in rows),
+            conditions=self.conditions[rows],
             **{name: None if values is None else values[rows] for name, values in optional.items()},
         )
 
@@ -142,7 +147,11 @@ class Measurements:
 
 
 def read_measurements(
-    path: str | Path | Table, robot: Robot, quaternions: Order = "wxyz", rotation: str | None = None
+    path: str | Path | Table,
+    robot: Robot,
+    quaternions: Order = "wxyz",
+    rotation: str | None = None,
+    payload_kg: float | None = None,
 ) -> Measurements:
     """Read joint values with positions, poses or distances.
 
@@ -159,6 +168,8 @@ def read_measurements(
         As their columns are named, or x, y, z, w in the order in which these stand.
     rotation : str, optional
         Convention of angles whose columns do not say it: ``kuka-abc``, ``ZYX-deg``, ``rotvec`` … (``data_layout.md``).
+    payload_kg : float, optional
+        Mass at the flange in all rows, where no column ``payload_kg`` says it.
 
     Returns
     -------
@@ -169,14 +180,15 @@ def read_measurements(
     ------
     InputError
         Missing columns, bad rows, joint values of another unit or number than the robot's, angles whose convention is
-        open; the message names the line.
+        open, masses that no arm carries; the message names the line.
     """
     table = read_table(path, WHAT, quaternions)
     q = joint_values(table, robot)
-    targets = targets_of(table)
+    targets, conditions = targets_of(table), read_conditions(table, payload_kg)
     if table.has("x", LENGTHS):
         poses, columns, said = oriented(table, rotation)
-        data = Measurements(table.where, table.lines, q, targets, table.points(), notes=said + unread(table, columns))
+        said += unread(table, (*columns, PAYLOAD))
+        data = Measurements(table.where, table.lines, q, targets, table.points(), notes=said, conditions=conditions)
         if "station" in table:
             data = replace(data, stations=tuple(table.text("station")))
         if poses is not None:
@@ -197,8 +209,8 @@ def read_measurements(
     within(table, "distance", distances, "mm")
     if rotation is not None:
         raise InputError(f"{table.where}: --rotation {rotation}, but distances have no orientation; leave it out")
-    rows, notes = _from_rows(table), unread(table)
-    return Measurements(table.where, table.lines, q, targets, distances=distances, from_row=rows, notes=notes)
+    own = {"distances": distances, "from_row": _from_rows(table), "notes": unread(table, (PAYLOAD,))}
+    return Measurements(table.where, table.lines, q, targets, **own, conditions=conditions)
 
 
 def targets_of(table: Table) -> tuple[str, ...]:
@@ -235,7 +247,9 @@ def _usable(data: Measurements, table: Table) -> Measurements:
         undecided = np.array([status == AMBIGUOUS for status in table.text(STATUS)])
     rotations = np.zeros((len(data), 0)) if data.rotations is None else data.rotations.reshape(len(data), -1)
     names = np.unique(data.targets, return_inverse=True)[1]
-    every = np.column_stack([data.q, names, data.points(), rotations])
+    mass = data.conditions.payload_kg
+    carried = np.zeros(len(data)) if mass is None else mass
+    every = np.column_stack([data.q, names, data.points(), rotations, carried])
     copies = np.ones(len(data), bool)
     copies[np.unique(every, axis=0, return_index=True)[1]] = False
     reasons = {

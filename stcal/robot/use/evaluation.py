@@ -23,7 +23,7 @@ from stcal.robot.identify.residuals import (
     only_of,
     parameter_names,
     residuals,
-    tips,
+    tips_of,
 )
 from stcal.robot.identify.result import position_errors
 from stcal.robot.identify.start import Fit, start
@@ -249,7 +249,7 @@ def _evaluated(robot: Robot, state: State, seen: Observed, fit: Fit, wrong: np.n
 def _derivatives(state: State, base: Rigid, seen: Observed, fit: Fit) -> np.ndarray:
     """(r, w, k) by the base, turns about its origin over shifts, and by the tools' points."""
     parts = [np.zeros((len(seen), WIDTH[seen.kind], 0))]
-    tip = tips(state, seen.data.q, seen.data.targets)
+    tip = tips_of(state, seen.data)
     if "base" in fit and seen.kind != "distance":
         moves = np.zeros((len(tip), 6, 6))
         moves[:, :3, :3] = moves[:, 3:, 3:] = np.eye(3)

@@ -16,7 +16,7 @@ from stcal.report.page import render
 from stcal.report.text import number, text_table
 from stcal.robot.identify.drawings import Drawn, joints_figure, space_picture
 from stcal.robot.identify.report import placed_cells, placed_parts
-from stcal.robot.identify.residuals import tips
+from stcal.robot.identify.residuals import tips_of
 from stcal.robot.use.compensation import joint_cells, joint_columns
 from stcal.robot.use.evaluation import Evaluated, Evaluation, Figures
 from stcal.robot.use.files import EvaluationFile
@@ -79,6 +79,7 @@ def notes(result: Evaluation) -> list[str]:
     return [
         *_verdicts(result),
         *_wrong(result),
+        *_rigid(result),
         *(f"{each.robot.name}: {said}" for each in result.robots for said in left_lines(each)),
     ]
 
@@ -92,6 +93,12 @@ def _verdicts(result: Evaluation) -> list[str]:
         else:
             found.append(f"{each.better} and {each.worse} differ by no more than chance: mean error {size}")
     return [*found, *([f"best: {result.best}"] if result.best and len(result.robots) > 2 else [])]
+
+
+def _rigid(result: Evaluation) -> list[str]:
+    """Robots that know nothing of what loads do."""
+    rigid = (each.robot.name for each in result.robots if each.robot.elasticity is None)
+    return [note for name in rigid for note in result.seen.data.conditions.ignored(f"robot {name}")]
 
 
 def _wrong(result: Evaluation) -> list[str]:
@@ -141,7 +148,7 @@ def evaluated_csv(result: Evaluation) -> str:
         else:
             head.append(f"{name}_residual_mm")
         head += [f"{name}_error_mm", *([f"{name}_error_deg"] if turned else [])]
-        modelled.append(tips(each.state, data.q, data.targets).translation)
+        modelled.append(tips_of(each.state, data).translation)
     writer.writerow(head)
     turns = Poses(data.rotations, data.points()).quaternions() if data.rotations is not None else None
     place_of = {int(row): i for i, row in enumerate(result.seen.first)}
@@ -206,7 +213,7 @@ def evaluation_page(result: Evaluation) -> str:
         fitted=FITTED[result.refit],
         heads=heads,
         rows=rows,
-        notes=[*_verdicts(result), *_wrong(result)],
+        notes=[*_verdicts(result), *_wrong(result), *_rigid(result)],
         drawn_by_row=uri(_row_figure(result)),
         by_place=uri(_place_figure(result)) if points else "",
         robots=[
@@ -250,7 +257,7 @@ def _directions(result: Evaluation, each: Evaluated) -> list[list[str]]:
 def _place(result: Evaluation, each: Evaluated) -> np.ndarray:
     """(r, 3) of the tool in the robot's base, mm."""
     data = result.seen.data
-    return each.robot.world_from_base.inverse() @ tips(each.state, data.q, data.targets).translation
+    return each.robot.world_from_base.inverse() @ tips_of(each.state, data).translation
 
 
 def _colour(result: Evaluation, each: Evaluated) -> str:

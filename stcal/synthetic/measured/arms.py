@@ -4,13 +4,15 @@ from collections.abc import Sequence
 from dataclasses import astuple, dataclass, replace
 
 import numpy as np
+from numpy.typing import ArrayLike
 from scipy.spatial.transform import Rotation
 
 from stcal.errors import ConvergenceError
 from stcal.geometry.rigid import Poses, Rigid
-from stcal.robot.identify.elastic import DOWN, usual
+from stcal.robot.identify.elastic import DOWN, MOMENT, usual
 from stcal.robot.identify.nominal import Deviations
 from stcal.robot.identify.residuals import State, tips
+from stcal.robot.kinematics.conditions import loaded
 from stcal.robot.kinematics.dh import robot_from_chain
 from stcal.robot.kinematics.example import mh80
 from stcal.robot.kinematics.forward import chain_parameters, flange_poses, jacobian, moved_chain, with_values
@@ -38,11 +40,13 @@ def made(robot: Robot, rng: np.random.Generator, sigma_mm: float = 0.3, sigma_ra
     return replace(found, rows=tuple(rows), tools=dict(robot.tools))
 
 
-def elastic(robot: Robot, rng: np.random.Generator, share: float = 1.0) -> Robot:
-    """The robot with links that give way to gravity, and gears, by normal numbers of ``share`` times the usual σ."""
+def elastic(robot: Robot, rng: np.random.Generator, share: float = 1.0, heavier: float = 1.0) -> Robot:
+    """The robot with links that give way to gravity, and gears, by normal numbers of ``share`` times the usual σ; its
+    masses are ``heavier`` times the usual ones."""
     known, n = usual(robot.chain()), len(robot.rows)
     sigma = np.array([*share * np.array(astuple(Deviations())), 1.0])[known.group]
     values = known.expected + rng.normal(0, sigma) / known.scale
+    values[known.group == MOMENT] *= heavier
     compliance, rest = np.abs(values[: 2 * n]), values[2 * n :]
     none = Elasticity(np.zeros((n, 2)), np.zeros((n, 3)), np.zeros((n, 4)), DOWN)
     return replace(robot, elasticity=with_values(none, np.append(compliance, rest)))
@@ -84,11 +88,12 @@ def measured(
     sigma_rad: float = 2e-4,
     targets: Sequence[str] = (),
     covariance: np.ndarray | None = None,
+    payload_kg: ArrayLike | None = None,
 ) -> Measurements:
     """What an instrument sees of the robot at joint vectors (m, n): poses with normal noise of these σ per axis, or of
-    ``covariance`` (m, 6, 6) which then comes with them; of tool ``""``, or of each row's."""
-    targets = tuple(targets) or ("",) * len(q)
-    tip = tips(State(robot.chain(), dict(robot.tools)), q, targets)
+    ``covariance`` (m, 6, 6) which then comes with them; of tool ``""``, or of each row's, and with each row's load."""
+    targets, conditions = tuple(targets) or ("",) * len(q), loaded(payload_kg, len(q))
+    tip = tips(State(robot.chain(), dict(robot.tools)), q, targets, conditions)
     noise = rng.normal(0, 1, (len(q), 6))
     if covariance is None:
         noise = noise * np.repeat([sigma_rad, sigma_mm], 3)
@@ -96,7 +101,8 @@ def measured(
         noise = np.einsum("mij,mj->mi", np.linalg.cholesky(covariance), noise)
     turn = Rotation.from_rotvec(noise[:, :3]).as_matrix()
     place = tip.translation + noise[:, 3:]
-    return Measurements("simulated", range(2, len(q) + 2), q, targets, place, turn @ tip.rotation, covariance)
+    lines, rotation = range(2, len(q) + 2), turn @ tip.rotation
+    return Measurements("simulated", lines, q, targets, place, rotation, covariance, conditions=conditions)
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -1,5 +1,6 @@
 """Elastic arms: what gravity and gears do is found where it is, and left alone where it is not."""
 
+import re
 from dataclasses import replace
 
 import numpy as np
@@ -7,11 +8,15 @@ import pytest
 
 from stcal.errors import InputError
 from stcal.geometry.rigid import Rigid
-from stcal.robot import forward
+from stcal.robot import forward, read_measurements
+from stcal.robot.identify.elastic import DOWN, HEAVIER, MOMENT, usual
 from stcal.robot.identify.result import Identified, IdentifyOptions
 from stcal.robot.identify.solve import identify
+from stcal.robot.kinematics.conditions import USUAL
 from stcal.robot.kinematics.example import mh80
-from stcal.robot.kinematics.model import Robot
+from stcal.robot.kinematics.model import Elasticity, Robot
+from stcal.robot.use.evaluation import evaluate
+from stcal.robot.use.evaluation_report import notes
 from stcal.synthetic.measured.arms import elastic, joint_vectors, made, measured, placed
 
 
@@ -106,3 +111,90 @@ def test_sigma_elsewhere_hold_what_a_rigid_model_leaves():
     assert rms(rigid.predicted.ranges_mm) > 1.5 * rms(alone.predicted.ranges_mm)
     # what goes with the three strongest causes, of more
     assert elsewhere(rigid, true) < 1.5 * rms(rigid.predicted.ranges_mm)
+
+
+CENTRE = np.array([0.0, 30.0, 120.0])
+
+
+def carrying(rows: int, seed: int, payloads: tuple[float, ...], heavier: float = 1.0):
+    """A heavier elastic arm, its drawing with the place of the load, and positions, one payload after the other."""
+    rng = np.random.default_rng(seed)
+    true = elastic(placed(made(mh80(), rng), Rigid(), {"": Rigid.exp([0.1, 0.2, 0, 50, 60, 70])}), rng, 1.0, heavier)
+    true = replace(true, elasticity=replace(true.elasticity, payload_centre=CENTRE))
+    none = Elasticity(np.zeros((6, 2)), np.zeros((6, 3)), np.zeros((6, 4)), DOWN, payload_centre=CENTRE)
+    mass = np.resize(payloads, rows)
+    data = measured(true, joint_vectors(true, rows, rng), rng, payload_kg=mass)
+    return true, replace(mh80(), elasticity=none), replace(data, rotations=None)
+
+
+def sag_error(found: Robot, true: Robot, mass: float) -> float:
+    """RMS of what a load moves the tool by, as identified and as it is, mm, over that of what it does."""
+    q = joint_vectors(true, 100, np.random.default_rng(98))
+    by, does = (forward(each, q, payload_kg=mass).translation - forward(each, q).translation for each in (found, true))
+    by = by @ found.world_from_base.rotation.T
+    return float(np.sqrt(((by - does) ** 2).sum() / (does**2).sum()))
+
+
+def test_rows_with_two_payloads_tell_how_compliant_the_arm_is():
+    """Of an arm 1.6 times as heavy as usual what 100 kg do (0.4 mm) is known to a sixth from positions of 0.05 mm, and
+    not at all where it is taken as usual."""
+    true, nominal, data = carrying(80, 5, (0.0, 60.0), 1.6)
+    found = identify(nominal, data, IdentifyOptions(model="elastic", folds=0))
+    assert 0.01 < sag_error(found.robot, true, 100.0) < 0.25
+    assert found.weighting.sigma_mm == pytest.approx(0.05, rel=0.25)
+    own, sigma = (each.compliance[:3, 0] for each in (found.robot.elasticity, found.elasticity_sigma))
+    assert np.abs((own - true.elasticity.compliance[:3, 0]) / sigma).max() < 3.5
+    assert (found.robot.elasticity.payload_centre == CENTRE).all()
+    assert found.robot.elasticity.payload_kg == 0.0
+    without = identify(nominal, replace(data, conditions=USUAL), IdentifyOptions(model="elastic", folds=0))
+    assert sag_error(without.robot, true, 100.0) > 0.4
+
+
+def test_the_payload_of_all_rows_is_that_of_the_identified_file():
+    true, nominal, data = carrying(60, 6, (40.0,))
+    found = identify(nominal, data, IdentifyOptions(model="elastic", folds=0))
+    assert found.robot.elasticity.payload_kg == 40.0
+    q = joint_vectors(true, 50, np.random.default_rng(97))
+    seen = found.robot.world_from_base @ forward(found.robot, q)
+    assert np.linalg.norm(seen.translation - forward(true, q, payload_kg=40.0).translation, axis=1).mean() < 0.1
+
+
+def test_a_payload_of_an_arm_identified_as_rigid_is_said_to_do_nothing():
+    data = carrying(60, 6, (40.0,))[2]
+    found = identify(mh80(), data, IdentifyOptions(folds=0))
+    assert "the arm as identified is rigid, payload_kg moves nothing" in found.notes[-1]
+
+
+def test_usual_moments_may_all_be_wrong_by_one_factor_where_loads_are_known():
+    """(1 + σ² m mᵀ)⁻¹ is what the rows of the whitened moments make; without loads nothing is changed."""
+    chain = mh80().chain()
+    free, known = usual(chain), usual(chain, carried=True)
+    assert (free.jacobian() == np.diag(free.scale)).all()
+    own = free.group == MOMENT
+    shares = (free.expected * free.scale)[own]
+    covariance = np.eye(own.sum()) + HEAVIER**2 * np.outer(shares, shares)
+    by = (known.jacobian() / known.scale)[np.ix_(own, own)]
+    assert np.abs(by.T @ by @ covariance - np.eye(own.sum())).max() < 1e-9
+    assert np.abs(known.jacobian() - free.jacobian())[~own].max() == 0
+
+
+def test_files_of_measurements_say_what_was_carried(tmp_path):
+    true, nominal, data = carrying(30, 7, (0.0, 60.0))
+    names = [f"q{i}_rad" for i in range(1, 7)] + ["x_mm", "y_mm", "z_mm", "payload_kg"]
+    rows = np.column_stack([data.q, data.positions, data.conditions.payload_kg])
+    path = tmp_path / "data.csv"
+    np.savetxt(path, rows, delimiter=",", header=",".join(names), comments="", fmt="%.12g")
+    read = read_measurements(path, nominal)
+    assert (read.conditions.payload_kg == data.conditions.payload_kg).all()
+    assert (read[1::2].conditions.payload_kg == 60).all()
+    assert read.notes == ()
+    result = evaluate({"true": true, "drawn": mh80()}, read)
+    errors = [each.errors_mm for each in result.robots]
+    assert errors[0].mean() < 0.12 < errors[1].mean()
+    assert any(note.startswith("robot drawn is rigid, payload_kg moves nothing") for note in notes(result))
+    for text, message in (("-1", "line 2: payload_kg is -1; 0 … 10000 needed"), ("nan", "payload_kg is 'nan'")):
+        bad = path.read_text().splitlines()
+        bad[1] = bad[1].rpartition(",")[0] + f",{text}"
+        path.write_text("\n".join(bad) + "\n")
+        with pytest.raises(InputError, match=re.escape(message)):
+            read_measurements(path, nominal)

@@ -178,8 +178,7 @@ def test_a_payload_is_in_the_file_and_in_rows_made_of_a_chain(tmp_path):
     step = np.random.default_rng(3).normal(0, 1e-3, len(chain_parameters(robot.chain())))
     moved = moved_chain(robot.chain(), step)
     found = robot_from_chain(moved, {"": TOOL}, robot)
-    shift = np.linalg.norm(found.chain().elasticity.payload_centre - moved.elasticity.payload_centre)
-    assert 0 < shift < 1e-2  # the last joint's frame turns and slides about its axis by what was adjusted
+    assert (found.elasticity.payload_centre == np.ones(3)).all()
     heavy = loaded(60.0, len(q))
     sag = flange_poses(moved, q, heavy).translation - flange_poses(moved, q).translation
     again = flange_poses(found.chain(), q, heavy).translation - flange_poses(found.chain(), q).translation
