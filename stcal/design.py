@@ -1,7 +1,7 @@
 """What the hardware is: the target's faces and circles, and the dot board. Files: ``io/design.py``."""
 
 from collections.abc import Iterable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import lru_cache
 from typing import Literal
 
@@ -62,6 +62,10 @@ class TargetDesign:
     def rough_poses(self) -> dict[str, Rigid]:
         """Rough pose by face id, of the faces that have one."""
         return {face.id: face.rough_target_from_face for face in self.faces if face.rough_target_from_face is not None}
+
+    def patterns_alone(self) -> "TargetDesign":
+        """Without the rough poses: what a calibration depends on."""
+        return replace(self, faces=tuple(replace(face, rough_target_from_face=None) for face in self.faces))
 
     def radius_of(self) -> dict[CircleLabel, float]:
         """Radius in mm by label."""

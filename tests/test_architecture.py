@@ -17,7 +17,7 @@ MOST_ENTRIES = 16
 LAYERS = (
     ("errors", "front", "parallel", "held_out"),
     ("geometry",),
-    ("design", "labels"),
+    ("design", "labels", "likeness"),
     ("io",),
     ("boards", "report"),
     ("synthetic", "drawing"),

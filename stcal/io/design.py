@@ -20,6 +20,7 @@ from stcal.errors import InputError
 from stcal.geometry.rigid import Rigid
 from stcal.io.toml import Finite, Positive, Strict, load_toml, toml_string
 from stcal.labels import BOARD
+from stcal.likeness import MAX_GAP, MAX_RADIUS_RATIO, whole_likeness
 
 REMEDY = "`stcal-sfm init DIR` writes one"
 ROUGH_KEYS = "rough_pose = { origin_mm, x, normal }"
@@ -127,7 +128,7 @@ def load_target(path: str | Path) -> TargetDesign:
     ------
     InputError
         Unknown or missing keys, duplicate ids, overlapping circles, frame circles that are missing, collinear,
-        or left-handed; the message names the file and the place.
+        or left-handed, faces that look the same; the message names the file and the place.
     """
     data = load_toml(path, _TargetFile, "target file", REMEDY)
     where = f"target file {path}"
@@ -135,7 +136,9 @@ def load_target(path: str | Path) -> TargetDesign:
     for face in data.face:
         if face.id == BOARD:
             raise InputError(f"{where}: face id {BOARD} is taken by the board; choose another")
-    return TargetDesign(data.name, data.polarity, tuple(_face(face, f"{where}: face {face.id}") for face in data.face))
+    faces = tuple(_face(face, f"{where}: face {face.id}") for face in data.face)
+    _require_distinct(faces, where)
+    return TargetDesign(data.name, data.polarity, faces)
 
 
 def load_board(path: str | Path) -> BoardDesign:
@@ -222,6 +225,31 @@ def _face(face: _FaceFile, where: str) -> FaceDesign:
         rough = _rough_pose(face.rough_pose, where) @ Rigid(drawing_from_face, np.append(origin, 0.0))
     xy_face = (xy - origin) @ face_from_drawing.T
     return FaceDesign(face.id, tuple(ids), xy_face, radius, face.origin, face.x, face.y, rough)
+
+
+def _require_distinct(faces: tuple[FaceDesign, ...], where: str) -> None:
+    """Refuse faces that no photograph tells apart, and a face that looks the same when it is turned."""
+    for i, one in enumerate(faces):
+        for other in faces[i:]:
+            few, many = (one, other) if len(one.ids) <= len(other.ids) else (other, one)
+            like = whole_likeness(
+                few.xy_mm, few.radius_mm, many.xy_mm, many.radius_mm, np.arange(len(few.ids)) if few is many else None
+            )
+            if like is None:
+                continue
+            size = "" if abs(like.scale - 1) < 0.005 else f" at {like.scale:.2f} times the size"
+            off = f"places differ by up to {round(like.gap_mm, 3):g} mm, radii by {round(like.radius_mm, 3):g} mm"
+            if few is many:
+                what = f"face {one.id} looks the same after a turn by {abs(np.degrees(like.turn_rad)):.0f}°"
+            elif len(few.ids) == len(many.ids):
+                what = f"faces {one.id} and {other.id} have the same pattern{size}"
+            else:
+                what = f"the {len(few.ids)} circles of face {few.id} are all on face {many.id} too{size}"
+            raise InputError(
+                f"{where}: {what} ({off}); "
+                f"change a circle on {'it' if few is many else 'one of them'}, its place by more than "
+                f"{MAX_GAP:g} radii or its radius by more than {MAX_RADIUS_RATIO - 1:.0%}"
+            )
 
 
 def _rough_pose(pose: _RoughPoseFile, where: str) -> Rigid:

@@ -20,8 +20,15 @@ CIRCLES = """\
   { id = "3", x_mm = 0, y_mm = 40, radius_mm = 8 },
   { id = "4", x_mm = 40, y_mm = 40, radius_mm = 4 },
 """
+CIRCLES_OF_60 = """\
+  { id = "1", x_mm = 0, y_mm = 0, radius_mm = 12 },
+  { id = "2", x_mm = 60, y_mm = 0, radius_mm = 12 },
+  { id = "3", x_mm = 0, y_mm = 60, radius_mm = 12 },
+  { id = "4", x_mm = 60, y_mm = 60, radius_mm = 6 },
+"""
 HEAD = 'name = "t"\npolarity = "bright"\n'
 FACE = f'[[face]]\nid = "1"\norigin = "1"\nx = "2"\ny = "3"\ncircles = [\n{CIRCLES}]\n'
+FACE_OF_60 = FACE.replace(CIRCLES, CIRCLES_OF_60).replace('[[face]]\nid = "1"', '[[face]]\nid = "2"')
 TARGET = HEAD + FACE
 BOARD = 'rows = 7\ncolumns = 9\npitch_mm = 30.0\nradius_mm = 7.5\npolarity = "bright"\n'
 
@@ -130,7 +137,7 @@ identifiers = st.text(
 @given(st.lists(identifiers, min_size=4, max_size=4, unique=True), st.text(st.characters(codec="utf-8")))
 def test_any_allowed_id_and_any_name_survive(tmp_path_factory, ids, name):
     xy = [[0, 0], [40, 0], [0, 40], [40, 40]]
-    target = TargetDesign(name, "dark", (FaceDesign("f", tuple(ids), xy, [5.0] * 4, *ids[:3]),))
+    target = TargetDesign(name, "dark", (FaceDesign("f", tuple(ids), xy, [5.0, 5, 5, 8], *ids[:3]),))
     path = tmp_path_factory.getbasetemp() / "names.toml"
     path.write_text(target_toml(target), encoding="utf-8", newline="\n")
     found = load_target(path)
@@ -179,6 +186,14 @@ def test_a_target_without_rough_poses_has_the_key_in_a_comment(tmp_path):
     assert target_of(tmp_path, text).rough_poses() == {}
     uncommented = text.replace("# rough_pose", "rough_pose")
     assert target_of(tmp_path, uncommented).rough_poses()["1"].matrix() == pytest.approx(np.eye(4))
+
+
+def test_mirror_images_and_small_likenesses_are_taken(tmp_path):
+    # The reference design has both: faces 2 and 4 are mirror images, and all five share nine of ten circles.
+    assert len(target_of(tmp_path, target_toml(reference_target())).faces) == 5
+    moved = changed("x_mm = 40, y_mm = 40, radius_mm = 4", "x_mm = 44, y_mm = 40, radius_mm = 4", FACE)
+    two = target_of(tmp_path, TARGET + moved.replace('[[face]]\nid = "1"', '[[face]]\nid = "2"'))
+    assert [face.id for face in two.faces] == ["1", "2"]  # 4 mm are more than half a radius
 
 
 def test_no_negative_zero_is_written():
@@ -240,6 +255,18 @@ WRONG_TARGETS = {
     "left-handed": (changed("x_mm = 0, y_mm = 40", "x_mm = 0, y_mm = -40"), "turns clockwise seen from outside"),
     "left-handed by exchange": (changed('x = "2"\ny = "3"', 'x = "3"\ny = "2"'), "through 3 and 2 turns clockwise"),
     "a board": (BOARD, "face: key missing"),
+    "two faces alike": (TARGET + changed('[[face]]\nid = "1"', '[[face]]\nid = "2"', FACE),
+                        "faces 1 and 2 have the same pattern (places differ by up to 0 mm, radii by 0 mm); change a "
+                        "circle on one of them"),
+    "two faces alike, drawn apart": (TARGET + changed("y_mm = 40, radius_mm = 8", "y_mm = 41, radius_mm = 9",
+                                                      changed('[[face]]\nid = "1"', '[[face]]\nid = "2"', FACE)),
+                                     "1 and 2 have the same pattern (places differ by up to 0.638 mm, radii by 1 mm"),
+    "a face at another size": (
+        TARGET + FACE_OF_60, "faces 1 and 2 have the same pattern at 1.50 times the size (places differ by up to 0 mm"),
+    "a face among more circles": (
+        TARGET + FACE_OF_60.replace("},\n]\n", "},\n"  '{ id = "5", x_mm = 90, y_mm = 90, radius_mm = 6 }]\n'),
+        "the 4 circles of face 1 are all on face 2 too at 1.50 times"),
+    "a face of half a turn": (changed("radius_mm = 4", "radius_mm = 8"), "face 1 looks the same after a turn by 90°"),
     "rough pose without normal": (changed('y = "3"', 'y = "3"\nrough_pose = { origin_mm = [0, 0, 0], x = [1, 0, 0] }'),
                                   "face.1.rough_pose.normal: key missing"),
     "rough pose with a zero": (changed('y = "3"', rough("[0, 0, 0]", "[0, 0, 1]")),

@@ -5,6 +5,7 @@ from typing import Annotated
 
 import typer
 
+from stcal.cli.designs import designs_told
 from stcal.cli.options import ReportFile, Strict, TargetFile, Workers, require_passed
 from stcal.cli.terminal import StageProgress, say, write
 from stcal.errors import InputError
@@ -64,7 +65,8 @@ def calibrate_camera(
         raise InputError(f"{out}: exists; give a new file with --out")
     target_design = target_of(target)
     board_design = board_of(None) if board is None else load_flat_board(board)
-    with StageProgress() as progress:
+    dots = isinstance(board_design, BoardDesign)
+    with designs_told(target, board, with_target=dots), StageProgress() as progress:
         if isinstance(board_design, BoardDesign):
             result = calibrate(images, target_design, board_design, model, workers=workers, progress=progress)
         else:

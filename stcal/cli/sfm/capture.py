@@ -6,6 +6,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from stcal.cli.designs import designs_told
 from stcal.cli.options import (
     MOST_SEED,
     BoardFile,
@@ -62,9 +63,8 @@ def plan(
     out: JsonFile = None,
 ) -> None:
     """Forecast the σ before any photograph is taken, and what would help most; no Monte Carlo."""
-    from stcal.design import reference_board, reference_target
     from stcal.io.camera import read_camera
-    from stcal.io.design import load_board, load_target
+    from stcal.io.design import board_of, target_of
     from stcal.sfm.plan.file import PlanFile
     from stcal.sfm.plan.noise import expected_noise, noise_of_run, stated_noise
     from stcal.sfm.plan.nominal import nominal_poses
@@ -74,7 +74,7 @@ def plan(
     from stcal.sfm.run.options import RunOptions
     from stcal.sfm.run.saved import load_run
 
-    design = load_target(target) if target else reference_target()
+    design = target_of(target)
     if noise is not None and run is not None:
         raise InputError(f"--noise {noise:g} and --run {run}: two sources of one σ; give one of them")
     if noise is not None:
@@ -93,7 +93,8 @@ def plan(
         RunOptions(refine_camera=refine_camera),
         seed,
     )
-    result = planned(options, design, load_board(board) if board else reference_board(), nominal_poses(design, faces))
+    with designs_told(target, board):
+        result = planned(options, design, board_of(board), nominal_poses(design, faces))
     say(plan_text(result, source))
     if out:
         write(out, PlanFile.of_plan(result), "as JSON")
@@ -159,8 +160,9 @@ def watch(
     options = WatchOptions(interval, idle, views, run_options)
     say(f"watching {images}; report: {out / 'report.html'}")
     sys.stdout.flush()
-    for update in updates(images, camera, out, target, board, options):
-        _say_update(update)
+    with designs_told(target, board):
+        for update in updates(images, camera, out, target, board, options):
+            _say_update(update)
 
 
 def _say_update(update: "Update") -> None:
@@ -243,8 +245,9 @@ def capture(
     trigger = Trigger(count, every, sys.stdin, lambda text: (say(text), sys.stdout.flush()))
     try:
         say(f"{source.name}; report: {out / 'report.html'}")
-        for taken in photograph(source, growing, group, exposure, settle, trigger.ready):
-            say(f"taken {taken.name}: {taken.light()}")
-            _say_update(taken.update)
+        with designs_told(target, board):
+            for taken in photograph(source, growing, group, exposure, settle, trigger.ready):
+                say(f"taken {taken.name}: {taken.light()}")
+                _say_update(taken.update)
     finally:
         source.close()

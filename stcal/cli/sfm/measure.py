@@ -8,6 +8,7 @@ from typing import Annotated
 
 import typer
 
+from stcal.cli.designs import designs_told
 from stcal.cli.options import (
     CameraFile,
     MaxDiameter,
@@ -139,7 +140,8 @@ def measure(
     options = work.MeasureOptions(
         PoseOptions(sigma_factor=sigma_factor), previous, sequence, ellipse_options(min_diameter, max_diameter), workers
     )
-    with handed_over(scheduler, send_images), StageProgress() as progress:
+    told = designs_told(target, board, with_board=False)
+    with told, handed_over(scheduler, send_images), StageProgress() as progress:
         result = work.measure(
             images, read_camera(camera), known, design, load_board(board) if board else None, options, progress
         )

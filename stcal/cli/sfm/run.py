@@ -6,6 +6,7 @@ from typing import Annotated
 
 import typer
 
+from stcal.cli.designs import designs_told
 from stcal.cli.options import (
     BoardFile,
     CameraFile,
@@ -160,7 +161,7 @@ def run(
         workers=workers,
         exclude=tuple(exclude or ()),
     )
-    with handed_over(scheduler, send_images), StageProgress() as progress:
+    with designs_told(target, board), handed_over(scheduler, send_images), StageProgress() as progress:
         result = pipeline.run(images, camera, out, target, board, options, progress)
     say(run_text(result))
     failed = [check.title for check in result.checks if check.verdict == "failed"]
@@ -211,6 +212,7 @@ def detect(
     chosen_images(images, options.exclude)
     given = {"images": images, "--camera": camera, "--target": target, "--board": board}
     with (
+        designs_told(target, board),
         handed_over(scheduler, send_images),
         run_folder(out, MarkerFile.of(images, None), given) as folder,
         StageProgress() as progress,

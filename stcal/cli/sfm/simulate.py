@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from stcal.cli.designs import designs_told
 from stcal.cli.options import MOST_SEED, BoardFile, JsonFile, TargetFile, Workers
 from stcal.cli.terminal import StageProgress, say, write
 from stcal.errors import InputError
@@ -89,7 +90,9 @@ def simulate(
     )
     if second_design and (target or board):
         raise InputError("--second-design and --target or --board: two designs; give one of them")
-    scene = _scene(options, _designs(target, board, second_design), groups, camera, fisheye)
+    one_given = (target is None) != (board is None)  # both are the reference's where neither is
+    with designs_told(target, board, with_target=one_given, with_board=one_given):
+        scene = _scene(options, _designs(target, board, second_design), groups, camera, fisheye)
     rendering = RenderOptions(noise=noise, blur_px=blur, clutter=clutter, bit_depth=16 if sixteen_bit else 8, seed=seed)
     kind = "png" if png or sixteen_bit else "jpg"
     with StageProgress() as progress:

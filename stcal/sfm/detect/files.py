@@ -126,7 +126,7 @@ def _fingerprint(
         return value.tolist() if isinstance(value, np.ndarray) else str(value)
 
     dots = {key: value for key, value in asdict(board).items() if key != "stated"} if board else None
-    parts = [CACHE_VERSION, asdict(camera), asdict(target), dots, asdict(options)]
+    parts = [CACHE_VERSION, asdict(camera), asdict(target.patterns_alone()), dots, asdict(options)]
     parts += [detector.__name__] if detector else []
     return hashlib.sha256(json.dumps(parts, default=plain, sort_keys=True).encode()).hexdigest()
 

@@ -22,6 +22,7 @@ from stcal.sfm.adjust.refine import refine
 from stcal.sfm.adjust.scale import find_scale
 from stcal.sfm.data.model import Outlier, WorldModel
 from stcal.sfm.data.observations import ImageObservations, by_group
+from stcal.sfm.data.pitch import pitch_hint
 from stcal.sfm.mapping.database import image_ids, write_database
 from stcal.sfm.mapping.graph import ImageGraph
 from stcal.sfm.mapping.incremental import left_out, map_group
@@ -107,7 +108,7 @@ def require_usable(group: list[ImageObservations], board_alone: bool = False) ->
     if not any(isinstance(label, DotLabel) for image in group for label in image.labels):
         raise MappingError(
             f"{where}: no board recognised in {len(group)} images; keep the whole board in view, "
-            "check board.toml (rows, columns, polarity)"
+            "check board.toml (rows, columns, pitch_mm, radius_mm, polarity)"
         )
 
 
@@ -163,7 +164,7 @@ def _key(
         CACHE_VERSION,
         list(skeleton),
         [camera.width, camera.height, camera.parameters()],
-        asdict(target),
+        asdict(target.patterns_alone()),
         asdict(board),
         asdict(pair_options),
         eccentricity,
@@ -269,6 +270,7 @@ def solve_groups(
                 )
                 find_scale(solution.model, board)
             except (MappingError, ScaleError, ConvergenceError, DegenerateError) as error:
+                error.args = (f"{error}{pitch_hint(group, board)}",)
                 errors.append(error)
             else:
                 solutions.append(solution)

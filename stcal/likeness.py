@@ -1,0 +1,148 @@
+"""How alike two patterns of circles are, turned and at any size: what a camera cannot tell apart."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.spatial import KDTree
+from scipy.spatial.distance import pdist, squareform
+
+MAX_GAP = 0.5
+"""Circles of two patterns coincide when their centres are closer than this many radii …"""
+MAX_RADIUS_RATIO = 1.3
+"""… and their radii differ by less than this factor."""
+MIN_COMMON = 4
+BLOCK = 4000
+"""Motions looked at together: bounds the memory for patterns of many circles."""
+MOST_CIRCLES = 100
+"""Of a pattern that is compared as a whole; larger ones take minutes."""
+
+
+@dataclass(frozen=True, slots=True)
+class Likeness:
+    """How a whole pattern lies on another at best.
+
+    ``gap_mm`` : largest distance of two centres; ``radius_mm`` : largest difference of two radii; both at the size of
+    the other pattern; ``turn_rad`` : −π … π; ``scale`` : the other's size over its own; ``shift_mm`` : after both.
+    """
+
+    gap_mm: float
+    radius_mm: float
+    turn_rad: float
+    scale: float
+    shift_mm: tuple[float, float]
+
+    def moved(self, xy: np.ndarray) -> np.ndarray:
+        """A point (2,) of the pattern where it lies on the other."""
+        c, s = self.scale * np.cos(self.turn_rad), self.scale * np.sin(self.turn_rad)
+        return np.array([[c, -s], [s, c]]) @ xy + self.shift_mm
+
+
+def whole_likeness(xy, radius, other_xy, other_radius, in_place: np.ndarray | None = None) -> Likeness | None:
+    """The motion, at any size, that puts every circle of a pattern onto a circle of another one, with the smallest gap.
+
+    Parameters
+    ----------
+    xy, other_xy : (n, 2) and (m, 2) centres, mm
+    radius, other_radius : (n,) and (m,) mm
+    in_place : (n,) places among the other's, optional
+        Of the same circles, where both are of one pattern: the motion that leaves it in place is none.
+
+    Returns
+    -------
+    Likeness or None
+        None where no motion puts all circles within ``MAX_GAP`` radii and ``MAX_RADIUS_RATIO``, and for patterns of
+        more than ``MOST_CIRCLES``.
+    """
+    own, other = (points[:, 0] + 1j * points[:, 1] for points in (np.asarray(xy, float), np.asarray(other_xy, float)))
+    n, m = len(own), len(other)
+    if not 2 <= n <= m <= MOST_CIRCLES:
+        return None
+    i, j = np.unravel_index(squareform(pdist(xy)).argmax(), (n, n))
+    p, q = (g.ravel() for g in np.meshgrid(np.arange(m), np.arange(m)))
+    p, q = p[p != q], q[p != q]
+    factor = (other[q] - other[p]) / (own[j] - own[i])
+    fits = alike(abs(factor) * radius[i], other_radius[p]) & alike(abs(factor) * radius[j], other_radius[q])
+    tree, best = KDTree(np.column_stack([other.real, other.imag])), None
+    for start, turn in zip(p[fits], factor[fits], strict=True):
+        moved = other[start] + turn * (own - own[i])
+        _, nearest = tree.query(np.column_stack([moved.real, moved.imag]))
+        if len(set(nearest.tolist())) < n or (in_place is not None and (nearest == in_place).all()):
+            continue
+        found = _fitted(own, radius, other[nearest], other_radius[nearest])
+        if found is not None and (best is None or _order(found) < _order(best)):
+            best = found
+    return best
+
+
+def _order(likeness: Likeness) -> tuple[float, float]:
+    """By the gap, and of equal ones by the turn."""
+    return round(likeness.gap_mm, 6), abs(likeness.turn_rad)
+
+
+def _fitted(own, radius, other, other_radius) -> Likeness | None:
+    """Of circles in pairs, centres as complex numbers: the motion of least squares, if all then coincide; without
+    change of size where that will do."""
+    centred, target = own - own.mean(), other - other.mean()
+    factor = (centred.conj() @ target) / (abs(centred) ** 2).sum()
+    for change in (factor / abs(factor), factor):
+        scale = float(abs(change))
+        gap = abs(change * centred - target)
+        near = gap < MAX_GAP * np.minimum(scale * radius, other_radius)
+        if near.all() and alike(scale * radius, other_radius).all():
+            off = float(abs(scale * radius - other_radius).max())
+            shift = other.mean() - change * own.mean()
+            return Likeness(float(gap.max()), off, float(np.angle(change)), scale, (shift.real, shift.imag))
+    return None
+
+
+def common_circles(xy, radius, other_xy, other_radius, same: bool) -> set[frozenset[int]]:
+    """Sets of circles that coincide with circles of another pattern under some rigid motion of the plane that puts two
+    circles onto two.
+
+    Parameters
+    ----------
+    xy, other_xy : (n, 2) and (m, 2) centres, mm
+    radius, other_radius : (n,) and (m,) mm
+    same : bool
+        Both are one pattern: the motion that leaves it in place is none.
+
+    Returns
+    -------
+    set of frozenset of int
+        Places in ``xy``, ``MIN_COMMON`` or more in each.
+    """
+    n, m = len(xy), len(other_xy)
+    k, near = (g.ravel() for g in np.meshgrid(np.arange(n), np.arange(n)))
+    p, q = (g.ravel() for g in np.meshgrid(np.arange(m), np.arange(m)))
+    k, near, p, q = k[k != near], near[k != near], p[p != q], q[p != q]
+    step, other_step = xy[near] - xy[k], other_xy[q] - other_xy[p]
+    length, other_length = np.linalg.norm(step, axis=1), np.linalg.norm(other_step, axis=1)
+    slack = MAX_GAP * min(radius.min(), other_radius.min())
+    like = alike(radius[k][:, None], other_radius[p]) & alike(radius[near][:, None], other_radius[q])
+    a, b = np.nonzero((np.abs(length[:, None] - other_length) < slack) & like)
+    sets: set[frozenset[int]] = set()
+    for start in range(0, len(a), BLOCK):
+        block = slice(start, start + BLOCK)
+        fits = _coincide(
+            xy, radius, other_xy, other_radius, (k[a[block]], p[b[block]]), step[a[block]], other_step[b[block]], same
+        )
+        sets |= {frozenset(np.flatnonzero(row).tolist()) for row in np.unique(fits, axis=0) if row.sum() >= MIN_COMMON}
+    return sets
+
+
+def _coincide(xy, radius, other_xy, other_radius, origin, step, other_step, same: bool) -> np.ndarray:
+    """For every motion, given by two circles put onto two, the mask (motions, n) of circles that coincide."""
+    turn = np.arctan2(other_step[:, 1], other_step[:, 0]) - np.arctan2(step[:, 1], step[:, 0])
+    c, s = np.cos(turn)[:, None], np.sin(turn)[:, None]
+    x, y = np.moveaxis(xy - xy[origin[0]][:, None], 2, 0)
+    moved = np.stack([c * x - s * y, s * x + c * y], -1) + other_xy[origin[1]][:, None]
+    gap, nearest = KDTree(other_xy).query(moved)
+    fits = (gap < MAX_GAP * np.minimum(radius, other_radius[nearest])) & alike(radius[None], other_radius[nearest])
+    if same:  # the reading itself is no rival
+        fits = fits[~((nearest == np.arange(len(xy))) | ~fits).all(1)]
+    return fits
+
+
+def alike(a, b):
+    """Whether radii pass for one another."""
+    return np.maximum(a, b) < MAX_RADIUS_RATIO * np.minimum(a, b)

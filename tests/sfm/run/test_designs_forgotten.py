@@ -1,0 +1,120 @@
+"""Designs that were forgotten or are wrong: what was assumed, and what the images say."""
+
+from dataclasses import replace
+
+import pytest
+
+from stcal.design import reference_board, reference_target
+from stcal.errors import InputError
+from stcal.io.design import board_toml, load_target, target_toml
+from stcal.sfm.data.pitch import measured_pitch_mm, pitch_hint
+from stcal.sfm.detect.ambiguity import likeness_notes
+from stcal.synthetic.scene import second_design
+
+pytestmark = pytest.mark.usefixtures("no_page")
+
+TARGET_ASSUMED = "assumed: the reference target, 5 faces of 10 circles (no --target)"
+BOARD_ASSUMED = "assumed: the reference board, 7×9 dots of radius 7.5 mm, pitch 30 mm (no --board)"
+
+
+@pytest.fixture
+def two_images(small_set):
+    small = small_set("12", detected=False)
+    small.image(3).unlink()
+    small.image(2).unlink()
+    return small
+
+
+@pytest.mark.slow
+def test_the_reference_target_is_said_and_named_in_an_error(stcal_sfm, two_images, tmp_path):
+    board = tmp_path / "board.toml"
+    board.write_text(board_toml(second_design()[1]))
+    code, out, err = stcal_sfm(*two_images.arguments("--board", board))
+    assert code == 3
+    assert TARGET_ASSUMED in out
+    assert "reference board" not in out + err
+    assert "no board recognised in 2 images" in err
+    assert err.rstrip().endswith(TARGET_ASSUMED)
+
+
+def test_the_reference_board_is_said_and_named_in_an_error(stcal_sfm, two_images, tmp_path):
+    target = tmp_path / "target.toml"
+    target.write_text(target_toml(second_design()[0]))
+    code, out, err = stcal_sfm(*two_images.arguments("--target", target))
+    assert code == 3
+    assert BOARD_ASSUMED in out
+    assert "no face of the target recognised" in err
+    assert err.rstrip().endswith(BOARD_ASSUMED)
+
+
+def test_measure_and_calibrate_camera_name_what_they_assumed(stcal_sfm, small_set, small_run, tmp_path):
+    small = small_set("12", detected=False)
+    for i in (1, 2, 3):
+        small.image(i).unlink()
+    one = "--workers", 1
+    code, out, err = stcal_sfm("calibrate-camera", small.images, "--out", tmp_path / "cameras.txt", *one)
+    assert code == 3
+    assert "the reference target" in out
+    assert "1 of 1 images show the board" in err
+    assert "pitch 30 mm (no --board)" in err
+    measured = "measure", small.images, "--camera", small.camera, "--faces", small_run / "faces.json", *one
+    code, out, err = stcal_sfm(*measured, "--out", tmp_path / "poses.csv")
+    assert code == 0
+    assert TARGET_ASSUMED in out
+    assert "reference board" not in out
+
+
+def test_plan_names_what_it_assumed(stcal_sfm):
+    code, out, _ = stcal_sfm("plan", "--images", 2, "--width", 1296, "--groups", "12")
+    assert code == 0
+    assert TARGET_ASSUMED in out
+    assert BOARD_ASSUMED in out
+
+
+def test_images_tell_the_pitch(small_result):
+    images = small_result.observations()
+    board = reference_board()
+    # Blur of 0.7 px on dots of some 10 px makes them larger by a few per cent at most, and the pitch as much smaller.
+    assert measured_pitch_mm(images, board) == pytest.approx(30, rel=0.03)
+    assert pitch_hint(images, board) == ""
+    hint = pitch_hint(images, replace(board, pitch_mm=25.0))
+    assert "dots of radius_mm 7.5 are 30" in hint or "dots of radius_mm 7.5 are 29" in hint
+    assert "the board file says pitch_mm 25: correct pitch_mm, or radius_mm" in hint
+    assert measured_pitch_mm([image.select([]) for image in images], board) is None
+
+
+def test_a_run_with_another_pitch_names_the_measured_one(stcal_sfm, small_set):
+    small = small_set("12", detected=False)
+    board = small.folder / "board.toml"
+    board.write_text(board.read_text().replace("pitch_mm = 30.0", "pitch_mm = 25.0"))
+    code, _, err = stcal_sfm(*small.arguments("--board", board, "--target", small.folder / "target.toml"))
+    assert code == 3
+    assert "0 board dots mapped" in err
+    assert "the board file says pitch_mm 25: correct pitch_mm" in err
+
+
+def test_faces_that_one_circle_tells_apart_are_noted(stcal_sfm, tmp_path):
+    one, mirrored = likeness_notes(reference_target())
+    assert "faces 1, 2, 3, 4, 5: one circle tells each from another" in one
+    # Their circles c: (94.142, 65.858) and (100, 80), after a motion that fits the other nine.
+    assert "1:c against face 2, 15.3 mm" in one
+    assert "mirror images: 2 and 4, 3 and 5" in mirrored
+    assert likeness_notes(second_design()[0]) == []
+    path = tmp_path / "target.toml"
+    path.write_text(target_toml(reference_target()))
+    code, out, _ = stcal_sfm("plan", "--target", path, "--images", 2, "--width", 1296, "--groups", "12")
+    assert code == 0
+    assert out.startswith(f"note: {one}\nnote: {mirrored}\n")
+
+
+def test_faces_of_one_pattern_end_a_command(stcal_sfm, tmp_path):
+    target = reference_target()
+    twice = replace(target, faces=(*target.faces, replace(target.faces[1], id="6")))
+    path = tmp_path / "target.toml"
+    path.write_text(target_toml(twice))
+    with pytest.raises(InputError, match="faces 2 and 6 have the same pattern"):
+        load_target(path)
+    code, _, err = stcal_sfm("plan", "--target", path)
+    assert code == 2
+    assert "faces 2 and 6 have the same pattern" in err
+    assert "change a circle on one of them" in err
