@@ -23,6 +23,8 @@ from stcal.io.saving import RUN_MARKER
 
 SUFFIXES = (".jpg", ".jpeg", ".png", ".tif", ".tiff", ".bmp")
 EXCLUDED = "taken out with --exclude"
+HOLDS_IMAGES = "it holds images"
+"""In the reason why a folder is left out."""
 TOP_GROUP = "."
 """Name of the group that images lying directly in the folder form."""
 
@@ -104,7 +106,7 @@ def find_images(folder: str | Path) -> tuple[list[ImageFile], list[Skipped]]:
             _sort_in(path, path.name, TOP_GROUP, files, skipped)
     if not files:
         # A folder in a folder says most: the images lie deeper than they should.
-        left_out = sorted(skipped, key=lambda s: not s.reason.startswith("a folder"))[:1]
+        left_out = sorted(skipped, key=lambda s: (s.gate != "folder", HOLDS_IMAGES not in s.reason))[:1]
         hint = "".join(f" (left out {s.name}: {s.reason})" for s in left_out)
         raise InputError(
             f"image folder {root}: no image, one of {', '.join(s[1:] for s in SUFFIXES)}{hint}; "
@@ -143,7 +145,11 @@ def _sort_in(path: Path, name: str, group: str, files: list, skipped: list) -> N
         return
     plain = name.encode("utf-8", "backslashreplace").decode()
     if path.is_dir():
-        skipped.append(Skipped(plain, "a folder inside a group; images lie in <group>/ directly", "folder"))
+        reason = "a folder inside a group; images lie in <group>/ directly"
+        with contextlib.suppress(OSError):  # of a folder that cannot be read
+            if any(inner.suffix.lower() in SUFFIXES for inner in path.iterdir()):
+                reason += f"; {HOLDS_IMAGES}: did you mean {path.parent}?"
+        skipped.append(Skipped(plain, reason, "folder"))
     elif path.suffix.lower() not in SUFFIXES:
         kinds = ", ".join(SUFFIXES)
         skipped.append(Skipped(plain, "not an image file", "file_type", path.suffix or "no suffix", kinds))

@@ -24,7 +24,7 @@ from stcal.sfm.run.marker import MarkerFile
 from stcal.sfm.run.options import RunOptions
 from stcal.sfm.run.published import compare_with_paper, require_comparable
 from stcal.sfm.run.result import RunResult
-from stcal.sfm.run.solve import solve_groups, unseen_board, usable_groups
+from stcal.sfm.run.solve import solve_groups, ungrouped, unseen_board, usable_groups
 from stcal.sfm.run.transaction import RunFolder, run_folder
 
 DRAWN_WITH = "matplotlib.backends.backend_svg", "mpl_toolkits.mplot3d.axes3d"
@@ -173,7 +173,13 @@ def _solved(
         solutions=tuple(solutions),
         calibration=calibration,
         chains=measure_chains(calibration.faces, calibration.target),
-        notes=(*unusable, *unsolved, *calibration.notes, *unseen_board(solutions, board)),
+        notes=(
+            *ungrouped(labelled),
+            *unusable,
+            *unsolved,
+            *calibration.notes,
+            *unseen_board(solutions, board),
+        ),
     )
 
 

@@ -269,6 +269,20 @@ def _once(view: PlaneView, readings: list[Readings]) -> bool:
     return sum(each[0].plane == view.plane for each in readings if each[0].named) == 1
 
 
+OF_A_BOARD, OF_A_FACE = ("a board of ", "board of "), ("a pattern ",)
+"""How notes begin that leave a whole board or face out of an image."""
+
+
+def leaves_a_board_out(note: str) -> bool:
+    """Whether a note is of a whole board, not of single dots."""
+    return note.startswith(OF_A_BOARD)
+
+
+def leaves_a_pattern_out(note: str) -> bool:
+    """Whether a note is of a whole face or board, not of single circles or of the image."""
+    return note.startswith(OF_A_BOARD + OF_A_FACE)
+
+
 def _contradiction(views: Readings) -> str:
     view = views[0]
     if not view.named:

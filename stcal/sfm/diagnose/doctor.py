@@ -19,8 +19,9 @@ from stcal.io.images import decode
 from stcal.parallel import run_parallel
 from stcal.sfm.data.model import MIN_POINTS, MetricModel
 from stcal.sfm.detect.circles.ellipses import EllipseOptions
+from stcal.sfm.detect.labels import leaves_a_pattern_out
 from stcal.sfm.diagnose.examine import CircleVerdict, Expected, OptionTrial, by_geometry, examine, labels_found, trials
-from stcal.sfm.diagnose.findings import Diagnosis, Finding, advice, in_order
+from stcal.sfm.diagnose.findings import WHOLE_PATTERN, Diagnosis, Finding, advice, in_order
 from stcal.sfm.diagnose.missing import missing_circles
 from stcal.sfm.mapping.database import image_ids
 from stcal.sfm.mapping.models import read_model
@@ -107,8 +108,12 @@ def _images(run: SavedRun, mapped: set[str]) -> list[Finding]:
         for image in run.observations
         if image.name not in mapped | told
     ]
-    notes = [each for each in left_out["notes"] if each["image"] not in mapped]
-    return findings + [Finding(each["image"], (), "note", None, None, "", each["note"]) for each in notes]
+    for each in left_out["notes"]:
+        if each["image"] not in mapped:
+            findings.append(Finding(each["image"], (), "note", None, None, "", each["note"]))
+        elif leaves_a_pattern_out(each["note"]):
+            findings.append(Finding(each["image"], (), WHOLE_PATTERN, None, None, "", each["note"]))
+    return findings
 
 
 def _circles(run: SavedRun) -> list[Finding]:

@@ -43,6 +43,8 @@ CAUSES = {
 }
 TRIFLES = ("views", "hidden", "note", "copy", "file_type", "folder", "excluded")
 """Gates of what can hardly be helped, or needs no help."""
+WHOLE_PATTERN = "whole_pattern"
+"""Gate of a face or board that an image shows, and that was left out of it as a whole."""
 MAX_LABELS = 12
 MAX_LINES = 40
 
@@ -152,7 +154,9 @@ def table(diagnosis: Diagnosis, lines: int | None = MAX_LINES) -> str:
         return f"nothing was left out: {heading}, every circle in view has a label"
     files = _number(diagnosis.files - diagnosis.images, "file")
     images = _number(diagnosis.images - diagnosis.mapped, "image")
-    text = [f"{heading}; left out: {files}, {images}, {_circles(found)}"]
+    patterns = [each for each in found if each.gate == WHOLE_PATTERN]
+    whole = f"{_number(len(patterns), 'whole face or board', 'whole faces and boards')}, " if patterns else ""
+    text = [f"{heading}; left out: {files}, {images}, {whole}{_circles(found)}"]
     for gate, count in sorted(by_gate(found).items(), key=lambda item: (-item[1].circles, -item[1].images)):
         circles = f"{_number(count.circles, 'circle')} of " if count.circles else ""
         text.append(f"  {gate:<18}{circles}{_number(count.images, 'image')}")
@@ -179,8 +183,8 @@ def _circles(findings: Iterable[Finding]) -> str:
     return f"{circles} of {_number(images, 'image')}" if own else circles
 
 
-def _number(count: int, what: str) -> str:
-    return f"{count} {what}{'' if count == 1 else 's'}"
+def _number(count: int, what: str, several: str = "") -> str:
+    return f"{count} {what}" if count == 1 else f"{count} {several or what + 's'}"
 
 
 def _line(own: list[Finding]) -> str:

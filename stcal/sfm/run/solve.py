@@ -3,7 +3,7 @@
 import hashlib
 import json
 import shutil
-from collections.abc import Collection, Sequence
+from collections.abc import Collection, Iterable, Sequence
 from dataclasses import asdict, dataclass, fields
 from pathlib import Path
 
@@ -15,7 +15,7 @@ from stcal.geometry.camera import Camera
 from stcal.geometry.rigid import Rigid
 from stcal.io.cache import keep, kept
 from stcal.io.camera import CalibratedCamera
-from stcal.io.images import SUFFIXES, TOP_GROUP, Skipped
+from stcal.io.images import HOLDS_IMAGES, SUFFIXES, TOP_GROUP, Skipped
 from stcal.labels import DotLabel, dot_cells, parse_labels
 from stcal.parallel import Progress
 from stcal.sfm.adjust.refine import refine
@@ -23,6 +23,7 @@ from stcal.sfm.adjust.scale import find_scale
 from stcal.sfm.data.model import Outlier, WorldModel
 from stcal.sfm.data.observations import ImageObservations, by_group
 from stcal.sfm.data.pitch import pitch_hint
+from stcal.sfm.detect.labels import LabelledImage, leaves_a_board_out
 from stcal.sfm.mapping.database import image_ids, write_database
 from stcal.sfm.mapping.graph import ImageGraph
 from stcal.sfm.mapping.incremental import left_out, map_group
@@ -74,15 +75,47 @@ def usable_groups(
             if len(group) < 2:
                 count = f"1 usable image ({group[0].name})" if group else "0 usable images"
                 why = "".join(f", not {s.name}: {s.reason}" for s in first)
-                raise MappingError(f"group {name}: {count}, 2 needed{why}; add photographs from other places")
+                remedy = "add photographs from other places"
+                if name == TOP_GROUP and group and len(groups) > 1:
+                    others = _listed(g for g in groups if g != TOP_GROUP)
+                    remedy = (
+                        f"it lies beside the folders of groups ({others}): move it into the one it belongs to, or "
+                        f"leave it out with --exclude {group[0].name}"
+                    )
+                raise MappingError(f"group {name}: {count}, 2 needed{why}; {remedy}")
             require_usable(group, board_alone)
         except MappingError as error:
             errors.append(error)
         else:
             usable[name] = group
     if not usable:
+        deeper = [f"; {each.name}: {each.reason}" for each in skipped if HOLDS_IMAGES in each.reason]
+        errors[0].args = (f"{errors[0]}{''.join(deeper[:1])}",)
         raise errors[0]
     return usable, [_left_out(error) for error in errors]
+
+
+def ungrouped(labelled: Sequence[LabelledImage]) -> list[str]:
+    """What is taken for granted of images that lie in no folder of a group."""
+    own = [each for each in labelled if each.observations.group == TOP_GROUP]
+    if not own:
+        return []
+    dropped = [each.observations.name for each in own if any(map(leaves_a_board_out, each.notes))]
+    found = (
+        f"; the board of {len(dropped)} of them ({_listed(dropped)}) is elsewhere and was left out, so that they are "
+        "more than one group"
+        if dropped
+        else ""
+    )
+    return [
+        f"assumed: {len(own)} images that lie in no folder of a group are one group, in which only the camera "
+        f"moved{found}; put the images of each setting of target and board into a folder of its own, IMAGES/<group>/"
+    ]
+
+
+def _listed(names: Iterable[str], most: int = 4) -> str:
+    every = list(names)
+    return ", ".join(every[:most]) + (", …" if len(every) > most else "")
 
 
 def _left_out(error: StcalError) -> str:
