@@ -30,6 +30,7 @@ MODULES = (
     "stcal.sfm.report.compare",
     "stcal.synthetic.truth",
     "stcal.sfm.camera.file",
+    "stcal.sfm.camera.rig_file",
     "stcal.sfm.plan.file",
     "stcal.sfm.budget.file",
     "stcal.sfm.interop.file",

@@ -138,6 +138,11 @@ CALLS = (
     Call("sfm budget", "@run --field operator=A --json >budget.json", 1.5),
     Call("sfm advise", "@run --count 1 --json >advice.json", 10.0),
     Call("sfm calibrate-camera", f"@data/images {_DESIGNS} --out +cameras.txt --workers 1 --report >page.html", 15.0),
+    Call(
+        "sfm calibrate-camera",
+        f"@rig {_DESIGNS} --rig --model OPENCV --model right=RADIAL --out +calibrated --workers 1 --report >page.html",
+        30.0,
+    ),
     Call("sfm watch", f"{_SET} --out ~run --idle 0.4 --interval 0.2", 5.0),
     Call(
         "sfm capture",

@@ -2,6 +2,7 @@
 
 import json
 import os
+import tempfile
 from collections.abc import Sequence
 from contextlib import suppress
 from itertools import chain
@@ -63,6 +64,44 @@ def save(path: Path, content: str | bytes) -> None:
     finally:
         with suppress(OSError):  # where a file stands in the folder's place there is none to remove
             partial.unlink(missing_ok=True)
+
+
+def require_new_folder(out: Path, images: Path) -> None:
+    """Refuse, before the work, a place that holds anything, that lies among the photographs or cannot be written.
+
+    Raises
+    ------
+    InputError
+        Which.
+    """
+    if out.exists() and (not out.is_dir() or any(out.iterdir())):
+        raise InputError(f"--out {out}: is not a new or empty folder; give another place")
+    if real_place(images) in (real_place(out), *real_place(out).parents):
+        raise InputError(f"--out {out}: lies in the folder of the photographs {images}; give another place")
+    above = next(each for each in out.absolute().parents if each.exists())
+    try:
+        tempfile.TemporaryDirectory(prefix=f".{out.name}-", dir=above).cleanup()
+    except OSError as error:
+        raise InputError(f"--out {out}: cannot be written: {error.strerror or error}; give another place") from error
+
+
+def save_folder(out: Path, files: dict[str, str]) -> None:
+    """Write all files into a new folder, or none.
+
+    Raises
+    ------
+    InputError
+        They cannot be written.
+    """
+    out.parent.mkdir(parents=True, exist_ok=True)
+    with tempfile.TemporaryDirectory(prefix=f".{out.name}-", dir=out.parent) as folder:
+        made = Path(folder) / "made"
+        for name, content in files.items():
+            save(made / name, content)
+        try:
+            made.replace(out)
+        except OSError as error:
+            raise InputError(f"{out}: cannot be written: {error.strerror or error}; give another place") from error
 
 
 def json_text(content) -> str:

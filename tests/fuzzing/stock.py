@@ -96,6 +96,8 @@ def _of_runs(folder: Path) -> None:
     placed_faces = {key: truth[key] for key in ("unit", "reference_face", "target_from_face", "circles")}
     (folder / "faces.json").write_text(json.dumps({"format": "stcal faces 1"} | placed_faces, indent=1))
     export_model(folder / "run", folder / "model-txt", "colmap-txt")
+    for camera in ("left", "right"):  # two cameras at one place
+        shutil.copytree(folder / "data/images", folder / "rig" / camera)
     (folder / "detected").mkdir()
     shutil.copytree(folder / "run/cache", folder / "detected/cache")
     shutil.copy(folder / "run/detections.csv", folder / "detected")

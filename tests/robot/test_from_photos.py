@@ -10,6 +10,7 @@ import pytest
 from stcal.errors import ConvergenceError, DegenerateError, InputError
 from stcal.geometry.rigid import Poses, Rigid
 from stcal.io.images import Skipped
+from stcal.io.saving import require_new_folder, save_folder
 from stcal.io.table import Table, pose_cells, read_table
 from stcal.robot.identify.result import IdentifyOptions
 from stcal.robot.kinematics.example import mh80
@@ -22,7 +23,7 @@ from stcal.synthetic.measured.arms import made
 from stcal.synthetic.measured.image_poses import known_target, see
 from stcal.synthetic.scene import SceneOptions, make_scene
 from stcal.workflows.from_photos import run as work
-from stcal.workflows.from_photos.output import files_of, require_new_folder, save_folder
+from stcal.workflows.from_photos.output import files_of
 from stcal.workflows.from_photos.report import story
 from stcal.workflows.from_photos.result import FromPhotos
 

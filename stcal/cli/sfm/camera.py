@@ -7,7 +7,7 @@ import typer
 
 from stcal.cli.designs import designs_told
 from stcal.cli.options import ReportFile, Strict, TargetFile, Workers, require_passed
-from stcal.cli.terminal import StageProgress, say, write
+from stcal.cli.terminal import StageProgress, print_each, say, write
 from stcal.errors import InputError
 
 app = typer.Typer()
@@ -17,11 +17,20 @@ app = typer.Typer()
 def calibrate_camera(
     images: Annotated[
         Path,
-        typer.Argument(help="Read photographs that show the board from this folder, or from IMAGES/<group>/ as run."),
+        typer.Argument(
+            help="Read photographs that show the board from this folder, or from IMAGES/<group>/ as run; with --rig "
+            "from IMAGES/<camera>/."
+        ),
     ],
     out: Annotated[
-        Path, typer.Option("--out", writable=True, help="Write the camera to this file, which must not exist.")
-    ] = Path("cameras.txt"),
+        Path | None,
+        typer.Option(
+            "--out",
+            writable=True,
+            help="Write the camera to this file, which must not exist, cameras.txt if not given; with --rig all "
+            "cameras to this folder, which must be new, rig if not given.",
+        ),
+    ] = None,
     target: TargetFile = None,
     board: Annotated[
         Path | None,
@@ -30,14 +39,23 @@ def calibrate_camera(
             help="Read the board from this file: dots, chessboard or ChArUco (TOML), in place of the reference board.",
         ),
     ] = None,
+    rig: Annotated[
+        bool,
+        typer.Option(
+            "--rig",
+            help="Calibrate cameras that are fixed to each other: a folder of photographs for each, those of one "
+            "instant named alike.",
+        ),
+    ] = False,
     model: Annotated[
-        str,
+        list[str] | None,
         typer.Option(
             help="Fit this model of COLMAP: SIMPLE_PINHOLE, PINHOLE, SIMPLE_RADIAL, RADIAL, OPENCV, FULL_OPENCV; of "
             "wide lenses SIMPLE_RADIAL_FISHEYE, RADIAL_FISHEYE, OPENCV_FISHEYE, THIN_PRISM_FISHEYE; or `auto`: the "
-            "simplest that foretells held-out views as well as the best."
+            "simplest that foretells held-out views as well as the best. OPENCV if not given; with --rig also "
+            "CAMERA=MODEL, for each camera that differs."
         ),
-    ] = "OPENCV",
+    ] = None,
     json_file: Annotated[
         Path | None,
         typer.Option(
@@ -51,11 +69,34 @@ def calibrate_camera(
     strict: Strict = False,
     workers: Workers = None,
 ) -> None:
-    """Calibrate the camera from views of the board, without any start: cameras.txt with σ and correlations, for run."""
+    """Calibrate the camera from views of the board, without any start: cameras.txt with σ and correlations, for run; or
+    the cameras of a rig, and where they sit."""
     from stcal.boards.file import load_flat_board
     from stcal.design import BoardDesign
-    from stcal.io.camera import CalibratedCamera, write_cameras_txt
     from stcal.io.design import board_of, target_of
+    from stcal.workflows.calibrate_rig import Models
+
+    models = Models.of(model or [], "OPENCV")
+    target_design = target_of(target)
+    board_design = board_of(None) if board is None else load_flat_board(board)
+    dots = isinstance(board_design, BoardDesign)
+    common = (json_file, report, workers)
+    with designs_told(target, board, with_target=dots):
+        if rig:
+            failed = _rig(images, out or Path("rig"), target_design, board_design, models, *common)
+        elif models.own:
+            raise InputError(
+                f"--model {next(iter(models.own))}=…: names a camera of a rig; give --rig, or a model alone"
+            )
+        else:
+            failed = _one(images, out or Path("cameras.txt"), target_design, board_design, models.common, *common)
+    require_passed(strict, failed, report)
+
+
+def _one(images: Path, out: Path, target, board, model: str, json_file, report, workers) -> list[str]:
+    """What failed."""
+    from stcal.design import BoardDesign
+    from stcal.io.camera import CalibratedCamera, write_cameras_txt
     from stcal.sfm.camera.calibrate import calibrate_camera as calibrate
     from stcal.sfm.camera.file import CalibrationFile
     from stcal.sfm.camera.text import calibration_text
@@ -63,24 +104,42 @@ def calibrate_camera(
 
     if out.exists():
         raise InputError(f"{out}: exists; give a new file with --out")
-    target_design = target_of(target)
-    board_design = board_of(None) if board is None else load_flat_board(board)
-    dots = isinstance(board_design, BoardDesign)
-    with designs_told(target, board, with_target=dots), StageProgress() as progress:
-        if isinstance(board_design, BoardDesign):
-            result = calibrate(images, target_design, board_design, model, workers=workers, progress=progress)
+    with StageProgress() as progress:
+        if isinstance(board, BoardDesign):
+            result = calibrate(images, target, board, model, workers=workers, progress=progress)
         else:
-            result = calibrate_camera_by_corners(images, board_design, model, workers, progress)
+            result = calibrate_camera_by_corners(images, board, model, workers, progress)
     own = result.intrinsics
     write_cameras_txt(out, CalibratedCamera.of(own.camera, own.colmap_model, own.covariance))
     summary = CalibrationFile.of(result)
-    json_file = json_file or out.with_suffix(".json")
     say(calibration_text(result, summary))
     say(f"camera file: {out}")
-    write(json_file, summary, "figures and checks")
+    write(json_file or out.with_suffix(".json"), summary, "figures and checks")
     if report:
         from stcal.sfm.camera.report import calibration_page
 
         write(report, calibration_page(result, summary, str(images)), "report")
-    failed = result.split is not None and result.split.verdict == "failed"
-    require_passed(strict, ["split-half check"] if failed else [], report)
+    return ["split-half check"] if result.split is not None and result.split.verdict == "failed" else []
+
+
+def _rig(images: Path, out: Path, target, board, models, json_file, report, workers) -> list[str]:
+    """What failed."""
+    from stcal.io.saving import require_new_folder, save_folder
+    from stcal.sfm.camera.rig_file import RigCalibrationFile
+    from stcal.sfm.camera.rig_report import rig_page, rig_text
+    from stcal.workflows.calibrate_rig import calibrate_rig_from_photographs, files_of
+
+    require_new_folder(out, images)
+    with StageProgress() as progress:
+        found = calibrate_rig_from_photographs(images, target, board, models, workers, progress)
+    files, missing = files_of(found)
+    save_folder(out, files)
+    say(rig_text(found))
+    print_each("note", missing)
+    say(f"rig: {out}: {', '.join(files)}")
+    if json_file:
+        write(json_file, RigCalibrationFile.of(found), "figures and checks")
+    if report:
+        write(report, rig_page(found, str(images)), "report")
+    each = zip(found.names, found.cameras, strict=True)
+    return [f"split-half check of {name}" for name, own in each if own.split and own.split.verdict == "failed"]

@@ -1,7 +1,6 @@
 """A hand-eye calibration for the terminal, and as a page."""
 
 import numpy as np
-from scipy.spatial.transform import Rotation
 
 from stcal.geometry.rigid import Rigid
 from stcal.handeye.data.loop import FRAMES
@@ -19,9 +18,9 @@ from stcal.handeye.validate import Compared
 from stcal.io.camera import PARAMETER_NAMES, parameter_names
 from stcal.report.figure import uri
 from stcal.report.page import render, verdict
+from stcal.report.poses import HEADS, transform_rows
 from stcal.report.text import NONE, number, text_table
 
-HEADS = ("", "mm", "± σ", "rotation vector °", "± σ")
 ERRORS = {
     "rotation_rad": ("rotation °", np.degrees(1.0), 4),
     "translation_mm": ("board's origin mm", 1.0, 3),
@@ -117,15 +116,6 @@ def _headline(outcome: Outcome) -> str:
 def _transforms(result: HandEye) -> list[tuple[str, Rigid, np.ndarray | None]]:
     covariances = (result.covariance, result.stand_covariance)
     return [(*item, covariance) for item, covariance in zip(result.transforms.items(), covariances, strict=True)]
-
-
-def transform_rows(pose: Rigid, covariance: np.ndarray | None) -> list[list[str]]:
-    """Of x, y, z: translation and rotation vector, each with σ."""
-    turn = np.degrees(Rotation.from_matrix(np.array(pose.rotation)).as_rotvec())
-    sigma = [None] * 6 if covariance is None else np.sqrt(np.maximum(np.diag(covariance), 0))
-    sigma = [*(None if s is None else np.degrees(s) for s in sigma[:3]), *sigma[3:]]
-    columns = zip("xyz", pose.translation, sigma[3:], turn, sigma[:3], strict=True)
-    return [[a, number(t, 4), number(s, 4), number(r, 4), number(d, 4)] for a, t, s, r, d in columns]
 
 
 def _splits_text(outcome: Outcome) -> str:

@@ -7,7 +7,6 @@ import numpy as np
 from stcal.handeye.data.loop import FRAMES
 from stcal.handeye.report.figures import BAD, GOOD, pose_bars
 from stcal.handeye.report.page import (
-    HEADS,
     adjusted,
     coverage,
     matrix_text,
@@ -15,13 +14,13 @@ from stcal.handeye.report.page import (
     pose_rows,
     scale_text,
     sigma_rows,
-    transform_rows,
     turns_text,
     verdict_parts,
 )
 from stcal.handeye.report.rig_outcome import RigOutcome, asides, rig_judged
 from stcal.handeye.result import HandEye
 from stcal.report.page import render
+from stcal.report.poses import HEADS, transform_rows
 from stcal.report.text import NONE, number, text_table
 
 

@@ -8,12 +8,13 @@ import ast
 import re
 import struct
 import xml.etree.ElementTree as ElementTree
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
 from stcal.errors import InputError
+from stcal.geometry.rigid import Rigid
 from stcal.io.camera import (
     COLMAP_PIXEL_ORIGIN,
     CalibratedCamera,
@@ -46,6 +47,7 @@ SUFFIXES = {
 """Form that a name asks for."""
 MRCAL = {f"LENSMODEL_{name}": count for name, count in (("PINHOLE", 0), *((f"OPENCV{n}", n) for n in (4, 5, 8, 12)))}
 """Coefficients of mrcal's models that are OpenCV's."""
+MM_PER_M = 1000.0
 KALIBR = ("pinhole", "omni", "eucm", "ds")
 METASHAPE = ("f", "cx", "cy", "b1", "b2", "k1", "k2", "k3", "k4", "p1", "p2")
 
@@ -255,6 +257,25 @@ def _kalibr(camera: CalibratedCamera, name: str) -> str:
         f"{name}:\n  camera_model: pinhole\n  intrinsics: {lens}\n  distortion_model: {kind}\n"
         f"  distortion_coeffs: {values}\n  resolution: [{camera.width}, {camera.height}]\n"
     )
+
+
+def kalibr_chain(cameras: Sequence[tuple[str, CalibratedCamera, Rigid]]) -> str:
+    """``camchain.yaml`` of several cameras, each with its name and camera_from_first; Kalibr numbers them, and states
+    each camera in the one before it, in metres.
+
+    Raises
+    ------
+    InputError
+        A lens that the form cannot hold.
+    """
+    parts = []
+    for number, (name, camera, pose) in enumerate(cameras):
+        parts.append(f"# cam{number}: {name}\n{_kalibr(camera, f'cam{number}')}")
+        if number:
+            own = (pose @ cameras[number - 1][2].inverse()).matrix()
+            own[:3, 3] /= MM_PER_M
+            parts.append("".join(["  T_cn_cnm1:\n", *(f"  - {row}\n" for row in own.tolist())]))
+    return "".join(parts)
 
 
 def _mrcal(camera: CalibratedCamera, _: str) -> str:

@@ -110,37 +110,57 @@ def reduced(block: Block, shared: Shared, huber: float) -> Reduced:
     return Reduced(full[np.ix_(outer, outer)] - away.normal, full_right[outer] - away.right, away, cameras)
 
 
+@dataclass(frozen=True, slots=True, eq=False)
+class PoseEquations:
+    """Normal equations of a model's m images: ``normal``, ``right`` over p points and s others, (3p + s); ``block`` :
+    (m, 6, 6), ``block_right`` : (m, 6) of the poses; ``cross`` : (m, 6, 3p + s) between them."""
+
+    normal: np.ndarray
+    right: np.ndarray
+    block: np.ndarray
+    block_right: np.ndarray
+    cross: np.ndarray
+
+
+def equations_of_poses(
+    model: GroupModel, by_pose: np.ndarray, by_point: np.ndarray, by_others: np.ndarray, residual: np.ndarray
+) -> PoseEquations:
+    """From derivatives (n, 2, 6), (n, 2, 3), (n, 2, s) and residuals (n, 2), all over σ."""
+    m, p, s = len(model.images), len(model.labels), by_others.shape[2]
+    at = np.swapaxes(by_pose, 1, 2)
+    cross = np.zeros((m, 6, 3 * p + s))
+    columns = 3 * model.point_index[:, None] + np.arange(3)
+    cross[model.image_index[:, None, None], np.arange(6)[:, None], columns[:, None]] = at @ by_point
+    normal, right = np.zeros((3 * p + s, 3 * p + s)), np.zeros(3 * p + s)
+    blocks, rights = blocks_of(by_point, residual, model.point_index, p)
+    place = 3 * np.arange(p)[:, None] + np.arange(3)
+    normal[place[:, :, None], place[:, None]] = blocks
+    right[: 3 * p] = rights.ravel()
+    if s:
+        np.add.at(cross[:, :, 3 * p :], model.image_index, at @ by_others)
+        coupled = np.zeros((p, 3, s))
+        np.add.at(coupled, model.point_index, np.swapaxes(by_point, 1, 2) @ by_others)
+        normal[: 3 * p, 3 * p :] = coupled.reshape(3 * p, s)
+        normal[3 * p :, : 3 * p] = normal[: 3 * p, 3 * p :].T
+        normal[3 * p :, 3 * p :] = np.einsum("nki,nkj->ij", by_others, by_others)
+        right[3 * p :] = np.einsum("nki,nk->i", by_others, residual)
+    return PoseEquations(normal, right, *blocks_of(by_pose, residual, model.image_index, m), cross)
+
+
 def without_cameras(
     model: GroupModel, camera: Camera, basis: np.ndarray, huber: float
 ) -> tuple[np.ndarray, np.ndarray, Reduction]:
     """Normal equations over points (3p) and intrinsics (q), and the way back to the cameras."""
-    m, p, q = len(model.images), len(model.labels), basis.shape[1]
     by_pose, by_point = projection_jacobians(model, camera)
     root = np.sqrt(robust_weights(model, camera, huber))[:, None]
-    a, c = model.whiten(by_pose) * root[..., None], model.whiten(by_point) * root[..., None]
-    residual = normalised(model, camera) * root
-    at = np.swapaxes(a, 1, 2)
-    cross = np.zeros((m, 6, 3 * p + q))
-    columns = 3 * model.point_index[:, None] + np.arange(3)
-    cross[model.image_index[:, None, None], np.arange(6)[:, None], columns[:, None]] = at @ c
-    normal, right = np.zeros((3 * p + q, 3 * p + q)), np.zeros(3 * p + q)
-    blocks, rights = blocks_of(c, residual, model.point_index, p)
-    place = 3 * np.arange(p)[:, None] + np.arange(3)
-    normal[place[:, :, None], place[:, None]] = blocks
-    right[: 3 * p] = rights.ravel()
-    if q:
+    by_intrinsics = np.zeros((*by_pose.shape[:2], 0))
+    if basis.shape[1]:
         xyz = model.xyz_camera()
         by_intrinsics = camera.parameter_jacobian(xyz[:, :2] / xyz[:, 2:]) @ basis
-        e = model.whiten(by_intrinsics) * root[..., None]
-        np.add.at(cross[:, :, 3 * p :], model.image_index, at @ e)
-        coupled = np.zeros((p, 3, q))
-        np.add.at(coupled, model.point_index, np.swapaxes(c, 1, 2) @ e)
-        normal[: 3 * p, 3 * p :] = coupled.reshape(3 * p, q)
-        normal[3 * p :, : 3 * p] = normal[: 3 * p, 3 * p :].T
-        normal[3 * p :, 3 * p :] = np.einsum("nki,nkj->ij", e, e)
-        right[3 * p :] = np.einsum("nki,nk->i", e, residual)
-    cameras = reduce(*blocks_of(a, residual, model.image_index, m), cross)
-    return normal - cameras.normal, right - cameras.right, cameras
+    a, c, e = (model.whiten(d) * root[..., None] for d in (by_pose, by_point, by_intrinsics))
+    own = equations_of_poses(model, a, c, e, normalised(model, camera) * root)
+    cameras = reduce(own.block, own.block_right, own.cross)
+    return own.normal - cameras.normal, own.right - cameras.right, cameras
 
 
 def rows_of_view(model: GroupModel, camera: Camera, basis: np.ndarray) -> np.ndarray:

@@ -187,6 +187,16 @@ def judged(
     return CameraCalibration(result, tuple(views), skipped, rounds, projection, split, foretold, tuple(warnings))
 
 
+def rejudged(before: CameraCalibration, result: Intrinsics, board: BoardDesign) -> CameraCalibration:
+    """A calibration whose camera others have helped to determine: σ over the image and warnings are those of
+    ``result``, checks by halves and views held out those of the camera alone."""
+    projection = projection_sigma(result)
+    stale = _warnings(before.intrinsics, before.projection, before.split, board)
+    kept = [each for each in before.warnings if each not in stale]
+    warnings = (*kept, *_warnings(result, projection, before.split, board))
+    return replace(before, intrinsics=result, projection=projection, warnings=warnings)
+
+
 def first_size(files: list[ImageFile]) -> tuple[int, int]:
     """Width and height of the first readable image."""
     for file in files:

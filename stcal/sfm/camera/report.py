@@ -28,10 +28,10 @@ def calibration_page(result: CameraCalibration, summary: CalibrationFile, where:
         summary=summary,
         views=len(result.views),
         dots=sum(len(view) for view in result.views),
-        sigma=_sigma(result),
+        sigma=sigma_map(result),
         halves=_halves(result),
         split=result.split,
-        residuals=_residuals(result),
+        residuals=residual_map(result),
         lens=uri(distortion_figure(CalibratedCamera.of(intrinsics.camera, intrinsics.colmap_model))),
         parameters=[
             [name, number(each.value, 4 if name[0] in "fc" else 7), number(each.sigma, 4 if name[0] in "fc" else 7)]
@@ -82,7 +82,7 @@ def _map(result: CameraCalibration, values: np.ndarray, label: str):
     return uri(figure)
 
 
-def _sigma(result: CameraCalibration) -> str:
+def sigma_map(result: CameraCalibration) -> str:
     return _map(result, result.projection.sigma_px, "σ of a projection, px")
 
 
@@ -93,7 +93,7 @@ def _halves(result: CameraCalibration) -> str | None:
     return _map(result, np.linalg.norm(moved, axis=1), "difference of the halves, px")
 
 
-def _residuals(result: CameraCalibration) -> str:
+def residual_map(result: CameraCalibration) -> str:
     """Means over cells of the image: what the model leaves is alike in neighbours, noise is not."""
     figure, axes = _image_axes(result)
     camera = result.intrinsics.camera

@@ -1,0 +1,321 @@
+"""The equations of a camera calibration: of one camera, of several on the same boards, or of a rig of cameras.
+
+A view of camera k at an instant t has the pose ``camera_k_from_first @ first_from_board[t]``; cameras that are no rig
+have instants of their own, and none sits anywhere on another. Poses are reduced away instant by instant, then the dots
+of each board; what is kept are the intrinsics of all cameras and, of a rig, where they sit (Helmert blocking).
+"""
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from stcal.errors import ConvergenceError
+from stcal.geometry.camera import Camera
+from stcal.geometry.least_squares import minimise
+from stcal.geometry.normal_equations import Reduction, reduce
+from stcal.geometry.rigid import Rigid, skew
+from stcal.sfm.adjust.blocks import equations_of_poses, image_cost, normalised, robust_weights
+from stcal.sfm.adjust.group import moved_poses, projection_jacobians
+from stcal.sfm.camera.shape import BoardShape
+from stcal.sfm.data.model import MetricModel
+
+MAX_STEPS = 200
+EXACTLY = 1e-15
+"""Share of χ² that the last step may promise …"""
+SETTLED_PX = 1e-6
+"""… or by less than this it moves every projection: along a valley there is always more to gain, and nothing to see."""
+TINY_PX = 1e-3
+"""Focal length of no lens."""
+CREEPING_PX = 1e-3
+"""Moves below this after all steps are along a direction that hardly changes the images: its σ says so."""
+START_DAMPING = 1e-3
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class State:
+    """Unknowns.
+
+    ``models`` : what one camera saw of one folder's board; ``folder``, ``camera_of`` : of each model, those of one
+    folder share their points; ``instant_of`` : (m,) of each model's images, place among its folder's poses;
+    ``first_from_board`` : these poses, by folder; ``cameras`` ; ``camera_from_first`` : where each sits on a rig,
+    empty where they are none.
+    """
+
+    models: tuple[MetricModel, ...]
+    folder: tuple[str, ...]
+    camera_of: tuple[int, ...]
+    instant_of: tuple[np.ndarray, ...]
+    first_from_board: dict[str, tuple[Rigid, ...]]
+    cameras: tuple[Camera, ...]
+    camera_from_first: tuple[Rigid, ...] = ()
+
+    def boards(self) -> dict[str, list[int]]:
+        """Models by folder."""
+        members: dict[str, list[int]] = {}
+        for i, folder in enumerate(self.folder):
+            members.setdefault(folder, []).append(i)
+        return members
+
+    def seen(self) -> "State":
+        """With the views' poses as those of instants and cameras are."""
+        return replace(
+            self, models=tuple(replace(m, camera_from_model=self._poses(i)) for i, m in enumerate(self.models))
+        )
+
+    def _poses(self, i: int) -> tuple[Rigid, ...]:
+        poses, k = self.first_from_board[self.folder[i]], self.camera_of[i]
+        own = [poses[t] for t in self.instant_of[i].tolist()]
+        return tuple(self.camera_from_first[k] @ pose for pose in own) if self._sits(k) else tuple(own)
+
+    def _sits(self, k: int) -> bool:
+        return bool(self.camera_from_first) and k > 0
+
+    def cost(self, huber: float) -> float:
+        """χ² of the images, Huber's beyond ``huber``."""
+        return sum(image_cost(m, self.cameras[k], huber) for m, k in zip(self.models, self.camera_of, strict=True))
+
+    def normalised(self) -> np.ndarray:
+        """Residuals of all observations over σ, (n, 2)."""
+        each = zip(self.models, self.camera_of, strict=True)
+        return np.concatenate([normalised(m, self.cameras[k]) for m, k in each])
+
+    def redundancy(self, kept: int) -> int:
+        """Observed coordinates less poses and the ``kept`` unknowns: the dots bring as many observations as
+        unknowns."""
+        poses = sum(len(each) for each in self.first_from_board.values())
+        return sum(2 * len(m.image_index) for m in self.models) - 6 * poses - kept
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Setting:
+    """What stays the same in one minimisation; by camera ``basis`` : (16, q) and ``weight`` : (q, q) of the vague prior
+    about ``start``. ``rig`` : whether the cameras sit on one."""
+
+    basis: tuple[np.ndarray, ...]
+    weight: tuple[np.ndarray, ...]
+    start: tuple[Camera, ...]
+    shape: dict[str, BoardShape]
+    sigma_mm: float
+    huber: float
+    rig: bool = False
+
+    def away(self, k: int, camera: Camera) -> np.ndarray:
+        """Parameters of the COLMAP model minus those at the start, (q,)."""
+        return np.linalg.pinv(self.basis[k]) @ (camera.parameters() - self.start[k].parameters())
+
+    def intrinsics(self, k: int) -> slice:
+        """Place of a camera's intrinsics among the kept unknowns."""
+        ends = np.cumsum([0, *(b.shape[1] for b in self.basis)])
+        return slice(int(ends[k]), int(ends[k + 1]))
+
+    def sits(self, k: int) -> slice:
+        """Place of where a camera sits on the rig, (6,) or of nothing."""
+        begin = self.intrinsics(len(self.basis) - 1).stop
+        return slice(begin + 6 * (k - 1), begin + 6 * k) if self.rig and k else slice(begin, begin)
+
+    def of_camera(self, k: int) -> np.ndarray:
+        """Places of all that a camera's views depend on, among the kept unknowns."""
+        intrinsics, sits = self.intrinsics(k), self.sits(k)
+        return np.concatenate([np.arange(intrinsics.start, intrinsics.stop), np.arange(sits.start, sits.stop)])
+
+    @property
+    def kept(self) -> int:
+        """How many unknowns are kept."""
+        return max(self.sits(len(self.basis) - 1).stop, self.intrinsics(len(self.basis) - 1).stop)
+
+
+def dots_costs(state: State, setting: Setting) -> np.ndarray:
+    """χ² of the dots' places: of the board's σ, and of its bends."""
+    each = [
+        setting.shape[folder].costs(state.models[rows[0]].xyz_model, setting.sigma_mm)
+        for folder, rows in state.boards().items()
+    ]
+    return np.sum(each, axis=0)
+
+
+def _cost(state: State, setting: Setting) -> float:
+    cost = float(dots_costs(state, setting).sum())
+    for k, camera in enumerate(state.cameras):
+        away = setting.away(k, camera)
+        cost += float(away @ setting.weight[k] @ away)
+    return cost + state.cost(setting.huber)
+
+
+def derivatives(state: State, setting: Setting, i: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Derivatives of a model's projections, px: by its instants' poses, (n, 2, 6), by its points, (n, 2, 3), and by
+    what :meth:`Setting.of_camera` places, (n, 2, k).
+
+    All motions are left perturbations. Of camera_k_from_first = (R, t) and first_from_board = (S, s), a turn w and a
+    shift d of the latter turn the view's pose by R w and shift it by R d; of the former, by w and by w × R s + d.
+    """
+    model, k = state.models[i], state.camera_of[i]
+    camera = state.cameras[k]
+    by_pose, by_point = projection_jacobians(model, camera)
+    xyz = model.xyz_camera()
+    by_shared = camera.parameter_jacobian(xyz[:, :2] / xyz[:, 2:]) @ setting.basis[k]
+    if setting.rig and k:
+        turn = state.camera_from_first[k].rotation
+        poses = state.first_from_board[state.folder[i]]
+        carried = np.array([poses[t].translation for t in state.instant_of[i].tolist()]) @ turn.T
+        by_shift = by_pose[:, :, 3:]
+        by_turn = by_pose[:, :, :3] - by_shift @ skew(carried[model.image_index])
+        by_shared = np.concatenate([by_shared, by_turn, by_shift], axis=2)
+        by_pose = np.concatenate([by_pose[:, :, :3] @ turn, by_shift @ turn], axis=2)
+    return by_pose, by_point, by_shared
+
+
+def _of_board(state: State, setting: Setting, folder: str, rows: list[int]):
+    """Normal equations over a board's dots and the kept unknowns, poses reduced away, and the way back to these."""
+    p, t = setting.shape[folder].places.size, len(state.first_from_board[folder])
+    size = p + setting.kept
+    full, full_right = np.zeros((size, size)), np.zeros(size)
+    block, block_right, cross = np.zeros((t, 6, 6)), np.zeros((t, 6)), np.zeros((t, 6, size))
+    for i in rows:
+        model, k, instant = state.models[i], state.camera_of[i], state.instant_of[i]
+        root = np.sqrt(robust_weights(model, state.cameras[k], setting.huber))[:, None]
+        a, c, e = (model.whiten(d) * root[..., None] for d in derivatives(state, setting, i))
+        own = equations_of_poses(model, a, c, e, normalised(model, state.cameras[k]) * root)
+        place = np.concatenate([np.arange(p), p + setting.of_camera(k)])
+        full[np.ix_(place, place)] += own.normal
+        full_right[place] += own.right
+        block[instant] += own.block
+        block_right[instant] += own.block_right
+        cross[np.ix_(instant, np.arange(6), place)] += own.cross
+    poses = reduce(block, block_right, cross)
+    return full - poses.normal, full_right - poses.right, poses
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Normal:
+    """Normal equations over the kept unknowns; the dots of each board are reduced away, the poses before them.
+    ``dots_left`` : redundancy of the observations of the dots."""
+
+    cost: float
+    state: State
+    setting: Setting
+    normal: np.ndarray
+    right: np.ndarray
+    boards: tuple[Reduction, ...]
+    poses: tuple[Reduction, ...]
+    dots_left: float
+
+    @classmethod
+    def of(cls, state: State, setting: Setting) -> "Normal":
+        normal, right = np.zeros((setting.kept, setting.kept)), np.zeros(setting.kept)
+        for k, camera in enumerate(state.cameras):
+            place = setting.intrinsics(k)
+            normal[place, place] += setting.weight[k]
+            right[place] -= setting.weight[k] @ setting.away(k, camera)
+        boards, poses = [], []
+        for folder, rows in state.boards().items():
+            shape = setting.shape[folder]
+            p = shape.places.size
+            full, full_right, away = _of_board(state, setting, folder, rows)
+            own = shape.weight(setting.sigma_mm)
+            full[:p, :p] += own
+            full_right[:p] -= own @ (state.models[rows[0]].xyz_model - shape.places).ravel()
+            dots = reduce(full[None, :p, :p], full_right[None, :p], full[None, :p, p:])
+            normal += full[p:, p:] - dots.normal
+            right += full_right[p:] - dots.right
+            boards.append(dots)
+            poses.append(away)
+        covariance = np.linalg.inv(normal)
+        dots_left = sum(
+            setting.shape[folder].redundancy(board, covariance, setting.sigma_mm)
+            for board, folder in zip(boards, state.boards(), strict=True)
+        )
+        return cls(_cost(state, setting), state, setting, normal, right, tuple(boards), tuple(poses), float(dots_left))
+
+    def with_flat_boards(self) -> dict[str, BoardShape]:
+        """The shapes, without bends of the boards whose bends may be chance."""
+        covariance, setting = np.linalg.inv(self.normal), self.setting
+        return {
+            folder: setting.shape[folder].flat_by_chance(
+                self.state.models[rows[0]].xyz_model, board, covariance, setting.sigma_mm
+            )
+            for board, (folder, rows) in zip(self.boards, self.state.boards().items(), strict=True)
+        }
+
+    def step(self, damping: float | np.ndarray) -> tuple[np.ndarray, float]:
+        """Of the kept unknowns, then of the dots of each board, then of its poses."""
+        own = np.linalg.solve(self.normal + damping * np.diag(np.diag(self.normal)), self.right)
+        gain = 2 * float(own @ self.right) - float(own @ self.normal @ own)
+        gain += sum(each.gain for each in (*self.boards, *self.poses))
+        dots = [board.back(own).ravel() for board in self.boards]
+        poses = [each.back(np.concatenate([moved, own])).ravel() for each, moved in zip(self.poses, dots, strict=True)]
+        step = np.concatenate([own, *dots, *poses])
+        return step, gain if self.largest_move(step) > SETTLED_PX else 0.0
+
+    def largest_move(self, step: np.ndarray) -> float:
+        """By which a step moves any projection, px."""
+        new = moved(self.state, self.setting, step)
+        moves = [
+            np.abs(b.residuals_px(new.cameras[k]) - a.residuals_px(self.state.cameras[k])).max()
+            for a, b, k in zip(self.state.models, new.models, self.state.camera_of, strict=True)
+        ]
+        return float(max(moves))
+
+
+def minimum(state: State, setting: Setting) -> State:
+    """The state of least cost: what is kept is damped, dots and poses at their best for each step of it.
+
+    Raises
+    ------
+    ConvergenceError
+        None is reached.
+    """
+    found = minimise(
+        state,
+        lambda at: Normal.of(at, setting),
+        lambda at, step: moved(at, setting, step),
+        cost=lambda at: _cost(at, setting),
+        damping=START_DAMPING,
+        settled=EXACTLY,
+        max_steps=MAX_STEPS,
+    )
+    if not found.converged:  # along a direction that hardly changes the images: its σ says so
+        move = found.linear.largest_move(found.linear.step(START_DAMPING)[0])
+        if not move < CREEPING_PX:
+            raise ConvergenceError(
+                f"camera: projections still move by {move:.1g} px after {found.steps} steps, {CREEPING_PX:g} px "
+                "needed; look at the images, add views that fill the image and are tilted, or choose a simpler --model"
+            )
+    return found.state
+
+
+def moved(state: State, setting: Setting, step: np.ndarray) -> State:
+    """The state after a step of :meth:`Normal.step`."""
+    boards, models = state.boards(), list(state.models)
+    own, rest = np.split(step, [setting.kept])
+    sizes = [setting.shape[folder].places.size for folder in boards]
+    *dots, rest = np.split(rest, np.cumsum(sizes))
+    instants = np.cumsum([6 * len(state.first_from_board[folder]) for folder in boards])[:-1]
+    first_from_board = {
+        folder: moved_poses(state.first_from_board[folder], each.reshape(-1, 6))
+        for folder, each in zip(boards, np.split(rest, instants), strict=True)
+    }
+    for rows, shift in zip(boards.values(), dots, strict=True):
+        for i in rows:
+            models[i] = replace(models[i], xyz_model=models[i].xyz_model + shift.reshape(-1, 3))
+    cameras = tuple(
+        camera.with_parameters(_positive(camera.parameters() + setting.basis[k] @ own[setting.intrinsics(k)]))
+        for k, camera in enumerate(state.cameras)
+    )
+    camera_from_first = state.camera_from_first
+    if setting.rig:
+        turned = moved_poses(camera_from_first[1:], own[setting.sits(1).start :].reshape(-1, 6))
+        camera_from_first = (camera_from_first[0], *turned)
+    return replace(
+        state,
+        models=tuple(models),
+        first_from_board=first_from_board,
+        cameras=cameras,
+        camera_from_first=camera_from_first,
+    ).seen()
+
+
+def _positive(parameters: np.ndarray) -> np.ndarray:
+    """Parameters of a camera; where a step leaves none, such as no image agrees with."""
+    if (parameters[:2] > 0).all() and np.isfinite(parameters).all():
+        return parameters
+    return np.concatenate([[TINY_PX, TINY_PX], np.zeros(len(parameters) - 2)])

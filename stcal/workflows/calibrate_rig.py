@@ -1,0 +1,144 @@
+"""Calibrate the cameras of a rig from a folder with one of photographs for each."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+from stcal.boards.design import CharucoDesign, FlatBoard
+from stcal.design import BoardDesign, TargetDesign
+from stcal.errors import InputError, StcalError
+from stcal.io.camera import CalibratedCamera, cameras_txt
+from stcal.io.cameras.forms import kalibr_chain
+from stcal.io.images import name_fault
+from stcal.io.json import ResultFile
+from stcal.io.saving import json_text
+from stcal.parallel import Progress
+from stcal.sfm.camera.calibrate import CameraCalibration, calibrate_camera
+from stcal.sfm.camera.file import CalibrationFile
+from stcal.sfm.camera.rig import RigCalibration, calibrate_rig
+from stcal.sfm.camera.rig_file import RigCalibrationFile
+from stcal.workflows.calibrate_camera import calibrate_camera_by_corners, corner_grid
+
+RIG_FILE, CHAIN_FILE = "rig.json", "camchain.yaml"
+TAKEN = ("rig", "camchain")
+"""Names whose files would stand in the place of these."""
+
+
+@dataclass(frozen=True, slots=True)
+class Models:
+    """Lens models: ``own`` by camera, ``common`` for the others."""
+
+    own: Mapping[str, str]
+    common: str
+
+    @classmethod
+    def of(cls, given: Sequence[str], default: str) -> "Models":
+        """From words NAME=MODEL, and one MODEL.
+
+        Raises
+        ------
+        InputError
+            Two for one camera.
+        """
+        own: dict[str, str] = {}
+        common = [word for word in given if "=" not in word]
+        for word in given:
+            name, separator, model = word.rpartition("=")
+            if separator and name in own:
+                raise InputError(f"--model {word}: {name} has {own[name]} already; one for each camera")
+            if separator:
+                own[name] = model
+        if len(common) > 1:
+            raise InputError(f"--model {common[1]}: {common[0]} is given too; one for all, or NAME=MODEL for each")
+        return cls(own, common[0] if common else default)
+
+
+def calibrate_rig_from_photographs(
+    folder: Path,
+    target: TargetDesign,
+    board: BoardDesign | FlatBoard,
+    models: Models,
+    workers: int | None = None,
+    progress: Progress | None = None,
+) -> RigCalibration:
+    """Each camera by itself, then all together.
+
+    Parameters
+    ----------
+    folder
+        With a folder of photographs for each camera; images of one instant have the same name in all.
+    target, board, workers, progress
+        As of :func:`calibrate_camera`; boards of corners too.
+    models
+        COLMAP's, or ``auto``.
+
+    Raises
+    ------
+    StcalError
+        One of its kinds; the message names the camera.
+    """
+    names = camera_names(folder)
+    unknown = [name for name in models.own if name not in names]
+    if unknown:
+        raise InputError(f"--model {unknown[0]}=…: no folder {unknown[0]} in {folder}; it has {', '.join(names)}")
+    grid = board if isinstance(board, BoardDesign) else corner_grid(board)
+    cameras: dict[str, CameraCalibration] = {}
+    for name in names:
+        model = models.own.get(name, models.common)
+
+        def step(stage: str, done: int, total: int, name=name) -> None:
+            if progress:
+                progress(f"{name}: {stage}", done, total)
+
+        try:
+            if isinstance(board, BoardDesign):
+                found = calibrate_camera(folder / name, target, board, model, workers=workers, progress=step)
+            else:
+                found = calibrate_camera_by_corners(folder / name, board, model, workers, step)
+        except StcalError as error:
+            raise type(error)(f"rig: {name}: {error}") from error
+        cameras[name] = found
+    return calibrate_rig(cameras, grid, isinstance(board, CharucoDesign))
+
+
+def camera_names(folder: Path) -> list[str]:
+    """Folders in it.
+
+    Raises
+    ------
+    InputError
+        Fewer than two, or names that no file can have.
+    """
+    if not folder.is_dir():
+        raise InputError(f"rig folder {folder}: {'not a folder' if folder.exists() else 'does not exist'}; give one")
+    names = sorted(each.name for each in folder.iterdir() if each.is_dir() and not each.name.startswith("."))
+    if len(names) < 2:
+        raise InputError(
+            f"rig folder {folder}: {len(names)} folders in it, one for each of two cameras and more needed; put "
+            "photographs into <camera>/, or leave --rig away"
+        )
+    for name in names:
+        fault = "is that of a file of the result" if name.lower() in TAKEN else name_fault(name)
+        if fault or not name.isprintable():
+            raise InputError(f"rig folder {folder}: camera name {name!r} {fault or 'is not printable'}; rename it")
+    return names
+
+
+def files_of(rig: RigCalibration) -> tuple[dict[str, str], list[str]]:
+    """Contents by name: a camera file and its JSON for each camera, ``rig.json``, and ``camchain.yaml`` where Kalibr
+    has models for the lenses; and what is missing, and why."""
+    files, cameras = {}, []
+    for name, own in zip(rig.names, rig.cameras, strict=True):
+        intrinsics = own.intrinsics
+        camera = CalibratedCamera.of(intrinsics.camera, intrinsics.colmap_model, intrinsics.covariance)
+        files |= {f"{name}.txt": cameras_txt(camera), f"{name}.json": json_text(CalibrationFile.of(own))}
+        cameras.append((name, camera))
+    summary: ResultFile = RigCalibrationFile.of(rig)
+    files[RIG_FILE] = json_text(summary)
+    missing = []
+    try:
+        chain = [(*each, pose) for each, pose in zip(cameras, rig.camera_from_first, strict=True)]
+        files[CHAIN_FILE] = kalibr_chain(chain)
+    except InputError as error:
+        missing.append(f"no {CHAIN_FILE}: {error}")
+    return files, missing
