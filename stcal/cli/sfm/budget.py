@@ -7,6 +7,7 @@ import typer
 
 from stcal.cli.options import JsonFile, Run
 from stcal.cli.terminal import say, write
+from stcal.errors import InputError
 
 app = typer.Typer()
 
@@ -28,11 +29,28 @@ def budget(
             "--field", help="Write NAME=VALUE into the head, such as operator='A. Smith'; may be given several times."
         ),
     ] = None,
+    check_lengths: Annotated[
+        Path | None,
+        typer.Option(
+            "--check-lengths",
+            help="Compare distances between circles with the lengths in this file (CSV: from, to, length_mm, "
+            "sigma_mm).",
+        ),
+    ] = None,
+    lengths: Annotated[
+        Path | None,
+        typer.Option("--lengths", help="Compare the longest distances with the second calibration in this folder."),
+    ] = None,
+    lengths_statement: Annotated[
+        Path | None,
+        typer.Option("--lengths-statement", help="Read what is stated of that run from this file; --statement if not."),
+    ] = None,
     out: JsonFile = None,
 ) -> None:
     """Compute the uncertainty budget of faces and of the target's longest distances (GUM), each contribution apart."""
     from stcal.sfm.budget.combine import budget_of_run
     from stcal.sfm.budget.file import BudgetFile
+    from stcal.sfm.budget.lengths import against_run, against_stated
     from stcal.sfm.budget.statement import statement_of
     from stcal.sfm.budget.text import budget_text
     from stcal.sfm.run.saved import load_run
@@ -40,7 +58,16 @@ def budget(
 
     saved = load_run(run)
     stated = statement_of(saved.board.stated, statement, field or ())
-    file = BudgetFile.of(budget_of_run(saved, stated), saved, verify(run))
+    if lengths_statement is not None and lengths is None:
+        raise InputError(f"--lengths-statement {lengths_statement}: of a second calibration; give it with --lengths")
+    found, tests = budget_of_run(saved, stated), []
+    if check_lengths is not None:
+        tests.append(against_stated(found, check_lengths))
+    if lengths is not None:
+        second = load_run(lengths)
+        its = statement_of(second.board.stated, lengths_statement or statement)
+        tests.append(against_run(found, budget_of_run(second, its), lengths, (saved.board, second.board)))
+    file = BudgetFile.of(found, saved, verify(run), tests)
     say(budget_text(file))
     if out:
         write(out, file, "as JSON")

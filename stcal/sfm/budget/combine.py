@@ -171,19 +171,19 @@ def measurands(joint: JointResult, own: Derivatives, reference_face: str) -> lis
         found += [
             Measurand(kind, face, (), None, own.faces[face][rows], own.face_designed[face][rows]) for face in others
         ]
-    return found + [distance(joint, a, b) for a, b in longest(joint.labels, joint.xyz_model)]
+    return found + [distance(joint, a, b) for a, b in longest_of(joint.labels, joint.xyz_model)[:LONGEST]]
 
 
-def longest(labels: Sequence[CircleLabel], xyz: np.ndarray) -> list[tuple[int, int]]:
-    """The two circles farthest apart of every two faces, and of each; of these pairs the longest."""
+def longest_of(labels: Sequence[CircleLabel], xyz: np.ndarray) -> list[tuple[int, int]]:
+    """The two circles farthest apart of every two faces, and of each face that has two; the longest first."""
     faces: dict[str, list[int]] = {}
     for i, label in enumerate(labels):
         faces.setdefault(label.face, []).append(i)
     pairs = []
     for a, b in combinations_with_replacement(faces, 2):
         ends = combinations(faces[a], 2) if a == b else ((i, j) for i in faces[a] for j in faces[b])
-        pairs.append(max(ends, key=lambda pair: float(np.linalg.norm(xyz[pair[0]] - xyz[pair[1]]))))
-    return sorted(pairs, key=lambda pair: -float(np.linalg.norm(xyz[pair[0]] - xyz[pair[1]])))[:LONGEST]
+        pairs += sorted(ends, key=lambda pair: -float(np.linalg.norm(xyz[pair[0]] - xyz[pair[1]])))[:1]
+    return sorted(pairs, key=lambda pair: -float(np.linalg.norm(xyz[pair[0]] - xyz[pair[1]])))
 
 
 def distance(joint: JointResult, i: int, j: int) -> Measurand:

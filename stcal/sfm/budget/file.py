@@ -1,6 +1,7 @@
 """What ``budget`` writes with ``--json``, and what its page and PDF show."""
 
 import math
+from collections.abc import Sequence
 from dataclasses import asdict
 from typing import Any, Literal
 
@@ -11,6 +12,7 @@ import stcal
 from stcal.io.json import ByName, Finite, Part, ResultFile
 from stcal.io.saving import RUN_MARKER
 from stcal.sfm.budget.combine import COVERAGE_FACTOR, Budget, Row
+from stcal.sfm.budget.lengths import LengthTest
 from stcal.sfm.budget.sources import Source
 from stcal.sfm.run.saved import SavedRun
 from stcal.sfm.run.verify import VerifyFile
@@ -78,6 +80,49 @@ class StatedRow(Part):
     origin: str
 
 
+class LengthRow(Part):
+    circles: list[str]
+    measured_mm: float
+    reference_mm: float
+    error_um: float
+    expanded_um: float
+    e_n: Finite
+
+
+class LengthTestPart(Part):
+    """Against one reference."""
+
+    reference: str
+    lengths: list[LengthRow]
+    beyond: int
+    limit: float
+    agrees: bool
+    notes: list[str]
+
+    @classmethod
+    def of(cls, test: LengthTest) -> "LengthTestPart":
+        """The part of a test."""
+        rows = [
+            LengthRow(
+                circles=list(each.circles),
+                measured_mm=each.measured_mm,
+                reference_mm=each.reference_mm,
+                error_um=MICRO * each.error_mm,
+                expanded_um=MICRO * each.expanded_mm,
+                e_n=each.e_n,
+            )
+            for each in test.lengths
+        ]
+        return cls(
+            reference=test.reference,
+            lengths=rows,
+            beyond=test.beyond,
+            limit=test.limit,
+            agrees=test.agrees,
+            notes=list(test.notes),
+        )
+
+
 class BudgetFile(ResultFile):
     """Of ``budget``."""
 
@@ -121,12 +166,19 @@ class BudgetFile(ResultFile):
         "`correction_ppm`, and `distance_um` with `contributions`, `sensitivities`, `standard`, `expanded`, "
         "`coverage`, `degrees_of_freedom` as of faces"
     )
+    length_tests: list[LengthTestPart] = Field(
+        description="with `--check-lengths` and `--lengths`: `reference` (file or run); `lengths` between `circles`: "
+        "`measured_mm` (corrected) and `reference_mm`, length measurement error `error_um` (VDI/VDE 2634), U of both "
+        "`expanded_um`, and `e_n`, the error over it (ISO 13528; null where both are exact); how many are `beyond` U, "
+        "the `limit` of the largest |E_n| for so many lengths, whether all `agrees`, and `notes`"
+    )
     notes: list[str] = Field(description="what is not in the combined uncertainty, or not known")
 
     @classmethod
-    def of(cls, budget: Budget, run: SavedRun, verified: VerifyFile) -> "BudgetFile":
+    def of(cls, budget: Budget, run: SavedRun, verified: VerifyFile, tests: Sequence[LengthTest] = ()) -> "BudgetFile":
         """The file of a run's budget; ``verified`` : what became of its files."""
-        return cls.model_validate(_content(budget, run, verified))
+        parts = [LengthTestPart.of(each) for each in tests]
+        return cls.model_validate(_content(budget, run, verified) | {"length_tests": parts})
 
 
 def _content(budget: Budget, run: SavedRun, verified: VerifyFile) -> dict[str, Any]:

@@ -2,8 +2,10 @@
 
 from collections.abc import Sequence
 
-from stcal.report.text import text_table
-from stcal.sfm.budget.file import BudgetFile, SourceRow, Uncertainty
+import numpy as np
+
+from stcal.report.text import number, text_table
+from stcal.sfm.budget.file import BudgetFile, LengthTestPart, SourceRow, Uncertainty
 
 
 def budget_text(file: BudgetFile) -> str:
@@ -24,7 +26,41 @@ def budget_text(file: BudgetFile) -> str:
     ):
         lines += ["", *_table(title, columns, file)]
     lines += [f"{_name(each.circles)}: {_length(each, file)}" for each in lengths]
+    for test in file.length_tests:
+        lines += ["", *_length_test(test)]
     return "\n".join([*lines, "", *(f"note: {note}" for note in file.notes)])
+
+
+def _length_test(test: LengthTestPart) -> list[str]:
+    """Lengths, and the verdict."""
+    rows = [("<length", "measured mm", "reference mm", "error µm", "U µm", "E_n")]
+    for each in test.lengths:
+        values = (
+            f"{each.measured_mm:.4f}",
+            f"{each.reference_mm:.4f}",
+            f"{each.error_um:.2f}",
+            f"{each.expanded_um:.2f}",
+        )
+        rows.append((_name(each.circles), *values, number(each.e_n, 2)))
+    return [
+        f"length test against {test.reference}:",
+        *text_table(rows),
+        verdict_of(test),
+        *(f"note: {each}" for each in test.notes),
+    ]
+
+
+def verdict_of(test: LengthTestPart) -> str:
+    """In words."""
+    count = len(test.lengths)
+    return (
+        f"{'agrees' if test.agrees else 'differs'}: {test.beyond} of {count} lengths beyond U, by chance 1 in 22 is; "
+        f"largest |E_n| {number(max(abs(e) for e in _known(test)), 2)}, up to {test.limit:.2f} for {count}"
+    )
+
+
+def _known(test: LengthTestPart) -> list[float]:
+    return [np.inf if each.e_n is None else each.e_n for each in test.lengths]
 
 
 def _name(circles: Sequence[str]) -> str:

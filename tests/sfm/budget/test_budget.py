@@ -9,7 +9,7 @@ import pytest
 
 from stcal.design import StatedSize
 from stcal.io.design import board_toml, load_board
-from stcal.sfm.budget.combine import budget_of_run, longest
+from stcal.sfm.budget.combine import budget_of_run, longest_of
 from stcal.sfm.budget.sources import correction
 from stcal.sfm.budget.statement import FIELDS, statement_of
 from stcal.sfm.run.saved import load_run
@@ -116,7 +116,7 @@ def test_a_board_file_keeps_what_is_stated(saved, tmp_path):
 def test_the_longest_distances_are_of_different_pairs_of_faces():
     labels = [replace_label(face, circle) for face in "12" for circle in "ab"]
     xyz = np.array([[0, 0, 0], [1, 0, 0], [0, 5, 0], [0, 7, 0.0]])
-    assert longest(labels, xyz) == [(1, 3), (2, 3), (0, 1)]
+    assert longest_of(labels, xyz) == [(1, 3), (2, 3), (0, 1)]
 
 
 def replace_label(face, circle):

@@ -1,0 +1,115 @@
+"""Distances against stated lengths and against a second calibration."""
+
+import json
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from stcal.sfm.budget.combine import budget_of_run, longest_of
+from stcal.sfm.budget.lengths import SHARED, against_run, against_stated
+from stcal.sfm.budget.statement import statement_of
+from stcal.sfm.run.saved import load_run
+from tests.outcome import INPUT, assert_error
+
+PITCH = "[board]\npitch_sigma_ppm = 50.0\n"
+
+
+@pytest.fixture(scope="module")
+def saved(small_run):
+    return load_run(small_run)
+
+
+@pytest.fixture(scope="module")
+def budget(saved):
+    return budget_of_run(saved)
+
+
+def lengths_csv(path, budget, off_u=0.0, rows=4, sigma_mm=0.001, head="from,to,length_mm,sigma_mm"):
+    """Lengths of the run, each shorter by so many expanded uncertainties."""
+    lines = [head]
+    for i, j in longest_of(budget.joint.labels, budget.joint.xyz_model)[:rows]:
+        a, b = budget.joint.labels[i], budget.joint.labels[j]
+        length = float(np.linalg.norm(budget.joint.xyz_model[i] - budget.joint.xyz_model[j]))
+        u = next(r.standard for r in budget.of_kind("distance") if r.measurand.circles == (a, b))
+        cells = [a, b, f"{length - off_u * 2 * np.hypot(u, sigma_mm):.9f}", str(sigma_mm)]
+        lines.append(",".join(cells[: head.count(",") + 1]))
+    path.write_text("\n".join(lines) + "\n")
+    return path
+
+
+@pytest.mark.parametrize(
+    ("off_u", "rows", "beyond", "agrees"),
+    [(0.0, 4, 0, True), (0.9, 4, 0, True), (1.1, 1, 1, False), (1.1, 4, 4, True), (1.5, 4, 4, False)],
+)
+def test_errors_over_their_uncertainty(budget, tmp_path, off_u, rows, beyond, agrees):
+    """Of four lengths the limit is 1.27: each is beyond 2.53 σ by chance in 1 of 88, all four in 1 of 22."""
+    found = against_stated(budget, lengths_csv(tmp_path / "lengths.csv", budget, off_u, rows))
+    assert [each.e_n for each in found.lengths] == pytest.approx([off_u] * rows, abs=1e-5)
+    assert (found.beyond, found.agrees) == (beyond, agrees)
+    assert found.limit == pytest.approx({1: 1.0, 4: 1.2655}[rows], abs=1e-3)
+    assert found.notes == ()
+
+
+def test_lengths_without_sigma_are_exact(budget, tmp_path):
+    path = lengths_csv(tmp_path / "lengths.csv", budget, 0.9, sigma_mm=0.0, head="from,to,length_mm")
+    found = against_stated(budget, path)
+    assert [each.e_n for each in found.lengths] == pytest.approx([0.9] * 4, abs=1e-5)
+    assert found.notes == (f"{path} states no sigma_mm: its lengths are taken as exact",)
+
+
+def test_a_run_against_itself_differs_by_nothing_and_pitch_is_not_in_it(saved, budget, tmp_path):
+    """U of the difference is √2 that of one run; a pitch that both share leaves it as it is, another board's does
+    not."""
+    plain = against_run(budget, budget, saved.folder, (saved.board, saved.board))
+    assert plain.agrees
+    assert "cannot be seen here" in plain.notes[0]
+    longest = budget.of_kind("distance")[0]
+    assert plain.lengths[0].circles == longest.measurand.circles
+    assert plain.lengths[0].error_mm == 0
+    assert plain.lengths[0].expanded_mm == pytest.approx(np.sqrt(2) * longest.expanded)
+    path = tmp_path / "lab.toml"
+    path.write_text(PITCH)
+    stated = budget_of_run(saved, statement_of(saved.board.stated, path))
+    same = against_run(stated, stated, saved.folder, (saved.board, saved.board))
+    assert same.lengths[0].expanded_mm == pytest.approx(plain.lengths[0].expanded_mm)
+    other = against_run(stated, stated, saved.folder, (saved.board, replace(saved.board, pitch_mm=20.0)))
+    pitch = 50e-6 * longest.measurand.length_mm
+    wanted = np.hypot(plain.lengths[0].expanded_mm, 2 * np.sqrt(2) * pitch)
+    assert other.lengths[0].expanded_mm == pytest.approx(wanted, rel=2e-3)
+    assert other.notes == ()
+    assert "board_pitch" in SHARED
+
+
+def test_command(stcal_sfm, small_run, budget, tmp_path):
+    path, out = lengths_csv(tmp_path / "lengths.csv", budget, 1.5), tmp_path / "budget.json"
+    code, text, _ = stcal_sfm("budget", small_run, "--check-lengths", path, "--lengths", small_run, "--json", out)
+    assert code == 0
+    assert f"length test against {path}:" in text
+    assert "differs: 4 of 4 lengths beyond U, by chance 1 in 22 is; largest |E_n| 1.50, up to 1.27 for 4" in text
+    assert "agrees: 0 of " in text
+    one, two = json.loads(out.read_text())["length_tests"]
+    assert (one["agrees"], two["agrees"]) == (False, True)
+    assert one["lengths"][0]["e_n"] == pytest.approx(1.5, abs=1e-5)
+    assert len(two["lengths"]) == 10  # of four faces: six pairs and four within
+
+
+@pytest.mark.parametrize(
+    ("row", "words"),
+    [
+        ("1:1,9:9,100,0", "line 2: no circle 9:9 in the run"),
+        ("1:1,1:1,100,0", "line 2: 1:1 to 1:1, 100 ± 0 mm"),
+        ("1:1,1:2,-3,0", "a length between two circles needed"),
+        ("1:1,1:2,40,-1", "a σ of 0 or more"),
+        ("1:1,1:2,x,0", "length_mm is 'x'"),
+    ],
+)
+def test_lengths_that_are_none(stcal_sfm, small_run, tmp_path, row, words):
+    path = tmp_path / "lengths.csv"
+    path.write_text(f"from,to,length_mm,sigma_mm\n{row}\n")
+    assert_error(stcal_sfm("budget", small_run, "--check-lengths", path), INPUT, str(path), words)
+
+
+def test_a_statement_of_no_second_run(stcal_sfm, small_run, tmp_path):
+    words = "of a second calibration; give it with --lengths"
+    assert_error(stcal_sfm("budget", small_run, "--lengths-statement", tmp_path / "x.toml"), INPUT, words)
