@@ -45,7 +45,7 @@ def place_of(path: Path) -> str:
 def documents() -> list[Path]:
     """All pages that are written by hand."""
     own = [path for path in sorted(DOCS.rglob("*.md")) if path.relative_to(DOCS).parts[0] not in NOT_PAGES]
-    return [*own, ROOT / "data_layout.md", ROOT / "CONTRIBUTING.md", ROOT / "CHANGELOG.md"]
+    return [*own, ROOT / "README.md", ROOT / "data_layout.md", ROOT / "CONTRIBUTING.md", ROOT / "CHANGELOG.md"]
 
 
 def collect(source: Path) -> None:
@@ -83,8 +83,6 @@ def with_links(text: str, page: Path, linked: set[Path]) -> str:
         if not link or urlsplit(link).scheme:
             return match[0]
         path = (page.parent / link).resolve()
-        if path == ROOT / "README.md":
-            path = DOCS / "index.md"
         if path.is_file():
             linked.add(path)
             return f"{match[1]}{posixpath.relpath(place_of(path), own)}{'#' * bool(anchor)}{anchor}{match[3]}"

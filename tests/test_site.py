@@ -25,12 +25,19 @@ def test_questions_are_answered_one_click_from_the_first_page(question):
     assert [word for word in QUESTIONS[question] if word not in answer] == []
 
 
+def test_every_page_is_listed():
+    """In docs/index.md, or in a page of pages that is: Sphinx would end the build."""
+    lists = [site.DOCS / "index.md", site.DOCS / "accuracy" / "index.md", site.ROOT / "data_layout.md"]
+    listed = {(page.parent / link).resolve() for page in lists for link in site.items(page.read_text("utf-8"))}
+    assert sorted(set(site.documents()) - listed - {lists[0]}) == []
+
+
 def test_links_hold_where_pages_stand_in_the_site():
     page, linked = site.DOCS / "howto" / "checks.md", set()
     text = "[a](../cameras.md#x) [b](../../data_layout.md) [c](https://x.org) [e](../../README.md) [f](../none.md)"
     made = site.with_links(text, page, linked)
-    assert made == "[a](../cameras.md#x) [b](../data_layout.md) [c](https://x.org) [e](../index.md) [f](../none.md)"
-    assert {path.name for path in linked} == {"cameras.md", "data_layout.md", "index.md"}
+    assert made == "[a](../cameras.md#x) [b](../data_layout.md) [c](https://x.org) [e](../README.md) [f](../none.md)"
+    assert {path.name for path in linked} == {"cameras.md", "data_layout.md", "README.md"}
 
 
 def test_dead_links_are_found(tmp_path):

@@ -3,6 +3,7 @@
 import inspect
 import io
 import json
+import os
 import re
 import subprocess
 import sys
@@ -187,3 +188,18 @@ def test_json_on_a_terminal_is_printable_and_the_same(monkeypatch, encoding, sho
     text = raw.getvalue().decode(encoding)
     assert json.loads(text) == {"note": "12 µm \u202e\x9b"}
     assert shown in text
+
+
+# --- completion ---
+
+
+def test_a_shell_asks_what_may_stand_next():
+    """Nothing more than words is printed, and no run begins."""
+    code = "from stcal.cli.entry import main_sfm; main_sfm()"
+    asked = {"_STCAL_SFM_COMPLETE": "complete_bash", "COMP_WORDS": "stcal-sfm run --ref", "COMP_CWORD": "2"}
+    words = [sys.executable, "-P", "-c", code]
+    ended = subprocess.run(words, capture_output=True, text=True, env=os.environ | asked, check=False)
+    assert (ended.returncode, ended.stdout.split()) == (0, ["--reference-face", "--refine-camera"])
+    asked = {"_STCAL_SFM_COMPLETE": "source_bash"}
+    ended = subprocess.run(words, capture_output=True, text=True, env=os.environ | asked, check=False)
+    assert "complete -o default -F _stcal_sfm_completion stcal-sfm" in ended.stdout

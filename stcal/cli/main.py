@@ -1,11 +1,13 @@
 """``stcal``, the umbrella command, and ``stcal-sfm``, its shortcut: errors become one line and an exit code."""
 
+import os
 import signal
 import sys
 from io import TextIOWrapper
 from typing import Any, NoReturn
 
 import typer
+from typer._completion_classes import completion_init
 
 import stcal
 from stcal.cli import cameras, handeye, locate, register, robot, sfm
@@ -69,6 +71,8 @@ def main_sfm() -> None:
 
 def _guarded(application: typer.Typer) -> None:
     debug = "--debug" in sys.argv
+    if any(name.startswith("_STCAL") and name.endswith("_COMPLETE") for name in os.environ):
+        completion_init()  # a shell asks what may stand next, docs/howto/install.md
     signal.signal(signal.SIGTERM, _terminate)
     signal.signal(signal.SIGINT, signal.default_int_handler)
     arguments = [a for a in sys.argv[1:] if a != "--debug"]
