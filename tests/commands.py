@@ -135,7 +135,7 @@ CALLS = (
     Call("sfm plan", f"--images 2 --width 800 {_DESIGNS} --json >plan.json", 4.0),
     Call("sfm plan", "--images 2 --camera @data/cameras.txt --run @run --json >plan.json", 4.0),
     Call("sfm plan", "--images 2 --faces @faces.json --target @data/target.toml", 3.0),
-    Call("sfm budget", "@run --field operator=A --lengths @run --json >budget.json", 1.5),
+    Call("sfm budget", "@run --field operator=A --lengths @run --json >budget.json --report >page.html", 2.5),
     Call("sfm advise", "@run --count 1 --json >advice.json", 10.0),
     Call("sfm calibrate-camera", f"@data/images {_DESIGNS} --out +cameras.txt --workers 1 --report >page.html", 15.0),
     Call(

@@ -5,9 +5,10 @@ from typing import Annotated
 
 import typer
 
-from stcal.cli.options import JsonFile, Run
+from stcal.cli.options import JsonFile, ReportFile, Run
 from stcal.cli.terminal import say, write
 from stcal.errors import InputError
+from stcal.io.saving import keep_apart
 
 app = typer.Typer()
 
@@ -45,12 +46,16 @@ def budget(
         Path | None,
         typer.Option("--lengths-statement", help="Read what is stated of that run from this file; --statement if not."),
     ] = None,
+    page: ReportFile = None,
+    pdf: Annotated[bool, typer.Option("--pdf", help="Also write the page as PDF, beside it (stcal[pdf]).")] = False,
     out: JsonFile = None,
 ) -> None:
     """Compute the uncertainty budget of faces and of the target's longest distances (GUM), each contribution apart."""
+    from stcal.report.pdf import pdf_of
     from stcal.sfm.budget.combine import budget_of_run
     from stcal.sfm.budget.file import BudgetFile
     from stcal.sfm.budget.lengths import against_run, against_stated
+    from stcal.sfm.budget.page import budget_page
     from stcal.sfm.budget.statement import statement_of
     from stcal.sfm.budget.text import budget_text
     from stcal.sfm.run.saved import load_run
@@ -58,6 +63,8 @@ def budget(
 
     saved = load_run(run)
     stated = statement_of(saved.board.stated, statement, field or ())
+    if pdf:
+        _require_pdf(page, run)
     if lengths_statement is not None and lengths is None:
         raise InputError(f"--lengths-statement {lengths_statement}: of a second calibration; give it with --lengths")
     found, tests = budget_of_run(saved, stated), []
@@ -71,3 +78,26 @@ def budget(
     say(budget_text(file))
     if out:
         write(out, file, "as JSON")
+    if page:
+        html = budget_page(file)
+        write(page, html, "report")
+        if pdf:
+            write(page.with_suffix(".pdf"), pdf_of(html), "PDF")
+
+
+def _require_pdf(page: Path | None, run: Path) -> None:
+    """Refuse, before the work, a PDF that has no page or no place.
+
+    Raises
+    ------
+    InputError
+        Which, and what to do.
+    """
+    from stcal.report.pdf import require_pdf
+
+    if page is None:
+        raise InputError("--pdf: the PDF stands beside the page; give that with --report FILE.html")
+    if page.suffix.lower() == ".pdf":
+        raise InputError(f"--report {page}: the page is HTML; give {page.with_suffix('.html')}, and --pdf for the PDF")
+    keep_apart([("--pdf", page.with_suffix(".pdf"))], [("RUN", run)])
+    require_pdf()

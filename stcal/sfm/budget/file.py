@@ -270,8 +270,8 @@ def notes_of(budget: Budget, verified: VerifyFile) -> list[str]:
         )
     if budget.correction:
         found.append(
-            f"the stated expansion makes lengths {PPM * budget.correction:+.1f} ppm larger than the run has them; "
-            "it is not applied to faces.json: correct them, or the expanded uncertainties do not hold"
+            f"for the stated expansion lengths of the run are to be changed by {PPM * budget.correction:+.1f} ppm; "
+            "this is not done in faces.json, and the expanded uncertainties hold for corrected lengths"
         )
     if faults := verified.faults():
         found.append(f"the run's folder is not as the run left it: {'; '.join(faults)}")

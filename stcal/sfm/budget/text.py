@@ -22,10 +22,10 @@ def budget_text(file: BudgetFile) -> str:
     for title, columns in (
         (f"position, µm, against face {file.reference_face}", {f: each.position_um for f, each in faces.items()}),
         (f"rotation, mdeg, against face {file.reference_face}", {f: each.rotation_mdeg for f, each in faces.items()}),
-        ("longest distances, µm", {_name(each.circles): each.distance_um for each in lengths}),
+        ("longest distances, µm", {name_of(each.circles): each.distance_um for each in lengths}),
     ):
         lines += ["", *_table(title, columns, file)]
-    lines += [f"{_name(each.circles)}: {_length(each, file)}" for each in lengths]
+    lines += [f"{name_of(each.circles)}: {_length(each, file)}" for each in lengths]
     for test in file.length_tests:
         lines += ["", *_length_test(test)]
     return "\n".join([*lines, "", *(f"note: {note}" for note in file.notes)])
@@ -41,7 +41,7 @@ def _length_test(test: LengthTestPart) -> list[str]:
             f"{each.error_um:.2f}",
             f"{each.expanded_um:.2f}",
         )
-        rows.append((_name(each.circles), *values, number(each.e_n, 2)))
+        rows.append((name_of(each.circles), *values, number(each.e_n, 2)))
     return [
         f"length test against {test.reference}:",
         *text_table(rows),
@@ -63,7 +63,8 @@ def _known(test: LengthTestPart) -> list[float]:
     return [np.inf if each.e_n is None else each.e_n for each in test.lengths]
 
 
-def _name(circles: Sequence[str]) -> str:
+def name_of(circles: Sequence[str]) -> str:
+    """Of a length, by its ends."""
     return "–".join(circles)
 
 

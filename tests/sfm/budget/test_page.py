@@ -1,0 +1,37 @@
+"""The page of a budget and its PDF."""
+
+import re
+
+from stcal.report import pdf
+from tests.outcome import INPUT, assert_error
+
+STATED = "[board]\nexpansion_ppm_per_k = 8\ntemperature_c = 25\ntemperature_sigma_k = 0.5\n"
+
+
+def test_page_and_pdf(stcal_sfm, small_run, tmp_path, monkeypatch):
+    """Fields are text, not markup; a contribution stands in the page as in the terminal."""
+    monkeypatch.setattr(pdf, "pdf_of", lambda page: b"%PDF-" + page[:15].encode())
+    statement, page = tmp_path / "lab.toml", tmp_path / "budget.html"
+    statement.write_text(STATED)
+    field = "operator=<b>A & B</b>"
+    words = ("--statement", statement, "--field", field, "--lengths", small_run, "--report", page, "--pdf")
+    code, text, _ = stcal_sfm("budget", small_run, *words)
+    assert code == 0
+    html = page.read_text(encoding="utf-8")
+    assert "&lt;b&gt;A &amp; B&lt;/b&gt;" in html
+    assert "<b>A &" not in html
+    combined = next(line for line in text.splitlines() if line.startswith("combined standard")).split()[4:]
+    row = re.search(r'<th scope="row" class="l">combined standard uncertainty u</th>(.*?)</tr>', html, re.DOTALL)
+    assert row is not None
+    assert re.findall(r"<td>([\d.]+)</td>", row[1]) == combined
+    assert "by +40.0 ppm" in html
+    assert "<strong>agrees: 0 of 10 lengths beyond U" in html
+    assert re.search(r"SHA-256 of faces.json</th><td[^>]*>[0-9a-f]{64}<", html)
+    assert not re.search(r'(?:src|href)="(?!data:|#)', html)
+    assert (tmp_path / "budget.pdf").read_bytes() == b"%PDF-<!DOCTYPE html>"
+
+
+def test_a_pdf_stands_beside_a_page(stcal_sfm, small_run, tmp_path):
+    assert_error(stcal_sfm("budget", small_run, "--pdf"), INPUT, "give that with --report FILE.html")
+    words = ("--report", tmp_path / "budget.pdf", "--pdf")
+    assert_error(stcal_sfm("budget", small_run, *words), INPUT, "the page is HTML")
