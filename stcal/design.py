@@ -22,7 +22,8 @@ class FaceDesign:
     ``ids`` : n circle ids; ``xy_mm`` : (n, 2); ``radius_mm`` : (n,);
     ``origin``, ``x``, ``y`` : ids of the circles that define the frame;
     ``rough_target_from_face`` : where the face is about to be, in any frame that all faces share, or None where the
-    design does not say. For plans and simulations: a calibration does not use it.
+    design does not say. For plans and simulations: a calibration does not use it;
+    ``outline_mm`` : (k, 2) corners of its plate in order, face frame, for drawings; None where the design has none.
     """
 
     id: str
@@ -33,10 +34,13 @@ class FaceDesign:
     x: str
     y: str
     rough_target_from_face: Rigid | None = None
+    outline_mm: Array | None = None
 
     def __post_init__(self):
         freeze(self, "xy_mm", (len(self.ids), 2), f"face {self.id}: circles")
         freeze(self, "radius_mm", (len(self.ids),), f"face {self.id}: radii")
+        if self.outline_mm is not None:
+            freeze(self, "outline_mm", (None, 2), f"face {self.id}: outline")
 
     def labels(self) -> list[CircleLabel]:
         """``face:circle`` for every circle, in order."""

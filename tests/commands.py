@@ -107,6 +107,7 @@ CALLS = (
     Call("sfm run", f"{_SET} --out +new", 9.0),
     Call("sfm detect", f"{_SET} --out ~detected", 1.5),
     Call("sfm init", "+design"),
+    Call("sfm design", "+own --size 130,120,110 --circles 9 --images 2 --width 1296", 6.0),
     Call("sfm draw", "@data/target.toml --out +target.pdf", 2.0),
     Call("sfm draw", "@data/board.toml --out +board.svg --margin-mm 5"),
     Call("sfm draw", "@locate/board.toml --out +board.dxf", 1.0),

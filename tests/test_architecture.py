@@ -37,7 +37,7 @@ INSIDE = {
         ("adjust",),
         ("checks", "camera", "measure"),
         ("run",),
-        ("interop", "diagnose", "plan", "budget"),
+        ("interop", "diagnose", "plan", "budget", "make"),
         (".",),
     ),
     "robot": (("kinematics",), ("identify", "axes", "urdf"), ("use",), ("export",), (".",)),

@@ -37,7 +37,7 @@ class Part:
 
 
 def target_parts(target: TargetDesign, margin_mm: float) -> list[Part]:
-    """A plate for each face, ``margin_mm`` beyond the rims of its circles."""
+    """A plate for each face: its own outline, or ``margin_mm`` beyond the rims of its circles."""
     return [face_part(face, target.polarity, margin_mm) for face in target.faces]
 
 
@@ -50,7 +50,8 @@ def face_part(face: FaceDesign, polarity: Polarity, margin_mm: float) -> Part:
         for circle, (x, y), r in zip(face.ids, face.xy_mm.tolist(), face.radius_mm.tolist(), strict=True)
     ]
     frame = (f"mm from circle {face.origin},", f"X through {face.x}", "", "")
-    return _part(f"face {face.id}", shapes, polarity, margin_mm, table=(frame, head, *rows))
+    table = (frame, head, *rows)
+    return _part(f"face {face.id}", shapes, polarity, margin_mm, table=table, outline=face.outline_mm)
 
 
 def board_parts(board: BoardDesign | FlatBoard | BoardSet, margin_mm: float) -> list[Part]:
@@ -110,8 +111,10 @@ def _discs(xy, radii, names, polarity: Polarity) -> list[Shape]:
     return [Disc(x, y, radius, ink, name=str(name)) for (x, y), radius, name in rows]
 
 
-def _part(name: str, pattern, polarity: Polarity, margin_mm: float, spans=(), table=()) -> Part:
-    (left, below), (right, above) = extent(pattern) + margin_mm * np.array([[-1.0], [1.0]])
-    outline = np.array([[left, below], [right, below], [right, above], [left, above]])
+def _part(name: str, pattern, polarity: Polarity, margin_mm: float, spans=(), table=(), outline=None) -> Part:
+    if outline is None:
+        (left, below), (right, above) = extent(pattern) + margin_mm * np.array([[-1.0], [1.0]])
+        outline = np.array([[left, below], [right, below], [right, above], [left, above]])
+    outline = np.asarray(outline)
     ground = [Area((outline,), "black", "GROUND")] if polarity == "bright" else []
     return Part(name, outline, (*ground, *pattern), spans, table)

@@ -66,6 +66,7 @@ class _FaceFile(Strict):
     x: Name
     y: Name
     rough_pose: _RoughPoseFile | None = None
+    outline_mm: list[tuple[Finite, Finite]] | None = Field(default=None, min_length=3, max_length=1000)
     circles: list[_CircleFile] = Field(min_length=4)
 
 
@@ -224,7 +225,29 @@ def _face(face: _FaceFile, where: str) -> FaceDesign:
         drawing_from_face[:2, :2] = face_from_drawing.T
         rough = _rough_pose(face.rough_pose, where) @ Rigid(drawing_from_face, np.append(origin, 0.0))
     xy_face = (xy - origin) @ face_from_drawing.T
-    return FaceDesign(face.id, tuple(ids), xy_face, radius, face.origin, face.x, face.y, rough)
+    outline = None
+    if face.outline_mm is not None:
+        _require_inside(ids, xy, radius, np.array(face.outline_mm), where)
+        outline = (np.array(face.outline_mm) - origin) @ face_from_drawing.T
+    return FaceDesign(face.id, tuple(ids), xy_face, radius, face.origin, face.x, face.y, rough, outline)
+
+
+def _require_inside(ids: list[str], xy: np.ndarray, radius: np.ndarray, outline: np.ndarray, where: str) -> None:
+    """Refuse circles that reach over the edge of their plate."""
+    side = np.roll(outline, -1, axis=0) - outline
+    length = np.linalg.norm(side, axis=1)
+    if length.min() == 0:
+        raise InputError(f"{where}: outline_mm has the same corner twice; corners in order around the plate needed")
+    from_corner = xy[:, None] - outline
+    along = ((from_corner * side).sum(2) / length**2).clip(0, 1)
+    gap = np.linalg.norm(from_corner - along[..., None] * side, axis=2).min(1) - radius
+    above = outline[:, 1] > xy[:, 1:]
+    crossed = above != np.roll(above, -1, axis=1)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        at = outline[:, 0] + (xy[:, 1:] - outline[:, 1]) * side[:, 0] / side[:, 1]
+    inside = (crossed & (xy[:, :1] < at)).sum(1) % 2 == 1
+    for name in (name for name, ok in zip(ids, inside & (gap >= 0), strict=True) if not ok):
+        raise InputError(f"{where}: circle {name} reaches over outline_mm; corners in order around all circles needed")
 
 
 def _require_distinct(faces: tuple[FaceDesign, ...], where: str) -> None:
@@ -291,6 +314,7 @@ def target_toml(target: TargetDesign) -> str:
             f"x = {toml_string(face.x)}",
             f"y = {toml_string(face.y)}",
             *_rough_lines(face.rough_target_from_face),
+            *_outline_lines(face.outline_mm),
             "circles = [",
         ]
         lines += [
@@ -313,6 +337,13 @@ def _rough_lines(pose: Rigid | None) -> list[str]:
         for values in (pose.translation, pose.rotation[:, 0], pose.rotation[:, 2])
     )
     return [*about, f"rough_pose = {{ origin_mm = {place}, x = {x}, normal = {normal} }}"]
+
+
+def _outline_lines(outline: np.ndarray | None) -> list[str]:
+    if outline is None:
+        return []
+    corners = ", ".join(f"[{_number(x)}, {_number(y)}]" for x, y in np.asarray(outline).tolist())
+    return [f"outline_mm = [{corners}]  # corners of its plate, for `draw`"]
 
 
 def board_toml(board: BoardDesign) -> str:

@@ -123,8 +123,8 @@ class Scene:
         return np.array([self.circles_target[label] for label in self.target.face(face_id).labels()])
 
     def face_outline(self, face_id: str) -> np.ndarray:
-        """Corners of the visible side of a face, (4, 3), target frame."""
-        return self.target_from_face[face_id] @ _face_rectangle(self.target.face(face_id))
+        """Corners of the visible side of a face, (k, 3), target frame."""
+        return self.target_from_face[face_id] @ _face_corners(self.target.face(face_id))
 
     def board_outline(self, group: str) -> np.ndarray:
         """Corners of the board's plate, (4, 3), target frame."""
@@ -249,7 +249,7 @@ def _made_group(pair, target, board, camera, target_from_face, circles, options,
         np.array([circles[label] for row in labels for label in row]),
         np.repeat(normals, [len(row) for row in labels], axis=0),
         axes,
-        np.vstack([target_from_face[face.id] @ _face_rectangle(face) for face in target.faces]),
+        np.vstack([target_from_face[face.id] @ _face_corners(face) for face in target.faces]),
         dots,
         _board_rectangle(board),
     )
@@ -273,7 +273,9 @@ def _rectangle(xy: np.ndarray, radius: np.ndarray, margin: float) -> np.ndarray:
 
 
 @lru_cache(maxsize=32)
-def _face_rectangle(face: FaceDesign) -> np.ndarray:
+def _face_corners(face: FaceDesign) -> np.ndarray:
+    if face.outline_mm is not None:
+        return frozen(np.pad(face.outline_mm, ((0, 0), (0, 1))), (None, 3), "outline")
     return _rectangle(face.xy_mm, face.radius_mm, FACE_MARGIN_MM)
 
 
@@ -286,7 +288,7 @@ def _check_convex(target: TargetDesign, target_from_face: dict[str, Rigid]) -> N
     for front in target.faces:
         for face in target.faces:
             face_from_target = target_from_face[front.id].inverse()
-            height = (face_from_target @ (target_from_face[face.id] @ _face_rectangle(face)))[:, 2].max()
+            height = (face_from_target @ (target_from_face[face.id] @ _face_corners(face)))[:, 2].max()
             if height > CONVEX_TOLERANCE_MM:
                 raise DegenerateError(
                     f"scene: face {face.id} reaches {height:.0f} mm in front of face {front.id} and may cover it; "

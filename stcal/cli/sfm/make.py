@@ -1,11 +1,16 @@
 """``stcal-sfm``: targets and boards to be made."""
 
+import os
+from functools import partial
 from pathlib import Path
 from typing import Annotated
 
 import typer
 
-from stcal.cli.terminal import say
+from stcal.cli.options import MOST_SEED
+from stcal.cli.terminal import StageProgress, say
+from stcal.errors import InputError
+from stcal.io.saving import BOARD, TARGET, save
 
 app = typer.Typer()
 
@@ -37,3 +42,65 @@ def draw(
     from stcal.drawing.text import drawn_text
 
     say(drawn_text(drawn(design, out, paper, margin)))
+
+
+@app.command()
+def design(
+    folder: Annotated[
+        Path, typer.Argument(help="Write target.toml to this folder, and board.toml where there is none.")
+    ],
+    size: Annotated[
+        str, typer.Option("--size", help="Make it for a box of this width, height and depth: W,H,D in mm.")
+    ],
+    circles: Annotated[int, typer.Option(min=9, max=40, help="Place this many circles on each face.")] = 10,
+    radius: Annotated[
+        float | None,
+        typer.Option(
+            "--radius-mm",
+            min=0.01,
+            max=1e4,
+            help="Draw the smaller circles with this radius; one that suits box and camera if not given.",
+        ),
+    ] = None,
+    distance: Annotated[
+        float, typer.Option("--distance-mm", min=50, max=1e5, help="Place the camera at this distance.")
+    ] = 1000.0,
+    width: Annotated[
+        int, typer.Option(min=320, max=100_000, help="Take images of this width, px; 3:2 images of a 24 mm lens.")
+    ] = 5184,
+    camera: Annotated[
+        Path | None, typer.Option("--camera", help="Read the camera from this file, in place of --width.")
+    ] = None,
+    bright: Annotated[
+        bool, typer.Option("--bright/--dark", help="Make bright circles on dark plates, or dark ones on bright.")
+    ] = False,
+    images: Annotated[int, typer.Option("--images", min=2, max=500, help="Plan this many images in each group.")] = 10,
+    seed: Annotated[int, typer.Option(min=0, max=MOST_SEED, help="Draw everything random with this seed.")] = 0,
+) -> None:
+    """Make a target for a box: circles on five sides that name each face with any three hidden; and forecast its σ."""
+    from stcal.io.camera import read_camera
+    from stcal.io.design import board_toml, load_board, target_toml
+    from stcal.sfm.make.box import size_of
+    from stcal.sfm.make.design import MakeOptions, made_text, make_target
+    from stcal.sfm.plan.noise import expected_noise
+    from stcal.sfm.plan.session import PlanOptions, plan
+    from stcal.sfm.plan.tables import plan_text
+
+    target_file, board_file = folder / TARGET, folder / BOARD
+    if os.path.lexists(target_file):
+        raise InputError(f"{target_file}: exists; move it away, or give another folder")
+    board = load_board(board_file) if os.path.lexists(board_file) else None
+    model = read_camera(camera) if camera else None
+    options = MakeOptions(size_of(size), circles, radius, distance, width, model, "bright" if bright else "dark", seed)
+    with StageProgress() as progress:
+        made = make_target(options, partial(progress, "hide"))
+    target = made.pattern.target
+    noise, source = expected_noise()
+    planned = PlanOptions(images=images, distance_mm=distance, width=width, camera=model, noise=noise, seed=seed)
+    forecast = plan(planned, target, board or made.board, target.rough_poses())
+    save(target_file, target_toml(target))
+    say(f"{made_text(made)}\n{target_file}")
+    if board is None:
+        save(board_file, board_toml(made.board))
+        say(board_file)
+    say(f"\n{plan_text(forecast, source)}")

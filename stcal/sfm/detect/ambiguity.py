@@ -30,6 +30,15 @@ def _confusable(key) -> dict[str, tuple[frozenset[int], ...]]:
     return found
 
 
+def in_common(face: FaceDesign, other: FaceDesign, mirrored: bool = False) -> int:
+    """How many circles of a face at most coincide with circles of another, or with its own after a turn, moved as a
+    whole or, ``mirrored``, turned over; 0 where fewer than ``MIN_COMMON``."""
+    xy = np.asarray(face.xy_mm) * [-1 if mirrored else 1, 1]
+    same = face.id == other.id and not mirrored
+    found = common_circles(xy, face.radius_mm, other.xy_mm, other.radius_mm, same)
+    return max(map(len, found), default=0)
+
+
 def is_named(face: FaceDesign, found: np.ndarray, target: TargetDesign) -> bool:
     """Whether the circles found (mask) name the face: no other reading explains them all."""
     circles = frozenset(np.flatnonzero(found).tolist())

@@ -1,0 +1,1 @@
+"""Targets to be made: patterns that cannot be mistaken for one another."""

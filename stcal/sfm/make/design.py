@@ -1,0 +1,155 @@
+"""A target for a box, with circles that its camera sees well, and a board for it: drawn at random, and verified."""
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from stcal.design import BoardDesign, Polarity
+from stcal.errors import InputError
+from stcal.geometry.camera import COEFFICIENTS, Camera
+from stcal.io.camera import CameraModel
+from stcal.sfm.data.patterns import MAX_TILT_RAD
+from stcal.sfm.detect.circles.ellipses import EllipseOptions, diameter_limits_px
+from stcal.sfm.make.box import sides_of
+from stcal.sfm.make.hidden import unnamed_cases
+from stcal.sfm.make.pattern import HIDDEN, LARGE, Pattern, make_pattern
+from stcal.synthetic.scene import FOCAL_PER_WIDTH
+
+FARTHER = 1.1
+"""Cameras stand up to a tenth farther off than they are to."""
+WELL_SEEN = 1.5
+"""Diameter of the smallest circle, most tilted and farthest away, over the smallest that is sought."""
+RADIUS_SHARE = 1 / 30
+"""Of the smaller circles where none is given, in parts of the box's shortest side."""
+RADIUS_STEP_MM = 0.25
+PITCH_SHARE = 0.23
+"""Of the board, in parts of the box's longest side: the board reaches beyond it on all sides."""
+PITCH_STEP_MM = 5.0
+ROWS, COLUMNS = 7, 9
+BOARD_SIGMA_MM = 0.02
+"""Of dots as a good printer places them; a milled or photographic plate states its own."""
+
+
+@dataclass(frozen=True, slots=True)
+class MakeOptions:
+    """What is to be made.
+
+    ``size_mm`` : width, height, depth of the box; ``circles`` : of each face; ``radius_mm`` : of the smaller circles,
+    None for one that suits; ``distance_mm`` : from the cameras; ``width`` : px, 3:2 images of a 24 mm lens, where no
+    ``camera`` is given.
+    """
+
+    size_mm: tuple[float, float, float]
+    circles: int = 10
+    radius_mm: float | None = None
+    distance_mm: float = 1000.0
+    width: int = 5184
+    camera: CameraModel | None = None
+    polarity: Polarity = "dark"
+    seed: int = 0
+
+    def ideal_camera(self) -> Camera:
+        """Without distortion.
+
+        Raises
+        ------
+        InputError
+            The camera file states no image size.
+        """
+        width, height = self.width, round(self.width * 2 / 3)
+        focal = np.full(2, FOCAL_PER_WIDTH * width)
+        if self.camera is not None:
+            width, height, focal = self.camera.width, self.camera.height, self.camera.focal
+        if not (width and height):
+            raise InputError(
+                f"camera file {self.camera and self.camera.source} states no image size; add it to the file"
+            )
+        return Camera(width, height, focal, [(width - 1) / 2, (height - 1) / 2], np.zeros(COEFFICIENTS))
+
+    def least_radius_mm(self) -> float:
+        """Of circles that are found where they are farthest away and most tilted, with room to spare."""
+        camera = self.ideal_camera()
+        least, _ = diameter_limits_px(camera.width * camera.height, EllipseOptions())
+        px_per_mm = np.sqrt(camera.focal.prod()) / (FARTHER * self.distance_mm)
+        return float(WELL_SEEN * least / (2 * px_per_mm * np.sqrt(np.cos(MAX_TILT_RAD))))
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Made:
+    """``radius_mm`` : of the smaller circles, ``least_mm`` the smallest that the camera sees well; ``cases`` of hidden
+    circles tried, all of them named."""
+
+    options: MakeOptions
+    pattern: Pattern
+    board: BoardDesign
+    radius_mm: float
+    least_mm: float
+    cases: int
+
+
+def make_target(options: MakeOptions, progress: Callable[[int, int], None] | None = None) -> Made:
+    """A pattern for each side of the box but the one that it stands on, and a board.
+
+    Parameters
+    ----------
+    options : MakeOptions
+    progress : callable, optional
+        (done, total) cases of hidden circles.
+
+    Raises
+    ------
+    InputError
+        Circles too small for the camera, too few, or without room; a face that is not named with circles hidden.
+    """
+    least = options.least_radius_mm()
+    radius = options.radius_mm
+    if radius is None:
+        suits = max(least, RADIUS_SHARE * min(options.size_mm))
+        radius = float(np.ceil(suits / RADIUS_STEP_MM - 1e-9) * RADIUS_STEP_MM)
+    if radius < least:
+        raise InputError(
+            f"--radius-mm {radius:g}: at {options.distance_mm:g} mm this camera sees circles well from {least:.2f} mm "
+            "on; larger circles, a nearer camera or more pixels needed"
+        )
+    camera = options.ideal_camera()
+    most = diameter_limits_px(camera.width * camera.height, EllipseOptions())[1]
+    largest = 2 * LARGE * radius * float(np.sqrt(camera.focal.prod())) / options.distance_mm
+    if largest * FARTHER > most:
+        raise InputError(
+            f"radius {LARGE * radius:g} mm is {largest:.0f} px in the image, at most {most / FARTHER:.0f} px are "
+            "sought; smaller circles or a camera farther away needed"
+        )
+    name = "box {:g} x {:g} x {:g} mm".format(*options.size_mm)
+    pattern = make_pattern(sides_of(options.size_mm), options.circles, radius, options.polarity, options.seed, name)
+    failed, cases = unnamed_cases(pattern.target, camera, options.distance_mm, HIDDEN, progress)
+    if failed:
+        face, gone = failed[0]
+        raise InputError(
+            f"face {face}: not named with circles {', '.join(gone)} hidden, as in {len(failed)} of {cases} cases; "
+            "another --seed or more --circles needed"
+        )
+    return Made(options, pattern, _board(options, least), radius, least, cases)
+
+
+def _board(options: MakeOptions, least_mm: float) -> BoardDesign:
+    pitch = max(PITCH_SHARE * max(options.size_mm), 4 * least_mm)
+    pitch = float(np.ceil(pitch / PITCH_STEP_MM - 1e-9) * PITCH_STEP_MM)
+    plain = BoardDesign(ROWS, COLUMNS, pitch, pitch / 4, options.polarity, BOARD_SIGMA_MM)
+    return replace(plain, corner=(0, COLUMNS - 1), corner_radius_mm=1.5 * pitch / 4)
+
+
+def made_text(made: Made) -> str:
+    """What was made, and how well its faces are told apart."""
+    options, target = made.options, made.pattern.target
+    large, alike = LARGE * made.radius_mm, made.pattern.likeness
+    common = f"at most {alike} of its circles" if alike else "never four circles"
+    return "\n".join(
+        [
+            f"{target.name}: {len(target.faces)} faces of {options.circles} circles, radius {made.radius_mm:g} and "
+            f"{large:g} mm, {target.polarity}",
+            f"smallest radius that is seen well at {options.distance_mm:g} mm: {made.least_mm:.2f} mm",
+            f"a face has {common} in common with another face, a mirror image or itself turned",
+            f"named with any {HIDDEN} circles hidden: {made.cases} of {made.cases} cases",
+        ]
+    )

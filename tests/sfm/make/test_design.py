@@ -1,0 +1,168 @@
+"""A pattern that is made by itself: unambiguous, read with circles hidden, seen well, and where the box has it."""
+
+from itertools import combinations
+
+import numpy as np
+import pytest
+
+from stcal.cli.sfm.make import design as command
+from stcal.design import TargetDesign
+from stcal.errors import InputError
+from stcal.io.design import load_board, load_target, target_toml
+from stcal.likeness import MIN_COMMON
+from stcal.sfm.detect.ambiguity import confusable, in_common, is_named, mirror_images
+from stcal.sfm.make.box import sides_of, size_of
+from stcal.sfm.make.design import MakeOptions, make_target
+from stcal.sfm.make.hidden import unnamed_cases
+from stcal.sfm.make.pattern import HIDDEN, LARGE, LEAST_CIRCLES, make_pattern
+from stcal.synthetic.designs import face_of_drawing, second_design
+
+SIZE = (130.0, 110.0, 100.0)
+
+
+@pytest.fixture(scope="module")
+def made():
+    return make_target(MakeOptions(SIZE, circles=LEAST_CIRCLES, distance_mm=800.0, width=2592))
+
+
+def test_each_face_is_named_with_any_three_circles_hidden(made):
+    """All cases: by the finder in made views, which the maker has run, and by the naming alone."""
+    target = made.pattern.target
+    assert made.cases == 5 * 84
+    for face in target.faces:
+        for gone in combinations(range(len(face.ids)), HIDDEN):
+            found = np.ones(len(face.ids), bool)
+            found[list(gone)] = False
+            assert is_named(face, found, target)
+
+
+def test_no_four_circles_are_alike_in_two_readings(made):
+    """Not with another face, not turned, not in a mirror: by the package's own search for likeness."""
+    target = made.pattern.target
+    assert made.pattern.likeness < MIN_COMMON
+    assert confusable(target) == {face.id: () for face in target.faces}
+    assert mirror_images(target) == {}
+    for face in target.faces:
+        for other in target.faces:
+            assert in_common(face, other, mirrored=True) == 0
+
+
+def test_likeness_is_found_where_there_is_some(made):
+    """A face beside itself, turned and mirrored; and the cases of hidden circles fail."""
+    face = made.pattern.target.faces[0]
+    turned = type(face)("turned", face.ids, face.xy_mm @ [[0, 1], [-1, 0]], face.radius_mm, face.origin, face.x, face.y)
+    mirrored = type(face)("mirrored", face.ids, face.xy_mm * [-1, 1], face.radius_mm, face.origin, face.y, face.x)
+    assert in_common(turned, face) == len(face.ids)
+    assert in_common(mirrored, face) < MIN_COMMON
+    assert in_common(mirrored, face, mirrored=True) == len(face.ids)
+    assert in_common(face, face) == 0
+    two = TargetDesign("two", "dark", (face, turned))
+    camera = MakeOptions(SIZE, width=2592).ideal_camera()
+    failed, cases = unnamed_cases(two, camera, 800.0, HIDDEN, None)
+    assert len(failed) == cases == 168
+
+
+def test_a_symmetric_design_fails_the_cases_of_hidden_circles():
+    """Ten circles of two sizes in rows that a half turn takes to themselves, but for one."""
+    x, y = np.meshgrid(np.arange(5) * 20.0, [0.0, 20.0])
+    rows = [(str(i), *xy, 4.0) for i, xy in enumerate(zip(x.ravel(), y.ravel(), strict=True), 1)]
+    rows[7] = ("8", 45.0, 27.0, 6.0)
+    face, _ = face_of_drawing("only", rows, "1", "5", "6")
+    target = TargetDesign("rows", "dark", (face,))
+    failed, cases = unnamed_cases(target, MakeOptions(SIZE, width=2592).ideal_camera(), 800.0, HIDDEN, None)
+    odd = [gone for _, gone in failed if {"3", "8"} <= set(gone)]  # the one off its place, and where it would go
+    assert len(odd) == 8
+    assert len(failed) < 0.2 * cases
+
+
+def test_circles_are_seen_well_and_keep_apart(made):
+    target, options = made.pattern.target, made.options
+    px_per_mm = options.ideal_camera().focal[0] / (1.1 * options.distance_mm)
+    assert 2 * made.radius_mm * px_per_mm * np.sqrt(np.cos(np.radians(70))) > 1.4 * 4.5
+    for face in target.faces:
+        assert set(face.radius_mm) == {made.radius_mm, LARGE * made.radius_mm}
+        gap = np.linalg.norm(face.xy_mm[:, None] - face.xy_mm, axis=2) - face.radius_mm[:, None] - face.radius_mm
+        assert gap[~np.eye(len(gap), dtype=bool)].min() > 0.5 * made.radius_mm
+
+
+def test_faces_lie_on_the_box(made):
+    """Plates' corners are corners of the box, shared by three faces but for those below; normals point outwards."""
+    corners = []
+    for face in made.pattern.target.faces:
+        assert face.rough_target_from_face is not None
+        assert face.outline_mm is not None
+        place = face.rough_target_from_face @ np.pad(face.outline_mm, ((0, 0), (0, 1)))
+        corners += np.round(place, 6).tolist()
+        assert place.mean(0) @ face.rough_target_from_face.rotation[:, 2] > 0.49 * min(SIZE)
+    w, h, d = SIZE
+    counts = {tuple(c): corners.count(c) for c in corners}
+    box = {(x, y, z) for x in (-w / 2, w / 2) for y in (-d / 2, d / 2) for z in (-h / 2, h / 2)}
+    assert set(counts) == box
+    assert all(n == (3 if z > 0 else 2) for (_, _, z), n in counts.items())
+
+
+def test_the_file_has_all_of_it(made, tmp_path):
+    (tmp_path / "target.toml").write_text(target_toml(made.pattern.target))
+    again = load_target(tmp_path / "target.toml")
+    for face, own in zip(again.faces, made.pattern.target.faces, strict=True):
+        np.testing.assert_allclose(face.xy_mm, own.xy_mm, atol=1e-9)
+        np.testing.assert_allclose(face.outline_mm, own.outline_mm, atol=1e-9)
+        assert face.rough_target_from_face is not None
+        assert own.rough_target_from_face is not None
+        np.testing.assert_allclose(face.rough_target_from_face.matrix(), own.rough_target_from_face.matrix(), atol=1e-9)
+
+
+def test_another_seed_makes_another_pattern():
+    sides = sides_of(SIZE)[:1]
+    patterns = [make_pattern(sides, 10, 4.0, "dark", seed, "box").target.faces[0].xy_mm for seed in (1, 1, 2)]
+    np.testing.assert_array_equal(patterns[0], patterns[1])
+    assert not np.allclose(patterns[0], patterns[2])
+
+
+@pytest.mark.parametrize(
+    ("options", "said"),
+    [
+        (MakeOptions(SIZE, radius_mm=1.0), r"--radius-mm 1: at 1000 mm this camera sees circles well from 2\.28 mm on"),
+        (MakeOptions(SIZE, radius_mm=60.0, distance_mm=500.0), "px are sought"),
+        (MakeOptions(SIZE, circles=8), "--circles 8: 9 needed, 6 name a face and 3 may be hidden"),
+        (MakeOptions(SIZE, circles=40, radius_mm=9.0), "face front: no room for 40 circles of 9 and 14.4 mm"),
+    ],
+)
+def test_what_cannot_be_made_is_refused(options, said):
+    with pytest.raises(InputError, match=said):
+        make_target(options)
+
+
+@pytest.mark.parametrize("size", ["130", "130,110", "a,b,c", "0,1,1", "nan,1,1", "1e6,1,1"])
+def test_sizes_are_three_lengths(size):
+    with pytest.raises(InputError, match="--size"):
+        size_of(size)
+
+
+@pytest.mark.parametrize(
+    ("outline", "said"),
+    [
+        ("[[-5, -5], [90, -5], [90, 90], [-5, 90]]", "reaches over outline_mm"),
+        ("[[-50, -50], [-50, -50], [190, 190]]", "the same corner twice"),
+        ("[[-50, -50], [190, 190]]", "outline_mm"),
+    ],
+)
+def test_outlines_that_do_not_fit_are_refused(tmp_path, outline, said):
+    text = target_toml(second_design()[0]).replace("circles = [", f"outline_mm = {outline}\ncircles = [", 1)
+    (tmp_path / "target.toml").write_text(text)
+    with pytest.raises(InputError, match=said):
+        load_target(tmp_path / "target.toml")
+
+
+def test_the_command_keeps_a_board_and_replaces_nothing(tmp_path, capsys):
+    (tmp_path / "board.toml").write_text('rows = 5\ncolumns = 6\npitch_mm = 40\nradius_mm = 10\npolarity = "dark"\n')
+    before = (tmp_path / "board.toml").read_text()
+    command(tmp_path, "130,110,100", circles=9, images=2, width=2592, distance=800.0)
+    said = capsys.readouterr().out
+    assert "named with any 3 circles hidden: 420 of 420 cases" in said
+    assert "worst is face" in said  # the forecast
+    assert (tmp_path / "board.toml").read_text() == before
+    assert load_board(tmp_path / "board.toml").rows == 5
+    assert load_target(tmp_path / "target.toml").rough_poses().keys() == {"front", "right", "back", "left", "top"}
+    with pytest.raises(InputError, match="exists"):
+        command(tmp_path, "130,110,100")
