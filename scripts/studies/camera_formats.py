@@ -28,7 +28,14 @@ LENSES = {
         [0.02, -0.01, 1e-3, -2e-3, 3e-3, -1e-3, 0, 0, 1e-3, 0, -1e-3],
     ),
 }
-SUFFIX = {"colmap": ".txt", "colmap-bin": ".bin", "mrcal": ".cameramodel", "metashape": ".xml", "matlab": ".mat"}
+SUFFIX = {
+    "colmap": ".txt",
+    "colmap-bin": ".bin",
+    "mrcal": ".cameramodel",
+    "metashape": ".xml",
+    "metashape-cameras": ".xml",
+    "matlab": ".mat",
+}
 EXACT_PX = 1e-9
 TRIED = (
     ("COLMAP", "FOV", "1 FOV {0} {1} 812 809 640 478 0.9"),
@@ -51,6 +58,12 @@ TRIED = (
         "tilted sensor",
         "image_width: {0}\nimage_height: {1}\ncamera_matrix: [812, 0, 640, 0, 809, 478, 0, 0, 1]\n"
         "distortion_coefficients: [-0.1, 0.03, 0.001, -0.002, 0.01, 0, 0, 0, 0, 0, 0, 0, 0.002, -0.003]",
+    ),
+    (
+        "mrcal",
+        "CAHVOR",
+        "{{'lensmodel': 'LENSMODEL_CAHVOR', 'intrinsics': [812, 809, 640, 478, 0.01, -0.02, 0.002, -0.1, 0.03], "
+        "'extrinsics': [0, 0, 0, 0, 0, 0], 'imagersize': [{0}, {1}]}}",
     ),
     (
         "Kalibr",

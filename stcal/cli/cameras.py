@@ -31,6 +31,7 @@ class Form(StrEnum):
     kalibr = "kalibr"
     mrcal = "mrcal"
     metashape = "metashape"
+    metashape_cameras = "metashape-cameras"
     matlab = "matlab"
     zhang = "zhang"
 

@@ -21,13 +21,14 @@ SUFFIX = {form: suffix for suffix, form in reversed(SUFFIXES.items())} | {
     "ros": ".yaml",
     "kalibr": ".yaml",
     "zhang": ".txt",
+    "metashape-cameras": ".xml",
 }
 REFUSED = {
     "OPENCV": ("zhang",),
     "PINHOLE": (),
-    "FULL_OPENCV": ("kalibr", "metashape", "matlab", "zhang"),
+    "FULL_OPENCV": ("kalibr", "metashape", "metashape-cameras", "matlab", "zhang"),
     "OPENCV_FISHEYE": ("mrcal", "matlab", "zhang"),
-    "THIN_PRISM_FISHEYE": ("opencv", "ros", "kalibr", "mrcal", "metashape", "matlab", "zhang"),
+    "THIN_PRISM_FISHEYE": ("opencv", "ros", "kalibr", "mrcal", "metashape", "metashape-cameras", "matlab", "zhang"),
 }
 """Forms that cannot hold a lens."""
 

@@ -8,7 +8,7 @@ import pycolmap
 import pytest
 
 from stcal.errors import InputError
-from stcal.io.camera import read_camera
+from stcal.io.camera import CameraModel, read_camera
 from stcal.io.cameras.fit import fit_lens
 from stcal.io.cameras.foreign import COLMAP_FOREIGN, ForeignLens
 from stcal.io.cameras.read import read_lens
@@ -213,3 +213,38 @@ def test_a_wrong_lens_is_named(tmp_path, text, message):
     (tmp_path / "camera").write_text(text)
     with pytest.raises(InputError, match=message):
         read_lens(tmp_path / "camera")
+
+
+CAHVOR = (4842.918, 4842.771, 1970.528, 1085.302, -0.001, 0.002, -0.637, -0.002, 0.016)
+
+
+def cahvor_file(path, numbers):
+    text = f"{{'lensmodel': 'LENSMODEL_CAHVOR', 'intrinsics': {list(numbers)}, 'imagersize': [4000, 2200]}}"
+    path.write_text(text)
+    return read_lens(path)
+
+
+def test_cahvor_projects_as_mrcal_does(tmp_path):
+    """Numbers of mrcal's own test of projections, test/test-projections.py, px."""
+    lens = cahvor_file(tmp_path / "a.cameramodel", CAHVOR)
+    assert isinstance(lens, ForeignLens)
+    rays = np.array([[1.0, 2.0, 10.0], [-1.1, 0.3, 1.0], [-0.9, -1.5, 1.0]])
+    told = [[2143.17840406, 1442.93419919], [-92.63813066, 1653.09646897], [-249.83199315, -2606.46477164]]
+    assert lens.project(rays) == pytest.approx(np.array(told), abs=1e-6)
+
+
+def test_cahvor_about_the_axis_of_the_image_is_opencvs(tmp_path):
+    lens = cahvor_file(tmp_path / "a.cameramodel", (*CAHVOR[:4], 0, 0, 0.01, -0.1, 0.02))
+    assert isinstance(lens, CameraModel)
+    assert lens.focal == pytest.approx([1.01 * CAHVOR[0], 1.01 * CAHVOR[1]])
+    assert lens.distortion[:4] == pytest.approx([-0.1 / 1.01, 0.02 / 1.01, 0, 0])
+    # … and as the formula goes on when the axis is turned by hardly anything
+    near = cahvor_file(tmp_path / "b.cameramodel", (*CAHVOR[:4], 1e-12, 0, 0.01, -0.1, 0.02))
+    rays = np.array([[0.3, -0.2, 1.0], [-0.1, 0.25, 1.0]])
+    assert isinstance(near, ForeignLens)
+    assert near.project(rays) == pytest.approx(lens.sized(4000, 2200).project(rays), abs=1e-6)
+
+
+def test_cahvor_that_is_none(tmp_path):
+    with pytest.raises(InputError, match="8 intrinsics of LENSMODEL_CAHVOR; 9 needed"):
+        cahvor_file(tmp_path / "a.cameramodel", CAHVOR[:8])

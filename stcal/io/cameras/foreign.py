@@ -13,7 +13,13 @@ from scipy.ndimage import map_coordinates
 
 from stcal.errors import InputError
 from stcal.geometry.camera import Camera
-from stcal.io.camera import COLMAP_PIXEL_ORIGIN, CameraModel, camera_from_colmap, camera_from_opencv
+from stcal.io.camera import (
+    COLMAP_PIXEL_ORIGIN,
+    CalibratedCamera,
+    CameraModel,
+    camera_from_colmap,
+    camera_from_opencv,
+)
 
 COLMAP_FOREIGN = {
     "FOV": (7, 5),
@@ -299,3 +305,46 @@ def of_splines(name: str, numbers: list[float], width: float, height: float, sou
 
     called = f"mrcal's splines of {columns}×{rows} points"
     return ForeignLens(called, project, int(width), int(height), source)
+
+
+def refused(camera: CalibratedCamera, form: str, why: str) -> InputError:
+    """What a form cannot hold."""
+    return InputError(f"{form} has no place for {why} of {camera.colmap_model}; write --form colmap")
+
+
+def of_cahvor(numbers, width: float, height: float, source: str) -> CameraModel | ForeignLens:
+    """mrcal's ``LENSMODEL_CAHVOR`` : fx, fy, cx, cy, two angles of the optical axis, r0, r1, r2; where the axis is that
+    of the image, it is a model of ours.
+
+    Raises
+    ------
+    InputError
+        A wrong number of parameters, or impossible values.
+
+    References
+    ----------
+    D. Gennery, "Generalized camera calibration including fish-eye lenses", IJCV 68, 2006: a ray P is bent to
+    P + μ (P − ζ o), with ζ = P · o, τ = |P|² / ζ² − 1 and μ = r0 + r1 τ + r2 τ².
+    """
+    if len(numbers) != 9:
+        raise InputError(f"camera file {source}: {len(numbers)} intrinsics of LENSMODEL_CAHVOR; 9 needed")
+    (fx, fy, cx, cy), (alpha, beta, *r) = numbers[:4], numbers[4:]
+    if not np.isfinite(numbers).all():
+        raise InputError(f"camera file {source}: a camera parameter is not a finite number; correct it")
+    if alpha == beta == 0:
+        grown = 1 + r[0]
+        k1, k2 = (r[1] / grown, r[2] / grown) if grown else (0.0, 0.0)
+        return of_opencv([fx * grown, fy * grown, cx, cy], np.array([k1, k2, 0.0, 0.0]), width, height, source)
+    camera_from_opencv([fx, fy, cx, cy], np.zeros(4), False, width, height, source)  # refuses impossible values
+    axis = np.array([np.sin(alpha) * np.cos(beta), np.sin(beta), np.cos(alpha) * np.cos(beta)])
+
+    def project(rays: np.ndarray) -> np.ndarray:
+        with np.errstate(all="ignore"):
+            along = rays @ axis
+            tau = (rays**2).sum(axis=1) / along**2 - 1
+            bent = rays + (r[0] + tau * (r[1] + tau * r[2]))[:, None] * (rays - along[:, None] * axis)
+            inside = (along > 0) & (bent[:, 2] > 0)
+            xy = np.array([cx, cy]) + np.array([fx, fy]) * bent[:, :2] / bent[:, 2:]
+        return np.where(inside[:, None], xy, np.nan)
+
+    return ForeignLens("mrcal's CAHVOR", project, int(width), int(height), source)

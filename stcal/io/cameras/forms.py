@@ -1,4 +1,4 @@
-"""Cameras of other programs: Kalibr, mrcal, Metashape, COLMAP's ``cameras.bin``; and each form written.
+"""Cameras of other programs: Kalibr, mrcal, COLMAP's ``cameras.bin``; and each form written.
 
 Pixel origins: (0, 0) is the centre of the first pixel in OpenCV, ROS, Kalibr and mrcal, (0.5, 0.5) in COLMAP and
 Metashape, whose principal point is counted from the middle of the image.
@@ -7,7 +7,6 @@ Metashape, whose principal point is counted from the middle of the image.
 import ast
 import re
 import struct
-import xml.etree.ElementTree as ElementTree
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 
@@ -16,22 +15,24 @@ import numpy as np
 from stcal.errors import InputError
 from stcal.geometry.rigid import Rigid
 from stcal.io.camera import (
-    COLMAP_PIXEL_ORIGIN,
     CalibratedCamera,
     CameraModel,
     camera_from_opencv,
     cameras_txt,
     parameter_names,
 )
+from stcal.io.cameras import metashape
 from stcal.io.cameras.foreign import (
     COLMAP_FOREIGN,
     NUMBERS,
     ForeignLens,
+    of_cahvor,
     of_colmap,
     of_kalibr,
     of_opencv,
     of_splines,
     one_of,
+    refused,
 )
 from stcal.io.cameras.matlab import mat, zhang
 
@@ -49,7 +50,8 @@ MRCAL = {f"LENSMODEL_{name}": count for name, count in (("PINHOLE", 0), *((f"OPE
 """Coefficients of mrcal's models that are OpenCV's."""
 MM_PER_M = 1000.0
 KALIBR = ("pinhole", "omni", "eucm", "ds")
-METASHAPE = ("f", "cx", "cy", "b1", "b2", "k1", "k2", "k3", "k4", "p1", "p2")
+SIGMA_FORMS = ("colmap", "metashape-cameras")
+"""That have a place for σ and correlations."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -102,39 +104,14 @@ def from_mrcal(text: str, source: str) -> CameraModel | ForeignLens:
         raise InputError(f"camera file {source}: not mrcal's form ({reason}); write it anew with mrcal") from error
     if str(lens).startswith("LENSMODEL_SPLINED"):
         return of_splines(lens, numbers, width, height, source)
+    if lens == "LENSMODEL_CAHVOR":
+        return of_cahvor(numbers, width, height, source)
     if lens not in MRCAL or len(numbers) != 4 + MRCAL[lens]:
         raise InputError(
-            f"camera file {source}: {lens} with {len(numbers)} intrinsics; {', '.join(MRCAL)} and splined ones are "
-            "read: mrcal-convert-lensmodel makes one of another"
+            f"camera file {source}: {lens} with {len(numbers)} intrinsics; {', '.join(MRCAL)}, CAHVOR and splined "
+            "ones are read: mrcal-convert-lensmodel makes one of another"
         )
     return of_opencv(numbers[:4], np.array(numbers[4:]), width, height, source)
-
-
-def from_metashape(root: ElementTree.Element, source: str) -> CameraModel:
-    """A ``<calibration>`` of Metashape: frame or fisheye, without skew.
-
-    Raises
-    ------
-    InputError
-        Another projection, values that have no place in OpenCV's model, or none where they must be.
-    """
-    texts = {child.tag: (child.text or "").strip() for child in root}
-    kind = texts.get("projection", "frame")
-    if kind not in ("frame", "fisheye", "equidistant_fisheye"):
-        raise InputError(f"camera file {source}: projection {kind}; frame and fisheye are read")
-    v = {name: float(texts.get(name, 0) or 0) for name in METASHAPE}
-    width, height = float(texts["width"]), float(texts["height"])
-    if v["b2"] or (v["k4"] and kind == "frame"):
-        name = "b2" if v["b2"] else "k4"
-        raise InputError(
-            f"camera file {source}: {name} is {v[name]:g}, without place in OpenCV's model; fit without it"
-        )
-    centre = width / 2 + v["cx"] - COLMAP_PIXEL_ORIGIN, height / 2 + v["cy"] - COLMAP_PIXEL_ORIGIN
-    distortion = np.array([v["k1"], v["k2"], v["p2"], v["p1"], v["k3"], v["k4"]])
-    lens = [v["f"] + v["b1"], v["f"], *centre]
-    if kind == "frame":
-        return camera_from_opencv(lens, distortion[:5], False, width, height, source)
-    return camera_from_opencv(lens, distortion, True, width, height, source, tangential=True)
 
 
 def from_colmap_binary(content: bytes, choice: str, source: str) -> CameraModel | ForeignLens:
@@ -182,13 +159,11 @@ def written(camera: CalibratedCamera, form: str, name: str) -> Written:
     if not re.fullmatch(r"[A-Za-z]\w*", name, re.ASCII):
         raise InputError(f"camera name {name}: letters, digits and _ needed, a letter first, such as cam0")
     lost = ["the image's size"] if form == "zhang" else []
-    if camera.covariance is not None and form != "colmap":
+    if camera.covariance is not None and form not in SIGMA_FORMS:
         lost.append("σ and correlations of the parameters")
+    if camera.covariance is not None and form == "metashape-cameras":
+        lost += metashape.without_sigma(camera)
     return Written(WRITERS[form](camera, name), tuple(lost))
-
-
-def _refuse(camera: CalibratedCamera, form: str, why: str) -> InputError:
-    return InputError(f"{form} has no place for {why} of {camera.colmap_model}; write --form colmap")
 
 
 def _colmap_binary(camera: CalibratedCamera, _: str) -> bytes:
@@ -202,7 +177,7 @@ def _fisheye_four(camera: CalibratedCamera, form: str) -> list[float]:
     """k1 … k4 of an equidistant camera that has nothing else."""
     rest = [*camera.distortion[2:4], *camera.distortion[8:]]
     if any(rest):
-        raise _refuse(camera, form, "p1, p2 and prisms")
+        raise refused(camera, form, "p1, p2 and prisms")
     return [float(camera.distortion[i]) for i in (0, 1, 4, 5)]
 
 
@@ -251,7 +226,7 @@ def _kalibr(camera: CalibratedCamera, name: str) -> str:
     else:
         kind, values = "radtan", [float(k) for k in camera.distortion[:4]]
         if camera.distortion[4:].any():
-            raise _refuse(camera, "kalibr", "more than k1, k2, p1, p2")
+            raise refused(camera, "kalibr", "more than k1, k2, p1, p2")
     lens = [*camera.focal.tolist(), *camera.centre.tolist()]
     return (
         f"{name}:\n  camera_model: pinhole\n  intrinsics: {lens}\n  distortion_model: {kind}\n"
@@ -280,7 +255,7 @@ def kalibr_chain(cameras: Sequence[tuple[str, CalibratedCamera, Rigid]]) -> str:
 
 def _mrcal(camera: CalibratedCamera, _: str) -> str:
     if camera.fisheye:
-        raise _refuse(camera, "mrcal", "the equidistant projection")
+        raise refused(camera, "mrcal", "the equidistant projection")
     values = _coefficients(camera) if camera.distortion.any() else []
     values = values[:4] if len(values) == 5 and not values[4] else values
     lens = next(name for name, count in MRCAL.items() if count == len(values))
@@ -291,21 +266,6 @@ def _mrcal(camera: CalibratedCamera, _: str) -> str:
     )
 
 
-def _metashape(camera: CalibratedCamera, _: str) -> str:
-    k1, k2, p1, p2, k3, k4, *rest = camera.distortion.tolist()
-    if any(rest) or (k4 and not camera.fisheye):
-        raise _refuse(camera, "metashape", "k4 to k6 and prisms")
-    (fx, fy), (cx, cy) = camera.focal.tolist(), camera.centre.tolist()
-    centre = cx + COLMAP_PIXEL_ORIGIN - camera.width / 2, cy + COLMAP_PIXEL_ORIGIN - camera.height / 2
-    values = dict(zip(METASHAPE, (fy, *centre, fx - fy, 0.0, k1, k2, k3, k4, p2, p1), strict=True))
-    root = ElementTree.Element("calibration")
-    parts = {"projection": "fisheye" if camera.fisheye else "frame", "width": camera.width, "height": camera.height}
-    for tag, value in (parts | values).items():
-        ElementTree.SubElement(root, tag).text = str(value) if tag in parts else repr(float(value))
-    ElementTree.indent(root)
-    return f'<?xml version="1.0" encoding="UTF-8"?>\n{ElementTree.tostring(root, encoding="unicode")}\n'
-
-
 WRITERS: Mapping[str, Callable[[CalibratedCamera, str], str | bytes]] = {
     "colmap": lambda camera, _: cameras_txt(camera),
     "colmap-bin": _colmap_binary,
@@ -313,7 +273,8 @@ WRITERS: Mapping[str, Callable[[CalibratedCamera, str], str | bytes]] = {
     "ros": _ros,
     "kalibr": _kalibr,
     "mrcal": _mrcal,
-    "metashape": _metashape,
+    "metashape": lambda camera, _: metashape.calibration(camera),
+    "metashape-cameras": metashape.cameras,
     "matlab": mat,
     "zhang": zhang,
 }

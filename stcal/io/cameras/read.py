@@ -22,7 +22,7 @@ from stcal.io.camera import (
     camera_model,
     parameter_names,
 )
-from stcal.io.cameras import forms, matlab
+from stcal.io.cameras import forms, matlab, metashape
 from stcal.io.cameras.foreign import ForeignLens, of_colmap, of_database, of_opencv, one_of
 from stcal.io.covariance import Rows, require_covariance
 from stcal.io.files import SETTINGS_BYTES, read_bytes
@@ -56,11 +56,11 @@ def read_lens(path: str | Path, name: str = "") -> CameraModel | ForeignLens:
     try:
         if text.lstrip().startswith("<"):
             root = ElementTree.fromstring(text)
-            return (
-                forms.from_metashape(root, str(path))
-                if root.tag == "calibration"
-                else _from_opencv(_xml_values(root), path)
-            )
+            if root.tag == "calibration":
+                return metashape.from_calibration(root, str(path))
+            if root.tag in metashape.ROOTS:
+                return metashape.from_cameras(root, name, str(path))
+            return _from_opencv(_xml_values(root), path)
         rows = [line.split() for line in text.splitlines() if line.strip() and not line.lstrip().startswith("#")]
         if rows and rows[0][0].startswith("{") and "lensmodel" in text:
             return forms.from_mrcal(text, str(path))

@@ -1,0 +1,212 @@
+"""Agisoft Metashape's cameras: a lens alone (``<calibration>``), or all sensors of exported cameras, with covariances.
+
+The principal point is counted from the middle of the image; ``b1`` is what the horizontal focal length exceeds the
+vertical one by, ``p1`` and ``p2`` are OpenCV's p2 and p1 (Metashape Professional's user manual, appendix D). Beside an
+adjusted calibration stands a ``<covariance>`` of the parameters that were adjusted, in their own units.
+"""
+
+import xml.etree.ElementTree as ElementTree
+from dataclasses import replace
+
+import numpy as np
+
+from stcal.errors import InputError
+from stcal.io.camera import (
+    COLMAP_PIXEL_ORIGIN,
+    FISHEYE,
+    PARAMETER_NAMES,
+    CalibratedCamera,
+    CameraModel,
+    camera_from_opencv,
+    intrinsic_basis,
+)
+from stcal.io.cameras.foreign import one_of, refused
+from stcal.io.covariance import Rows, require_covariance
+
+NAMES = ("f", "cx", "cy", "b1", "b2", "k1", "k2", "k3", "k4", "p1", "p2")
+ROOTS = ("document", "chunk", "sensors", "sensor")
+"""Of files with sensors."""
+KINDS = ("frame", "fisheye", "equidistant_fisheye")
+HELD_PX = 1e-3
+"""What a parameter that was held fixed may move at the edge of the image: a covariance without it were singular."""
+OWN = {"f": "fy", "p1": "p2", "p2": "p1"} | {name: name for name in ("cx", "cy", "k1", "k2", "k3", "k4")}
+"""OpenCV's names of parameters; ``b1`` and ``f`` together are fx."""
+
+
+def from_calibration(root: ElementTree.Element, source: str) -> CameraModel:
+    """A ``<calibration>`` : frame or fisheye, without skew.
+
+    Raises
+    ------
+    InputError
+        Another projection, values that have no place in OpenCV's model, or none where they must be.
+    """
+    texts = {child.tag: (child.text or "").strip() for child in root}
+    kind = texts.get("projection", root.get("type", "frame"))
+    if kind not in KINDS:
+        raise InputError(f"camera file {source}: projection {kind}; frame and fisheye are read")
+    v = {name: float(texts.get(name, 0) or 0) for name in NAMES}
+    size = root.find("resolution")
+    stated = texts if size is None else size.attrib
+    width, height = float(stated["width"]), float(stated["height"])
+    if v["b2"] or (v["k4"] and kind == "frame"):
+        name = "b2" if v["b2"] else "k4"
+        raise InputError(
+            f"camera file {source}: {name} is {v[name]:g}, without place in OpenCV's model; fit without it"
+        )
+    centre = width / 2 + v["cx"] - COLMAP_PIXEL_ORIGIN, height / 2 + v["cy"] - COLMAP_PIXEL_ORIGIN
+    distortion = np.array([v["k1"], v["k2"], v["p2"], v["p1"], v["k3"], v["k4"]])
+    lens = [v["f"] + v["b1"], v["f"], *centre]
+    if kind == "frame":
+        return camera_from_opencv(lens, distortion[:5], False, width, height, source)
+    return camera_from_opencv(lens, distortion, True, width, height, source, tangential=True)
+
+
+def from_cameras(root: ElementTree.Element, choice: str, source: str) -> CameraModel:
+    """A sensor of exported cameras, or of a project's ``doc.xml``, as adjusted, with its covariance.
+
+    Raises
+    ------
+    InputError
+        No calibrated sensor, several and no choice, or a covariance that is none; and as :func:`from_calibration`.
+    """
+    sensors = {}
+    for number, sensor in enumerate(root.iter("sensor")):
+        found = sensor.findall("calibration")
+        adjusted = [each for each in found if each.get("class", "adjusted") == "adjusted"] or found
+        if adjusted:
+            name = sensor.get("label") or sensor.get("id") or str(number)
+            sensors[name if name not in sensors else f"{name} {number}"] = (adjusted[-1], sensor.find("covariance"))
+    if not sensors:
+        raise InputError(f"camera file {source}: no sensor with a calibration; export the cameras after alignment")
+    own, covariance = sensors[one_of(list(sensors), choice, source)]
+    camera = from_calibration(own, source)
+    return camera if covariance is None else _with_covariance(camera, covariance, source)
+
+
+def _with_covariance(camera: CameraModel, stated: ElementTree.Element, source: str) -> CameraModel:
+    names = (stated.findtext("params") or "").split()
+    try:
+        matrix = np.array((stated.findtext("coeffs") or "").split(), float)
+        if not names or set(names) - set(NAMES) or len(set(names)) < len(names) or len(matrix) != len(names) ** 2:
+            raise InputError(f"{len(names)} parameters, {len(matrix)} numbers")
+        matrix = matrix.reshape(len(names), -1)
+        require_covariance(matrix, len(names), Rows(tuple(names)))
+    except (InputError, ValueError) as error:
+        raise InputError(f"camera file {source}: <covariance>: {error}; export the cameras again") from error
+    if "b2" in names:
+        raise InputError(f"camera file {source}: b2 was adjusted, without place in OpenCV's model; fit without it")
+    camera = replace(camera, colmap_model=_model(camera.colmap_model, names))
+    by_theirs = np.zeros((len(PARAMETER_NAMES), len(names)))
+    for column, name in enumerate(names):
+        if name in OWN:
+            by_theirs[PARAMETER_NAMES.index(OWN[name]), column] = 1
+        if name in ("f", "b1"):
+            by_theirs[PARAMETER_NAMES.index("fx"), column] = 1
+    basis = intrinsic_basis(camera.colmap_model)
+    to_model = np.linalg.pinv(basis)
+    covariance = to_model @ by_theirs @ matrix @ by_theirs.T @ to_model.T
+    adjusted = to_model @ by_theirs
+    held = np.array([not row.any() for row in adjusted])
+    if not {"f", "b1"} <= set(names) and basis[:2].any(axis=0).sum() == 2:
+        held[0] = True
+    held_sigma = (to_model @ np.diag(_edge(camera)) @ to_model.T).diagonal()
+    return replace(camera, covariance=covariance + np.diag(np.where(held, held_sigma**2, 0.0)))
+
+
+def _model(colmap_model: str, names: list[str]) -> str:
+    """The model with a place for these of Metashape's parameters, and for those that it has already."""
+    if FISHEYE in colmap_model:
+        return "THIN_PRISM_FISHEYE" if {"p1", "p2"} & set(names) else colmap_model
+    if "k3" in names or "k4" in names:
+        return "FULL_OPENCV"
+    distorted = {"k1", "k2", "p1", "p2"} & set(names)
+    return "OPENCV" if distorted and colmap_model != "FULL_OPENCV" else colmap_model
+
+
+def _edge(camera: CameraModel) -> np.ndarray:
+    """By which each parameter (16,) changes when it moves the corner of the image by :data:`HELD_PX`."""
+    width, height = camera.width or 2 * camera.centre[0], camera.height or 2 * camera.centre[1]
+    focal = float(camera.focal.mean())
+    reach = np.hypot(width, height) / 2 / focal
+    powers = np.array([3, 5, 2, 2, 7, 9, 11, 13, 2, 4, 2, 4])
+    if FISHEYE not in camera.colmap_model:
+        powers[5:8] = [3, 5, 7]  # of the bottom
+    return HELD_PX * np.concatenate([[1 / reach] * 2, [1.0] * 2, reach ** -powers.astype(float) / focal])
+
+
+def _values(camera: CalibratedCamera, form: str) -> dict[str, float]:
+    k1, k2, p1, p2, k3, k4, *rest = camera.distortion.tolist()
+    if any(rest) or (k4 and not camera.fisheye):
+        raise refused(camera, form, "k4 to k6 and prisms")
+    (fx, fy), (cx, cy) = camera.focal.tolist(), camera.centre.tolist()
+    centre = cx + COLMAP_PIXEL_ORIGIN - camera.width / 2, cy + COLMAP_PIXEL_ORIGIN - camera.height / 2
+    return dict(zip(NAMES, (fy, *centre, fx - fy, 0.0, k1, k2, k3, k4, p2, p1), strict=True))
+
+
+def calibration(camera: CalibratedCamera) -> str:
+    """The lens alone.
+
+    Raises
+    ------
+    InputError
+        One that Metashape has no model for.
+    """
+    root = ElementTree.Element("calibration")
+    parts = {"projection": _kind(camera), "width": camera.width, "height": camera.height}
+    for tag, value in (parts | _values(camera, "metashape")).items():
+        ElementTree.SubElement(root, tag).text = str(value) if tag in parts else repr(float(value))
+    return _text(root)
+
+
+def cameras(camera: CalibratedCamera, name: str) -> str:
+    """Exported cameras with one sensor and no image; errors as of :func:`calibration`."""
+    values = _values(camera, "metashape-cameras")
+    size = {"width": str(camera.width), "height": str(camera.height)}
+    root = ElementTree.Element("document", version="1.5.0")
+    chunk = ElementTree.SubElement(root, "chunk", label="stcal", enabled="true")
+    sensors = ElementTree.SubElement(chunk, "sensors", next_id="1")
+    sensor = ElementTree.SubElement(sensors, "sensor", id="0", label=name, type=_kind(camera))
+    ElementTree.SubElement(sensor, "resolution", size)
+    own = ElementTree.SubElement(sensor, "calibration", {"type": _kind(camera), "class": "adjusted"})
+    ElementTree.SubElement(own, "resolution", size)
+    for tag, value in values.items():
+        ElementTree.SubElement(own, tag).text = repr(float(value))
+    if camera.covariance is not None:
+        names, matrix = _covariance(camera, camera.covariance)
+        stated = ElementTree.SubElement(sensor, "covariance")
+        ElementTree.SubElement(stated, "params").text = " ".join(names)
+        ElementTree.SubElement(stated, "coeffs").text = " ".join(map(repr, matrix.ravel().tolist()))
+    return _text(root)
+
+
+def _covariance(camera: CalibratedCamera, covariance: np.ndarray) -> tuple[list[str], np.ndarray]:
+    """Metashape's names of the parameters that the model has, and their covariance."""
+    basis = intrinsic_basis(camera.colmap_model)
+    rows = np.zeros((len(NAMES), len(PARAMETER_NAMES)))
+    for row, name in enumerate(NAMES):
+        if name in OWN:
+            rows[row, PARAMETER_NAMES.index(OWN[name])] = 1
+    rows[NAMES.index("b1"), [PARAMETER_NAMES.index("fx"), PARAMETER_NAMES.index("fy")]] = [1, -1]
+    if not camera.fisheye:
+        rows[NAMES.index("k4")] = 0  # OpenCV's is another
+    by_model = rows @ basis
+    there = np.flatnonzero(by_model.any(axis=1))
+    matrix = by_model[there] @ covariance @ by_model[there].T
+    return [NAMES[i] for i in there], matrix
+
+
+def without_sigma(camera: CalibratedCamera) -> list[str]:
+    """Parameters whose σ Metashape has no place for; they are 0."""
+    rational = not camera.fisheye and camera.colmap_model == "FULL_OPENCV"
+    prisms = camera.colmap_model == "THIN_PRISM_FISHEYE"
+    return ["σ of k4, k5 and k6"] * rational + ["σ of the thin prisms"] * prisms
+
+
+def _kind(camera: CalibratedCamera) -> str:
+    return "fisheye" if camera.fisheye else "frame"
+
+
+def _text(root: ElementTree.Element) -> str:
+    ElementTree.indent(root)
+    return f'<?xml version="1.0" encoding="UTF-8"?>\n{ElementTree.tostring(root, encoding="unicode")}\n'
