@@ -119,18 +119,23 @@ def _write(database, camera, observations, pairs, keypoints_px) -> None:
             database.write_two_view_geometry(ids[a.name], ids[b.name], geometry)
 
 
-def labels_csv(observations: Sequence[ImageObservations], corrected_px: Sequence[np.ndarray]) -> str:
-    """Text of ``labels.csv``: label, float64 measured and corrected centre and σ of every (image, keypoint)."""
+def labels_csv(
+    observations: Sequence[ImageObservations], corrected_px: Sequence[np.ndarray], residual_px: Sequence[np.ndarray]
+) -> str:
+    """Text of ``labels.csv``: label, float64 measured and corrected centre, σ and residual of every (image, keypoint);
+    residuals that are nan, of what is not in the result, stay empty."""
     stream = io.StringIO()
     writer = csv.writer(stream, lineterminator="\n")
     columns = (
-        "image_id keypoint image group label x_px y_px corrected_x_px corrected_y_px var_x_px2 cov_xy_px2 var_y_px2"
+        "image_id keypoint image group label x_px y_px corrected_x_px corrected_y_px var_x_px2 cov_xy_px2 var_y_px2 "
+        "residual_x_px residual_y_px"
     )
     writer.writerow(columns.split())
     ids = image_ids(observations)
-    for image, corrected in zip(observations, corrected_px, strict=True):
+    for image, corrected, residual in zip(observations, corrected_px, residual_px, strict=True):
         covariance = image.covariance_px2.reshape(-1, 4)[:, [0, 1, 3]]
         values = np.column_stack([image.centre_px, corrected, covariance]).tolist()
         for k, label in enumerate(image.labels):
-            writer.writerow([ids[image.name], k, image.name, image.group, label, *map(repr, values[k])])
+            own = ["" if np.isnan(v) else repr(v) for v in residual[k].tolist()]
+            writer.writerow([ids[image.name], k, image.name, image.group, label, *map(repr, values[k]), *own])
     return stream.getvalue()

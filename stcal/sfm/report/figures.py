@@ -82,9 +82,9 @@ def scene_view(scene: dict, camera: dict, colours: dict[str, str], azimuth: floa
     figure, axes = _space(everything, 5.4, 4.9, elevation=22, azimuth=azimuth)
     lines, ink = [], []
     for each in scene["cameras"]:
-        frustum = _frustum(each, camera, depth)
-        lines += frustum
-        ink += [colours.get(each["group"], INK)] * len(frustum)
+        pyramid = frustum(each, camera, depth)
+        lines += pyramid
+        ink += [colours.get(each["group"], INK)] * len(pyramid)
     axes.add_collection3d(Line3DCollection(lines, colors=ink, linewidths=0.9), autolim=False)
     for name, xyz in boards.items():
         axes.scatter(*xyz.T, s=2, color=colours.get(name, INK), depthshade=False)
@@ -104,7 +104,7 @@ def target_view(circles: dict[str, list[float]], faces: dict[str, dict], azimuth
         pose = np.array(face["target_from_face"], float)
         lines += [np.array([pose[:3, 3], pose[:3, 3] + reach * pose[:3, i]]) for i in range(3)]
         ink += AXIS_COLOURS
-        sheets += _outline(own, pose)
+        sheets += outline(own, pose)
         names.append((name, (own.mean(0) if len(own) else pose[:3, 3]) + 0.9 * reach * pose[:3, 2]))
     figure, axes = _space(np.vstack([xyz, *lines, *[at for _, at in names]]), 5.4, 4.9, elevation=24, azimuth=azimuth)
     axes.add_collection3d(Poly3DCollection(sheets, facecolors="#7f93a8", alpha=0.16), autolim=False)
@@ -115,7 +115,7 @@ def target_view(circles: dict[str, list[float]], faces: dict[str, dict], azimuth
     return uri(figure)
 
 
-def _outline(xyz: np.ndarray, target_from_face: np.ndarray) -> list[np.ndarray]:
+def outline(xyz: np.ndarray, target_from_face: np.ndarray) -> list[np.ndarray]:
     """The convex hull of a face's circles in its plane, or nothing where they span none."""
     from scipy.spatial import ConvexHull, QhullError
 
@@ -125,7 +125,7 @@ def _outline(xyz: np.ndarray, target_from_face: np.ndarray) -> list[np.ndarray]:
         return []
 
 
-def _frustum(pose: dict, camera: dict, depth: float) -> list[np.ndarray]:
+def frustum(pose: dict, camera: dict, depth: float) -> list[np.ndarray]:
     """Lines of a camera's pyramid; rows of ``axes`` are the camera's axes, Z the way it looks."""
     at, axes = np.array(pose["position_mm"], float), np.array(pose["axes"], float)
     half = depth * np.array(camera["size_px"]) / (2 * np.array(camera["focal_px"]))

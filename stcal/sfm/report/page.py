@@ -1,8 +1,7 @@
 """``report.html``: the report as one page that opens off line, for people; ``report.json`` is the same for programs."""
 
-import base64
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 
 from stcal.labels import BOARD, parse_label
 from stcal.parallel import run_briefly
@@ -13,12 +12,13 @@ from stcal.sfm.report.checks import COLOURS, checks_values
 from stcal.sfm.report.comparison import comparison_cells
 from stcal.sfm.report.crosscheck import crosscheck_values
 from stcal.sfm.report.judgement import Judgement, judgement_of
+from stcal.sfm.report.photographs import FIRST_IMAGES, Residuals, photographs
+from stcal.sfm.report.space import space_parts
 
 SIDES = {-58: "", 122: ", from the other side"}
 """Azimuths from which target and cameras are drawn."""
 FIRST_PAIRS = 15
-FIRST_IMAGES = 100
-"""Rows and overlays that the page has room for."""
+"""Rows that the page has room for."""
 SOLVES = {
     "joint": "joint: one adjustment over all groups",
     "chain": "chain: group by group, then combined",
@@ -29,13 +29,20 @@ VERDICTS = {"yes": "passed", "with care": "suspicious", "no": "failed"}
 FRAMES = {"plane": "plane: Z from the plane of all circles", "three-point": "three-point: from three circles"}
 
 
-def report_html(report: dict, overlays: dict[str, bytes], reload_s: int | None = None, gone: int = 0) -> str:
+def report_html(
+    report: dict,
+    overlays: dict[str, bytes],
+    residuals: Mapping[str, Residuals] | None = None,
+    reload_s: int | None = None,
+    gone: int = 0,
+) -> str:
     """The page.
 
     Parameters
     ----------
     report : what :func:`stcal.sfm.run.output.report_of` made
     overlays : JPEG by image name
+    residuals : centres and their residuals by image name, px; none are drawn where None
     reload_s : the page loads itself anew so often; never where None
     gone : overlays that are no longer in the run's folder
     """
@@ -55,6 +62,7 @@ def report_html(report: dict, overlays: dict[str, bytes], reload_s: int | None =
         **_faces(report),
         scales=_scales(report),
         boards=boards,
+        space=space_parts(report, colours),
         views=views,
         **_residuals(report, colours),
         bars=bars,
@@ -66,7 +74,7 @@ def report_html(report: dict, overlays: dict[str, bytes], reload_s: int | None =
         **(checks_values(report["checks"]) if "checks" in report else {}),
         **({"compared": comparison_cells(report["comparison"])} if "comparison" in report else {}),
         **({"cross": crosscheck_values(report["crosscheck"])} if "crosscheck" in report else {}),
-        overlays=_overlays(report, overlays),
+        photographs=photographs(report, overlays, residuals or {}),
         rest=len(report["images"]) - len(overlays) - gone,
         gone=gone,
     )
@@ -244,7 +252,7 @@ def _boards(report: dict) -> dict[str, tuple]:
     return {name: (own, reach, height) for name, own in residuals.items()}
 
 
-# --- residuals, pairs, left out, overlays -----------------------------------------------------------------------------
+# --- residuals, pairs, left out ---------------------------------------------------------------------------------------
 
 
 def _residuals(report: dict, colours: dict[str, str]) -> dict:
@@ -297,26 +305,3 @@ def _circles_left_out(report: dict) -> list[list]:
     for each in report["left_out"]["circles"]:
         circles.setdefault((each["image"], each["reason"]), []).append(each["label"])
     return [[image, len(labels), join(labels), reason] for (image, reason), labels in circles.items()]
-
-
-def shown_overlays(report: dict) -> list[str]:
-    """Names of the images whose overlays the page shows: all, or of a large set those that most deserve a look."""
-    names = [image["name"] for image in report["images"]]
-    if len(names) <= FIRST_IMAGES:
-        return names
-    worst = {row["image"]: row["max_px"] for row in report["residuals_by_image"]}
-    told = {each["image"] for each in report["left_out"]["notes"]}
-    ranked = sorted(names, key=lambda name: (name in worst, name not in told, -worst.get(name, 0.0)))
-    chosen = set(ranked[:FIRST_IMAGES])
-    return [name for name in names if name in chosen]
-
-
-def _overlays(report: dict, overlays: dict[str, bytes]) -> list[tuple[str, str, str]]:
-    """(image, what was found in it, JPEG as a data URI)."""
-    mapped = {row["image"]: row for row in report["residuals_by_image"]}
-    frames = []
-    for name, jpeg in overlays.items():
-        own = mapped.get(name)
-        says = f"{own['observations']} centres, {number(own['rms_px'], 4)} px RMS" if own else "not mapped"
-        frames.append((name, says, "data:image/jpeg;base64," + base64.b64encode(jpeg).decode()))
-    return frames

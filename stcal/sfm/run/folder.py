@@ -1,7 +1,9 @@
 """What a run writes into its folder: overlays, results, report."""
 
 import contextlib
+import csv
 import hashlib
+import io
 import os
 from collections.abc import Iterator, Mapping
 from concurrent.futures import ThreadPoolExecutor
@@ -14,6 +16,7 @@ from stcal.design import TargetDesign
 from stcal.errors import InputError
 from stcal.io.camera import CalibratedCamera, write_cameras_txt
 from stcal.io.design import board_toml, target_toml
+from stcal.io.files import TABLE_BYTES, read_bytes
 from stcal.io.json import checked, read_json
 from stcal.io.saving import BOARD, CAMERA, RUN_MARKER, TARGET, json_text, save
 from stcal.parallel import Progress
@@ -27,8 +30,9 @@ from stcal.sfm.detect.overlay import draw_overlay
 from stcal.sfm.mapping.database import image_ids, labels_csv, write_database
 from stcal.sfm.mapping.models import write_model
 from stcal.sfm.report.judgement import Judgement, judged
-from stcal.sfm.report.page import report_html, shown_overlays
-from stcal.sfm.run.output import report_of
+from stcal.sfm.report.page import report_html
+from stcal.sfm.report.photographs import Residuals, shown_overlays
+from stcal.sfm.run.output import report_of, residuals_px
 from stcal.sfm.run.report import ReportFile
 from stcal.sfm.run.result import RunResult
 from stcal.sfm.run.saved import SavedRun
@@ -94,7 +98,7 @@ def write_run(result: RunResult, out: Path, progress: Progress, reload_s: int | 
     models = {s.model.group: s.model for s in result.solutions}
     corrected = _corrected_px(models, observations)
     write_database(out / "database.db", result.camera, observations, result.graph.pairs, corrected)
-    save(out / "labels.csv", labels_csv(observations, corrected))
+    save(out / "labels.csv", labels_csv(observations, corrected, residuals_px(result)))
     for name, model in models.items():
         folder = out / "models" / name  # "models/." where the images lie directly in their folder
         write_model(folder, [model], observations, ids, result.camera)
@@ -174,7 +178,7 @@ def _page_and_pdf(run: Path, pdf: bool, out: Path) -> tuple[tuple[Path, ...], in
     shown = shown_overlays(report)
     overlays = {name: there.read_bytes() for name in shown if (there := overlay_path(run, name)).is_file()}
     gone = len(shown) - len(overlays)
-    page = report_html(report, overlays, gone=gone)
+    page = report_html(report, overlays, _residuals(run, list(overlays)), gone=gone)
     made: list[tuple[Path, bytes]] = [(out, page.encode())]
     if pdf:
         made.append((out.with_suffix(".pdf"), pdf_of(page)))
@@ -185,7 +189,21 @@ def _page_and_pdf(run: Path, pdf: bool, out: Path) -> tuple[tuple[Path, ...], in
 
 def _report_page(run: Path, report: dict, reload_s: int | None = None) -> bytes:
     overlays = {name: overlay_path(run, name).read_bytes() for name in shown_overlays(report)}
-    return report_html(report, overlays, reload_s).encode()
+    return report_html(report, overlays, _residuals(run, list(overlays)), reload_s).encode()
+
+
+def _residuals(run: Path, names: list[str]) -> dict[str, Residuals]:
+    """Centres and residuals of these images, by ``labels.csv``; none of a version that kept none."""
+    path = run / "labels.csv"
+    rows: dict[str, list[list[float]]] = {name: [] for name in names}
+    try:
+        for row in csv.DictReader(io.StringIO(read_bytes(path, TABLE_BYTES).decode())):
+            if row["image"] in rows and row.get("residual_x_px"):
+                own = [float(row[key]) for key in ("x_px", "y_px", "residual_x_px", "residual_y_px")]
+                rows[row["image"]].append(own)
+    except (LookupError, TypeError, ValueError, csv.Error) as error:
+        raise InputError(f"{path}: damaged, or of another version ({error}); run it again") from error
+    return {name: np.array(own).reshape(-1, 4) for name, own in rows.items()}
 
 
 def require_report(saved: SavedRun) -> None:

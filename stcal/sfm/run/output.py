@@ -90,6 +90,17 @@ def report_of(result: RunResult) -> ReportFile:
     )
 
 
+def residuals_px(result: RunResult) -> list[np.ndarray]:
+    """Of every keypoint of every image, (k, 2), corrected minus projected; nan where it is not in the answer."""
+    models = _final_models(result)
+    found = {each.name: np.full((len(each), 2), np.nan) for each in result.observations()}
+    for model in models.values():
+        residual = model.residuals_px(result.calibration.camera)
+        for name, rows in zip(model.images, model.rows_by_image(), strict=True):
+            found[name][model.keypoint[rows]] = residual[rows]
+    return list(found.values())
+
+
 def _final_models(result: RunResult) -> dict[str, GroupModel]:
     """The models that the answer rests on."""
     if result.calibration.joint:

@@ -172,6 +172,8 @@ def _labels(path: Path, names: list[tuple[str, str, int]], camera: Camera, known
     """Observations and corrected centres of ``labels.csv`` for the images (name, group, circles) of the database."""
     rows: dict[str, list[dict]] = {name: [] for name, _, _ in names}
     for row in csv.DictReader(io.StringIO(read_bytes(path, TABLE_BYTES).decode())):
+        if None in row.values():
+            raise ValueError(f"image {row['image']}: keypoint {row['keypoint']}: its row is cut")
         rows[row["image"]].append(row)
     observations, corrected = [], []
     for name, group, circles in names:

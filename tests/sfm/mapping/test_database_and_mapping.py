@@ -84,12 +84,15 @@ def test_board_dots_match_in_a_group_only_and_target_circles_everywhere(observed
 
 
 def test_labels_csv_joins_by_image_and_keypoint(observed):
-    rows = labels_csv(observed, [o.centre_px - 0.01 for o in observed]).splitlines()
+    residual = [np.where(np.arange(len(o))[:, None] == 1, np.nan, o.centre_px + 0.5) for o in observed]
+    rows = labels_csv(observed, [o.centre_px - 0.01 for o in observed], residual).splitlines()
     first = rows[1].split(",")
     assert first[:2] == ["1", "0"]
     assert first[4] == observed[0].labels[0]
     assert float(first[5]) == observed[0].centre_px[0, 0]  # float64, not the database's float32
     assert float(first[7]) == observed[0].centre_px[0, 0] - 0.01
+    assert [float(each) for each in first[12:]] == (observed[0].centre_px[0] + 0.5).tolist()
+    assert rows[2].split(",")[12:] == ["", ""]  # not in the result
     assert len(rows) == 1 + sum(len(o) for o in observed)
 
 

@@ -1,6 +1,9 @@
 """``report``: the page of a finished run made again, and its PDF."""
 
+import csv
 import json
+import math
+import re
 import shutil
 
 import pytest
@@ -13,6 +16,7 @@ from stcal.sfm.run.text import run_text
 from stcal.sfm.run.transaction import added_results
 from stcal.sfm.run.verify import verify
 from tests.outcome import INPUT, assert_error
+from tests.report.browser import faults, opened, show, sideways_px
 
 
 @pytest.fixture
@@ -83,3 +87,29 @@ def test_terminal_file_and_page_have_the_same_judgement(small_result, small_run)
     for question, answer in stored.answers():
         assert f"{question} {answer}" in terminal
         assert f"<dt>{question}</dt><dd>{escape(answer)}</dd>" in page
+
+
+def test_residuals_of_the_table_are_those_of_the_report_and_of_the_page(small_run):
+    report = json.loads((small_run / "report.json").read_text())
+    with open(small_run / "labels.csv", encoding="utf-8", newline="") as stream:
+        rows = [row for row in csv.DictReader(stream) if row["residual_x_px"]]
+    page = (small_run / "report.html").read_text()
+    factor = float(re.search(r"measured less projected, ([\d,]+) times", page)[1].replace(",", ""))
+    drawn = page.split('alt="Overlay of ')
+    for image in report["residuals_by_image"]:
+        own = [[float(row[f"residual_{axis}_px"]) for axis in "xy"] for row in rows if row["image"] == image["image"]]
+        assert len(own) == image["observations"]
+        assert math.sqrt(sum(x * x + y * y for x, y in own) / (2 * len(own))) == pytest.approx(image["rms_px"])
+        assert max(math.hypot(*each) for each in own) == pytest.approx(image["max_px"])
+        (part,) = [each for each in drawn if each.startswith(image["image"])]
+        vectors = re.findall(r"M[\d.-]+ [\d.-]+l([\d.-]+) ([\d.-]+)", part)
+        assert [[float(v) / factor for v in each] for each in vectors] == [
+            [pytest.approx(v, abs=0.051 / factor) for v in each] for each in own
+        ]
+
+
+def test_the_page_of_a_run_in_a_browser(small_run):
+    with opened() as chrome:
+        for width in (1280, 400):
+            show(chrome, small_run / "report.html", width)
+            assert (width, sideways_px(chrome), faults(chrome)) == (width, 0, [])

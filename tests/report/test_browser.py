@@ -1,0 +1,192 @@
+"""The page of a run in a browser: nothing in the console, turned, sorted, enlarged, and narrow."""
+
+import io
+from itertools import pairwise
+
+import numpy as np
+import pytest
+from PIL import Image
+from selenium.webdriver import ActionChains, Keys
+from selenium.webdriver.common.by import By
+
+from stcal.sfm.report.page import report_html
+from tests.report.browser import faults, opened, show, sideways_px
+from tests.sfm.report.test_report import by_image, make
+
+NAMES = ["a/9.jpg", "a/10.jpg", "a/1.jpg"]
+RMS = [0.02, 0.004, 0.1]
+
+
+def jpeg() -> bytes:
+    stream = io.BytesIO()
+    Image.new("RGB", (648, 432), "navy").save(stream, "JPEG")
+    return stream.getvalue()
+
+
+@pytest.fixture(scope="module")
+def page(tmp_path_factory):
+    """Of a run of three images with residuals."""
+    report = make()
+    report["images"] = [{"image_id": i, "name": n, "group": "a", "circles": 12} for i, n in enumerate(NAMES, 1)]
+    report["residuals_by_image"] = [by_image(n) | {"rms_px": r} for n, r in zip(NAMES, RMS, strict=True)]
+    centres = np.random.default_rng(1).uniform((0, 0), (2592, 1728), (12, 2))
+    residuals = {name: np.column_stack([centres, np.full((12, 2), 0.01)]) for name in NAMES}
+    file = tmp_path_factory.mktemp("page") / "report.html"
+    file.write_text(report_html(report, dict.fromkeys(NAMES, jpeg()), residuals), encoding="utf-8")
+    return file
+
+
+@pytest.fixture(scope="module")
+def chrome():
+    with opened() as browser:
+        yield browser
+
+
+@pytest.fixture
+def opened_page(chrome, page):
+    show(chrome, page)
+    yield chrome
+    assert faults(chrome) == []
+
+
+def picture(chrome) -> str:
+    return chrome.execute_script("return document.querySelector('.turn canvas').toDataURL()")
+
+
+def drag(chrome, canvas) -> None:
+    ActionChains(chrome).move_to_element(canvas).click_and_hold().move_by_offset(80, 30).release().perform()
+
+
+def touch(chrome, canvas) -> None:
+    box = canvas.rect
+    x, y = box["x"] + box["width"] / 2, box["y"] + box["height"] / 2
+    top = chrome.execute_script("return window.scrollY")
+    for kind, moved in (("touchStart", 0), ("touchMove", 60), ("touchEnd", None)):
+        points = [] if moved is None else [{"x": x + moved, "y": y - top}]
+        chrome.execute_cdp_cmd("Input.dispatchTouchEvent", {"type": kind, "touchPoints": points})
+
+
+def keys(chrome, canvas) -> None:
+    canvas.send_keys(Keys.ARROW_LEFT, Keys.ARROW_UP)
+
+
+@pytest.mark.parametrize("turn", [drag, touch, keys])
+def test_the_scene_turns(opened_page, turn):
+    canvas = opened_page.find_element(By.CSS_SELECTOR, ".turn canvas")
+    opened_page.execute_script("arguments[0].scrollIntoView({block: 'center'})", canvas)
+    before = picture(opened_page)
+    turn(opened_page, canvas)
+    turned = picture(opened_page)
+    assert turned != before
+    opened_page.find_element(By.CSS_SELECTOR, ".turn button[value=target]").click()
+    assert picture(opened_page) not in (before, turned)
+    opened_page.find_element(By.CSS_SELECTOR, ".turn button[value=all]").click()
+    assert picture(opened_page) == before
+
+
+def test_something_is_drawn(opened_page):
+    """Beside the empty canvas: of the scene's colours each."""
+    drawn = opened_page.execute_script(
+        "const c = document.querySelector('.turn canvas');"
+        "const p = c.getContext('2d').getImageData(0, 0, c.width, c.height).data, found = new Set();"
+        "for (let i = 0; i < p.length; i += 4) if (p[i + 3] == 255) found.add(p[i] + ' ' + p[i + 1] + ' ' + p[i + 2]);"
+        "return [...found];"
+    )
+    axes_and_group = {"193 39 45", "46 139 61", "36 87 168", "0 114 178", "0 0 0"}
+    assert axes_and_group <= set(drawn)
+
+
+def press(chrome, table: str, index: int) -> str:
+    """Click on a heading; what it says of the order."""
+    head = chrome.find_elements(By.CSS_SELECTOR, f"{table} thead tr:last-child th")[index]
+    chrome.execute_script("arguments[0].scrollIntoView({block: 'center'})", head)
+    head.find_element(By.TAG_NAME, "button").click()
+    return head.get_attribute("aria-sort")
+
+
+def images(chrome) -> list[str]:
+    rows = chrome.find_elements(By.CSS_SELECTOR, "#residuals > .scroll tbody tr")
+    return [row.find_element(By.CSS_SELECTOR, "td").text for row in rows]
+
+
+def test_tables_sort_at_a_click(opened_page):
+    table = "#residuals > .scroll"
+    assert images(opened_page) == NAMES
+    assert press(opened_page, table, 4) == "ascending"  # RMS
+    assert images(opened_page) == ["a/10.jpg", "a/9.jpg", "a/1.jpg"]
+    assert press(opened_page, table, 4) == "descending"
+    assert images(opened_page) == ["a/1.jpg", "a/9.jpg", "a/10.jpg"]
+    assert press(opened_page, table, 1) == "ascending"  # names, numbers in them by value
+    assert images(opened_page) == ["a/1.jpg", "a/9.jpg", "a/10.jpg"]
+    sorted_by = opened_page.find_elements(By.CSS_SELECTOR, f"{table} [aria-sort]:not([aria-sort=none])")
+    assert [head.text.split()[0] for head in sorted_by] == ["Image"]
+    press(opened_page, table, 1)
+    assert press(opened_page, table, 1) == "none"
+    assert images(opened_page) == NAMES
+
+
+def test_what_is_missing_comes_last_either_way(opened_page):
+    table = "#trust .scroll"
+    assert [press(opened_page, table, 1) for _ in range(2)] == ["ascending", "descending"]
+    cells = opened_page.find_elements(By.CSS_SELECTOR, f"{table} tbody tr td:nth-child(2)")
+    values = [cell.text for cell in cells]
+    assert values[-2:] == ["–", "–"]
+    numbers = [float(value) for value in values[:-2]]
+    assert all(a >= b for a, b in pairwise(numbers))
+    assert len(numbers) > 3
+
+
+def test_a_photograph_is_enlarged_with_its_vectors(opened_page):
+    opened_page.find_element(By.CSS_SELECTOR, "#photo-1 .open").click()
+    photo = opened_page.find_element(By.CSS_SELECTOR, "#photo-1 img")
+    assert photo.rect["width"] > 1000
+    vectors = opened_page.find_element(By.CSS_SELECTOR, "#photo-1 .vectors")
+    assert {k: round(v) for k, v in vectors.rect.items()} == {k: round(v) for k, v in photo.rect.items()}
+    ActionChains(opened_page).send_keys(Keys.ARROW_RIGHT).perform()
+    assert opened_page.current_url.endswith("#photo-2")
+    ActionChains(opened_page).send_keys(Keys.ESCAPE).perform()
+    assert opened_page.find_elements(By.CSS_SELECTOR, ".photo:target") == []
+    box = opened_page.find_element(By.ID, "vectors")
+    opened_page.execute_script("arguments[0].scrollIntoView({block: 'center'})", box)
+    box.click()
+    assert not vectors.is_displayed()
+
+
+def test_vectors_stand_where_the_circles_are(opened_page):
+    """The first centre of the image, through the browser's own transform of the drawing."""
+    opened_page.find_element(By.CSS_SELECTOR, "#photo-0 .open").click()
+    x, y = opened_page.execute_script(
+        "const path = document.querySelector('#photo-0 .vectors path'), p = path.getPointAtLength(0);"
+        "const s = p.matrixTransform(path.getScreenCTM()); return [s.x, s.y];"
+    )
+    photo = opened_page.find_element(By.CSS_SELECTOR, "#photo-0 img").rect
+    top = opened_page.execute_script("return window.scrollY")
+    centre = np.random.default_rng(1).uniform((0, 0), (2592, 1728), (12, 2))[0]
+    scale = photo["width"] / 2592
+    assert x == pytest.approx(photo["x"] + scale * (centre[0] + 0.5), abs=0.1)
+    assert y == pytest.approx(photo["y"] - top + scale * (centre[1] + 0.5), abs=0.5)
+
+
+@pytest.mark.parametrize("width", [400, 1280])
+def test_the_page_is_never_wider_than_its_window(chrome, page, width):
+    show(chrome, page, width)
+    assert sideways_px(chrome) == 0
+    assert faults(chrome) == []
+
+
+def test_without_script_and_on_paper_the_pictures_stand(chrome, page):
+    canvas, still = ".turn canvas", ".still img"
+    chrome.execute_cdp_cmd("Emulation.setScriptExecutionDisabled", {"value": True})
+    try:
+        show(chrome, page)
+        shown = [chrome.find_element(By.CSS_SELECTOR, each).is_displayed() for each in (canvas, still)]
+    finally:
+        chrome.execute_cdp_cmd("Emulation.setScriptExecutionDisabled", {"value": False})
+    assert shown == [False, True]
+    show(chrome, page)
+    assert [chrome.find_element(By.CSS_SELECTOR, each).is_displayed() for each in (canvas, still)] == [True, False]
+    chrome.execute_cdp_cmd("Emulation.setEmulatedMedia", {"media": "print"})
+    try:
+        assert [chrome.find_element(By.CSS_SELECTOR, each).is_displayed() for each in (canvas, still)] == [False, True]
+    finally:
+        chrome.execute_cdp_cmd("Emulation.setEmulatedMedia", {"media": ""})
