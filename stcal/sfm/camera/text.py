@@ -2,6 +2,7 @@
 
 import numpy as np
 
+from stcal.io.camera import COLMAP_PIXEL_ORIGIN
 from stcal.report.text import number, text_table
 from stcal.sfm.camera.calibrate import CameraCalibration
 from stcal.sfm.camera.file import CalibrationFile
@@ -31,6 +32,10 @@ def calibration_text(result: CameraCalibration, summary: CalibrationFile) -> str
         f"{name:>4} {each.value:14.6f} ± {each.sigma:.6f}{' px' if name[0] in 'fc' else ''}"
         for name, each in summary.parameters.items()
     ]
+    lines.append(
+        "cx, cy count from the centre of the top-left pixel; the camera file is COLMAP's, counts from that pixel's "
+        f"corner and has them {COLMAP_PIXEL_ORIGIN:g} px larger"
+    )
     lines.append(
         f"σ of a projection: {np.median(result.projection.sigma_px):.4f} px median over the image, "
         f"{result.projection.corner_sigma_px.max():.4f} px in the worst corner"

@@ -5,6 +5,7 @@ from pathlib import Path
 
 import numpy as np
 
+from stcal.io.camera import CalibratedCamera
 from stcal.io.images import Skipped
 from stcal.labels import DotLabel
 from stcal.report.text import text_table
@@ -38,6 +39,8 @@ def run_text(result: RunResult) -> str:
         lines.append(
             "uncorrected control: without the eccentricity faces are off by tens of µm, and no residual shows it"
         )
+    if result.camera.covariance is not None and not result.options.refine_camera:
+        lines.append(_camera_taken_as_exact(result.camera))
     reused = sum(image.reused for image in result.detection.images)
     if reused:
         lines.append(f"detections kept from an earlier run: {reused} of {len(result.detection.images)}")
@@ -52,6 +55,16 @@ def run_text(result: RunResult) -> str:
     if result.target.target_from_face:
         lines.append(f"faces:  {result.out / 'faces.json'}")
     return "\n".join([*lines, f"report: {result.out / 'report.html'}"])
+
+
+def _camera_taken_as_exact(camera: CalibratedCamera) -> str:
+    """Of a camera file that states σ."""
+    assert camera.covariance is not None
+    focal = float(np.sqrt(camera.covariance[0, 0]))
+    return (
+        f"the camera file states σ of its parameters ({focal:.2g} px of the focal length), and this run takes them as "
+        "exact: no σ below holds them; --refine-camera adjusts the intrinsics within them and carries them into all σ"
+    )
 
 
 def detection_text(detection: DetectionResult, labelled: Sequence[LabelledImage]) -> str:

@@ -1,6 +1,7 @@
 """Intrinsics from board views: without pixels against the truth and their own σ, with pixels, and refusals."""
 
 import json
+import re
 from dataclasses import replace
 from types import SimpleNamespace
 
@@ -220,6 +221,12 @@ def test_a_board_upside_down_is_numbered_like_the_others():
 def require_true_and_said(out, truth, printed, photographs):
     """The camera file is a prior that covers the truth, and the figures beside it say the same."""
     assert "split-half check" in printed
+    # Terminal and file have the same principal point, half a pixel apart as the line below says.
+    (shown,) = re.findall(r"^ *cx +([0-9.]+) ±", printed, flags=re.MULTILINE)
+    stated = out.read_text(encoding="utf-8").splitlines()[-1].split()
+    assert stated[1] == "OPENCV"
+    assert float(stated[6]) == pytest.approx(float(shown) + 0.5, abs=1e-6)
+    assert "counts from that pixel's corner and has them 0.5 px larger" in printed
     camera = read_camera(out).calibrated(truth.width, truth.height)
     prior = camera_prior(camera)
     assert prior.colmap_model == "OPENCV"

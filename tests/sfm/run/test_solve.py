@@ -1,11 +1,15 @@
 """What cannot be solved is refused before anything is mapped, and says what to add."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
 from stcal.errors import MappingError
+from stcal.io.camera import CalibratedCamera
 from stcal.io.images import Skipped
 from stcal.sfm.run.solve import require_usable, usable_groups
+from stcal.sfm.run.text import run_text
 
 
 @pytest.fixture(scope="module")
@@ -53,3 +57,16 @@ def test_a_folder_of_copies_or_of_notes_is_no_group(group):
         Skipped("99/notes.txt", "not an image file"),
     ]
     assert usable_groups({"12": group}, skipped) == ({"12": group}, [])
+
+
+def test_a_run_that_takes_a_camera_with_sigma_as_exact_says_so(small_result):
+    assert "--refine-camera" not in run_text(small_result)
+    camera = small_result.camera
+    stated = CalibratedCamera.of(camera, camera.colmap_model, np.diag([1.44] * len(camera.colmap_params())))
+    said = (
+        "the camera file states σ of its parameters (1.2 px of the focal length), and this run takes them as exact: no "
+        "σ below holds them; --refine-camera adjusts the intrinsics within them"
+    )
+    assert said in run_text(replace(small_result, camera=stated))
+    refined = replace(small_result, camera=stated, options=replace(small_result.options, refine_camera=True))
+    assert said not in run_text(refined)
