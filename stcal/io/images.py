@@ -28,6 +28,16 @@ HOLDS_IMAGES = "it holds images"
 TOP_GROUP = "."
 """Name of the group that images lying directly in the folder form."""
 
+NOISE_BLUR_PX = 1.5
+"""σ of the blur that takes noise away."""
+SAME_NOISE = 1.2
+"""RMS difference of two forms of one photograph, in RMS of its noise, at most: a JPEG of low quality differs by 1.1,
+two exposures by 1.5."""
+SAME_GREY = 1.0
+"""And grey values of 255: what rounding and compression change where there is no noise."""
+SAME_EDGES = 1.5
+"""So much more at most over the whole image: compression changes edges a little, a camera that moved much."""
+
 THUMBNAIL_PX = 1400
 THUMBNAIL_QUALITY = 80
 MOST_JPEG_SIDE = 65_000
@@ -231,6 +241,31 @@ def grey_8bit(image: np.ndarray) -> np.ndarray:
 def grey_fine(image: np.ndarray) -> np.ndarray:
     """The image in the grey values of :func:`grey_8bit`, not rounded to them."""
     return image if image.dtype == np.uint8 else image * np.float32(255.0 / _bright_end(image))
+
+
+def same_photograph(image: np.ndarray, other: np.ndarray) -> bool:
+    """Whether two grey images are of one exposure, kept in two forms: their noise is the same, as far as a form with
+    losses leaves it. Two exposures from one place have noise of their own, and differ by √2 of it.
+
+    Parameters
+    ----------
+    image, other : (height, width) uint8 or uint16
+        They may differ in brightness by a factor and a constant.
+    """
+    if image.shape != other.shape:
+        return False
+    one, two = (grey_8bit(each).astype(np.float32) for each in (image, other))
+    one, two = one - one.mean(), two - two.mean()
+    one *= float((one * two).mean()) / max(float((one * one).mean()), 1e-9)
+    smooth = [cv2.GaussianBlur(each, (0, 0), NOISE_BLUR_PX) for each in (one, two)]
+    slope = np.hypot(*np.gradient(smooth[0]))
+    flat = slope <= np.median(slope)  # edges would hide it
+
+    def rms(values: np.ndarray) -> float:
+        return float(np.sqrt((values[flat] ** 2).mean()))
+
+    allowed = max(SAME_GREY, SAME_NOISE * max(rms(one - smooth[0]), rms(two - smooth[1])))
+    return rms(two - one) < allowed and float(np.sqrt(((two - one) ** 2).mean())) < SAME_EDGES * allowed
 
 
 def shrunk(image: np.ndarray, scale: float) -> np.ndarray:

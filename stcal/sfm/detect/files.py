@@ -2,9 +2,12 @@
 
 import hashlib
 import json
-from collections.abc import Callable, Sequence
+import re
+from collections import Counter
+from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import asdict, dataclass, fields
+from itertools import combinations
 from pathlib import Path
 
 import numpy as np
@@ -14,7 +17,7 @@ from stcal.errors import ConvergenceError, DetectionError, InputError
 from stcal.geometry.camera import Camera
 from stcal.io.cache import keep, kept, packed
 from stcal.io.camera import CameraModel
-from stcal.io.images import ImageFile, Skipped, decode, grey_8bit, thumbnail
+from stcal.io.images import ImageFile, Skipped, decode, grey_8bit, same_photograph, thumbnail
 from stcal.io.saving import save
 from stcal.io.spread import run_on_images
 from stcal.labels import parse_label, parse_labels
@@ -26,6 +29,14 @@ from stcal.sfm.detect.sightings import BoardSighting, FaceSighting, ImageDetecti
 
 CACHE_VERSION = 7
 """Raised whenever detection gives other results for the same image: what was kept is then not used again."""
+
+LOSSY = (".jpg", ".jpeg")
+COPY = re.compile(r"\b(copy|kopie|copie|copia|cópia)\b|\(\d+\)|~", re.IGNORECASE)
+"""What file managers add to the name of a second copy."""
+SAME_PLACE_PX = 4.0
+SAME_SHARE = 0.6
+"""Share of an image's circles that lie within the same squares of that side in another form of it; at a square's edge
+some change over."""
 
 Detector = Callable[[np.ndarray, Camera, TargetDesign, BoardDesign | None, EllipseOptions], ImageDetection]
 """Reads one grey image."""
@@ -63,6 +74,7 @@ def detect_files(
     workers: int | None = None,
     progress: Callable[[str], None] | None = None,
     detector: Detector | None = None,
+    forms: bool = True,
 ) -> DetectionResult:
     """Detect in all files; what cannot be used is skipped and listed.
 
@@ -71,6 +83,7 @@ def detect_files(
     cache : folder for results by content
     progress : called with the name of each finished file, in any order
     detector : what reads one image; ours where None
+    forms : whether one photograph in several forms, as PNG and JPEG, counts once, as files of one content always do
 
     Raises
     ------
@@ -96,7 +109,7 @@ def detect_files(
         found[i] = outcome if isinstance(outcome, Skipped) else _stored(files[i], cache, *outcome)
         if progress:
             progress(files[i].name)
-    images, skipped = _without_copies([f for f in found if f is not None])
+    images, skipped = _without_copies([f for f in found if f is not None], forms)
     if not images:
         first = skipped[0]
         raise InputError(f"no usable image among {len(files)}: {first.name}: {first.reason}")
@@ -316,25 +329,60 @@ def _stored_look(stored, meta) -> SecondLook:
     return SecondLook(parse_labels(meta["labels"]), _stored_centres(stored), missed)
 
 
-def copy_of(file: ImageFile, first: str) -> Skipped:
+def copy_of(file: ImageFile, first: str, what: str = "") -> Skipped:
     """Why a second file of the same content is left out."""
-    return Skipped(file.name, f"the same image as {first}", "copy")
+    return Skipped(file.name, f"the same image as {first}{what}", "copy")
 
 
-def _without_copies(found: list[DetectedImage | Skipped]) -> tuple[list[DetectedImage], list[Skipped]]:
-    """A second copy of a photograph adds no information and would pass for it."""
-    images: list[DetectedImage] = []
-    skipped: list[Skipped] = []
-    first: dict[str, str] = {}
-    for each in found:
-        if isinstance(each, Skipped):
-            skipped.append(each)
-        elif each.digest in first:
-            skipped.append(copy_of(each.file, first[each.digest]))
-        else:
-            first[each.digest] = each.file.name
-            images.append(each)
-    return images, skipped
+def _without_copies(found: list[DetectedImage | Skipped], forms: bool) -> tuple[list[DetectedImage], list[Skipped]]:
+    """A second copy of a photograph adds no information and would pass for it: of files with the same content the
+    plainest name stays, of one photograph in several ``forms`` the one without losses."""
+    every = [each for each in found if isinstance(each, DetectedImage)]
+    plain: dict[str, DetectedImage] = {}
+    for each in sorted(every, key=lambda each: _plainness(each.file)):
+        plain.setdefault(each.digest, each)
+    firsts = [(each, plain[each.digest]) for each in every]
+    gone = {each.file.name: copy_of(each.file, first.file.name) for each, first in firsts if each is not first}
+    for one, two in _in_two_forms([each for each, first in firsts if each is first] if forms else []):
+        first, second = sorted((one, two), key=lambda each: _plainness(each.file))
+        if {first.file.name, second.file.name} & gone.keys() or not _same_pixels(first.file, second.file):
+            continue
+        gone[second.file.name] = copy_of(second.file, first.file.name, ", saved in another form")
+    images = [each for each in every if each.file.name not in gone]
+    skipped = [each if isinstance(each, Skipped) else gone.get(each.file.name) for each in found]
+    return images, [each for each in skipped if each is not None]
+
+
+def _plainness(file: ImageFile) -> tuple[bool, bool, int]:
+    """Less is plainer: a form without losses, no word of a copy in the name, a short name."""
+    return file.path.suffix.lower() in LOSSY, bool(COPY.search(file.path.stem)), len(file.path.stem)
+
+
+def _in_two_forms(images: list[DetectedImage]) -> Iterator[tuple[DetectedImage, DetectedImage]]:
+    """Pairs of images in different forms whose circles are at the same places, to some px. A camera that stands still
+    takes such pairs too, but in one form."""
+    kinds = [each.file.path.suffix.lower()[:4].replace(".jpe", ".jpg") for each in images]
+    if len(set(kinds)) < 2:
+        return
+    cells = [
+        {tuple(cell) for cell in np.floor(each.detection.centres.centre_px / SAME_PLACE_PX).astype(int).tolist()}
+        for each in images
+    ]
+    images_of: dict[tuple, list[int]] = {}
+    for i, own in enumerate(cells):
+        for cell in own:
+            images_of.setdefault(cell, []).append(i)
+    common = Counter(pair for seen in images_of.values() for pair in combinations(seen, 2))
+    for (i, j), count in sorted(common.items()):
+        if kinds[i] != kinds[j] and count >= SAME_SHARE * min(len(cells[i]), len(cells[j])):
+            yield images[i], images[j]
+
+
+def _same_pixels(one: ImageFile, two: ImageFile) -> bool:
+    try:
+        return same_photograph(*(decode(each.read(), each.name) for each in (one, two)))
+    except (InputError, OSError):
+        return False
 
 
 def require_upright(images: tuple[DetectedImage, ...]) -> None:

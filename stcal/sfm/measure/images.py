@@ -136,7 +136,9 @@ def measure(
     else:
         with tempfile.TemporaryDirectory(prefix="stcal-measure-") as scratch:
             cache = Path(scratch)
-            detection = detect_files(files, camera, design, board, options.ellipses, cache, options.workers, step)
+            detection = detect_files(
+                files, camera, design, board, options.ellipses, cache, options.workers, step, forms=False
+            )
         observations, notes = _labelled(detection.images, design)
         prior = None if camera.covariance is None else CameraPrior(camera.colmap_model, camera.covariance)
         result = measure_labelled(observations, detection.camera, target, options, prior)

@@ -1,0 +1,62 @@
+"""One photograph is one view, however often and in whatever form it lies in the folder."""
+
+import shutil
+
+import cv2
+import numpy as np
+import pytest
+
+from stcal.io.images import same_photograph
+from tests.sfm.conftest import SMALL
+
+pytestmark = pytest.mark.usefixtures("no_page")
+NOISE = 2.5
+"""Grey values: 1 % of full scale."""
+
+
+def as_jpeg(image, quality: int) -> np.ndarray:
+    _, data = cv2.imencode(".jpg", image, [cv2.IMWRITE_JPEG_QUALITY, quality])
+    return cv2.imdecode(data, cv2.IMREAD_GRAYSCALE)
+
+
+@pytest.fixture(scope="module")
+def sharp(small_dataset):
+    image = cv2.imread(str(small_dataset / "images" / "12" / "IMG_1000.jpg"), cv2.IMREAD_GRAYSCALE)
+    return cv2.GaussianBlur(image, (0, 0), 1.0).astype(float)
+
+
+def exposure(sharp, seed: int) -> np.ndarray:
+    noise = NOISE * np.random.default_rng(seed).standard_normal(sharp.shape)
+    return np.clip(sharp + noise, 0, 255).round().astype(np.uint8)
+
+
+@pytest.mark.parametrize("quality", [60, 80, 95])
+def test_a_form_with_losses_is_the_same_photograph_and_a_second_exposure_is_not(sharp, quality):
+    first, second = exposure(sharp, 1), exposure(sharp, 2)
+    assert same_photograph(first, as_jpeg(first, quality))
+    assert same_photograph(as_jpeg(first, quality), first)
+    assert not same_photograph(first, second)
+    assert not same_photograph(as_jpeg(first, quality), as_jpeg(second, quality))
+
+
+def test_sixteen_bits_and_a_picture_without_noise_are_the_same_photograph(sharp):
+    first = exposure(sharp, 1)
+    assert same_photograph(first, first.astype(np.uint16) * 200)
+    smooth = sharp.round().astype(np.uint8)
+    assert same_photograph(smooth, as_jpeg(smooth, 90))
+    assert not same_photograph(smooth, smooth[:-1])
+    assert not same_photograph(smooth, np.roll(smooth, 1, axis=1))
+
+
+def test_png_and_jpeg_of_one_photograph_are_one_view(stcal_sfm, small_set):
+    small = small_set("12")
+    cv2.imwrite(str(small.image(1).with_suffix(".png")), cv2.imread(str(small.image(1)), cv2.IMREAD_GRAYSCALE))
+    shutil.copy(small.image(2), small.image(2).with_name("IMG_1002 (copy).jpg"))
+    shutil.copy(small.image(3), small.image(3).with_name("Copy of IMG_1003.jpg"))
+    files = "--target", small.folder / "target.toml", "--board", small.folder / "board.toml"
+    code, out, _ = stcal_sfm(*small.arguments(*files, "--solve", "chain"))
+    assert code == 0
+    assert f"group 12: {SMALL.images_per_group} images" in out
+    assert "skipped 12/IMG_1001.jpg: the same image as 12/IMG_1001.png, saved in another form" in out
+    assert "skipped 12/IMG_1002 (copy).jpg: the same image as 12/IMG_1002.jpg" in out
+    assert "skipped 12/Copy of IMG_1003.jpg: the same image as 12/IMG_1003.jpg" in out
