@@ -86,7 +86,7 @@ def _scene(each: Located, files: SceneFiles, layout: TargetLayout, model: Camera
     """Values of a scene as the template shows them."""
     by_name = {file.name: file for file in files.files}
     shown = each.tags.readable()
-    best = max(shown, key=lambda exposure: len(exposure.tags), default=None)
+    best = best_exposure(shown, layout)
     few = shown if len(shown) > 1 else []
     return {
         "decision": _decision(each),
@@ -106,6 +106,20 @@ def _scene(each: Located, files: SceneFiles, layout: TargetLayout, model: Camera
         "best": best and _picture(best, by_name[best.name], each, layout, model, WIDE_PX),
         "small": [_picture(own, by_name[own.name], None, layout, model, SMALL_PX) for own in few],
     }
+
+
+def best_exposure(exposures: Sequence[Exposure], layout: TargetLayout) -> Exposure | None:
+    """The one with most tags of the layout; of several that with the smallest σ of their corners and edges, which
+    darkness and saturation raise. None where there is none."""
+    known = layout.rows()
+
+    def rank(exposure: Exposure) -> tuple[int, float]:
+        own = [tag in known for tag in exposure.tags.tags]
+        corners = np.trace(exposure.tags.covariance_px2, axis1=2, axis2=3)
+        variance = (corners + exposure.tags.edge_sigma_px()[:, None] ** 2)[own]
+        return sum(own), -float(np.median(variance)) if any(own) else 0.0
+
+    return max(exposures, key=rank, default=None)
 
 
 def _picture(
