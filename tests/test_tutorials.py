@@ -1,0 +1,44 @@
+"""The tutorials run, block after block, and print what they say."""
+
+import os
+import re
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).resolve().parents[1]
+TUTORIALS = sorted((ROOT / "docs" / "tutorials").glob("*.md"))
+BLOCK = re.compile(r"^```(bash|python|text)\n(.*?)^```$", re.MULTILINE | re.DOTALL)
+NUMBER = re.compile(r"\d+(?:\.\d+)?")
+"""Of what a page shows; another processor rounds otherwise."""
+
+
+def run(kind: str, code: str, folder: Path) -> str:
+    """What a block prints, run in a folder by the program that is tested."""
+    programs = str(Path(sys.executable).parent)
+    environment = os.environ | {"PATH": f"{programs}{os.pathsep}{os.environ['PATH']}", "PYTHONPATH": str(ROOT)}
+    words = ["bash", "-euo", "pipefail", "-c", code] if kind == "bash" else [sys.executable, "-c", code]
+    ended = subprocess.run(words, cwd=folder, env=environment, capture_output=True, text=True, check=False)
+    assert ended.returncode == 0, f"{code}\n{ended.stdout}\n{ended.stderr}"
+    return ended.stdout
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("page", TUTORIALS, ids=lambda page: page.stem)
+def test_a_tutorial_runs_and_prints_what_it_says(page, tmp_path):
+    (tmp_path / "tests").symlink_to(ROOT / "tests")
+    printed = ""
+    for kind, code in BLOCK.findall(page.read_text("utf-8")):
+        if kind != "text":
+            printed = run(kind, code, tmp_path)
+            continue
+        lines = {NUMBER.sub("#", line).strip() for line in printed.splitlines()}
+        assert [line for line in code.splitlines() if NUMBER.sub("#", line).strip() not in lines] == [], printed
+
+
+def test_every_tutorial_has_blocks_that_run():
+    assert len(TUTORIALS) >= 4
+    for page in TUTORIALS:
+        assert {kind for kind, _ in BLOCK.findall(page.read_text("utf-8"))} & {"bash", "python"}, page.name
