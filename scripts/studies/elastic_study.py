@@ -102,7 +102,7 @@ def draw_loaded(case: Case, seed: int) -> tuple[np.ndarray, np.ndarray]:
     true = replace(true, elasticity=replace(true.elasticity, payload_centre=CENTRE))
     nominal = replace(mh80(), elasticity=replace(true.elasticity, compliance=np.zeros((6, 2))))
     mass = np.resize(case.payloads, case.rows)
-    data = measured(true, joint_vectors(true, case.rows, rng), rng, SIGMA_MM, SIGMA_RAD, payload_kg=mass)
+    data = measured(true, joint_vectors(true, case.rows, rng), rng, SIGMA_MM, SIGMA_RAD, conditions=Conditions(mass))
     if case.kind == "position":
         data = replace(data, rotations=None)
     q, carried = joint_vectors(true, NEW_POSES, rng), Conditions(rng.uniform(0, MOST_KG, NEW_POSES))

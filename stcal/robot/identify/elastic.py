@@ -14,7 +14,7 @@ from stcal.robot.kinematics.conditions import USUAL, Conditions
 from stcal.robot.kinematics.forward import GRAVITY_M_S2, elasticity_values
 from stcal.robot.kinematics.model import Chain, Elasticity, Robot
 
-AXIS, ACROSS, PERIODIC, MOMENT = 3, 4, 5, 6
+AXIS, ACROSS, PERIODIC, HYSTERESIS, MOMENT = 3, 4, 5, 6, 7
 """Groups of σ, after those of the dimensions; that of moments, and those after it, are not estimated."""
 MASS_KG = 100.0
 """Of an arm of one metre, growing with the square of its length, from the first link to the last falling to nothing:
@@ -31,9 +31,9 @@ SOME = 0.1
 
 @dataclass(frozen=True, slots=True, eq=False)
 class UsualElasticity:
-    """``expected``, ``scale`` : (9 n,) what each of :func:`elasticity_values` is expected to be, and what makes it rad
-    at the joint's usual torque, or a share of the usual moment; ``group`` : (9 n,) whose σ; ``factor_sigma`` : of a
-    factor that all moments have in common."""
+    """``expected``, ``scale`` : (9 n,), or (10 n,) with hysteresis, what each of :func:`elasticity_values` is expected
+    to be, and what makes it rad at the joint's usual torque, or a share of the usual moment; ``group`` : of each, whose
+    σ; ``factor_sigma`` : of a factor that all moments have in common."""
 
     expected: np.ndarray
     scale: np.ndarray
@@ -41,16 +41,17 @@ class UsualElasticity:
     factor_sigma: float = 0.0
 
     def away(self, chain: Chain) -> np.ndarray:
-        """(9 n,) from what is expected, rad or shares."""
+        """From what is expected, rad or shares."""
         assert chain.elasticity is not None
-        return self._apart((elasticity_values(chain.elasticity) - self.expected) * self.scale)
+        values = elasticity_values(chain.elasticity, HYSTERESIS in self.group)
+        return self._apart((values - self.expected) * self.scale)
 
     def jacobian(self) -> np.ndarray:
-        """(9 n, 9 n) of :meth:`away` by the values."""
+        """Of :meth:`away` by the values."""
         return self._apart(np.diag(self.scale))
 
     def _apart(self, shares: np.ndarray) -> np.ndarray:
-        """Shares (9 n, …), independent with σ 1: moments err by these and, all together, by the factor. The inverse
+        """Shares, independent with σ 1: moments err by these and, all together, by the factor. The inverse
         root of their covariance 1 + σ² m mᵀ is shorter along m, the usual moments, and as it was across."""
         if not self.factor_sigma:
             return shares
@@ -61,14 +62,18 @@ class UsualElasticity:
         return shares - less * np.multiply.outer(along, along @ shares)
 
 
-def usual(chain: Chain, carried: bool = False) -> UsualElasticity:
-    """Of an arm with these dimensions; known loads are ``carried``, which show how heavy it is itself."""
+def usual(chain: Chain, carried: bool = False, hysteresis: bool = False) -> UsualElasticity:
+    """Of an arm with these dimensions; known loads are ``carried``, which show how heavy it is itself; with
+    ``hysteresis`` (10 n,)."""
     n = len(chain)
     moment, beside = _moments(chain)
     torque = np.cumsum((np.linalg.norm(moment, axis=1) + beside)[::-1])[::-1]
     expected = np.concatenate([np.zeros(2 * n), moment.ravel(), np.zeros(4 * n)])
     scale = np.concatenate([np.repeat(torque, 2), np.repeat(1 / beside, 3), np.ones(4 * n)])
     group = np.concatenate([np.tile([AXIS, ACROSS], n), np.full(3 * n, MOMENT), np.full(4 * n, PERIODIC)])
+    if hysteresis:
+        expected, scale = np.append(expected, np.zeros(n)), np.append(scale, np.ones(n))
+        group = np.append(group, np.full(n, HYSTERESIS))
     return UsualElasticity(expected, scale, group, HEAVIER if carried else 0.0)
 
 
@@ -81,7 +86,7 @@ def carries(chain: Chain, conditions: Conditions) -> bool:
 
 def bending(state: State, robot: Robot, deflection_rad: float, conditions: Conditions = USUAL) -> State:
     """The state with elasticity to be adjusted: as the robot file has it, or hardly any, and gravity down from the
-    base; with the mass that all rows carried, if it was one."""
+    base; with the mass that all rows carried, if it was one, and with hysteresis if rows say from where joints came."""
     elasticity = state.chain.elasticity
     if elasticity is None or not elasticity.compliance.any():
         n, known = len(state.chain), usual(state.chain)
@@ -94,7 +99,8 @@ def bending(state: State, robot: Robot, deflection_rad: float, conditions: Condi
     mass = conditions.payload_kg
     if mass is not None and np.ptp(mass) == 0:
         elasticity = replace(elasticity, payload_kg=float(mass[0]))
-    return replace(state, chain=replace(state.chain, elasticity=elasticity), elastic=True)
+    chain = replace(state.chain, elasticity=elasticity)
+    return replace(state, chain=chain, elastic=True, hysteresis=conditions.approached)
 
 
 def _moments(chain: Chain) -> tuple[np.ndarray, np.ndarray]:

@@ -56,6 +56,7 @@ class ElasticJoint(Part):
     across_rad_per_Nm: float
     moment_Nm: list[float]
     periodic_rad: list[float]
+    hysteresis_rad: float
 
 
 class ElasticityFound(Part):
@@ -127,7 +128,8 @@ class IdentifiedFile(ResultFile):
     )
     elasticity: ElasticityFound | None = Field(
         description="of the elastic model: `gravity` in the base, and for each of the `joints` what stands in the "
-        "robot file, `axis_rad_per_Nm`, `across_rad_per_Nm`, `moment_Nm`, `periodic_rad`; `sigma` of the same"
+        "robot file, `axis_rad_per_Nm`, `across_rad_per_Nm`, `moment_Nm`, `periodic_rad`, `hysteresis_rad`; `sigma` of "
+        "the same"
     )
     sigma_mm: float | None = Field(
         description="of one coordinate, given or estimated (null where each row has its own)"
@@ -137,7 +139,8 @@ class IdentifiedFile(ResultFile):
     deviations: dict[str, float | None] = Field(
         description="`length_mm`, `twist_rad`, `zero_rad`: σ of this robot's dimensions about nominal, as estimated; "
         "`axis_rad`, `across_rad`: of what links give way by about their joints' axes and across them, at the torque "
-        "that is usual for an arm of this length; `periodic_rad`: of what gears err; null where it has none"
+        "that is usual for an arm of this length; `periodic_rad`: of what gears err, `hysteresis_rad`: of "
+        "what they do by where they came from; null where it has none"
     )
     errors: BothErrors = Field(
         description="`nominal` (with base and tools fitted) and `identified`: `mean_mm`, `rms_mm`, `max_mm`"

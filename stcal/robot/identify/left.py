@@ -76,7 +76,8 @@ def left(
     """What the residuals of ``state`` go with.
 
     Candidates are each joint's zero and its angle, once and twice a turn, as a motion of that joint (a gear's or an
-    encoder's error) and as one of the tool along the base's axes; prismatic joints' values; the torque of a load at the
+    encoder's error) and as one of the tool along the base's axes, and the direction from which it came; prismatic
+    joints' values; the torque of a load at the
     tool about each joint, where z of the base is up; and place: scale, linear, distance from the base's axis.
 
     Parameters
@@ -230,6 +231,9 @@ def _candidates(state: State, seen: Observed, world_from_base: Rigid) -> list[_C
             what = f"the angle of joint {joint}, {said}"
             add(f"{what}, along its motion", own[:, :, None] * waves[:, None], joint, turns)
             add(what, np.einsum("dc,mt->mdct", along, waves).reshape(len(waves), 6, 6), joint, turns)
+        came = data.conditions.approach
+        if came is not None and came[:, i].any():
+            add(f"the direction from which joint {joint} came", own[:, :, None] * came[:, i, None, None], joint)
         torque = np.einsum("mi,mi->m", z, np.cross(arm, base[:, 2]))
         if np.abs(torque).max() > NEW * np.linalg.norm(arm, axis=1).max():
             what = f"gravity's torque about joint {joint}"

@@ -25,7 +25,7 @@ COAXIAL_MM = 100.0
 """Of parallel axes closer than this an error of length across them turns θ by more than zero positions err (0.5 mm over
 5 mrad)."""
 LENGTH, TWIST, ZERO = 0, 1, 2
-FIXED_LENGTH, FIXED_ANGLE = 7, 8
+FIXED_LENGTH, FIXED_ANGLE = 8, 9
 FIXED_MM, FIXED_RAD = 1e-4, 1e-7
 """σ of dimensions that are not adjusted: a ten-thousandth of a millimetre at 1 m."""
 Adjusted = Literal["all", "geometry", "zeros", "base,tool"]
@@ -58,8 +58,9 @@ def adjusted(text: str) -> Adjusted:
 @dataclass(frozen=True, slots=True)
 class Deviations:
     """σ of a robot's dimensions about nominal: lengths (mm), twists, and zero positions of joints (rad, mm); and of
-    what its links give way by at the usual torque about the joints' axes and across them, and of its gears (rad). The
-    values here are what is expected before the data are seen: some tenths of a millimetre and of a degree."""
+    what its links give way by at the usual torque about the joints' axes and across them, of its gears, and of its
+    joints' hysteresis (rad). The values here are what is expected before the data are seen: some tenths of a millimetre
+    and of a degree."""
 
     length_mm: float = 0.5
     twist_rad: float = 1e-3
@@ -67,6 +68,7 @@ class Deviations:
     axis_rad: float = 3e-4
     across_rad: float = 1e-4
     periodic_rad: float = 1e-4
+    hysteresis_rad: float = 1e-4
 
     def of(self, groups: np.ndarray) -> dict[str, float | None]:
         """By name; None of groups that the robot has no dimensions of."""
@@ -127,7 +129,7 @@ class NominalRows:
         kept = np.isin(group, KEPT[adjust])
         kept |= [[name in joint.fixed for name in DIMENSIONS] for joint in nominal.joints]
         group[kept] = np.where(group[kept] == LENGTH, FIXED_LENGTH, FIXED_ANGLE)
-        elasticity = usual(nominal.chain(), carried) if state.elastic else None
+        elasticity = usual(nominal.chain(), carried, state.hysteresis) if state.elastic else None
         return cls(nominal, coaxial, jacobian, np.abs(jacobian * units).max(axis=2) > 1e-9, group, elasticity)
 
     def held(self, state: State, deviations: Deviations, kind: Kind) -> Held:

@@ -45,7 +45,8 @@ def identified_text(result: Identified, nominal: Robot) -> str:
     lines += ["", *text_table(rows, (6, *[11, 7] * 5))]
     lines += ["", *text_table([["<mm and rotation vector, deg", *PLACE], *placed], (34, *[9] * 6))]
     if result.elasticity_sigma is not None:
-        lines += ["", *text_table([ELASTIC, *elastic_rows(result)], (16, *[12] * 4))]
+        head = elastic_head(result)
+        lines += ["", *text_table([head, *elastic_rows(result)], (16, *[12] * (len(head) - 1)))]
     indices = result.observability.values()
     lines += ["", "observability  " + "   ".join(f"{name} {value:.3g}" for name, value in indices.items())]
     outliers = result.outliers()
@@ -137,7 +138,7 @@ def identified_page(result: Identified, nominal: Robot) -> str:
         noise=_noise(result),
         model=[*_price(result), *_model(result)],
         elastic=elastic_rows(result),
-        elastic_head=ELASTIC,
+        elastic_head=elastic_head(result),
         errors_by_row=uri(_figure(result)),
         dh=_rows(result, nominal),
         placed=[placed_cells(each) for each in result.placed],
@@ -182,9 +183,14 @@ def _model(result: Identified) -> list[str]:
     ]
 
 
+def elastic_head(result: Identified) -> list[str]:
+    """Over :func:`elastic_rows`."""
+    return [*ELASTIC, *(["hysteresis"] if result.state.hysteresis else [])]
+
+
 def elastic_rows(result: Identified) -> list[list[str]]:
-    """Of each joint, what its link gives way by at the torques of the measured rows (RMS), and the amplitudes of its
-    gear, with σ."""
+    """Of each joint, what its link gives way by at the torques of the measured rows (RMS), the amplitudes of its gear,
+    and where it was adjusted its hysteresis, with σ."""
     elasticity, sigma = result.state.chain.elasticity, result.elasticity_sigma
     if elasticity is None or sigma is None:
         return []
@@ -202,6 +208,8 @@ def elastic_rows(result: Identified) -> list[list[str]]:
         for pair in (slice(0, 2), slice(2, 4)):
             size, each = float(np.linalg.norm(elasticity.periodic[i, pair])), sigma.periodic[i, pair]
             cells.append((size, float(np.sqrt((each**2).mean()))))
+        if result.state.hysteresis:
+            cells.append((elasticity.hysteresis[i], sigma.hysteresis[i]))
         rows.append([str(i + 1), *(f"{MDEG * value:.1f} ± {MDEG * s:.1f}" for value, s in cells)])
     return rows
 
@@ -213,9 +221,10 @@ def _elasticity(result: Identified) -> dict | None:
         return None
 
     def joints(each: Elasticity) -> list[dict]:
-        parts = zip(each.compliance.tolist(), each.moment.tolist(), each.periodic.tolist(), strict=True)
+        parts = (each.compliance, each.moment, each.periodic, each.hysteresis)
         return [
-            {"axis_rad_per_Nm": a, "across_rad_per_Nm": b, "moment_Nm": m, "periodic_rad": p} for (a, b), m, p in parts
+            {"axis_rad_per_Nm": a, "across_rad_per_Nm": b, "moment_Nm": m, "periodic_rad": p, "hysteresis_rad": h}
+            for (a, b), m, p, h in zip(*(part.tolist() for part in parts), strict=True)
         ]
 
     return {"gravity": found.gravity.tolist(), "joints": joints(found), "sigma": joints(sigma)}
@@ -314,6 +323,7 @@ def _noise(result: Identified) -> str:
     kinds = (
         *((" mm in lengths", 1.0), ("° in twists", degrees), ("° in zero positions", degrees)),
         *(("° by gravity about axes", degrees), ("° across them", degrees), ("° by gears", degrees)),
+        ("° by hysteresis", degrees),
     )
     found = zip(result.deviations.values(), kinds, strict=True)
     shown = ", ".join(f"{sigma * unit:.2g}{what}" for sigma, (what, unit) in found if sigma is not None)

@@ -28,17 +28,19 @@ WIDTH = {"pose": 6, "position": 3, "distance": 1}
 @dataclass(frozen=True, slots=True, eq=False)
 class State:
     """What is identified: the chain, and flange_from_tool by target; where ``elastic`` the chain's elasticity too, the
-    parameters of which are the last ones; and station_from_world by station, the first of which is the world."""
+    parameters of which are the last ones, with ``hysteresis`` or without; and station_from_world by station, the first
+    of which is the world."""
 
     chain: Chain
     tools: dict[str, Rigid]
     elastic: bool = False
     stations: dict[str, Rigid] = field(default_factory=lambda: {"": Rigid()})
+    hysteresis: bool = False
 
     @property
     def elastic_count(self) -> int:
         """Parameters of the elasticity."""
-        return 9 * len(self.chain) if self.elastic else 0
+        return (10 if self.hysteresis else 9) * len(self.chain) if self.elastic else 0
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -200,7 +202,7 @@ def tip_jacobian(
         tools_part[rows, 3:, place : place + 3] = tip.rotation[rows]
     parts = [axes_part, tools_part, np.zeros((len(tip), 6, 6 * (len(state.stations) - 1)))]
     if state.elastic:
-        parts.append(elasticity_jacobian(state.chain, q, tip, conditions))
+        parts.append(elasticity_jacobian(state.chain, q, tip, conditions, state.hysteresis))
     return tip, np.concatenate(parts, axis=2)
 
 
@@ -217,7 +219,7 @@ def moved(state: State, step: np.ndarray, kind: Kind) -> State:
         stations[name] = stations[name] @ Rigid.exp(step[k + 6 * s : k + 6 * s + 6])
     chain = moved_chain(state.chain, step[: len(chain_parameters(state.chain))])
     if state.elastic and chain.elasticity is not None:
-        values = elasticity_values(chain.elasticity) + step[-state.elastic_count :]
+        values = elasticity_values(chain.elasticity, state.hysteresis) + step[-state.elastic_count :]
         chain = replace(chain, elasticity=with_values(chain.elasticity, values))
     return replace(state, chain=chain, tools=tools, stations=stations)
 

@@ -204,7 +204,8 @@ def _elasticity_sigma(state: State, covariance: np.ndarray) -> Elasticity | None
     """σ of the elasticity by the covariance (k, k) of all parameters."""
     if not state.elastic or state.chain.elasticity is None:
         return None
-    return with_values(state.chain.elasticity, np.sqrt(np.diag(covariance))[-state.elastic_count :])
+    none = replace(state.chain.elasticity, hysteresis=np.zeros(len(state.chain)))
+    return with_values(none, np.sqrt(np.diag(covariance))[-state.elastic_count :])
 
 
 def _still_joints(robot: Robot, data: Measurements, partial: bool) -> None:

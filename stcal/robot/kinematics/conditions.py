@@ -1,6 +1,6 @@
-"""Under which conditions joint vectors were reached: what the flange carried."""
+"""Under which conditions joint vectors were reached: what the flange carried, and from where joints came."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -10,6 +10,8 @@ from stcal.geometry.arrays import freeze
 from stcal.io.table import Table
 
 PAYLOAD = "payload_kg"
+APPROACH = "approach"
+DIRECTIONS = (-1.0, 0.0, 1.0)
 MOST_KG = 1e4
 """Arms carry up to 2.3 t."""
 
@@ -22,16 +24,23 @@ class Conditions:
     ----------
     payload_kg : (m,) array, optional
         Mass at the flange; that of the robot file where not given.
+    approach : (m, n) array, optional
+        Direction in which each joint moved last: 1 upwards, −1 downwards, 0 where that is not known.
 
     Raises
     ------
     InputError
-        A mass that is not finite, below 0, or beyond all that arms carry.
+        A mass that is not finite, below 0, or beyond all that arms carry; other directions.
     """
 
     payload_kg: np.ndarray | None = None
+    approach: np.ndarray | None = None
 
     def __post_init__(self):
+        if self.approach is not None:
+            freeze(self, "approach", (None, None), "approach")
+            for value in self.approach[~np.isin(self.approach, DIRECTIONS)]:
+                raise InputError(f"approach is {value:g}; 1, -1 or 0 needed")
         if self.payload_kg is not None:
             freeze(self, "payload_kg", (None,), "payload")
             for value in self.payload_kg[(self.payload_kg < 0) | (self.payload_kg > MOST_KG)]:
@@ -39,7 +48,14 @@ class Conditions:
 
     def __getitem__(self, index) -> "Conditions":
         """Of the joint vectors at a mask, slice or list."""
-        return self if self.payload_kg is None else Conditions(self.payload_kg[index])
+        if self.payload_kg is None and self.approach is None:
+            return self
+        return Conditions(*(None if each is None else each[index] for each in (self.payload_kg, self.approach)))
+
+    @property
+    def approached(self) -> bool:
+        """Whether it is known of any joint from where it came."""
+        return self.approach is not None and bool(self.approach.any())
 
     @property
     def loaded(self) -> bool:
@@ -73,14 +89,39 @@ def loaded(payload_kg: ArrayLike | None, count: int) -> Conditions:
     return Conditions(np.broadcast_to(values, (count,)))
 
 
-def read_conditions(table: Table, payload_kg: float | None = None) -> Conditions:
-    """Of a table's rows: column ``payload_kg``, or one mass for all.
+def read_conditions(table: Table, payload_kg: float | None = None, joints: int = 0) -> Conditions:
+    """Of a table's rows: column ``payload_kg``, or one mass for all; and columns ``approach1`` … of so many joints.
 
     Raises
     ------
     InputError
-        Both, or a mass that cannot be; the message names the line.
+        Both, or a mass or direction that cannot be; the message names the line.
     """
+    return replace(_carried(table, payload_kg), approach=_approach(table, joints))
+
+
+def approach_columns(joints: int) -> tuple[str, ...]:
+    """``approach1`` … of so many joints."""
+    return tuple(f"{APPROACH}{i + 1}" for i in range(joints))
+
+
+def _approach(table: Table, joints: int) -> np.ndarray | None:
+    named = approach_columns(joints)
+    if not any(name in table for name in named):
+        return None
+    values = np.zeros((len(table), joints))
+    for i, name in enumerate(named):
+        if name in table:
+            values[:, i] = table.numbers(name)
+            for row in np.flatnonzero(~np.isin(values[:, i], DIRECTIONS)):
+                raise InputError(
+                    f"{table.where}: line {table.lines[row]}: {name} is {values[row, i]:g}; 1 (joint {i + 1} came from "
+                    "below), -1 (from above) or 0 (not known) needed"
+                )
+    return values
+
+
+def _carried(table: Table, payload_kg: float | None) -> Conditions:
     if PAYLOAD not in table:
         return loaded(payload_kg, len(table))
     if payload_kg is not None:

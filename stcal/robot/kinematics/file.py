@@ -53,6 +53,7 @@ class _ElasticityFile(Strict):
     across_rad_per_Nm: list[Finite] | None = None
     moment_Nm: list[tuple[Finite, Finite, Finite]] | None = None
     periodic_rad: list[tuple[Finite, Finite, Finite, Finite]] | None = None
+    hysteresis_rad: list[Finite] | None = None
     payload_kg: Finite = 0.0
     payload_centre_mm: tuple[Finite, Finite, Finite] = (0.0, 0.0, 0.0)
 
@@ -68,7 +69,9 @@ class _ElasticityFile(Strict):
         if not 0 <= self.payload_kg <= MOST_KG:
             raise InputError(f"{where}: payload_kg is {self.payload_kg:g}; 0 … {MOST_KG:g} needed")
         centre = np.array(self.payload_centre_mm)
-        return Elasticity(compliance, moment, periodic, np.array(self.gravity), self.payload_kg, centre)
+        load = self.payload_kg, centre
+        hysteresis = np.array(self.hysteresis_rad or none)
+        return Elasticity(compliance, moment, periodic, np.array(self.gravity), *load, hysteresis)
 
 
 class _RobotFile(Strict):
@@ -225,8 +228,10 @@ def robot_toml(robot: Robot, comments: Sequence[str] = ()) -> str:
 def _elasticity_lines(elasticity: Elasticity) -> list[str]:
     axis, across = elasticity.compliance.T
     load = []
+    if elasticity.hysteresis.any():
+        load.append(f"hysteresis_rad = {_numbers(elasticity.hysteresis)}  # half of it: farther if it came from below")
     if elasticity.payload_kg or elasticity.payload_centre.any():
-        load = [
+        load += [
             f"payload_kg = {_number(elasticity.payload_kg)}",
             f"payload_centre_mm = {_numbers(elasticity.payload_centre)}  # in the frame of the flange",
         ]

@@ -153,6 +153,11 @@ def waves(chain: Chain, q: np.ndarray) -> np.ndarray:
     return np.where(chain.prismatic[:, None], 0.0, found)
 
 
+def _turning(chain: Chain) -> np.ndarray:
+    """(n, N) angles of the joints by values of the controller's revolute ones; others are not turned."""
+    return np.where(chain.prismatic[:, None] | chain.prismatic, 0.0, chain.coupling)
+
+
 def deflections(chain: Chain, q: np.ndarray, conditions: Conditions = USUAL) -> np.ndarray:
     """(n, m, 3) rad by which each link gives way, in its own frame: by the torques on the arm as if it were rigid,
     which differ from those on the bent one by as little as it bends."""
@@ -162,6 +167,8 @@ def deflections(chain: Chain, q: np.ndarray, conditions: Conditions = USUAL) -> 
     axis, across = elasticity.compliance.T
     turn = torque * np.stack([across, across, axis], axis=1)[:, None]
     turn[:, :, 2] += np.einsum("ik,kim->im", elasticity.periodic, waves(chain, q))
+    if conditions.approach is not None and elasticity.hysteresis.any():
+        turn[:, :, 2] += _turning(chain) @ (elasticity.hysteresis * conditions.approach).T
     return turn
 
 
@@ -224,8 +231,11 @@ def chain_jacobian(chain: Chain, q: np.ndarray, tip: Poses, conditions: Conditio
     return np.moveaxis(np.concatenate(columns, axis=2), 0, 2)
 
 
-def elasticity_jacobian(chain: Chain, q: np.ndarray, tip: Poses, conditions: Conditions = USUAL) -> np.ndarray:
-    """Derivative of poses ``tip`` (world_from_tool) by :func:`elasticity_values`, (m, 6, 9 n), in the world's axes."""
+def elasticity_jacobian(
+    chain: Chain, q: np.ndarray, tip: Poses, conditions: Conditions = USUAL, hysteresis: bool = False
+) -> np.ndarray:
+    """Derivative of poses ``tip`` (world_from_tool) by :func:`elasticity_values`, (m, 6, 9 n or 10 n), in the world's
+    axes."""
     elasticity = _elasticity(chain)
     rotation, origin = links(replace(chain, elasticity=None), q)
     torque, z = torques(chain, q, rotation, origin, conditions), rotation[..., 2]
@@ -240,23 +250,29 @@ def elasticity_jacobian(chain: Chain, q: np.ndarray, tip: Poses, conditions: Con
     turned = np.concatenate([np.stack([about, torque - about], axis=1), np.moveaxis(periodic, 0, 1)], axis=1)
     by_turn = np.concatenate([turned, np.cross(turned, lever[:, None])], axis=3)  # (n, 6, m, 6)
     parts = [by_turn[:, :2].reshape(-1, len(q), 6), by_moment, by_turn[:, 2:].reshape(-1, len(q), 6)]
+    if hysteresis:
+        came = np.zeros((len(q), len(chain))) if conditions.approach is None else conditions.approach
+        each = np.concatenate([z, np.cross(z, lever)], axis=2)
+        parts.append(np.einsum("ij,mj,imc->jmc", _turning(chain), came, each))
     return np.moveaxis(np.concatenate(parts), 0, 2)
 
 
-def elasticity_values(elasticity: Elasticity) -> np.ndarray:
-    """(9 n,) compliance, moment and periodic of all joints, each row by row."""
-    return np.concatenate([elasticity.compliance.ravel(), elasticity.moment.ravel(), elasticity.periodic.ravel()])
+def elasticity_values(elasticity: Elasticity, hysteresis: bool = False) -> np.ndarray:
+    """(9 n,) compliance, moment and periodic of all joints, each row by row; (10 n,) with ``hysteresis``."""
+    parts = [elasticity.compliance.ravel(), elasticity.moment.ravel(), elasticity.periodic.ravel()]
+    return np.concatenate([*parts, *([elasticity.hysteresis] if hysteresis else [])])
 
 
 def with_values(elasticity: Elasticity, values: np.ndarray) -> Elasticity:
-    """With other :func:`elasticity_values`, (9 n,)."""
+    """With other :func:`elasticity_values`, (9 n,) or (10 n,)."""
     n = len(elasticity.moment)
-    compliance, moment, periodic = np.split(values, [2 * n, 5 * n])
+    compliance, moment, periodic, hysteresis = np.split(values, [2 * n, 5 * n, 9 * n])
     return replace(
         elasticity,
         compliance=compliance.reshape(n, 2),
         moment=moment.reshape(n, 3),
         periodic=periodic.reshape(n, 4),
+        hysteresis=hysteresis if len(hysteresis) else elasticity.hysteresis,
     )
 
 

@@ -12,7 +12,7 @@ from stcal.geometry.rigid import Poses
 from stcal.io.quaternions import Order
 from stcal.io.table import ANGLES, LENGTHS, Table, read_table
 from stcal.robot.kinematics.columns import oriented, unread
-from stcal.robot.kinematics.conditions import PAYLOAD, USUAL, Conditions, read_conditions
+from stcal.robot.kinematics.conditions import PAYLOAD, USUAL, Conditions, approach_columns, read_conditions
 from stcal.robot.kinematics.damped import reach_mm
 from stcal.robot.kinematics.model import Robot
 
@@ -60,7 +60,7 @@ class Measurements:
     notes : tuple of str
         On rows of the file that are not here, columns that were not read, and angles by their convention.
     conditions : Conditions
-        What the flange carried.
+        What the flange carried, and from where joints came.
 
     Raises
     ------
@@ -184,10 +184,11 @@ def read_measurements(
     """
     table = read_table(path, WHAT, quaternions)
     q = joint_values(table, robot)
-    targets, conditions = targets_of(table), read_conditions(table, payload_kg)
+    targets, conditions = targets_of(table), read_conditions(table, payload_kg, len(robot.rows))
+    own = (PAYLOAD, *approach_columns(len(robot.rows)))
     if table.has("x", LENGTHS):
         poses, columns, said = oriented(table, rotation)
-        said += unread(table, (*columns, PAYLOAD))
+        said += unread(table, (*columns, *own))
         data = Measurements(table.where, table.lines, q, targets, table.points(), notes=said, conditions=conditions)
         if "station" in table:
             data = replace(data, stations=tuple(table.text("station")))
@@ -209,8 +210,8 @@ def read_measurements(
     within(table, "distance", distances, "mm")
     if rotation is not None:
         raise InputError(f"{table.where}: --rotation {rotation}, but distances have no orientation; leave it out")
-    own = {"distances": distances, "from_row": _from_rows(table), "notes": unread(table, (PAYLOAD,))}
-    return Measurements(table.where, table.lines, q, targets, **own, conditions=conditions)
+    seen = {"distances": distances, "from_row": _from_rows(table), "notes": unread(table, own)}
+    return Measurements(table.where, table.lines, q, targets, **seen, conditions=conditions)
 
 
 def targets_of(table: Table) -> tuple[str, ...]:

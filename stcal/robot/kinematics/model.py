@@ -93,6 +93,8 @@ class Elasticity:
         rad: of sin q, cos q, sin 2q, cos 2q of revolute joints.
     gravity : (3,) array
         Its direction, of length 1: in the base of a robot, in the first joint's frame of a :class:`Chain`.
+    hysteresis : (n,) array
+        rad: what revolute joints are turned farther by that came from below, and less by that came from above.
     payload_kg : float
         Mass that is carried where nothing else is said of joint vectors.
     payload_centre : (3,) array
@@ -110,10 +112,14 @@ class Elasticity:
     gravity: np.ndarray
     payload_kg: float = 0.0
     payload_centre: np.ndarray = field(default_factory=lambda: np.zeros(3))
+    hysteresis: np.ndarray = None  # pyright: ignore[reportAssignmentType]  # made below: its size is that of the joints
 
     def __post_init__(self):
         n = len(self.compliance)
+        if self.hysteresis is None:  # not given
+            object.__setattr__(self, "hysteresis", np.zeros(n))
         shapes = {"compliance": (n, 2), "moment": (n, 3), "periodic": (n, 4), "gravity": (3,), "payload_centre": (3,)}
+        shapes["hysteresis"] = (n,)
         loaded(self.payload_kg, 1)
         for name, shape in shapes.items():
             object.__setattr__(self, name, frozen(getattr(self, name), shape, f"elasticity: {name}"))

@@ -4,7 +4,6 @@ from collections.abc import Sequence
 from dataclasses import astuple, dataclass, replace
 
 import numpy as np
-from numpy.typing import ArrayLike
 from scipy.spatial.transform import Rotation
 
 from stcal.errors import ConvergenceError
@@ -12,7 +11,7 @@ from stcal.geometry.rigid import Poses, Rigid
 from stcal.robot.identify.elastic import DOWN, MOMENT, usual
 from stcal.robot.identify.nominal import Deviations
 from stcal.robot.identify.residuals import State, tips
-from stcal.robot.kinematics.conditions import loaded
+from stcal.robot.kinematics.conditions import USUAL, Conditions
 from stcal.robot.kinematics.dh import robot_from_chain
 from stcal.robot.kinematics.example import mh80
 from stcal.robot.kinematics.forward import chain_parameters, flange_poses, jacobian, moved_chain, with_values
@@ -88,11 +87,11 @@ def measured(
     sigma_rad: float = 2e-4,
     targets: Sequence[str] = (),
     covariance: np.ndarray | None = None,
-    payload_kg: ArrayLike | None = None,
+    conditions: Conditions = USUAL,
 ) -> Measurements:
     """What an instrument sees of the robot at joint vectors (m, n): poses with normal noise of these σ per axis, or of
-    ``covariance`` (m, 6, 6) which then comes with them; of tool ``""``, or of each row's, and with each row's load."""
-    targets, conditions = tuple(targets) or ("",) * len(q), loaded(payload_kg, len(q))
+    ``covariance`` (m, 6, 6) which then comes with them; of tool ``""``, or of each row's, and under its conditions."""
+    targets = tuple(targets) or ("",) * len(q)
     tip = tips(State(robot.chain(), dict(robot.tools)), q, targets, conditions)
     noise = rng.normal(0, 1, (len(q), 6))
     if covariance is None:

@@ -10,9 +10,10 @@ from stcal.errors import InputError
 from stcal.geometry.rigid import Rigid
 from stcal.robot import forward, read_measurements
 from stcal.robot.identify.elastic import DOWN, HEAVIER, MOMENT, usual
+from stcal.robot.identify.report import identified_file, identified_text
 from stcal.robot.identify.result import Identified, IdentifyOptions
 from stcal.robot.identify.solve import identify
-from stcal.robot.kinematics.conditions import USUAL
+from stcal.robot.kinematics.conditions import USUAL, Conditions
 from stcal.robot.kinematics.example import mh80
 from stcal.robot.kinematics.model import Elasticity, Robot
 from stcal.robot.use.evaluation import evaluate
@@ -123,7 +124,7 @@ def carrying(rows: int, seed: int, payloads: tuple[float, ...], heavier: float =
     true = replace(true, elasticity=replace(true.elasticity, payload_centre=CENTRE))
     none = Elasticity(np.zeros((6, 2)), np.zeros((6, 3)), np.zeros((6, 4)), DOWN, payload_centre=CENTRE)
     mass = np.resize(payloads, rows)
-    data = measured(true, joint_vectors(true, rows, rng), rng, payload_kg=mass)
+    data = measured(true, joint_vectors(true, rows, rng), rng, conditions=Conditions(mass))
     return true, replace(mh80(), elasticity=none), replace(data, rotations=None)
 
 
@@ -198,3 +199,53 @@ def test_files_of_measurements_say_what_was_carried(tmp_path):
         path.write_text("\n".join(bad) + "\n")
         with pytest.raises(InputError, match=re.escape(message)):
             read_measurements(path, nominal)
+
+
+def approached(rows: int, seed: int, size_rad: float):
+    """A stiff arm, its hysteresis, and positions that joints came to from either side."""
+    rng = np.random.default_rng(seed)
+    true = placed(made(mh80(), rng), Rigid(), {"": Rigid.exp([0.1, 0.2, 0, 50, 60, 70])})
+    came, half = rng.choice([-1.0, 1.0], (rows, 6)), size_rad * np.array([1, 1, -1, 1, 0.5, 1])
+    none = Elasticity(np.zeros((6, 2)), np.zeros((6, 3)), np.zeros((6, 4)), DOWN, hysteresis=half)
+    true = replace(true, elasticity=none)
+    data = measured(true, joint_vectors(true, rows, rng), rng, conditions=Conditions(approach=came))
+    return half, replace(data, rotations=None)
+
+
+def test_hysteresis_is_found_where_rows_say_from_where_joints_came():
+    """0.15 mrad (half of it) at up to 2 m is 0.3 mm: joints 1 to 3 to a tenth of it, by 60 positions of 0.05 mm."""
+    half, data = approached(60, 8, 1.5e-4)
+    found = identify(mh80(), data, IdentifyOptions(model="auto", folds=4, repeats=1))
+    assert found.model == "elastic"
+    own, sigma = (each.hysteresis for each in (found.robot.elasticity, found.elasticity_sigma))
+    assert own[:3] == pytest.approx(half[:3], abs=3e-5)
+    assert np.abs((own - half) / sigma).max() < 3.5
+    assert sigma[:3].max() < 2e-5
+    assert found.weighting.sigma_mm == pytest.approx(0.05, rel=0.3)
+    assert "hysteresis" in identified_text(found, mh80())
+    assert identified_file(found, mh80()).elasticity.joints[0].hysteresis_rad == pytest.approx(own[0])
+    rigid = identify(mh80(), data, IdentifyOptions(folds=0))
+    assert "the direction from which joint" in rigid.left[0].what
+
+
+def test_where_nothing_says_from_where_joints_came_there_is_no_hysteresis():
+    _, data = approached(60, 8, 1.5e-4)
+    found = identify(mh80(), replace(data, conditions=USUAL), IdentifyOptions(model="elastic", folds=0))
+    assert not found.robot.elasticity.hysteresis.any()
+    assert found.deviations["hysteresis_rad"] is None
+
+
+@pytest.mark.parametrize(
+    ("cell", "message"), [("2", "line 2: approach2 is 2; 1 (joint 2 came from below)"), ("nan", "approach2 is 'nan'")]
+)
+def test_directions_in_files(tmp_path, cell, message):
+    names = [f"q{i}_deg" for i in range(1, 7)] + ["x_mm", "y_mm", "z_mm", "approach2"]
+    path = tmp_path / "data.csv"
+    path.write_text(f"{','.join(names)}\n1,2,3,4,5,6,1,2,3,-1\n2,2,3,4,5,6,1,2,4,1\n")
+    read = read_measurements(path, mh80())
+    assert read.conditions.approach[:, 1].tolist() == [-1, 1]
+    assert not read.conditions.approach[:, 0].any()
+    assert read.notes == ()
+    path.write_text(f"{','.join(names)}\n1,2,3,4,5,6,1,2,3,{cell}\n")
+    with pytest.raises(InputError, match=re.escape(message)):
+        read_measurements(path, mh80())

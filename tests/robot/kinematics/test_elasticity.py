@@ -8,7 +8,7 @@ import pytest
 from stcal.errors import InputError
 from stcal.geometry.rigid import Poses, Rigid
 from stcal.robot import forward, inverse
-from stcal.robot.kinematics.conditions import loaded
+from stcal.robot.kinematics.conditions import Conditions, loaded
 from stcal.robot.kinematics.dh import robot_from_chain
 from stcal.robot.kinematics.example import mh80
 from stcal.robot.kinematics.file import load_robot, robot_toml
@@ -110,6 +110,7 @@ def test_gravity_alone_is_a_rigid_arm(tmp_path):
         ("stiffness = 3", "stiffness"),
         ("payload_kg = -1", "elasticity: payload_kg is -1; 0 … 10000 needed"),
         ("payload_kg = nan", "payload_kg"),
+        ("hysteresis_rad = [1e-5]", "elasticity: hysteresis_rad has 1 entries, 6 needed"),
         ("payload_centre_mm = [1, 2]", "payload_centre_mm"),
     ],
 )
@@ -195,3 +196,53 @@ def test_masses_that_cannot_be_are_refused(mass):
 def test_a_rigid_arm_gives_way_to_no_payload():
     q = vectors(mh80())
     assert np.abs(forward(mh80(), q, payload_kg=80).difference(forward(mh80(), q))).max() == 0
+
+
+COUPLING = np.eye(6)
+COUPLING[2, 1] = 1.0
+
+
+def loose() -> Robot:
+    """A coupled arm of which joints are 0.1 mrad farther where they came from below."""
+    elasticity = replace(bent(1e-4).elasticity, hysteresis=1e-4 * np.array([1, -0.5, 2, 0.3, 0.7, 1]))
+    return replace(bent(), coupling=COUPLING, elasticity=elasticity)
+
+
+def test_hysteresis_is_an_error_of_the_controllers_values():
+    robot, rng = loose(), np.random.default_rng(5)
+    q, came = vectors(robot), rng.choice([-1.0, 0.0, 1.0], (20, 6))
+    chain = robot.chain()
+    moved = flange_poses(chain, q, Conditions(approach=came))
+    shifted = flange_poses(chain, q + robot.elasticity.hysteresis * came)
+    assert np.abs(moved.difference(shifted)).max() < 1e-6
+    assert np.abs(moved.difference(flange_poses(chain, q))[:, 3:]).max() > 0.1
+
+
+def test_derivatives_by_hysteresis_are_those_of_small_changes():
+    robot, q = loose(), vectors(loose())
+    chain, rng = robot.chain(), np.random.default_rng(6)
+    conditions = Conditions(rng.uniform(0, 50, 20), rng.choice([-1.0, 1.0], (20, 6)))
+    values = elasticity_values(chain.elasticity, hysteresis=True)
+    assert (with_values(chain.elasticity, values).hysteresis == robot.elasticity.hysteresis).all()
+    tip = flange_poses(chain, q, conditions) @ TOOL
+    found = elasticity_jacobian(chain, q, tip, conditions, hysteresis=True)
+    assert found.shape == (20, 6, 60)
+    for k in range(54, 60):
+        step = np.zeros(60)
+        step[k] = 1e-6
+        ahead, behind = (
+            flange_poses(replace(chain, elasticity=with_values(chain.elasticity, values + s)), q, conditions) @ TOOL
+            for s in (step, -step)
+        )
+        assert found[:, :, k] == pytest.approx(ahead.difference(behind) / 2e-6, rel=1e-3, abs=0.5)
+
+
+def test_hysteresis_is_in_the_file(tmp_path):
+    path = tmp_path / "robot.toml"
+    path.write_text(robot_toml(loose()))
+    assert load_robot(path).elasticity.hysteresis == pytest.approx(loose().elasticity.hysteresis, rel=1e-15)
+
+
+def test_other_directions_are_refused():
+    with pytest.raises(InputError, match="approach is 2; 1, -1 or 0 needed"):
+        Conditions(approach=np.array([[1.0, 2.0]]))
