@@ -65,8 +65,8 @@ def whole_likeness(xy, radius, other_xy, other_radius, in_place: np.ndarray | No
     tree, best = KDTree(np.column_stack([other.real, other.imag])), None
     for start, turn in zip(p[fits], factor[fits], strict=True):
         moved = other[start] + turn * (own - own[i])
-        _, nearest = tree.query(np.column_stack([moved.real, moved.imag]))
-        if len(set(nearest.tolist())) < n or (in_place is not None and (nearest == in_place).all()):
+        nearest = np.asarray(tree.query(np.column_stack([moved.real, moved.imag]))[1])
+        if len(np.unique(nearest)) < n or (in_place is not None and (nearest == in_place).all()):
             continue
         found = _fitted(own, radius, other[nearest], other_radius[nearest])
         if found is not None and (best is None or _order(found) < _order(best)):

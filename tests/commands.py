@@ -112,6 +112,7 @@ CALLS = (
     Call("sfm draw", "@data/board.toml --out +board.svg --margin-mm 5"),
     Call("sfm draw", "@locate/board.toml --out +board.dxf", 1.0),
     Call("sfm simulate", "+set --width 324 --images 2 --workers 1", 3.0),
+    Call("sfm simulate", f"+set {_DESIGNS} --camera @data/cameras.txt --groups 12 --images 2 --workers 1", 3.0),
     Call("sfm demo", "--out +demo --workers 1", 40.0),
     Call("sfm compare", "@run @data/truth.json --json >errors.json"),
     Call("sfm compare", "@run/faces.json @data/truth.json --json >errors.json"),
