@@ -109,6 +109,7 @@ CALLS = (
     Call("sfm init", "+design"),
     Call("sfm design", "+own --size 130,120,110 --circles 9 --images 2 --width 1296", 6.0),
     Call("sfm draw", "@data/target.toml --out +target.pdf", 2.0),
+    Call("sfm draw", "@own.toml --out +net.svg --net"),
     Call("sfm draw", "@data/board.toml --out +board.svg --margin-mm 5"),
     Call("sfm draw", "@locate/board.toml --out +board.dxf", 1.0),
     Call("sfm simulate", "+set --width 324 --images 2 --workers 1", 3.0),

@@ -9,6 +9,7 @@ from stcal.boards.file import board_content
 from stcal.boards.several import load_boards
 from stcal.design import BoardDesign, TargetDesign
 from stcal.drawing.dxf import dxf
+from stcal.drawing.net import net_parts
 from stcal.drawing.parts import Part, board_parts, target_parts
 from stcal.drawing.pdf import pdf
 from stcal.drawing.sheets import MOST_MM, PAPERS, Sheet, one_sheet, paper_sheets
@@ -33,7 +34,9 @@ class Drawn:
     paper: str
 
 
-def draw(design: str | Path, path: str | Path, paper: str = "", margin_mm: float = MARGIN_MM) -> Drawn:
+def draw(
+    design: str | Path, path: str | Path, paper: str = "", margin_mm: float = MARGIN_MM, net: bool = False
+) -> Drawn:
     """Draw a target or a board 1:1 to a new file, whose suffix tells the form.
 
     Parameters
@@ -43,7 +46,9 @@ def draw(design: str | Path, path: str | Path, paper: str = "", margin_mm: float
     paper : str
         Of :data:`~stcal.drawing.sheets.PAPERS`, or ``own``; if not given A4 for PDF, ``own`` for SVG and DXF.
     margin_mm : float
-        From the outermost circles to the edge of a plate.
+        From the outermost circles to the edge of a plate, where the design has no outline.
+    net : bool
+        The plates of a target unfolded into one plane, by their outlines and rough poses.
 
     Raises
     ------
@@ -53,11 +58,17 @@ def draw(design: str | Path, path: str | Path, paper: str = "", margin_mm: float
     path = Path(path)
     paper = _paper(path, paper)
     what = load_design(design)
-    parts = target_parts(what, margin_mm) if isinstance(what, TargetDesign) else board_parts(what, margin_mm)
+    if net and not isinstance(what, TargetDesign):
+        raise InputError(f"--net: {design} is a board; nets are of targets")
+    parts = net_parts(what) if net and isinstance(what, TargetDesign) else _parts(what, margin_mm)
     title = what.name if isinstance(what, TargetDesign) else parts[0].name if len(parts) == 1 else "boards"
     sheets = sheets_of(parts, paper, title, apart=path.suffix.lower() == ".pdf")
     save(path, content_of(sheets, path))
     return Drawn(path, parts, sheets, paper)
+
+
+def _parts(what: TargetDesign | BoardDesign | FlatBoard | BoardSet, margin_mm: float) -> list[Part]:
+    return target_parts(what, margin_mm) if isinstance(what, TargetDesign) else board_parts(what, margin_mm)
 
 
 def load_design(path: str | Path) -> TargetDesign | BoardDesign | FlatBoard | BoardSet:

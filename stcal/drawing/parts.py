@@ -14,7 +14,7 @@ from stcal.boards.design import (
     FlatBoard,
 )
 from stcal.design import BoardDesign, FaceDesign, Polarity, TargetDesign
-from stcal.drawing.shapes import Area, Disc, Shape, extent, said_mm
+from stcal.drawing.shapes import Area, Disc, Line, Shape, extent, said_mm
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -22,7 +22,8 @@ class Part:
     """A flat piece, seen from the side that is photographed, Y upwards.
 
     ``name``; ``outline`` : (k, 2) where it is cut; ``shapes`` : what it shows; ``spans`` : lengths within it that are
-    written beside it, as (axis, from, to, words); ``table`` : rows of words, the first of them the heads.
+    written beside it, as (axis, from, to, words); ``table`` : rows of words, the first a note, the second the heads;
+    ``lines`` : where it is cut and folded, in place of the outline, which is then what all of it lies in.
     """
 
     name: str
@@ -30,6 +31,7 @@ class Part:
     shapes: tuple[Shape, ...]
     spans: tuple[tuple[int, float, float, str], ...] = ()
     table: tuple[tuple[str, ...], ...] = ()
+    lines: tuple[Line, ...] = ()
 
     def pattern(self) -> list[Shape]:
         """What it shows but for the ground."""

@@ -12,6 +12,7 @@ import numpy as np
 from stcal.geometry.rigid import Poses, Rigid
 from stcal.io.camera import CalibratedCamera, read_camera, write_cameras_txt
 from stcal.io.cameras.forms import written
+from stcal.io.design import target_toml
 from stcal.io.table import POSE, pose_cells
 from stcal.locate.data.layout import layout_toml
 from stcal.robot.kinematics.example import mh80
@@ -19,6 +20,8 @@ from stcal.robot.kinematics.file import robot_toml
 from stcal.robot.kinematics.forward import forward
 from stcal.robot.kinematics.inverse import inverse
 from stcal.sfm.interop.export_model import export_model
+from stcal.sfm.make.box import sides_of
+from stcal.sfm.make.pattern import make_pattern
 from stcal.sfm.pipeline import RunOptions, run
 from stcal.sfm.run.marker import MarkerFile, digest_of
 from stcal.synthetic.dataset import write_dataset
@@ -105,6 +108,8 @@ def _of_runs(folder: Path) -> None:
     sealed = marker.sealed({"detections.csv": digest_of(folder / "detected/detections.csv")})
     (folder / "detected/stcal-run.json").write_text(json.dumps(sealed.content()))
     (folder / "no-colmap").write_text("no program\n")
+    own = make_pattern(sides_of((90.0, 80.0, 70.0))[:2], 9, 3.0, "dark", 1, "two plates").target
+    (folder / "own.toml").write_text(target_toml(own))
 
 
 def _cameras(folder: Path) -> None:

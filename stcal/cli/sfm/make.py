@@ -36,12 +36,15 @@ def draw(
     margin: Annotated[
         float, typer.Option("--margin-mm", min=0, max=1e4, help="Add this around the outermost circles, mm.")
     ] = 10.0,
+    net: Annotated[
+        bool, typer.Option("--net", help="Draw a target's plates as one net to fold, by outline_mm and rough_pose.")
+    ] = False,
 ) -> None:
     """Draw a target or a board 1:1, with dimensions, cut marks and scale bars, to print, cut or mill."""
     from stcal.drawing.draw import draw as drawn
     from stcal.drawing.text import drawn_text
 
-    say(drawn_text(drawn(design, out, paper, margin)))
+    say(drawn_text(drawn(design, out, paper, margin, net)))
 
 
 @app.command()

@@ -1,0 +1,196 @@
+"""A folding net: plates that share an edge in space, unfolded into one plane, with tabs to glue the other edges.
+
+Plates are the faces' ``outline_mm``, placed by their rough poses.
+"""
+
+from collections.abc import Iterable
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from stcal.design import FaceDesign, TargetDesign
+from stcal.drawing.parts import Part, face_part
+from stcal.drawing.shapes import Area, Disc, Line, Shape, Text
+from stcal.errors import InputError
+from stcal.io.design import ROUGH_KEYS
+
+TOGETHER_MM, TOGETHER_SHARE = 1.0, 0.01
+"""Ends of an edge that two plates share lie so near to one another, also in parts of its length."""
+TAB_MM, TAB_SHARE = 10.0, 0.25
+"""Width of a tab, at most that and that part of its edge."""
+SKETCH = 1 / 8
+"""Scale of the sketch that names the faces."""
+APART = 15.0
+LETTERS = 2.0
+TOUCH = 1e-3
+"""By which plates may overlap, mm: rounding."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Plate:
+    """``net_from_face`` : turn (2, 2) and shift (2,) into the net's plane."""
+
+    face: FaceDesign
+    turn: np.ndarray
+    shift: np.ndarray
+
+    def place(self, xy) -> np.ndarray:
+        """In the net."""
+        return np.asarray(xy) @ self.turn.T + self.shift
+
+    def corners(self) -> np.ndarray:
+        """Of its outline, (k, 2), in the net."""
+        return self.place(self.face.outline_mm)
+
+
+def net_parts(target: TargetDesign) -> list[Part]:
+    """The net in as few pieces as fold flat without covering one another.
+
+    Raises
+    ------
+    InputError
+        A face without outline or rough pose, or no two plates that share an edge.
+    """
+    for face in target.faces:
+        if face.outline_mm is None or face.rough_target_from_face is None:
+            raise InputError(
+                f"--net: face {face.id} has no {'outline_mm' if face.outline_mm is None else ROUGH_KEYS}; add it to "
+                "the target file, or draw plates one by one without --net"
+            )
+    shared = _shared_edges(target)
+    if not shared:
+        raise InputError("--net: no two plates share an edge; correct outline_mm and rough_pose, or draw without --net")
+    faces = [replace(face, outline_mm=_against_the_clock(face)) for face in target.faces]
+    left = sorted(faces, key=lambda face: -sum(face.id == one for one, _ in shared))
+    pieces: list[list[_Plate]] = []
+    folds: set[tuple[tuple[str, int], tuple[str, int]]] = set()
+    while left:
+        piece = [_Plate(left[0], np.eye(2), np.zeros(2))]
+        free = {face.id for face in left[1:]}
+        for plate in piece:  # grows
+            for edge in range(len(plate.corners())):
+                other = shared.get((plate.face.id, edge))
+                if other is None or other[0] not in free:
+                    continue
+                unfolded = _unfolded(plate, edge, target.face(other[0]), other[1])
+                if _is_clear(unfolded.corners(), piece):
+                    piece.append(unfolded)
+                    free.remove(other[0])
+                    folds |= {((plate.face.id, edge), other), (other, (plate.face.id, edge))}
+        pieces.append(piece)
+        left = [face for face in left if face.id in free]
+    names = [f"net {n} of {len(pieces)}" for n in range(1, len(pieces) + 1)] if len(pieces) > 1 else ["net"]
+    return [_part(name, piece, target, shared, folds) for name, piece in zip(names, pieces, strict=True)]
+
+
+def _shared_edges(target: TargetDesign) -> dict[tuple[str, int], tuple[str, int]]:
+    """Face and number of an edge that lies where another's does, both ways round; edges run against the clock."""
+    ends = {}
+    for face in target.faces:
+        assert face.rough_target_from_face is not None
+        outline = _against_the_clock(face)
+        place = face.rough_target_from_face @ np.pad(outline, ((0, 0), (0, 1)))
+        ends |= {(face.id, k): (place[k], place[(k + 1) % len(place)]) for k in range(len(place))}
+    found = {}
+    for one, (a, b) in ends.items():
+        near = max(TOGETHER_MM, TOGETHER_SHARE * float(np.linalg.norm(b - a)))
+        for other, (c, d) in ends.items():
+            if one[0] != other[0] and max(np.linalg.norm(a - d), np.linalg.norm(b - c)) < near:
+                found[one] = other
+    return {one: other for one, other in found.items() if found.get(other) == one}
+
+
+def _against_the_clock(face: FaceDesign) -> np.ndarray:
+    outline = np.asarray(face.outline_mm)
+    ahead = np.roll(outline, -1, axis=0)
+    area = (outline[:, 0] * ahead[:, 1] - ahead[:, 0] * outline[:, 1]).sum()
+    return outline if area > 0 else outline[::-1]
+
+
+def _unfolded(plate: _Plate, edge: int, face: FaceDesign, own: int) -> _Plate:
+    """The face laid beside a plate, its edge along the plate's, the other way round."""
+    corners, outline = plate.corners(), _against_the_clock(face)
+    start, end = corners[edge], corners[(edge + 1) % len(corners)]
+    last, first = outline[own], outline[(own + 1) % len(outline)]
+    angle = np.arctan2(*(end - start)[::-1]) - np.arctan2(*(last - first)[::-1])
+    turn = np.array([[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]])
+    middle = (start + end) / 2 - turn @ (first + last) / 2
+    return _Plate(replace(face, outline_mm=outline), turn, middle)
+
+
+def _is_clear(corners: np.ndarray, plates: Iterable[_Plate]) -> bool:
+    """Whether a polygon covers none of the plates; of polygons with dents their hulls count."""
+    return not any(_overlap(corners, plate.corners()) for plate in plates)
+
+
+def _overlap(one: np.ndarray, other: np.ndarray) -> bool:
+    """By separating axes along the normals of the sides."""
+    for polygon in (one, other):
+        side = np.roll(polygon, -1, axis=0) - polygon
+        normals = np.column_stack([side[:, 1], -side[:, 0]]) / np.linalg.norm(side, axis=1)[:, None]
+        a, b = one @ normals.T, other @ normals.T
+        if ((a.max(0) <= b.min(0) + TOUCH) | (b.max(0) <= a.min(0) + TOUCH)).any():
+            return False
+    return True
+
+
+def _part(name: str, piece: list[_Plate], target: TargetDesign, shared, folds) -> Part:
+    grounds: list[Shape] = []
+    shapes: list[Shape] = []
+    lines: list[Line] = []
+    tabs: list[np.ndarray] = []
+    for plate in piece:
+        own = face_part(plate.face, target.polarity, 0.0)
+        for shape in own.shapes:
+            if isinstance(shape, Disc):
+                x, y = plate.place([shape.x, shape.y]).tolist()
+                shapes.append(replace(shape, x=x, y=y))
+            elif isinstance(shape, Area):
+                grounds.append(replace(shape, lines=tuple(plate.place(line) for line in shape.lines)))
+        corners = plate.corners()
+        for edge in range(len(corners)):
+            this, other = (plate.face.id, edge), shared.get((plate.face.id, edge))
+            ends = np.array([corners[edge], corners[(edge + 1) % len(corners)]])
+            folded = (this, other) in folds
+            if folded:
+                if this < other:
+                    lines.append(Line(ends, "FOLD", "grey", dashed=True))
+                continue
+            tab = _tab(ends) if other and this < other else None
+            if tab is None or not _is_clear(tab, piece) or any(_overlap(tab, each) for each in tabs):
+                lines.append(Line(ends, "CUT", width=0.1))
+                continue
+            tabs.append(tab)
+            lines += [Line(ends, "FOLD", "grey", dashed=True), Line(tab, "CUT", width=0.1)]
+            x, y = tab.mean(0).tolist()
+            level = abs(ends[0, 1] - ends[1, 1]) < abs(ends[0, 0] - ends[1, 0])
+            words = f"under {other[0]}"
+            at = (x, y - LETTERS / 2) if level else (x + LETTERS / 2, y)
+            shapes.append(Text(*at, words, LETTERS, "middle", turned=not level))
+    every = np.concatenate([*(plate.corners() for plate in piece), *tabs])
+    (left, below), (right, above) = every.min(0), every.max(0)
+    outline = np.array([[left, below], [right, below], [right, above], [left, above]])
+    return Part(name, outline, (*grounds, *shapes, *_sketch(piece, right + APART, above)), lines=tuple(lines))
+
+
+def _tab(ends: np.ndarray) -> np.ndarray:
+    """A trapezium to the right of an edge, which is outside; (4, 2), open at the edge."""
+    along = ends[1] - ends[0]
+    length = float(np.linalg.norm(along))
+    along = along / length
+    out = np.array([along[1], -along[0]])
+    width = min(TAB_MM, TAB_SHARE * length)
+    return np.array([ends[0], ends[0] + width * (along + out), ends[1] + width * (out - along), ends[1]])
+
+
+def _sketch(piece: list[_Plate], left: float, above: float) -> list[Shape]:
+    """The plates small, each with its face's name."""
+    every = np.concatenate([plate.corners() for plate in piece])
+    shift = np.array([left, above]) - SKETCH * np.array([every[:, 0].min(), every[:, 1].max()])
+    shapes: list[Shape] = []
+    for plate in piece:
+        corners = SKETCH * plate.corners() + shift
+        x, y = corners.mean(0).tolist()
+        shapes.append(Line(corners, "LABELS", closed=True))
+        shapes.append(Text(x, y - LETTERS / 2, plate.face.id, LETTERS, "middle"))
+    return shapes
