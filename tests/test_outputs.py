@@ -15,6 +15,7 @@ FOLDERS = {
     ("run", "out"),
     ("detect", "out"),
     ("init", "folder"),
+    ("design", "folder"),
     ("simulate", "folder"),
     ("demo", "out"),
     ("watch", "out"),
