@@ -214,7 +214,7 @@ def _content(budget: Budget, run: SavedRun, verified: VerifyFile) -> dict[str, A
         "correction_ppm": PPM * budget.correction,
         "faces": _faces(budget),
         "distances": [_distance(row, budget) for row in budget.of_kind("distance")],
-        "notes": notes_of(budget, verified),
+        "notes": notes_of(budget, verified, run),
     }
 
 
@@ -259,7 +259,7 @@ def _uncertainty(row: Row, budget: Budget, unit: float) -> dict:
     }
 
 
-def notes_of(budget: Budget, verified: VerifyFile) -> list[str]:
+def notes_of(budget: Budget, verified: VerifyFile, run: SavedRun) -> list[str]:
     """What a reader must know that no number says."""
     unknown = [each.title for each in budget.sources if each.origin == "not stated"]
     found = []
@@ -272,6 +272,12 @@ def notes_of(budget: Budget, verified: VerifyFile) -> list[str]:
         found.append(
             f"for the stated expansion lengths of the run are to be changed by {PPM * budget.correction:+.1f} ppm; "
             "this is not done in faces.json, and the expanded uncertainties hold for corrected lengths"
+        )
+    failed = [check["title"] for check in run.report.get("checks", ()) if check["verdict"] == "failed"]
+    if failed:
+        found.append(
+            f"failed checks of the run: {len(failed)}, first {failed[0]}; what they found is not among the inputs, and "
+            "this budget does not hold before it is put right"
         )
     if faults := verified.faults():
         found.append(f"the run's folder is not as the run left it: {'; '.join(faults)}")

@@ -158,6 +158,18 @@ def test_a_changed_run_is_named(stcal_sfm, small_run, tmp_path):
     assert "note: the run's folder is not as the run left it: 1 changed (report.html)" in text
 
 
+def test_a_failed_check_is_said(stcal_sfm, small_run, tmp_path):
+    copy = tmp_path / "run"
+    shutil.copytree(small_run, copy)
+    report = json.loads((copy / "report.json").read_text())
+    title = report["checks"][1]["title"]
+    report["checks"][1]["verdict"] = "failed"
+    (copy / "report.json").write_text(json.dumps(report))
+    code, text, _ = stcal_sfm("budget", copy)
+    assert code == 0
+    assert f"note: failed checks of the run: 1, first {title}; what they found is not among the inputs" in text
+
+
 @pytest.mark.parametrize(
     ("content", "words"),
     [
