@@ -182,6 +182,8 @@ CALLS = (
         4.0,
     ),
     Call("robot identify", "@robot/sweeps.csv --robot @robot/robot.toml --observe distance --partial --folds 0", 1.0),
+    Call("robot identify", "@robot/loaded.csv --robot @robot/elastic.toml --folds 0 --out >r.toml", 2.0),
+    Call("robot evaluate", "@robot/loaded.csv --robot @robot/elastic.toml --refit none", 1.0),
     Call(
         "robot evaluate",
         f"@robot/poses.csv --robot @robot/robot.toml --robot @robot/made.toml --out >rows.csv {_ALL}",

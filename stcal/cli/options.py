@@ -110,6 +110,8 @@ PayloadKg = Annotated[
     float | None,
     typer.Option(
         "--payload-kg",
+        min=0,
+        max=1e4,
         help="Take this mass at the flange in all rows, where no column payload_kg says it; by default the robot "
         "file's.",
     ),

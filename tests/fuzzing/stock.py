@@ -15,17 +15,19 @@ from stcal.io.cameras.forms import written
 from stcal.io.design import target_toml
 from stcal.io.table import POSE, pose_cells
 from stcal.locate.data.layout import layout_toml
+from stcal.robot.kinematics.conditions import Conditions
 from stcal.robot.kinematics.example import mh80
 from stcal.robot.kinematics.file import robot_toml
 from stcal.robot.kinematics.forward import forward
 from stcal.robot.kinematics.inverse import inverse
+from stcal.robot.kinematics.model import Robot
 from stcal.sfm.interop.export_model import export_model
 from stcal.sfm.make.box import sides_of
 from stcal.sfm.make.pattern import make_pattern
 from stcal.sfm.pipeline import RunOptions, run
 from stcal.sfm.run.marker import MarkerFile, digest_of
 from stcal.synthetic.dataset import write_dataset
-from stcal.synthetic.measured.arms import joint_vectors, made, measured, placed
+from stcal.synthetic.measured.arms import elastic, joint_vectors, made, measured, placed
 from stcal.synthetic.measured.handeye import simulated
 from stcal.synthetic.measured.handeye_rig import FIRST_FROM
 from stcal.synthetic.scene import SceneOptions, make_scene
@@ -187,6 +189,17 @@ def _robots(folder: Path, rng: np.random.Generator) -> None:
         for c in commanded
     ]
     write_rows(folder / "verify.csv", ["set", *(f"commanded_{c}" for c in POSE[:3]), *POSE[:3]], rows)
+    _loaded(folder, arm, q)
+
+
+def _loaded(folder: Path, arm: Robot, q: np.ndarray) -> None:
+    """The arm with elastic links, and positions of it with and without a load, joint 2 coming from either side."""
+    rng = np.random.default_rng(3)
+    bent, mass, came = elastic(arm, rng), np.resize([0.0, 60.0], len(q)), np.resize([1.0, 1.0, -1.0], len(q))
+    (folder / "elastic.toml").write_text(robot_toml(bent, []))
+    seen = measured(bent, q, rng, conditions=Conditions(mass))
+    names = [*(f"q{i}_deg" for i in range(1, 7)), *POSE[:3], "payload_kg", "approach2"]
+    write_rows(folder / "loaded.csv", names, np.column_stack([np.degrees(q), seen.points(), mass, came]).tolist())
 
 
 def _held(folder: Path) -> None:

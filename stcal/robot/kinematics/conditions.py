@@ -113,7 +113,7 @@ def _approach(table: Table, joints: int) -> np.ndarray | None:
     for i, name in enumerate(named):
         if name in table:
             values[:, i] = table.numbers(name)
-            for row in np.flatnonzero(~np.isin(values[:, i], DIRECTIONS)):
+            for row in np.flatnonzero(~np.isin(values[:, i], DIRECTIONS)).tolist():
                 raise InputError(
                     f"{table.where}: line {table.lines[row]}: {name} is {values[row, i]:g}; 1 (joint {i + 1} came from "
                     "below), -1 (from above) or 0 (not known) needed"
