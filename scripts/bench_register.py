@@ -82,7 +82,7 @@ def command_seconds(words: list, environment: dict[str, str] | None = None) -> t
 
 def commands(path: Path, folder: Path) -> dict[str, float]:
     """Seconds of the command with more and more files."""
-    out, page = ["--out", folder / "out.json"], ["--report", folder / "out.html"]
+    out, page = ["--overwrite", "--out", folder / "out.json"], ["--report", folder / "out.html"]
     ways = {"command": [], "command, --out": out, "command, --out --report": [*out, *page]}
     return {name: command_seconds([path, *words])[0] for name, words in ways.items()}
 

@@ -94,6 +94,7 @@ class Call:
         return [
             *self.command.split(),
             *(str(places[word[0]] / word[1:]) if word[0] in places else word for word in self.split()),
+            *(["--overwrite"] if self.outputs else []),
         ]
 
 

@@ -7,6 +7,8 @@ from typing import get_args
 import pytest
 from typer.models import ParameterInfo
 
+from stcal.cli.main import main
+from stcal.cli.options import ALWAYS_NEW
 from stcal.errors import InputError
 from stcal.io.saving import RUN_ENTRIES, RUN_MARKER, keep_apart
 from tests.commands import CALLS, COMMANDS, paths_of
@@ -60,6 +62,61 @@ def test_no_output_replaces_an_input(command, output, read, tmp_path):
     with pytest.raises(InputError, match="is a file of "):
         command(**given | {read: tmp_path, output: own})
     assert own.read_text() == "mine"
+
+
+@pytest.mark.parametrize(
+    ("command", "output"),
+    [
+        pytest.param(c, o, id=f"{c.__name__}-{o}")
+        for c in EVERY
+        for o in sorted(c.outputs)
+        if c.__name__ not in ALWAYS_NEW
+    ],
+)
+def test_no_output_replaces_a_file_in_silence(command, output, tmp_path):
+    """One rule for every file that any command writes, before its work; links, to nothing too, are files."""
+    place, link = tmp_path / "earlier", tmp_path / "link"
+    place.write_text("a better one")
+    link.symlink_to(tmp_path / "nothing")
+    given = dict.fromkeys(paths_of(command))
+    for each in (place, link):
+        with pytest.raises(InputError, match=f"{each}: exists; give another name, or --overwrite to replace it"):
+            command(**given | {output: each})
+    assert place.read_text() == "a better one"
+    assert "overwrite" in inspect.signature(command).parameters
+
+
+def test_overwrite_replaces_what_is_there(tmp_path, monkeypatch, capsys):
+    """The table of an earlier call, and only with the option."""
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "b.toml").write_text("mine")
+
+    def init(*more):
+        monkeypatch.setattr("sys.argv", ["stcal", "robot", "init", "b.toml", *more])
+        with pytest.raises(SystemExit) as end:
+            main()
+        return end.value.code, capsys.readouterr().err
+
+    code, error = init()
+    assert (code, error) == (2, "error: b.toml: exists; give another name, or --overwrite to replace it\n")
+    assert (tmp_path / "b.toml").read_text() == "mine"
+    assert init("--overwrite") == (0, "")
+    assert "[[joint]]" in (tmp_path / "b.toml").read_text()
+
+
+def test_calls_that_write_nothing_ask_for_nothing(tmp_path, monkeypatch):
+    """`measure --serve` beside an earlier poses.csv; the file of the camera is what is refused."""
+    monkeypatch.chdir(tmp_path)
+    Path("poses.csv").write_text("an earlier table")
+    given = {"camera": tmp_path / "none.txt", "faces": tmp_path / "none.json", "out": Path("poses.csv")}
+    with pytest.raises(InputError, match=r"--out poses\.csv: exists"):
+        COMMANDS["sfm measure"](**given, images=tmp_path / "images")
+    with pytest.raises(InputError, match=r"none\.json"):
+        COMMANDS["sfm measure"](
+            **given, target=None, board=None, sigma_factor=None, json_file=None, report=None, joints=None,
+            previous=False, sequence=False, scheduler=None, send_images=False, strict=False, serve=True,
+            min_diameter=None, max_diameter=450.0, host="127.0.0.1", port=0, max_megabytes=1.0, workers=1,
+        )  # fmt: skip
 
 
 def test_a_file_beside_a_runs_own_is_written_again(tmp_path):

@@ -150,7 +150,7 @@ def test_json_goes_to_standard_output_alone(program, tmp_path, monkeypatch):
     assert program("robot", "init", nominal)[0] == 0
     words = ["robot", "design", "--robot", nominal, "--count", "16", "--candidates", "40", "--out", "q.csv"]
     _, said, _ = program(*words, "--json", "design.json")
-    code, out, err = program(*words, "--json", "-")
+    code, out, err = program(*words, "--json", "-", "--overwrite")
     assert code == 0
     assert json.loads(out) == json.loads((tmp_path / "design.json").read_text(encoding="utf-8"))
     assert err.splitlines() == said.replace("written: design.json\n", "").splitlines()

@@ -13,7 +13,7 @@ import stcal
 from stcal.cli import cameras, handeye, locate, register, robot, sfm
 from stcal.cli.entry import NO_MEMORY, lacks_memory
 from stcal.cli.help import PLAIN, Commands
-from stcal.cli.options import protect_inputs
+from stcal.cli.options import protect_outputs
 from stcal.cli.terminal import printable, say
 from stcal.errors import StcalError
 
@@ -37,7 +37,7 @@ app.add_typer(locate.app, name="locate")
 app.add_typer(cameras.app, name="camera")
 app.add_typer(handeye.app)
 app.command("register")(register.register)
-protect_inputs(app)
+protect_outputs(app)
 
 
 @sfm.app.callback(invoke_without_command=True)

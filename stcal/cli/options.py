@@ -1,8 +1,10 @@
 """Options that several commands share."""
 
 import inspect
+import os
 from collections.abc import Callable, Sequence
 from contextlib import AbstractContextManager, nullcontext
+from contextvars import ContextVar
 from enum import StrEnum
 from functools import wraps
 from pathlib import Path
@@ -64,6 +66,14 @@ Strict = Annotated[
     bool,
     typer.Option("--strict", help="End with exit code 4 where a check has failed; results are written all the same."),
 ]
+Overwrite = Annotated[bool, typer.Option("--overwrite", help="Replace output files that are there.")]
+"""Of every command that writes a file."""
+ALWAYS_NEW = ("export_database", "export_run")
+"""Commands that replace nothing in any case: what they write others work on."""
+WRITE_NOTHING = ("serve", "dry_run")
+"""Options with which no output is written."""
+_replacing: ContextVar[bool] = ContextVar("_replacing", default=True)
+"""Whether a command's outputs may be there already."""
 MOST_SEED = 2**63 - 1
 """Of 64 bits with a sign, as other programs read it in result files."""
 Workers = Annotated[
@@ -245,22 +255,35 @@ def ellipse_options(min_diameter: float | None, max_diameter: float) -> "Ellipse
     return EllipseOptions(min_diameter_px=min_diameter, max_diameter_px=max_diameter)
 
 
-def protect_inputs(application: typer.Typer) -> None:
-    """Let no command of an application write over what it was given to read: every path among its parameters is an
-    input, but those whose option says that it is ``writable``. Standard output is that of ``--json -`` alone."""
+def require_new(outputs: Sequence[tuple[str, Path]]) -> None:
+    """Refuse, before the work, outputs (option, path) that are there already, unless ``--overwrite`` was given."""
+    for option, path in outputs:
+        if not _replacing.get() and os.path.lexists(path) and not path.is_dir():
+            where = f"{option} {path}" if option.startswith("-") else path
+            raise InputError(f"{where}: exists; give another name, or --overwrite to replace it")
+
+
+def protect_outputs(application: typer.Typer) -> None:
+    """Let no command of an application write over what it was given to read, nor in silence over anything else.
+
+    Every path among its parameters is an input, but those whose option says that it is ``writable``. What is there
+    already is replaced with ``--overwrite`` alone, which is added to the options of each command that writes a file.
+    Standard output is that of ``--json -`` alone.
+    """
     for command in application.registered_commands:
         if command.callback is not None:
             command.callback = _protected(command.callback)
     for group in application.registered_groups:
         if group.typer_instance is not None:
-            protect_inputs(group.typer_instance)
+            protect_outputs(group.typer_instance)
 
 
 def _protected(command: Callable) -> Callable:
     if hasattr(command, "outputs"):  # reached through two applications
         return command
     words, outputs = {}, set()
-    for name, parameter in inspect.signature(command, eval_str=True).parameters.items():
+    signature = inspect.signature(command, eval_str=True)
+    for name, parameter in signature.parameters.items():
         for info in get_args(parameter.annotation)[1:]:
             # With Annotated, Typer takes an option's first name for its default.
             names = [each for each in (info.default, *(info.param_decls or ())) if isinstance(each, str)]
@@ -268,7 +291,7 @@ def _protected(command: Callable) -> Callable:
             outputs |= {name} if getattr(info, "writable", False) else set()
 
     @wraps(command)
-    def checked(**given):
+    def checked(overwrite: bool = False, **given):
         paths = [
             (name, path)
             for name, value in given.items()
@@ -280,9 +303,21 @@ def _protected(command: Callable) -> Callable:
         for option in alone:
             if option != "--json":
                 raise InputError(f"{option} -: only --json writes to standard output; give the name of a file")
-        keep_apart([each for each in written if each[1] != STANDARD_OUTPUT], read)
-        with said_apart() if alone else nullcontext():
-            return command(**given)
+        written = [each for each in written if each[1] != STANDARD_OUTPUT]
+        keep_apart(written, read)
+        token = _replacing.set(overwrite)
+        try:
+            if command.__name__ not in ALWAYS_NEW and not any(given.get(name) for name in WRITE_NOTHING):
+                require_new(written)
+            with said_apart() if alone else nullcontext():
+                return command(**given)
+        finally:
+            _replacing.reset(token)
 
     checked.outputs = frozenset(outputs)  # type: ignore[attr-defined]
+    if outputs and command.__name__ not in ALWAYS_NEW:
+        more = inspect.Parameter("overwrite", inspect.Parameter.KEYWORD_ONLY, default=False, annotation=Overwrite)
+        # Typer reads both.
+        checked.__signature__ = signature.replace(parameters=[*signature.parameters.values(), more])  # type: ignore[attr-defined]
+        checked.__annotations__ = {**command.__annotations__, "overwrite": Overwrite}
     return checked

@@ -508,7 +508,7 @@ def test_the_order_of_quaternions_is_an_option(command, tmp_path):
 def test_differential_evolution_begins_where_it_is_told(command, tmp_path):
     truth = simulated(np.random.default_rng(3), 12, **NOISE)
     path, out = poses_file(tmp_path / "poses.csv", truth), tmp_path / "found.json"
-    words = ("--method", "de", "--splits", 0, "--out", out)
+    words = ("--method", "de", "--splits", 0, "--out", out, "--overwrite")
     code, text, _ = command(path, *words, "--de-bounds-deg", "closed-form,10", "--de-bounds-mm", "closed-form,20")
     assert code == 0
     assert "first population ±10° about the closed-form solution and ±20 mm about the closed-form solution" in text

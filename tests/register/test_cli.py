@@ -117,7 +117,7 @@ def test_methods_and_threshold(run, tmp_path):
         ("liu2017", ["--threshold", 0.5]),
         ("robust", ["--threshold", 0.3]),
     ):
-        code, _, err = run(pairs, "--method", method, *more, "--folds", 0, "--out", out)
+        code, _, err = run(pairs, "--method", method, *more, "--folds", 0, "--out", out, "--overwrite")
         assert (code, err) == (0, "")
         content = json.loads(out.read_text())
         assert content["held_out"] is None

@@ -218,9 +218,9 @@ def test_command_line(stcal_robot, tmp_path):
     q = values(mh80())
     assert np.abs(forward(load_robot(again), q).difference(forward(mh80(), q))).max() < 1e-9
     for words, told in (
-        ((toml, again), "both are robot files; one of each needed"),
+        ((toml, tmp_path / "c.toml"), "both are robot files; one of each needed"),
         ((toml, tmp_path / "c.txt"), "a name ending in .urdf or .toml needed"),
-        ((toml, urdf, "--to-link", "a"), "only of a URDF that is read"),
+        ((toml, tmp_path / "c.urdf", "--to-link", "a"), "only of a URDF that is read"),
     ):
         code, _, error = stcal_robot("convert", *words)
         assert (code, told in error) == (2, True)

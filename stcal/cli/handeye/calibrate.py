@@ -32,6 +32,7 @@ from stcal.cli.options import (
     Strict,
     Workers,
     exports_of,
+    require_new,
     require_passed,
 )
 from stcal.cli.terminal import StageProgress, print_each, say, write
@@ -277,6 +278,7 @@ def handeye(
         [*((name, path) for name, path in written.items() if path), *(("--export", path) for _, path in exports)],
         [(name, path) for name, path in read.items() if path],
     )
+    require_new([("--export", path) for _, path in exports])
     _require_frames(ros or urdf, exports, (setup or SetupName.in_hand).value, parent, child, camera_frame.value)
     if not folder and (sigma_px is not None or sigma_board_mm is not None):
         raise InputError(

@@ -18,6 +18,7 @@ from stcal.cli.options import (
     SecondTable,
     exports_of,
     one_table,
+    require_new,
 )
 from stcal.cli.terminal import print_each, say, write
 from stcal.errors import DegenerateError, InputError
@@ -91,6 +92,7 @@ def compensate(
         [*((name, path) for name, path in written.items() if path), *(("--export", path) for _, path in exports)],
         [(name, path) for name, path in read.items() if path],
     )
+    require_new([("--export", path) for _, path in exports])
     identified = load_robot(robot_file)
     source = one_table(targets, first, second, key, "TARGETS", quaternions=quaternions.value)
     wanted = read_targets(source, identified, quaternions.value, rotation, payload_kg)

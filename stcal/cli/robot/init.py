@@ -6,20 +6,15 @@ from typing import Annotated
 import typer
 
 from stcal.cli.terminal import write
-from stcal.errors import InputError
 
 
 def init(
-    file: Annotated[Path, typer.Argument(writable=True, help="Write the robot file here; it must not exist.")] = Path(
-        "robot.toml"
-    ),
+    file: Annotated[Path, typer.Argument(writable=True, help="Write the robot file here.")] = Path("robot.toml"),
 ) -> None:
     """Write an example of a robot file, to edit: a six-axis arm of 2 m reach."""
     from stcal.robot.kinematics.example import mh80
     from stcal.robot.kinematics.file import robot_toml
 
-    if file.exists():
-        raise InputError(f"robot file {file}: exists already; give another name or move it away")
     comments = (
         "One [[joint]] for each joint, from the base; of type revolute or prismatic (then min_mm and max_mm).",
         "Optional: min_deg, max_deg, beta_deg, base, tool, [[target]] for more tools, and coupling, which makes",

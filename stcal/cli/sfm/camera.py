@@ -6,8 +6,8 @@ from typing import Annotated
 import typer
 
 from stcal.cli.designs import designs_told
-from stcal.cli.options import ReportFile, Strict, TargetFile, Workers, require_passed
-from stcal.cli.terminal import StageProgress, print_each, say, write
+from stcal.cli.options import ReportFile, Strict, TargetFile, Workers, require_new, require_passed
+from stcal.cli.terminal import STANDARD_OUTPUT, StageProgress, print_each, say, write
 from stcal.errors import InputError
 
 app = typer.Typer()
@@ -27,7 +27,7 @@ def calibrate_camera(
         typer.Option(
             "--out",
             writable=True,
-            help="Write the camera to this file, which must not exist, cameras.txt if not given; with --rig all "
+            help="Write the camera to this file, cameras.txt if not given; with --rig all "
             "cameras to this folder, which must be new, rig if not given.",
         ),
     ] = None,
@@ -102,8 +102,8 @@ def _one(images: Path, out: Path, target, board, model: str, json_file, report, 
     from stcal.sfm.camera.text import calibration_text
     from stcal.workflows.calibrate_camera import calibrate_camera_by_corners
 
-    if out.exists():
-        raise InputError(f"{out}: exists; give a new file with --out")
+    json_file = json_file or out.with_suffix(".json")
+    require_new([("--out", out), *([("--json", json_file)] if json_file != STANDARD_OUTPUT else [])])
     with StageProgress() as progress:
         if isinstance(board, BoardDesign):
             result = calibrate(images, target, board, model, workers=workers, progress=progress)
@@ -114,7 +114,7 @@ def _one(images: Path, out: Path, target, board, model: str, json_file, report, 
     summary = CalibrationFile.of(result)
     say(calibration_text(result, summary))
     say(f"camera file: {out}")
-    write(json_file or out.with_suffix(".json"), summary, "figures and checks")
+    write(json_file, summary, "figures and checks")
     if report:
         from stcal.sfm.camera.report import calibration_page
 

@@ -1,6 +1,5 @@
 """``stcal-sfm``: what goes to and comes from COLMAP, and why something was left out."""
 
-import os
 from enum import StrEnum
 from pathlib import Path
 from typing import Annotated
@@ -165,7 +164,7 @@ def faces(
     ],
     run: Annotated[Path, typer.Option("--run", help="Read the run in this folder, whose database was mapped.")],
     out: Annotated[
-        Path | None, typer.Option("--out", writable=True, help="Also write the faces to this new file, as faces.json.")
+        Path | None, typer.Option("--out", writable=True, help="Also write the faces to this file, as faces.json.")
     ] = None,
     solve: Annotated[
         Chained,
@@ -180,8 +179,6 @@ def faces(
     from stcal.sfm.interop.text import faces_text
     from stcal.sfm.run.saved import load_run
 
-    if out is not None and os.path.lexists(out):
-        raise InputError(f"{out}: exists; give a new file with --out")
     if out is not None and not out.parent.is_dir():
         raise InputError(f"{out}: no folder {out.parent}; make it, or give another place with --out")
     saved = load_run(run)

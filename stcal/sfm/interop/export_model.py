@@ -72,7 +72,7 @@ def export_model(run: str | Path, out: str | Path, kind: str) -> ExportedModel:
 
     Parameters
     ----------
-    out : new, or an empty folder for a format that is a folder
+    out : new, or an empty folder for a format that is a folder; folders above it are made
     kind : a :data:`ModelFormat`
 
     Raises
@@ -94,6 +94,7 @@ def export_model(run: str | Path, out: str | Path, kind: str) -> ExportedModel:
     camera = saved.camera
     focal_px = float(camera.focal.mean())
     try:
+        out.parent.mkdir(parents=True, exist_ok=True)
         with tempfile.TemporaryDirectory(prefix=f".{out.name}.partial-", dir=out.parent) as scratch:
             partial = Path(scratch) / out.name
             beside = partial / labels.name if kind in FOLDERS else Path(scratch) / labels.name
@@ -124,8 +125,9 @@ def export_model(run: str | Path, out: str | Path, kind: str) -> ExportedModel:
 
 
 def _require_free(out: Path, labels: Path, kind: str) -> None:
-    if not out.parent.is_dir():
-        raise InputError(f"{out}: no folder {out.parent}; make it, or give another place")
+    above = next(folder for folder in out.absolute().parents if os.path.lexists(folder))
+    if not above.is_dir():
+        raise InputError(f"{out}: {above} is a file; give another place")
     empty = kind in FOLDERS and out.is_dir() and not any(out.iterdir())
     for path in (out, labels):
         if os.path.lexists(path) and not (path == out and empty):
@@ -200,7 +202,12 @@ def _labels_csv(points: Sequence[_Point], faces: FacesFile, kind: str) -> str:
 
 def _ply(points: Sequence[_Point]) -> str:
     """Text PLY in double precision: pycolmap's own has single, and its points in an order that is not documented."""
-    header = ["ply", "format ascii 1.0", "comment mm, target frame", f"element vertex {len(points)}"]
+    header = [
+        "ply",
+        "format ascii 1.0",
+        "comment mm, target frame; points only, no cameras",
+        f"element vertex {len(points)}",
+    ]
     header += [f"property double {axis}" for axis in "xyz"]
     header += [f"property uchar {name}" for name in ("red", "green", "blue")]
     return "\n".join([*header, "end_header", *(_numbers(*p.xyz, *p.rgb) for p in points), ""])

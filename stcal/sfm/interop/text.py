@@ -20,10 +20,10 @@ def database_text(written: Exported) -> str:
 
 def model_text(written: ExportedModel, kind: str) -> str:
     """What is in the model, and the ideal camera of a format that knows no other."""
-    lines = [
-        f"{written.images} images and {written.points} points, mm, target frame: {written.path}",
-        f"labels: {written.labels}",
-    ]
+    holds = f"{written.images} images and {written.points} points"
+    if kind == "ply":
+        holds = f"{written.points} points, not the cameras of the {written.images} images, which other formats hold"
+    lines = [f"{holds}; mm, target frame: {written.path}", f"labels: {written.labels}"]
     if written.focal_px is not None and written.centre_px is not None:
         x, y = written.centre_px
         lines.append(

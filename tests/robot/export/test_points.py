@@ -202,7 +202,7 @@ def test_command_line(case, stcal_robot, tmp_path):
     assert f"note: --export kuka={tmp_path / 'new' / 'a.dat'}: 5 points, joints" in out
     assert (tmp_path / "new/a.dat").read_text() == case.text("kuka", name="a.dat")
     assert b"///POSTYPE PULSE\r\n" in (tmp_path / "b.jbi").read_bytes()
-    code, out, _ = stcal_robot("compensate", case.path, *robots, *made_[:2], "--export-as", "poses")
+    code, out, _ = stcal_robot("compensate", case.path, *robots, *made_[:2], "--export-as", "poses", "--overwrite")
     assert (tmp_path / "new/a.dat").read_text() == case.text("kuka", "poses", name="a.dat")
     for words, told in (
         (("--export", "kuka"), "no file; give kuka=FILE"),

@@ -109,7 +109,7 @@ def test_notes_reach_terminal_and_json(data, stcal_robot):
     robot, out = ("--robot", data.folder / "robot.toml"), data.folder / "out.json"
     angles = "orientation: w_deg, p_deg, r_deg as Euler angles xyz (about fixed axes), degrees"
     path = data.write("data.csv", WPR, "load")
-    code, printed, _ = stcal_robot("identify", path, *robot, "--folds", 0, "--json", out)
+    code, printed, _ = stcal_robot("identify", path, *robot, "--folds", 0, "--json", out, "--overwrite")
     assert code == 0
     assert "40 poses, 30 parameters determined" in printed
     for note in (angles, "column not read: load"):
@@ -117,14 +117,14 @@ def test_notes_reach_terminal_and_json(data, stcal_robot):
         assert note in json.loads(out.read_text())["notes"]
     poses = forward(mh80(), data.seen.q)
     targets = data.write("targets.csv", WPR, "load", poses=poses)
-    code, printed, _ = stcal_robot("compensate", targets, *robot, "--json", out)
+    code, printed, _ = stcal_robot("compensate", targets, *robot, "--json", out, "--overwrite")
     assert code == 0
     assert json.loads(out.read_text())["notes"][:2] == [angles, "column not read: load"]
     assert f"note: targets {targets}: column not read: load" in printed
     at = ["commanded_x_mm", "commanded_y_mm", "commanded_z_mm"]
     lines = [",".join([*at, *POSE[:3], "load"]), *(f"{i},{i * i},0,{i},{i * i},0,1" for i in range(5))]
     (data.folder / "v.csv").write_text("\n".join(lines) + "\n")
-    code, printed, _ = stcal_robot("verify", data.folder / "v.csv", "--json", out)
+    code, printed, _ = stcal_robot("verify", data.folder / "v.csv", "--json", out, "--overwrite")
     assert "note: column not read: load" in printed
     assert json.loads(out.read_text())["notes"] == ["column not read: load"]
 

@@ -140,6 +140,7 @@ def test_command_line(tmp_path, monkeypatch, capsys):
                 str(made[2]),
                 "--report",
                 str(made[3]),
+                "--overwrite",
             ],
         )
         with pytest.raises(SystemExit) as caught:

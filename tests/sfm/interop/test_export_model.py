@@ -350,7 +350,12 @@ def test_the_command(small_run, stcal_sfm, tmp_path):
     assert "(647.5, 431.5)" in out  # 1296 × 864 px, centre of the first pixel at (0, 0)
     code, out, _ = stcal_sfm("export-model", small_run, tmp_path / "model.ply", "--format", "ply")
     assert (code, "ideal" in out) == (0, False)
+    assert " points, not the cameras of the 8 images, which other formats hold; mm, target frame: " in out
+    assert "comment mm, target frame; points only, no cameras\n" in (tmp_path / "model.ply").read_text(encoding="utf-8")
     assert sorted(path.name for path in tmp_path.iterdir()) == ["empty", "model.ply", "model.ply.labels.csv"]
+    code, out, _ = stcal_sfm("export-model", small_run, tmp_path / "new" / "place", "--format", "colmap-txt")
+    assert (code, out.startswith("8 images and ")) == (0, True)
+    assert (tmp_path / "new" / "place" / "cameras.txt").exists()
 
 
 @pytest.mark.parametrize("kind", FORMATS)
@@ -391,8 +396,10 @@ def test_errors(small_run, stcal_sfm, tmp_path):
         assert not out.exists()
         return error
 
-    out = tmp_path / "out" / "m"
-    assert "no folder" in refused(small_run, out)
+    out = tmp_path / "a file" / "m"
+    (tmp_path / "a file").write_text("mine", encoding="utf-8")
+    assert f"{tmp_path / 'a file'} is a file; give another place" in refused(small_run, out)
+    (tmp_path / "a file").unlink()
     out.parent.mkdir()
     assert "format obj: unknown; give one of colmap-bin" in refused(small_run, out, "obj")
     assert "not a run's folder" in refused(tmp_path, out)
