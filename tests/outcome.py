@@ -3,7 +3,7 @@
 import re
 
 INPUT, COMPUTATION, INTERRUPTED = 2, 3, 130
-_PROGRESS = re.compile(r"\w+: \d+ of \d+")
+_PROGRESS = re.compile(r"\w+: \d+ of \d+(, about \d+ (s|min) left)?")
 
 
 def lines_of(stderr: str) -> list[str]:

@@ -18,6 +18,7 @@ import stcal
 from stcal.cli import terminal
 from stcal.cli.entry import lacks_memory
 from stcal.cli.main import app, main
+from stcal.cli.sfm import app as sfm
 from tests.commands import COMMANDS
 from tests.outcome import INPUT, assert_error
 
@@ -155,6 +156,7 @@ def test_json_goes_to_standard_output_alone(program, tmp_path, monkeypatch):
     assert json.loads(out) == json.loads((tmp_path / "design.json").read_text(encoding="utf-8"))
     assert err.splitlines() == said.replace("written: design.json\n", "").splitlines()
     assert not (tmp_path / "-").exists()
+    assert "  O1: volume of the ellipsoid of uncertainty (D-optimality)\n  O2: inverse condition number\n" in said
 
 
 def test_only_json_goes_to_standard_output(program, tmp_path, monkeypatch):
@@ -203,3 +205,91 @@ def test_a_shell_asks_what_may_stand_next():
     asked = {"_STCAL_SFM_COMPLETE": "source_bash"}
     ended = subprocess.run(words, capture_output=True, text=True, env=os.environ | asked, check=False)
     assert "complete -o default -F _stcal_sfm_completion stcal-sfm" in ended.stdout
+
+
+# --- how much is said, and in which colours ---
+
+
+def test_a_stage_that_takes_long_says_what_is_left():
+    assert terminal.time_left(10.0, 2, 8) == ", about 30 s left"
+    assert terminal.time_left(60.0, 1, 6) == ", about 5 min left"
+    assert terminal.time_left(10.0, 8, 8) == terminal.time_left(1.0, 7, 8) == terminal.time_left(0.0, 0, 8) == ""
+
+
+def progress_of(capsys, monkeypatch, quiet: bool, verbose: bool) -> list[str]:
+    """Three steps, four seconds each."""
+    clock = iter(100.0 + 4 * i for i in range(10))
+    monkeypatch.setattr(terminal.time, "monotonic", lambda: next(clock))
+    with terminal.manner(quiet, verbose), terminal.StageProgress() as progress:
+        for done in range(4):
+            progress("check", done, 3)
+    return capsys.readouterr().err.splitlines()
+
+
+def test_progress_as_lines(capsys, monkeypatch):
+    each = ["check: 1 of 3, about 8 s left", "check: 2 of 3, about 4 s left"]
+    assert progress_of(capsys, monkeypatch, False, False) == [each[0], "check: 3 of 3"]
+    assert progress_of(capsys, monkeypatch, False, True) == [*each, "check: 3 of 3 in 12.0 s"]
+    assert progress_of(capsys, monkeypatch, True, False) == []
+
+
+@pytest.mark.parametrize("word", ["--quiet", "-q"])
+def test_a_quiet_command_says_errors_alone(program, tmp_path, word):
+    assert program("robot", "init", tmp_path / "a.toml", word) == (0, "", "")
+    assert (tmp_path / "a.toml").exists()
+    assert_error(program("robot", "init", tmp_path / "a.toml", word), INPUT, "exists")
+
+
+def test_warnings_of_a_quiet_command(capsys):
+    with terminal.manner(True, False):
+        terminal.print_each("note", ["a"])
+        terminal.print_each("warning", ["b\x1b"])
+    assert capsys.readouterr() == ("", "warning: b?\n")
+
+
+def test_every_command_can_be_quiet_or_say_more():
+    for command in COMMANDS.values():
+        assert {"quiet", "verbose"} <= set(inspect.signature(command).parameters)
+
+
+SAID = """checks: 1 failed, 2 suspicious, 14 passed, 2 not possible
+  failed: Residuals: 12/failed.jpg at 3 px, not passed
+verdict: use with care: few poses
+split-half check: passed; p = 0.5
+warning: focus"""
+
+
+@pytest.mark.parametrize(
+    ("variables", "terminal_there", "coloured"),
+    [
+        ({"TERM": "xterm"}, True, True),
+        ({"TERM": "xterm", "NO_COLOR": ""}, True, True),
+        ({"TERM": "xterm", "NO_COLOR": "1"}, True, False),
+        ({"TERM": "dumb"}, True, False),
+        ({"TERM": "xterm"}, False, False),
+    ],
+)
+def test_words_of_verdicts_have_colours_on_a_terminal(monkeypatch, variables, terminal_there, coloured):
+    class Stream(io.StringIO):
+        def isatty(self):
+            return terminal_there
+
+    monkeypatch.delenv("NO_COLOR", raising=False)
+    for name, value in variables.items():
+        monkeypatch.setenv(name, value)
+    stream = Stream()
+    monkeypatch.setattr("sys.stdout", stream)
+    terminal.say(SAID)
+    text = stream.getvalue()
+    assert re.sub(r"\x1b\[\d+m", "", text) == SAID + "\n"
+    words = re.findall(r"\x1b\[(\d+)m([^\x1b]+)\x1b\[0m", text)
+    red, yellow, green = "31", "33", "32"
+    wanted = [(red, "failed"), (yellow, "suspicious"), (green, "passed"), (red, "failed"), (yellow, "use with care")]
+    assert words == ([*wanted, (green, "passed"), (yellow, "warning")] if coloured else [])
+
+
+def test_help_tells_of_completion():
+    """Both programs; no command has an option more for it."""
+    for application in (app, sfm):
+        assert "--install-completion" in CliRunner().invoke(application, ["-h"]).output
+    assert "completion" not in CliRunner().invoke(app, ["register", "-h"]).output

@@ -7,7 +7,6 @@ from typer.core import TyperGroup
 PLAIN: dict[str, Any] = {
     "rich_markup_mode": None,  # rich takes twice as long to load as all the rest of `--help`
     "context_settings": {"max_content_width": 120, "help_option_names": ["-h", "--help"]},
-    "add_completion": False,
     "pretty_exceptions_enable": False,
     "no_args_is_help": True,
 }

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Annotated, get_args
 
 import typer
 
-from stcal.cli.terminal import STANDARD_OUTPUT, print_each, said_apart
+from stcal.cli.terminal import STANDARD_OUTPUT, manner, print_each, said_apart
 from stcal.errors import ChecksFailed, InputError
 from stcal.io.saving import keep_apart
 
@@ -68,6 +68,10 @@ Strict = Annotated[
 ]
 Overwrite = Annotated[bool, typer.Option("--overwrite", help="Replace output files that are there.")]
 """Of every command that writes a file."""
+Quiet = Annotated[bool, typer.Option("--quiet", "-q", help="Say nothing but warnings and errors.")]
+Verbose = Annotated[
+    bool, typer.Option("--verbose", "-v", help="Say more: each step, the time that stages take, what images show.")
+]
 ALWAYS_NEW = ("export_database", "export_run")
 """Commands that replace nothing in any case: what they write others work on."""
 WRITE_NOTHING = ("serve", "dry_run")
@@ -267,7 +271,8 @@ def protect_outputs(application: typer.Typer) -> None:
     """Let no command of an application write over what it was given to read, nor in silence over anything else.
 
     Every path among its parameters is an input, but those whose option says that it is ``writable``. What is there
-    already is replaced with ``--overwrite`` alone, which is added to the options of each command that writes a file.
+    already is replaced with ``--overwrite`` alone, which is added to the options of each command that writes a file, as
+    ``--quiet`` and ``--verbose`` are to all.
     Standard output is that of ``--json -`` alone.
     """
     for command in application.registered_commands:
@@ -291,7 +296,7 @@ def _protected(command: Callable) -> Callable:
             outputs |= {name} if getattr(info, "writable", False) else set()
 
     @wraps(command)
-    def checked(overwrite: bool = False, **given):
+    def checked(overwrite: bool = False, quiet: bool = False, verbose: bool = False, **given):
         paths = [
             (name, path)
             for name, value in given.items()
@@ -309,15 +314,17 @@ def _protected(command: Callable) -> Callable:
         try:
             if command.__name__ not in ALWAYS_NEW and not any(given.get(name) for name in WRITE_NOTHING):
                 require_new(written)
-            with said_apart() if alone else nullcontext():
+            with manner(quiet, verbose), said_apart() if alone else nullcontext():
                 return command(**given)
         finally:
             _replacing.reset(token)
 
     checked.outputs = frozenset(outputs)  # type: ignore[attr-defined]
+    more = {"quiet": Quiet, "verbose": Verbose}
     if outputs and command.__name__ not in ALWAYS_NEW:
-        more = inspect.Parameter("overwrite", inspect.Parameter.KEYWORD_ONLY, default=False, annotation=Overwrite)
-        # Typer reads both.
-        checked.__signature__ = signature.replace(parameters=[*signature.parameters.values(), more])  # type: ignore[attr-defined]
-        checked.__annotations__ = {**command.__annotations__, "overwrite": Overwrite}
+        more = {"overwrite": Overwrite, **more}
+    added = [inspect.Parameter(n, inspect.Parameter.KEYWORD_ONLY, default=False, annotation=a) for n, a in more.items()]
+    # Typer reads both.
+    checked.__signature__ = signature.replace(parameters=[*signature.parameters.values(), *added])  # type: ignore[attr-defined]
+    checked.__annotations__ = {**command.__annotations__, **more}
     return checked

@@ -2,6 +2,7 @@
 standard error; and the files they write, one of them to standard output where it is asked for there."""
 
 import json
+import os
 import re
 import sys
 import time
@@ -18,25 +19,66 @@ if TYPE_CHECKING:
     from rich.progress import TaskID
 
 LINE_EVERY_S = 5.0
+LEFT_FROM_S = 2.0
+"""A stage that will take so long yet says so."""
 STANDARD_OUTPUT = Path("-")
 """In place of a JSON file's name."""
 _taker: ContextVar[TextIO | None] = ContextVar("_taker", default=None)
 """Standard output while a file goes there."""
 
+_quiet: ContextVar[bool] = ContextVar("_quiet", default=False)
+_verbose: ContextVar[bool] = ContextVar("_verbose", default=False)
+RED, YELLOW, GREEN = 31, 33, 32
+"""Of ECMA-48."""
+COLOURS = {
+    "failed": RED,
+    "do not use": RED,
+    "suspicious": YELLOW,
+    "use with care": YELLOW,
+    "warning": YELLOW,
+    "passed": GREEN,
+    "good": GREEN,
+}
+"""By the word of a verdict."""
+VERDICTS = re.compile(
+    r"(?m)(?P<before>^ *|^(?:verdict|split-half check): |(?<=checks: )\d+ |(?<=, )\d+ )"
+    rf"(?P<word>{'|'.join(COLOURS)})(?=[:;,]| *$)"
+)
+"""Where such a word is one: before what it judges, after `verdict`, and in the counts of checks."""
+
+
+@contextmanager
+def manner(quiet: bool, verbose: bool) -> Iterator[None]:
+    """What a command says meanwhile: nothing but warnings and errors, or more than usual."""
+    tokens = _quiet.set(quiet), _verbose.set(verbose)
+    try:
+        yield
+    finally:
+        _quiet.reset(tokens[0])
+        _verbose.reset(tokens[1])
+
+
+def verbose() -> bool:
+    """Whether more than usual is to be said."""
+    return _verbose.get()
+
 
 class StageProgress:
-    """A callable (stage, done, total): a bar on a terminal, plain lines otherwise; use as a context manager."""
+    """A callable (stage, done, total): a bar on a terminal, plain lines otherwise, with the time left; nothing where
+    the command is quiet. Use as a context manager."""
 
     def __init__(self):
         self.bar = None
         self.tasks: dict[str, TaskID] = {}
         self.last = 0.0
-        if sys.stderr.isatty():
+        self.began: dict[str, float] = {}
+        if sys.stderr.isatty() and not _quiet.get():
             from rich.console import Console
             from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
+            from rich.progress import TimeRemainingColumn as TimeLeftColumn
 
             columns = (TextColumn("{task.description:<10}"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn())
-            self.bar = Progress(*columns, console=Console(stderr=True))
+            self.bar = Progress(*columns, TextColumn("left"), TimeLeftColumn(), console=Console(stderr=True))
 
     def __enter__(self) -> "StageProgress":
         if self.bar:
@@ -48,15 +90,29 @@ class StageProgress:
             self.bar.stop()
 
     def __call__(self, stage: str, done: int, total: int) -> None:
+        if _quiet.get():
+            return
         if self.bar:
             if stage not in self.tasks:
                 self.tasks[stage] = self.bar.add_task(stage, total=total)
             self.bar.update(self.tasks[stage], completed=done, total=total)
             return
         now = time.monotonic()
-        if done == total or (done and now - self.last > LINE_EVERY_S):
+        began = self.began.setdefault(stage, now)
+        if done == total or (done and (now - self.last > LINE_EVERY_S or _verbose.get())):
             self.last = now
-            print(f"{stage}: {done} of {total}", file=sys.stderr, flush=True)
+            more = time_left(now - began, done, total)
+            if _verbose.get() and done == total:
+                more = f" in {now - began:.1f} s"
+            print(f"{stage}: {done} of {total}{more}", file=sys.stderr, flush=True)
+
+
+def time_left(taken_s: float, done: int, total: int) -> str:
+    """In words, as if each takes as long as those that are done; empty where it is hardly any."""
+    left = taken_s / done * (total - done) if done else 0.0
+    if left < LEFT_FROM_S:
+        return ""
+    return f", about {left:.0f} s left" if left < 100 else f", about {left / 60:.0f} min left"
 
 
 def printable(text: str) -> str:
@@ -72,8 +128,16 @@ def _instead(character: str) -> str:
 
 
 def say(*values: object, sep: str = " ", end: str = "\n") -> None:
-    """Print; names that come from files may hold any characters."""
-    print(printable(sep.join(map(str, values))), end=end)
+    """Print, unless the command is quiet; names that come from files may hold any characters."""
+    if not _quiet.get():
+        print(_coloured(printable(sep.join(map(str, values)))), end=end)
+
+
+def _coloured(text: str) -> str:
+    """With the words of verdicts in colour on a terminal, where `NO_COLOR` (no-color.org) is not set."""
+    if not sys.stdout.isatty() or os.environ.get("NO_COLOR") or os.environ.get("TERM") == "dumb":
+        return text
+    return VERDICTS.sub(lambda found: f"{found['before']}\x1b[{COLOURS[found['word']]}m{found['word']}\x1b[0m", text)
 
 
 @contextmanager
@@ -106,4 +170,6 @@ def _escaped(text: str, encoding: str) -> str:
 def print_each(said: str, lines: Iterable[object]) -> None:
     """Each on a line of its own, after the word."""
     for line in lines:
+        if _quiet.get() and said.startswith("warning"):
+            sys.stderr.write(f"{printable(f'{said}: {line}')}\n")
         say(f"{said}: {line}")

@@ -85,9 +85,7 @@ def run(
         if options.compare and result.target.target_from_face:
             published = _published(images, model, folder, *designs, options, progress)
             result = replace(result, comparison=compare_with_paper(result, published))
-        progress("check", 0, 1)
-        result = replace(result, checks=run_checks(result.evidence(camera_prior(result.camera))))
-        progress("check", 1, 1)
+        result = replace(result, checks=run_checks(result.evidence(camera_prior(result.camera)), progress))
         return replace(result, judgement=write_run(result, folder.stage, progress, reload_s))
 
 
@@ -154,13 +152,13 @@ def _solved(
     solutions, unsolved = solve_groups(
         observations, graph, scratch, folder.cache, known, target, board, options, progress, groups
     )
-    progress("faces", 0, 1)
     models, settled = [s.model for s in solutions], options.adjustment(target)
     if board_alone:
+        progress("faces", 0, 1)
         calibration = calibrate_board(models, known, board, settled)
+        progress("faces", 1, 1)
     else:
-        calibration = calibrate(models, known, target, board, settled, camera_prior(known))
-    progress("faces", 1, 1)
+        calibration = calibrate(models, known, target, board, settled, camera_prior(known), progress)
     return RunResult(
         out=folder.out,
         camera=known,

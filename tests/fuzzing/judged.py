@@ -38,7 +38,7 @@ EARLIER = "of an earlier call\n"
 IN, OUT = "in", "out"
 CAPABILITIES, ANY_FILE = 0x20080522, 0b110
 """Version of Linux's interface, and the bits of CAP_DAC_OVERRIDE and CAP_DAC_READ_SEARCH."""
-_PROGRESS = re.compile(r"[\w, ]+: \d+ of \d+")
+_PROGRESS = re.compile(r"[\w, ]+: \d+ of \d+(, about \d+ (s|min) left)?")
 _NO_POSE = "no pose accepted"
 """Said on standard output with exit code 3 by a command that has done its work."""
 

@@ -26,7 +26,7 @@ from stcal.cli.options import (
     load_ahead,
     require_passed,
 )
-from stcal.cli.terminal import StageProgress, say, write
+from stcal.cli.terminal import StageProgress, say, verbose, write
 from stcal.errors import InputError
 from stcal.io.saving import keep_apart
 
@@ -144,7 +144,7 @@ def run(
     from stcal.sfm import pipeline
     from stcal.sfm.mapping.pairs import PairOptions
     from stcal.sfm.run.options import RunOptions
-    from stcal.sfm.run.text import run_text
+    from stcal.sfm.run.text import found_lines, run_text
 
     options = RunOptions(
         solve=solve.value if solve is not None else None,
@@ -163,6 +163,8 @@ def run(
     )
     with designs_told(target, board), handed_over(scheduler, send_images), StageProgress() as progress:
         result = pipeline.run(images, camera, out, target, board, options, progress)
+    if verbose():
+        say("\n".join(found_lines(result.labelled)))
     say(run_text(result))
     failed = [check.title for check in result.checks if check.verdict == "failed"]
     require_passed(strict, failed, result.out / "report.html")

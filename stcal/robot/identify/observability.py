@@ -25,6 +25,8 @@ MEANING = {
     "O5": "harmonic mean, near to A-optimality",
 }
 """Of the indices, in words."""
+EXPLAINED = [f"  {name}: {words}" for name, words in MEANING.items()]
+"""A line of each, for the terminal."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -11,7 +11,7 @@ from stcal.report.text import NONE, number, text_table
 from stcal.robot.identify.drawings import Drawn, joints_figure, space_picture
 from stcal.robot.identify.files import IdentifiedFile
 from stcal.robot.identify.nominal import DIMENSIONS, Placed, dh_values
-from stcal.robot.identify.observability import MEANING
+from stcal.robot.identify.observability import EXPLAINED, MEANING
 from stcal.robot.identify.result import OUTLIER_WEIGHT, Identified
 from stcal.robot.kinematics.forward import links, torques
 from stcal.robot.kinematics.model import Elasticity, Robot
@@ -49,6 +49,7 @@ def identified_text(result: Identified, nominal: Robot) -> str:
         lines += ["", *text_table([head, *elastic_rows(result)], (16, *[12] * (len(head) - 1)))]
     indices = result.observability.values()
     lines += ["", "observability  " + "   ".join(f"{name} {value:.3g}" for name, value in indices.items())]
+    lines += EXPLAINED
     outliers = result.outliers()
     if outliers:
         lines.append(f"outliers, of less than half weight: {len(outliers)}")

@@ -16,7 +16,13 @@ from stcal.geometry.arrays import Array, freeze
 from stcal.geometry.rigid import Poses
 from stcal.io.table import POSE, pose_cells
 from stcal.parallel import one_thread
-from stcal.robot.identify.observability import SEEN, ObservabilityIndices, identification_jacobian, parameter_scale
+from stcal.robot.identify.observability import (
+    EXPLAINED,
+    SEEN,
+    ObservabilityIndices,
+    identification_jacobian,
+    parameter_scale,
+)
 from stcal.robot.kinematics.forward import forward
 from stcal.robot.kinematics.model import Robot
 from stcal.robot.use.compensation import joint_cells, joint_columns
@@ -333,6 +339,7 @@ def design_text(result: PoseDesign) -> str:
     for name, value in result.chosen.values().items():
         ratio = f"{value / median[name]:.2f}" if median[name] > 0 else "–"
         lines.append(f"{name:<3}{value:12.4g}{median[name]:12.4g}{ratio:>8}")
+    lines += EXPLAINED
     text = f"σ of predicted positions: {1000 * result.sigma_mm:.1f} µm per axis"
     if np.isfinite(result.random_sigma_mm):
         ratio = result.random_sigma_mm / result.sigma_mm

@@ -10,6 +10,7 @@ from stcal.errors import MappingError
 from stcal.geometry.camera import Camera
 from stcal.geometry.rigid import Rigid
 from stcal.io.camera import CameraPrior
+from stcal.parallel import Progress, counted
 from stcal.sfm.adjust.chain import CalibratedTarget, chain_faces, chain_singly, unlinked_faces
 from stcal.sfm.adjust.faces import FaceInGroup, faces_of_group, missing_frame_circles
 from stcal.sfm.adjust.group import adjust
@@ -48,10 +49,12 @@ def calibrate(
     board: BoardDesign,
     options: AdjustOptions,
     prior: CameraPrior | None = None,
+    progress: Progress | None = None,
 ) -> Calibration:
     """Calibrate the target from the groups' models (worlds without unit, corrections settled).
 
-    ``prior`` : the camera's intrinsics as observations, for options that refine them.
+    ``prior`` : the camera's intrinsics as observations, for options that refine them; ``progress`` : called with
+    (``faces``, done, total) after the chain, each joint adjustment, and the covariances.
 
     Raises
     ------
@@ -62,7 +65,8 @@ def calibrate(
     ConvergenceError
         The adjustment finds no minimum.
     """
-    published = options.solve == "paper"
+    published, joint_rounds = options.solve == "paper", _joint_rounds(options, prior)
+    step = counted(progress or (lambda *_: None), "faces", 1 + joint_rounds + (joint_rounds > 0))
     scales = {model.group: find_scale(model, board, published) for model in models}
     metric = [model.metric(scales[model.group].group_from_world()) for model in models]
     faces, notes = _faces(metric, camera, target, options)
@@ -80,9 +84,11 @@ def calibrate(
     factor = image_sigma_factor(models, camera)
     metric = [_placed(m, scales[m.group], calibrated) for m in models if m.group in calibrated.target_from_group]
     joint = None
-    if options.solve == "joint":
-        joint, factor = _adjust_all(metric, factor, camera, target, board, options, prior)
+    step(None)
+    if joint_rounds:
+        joint, factor = _adjust_all(metric, factor, camera, target, board, options, prior, step)
         calibrated = calibrated_target(joint, calibrated, target, options.frame)
+        step(None)
         metric = [m.moved(calibrated.target_from_group[m.group]) for m in joint.models]
         camera = joint.camera
         notes += _unsettled(joint)
@@ -171,21 +177,28 @@ def _unsettled(joint: JointResult) -> list[str]:
     ]
 
 
+def _joint_rounds(options: AdjustOptions, prior: CameraPrior | None) -> int:
+    """How many joint adjustments are made; refined intrinsics want one more."""
+    return 0 if options.solve != "joint" else JOINT_ROUNDS + (options.refine_camera and prior is not None)
+
+
 def _adjust_all(
-    models: list[MetricModel], factor: float, camera: Camera, target, board, options: AdjustOptions, prior
+    models: list[MetricModel], factor: float, camera: Camera, target, board, options: AdjustOptions, prior, step
 ) -> tuple[JointResult, float]:
     """The joint adjustment from the chained result, and the factor on the centres' σ; eccentricity follows, and with
     refined intrinsics that factor too: a wrong camera makes residuals of its own."""
     radius = target.radius_of() | board.radius_of()
     own = [m.covariance_px2 for m in models]
+    rounds = _joint_rounds(options, prior)
     prior = prior if options.refine_camera else None
     current = camera
-    for _ in range(JOINT_ROUNDS + (prior is not None)):
+    for _ in range(rounds):
         if options.eccentricity:
             models = [replace(m, shift_px=eccentricity_px(m, current, radius, 1.0)) for m in models]
         models = [replace(m, covariance_px2=factor**2 * c) for m, c in zip(models, own, strict=True)]
         result = adjust_jointly(models, board, camera, options.flatness_mm, prior, current)
         models, current = list(result.models), result.camera
+        step(None)
         if prior is not None:
             plain = [replace(m, covariance_px2=c) for m, c in zip(models, own, strict=True)]
             factor = image_sigma_factor([adjust(m, current) for m in plain], current)

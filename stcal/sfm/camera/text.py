@@ -6,6 +6,7 @@ from stcal.io.camera import COLMAP_PIXEL_ORIGIN
 from stcal.report.text import number, text_table
 from stcal.sfm.camera.calibrate import CameraCalibration
 from stcal.sfm.camera.file import CalibrationFile
+from stcal.sfm.camera.trust import FAILED_P, SUSPICIOUS_P
 
 
 def models_table(summary: CalibrationFile) -> list[str]:
@@ -53,6 +54,7 @@ def calibration_text(result: CameraCalibration, summary: CalibrationFile) -> str
     if split := result.split:
         lines.append(
             f"split-half check: {split.verdict}; p = {split.p_value:.2g}, largest difference {split.largest_px:.4f} px "
-            f"where {np.sqrt(2) * split.largest_sigma_px:.4f} px is expected"
+            f"where {np.sqrt(2) * split.largest_sigma_px:.4f} px is expected (suspicious by chance in one "
+            f"calibration in {1 / SUSPICIOUS_P:,.0f}, failed in one in {1 / FAILED_P:,.0f})"
         )
     return "\n".join(lines + [f"warning: {warning}" for warning in result.warnings])

@@ -1,12 +1,15 @@
 """Checks that residuals cannot fake: each asks a question that a wrong result with small residuals answers wrongly."""
 
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass, replace
+from functools import partial
 
 import numpy as np
 
 from stcal.design import BoardDesign, TargetDesign
 from stcal.errors import StcalError
 from stcal.io.camera import CalibratedCamera, CameraPrior
+from stcal.parallel import Progress, counted
 from stcal.sfm.adjust.calibration import Calibration, calibrate, image_sigma_factor
 from stcal.sfm.adjust.group import adjust
 from stcal.sfm.adjust.network import Network, free_network, solve_score
@@ -78,44 +81,51 @@ class Evidence:
         return [free_network(m.metric(scales[m.group].group_from_world()), camera, factor) for m in models]
 
 
-def run_checks(evidence: Evidence) -> tuple[Check, ...]:
-    """All checks of a run, in the order of the report."""
+def run_checks(evidence: Evidence, progress: Progress | None = None) -> tuple[Check, ...]:
+    """All checks of a run, in the order of the report; ``progress`` is called with (``check``, done, total)."""
     networks, calibration = evidence.networks(), evidence.calibration
     camera, board, target = calibration.camera, evidence.board, evidence.target
     radii = measure_radii(networks, evidence.images, target.radius_of() | board.radius_of(), camera)
-    return (
-        camera_check(networks, evidence.camera, calibration, evidence.prior),
-        field_check(networks, camera),
-        sigma_check(networks, calibration.sigma_factor),
+    made: tuple[Callable[[], Check | Iterable[Check]], ...] = (
+        lambda: camera_check(networks, evidence.camera, calibration, evidence.prior),
+        lambda: field_check(networks, camera),
+        lambda: sigma_check(networks, calibration.sigma_factor),
         *_joint_checks(evidence, networks),
-        moved_check(networks),
-        image_check(networks),
-        sharpness_check(networks, evidence.blur_px),
-        evenness_check(networks, evidence.images, camera),
-        labels_check(networks, evidence.outliers, evidence.images, camera),
-        *board_checks(networks, board),
-        pitch_check(calibration.target, target, radii),
-        *radius_checks(radii),
-        flatness_check(networks, evidence.options.flatness_mm),
-        control_check(evidence, networks),
+        lambda: moved_check(networks),
+        lambda: image_check(networks),
+        lambda: sharpness_check(networks, evidence.blur_px),
+        lambda: evenness_check(networks, evidence.images, camera),
+        lambda: labels_check(networks, evidence.outliers, evidence.images, camera),
+        lambda: board_checks(networks, board),
+        lambda: pitch_check(calibration.target, target, radii),
+        lambda: radius_checks(radii),
+        lambda: flatness_check(networks, evidence.options.flatness_mm),
+        lambda: control_check(evidence, networks),
     )
+    step = counted(progress or (lambda *_: None), "check", len(made))
+    checks: list[Check] = []
+    for make in made:
+        found = make()
+        checks += [found] if isinstance(found, Check) else found
+        step(None)
+    return tuple(checks)
 
 
-def _joint_checks(evidence: Evidence, networks: list[Network]) -> list[Check]:
+def _joint_checks(evidence: Evidence, networks: list[Network]) -> list[Callable[[], Check]]:
     joint = evidence.calibration.joint
     if not evidence.calibration.target.target_from_face:
-        return [impossible(key, title, "the board alone, no face", "") for key, title in JOINT]
+        return [partial(impossible, key, title, "the board alone, no face", "") for key, title in JOINT]
     if joint is None:
         reason = "needs the covariances of the joint adjustment"
-        return [impossible(key, title, reason, "run with --solve joint") for key, title in JOINT]
+        return [partial(impossible, key, title, reason, "run with --solve joint") for key, title in JOINT]
     again = Again(evidence.calibration, joint, evidence.target, evidence.board, evidence.options)
     linked = {model.group for model in joint.models}
     own = [n for n in networks if n.model.group in linked]
     return [
-        agreement_check(joint, own),
-        halves_check(again),
-        groups_check(again),
-        loops_check(again),
+        partial(agreement_check, joint, own),
+        partial(halves_check, again),
+        partial(groups_check, again),
+        partial(loops_check, again),
     ]
 
 

@@ -18,6 +18,9 @@ from stcal.sfm.run.comparison import Comparison
 from stcal.sfm.run.result import RunResult
 from stcal.sfm.run.solve import GroupSolution
 
+NOTED, NAMED = 4, 6
+"""Images whose notes are printed; further ones that are named."""
+
 
 def run_text(result: RunResult) -> str:
     """The answer: groups, what was left out, faces with σ and checks that did not pass."""
@@ -25,11 +28,7 @@ def run_text(result: RunResult) -> str:
     for solution in result.solutions:
         lines += _group(solution, result.calibration.scales[solution.model.group].rms_mm())
     lines += result.notes
-    noted = sum(bool(each.notes) for each in result.labelled)
-    if noted:
-        lines.append(
-            f"something was left out in {noted} of {len(result.labelled)} images; the report says what and why"
-        )
+    lines += _noted(result.labelled)
     if result.options.solve == "paper":
         lines.append(
             "as published, for comparison: centres of contours, alike in weight, without the eccentricity; faces are "
@@ -104,6 +103,16 @@ def _skipped(skipped: Sequence[Skipped]) -> Iterator[str]:
     return (f"skipped {each.name}: {each.reason}" for each in skipped)
 
 
+def _noted(labelled: Sequence[LabelledImage]) -> Iterator[str]:
+    """What was left out within images, of the first ones; names of the others."""
+    noted = {each.observations.name: each.notes for each in labelled if each.notes}
+    for name in list(noted)[:NOTED]:
+        yield from (f"{name}: {note}" for note in noted[name])
+    if others := list(noted)[NOTED:]:
+        more = f" and {len(others) - NAMED} more" if len(others) > NAMED else ""
+        yield f"something was left out in {', '.join(others[:NAMED])}{more} too; the report says what and why"
+
+
 def _group(solution: GroupSolution, board_rms_mm: float) -> Iterator[str]:
     pair = solution.pairs[0]
     yield (
@@ -120,10 +129,10 @@ def _group(solution: GroupSolution, board_rms_mm: float) -> Iterator[str]:
 def _faces(result: RunResult) -> Iterator[str]:
     target = result.target
     sigma_heading = "   σ position µm      σ rotation mdeg" if target.face_covariance else ""
-    yield f"{'face':>6} {'x':>11} {'y':>11} {'z':>11} mm{sigma_heading}"
+    yield f"{'face':>6} {'x':>10} {'y':>10} {'z':>10} mm{sigma_heading}"
     for face_id, pose in target.target_from_face.items():
         x, y, z = pose.translation
-        line = f"{face_id:>6} {x:11.4f} {y:11.4f} {z:11.4f}"
+        line = f"{face_id:>6} {x:10.4f} {y:10.4f} {z:10.4f}"
         covariance = target.face_covariance.get(face_id)
         if face_id == target.reference_face:
             line += "      reference"

@@ -112,6 +112,7 @@ def test_notes_reach_terminal_and_json(data, stcal_robot):
     code, printed, _ = stcal_robot("identify", path, *robot, "--folds", 0, "--json", out, "--overwrite")
     assert code == 0
     assert "40 poses, 30 parameters determined" in printed
+    assert "\n  O3: the combination of parameters that is seen worst (E-optimality)\n" in printed
     for note in (angles, "column not read: load"):
         assert f"note: {note}" in printed
         assert note in json.loads(out.read_text())["notes"]

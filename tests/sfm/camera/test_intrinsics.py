@@ -297,7 +297,7 @@ def test_two_views_are_refused_and_another_size_is_named(stcal_sfm, small_set):
     ("more", "message"),
     [
         (["--model", "FISHEYE"], "camera model FISHEYE: not supported; use one of SIMPLE_PINHOLE"),
-        (["--out", "target.toml"], "target.toml: exists; give a new file with --out"),
+        (["--out", "target.toml"], "--out target.toml: exists; give another name, or --overwrite to replace it"),
     ],
 )
 def test_impossible_options(stcal_sfm, small_dataset, monkeypatch, more, message):

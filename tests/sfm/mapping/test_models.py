@@ -725,7 +725,7 @@ def test_nothing_is_overwritten(saved, stcal_sfm, tmp_path):
     for name in ("mine", "link", "."):
         out = tmp_path / name
         outcome = stcal_sfm("faces", saved.folder / "models", "--run", saved.folder, "--out", out)
-        said = "is a folder; the name of a file needed" if name == "." else "exists; give a new file with --out"
+        said = "is a folder; the name of a file needed" if name == "." else "exists; give another name, or --overwrite"
         assert_error(outcome, INPUT, f"{out}: {said}")
     out = tmp_path / "no" / "f.json"
     outcome = stcal_sfm("faces", saved.folder / "models", "--run", saved.folder, "--out", out)

@@ -1,6 +1,7 @@
 """Images taken out by name, and runs that end as failed where their checks have."""
 
 import json
+from types import SimpleNamespace
 
 import cv2
 import numpy as np
@@ -10,6 +11,7 @@ from stcal.errors import InputError
 from stcal.io.images import chosen_images
 from stcal.sfm.checks.verdict import Check, ranked
 from stcal.sfm.run.saved import load_run
+from stcal.sfm.run.text import _faces, _noted
 from tests.outcome import INPUT, assert_error
 
 CHECKS_FAILED = 4
@@ -38,8 +40,9 @@ def files(small):
 def test_a_failed_check_names_its_image_and_the_option_that_takes_it_out(with_a_stray, stcal_sfm):
     """Exit code 0 as ever, 4 with --strict, and 0 again with what the first remedy says."""
     small = with_a_stray
-    code, out, _ = stcal_sfm(*small.arguments(*files(small)))
+    code, out, err = stcal_sfm(*small.arguments(*files(small)))
     assert code == 0
+    assert {"faces: 4 of 4", "check: 17 of 17"} <= set(err.splitlines())
     lines = out.splitlines()
     (counts,) = (i for i, line in enumerate(lines) if line.startswith("checks: "))
     assert lines[counts + 1] == "  (a check is suspicious by chance in one run in 1,000, failed in one in 100,000)"
@@ -80,6 +83,32 @@ def test_images_are_named_as_in_results_or_by_their_path(small_set, monkeypatch)
     assert len(kept) == 5
     with pytest.raises(InputError, match="--exclude takes out all 8 images; leave some in"):
         chosen_images(small.images, [each.name for each in chosen_images(small.images)[0]])
+
+
+def test_images_in_which_something_was_left_out_are_named():
+    images = [
+        SimpleNamespace(observations=SimpleNamespace(name=f"12/{i}.jpg"), notes=(f"face 2: no circle {i}",) * (i % 3))
+        for i in range(18)
+    ]
+    lines = list(_noted(images))
+    assert lines[:3] == ["12/1.jpg: face 2: no circle 1", *["12/2.jpg: face 2: no circle 2"] * 2]
+    assert len(lines) == 7
+    assert lines[-1] == (
+        "something was left out in 12/7.jpg, 12/8.jpg, 12/10.jpg, 12/11.jpg, 12/13.jpg, 12/14.jpg and 2 more too; the "
+        "report says what and why"
+    )
+    assert list(_noted(images[:3])) == lines[:3]
+
+
+def test_the_table_of_faces_fits_into_80_columns(small_result):
+    lines = list(_faces(small_result))
+    assert len(lines) > 3
+    assert max(map(len, lines)) <= 80
+    (name, x, y, z, *sigma) = lines[2].split()
+    assert len(sigma) == 6
+    assert [float(v) for v in (x, y, z)] == [
+        round(v, 4) for v in small_result.target.target_from_face[name].translation.tolist()
+    ]
 
 
 def test_of_failed_checks_those_that_name_an_image_come_first():
