@@ -34,8 +34,8 @@ def test_every_option_is_documented(name, command):
 VERBS = """
 Accept Add Adjust Advise Allow Also Answer Assume Begin Blur Calibrate Call Choose Compare Compute Convert Copy Correct
 Count Cross-validate Decide Detect Divide Draw End Explain Find Fit Follow Forecast Give Hand Hold Identify Ignore Keep
-Lay Listen Look Make Map Match Measure Multiply Name Photograph Place Plan Print Rank Read Reject Render Run Send Set
-Show Solve Spread Start Stop Take Tell Treat Use Write
+Lay Listen Look Make Map Match Measure Multiply Name Photograph Place Plan Print Rank Read Reject Render Replace Run Say
+Send Set Show Solve Spread Start Stop Take Tell Treat Use Write
 """
 """With which a help text may begin; *Also* goes before one of the others."""
 
