@@ -23,7 +23,7 @@ FOLDERS = {
     ("watch", "out"),
     ("from_photos", "out"),
 }
-FOLDERS |= {("export_model", "out"), ("capture", "out"), ("capture", "images"), ("design", "folder")}
+FOLDERS |= {("export_model", "out"), ("capture", "out"), ("capture", "images")}
 """New ones, which replace nothing, or those of `tests/sfm/run/test_transaction.py`."""
 WRITES = ("Write ", "Also write ", "Draw ", "Keep ")
 EVERY = list(COMMANDS.values())
