@@ -111,7 +111,8 @@ def _use(report: dict) -> tuple[Use, str]:
             "With care: groups were solved one by one; there are no σ, and fewer checks.",
         )
     passed = f"{counts['passed']} checks passed" if counts["passed"] else "nothing was checked"
-    open_ = f", {counts['not possible']} were not possible" if counts["not possible"] else ""
+    n = counts["not possible"]
+    open_ = f", {n} {'was' if n == 1 else 'were'} not possible" if n else ""
     return "yes", f"Yes: {passed}{open_}."
 
 

@@ -13,7 +13,7 @@ from pathlib import Path
 import numpy as np
 
 from stcal.design import TargetDesign
-from stcal.errors import InputError
+from stcal.errors import InputError, StcalError
 from stcal.io.camera import CalibratedCamera, write_cameras_txt
 from stcal.io.design import board_toml, target_toml
 from stcal.io.files import TABLE_BYTES, read_bytes
@@ -175,10 +175,12 @@ def _page_and_pdf(run: Path, pdf: bool, out: Path) -> tuple[tuple[Path, ...], in
         checked(report, ReportFile)
     except InputError as error:
         raise InputError(f"{path}: damaged, or of another version ({error}); run it again") from error
-    shown = shown_overlays(report)
-    overlays = {name: there.read_bytes() for name in shown if (there := overlay_path(run, name)).is_file()}
-    gone = len(shown) - len(overlays)
-    page = report_html(report, overlays, _residuals(run, list(overlays)), gone=gone)
+    with _as_written(path):
+        shown = shown_overlays(report)
+        overlays = {name: there.read_bytes() for name in shown if (there := overlay_path(run, name)).is_file()}
+    gone, residuals = len(shown) - len(overlays), _residuals(run, list(overlays))
+    with _as_written(path):
+        page = report_html(report, overlays, residuals, gone=gone)
     made: list[tuple[Path, bytes]] = [(out, page.encode())]
     if pdf:
         made.append((out.with_suffix(".pdf"), pdf_of(page)))
@@ -206,17 +208,22 @@ def _residuals(run: Path, names: list[str]) -> dict[str, Residuals]:
     return {name: np.array(own).reshape(-1, 4) for name, own in rows.items()}
 
 
-def require_report(saved: SavedRun) -> None:
-    """Refuse a run whose report cannot be added to: of another version, without its overlays, or read-only."""
+@contextlib.contextmanager
+def _as_written(path: Path) -> Iterator[None]:
+    """InputError for a report that a page cannot be made of, or a file that it needs."""
     try:
-        _report_page(saved.folder, {key: value for key, value in saved.report.items() if key != "crosscheck"})
+        yield
     except OSError as error:
         raise InputError(f"{error.filename}: {error.strerror or error}; the report needs it, run it again") from error
-    except (LookupError, TypeError, ValueError, AttributeError) as error:
+    except (LookupError, TypeError, ValueError, AttributeError, StcalError) as error:
         reason = f"no {error}" if isinstance(error, KeyError) else error
-        raise InputError(
-            f"{saved.folder / 'report.json'}: damaged, or of another version ({reason}); run it again"
-        ) from error
+        raise InputError(f"{path}: damaged, or of another version ({reason}); run it again") from error
+
+
+def require_report(saved: SavedRun) -> None:
+    """Refuse a run whose report cannot be added to: of another version, without its overlays, or read-only."""
+    with _as_written(saved.folder / "report.json"):
+        _report_page(saved.folder, {key: value for key, value in saved.report.items() if key != "crosscheck"})
     if not os.access(saved.folder, os.W_OK):
         raise InputError(f"run {saved.folder}: cannot be written to, and the comparison goes into its report; copy it")
 

@@ -79,6 +79,20 @@ def test_what_cannot_be_made_is_said_in_one_line(own, tmp_path, stcal_sfm):
     assert (own / "report.html").exists()
 
 
+@pytest.mark.parametrize(
+    ("name", "old", "new"),
+    [
+        ("report.json", '"label": "1:1"', '"label": "?"'),
+        ("labels.csv", "\n1,0,", "\n1,0,12/IMG_1000.jpg,12,x,0,0,0,0,1,0,1,left,0\n1,0,"),
+    ],
+)
+def test_a_page_that_cannot_be_made_leaves_the_earlier_one(own, stcal_sfm, name, old, new):
+    text, before = (own / name).read_text(), (own / "report.html").read_bytes()
+    (own / name).write_text(text.replace(old, new, 1))
+    assert_error(stcal_sfm("report", own), INPUT, f"{name}: damaged, or of another version", "run it again")
+    assert (own / "report.html").read_bytes() == before
+
+
 def test_terminal_file_and_page_have_the_same_judgement(small_result, small_run):
     stored = Judgement.model_validate(json.loads((small_run / "report.json").read_text())["judgement"])
     assert stored == small_result.judgement
