@@ -1,6 +1,5 @@
 """From a file of a target or a board to a drawing of it."""
 
-import os
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -37,7 +36,7 @@ class Drawn:
 def draw(
     design: str | Path, path: str | Path, paper: str = "", margin_mm: float = MARGIN_MM, net: bool = False
 ) -> Drawn:
-    """Draw a target or a board 1:1 to a new file, whose suffix tells the form.
+    """Draw a target or a board 1:1 to a file, whose suffix tells the form.
 
     Parameters
     ----------
@@ -53,7 +52,7 @@ def draw(
     Raises
     ------
     InputError
-        The design cannot be read or drawn, the file exists or has another suffix, or the paper does not go with it.
+        The design cannot be read or drawn, the file has another suffix, or the paper does not go with it.
     """
     path = Path(path)
     paper = _paper(path, paper)
@@ -112,8 +111,6 @@ def _paper(path: Path, paper: str) -> str:
     suffix = path.suffix.lower()
     if suffix not in SUFFIXES:
         raise InputError(f"{path}: suffix {path.suffix or 'missing'}; one of {', '.join(SUFFIXES)} needed")
-    if os.path.lexists(path):
-        raise InputError(f"{path}: exists, and nothing is overwritten; give a new file")
     names = {name.lower(): name for name in (*PAPERS, OWN)}
     if paper and paper.lower() not in names:
         raise InputError(f"--paper {paper}: unknown; one of {', '.join(names.values())} needed")

@@ -165,7 +165,6 @@ def test_outlines_of_cells_have_holes_and_stay_apart_at_corners():
         ("a.pdf", "A9", "--paper A9: unknown; one of A5, "),
         ("a.dxf", "A4", "--paper A4: a DXF is no page"),
         ("a.svg", "A4", "2 sheets, an SVG holds one"),
-        ("board.svg", "", "exists, and nothing is overwritten"),
     ],
 )
 def test_what_cannot_be_drawn_is_refused(files, name, paper, said):

@@ -22,9 +22,7 @@ def draw(
     ],
     out: Annotated[
         Path,
-        typer.Option(
-            "--out", writable=True, help="Write this new file; its suffix tells the form: .pdf, .svg or .dxf."
-        ),
+        typer.Option("--out", writable=True, help="Write this file; its suffix tells the form: .pdf, .svg or .dxf."),
     ],
     paper: Annotated[
         str,
