@@ -5,6 +5,10 @@ Simulated are the centres of dots or corners on a board that is shown 15 times; 
 `stereo_target`, whose centres stcal finds. Told is by how much a camera sees directions elsewhere than the true one,
 after the best turn, px RMS: over the whole image, and within the hull of all dots; the median of the trials. mrcal is
 called where its program is on the PATH. Views are complete, as OpenCV's method RO wants them.
+
+With --real, photographs of which no truth is known: each view is foretold by a calibration without it, five parts.
+Judged alike are all cameras: board and poses of the other views are adjusted to each camera, and then the pose of the
+view that was held out; told is the RMS of what is left of it, px per coordinate.
 """
 
 import argparse
@@ -12,6 +16,7 @@ import shutil
 import subprocess
 import sys
 import tempfile
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 
@@ -21,6 +26,7 @@ import pycolmap
 from scipy.spatial import Delaunay
 from scipy.spatial.transform import Rotation
 
+from stcal.boards.file import load_flat_board
 from stcal.design import BoardDesign, reference_board
 from stcal.geometry.camera import Camera
 from stcal.geometry.conic import circle_image_offset
@@ -28,9 +34,11 @@ from stcal.io.camera import camera_from_colmap, read_camera
 from stcal.io.cameras.difference import camera_difference
 from stcal.io.design import board_of, target_of
 from stcal.sfm.camera.calibrate import calibrate_camera
+from stcal.sfm.camera.held_out import FOLDS, foretold
 from stcal.sfm.camera.intrinsics import adjust_intrinsics
 from stcal.sfm.camera.views import closed_form, start_camera, start_pose
 from stcal.sfm.data.observations import ImageObservations
+from stcal.workflows.calibrate_camera import calibrate_camera_by_corners, corner_grid
 
 TRUE = Camera(2592, 1728, [2790.0, 2784.0], [1301.0, 859.0], [-0.06, 0.045, 1.5e-4, -1e-4, 0, 0, 0, 0])
 SIZE = 2592, 1728
@@ -40,6 +48,29 @@ NOISE_PX = 0.02
 MODEL, MRCAL_MODEL = "OPENCV", "LENSMODEL_OPENCV4"
 DATA = Path(__file__).resolve().parents[3] / "shared" / "data" / "stereo_target"
 SETS = ("clean", "clutter", "white_block")
+REAL = {
+    "dotgrid_handeye/images": """rows = 10
+columns = 10
+pitch_mm = 20.0
+radius_mm = 5.0
+polarity = "dark"
+sigma_mm = 0.1
+[corner]
+row = 9
+column = 0
+radius_mm = 10.0
+""",
+    "charuco_handeye/test_set_charuco/images": """type = "charuco"
+rows = 7
+columns = 5
+square_mm = 36.195
+marker_mm = 18.256
+dictionary = "DICT_6X6_250"
+""",
+}
+"""Folders of photographs, and their boards."""
+WRONG_TIMES = 5.0
+"""Dots that are so many times the median off by every camera are measured wrongly."""
 
 
 def boards() -> dict[str, tuple[BoardDesign, float, float]]:
@@ -194,11 +225,65 @@ def row(name: str, trials: list[dict[str, tuple[float, float]]]) -> str:
     return f"| {name} | {len(trials)} | " + " | ".join(cells) + " |"
 
 
+def photographed(folder: Path, board_toml: str) -> tuple[list[ImageObservations], BoardDesign, tuple[int, int]]:
+    """Complete views of a board of dots or corners, the board, and the images' size."""
+    with tempfile.TemporaryDirectory() as scratch:
+        file = Path(scratch) / "board.toml"
+        file.write_text(board_toml)
+        board = load_flat_board(file)
+    if isinstance(board, BoardDesign):
+        found, grid = calibrate_camera(folder, target_of(None), board, MODEL), board
+    else:
+        found, grid = calibrate_camera_by_corners(folder, board, MODEL), corner_grid(board)
+    camera, most = found.intrinsics.camera, max(map(len, found.views))
+    return [view for view in found.views if len(view) == most], grid, (camera.width, camera.height)
+
+
+def left(camera: Camera | None, others: Sequence, own: Sequence, board: BoardDesign) -> np.ndarray:
+    """Residuals (n, 2) of views that were held out, px; not a number without a camera."""
+    if camera is None:
+        return np.full((sum(map(len, own)), 2), np.nan)
+    result = adjust_intrinsics(others, board, camera, MODEL, held=True)
+    return np.concatenate([foretold(view, board, result)[0] for view in own])
+
+
+def real_row(name: str, board_toml: str) -> str:
+    """RMS of each way on views held out; the least in bold."""
+    views, board, size = photographed(DATA.parent / name, board_toml)
+    found: dict[str, list[np.ndarray]] = {way: [] for way in WAYS}
+    for fold in range(FOLDS):
+        own = [view for i, view in enumerate(views) if i % FOLDS == fold]
+        others = [view for i, view in enumerate(views) if i % FOLDS != fold]
+        for way, calibrate in WAYS.items():
+            found[way].append(left(calibrate(others, board, size), others, own, board))
+    residuals = {way: np.concatenate(each) for way, each in found.items()}
+    length = np.array([np.linalg.norm(each, axis=1) for each in residuals.values() if np.isfinite(each).all()])
+    wrong = (length > WRONG_TIMES * np.median(length)).all(axis=0)
+    rms = {way: float(np.sqrt((each[~wrong] ** 2).mean())) for way, each in residuals.items()}
+    best = min(v for v in rms.values() if np.isfinite(v))
+    cells = [f"{v:.4f}" if np.isfinite(v) else "–" for v in rms.values()]
+    cells = [f"**{c}**" if v == best else c for c, v in zip(cells, rms.values(), strict=True)]
+    count = f"{len(views)} views, {len(wrong)} points, {int(wrong.sum())} of them wrong"
+    return f"| {name.split('/')[0]}: {count} | {' | '.join(cells)} |"
+
+
+def real() -> None:
+    """Photographs without truth."""
+    print(f"| px RMS of views held out | {' | '.join(WAYS)} |")
+    print("|---|" + "---|" * len(WAYS))
+    for name, board_toml in REAL.items():
+        print(real_row(name, board_toml), flush=True)
+
+
 def main() -> None:
     """Simulate, calibrate, print."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--trials", type=int, default=20)
+    parser.add_argument("--real", action="store_true", help="photographs without truth instead")
     options = parser.parse_args()
+    if options.real:
+        real()
+        return
     print(f"| px RMS over the image (where dots are) | trials | {' | '.join(WAYS)} |")
     print("|---|" + "---|" * (len(WAYS) + 1))
     for name, (board, sigma_mm, bow_mm) in boards().items():

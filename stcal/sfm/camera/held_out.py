@@ -100,7 +100,7 @@ def held_out(
         others = [view for i, view in enumerate(views) if i % folds != fold]
         result = adjust_intrinsics(others, board, start, colmap_model)
         factors.append(result.factors.centres)
-        found |= {view.name: _foretold(view, board, result) for view in own}
+        found |= {view.name: foretold(view, board, result) for view in own}
     residuals_px, in_sigma = zip(*(found[view.name] for view in views), strict=True)
     return HeldOut(residuals_px, in_sigma, float(np.median(factors)), folds)
 
@@ -190,7 +190,7 @@ def _tried(views, board: BoardDesign, start: Camera, model: str) -> HeldOut | St
         return error
 
 
-def _foretold(view: ImageObservations, board: BoardDesign, result: Intrinsics) -> tuple[np.ndarray, np.ndarray]:
+def foretold(view: ImageObservations, board: BoardDesign, result: Intrinsics) -> tuple[np.ndarray, np.ndarray]:
     """Residuals (n, 2) of a view, px and in the centres' own σ, after its pose is fitted to it."""
     camera = result.camera
     ((group, members),) = by_group([view]).items()

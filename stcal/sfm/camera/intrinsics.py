@@ -115,6 +115,7 @@ def adjust_intrinsics(
     colmap_model: str,
     camera_of_view: Sequence[int] | None = None,
     factors: SigmaFactors | None = None,
+    held: bool = False,
 ) -> Intrinsics:
     """Adjust the intrinsics from ``start``.
 
@@ -123,6 +124,7 @@ def adjust_intrinsics(
     views : board dots alone, at least three views
     camera_of_view : which camera took each view, for a comparison of cameras 0, 1, … on the same boards
     factors : taken as known; estimated where None
+    held : the intrinsics stay at ``start``, poses and board alone are adjusted; ``covariance`` is (0, 0) then
 
     Raises
     ------
@@ -131,12 +133,12 @@ def adjust_intrinsics(
     DegenerateError
         The dots of a view do not determine its pose.
     """
-    basis = intrinsic_basis(colmap_model)
+    basis = intrinsic_basis(colmap_model)[:, : 0 if held else None]
     state = _start_state(views, camera_of_view or [0] * len(views), board, start)
     c = len(state.cameras)
     setting = Setting(
         basis=(basis,) * c,
-        weight=(np.linalg.inv(vague_prior(start, colmap_model)),) * c,
+        weight=(np.zeros((0, 0)) if held else np.linalg.inv(vague_prior(start, colmap_model)),) * c,
         start=(start,) * c,
         shape=design_shapes(state, board),
         sigma_mm=board.sigma_mm,
