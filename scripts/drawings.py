@@ -36,8 +36,8 @@ FOCAL_PX = 24 / 36 * 5184
 NOISE_PX = 0.01
 LAYERS = (
     ("errors", "geometry"),
-    ("labels", "design", "io", "boards", "report"),
-    ("synthetic",),
+    ("labels", "design", "likeness", "io", "boards", "report"),
+    ("synthetic", "drawing"),
     ("sfm", "robot", "register", "handeye", "locate"),
     ("workflows",),
     ("cli",),
@@ -235,7 +235,7 @@ def folders():
         fontsize=8.5,
         color=INK,
     )
-    axes.set(xlim=(-5.8, 5.8), ylim=(-1.0, top + 0.8))
+    axes.set(xlim=(-6.2, 6.2), ylim=(-1.0, top + 0.8))
     axes.axis("off")
     return figure
 
