@@ -112,22 +112,22 @@ def _image_json(each: MeasuredImage) -> dict:
 
 
 def measure_text(result: MeasureResult) -> str:
-    """The table for people."""
+    """The table for people, 80 columns wide for names of eight characters: σ are the largest of three axes, n counts
+    circles."""
     wide = max([len(each.name) for each in result.images] + [5])
+    faces = max([len("+".join(each.pose.faces)) for each in result.images] + [5])
     lines = [
-        f"{'image':{wide}}  {'faces':7} {'circles':>7}  {'status':9} {'x':>10} {'y':>10} {'z':>10} mm   "
-        f"{'σ position µm':^20} {'σ rotation mdeg':^20} {'RMS px':>7} {'χ²/dof':>7}"
+        f"{'image':{wide}}  {'faces':{faces}}  n {'status':9} {'x':>9} {'y':>8} {'z':>8} mm {'σ µm':>5} {'σ mdeg':>6} "
+        f"{'RMS px':>6}"
     ]
     for each in result.images:
         pose = each.pose
         sigma = np.sqrt(np.diag(pose.covariance))
-        place = " ".join(f"{v:10.4f}" for v in pose.camera_from_target.translation)
-        position = " ".join(f"{1e3 * v:6.1f}" for v in sigma[3:])
-        turn = " ".join(f"{1e3 * np.degrees(v):6.2f}" for v in sigma[:3])
+        place = " ".join(f"{v:8.3f}" for v in pose.camera_from_target.translation)
         verdict = fit_verdict(pose)
         lines.append(
-            f"{each.name:{wide}}  {'+'.join(pose.faces):7} {len(pose.labels):7}  {pose.status:9} {place}      "
-            f"{position} {turn} {pose.rms_px():7.4f} {pose.chi2_per_redundancy():7.2f}"
+            f"{each.name:{wide}}  {'+'.join(pose.faces):{faces}} {len(pose.labels):2} {pose.status:9}  {place}   "
+            f"{1e3 * sigma[3:].max():5.1f} {1e3 * np.degrees(sigma[:3].max()):6.2f} {pose.rms_px():6.4f}"
             + ("" if verdict == "passed" else f"  {verdict}")
         )
         lines += [

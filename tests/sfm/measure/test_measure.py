@@ -22,7 +22,7 @@ from stcal.sfm import RunOptions, run
 from stcal.sfm.data.observations import ImageObservations
 from stcal.sfm.data.projection import project_circles
 from stcal.sfm.measure.images import MeasureOptions, measure, measure_labelled
-from stcal.sfm.measure.output import poses_file
+from stcal.sfm.measure.output import measure_text, poses_file
 from stcal.sfm.measure.pose import NO_FACE, PoseOptions, pose_from_circles, resolved
 from stcal.sfm.measure.report import measure_page
 from stcal.sfm.measure.target import TargetCircles, read_target
@@ -560,7 +560,18 @@ def test_strict_ends_as_failed_where_residuals_are_beyond_their_sigma(small_data
     """σ stated a hundred times too small; with their own σ the same images pass."""
     words = command(small_dataset, small_run, tmp_path, "--strict")
     assert stcal_sfm(*words)[0] == 0
-    code, _, err = stcal_sfm(*words, "--sigma-factor", 0.01)
+    code, _, err = stcal_sfm(*words, "--sigma-factor", 0.01, "--overwrite")
     assert code == 4
     assert "error: --strict: failed: χ² of " in err
     assert (tmp_path / "poses.csv").exists()
+
+
+def test_the_table_fits_into_80_columns(scene, known):
+    rng = np.random.default_rng(0)
+    images = [see(scene, view(faces_view(scene, ("1", "2")), 0.3, 9000, rng), ("1", "2"), 0.02, rng) for _ in range(2)]
+    named = [replace(image, name=f"{k:04}.jpg") for k, image in enumerate(images)]
+    result = measure_labelled(named, scene.camera, known.truth)
+    head, *rows = measure_text(result).splitlines()[:3]
+    assert [head.split()[:3], len(head)] == [["image", "faces", "n"], len(rows[0])]
+    assert len(head) <= 80
+    assert [row.split()[0] for row in rows] == ["0000.jpg", "0001.jpg"]
