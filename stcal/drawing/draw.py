@@ -72,6 +72,8 @@ def _parts(what: TargetDesign | BoardDesign | FlatBoard | BoardSet, margin_mm: f
 
 def load_design(path: str | Path) -> TargetDesign | BoardDesign | FlatBoard | BoardSet:
     """A target, or a board or boards of any kind."""
+    if not Path(path).exists():
+        raise InputError(f"{path}: no such file; give a target.toml or a board file (`stcal-sfm init` writes both)")
     content = board_content(path)
     return load_target(path) if content is not None and "face" in content else load_boards(path)
 

@@ -175,6 +175,11 @@ def test_what_cannot_be_drawn_is_refused(files, name, paper, said):
     assert len(list(files.iterdir())) == 3
 
 
+def test_a_design_that_is_not_there_is_said(files):
+    with pytest.raises(InputError, match=r"nothing\.toml: no such file; give a target\.toml or a board file"):
+        draw(files / "nothing.toml", files / "a.svg")
+
+
 def test_far_too_many_sheets_are_refused(files):
     (files / "board.toml").write_text('type = "chessboard"\nrows = 60\ncolumns = 60\nsquare_mm = 100\n')
     with pytest.raises(InputError, match=r"--paper A4: \d+ sheets, at most 500"):
