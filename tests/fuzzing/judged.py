@@ -38,7 +38,7 @@ EARLIER = "of an earlier call\n"
 IN, OUT = "in", "out"
 CAPABILITIES, ANY_FILE = 0x20080522, 0b110
 """Version of Linux's interface, and the bits of CAP_DAC_OVERRIDE and CAP_DAC_READ_SEARCH."""
-_PROGRESS = re.compile(r"[\w, ]+: \d+ of \d+(, about \d+ (s|min) left)?")
+_PROGRESS = re.compile(r"(\S+: )?[\w, ]+: \d+ of \d+(, about \d+ (s|min) left)?")
 _NO_POSE = "no pose accepted"
 """Said on standard output with exit code 3 by a command that has done its work."""
 
@@ -308,6 +308,9 @@ BINARY = (".mat", ".bin")
 def broken(path: Path) -> str:
     """Why a result file is none; empty where it is one."""
     try:
+        if path.suffix == ".pdf":
+            whole = path.read_bytes().rstrip().endswith(b"%%EOF")
+            return "" if whole else "cut off"
         if path.suffix in BINARY:
             return "" if path.stat().st_size else "empty"
         text = path.read_text(encoding="utf-8")

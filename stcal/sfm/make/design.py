@@ -26,6 +26,8 @@ RADIUS_STEP_MM = 0.25
 PITCH_SHARE = 0.23
 """Of the board, in parts of the box's longest side: the board reaches beyond it on all sides."""
 PITCH_STEP_MM = 5.0
+ATTEMPTS = 8
+"""Patterns drawn until one is named in all cases."""
 ROWS, COLUMNS = 7, 9
 BOARD_SIGMA_MM = 0.02
 """Of dots as a good printer places them; a milled or photographic plate states its own."""
@@ -120,16 +122,25 @@ def make_target(options: MakeOptions, progress: Callable[[int, int], None] | Non
             f"radius {LARGE * radius:g} mm is {largest:.0f} px in the image, at most {most / FARTHER:.0f} px are "
             "sought; smaller circles or a camera farther away needed"
         )
-    name = "box {:g} x {:g} x {:g} mm".format(*options.size_mm)
-    pattern = make_pattern(sides_of(options.size_mm), options.circles, radius, options.polarity, options.seed, name)
-    failed, cases = unnamed_cases(pattern.target, camera, options.distance_mm, HIDDEN, progress)
-    if failed:
-        face, gone = failed[0]
-        raise InputError(
-            f"face {face}: not named with circles {', '.join(gone)} hidden, as in {len(failed)} of {cases} cases; "
-            "another --seed or more --circles needed"
-        )
+    pattern, cases = _named(options, radius, progress)
     return Made(options, pattern, _board(options, least), radius, least, cases)
+
+
+def _named(options: MakeOptions, radius_mm: float, progress: Callable[[int, int], None] | None) -> tuple[Pattern, int]:
+    """The first pattern drawn of which each face is named in all cases of hidden circles, and their number."""
+    name, sides = "box {:g} x {:g} x {:g} mm".format(*options.size_mm), sides_of(options.size_mm)
+    failed, cases = [], 0
+    for attempt in range(ATTEMPTS):
+        seed = [options.seed, attempt] if attempt else options.seed
+        pattern = make_pattern(sides, options.circles, radius_mm, options.polarity, seed, name)
+        failed, cases = unnamed_cases(pattern.target, options.ideal_camera(), options.distance_mm, HIDDEN, progress)
+        if not failed:
+            return pattern, cases
+    face, gone = failed[0]
+    raise InputError(
+        f"face {face}: not named with circles {', '.join(gone)} hidden, as in {len(failed)} of {cases} cases; "
+        f"{ATTEMPTS} patterns tried; another --seed or more --circles needed"
+    )
 
 
 def _board(options: MakeOptions, least_mm: float) -> BoardDesign:

@@ -39,7 +39,7 @@ class Pattern:
 
 
 def make_pattern(
-    sides: list[Side], circles: int, radius_mm: float, polarity: Polarity, seed: int, name: str
+    sides: list[Side], circles: int, radius_mm: float, polarity: Polarity, seed: int | list[int], name: str
 ) -> Pattern:
     """A face for each side, each named by its circles with any :data:`HIDDEN` of them hidden.
 

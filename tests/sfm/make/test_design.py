@@ -11,6 +11,7 @@ from stcal.errors import InputError
 from stcal.io.design import load_board, load_target, target_toml
 from stcal.likeness import MIN_COMMON
 from stcal.sfm.detect.ambiguity import confusable, in_common, is_named, mirror_images
+from stcal.sfm.make import design
 from stcal.sfm.make.box import sides_of, size_of
 from stcal.sfm.make.design import MakeOptions, make_target
 from stcal.sfm.make.hidden import unnamed_cases
@@ -73,6 +74,18 @@ def test_a_symmetric_design_fails_the_cases_of_hidden_circles():
     odd = [gone for _, gone in failed if {"3", "8"} <= set(gone)]  # the one off its place, and where it would go
     assert len(odd) == 8
     assert len(failed) < 0.2 * cases
+
+
+def test_a_pattern_that_is_not_always_named_is_drawn_anew(monkeypatch):
+    """Nine circles leave six, which is all that a face needs: of such patterns one in a few fails a case."""
+    options = MakeOptions((130.0, 120.0, 110.0), circles=LEAST_CIRCLES, width=1296)
+    with monkeypatch.context() as once:
+        once.setattr(design, "ATTEMPTS", 1)
+        with pytest.raises(
+            InputError, match=r"not named with circles .* hidden, as in 1 of 420 cases; 1 patterns tried"
+        ):
+            make_target(options)
+    assert make_target(options).cases == 5 * 84
 
 
 def test_circles_are_seen_well_and_keep_apart(made):
