@@ -175,7 +175,7 @@ def test_photographs_to_a_compensated_arm_and_tags_to_its_base(cell):
     for option, file in (("--hand-eye", "handeye.json"), ("--registration", "register.json")):
         cell.call(
             "stcal locate run {0}/scene.png --layout {0}/layout.toml --camera {0}/tags-camera.txt "
-            f"{option} {{0}}/{file} --out {{0}}/goals.csv"
+            f"{option} {{0}}/{file} --out {{0}}/goals.csv --overwrite"
         )
         table = read_table(root / "goals.csv", "goals")
         goal = table.poses("base_from_goal_")[0]
