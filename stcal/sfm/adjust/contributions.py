@@ -11,17 +11,14 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from stcal.design import BoardDesign
 from stcal.geometry.arrays import frozen
-from stcal.geometry.camera import Camera
 from stcal.geometry.normal_equations import constrained_inverse
 from stcal.geometry.rigid import skew
-from stcal.io.camera import PARAMETER_NAMES, CameraPrior
+from stcal.io.camera import PARAMETER_NAMES
 from stcal.sfm.adjust.blocks import Block, Reduced, robust_weights
 from stcal.sfm.adjust.equations import Setting, Shared, free_directions, normal_equations, planes
 from stcal.sfm.adjust.group import projection_jacobians
-from stcal.sfm.adjust.joint import Adjusted, JointResult, adjusted
-from stcal.sfm.data.model import MetricModel
+from stcal.sfm.adjust.joint import Adjusted, JointResult
 
 CIRCLES, DOTS, BOARD, FLATNESS, INTRINSICS = "circles", "dots", "board", "flatness", "intrinsics"
 OBSERVED = (CIRCLES, DOTS, BOARD, FLATNESS, INTRINSICS)
@@ -55,21 +52,8 @@ class Contributions:
         object.__setattr__(self, "by_intrinsics", frozen(self.by_intrinsics, (c, len(PARAMETER_NAMES)), "intrinsics"))
 
 
-def contributions(
-    models: Sequence[MetricModel],
-    board: BoardDesign,
-    camera: Camera,
-    flatness_mm: float | None = None,
-    prior: CameraPrior | None = None,
-    start: Camera | None = None,
-) -> Contributions:
-    """Adjust, and take the covariance at the minimum apart; arguments and errors as of
-    :func:`stcal.sfm.adjust.joint.adjusted`."""
-    return contributions_of(adjusted(models, board, camera, flatness_mm, prior, start))
-
-
 def contributions_of(state: Adjusted) -> Contributions:
-    """The same of an adjustment that is done."""
+    """The covariance at the minimum of an adjustment, taken apart."""
     blocks, shared, setting, joint = state.blocks, state.shared, state.setting, state.result()
     normal, _, groups = normal_equations(blocks, shared, setting)
     c = shared.xyz_model.size
