@@ -8,23 +8,27 @@ from stcal.sfm.plan.views import PlannedView
 
 
 def forecast_table(forecast: Forecast, shares: dict[str, dict[str, float]]) -> list[str]:
-    """One line for each face."""
+    """One line for each face, 80 columns for short names."""
+    rows = ForecastPart.of(forecast, shares).faces
+    circles = {face: f"{row.worst_circle} {row.worst_circle_sigma_um:.2f}" for face, row in rows.items()}
+    wide, worst = max([4, *map(len, rows)]), max([8, *map(len, circles.values())])
+    axes = " ".join(f"{name:>5}" for name in ("x", "y", "z", "all", "x", "y", "z"))
     lines = [
-        f"{'face':>6} {'σ position µm':^23} {'σ rotation mdeg':^17}  {'worst circle µm':<16} of the variance",
-        f"{'':>6} {'x':>5} {'y':>5} {'z':>5} {'all':>5} {'x':>5} {'y':>5} {'z':>5}",
+        f"{'face':>{wide}} {'σ position µm':^23} {'σ rotation mdeg':^17}  {'circle':<{worst}}  share of",
+        f"{'':>{wide}} {axes}  {'worst µm':<{worst}}  variance",
     ]
-    for face, row in ForecastPart.of(forecast, shares).faces.items():
+    for face, row in rows.items():
         position = " ".join(f"{s:5.2f}" for s in [*row.translation_sigma_um, row.position_sigma_um])
         rotation = " ".join(f"{s:5.2f}" for s in row.rotation_sigma_mdeg)
-        circle = f"{row.worst_circle} {row.worst_circle_sigma_um:.2f}"
-        lines.append(f"{face:>6} {position} {rotation}  {circle:<16} {_shares_text(row.variance_shares)}")
+        parts = _shares_text(row.variance_shares)
+        lines.append(f"{face:>{wide}} {position} {rotation}  {circles[face]:<{worst}}  {parts}")
     return lines
 
 
 def _shares_text(shares: dict[str, float]) -> str:
     """The largest first."""
     ordered = sorted(shares.items(), key=lambda each: -each[1])
-    return ", ".join(f"{source} {100 * max(share, 0.0):.0f} %" for source, share in ordered)
+    return ", ".join(f"{source.removeprefix('image ')} {100 * max(share, 0.0):.0f} %" for source, share in ordered)
 
 
 def plan_text(plan: Plan, noise: str) -> str:
@@ -61,19 +65,17 @@ def advice_text(advice: Advice) -> str:
             f"little; with a board of half the σ: {MICRO * advice.better_board.worst()[1]:.2f} µm"
         )
     lines += ["", f"further views, one after the other, the best of {advice.tried}:"]
-    lines.append(
-        f"{'group':>6}  {'from':<20} {'go':<26} {'mm':>5}  {'worst face, µm':<18} seen at, and nearest photograph"
-    )
+    lines.append(f"{'group':>6}  {'from':<20} {'go':<22} {'mm':>5}  worst face, µm")
     before = f"{worst}: {MICRO * sigma:.2f}"
     for choice in advice.choices:
         view = choice.view
         after = f"{choice.face}: {MICRO * choice.sigma_mm:.2f}"
         change = f"{before} → {after}"
         tilts = ", ".join(f"{'' if key == 'board' else 'face '}{key} {t:.0f}°" for key, t in view.tilts_deg.items())
-        lines.append(
-            f"{view.group:>6}  {view.middle:<20} {where(view):<26} {view.distance_mm:5.0f}  {change:<18} "
-            f"{tilts}; {view.nearest} {view.nearest_deg:.0f}° away"
-        )
+        lines += [
+            f"{view.group:>6}  {view.middle:<20} {where(view):<22} {view.distance_mm:5.0f}  {change}",
+            f"{'':>6}  sees {tilts}; {view.nearest} {view.nearest_deg:.0f}° away",
+        ]
         before = after
     if not advice.choices:
         lines.append("none: no other view within ±50° shows the whole board and a face")

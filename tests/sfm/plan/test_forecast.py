@@ -360,6 +360,8 @@ def test_advise_command(stcal_sfm, small_run, tmp_path, coarse):
     now, then = (f"{c['worst_face']}: {c['worst_sigma_um']:.2f}" for c in (content, view))
     assert f"{now} → {then}" in text
     assert "warning" not in text
+    (head,) = (i for i, line in enumerate(text.splitlines()) if line.split()[:2] == ["group", "from"])
+    assert max(map(len, text.splitlines()[head : head + 3])) <= 80
 
 
 @pytest.mark.slow
@@ -400,6 +402,8 @@ def test_plan_command(stcal_sfm, tmp_path):
     assert content["groups"] == ["12", "14", "15", "23"]
     assert content["worst_face"] == "3"  # the only one that is two groups away from the reference
     assert "worst is face 3" in text
+    (head,) = (i for i, line in enumerate(text.splitlines()) if line.startswith("face "))
+    assert 70 < max(map(len, text.splitlines()[head : head + 6])) <= 80
     assert {row["what"] for row in content["remedies"]} >= {"twice the images", "a board of half the σ"}
 
 
