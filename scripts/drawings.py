@@ -111,6 +111,11 @@ def residuals():
             left = np.concatenate([m.residuals_px(scene.camera).ravel() for m in models])
             rows.append((float(np.sqrt((left**2).mean())), 1e3 * float(np.sqrt(np.mean(np.square(apart))))))
     values = np.array(rows).reshape(len(sizes), 2, 2)
+    for size, ((left, apart), (plain_left, plain_apart)) in zip(sizes, values, strict=True):
+        print(
+            f"radii × {size:g}: residuals {left:.4f} px, faces {apart:.1f} µm; uncorrected {plain_left:.4f} px, "
+            f"{plain_apart:.1f} µm"
+        )
     figure = new_figure(8.4, 2.9)
     for axes, k, title in zip(
         figure.subplots(1, 2), (0, 1), ("residuals, px RMS", "error of the faces, µm RMS"), strict=True
