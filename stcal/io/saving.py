@@ -14,6 +14,8 @@ RUN_MARKER = "stcal-run.json"
 """Tells a run's folder from others."""
 CAMERA, TARGET, BOARD = "cameras.txt", "target.toml", "board.toml"
 """Copies of what a run was given."""
+REFINED_CAMERA = "refined_cameras.txt"
+"""As a run adjusted it, where it did, with σ."""
 REPORT_PDF = "report.pdf"
 """Of a run's report.html, where one was asked for."""
 RUN_ENTRIES = (
@@ -26,6 +28,7 @@ RUN_ENTRIES = (
     "detections.csv",
     "database.db",
     CAMERA,
+    REFINED_CAMERA,
     TARGET,
     BOARD,
     "models",

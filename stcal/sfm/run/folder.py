@@ -18,7 +18,7 @@ from stcal.io.camera import CalibratedCamera, write_cameras_txt
 from stcal.io.design import board_toml, target_toml
 from stcal.io.files import TABLE_BYTES, read_bytes
 from stcal.io.json import checked, read_json
-from stcal.io.saving import BOARD, CAMERA, RUN_MARKER, TARGET, json_text, save
+from stcal.io.saving import BOARD, CAMERA, REFINED_CAMERA, RUN_MARKER, TARGET, json_text, save
 from stcal.parallel import Progress
 from stcal.report.pdf import pdf_of, require_pdf
 from stcal.sfm.adjust.file import FacesFile
@@ -105,6 +105,8 @@ def write_run(result: RunResult, out: Path, progress: Progress, reload_s: int | 
     adjusted = CalibratedCamera.of(result.calibration.camera, result.camera.colmap_model)
     write_model(out / "target_model", result.calibration.models, observations, ids, adjusted)
     write_cameras_txt(out / CAMERA, result.camera)
+    if (refined := result.refined_camera) is not None:
+        write_cameras_txt(out / REFINED_CAMERA, refined)
     save(out / TARGET, target_toml(result.target_design))
     save(out / BOARD, board_toml(result.board_design))
     report = judged(report_of(result).content())

@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 
 from stcal.design import BoardDesign, TargetDesign
-from stcal.io.camera import CalibratedCamera, CameraPrior
+from stcal.io.camera import CalibratedCamera, CameraPrior, refinable
 from stcal.sfm.adjust.calibration import Calibration
 from stcal.sfm.adjust.chain import FaceChain
 from stcal.sfm.checks.suite import Evidence
@@ -77,6 +77,14 @@ class RunResult:
     def target(self):
         """The calibrated target."""
         return self.calibration.target
+
+    @property
+    def refined_camera(self) -> CalibratedCamera | None:
+        """As adjusted, with covariance; None where the intrinsics were held."""
+        joint = self.calibration.joint
+        if joint is None or not joint.camera_covariance.size:
+            return None
+        return CalibratedCamera.of(joint.camera, refinable(self.camera).colmap_model, joint.camera_covariance)
 
     def observations(self) -> list[ImageObservations]:
         """Labelled centres of all images, in the database's order."""

@@ -7,6 +7,7 @@ import numpy as np
 
 from stcal.io.camera import CalibratedCamera
 from stcal.io.images import Skipped
+from stcal.io.saving import REFINED_CAMERA
 from stcal.labels import DotLabel
 from stcal.report.text import text_table
 from stcal.sfm.checks.verdict import BY_CHANCE, Check, ranked
@@ -53,6 +54,8 @@ def run_text(result: RunResult) -> str:
         lines += [f"{question} {answer}" for question, answer in result.judgement.answers()]
     if result.target.target_from_face:
         lines.append(f"faces:  {result.out / 'faces.json'}")
+    if result.refined_camera is not None:
+        lines.append(f"camera: {result.out / REFINED_CAMERA}, as adjusted, with σ")
     return "\n".join([*lines, f"report: {result.out / 'report.html'}"])
 
 
