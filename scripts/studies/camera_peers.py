@@ -13,7 +13,7 @@ the target's circles stand where the board's dots do not reach. `mrcal, free` : 
 
 With --real, photographs of which no truth is known: each view is foretold by a calibration without it, five parts.
 Judged alike are all cameras: board and poses of the other views are adjusted to each camera, and then the pose of the
-view that was held out; told is the RMS of what is left of it, px per coordinate.
+view that was held out; told is the RMS of what is left of it, px per coordinate; bold by the views' differences.
 """
 
 import argparse
@@ -239,6 +239,12 @@ def with_the_target(folder: Path, found: Camera, designs: tuple[Path | None, Pat
     return result.refined_camera
 
 
+def as_near(squares: np.ndarray, best: np.ndarray) -> bool:
+    """Whether mean squares (n,) differ from the best by less than two standard errors of their differences."""
+    further = squares - best
+    return bool(further.mean() <= 2 * further.std(ddof=min(1, len(best) - 1)) / np.sqrt(len(best)))
+
+
 def row(name: str, trials: list[dict[str, tuple[float, float]]]) -> str:
     """RMS of the trials; the nearest to the truth over the image, and what is as near, in bold."""
     squares = {way: np.square([trial.get(way, (np.nan, np.nan)) for trial in trials]) for way in COLUMNS}
@@ -247,8 +253,7 @@ def row(name: str, trials: list[dict[str, tuple[float, float]]]) -> str:
     cells = []
     for way in COLUMNS:
         whole, inside = rms[way]
-        further = squares[way][:, 0] - best
-        bold = "**" if further.mean() <= 2 * further.std() / np.sqrt(len(trials)) else ""
+        bold = "**" if as_near(squares[way][:, 0], best) else ""
         cells.append(f"{bold}{whole:.4f} ({inside:.4f}){bold}" if np.isfinite(whole) else "–")
     return f"| {name} | {len(trials)} | " + " | ".join(cells) + " |"
 
@@ -276,7 +281,7 @@ def left(camera: Camera | None, others: Sequence, own: Sequence, board: BoardDes
 
 
 def real_row(name: str, board_toml: str) -> str:
-    """RMS of each way on views held out; the least in bold."""
+    """RMS of each way on views held out; the least, and what is as small, in bold."""
     views, board, size = photographed(DATA.parent / name, board_toml)
     found: dict[str, list[np.ndarray]] = {way: [] for way in WAYS}
     for fold in range(FOLDS):
@@ -287,10 +292,17 @@ def real_row(name: str, board_toml: str) -> str:
     residuals = {way: np.concatenate(each) for way, each in found.items()}
     length = np.array([np.linalg.norm(each, axis=1) for each in residuals.values() if np.isfinite(each).all()])
     wrong = (length > WRONG_TIMES * np.median(length)).all(axis=0)
-    rms = {way: float(np.sqrt((each[~wrong] ** 2).mean())) for way, each in residuals.items()}
-    best = min(v for v in rms.values() if np.isfinite(v))
-    cells = [f"{v:.4f}" if np.isfinite(v) else "–" for v in rms.values()]
-    cells = [f"**{c}**" if v == best else c for c, v in zip(cells, rms.values(), strict=True)]
+    # views are complete, in the order of the folds, and alike in points
+    view = np.repeat(np.arange(len(views)), len(wrong) // len(views))[~wrong]
+    squares = {
+        way: np.bincount(view, (each[~wrong] ** 2).mean(axis=1)) * (len(views) / len(view))
+        for way, each in residuals.items()
+    }
+    best = min((each for each in squares.values() if np.isfinite(each).all()), key=np.mean)
+    cells = []
+    for each in squares.values():
+        bold = "**" if as_near(each, best) else ""
+        cells.append(f"{bold}{np.sqrt(each.mean()):.4f}{bold}" if np.isfinite(each).all() else "–")
     count = f"{len(views)} views, {len(wrong)} points, {int(wrong.sum())} of them wrong"
     return f"| {name.split('/')[0]}: {count} | {' | '.join(cells)} |"
 
