@@ -282,15 +282,21 @@ def _handed_over(executor: Executor, function, jobs: Sequence[tuple], at_once: i
 
 @contextlib.contextmanager
 def _deaf_to_interrupts():
-    """Processes started meanwhile ignore Ctrl-C from their first moment, not only after their imports."""
+    """Processes started meanwhile ignore Ctrl-C from their first moment, not only after their imports. SIGTERM waits: a
+    process that its parent leaves before it has read what to do ends with a stack on the terminal."""
     if threading.current_thread() is not threading.main_thread():
         yield
         return
-    before = signal.signal(signal.SIGINT, signal.SIG_IGN)
+    asked: list[int] = []
+    before = [(signal.SIGINT, signal.signal(signal.SIGINT, signal.SIG_IGN))]
+    before.append((signal.SIGTERM, signal.signal(signal.SIGTERM, lambda number, _: asked.append(number))))
     try:
         yield
     finally:
-        signal.signal(signal.SIGINT, before)
+        for number, handler in before:
+            signal.signal(number, signal.SIG_DFL if handler is None else handler)
+        for number in asked[:1]:
+            signal.raise_signal(number)
 
 
 def _follow_parent() -> None:

@@ -74,6 +74,29 @@ signal.pause()
     assert (found.returncode, found.stderr) == (7, "")
 
 
+def test_sigterm_while_a_process_starts_waits_until_that_has_what_it_begins_with():
+    """The server has forked it, and it reads from this process what to do: cut off there, it would print a stack."""
+    begin = """
+import os, signal, sys, time
+from multiprocessing import forkserver
+from stcal.parallel import run_parallel
+
+connect = forkserver.connect_to_new_process
+
+def asked(fds):
+    found = connect(fds)
+    os.kill(os.getpid(), signal.SIGTERM)
+    time.sleep(0.2)
+    return found
+
+signal.signal(signal.SIGTERM, lambda *_: sys.exit(7))
+forkserver.connect_to_new_process = asked
+list(run_parallel(abs, [(-1,), (-2,)], 2))
+"""
+    found = subprocess.run([sys.executable, "-P", "-c", begin], capture_output=True, text=True, check=False, timeout=60)
+    assert (found.returncode, found.stderr) == (7, "")
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("seconds", [0.5, 2.0, 5.0])
 @pytest.mark.parametrize(("number", "said", "code"), ENDS)

@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 
 from stcal.design import BoardDesign, TargetDesign
-from stcal.io.camera import CalibratedCamera, CameraPrior, refinable
+from stcal.io.camera import CalibratedCamera, CameraPrior
 from stcal.sfm.adjust.calibration import Calibration
 from stcal.sfm.adjust.chain import FaceChain
 from stcal.sfm.checks.suite import Evidence
@@ -84,7 +84,7 @@ class RunResult:
         joint = self.calibration.joint
         if joint is None or not joint.camera_covariance.size:
             return None
-        return CalibratedCamera.of(joint.camera, refinable(self.camera).colmap_model, joint.camera_covariance)
+        return CalibratedCamera.of(joint.camera, self.camera.colmap_model, joint.camera_covariance)
 
     def observations(self) -> list[ImageObservations]:
         """Labelled centres of all images, in the database's order."""
