@@ -1,18 +1,19 @@
 """Elastic arms in ``stcal robot identify``: simulated arms as they leave the factory, measured over their ranges.
 
-.venv/bin/python scripts/studies/elastic_study.py [--draws 200] [--only TEXT] [--payload]
+.venv/bin/python scripts/studies/elastic_study.py [--draws 200] [--only TEXT] [--payload | --trees]
 
 Each line is a kind of observation, a number of rows, and by how much links give way and gears err, in usual σ (0.017°
 at the usual torque about the axes, 0.006° across them, 0.006° of the gears). ``elastic taken`` : draws in which
 ``auto`` did. RMS errors of positions at 50 new joint vectors, mm: ``rigid`` and ``elastic`` identified, and of
 ``auto``. ``bound`` : RMS error of the elastic one over what the noise and these σ allow the best estimate (posterior
-covariance at the true arm, σ known). ``calibration`` : root of the mean square of its errors over their σ, as
-predicted.
+covariance at the true arm, σ known). ``NEES`` : mean square of its errors over their predicted σ, ± standard error of
+the draws; 1 is expected.
 
 ``--payload`` : other rows carry other masses at the flange, and arms are heavier than usual by a factor of σ 0.5; new
 joint vectors carry 0 … 100 kg. ``unknown`` : identified without the masses, and asked without; ``known``, ``bound``,
-``calibration`` as above, with them. ``axis`` : root of the mean square of the compliances' errors about the joints'
-axes over their σ.
+``NEES`` as above, with them. ``axis`` : the same of the compliances about the joints' axes.
+
+``--trees`` : two arms on a torso, with three markers; columns as without.
 """
 
 import argparse
@@ -33,7 +34,7 @@ from stcal.robot.kinematics.conditions import USUAL, Conditions
 from stcal.robot.kinematics.example import mh80
 from stcal.robot.kinematics.measurements import Measurements
 from stcal.robot.kinematics.model import Robot
-from stcal.synthetic.measured.arms import elastic, joint_vectors, made, measured, placed
+from stcal.synthetic.measured.arms import MARKERS, elastic, joint_vectors, made, measured, placed, two_arms
 from stcal.workflows.cluster import executor_of
 
 NEW_POSES = 50
@@ -44,17 +45,33 @@ MADE = Deviations(length_mm=0.3, twist_rad=5e-4, zero_rad=7e-4)
 
 @dataclass(frozen=True)
 class Case:
-    """``kind`` of observations, ``rows``, and ``share`` of usual elasticity."""
+    """``kind`` of observations, ``rows``, and ``share`` of usual elasticity; of a ``tree`` or an arm."""
 
     kind: str
     rows: int
     share: float
     payloads: tuple[float, ...] = ()
+    tree: bool = False
 
     def title(self) -> str:
         """First cells of its line."""
         last = " and ".join(f"{mass:g}" for mass in self.payloads) or f"{self.share:g}"
         return f"{self.kind} | {self.rows} | {last}"
+
+    def nominal(self) -> Robot:
+        """As drawn."""
+        return two_arms() if self.tree else mh80()
+
+    def targets(self, count: int) -> tuple[str, ...]:
+        """Of so many rows."""
+        return ((MARKERS if self.tree else ("",)) * count)[:count]
+
+    def made(self, rng: np.random.Generator) -> Robot:
+        """As made, somewhere, with a tool of its own."""
+        if self.tree:
+            return made(two_arms(), rng)
+        tool = Rigid.exp(rng.normal(0, 0.5, 6) * [1, 1, 1, 200, 200, 200])
+        return placed(made(mh80(), rng), Rigid.exp(rng.normal(0, 1, 6) * [1, 1, 1, 1000, 1000, 1000]), {"": tool})
 
 
 CASES = (
@@ -65,6 +82,8 @@ LOADED = (
     *(Case("position", rows, 1.0, masses) for masses in ((0, 60), (60,)) for rows in (60, 120)),
     Case("pose", 60, 1.0, (0, 60)),
 )
+TREES = tuple(Case(kind, 180, share, tree=True) for share in (0.0, 1.0) for kind in ("position", "pose"))
+EVERY = (*CASES, *LOADED, *TREES)
 MOST_KG = 100.0
 """That new joint vectors carry."""
 CENTRE = np.array([20.0, -30.0, 150.0])
@@ -74,29 +93,29 @@ CENTRE = np.array([20.0, -30.0, 150.0])
 def draw(case: Case, seed: int) -> tuple[bool, np.ndarray, np.ndarray]:
     """Whether ``auto`` took the elastic one; mean squares of errors, mm², by rigid, elastic, auto and what is possible;
     and of errors over σ, by the elastic one."""
-    rng = np.random.default_rng([CASES.index(case), seed])
-    tool = Rigid.exp(rng.normal(0, 0.5, 6) * [1, 1, 1, 200, 200, 200])
-    true = placed(made(mh80(), rng), Rigid.exp(rng.normal(0, 1, 6) * [1, 1, 1, 1000, 1000, 1000]), {"": tool})
+    rng = np.random.default_rng([EVERY.index(case), seed])
+    true = case.made(rng)
     if case.share:
         true = elastic(true, rng, case.share)
-    data = measured(true, joint_vectors(true, case.rows, rng), rng, SIGMA_MM, SIGMA_RAD)
+    rows = joint_vectors(true, case.rows, rng)
+    data = measured(true, rows, rng, SIGMA_MM, SIGMA_RAD, case.targets(case.rows))
     if case.kind == "position":
         data = replace(data, rotations=None)
     q = joint_vectors(true, NEW_POSES, rng)
-    found = {model: identify(mh80(), data, IdentifyOptions(model=model, folds=0)) for model in ("rigid", "elastic")}
-    found["auto"] = identify(mh80(), data, IdentifyOptions(model="auto", repeats=1))
-    squares = [(errors(each, true, q) ** 2).sum(1).mean() for each in found.values()]
+    nominal = case.nominal()
+    found = {model: identify(nominal, data, IdentifyOptions(model=model, folds=0)) for model in ("rigid", "elastic")}
+    found["auto"] = identify(nominal, data, IdentifyOptions(model="auto", repeats=1))
+    squares = [(errors(case, each, true, q) ** 2).sum(1).mean() for each in found.values()]
     least = possible(true, data, case, q)
-    normal = errors(found["elastic"], true, q) ** 2 / variances(found["elastic"], q)
+    normal = errors(case, found["elastic"], true, q) ** 2 / variances(case, found["elastic"], q)
     return found["auto"].model == "elastic", np.array([*squares, least]), normal.mean()
 
 
 def draw_loaded(case: Case, seed: int) -> tuple[np.ndarray, np.ndarray]:
     """Mean squares of errors, mm², without and with known masses, and of what is possible; and of errors over σ, of
     positions, and of the compliances about the axes."""
-    rng = np.random.default_rng([100 + LOADED.index(case), seed])
-    tool = Rigid.exp(rng.normal(0, 0.5, 6) * [1, 1, 1, 200, 200, 200])
-    true = placed(made(mh80(), rng), Rigid.exp(rng.normal(0, 1, 6) * [1, 1, 1, 1000, 1000, 1000]), {"": tool})
+    rng = np.random.default_rng([90 + EVERY.index(case), seed])
+    true = case.made(rng)
     true = elastic(true, rng, case.share, max(rng.normal(1, HEAVIER), 0.2))
     assert true.elasticity is not None
     true = replace(true, elasticity=replace(true.elasticity, payload_centre=CENTRE))
@@ -109,28 +128,33 @@ def draw_loaded(case: Case, seed: int) -> tuple[np.ndarray, np.ndarray]:
     options = IdentifyOptions(model="elastic", folds=0)
     known = identify(nominal, data, options)
     unknown = identify(nominal, replace(data, conditions=USUAL), options)
-    off = errors(known, true, q, carried)
-    squares = [(errors(unknown, true, q, carried, USUAL) ** 2).sum(1).mean(), (off**2).sum(1).mean()]
+    off = errors(case, known, true, q, carried)
+    squares = [(errors(case, unknown, true, q, carried, USUAL) ** 2).sum(1).mean(), (off**2).sum(1).mean()]
     found, sigma = known.robot.elasticity, known.elasticity_sigma
     assert found is not None
     assert sigma is not None
     axis = ((found.compliance - true.elasticity.compliance) / sigma.compliance)[:, 0] ** 2
-    normal = [(off**2 / variances(known, q, carried)).mean(), axis.mean()]
+    normal = [(off**2 / variances(case, known, q, carried)).mean(), axis.mean()]
     return np.array([*squares, possible(true, data, case, q, carried)]), np.array(normal)
 
 
 def errors(
-    found: Identified, true: Robot, q: np.ndarray, carried: Conditions = USUAL, told: Conditions | None = None
+    case: Case,
+    found: Identified,
+    true: Robot,
+    q: np.ndarray,
+    carried: Conditions = USUAL,
+    told: Conditions | None = None,
 ) -> np.ndarray:
     """(m, 3) of positions in the instrument's frame, mm; ``told`` : what is said to be carried, if not ``carried``."""
-    really = tips(State(true.chain(), dict(true.tools)), q, ("",) * len(q), carried)
+    really = tips(State(true.chain(), dict(true.tools)), q, case.targets(len(q)), carried)
     believed = carried if told is None else told
-    return tips(found.state, q, ("",) * len(q), believed).translation - really.translation
+    return tips(found.state, q, case.targets(len(q)), believed).translation - really.translation
 
 
-def variances(found: Identified, q: np.ndarray, carried: Conditions = USUAL) -> np.ndarray:
+def variances(case: Case, found: Identified, q: np.ndarray, carried: Conditions = USUAL) -> np.ndarray:
     """(m, 3) by its covariance, mm²."""
-    place = tip_jacobian(found.state, q, ("",) * len(q), found.seen.kind, carried)[1][:, 3:]
+    place = tip_jacobian(found.state, q, case.targets(len(q)), found.seen.kind, carried)[1][:, 3:]
     adjusted = found.adjustment
     covariance = adjusted.parts.covariance(np.zeros(len(adjusted.parts.least)))
     return np.einsum("rik,kl,ril->ri", place, covariance, place)
@@ -141,7 +165,7 @@ def possible(true: Robot, data: Measurements, case: Case, q: np.ndarray, carried
     state = State(true.chain(), dict(true.tools), elastic=bool(case.share))
     seen = observed(data)
     derivative = jacobian(state, seen)
-    rows = NominalRows.about(state, parameter_units(derivative), mh80(), carried=data.conditions.loaded)
+    rows = NominalRows.about(state, parameter_units(derivative), case.nominal(), carried=data.conditions.loaded)
     usual = Deviations()
     known = replace(
         MADE,
@@ -155,7 +179,7 @@ def possible(true: Robot, data: Measurements, case: Case, q: np.ndarray, carried
     normal = white.T @ white + held.normal()
     units = 1 / np.sqrt(np.diag(normal))  # by what is seen and held of each: moments span ten decades of others
     covariance = np.linalg.pinv(normal * units[:, None] * units, hermitian=True) * units[:, None] * units
-    place = tip_jacobian(state, q, ("",) * len(q), seen.kind, carried)[1][:, 3:]
+    place = tip_jacobian(state, q, case.targets(len(q)), seen.kind, carried)[1][:, 3:]
     return float(np.einsum("rik,kl,ril->r", place, covariance, place).mean())
 
 
@@ -167,34 +191,39 @@ def main() -> None:
     parser.add_argument("--only", default="", metavar="TEXT", help="cases whose lines begin so")
     parser.add_argument("--scheduler", metavar="ADDRESS", help="hand the draws to this Dask cluster")
     parser.add_argument("--payload", action="store_true", help="the cases with payloads")
+    parser.add_argument("--trees", action="store_true", help="the cases of two arms on a torso")
     arguments = parser.parse_args()
     print(f"{arguments.draws} draws each, simulated\n")
     if arguments.payload:
         payloads(arguments)
         return
-    print("| observed | rows | usual σ × | elastic taken | rigid, mm | elastic, mm | auto, mm | bound | calibration |")
+    print("| observed | rows | usual σ × | elastic taken | rigid, mm | elastic, mm | auto, mm | bound | NEES |")
     print("|---" * 9 + "|")
     with executor_of(arguments.scheduler) as pool:
-        for case in (each for each in CASES if each.title().startswith(arguments.only)):
+        for case in (each for each in (TREES if arguments.trees else CASES) if each.title().startswith(arguments.only)):
             taken, squares, normal = zip(*pool.map(partial(draw, case), range(arguments.draws)), strict=True)
             rms = np.sqrt(np.mean(squares, axis=0))
             cells = [str(sum(taken)), *(f"{value:.3f}" for value in rms[:3])]
-            cells += [f"{rms[1] / rms[3]:.2f}", f"{np.sqrt(np.mean(normal)):.2f}"]
+            cells += [f"{rms[1] / rms[3]:.2f}", nees(np.array(normal))]
             print(f"| {case.title()} | {' | '.join(cells)} |", flush=True)
 
 
 def payloads(arguments: argparse.Namespace) -> None:
     """Run the cases with payloads; print."""
-    print("| observed | rows | payloads, kg | unknown, mm | known, mm | bound | calibration | axis |")
+    print("| observed | rows | payloads, kg | unknown, mm | known, mm | bound | NEES | axis |")
     print("|---" * 8 + "|")
     with executor_of(arguments.scheduler) as pool:
         for case in (each for each in LOADED if each.title().startswith(arguments.only)):
             squares, normal = zip(*pool.map(partial(draw_loaded, case), range(arguments.draws)), strict=True)
-            rms, calibration = np.sqrt(np.mean(squares, axis=0)), np.sqrt(np.mean(normal, axis=0))
+            rms = np.sqrt(np.mean(squares, axis=0))
             cells = [*(f"{value:.3f}" for value in rms[:2]), f"{rms[1] / rms[2]:.2f}"]
-            print(
-                f"| {case.title()} | {' | '.join([*cells, *(f'{value:.2f}' for value in calibration)])} |", flush=True
-            )
+            cells += [nees(each) for each in np.transpose(normal)]
+            print(f"| {case.title()} | {' | '.join(cells)} |", flush=True)
+
+
+def nees(each: np.ndarray) -> str:
+    """Of draws (d,)."""
+    return f"{each.mean():.2f} ± {each.std() / np.sqrt(len(each)):.2f}"
 
 
 if __name__ == "__main__":

@@ -23,6 +23,7 @@ from stcal.report.page import render
 from stcal.report.text import number, text_table
 from stcal.robot.identify.result import Identified, IdentifyOptions
 from stcal.robot.identify.solve import identify
+from stcal.robot.kinematics.conditions import read_conditions
 from stcal.robot.kinematics.file import load_robot
 from stcal.robot.kinematics.forward import forward
 from stcal.robot.kinematics.measurements import Measurements, joint_values, targets_of
@@ -119,7 +120,8 @@ def _measurements(pairs: Pairs, file: Path | Table, robot: Robot) -> Measurement
         q = joint_values(table, robot)
     except InputError as error:
         raise InputError(f"{error} (--robot needs the joint values of each point)") from error
-    return Measurements(pairs.where, pairs.lines, q, targets_of(table), pairs.xyz_b)
+    conditions = read_conditions(table, joints=len(robot.rows))
+    return Measurements(pairs.where, pairs.lines, q, targets_of(table), pairs.xyz_b, conditions=conditions)
 
 
 def grown(robot: Robot, data: Measurements, good: np.ndarray, settings: IdentifyOptions):
@@ -139,11 +141,12 @@ def grown(robot: Robot, data: Measurements, good: np.ndarray, settings: Identify
 
 def positions(robot: Robot, data: Measurements) -> np.ndarray:
     """(m, 3) of the targets, in the instrument's frame."""
-    out = np.empty((len(data), 3))
+    out, mass = np.empty((len(data), 3)), data.conditions.payload_kg
     for name in set(data.targets):
         own = [i for i, target in enumerate(data.targets) if target == name]
         tool = name if name in robot.tools else ""
-        out[own] = robot.world_from_base @ forward(robot, data.q[own], tool).translation
+        carried = None if mass is None else mass[own]
+        out[own] = robot.world_from_base @ forward(robot, data.q[own], tool, carried).translation
     return out
 
 

@@ -11,7 +11,7 @@ from stcal.geometry.rigid import Rigid
 from stcal.robot.kinematics.example import mh80
 from stcal.robot.kinematics.file import load_robot, robot_toml
 from stcal.robot.kinematics.forward import forward
-from stcal.synthetic.measured.arms import joint_vectors, made, placed
+from stcal.synthetic.measured.arms import elastic, joint_vectors, made, placed
 
 HEAD = "ax_mm,ay_mm,az_mm,bx_mm,by_mm,bz_mm"
 B_FROM_A = Rigid.exp([0.3, -0.4, 1.1, 2500.0, -300.0, 800.0])
@@ -300,6 +300,26 @@ def test_base_and_kinematics_together(run, tmp_path, robot_pairs):
     new = joint_vectors(real, 200, np.random.default_rng(9), 0.5)
     predicted = robot.world_from_base @ forward(robot, new).translation
     assert np.linalg.norm(predicted - B_FROM_A @ forward(real, new).translation, axis=1).mean() < 0.15
+
+
+@pytest.mark.slow
+def test_loads_at_the_flange_are_known_to_an_elastic_robot(run, tmp_path):
+    """Every other point with 60 kg, which bends the arm by a millimetre: a is where the file says."""
+    rng = np.random.default_rng(6)
+    drawn = elastic(placed(mh80(), Rigid(), {"": Rigid(np.eye(3), [40.0, -20.0, 120.0])}), rng, 3.0)
+    q, mass = joint_vectors(drawn, 45, rng), np.resize([0.0, 60.0], 45)
+    a = forward(drawn, q, payload_kg=mass).translation
+    assert np.abs(a - forward(drawn, q).translation).max() > 0.3
+    b = B_FROM_A @ a + rng.normal(0, 0.03, (45, 3))
+    pairs, out = tmp_path / "pairs.csv", tmp_path / "o.json"
+    head = HEAD + "".join(f",q{i}_deg" for i in range(1, 7)) + ",payload_kg"
+    pairs.write_text("\n".join([head, *rows_of(a, b, np.column_stack([np.degrees(q), mass]))]))
+    (tmp_path / "robot.toml").write_text(robot_toml(drawn))
+    code, _, err = run(pairs, "--robot", tmp_path / "robot.toml", "--folds", 2, "--out", out)
+    assert (code, err) == (0, "")
+    content = json.loads(out.read_text())["robot"]
+    assert content["a_off_robot_file_mm"] < 1e-3
+    assert content["sigma_mm"] == pytest.approx(0.03, rel=0.3)
 
 
 def test_joint_values_are_needed_for_a_robot(run, tmp_path, robot_pairs):

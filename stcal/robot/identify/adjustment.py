@@ -7,7 +7,7 @@ import numpy as np
 
 from stcal.geometry.least_squares import NormalEquations, minimise
 from stcal.geometry.robust import huber_cost, huber_weights, length_limit
-from stcal.robot.identify.residuals import WIDTH, Kind, Observed, State, linear, moved, residuals
+from stcal.robot.identify.residuals import WIDTH, Kind, Observed, State, curvature, linear, moved, residuals
 
 MAX_STEPS = 100
 SETTLED = 1e-10
@@ -54,6 +54,17 @@ class Weighting:
             sigma = self.factor * np.array([self.sigma_rad] * 3 + [self.sigma_mm] * 3)
             values = values / sigma[-width:, None]
         return values[..., 0] if flat else values
+
+    def pull(self, white: np.ndarray, seen: Observed) -> np.ndarray:
+        """Half the derivative (r, w) by residuals of the sum of squares of what :meth:`whiten` makes of them, ``white``
+        (r, w)."""
+        width = white.shape[1]
+        if not (self.given and width > 1):
+            return white / (self.factor * np.array([self.sigma_rad] * 3 + [self.sigma_mm] * 3)[-width:])
+        root = self.factor * np.linalg.cholesky(seen.data.own_covariance()[:, -width:, -width:])
+        if seen.data.common is not None:
+            white = _decorrelated(white[..., None], np.linalg.solve(root, seen.data.common[:, -width:]))[..., 0]
+        return np.linalg.solve(np.swapaxes(root, 1, 2), white[..., None])[..., 0]
 
     def columns(self, width: int) -> dict[str, slice]:
         """Which of the ``width`` coordinates each σ is of."""
@@ -169,7 +180,11 @@ def solve(
 
     def linearise(at: _Away) -> NormalEquations:
         found, gradient = _linearised(at.state, seen, weighting, limit)
-        return NormalEquations(found.cost, found.normal, gradient) + kept(at.away)
+        straight = NormalEquations(found.cost, found.normal, gradient) + kept(at.away)
+        curved = curvature_of(found, seen, weighting)
+        if curved is None or not _convex(straight.normal - curved, found.units):
+            return straight
+        return replace(straight, normal=straight.normal - curved)
 
     accepted = ACCEPTED_ELASTIC if state.elastic else ACCEPTED
     found = minimise(
@@ -183,6 +198,28 @@ def solve(
     ).required(f"{seen.data.where}: identification", "check the robot file and the outliers", accepted)
     solution = _linearised(found.state.state, seen, weighting, limit)[0]
     return replace(solution, prior=known, conditions=conditions, count=count)
+
+
+def curvature_of(solution: Solution, seen: Observed, weighting: Weighting) -> np.ndarray | None:
+    """(k, k) what products of compliance and moment take from the normal matrix, where there are such; without it
+    descents along their bent valleys take hundreds of steps."""
+    if not solution.state.elastic or seen.kind == "distance":
+        return None
+    white = solution.weights[:, None] * weighting.whiten(solution.residuals, seen)
+    own = curvature(solution.state, seen, weighting.pull(white, seen))
+    k, count = len(solution.units), solution.state.elastic_count
+    found = np.zeros((k, k))
+    place = slice(k - count, k - count + len(own))
+    found[place, place] = own
+    return found
+
+
+def _convex(normal: np.ndarray, units: np.ndarray) -> bool:
+    try:
+        np.linalg.cholesky(normal * units[:, None] * units)
+    except np.linalg.LinAlgError:
+        return False
+    return True
 
 
 @dataclass(frozen=True, slots=True, eq=False)

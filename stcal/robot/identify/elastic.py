@@ -5,10 +5,12 @@ compliance about the axes, across them, and of gears are estimated with the othe
 shows nothing of a kind, its σ becomes small and the kind is as good as absent.
 """
 
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 
 import numpy as np
 
+from stcal.geometry.rigid import Rigid
 from stcal.robot.identify.residuals import State
 from stcal.robot.kinematics.conditions import USUAL, Conditions
 from stcal.robot.kinematics.forward import GRAVITY_M_S2, elasticity_values
@@ -67,7 +69,7 @@ def usual(chain: Chain, carried: bool = False, hysteresis: bool = False) -> Usua
     ``hysteresis`` (10 n,)."""
     n = len(chain)
     moment, beside = _moments(chain)
-    torque = np.cumsum((np.linalg.norm(moment, axis=1) + beside)[::-1])[::-1]
+    torque = chain.gathered(np.linalg.norm(moment, axis=1) + beside)
     expected = np.concatenate([np.zeros(2 * n), moment.ravel(), np.zeros(4 * n)])
     scale = np.concatenate([np.repeat(torque, 2), np.repeat(1 / beside, 3), np.ones(4 * n)])
     group = np.concatenate([np.tile([AXIS, ACROSS], n), np.full(3 * n, MOMENT), np.full(4 * n, PERIODIC)])
@@ -106,10 +108,31 @@ def bending(state: State, robot: Robot, deflection_rad: float, conditions: Condi
 def _moments(chain: Chain) -> tuple[np.ndarray, np.ndarray]:
     """(n, 3) N m of each link with what follows put at the next joint, and (n,) what they are known to."""
     n = len(chain)
-    to_next = np.vstack([chain.translation[1:], chain.last_from_flange.translation])
-    length_m = 1e-3 * max(float(np.linalg.norm(to_next, axis=1).sum()), 1.0)
-    share = np.arange(n, 0, -1) - 0.5
-    weight = GRAVITY_M_S2 * MASS_KG * length_m**2 * share / share.sum()
-    after = np.append(np.cumsum(weight[::-1])[::-1][1:], 0.0)
-    moment = 1e-3 * to_next * (weight / 2 + after)[:, None]
-    return moment, BESIDE * length_m * (weight + after)
+    carrier = [chain.after(i) for i in range(n)]
+    last = sorted(set(range(n)) - set(carrier))
+    ends = {i: chain.last_from_flange if chain.grown is None else chain.grown.ends[i] for i in last}
+    longest, above = _longest(chain, ends)
+    length_m = 1e-3 * max(longest, 1.0)
+    share = above - 0.5
+    weight = GRAVITY_M_S2 * MASS_KG * length_m**2 * share / (0.5 * above.max() ** 2)
+    whole = chain.gathered(weight)
+    moment = np.zeros((n, 3))
+    for i in range(n):
+        following = [k for k in range(n) if carrier[k] == i]
+        next_mm = chain.translation[following] if following else ends[i].translation[None]
+        moment[i] = next_mm.mean(0) * weight[i] / 2 + whole[following] @ next_mm[: len(following)]
+    return 1e-3 * moment, BESIDE * length_m * whole
+
+
+def _longest(chain: Chain, ends: Mapping[int, Rigid]) -> tuple[float, np.ndarray]:
+    """Length, mm, of the longest way from the first joint of a branch at the base to its end; and (n,) how many joints
+    follow one another from each to the farthest end, itself counted."""
+    length, above = np.zeros(len(chain)), np.ones(len(chain))
+    for i, end in ends.items():
+        length[i] = np.linalg.norm(end.translation)
+    for i in range(len(chain) - 1, -1, -1):
+        before = chain.after(i)
+        if before >= 0:
+            length[before] = max(length[before], np.linalg.norm(chain.translation[i]) + length[i])
+            above[before] = max(above[before], 1 + above[i])
+    return float(length.max()), above

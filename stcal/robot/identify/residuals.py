@@ -13,6 +13,7 @@ from stcal.robot.kinematics.forward import (
     carried_poses,
     chain_jacobian,
     chain_parameters,
+    elasticity_curvature,
     elasticity_jacobian,
     elasticity_values,
     moved_chain,
@@ -136,6 +137,15 @@ def linear(state: State, seen: Observed) -> tuple[np.ndarray, np.ndarray]:
     return _beside(state, tip, seen), as_seen(state, seen, tip, full)
 
 
+def curvature(state: State, seen: Observed, pull: np.ndarray) -> np.ndarray:
+    """Second derivative, (9 n, 9 n), of the sum of ``pull`` (r, 6 or 3) times what the model says, by compliances and
+    moments."""
+    tip, data = tips_of(state, seen.data), seen.data
+    moves = as_seen(state, seen, tip, np.broadcast_to(np.eye(6), (len(tip), 6, 6)))
+    pulls = np.einsum("rw,rwk->rk", pull, moves)
+    return elasticity_curvature(state.chain, data.q, tip, data.targets, pulls, data.conditions)
+
+
 def as_seen(state: State, seen: Observed, tip: Poses, moves: np.ndarray) -> np.ndarray:
     """What observations see, (r, 6 or 3 or 1, k), of motions of the tools (m, 6, k) at ``tip``: rad over mm, in the
     world's axes; seen in those of the row's station."""
@@ -202,7 +212,7 @@ def tip_jacobian(
         tools_part[rows, 3:, place : place + 3] = tip.rotation[rows]
     parts = [axes_part, tools_part, np.zeros((len(tip), 6, 6 * (len(state.stations) - 1)))]
     if state.elastic:
-        parts.append(elasticity_jacobian(state.chain, q, tip, conditions, state.hysteresis))
+        parts.append(elasticity_jacobian(state.chain, q, tip, targets, conditions, state.hysteresis))
     return tip, np.concatenate(parts, axis=2)
 
 

@@ -5,7 +5,7 @@ from typing import get_args
 
 import numpy as np
 
-from stcal.errors import DegenerateError, InputError
+from stcal.errors import DegenerateError
 from stcal.geometry.rigid import skew
 from stcal.geometry.robust import huber_weights
 from stcal.held_out import dealt
@@ -47,7 +47,7 @@ from stcal.robot.identify.result import (
     position_errors,
 )
 from stcal.robot.identify.start import start
-from stcal.robot.identify.variances import GROSS, components, estimated
+from stcal.robot.identify.variances import GROSS, Relaxation, components, estimated
 from stcal.robot.kinematics.dh import robot_from_chain
 from stcal.robot.kinematics.forward import with_values
 from stcal.robot.kinematics.measurements import Measurements
@@ -116,11 +116,6 @@ def identify(robot: Robot, data: Measurements, options: IdentifyOptions | None =
     1996.
     """
     options = options or IdentifyOptions()
-    if robot.tree is not None and options.model != "rigid":
-        raise InputError(
-            f"robot {robot.name}: --model {options.model}, but it is a tree, whose branches load each other; --model "
-            "rigid, or a robot file of one arm"
-        )
     seen = observed(data, options.observe)
     _still_joints(robot, data, options.partial)
     first = start(robot, data)
@@ -311,13 +306,16 @@ def _by_medians(state: State, seen: Observed, options: IdentifyOptions, rows: No
 def _settled(state: State, seen: Observed, options: IdentifyOptions, known: Known, rounds: int) -> Adjustment:
     """Solve, and estimate σ, in turns."""
     rows, weighting, deviations = known
+    relaxation = Relaxation()
     for _ in range(rounds):
         solution = solve(state, seen, weighting, options.robust, rows.held(state, deviations, seen.kind))
         parts = components(solution, seen, weighting, options.robust, rows, deviations)
-        new_weighting, new_deviations, change = estimated(parts, rows, weighting, deviations)
+        best = parts.best()
+        change = float(np.abs(best).max())
         if change < VARIANCE_SETTLED:
             return Adjustment(solution, weighting, deviations, rows, parts)
-        state, weighting, deviations = solution.state, new_weighting, new_deviations
+        state = solution.state
+        weighting, deviations = estimated(relaxation.step(best), rows, weighting, deviations)
     note = f"the σ still change by {np.expm1(change):.2%} after {rounds} rounds of estimating them"
     return Adjustment(solution, weighting, deviations, rows, parts, (note,) if change > VARIANCE_UNSETTLED else ())
 

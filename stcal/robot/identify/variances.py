@@ -14,7 +14,7 @@ from scipy.special import chdtr, chdtrc
 
 from stcal.geometry.least_squares import NormalEquations
 from stcal.geometry.variances import Parts
-from stcal.robot.identify.adjustment import USELESS_MM, Solution, Weighting, huber_limit
+from stcal.robot.identify.adjustment import USELESS_MM, Solution, Weighting, curvature_of, huber_limit
 from stcal.robot.identify.elastic import MOMENT
 from stcal.robot.identify.nominal import DOUBT, Deviations, NominalRows
 from stcal.robot.identify.residuals import WIDTH, Kind, Observed, jacobian
@@ -31,6 +31,8 @@ NODES, NODE_WEIGHTS = np.sqrt(3.0) * np.array([0.0, -1.0, 1.0]), np.array([4.0, 
 """Gauss-Hermite of three points for a standard normal distribution."""
 MOST_PRODUCT = 5
 """Dimensions: 243 points; of rigid arms there are no more."""
+LEAST_SHARE = 0.1
+"""Of a step of the σ."""
 STEP = 1e-4
 """Of the second derivatives, in log σ."""
 
@@ -118,7 +120,9 @@ def components(
             parts.append((NormalEquations.of(e[mine], j[mine]), mine.sum(), np.log(expected / sigma), DOUBT, -np.inf))
     each, *known = zip(*parts, strict=True)
     count, expected, doubt, least = (np.array(values, float) for values in known)
-    return Components(Parts(NormalEquations.stacked(each), count, fixed, expected, doubt), least, units)
+    bent = curvature_of(solution, seen, weighting)
+    bent = None if bent is None else bent * units[:, None] * units
+    return Components(Parts(NormalEquations.stacked(each), count, fixed, expected, doubt, bent=bent), least, units)
 
 
 def _linear(white: np.ndarray, derivative: np.ndarray, columns: slice, weight: np.ndarray) -> NormalEquations:
@@ -130,14 +134,32 @@ def _linear(white: np.ndarray, derivative: np.ndarray, columns: slice, weight: n
     return NormalEquations(cost, weighted @ j.reshape(-1, k), -(weighted @ e))
 
 
-def estimated(parts: Components, rows: NominalRows, weighting: Weighting, deviations: Deviations):
-    """σ of the measurements and of the dimensions that are best, and by how much a logarithm of one changed."""
-    best = parts.best()
+class Relaxation:
+    """Shares of the steps of an iteration that may overshoot, by how the last two steps agree (Aitken's Δ² of vectors,
+    Irons & Tuck, Int. J. Numerical Methods in Engineering 1, 1969)."""
+
+    def __init__(self) -> None:
+        self._share, self._last = 1.0, None
+
+    def step(self, wanted: np.ndarray) -> np.ndarray:
+        """What to go of a step (p,) that is ``wanted``."""
+        if self._last is not None:
+            turned = wanted - self._last
+            share = -self._share * float(self._last @ turned) / max(float(turned @ turned), 1e-300)
+            self._share = float(np.clip(share, LEAST_SHARE, 1.0))
+        self._last = wanted
+        return self._share * wanted
+
+
+def estimated(
+    change: np.ndarray, rows: NominalRows, weighting: Weighting, deviations: Deviations
+) -> tuple[Weighting, Deviations]:
+    """σ of the measurements and of the dimensions, changed by ``change`` (p,) of their logarithms."""
     names = [name for name in ("factor", "rad", "mm") if name in weighting.estimated]
-    new = {name: weighting.value(name) * np.exp(x) for name, x in zip(names, best, strict=False)}
+    new = {name: weighting.value(name) * np.exp(x) for name, x in zip(names, change, strict=False)}
     sigma = np.array(astuple(deviations))
-    sigma[np.intersect1d(rows.groups, np.arange(len(sigma)))] *= np.exp(best[len(names) :])
-    return weighting.with_values(new), Deviations(*sigma.tolist()), float(np.abs(best).max())
+    sigma[np.intersect1d(rows.groups, np.arange(len(sigma)))] *= np.exp(change[len(names) :])
+    return weighting.with_values(new), Deviations(*sigma.tolist())
 
 
 def _kept(kind: Kind) -> float:

@@ -57,7 +57,7 @@ class InverseProblem:
     @property
     def under_actuated(self) -> bool:
         chain = self.robot.chain()
-        return len(chain.branch(chain.carrier(self.tool))) < 6
+        return len(chain.branch(chain.carrier(self.tool)).path()) < 6
 
     def clipped(self, q: np.ndarray) -> np.ndarray:
         return np.clip(q, *self.bounds.T)
@@ -79,7 +79,7 @@ def reach_mm(robot: Robot, tool: str = "") -> float:
     chain = whole.branch(whole.carrier(tool))
     end = chain.last_from_flange @ robot.tool(tool)
     travel = np.abs(robot.limits()[robot.prismatic])
-    links = np.linalg.norm(chain.translation[1:], axis=1).sum() + np.linalg.norm(end.translation)
+    links = np.linalg.norm(chain.translation[list(chain.path()[1:])], axis=1).sum() + np.linalg.norm(end.translation)
     return float(max(links + travel[np.isfinite(travel)].sum(), 1.0))
 
 

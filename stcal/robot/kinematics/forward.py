@@ -71,7 +71,8 @@ def jacobian(robot: Robot, q: ArrayLike, tool: str = "") -> np.ndarray:
     swept = np.cross(z, flange_poses(chain, values).translation - origins)
     sliding = chain.prismatic[:, None, None]
     columns = np.concatenate([np.where(sliding, 0.0, z), np.where(sliding, z, swept)], axis=2)
-    return np.moveaxis(columns, 0, 2) @ chain.coupling
+    path = list(chain.path())
+    return np.moveaxis(columns[path], 0, 2) @ chain.coupling[path]
 
 
 def flange_poses(chain: Chain, q: np.ndarray, conditions: Conditions = USUAL) -> Poses:
@@ -82,12 +83,11 @@ def flange_poses(chain: Chain, q: np.ndarray, conditions: Conditions = USUAL) ->
     InputError
         The joints are a tree, which has no one flange.
     """
-    if chain.grown is not None:
-        raise InputError("the robot is a tree of joints, which has no one flange; a robot file of one arm needed")
     rotation, translation = np.empty((len(q), 3, 3)), np.empty((len(q), 3))
+    path = chain.path()
     for start in range(0, len(q), CHUNK):
         part = slice(start, start + CHUNK)
-        axes, origin = _walk(chain, q[part], conditions[part])
+        axes, origin = _walk(chain, path, q[part], conditions[part])
         end = chain.last_from_flange
         rotation[part] = np.einsum("cjm,ck->mjk", axes, end.rotation)
         translation[part] = (origin + np.einsum("cjm,c->jm", axes, end.translation)).T
@@ -102,7 +102,7 @@ def carried_poses(chain: Chain, q: np.ndarray, targets: Sequence[str], condition
     rotation, translation = np.empty((len(q), 3, 3)), np.empty((len(q), 3))
     for each in np.unique(carrier):
         rows = carrier == each
-        found = flange_poses(chain.branch(int(each)), q[rows])
+        found = flange_poses(chain.branch(int(each)), q[rows], conditions[rows])
         rotation[rows], translation[rows] = found.rotation, found.translation
     return Poses(rotation, translation)
 
@@ -115,7 +115,7 @@ def joint_frames(chain: Chain, q: np.ndarray, conditions: Conditions = USUAL) ->
     def keep(i: int, axes: np.ndarray, place: np.ndarray) -> None:
         rotation[i], origin[i] = np.moveaxis(axes, 2, 0).swapaxes(1, 2), place.T
 
-    _walk(chain, q, conditions, keep)
+    _walk(chain, range(n), q, conditions, keep)
     return rotation, origin
 
 
@@ -134,15 +134,17 @@ def torques(
     """(n, m, 3) N m of gravity about each joint, in the world's axes; ``rotation`` (n, m, 3, 3), ``origin`` (n, m, 3):
     of :func:`links` at joint vectors (m, n)."""
     elasticity = _elasticity(chain)
-    carried = np.cumsum((rotation @ elasticity.moment[:, None, :, None])[::-1, :, :, 0], axis=0)[::-1]
+    carried = chain.gathered((rotation @ elasticity.moment[:, None, :, None])[:, :, :, 0])
     mass = conditions.payload_kg
     if mass is None:
         mass = np.full(len(q), elasticity.payload_kg)
     if mass.any():
-        place = origin[-1] + rotation[-1] @ elasticity.payload_centre
-        if chain.prismatic[-1]:
-            place = place + rotation[-1, :, :, 2] * (q @ chain.coupling[-1])[:, None]
-        carried = carried + 1e-3 * GRAVITY_M_S2 * mass[:, None] * (place - origin)
+        last = chain.carrier("")
+        place = origin[last] + rotation[last] @ elasticity.payload_centre
+        if chain.prismatic[last]:
+            place = place + rotation[last, :, :, 2] * (q @ chain.coupling[last])[:, None]
+        held = chain.carries([""])[:, :, None]
+        carried = carried + held * (1e-3 * GRAVITY_M_S2 * mass[:, None] * (place - origin))
     return np.cross(carried, chain.rotation[0] @ elasticity.gravity)
 
 
@@ -178,8 +180,11 @@ def _elasticity(chain: Chain) -> Elasticity:
     return chain.elasticity
 
 
-def _walk(chain: Chain, q: np.ndarray, conditions: Conditions = USUAL, visit=None) -> tuple[np.ndarray, np.ndarray]:
-    """Axes (3 axes, 3 components, m) and origin (3, m) after the last joint; ``visit`` sees each frame unmoved."""
+def _walk(
+    chain: Chain, joints: Sequence[int], q: np.ndarray, conditions: Conditions = USUAL, visit=None
+) -> tuple[np.ndarray, np.ndarray]:
+    """Axes (3 axes, 3 components, m) and origin (3, m) after the last of ``joints``, of which each follows those that
+    carry it; ``visit`` sees each frame unmoved."""
     m = len(q)
     give = None
     if chain.elasticity is not None:
@@ -189,7 +194,7 @@ def _walk(chain: Chain, q: np.ndarray, conditions: Conditions = USUAL, visit=Non
     axes = np.repeat(np.eye(3)[:, :, None], m, axis=2)
     origin = np.zeros((3, m))
     moved = {-1: (axes, origin)}  # by the joints that carry others than the next one
-    for i in range(len(chain)):
+    for i in joints:
         if chain.after(i) != i - 1:
             axes, origin = moved[chain.after(i)]
         origin = origin + np.tensordot(chain.translation[i], axes, 1)
@@ -232,10 +237,15 @@ def chain_jacobian(chain: Chain, q: np.ndarray, tip: Poses, conditions: Conditio
 
 
 def elasticity_jacobian(
-    chain: Chain, q: np.ndarray, tip: Poses, conditions: Conditions = USUAL, hysteresis: bool = False
+    chain: Chain,
+    q: np.ndarray,
+    tip: Poses,
+    targets: Sequence[str],
+    conditions: Conditions = USUAL,
+    hysteresis: bool = False,
 ) -> np.ndarray:
-    """Derivative of poses ``tip`` (world_from_tool) by :func:`elasticity_values`, (m, 6, 9 n or 10 n), in the world's
-    axes."""
+    """Derivative of poses ``tip`` (world_from_tool of ``targets``) by :func:`elasticity_values`, in the
+    world's axes, (m, 6, 9 n or 10 n)."""
     elasticity = _elasticity(chain)
     rotation, origin = links(replace(chain, elasticity=None), q)
     torque, z = torques(chain, q, rotation, origin, conditions), rotation[..., 2]
@@ -244,17 +254,44 @@ def elasticity_jacobian(
     lever = tip.translation - origin
     axis, across = elasticity.compliance.T[:, :, None, None, None]
     gives = across * np.eye(3) + (axis - across) * z[..., :, None] * z[..., None, :]  # (n, m, 3, 3)
-    moved = np.cumsum(np.concatenate([gives, -skew(lever) @ gives], axis=2), axis=0)
-    pulled = np.cross(rotation, (chain.rotation[0] @ elasticity.gravity)[:, None], axisa=2, axisb=0, axisc=2)
+    gives = np.concatenate([gives, -skew(lever) @ gives], axis=2)
+    moves = chain.carries(targets)[:, :, None]
+    moved = chain.passed(np.where(moves[..., None], gives, 0.0))
+    pulled = _by_moment(chain, rotation, elasticity)
     by_moment = np.moveaxis(moved @ pulled, 3, 1).reshape(-1, len(q), 6)
     turned = np.concatenate([np.stack([about, torque - about], axis=1), np.moveaxis(periodic, 0, 1)], axis=1)
     by_turn = np.concatenate([turned, np.cross(turned, lever[:, None])], axis=3)  # (n, 6, m, 6)
+    by_turn = np.where(moves[:, None], by_turn, 0.0)
     parts = [by_turn[:, :2].reshape(-1, len(q), 6), by_moment, by_turn[:, 2:].reshape(-1, len(q), 6)]
     if hysteresis:
         came = np.zeros((len(q), len(chain))) if conditions.approach is None else conditions.approach
-        each = np.concatenate([z, np.cross(z, lever)], axis=2)
+        each = np.where(moves, np.concatenate([z, np.cross(z, lever)], axis=2), 0.0)
         parts.append(np.einsum("ij,mj,imc->jmc", _turning(chain), came, each))
     return np.moveaxis(np.concatenate(parts), 0, 2)
+
+
+def elasticity_curvature(
+    chain: Chain, q: np.ndarray, tip: Poses, targets: Sequence[str], pull: np.ndarray, conditions: Conditions = USUAL
+) -> np.ndarray:
+    """Second derivative, (9 n, 9 n), of the sum of ``pull`` (m, 6) times :func:`elasticity_jacobian`'s motions: of
+    products of compliance and moment."""
+    elasticity, n = _elasticity(chain), len(chain)
+    rotation, origin = links(replace(chain, elasticity=None), q)
+    z = rotation[..., 2]
+    turn = pull[:, :3] + np.cross(tip.translation - origin, pull[:, 3:])
+    turn = np.where(chain.carries(targets)[:, :, None], turn, 0.0)
+    about = z * (z * turn).sum(2)[:, :, None]
+    pulled = _by_moment(chain, rotation, elasticity)
+    each = np.einsum("iamc,jmck->iajk", np.stack([about, turn - about], axis=1), pulled, optimize=True)
+    each = np.where(chain.behind()[:, None, :, None], each, 0.0).reshape(2 * n, 3 * n)
+    found = np.zeros((9 * n, 9 * n))
+    found[: 2 * n, 2 * n : 5 * n], found[2 * n : 5 * n, : 2 * n] = each, each.T
+    return found
+
+
+def _by_moment(chain: Chain, rotation: np.ndarray, elasticity: Elasticity) -> np.ndarray:
+    """(n, m, 3, 3) torque, in the world's axes, by each link's moment."""
+    return np.cross(rotation, (chain.rotation[0] @ elasticity.gravity)[:, None], axisa=2, axisb=0, axisc=2)
 
 
 def elasticity_values(elasticity: Elasticity, hysteresis: bool = False) -> np.ndarray:

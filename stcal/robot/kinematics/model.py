@@ -200,7 +200,7 @@ class Robot:
     ------
     InputError
         Rows and joints differ in number, or there are none; a coupling matrix of another shape, or a singular one;
-        elasticity of a tree.
+        elasticity of another number of joints.
     """
 
     name: str
@@ -226,10 +226,6 @@ class Robot:
         if self.elasticity is not None and len(self.elasticity.moment) != n:
             raise InputError(
                 f"robot {self.name}: elasticity of {len(self.elasticity.moment)} joints, {n} needed, as many as rows"
-            )
-        if self.elasticity is not None and self.tree is not None:
-            raise InputError(
-                f"robot {self.name}: elasticity of a tree, whose branches load each other, is not known; leave it out"
             )
 
     @property
@@ -274,7 +270,8 @@ class Robot:
         elasticity = self.elasticity
         if elasticity is not None:
             first = self.world_from_base.inverse() @ gaps[0]
-            centre = ends[-1] @ elasticity.payload_centre
+            loaded_end = -1 if self.tree is None else self.tree.carriers.get("", -1)
+            centre = ends[loaded_end] @ elasticity.payload_centre
             elasticity = replace(elasticity, gravity=first.rotation.T @ elasticity.gravity, payload_centre=centre)
         grown = None if self.tree is None else Grown(self.tree, tuple(ends))
         return Chain(rotation, translation, ends[-1], self.prismatic, self.coupling, elasticity, grown)
@@ -287,10 +284,12 @@ class Robot:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Grown:
-    """A tree of joints: ``tree``; and ``ends`` : (n,) where each joint's row ends, in the frame of the joint."""
+    """A tree of joints: ``tree``; ``ends`` : (n,) where each joint's row ends, in the frame of the joint; and ``tip`` :
+    the joint whose row's end is the flange, where one is meant."""
 
     tree: Tree
     ends: tuple[Rigid, ...]
+    tip: int | None = None
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -341,13 +340,45 @@ class Chain:
         found = {name: np.isin(np.arange(len(self)), self.grown.tree.path(self.carrier(name))) for name in set(targets)}
         return np.array([found[name] for name in targets]).reshape(-1, len(self)).T
 
+    def behind(self) -> np.ndarray:
+        """(n, n) whether each joint carries each joint, or is it."""
+        return self.passed(np.eye(len(self))).T > 0
+
+    def gathered(self, each: np.ndarray) -> np.ndarray:
+        """(n, …) of every joint: what it and those it carries have, summed."""
+        total = np.array(each)
+        for i in range(len(self) - 1, -1, -1):
+            if self.after(i) >= 0:
+                total[self.after(i)] += total[i]
+        return total
+
+    def passed(self, each: np.ndarray) -> np.ndarray:
+        """(n, …) of every joint: what it and those that carry it have, summed."""
+        total = np.array(each)
+        for i in range(len(self)):
+            if self.after(i) >= 0:
+                total[i] += total[self.after(i)]
+        return total
+
     def branch(self, carrier: int) -> "Chain":
-        """The joints from the world to ``carrier``, one after the other, and the end of its row as flange."""
+        """The end of the row of ``carrier`` as flange; the other branches stay, as what they weigh bends this one."""
         if self.grown is None:
             return self
-        rows = list(self.grown.tree.path(carrier))
-        end = self.grown.ends[carrier]
-        return Chain(self.rotation[rows], self.translation[rows], end, self.prismatic[rows], self.coupling[rows])
+        return replace(self, last_from_flange=self.grown.ends[carrier], grown=replace(self.grown, tip=carrier))
+
+    def path(self) -> tuple[int, ...]:
+        """The joints from the world to the flange.
+
+        Raises
+        ------
+        InputError
+            A tree, which has no one flange.
+        """
+        if self.grown is None:
+            return tuple(range(len(self)))
+        if self.grown.tip is None:
+            raise InputError("the robot is a tree of joints, which has no one flange; a robot file of one arm needed")
+        return self.grown.tree.path(self.grown.tip)
 
 
 def about_z(angle: float) -> np.ndarray:

@@ -25,6 +25,7 @@ from stcal.robot.kinematics.model import Elasticity, Robot
 from stcal.synthetic.measured.arms import joint_vectors
 
 TOOL = Rigid.exp([0.1, 0.2, 0.3, 50, 60, 70])
+ALONE = ("",) * 20
 
 
 def bent(scale: float = 1.0) -> Robot:
@@ -62,7 +63,7 @@ def test_derivatives_are_those_of_small_changes():
     def tips(moved) -> Poses:
         return flange_poses(replace(chain, elasticity=with_values(chain.elasticity, moved)), q) @ TOOL
 
-    found = elasticity_jacobian(chain, q, tips(values))
+    found = elasticity_jacobian(chain, q, tips(values), ALONE)
     for k, value in enumerate(values):
         step = np.zeros(len(values))
         step[k] = max(1e-3 * abs(value), 1e-10)
@@ -225,7 +226,7 @@ def test_derivatives_by_hysteresis_are_those_of_small_changes():
     values = elasticity_values(chain.elasticity, hysteresis=True)
     assert (with_values(chain.elasticity, values).hysteresis == robot.elasticity.hysteresis).all()
     tip = flange_poses(chain, q, conditions) @ TOOL
-    found = elasticity_jacobian(chain, q, tip, conditions, hysteresis=True)
+    found = elasticity_jacobian(chain, q, tip, ALONE, conditions, hysteresis=True)
     assert found.shape == (20, 6, 60)
     for k in range(54, 60):
         step = np.zeros(60)
