@@ -4,6 +4,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, replace
 
 import numpy as np
+from scipy.linalg import solve_triangular
 
 from stcal.geometry.least_squares import NormalEquations, minimise
 from stcal.geometry.robust import huber_cost, huber_weights, length_limit
@@ -22,6 +23,10 @@ ACCEPTED = 1e-4
 weights make every step half as long as it should be, they are many and short."""
 ACCEPTED_ELASTIC = 0.05
 """The same along bent valleys: 0.2 σ of what is hardly known."""
+MOST_BENT = 0.8
+"""Of the curvature along a direction, what second derivatives may take away."""
+ROUNDING = 1e-13
+"""Of a normal matrix with a diagonal of 1."""
 STAYS_MM = 1e-3
 """σ of a movement that the observations never show."""
 LEAST_GAIN, LEAST_ELASTIC = 1e-9, 1e-3
@@ -182,9 +187,9 @@ def solve(
         found, gradient = _linearised(at.state, seen, weighting, limit)
         straight = NormalEquations(found.cost, found.normal, gradient) + kept(at.away)
         curved = curvature_of(found, seen, weighting)
-        if curved is None or not _convex(straight.normal - curved, found.units):
+        if curved is None:
             return straight
-        return replace(straight, normal=straight.normal - curved)
+        return replace(straight, normal=straight.normal - bounded(straight.normal, curved))
 
     accepted = ACCEPTED_ELASTIC if state.elastic else ACCEPTED
     found = minimise(
@@ -214,12 +219,15 @@ def curvature_of(solution: Solution, seen: Observed, weighting: Weighting) -> np
     return found
 
 
-def _convex(normal: np.ndarray, units: np.ndarray) -> bool:
-    try:
-        np.linalg.cholesky(normal * units[:, None] * units)
-    except np.linalg.LinAlgError:
-        return False
-    return True
+def bounded(normal: np.ndarray, curved: np.ndarray) -> np.ndarray:
+    """What ``curved`` (k, k) takes from ``normal`` (k, k) along any direction, but no more than a share of it: a saddle
+    is no minimum, and what is left of a flat valley is."""
+    scale = 1 / np.sqrt(np.diag(normal))
+    root = np.linalg.cholesky(normal * scale[:, None] * scale + ROUNDING * np.eye(len(scale)))
+    half = solve_triangular(root, curved * scale[:, None] * scale, lower=True)
+    share, directions = np.linalg.eigh(solve_triangular(root, half.T, lower=True))
+    along = root @ directions
+    return (along * np.minimum(share, MOST_BENT)) @ along.T / scale[:, None] / scale
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -14,8 +14,8 @@ from scipy.special import chdtr, chdtrc
 
 from stcal.geometry.least_squares import NormalEquations
 from stcal.geometry.variances import Parts
-from stcal.robot.identify.adjustment import USELESS_MM, Solution, Weighting, curvature_of, huber_limit
-from stcal.robot.identify.elastic import MOMENT
+from stcal.robot.identify.adjustment import USELESS_MM, Solution, Weighting, bounded, curvature_of, huber_limit
+from stcal.robot.identify.elastic import ACROSS, AXIS, MOMENT
 from stcal.robot.identify.nominal import DOUBT, Deviations, NominalRows
 from stcal.robot.identify.residuals import WIDTH, Kind, Observed, jacobian
 
@@ -23,6 +23,8 @@ LEAST = 1e-9
 """mm, rad: σ of data without noise."""
 FARTHEST = 3.0
 """log σ is looked for within this of where it was, a factor of 20, each round: beyond, rounding spoils the squares."""
+NEAREST = 0.7
+"""Of what products bend, a factor of two: what is farther the tangent says wrongly, and may call best."""
 QUIETER = -2.5
 """log σ of the data is looked for from here too: few data may be explained by noise alone, or by dimensions."""
 GROSS = 0.5
@@ -40,17 +42,18 @@ STEP = 1e-4
 @dataclass(frozen=True, slots=True, eq=False)
 class Components:
     """Parts of an adjustment, linear about its solution, in ``units`` (k,) of its parameters; those of the data first,
-    then the groups of the robot's dimensions. ``least`` : (p,) of log (σ / present σ)."""
+    then the groups of the robot's dimensions. ``least``, ``most`` : (p,) of log (σ / present σ)."""
 
     parts: Parts
     least: np.ndarray
+    most: np.ndarray
     units: np.ndarray
 
     def best(self) -> np.ndarray:
         """(p,) log (σ / present σ) of highest density."""
         data = np.isinf(self.parts.doubt)
         starts = (np.zeros(len(data)), np.where(data, QUIETER, self.parts.expected))
-        return self.parts.best(np.maximum(self.least, -FARTHEST), np.full(len(data), FARTHEST), starts)
+        return self.parts.best(self.least, self.most, starts)
 
     def covariance(self, best: np.ndarray) -> np.ndarray:
         """(k, k) covariance of the parameters about the estimate at ``best`` (p,)."""
@@ -67,7 +70,7 @@ class Components:
 
     def _root(self, best: np.ndarray) -> np.ndarray:
         """(p, f) square root of the covariance of log σ, of the f that are not at their least value."""
-        free = np.flatnonzero(best > np.maximum(self.least, -FARTHEST) + STEP)
+        free = np.flatnonzero(best > self.least + STEP)
         moves = STEP * np.eye(len(best))[free]
         gradient = self.parts.at(np.concatenate([best + moves, best - moves]))[1]
         hessian = (gradient[: len(free)] - gradient[len(free) :])[:, free] / (2 * STEP)
@@ -107,7 +110,7 @@ def components(
     for name, columns in weighting.columns(white.shape[1]).items():
         if name in weighting.estimated:
             own, count = _linear(white, derivative, columns, scaled), kept * white[honest, columns].size
-            parts.append((own, count, 0.0, np.inf, np.log(LEAST / weighting.value(name))))
+            parts.append((own, count, 0.0, np.inf, max(np.log(LEAST / weighting.value(name)), -FARTHEST), FARTHEST))
             fixed = fixed + _linear(white, derivative, columns, weight - scaled)
         else:
             fixed = fixed + _linear(white, derivative, columns, weight)
@@ -117,12 +120,15 @@ def components(
     for g, (sigma, expected) in enumerate(zip(astuple(deviations), astuple(Deviations()), strict=True)):
         mine = group == g
         if mine.any():
-            parts.append((NormalEquations.of(e[mine], j[mine]), mine.sum(), np.log(expected / sigma), DOUBT, -np.inf))
+            far = NEAREST if g in (AXIS, ACROSS) else FARTHEST
+            own = NormalEquations.of(e[mine], j[mine])
+            parts.append((own, mine.sum(), np.log(expected / sigma), DOUBT, -far, far))
     each, *known = zip(*parts, strict=True)
-    count, expected, doubt, least = (np.array(values, float) for values in known)
-    bent = curvature_of(solution, seen, weighting)
-    bent = None if bent is None else bent * units[:, None] * units
-    return Components(Parts(NormalEquations.stacked(each), count, fixed, expected, doubt, bent=bent), least, units)
+    count, expected, doubt, least, most = (np.array(values, float) for values in known)
+    together, bent = NormalEquations.stacked(each), curvature_of(solution, seen, weighting)
+    if bent is not None:
+        bent = bounded(together.normal.sum(0) + fixed.normal, bent * units[:, None] * units)
+    return Components(Parts(together, count, fixed, expected, doubt, bent=bent), least, most, units)
 
 
 def _linear(white: np.ndarray, derivative: np.ndarray, columns: slice, weight: np.ndarray) -> NormalEquations:
@@ -145,7 +151,8 @@ class Relaxation:
         """What to go of a step (p,) that is ``wanted``."""
         if self._last is not None:
             turned = wanted - self._last
-            share = -self._share * float(self._last @ turned) / max(float(turned @ turned), 1e-300)
+            falls = -float(self._last @ turned)  # where it does not, there is no sign of overshooting
+            share = self._share * falls / max(float(turned @ turned), 1e-300) if falls > 0 else 1.0
             self._share = float(np.clip(share, LEAST_SHARE, 1.0))
         self._last = wanted
         return self._share * wanted

@@ -5,7 +5,8 @@ import pytest
 
 from stcal.geometry.least_squares import NormalEquations
 from stcal.geometry.variances import Parts
-from stcal.robot.identify.variances import Components
+from stcal.robot.identify.adjustment import MOST_BENT, bounded
+from stcal.robot.identify.variances import Components, Relaxation
 
 
 def regression(
@@ -21,7 +22,8 @@ def regression(
         each, count, doubt = [*each, NormalEquations.of(np.zeros(width), mine)], [rows, groups], [np.inf, 1.0]
     fixed = NormalEquations(0.0, 1e-12 * np.eye(width), np.zeros(width))
     parts = Parts(NormalEquations.stacked(each), np.array(count), fixed, np.zeros(len(count)), np.array(doubt))
-    return Components(parts, np.full(len(count), -np.inf), np.ones(width)), design, seen, drawn
+    far = np.full(len(count), 3.0)
+    return Components(parts, -far, far, np.ones(width)), design, seen, drawn
 
 
 @pytest.mark.parametrize("rows", [14, 24, 104])
@@ -54,7 +56,27 @@ def test_parts_without_noise_do_not_break_it():
     exact = design @ [1.0, 2.0, 3.0]
     each = NormalEquations.stacked([NormalEquations.of(exact, -design)])
     none = NormalEquations(0.0, np.zeros((3, 3)), np.zeros(3))
-    parts = Components(Parts(each, np.array([20]), none, np.zeros(1), np.array([np.inf])), np.array([-2.0]), np.ones(3))
+    parts = Parts(each, np.array([20]), none, np.zeros(1), np.array([np.inf]))
+    parts = Components(parts, np.array([-2.0]), np.array([3.0]), np.ones(3))
     best = parts.best()
     assert best == pytest.approx([-2.0])
     assert np.isfinite(parts.covariance(best)).all()
+
+
+@pytest.mark.parametrize("slope", [-2.5, -0.5, 0.9])
+def test_steps_that_overshoot_are_shortened(slope):
+    """Of an iteration x → slope · x the first wanted step is (slope - 1) x; at -2.5 whole steps lead away for ever."""
+    relaxation, x = Relaxation(), np.array([1.0, -2.0])
+    for _ in range(30):
+        x = x + relaxation.step((slope - 1) * x)
+    assert np.abs(x).max() < 0.1 * max(slope, 0) ** 30 * 20 + 1e-6
+
+
+def test_second_derivatives_leave_a_minimum():
+    """They are as they are where they take little, and are cut off where they would make a saddle."""
+    root = np.random.default_rng(0).normal(size=(4, 4)) * [1, 10, 100, 1000]
+    normal, share = root @ root.T, np.array([-1.0, 0.1, 0.5, 2.0])
+    little = (root * np.minimum(share, 0.5)) @ root.T
+    assert bounded(normal, little) == pytest.approx(little, rel=1e-6)
+    left = normal - bounded(normal, (root * share) @ root.T)
+    assert left == pytest.approx((root * [2.0, 0.9, 0.5, 1 - MOST_BENT]) @ root.T, rel=1e-6)
