@@ -1,6 +1,6 @@
 """Elastic arms in ``stcal robot identify``: simulated arms as they leave the factory, measured over their ranges.
 
-.venv/bin/python scripts/studies/elastic_study.py [--draws 200] [--only TEXT] [--payload | --trees]
+.venv/bin/python scripts/studies/elastic_study.py [--draws 200] [--only TEXT] [--payload | --trees | --approach]
 
 Each line is a kind of observation, a number of rows, and by how much links give way and gears err, in usual σ (0.017°
 at the usual torque about the axes, 0.006° across them, 0.006° of the gears). ``elastic taken`` : draws in which
@@ -14,6 +14,9 @@ joint vectors carry 0 … 100 kg. ``unknown`` : identified without the masses, a
 ``NEES`` as above, with them. ``axis`` : the same of the compliances about the joints' axes.
 
 ``--trees`` : two arms on a torso, with three markers; columns as without.
+
+``--approach`` : joints have a hysteresis too, of the same share of the usual 0.006°, and rows say from where they came;
+so do the new joint vectors. Columns as without.
 """
 
 import argparse
@@ -45,13 +48,15 @@ MADE = Deviations(length_mm=0.3, twist_rad=5e-4, zero_rad=7e-4)
 
 @dataclass(frozen=True)
 class Case:
-    """``kind`` of observations, ``rows``, and ``share`` of usual elasticity; of a ``tree`` or an arm."""
+    """``kind`` of observations, ``rows``, and ``share`` of usual elasticity; of a ``tree`` or an arm, whose joints come
+    from either side where ``approach``."""
 
     kind: str
     rows: int
     share: float
     payloads: tuple[float, ...] = ()
     tree: bool = False
+    approach: bool = False
 
     def title(self) -> str:
         """First cells of its line."""
@@ -65,6 +70,10 @@ class Case:
     def targets(self, count: int) -> tuple[str, ...]:
         """Of so many rows."""
         return ((MARKERS if self.tree else ("",)) * count)[:count]
+
+    def came(self, rng: np.random.Generator, count: int) -> Conditions:
+        """Of so many joint vectors."""
+        return Conditions(approach=rng.choice([-1.0, 1.0], (count, 6))) if self.approach else USUAL
 
     def made(self, rng: np.random.Generator) -> Robot:
         """As made, somewhere, with a tool of its own."""
@@ -82,8 +91,9 @@ LOADED = (
     *(Case("position", rows, 1.0, masses) for masses in ((0, 60), (60,)) for rows in (60, 120)),
     Case("pose", 60, 1.0, (0, 60)),
 )
-TREES = tuple(Case(kind, 180, share, tree=True) for share in (0.0, 1.0) for kind in ("position", "pose"))
-EVERY = (*CASES, *LOADED, *TREES)
+TREES = tuple(Case(kind, 180, s, tree=True) for kind, s in (("position", 0.0), ("position", 1.0), ("pose", 1.0)))
+LOOSE = tuple(Case("position", rows, share, approach=True) for share in (0.0, 1.0, 3.0) for rows in (50, 100))
+EVERY = (*CASES, *LOADED, *TREES, *LOOSE)
 MOST_KG = 100.0
 """That new joint vectors carry."""
 CENTRE = np.array([20.0, -30.0, 150.0])
@@ -97,17 +107,21 @@ def draw(case: Case, seed: int) -> tuple[bool, np.ndarray, np.ndarray]:
     true = case.made(rng)
     if case.share:
         true = elastic(true, rng, case.share)
-    rows = joint_vectors(true, case.rows, rng)
-    data = measured(true, rows, rng, SIGMA_MM, SIGMA_RAD, case.targets(case.rows))
+    if case.approach and true.elasticity is not None:
+        loose = rng.normal(0, case.share * Deviations().hysteresis_rad, 6)
+        true = replace(true, elasticity=replace(true.elasticity, hysteresis=loose))
+    rows, targets = joint_vectors(true, case.rows, rng), case.targets(case.rows)
+    came = case.came(rng, case.rows)
+    data = measured(true, rows, rng, SIGMA_MM, SIGMA_RAD, targets, conditions=came)
     if case.kind == "position":
         data = replace(data, rotations=None)
-    q = joint_vectors(true, NEW_POSES, rng)
+    q, there = joint_vectors(true, NEW_POSES, rng), case.came(rng, NEW_POSES)
     nominal = case.nominal()
     found = {model: identify(nominal, data, IdentifyOptions(model=model, folds=0)) for model in ("rigid", "elastic")}
     found["auto"] = identify(nominal, data, IdentifyOptions(model="auto", repeats=1))
-    squares = [(errors(case, each, true, q) ** 2).sum(1).mean() for each in found.values()]
-    least = possible(true, data, case, q)
-    normal = errors(case, found["elastic"], true, q) ** 2 / variances(case, found["elastic"], q)
+    squares = [(errors(case, each, true, q, there) ** 2).sum(1).mean() for each in found.values()]
+    least = possible(true, data, case, q, there)
+    normal = errors(case, found["elastic"], true, q, there) ** 2 / variances(case, found["elastic"], q, there)
     return found["auto"].model == "elastic", np.array([*squares, least]), normal.mean()
 
 
@@ -162,7 +176,7 @@ def variances(case: Case, found: Identified, q: np.ndarray, carried: Conditions 
 
 def possible(true: Robot, data: Measurements, case: Case, q: np.ndarray, carried: Conditions = USUAL) -> float:
     """Mean square error, mm², of the best estimate: σ known, linear about the true arm."""
-    state = State(true.chain(), dict(true.tools), elastic=bool(case.share))
+    state = State(true.chain(), dict(true.tools), elastic=bool(case.share), hysteresis=case.approach)
     seen = observed(data)
     derivative = jacobian(state, seen)
     rows = NominalRows.about(state, parameter_units(derivative), case.nominal(), carried=data.conditions.loaded)
@@ -172,6 +186,7 @@ def possible(true: Robot, data: Measurements, case: Case, q: np.ndarray, carried
         axis_rad=case.share * usual.axis_rad,
         across_rad=case.share * usual.across_rad,
         periodic_rad=case.share * usual.periodic_rad,
+        hysteresis_rad=case.share * usual.hysteresis_rad,
     )
     sigma = np.repeat([SIGMA_RAD, SIGMA_MM], 3)[-derivative.shape[1] :]
     white = (derivative / sigma[:, None]).reshape(-1, derivative.shape[2])
@@ -192,6 +207,7 @@ def main() -> None:
     parser.add_argument("--scheduler", metavar="ADDRESS", help="hand the draws to this Dask cluster")
     parser.add_argument("--payload", action="store_true", help="the cases with payloads")
     parser.add_argument("--trees", action="store_true", help="the cases of two arms on a torso")
+    parser.add_argument("--approach", action="store_true", help="the cases with hysteresis")
     arguments = parser.parse_args()
     print(f"{arguments.draws} draws each, simulated\n")
     if arguments.payload:
@@ -199,8 +215,9 @@ def main() -> None:
         return
     print("| observed | rows | usual σ × | elastic taken | rigid, mm | elastic, mm | auto, mm | bound | NEES |")
     print("|---" * 9 + "|")
+    cases = TREES if arguments.trees else LOOSE if arguments.approach else CASES
     with executor_of(arguments.scheduler) as pool:
-        for case in (each for each in (TREES if arguments.trees else CASES) if each.title().startswith(arguments.only)):
+        for case in (each for each in cases if each.title().startswith(arguments.only)):
             taken, squares, normal = zip(*pool.map(partial(draw, case), range(arguments.draws)), strict=True)
             rms = np.sqrt(np.mean(squares, axis=0))
             cells = [str(sum(taken)), *(f"{value:.3f}" for value in rms[:3])]

@@ -1,0 +1,44 @@
+"""Held-out errors of a measured arm, by what is observed of it: 30 poses of a Rokae arm by a laser tracker.
+
+.venv/bin/python scripts/studies/measured_robots.py [--seeds 5]
+
+Each row is held out once in each division into six parts, of which there are five for each seed. Mean errors of
+positions, mm: mean over the seeds, and least and most of them.
+"""
+
+import argparse
+import tempfile
+from pathlib import Path
+
+import numpy as np
+from same_results import prepare
+
+from stcal.robot.identify.result import IdentifyOptions
+from stcal.robot.identify.solve import identify
+from stcal.robot.kinematics.file import load_robot
+from stcal.robot.kinematics.measurements import read_measurements
+
+
+def main() -> None:
+    """Identify with every seed; print."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--seeds", type=int, default=5)
+    seeds = range(parser.parse_args().seeds)
+    with tempfile.TemporaryDirectory() as folder:
+        prepare(Path(folder))
+        robot = load_robot(Path(folder) / "rokae.toml")
+        data = read_measurements(Path(folder) / "rokae.csv", robot)
+    print(f"rokae_tracker: {len(data)} poses\n")
+    print("| observed | model | mean of seeds, mm | least | most | elastic taken |")
+    print("|---" * 6 + "|")
+    for observe in ("pose", "position"):
+        for model in ("rigid", "auto"):
+            found = [identify(robot, data, IdentifyOptions(observe, seed=seed, model=model)) for seed in seeds]
+            mean = np.array([np.nanmean(each.held_out.position_mm) for each in found if each.held_out is not None])
+            taken = sum(each.model == "elastic" for each in found)
+            cells = [f"{value:.4f}" for value in (mean.mean(), mean.min(), mean.max())]
+            print(f"| {observe} | {model} | {' | '.join(cells)} | {taken} of {len(found)} |", flush=True)
+
+
+if __name__ == "__main__":
+    main()
