@@ -2,11 +2,12 @@
 
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
+from functools import partial
 
 import numpy as np
 from scipy.linalg import solve_triangular
 
-from stcal.geometry.least_squares import NormalEquations, minimise
+from stcal.geometry.least_squares import Minimum, NormalEquations, minimise
 from stcal.geometry.robust import huber_cost, huber_weights, length_limit
 from stcal.robot.identify.residuals import WIDTH, Kind, Observed, State, curvature, linear, moved, residuals
 
@@ -27,6 +28,9 @@ MOST_BENT = 0.8
 """Of the curvature along a direction, what second derivatives may take away."""
 ROUNDING = 1e-13
 """Of a normal matrix with a diagonal of 1."""
+NEAR, NEAR_STEPS = 1.0, 50
+"""In units of σ²: what a straight step promises where second derivatives are good for. Steps by these from afar may end
+where compliance and moment both have the wrong sign."""
 STAYS_MM = 1e-3
 """σ of a movement that the observations never show."""
 LEAST_GAIN, LEAST_ELASTIC = 1e-9, 1e-3
@@ -183,24 +187,32 @@ def solve(
     def kept(away: np.ndarray) -> NormalEquations:
         return NormalEquations(float(away @ (hold @ away + 2 * pull)), hold, hold @ away + pull)
 
-    def linearise(at: _Away) -> NormalEquations:
+    def linearise(at: _Away, bends: bool) -> NormalEquations:
         found, gradient = _linearised(at.state, seen, weighting, limit)
         straight = NormalEquations(found.cost, found.normal, gradient) + kept(at.away)
-        curved = curvature_of(found, seen, weighting)
+        curved = curvature_of(found, seen, weighting) if bends else None
         if curved is None:
             return straight
         return replace(straight, normal=straight.normal - bounded(straight.normal, curved))
 
-    accepted = ACCEPTED_ELASTIC if state.elastic else ACCEPTED
-    found = minimise(
-        _Away(state, np.zeros(len(hold))),
-        linearise,
-        lambda at, step: _Away(moved(at.state, step, seen.kind), at.away + step),
-        cost=lambda at: _cost(residuals(at.state, seen), seen, weighting, limit) + float(kept(at.away).cost),
-        settled=SETTLED,
-        least_gain=LEAST_ELASTIC if state.elastic else LEAST_GAIN,
-        max_steps=MAX_STEPS,
-    ).required(f"{seen.data.where}: identification", "check the robot file and the outliers", accepted)
+    def descended(begin: _Away, bends: bool, least_gain: float, max_steps: int) -> Minimum[_Away, NormalEquations]:
+        return minimise(
+            begin,
+            partial(linearise, bends=bends),
+            lambda at, step: _Away(moved(at.state, step, seen.kind), at.away + step),
+            cost=lambda at: _cost(residuals(at.state, seen), seen, weighting, limit) + float(kept(at.away).cost),
+            settled=SETTLED,
+            least_gain=least_gain,
+            max_steps=max_steps,
+        )
+
+    begin = _Away(state, np.zeros(len(hold)))
+    if state.elastic:
+        near = descended(begin, False, NEAR, NEAR_STEPS).state
+        found, accepted = descended(near, True, LEAST_ELASTIC, MAX_STEPS), ACCEPTED_ELASTIC
+    else:
+        found, accepted = descended(begin, False, LEAST_GAIN, MAX_STEPS), ACCEPTED
+    found.required(f"{seen.data.where}: identification", "check the robot file and the outliers", accepted)
     solution = _linearised(found.state.state, seen, weighting, limit)[0]
     return replace(solution, prior=known, conditions=conditions, count=count)
 
