@@ -21,11 +21,11 @@ from stcal.register.report.page import matrix_lines, matrix_rows
 from stcal.register.workspace.findings import Findings
 from stcal.report.page import render
 from stcal.report.text import number, text_table
+from stcal.robot.identify.residuals import State, tips
 from stcal.robot.identify.result import Identified, IdentifyOptions
 from stcal.robot.identify.solve import identify
 from stcal.robot.kinematics.conditions import read_conditions
 from stcal.robot.kinematics.file import load_robot
-from stcal.robot.kinematics.forward import forward
 from stcal.robot.kinematics.measurements import Measurements, joint_values, targets_of
 from stcal.robot.kinematics.model import Robot
 
@@ -141,13 +141,8 @@ def grown(robot: Robot, data: Measurements, good: np.ndarray, settings: Identify
 
 def positions(robot: Robot, data: Measurements) -> np.ndarray:
     """(m, 3) of the targets, in the instrument's frame."""
-    out, mass = np.empty((len(data), 3)), data.conditions.payload_kg
-    for name in set(data.targets):
-        own = [i for i, target in enumerate(data.targets) if target == name]
-        tool = name if name in robot.tools else ""
-        carried = None if mass is None else mass[own]
-        out[own] = robot.world_from_base @ forward(robot, data.q[own], tool, carried).translation
-    return out
+    tools = {name: robot.tool(name if name in robot.tools else "") for name in data.targets}
+    return tips(State(robot.chain(), tools), data.q, data.targets, data.conditions).translation
 
 
 def comparison_text(beside: Comparison) -> str:

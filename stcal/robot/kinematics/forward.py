@@ -57,7 +57,7 @@ def jacobian(robot: Robot, q: ArrayLike, tool: str = "") -> np.ndarray:
     -------
     (m, 6, n) array
         Rotation vector (rad) over translation (mm) of the tool's origin, both in the axes of the base (left
-        perturbation), by rad or mm of each joint.
+        perturbation), by rad or mm of each joint; what links give way by is taken as it is.
 
     Raises
     ------
@@ -139,13 +139,22 @@ def torques(
     if mass is None:
         mass = np.full(len(q), elasticity.payload_kg)
     if mass.any():
-        last = chain.carrier("")
+        last = _loaded(chain)
         place = origin[last] + rotation[last] @ elasticity.payload_centre
         if chain.prismatic[last]:
             place = place + rotation[last, :, :, 2] * (q @ chain.coupling[last])[:, None]
         held = chain.carries([""])[:, :, None]
         carried = carried + held * (1e-3 * GRAVITY_M_S2 * mass[:, None] * (place - origin))
     return np.cross(carried, chain.rotation[0] @ elasticity.gravity)
+
+
+def _loaded(chain: Chain) -> int:
+    """The joint behind which a load hangs."""
+    if chain.grown is not None and "" not in chain.grown.tree.carriers:
+        raise InputError(
+            "the robot is a tree of joints, and its file does not say which carries the load; give [tool] joint"
+        )
+    return chain.carrier("")
 
 
 def waves(chain: Chain, q: np.ndarray) -> np.ndarray:

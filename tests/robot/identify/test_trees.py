@@ -112,6 +112,8 @@ def test_one_arm_bends_the_other():
 def test_a_load_hangs_at_the_tool_without_name():
     rng = np.random.default_rng(1)
     robot = elastic(two_arms(), rng)
+    with pytest.raises(InputError, match=r"which carries the load; give \[tool\] joint"):
+        forward(robot, np.zeros((1, 14)), "left", 50.0)
     named = replace(robot.tree, carriers={**robot.tree.carriers, "": 7})
     robot = replace(robot, tree=named, tools={**robot.tools, "": Rigid()})
     stiff = np.array(robot.elasticity.compliance)
