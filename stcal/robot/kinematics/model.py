@@ -78,9 +78,9 @@ class Elasticity:
     """What turns the links of n joints by a little more than the joints do: gravity, and gears.
 
     What joint i carries pulls with the torque T = M × g about its place, M being the sum of the moments of its link and
-    of all links that it carries, each as it is turned. The link gives way by the rotation c T, with one c about the joint's
-    axis and another across it. Gears add an angle with one and two periods a turn of the joint. A payload is a mass at
-    a place of the flange, and pulls with its weight at that place beside M.
+    of all links that it carries, each as it is turned. The link gives way by the rotation c T, with one c about the
+    joint's axis and another across it. Gears add an angle with one and two periods a turn of the joint. A payload is a
+    mass at a place of the flange, and pulls with its weight at that place beside M.
 
     Parameters
     ----------
@@ -98,7 +98,8 @@ class Elasticity:
     payload_kg : float
         Mass that is carried where nothing else is said of joint vectors.
     payload_centre : (3,) array
-        Its centre, mm: in the flange's frame of a robot, in that of the joint that carries it, as it has moved, of a :class:`Chain`.
+        Its centre, mm: in the flange's frame of a robot, in that of the joint that carries it, as it has moved, of a
+        :class:`Chain`.
 
     Raises
     ------
@@ -297,7 +298,7 @@ class Chain:
     """Fixed transforms of an arm: everything that calibration changes.
 
     ``rotation``, ``translation`` : (n, 3, 3), (n, 3) of each joint's frame in that of the joint that carries it (the
-    first: in the world); ``last_from_flange`` : flange in the frame of the last joint before it; ``prismatic`` : (n,);
+    first: in the world); ``last_from_flange`` : flange in the frame of the joint that carries it; ``prismatic`` : (n,);
     ``coupling`` : (n, N), of all N values of the controller. Joint values turn about, or move along, z of the joint's
     frame; ``elasticity`` : what links give way by; ``grown`` : where joints are a tree.
     """
