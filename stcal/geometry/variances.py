@@ -12,9 +12,6 @@ from scipy.optimize import minimize
 
 from stcal.geometry.least_squares import NormalEquations
 
-LEAST_CONVEX = 1e-9
-"""Least eigenvalue, of a matrix with a diagonal of 1, of a minimum."""
-
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Parts:
@@ -23,8 +20,7 @@ class Parts:
     ``each`` : p problems, each over its present σ; ``count`` : (p,) of their numbers; ``fixed`` : what has no σ to be
     estimated; ``expected``, ``doubt`` : (p,) mean and σ of what is known of x beforehand, ``doubt`` infinite where
     nothing is; ``caution`` : (p,) redundancies that are not counted; ``held`` : share of each parameter's information
-    that is added, so that what nothing determines is not singular; ``bent`` : (k, k) what second derivatives of what is
-    adjusted take from the normal matrix, where that leaves a minimum.
+    that is added, so that what nothing determines is not singular.
     """
 
     each: NormalEquations
@@ -34,7 +30,6 @@ class Parts:
     doubt: np.ndarray | float = np.inf
     caution: np.ndarray | float = 0.0
     held: float = 0.0
-    bent: np.ndarray | None = None
 
     def at(self, x: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
         """At x (m, p): log posterior density (m,), its gradient (m, p), parameters (m, k) beyond the state and their
@@ -42,9 +37,6 @@ class Parts:
         share, normals = np.exp(-2 * x), self.each.normal
         p, k = self.each.gradient.shape
         normal = (share @ normals.reshape(p, -1)).reshape(-1, k, k) + self.fixed.normal
-        if self.bent is not None:
-            bent = normal - self.bent
-            normal = np.where(_convex(bent)[:, None, None], bent, normal)
         scale = np.sqrt(np.maximum(np.einsum("mkk->mk", normal), 1e-300))
         unit = normal / scale[:, :, None] / scale[:, None, :] + self.held * np.eye(k)
         inverse = np.linalg.inv(unit) / scale[:, :, None] / scale[:, None, :]
@@ -70,12 +62,6 @@ class Parts:
         bounds, begin = -2 * np.column_stack([high, low]), [-2 * np.clip(x, low, high) for x in starts]
         fits = [minimize(downhill, logs, jac=True, method="L-BFGS-B", bounds=bounds) for logs in begin]
         return -min(fits, key=lambda fit: fit.fun).x / 2
-
-
-def _convex(normal: np.ndarray) -> np.ndarray:
-    """(m,) whether matrices (m, k, k) are positive definite."""
-    scale = np.sqrt(np.maximum(np.einsum("mkk->mk", normal), 1e-300))
-    return np.linalg.eigvalsh(normal / scale[:, :, None] / scale[:, None, :])[:, 0] > LEAST_CONVEX
 
 
 def component_variances(

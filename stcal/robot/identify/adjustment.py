@@ -24,13 +24,14 @@ ACCEPTED = 1e-4
 weights make every step half as long as it should be, they are many and short."""
 ACCEPTED_ELASTIC = 0.05
 """The same along bent valleys: 0.2 σ of what is hardly known."""
-MOST_BENT = 0.8
-"""Of the curvature along a direction, what second derivatives may take away."""
+MOST_BENT = 2 / 3
+"""Of the curvature along a direction, what second derivatives may take away: variances become three times as large.
+Flatter valleys have two minima, of which no curvature at one knows."""
 ROUNDING = 1e-13
-"""Of a normal matrix with a diagonal of 1."""
+"""Of the square root of a normal matrix with a diagonal of 1 and some hundred parameters."""
 NEAR, NEAR_STEPS = 1.0, 50
 """In units of σ²: what a straight step promises where second derivatives are good for. Steps by these from afar may end
-where compliance and moment both have the wrong sign."""
+where compliance and moment both have the wrong sign. Along bent valleys straight ones are many; they need not end."""
 STAYS_MM = 1e-3
 """σ of a movement that the observations never show."""
 LEAST_GAIN, LEAST_ELASTIC = 1e-9, 1e-3
@@ -55,13 +56,10 @@ class Weighting:
         values = values[..., None] if flat else values
         width = values.shape[1]
         if self.given and width > 1:
-            root = self.factor * np.linalg.cholesky(seen.data.own_covariance()[:, -width:, -width:])
-            values = np.linalg.solve(root, values)
-            if seen.data.common is not None:
-                values = _decorrelated(values, np.linalg.solve(root, seen.data.common[:, -width:]))
+            root = self._root(seen, width)
+            values = _decorrelated(np.linalg.solve(root, values), root, seen)
         else:
-            sigma = self.factor * np.array([self.sigma_rad] * 3 + [self.sigma_mm] * 3)
-            values = values / sigma[-width:, None]
+            values = values / self._sigma(width)[:, None]
         return values[..., 0] if flat else values
 
     def pull(self, white: np.ndarray, seen: Observed) -> np.ndarray:
@@ -69,11 +67,18 @@ class Weighting:
         (r, w)."""
         width = white.shape[1]
         if not (self.given and width > 1):
-            return white / (self.factor * np.array([self.sigma_rad] * 3 + [self.sigma_mm] * 3)[-width:])
-        root = self.factor * np.linalg.cholesky(seen.data.own_covariance()[:, -width:, -width:])
-        if seen.data.common is not None:
-            white = _decorrelated(white[..., None], np.linalg.solve(root, seen.data.common[:, -width:]))[..., 0]
-        return np.linalg.solve(np.swapaxes(root, 1, 2), white[..., None])[..., 0]
+            return white / self._sigma(width)
+        root = self._root(seen, width)
+        white = _decorrelated(white[..., None], root, seen)
+        return np.linalg.solve(np.swapaxes(root, 1, 2), white)[..., 0]
+
+    def _sigma(self, width: int) -> np.ndarray:
+        """(width,) of the coordinates."""
+        return self.factor * np.array([self.sigma_rad] * 3 + [self.sigma_mm] * 3)[-width:]
+
+    def _root(self, seen: Observed, width: int) -> np.ndarray:
+        """(r, width, width) of the covariances that came with the measurements."""
+        return self.factor * np.linalg.cholesky(seen.data.own_covariance()[:, -width:, -width:])
 
     def columns(self, width: int) -> dict[str, slice]:
         """Which of the ``width`` coordinates each σ is of."""
@@ -91,9 +96,13 @@ class Weighting:
         return replace(self, sigma_mm=new["mm"], sigma_rad=new["rad"], factor=new["factor"])
 
 
-def _decorrelated(values: np.ndarray, common: np.ndarray) -> np.ndarray:
-    """Values (r, w, k), all of σ 1 but for common errors (r, w, c), times the inverse root of their covariance
-    1 + F Fᵀ, F being ``common`` with its rows stacked: what all observations may have in common counts less."""
+def _decorrelated(values: np.ndarray, root: np.ndarray, seen: Observed) -> np.ndarray:
+    """Values (r, w, k), all of σ 1 but for the errors that the observations have in common, times the inverse root of
+    their covariance 1 + F Fᵀ, F being these errors over ``root`` (r, w, w) with its rows stacked: what all may have in
+    common counts less."""
+    if seen.data.common is None:
+        return values
+    common = np.linalg.solve(root, seen.data.common[:, -root.shape[1] :])
     f = common.reshape(-1, common.shape[2])
     size, directions = np.linalg.eigh(f.T @ f)
     size, directions = size[size > 0], directions[:, size > 0]
@@ -193,7 +202,7 @@ def solve(
         curved = curvature_of(found, seen, weighting) if bends else None
         if curved is None:
             return straight
-        return replace(straight, normal=straight.normal - bounded(straight.normal, curved))
+        return replace(straight, normal=straight.normal - Bent.of(straight.normal, curved).taken())
 
     def descended(begin: _Away, bends: bool, least_gain: float, max_steps: int) -> Minimum[_Away, NormalEquations]:
         return minimise(
@@ -219,7 +228,7 @@ def solve(
 
 def curvature_of(solution: Solution, seen: Observed, weighting: Weighting) -> np.ndarray | None:
     """(k, k) what products of compliance and moment take from the normal matrix, where there are such; without it
-    descents along their bent valleys take hundreds of steps."""
+    descents along their bent valleys take hundreds of steps. Of distances, which bend by themselves, none are taken."""
     if not solution.state.elastic or seen.kind == "distance":
         return None
     white = solution.weights[:, None] * weighting.whiten(solution.residuals, seen)
@@ -231,15 +240,37 @@ def curvature_of(solution: Solution, seen: Observed, weighting: Weighting) -> np
     return found
 
 
-def bounded(normal: np.ndarray, curved: np.ndarray) -> np.ndarray:
-    """What ``curved`` (k, k) takes from ``normal`` (k, k) along any direction, but no more than a share of it: a saddle
-    is no minimum, and what is left of a flat valley is."""
-    scale = 1 / np.sqrt(np.diag(normal))
-    root = np.linalg.cholesky(normal * scale[:, None] * scale + ROUNDING * np.eye(len(scale)))
-    half = solve_triangular(root, curved * scale[:, None] * scale, lower=True)
-    share, directions = np.linalg.eigh(solve_triangular(root, half.T, lower=True))
-    along = root @ directions
-    return (along * np.minimum(share, MOST_BENT)) @ along.T / scale[:, None] / scale
+@dataclass(frozen=True, slots=True, eq=False)
+class Bent:
+    """What second derivatives take from a normal matrix (k, k), as shares of it along directions that are independent
+    by it: at the most :data:`MOST_BENT`, since a saddle is no minimum, and what is left of a flat valley is.
+
+    ``root`` : (k, k) of the normal matrix; ``directions`` : (k, k) in columns; ``share`` : (k,).
+    """
+
+    root: np.ndarray
+    directions: np.ndarray
+    share: np.ndarray
+
+    @classmethod
+    def of(cls, normal: np.ndarray, curved: np.ndarray) -> "Bent":
+        """Where all of what second derivatives take is ``curved`` (k, k)."""
+        scale = np.sqrt(np.diag(normal))
+        unit = normal / scale[:, None] / scale + ROUNDING * np.eye(len(scale))
+        root = scale[:, None] * np.linalg.cholesky(unit)
+        half = solve_triangular(root, curved, lower=True)
+        share, directions = np.linalg.eigh(solve_triangular(root, half.T, lower=True))
+        return cls(root, directions, np.minimum(share, MOST_BENT))
+
+    def taken(self) -> np.ndarray:
+        """(k, k) from the normal matrix."""
+        along = self.root @ self.directions
+        return (along * self.share) @ along.T
+
+    def bends(self) -> np.ndarray:
+        """(k, k) B: with the normal matrix N, Bᵀ N B is what is left of it."""
+        wider = (self.directions * np.sqrt(1 - self.share)) @ self.directions.T
+        return solve_triangular(self.root, wider @ self.root.T, lower=True, trans="T")
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -7,14 +7,14 @@ of the σ of their covariance there and of the square of their shift (Kass & Ste
 about the maximum: in place of σ taken as known it is wider by what a t distribution is wider than a normal one.
 """
 
-from dataclasses import astuple, dataclass
+from dataclasses import astuple, dataclass, replace
 
 import numpy as np
 from scipy.special import chdtr, chdtrc
 
 from stcal.geometry.least_squares import NormalEquations
 from stcal.geometry.variances import Parts
-from stcal.robot.identify.adjustment import USELESS_MM, Solution, Weighting, bounded, curvature_of, huber_limit
+from stcal.robot.identify.adjustment import USELESS_MM, Bent, Solution, Weighting, curvature_of, huber_limit
 from stcal.robot.identify.elastic import ACROSS, AXIS, MOMENT
 from stcal.robot.identify.nominal import DOUBT, Deviations, NominalRows
 from stcal.robot.identify.residuals import WIDTH, Kind, Observed, jacobian
@@ -33,8 +33,8 @@ NODES, NODE_WEIGHTS = np.sqrt(3.0) * np.array([0.0, -1.0, 1.0]), np.array([4.0, 
 """Gauss-Hermite of three points for a standard normal distribution."""
 MOST_PRODUCT = 5
 """Dimensions: 243 points; of rigid arms there are no more."""
-LEAST_SHARE = 0.1
-"""Of a step of the σ."""
+SHORTEST = 0.1
+"""Share of a step of the σ: two that lead back and forth by chance stop nothing."""
 STEP = 1e-4
 """Of the second derivatives, in log σ."""
 
@@ -125,10 +125,21 @@ def components(
             parts.append((own, mine.sum(), np.log(expected / sigma), DOUBT, -far, far))
     each, *known = zip(*parts, strict=True)
     count, expected, doubt, least, most = (np.array(values, float) for values in known)
-    together, bent = NormalEquations.stacked(each), curvature_of(solution, seen, weighting)
-    if bent is not None:
-        bent = bounded(together.normal.sum(0) + fixed.normal, bent * units[:, None] * units)
-    return Components(Parts(together, count, fixed, expected, doubt, bent=bent), least, most, units)
+    together, curved = NormalEquations.stacked(each), curvature_of(solution, seen, weighting)
+    if curved is not None:
+        together, fixed = _bent(together, fixed, np.isfinite(doubt), curved * units[:, None] * units)
+    return Components(Parts(together, count, fixed, expected, doubt), least, most, units)
+
+
+def _bent(
+    each: NormalEquations, fixed: NormalEquations, held: np.ndarray, curved: np.ndarray
+) -> tuple[NormalEquations, NormalEquations]:
+    """With what second derivatives take, ``curved`` (k, k), gone from the parts that are ``held`` (p,) and from what is
+    fixed: at the minimum the data pull as much as these hold, which changes with the σ of these, not of the data."""
+    normal = fixed.normal + each.normal[held].sum(0)
+    bends = Bent.of(normal, curved).bends()
+    own = np.where(held[:, None, None], bends.T @ each.normal @ bends, each.normal)
+    return replace(each, normal=own), replace(fixed, normal=bends.T @ fixed.normal @ bends)
 
 
 def _linear(white: np.ndarray, derivative: np.ndarray, columns: slice, weight: np.ndarray) -> NormalEquations:
@@ -153,7 +164,7 @@ class Relaxation:
             turned = wanted - self._last
             falls = -float(self._last @ turned)  # where it does not, there is no sign of overshooting
             share = self._share * falls / max(float(turned @ turned), 1e-300) if falls > 0 else 1.0
-            self._share = float(np.clip(share, LEAST_SHARE, 1.0))
+            self._share = float(np.clip(share, SHORTEST, 1.0))
         self._last = wanted
         return self._share * wanted
 

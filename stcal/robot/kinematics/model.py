@@ -163,6 +163,10 @@ class Tree:
         """The joint that carries ``joint``; −1 for the base."""
         return self.mounts[joint][0] if joint in self.mounts else joint - 1
 
+    def carrier(self, tool: str, last: int) -> int:
+        """The joint that carries a tool, if ``last`` is the last one."""
+        return self.carriers.get(tool, last)
+
     def path(self, joint: int) -> tuple[int, ...]:
         """Joints from the base to ``joint``."""
         found = []
@@ -271,8 +275,9 @@ class Robot:
         elasticity = self.elasticity
         if elasticity is not None:
             first = self.world_from_base.inverse() @ gaps[0]
-            loaded_end = -1 if self.tree is None else self.tree.carriers.get("", -1)
-            centre = ends[loaded_end] @ elasticity.payload_centre
+            last = len(ends) - 1
+            end = last if self.tree is None else self.tree.carrier("", last)
+            centre = ends[end] @ elasticity.payload_centre
             elasticity = replace(elasticity, gravity=first.rotation.T @ elasticity.gravity, payload_centre=centre)
         grown = None if self.tree is None else Grown(self.tree, tuple(ends))
         return Chain(rotation, translation, ends[-1], self.prismatic, self.coupling, elasticity, grown)
@@ -285,12 +290,12 @@ class Robot:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Grown:
-    """A tree of joints: ``tree``; ``ends`` : (n,) where each joint's row ends, in the frame of the joint; and ``tip`` :
-    the joint whose row's end is the flange, where one is meant."""
+    """A tree of joints: ``tree``; ``ends`` : (n,) where each joint's row ends, in the frame of the joint; and
+    ``flange_joint`` : whose row's end is the flange, where one is meant."""
 
     tree: Tree
     ends: tuple[Rigid, ...]
-    tip: int | None = None
+    flange_joint: int | None = None
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -332,7 +337,7 @@ class Chain:
     def carrier(self, target: str) -> int:
         """The joint that carries a target."""
         last = len(self) - 1
-        return last if self.grown is None else self.grown.tree.carriers.get(target, last)
+        return last if self.grown is None else self.grown.tree.carrier(target, last)
 
     def carries(self, targets: Sequence[str]) -> np.ndarray:
         """(n, m) whether each joint moves each of the targets."""
@@ -365,7 +370,7 @@ class Chain:
         """The end of the row of ``carrier`` as flange; the other branches stay, as what they weigh bends this one."""
         if self.grown is None:
             return self
-        return replace(self, last_from_flange=self.grown.ends[carrier], grown=replace(self.grown, tip=carrier))
+        return replace(self, last_from_flange=self.grown.ends[carrier], grown=replace(self.grown, flange_joint=carrier))
 
     def path(self) -> tuple[int, ...]:
         """The joints from the world to the flange.
@@ -377,9 +382,9 @@ class Chain:
         """
         if self.grown is None:
             return tuple(range(len(self)))
-        if self.grown.tip is None:
+        if self.grown.flange_joint is None:
             raise InputError("the robot is a tree of joints, which has no one flange; a robot file of one arm needed")
-        return self.grown.tree.path(self.grown.tip)
+        return self.grown.tree.path(self.grown.flange_joint)
 
 
 def about_z(angle: float) -> np.ndarray:

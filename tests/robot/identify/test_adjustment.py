@@ -73,6 +73,9 @@ def test_what_is_common_to_all_observations_is_whitened_too():
         full[6 * i : 6 * i + 6, 6 * i : 6 * i + 6] = own[i]
     flat = common.reshape(30, 2)
     np.testing.assert_allclose(white @ (full + flat @ flat.T) @ white.T, np.eye(30), atol=1e-9)
+    values = rng.normal(size=(5, 6))  # and half the derivative of their squares is the inverse of Σ times them
+    pull = Weighting(1.0, 1.0, given=True).pull(Weighting(1.0, 1.0, given=True).whiten(values, seen), seen)
+    np.testing.assert_allclose((full + flat @ flat.T) @ pull.ravel(), values.ravel(), atol=1e-9)
 
 
 def test_no_minimum_within_the_steps_is_an_error(case, monkeypatch):

@@ -5,7 +5,7 @@ import pytest
 
 from stcal.geometry.least_squares import NormalEquations
 from stcal.geometry.variances import Parts
-from stcal.robot.identify.adjustment import MOST_BENT, bounded
+from stcal.robot.identify.adjustment import MOST_BENT, Bent
 from stcal.robot.identify.variances import Components, Relaxation
 
 
@@ -77,6 +77,8 @@ def test_second_derivatives_leave_a_minimum():
     root = np.random.default_rng(0).normal(size=(4, 4)) * [1, 10, 100, 1000]
     normal, share = root @ root.T, np.array([-1.0, 0.1, 0.5, 2.0])
     little = (root * np.minimum(share, 0.5)) @ root.T
-    assert bounded(normal, little) == pytest.approx(little, rel=1e-6)
-    left = normal - bounded(normal, (root * share) @ root.T)
-    assert left == pytest.approx((root * [2.0, 0.9, 0.5, 1 - MOST_BENT]) @ root.T, rel=1e-6)
+    assert Bent.of(normal, little).taken() == pytest.approx(little, rel=1e-6)
+    bent = Bent.of(normal, (root * share) @ root.T)
+    left = (root * [2.0, 0.9, 0.5, 1 - MOST_BENT]) @ root.T
+    assert normal - bent.taken() == pytest.approx(left, rel=1e-6)
+    assert bent.bends().T @ normal @ bent.bends() == pytest.approx(left, rel=1e-6)
