@@ -39,12 +39,12 @@ class Drawn:
 
 
 def joints_figure(shown: Drawn, findings: Iterable[Finding]):
-    """Residual along each joint's own motion against its value, of good rows; a curve where it was found to go with
-    it."""
+    """Residual along each joint's own motion against its value, of good rows that it moves; a curve where it was found
+    to go with it."""
     seen, chain, tip = shown.seen, shown.state.chain, shown.tips()
     data = seen.data
     turned, origins = joint_frames(chain, data.q, data.conditions)
-    values, n = data.q @ chain.coupling.T, len(chain)
+    values, n, carries = data.q @ chain.coupling.T, len(chain), chain.carries(data.targets)
     found = shown.residuals[:, -3:]
     across = min(n, 3)
     down = -(-n // across)
@@ -58,7 +58,8 @@ def joints_figure(shown: Drawn, findings: Iterable[Finding]):
             continue
         z, sliding = turned[i][:, :, 2], chain.prismatic[i]
         own = [z * 0, z] if sliding else [z, np.cross(z, tip.translation - origins[i])]
-        motion = as_seen(shown.state, seen, tip, np.hstack(own)[:, :, None])[:, -found.shape[1] :, 0]
+        own = np.hstack(own) * carries[i, :, None]
+        motion = as_seen(shown.state, seen, tip, own[:, :, None])[:, -found.shape[1] :, 0]
         size = np.linalg.norm(motion, axis=1)
         moves = shown.good & (size > LEAST_MOTION * max(size.max(), 1e-300))
         along = np.einsum("rw,rw->r", motion[moves], found[moves]) / size[moves]

@@ -8,6 +8,7 @@ from scipy.stats import chi2
 
 from stcal.errors import InputError
 from stcal.geometry.rigid import Rigid
+from stcal.robot.identify.drawings import Drawn, joints_figure
 from stcal.robot.identify.residuals import (
     State,
     curvature,
@@ -171,6 +172,15 @@ def test_joints_of_the_other_arm_move_nothing():
     columns = by_joints(robot, joint_vectors(robot, 4, np.random.default_rng(0)), "left")
     assert np.abs(columns[:, :, 8:]).max() == 0
     assert np.abs(columns[:, :, :8]).max(axis=(0, 1)).min() > 0
+
+
+def test_joints_are_drawn_with_the_rows_that_they_move():
+    robot, rng = two_arms(), np.random.default_rng(3)
+    seen = observed(seen_by(robot, rng, each=4))
+    state = State(robot.chain(), dict(robot.tools))
+    drawn = Drawn(state, robot.world_from_base, seen, residuals(state, seen), np.ones(12, bool))
+    points = [len(axes.lines[1].get_xdata()) for axes in joints_figure(drawn, ()).axes[:14]]
+    assert points == [12] * 2 + [8] * 3 + [4] * 9  # torso; left arm as far as the elbow; left hand, right arm
 
 
 def test_two_arms_are_identified_together():
