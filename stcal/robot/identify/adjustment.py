@@ -270,7 +270,7 @@ class Bent:
     def bends(self) -> np.ndarray:
         """(k, k) B: with the normal matrix N, Bᵀ N B is what is left of it."""
         wider = (self.directions * np.sqrt(1 - self.share)) @ self.directions.T
-        return solve_triangular(self.root, wider @ self.root.T, lower=True, trans="T")
+        return solve_triangular(self.root, wider @ self.root.T, lower=True, trans=1)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
