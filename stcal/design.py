@@ -61,7 +61,9 @@ class TargetDesign:
             if face.id == face_id:
                 return face
         known = ", ".join(face.id for face in self.faces)
-        raise InputError(f"target {self.name}: no face {face_id}; the design has {known}, choose one of them")
+        raise InputError(
+            "E-TARGET-NO-FACE", f"target {self.name}: no face {face_id}; the design has {known}, choose one of them"
+        )
 
     def rough_poses(self) -> dict[str, Rigid]:
         """Rough pose by face id, of the faces that have one."""

@@ -1,15 +1,40 @@
-"""The exception tree.
+"""The exception tree, and the codes of errors.
 
-Every message is one line: what, where, measured, needed, what to do. The command line prints it and
-exits with the class's ``exit_code`` (2: the input is at fault; 3: the computation could not deliver; 4: what it
-delivered failed its checks, and that was asked for).
+Every message is one line: what, where, measured, needed, what to do. The command line prints it and exits with the
+class's ``exit_code`` (2: the input is at fault; 3: the computation could not deliver; 4: what it delivered failed its
+checks, and that was asked for).
+
+Every error also has a short code such as ``E-CAMERA-MODEL``, which stays when its sentence is reworded. One code names
+one kind of mistake, wherever it is found. ``--debug`` and JSON show the code; `docs/reference/errors.md` lists all
+codes with their sentences.
 """
 
 
 class StcalError(Exception):
-    """Base of every error that stcal raises on purpose."""
+    """Base of every error that stcal raises on purpose.
+
+    Parameters
+    ----------
+    code : kind of the mistake, like ``E-CAMERA-MODEL``
+    message : one line for people
+    """
 
     exit_code = 3
+
+    def __init__(self, code: str, message: str):
+        super().__init__(code, message)  # both in ``args``, so that processes can hand the error on
+
+    @property
+    def code(self) -> str:
+        """Kind of the mistake, like ``E-CAMERA-MODEL``."""
+        return self.args[0]
+
+    def __str__(self) -> str:
+        return self.args[1]
+
+    def append(self, text: str) -> None:
+        """Add text at the end of the message."""
+        self.args = (self.code, f"{self}{text}")
 
 
 class InputError(StcalError):

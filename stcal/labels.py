@@ -75,7 +75,7 @@ def parse_label(text: str) -> Label:
                 return label
     elif plane and rest:
         return CircleLabel(plane, rest)
-    raise InputError(f"label {text}: face:circle or {BOARD}:row:column needed")
+    raise InputError("E-LABEL-FORM", f"label {text}: face:circle or {BOARD}:row:column needed")
 
 
 def parse_labels(texts: Iterable[str]) -> tuple[Label, ...]:
@@ -94,7 +94,7 @@ def circle_labels(texts: Iterable[str]) -> tuple[CircleLabel, ...]:
     labels = []
     for label in map(parse_label, texts):
         if not isinstance(label, CircleLabel):
-            raise InputError(f"label {label}: face:circle needed")
+            raise InputError("E-LABEL-FORM", f"label {label}: face:circle needed")
         labels.append(label)
     return tuple(labels)
 
@@ -110,6 +110,6 @@ def dot_cells(labels: Iterable[Label]) -> np.ndarray:
     cells = []
     for label in labels:
         if not isinstance(label, DotLabel):
-            raise InputError(f"label {label}: {BOARD}:row:column needed")
+            raise InputError("E-LABEL-FORM", f"label {label}: {BOARD}:row:column needed")
         cells.append((label.row, label.column))
     return np.array(cells, int).reshape(-1, 2)

@@ -31,6 +31,7 @@ from stcal.sfm.data.model import WorldModel
 from stcal.sfm.data.observations import ImageObservations
 from stcal.sfm.plan.simulated import observe, true_models
 from stcal.synthetic.scene import Scene, SceneOptions, make_scene
+from tests.shared import Once, without_rights
 
 SHARED = Path(__file__).resolve().parents[2] / "shared" / "data"
 SAMPLE = Path(__file__).parent / "data" / "sample"
@@ -45,8 +46,23 @@ typer.main.get_command = cache(typer.main.get_command)  # of hundreds of calls h
 
 def pytest_configure(config):
     """Fewer examples of each property where slow tests are left out; all of them with the others."""
-    if config.option.markexpr == "not slow":
+    if "not slow" in config.option.markexpr:
         settings.load_profile("quick")
+
+
+@pytest.fixture(scope="session", autouse=True)
+def plain_rights():
+    """The rights of a plain user, also where the superuser runs the tests, so that shared data cannot be written to."""
+    with without_rights():
+        yield
+
+
+@pytest.fixture(scope="session")
+def once(tmp_path_factory, worker_id):
+    """Makes folders once for all processes of a test run; none of their files may have changed at its end."""
+    shared = Once(tmp_path_factory, worker_id)
+    yield shared
+    assert shared.changed() == []
 
 
 @pytest.fixture(scope="session")

@@ -7,10 +7,10 @@ import pytest
 from typer.testing import CliRunner
 
 from stcal.cli.cameras import app
-from stcal.errors import InputError
 from stcal.geometry.camera import Camera
 from stcal.io.camera import CalibratedCamera, read_camera, write_cameras_txt
 from stcal.io.cameras.difference import camera_difference
+from tests.outcome import fails_with
 
 CAMERA = Camera(1280, 960, [900.0, 905.0], [640.0, 475.0], [-0.1, 0.03, 1e-3, -2e-3, 0, 0, 0, 0])
 
@@ -38,12 +38,12 @@ def test_a_camera_goes_to_kalibr_and_back(folder):
 
 def test_a_size_that_the_file_does_not_state_is_asked_for(folder):
     (folder / "i.yaml").write_text("intrinsics:\n  fx: 900\n  fy: 905\n  cx: 640\n  cy: 475\n")
-    with pytest.raises(InputError, match="states no image size; give it with --size WxH"):
+    with fails_with("E-CAMERA-SIZE … --size"):
         call("show", folder / "i.yaml")
     assert "1280×960" in call("show", folder / "i.yaml", "--size", "1280x960")
-    with pytest.raises(InputError, match="--size 12: two numbers with x between needed"):
+    with fails_with("E-OPTION-SIZE … --size … 12"):
         call("show", folder / "i.yaml", "--size", "12")
-    with pytest.raises(InputError, match=r"no form of suffix \.json; give --form"):
+    with fails_with("E-OPTION-FORM … .json … --form"):
         call("convert", folder / "a.txt", folder / "b.json")
 
 
@@ -74,5 +74,5 @@ def test_cameras_of_two_sizes_are_refused(folder):
     write_cameras_txt(
         folder / "b.txt", CalibratedCamera.of(Camera(640, 480, [450, 450], [320, 240], np.zeros(8)), "PINHOLE")
     )
-    with pytest.raises(InputError, match="1280×960 and 640×480 px; files of one image size needed"):
+    with fails_with("E-CAMERA-SIZES-DIFFER … 1280 … 960 … 640 … 480"):
         call("compare", folder / "a.txt", folder / "b.txt")

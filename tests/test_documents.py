@@ -3,10 +3,10 @@
 import re
 from pathlib import Path
 
-import pytest
 from typer.main import get_command
 
 import stcal
+import stcal.errors
 from stcal.cli.main import app
 from tests.scripts import load_script
 
@@ -24,11 +24,11 @@ def commands(command, path=()):
         yield from commands(each, (*path, name))
 
 
-@pytest.mark.parametrize(("name", "command"), list(commands(get_command(app))))
-def test_every_option_is_documented(name, command):
+def test_every_option_is_documented():
     text = "".join(document.read_text(encoding="utf-8") for document in DOCUMENTS)
-    options = [option for each in command.params for option in each.opts if option.startswith("--")]
-    assert [option for option in options if option != "--help" and option not in text] == []
+    for name, command in commands(get_command(app)):
+        options = [option for each in command.params for option in each.opts if option.startswith("--")]
+        assert [option for option in options if option != "--help" and option not in text] == [], name
 
 
 VERBS = """
@@ -40,25 +40,24 @@ Send Set Show Solve Spread Start Stop Take Tell Treat Use Write
 """With which a help text may begin; *Also* goes before one of the others."""
 
 
-@pytest.mark.parametrize(("name", "command"), list(commands(get_command(app))))
-def test_every_help_is_a_sentence_with_a_verb(name, command):
-    texts = {each.name: each.help for each in command.params if each.name != "help"}
-    texts["command"] = command.help
-    for what, text in texts.items():
-        first = (text or "").split("\n\n")[0].strip()
-        words = first.split()
-        assert words, f"{name} {what}: no help"
-        assert words[0] in VERBS.split(), f"{name} {what}: {first}"
-        assert words[0] != "Also" or words[1] == "write", f"{name} {what}: {first}"
-        assert first.endswith((".", "….")), f"{name} {what}: {first}"
+def test_every_help_is_a_sentence_with_a_verb():
+    for name, command in commands(get_command(app)):
+        texts = {f"{name} {each.name}": each.help for each in command.params if each.name != "help"}
+        for what, text in (texts | {name: command.help}).items():
+            first = (text or "").split("\n\n")[0].strip()
+            words = first.split()
+            assert words, f"{what}: no help"
+            assert words[0] in VERBS.split(), f"{what}: {first}"
+            assert words[0] != "Also" or words[1] == "write", f"{what}: {first}"
+            assert first.endswith((".", "….")), f"{what}: {first}"
 
 
 layout = load_script("data_layout")
 
 
-@pytest.mark.parametrize("document", layout.documents(), ids=lambda path: path.stem)
-def test_the_tables_of_result_files_are_those_of_the_models(document):
-    assert layout.made_anew(document.read_text(encoding="utf-8"))[1] == []
+def test_the_tables_of_result_files_are_those_of_the_models():
+    texts = {document.name: document.read_text(encoding="utf-8") for document in layout.documents()}
+    assert {name: wrong for name, text in texts.items() if (wrong := layout.made_anew(text)[1])} == {}
 
 
 def test_every_model_has_its_table():
@@ -74,11 +73,11 @@ def test_a_table_that_differs_is_named():
     assert (again, differing) == (text, ["FacesFile"])
 
 
-@pytest.mark.parametrize("document", DOCUMENTS, ids=lambda path: str(path.relative_to(ROOT)))
-def test_links_of_documents_lead_to_files(document):
-    links = [link.partition("#")[0] for link in LINK.findall(document.read_text(encoding="utf-8"))]
-    paths = [link for link in links if link and not link.startswith("http")]
-    assert [link for link in paths if not (document.parent / link).exists()] == []
+def test_links_of_documents_lead_to_files():
+    for document in DOCUMENTS:
+        links = [link.partition("#")[0] for link in LINK.findall(document.read_text(encoding="utf-8"))]
+        paths = [link for link in links if link and not link.startswith("http")]
+        assert [link for link in paths if not (document.parent / link).exists()] == [], document.name
 
 
 def test_first_page_is_short_and_the_version_is_one():
@@ -92,3 +91,20 @@ def test_the_page_of_checks_has_each_check_by_its_key():
     sources = "\n".join(path.read_text(encoding="utf-8") for path in (ROOT / "stcal" / "sfm" / "checks").glob("*.py"))
     made = set(re.findall(r'(?:judge|key = |key, title = |impossible)\(?"([a-z-]+)"', sources))
     assert told == made
+
+
+errors = load_script("errors")
+
+
+def test_the_page_of_errors_is_that_of_the_source():
+    """`scripts/errors.py` makes it anew; a changed sentence is read in its diff."""
+    assert errors.PAGE.read_text(encoding="utf-8") == errors.page()
+
+
+def test_each_error_has_a_code_and_each_code_one_exit_code():
+    exits: dict[str, set[int]] = {}
+    for kind, code, _ in errors.all_errors():
+        if hasattr(stcal.errors, kind):
+            exits.setdefault(code, set()).add(getattr(stcal.errors, kind).exit_code)
+    assert len(exits) > 300
+    assert {code: found for code, found in exits.items() if len(found) > 1} == {}

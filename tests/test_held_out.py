@@ -44,7 +44,7 @@ def test_rows_are_held_out_of_all_ways():
     def way(rest, own):
         seen.append((rest, own))
         if 5 in own:
-            raise DegenerateError("this fold cannot be solved")
+            raise DegenerateError("E-TEST", "this fold cannot be solved")
         return 2.0 * own
 
     done, rows, errors = held_out_errors([way, way], dealt(11, 4, rng()))

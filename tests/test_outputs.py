@@ -9,9 +9,9 @@ from typer.models import ParameterInfo
 
 from stcal.cli.main import main
 from stcal.cli.options import ALWAYS_NEW
-from stcal.errors import InputError
 from stcal.io.saving import RUN_ENTRIES, RUN_MARKER, keep_apart
 from tests.commands import CALLS, COMMANDS, paths_of
+from tests.outcome import fails_with
 
 FOLDERS = {
     ("run", "out"),
@@ -30,7 +30,7 @@ EVERY = list(COMMANDS.values())
 
 
 PAIRS = [
-    pytest.param(command, output, read, id=f"{command.__name__}-{output}-{read}")
+    (command, output, read)
     for command in EVERY
     for output in sorted(command.outputs)
     for read in paths_of(command)
@@ -50,40 +50,31 @@ def test_every_option_that_writes_is_known():
     assert len(PAIRS) > 60
 
 
-@pytest.mark.parametrize(("command", "output", "read"), PAIRS)
-def test_no_output_replaces_an_input(command, output, read, tmp_path):
+def test_no_output_replaces_an_input(tmp_path):
     """The file itself, by another way to it, and a file in a folder that is read."""
     own = tmp_path / "given"
     own.write_text("mine")
-    given = dict.fromkeys(paths_of(command))
-    for place in (own, tmp_path / "." / "x" / ".." / "given"):
-        with pytest.raises(InputError, match="is an input of this command; give another name"):
-            command(**given | {read: own, output: place})
-    with pytest.raises(InputError, match="is a file of "):
-        command(**given | {read: tmp_path, output: own})
+    another_way = tmp_path / "." / "x" / ".." / "given"
+    for command, output, read in PAIRS:
+        given = dict.fromkeys(paths_of(command))
+        for paths in ({read: own, output: own}, {read: own, output: another_way}, {read: tmp_path, output: own}):
+            with fails_with("E-OUTPUT-IS-INPUT … given"):
+                command(**given | paths)
     assert own.read_text() == "mine"
 
 
-@pytest.mark.parametrize(
-    ("command", "output"),
-    [
-        pytest.param(c, o, id=f"{c.__name__}-{o}")
-        for c in EVERY
-        for o in sorted(c.outputs)
-        if c.__name__ not in ALWAYS_NEW
-    ],
-)
-def test_no_output_replaces_a_file_in_silence(command, output, tmp_path):
+def test_no_output_replaces_a_file_in_silence(tmp_path):
     """One rule for every file that any command writes, before its work; links, to nothing too, are files."""
     place, link = tmp_path / "earlier", tmp_path / "link"
     place.write_text("a better one")
     link.symlink_to(tmp_path / "nothing")
-    given = dict.fromkeys(paths_of(command))
-    for each in (place, link):
-        with pytest.raises(InputError, match=f"{each}: exists; give another name, or --overwrite to replace it"):
-            command(**given | {output: each})
+    for command in EVERY:
+        for output in command.outputs if command.__name__ not in ALWAYS_NEW else ():
+            for path in (place, link):
+                with fails_with(f"E-OUTPUT-EXISTS … {path} … --overwrite"):
+                    command(**dict.fromkeys(paths_of(command)) | {output: path})
+            assert "overwrite" in inspect.signature(command).parameters
     assert place.read_text() == "a better one"
-    assert "overwrite" in inspect.signature(command).parameters
 
 
 def test_overwrite_replaces_what_is_there(tmp_path, monkeypatch, capsys):
@@ -109,9 +100,9 @@ def test_calls_that_write_nothing_ask_for_nothing(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     Path("poses.csv").write_text("an earlier table")
     given = {"camera": tmp_path / "none.txt", "faces": tmp_path / "none.json", "out": Path("poses.csv")}
-    with pytest.raises(InputError, match=r"--out poses\.csv: exists"):
+    with fails_with("E-OUTPUT-EXISTS … --out poses.csv"):
         COMMANDS["sfm measure"](**given, images=tmp_path / "images")
-    with pytest.raises(InputError, match=r"none\.json"):
+    with fails_with("E-FILE-UNREADABLE … none.json"):
         COMMANDS["sfm measure"](
             **given, target=None, board=None, sigma_factor=None, json_file=None, report=None, joints=None,
             previous=False, sequence=False, scheduler=None, send_images=False, strict=False, serve=True,
@@ -125,7 +116,7 @@ def test_a_file_beside_a_runs_own_is_written_again(tmp_path):
     keep_apart([("--json", tmp_path / "doctor.json")], [("run", tmp_path)])
     for name in RUN_ENTRIES:
         (tmp_path / name).touch()
-        with pytest.raises(InputError, match="is a file of run"):
+        with fails_with("E-OUTPUT-IS-INPUT … run"):
             keep_apart([("--json", tmp_path / name)], [("run", tmp_path)])
 
 
@@ -134,17 +125,17 @@ def test_a_result_file_in_a_folder_of_images_is_written_again(tmp_path):
     (tmp_path / "a.jpg").write_bytes(b"x")
     keep_apart([("--json", tmp_path / "poses.json")], [("images", Path(tmp_path))])
     keep_apart([("--json", tmp_path / "new.json")], [("images", Path(tmp_path))])
-    with pytest.raises(InputError, match="is a file of images"):
+    with fails_with("E-OUTPUT-IS-INPUT … images"):
         keep_apart([("--out", tmp_path / "a.jpg")], [("images", tmp_path)])
 
 
 def test_two_outputs_are_kept_apart(tmp_path):
-    with pytest.raises(InputError, match="is also what --out writes"):
+    with fails_with("E-OUTPUT-TWICE … --out"):
         keep_apart([("--out", tmp_path / "a"), ("--json", tmp_path / "a")], [])
 
 
 def test_every_path_of_a_list_is_an_input(tmp_path):
-    with pytest.raises(InputError, match="is an input of this command"):
+    with fails_with("E-OUTPUT-IS-INPUT"):
         keep_apart([("--out", tmp_path / "a")], [("sources", tmp_path / "a"), ("sources", tmp_path / "b")])
 
 
@@ -155,7 +146,7 @@ def test_a_table_in_a_folder_of_images_is_written_again(tmp_path, name):
     keep_apart([("--out", tmp_path / name)], [("images", tmp_path)])
     for read in ("a.jpg", "cameras.txt", "points3D.bin", "database.db", "drawing.png"):
         (tmp_path / read).write_text("mine")
-        with pytest.raises(InputError, match="is a file of images"):
+        with fails_with("E-OUTPUT-IS-INPUT … images"):
             keep_apart([("--out", tmp_path / read)], [("images", tmp_path)])
 
 

@@ -98,7 +98,7 @@ class Cell:
         q = solve(InverseProblem.of(self.drawn), poses, np.tile(NEAR, (count, 1)))
         off = np.abs(forward(self.drawn, q).translation - a).max()
         if off > 1e-6:
-            raise DegenerateError(f"inverse kinematics: {off:.2g} mm from a place of the cube")
+            raise DegenerateError("E-NO-MINIMUM", f"inverse kinematics: {off:.2g} mm from a place of the cube")
         return Points(a, self.b_from_base @ forward(self.real, q).translation, q)
 
     def measured(self, count: int, side: float, case: tuple[float, float], rng: np.random.Generator) -> Points:

@@ -85,7 +85,9 @@ class TagLayout:
         object.__setattr__(self, "corners_mm", frozen(self.corners_mm, (len(self.tags), 4, 2), "tags' corners"))
         if len(set(self.tags)) < len(self.tags):
             twice = next(tag for tag in self.tags if self.tags.count(tag) > 1)
-            raise InputError(f"tag layout: tag {twice[1]} of {twice[0]} occurs twice; tags must differ")
+            raise InputError(
+                "E-TAG-REPEATED", f"tag layout: tag {twice[1]} of {twice[0]} occurs twice; tags must differ"
+            )
 
     def xy_mm(self) -> np.ndarray:
         """(4n, 2), tag by tag, mm."""
@@ -189,7 +191,7 @@ class AsymmetricCirclesDesign:
             The design has none.
         """
         if self.radius_mm is None:
-            raise InputError("asymmetric circles: no radius; radius_mm needed")
+            raise InputError("E-BOARD-RADIUS", "asymmetric circles: no radius; radius_mm needed")
         return np.full(self.rows * self.columns, self.radius_mm)
 
     def lattice(self) -> LatticePart:

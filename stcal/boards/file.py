@@ -129,7 +129,9 @@ class TagEntry(Strict):
         if self.x_mm is None and self.y_mm is None:
             return None
         if self.x_mm is None or self.y_mm is None or self.size_mm is None:
-            raise InputError(f"{where}: tag {self.id}: x_mm, y_mm and size_mm needed together, or corners_mm")
+            raise InputError(
+                "E-TAG-PLACE", f"{where}: tag {self.id}: x_mm, y_mm and size_mm needed together, or corners_mm"
+            )
         square = self.size_mm / 2 * np.array([[-1, -1], [1, -1], [1, 1], [-1, 1]], float)
         cosine, sine = np.cos(np.radians(self.angle_deg)), np.sin(np.radians(self.angle_deg))
         return square @ np.array([[cosine, sine], [-sine, cosine]]) + [self.x_mm, self.y_mm]
@@ -187,7 +189,7 @@ def design_of(path: str | Path, content: dict[str, Any] | None) -> BoardDesign |
     if content is None:
         return load_board(path)  # no TOML: says why
     if "type" not in content and not OF_OTHERS.isdisjoint(content):
-        raise InputError(f"board file {path}: no type; {REMEDY}")
+        raise InputError("E-BOARD-TYPE", f"board file {path}: no type; {REMEDY}")
     return flat_board(content, f"board file {path}")
 
 
@@ -210,8 +212,10 @@ def flat_board(content: dict[str, Any], where: str) -> BoardDesign | FlatBoard:
     if kind == "asymmetric-circles":
         return _asymmetric(validated(content, _AsymmetricCircles, where), where)
     if kind == SET:
-        raise InputError(f"{where}: several boards, not flat together; the file of a single board needed here")
-    raise InputError(f"{where}: type {kind!r}; one of {', '.join(KINDS)} needed")
+        raise InputError(
+            "E-BOARD-SINGLE", f"{where}: several boards, not flat together; the file of a single board needed here"
+        )
+    raise InputError("E-BOARD-TYPE", f"{where}: type {kind!r}; one of {', '.join(KINDS)} needed")
 
 
 def board_content(path: str | Path) -> dict[str, Any] | None:
@@ -226,7 +230,7 @@ def board_content(path: str | Path) -> dict[str, Any] | None:
         text = read_bytes(path, SETTINGS_BYTES).decode("utf-8-sig")
         return tomllib.loads(text)
     except OSError as error:
-        raise InputError(f"board file {path}: {error.strerror or error}; {REMEDY}") from error
+        raise InputError("E-BOARD-UNREADABLE", f"board file {path}: {error.strerror or error}; {REMEDY}") from error
     except UnicodeDecodeError:
         return None
     except (ValueError, RecursionError):
@@ -244,8 +248,9 @@ def _kalibr_content(text: str) -> dict[str, Any] | None:
 def _charuco(data: _Charuco, where: str) -> CharucoDesign:
     if data.marker_mm > MOST_MARKER * data.square_mm:
         raise InputError(
+            "E-BOARD-MARKER-SIZE",
             f"{where}: marker_mm {data.marker_mm:g}, under {MOST_MARKER:g} of square_mm {data.square_mm:g} needed; "
-            "are they swapped?"
+            "are they swapped?",
         )
     board = CharucoDesign(
         data.rows,
@@ -266,14 +271,14 @@ def _tags(data: TagsFile, where: str) -> TagLayout:
     for tag, place in zip(data.tag, corners, strict=True):
         own = f"{where}: tag {tag.id}"
         if place is None:
-            raise InputError(f"{own}: no place; x_mm, y_mm and size_mm, or corners_mm needed")
+            raise InputError("E-TAG-PLACE", f"{own}: no place; x_mm, y_mm and size_mm, or corners_mm needed")
         if tag.id >= (there := _tags_of(tag.dictionary)):
-            raise InputError(f"{own}: {tag.dictionary} has 0 … {there - 1}; correct id or dictionary")
+            raise InputError("E-TAG-ID-RANGE", f"{own}: {tag.dictionary} has 0 … {there - 1}; correct id or dictionary")
         _require_convex(place, own)
     try:
         return TagLayout(tuple((tag.dictionary, tag.id) for tag in data.tag), np.array(corners), data.sigma_mm)
     except InputError as error:
-        raise InputError(f"{where}: {error}") from error
+        raise InputError(error.code, f"{where}: {error}") from error
 
 
 def _require_convex(corners: np.ndarray, where: str) -> None:
@@ -283,8 +288,9 @@ def _require_convex(corners: np.ndarray, where: str) -> None:
     turn = side[:, 0] * following[:, 1] - side[:, 1] * following[:, 0]
     if turn.min() <= LEAST_AREA * (side**2).sum(1).max():
         raise InputError(
+            "E-TAG-CORNERS",
             f"{where}: corners_mm turn the other way, cross or lie on a line; top left, top right, bottom right, "
-            "bottom left as printed needed, Y downwards"
+            "bottom left as printed needed, Y downwards",
         )
 
 
@@ -309,8 +315,9 @@ def _require_tags(board: CharucoDesign | AprilGridDesign, where: str) -> None:
     ids = board.tag_ids()
     if ids.stop > (there := _tags_of(board.dictionary)):
         raise InputError(
+            "E-TAG-ID-RANGE",
             f"{where}: tags {ids.start} … {ids.stop - 1}, {board.dictionary} has 0 … {there - 1}; correct rows, "
-            "columns, first_id or dictionary"
+            "columns, first_id or dictionary",
         )
 
 
@@ -321,12 +328,13 @@ def _tags_of(dictionary: str) -> int:
 
 def _asymmetric(data: _AsymmetricCircles, where: str) -> AsymmetricCirclesDesign:
     if (data.radius_mm is None) == (data.diameter_mm is None):
-        raise InputError(f"{where}: radius_mm or diameter_mm needed, one of them")
+        raise InputError("E-BOARD-RADIUS", f"{where}: radius_mm or diameter_mm needed, one of them")
     radius = data.radius_mm if data.diameter_mm is None else data.diameter_mm / 2
     most = data.spacing_mm / np.sqrt(2)
     if radius is None or radius >= most:
         raise InputError(
+            "E-BOARD-RADIUS",
             f"{where}: radius {radius:g} mm, under {most:g} mm needed for circles apart; spacing_mm is half of what "
-            "neighbours in a row are apart"
+            "neighbours in a row are apart",
         )
     return AsymmetricCirclesDesign(data.rows, data.columns, data.spacing_mm, radius, data.polarity, data.sigma_mm)

@@ -63,7 +63,10 @@ def board_of(content: dict[str, Any], where: str) -> AprilGridDesign | Chessboar
         data = validated(content, _AprilGrid, where)
         there = len(cv2.aruco.getPredefinedDictionary(cv2.aruco.DICT_APRILTAG_36h11).bytesList)
         if (count := data.codeOffset + data.tagRows * data.tagCols) > there:
-            raise InputError(f"{where}: tags up to {count - 1}, tag36h11 has 0 … {there - 1}; correct tagRows, tagCols")
+            raise InputError(
+                "E-TAG-ID-RANGE",
+                f"{where}: tags up to {count - 1}, tag36h11 has 0 … {there - 1}; correct tagRows, tagCols",
+            )
         size = METRE_MM * data.tagSize
         return AprilGridDesign(data.tagRows, data.tagCols, size, data.tagSpacing, None, data.codeOffset, FAMILY)
     if kind == "checkerboard":
@@ -71,16 +74,18 @@ def board_of(content: dict[str, Any], where: str) -> AprilGridDesign | Chessboar
         across, down = data.colSpacingMeters, data.rowSpacingMeters
         if abs(across - down) > SAME_WITHIN * across:
             raise InputError(
-                f"{where}: colSpacingMeters {across:g}, rowSpacingMeters {down:g}; squares needed, both the same"
+                "E-BOARD-SPACING",
+                f"{where}: colSpacingMeters {across:g}, rowSpacingMeters {down:g}; squares needed, both the same",
             )
         return ChessboardDesign(data.targetRows, data.targetCols, METRE_MM * across)
     if kind == "circlegrid":
         data = validated(content, _CircleGrid, where)
         if not data.asymmetricGrid:
             raise InputError(
+                "E-BOARD-RADIUS",
                 f"{where}: asymmetricGrid false, a grid whose circles have no radius; write a board.toml with rows, "
-                "columns, pitch_mm, radius_mm and polarity"
+                "columns, pitch_mm, radius_mm and polarity",
             )
         spacing = METRE_MM * data.spacingMeters
         return AsymmetricCirclesDesign(data.targetRows, data.targetCols, spacing, None, "dark")
-    raise InputError(f"{where}: target_type {kind!r}; one of {', '.join(KINDS)} needed")
+    raise InputError("E-BOARD-TYPE", f"{where}: target_type {kind!r}; one of {', '.join(KINDS)} needed")

@@ -42,17 +42,19 @@ class _Place(PoseEntry):
         if self.common_from_board is not None:
             if len(said) > 1:
                 other = min(said - {"common_from_board"})
-                raise InputError(f"{where}: common_from_board and {other}; the place needed once")
+                raise InputError(
+                    "E-BOARD-KEY-CONFLICT", f"{where}: common_from_board and {other}; the place needed once"
+                )
             if [len(row) for row in self.common_from_board] != [4] * 4:
-                raise InputError(f"{where}: common_from_board: 4 rows of 4 numbers needed")
+                raise InputError("E-BOARD-PLACE", f"{where}: common_from_board: 4 rows of 4 numbers needed")
             try:
                 return Rigid.from_matrix(self.common_from_board)
             except InputError as error:
-                raise InputError(f"{where}: common_from_board: {error}") from error
+                raise InputError("E-BOARD-PLACE", f"{where}: common_from_board: {error}") from error
         if self.rpy_deg is None:
             return self.rigid(where)
         if said & {"qw", "qx", "qy", "qz"}:
-            raise InputError(f"{where}: rpy_deg and a quaternion; one of them needed")
+            raise InputError("E-BOARD-KEY-CONFLICT", f"{where}: rpy_deg and a quaternion; one of them needed")
         turn = Rotation.from_euler("xyz", self.rpy_deg, degrees=True)
         return Rigid(turn.as_matrix(), [self.x_mm, self.y_mm, self.z_mm])
 
@@ -87,13 +89,15 @@ def _board(path: Path, entry: dict[str, Any], where: str) -> BoardDesign | FlatB
     if "file" not in entry:
         return flat_board(entry, where)
     if not isinstance(entry["file"], str):
-        raise InputError(f"{where}: file: a string needed")
+        raise InputError("E-BOARD-FILE-KEY", f"{where}: file: a string needed")
     if extra := sorted(set(entry) - {"file"}):
-        raise InputError(f"{where}: {', '.join(extra)} beside file; what the board is stands in its file")
+        raise InputError(
+            "E-BOARD-KEY-CONFLICT", f"{where}: {', '.join(extra)} beside file; what the board is stands in its file"
+        )
     try:
         return load_flat_board(path.parent / entry["file"])
     except InputError as error:
-        raise InputError(f"{where}: {error}") from error
+        raise InputError(error.code, f"{where}: {error}") from error
 
 
 def _require_told_apart(found: BoardSet, where: str) -> None:
@@ -101,12 +105,13 @@ def _require_told_apart(found: BoardSet, where: str) -> None:
     for name, board in zip(found.names, found.boards, strict=True):
         if _turnable(board):
             raise InputError(
+                "E-BOARD-AMBIGUOUS",
                 f"{where}: {name} looks the same turned, so that its points have no numbers in the common frame; "
-                "a chessboard of an odd and an even side, a larger corner dot, or tags needed"
+                "a chessboard of an odd and an even side, a larger corner dot, or tags needed",
             )
     for (one, first), (two, second) in combinations(zip(found.names, found.boards, strict=True), 2):
         if said := _alike(first, second):
-            raise InputError(f"{where}: {one} and {two} look alike: {said}")
+            raise InputError("E-BOARD-AMBIGUOUS", f"{where}: {one} and {two} look alike: {said}")
 
 
 def _turnable(board: BoardDesign | FlatBoard) -> bool:

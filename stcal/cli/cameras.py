@@ -69,7 +69,8 @@ def convert(
     kind = form.value if form else SUFFIXES.get(out.suffix.lower())
     if kind is None:
         raise InputError(
-            f"{out}: no form of suffix {out.suffix or 'none'}; give --form, or one of {', '.join(SUFFIXES)}"
+            "E-OPTION-FORM",
+            f"{out}: no form of suffix {out.suffix or 'none'}; give --form, or one of {', '.join(SUFFIXES)}",
         )
     camera = _camera(source, name, size)
     made = written(camera, kind, name or "cam0")
@@ -131,10 +132,10 @@ def _camera(path: Path, name: str, size: str) -> "CalibratedCamera":
     lens = read_lens(path, name)
     given = size.lower().split("x") if size else ["0", "0"]
     if len(given) != 2 or not all(side.isdigit() for side in given):
-        raise InputError(f"--size {size}: two numbers with x between needed, such as 1920x1080")
+        raise InputError("E-OPTION-SIZE", f"--size {size}: two numbers with x between needed, such as 1920x1080")
     width, height = lens.width or int(given[0]), lens.height or int(given[1])
     if not (width and height):
-        raise InputError(f"camera file {path}: states no image size; give it with --size WxH")
+        raise InputError("E-CAMERA-SIZE", f"camera file {path}: states no image size; give it with --size WxH")
     if isinstance(lens, CameraModel):
         return lens.calibrated(width, height)
     found = fit_lens(lens, width, height)

@@ -35,7 +35,7 @@ def designs_told(
         yield
     except StcalError as error:
         if assumed and not isinstance(error, InputError):
-            error.args = (f"{error}; assumed: {' and '.join(assumed)}",)
+            error.append(f"; assumed: {' and '.join(assumed)}")
         raise
 
 

@@ -238,12 +238,17 @@ def run(
     from stcal.locate.report.tables import accepted, poses_csv, run_text, uncertain
 
     if hand_eye and registration:
-        raise InputError(f"--hand-eye {hand_eye}, --registration {registration}: two ways to one base; give one")
+        raise InputError(
+            "E-OPTION-CONFLICT", f"--hand-eye {hand_eye}, --registration {registration}: two ways to one base; give one"
+        )
     chain = None
     if hand_eye is None and robot_poses:
-        raise InputError("--robot-poses: only with --hand-eye, of a camera on the flange")
+        raise InputError("E-OPTION-NEEDS", "--robot-poses: only with --hand-eye, of a camera on the flange")
     if hand_eye is None and registration is None and offset:
-        raise InputError("--offset: only with --hand-eye or --registration, which lead from the camera to the robot")
+        raise InputError(
+            "E-OPTION-NEEDS",
+            "--offset: only with --hand-eye or --registration, which lead from the camera to the robot",
+        )
     if hand_eye:
         chain = read_chain(hand_eye, robot_poses, offset, quaternions.value, key)
     elif registration:
@@ -264,7 +269,10 @@ def run(
     scenes = find_scenes(exposures)
     missing = chain.without_pose([scene.name for scene in scenes]) if chain else []
     if missing:
-        raise InputError(f"robot poses {robot_poses}: none of scene {missing[0]}; add a row, or take the scene away")
+        raise InputError(
+            "E-ROBOT-POSES-SCENE",
+            f"robot poses {robot_poses}: none of scene {missing[0]}; add a row, or take the scene away",
+        )
     results = list(located(scenes, target, model, LocateOptions(method.value, limits, patent, moved_px, workers)))
     doubts = on_chain(chain, {each.name: uncertain(each) for each in accepted(results)}) if chain else ()
     say(run_text(results, chain))

@@ -1,9 +1,11 @@
 """``stcal``, the umbrella command, and ``stcal-sfm``, its shortcut: errors become one line and an exit code."""
 
+import json
 import os
 import signal
 import sys
 from io import TextIOWrapper
+from itertools import pairwise
 from typing import Any, NoReturn
 
 import typer
@@ -86,7 +88,10 @@ def _guarded(application: typer.Typer) -> None:
             raise KeyboardInterrupt
         sys.exit(code if isinstance(code, int) else 0)
     except StcalError as error:
+        if "--json=-" in arguments or ["--json", "-"] in map(list, pairwise(arguments)):
+            print(json.dumps({"error": str(error), "code": error.code}, ensure_ascii=False))
         if debug:
+            error.add_note(error.code)
             raise
         _fail(str(error), error.exit_code)
     except UsageError as error:

@@ -191,7 +191,7 @@ def several_tables(
 ) -> "Path | Table | list[Table]":
     """The file that was named first; or --a joined with each --b, with what was left out printed."""
     if (given is None) == (first is None) or (first is None) != (not seconds):
-        raise InputError(f"{what}: one file, or --a and --b with --key, needed")
+        raise InputError("E-OPTION-FILES", f"{what}: one file, or --a and --b with --key, needed")
     if given is not None:
         if columns is None:
             return given
@@ -212,7 +212,7 @@ def exports_of(words: Sequence[str], require_form: Callable[[str], None]) -> lis
         form, _, path = word.partition("=")
         require_form(form)
         if not path:
-            raise InputError(f"--export {word}: no file; give {form}=FILE")
+            raise InputError("E-OPTION-VALUE", f"--export {word}: no file; give {form}=FILE")
         found.append((form, Path(path)))
     return found
 
@@ -226,7 +226,7 @@ def handed_over(scheduler: str | None, send_images: bool) -> AbstractContextMana
     """Where images are worked on meanwhile: on a cluster, or by processes of this machine."""
     if scheduler is None:
         if send_images:
-            raise InputError("--send-images: only with --scheduler, to whose machines they are sent")
+            raise InputError("E-OPTION-NEEDS", "--send-images: only with --scheduler, to whose machines they are sent")
         return nullcontext()
     from stcal.workflows.cluster import dask_cluster
 
@@ -239,7 +239,8 @@ def require_passed(strict: bool, failed: Sequence[str], report: Path | None = No
         more = f" and {len(failed) - 2} more" if len(failed) > 2 else ""
         where = f"; see {report}" if report else ""
         raise ChecksFailed(
-            f"--strict: failed: {', '.join(failed[:2])}{more}; results are written, do not use them{where}"
+            "E-CHECKS-FAILED",
+            f"--strict: failed: {', '.join(failed[:2])}{more}; results are written, do not use them{where}",
         )
 
 
@@ -255,7 +256,9 @@ def ellipse_options(min_diameter: float | None, max_diameter: float) -> "Ellipse
     from stcal.sfm.detect.circles.ellipses import EllipseOptions
 
     if min_diameter is not None and max_diameter <= min_diameter:
-        raise InputError(f"--max-diameter {max_diameter:g} px, more than --min-diameter {min_diameter:g} px needed")
+        raise InputError(
+            "E-OPTION-RANGE", f"--max-diameter {max_diameter:g} px, more than --min-diameter {min_diameter:g} px needed"
+        )
     return EllipseOptions(min_diameter_px=min_diameter, max_diameter_px=max_diameter)
 
 
@@ -264,7 +267,7 @@ def require_new(outputs: Sequence[tuple[str, Path]]) -> None:
     for option, path in outputs:
         if not _replacing.get() and os.path.lexists(path) and not path.is_dir():
             where = f"{option} {path}" if option.startswith("-") else path
-            raise InputError(f"{where}: exists; give another name, or --overwrite to replace it")
+            raise InputError("E-OUTPUT-EXISTS", f"{where}: exists; give another name, or --overwrite to replace it")
 
 
 def protect_outputs(application: typer.Typer) -> None:
@@ -307,7 +310,9 @@ def _protected(command: Callable) -> Callable:
         alone = [option for option, path in written if path == STANDARD_OUTPUT]
         for option in alone:
             if option != "--json":
-                raise InputError(f"{option} -: only --json writes to standard output; give the name of a file")
+                raise InputError(
+                    "E-OPTION-STDOUT", f"{option} -: only --json writes to standard output; give the name of a file"
+                )
         written = [each for each in written if each[1] != STANDARD_OUTPUT]
         keep_apart(written, read)
         token = _replacing.set(overwrite)

@@ -101,11 +101,11 @@ def register(
     from stcal.register.workspace.findings import findings
 
     if identified and not robot_file:
-        raise InputError(f"--identified {identified}: only with --robot FILE")
+        raise InputError("E-OPTION-NEEDS", f"--identified {identified}: only with --robot FILE")
     published = {"sample": sample, "share": share, "tries": tries, "orthogonal_within": orthogonality}
     published = {name: value for name, value in published.items() if value is not None}
     if published and method != Method.liu2017:
-        raise InputError("--sample, --share, --tries, --orthogonality: only with --method liu2017")
+        raise InputError("E-OPTION-NEEDS", "--sample, --share, --tries, --orthogonality: only with --method liu2017")
     liu2017 = replace(Liu2017Options(), **published) if method == Method.liu2017 else None
     source = one_table(pairs_file, first, second, key, "PAIRS", ("a", "b"))
     pairs = read_pairs(source)

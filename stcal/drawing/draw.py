@@ -58,7 +58,7 @@ def draw(
     paper = _paper(path, paper)
     what = load_design(design)
     if net and not isinstance(what, TargetDesign):
-        raise InputError(f"--net: {design} is a board; nets are of targets")
+        raise InputError("E-DRAW-DESIGN", f"--net: {design} is a board; nets are of targets")
     parts = net_parts(what) if net and isinstance(what, TargetDesign) else _parts(what, margin_mm)
     title = what.name if isinstance(what, TargetDesign) else parts[0].name if len(parts) == 1 else "boards"
     sheets = sheets_of(parts, paper, title, apart=path.suffix.lower() == ".pdf")
@@ -73,7 +73,9 @@ def _parts(what: TargetDesign | BoardDesign | FlatBoard | BoardSet, margin_mm: f
 def load_design(path: str | Path) -> TargetDesign | BoardDesign | FlatBoard | BoardSet:
     """A target, or a board or boards of any kind."""
     if not Path(path).exists():
-        raise InputError(f"{path}: no such file; give a target.toml or a board file (`stcal-sfm init` writes both)")
+        raise InputError(
+            "E-DRAW-DESIGN", f"{path}: no such file; give a target.toml or a board file (`stcal-sfm init` writes both)"
+        )
     content = board_content(path)
     return load_target(path) if content is not None and "face" in content else load_boards(path)
 
@@ -100,11 +102,14 @@ def content_of(sheets: list[Sheet], path: Path) -> str | bytes:
         largest = max(max(sheet.width, sheet.height) for sheet in sheets)
         if largest > MOST_MM:
             raise InputError(
-                f"{path}: page of {largest:.0f} mm, at most {MOST_MM:.0f} mm in a PDF; take --paper or .svg"
+                "E-DRAW-SHEETS",
+                f"{path}: page of {largest:.0f} mm, at most {MOST_MM:.0f} mm in a PDF; take --paper or .svg",
             )
         return pdf(sheets)
     if len(sheets) > 1:
-        raise InputError(f"{path}: {len(sheets)} sheets, an SVG holds one; take .pdf, a larger --paper, or none")
+        raise InputError(
+            "E-DRAW-SHEETS", f"{path}: {len(sheets)} sheets, an SVG holds one; take .pdf, a larger --paper, or none"
+        )
     return svg(sheets[0]) if suffix == ".svg" else dxf(sheets[0])
 
 
@@ -112,11 +117,15 @@ def _paper(path: Path, paper: str) -> str:
     """The paper's name as it is listed."""
     suffix = path.suffix.lower()
     if suffix not in SUFFIXES:
-        raise InputError(f"{path}: suffix {path.suffix or 'missing'}; one of {', '.join(SUFFIXES)} needed")
+        raise InputError(
+            "E-OUTPUT-SUFFIX", f"{path}: suffix {path.suffix or 'missing'}; one of {', '.join(SUFFIXES)} needed"
+        )
     names = {name.lower(): name for name in (*PAPERS, OWN)}
     if paper and paper.lower() not in names:
-        raise InputError(f"--paper {paper}: unknown; one of {', '.join(names.values())} needed")
+        raise InputError("E-OPTION-VALUE", f"--paper {paper}: unknown; one of {', '.join(names.values())} needed")
     name = names.get(paper.lower(), "A4" if suffix == ".pdf" else OWN)
     if suffix == ".dxf" and name != OWN:
-        raise InputError(f"--paper {paper}: a DXF is no page; take .pdf or .svg, or leave --paper out")
+        raise InputError(
+            "E-OPTION-CONFLICT", f"--paper {paper}: a DXF is no page; take .pdf or .svg, or leave --paper out"
+        )
     return name

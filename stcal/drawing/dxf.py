@@ -26,7 +26,7 @@ def new_drawing():
         from ezdxf import units
         from ezdxf.filemanagement import new
     except ImportError as error:
-        raise InputError("DXF: needs ezdxf; install stcal[cad]") from error
+        raise InputError("E-EXTRA-MISSING", "DXF: needs ezdxf; install stcal[cad]") from error
     return new("R2010", units=units.MM)
 
 

@@ -54,12 +54,15 @@ def net_parts(target: TargetDesign) -> list[Part]:
     for face in target.faces:
         if face.outline_mm is None or face.rough_target_from_face is None:
             raise InputError(
+                "E-DRAW-NET",
                 f"--net: face {face.id} has no {'outline_mm' if face.outline_mm is None else ROUGH_KEYS}; add it to "
-                "the target file, or draw plates one by one without --net"
+                "the target file, or draw plates one by one without --net",
             )
     shared = _shared_edges(target)
     if not shared:
-        raise InputError("--net: no two plates share an edge; correct outline_mm and rough_pose, or draw without --net")
+        raise InputError(
+            "E-DRAW-NET", "--net: no two plates share an edge; correct outline_mm and rough_pose, or draw without --net"
+        )
     faces = [replace(face, outline_mm=_against_the_clock(face)) for face in target.faces]
     left = sorted(faces, key=lambda face: -sum(face.id == one for one, _ in shared))
     pieces: list[list[_Plate]] = []

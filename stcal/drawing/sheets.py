@@ -94,7 +94,9 @@ def paper_sheets(parts: Sequence[Part], paper: str, title: str) -> list[Sheet]:
     split = [min(_ways(part, paper), key=lambda way: way.count()) for part in parts]
     total = sum(way.count() for way in split)
     if total > MOST_SHEETS:
-        raise InputError(f"--paper {paper}: {total} sheets, at most {MOST_SHEETS}; take a larger paper, or none")
+        raise InputError(
+            "E-DRAW-SHEETS", f"--paper {paper}: {total} sheets, at most {MOST_SHEETS}; take a larger paper, or none"
+        )
     return [
         sheet
         for part, way in zip(parts, split, strict=True)

@@ -43,7 +43,9 @@ class Affine:
             The linear part flattens space.
         """
         if np.linalg.cond(self.linear) > 1e12:
-            raise DegenerateError("affine transform: its 3×3 part is singular; an invertible one needed")
+            raise DegenerateError(
+                "E-AFFINE-SINGULAR", "affine transform: its 3×3 part is singular; an invertible one needed"
+            )
         back = np.linalg.inv(self.linear)
         return Affine(back, -back @ self.translation)
 

@@ -42,7 +42,9 @@ def align_affine(xyz_a: np.ndarray, xyz_b: np.ndarray, weights: np.ndarray | Non
     root = np.sqrt(w)[:, None]
     linear, _, _, s = np.linalg.lstsq(root * (b - mean_b), root * (a - mean_a), rcond=None)
     if s[2] <= 1e-9 * s[0]:
-        raise DegenerateError("alignment: the points are coplanar; an affine transform needs points off the plane")
+        raise DegenerateError(
+            "E-POINTS-COPLANAR", "alignment: the points are coplanar; an affine transform needs points off the plane"
+        )
     return Affine(linear.T, mean_a - linear.T @ mean_b)
 
 
@@ -61,10 +63,10 @@ def _checked(xyz_a, xyz_b, weights, needed: int) -> tuple[np.ndarray, np.ndarray
     """Points as arrays, and weights of sum 1."""
     a, b = np.asarray(xyz_a, float), np.asarray(xyz_b, float)
     if a.shape != b.shape or len(a) < needed:
-        raise DegenerateError(f"alignment: {len(a)} and {len(b)} points, {needed} or more pairs needed")
+        raise DegenerateError("E-POINTS-FEW", f"alignment: {len(a)} and {len(b)} points, {needed} or more pairs needed")
     w = np.ones(len(a)) if weights is None else np.asarray(weights, float)
     if (w < 0).any() or not w.any():
-        raise DegenerateError("alignment: weights are negative or all zero; positive weights needed")
+        raise DegenerateError("E-ALIGN-WEIGHTS", "alignment: weights are negative or all zero; positive weights needed")
     return a, b, w / w.sum()
 
 
@@ -82,7 +84,9 @@ def _align(xyz_a, xyz_b, weights, with_scale: bool) -> Similarity:
     da, db = a - mean_a, b - mean_b
     for points in (da, db):
         if _collinear(points[w > 0]):
-            raise DegenerateError("alignment: the points are collinear; points off the line are needed")
+            raise DegenerateError(
+                "E-POINTS-COLLINEAR", "alignment: the points are collinear; points off the line are needed"
+            )
     rotation, product = best_rotations((w[:, None] * da).T @ db)
     scale = float(product / (w @ (db**2).sum(1))) if with_scale else 1.0
     return Similarity(scale, Rigid(rotation, mean_a - scale * rotation @ mean_b))

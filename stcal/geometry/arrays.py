@@ -50,9 +50,9 @@ def frozen(values: ArrayLike, shape: Shape | None = None, what: str = "array", d
     if shape not in (None, array.shape) and (
         array.ndim != len(shape) or any(n is not None and n != m for n, m in zip(shape, array.shape, strict=True))
     ):
-        raise InputError(f"{what}: shape {array.shape}, {shape} needed")
+        raise InputError("E-ARRAY-SHAPE", f"{what}: shape {array.shape}, {shape} needed")
     if array.dtype.kind == "f" and b"\0" in np.isfinite(array).tobytes():  # a third of the time of all() on few numbers
-        raise InputError(f"{what}: holds values that are not finite")
+        raise InputError("E-ARRAY-NOT-FINITE", f"{what}: holds values that are not finite")
     array.flags.writeable = False
     return array
 

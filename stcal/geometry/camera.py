@@ -55,11 +55,15 @@ class Camera:
             object.__setattr__(self, "distortion", np.pad(self.distortion, (0, 4)))
         freeze(self, "distortion", (COEFFICIENTS,), "distortion")
         if (self.focal <= 0).any():
-            raise InputError(f"camera: focal length {self.focal.tolist()} px, positive numbers needed")
+            raise InputError(
+                "E-CAMERA-FOCAL", f"camera: focal length {self.focal.tolist()} px, positive numbers needed"
+            )
         if self.width < 1 or self.height < 1:
-            raise InputError(f"camera: size {self.width}×{self.height} px, a positive size needed")
+            raise InputError("E-CAMERA-SIZE", f"camera: size {self.width}×{self.height} px, a positive size needed")
         if self.fisheye and self.distortion[[6, 7, 9, 11]].any():
-            raise InputError("camera: k5, k6, s2 or s4 of an equidistant camera, which has none; 0 needed")
+            raise InputError(
+                "E-CAMERA-COEFFICIENTS", "camera: k5, k6, s2 or s4 of an equidistant camera, which has none; 0 needed"
+            )
 
     def same_as(self, other: "Camera") -> bool:
         """Whether all numbers are equal."""
@@ -197,7 +201,9 @@ class Camera:
         if not self.distortion.any():
             return self._perspective(target.copy(), target)
         if not np.isfinite(target).all():
-            raise ConvergenceError("camera: a pixel to undistort is not finite; finite coordinates needed")
+            raise ConvergenceError(
+                "E-CAMERA-PIXEL", "camera: a pixel to undistort is not finite; finite coordinates needed"
+            )
         x, y = start_x, start_y = target[..., 0].copy(), target[..., 1].copy()
         steps = 0
         with np.errstate(over="ignore", invalid="ignore"):  # where it diverges; reported below
@@ -218,8 +224,9 @@ class Camera:
         worst = np.unravel_index(np.argmin(good), good.shape)
         at = self.focal * target[worst] + self.centre
         raise ConvergenceError(
+            "E-CAMERA-FOLDED",
             f"camera: no undistorted point for pixel ({at[0]:.0f}, {at[1]:.0f}); "
-            "the distortion coefficients fold the image over there, check them"
+            "the distortion coefficients fold the image over there, check them",
         )
 
     def _perspective(self, xy: np.ndarray, target: np.ndarray) -> np.ndarray:
@@ -231,8 +238,9 @@ class Camera:
         if (theta >= WIDEST_RAD).any():
             at = self.focal * target[np.unravel_index(theta.argmax(), theta.shape)] + self.centre
             raise ConvergenceError(
+                "E-CAMERA-FIELD",
                 f"camera: pixel ({at[0]:.0f}, {at[1]:.0f}) is {np.degrees(theta.max()):.1f}° from the axis, less than "
-                f"{np.degrees(WIDEST_RAD):.0f}° needed; use the middle of the image"
+                f"{np.degrees(WIDEST_RAD):.0f}° needed; use the middle of the image",
             )
         return xy * np.where(theta > 0, np.tan(theta) / np.where(theta > 0, theta, 1.0), 1.0)[..., None]
 

@@ -74,12 +74,14 @@ def ellipse_of_conic(conic: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """
     q = conic[:2, :2]
     if np.linalg.det(q) <= 0:
-        raise DegenerateError("conic: not an ellipse; the circle must lie wholly in front of the camera")
+        raise DegenerateError(
+            "E-CONIC-NO-ELLIPSE", "conic: not an ellipse; the circle must lie wholly in front of the camera"
+        )
     centre = -np.linalg.solve(q, conic[:2, 2])
     level = -(conic[2, 2] + conic[:2, 2] @ centre)
     value, vector = np.linalg.eigh(q)
     if level * value[0] <= 0:
-        raise DegenerateError("conic: no real points; an ellipse of positive size needed")
+        raise DegenerateError("E-CONIC-NO-ELLIPSE", "conic: no real points; an ellipse of positive size needed")
     value = value / level
     return centre, (vector / np.sqrt(value)) @ vector.T
 

@@ -41,7 +41,9 @@ def poses_of_plane(xy_plane: np.ndarray, xy_normalised: np.ndarray) -> PlanePose
     jacobian = homography_jacobian(homography, np.zeros((1, 2)))[0]
     determinant = float(np.linalg.det(jacobian))
     if determinant <= 0:
-        raise DegenerateError("plane: its points are seen mirrored; seen from behind, or numbered wrongly")
+        raise DegenerateError(
+            "E-POINTS-MIRRORED", "plane: its points are seen mirrored; seen from behind, or numbered wrongly"
+        )
     at = homography[:2, 2] / homography[2, 2]
     camera_from_sight = _turn_to(np.append(at, 1.0))
     # What a step of the plane is on a screen square to the line of sight, at unit distance.

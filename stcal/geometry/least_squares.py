@@ -118,8 +118,9 @@ class Minimum(Generic[S, L]):
         """
         if not (self.converged | (self.promised <= accepted)).all():
             raise ConvergenceError(
+                "E-NO-MINIMUM",
                 f"{what}: no minimum after {self.steps} steps, the last was to gain {np.max(self.promised):.2g} σ²; "
-                f"{remedy}"
+                f"{remedy}",
             )
         return self
 

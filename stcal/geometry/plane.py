@@ -53,11 +53,11 @@ def fit_planes(xyz: np.ndarray, towards: np.ndarray | None = None) -> tuple[np.n
     """:func:`fit_plane` of each of k sets of points, (k, n, 3): normals (k, 3), offsets (k,) and spreads (k,)."""
     n = xyz.shape[1]
     if n < 3:
-        raise DegenerateError(f"plane: {n} points, 3 needed")
+        raise DegenerateError("E-POINTS-FEW", f"plane: {n} points, 3 needed")
     mean = xyz.mean(1)
     _, s, vt = np.linalg.svd(xyz - mean[:, None], full_matrices=False)
     if (s[:, 1] <= 1e-9 * s[:, 0]).any():
-        raise DegenerateError("plane: the points are collinear; points off the line are needed")
+        raise DegenerateError("E-POINTS-COLLINEAR", "plane: the points are collinear; points off the line are needed")
     normal = vt[:, 2]
     if towards is not None:
         normal = np.where((normal @ towards < 0)[:, None], -normal, normal)
@@ -74,10 +74,12 @@ def fit_homography(xy_b: np.ndarray, xy_a: np.ndarray) -> np.ndarray:
     """
     b, a = np.asarray(xy_b, float), np.asarray(xy_a, float)
     if len(b) < 4:
-        raise DegenerateError(f"homography: {len(b)} point pairs, 4 needed")
+        raise DegenerateError("E-POINTS-FEW", f"homography: {len(b)} point pairs, 4 needed")
     (found,) = fit_homographies(b[None], a[None], np.ones((1, len(b)), bool))
     if not np.isfinite(found).all():
-        raise DegenerateError("homography: the points do not determine it (three of four on a line)")
+        raise DegenerateError(
+            "E-POINTS-COLLINEAR", "homography: the points do not determine it (three of four on a line)"
+        )
     return found
 
 
@@ -185,6 +187,6 @@ def refine_planar_pose(camera_from_plane: Rigid, xy_plane: np.ndarray, xy_normal
         return NormalEquations.of((p[:, :2] / p[:, 2:] - xy_normalised).ravel(), by_pose.reshape(-1, 6))
 
     if not np.isfinite(linearise(camera_from_plane).cost):
-        raise DegenerateError("planar pose: points behind the camera")
+        raise DegenerateError("E-POINTS-BEHIND", "planar pose: points behind the camera")
     found = minimise(camera_from_plane, linearise, perturbed, least_gain=EXACT, max_steps=MAX_STEPS)
     return found.required("planar pose", "check that the points are numbered rightly").state

@@ -113,7 +113,7 @@ def two_minima(
             break
         sigma = wider
     if not np.isfinite(found.cost[0]) or not found.settled[0]:
-        raise ConvergenceError(failure)
+        raise ConvergenceError("E-NO-MINIMUM", failure)
     two = distinct(found.poses, found.normal[0], sigma)
     if planar and not two:
         again = descend(mirrored(found.poses[[0]], target_from_plane), HUBER * sigma)

@@ -70,7 +70,9 @@ class Rigid:
         freeze(self, "translation", (3,), "translation")
         deviation = _off_proper(*self.rotation.tolist())
         if deviation > 1e-6:
-            raise InputError("rotation: not a proper rotation matrix; orthogonal with determinant +1 needed")
+            raise InputError(
+                "E-ROTATION-IMPROPER", "rotation: not a proper rotation matrix; orthogonal with determinant +1 needed"
+            )
         if deviation > 1e-12:  # brought onto SO(3), or a product of accepted rotations could fail the check above
             u, _, vt = np.linalg.svd(self.rotation)
             object.__setattr__(self, "rotation", frozen(u @ vt))
@@ -80,12 +82,17 @@ class Rigid:
         """From a 4×4 (or 3×4) homogeneous matrix; the rotation part is projected onto SO(3)."""
         m = frozen(matrix, what="rigid transform")
         if m.shape not in ((4, 4), (3, 4)):
-            raise InputError(f"rigid transform: shape {m.shape}, 4×4 needed")
+            raise InputError("E-ARRAY-SHAPE", f"rigid transform: shape {m.shape}, 4×4 needed")
         if (m[3:] != [0, 0, 0, 1]).any():
-            raise InputError(f"rigid transform: last row {m[3].tolist()}, 0 0 0 1 needed; is the matrix transposed?")
+            raise InputError(
+                "E-MATRIX-LAST-ROW",
+                f"rigid transform: last row {m[3].tolist()}, 0 0 0 1 needed; is the matrix transposed?",
+            )
         u, s, vt = np.linalg.svd(m[:3, :3])
         if np.linalg.det(m[:3, :3]) <= 0 or np.abs(s - 1).max() > 1e-3:
-            raise InputError("rigid transform: the 3×3 part is not a rotation (left-handed or scaled)")
+            raise InputError(
+                "E-ROTATION-IMPROPER", "rigid transform: the 3×3 part is not a rotation (left-handed or scaled)"
+            )
         return cls(u @ vt, m[:3, 3])
 
     @classmethod
@@ -138,7 +145,7 @@ class Similarity:
 
     def __post_init__(self):
         if not (np.isfinite(self.scale) and self.scale > 0):
-            raise InputError(f"similarity: scale {self.scale}, a positive number needed")
+            raise InputError("E-SCALE-VALUE", f"similarity: scale {self.scale}, a positive number needed")
 
     def inverse(self) -> "Similarity":
         """b_from_a."""
@@ -182,7 +189,9 @@ class Poses:
         r = self.rotation
         left_handed = np.einsum("mi,mi->m", np.cross(r[:, 0], r[:, 1]), r[:, 2]) < 0
         if len(r) and (left_handed.any() or np.abs(r @ np.swapaxes(r, 1, 2) - np.eye(3)).max() > 1e-6):
-            raise InputError("rotations: not proper rotation matrices; orthogonal with determinant +1 needed")
+            raise InputError(
+                "E-ROTATION-IMPROPER", "rotations: not proper rotation matrices; orthogonal with determinant +1 needed"
+            )
 
     @classmethod
     def of(cls, transforms: Iterable[Rigid]) -> "Poses":
@@ -197,7 +206,10 @@ class Poses:
         wxyz = np.asarray(wxyz, float)
         off = np.abs(np.linalg.norm(wxyz, axis=1) - 1)
         if len(off) and off.max() > UNIT_WITHIN:
-            raise InputError(f"quaternion {off.argmax() + 1}: length off 1 by {off.max():.3g}, {UNIT_WITHIN:g} allowed")
+            raise InputError(
+                "E-QUATERNION-LENGTH",
+                f"quaternion {off.argmax() + 1}: length off 1 by {off.max():.3g}, {UNIT_WITHIN:g} allowed",
+            )
         return cls(Rotation.from_quat(wxyz[:, [1, 2, 3, 0]]).as_matrix(), translation)
 
     def matrix(self) -> np.ndarray:

@@ -252,7 +252,7 @@ def choose(
         race.give_up()
         race.run(range(min(FIRST_SPLITS, len(rows)), len(rows)), progress)
     if not race.running:
-        raise DegenerateError(race.failed[candidates[0]])
+        raise DegenerateError("E-HANDEYE-NO-METHOD", race.failed[candidates[0]])
     chosen = race.best()
     parts = [race.errors[race.best(but=out)][k] for k, out in enumerate(rows)]
     held_out = HeldOutPoses(rows, **{name: np.array([each[name] for each in parts]) for name in parts[0]})

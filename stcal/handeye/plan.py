@@ -99,7 +99,7 @@ def plan_poses(
         The result has no covariance, or no candidate is reachable with the board in view.
     """
     if result.covariance is None:
-        raise InputError(f"plan: {result.method} gives no σ; give a result of pose or reprojection")
+        raise InputError("E-PLAN-NO-SIGMA", f"plan: {result.method} gives no σ; give a result of pose or reprojection")
     kept = np.flatnonzero(~result.outliers)
     loop = Loop.of(pairs, result.setup)[kept]
     errors, rng = _Errors.of(loop, result), np.random.default_rng(seed)
@@ -117,8 +117,9 @@ def plan_poses(
         flange = stand_from_mount.inverse() if loop.inverted else stand_from_mount
         if not len(flange):
             raise InputError(
+                "E-PLAN-NO-VIEW",
                 f"plan: none of {CANDIDATES} views as near and as far as the board was seen holds all of it and "
-                f"{MARGIN:.0%} of the image around; take it from farther away, or give a smaller board"
+                f"{MARGIN:.0%} of the image around; take it from farther away, or give a smaller board",
             )
         unscaled = Poses(ahead.rotation, ahead.translation / result.scale)
         each = normal + _information(Loop(stand_from_mount, unscaled, loop.inverted), errors, result)
@@ -152,8 +153,9 @@ def _first_reachable(flange: Poses, order: np.ndarray, reachable: Callable[[Pose
         if len(within):
             return int(part[within[0]])
     raise InputError(
+        "E-PLAN-OUT-OF-REACH",
         f"plan: none of {len(flange)} views of the whole board is in the robot's reach; check robot file, board and "
-        "setup"
+        "setup",
     )
 
 

@@ -93,8 +93,9 @@ def predict_motions(
     left = len(pairs) - count
     if count < 1 or left < LEAST_LEFT:
         raise InputError(
+            "E-OPTION-RANGE",
             f"--motions-held-out {count}: of {max(len(pairs) - 1, 0)} motions, 1 to {max(len(pairs) - LEAST_LEFT, 0)} "
-            "can be held out; give another number, or more poses"
+            "can be held out; give another number, or more poses",
         )
     kept = np.arange(left)
     result = handeye(pairs[kept], setup, method, None if views is None else views[kept], options)

@@ -97,7 +97,10 @@ class HandEye:
 
     def _named(self, name: str) -> Rigid:
         if name not in self.transforms:
-            raise InputError(f"hand-eye: {self.setup} has no {name}; it has {' and '.join(self.transforms)}")
+            raise InputError(
+                "E-HANDEYE-NO-TRANSFORM",
+                f"hand-eye: {self.setup} has no {name}; it has {' and '.join(self.transforms)}",
+            )
         return self.transforms[name]
 
     def widened(self, factor: float) -> "HandEye":

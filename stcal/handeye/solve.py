@@ -164,12 +164,20 @@ def handeye(
     """
     method = method or ("pose" if views is None else "reprojection")
     if method not in METHODS:
-        raise InputError(f"hand-eye: method {method!r} is unknown; one of {', '.join(METHODS)} needed")
+        raise InputError(
+            "E-OPTION-METHOD", f"hand-eye: method {method!r} is unknown; one of {', '.join(METHODS)} needed"
+        )
     if method == "reprojection" and (views is None or len(views) != len(pairs)):
-        raise InputError("hand-eye: reprojection needs the corners of every pose; give views, or use method pose")
+        raise InputError(
+            "E-HANDEYE-NEEDS-VIEWS",
+            "hand-eye: reprojection needs the corners of every pose; give views, or use method pose",
+        )
     options = options or HandEyeOptions()
     if options.arm is not None and method != "reprojection":
-        raise InputError(f"hand-eye: {method} does not solve for the arm; give views, and method reprojection")
+        raise InputError(
+            "E-HANDEYE-NEEDS-VIEWS",
+            f"hand-eye: {method} does not solve for the arm; give views, and method reprojection",
+        )
     task = _task(pairs, setup, views, options)
     if method == "pose":
         return _by_poses(task)
@@ -183,7 +191,8 @@ def _task(pairs: HandEyePoses, setup: Setup, views: Views | None, options: HandE
     seen = check(Loop.of(pairs, setup), setup, pairs.where, options.four_dof)
     if options.with_scale and len(pairs) < LEAST_WITH_SCALE:
         raise DegenerateError(
-            f"{pairs.where}: {len(pairs)} poses, {LEAST_WITH_SCALE} needed to find the board's size too; take more"
+            "E-HANDEYE-FEW-POSES",
+            f"{pairs.where}: {len(pairs)} poses, {LEAST_WITH_SCALE} needed to find the board's size too; take more",
         )
     notes: tuple[str, ...] = ()
     if options.symmetries:
@@ -197,7 +206,9 @@ def _task(pairs: HandEyePoses, setup: Setup, views: Views | None, options: HandE
 def _by_equations(task: _Task, method: str) -> HandEye:
     """The methods that solve AX = XB or AX = ZB."""
     if task.options.four_dof:
-        raise DegenerateError(f"hand-eye: {method} needs rotations about two axes; with four_dof use method pose")
+        raise DegenerateError(
+            "E-HANDEYE-AXES", f"hand-eye: {method} needs rotations about two axes; with four_dof use method pose"
+        )
     loop, notes, noise = task.loop, task.notes, task.options.noise
     unit_mm = noise.camera_mm / noise.camera_rad if noise.camera_mm and noise.camera_rad else UNIT_MM
     if method in AX_XB and not (used := poses_with_log(loop)).all():
@@ -206,8 +217,9 @@ def _by_equations(task: _Task, method: str) -> HandEye:
         loop = loop[used]
         if len(loop) < 3 or Observability.of(loop).useless:
             raise DegenerateError(
+                "E-HANDEYE-LARGE-TURNS",
                 f"hand-eye: without {left_out}, that turn by more than 170° against others, too few poses are left for "
-                f"{method}; use method pose or shah"
+                f"{method}; use method pose or shah",
             )
     if method in (*AX_XB, *AX_ZB):
         x, z = closed_form(loop, method, unit_mm)

@@ -131,7 +131,10 @@ def estimate_offset(
     """
     noise = noise or Noise()
     if len(pairs) < LEAST_POSES:
-        raise InputError(f"{pairs.where}: {len(pairs)} poses, {LEAST_POSES} needed for a time offset; take more")
+        raise InputError(
+            "E-TIME-OFFSET-FEW",
+            f"{pairs.where}: {len(pairs)} poses, {LEAST_POSES} needed for a time offset; take more",
+        )
     if _inside(stream, seconds).any():
         _require_motion(stream, seconds)
     offset = _scanned(pairs, stream, seconds, setup, with_scale)
@@ -139,7 +142,10 @@ def estimate_offset(
     for _ in range(ROUNDS):
         kept = _inside(stream, seconds + offset)
         if kept.sum() < LEAST_POSES:
-            raise InputError(f"{stream.where}: {kept.sum()} images within it at an offset of {offset:.3g} s; give more")
+            raise InputError(
+                "E-TIME-OFFSET-RANGE",
+                f"{stream.where}: {kept.sum()} images within it at an offset of {offset:.3g} s; give more",
+            )
         at = seconds[kept] + offset
         loop = Loop.of(replace(pairs[kept], base_from_flange=stream.at(at)), setup)
         state = state or LoopState(*start.robust(loop, with_scale))
@@ -156,8 +162,10 @@ def estimate_offset(
         step = -float(inverse[count] @ np.einsum("mai,ma->i", weighted, solution.residuals[used]))
         if not 0 < sigma < MOST_SIGMA_S:
             raise DegenerateError(
+                "E-TIME-OFFSET-SIGMA",
                 f"{stream.where}: the time offset would have σ {sigma:.2g} s, {MOST_SIGMA_S:g} s allowed: the motions "
-                "at the images do not tell it; leave --time-offset out, or take images while the flange turns and moves"
+                "at the images do not tell it; leave --time-offset out, or take images while the flange turns and "
+                "moves",
             )
         offset += float(np.clip(step, -MOST_STEP_S, MOST_STEP_S))
         if abs(step) < SETTLED * sigma:
@@ -167,7 +175,8 @@ def estimate_offset(
             at = stream.at(seconds[kept] + offset)
             return TimeOffset(offset, sigma, slope, kept, at, float(turn), float(way))
     raise ConvergenceError(
-        f"{stream.where}: the time offset does not settle, last {offset:.4g} ± {sigma:.2g} s; check times and poses"
+        "E-TIME-OFFSET-UNSETTLED",
+        f"{stream.where}: the time offset does not settle, last {offset:.4g} ± {sigma:.2g} s; check times and poses",
     )
 
 
@@ -182,9 +191,10 @@ def _require_motion(stream: Stream, seconds: np.ndarray) -> None:
     if any(way > MOVED * max(np.nan_to_num(own), 1e-9) for own, way in zip(noise, moved, strict=True)):
         return
     raise DegenerateError(
+        "E-TIME-OFFSET-STANDSTILL",
         f"{stream.where}: the flange stands still at the images, {moved[1]:.2g} mm and {np.degrees(moved[0]):.2g}° "
         f"within {WINDOW_S:g} s (RMS), where samples err by {noise[1]:.2g} mm and {np.degrees(noise[0]):.2g}°: no time "
-        "offset can be told; leave --time-offset out, or take images while the robot moves"
+        "offset can be told; leave --time-offset out, or take images while the robot moves",
     )
 
 
@@ -203,7 +213,8 @@ def _scanned(pairs: HandEyePoses, stream: Stream, seconds: np.ndarray, setup: Se
     if not np.isfinite(least):
         share = _inside(stream, seconds).sum()
         raise InputError(
+            "E-TIME-OFFSET-RANGE",
             f"{stream.where}: {share} of {len(seconds)} images lie within its times, {LEAST_KEPT:.0%} needed at some "
-            f"offset up to {WITHIN_S:g} s; give the whole stream, and times of clocks that differ by less"
+            f"offset up to {WITHIN_S:g} s; give the whole stream, and times of clocks that differ by less",
         )
     return best

@@ -122,7 +122,8 @@ def splits(count: int, held_out: int | None = None, repeats: int = 15, seed: int
     k = held_out or max(1, count // 4)
     if count - k < LEAST_LEFT:
         raise InputError(
-            f"cross-validation: {k} of {count} poses held out leave {count - k}, {LEAST_LEFT} needed; take more poses"
+            "E-HELD-OUT-FEW",
+            f"cross-validation: {k} of {count} poses held out leave {count - k}, {LEAST_LEFT} needed; take more poses",
         )
     return repeated_splits(count, k, repeats, np.random.default_rng(seed))
 
@@ -191,7 +192,7 @@ def errors_without(
         result = handeye(pairs[kept], setup, method, None if views is None else views[kept], options)
     except DegenerateError as error:
         names = ", ".join(pairs.names[i] for i in out)
-        raise DegenerateError(f"without {names}: {error}") from error
+        raise DegenerateError(error.code, f"without {names}: {error}") from error
     unseen = pairs[out]
     if arm is not None and result.reprojection is not None and result.reprojection.arm is not None:
         unseen = replace(unseen, base_from_flange=arm[out].poses(result.reprojection.arm))

@@ -89,8 +89,9 @@ class CameraModel:
         x, y = self.centre
         if not (0 < x < width and 0 < y < height):
             raise InputError(
+                "E-CAMERA-CENTRE",
                 f"camera file {self.source}: principal point ({x:.0f}, {y:.0f}) px is outside of {image} "
-                f"({width}×{height} px); use the camera file that belongs to the images"
+                f"({width}×{height} px); use the camera file that belongs to the images",
             )
 
 
@@ -192,8 +193,9 @@ def read_camera(path: str | Path, name: str = "") -> CameraModel:
     if isinstance(lens, CameraModel):
         return lens
     raise InputError(
+        "E-CAMERA-MODEL",
         f"camera file {path}: {lens.called} is none of {', '.join(COLMAP_MODELS)}; fit one of them to it with "
-        "`stcal camera convert`"
+        "`stcal camera convert`",
     )
 
 
@@ -218,19 +220,29 @@ def cameras_txt(camera: CalibratedCamera) -> str:
 def camera_model(flat: np.ndarray, colmap_model: str, width, height, path: Path) -> CameraModel:
     flat = np.pad(flat, (0, len(PARAMETER_NAMES) - len(flat)))
     if not np.isfinite(flat).all():
-        raise InputError(f"camera file {path}: a camera parameter is not a finite number; correct it")
+        raise InputError(
+            "E-CAMERA-NOT-FINITE", f"camera file {path}: a camera parameter is not a finite number; correct it"
+        )
     if (far := np.abs(flat).max()) > FARTHEST:
-        raise InputError(f"camera file {path}: a camera parameter of {far:g}, up to {FARTHEST:g} possible; correct it")
+        raise InputError(
+            "E-CAMERA-TOO-FAR",
+            f"camera file {path}: a camera parameter of {far:g}, up to {FARTHEST:g} possible; correct it",
+        )
     if (flat[:2] <= 0).any():
-        raise InputError(f"camera file {path}: focal length {flat[0]:g}, {flat[1]:g} px; positive numbers needed")
+        raise InputError(
+            "E-CAMERA-FOCAL", f"camera file {path}: focal length {flat[0]:g}, {flat[1]:g} px; positive numbers needed"
+        )
     if max(flat[:2]) > MAX_FOCAL_RATIO * min(flat[:2]):
         raise InputError(
+            "E-CAMERA-FOCAL",
             f"camera file {path}: focal lengths {flat[0]:g} and {flat[1]:g} px; not more than {MAX_FOCAL_RATIO:g} "
-            "times apart needed, pixels are nearly square"
+            "times apart needed, pixels are nearly square",
         )
     for side in (width, height):
         if side is not None and not (0 < side <= MAX_SIDE_PX and float(side).is_integer()):
-            raise InputError(f"camera file {path}: image side {side:g} px; a whole number in 1…{MAX_SIDE_PX} needed")
+            raise InputError(
+                "E-CAMERA-SIZE", f"camera file {path}: image side {side:g} px; a whole number in 1…{MAX_SIDE_PX} needed"
+            )
     width, height = (None if side is None else int(side) for side in (width, height))
     return CameraModel(flat[:2], flat[2:4], flat[4:], colmap_model, width, height, str(path))
 
@@ -245,10 +257,15 @@ def camera_from_colmap(colmap_model: str, width: float, height: float, params, s
     """
     if colmap_model not in _COLMAP_LAYOUT:
         known = ", ".join(_COLMAP_LAYOUT)
-        raise InputError(f"camera file {source}: model {colmap_model} is not supported; use one of {known}")
+        raise InputError(
+            "E-CAMERA-MODEL", f"camera file {source}: model {colmap_model} is not supported; use one of {known}"
+        )
     layout = _COLMAP_LAYOUT[colmap_model]
     if len(params) != len(layout):
-        raise InputError(f"camera file {source}: {len(params)} parameters for {colmap_model}, {len(layout)} needed")
+        raise InputError(
+            "E-CAMERA-COEFFICIENTS",
+            f"camera file {source}: {len(params)} parameters for {colmap_model}, {len(layout)} needed",
+        )
     flat = np.zeros(len(PARAMETER_NAMES))
     for place, value in zip(layout, params, strict=True):
         flat[list(place) if isinstance(place, tuple) else place] = value
@@ -288,17 +305,24 @@ def camera_from_opencv(
     path, size = Path(path), (width or None, height or None)
     if fisheye:
         if len(given) not in ((6,) if tangential else (0, 4)):
-            raise InputError(f"camera file {path}: {len(given)} coefficients of an equidistant lens; k1 to k4 needed")
+            raise InputError(
+                "E-CAMERA-COEFFICIENTS",
+                f"camera file {path}: {len(given)} coefficients of an equidistant lens; k1 to k4 needed",
+            )
         distortion = np.zeros(12)
         distortion[[0, 1, 2, 3, 4, 5] if tangential else [0, 1, 4, 5][: len(given)]] = given
         kind = "THIN_PRISM_FISHEYE" if distortion[2:4].any() else "OPENCV_FISHEYE"
         return camera_model(np.concatenate([lens, distortion]), kind, *size, path)
     if given[8:].any():
-        raise InputError(f"camera file {path}: {len(given)} distortion coefficients, at most 8 are supported")
+        raise InputError(
+            "E-CAMERA-COEFFICIENTS",
+            f"camera file {path}: {len(given)} distortion coefficients, at most 8 are supported",
+        )
     if len(given) not in DISTORTION_COUNTS:
         raise InputError(
+            "E-CAMERA-COEFFICIENTS",
             f"camera file {path}: {len(given)} distortion coefficients; {', '.join(map(str, DISTORTION_COUNTS))} "
-            "are possible (k1, k2, p1, p2, k3 …)"
+            "are possible (k1, k2, p1, p2, k3 …)",
         )
     distortion = np.zeros(8)
     distortion[: min(len(given), 8)] = given[:8]

@@ -98,10 +98,12 @@ def require_covariance(matrix: np.ndarray, size: int, rows: Rows, definite: bool
         Says what is measured and needed; whose covariance it is, is for the caller to say.
     """
     if matrix.shape != (size, size):
-        raise InputError(f"{'×'.join(map(str, matrix.shape)) or 'a single number'}, {size}×{size} needed")
+        raise InputError(
+            "E-COVARIANCE-SHAPE", f"{'×'.join(map(str, matrix.shape)) or 'a single number'}, {size}×{size} needed"
+        )
     fault = first_fault(matrix[None], rows, definite)
     if fault is not None:
-        raise InputError(fault.reason)
+        raise InputError("E-COVARIANCE-VALUE", fault.reason)
 
 
 def _reason(matrix, odd, correlation, lowest: float, rows: Rows, definite: bool) -> str:

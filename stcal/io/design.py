@@ -136,7 +136,7 @@ def load_target(path: str | Path) -> TargetDesign:
     _no_duplicates([face.id for face in data.face], f"{where}: face id")
     for face in data.face:
         if face.id == BOARD:
-            raise InputError(f"{where}: face id {BOARD} is taken by the board; choose another")
+            raise InputError("E-TARGET-ID", f"{where}: face id {BOARD} is taken by the board; choose another")
     faces = tuple(_face(face, f"{where}: face {face.id}") for face in data.face)
     _require_distinct(faces, where)
     return TargetDesign(data.name, data.polarity, faces)
@@ -150,16 +150,22 @@ def load_board(path: str | Path) -> BoardDesign:
 def board_design(data: BoardEntry, where: str) -> BoardDesign:
     """The board of an entry; ``where`` begins what an InputError says."""
     if 2 * data.radius_mm >= data.pitch_mm:
-        raise InputError(f"{where}: radius {data.radius_mm:g} mm, under half the pitch {data.pitch_mm:g} mm needed")
+        raise InputError(
+            "E-BOARD-RADIUS", f"{where}: radius {data.radius_mm:g} mm, under half the pitch {data.pitch_mm:g} mm needed"
+        )
     corner = None
     if data.corner is not None:
         corner = (data.corner.row, data.corner.column)
         if corner[0] not in (0, data.rows - 1) or corner[1] not in (0, data.columns - 1):
-            raise InputError(f"{where}: corner dot at row {corner[0]}, column {corner[1]}; a corner of the grid needed")
+            raise InputError(
+                "E-BOARD-CORNER",
+                f"{where}: corner dot at row {corner[0]}, column {corner[1]}; a corner of the grid needed",
+            )
         if not 1.15 * data.radius_mm <= data.corner.radius_mm < data.pitch_mm - data.radius_mm:
             raise InputError(
+                "E-BOARD-CORNER",
                 f"{where}: corner radius {data.corner.radius_mm:g} mm; at least {1.15 * data.radius_mm:g} mm "
-                f"and under {data.pitch_mm - data.radius_mm:g} mm needed"
+                f"and under {data.pitch_mm - data.radius_mm:g} mm needed",
             )
     return BoardDesign(
         data.rows,
@@ -187,7 +193,7 @@ def board_of(given: str | Path | BoardDesign | None) -> BoardDesign:
 def _no_duplicates(ids: list[str], what: str) -> None:
     for i, value in enumerate(ids):
         if value in ids[:i]:
-            raise InputError(f"{what} {value} occurs twice; ids must differ")
+            raise InputError("E-TARGET-ID", f"{what} {value} occurs twice; ids must differ")
 
 
 def _face(face: _FaceFile, where: str) -> FaceDesign:
@@ -195,28 +201,35 @@ def _face(face: _FaceFile, where: str) -> FaceDesign:
     _no_duplicates(ids, f"{where}: circle id")
     for key in ("origin", "x", "y"):
         if getattr(face, key) not in ids:
-            raise InputError(f"{where}: {key} circle {getattr(face, key)} is not among the circles {', '.join(ids)}")
+            raise InputError(
+                "E-TARGET-FRAME",
+                f"{where}: {key} circle {getattr(face, key)} is not among the circles {', '.join(ids)}",
+            )
     xy = np.array([[circle.x_mm, circle.y_mm] for circle in face.circles])
     radius = np.array([circle.radius_mm for circle in face.circles])
     gap = np.linalg.norm(xy[:, None] - xy, axis=2) - radius[:, None] - radius
     np.fill_diagonal(gap, np.inf)
     if gap.min() <= 0:
         i, j = np.unravel_index(gap.argmin(), gap.shape)
-        raise InputError(f"{where}: circles {ids[i]} and {ids[j]} overlap; move them apart")
+        raise InputError("E-TARGET-OVERLAP", f"{where}: circles {ids[i]} and {ids[j]} overlap; move them apart")
     origin, x, y = (xy[ids.index(getattr(face, key))] for key in ("origin", "x", "y"))
     length_x, length_y = np.linalg.norm(x - origin), np.linalg.norm(y - origin)
     if min(length_x, length_y) == 0:
-        raise InputError(f"{where}: frame circles {face.origin}, {face.x}, {face.y}; three different ones needed")
+        raise InputError(
+            "E-TARGET-FRAME", f"{where}: frame circles {face.origin}, {face.x}, {face.y}; three different ones needed"
+        )
     axis = (x - origin) / length_x
     sine = float(axis[0] * (y - origin)[1] - axis[1] * (y - origin)[0]) / length_y
     if abs(sine) < MIN_SINE:
         raise InputError(
-            f"{where}: frame circles {face.origin}, {face.x}, {face.y} are collinear; choose three off one line"
+            "E-TARGET-FRAME",
+            f"{where}: frame circles {face.origin}, {face.x}, {face.y} are collinear; choose three off one line",
         )
     if sine < 0:
         raise InputError(
+            "E-TARGET-FRAME",
             f"{where}: X to Y through {face.x} and {face.y} turns clockwise seen from outside; swap x and y, or "
-            "give positions as seen from outside with y up"
+            "give positions as seen from outside with y up",
         )
     face_from_drawing = np.array([axis, [-axis[1], axis[0]]])
     rough = None
@@ -237,7 +250,10 @@ def _require_inside(ids: list[str], xy: np.ndarray, radius: np.ndarray, outline:
     side = np.roll(outline, -1, axis=0) - outline
     length = np.linalg.norm(side, axis=1)
     if length.min() == 0:
-        raise InputError(f"{where}: outline_mm has the same corner twice; corners in order around the plate needed")
+        raise InputError(
+            "E-TARGET-OUTLINE",
+            f"{where}: outline_mm has the same corner twice; corners in order around the plate needed",
+        )
     from_corner = xy[:, None] - outline
     along = ((from_corner * side).sum(2) / length**2).clip(0, 1)
     gap = np.linalg.norm(from_corner - along[..., None] * side, axis=2).min(1) - radius
@@ -247,7 +263,10 @@ def _require_inside(ids: list[str], xy: np.ndarray, radius: np.ndarray, outline:
         at = outline[:, 0] + (xy[:, 1:] - outline[:, 1]) * side[:, 0] / side[:, 1]
     inside = (crossed & (xy[:, :1] < at)).sum(1) % 2 == 1
     for name in (name for name, ok in zip(ids, inside & (gap >= 0), strict=True) if not ok):
-        raise InputError(f"{where}: circle {name} reaches over outline_mm; corners in order around all circles needed")
+        raise InputError(
+            "E-TARGET-OUTLINE",
+            f"{where}: circle {name} reaches over outline_mm; corners in order around all circles needed",
+        )
 
 
 def _require_distinct(faces: tuple[FaceDesign, ...], where: str) -> None:
@@ -269,9 +288,10 @@ def _require_distinct(faces: tuple[FaceDesign, ...], where: str) -> None:
             else:
                 what = f"the {len(few.ids)} circles of face {few.id} are all on face {many.id} too{size}"
             raise InputError(
+                "E-TARGET-LIKENESS",
                 f"{where}: {what} ({off}); "
                 f"change a circle on {'it' if few is many else 'one of them'}, its place by more than "
-                f"{MAX_GAP:g} radii or its radius by more than {MAX_RADIUS_RATIO - 1:.0%}"
+                f"{MAX_GAP:g} radii or its radius by more than {MAX_RADIUS_RATIO - 1:.0%}",
             )
 
 
@@ -282,14 +302,18 @@ def _rough_pose(pose: _RoughPoseFile, where: str) -> Rigid:
         direction = np.array(getattr(pose, key))
         length = float(np.linalg.norm(direction))
         if length < MIN_DIRECTION:
-            raise InputError(f"{where}: rough_pose: {key} {list(getattr(pose, key))}; a direction needed, not zero")
+            raise InputError(
+                "E-TARGET-ROUGH-POSE",
+                f"{where}: rough_pose: {key} {list(getattr(pose, key))}; a direction needed, not zero",
+            )
         directions.append(direction / length)
     x, z = directions
     angle = float(np.degrees(np.arccos(np.clip(x @ z, -1, 1))))
     if abs(angle - 90) > MAX_SKEW_DEG:
         raise InputError(
+            "E-TARGET-ROUGH-POSE",
             f"{where}: rough_pose: {angle:.0f}° between x and normal, 90° needed (to {MAX_SKEW_DEG:g}°); x is the "
-            "direction of the drawing's X along the face, normal points out of it"
+            "direction of the drawing's X along the face, normal points out of it",
         )
     x = x - (x @ z) * z
     x /= np.linalg.norm(x)

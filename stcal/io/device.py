@@ -65,8 +65,9 @@ class OpenCVSource:
         cv2.utils.logging.setLogLevel(before)
         if not self._capture.isOpened():
             raise InputError(
+                "E-DEVICE-OPEN",
                 f"{self.name}: cannot be opened; check that it is plugged in and free (`ls /dev/video*`), or "
-                "--simulate with an image"
+                "--simulate with an image",
             )
         back_end = self._capture.getBackendName()
         manual = MANUAL_V4L2 if back_end == "V4L2" else MANUAL_OTHERS
@@ -74,14 +75,17 @@ class OpenCVSource:
             self._capture.set(cv2.CAP_PROP_AUTO_EXPOSURE, manual)
         if gain is not None and not self._capture.set(cv2.CAP_PROP_GAIN, gain):
             self.close()
-            raise InputError(f"{self.name}: its driver ({back_end}) takes no gain; leave --gain out")
+            raise InputError(
+                "E-DEVICE-SETTING", f"{self.name}: its driver ({back_end}) takes no gain; leave --gain out"
+            )
 
     def expose(self, exposure: float | None, settle_s: float) -> tuple[np.ndarray, float]:
         """As of :class:`Source`; frames are passed over until the settle time is over."""
         if exposure is not None and not self._capture.set(cv2.CAP_PROP_EXPOSURE, exposure):
             raise InputError(
+                "E-DEVICE-SETTING",
                 f"{self.name}: its driver takes no exposure {exposure:g}; give exposures in its unit (V4L2: 100 µs), "
-                "see `v4l2-ctl --list-ctrls`"
+                "see `v4l2-ctl --list-ctrls`",
             )
         until, frame = time.monotonic() + settle_s, None
         read = 0
@@ -89,9 +93,11 @@ class OpenCVSource:
             there, frame = self._capture.read()
             read += 1
             if not there or frame is None:
-                raise InputError(f"{self.name}: gives no image any more; check its cable and other programs")
+                raise InputError(
+                    "E-DEVICE-NO-IMAGE", f"{self.name}: gives no image any more; check its cable and other programs"
+                )
         if frame is None:
-            raise InputError(f"{self.name}: gives no image; check it")
+            raise InputError("E-DEVICE-NO-IMAGE", f"{self.name}: gives no image; check it")
         grey = frame if frame.ndim == 2 else cv2.cvtColor(frame, cv2.COLOR_BGR2GRAY)
         return grey, float(self._capture.get(cv2.CAP_PROP_EXPOSURE))
 
@@ -129,11 +135,15 @@ class SimulatedSource:
         """As of :class:`Source`; there is nothing to settle."""
         image = next(self._next, None)
         if image is None:
-            raise InputError(f"{self.name}: has shown all of its images; give more, or a lower --count")
+            raise InputError(
+                "E-DEVICE-NO-IMAGE", f"{self.name}: has shown all of its images; give more, or a lower --count"
+            )
         try:
             content = read_bytes(image, IMAGE_BYTES)
         except OSError as error:
-            raise InputError(f"{image}: {error.strerror or error}; an image needed to simulate a camera") from error
+            raise InputError(
+                "E-IMAGE-UNREADABLE", f"{image}: {error.strerror or error}; an image needed to simulate a camera"
+            ) from error
         really = 1.0 if exposure is None else exposure
         seen = really * self._gain * grey_8bit(decode(content, str(image))).astype(float)
         seen += self._rng.normal(0, SIMULATED_NOISE, seen.shape)
@@ -157,5 +167,7 @@ def checked_name(name: str, what: str) -> str:
         One that is none.
     """
     if not re.fullmatch(r"[\w][\w .-]{0,99}", name):
-        raise InputError(f"{what} {name!r}: letters, digits, spaces, '.', '-' and '_' needed, up to 100")
+        raise InputError(
+            "E-DEVICE-NAME", f"{what} {name!r}: letters, digits, spaces, '.', '-' and '_' needed, up to 100"
+        )
     return name

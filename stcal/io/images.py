@@ -103,7 +103,10 @@ def find_images(folder: str | Path) -> tuple[list[ImageFile], list[Skipped]]:
     """
     root = Path(folder)
     if not root.is_dir():
-        raise InputError(f"image folder {root}: {'not a folder' if root.exists() else 'does not exist'}; give a folder")
+        raise InputError(
+            "E-IMAGES-FOLDER",
+            f"image folder {root}: {'not a folder' if root.exists() else 'does not exist'}; give a folder",
+        )
     files, skipped = [], []
     for path in sorted(root.iterdir(), key=lambda p: (p.is_dir(), p.name)):
         if path.name.startswith("."):
@@ -119,8 +122,9 @@ def find_images(folder: str | Path) -> tuple[list[ImageFile], list[Skipped]]:
         left_out = sorted(skipped, key=lambda s: (s.gate != "folder", HOLDS_IMAGES not in s.reason))[:1]
         hint = "".join(f" (left out {s.name}: {s.reason})" for s in left_out)
         raise InputError(
+            "E-IMAGES-NONE",
             f"image folder {root}: no image, one of {', '.join(s[1:] for s in SUFFIXES)}{hint}; "
-            f"put them into {root}/<group>/"
+            f"put them into {root}/<group>/",
         )
     return files, skipped
 
@@ -140,13 +144,16 @@ def chosen_images(folder: str | Path, exclude: Sequence[str] = ()) -> tuple[list
         found = {file.name for file in files if word == file.name or Path(word).absolute() == file.path.absolute()}
         if not found:
             raise InputError(
+                "E-OPTION-EXCLUDE",
                 f"--exclude {word}: no such image in {folder}; give its name as results have it, such as "
-                f"{files[0].name}"
+                f"{files[0].name}",
             )
         out |= found
     kept = [file for file in files if file.name not in out]
     if not kept:
-        raise InputError(f"image folder {folder}: --exclude takes out all {len(files)} images; leave some in")
+        raise InputError(
+            "E-OPTION-EXCLUDE", f"image folder {folder}: --exclude takes out all {len(files)} images; leave some in"
+        )
     return kept, [*skipped, *(Skipped(f.name, EXCLUDED, "excluded") for f in files if f.name in out)]
 
 
@@ -192,11 +199,11 @@ def decode(data: bytes, name: str) -> np.ndarray:
         Empty, truncated or unreadable data.
     """
     if not data:
-        raise InputError(f"{name}: empty file (0 bytes); copy it again")
+        raise InputError("E-IMAGE-EMPTY", f"{name}: empty file (0 bytes); copy it again")
     if not _ends_properly(data):
-        raise InputError(f"{name}: truncated ({len(data)} bytes); copy it again")
+        raise InputError("E-IMAGE-TRUNCATED", f"{name}: truncated ({len(data)} bytes); copy it again")
     if _is_png(data) and not _png_intact(data):
-        raise InputError(f"{name}: damaged (a checksum is wrong); copy it again")
+        raise InputError("E-IMAGE-DAMAGED", f"{name}: damaged (a checksum is wrong); copy it again")
     flags = cv2.IMREAD_GRAYSCALE | cv2.IMREAD_ANYDEPTH | cv2.IMREAD_IGNORE_ORIENTATION
     with _STANDARD_ERROR, _decoder_messages() as messages:
         try:
@@ -204,11 +211,16 @@ def decode(data: bytes, name: str) -> np.ndarray:
         except cv2.error:
             image = None
     if image is None:
-        raise InputError(f"{name}: not readable as an image; copy it again, or convert it to {', '.join(SUFFIXES)}")
+        raise InputError(
+            "E-IMAGE-UNREADABLE",
+            f"{name}: not readable as an image; copy it again, or convert it to {', '.join(SUFFIXES)}",
+        )
     if damage := _DAMAGE.search(messages):
-        raise InputError(f"{name}: damaged ({damage[0].decode(errors='replace').strip()}); copy it again")
+        raise InputError(
+            "E-IMAGE-DAMAGED", f"{name}: damaged ({damage[0].decode(errors='replace').strip()}); copy it again"
+        )
     if image.dtype not in (np.uint8, np.uint16):
-        raise InputError(f"{name}: pixels of type {image.dtype}; 8 or 16 bit needed")
+        raise InputError("E-IMAGE-TYPE", f"{name}: pixels of type {image.dtype}; 8 or 16 bit needed")
     return image
 
 
@@ -226,9 +238,13 @@ def stated_size(data: bytes, name: str) -> tuple[int, int]:
             with Image.open(BytesIO(data)) as image:
                 return image.size
     except Image.DecompressionBombError as error:
-        raise InputError(f"{name}: more pixels than any camera has; send it as the camera took it") from error
+        raise InputError(
+            "E-IMAGE-TOO-LARGE", f"{name}: more pixels than any camera has; send it as the camera took it"
+        ) from error
     except Exception as error:  # what is no image fails in many ways
-        raise InputError(f"{name}: not readable as an image; convert it to {', '.join(SUFFIXES)}") from error
+        raise InputError(
+            "E-IMAGE-UNREADABLE", f"{name}: not readable as an image; convert it to {', '.join(SUFFIXES)}"
+        ) from error
 
 
 def grey_8bit(image: np.ndarray) -> np.ndarray:

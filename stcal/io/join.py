@@ -69,8 +69,9 @@ def join(
     if not common:
         first = [next(iter(own)) for own in places]
         raise InputError(
+            "E-TABLES-UNMATCHED",
             f"{a}, {b}: no {key} in common: {first[0]} … in the one, {first[1]} … in the other; correct them, or give "
-            "another --key"
+            "another --key",
         )
     joined: dict[str, list[str] | np.ndarray] = {}
     for table, own, prefix in zip(tables, places, prefixes, strict=True):
@@ -80,7 +81,8 @@ def join(
             new = prefix + name if posed else name
             if new in joined and posed:
                 raise InputError(
-                    f"{a}, {b}: both have {name}; positions or poses of one of them alone can be read here"
+                    "E-TABLES-BOTH",
+                    f"{a}, {b}: both have {name}; positions or poses of one of them alone can be read here",
                 )
             joined.setdefault(new, values[rows] if isinstance(values, np.ndarray) else [values[i] for i in rows])
     lines = [tables[0].lines[places[0][name]] for name in common]
@@ -105,7 +107,10 @@ def stack(tables: Sequence[Table], names: Sequence[str], called: dict[str, str],
     """
     twice = next((name for name in names if names.count(name) > 1), None)
     if twice is not None:
-        raise InputError(f"{tables[0].where}: two files are called {twice}; rename one, {column}s are called like them")
+        raise InputError(
+            "E-TABLES-NAMES",
+            f"{tables[0].where}: two files are called {twice}; rename one, {column}s are called like them",
+        )
     common = [name for name in tables[0].columns if name != column and all(name in each for each in tables)]
     columns: dict[str, list[str] | np.ndarray] = {}
     for name in common:
@@ -120,13 +125,17 @@ def stack(tables: Sequence[Table], names: Sequence[str], called: dict[str, str],
 
 def _places(table: Table, key: str) -> dict[str, int]:
     if key not in table:
-        raise InputError(f"{table.where}: no column {key}; the header is {table.header()}; give another --key")
+        raise InputError(
+            "E-TABLE-COLUMN-MISSING",
+            f"{table.where}: no column {key}; the header is {table.header()}; give another --key",
+        )
     found: dict[str, int] = {}
     for row, name in enumerate(table.text(key)):
         if name in found:
             raise InputError(
+                "E-TABLE-ROW-REPEATED",
                 f"{table.where}: line {table.lines[row]}: {key} {name} stands on line {table.lines[found[name]]} too; "
-                "every one once needed"
+                "every one once needed",
             )
         found[name] = row
     return found

@@ -172,11 +172,15 @@ def read_json(path: str | Path, what: str, remedy: str) -> dict[str, Any]:
     try:
         content = json.loads(read_bytes(path, TABLE_BYTES).decode("utf-8-sig"))  # Windows puts a byte-order mark first
     except OSError as error:
-        raise InputError(f"{where}: {error.strerror or error}; {remedy}") from error
+        raise InputError("E-FILE-UNREADABLE", f"{where}: {error.strerror or error}; {remedy}") from error
     except (ValueError, RecursionError) as error:  # not UTF-8, a NUL in the name, a number of 5000 digits, deep nesting
-        raise InputError(f"{where}: not JSON ({' '.join(str(error).split())[:100]}); {remedy}") from error
+        raise InputError(
+            "E-JSON-INVALID", f"{where}: not JSON ({' '.join(str(error).split())[:100]}); {remedy}"
+        ) from error
     if not isinstance(content, dict):
-        raise InputError(f"{where}: a {type(content).__name__}, an object with named keys needed; {remedy}")
+        raise InputError(
+            "E-JSON-CONTENT", f"{where}: a {type(content).__name__}, an object with named keys needed; {remedy}"
+        )
     return content
 
 
@@ -192,7 +196,7 @@ def checked(content: dict[str, Any], model: type[F]) -> F:
         return model.model_validate(content, extra="ignore")
     except ValidationError as error:
         key = error.errors()[0]["loc"][-1:]
-        raise InputError(first_mistake(error, f"no {str(*key)!r}")) from error
+        raise InputError("E-JSON-CONTENT", first_mistake(error, f"no {str(*key)!r}")) from error
 
 
 def read_result(path: str | Path, model: type[F], what: str, remedy: str) -> F:
@@ -201,4 +205,4 @@ def read_result(path: str | Path, model: type[F], what: str, remedy: str) -> F:
     try:
         return checked(content, model)
     except InputError as error:
-        raise InputError(f"{what} {path}: {error}; {remedy}") from error
+        raise InputError("E-JSON-CONTENT", f"{what} {path}: {error}; {remedy}") from error

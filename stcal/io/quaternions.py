@@ -32,8 +32,9 @@ def require_unit(wxyz: np.ndarray, place: Callable[[int], str], where: str, reme
     if len(bad):
         more = f" (and {len(bad) - 1} more)" if len(bad) > 1 else ""
         raise InputError(
+            "E-QUATERNION-LENGTH",
             f"{where}: {place(bad[0])}: quaternion of length {length[bad[0]]:.4g}, 1 ± {UNIT_WITHIN:g} needed{more}; "
-            f"{remedy}"
+            f"{remedy}",
         )
 
 

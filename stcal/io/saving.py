@@ -53,7 +53,7 @@ def save(path: Path, content: str | bytes) -> None:
         It cannot be written.
     """
     if not path.name or path.is_dir():
-        raise InputError(f"{path}: is a folder; the name of a file needed")
+        raise InputError("E-OUTPUT-FOLDER", f"{path}: is a folder; the name of a file needed")
     partial = path.with_name(f"{path.name}.{os.getpid()}.partial")
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
@@ -61,8 +61,9 @@ def save(path: Path, content: str | bytes) -> None:
         os.replace(partial, path)
     except OSError as error:
         raise InputError(
+            "E-OUTPUT-UNWRITABLE",
             f"{path}: cannot be written: {error.strerror or error}; check the folder's space and rights, or give "
-            "another place"
+            "another place",
         ) from error
     finally:
         with suppress(OSError):  # where a file stands in the folder's place there is none to remove
@@ -78,14 +79,18 @@ def require_new_folder(out: Path, images: Path) -> None:
         Which.
     """
     if out.exists() and (not out.is_dir() or any(out.iterdir())):
-        raise InputError(f"--out {out}: is not a new or empty folder; give another place")
+        raise InputError("E-OUTPUT-EXISTS", f"--out {out}: is not a new or empty folder; give another place")
     if real_place(images) in (real_place(out), *real_place(out).parents):
-        raise InputError(f"--out {out}: lies in the folder of the photographs {images}; give another place")
+        raise InputError(
+            "E-OUTPUT-PLACE", f"--out {out}: lies in the folder of the photographs {images}; give another place"
+        )
     above = next(each for each in out.absolute().parents if each.exists())
     try:
         tempfile.TemporaryDirectory(prefix=f".{out.name}-", dir=above).cleanup()
     except OSError as error:
-        raise InputError(f"--out {out}: cannot be written: {error.strerror or error}; give another place") from error
+        raise InputError(
+            "E-OUTPUT-UNWRITABLE", f"--out {out}: cannot be written: {error.strerror or error}; give another place"
+        ) from error
 
 
 def save_folder(out: Path, files: dict[str, str]) -> None:
@@ -104,7 +109,9 @@ def save_folder(out: Path, files: dict[str, str]) -> None:
         try:
             made.replace(out)
         except OSError as error:
-            raise InputError(f"{out}: cannot be written: {error.strerror or error}; give another place") from error
+            raise InputError(
+                "E-OUTPUT-UNWRITABLE", f"{out}: cannot be written: {error.strerror or error}; give another place"
+            ) from error
 
 
 def json_text(content) -> str:
@@ -162,13 +169,19 @@ def keep_apart(outputs: Sequence[tuple[str, Path]], inputs: Sequence[tuple[str, 
         for given, read in inputs:
             own = real_place(read)
             if place == own:
-                raise InputError(f"{option} {path}: is an input of this command; give another name")
+                raise InputError(
+                    "E-OUTPUT-IS-INPUT", f"{option} {path}: is an input of this command; give another name"
+                )
             if own in place.parents and place.exists() and not _is_ours(place, own):
-                raise InputError(f"{option} {path}: is a file of {given} {read}; give another name")
+                raise InputError(
+                    "E-OUTPUT-IS-INPUT", f"{option} {path}: is a file of {given} {read}; give another name"
+                )
         if place in places:
-            raise InputError(f"{option} {path}: is also what {places[place]} writes; give each its own name")
+            raise InputError(
+                "E-OUTPUT-TWICE", f"{option} {path}: is also what {places[place]} writes; give each its own name"
+            )
         if place.is_dir():
-            raise InputError(f"{option} {path}: is a folder; the name of a file needed")
+            raise InputError("E-OUTPUT-FOLDER", f"{option} {path}: is a folder; the name of a file needed")
         places[place] = option
 
 

@@ -77,8 +77,9 @@ def run_on_images(
         here = isinstance(error, BrokenProcessPool)
         what = "a process was ended from outside, for lack of memory perhaps" if here else str(error)
         raise DetectionError(
+            "E-WORKER-DIED",
             f"images, {len(jobs)} of them: {what}; run the same command again{', with fewer --workers' * here}"
-            f"{', finished detections are kept' * kept}"
+            f"{', finished detections are kept' * kept}",
         ) from error
 
 
@@ -105,7 +106,8 @@ def _on_worker(function: Callable, files: ImageFile | list[ImageFile], *argument
     for file in [files] if isinstance(files, ImageFile) else files:
         if file.content is None and not file.path.parent.is_dir():
             raise InputError(
+                "E-WORKER-PATH",
                 f"{file.path.parent}: not there on worker {socket.gethostname()}; give a path that all workers see, or "
-                "--send-images"
+                "--send-images",
             )
     return function(files, *arguments)

@@ -74,7 +74,8 @@ class Table:
             shown = self.columns[column][bad[0]]
             more = f" (and {len(bad) - 1} more)" if len(bad) > 1 else ""
             raise InputError(
-                f"{self.where}: line {self.lines[bad[0]]}: {column} is {str(shown)!r}, a finite number needed{more}"
+                "E-TABLE-NUMBER",
+                f"{self.where}: line {self.lines[bad[0]]}: {column} is {str(shown)!r}, a finite number needed{more}",
             )
         return values
 
@@ -89,7 +90,8 @@ class Table:
         far = np.flatnonzero(np.abs(values) > FARTHEST)
         if len(far):
             raise InputError(
-                f"{self.where}: line {self.lines[far[0]]}: {column} is {values[far[0]]:g}, up to {FARTHEST:g} possible"
+                "E-VALUE-TOO-FAR",
+                f"{self.where}: line {self.lines[far[0]]}: {column} is {values[far[0]]:g}, up to {FARTHEST:g} possible",
             )
         return values
 
@@ -99,7 +101,9 @@ class Table:
         if len(given) != 1:
             wanted = " or ".join(f"{name}_{unit}" for unit in units)
             found = "no such column" if not given else f"{len(given)} of them"
-            raise InputError(f"{self.where}: {found}, {wanted} needed; the header is {self.header()}")
+            raise InputError(
+                "E-TABLE-COLUMN-MISSING", f"{self.where}: {found}, {wanted} needed; the header is {self.header()}"
+            )
         return given[0]
 
     def has(self, name: str, units: dict[str, float]) -> bool:
@@ -115,7 +119,9 @@ class Table:
         there = [prefix + c for c in QUATERNION if prefix + c in self.columns]
         if there and len(there) < 4:
             missing = ", ".join(prefix + c for c in QUATERNION if prefix + c not in self.columns)
-            raise InputError(f"{self.where}: {', '.join(there)} without {missing}; all four or none needed")
+            raise InputError(
+                "E-TABLE-COLUMN-MISSING", f"{self.where}: {', '.join(there)} without {missing}; all four or none needed"
+            )
         return bool(there)
 
     def _order(self, prefix: str) -> list[str]:
@@ -145,7 +151,10 @@ class Table:
             return None
         if len(there) < len(COVARIANCE):
             missing = next(prefix + name for name in COVARIANCE if prefix + name not in self.columns)
-            raise InputError(f"{self.where}: {missing} is missing; all {len(COVARIANCE)} columns cov_… or none needed")
+            raise InputError(
+                "E-TABLE-COLUMN-MISSING",
+                f"{self.where}: {missing} is missing; all {len(COVARIANCE)} columns cov_… or none needed",
+            )
         full = np.zeros((len(self), 6, 6))
         i, j = np.triu_indices(6)
         full[:, i, j] = full[:, j, i] = np.column_stack([self.numbers(prefix + name) for name in COVARIANCE])
@@ -162,7 +171,10 @@ class Table:
         """
         fault = first_fault(full, rows, definite=True)
         if fault is not None:
-            raise InputError(f"{self.where}: line {self.lines[fault.row]}: covariance: {fault.reason}; correct it")
+            raise InputError(
+                "E-TABLE-COVARIANCE",
+                f"{self.where}: line {self.lines[fault.row]}: covariance: {fault.reason}; correct it",
+            )
 
     def common_errors(self, covariance: np.ndarray | None) -> np.ndarray | None:
         """(m, 6, r) of the columns ``common1_rx`` … ``common1_z``, ``common2_rx`` …; None where there are none.
@@ -176,16 +188,24 @@ class Table:
         if not count:
             return None
         if covariance is None:
-            raise InputError(f"{self.where}: columns common1_… without columns cov_…, which must hold them; give both")
+            raise InputError(
+                "E-TABLE-COVARIANCE",
+                f"{self.where}: columns common1_… without columns cov_…, which must hold them; give both",
+            )
         for name in common_columns(count):
             if name not in self.columns:
-                raise InputError(f"{self.where}: {name} is missing; all columns common1_rx … or none needed")
+                raise InputError(
+                    "E-TABLE-COLUMN-MISSING",
+                    f"{self.where}: {name} is missing; all columns common1_rx … or none needed",
+                )
         values = np.column_stack([self.numbers(name) for name in common_columns(count)])
         full = np.swapaxes(values.reshape(len(self), count, 6), 1, 2)
         fault = first_fault(covariance - full @ np.swapaxes(full, 1, 2), OF_POSE, definite=True)
         if fault is not None:
             where = f"{self.where}: line {self.lines[fault.row]}"
-            raise InputError(f"{where}: common errors are larger than the covariance; correct them")
+            raise InputError(
+                "E-TABLE-COVARIANCE", f"{where}: common errors are larger than the covariance; correct them"
+            )
         return full
 
     def header(self) -> str:
@@ -195,7 +215,9 @@ class Table:
 
     def _need(self, column: str) -> None:
         if column not in self.columns:
-            raise InputError(f"{self.where}: column {column} is missing; the header is {self.header()}")
+            raise InputError(
+                "E-TABLE-COLUMN-MISSING", f"{self.where}: column {column} is missing; the header is {self.header()}"
+            )
 
 
 def read_table(path: "str | Path | Table", what: str, quaternions: Order = "wxyz") -> Table:
@@ -216,27 +238,36 @@ def read_table(path: "str | Path | Table", what: str, quaternions: Order = "wxyz
     try:
         text = read_bytes(path, TABLE_BYTES).decode("utf-8-sig")
     except OSError as error:
-        raise InputError(f"{where}: {error.strerror or error}; check the path") from error
+        raise InputError("E-FILE-UNREADABLE", f"{where}: {error.strerror or error}; check the path") from error
     except UnicodeDecodeError as error:
-        raise InputError(f"{where}: not UTF-8 text; save it as CSV in UTF-8") from error
+        raise InputError("E-TABLE-ENCODING", f"{where}: not UTF-8 text; save it as CSV in UTF-8") from error
     lines = text.splitlines()
     used = [(i, line) for i, line in enumerate(lines, 1) if line.strip() and not line.lstrip().startswith("#")]
     if not used:
-        raise InputError(f"{where}: empty; a header and rows needed")
+        raise InputError("E-TABLE-EMPTY", f"{where}: empty; a header and rows needed")
     try:
         names = [name.strip() for name in next(csv.reader([used[0][1]]))]
     except csv.Error as error:
-        raise InputError(f"{where}: line {used[0][0]}: {error}; a header with names and units needed") from error
+        raise InputError(
+            "E-TABLE-HEADER", f"{where}: line {used[0][0]}: {error}; a header with names and units needed"
+        ) from error
     if len(names) == 1 and any(separator in names[0] for separator in ";\t"):
-        raise InputError(f"{where}: columns separated by ';' or tabs; commas needed, and '.' in numbers")
+        raise InputError(
+            "E-TABLE-DELIMITER", f"{where}: columns separated by ';' or tabs; commas needed, and '.' in numbers"
+        )
     for name in names:
         if names.count(name) > 1 or not name:
             shown = name or "without a name"
-            raise InputError(f"{where}: column {shown} occurs {names.count(name)} times; every name once needed")
+            raise InputError(
+                "E-TABLE-HEADER", f"{where}: column {shown} occurs {names.count(name)} times; every name once needed"
+            )
     if all(_is_number(name) for name in names):
-        raise InputError(f"{where}: line {used[0][0]} is numbers, a header with names and units needed, like x_mm,y_mm")
+        raise InputError(
+            "E-TABLE-HEADER",
+            f"{where}: line {used[0][0]} is numbers, a header with names and units needed, like x_mm,y_mm",
+        )
     if len(used) == 1:
-        raise InputError(f"{where}: a header but no rows; rows needed")
+        raise InputError("E-TABLE-EMPTY", f"{where}: a header but no rows; rows needed")
     numbers = [i for i, _ in used[1:]]
     rows = [line for _, line in used[1:]]
     try:
@@ -251,10 +282,15 @@ def read_table(path: "str | Path | Table", what: str, quaternions: Order = "wxyz
         cells = []
     if len(cells) != len(rows):
         open_one = next((i for i, line in used[1:] if line.count('"') % 2), numbers[0])
-        raise InputError(f"{where}: line {open_one}: a quoted cell goes over several lines; one row on one line needed")
+        raise InputError(
+            "E-TABLE-CELLS",
+            f"{where}: line {open_one}: a quoted cell goes over several lines; one row on one line needed",
+        )
     for line, row in zip(numbers, cells, strict=True):
         if len(row) != len(names):
-            raise InputError(f"{where}: line {line}: {len(row)} cells, {len(names)} needed as in the header")
+            raise InputError(
+                "E-TABLE-CELLS", f"{where}: line {line}: {len(row)} cells, {len(names)} needed as in the header"
+            )
     return Table(where, {n: [row[k].strip() for row in cells] for k, n in enumerate(names)}, numbers, quaternions)
 
 

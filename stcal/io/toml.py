@@ -53,7 +53,9 @@ class PoseEntry(Strict):
         wxyz = np.array([self.qw, self.qx, self.qy, self.qz])
         length = float(np.linalg.norm(wxyz))
         if abs(length - 1) > UNIT_WITHIN:
-            raise InputError(f"{where}: quaternion of length {length:.4g}, 1 needed; normalise qw, qx, qy, qz")
+            raise InputError(
+                "E-QUATERNION-LENGTH", f"{where}: quaternion of length {length:.4g}, 1 needed; normalise qw, qx, qy, qz"
+            )
         return Poses.from_quaternions([wxyz], [[self.x_mm, self.y_mm, self.z_mm]])[0]
 
 
@@ -68,7 +70,7 @@ def validated(content: Any, model: type[M], where: str) -> M:
     try:
         return model.model_validate(content)
     except ValidationError as error:
-        raise InputError(f"{where}: {first_mistake(error)}") from error
+        raise InputError("E-TOML-CONTENT", f"{where}: {first_mistake(error)}") from error
 
 
 def load_toml(path: str | Path, model: type[M], what: str, remedy: str) -> M:
@@ -83,9 +85,9 @@ def load_toml(path: str | Path, model: type[M], what: str, remedy: str) -> M:
         text = read_bytes(path, SETTINGS_BYTES).decode("utf-8-sig")  # Windows editors put a byte-order mark first
         content = tomllib.loads(text)
     except OSError as error:
-        raise InputError(f"{what} {path}: {error.strerror or error}; {remedy}") from error
+        raise InputError("E-FILE-UNREADABLE", f"{what} {path}: {error.strerror or error}; {remedy}") from error
     except (ValueError, RecursionError) as error:  # TOMLDecodeError, UnicodeDecodeError, numbers of 5000 digits
-        raise InputError(f"{what} {path}: not valid TOML: {error}") from error
+        raise InputError("E-TOML-INVALID", f"{what} {path}: not valid TOML: {error}") from error
     return validated(content, model, f"{what} {path}")
 
 

@@ -47,9 +47,9 @@ class LocateOptions:
 
     def __post_init__(self):
         if self.method not in ("joint", "patent"):
-            raise InputError(f"method {self.method!r}: joint or patent needed")
+            raise InputError("E-OPTION-METHOD", f"method {self.method!r}: joint or patent needed")
         if not self.moved_px > 0:
-            raise InputError(f"moved_px {self.moved_px:g}: a positive number needed")
+            raise InputError("E-OPTION-RANGE", f"moved_px {self.moved_px:g}: a positive number needed")
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -124,9 +124,10 @@ def register(
     ambiguous = alternative is not None and len(alternative.rows) >= AS_GOOD * fitted.inliers.sum()
     if alternative is not None and ambiguous and not allow_ambiguous:
         raise DegenerateError(
+            "E-REGISTER-TWO-TRANSFORMS",
             f"registration: {fitted.inliers.sum()} point pairs agree on one transform and {len(alternative.rows)} "
             f"others on another, {alternative.apart_mm:.4g} mm from it; register one group of rows alone, or allow "
-            "ambiguous answers"
+            "ambiguous answers",
         )
     inside = problem[fitted.inliers]
     covariance = covariance_of(inside, fitted.transform, fitted.sigma, fitted.threshold)
@@ -170,24 +171,31 @@ def register(
 def _checked(xyz_a, xyz_b, model: str, method: str, threshold_mm: float | None, weights, covariances) -> Problem:
     a, b = np.asarray(xyz_a, float), np.asarray(xyz_b, float)
     if a.ndim != 2 or a.shape[1:] != (3,) or a.shape != b.shape:
-        raise InputError(f"registration: points of shapes {a.shape} and {b.shape}; (n, 3) twice needed")
+        raise InputError(
+            "E-ARRAY-SHAPE", f"registration: points of shapes {a.shape} and {b.shape}; (n, 3) twice needed"
+        )
     for name, xyz in (("a", a), ("b", b)):
         bad = np.flatnonzero(~np.isfinite(xyz).all(1))
         if len(bad):
-            raise InputError(f"registration: row {bad[0] + 1} of {name} is not finite; remove it")
+            raise InputError("E-ARRAY-NOT-FINITE", f"registration: row {bad[0] + 1} of {name} is not finite; remove it")
     if model not in MODELS:
-        raise InputError(f"registration: model {model!r}; one of {', '.join(MODELS)} needed")
+        raise InputError("E-OPTION-VALUE", f"registration: model {model!r}; one of {', '.join(MODELS)} needed")
     if method not in METHODS:
-        raise InputError(f"registration: method {method!r}; one of {', '.join(METHODS)} needed")
+        raise InputError("E-OPTION-METHOD", f"registration: method {method!r}; one of {', '.join(METHODS)} needed")
     if threshold_mm is not None and not NEAREST_MM <= threshold_mm <= FARTHEST:
         raise InputError(
-            f"registration: threshold {threshold_mm:g} mm; a positive number, {NEAREST_MM:g} to {FARTHEST:g}, needed"
+            "E-OPTION-RANGE",
+            f"registration: threshold {threshold_mm:g} mm; a positive number, {NEAREST_MM:g} to {FARTHEST:g}, needed",
         )
     if method == "liu2017" and (weights is not None or covariances is not None):
-        raise InputError("registration: method liu2017 knows no weights or covariances; leave them out")
+        raise InputError(
+            "E-REGISTER-WEIGHTS", "registration: method liu2017 knows no weights or covariances; leave them out"
+        )
     chosen = MODELS["affine" if method == "liu2017" else model]
     if len(a) < chosen.needed:
-        raise DegenerateError(f"registration: {len(a)} point pairs, {chosen.needed} needed for the {chosen.name} model")
+        raise DegenerateError(
+            "E-POINTS-FEW", f"registration: {len(a)} point pairs, {chosen.needed} needed for the {chosen.name} model"
+        )
     return Problem(chosen, a, b, noise_of(len(a), weights, covariances))
 
 
@@ -279,8 +287,9 @@ def _as_assigned(problem: Problem, group: np.ndarray, threshold: float | None) -
 def _check_chance(problem: Problem, fitted: Fitted) -> None:
     if len(problem) > problem.model.sample and chance(problem, fitted) > np.log(BY_CHANCE):
         raise DegenerateError(
+            "E-REGISTER-CHANCE",
             f"registration: {fitted.inliers.sum()} of {len(problem)} point pairs agree to {fitted.sigma:.4g} mm, no "
-            "better than chance; check that row i of both is the same point"
+            "better than chance; check that row i of both is the same point",
         )
 
 

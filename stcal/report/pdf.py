@@ -27,9 +27,9 @@ def pdf_of(page: str) -> bytes:
         from weasyprint import HTML
         from weasyprint.urls import URLFetcher
     except ImportError as error:
-        raise InputError(NEEDED) from error
+        raise InputError("E-EXTRA-MISSING", NEEDED) from error
     except OSError as error:
-        raise InputError(NO_PANGO.format(reason=str(error).splitlines()[0])) from error
+        raise InputError("E-EXTRA-MISSING", NO_PANGO.format(reason=str(error).splitlines()[0])) from error
     stream = io.BytesIO()
     HTML(string=page, url_fetcher=URLFetcher(allowed_protocols=["data"])).write_pdf(stream)
     return stream.getvalue()

@@ -49,13 +49,17 @@ def write_dataset(
     """
     folder, options = Path(folder), render_options or RenderOptions()
     if image_format not in IMAGE_FORMATS:
-        raise InputError(f"data set: image format {image_format}, one of {', '.join(IMAGE_FORMATS)} needed")
+        raise InputError(
+            "E-OPTION-FORM", f"data set: image format {image_format}, one of {', '.join(IMAGE_FORMATS)} needed"
+        )
     if image_format == "jpg" and options.bit_depth != 8:
-        raise InputError(f"data set: JPEG holds 8 bits, not {options.bit_depth}; choose png")
+        raise InputError("E-OPTION-FORM", f"data set: JPEG holds 8 bits, not {options.bit_depth}; choose png")
     if not 1 <= jpeg_quality <= 100:
-        raise InputError(f"data set: JPEG quality {jpeg_quality}, 1 to 100 needed")
+        raise InputError("E-OPTION-RANGE", f"data set: JPEG quality {jpeg_quality}, 1 to 100 needed")
     if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
-        raise InputError(f"data set folder {folder}: exists and is not empty; give a new or an empty folder")
+        raise InputError(
+            "E-OUTPUT-EXISTS", f"data set folder {folder}: exists and is not empty; give a new or an empty folder"
+        )
     try:
         truth = json.dumps(TruthFile.of(scene, image_format).content())
         for group in scene.groups:
@@ -65,7 +69,9 @@ def write_dataset(
         (folder / "board.toml").write_text(board_toml(scene.board), encoding="utf-8")
         (folder / "truth.json").write_text(truth + "\n", encoding="utf-8")
     except OSError as error:
-        raise InputError(f"data set folder {folder}: {error.strerror or error}; give a writable folder") from error
+        raise InputError(
+            "E-OUTPUT-UNWRITABLE", f"data set folder {folder}: {error.strerror or error}; give a writable folder"
+        ) from error
     jobs = {
         image_name(group, i, image_format): (scene, group, i, options, jpeg_quality)
         for group, g in scene.groups.items()
@@ -84,4 +90,6 @@ def _write_image(path: Path, scene: Scene, group: str, image: int, options: Rend
     try:
         path.write_bytes(data)
     except OSError as error:
-        raise InputError(f"image {path}: {error.strerror or error}; free space or choose another folder") from error
+        raise InputError(
+            "E-OUTPUT-UNWRITABLE", f"image {path}: {error.strerror or error}; free space or choose another folder"
+        ) from error

@@ -27,7 +27,7 @@ BLOOM = 0.15
 def stored(image: np.ndarray, bits: int = 8) -> np.ndarray:
     """Pixels of a file: clipped, rounded, uint8; of 9 to 16 bits uint16 with white at 2^bits − 1."""
     if not 8 <= bits <= 16:
-        raise InputError(f"degraded image: {bits} bits, 8 to 16 needed")
+        raise InputError("E-SIMULATE-OPTIONS", f"degraded image: {bits} bits, 8 to 16 needed")
     top = 2**bits - 1
     levels = np.rint(np.clip(np.asarray(image, np.float32) * np.float32(top / WHITE), 0, top))
     return levels.astype(np.uint8 if bits == 8 else np.uint16)

@@ -27,7 +27,10 @@ class Sensor:
 
     def __post_init__(self):
         if self.gamma <= 0 or self.full_well <= 0 or self.read_noise < 0 or self.bits not in (8, 16):
-            raise InputError("sensor: gamma and full well positive, read noise not negative, 8 or 16 bits needed")
+            raise InputError(
+                "E-SIMULATE-OPTIONS",
+                "sensor: gamma and full well positive, read noise not negative, 8 or 16 bits needed",
+            )
 
 
 @dataclass(frozen=True, slots=True)
@@ -59,9 +62,11 @@ def expose(
     What was saturated in the photograph is white in all. The noise of the exposures is independent.
     """
     if photograph.dtype != np.uint8 or photograph.ndim != 2:
-        raise InputError(f"photograph: {photograph.dtype} of shape {photograph.shape}; 8-bit grey needed")
+        raise InputError(
+            "E-IMAGE-TYPE", f"photograph: {photograph.dtype} of shape {photograph.shape}; 8-bit grey needed"
+        )
     if not all(time > 0 for time in times):
-        raise InputError("exposure times: positive numbers needed")
+        raise InputError("E-EXPOSURES-VALUE", "exposure times: positive numbers needed")
     sensor, light = sensor or Sensor(), light or Light()
     rng = np.random.default_rng(seed)
     # Within a step of grey the light may have been anything: spread evenly, or a darker exposure would show the steps.

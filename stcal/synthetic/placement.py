@@ -74,7 +74,8 @@ def viewing_axes(normal_a: np.ndarray, normal_b: np.ndarray, where: str) -> np.n
     angle = np.degrees(np.arctan2(np.linalg.norm(np.cross(normal_a, normal_b)), normal_a @ normal_b))
     if not 5 <= angle <= 130:
         raise DegenerateError(
-            f"{where}: {angle:.0f}° between the faces, 5° to 130° needed to photograph both; pair other faces"
+            "E-SCENE-FACES",
+            f"{where}: {angle:.0f}° between the faces, 5° to 130° needed to photograph both; pair other faces",
         )
     up, towards = np.cross(normal_a, normal_b), normal_a + normal_b
     up, towards = up / np.linalg.norm(up), towards / np.linalg.norm(towards)
@@ -110,8 +111,9 @@ def place_group(
     target_from_board, views, valid = best
     if len(valid) < count:
         raise DegenerateError(
+            "E-SCENE-VIEWS",
             f"{shape.name}: {len(valid)} of {tried} views show faces and board ({shown} show the faces), "
-            f"{count} needed; enlarge distance_mm or reduce the focal length"
+            f"{count} needed; enlarge distance_mm or reduce the focal length",
         )
     picked = rng.permutation(_farthest(views.centres[valid] - shape.circles.mean(0), count))
     return target_from_board, [views.pose(i) for i in valid[picked]]

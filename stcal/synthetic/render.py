@@ -60,9 +60,11 @@ class RenderOptions:
     def __post_init__(self):
         for name in ("noise", "blur_px", "vignetting", "gradient", "spread", "exposure"):
             if getattr(self, name) < 0:
-                raise InputError(f"rendering: {name} {getattr(self, name):g}, zero or more needed")
+                raise InputError(
+                    "E-SIMULATE-OPTIONS", f"rendering: {name} {getattr(self, name):g}, zero or more needed"
+                )
         if self.bit_depth not in (8, 16):
-            raise InputError(f"rendering: bit depth {self.bit_depth}, 8 or 16 needed")
+            raise InputError("E-SIMULATE-OPTIONS", f"rendering: bit depth {self.bit_depth}, 8 or 16 needed")
 
 
 def render(scene: Scene, group: str, image: int, options: RenderOptions | None = None) -> np.ndarray:

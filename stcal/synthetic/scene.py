@@ -70,11 +70,13 @@ class SceneOptions:
     def __post_init__(self):
         for name in ("width", "height", "images_per_group", "distance_mm", "spread_deg"):
             if getattr(self, name) <= 0:
-                raise InputError(f"scene: {name} {getattr(self, name)}, a positive number needed")
+                raise InputError("E-SIMULATE-OPTIONS", f"scene: {name} {getattr(self, name)}, a positive number needed")
         if self.spread_deg > 80:
-            raise InputError(f"scene: spread_deg {self.spread_deg:g}, at most 80 possible")
+            raise InputError("E-OPTION-RANGE", f"scene: spread_deg {self.spread_deg:g}, at most 80 possible")
         if len(self.distortion) > 8:
-            raise InputError(f"scene: {len(self.distortion)} distortion coefficients, at most 8 possible")
+            raise InputError(
+                "E-CAMERA-COEFFICIENTS", f"scene: {len(self.distortion)} distortion coefficients, at most 8 possible"
+            )
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -161,7 +163,7 @@ def make_scene(
     nominal = nominal or target.rough_poses()
     missing = [face.id for face in target.faces if face.id not in nominal]
     if missing:
-        raise InputError(f"scene: no nominal pose of face {missing[0]}; give one pose per face")
+        raise InputError("E-TARGET-ROUGH-POSE", f"scene: no nominal pose of face {missing[0]}; give one pose per face")
     rng = np.random.default_rng(options.seed)
     target_from_face, circles = _made_target(target, nominal, options, rng)
     _check_convex(target, target_from_face)
@@ -170,7 +172,7 @@ def make_scene(
     for pair in options.groups or _default_groups(target, target_from_face):
         group = _made_group(pair, target, board, camera, target_from_face, circles, options, rng)
         if group.name in groups:
-            raise InputError(f"scene: group {group.name} occurs twice; give different pairs")
+            raise InputError("E-SCENE-GROUP", f"scene: group {group.name} occurs twice; give different pairs")
         groups[group.name] = group
     return Scene(target, board, camera, target_from_face, circles, groups, options.seed)
 
@@ -232,8 +234,9 @@ def _default_groups(target: TargetDesign, target_from_face: dict[str, Rigid]) ->
         return list(REFERENCE_GROUPS)
     if not seen:
         raise DegenerateError(
+            "E-SCENE-FACES",
             f"scene: no two faces of target {target.name} are 20° to 120° apart, so that one photograph shows both; "
-            "check the rough poses, or add a face"
+            "check the rough poses, or add a face",
         )
     return seen
 
@@ -291,6 +294,7 @@ def _check_convex(target: TargetDesign, target_from_face: dict[str, Rigid]) -> N
             height = (face_from_target @ (target_from_face[face.id] @ _face_corners(face)))[:, 2].max()
             if height > CONVEX_TOLERANCE_MM:
                 raise DegenerateError(
+                    "E-SCENE-FACES",
                     f"scene: face {face.id} reaches {height:.0f} mm in front of face {front.id} and may cover it; "
-                    "simulated targets must be convex, check the rough poses"
+                    "simulated targets must be convex, check the rough poses",
                 )

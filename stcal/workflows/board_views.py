@@ -73,7 +73,7 @@ def detect_boards(
         No image is readable, or the camera is not that of the images; the message names the first.
     """
     if not files:
-        raise InputError("no image; images of the board needed")
+        raise InputError("E-IMAGES-NONE", "no image; images of the board needed")
     jobs = [(file, model, board, tuple(dictionaries)) for file in files]
     by_job: dict[int, BoardDetection | Skipped] = {}
     for i, detection in run_on_images(_detect_board, jobs, workers):
@@ -84,7 +84,7 @@ def detect_boards(
     detections = [each for each in found if isinstance(each, BoardDetection)]
     if not detections:
         first = next(each for each in found if isinstance(each, Skipped))
-        raise InputError(f"no usable image among {len(files)}: {first.name}: {first.reason}")
+        raise InputError("E-IMAGES-NONE-USABLE", f"no usable image among {len(files)}: {first.name}: {first.reason}")
     size = detections[0].size
     model.require_inside(*detections[0].size, detections[0].name)
     found = [_of_size(each, size, detections[0].name) for each in found]

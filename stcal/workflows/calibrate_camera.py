@@ -108,7 +108,8 @@ def corner_grid(board: FlatBoard) -> BoardDesign:
         rows, columns = board.rows - 1, board.columns - 1
     else:
         raise InputError(
-            f"--board: {kind_of(board)}; a board of dots, a chessboard or a ChArUco board needed to calibrate a camera"
+            "E-BOARD-TYPE",
+            f"--board: {kind_of(board)}; a board of dots, a chessboard or a ChArUco board needed to calibrate a camera",
         )
     return BoardDesign(rows, columns, board.square_mm, POINT_RADIUS_MM, "bright", board.sigma_mm)
 

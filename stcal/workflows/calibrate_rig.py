@@ -45,11 +45,16 @@ class Models:
         for word in given:
             name, separator, model = word.rpartition("=")
             if separator and name in own:
-                raise InputError(f"--model {word}: {name} has {own[name]} already; one for each camera")
+                raise InputError(
+                    "E-OPTION-REPEATED", f"--model {word}: {name} has {own[name]} already; one for each camera"
+                )
             if separator:
                 own[name] = model
         if len(common) > 1:
-            raise InputError(f"--model {common[1]}: {common[0]} is given too; one for all, or NAME=MODEL for each")
+            raise InputError(
+                "E-OPTION-CONFLICT",
+                f"--model {common[1]}: {common[0]} is given too; one for all, or NAME=MODEL for each",
+            )
         return cls(own, common[0] if common else default)
 
 
@@ -80,7 +85,9 @@ def calibrate_rig_from_photographs(
     names = camera_names(folder)
     unknown = [name for name in models.own if name not in names]
     if unknown:
-        raise InputError(f"--model {unknown[0]}=…: no folder {unknown[0]} in {folder}; it has {', '.join(names)}")
+        raise InputError(
+            "E-OPTION-VALUE", f"--model {unknown[0]}=…: no folder {unknown[0]} in {folder}; it has {', '.join(names)}"
+        )
     grid = board if isinstance(board, BoardDesign) else corner_grid(board)
     cameras: dict[str, CameraCalibration] = {}
     for name in names:
@@ -96,7 +103,7 @@ def calibrate_rig_from_photographs(
             else:
                 found = calibrate_camera_by_corners(folder / name, board, model, workers, step)
         except StcalError as error:
-            raise type(error)(f"rig: {name}: {error}") from error
+            raise type(error)(error.code, f"rig: {name}: {error}") from error
         cameras[name] = found
     return calibrate_rig(cameras, grid, isinstance(board, CharucoDesign))
 
@@ -110,17 +117,23 @@ def camera_names(folder: Path) -> list[str]:
         Fewer than two, or names that no file can have.
     """
     if not folder.is_dir():
-        raise InputError(f"rig folder {folder}: {'not a folder' if folder.exists() else 'does not exist'}; give one")
+        raise InputError(
+            "E-IMAGES-FOLDER",
+            f"rig folder {folder}: {'not a folder' if folder.exists() else 'does not exist'}; give one",
+        )
     names = sorted(each.name for each in folder.iterdir() if each.is_dir() and not each.name.startswith("."))
     if len(names) < 2:
         raise InputError(
+            "E-RIG-CAMERAS",
             f"rig folder {folder}: {len(names)} folders in it, one for each of two cameras and more needed; put "
-            "photographs into <camera>/, or leave --rig away"
+            "photographs into <camera>/, or leave --rig away",
         )
     for name in names:
         fault = "is that of a file of the result" if name.lower() in TAKEN else name_fault(name)
         if fault or not name.isprintable():
-            raise InputError(f"rig folder {folder}: camera name {name!r} {fault or 'is not printable'}; rename it")
+            raise InputError(
+                "E-RIG-CAMERAS", f"rig folder {folder}: camera name {name!r} {fault or 'is not printable'}; rename it"
+            )
     return names
 
 

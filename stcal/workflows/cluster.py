@@ -64,14 +64,15 @@ def _connected(address: str) -> Iterator["_Workers"]:
     try:
         from distributed import Client
     except ImportError as error:
-        raise InputError("--scheduler: needs Dask; install stcal[dask]") from error
+        raise InputError("E-EXTRA-MISSING", "--scheduler: needs Dask; install stcal[dask]") from error
     _require_address(address)
     with _silent("distributed"), Client(address, timeout=ANSWER_S, set_as_default=False) as client:
         try:
             client.wait_for_workers(1, timeout=ANSWER_S)
         except OSError as error:
             raise InputError(
-                f"--scheduler {address}: no worker within {ANSWER_S} s; start one with `dask worker {address}`"
+                "E-CLUSTER-WORKERS",
+                f"--scheduler {address}: no worker within {ANSWER_S} s; start one with `dask worker {address}`",
             ) from error
         _require_same(dict[str, dict[str, str]](client.run(versions)), address)  # type: ignore[arg-type]
         yield _Workers(client, sum(dict[str, int](client.nthreads()).values()))  # type: ignore[arg-type]
@@ -102,13 +103,16 @@ def _require_address(address: str) -> None:
             await peer.identity()
 
     if not ADDRESS.fullmatch(address):
-        raise InputError(f"--scheduler {address}: no address of a scheduler; give one like tcp://host:8786")
+        raise InputError(
+            "E-OPTION-VALUE", f"--scheduler {address}: no address of a scheduler; give one like tcp://host:8786"
+        )
     try:
         asyncio.run(asyncio.wait_for(ask(), ANSWER_S))
     except Exception as error:  # what is no scheduler may answer anything
         raise InputError(
+            "E-CLUSTER-SCHEDULER",
             f"--scheduler {address}: no scheduler answers within {ANSWER_S} s; start one with `dask scheduler`, and "
-            "give the address that it prints"
+            "give the address that it prints",
         ) from error
 
 
@@ -129,8 +133,9 @@ def _require_same(found: dict[str, dict[str, str]], address: str) -> None:
         for name, version in own.items():
             if theirs[name] != version:
                 raise InputError(
+                    "E-CLUSTER-VERSIONS",
                     f"--scheduler {address}: worker {worker} has {name} {theirs[name] or 'none'}, {version or 'none'} "
-                    "here; results would not be the same, install the same versions"
+                    "here; results would not be the same, install the same versions",
                 )
 
 

@@ -119,7 +119,7 @@ def _measurements(pairs: Pairs, file: Path | Table, robot: Robot) -> Measurement
     try:
         q = joint_values(table, robot)
     except InputError as error:
-        raise InputError(f"{error} (--robot needs the joint values of each point)") from error
+        raise InputError(error.code, f"{error} (--robot needs the joint values of each point)") from error
     conditions = read_conditions(table, joints=len(robot.rows))
     return Measurements(pairs.where, pairs.lines, q, targets_of(table), pairs.xyz_b, conditions=conditions)
 

@@ -50,7 +50,8 @@ class WatchOptions:
     def __post_init__(self):
         if not (0 < self.interval_s < 1e6 and (self.idle_s is None or 0 < self.idle_s < 1e9) and self.views >= 0):
             raise InputError(
-                f"watch: every {self.interval_s:g} s, idle {self.idle_s} s, {self.views} views; positive times needed"
+                "E-OPTION-RANGE",
+                f"watch: every {self.interval_s:g} s, idle {self.idle_s} s, {self.views} views; positive times needed",
             )
 
 
@@ -191,7 +192,9 @@ def watch(
     growing = Growing.of(images, camera, out, target, board, options)
     images = Path(images)
     if not images.is_dir():
-        raise InputError(f"image folder {images}: not there; give the folder that photographs come into")
+        raise InputError(
+            "E-IMAGES-FOLDER", f"image folder {images}: not there; give the folder that photographs come into"
+        )
     known: dict[str, tuple] = {}
     before: dict[str, tuple] = {}
     quiet = 0.0

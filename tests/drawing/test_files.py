@@ -16,8 +16,8 @@ from stcal.drawing.parts import board_parts
 from stcal.drawing.pdf import POINT_MM, pdf
 from stcal.drawing.shapes import Disc, Line
 from stcal.drawing.sheets import EDGE, FOOT, FURNITURE, OVERLAP, PAPERS, SIDE, paper_sheets, seams_between
-from stcal.errors import InputError
 from stcal.io.design import board_toml, target_toml
+from tests.outcome import fails_with
 
 SVG = "{http://www.w3.org/2000/svg}"
 DIGITS = 1e-6
@@ -160,31 +160,31 @@ def test_outlines_of_cells_have_holes_and_stay_apart_at_corners():
 @pytest.mark.parametrize(
     ("name", "paper", "said"),
     [
-        ("a.png", "", r"suffix \.png; one of \.pdf, \.svg, \.dxf needed"),
-        ("a", "", "suffix missing"),
-        ("a.pdf", "A9", "--paper A9: unknown; one of A5, "),
-        ("a.dxf", "A4", "--paper A4: a DXF is no page"),
-        ("a.svg", "A4", "2 sheets, an SVG holds one"),
+        ("a.png", "", "E-OUTPUT-SUFFIX … .png … .pdf, .svg, .dxf"),
+        ("a", "", "E-OUTPUT-SUFFIX … missing"),
+        ("a.pdf", "A9", "E-OPTION-VALUE … --paper … A9 … A5"),
+        ("a.dxf", "A4", "E-OPTION-CONFLICT … --paper … A4"),
+        ("a.svg", "A4", "E-DRAW-SHEETS … 2"),
     ],
 )
 def test_what_cannot_be_drawn_is_refused(files, name, paper, said):
     (files / "board.svg").write_text("mine")
-    with pytest.raises(InputError, match=said):
+    with fails_with(said):
         draw(files / "board.toml", files / name, paper)
     assert (files / "board.svg").read_text() == "mine"
     assert len(list(files.iterdir())) == 3
 
 
 def test_a_design_that_is_not_there_is_said(files):
-    with pytest.raises(InputError, match=r"nothing\.toml: no such file; give a target\.toml or a board file"):
+    with fails_with("E-DRAW-DESIGN … nothing.toml … target.toml"):
         draw(files / "nothing.toml", files / "a.svg")
 
 
 def test_far_too_many_sheets_are_refused(files):
     (files / "board.toml").write_text('type = "chessboard"\nrows = 60\ncolumns = 60\nsquare_mm = 100\n')
-    with pytest.raises(InputError, match=r"--paper A4: \d+ sheets, at most 500"):
+    with fails_with("E-DRAW-SHEETS … --paper … A4 … 500"):
         draw(files / "board.toml", files / "board.pdf")
-    with pytest.raises(InputError, match=r"page of \d+ mm, at most 5000 mm in a PDF"):
+    with fails_with("E-DRAW-SHEETS … 5000"):
         draw(files / "board.toml", files / "board.pdf", "own")
 
 
@@ -192,13 +192,13 @@ def test_circles_without_a_radius_are_refused(files):
     (files / "grid.yaml").write_text(
         "target_type: circlegrid\ntargetCols: 4\ntargetRows: 5\nspacingMeters: 0.02\nasymmetricGrid: true\n"
     )
-    with pytest.raises(InputError, match="no radius; radius_mm needed"):
+    with fails_with("E-BOARD-RADIUS … radius_mm"):
         draw(files / "grid.yaml", files / "grid.pdf")
 
 
 def test_dxf_names_the_library_that_is_missing(files, monkeypatch):
     monkeypatch.setitem(sys.modules, "ezdxf", None)
-    with pytest.raises(InputError, match=r"install stcal\[cad\]$"):
+    with fails_with("E-EXTRA-MISSING"):
         draw(files / "board.toml", files / "board.dxf")
 
 

@@ -10,7 +10,6 @@ from stcal.design import TargetDesign, reference_target
 from stcal.drawing.draw import OWN, draw, sheets_of
 from stcal.drawing.net import _overlap, net_parts
 from stcal.drawing.shapes import Disc, Text
-from stcal.errors import InputError
 from stcal.geometry.rigid import Rigid
 from stcal.io.design import target_toml
 from stcal.sfm.detect.circles.ellipses import EllipseOptions
@@ -18,6 +17,7 @@ from stcal.sfm.detect.image import detect_image
 from stcal.sfm.make.box import sides_of
 from stcal.sfm.make.pattern import make_pattern
 from tests.drawing.raster import camera_of, page_image
+from tests.outcome import fails_with
 
 SIZE = (120.0, 100.0, 80.0)
 
@@ -92,7 +92,7 @@ def test_plates_that_run_the_same_way_along_an_edge_do_not_share_it():
         turn = np.array([[np.cos(angle), 0, np.sin(angle)], [0, 1, 0], [-np.sin(angle), 0, np.cos(angle)]])
         pose = Rigid(turn, turn @ [50.0, 0, 0])
         pages.append(replace(page, id=f"p{number}", rough_target_from_face=pose))
-    with pytest.raises(InputError, match="no two plates share an edge"):
+    with fails_with("E-DRAW-NET"):
         net_parts(TargetDesign("book", "dark", tuple(pages)))
 
 
@@ -106,13 +106,13 @@ def test_plates_that_touch_do_not_overlap():
 
 def test_what_lacks_an_outline_or_a_place_is_refused(target, tmp_path):
     (tmp_path / "reference.toml").write_text(target_toml(reference_target()))
-    with pytest.raises(InputError, match="--net: face 1 has no outline_mm; add it"):
+    with fails_with("E-DRAW-NET … --net … 1 … outline_mm"):
         draw(tmp_path / "reference.toml", tmp_path / "net.pdf", net=True)
     nowhere = tuple(replace(face, rough_target_from_face=None) for face in target.faces)
-    with pytest.raises(InputError, match="--net: face front has no rough_pose"):
+    with fails_with("E-DRAW-NET … --net … front … rough_pose"):
         net_parts(TargetDesign("box", "dark", nowhere))
     (tmp_path / "board.toml").write_text('type = "chessboard"\nrows = 4\ncolumns = 5\nsquare_mm = 10\n')
-    with pytest.raises(InputError, match="is a board; nets are of targets"):
+    with fails_with("E-DRAW-DESIGN"):
         draw(tmp_path / "board.toml", tmp_path / "net.pdf", net=True)
 
 

@@ -2,7 +2,6 @@
 
 import contextlib
 import csv
-import ctypes
 import hashlib
 import json
 import os
@@ -22,6 +21,7 @@ from pathlib import Path
 from stcal.cli.main import MESSAGE_CHARACTERS
 from stcal.io.saving import RUN_ENTRIES
 from tests.commands import PROGRAMS, Call
+from tests.shared import own_copy, without_rights
 
 LONGEST_S = 60.0
 """Of processor time; three times as much by the clock, as others may have the processor."""
@@ -36,8 +36,6 @@ KINDS = (
 )
 EARLIER = "of an earlier call\n"
 IN, OUT = "in", "out"
-CAPABILITIES, ANY_FILE = 0x20080522, 0b110
-"""Version of Linux's interface, and the bits of CAP_DAC_OVERRIDE and CAP_DAC_READ_SEARCH."""
 _PROGRESS = re.compile(r"(\S+: )?[\w, ]+: \d+ of \d+(, about \d+ (s|min) left)?")
 _NO_POSE = "no pose accepted"
 """Said on standard output with exit code 3 by a command that has done its work."""
@@ -85,9 +83,9 @@ def lay_out(stock: Path, folder: Path, call: Call, earlier: bool) -> tuple[Path,
 def _copy(source: Path, to: Path) -> None:
     to.parent.mkdir(parents=True, exist_ok=True)
     if source.is_dir():
-        shutil.copytree(source, to, dirs_exist_ok=True, ignore=shutil.ignore_patterns("lock"))
+        own_copy(source, to, ignore=shutil.ignore_patterns("lock"))
     else:
-        shutil.copy(source, to)
+        shutil.copyfile(source, to)
 
 
 def hashes(folder: Path) -> dict[str, str]:
@@ -117,7 +115,7 @@ def in_process(call: Call, program: str, folder: Path, more: tuple[str, ...] = (
     words = words[1:] if program == "stcal-sfm" else words
     before = os.getcwd()
     trace, code = "", None
-    with _caught_streams() as streams, _own_settings(), _without_rights(plain):
+    with _caught_streams() as streams, _own_settings(), without_rights(plain):
         sys.argv = [program, *words]
         os.chdir(folder)
         _forget_peak()
@@ -184,24 +182,6 @@ def _own_settings() -> Iterator[None]:
         sys.argv = argv
         for number, handler in zip(numbers, handlers, strict=True):
             signal.signal(number, handler)
-
-
-@contextlib.contextmanager
-def _without_rights(wanted: bool) -> Iterator[None]:
-    """Meanwhile without the superuser's right to read and write any file."""
-    if not wanted or os.geteuid() != 0:
-        yield
-        return
-    libc = ctypes.CDLL(None)
-    header, held = (ctypes.c_uint32 * 2)(CAPABILITIES, 0), (ctypes.c_uint32 * 6)()
-    libc.capget(header, held)
-    fewer = (ctypes.c_uint32 * 6)(*held)
-    fewer[0] &= ~ANY_FILE
-    libc.capset(header, fewer)
-    try:
-        yield
-    finally:
-        libc.capset(header, held)
 
 
 def _end(*_) -> None:

@@ -34,6 +34,7 @@ from stcal.synthetic.scene import SceneOptions, make_scene
 from tests.boards.drawn import chessboard_mm, photograph
 from tests.handeye.photographed import looks, photographs
 from tests.locate.drawn_target import CAMERA, LAYOUT, PER_MM, SHEET_MM, photo, sheet, tilted
+from tests.shared import own_copy
 
 SMALL = SceneOptions(seed=3, width=1296, height=864, images_per_group=4, groups=(("1", "2"), ("1", "4")))
 """As the tests' small data set."""
@@ -64,14 +65,14 @@ BOARD_AT_MM = (30, 230)
 
 def make_stock(folder: Path, dataset: Path | None = None, finished: Path | None = None) -> Path:
     """Fill a new folder; data set and run are copied where there are some."""
-    folder.mkdir(parents=True)
+    folder.mkdir(parents=True, exist_ok=True)
     if dataset:
-        shutil.copytree(dataset, folder / "data")
+        own_copy(dataset, folder / "data")
     else:
         write_dataset(folder / "data", make_scene(SMALL), workers=1)
     data = folder / "data"
     if finished:
-        shutil.copytree(finished, folder / "run")
+        own_copy(finished, folder / "run")
     else:
         designs = [data / name for name in ("target.toml", "board.toml")]
         run(data / "images", data / "cameras.txt", folder / "run", *designs, RunOptions(workers=1))
@@ -95,17 +96,17 @@ def write_rows(path: Path, header, rows) -> None:
 def _of_runs(folder: Path) -> None:
     """Photographs to measure with their joint values, a folder of detections, a model as text."""
     (folder / "shots").mkdir()
-    shutil.copy(folder / "data/images/12/IMG_1000.jpg", folder / "shots")
+    own_copy(folder / "data/images/12/IMG_1000.jpg", folder / "shots")
     write_rows(folder / "joints.csv", ["image", "q1_deg", "q2_deg"], [["IMG_1000.jpg", 10.5, -3.25]])
     truth = json.loads((folder / "data/truth.json").read_text())
     placed_faces = {key: truth[key] for key in ("unit", "reference_face", "target_from_face", "circles")}
     (folder / "faces.json").write_text(json.dumps({"format": "stcal faces 1"} | placed_faces, indent=1))
     export_model(folder / "run", folder / "model-txt", "colmap-txt")
     for camera in ("left", "right"):  # two cameras at one place
-        shutil.copytree(folder / "data/images", folder / "rig" / camera)
+        own_copy(folder / "data/images", folder / "rig" / camera)
     (folder / "detected").mkdir()
-    shutil.copytree(folder / "run/cache", folder / "detected/cache")
-    shutil.copy(folder / "run/detections.csv", folder / "detected")
+    own_copy(folder / "run/cache", folder / "detected/cache")
+    own_copy(folder / "run/detections.csv", folder / "detected")
     marker = MarkerFile.of(folder / "data/images", None)
     sealed = marker.sealed({"detections.csv": digest_of(folder / "detected/detections.csv")})
     (folder / "detected/stcal-run.json").write_text(json.dumps(sealed.content()))

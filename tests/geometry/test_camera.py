@@ -6,8 +6,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from stcal.errors import ConvergenceError, InputError
 from stcal.geometry.camera import Camera
+from tests.outcome import fails_with
 
 WIDTH, HEIGHT = 5184, 3456
 
@@ -114,45 +114,45 @@ def test_barrel_inverts_up_to_its_fold(radius):
 def test_barrel_refuses_every_point_beyond_its_fold(radius):
     # The cubic has a root there too, at −2.1 and less: the mirrored side of the image, and Newton finds it.
     for xy in ([radius, 0.0], [-0.6 * radius, 0.8 * radius], [[0.1, 0.2], [0.0, radius]]):
-        with pytest.raises(ConvergenceError, match="fold the image over"):
+        with fails_with("E-CAMERA-FOLDED"):
             BARREL.undistort(xy)
 
 
 def test_the_fold_is_reported_with_its_pixel():
-    with pytest.raises(ConvergenceError, match=r"pixel \(8180, 1700\)"):
+    with fails_with("E-CAMERA-FOLDED … 8180 … 1700"):
         BARREL.normalised_from_pixel([[2600.0, 1700], [8180, 1700]])
 
 
 def test_rational_pole_and_overflow_are_refused():
-    with pytest.raises(ConvergenceError, match="fold the image over"):
+    with fails_with("E-CAMERA-FOLDED"):
         camera_of([0, 0, 0, 0, 0, -1.0]).undistort([2.0, 0.0])
-    with pytest.raises(ConvergenceError, match="fold the image over"):
+    with fails_with("E-CAMERA-FOLDED"):
         BARREL.undistort([1e200, 1e200])
 
 
 @pytest.mark.parametrize("bad", [np.nan, np.inf])
 def test_pixels_that_are_not_finite_are_refused(bad):
-    with pytest.raises(ConvergenceError, match="not finite"):
+    with fails_with("E-CAMERA-PIXEL"):
         BARREL.normalised_from_pixel([[100.0, 100], [bad, 100]])
 
 
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        ({"width": 0}, "size 0×3456 px, a positive size needed"),
-        ({"height": -5}, "size 5184×-5 px, a positive size needed"),
-        ({"focal": [0, 1000]}, "focal length .* positive numbers needed"),
-        ({"focal": [1000, -1]}, "focal length .* positive numbers needed"),
-        ({"focal": [1000]}, r"focal length: shape \(1,\)"),
-        ({"focal": [np.nan, 1000]}, "focal length: holds values that are not finite"),
-        ({"centre": [1, np.inf]}, "principal point: holds values that are not finite"),
-        ({"distortion": np.zeros(5)}, r"distortion: shape \(5,\)"),
-        ({"distortion": np.full(8, np.nan)}, "distortion: holds values that are not finite"),
+        ({"width": 0}, "E-CAMERA-SIZE … 0 … 3456"),
+        ({"height": -5}, "E-CAMERA-SIZE … 5184 … -5"),
+        ({"focal": [0, 1000]}, "E-CAMERA-FOCAL"),
+        ({"focal": [1000, -1]}, "E-CAMERA-FOCAL"),
+        ({"focal": [1000]}, "E-ARRAY-SHAPE … focal length … (1,)"),
+        ({"focal": [np.nan, 1000]}, "E-ARRAY-NOT-FINITE … focal length"),
+        ({"centre": [1, np.inf]}, "E-ARRAY-NOT-FINITE … principal point"),
+        ({"distortion": np.zeros(5)}, "E-ARRAY-SHAPE … distortion … (5,)"),
+        ({"distortion": np.full(8, np.nan)}, "E-ARRAY-NOT-FINITE … distortion"),
     ],
 )
 def test_camera_refuses(change, message):
     good = {"width": WIDTH, "height": HEIGHT, "focal": [1e3, 1e3], "centre": [0, 0], "distortion": np.zeros(8)}
-    with pytest.raises(InputError, match=message):
+    with fails_with(message):
         Camera(**(good | change))
 
 
@@ -214,7 +214,7 @@ def test_derivatives_of_wide_lenses_are_those_of_differences(name):
 def test_beyond_a_right_angle_is_refused():
     camera = fisheye_of([0.0, 0.0, 0.0, 0.0])
     assert np.isfinite(camera.normalised_from_pixel([2600.0 + 2000 * np.radians(88), 1700.0])).all()
-    with pytest.raises(ConvergenceError, match=r"is 90\.0° from the axis, less than 89° needed"):
+    with fails_with("E-CAMERA-FIELD … 90.0 … 89"):
         camera.normalised_from_pixel([2600.0 + 2000 * np.radians(90), 1700.0])
-    with pytest.raises(InputError, match="k5, k6, s2 or s4 of an equidistant camera"):
+    with fails_with("E-CAMERA-COEFFICIENTS"):
         Camera(10, 10, [9, 9], [4, 4], [0, 0, 0, 0, 0, 0, 1, 0], True)

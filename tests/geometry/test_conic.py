@@ -6,8 +6,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
-from stcal.errors import DegenerateError
 from stcal.geometry.conic import circle_conic, circle_image_offset, conic_of_ellipse, ellipse_of_conic
+from tests.outcome import fails_with
 
 
 @st.composite
@@ -119,13 +119,16 @@ def test_ellipse_by_hand():
 @pytest.mark.parametrize(
     ("conic", "message"),
     [
-        (np.diag([1.0, -1, -1]), "not an ellipse"),  # hyperbola
-        (np.array([[1.0, 0, 0], [0, 0, 1], [0, 1, 0]]), "not an ellipse"),  # parabola
-        (np.diag([1.0, 1, 1]), "no real points"),
-        (np.diag([1.0, 1, 0]), "no real points"),  # a single point
-        (circle_conic([0, 0, 50.0], np.array([0.6, 0, 0.8]), 100.0), "not an ellipse"),  # crosses the camera's plane
+        (np.diag([1.0, -1, -1]), "E-CONIC-NO-ELLIPSE"),  # hyperbola
+        (np.array([[1.0, 0, 0], [0, 0, 1], [0, 1, 0]]), "E-CONIC-NO-ELLIPSE"),  # parabola
+        (np.diag([1.0, 1, 1]), "E-CONIC-NO-ELLIPSE"),
+        (np.diag([1.0, 1, 0]), "E-CONIC-NO-ELLIPSE"),  # a single point
+        (
+            circle_conic([0, 0, 50.0], np.array([0.6, 0, 0.8]), 100.0),
+            "E-CONIC-NO-ELLIPSE",
+        ),  # crosses the camera's plane
     ],
 )
 def test_conics_that_are_no_ellipse_are_refused(conic, message):
-    with pytest.raises(DegenerateError, match=message):
+    with fails_with(message):
         ellipse_of_conic(conic)

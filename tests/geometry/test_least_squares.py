@@ -3,10 +3,10 @@
 import numpy as np
 import pytest
 
-from stcal.errors import ConvergenceError
 from stcal.geometry.least_squares import NormalEquations, minimise
 from stcal.geometry.normal_equations import constrained_inverse, free_motions, generalised_inverse, reduce
 from stcal.geometry.robust import huber_cost, huber_weights, length_limit, robust_sigma
+from tests.outcome import fails_with
 
 
 def rosenbrock(x: np.ndarray) -> NormalEquations:
@@ -71,7 +71,7 @@ def test_where_there_is_no_minimum_it_says_so():
         np.zeros(1), lambda x: NormalEquations.of(1e3 * np.exp(-x), -1e3 * np.exp(-x)[:, None]), np.add, max_steps=5
     )
     assert not found.converged
-    with pytest.raises(ConvergenceError, match=r"^fit: no minimum after 5 steps, the last was to gain .* σ²; look$"):
+    with fails_with("E-NO-MINIMUM … fit … 5 … look"):
         found.required("fit", "look")
     assert found.required("fit", "look", accepted=1e9) is found
 

@@ -8,7 +8,6 @@ import numpy as np
 import pytest
 
 from stcal.cli.main import main
-from stcal.errors import InputError
 from stcal.geometry.rigid import Poses
 from stcal.handeye import HandEyeOptions, cross_validate, handeye, splits
 from stcal.handeye.data.loop import SETUPS
@@ -19,6 +18,7 @@ from stcal.synthetic.measured.handeye import simulated_views
 from stcal.workflows.handeye.arm import Arm
 from tests.boards.drawn import chessboard_mm
 from tests.handeye.photographed import BASE_FROM_BOARD, FLANGE_FROM_CAMERA, PER_MM, looks, photographs
+from tests.outcome import ended, fails_with
 
 OFF = (1e-3, 0.5)
 """σ of the axes about the robot's file: rad, mm."""
@@ -72,7 +72,7 @@ def test_sigma_is_honest_with_an_arm_that_errs():
 
 def test_only_corners_tell_of_the_arm():
     _, pairs, _, model = scene(3)
-    with pytest.raises(InputError, match="pose does not solve for the arm"):
+    with fails_with("E-HANDEYE-NEEDS-VIEWS … pose"):
         handeye(pairs, options=HandEyeOptions(arm=model))
 
 
@@ -98,10 +98,7 @@ def command(monkeypatch, capsys):
 
     def call(*arguments):
         monkeypatch.setattr(sys, "argv", ["stcal", "handeye", *map(str, arguments)])
-        with pytest.raises(SystemExit) as end:
-            main()
-        output = capsys.readouterr()
-        return end.value.code or 0, output.out, output.err
+        return ended(main, capsys)
 
     return call
 

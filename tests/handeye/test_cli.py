@@ -17,6 +17,7 @@ from stcal.io.table import POSE, pose_cells
 from stcal.synthetic.measured.handeye import BASE_FROM_BOARD, FLANGE_FROM_CAMERA, simulated
 from tests.boards.drawn import chessboard_mm
 from tests.handeye.photographed import CAMERA, looks, photographs, sheet_of_dots
+from tests.outcome import ended
 
 NOISE = {"robot": (2e-4, 0.1), "camera": (5e-4, 0.2)}
 INPUT, COMPUTATION = 2, 3
@@ -28,10 +29,7 @@ def command(monkeypatch, capsys):
 
     def call(*arguments):
         monkeypatch.setattr(sys, "argv", ["stcal", "handeye", *map(str, arguments)])
-        with pytest.raises(SystemExit) as end:
-            main()
-        output = capsys.readouterr()
-        return end.value.code or 0, output.out, output.err
+        return ended(main, capsys)
 
     return call
 

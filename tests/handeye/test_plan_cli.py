@@ -15,6 +15,7 @@ from stcal.robot.kinematics.example import mh80
 from stcal.robot.kinematics.file import save_robot
 from stcal.synthetic.measured.handeye import simulated
 from tests.handeye.test_cli import NOISE, poses_file
+from tests.outcome import ended
 
 INPUT = 2
 
@@ -25,10 +26,7 @@ def plan(monkeypatch, capsys):
 
     def call(*arguments):
         monkeypatch.setattr(sys, "argv", ["stcal", "handeye", "plan", *map(str, arguments)])
-        with pytest.raises(SystemExit) as end:
-            main()
-        output = capsys.readouterr()
-        return end.value.code or 0, output.out, output.err
+        return ended(main, capsys)
 
     return call
 

@@ -11,6 +11,7 @@ from stcal.cli.main import main
 from stcal.geometry.rigid import Poses, Rigid
 from stcal.synthetic.measured.handeye_stream import StreamTruth, simulated_stream
 from tests.handeye.rig.photographed import BOARD, write_poses
+from tests.outcome import ended
 
 INPUT, COMPUTATION = 2, 3
 CAMERA = "1 PINHOLE 800 600 1000 1000 406.5 293.5\n"
@@ -22,10 +23,7 @@ def command(monkeypatch, capsys):
 
     def call(*arguments):
         monkeypatch.setattr(sys, "argv", ["stcal", "handeye", *map(str, arguments)])
-        with pytest.raises(SystemExit) as end:
-            main()
-        output = capsys.readouterr()
-        return end.value.code or 0, output.out, output.err
+        return ended(main, capsys)
 
     return call
 

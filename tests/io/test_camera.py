@@ -1,7 +1,5 @@
 """Camera files: each kind with its pixel origin, and one test per way in which a file can be wrong."""
 
-import re
-
 import cv2
 import numpy as np
 import pycolmap
@@ -12,6 +10,7 @@ from hypothesis import strategies as st
 from stcal.errors import InputError
 from stcal.geometry.camera import Camera
 from stcal.io.camera import CalibratedCamera, read_camera, write_cameras_txt
+from tests.outcome import fails_with
 
 K = [[1000.0, 0, 500], [0, 1100, 400], [0, 0, 1]]
 D5 = [0.1, -0.2, 0.003, -0.004, 0.05]
@@ -202,7 +201,7 @@ def test_ros_industrial(tmp_path):
     assert camera.centre.tolist() == [789.7, 627.3]
     assert (camera.colmap_model, camera.width) == ("OPENCV", None)
     path.write_text("intrinsics:\n  fx: 1352.5\n  cx: 789.7\n")
-    with pytest.raises(InputError, match="intrinsics without fy, cy; fx, fy, cx, cy needed"):
+    with fails_with("E-CAMERA-CONTENT … fy, cy"):
         read_camera(path)
 
 
@@ -235,97 +234,106 @@ SIGMA, ALONE = "0.3 0.2 0.2 1e-4", ["1 0 0 0", "0 1 0 0", "0 0 1 0", "0 0 0 1"]
 STATED = {
     "negative": (
         ("0.3 -0.2 0.2 1e-4", ALONE),
-        "σ of cx is -0.2, a positive number up to 1000000 needed; write it again",
+        "E-CAMERA-COVARIANCE … 0.2 … 1000000",
     ),
-    "zero": (("0.3 0.2 0 1e-4", ALONE), "σ of cy is 0, a positive"),
-    "NaN": (("nan 0.2 0.2 1e-4", ALONE), "σ of f is nan, a positive"),
-    "too large": (("0.3 0.2 0.2 1e200", ALONE), "σ of k1 is 1e\\+200, a positive"),
-    "a word": (("0.3 0.2 0.2 small", ALONE), "'small'"),
-    "too few": (("0.3 0.2 0.2", ALONE), "3 σ, 4 needed"),
-    "twice": ((SIGMA, ALONE, 2), "a line of 4 σ and 4×4 correlations needed"),
-    "none": ((SIGMA, ALONE, 0), "a line of 4 σ and 4×4 correlations needed"),
-    "no correlations": ((SIGMA, []), "a line of 4 σ and 4×4 correlations needed"),
-    "a row short": ((SIGMA, [*ALONE[:3], "0 0 1"]), "a line of 4 σ and 4×4 correlations needed"),
-    "correlation 9": ((SIGMA, ["1 9 0 0", "9 1 0 0", *ALONE[2:]]), "correlation 9 of f and cx, −1 to 1 needed"),
-    "upper only": ((SIGMA, ["1 0.5 0 0", *ALONE[1:]]), "not symmetric by 100 % at f, cx"),
-    "lower only": ((SIGMA, [ALONE[0], "0.5 1 0 0", *ALONE[2:]]), "not symmetric by 100 % at f, cx"),
-    "diagonal of 9": ((SIGMA, ["9 0 0 0", *ALONE[1:]]), "correlation of f with itself is 9, 1 needed"),
-    "singular": ((SIGMA, ["1 1 0 0", "1 1 0 0", *ALONE[2:]]), "eigenvalue .*, a positive number needed"),
+    "zero": (("0.3 0.2 0 1e-4", ALONE), "E-CAMERA-COVARIANCE … 0"),
+    "NaN": (("nan 0.2 0.2 1e-4", ALONE), "E-CAMERA-COVARIANCE"),
+    "too large": (("0.3 0.2 0.2 1e200", ALONE), "E-CAMERA-COVARIANCE … 1 … 1 … 200"),
+    "a word": (("0.3 0.2 0.2 small", ALONE), "E-CAMERA-COVARIANCE"),
+    "too few": (("0.3 0.2 0.2", ALONE), "E-CAMERA-COVARIANCE … 3 σ, 4 needed"),
+    "twice": ((SIGMA, ALONE, 2), "E-CAMERA-COVARIANCE … 4 … 4 … 4"),
+    "none": ((SIGMA, ALONE, 0), "E-CAMERA-COVARIANCE … 4 … 4 … 4"),
+    "no correlations": ((SIGMA, []), "E-CAMERA-COVARIANCE … 4 … 4 … 4"),
+    "a row short": ((SIGMA, [*ALONE[:3], "0 0 1"]), "E-CAMERA-COVARIANCE … 4 … 4 … 4"),
+    "correlation 9": (
+        (SIGMA, ["1 9 0 0", "9 1 0 0", *ALONE[2:]]),
+        "E-CAMERA-COVARIANCE … 9 … 1 … 1",
+    ),
+    "upper only": ((SIGMA, ["1 0.5 0 0", *ALONE[1:]]), "E-CAMERA-COVARIANCE … 100"),
+    "lower only": (
+        (SIGMA, [ALONE[0], "0.5 1 0 0", *ALONE[2:]]),
+        "E-CAMERA-COVARIANCE … 100",
+    ),
+    "diagonal of 9": (
+        (SIGMA, ["9 0 0 0", *ALONE[1:]]),
+        "E-CAMERA-COVARIANCE … 9 … 1",
+    ),
+    "singular": ((SIGMA, ["1 1 0 0", "1 1 0 0", *ALONE[2:]]), "E-CAMERA-COVARIANCE"),
 }
 
 
 # fmt: off
 WRONG = {
-    "empty": ("", "neither COLMAP's cameras.txt nor OpenCV's"),
-    "comments only": ("# nothing\n# here\n", "neither COLMAP's"),
-    "prose": ("hello", "neither COLMAP's"),
-    "a list": ("- 1\n- 2\n", "neither COLMAP's"),
-    "control characters": (b"\0\1\2", "neither COLMAP's"),
-    "binary": (bytes(range(256)), "not a text file"),
-    "a photograph": (b"\xff\xd8\xff\xe0\x00\x10JFIF", "not a text file"),
-    "UTF-16": ("1 PINHOLE 10 10 1 1 1 1".encode("utf-16"), "not a text file"),
-    "COLMAP: two cameras": ("1 PINHOLE 9 9 1 1 1 1\n2 PINHOLE 9 9 1 1 1 1\n", "2 cameras, 1 needed; choose of 1, 2"),
-    "COLMAP: field of view": ("1 FOV 9 9 1 1 1 1 1", "COLMAP's FOV is none of SIMPLE_"),
-    "COLMAP: too few": ("1 PINHOLE 9 9 1 1 1", "3 parameters for PINHOLE, 4 needed"),
-    "COLMAP: far too few": ("1 SIMPLE_PINHOLE 9 9 1", "1 parameters for SIMPLE_PINHOLE, 3 needed"),
-    "COLMAP: too many": ("1 SIMPLE_PINHOLE 9 9 1 1 1 1", "4 parameters for SIMPLE_PINHOLE, 3 needed"),
-    "COLMAP: a word": ("1 PINHOLE 9 9 1 one 1 1", "'one'; numbers needed"),
-    "COLMAP: width a word": ("1 PINHOLE wide 9 1 1 1 1", "'wide'; numbers needed"),
-    "COLMAP: negative width": ("1 PINHOLE -9 9 1 1 1 1", "image side -9 px; a whole number"),
-    "COLMAP: zero height": ("1 PINHOLE 9 0 1 1 1 1", "image side 0 px; a whole number"),
-    "COLMAP: half a pixel": ("1 PINHOLE 9.5 9 1 1 1 1", "image side 9.5 px; a whole number"),
-    "COLMAP: 5000 digits": (f"1 PINHOLE {'9' * 5000} 9 1 1 1 1", "image side inf px"),
-    "COLMAP: NaN focal": ("1 PINHOLE 9 9 nan 1 1 1", "not a finite number"),
-    "COLMAP: NaN centre": ("1 PINHOLE 9 9 1 1 nan 1", "not a finite number"),
-    "COLMAP: inf distortion": ("1 SIMPLE_RADIAL 9 9 1 1 1 inf", "not a finite number"),
-    "COLMAP: negative focal": ("1 PINHOLE 9 9 1 -7 1 1", "focal length 1, -7 px; positive numbers needed"),
-    "COLMAP: zero focal": ("1 SIMPLE_PINHOLE 9 9 0 1 1", "focal length 0, 0 px; positive numbers needed"),
+    "empty": ("", "E-CAMERA-UNREADABLE"),
+    "comments only": ("# nothing\n# here\n", "E-CAMERA-UNREADABLE"),
+    "prose": ("hello", "E-CAMERA-UNREADABLE"),
+    "a list": ("- 1\n- 2\n", "E-CAMERA-UNREADABLE"),
+    "control characters": (b"\0\1\2", "E-CAMERA-UNREADABLE"),
+    "binary": (bytes(range(256)), "E-CAMERA-UNREADABLE"),
+    "a photograph": (b"\xff\xd8\xff\xe0\x00\x10JFIF", "E-CAMERA-UNREADABLE"),
+    "UTF-16": ("1 PINHOLE 10 10 1 1 1 1".encode("utf-16"), "E-CAMERA-UNREADABLE"),
+    "COLMAP: two cameras": ("1 PINHOLE 9 9 1 1 1 1\n2 PINHOLE 9 9 1 1 1 1\n", "E-CAMERA-SEVERAL … 2 … 1, 2"),
+    "COLMAP: field of view": ("1 FOV 9 9 1 1 1 1 1", "E-CAMERA-MODEL … COLMAP's FOV … SIMPLE_"),
+    "COLMAP: too few": ("1 PINHOLE 9 9 1 1 1", "E-CAMERA-COEFFICIENTS … 3 … PINHOLE … 4"),
+    "COLMAP: far too few": ("1 SIMPLE_PINHOLE 9 9 1", "E-CAMERA-COEFFICIENTS … 1 … SIMPLE_PINHOLE … 3"),
+    "COLMAP: too many": ("1 SIMPLE_PINHOLE 9 9 1 1 1 1", "E-CAMERA-COEFFICIENTS … 4 … SIMPLE_PINHOLE … 3"),
+    "COLMAP: a word": ("1 PINHOLE 9 9 1 one 1 1", "E-CAMERA-CONTENT"),
+    "COLMAP: width a word": ("1 PINHOLE wide 9 1 1 1 1", "E-CAMERA-CONTENT"),
+    "COLMAP: negative width": ("1 PINHOLE -9 9 1 1 1 1", "E-CAMERA-SIZE … -9"),
+    "COLMAP: zero height": ("1 PINHOLE 9 0 1 1 1 1", "E-CAMERA-SIZE … 0"),
+    "COLMAP: half a pixel": ("1 PINHOLE 9.5 9 1 1 1 1", "E-CAMERA-SIZE … 9.5"),
+    "COLMAP: 5000 digits": (f"1 PINHOLE {'9' * 5000} 9 1 1 1 1", "E-CAMERA-SIZE … inf"),
+    "COLMAP: NaN focal": ("1 PINHOLE 9 9 nan 1 1 1", "E-CAMERA-NOT-FINITE"),
+    "COLMAP: NaN centre": ("1 PINHOLE 9 9 1 1 nan 1", "E-CAMERA-NOT-FINITE"),
+    "COLMAP: inf distortion": ("1 SIMPLE_RADIAL 9 9 1 1 1 inf", "E-CAMERA-NOT-FINITE"),
+    "COLMAP: negative focal": ("1 PINHOLE 9 9 1 -7 1 1", "E-CAMERA-FOCAL … 1 … -7"),
+    "COLMAP: zero focal": ("1 SIMPLE_PINHOLE 9 9 0 1 1", "E-CAMERA-FOCAL … 0 … 0"),
     **{f"σ: {name}": (stated(*values), message) for name, (values, message) in STATED.items()},
-    "YAML: broken": ("camera_matrix: [1, 2", "neither COLMAP's"),
-    "YAML: unknown tag": ("a: !!python/object/apply:os.getcwd []", "could not determine a constructor"),
-    "YAML: matrix tag on a number": ("camera_matrix: !!opencv-matrix 5", "expected a mapping node"),
-    "YAML: a list as key": ("? [a, b]\n: 1\n", "unhashable key"),
-    "YAML: nested too deep": ("[" * 5000, "neither COLMAP's"),
-    "YAML: an alias": (yaml_text("&m [9, 0, 9, 0, 9, 9, 0, 0, 1]") + "\nother: *m", r"alias \*m: write the values"),
-    "YAML: an alias bomb": (BOMB + yaml_text(more="distortion_model: *i\n"), r"alias \*a: write the values"),
-    "YAML: contains itself": ("camera_matrix: &a [*a]", "neither COLMAP's"),
-    "YAML: no matrix": ("image_width: 640\n", "no camera_matrix; write it with"),
-    "YAML: matrix without data": ("camera_matrix: {rows: 3, cols: 3}", "neither COLMAP's"),
-    "YAML: matrix 2×2": (yaml_text("[1000, 0, 0, 1000]"), "camera_matrix of 4 numbers; 3×3 needed"),
-    "YAML: matrix 3×4": (yaml_text("[1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1, 0]"), "camera_matrix of 12 numbers"),
-    "YAML: matrix empty": (yaml_text("[]"), "camera_matrix of 0 numbers"),
-    "YAML: matrix null": (yaml_text("null"), "camera_matrix of 1 numbers"),
-    "YAML: matrix ragged": (yaml_text("[[1, 0, 2], [0, 1], [0, 0, 1]]"), "inhomogeneous"),
-    "YAML: matrix of words": (yaml_text("[a, b, c]"), "could not convert string to float"),
-    "YAML: matrix transposed": (yaml_text("[1000, 0, 0, 0, 1000, 0, 500, 400, 1]"), "is it transposed"),
-    "YAML: matrix doubled": (yaml_text("[2000, 0, 1000, 0, 2000, 800, 0, 0, 2]"), r"not \[fx 0 cx; 0 fy cy; 0 0 1\]"),
-    "YAML: matrix sheared": (yaml_text("[1000, 0, 500, 5, 1000, 400, 0, 0, 1]"), r"not \[fx 0 cx; 0 fy cy; 0 0 1\]"),
-    "YAML: skew": (yaml_text("[1000, 0.5, 500, 0, 1000, 400, 0, 0, 1]"), "skew 0.5 is not supported"),
-    "YAML: NaN skew": (yaml_text("[1000, .nan, 500, 0, 1000, 400, 0, 0, 1]"), "skew nan is not supported"),
-    "YAML: NaN focal": (yaml_text("[.nan, 0, 500, 0, 1000, 400, 0, 0, 1]"), "not a finite number"),
-    "YAML: NaN centre": (yaml_text("[1000, 0, .nan, 0, 1000, 400, 0, 0, 1]"), "not a finite number"),
-    "YAML: NaN distortion": (yaml_text(d="[.nan, 0, 0, 0]"), "not a finite number"),
-    "YAML: negative focal": (yaml_text("[-1000, 0, 500, 0, 1000, 400, 0, 0, 1]"), "focal length -1000, 1000 px"),
-    "YAML: thin prism": (yaml_text(d="[0, 0, 0, 0, 0, 0, 0, 0, 0.1, 0, 0, 0]"), "lens with thin prisms is none of"),
-    "YAML: k1 k2 k3": (yaml_text(d="[0.1, 0.2, 0.3]"), "3 distortion coefficients; 0, 4, 5, 8, 12, 14 are possible"),
-    "YAML: distortion null": (yaml_text(d="null"), "1 distortion coefficients"),
-    "YAML: distortion a mapping": (yaml_text(d="{a: 1}"), "neither COLMAP's"),
-    "YAML: a width that is true": (yaml_text(more="image_width: true"), "are .True, None.; numbers of pixels needed"),
-    "COLMAP: fy of 2": ("1 PINHOLE 1000 800 1000 2 500 400", "not more than 10 times apart"),
-    "YAML: negative width": (yaml_text(more="image_width: -5"), "image side -5 px"),
-    "YAML: infinite width": (yaml_text(more="image_width: .inf"), "image side inf px"),
-    "YAML: NaN height": (yaml_text(more="image_height: .nan"), "image side nan px"),
-    "YAML: fractional width": (yaml_text(more="image_width: 10.7"), "image side 10.7 px"),
-    "YAML: width a word": (yaml_text(more="image_width: wide"), "could not convert string to float: 'wide'"),
-    "YAML: width a list": (yaml_text(more="image_width: [5]"), "neither COLMAP's"),
-    "YAML: double sphere": (ROS.format(model="ds"), "distortion model 'ds' is not supported"),
-    "YAML: five of a fisheye": (ROS.format(model="equidistant"), "5 coefficients of an equidistant lens; k1 to"),
-    "YAML: model of two lines": (yaml_text(more='distortion_model: "a\\nb"'), "distortion model 'a.*b' is not"),
-    "XML: cut off": ("<opencv_storage><camera_matrix>", "neither COLMAP's"),
-    "XML: a web page": ("<!DOCTYPE html><html><body>404</body></html>", "no camera_matrix"),
-    "XML: words": ("<o><camera_matrix><data>a b</data></camera_matrix></o>", "could not convert string to float: 'a'"),
-    "XML: short": ("<o><camera_matrix><data>1 2 3</data></camera_matrix></o>", "camera_matrix of 3 numbers"),
-    "XML: no data": ("<o><camera_matrix>5</camera_matrix></o>", "camera_matrix of 1 numbers"),
+    "YAML: broken": ("camera_matrix: [1, 2", "E-CAMERA-UNREADABLE"),
+    "YAML: unknown tag": ("a: !!python/object/apply:os.getcwd []", "E-CAMERA-UNREADABLE"),
+    "YAML: matrix tag on a number": ("camera_matrix: !!opencv-matrix 5", "E-CAMERA-UNREADABLE"),
+    "YAML: a list as key": ("? [a, b]\n: 1\n", "E-CAMERA-UNREADABLE"),
+    "YAML: nested too deep": ("[" * 5000, "E-CAMERA-UNREADABLE"),
+    "YAML: an alias": (yaml_text("&m [9, 0, 9, 0, 9, 9, 0, 0, 1]") + "\nother: *m", "E-CAMERA-UNREADABLE"),
+    "YAML: an alias bomb": (BOMB + yaml_text(more="distortion_model: *i\n"), "E-CAMERA-UNREADABLE"),
+    "YAML: contains itself": ("camera_matrix: &a [*a]", "E-CAMERA-UNREADABLE"),
+    "YAML: no matrix": ("image_width: 640\n", "E-CAMERA-CONTENT … camera_matrix"),
+    "YAML: matrix without data": ("camera_matrix: {rows: 3, cols: 3}", "E-CAMERA-UNREADABLE"),
+    "YAML: matrix 2×2": (yaml_text("[1000, 0, 0, 1000]"), "E-CAMERA-COEFFICIENTS … matrix … 4"),
+    "YAML: matrix 3×4": (yaml_text("[1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1, 0]"), "E-CAMERA-COEFFICIENTS … matrix … 12"),
+    "YAML: matrix empty": (yaml_text("[]"), "E-CAMERA-COEFFICIENTS … matrix … 0"),
+    "YAML: matrix null": (yaml_text("null"), "E-CAMERA-COEFFICIENTS … matrix … 1"),
+    "YAML: matrix ragged": (yaml_text("[[1, 0, 2], [0, 1], [0, 0, 1]]"), "E-CAMERA-UNREADABLE"),
+    "YAML: matrix of words": (yaml_text("[a, b, c]"), "E-CAMERA-UNREADABLE"),
+    "YAML: matrix transposed": (yaml_text("[1000, 0, 0, 0, 1000, 0, 500, 400, 1]"), "E-CAMERA-MATRIX"),
+    "YAML: matrix doubled": (yaml_text("[2000, 0, 1000, 0, 2000, 800, 0, 0, 2]"), "E-CAMERA-MATRIX"),
+    "YAML: matrix sheared": (yaml_text("[1000, 0, 500, 5, 1000, 400, 0, 0, 1]"), "E-CAMERA-MATRIX"),
+    "YAML: skew": (yaml_text("[1000, 0.5, 500, 0, 1000, 400, 0, 0, 1]"), "E-CAMERA-SKEW … 0.5"),
+    "YAML: NaN skew": (yaml_text("[1000, .nan, 500, 0, 1000, 400, 0, 0, 1]"), "E-CAMERA-SKEW … nan"),
+    "YAML: NaN focal": (yaml_text("[.nan, 0, 500, 0, 1000, 400, 0, 0, 1]"), "E-CAMERA-NOT-FINITE"),
+    "YAML: NaN centre": (yaml_text("[1000, 0, .nan, 0, 1000, 400, 0, 0, 1]"), "E-CAMERA-NOT-FINITE"),
+    "YAML: NaN distortion": (yaml_text(d="[.nan, 0, 0, 0]"), "E-CAMERA-NOT-FINITE"),
+    "YAML: negative focal": (yaml_text("[-1000, 0, 500, 0, 1000, 400, 0, 0, 1]"), "E-CAMERA-FOCAL … -1000 … 1000"),
+    "YAML: thin prism": (yaml_text(d="[0, 0, 0, 0, 0, 0, 0, 0, 0.1, 0, 0, 0]"), "E-CAMERA-MODEL"),
+    "YAML: k1 k2 k3": (yaml_text(d="[0.1, 0.2, 0.3]"), "E-CAMERA-COEFFICIENTS … 3 … 0, 4, 5, 8, 12, 14"),
+    "YAML: distortion null": (yaml_text(d="null"), "E-CAMERA-COEFFICIENTS … 1"),
+    "YAML: distortion a mapping": (yaml_text(d="{a: 1}"), "E-CAMERA-UNREADABLE"),
+    "YAML: a width that is true": (yaml_text(more="image_width: true"), "E-CAMERA-SIZE"),
+    "COLMAP: fy of 2": ("1 PINHOLE 1000 800 1000 2 500 400", "E-CAMERA-FOCAL … 10"),
+    "YAML: negative width": (yaml_text(more="image_width: -5"), "E-CAMERA-SIZE … -5"),
+    "YAML: infinite width": (yaml_text(more="image_width: .inf"), "E-CAMERA-SIZE … inf"),
+    "YAML: NaN height": (yaml_text(more="image_height: .nan"), "E-CAMERA-SIZE … nan"),
+    "YAML: fractional width": (yaml_text(more="image_width: 10.7"), "E-CAMERA-SIZE … 10.7"),
+    "YAML: width a word": (yaml_text(more="image_width: wide"), "E-CAMERA-UNREADABLE … 'wide'"),
+    "YAML: width a list": (yaml_text(more="image_width: [5]"), "E-CAMERA-UNREADABLE"),
+    "YAML: double sphere": (ROS.format(model="ds"), "E-CAMERA-MODEL … 'ds'"),
+    "YAML: five of a fisheye": (ROS.format(model="equidistant"), "E-CAMERA-COEFFICIENTS … 5"),
+    "YAML: model of two lines": (yaml_text(more='distortion_model: "a\\nb"'), "E-CAMERA-MODEL"),
+    "XML: cut off": ("<opencv_storage><camera_matrix>", "E-CAMERA-UNREADABLE"),
+    "XML: a web page": ("<!DOCTYPE html><html><body>404</body></html>", "E-CAMERA-CONTENT … camera_matrix"),
+    "XML: words": ("<o><camera_matrix><data>a b</data></camera_matrix></o>", "E-CAMERA-UNREADABLE … 'a'"),
+    "XML: short": ("<o><camera_matrix><data>1 2 3</data></camera_matrix></o>", "E-CAMERA-COEFFICIENTS … matrix … 3"),
+    "XML: no data": ("<o><camera_matrix>5</camera_matrix></o>", "E-CAMERA-COEFFICIENTS … matrix … 1"),
 }
 # fmt: on
 
@@ -333,7 +341,7 @@ WRONG = {
 @pytest.mark.parametrize("case", WRONG)
 def test_a_wrong_file_is_named_in_one_line(tmp_path, case):
     content, message = WRONG[case]
-    with pytest.raises(InputError, match=f"^camera file {re.escape(str(tmp_path))}.*{message}") as caught:
+    with fails_with(message) as caught:
         read(tmp_path, content)
     assert len(str(caught.value).splitlines()) == 1
     assert len(str(caught.value)) < 350 + len(str(tmp_path))  # a line to read, not a dump of the file
@@ -342,14 +350,14 @@ def test_a_wrong_file_is_named_in_one_line(tmp_path, case):
 @pytest.mark.parametrize(
     ("name", "message"),
     [
-        (".", "Is a directory"),
-        ("missing.txt", "No such file"),
-        ("x" * 300, "File name too long"),
-        ("a\0b", "not a text"),
+        (".", "E-CAMERA-UNREADABLE … Is a directory"),
+        ("missing.txt", "E-CAMERA-UNREADABLE … No such file"),
+        ("x" * 300, "E-CAMERA-UNREADABLE … File name too long"),
+        ("a\0b", "E-CAMERA-UNREADABLE"),
     ],
 )
 def test_a_path_that_cannot_be_read(tmp_path, name, message):
-    with pytest.raises(InputError, match=message):
+    with fails_with(message):
         read_camera(tmp_path / name)
 
 
@@ -370,5 +378,5 @@ def test_a_parameter_out_of_all_bounds_is_named(tmp_path, place):
     values[place] = 1e308
     path = tmp_path / "cameras.txt"
     path.write_text(f"1 FULL_OPENCV 800 600 {' '.join(map(str, values))}\n")
-    with pytest.raises(InputError, match=r"a camera parameter of 1e\+308, up to 1e\+12 possible; correct it"):
+    with fails_with("E-CAMERA-TOO-FAR … 1e+308 … 1e+12"):
         read_camera(path)

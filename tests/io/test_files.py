@@ -14,6 +14,7 @@ from stcal.io.files import MB, MODEL_BYTES, SETTINGS_BYTES, TABLE_BYTES, read_by
 from stcal.io.json import read_json
 from stcal.io.saving import keep_apart
 from stcal.io.table import read_table
+from tests.outcome import fails_with
 
 READERS = {
     "camera": (read_camera, SETTINGS_BYTES),
@@ -43,7 +44,7 @@ def test_a_larger_file_is_an_error_with_the_limit(tmp_path, kind):
 
 @pytest.mark.skipif(not Path("/dev/zero").exists(), reason="no file without end on this system")
 def test_a_file_without_end_is_an_error():
-    with pytest.raises(InputError, match="/dev/zero: no end, at most 10 MB are read"):
+    with fails_with("E-CAMERA-UNREADABLE … /dev/zero … 10"):
         read_camera("/dev/zero")
 
 
@@ -52,7 +53,7 @@ def test_a_link_to_itself(tmp_path):
     link = tmp_path / "a"
     link.symlink_to("a")
     keep_apart([("--out", tmp_path / "b")], [("pairs", link)])
-    with pytest.raises(InputError, match="symbolic links"):
+    with fails_with("E-CAMERA-UNREADABLE … symbolic links"):
         read_camera(link)
 
 

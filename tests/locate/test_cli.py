@@ -16,6 +16,7 @@ from stcal.locate.data.layout import layout_toml, load_layout
 from stcal.synthetic.measured.tags import random_pose
 from tests.boards.drawn import photograph
 from tests.locate.drawn_target import CAMERA, LAYOUT, PER_MM, SHEET_MM, photo, sheet, tilted
+from tests.outcome import ended
 
 
 @pytest.fixture
@@ -24,10 +25,7 @@ def stcal(monkeypatch, capsys):
 
     def call(*arguments):
         monkeypatch.setattr(sys, "argv", ["stcal", *map(str, arguments)])
-        with pytest.raises(SystemExit) as ended:
-            main()
-        shown = capsys.readouterr()
-        return ended.value.code, shown.out, shown.err
+        return ended(main, capsys)
 
     return call
 

@@ -6,9 +6,9 @@ import sys
 
 import pytest
 
-from stcal.errors import InputError
 from stcal.report.page import environment
 from stcal.report.pdf import pdf_of
+from tests.outcome import fails_with
 
 pytestmark = pytest.mark.skipif(shutil.which("pdftotext") is None, reason="poppler-utils is not installed")
 PAGE = """
@@ -69,5 +69,5 @@ def test_the_same_page_gives_the_same_bytes():
 
 def test_without_the_library_one_line_says_how_to_get_it(monkeypatch):
     monkeypatch.setitem(sys.modules, "weasyprint", None)
-    with pytest.raises(InputError, match=r'^PDF: needs WeasyPrint, .* pip install "stcal\[pdf\]"$'):
+    with fails_with("E-EXTRA-MISSING"):
         pdf_of(page(1))

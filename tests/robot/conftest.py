@@ -1,17 +1,15 @@
 import pytest
 
 from stcal.cli.main import main
+from tests.outcome import Outcome, ended
 
 
 @pytest.fixture
 def stcal_robot(monkeypatch, capsys):
     """``stcal robot`` as it is called: exit code, what it printed, and its errors."""
 
-    def call(*arguments) -> tuple[int, str, str]:
+    def call(*arguments) -> Outcome:
         monkeypatch.setattr("sys.argv", ["stcal", "robot", *map(str, arguments)])
-        with pytest.raises(SystemExit) as caught:
-            main()
-        out, err = capsys.readouterr()
-        return caught.value.code, out, err
+        return ended(main, capsys)
 
     return call

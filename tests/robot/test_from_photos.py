@@ -26,6 +26,7 @@ from stcal.workflows.from_photos import run as work
 from stcal.workflows.from_photos.output import files_of
 from stcal.workflows.from_photos.report import story
 from stcal.workflows.from_photos.result import FromPhotos
+from tests.outcome import fails_with
 
 JOINTS = [f"q{i}_deg" for i in range(1, 7)]
 REST = np.radians([10.0, 20.0, -15.0, 30.0, -50.0, 40.0])
@@ -180,7 +181,7 @@ def test_without_sweeps_the_axis_method_is_left_out_with_its_reason(cell):
 
 def test_an_axis_that_is_not_found_does_not_end_the_rest(cell, monkeypatch):
     def unsettled(*_, **__):
-        raise ConvergenceError("joint 2: no minimum; measure a longer sweep")
+        raise ConvergenceError("E-TEST", "joint 2: no minimum; measure a longer sweep")
 
     monkeypatch.setattr(work, "robot_from_sweeps", unsettled)
     q = np.concatenate([SWEEPS, cell.about(5)])
@@ -239,32 +240,32 @@ def test_the_inputs_of_these_tests_are_taken(given):
 
 def test_a_folder_without_photographs(given, tmp_path):
     (tmp_path / "empty").mkdir()
-    with pytest.raises(InputError, match="no image, one of jpg"):
+    with fails_with("E-IMAGES-NONE … jpg"):
         given(["image", *JOINTS], rows_of(), images="empty")
 
 
 def test_no_names_in_common(given):
-    with pytest.raises(InputError, match=r"no image in common: a/000\.png … in the one, b/0\.png … in the other"):
+    with fails_with("E-TABLES-UNMATCHED … image … a/000.png … b/0.png"):
         given(["image", *JOINTS], rows_of([f"b/{i}.png" for i in range(8)]))
 
 
 def test_no_such_key(given):
-    with pytest.raises(InputError, match=r"log\.csv: no column photo; .* give another --key"):
+    with fails_with("E-TABLE-COLUMN-MISSING … log.csv … photo … --key"):
         given(["image", *JOINTS], rows_of(), key="photo")
 
 
 def test_a_photograph_twice(given):
-    with pytest.raises(InputError, match=r"line 3: image a/000\.png stands on line 2 too"):
+    with fails_with("E-TABLE-ROW-REPEATED … 3 … image … a/000.png … 2"):
         given(["image", *JOINTS], rows_of(["a/000.png"] * 2))
 
 
 def test_a_robot_of_fewer_joints(given):
-    with pytest.raises(InputError, match=r"log\.csv: a column q6_…, but robot MH80 has 5 joints"):
+    with fails_with("E-ROBOT-MISMATCH … log.csv … 6 … MH80 … 5"):
         given(["image", *JOINTS], rows_of(), five_joints())
 
 
 def test_a_robot_of_more_joints(given):
-    with pytest.raises(InputError, match=r"log\.csv: no such column, q7_rad or q7_deg needed; .*q6_deg"):
+    with fails_with("E-TABLE-COLUMN-MISSING … log.csv … no such column … q7_rad or q7_deg"):
         given(["image", *JOINTS], rows_of(), seven_joints())
 
 
@@ -272,13 +273,13 @@ def test_targets_of_a_tool_that_is_not_photographed(given):
     nominal = replace(mh80(), tools={"": Rigid(), "gripper": Rigid()})
     q = np.zeros((1, 6)).T
     targets = Table("targets.csv", {"target": ["gripper"]} | dict(zip(JOINTS, q, strict=True)), [2])
-    with pytest.raises(InputError, match=r"targets\.csv: line 2: target 'gripper' is not in robot MH80; there are ''"):
+    with fails_with("E-ROBOT-NO-TOOL … targets.csv … 2 … 'gripper' … MH80 … ''"):
         given(["image", *JOINTS], rows_of(), nominal, targets=targets)
 
 
 def test_poses_beside_the_joint_values(given):
     head = ["x_mm", "y_mm", "z_mm", "qw", "qx", "qy", "qz"]
-    with pytest.raises(InputError, match="both have x_mm"):
+    with fails_with("E-TABLES-BOTH … x_mm"):
         given(["image", *JOINTS, *head], [[*row, *pose_cells(Rigid())] for row in rows_of()])
 
 

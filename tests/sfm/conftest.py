@@ -1,6 +1,5 @@
 """Small data sets with pixels, made once, and the command line in this process."""
 
-import shutil
 import sys
 from dataclasses import dataclass, replace
 from importlib import import_module
@@ -12,6 +11,9 @@ from stcal.cli.main import main_sfm
 from stcal.sfm.pipeline import RunOptions, RunResult, run
 from stcal.synthetic.dataset import write_dataset
 from stcal.synthetic.scene import Scene, SceneOptions, make_scene
+from tests.fuzzing.stock import make_stock
+from tests.outcome import Outcome, ended
+from tests.shared import own_copy
 
 SMALL = SceneOptions(seed=3, width=1296, height=864, images_per_group=4, groups=(("1", "2"), ("1", "4")))
 
@@ -23,26 +25,33 @@ def small_scene() -> Scene:
 
 
 @pytest.fixture(scope="session")
-def small_dataset(small_scene, tmp_path_factory) -> Path:
+def small_dataset(small_scene, once) -> Path:
     """``small_scene`` as a folder. Not to be written to: see ``small_set``."""
-    folder = tmp_path_factory.mktemp("small") / "data"
-    write_dataset(folder, small_scene, workers=1)
-    return folder
+    return once.folder("small", lambda folder: write_dataset(folder, small_scene, workers=1))
 
 
 @pytest.fixture(scope="session")
-def small_result(small_dataset, tmp_path_factory) -> RunResult:
+def small_result(small_dataset, once) -> RunResult:
     """Of a run of ``small_dataset``; its folder is ``small_run``."""
-    out = tmp_path_factory.mktemp("small_run") / "run"
     data = small_dataset
     files = [data / name for name in ("target.toml", "board.toml")]
-    return run(data / "images", data / "cameras.txt", out, *files, RunOptions(workers=1))
+
+    def make(out: Path) -> RunResult:
+        return run(data / "images", data / "cameras.txt", out, *files, RunOptions(workers=1))
+
+    return once.value("small_run", make)[1]
 
 
 @pytest.fixture(scope="session")
 def small_run(small_result) -> Path:
     """A finished run of ``small_dataset``. Not to be written to."""
     return small_result.out
+
+
+@pytest.fixture(scope="session")
+def stock(small_dataset, small_run, once) -> Path:
+    """Valid inputs of every command, see `tests/fuzzing/stock.py`. Not to be written to."""
+    return once.folder("stock", lambda folder: make_stock(folder, small_dataset, small_run))
 
 
 @pytest.fixture(scope="session")
@@ -87,12 +96,12 @@ def small_set(small_dataset, small_run, tmp_path):
         own = SmallSet(tmp_path / "set")
         own.images.mkdir(parents=True)
         for group in groups:
-            shutil.copytree(small_dataset / "images" / group, own.images / group)
+            own_copy(small_dataset / "images" / group, own.images / group)
         for name in ("cameras.txt", "target.toml", "board.toml", "truth.json"):
-            shutil.copy(small_dataset / name, own.folder / name)
+            own_copy(small_dataset / name, own.folder / name)
         if detected:
-            shutil.copytree(small_run / "cache", own.out / "cache")
-            shutil.copy(small_run / "stcal-run.json", own.out)
+            own_copy(small_run / "cache", own.out / "cache")
+            own_copy(small_run / "stcal-run.json", own.out)
         return own
 
     return copy
@@ -108,11 +117,8 @@ def no_page(monkeypatch):
 def stcal_sfm(monkeypatch, capfd):
     """``stcal-sfm`` with arguments, in this process: exit code, text on standard output and on standard error."""
 
-    def call(*arguments) -> tuple[int, str, str]:
+    def call(*arguments) -> Outcome:
         monkeypatch.setattr(sys, "argv", ["stcal-sfm", *map(str, arguments)])
-        with pytest.raises(SystemExit) as ended:
-            main_sfm()
-        streams = capfd.readouterr()
-        return ended.value.code or 0, streams.out, streams.err
+        return ended(main_sfm, capfd)
 
     return call

@@ -11,16 +11,14 @@ from stcal.cli.main import main, main_sfm
 from stcal.io.camera import read_camera
 from stcal.io.design import load_board, load_target
 from stcal.workflows import versions
+from tests.outcome import ended
 
 
 @pytest.fixture
 def command(monkeypatch, capsys):
     def call(*arguments, entry=main_sfm):
         monkeypatch.setattr(sys, "argv", ["stcal-sfm", *map(str, arguments)])
-        with pytest.raises(SystemExit) as end:
-            entry()
-        output = capsys.readouterr()
-        return end.value.code or 0, output.out, output.err
+        return ended(entry, capsys)
 
     return call
 

@@ -12,14 +12,8 @@ from tests.fuzzing.judged import EARLIER, OUT, Outcome, failures, hashes, in_pro
 from tests.fuzzing.mistakes import MISTAKES, call_of
 from tests.fuzzing.mutations import BY_SUFFIX
 from tests.fuzzing.pool import mistaken, went_through
-from tests.fuzzing.stock import make_stock
 
 SEED, CASES, PARTS = 20, 360, 6
-
-
-@pytest.fixture(scope="module")
-def stock(tmp_path_factory, small_dataset, small_run):
-    return make_stock(tmp_path_factory.mktemp("fuzz") / "stock", small_dataset, small_run)
 
 
 def spoiled(stock, folder, numbers, both=True) -> list[Judged]:

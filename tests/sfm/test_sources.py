@@ -11,7 +11,6 @@ import typer.main
 from stcal.cli.main import app
 from tests.commands import Call
 from tests.fuzzing.judged import in_process, lay_out
-from tests.fuzzing.stock import make_stock
 
 ROOT = Path(__file__).parents[2]
 QUOTED = re.findall(r"`([^`]+)`", (ROOT / "docs" / "sources.md").read_text(encoding="utf-8"))
@@ -94,11 +93,6 @@ def call_of(text: str) -> Call:
         given += " --sample 6 --tries 200 --threshold-mm 5 --share 0.3"
     name = " ".join(words[1:size])
     return Call(f"sfm {name}" if words[0] == "stcal-sfm" else name, f"{given} {own}")
-
-
-@pytest.fixture(scope="module")
-def stock(tmp_path_factory, small_dataset, small_run):
-    return make_stock(tmp_path_factory.mktemp("sources") / "stock", small_dataset, small_run)
 
 
 @pytest.mark.slow

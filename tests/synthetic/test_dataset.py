@@ -6,13 +6,13 @@ import cv2
 import numpy as np
 import pytest
 
-from stcal.errors import InputError
 from stcal.io.camera import read_camera
 from stcal.io.design import load_board, load_target
 from stcal.synthetic.dataset import write_dataset
 from stcal.synthetic.render import RenderOptions, render
 from stcal.synthetic.scene import SceneOptions, make_scene, second_design
 from stcal.synthetic.truth import TruthFile
+from tests.outcome import fails_with
 
 OPTIONS = SceneOptions(seed=5, width=324, height=216, images_per_group=2)
 
@@ -103,12 +103,12 @@ def test_png_holds_the_image_exactly(tmp_path):
 
 def test_refusals(tmp_path, scene):
     (tmp_path / "mine.txt").write_text("keep")
-    with pytest.raises(InputError, match="not empty"):
+    with fails_with("E-OUTPUT-EXISTS"):
         write_dataset(tmp_path, scene)
-    with pytest.raises(InputError, match="not empty"):
+    with fails_with("E-OUTPUT-EXISTS"):
         write_dataset(tmp_path / "mine.txt", scene)
     assert [p.name for p in tmp_path.iterdir()] == ["mine.txt"]
-    with pytest.raises(InputError, match="image format tif"):
+    with fails_with("E-OPTION-FORM … tif"):
         write_dataset(tmp_path / "new", scene, image_format="tif")
-    with pytest.raises(InputError, match="JPEG holds 8 bits"):
+    with fails_with("E-OPTION-FORM"):
         write_dataset(tmp_path / "new", scene, RenderOptions(bit_depth=16))

@@ -282,10 +282,13 @@ def handeye(
     _require_frames(ros or urdf, exports, (setup or SetupName.in_hand).value, parent, child, camera_frame.value)
     if not folder and (sigma_px is not None or sigma_board_mm is not None):
         raise InputError(
-            "--sigma-px, --sigma-board-mm: only with images; give --sigma-camera-mm and --sigma-camera-deg"
+            "E-OPTION-NEEDS",
+            "--sigma-px, --sigma-board-mm: only with images; give --sigma-camera-mm and --sigma-camera-deg",
         )
     if folder and sigma_camera_mm is not None:
-        raise InputError("--sigma-camera-mm, --sigma-camera-deg: only with poses; with images give --sigma-px")
+        raise InputError(
+            "E-OPTION-NEEDS", "--sigma-camera-mm, --sigma-camera-deg: only with poses; with images give --sigma-px"
+        )
     evolution = _evolution(
         method,
         bounds_rad=_bounds("--de-bounds-deg", de_bounds_deg, math.radians(1)),
@@ -349,13 +352,22 @@ def _require_arm(
 ) -> None:
     """Options of the arm go together."""
     if robot_out and not with_kinematics:
-        raise InputError("--robot-out: only with --with-kinematics; the robot is as its file says else")
+        raise InputError(
+            "E-OPTION-NEEDS", "--robot-out: only with --with-kinematics; the robot is as its file says else"
+        )
     if with_kinematics and not folder:
-        raise InputError("--with-kinematics: only with a folder of images, in which the arm is seen to err")
+        raise InputError(
+            "E-OPTION-NEEDS", "--with-kinematics: only with a folder of images, in which the arm is seen to err"
+        )
     if with_kinematics and method not in (None, "reprojection"):
-        raise InputError(f"--with-kinematics: {method} does not solve for the arm; leave --method out")
+        raise InputError(
+            "E-OPTION-METHOD", f"--with-kinematics: {method} does not solve for the arm; leave --method out"
+        )
     if with_kinematics and four_dof:
-        raise InputError("--with-kinematics, --four-dof: one of them; an arm that turns about one axis hides its own")
+        raise InputError(
+            "E-OPTION-CONFLICT",
+            "--with-kinematics, --four-dof: one of them; an arm that turns about one axis hides its own",
+        )
 
 
 def _require_fitting(
@@ -366,13 +378,16 @@ def _require_fitting(
     from stcal.workflows.handeye.calibrate import ALL
 
     if camera_out and not (refine_camera or with_arm):
-        raise InputError("--camera-out: only with --refine-camera or --with-kinematics; the camera is as given else")
+        raise InputError(
+            "E-OPTION-NEEDS",
+            "--camera-out: only with --refine-camera or --with-kinematics; the camera is as given else",
+        )
     if refine_camera and of_poses:
-        raise InputError("--refine-camera: only with images; poses tell nothing of the camera")
+        raise InputError("E-OPTION-NEEDS", "--refine-camera: only with images; poses tell nothing of the camera")
     if camera_out and method not in (None, ALL, "reprojection"):
-        raise InputError(f"--camera-out: {method} does not adjust the camera; leave --method out")
+        raise InputError("E-OPTION-METHOD", f"--camera-out: {method} does not adjust the camera; leave --method out")
     if method not in (None, ALL, *METHODS):
-        raise InputError(f"--method {method}: unknown; {ALL} or one of {', '.join(METHODS)} needed")
+        raise InputError("E-OPTION-METHOD", f"--method {method}: unknown; {ALL} or one of {', '.join(METHODS)} needed")
 
 
 def _require_frames(
@@ -388,8 +403,9 @@ def _require_frames(
 
     if (parent or child or camera_frame != "optical") and not (ros or any(form in ROS_FORMS for form, _ in exports)):
         raise InputError(
+            "E-OPTION-NEEDS",
             "--parent, --child, --camera-frame: only with --ros, --urdf or --export of a ROS form, whose frames they "
-            "name"
+            "name",
         )
     require_frame_names(*frame_names(setup, parent, child, camera_frame))
 
@@ -408,7 +424,7 @@ def _bounds(option: str, text: str | None, factor: float) -> "Bounds | None":
         x, y, z = (factor * float(each) for each in about or "000")
         return Bounds(half_width, (x, y, z))
     except ValueError as error:
-        raise InputError(f"{option} {text}: one number, X,Y,Z,± or closed-form,± needed") from error
+        raise InputError("E-OPTION-VALUE", f"{option} {text}: one number, X,Y,Z,± or closed-form,± needed") from error
 
 
 def _evolution(method: str | None, **given) -> "EvolutionOptions":
@@ -418,7 +434,7 @@ def _evolution(method: str | None, **given) -> "EvolutionOptions":
 
     given = {name: value for name, value in given.items() if value is not None}
     if given and method not in (ALL, *EVOLVED):
-        raise InputError(f"--de-…: only with --method {', '.join(EVOLVED)} or {ALL}")
+        raise InputError("E-OPTION-NEEDS", f"--de-…: only with --method {', '.join(EVOLVED)} or {ALL}")
     return EvolutionOptions(**given)
 
 
@@ -427,7 +443,9 @@ def _save_camera(path: Path, outcome: "Outcome") -> None:
 
     found = outcome.result.reprojection
     if found is None:
-        raise InputError(f"--camera-out: {outcome.result.method} does not adjust the camera; leave --method out")
+        raise InputError(
+            "E-OPTION-METHOD", f"--camera-out: {outcome.result.method} does not adjust the camera; leave --method out"
+        )
     path.parent.mkdir(parents=True, exist_ok=True)
     write_cameras_txt(path, CalibratedCamera.of(found.camera, outcome.colmap_model, found.camera_covariance))
     say(f"written: {path}")

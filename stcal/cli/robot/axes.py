@@ -66,7 +66,8 @@ def axes(
     data = read_measurements(source, nominal, rotation=rotation)
     if len(set(data.stations)) > 1:
         raise InputError(
-            f"{data.where}: stations {', '.join(data.by_station())}; sweeps are seen from one, so give one at a time"
+            "E-STATION-SINGLE",
+            f"{data.where}: stations {', '.join(data.by_station())}; sweeps are seen from one, so give one at a time",
         )
     length_mm = _length(orientations, data)
     result = robot_from_sweeps(data, nominal, math.radians(still_deg), None if length_mm is None else ring(length_mm))
@@ -93,4 +94,4 @@ def _length(text: str, data: "Measurements") -> float | None:
     try:
         return float(text)
     except ValueError as error:
-        raise InputError(f"--orientations {text}: a length in mm, auto or off needed") from error
+        raise InputError("E-OPTION-VALUE", f"--orientations {text}: a length in mm, auto or off needed") from error

@@ -115,11 +115,15 @@ def compensate(
         write(path, made.text)
         print_each("note", made.notes)
     if not result.found.usable.any():
-        raise DegenerateError(f"{wanted.where}: none of {len(result)} poses is reached; see the warnings above")
+        raise DegenerateError(
+            "E-ROBOT-UNREACHED", f"{wanted.where}: none of {len(result)} poses is reached; see the warnings above"
+        )
 
 
 def _pulses(text: str | None) -> list[float] | None:
     try:
         return None if text is None else [float(cell) for cell in text.split(",")]
     except ValueError as error:
-        raise InputError(f"--pulses-per-deg {text}: numbers with commas between needed, one for each joint") from error
+        raise InputError(
+            "E-OPTION-VALUE", f"--pulses-per-deg {text}: numbers with commas between needed, one for each joint"
+        ) from error

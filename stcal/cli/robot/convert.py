@@ -47,10 +47,11 @@ def convert(
     from stcal.robot.urdf.write import coupled, require_same_poses, robot_urdf
 
     if out.suffix.lower() not in (*XML, ".toml"):
-        raise InputError(f"{out}: a name ending in .urdf or .toml needed")
+        raise InputError("E-OUTPUT-SUFFIX", f"{out}: a name ending in .urdf or .toml needed")
     if _is_xml(source) == (out.suffix.lower() in XML):
         raise InputError(
-            f"{source}, {out}: both are {'URDF' if _is_xml(source) else 'robot files'}; one of each needed"
+            "E-OPTION-FILES",
+            f"{source}, {out}: both are {'URDF' if _is_xml(source) else 'robot files'}; one of each needed",
         )
     if _is_xml(source):
         found = load_urdf(source, from_link, to_link or "", convention.value)
@@ -60,7 +61,9 @@ def convert(
         write(out, robot_toml(found.robot, [f"From {source.name}, {found.from_link} to {found.to_link}: {joints}."]))
         return
     if from_link or to_link or convention is not ConventionName.standard:
-        raise InputError("--from-link, --to-link, --convention: only of a URDF that is read; leave them out")
+        raise InputError(
+            "E-OPTION-NEEDS", "--from-link, --to-link, --convention: only of a URDF that is read; leave them out"
+        )
     robot = load_robot(source)
     text = robot_urdf(robot)
     require_same_poses(robot, text)
@@ -78,4 +81,4 @@ def _is_xml(path: Path) -> bool:
         with path.open("rb") as file:
             return file.read(200).lstrip(b"\xef\xbb\xbf \t\r\n").startswith(b"<")
     except OSError as error:
-        raise InputError(f"{path}: {error.strerror or error}; check the path") from error
+        raise InputError("E-FILE-UNREADABLE", f"{path}: {error.strerror or error}; check the path") from error

@@ -68,4 +68,4 @@ def _box(text: str) -> tuple[float, ...]:
     try:
         return tuple(float(cell) for cell in text.split(","))
     except ValueError as error:
-        raise InputError(f"--box {text}: six numbers with commas between needed, in mm") from error
+        raise InputError("E-OPTION-VALUE", f"--box {text}: six numbers with commas between needed, in mm") from error

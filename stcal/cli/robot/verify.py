@@ -38,7 +38,7 @@ def verify(
     from stcal.robot.use import verification as stage
 
     if plot and plot.suffix.lower() not in (".png", ".svg"):
-        raise InputError(f"--plot {plot}: a name ending in .png or .svg needed")
+        raise InputError("E-OUTPUT-SUFFIX", f"--plot {plot}: a name ending in .png or .svg needed")
     tables = several_tables(measured, first, seconds or [], key, "MEASURED", ("commanded_", ""), columns=columns)
     source = (
         tables if not isinstance(tables, list) else stack(tables, [path.stem for path in seconds or ()], {"pose": key})

@@ -66,7 +66,10 @@ def budget(
     if pdf:
         _require_pdf(page, run)
     if lengths_statement is not None and lengths is None:
-        raise InputError(f"--lengths-statement {lengths_statement}: of a second calibration; give it with --lengths")
+        raise InputError(
+            "E-OPTION-NEEDS",
+            f"--lengths-statement {lengths_statement}: of a second calibration; give it with --lengths",
+        )
     found, tests = budget_of_run(saved, stated), []
     if check_lengths is not None:
         tests.append(against_stated(found, check_lengths))
@@ -96,8 +99,11 @@ def _require_pdf(page: Path | None, run: Path) -> None:
     from stcal.report.pdf import require_pdf
 
     if page is None:
-        raise InputError("--pdf: the PDF stands beside the page; give that with --report FILE.html")
+        raise InputError("E-OPTION-NEEDS", "--pdf: the PDF stands beside the page; give that with --report FILE.html")
     if page.suffix.lower() == ".pdf":
-        raise InputError(f"--report {page}: the page is HTML; give {page.with_suffix('.html')}, and --pdf for the PDF")
+        raise InputError(
+            "E-OUTPUT-SUFFIX",
+            f"--report {page}: the page is HTML; give {page.with_suffix('.html')}, and --pdf for the PDF",
+        )
     keep_apart([("--pdf", page.with_suffix(".pdf"))], [("RUN", run)])
     require_pdf()

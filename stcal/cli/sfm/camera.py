@@ -86,7 +86,8 @@ def calibrate_camera(
             failed = _rig(images, out or Path("rig"), target_design, board_design, models, *common)
         elif models.own:
             raise InputError(
-                f"--model {next(iter(models.own))}=…: names a camera of a rig; give --rig, or a model alone"
+                "E-OPTION-NEEDS",
+                f"--model {next(iter(models.own))}=…: names a camera of a rig; give --rig, or a model alone",
             )
         else:
             failed = _one(images, out or Path("cameras.txt"), target_design, board_design, models.common, *common)

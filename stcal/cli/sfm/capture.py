@@ -76,7 +76,9 @@ def plan(
 
     design = target_of(target)
     if noise is not None and run is not None:
-        raise InputError(f"--noise {noise:g} and --run {run}: two sources of one σ; give one of them")
+        raise InputError(
+            "E-OPTION-CONFLICT", f"--noise {noise:g} and --run {run}: two sources of one σ; give one of them"
+        )
     if noise is not None:
         centre_noise, source = stated_noise(noise)
     else:

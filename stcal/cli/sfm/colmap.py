@@ -150,7 +150,8 @@ def crosscheck(
     say(f"report: {run / 'report.html'}")
     if check.differences:
         raise MappingError(
-            f"cross-check: native COLMAP {check.native} and stcal differ: {'; '.join(check.differences)}"
+            "E-CROSSCHECK-DIFFERS",
+            f"cross-check: native COLMAP {check.native} and stcal differ: {'; '.join(check.differences)}",
         )
 
 
@@ -180,7 +181,7 @@ def faces(
     from stcal.sfm.run.saved import load_run
 
     if out is not None and not out.parent.is_dir():
-        raise InputError(f"{out}: no folder {out.parent}; make it, or give another place with --out")
+        raise InputError("E-OUTPUT-FOLDER", f"{out}: no folder {out.parent}; make it, or give another place with --out")
     saved = load_run(run)
     calibration = calibrate_models(model, saved, solve.value)
     say(faces_text(calibration, saved))

@@ -89,7 +89,7 @@ def design(
 
     target_file, board_file = folder / TARGET, folder / BOARD
     if os.path.lexists(target_file):
-        raise InputError(f"{target_file}: exists; move it away, or give another folder")
+        raise InputError("E-OUTPUT-EXISTS", f"{target_file}: exists; move it away, or give another folder")
     board = load_board(board_file) if os.path.lexists(board_file) else None
     model = read_camera(camera) if camera else None
     options = MakeOptions(size_of(size), circles, radius, distance, width, model, "bright" if bright else "dark", seed)

@@ -116,12 +116,15 @@ def measure(
             "--strict": strict,
         }
         if given := [name for name, value in alone.items() if value]:
-            raise InputError(f"--serve and {given[0]}: images come over HTTP, one answer each; leave {given[0]} out")
+            raise InputError(
+                "E-OPTION-CONFLICT",
+                f"--serve and {given[0]}: images come over HTTP, one answer each; leave {given[0]} out",
+            )
         ellipses = ellipse_options(min_diameter, max_diameter)
         _serve(camera, faces, target, board, sigma_factor, ellipses, (host, port, max_megabytes, workers))
         return
     if images is None:
-        raise InputError("IMAGES: missing; give the folder of images, or --serve")
+        raise InputError("E-OPTION-MISSING", "IMAGES: missing; give the folder of images, or --serve")
     load_ahead(workers)
     from stcal.io.camera import read_camera
     from stcal.io.design import load_board, target_of
@@ -133,7 +136,7 @@ def measure(
 
     for path in (out, json_file, report):
         if path is not None and not path.parent.is_dir():
-            raise InputError(f"{path}: no folder {path.parent}; make it, or give another place")
+            raise InputError("E-OUTPUT-FOLDER", f"{path}: no folder {path.parent}; make it, or give another place")
     design = target_of(target)
     known = read_target(faces, design)
     table = read_table(joints, "joints") if joints else None

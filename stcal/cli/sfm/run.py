@@ -210,7 +210,9 @@ def detect(
         exclude=tuple(exclude or ()),
     )
     if (out / "faces.json").exists():
-        raise InputError(f"output folder {out}: holds a finished calibration; give another folder with --out")
+        raise InputError(
+            "E-OUTPUT-EXISTS", f"output folder {out}: holds a finished calibration; give another folder with --out"
+        )
     chosen_images(images, options.exclude)
     given = {"images": images, "--camera": camera, "--target": target, "--board": board}
     with (
@@ -260,4 +262,4 @@ def _flatness(text: str) -> float | None:
     try:
         return float(text)
     except ValueError as error:
-        raise InputError(f"--flatness {text}: a σ in mm, more than 0, or off") from error
+        raise InputError("E-OPTION-VALUE", f"--flatness {text}: a σ in mm, more than 0, or off") from error

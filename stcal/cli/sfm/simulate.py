@@ -31,7 +31,7 @@ def init(folder: Annotated[Path, typer.Argument(help="Write the two files to thi
     texts = {"target.toml": target_toml(reference_target()), "board.toml": board_toml(reference_board())}
     for name in texts:
         if (folder / name).exists():
-            raise InputError(f"{folder / name}: exists; move it away, or give another folder")
+            raise InputError("E-OUTPUT-EXISTS", f"{folder / name}: exists; move it away, or give another folder")
     for name, text in texts.items():
         save(folder / name, text)
         say(folder / name)
@@ -89,7 +89,7 @@ def simulate(
         images_per_group=images,
     )
     if second_design and (target or board):
-        raise InputError("--second-design and --target or --board: two designs; give one of them")
+        raise InputError("E-OPTION-CONFLICT", "--second-design and --target or --board: two designs; give one of them")
     one_given = (target is None) != (board is None)  # both are the reference's where neither is
     with designs_told(target, board, with_target=one_given, with_board=one_given):
         scene = _scene(options, _designs(target, board, second_design), groups, camera, fisheye)
@@ -132,10 +132,12 @@ def _scene(
         scene = make_scene(options, target, board, poses)
         return scene if fisheye is None else seen_wide(scene, fisheye, options.seed)
     if fisheye is not None:
-        raise InputError(f"--camera {camera} and --fisheye {fisheye:g}: two cameras; give one of them")
+        raise InputError(
+            "E-OPTION-CONFLICT", f"--camera {camera} and --fisheye {fisheye:g}: two cameras; give one of them"
+        )
     file = read_camera(camera)
     if not (file.width and file.height):
-        raise InputError(f"camera file {camera} states no image size; add it to the file")
+        raise InputError("E-CAMERA-SIZE", f"camera file {camera} states no image size; add it to the file")
     scene = make_scene(seen_by(options, file), target, board, poses)
     return replace(scene, camera=file.calibrated(0, 0))
 

@@ -80,12 +80,15 @@ def read_pairs(path: Path, said: Said, key: str = "image", quaternions: Order = 
     if not content.both:
         side = content.sides[0]
         held = f"{side.frames.name} alone" if side.frames is not None else "poses of one side, which is not said,"
-        raise InputError(f"{path}: {content.form} with {held}; give the robot's file as --a and the camera's as --b")
+        raise InputError(
+            "E-POSES-MIXED", f"{path}: {content.form} with {held}; give the robot's file as --a and the camera's as --b"
+        )
     robot, camera = (settled(_side(content, role, path), role, content, path, said) for role in FRAMES)
     if robot.guessed != camera.guessed and robot.guessed and camera.guessed:
         raise InputError(
+            "E-POSES-UNITS",
             f"{path}: by their size the robot's lengths are in {robot.guessed} and the camera's in {camera.guessed}; "
-            "write both in one unit, or to two files for --a and --b"
+            "write both in one unit, or to two files for --a and --b",
         )
     rows = list(range(len(robot)))
     names = robot.names or camera.names or robot.places
@@ -164,7 +167,7 @@ def own_table(path: Path, said: Said, key: str, quaternions: Order) -> Content:
     table = read_table(path, "table", quaternions)
     found = read_columns(table, read_bytes(path, TABLE_BYTES).decode("utf-8-sig"), key, said)
     if found is None:
-        raise InputError(f"{table.where}: no poses in its columns; the header is {table.header()}")
+        raise InputError("E-POSES-NOT-FOUND", f"{table.where}: no poses in its columns; the header is {table.header()}")
     return found
 
 
@@ -177,7 +180,9 @@ def _by_time(
     if times[0] is None or times[1] is None:
         if always:
             without = (robot, camera)[times[0] is not None]
-            raise InputError(f"{without.where}: no times of its poses; with --time-offset both files need them")
+            raise InputError(
+                "E-POSES-UNTIMED", f"{without.where}: no times of its poses; with --time-offset both files need them"
+            )
         return None
     if not always and set(times[1]) <= set(times[0]):
         return None
@@ -185,7 +190,10 @@ def _by_time(
     seconds = stream.after_origin(times[1])
     taken = taken_at(stream, seconds, tolerance_s)
     if not taken.kept.any():
-        raise InputError(f"{camera.where}: no pose has one of the robot: first {camera.names[0]}, {taken.why[0]}")
+        raise InputError(
+            "E-POSES-UNMATCHED",
+            f"{camera.where}: no pose has one of the robot: first {camera.names[0]}, {taken.why[0]}",
+        )
     kept = np.flatnonzero(taken.kept)
     of_camera = None if camera.covariance is None else camera.covariance[kept]
     names = tuple(camera.names[i] for i in kept)
@@ -208,7 +216,9 @@ def _side(content: Content, role: Role, path: Path) -> Side:
     if found is None:
         frames = content.sides[0].frames
         held = frames.name if frames else "poses"
-        raise InputError(f"{path}: {content.form} of {held}, {FRAMES[role][0]} needed here; give another file")
+        raise InputError(
+            "E-POSES-MIXED", f"{path}: {content.form} of {held}, {FRAMES[role][0]} needed here; give another file"
+        )
     return found
 
 
@@ -224,7 +234,9 @@ def settled(side: Side, role: Role, content: Content, path: Path, said: Said) ->
     far = np.flatnonzero(np.abs(side.translation).max(axis=1) > FARTHEST)
     if len(far):
         measured = np.abs(side.translation[far[0]]).max()
-        raise InputError(f"{path}: {side.places[far[0]]}: a length of {measured:.3g}, up to {FARTHEST:g} possible")
+        raise InputError(
+            "E-VALUE-TOO-FAR", f"{path}: {side.places[far[0]]}: a length of {measured:.3g}, up to {FARTHEST:g} possible"
+        )
     frames = _direction(side, role, path, said)
     factor, unit, guessed = _unit(side, frames.name, path, said)
     poses = Poses(side.rotation, factor * side.translation)
@@ -248,7 +260,9 @@ def _direction(side: Side, role: Role, path: Path, said: Said) -> Frames:
     if option is not None:
         if side.frames is not None and side.frames.stated and side.frames.name != option:
             raise InputError(
-                f"{path}: {side.frames.name} {side.frames.by}, --poses-are {option}; rename it, or leave the option out"
+                "E-OPTION-CONTRADICTS",
+                f"{path}: {side.frames.name} {side.frames.by}, --poses-are {option}; rename it, "
+                "or leave the option out",
             )
         return Frames(option, "as you say")
     if side.frames is not None:
@@ -274,13 +288,15 @@ def _unit(side: Side, name: str, path: Path, said: Said) -> tuple[float, str, st
     if 0 < nearest < farthest / MIXED:
         near, far = side.places[int(distances.argmin())], side.places[int(distances.argmax())]
         raise InputError(
+            "E-POSES-UNITS",
             f"{path}: {name}: {near} is {nearest:.3g} away and {far} {farthest:.3g}, as if in two units; write all in "
-            "one and give --length-unit mm or m"
+            "one and give --length-unit mm or m",
         )
     if METRES_UP_TO < farthest < MILLIMETRES_FROM or farthest == 0:
         raise InputError(
+            "E-POSES-UNITS",
             f"{path}: {name}: lengths up to {farthest:.3g}, {METRES_UP_TO:g} or less for metres and "
-            f"{MILLIMETRES_FROM:g} or more for mm needed to tell the unit; give --length-unit mm, cm or m"
+            f"{MILLIMETRES_FROM:g} or more for mm needed to tell the unit; give --length-unit mm, cm or m",
         )
     unit = "m" if farthest <= METRES_UP_TO else "mm"
     return LENGTHS[unit], f"{unit} by their size, up to {farthest:.4g}", unit
@@ -310,21 +326,24 @@ def matched(robot: Posed, camera: Posed, key: str) -> tuple[list[tuple[int, int]
     if not robot.names and not camera.names:
         if len(robot) != len(camera):
             raise InputError(
+                "E-POSES-COUNT",
                 f"{robot.where}, {camera.where}: {len(robot)} and {len(camera)} poses without names or times; as many "
-                "of each, or names, needed"
+                "of each, or names, needed",
             )
         return [(i, i) for i in range(len(robot))], "by their order, for neither file has names or times"
     if not robot.names or not camera.names:
         without, other = (robot, camera) if not robot.names else (camera, robot)
         raise InputError(
+            "E-POSES-UNNAMED",
             f"{without.where}: no names or times of its poses, {other.where} has: {other.names[0]} …; name both, like "
-            f"with a column {key}"
+            f"with a column {key}",
         )
     found = partners(robot.names, camera.names)
     if found is None:
         raise InputError(
+            "E-POSES-UNMATCHED",
             f"{robot.where}, {camera.where}: no name or time in common: {robot.names[0]} … in the one, "
-            f"{camera.names[0]} … in the other; correct them"
+            f"{camera.names[0]} … in the other; correct them",
         )
     return found
 

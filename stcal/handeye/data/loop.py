@@ -65,7 +65,7 @@ class Loop:
     def of(cls, pairs: HandEyePoses, setup: Setup) -> "Loop":
         """Of pairs in one of the setups."""
         if setup not in SETUPS:
-            raise InputError(f"hand-eye: setup {setup!r}; {' or '.join(SETUPS)} needed")
+            raise InputError("E-HANDEYE-SETUP", f"hand-eye: setup {setup!r}; {' or '.join(SETUPS)} needed")
         inverted = setup == "eye-to-hand"
         hand = pairs.base_from_flange.inverse() if inverted else pairs.base_from_flange
         covariances = (pairs.base_from_flange_covariance, pairs.camera_from_board_covariance)

@@ -70,8 +70,9 @@ class Motions:
         good = self.has_log()
         if good.sum() < 2:
             raise DegenerateError(
+                "E-HANDEYE-LARGE-TURNS",
                 f"hand-eye: {len(good) - good.sum()} of {len(good)} motions turn by more than "
-                f"{np.degrees(LARGEST_RAD):.0f}°, {method} needs 2 that do not; use another method or order of poses"
+                f"{np.degrees(LARGEST_RAD):.0f}°, {method} needs 2 that do not; use another method or order of poses",
             )
         return self[good]
 

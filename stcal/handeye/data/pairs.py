@@ -48,14 +48,15 @@ class HandEyePoses:
         m = len(self.base_from_flange)
         if len(self.camera_from_board) != m:
             raise InputError(
-                f"{self.where}: {m} poses of the flange and {len(self.camera_from_board)} of the board; pairs needed"
+                "E-POSES-COUNT",
+                f"{self.where}: {m} poses of the flange and {len(self.camera_from_board)} of the board; pairs needed",
             )
         for name in ("base_from_flange_covariance", "camera_from_board_covariance"):
             if getattr(self, name) is not None:
                 object.__setattr__(self, name, frozen(getattr(self, name), (m, 6, 6), name))
         names = tuple(self.names) or tuple(f"pose {i}" for i in range(1, m + 1))
         if len(names) != m:
-            raise InputError(f"{self.where}: {len(names)} names of {m} poses; one each needed")
+            raise InputError("E-NAMES-COUNT", f"{self.where}: {len(names)} names of {m} poses; one each needed")
         object.__setattr__(self, "names", names)
         self._check_copies()
 
@@ -76,7 +77,7 @@ class HandEyePoses:
                 try:
                     rigid.append(Rigid.from_matrix(matrix))
                 except InputError as error:
-                    raise InputError(f"{where}: {name}: {what}: {error}") from error
+                    raise InputError(error.code, f"{where}: {name}: {what}: {error}") from error
             sides.append(Poses.of(rigid))
         return cls(*sides, names=tuple(names), where=where)
 
@@ -109,10 +110,11 @@ class HandEyePoses:
             moved = np.linalg.norm(flange.translation[i] - flange.translation[j])
             turned = Rigid(flange.rotation[j].T @ flange.rotation[i]).angle_rad()
             if moved == 0 and turned < 1e-12:
-                raise InputError(f"{pair} are identical poses; take one of them out")
+                raise InputError("E-POSES-IDENTICAL", f"{pair} are identical poses; take one of them out")
             raise InputError(
+                "E-POSES-IDENTICAL",
                 f"{pair}: the board's pose is the same to the last digit, while the flange moved by {moved:.3g} mm and "
-                f"{np.degrees(turned):.3g}°; give each its own pose of the board"
+                f"{np.degrees(turned):.3g}°; give each its own pose of the board",
             )
 
 
@@ -152,7 +154,8 @@ def read_side(table: Table, wanted: str, inverse: str) -> tuple[Poses, np.ndarra
     if len(given) != 1:
         found = "no such columns" if not given else "both"
         raise InputError(
-            f"{table.where}: {found}, {wanted}_x_mm … or {inverse}_x_mm … needed; the header is {table.header()}"
+            "E-TABLE-COLUMN-MISSING",
+            f"{table.where}: {found}, {wanted}_x_mm … or {inverse}_x_mm … needed; the header is {table.header()}",
         )
     poses, covariance = table.poses(given[0] + "_"), table.pose_covariances(given[0] + "_")
     if given[0] == wanted:

@@ -39,9 +39,13 @@ class RigCamera:
     def __post_init__(self):
         object.__setattr__(self, "rows", frozen(self.rows, (len(self.views),), "rows", int))
         if len(self.images) != len(self.views):
-            raise InputError(f"camera {self.name}: {len(self.images)} names of {len(self.views)} views; one each")
+            raise InputError(
+                "E-NAMES-COUNT", f"camera {self.name}: {len(self.images)} names of {len(self.views)} views; one each"
+            )
         if len(set(self.rows.tolist())) < len(self.rows):
-            raise InputError(f"camera {self.name}: two images of one pose of the robot; take one of them out")
+            raise InputError(
+                "E-RIG-INSTANT", f"camera {self.name}: two images of one pose of the robot; take one of them out"
+            )
 
     def __len__(self) -> int:
         return len(self.views)
@@ -84,13 +88,19 @@ class RigPoses:
         names = tuple(self.names) or tuple(f"pose {i}" for i in range(1, m + 1))
         object.__setattr__(self, "names", names)
         if len(names) != m:
-            raise InputError(f"{self.where}: {len(names)} names of {m} poses of the robot; one each needed")
+            raise InputError(
+                "E-NAMES-COUNT", f"{self.where}: {len(names)} names of {m} poses of the robot; one each needed"
+            )
         called = [camera.name for camera in self.cameras]
         if not called or len(set(called)) < len(called):
-            raise InputError(f"{self.where}: cameras {', '.join(called) or '–'}; one or more, each of its own name")
+            raise InputError(
+                "E-RIG-CAMERAS", f"{self.where}: cameras {', '.join(called) or '–'}; one or more, each of its own name"
+            )
         for camera in self.cameras:
             if len(camera) and not (camera.rows.min() >= 0 and camera.rows.max() < m):
-                raise InputError(f"{self.where}: camera {camera.name}: a row that none of {m} poses has; correct it")
+                raise InputError(
+                    "E-RIG-ROW", f"{self.where}: camera {camera.name}: a row that none of {m} poses has; correct it"
+                )
 
     def __len__(self) -> int:
         return len(self.base_from_flange)

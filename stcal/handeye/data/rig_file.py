@@ -73,9 +73,13 @@ def read_rig_file(path: Path) -> RigFiles:
     for number, each in enumerate(content.camera, 1):
         poses = each.poses or content.poses
         if poses is None:
-            raise InputError(f"{WHAT} {path}: camera {each.name}: no poses of the robot; add `poses`, here or for all")
+            raise InputError(
+                "E-RIG-POSES", f"{WHAT} {path}: camera {each.name}: no poses of the robot; add `poses`, here or for all"
+            )
         if each.name in [other.name for other in cameras]:
-            raise InputError(f"{WHAT} {path}: camera {number} is called {each.name!r} as another is; one name each")
+            raise InputError(
+                "E-RIG-CAMERAS", f"{WHAT} {path}: camera {number} is called {each.name!r} as another is; one name each"
+            )
         files = (folder / name for name in (each.images, each.camera, poses))
         cameras.append(RigCameraFiles(each.name, *files, times=folder / each.times if each.times else None))
     return RigFiles(path, content.setup, folder / content.board, tuple(cameras))

@@ -56,8 +56,9 @@ class RobotPoses:
         if not self.images:
             if len(names) != len(self.base_from_flange):
                 raise InputError(
+                    "E-NAMES-COUNT",
                     f"{self.where}: {len(self.base_from_flange)} poses without names for {len(names)} images; as many, "
-                    "or a name for each, needed"
+                    "or a name for each, needed",
                 )
             numbers = [trailing_number(name) for name in names]
             order = list(range(len(names)))
@@ -86,10 +87,15 @@ class RobotPoses:
         for row, image in enumerate(self.images):
             of = [image] if image in names else short.get(image, [])
             if len(of) > 1:
-                raise InputError(f"{self.where}: {self.places[row]}: {image} may be {of[0]} or {of[1]}; give its path")
+                raise InputError(
+                    "E-IMAGE-NAME-AMBIGUOUS",
+                    f"{self.where}: {self.places[row]}: {image} may be {of[0]} or {of[1]}; give its path",
+                )
             if of and of[0] in found:
                 both = f"{self.places[found[of[0]]]} and {self.places[row]}"
-                raise InputError(f"{self.where}: {both}: both are of image {of[0]!r}; one row needed")
+                raise InputError(
+                    "E-POSE-REPEATED", f"{self.where}: {both}: both are of image {of[0]!r}; one row needed"
+                )
             if of:
                 found[of[0]] = row
             else:
@@ -117,16 +123,22 @@ def read_robot_poses(path: str | Path, quaternions: Order = "wxyz", said: Said |
     if (found := _of_others(path, said, quaternions)) is not None:
         return found
     if said.options():
-        raise InputError(f"robot poses {path}: its columns or keys say all; leave {', '.join(said.options())} out")
+        raise InputError(
+            "E-OPTION-NEEDS", f"robot poses {path}: its columns or keys say all; leave {', '.join(said.options())} out"
+        )
     if quaternions != "wxyz" and (path.is_dir() or path.suffix.lower() in YAML):
         raise InputError(
+            "E-OPTION-NEEDS",
             f"robot poses {path}: --quaternions {quaternions} is of a CSV file's columns; YAML gives each "
-            "of qx, qy, qz, qw by its name; correct the names"
+            "of qx, qy, qz, qw by its name; correct the names",
         )
     if path.is_dir():
         files = sorted(path.glob("*.yaml")) + sorted(path.glob("*.yml"))
         if not files:
-            raise InputError(f"robot poses {path}: a folder without *.yaml; a CSV file, or a YAML file for each image")
+            raise InputError(
+                "E-ROBOT-POSES-FORM",
+                f"robot poses {path}: a folder without *.yaml; a CSV file, or a YAML file for each image",
+            )
         read = _from_yaml([(file.stem, file) for file in files], f"robot poses {path}")
         return replace(read, understood=f"{path.name}: folder of {len(files)} {INDUSTRIAL}", own=False)
     if path.suffix.lower() in YAML:
@@ -179,10 +191,10 @@ def _listed(path: Path) -> list[tuple[str, Path]]:
     rows = content.get("data") if isinstance(content, dict) else content
     form = f"robot poses {path}: no list of pairs `image:` and `pose:`; give these, or the folder of the poses"
     if not isinstance(rows, list) or not rows:
-        raise InputError(form)
+        raise InputError("E-ROBOT-POSES-FORM", form)
     for row in rows:
         if not (isinstance(row, dict) and isinstance(row.get("image"), str) and isinstance(row.get("pose"), str)):
-            raise InputError(form)
+            raise InputError("E-ROBOT-POSES-FORM", form)
     return [(Path(row["image"]).name, path.parent / row["pose"]) for row in rows]
 
 
@@ -196,7 +208,7 @@ def _from_yaml(files: list[tuple[str, Path]], where: str) -> RobotPoses:
         row = [pose.get(key) if isinstance(pose, dict) else None for key in keys]
         for key, value in zip(keys, row, strict=True):
             if isinstance(value, bool) or not isinstance(value, int | float) or not np.isfinite(value):
-                raise InputError(f"{where}: {file.name}: {key} is {value!r}, a finite number needed")
+                raise InputError("E-POSE-VALUE", f"{where}: {file.name}: {key} is {value!r}, a finite number needed")
         values.append(row)
     flat = np.array(values, float)
     require_unit(flat[:, 3:], names.__getitem__, where, "correct it")
@@ -208,6 +220,8 @@ def _yaml(path: Path, where: str):
     try:
         return load_yaml(read_bytes(path, SETTINGS_BYTES).decode("utf-8"))
     except OSError as error:
-        raise InputError(f"{where}: {error.strerror or error}; give a readable file") from error
+        raise InputError("E-FILE-UNREADABLE", f"{where}: {error.strerror or error}; give a readable file") from error
     except (yaml.YAMLError, ValueError, RecursionError) as error:
-        raise InputError(f"{where}: not YAML ({' '.join(str(error).split())[:100]}); correct it") from error
+        raise InputError(
+            "E-YAML-INVALID", f"{where}: not YAML ({' '.join(str(error).split())[:100]}); correct it"
+        ) from error

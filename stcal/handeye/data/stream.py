@@ -59,12 +59,16 @@ class Stream:
             Fewer than two samples, or two of one time.
         """
         if len(times) < 2:
-            raise InputError(f"{where}: {len(times)} sample with a time, 2 needed; give the whole stream")
+            raise InputError(
+                "E-TIMES-FEW", f"{where}: {len(times)} sample with a time, 2 needed; give the whole stream"
+            )
         order = sorted(range(len(times)), key=times.__getitem__)
         origin = times[order[0]]
         seconds = np.array([float(times[i] - origin) for i in order])
         if len(same := np.flatnonzero(np.diff(seconds) < SAME_S)):
-            raise InputError(f"{where}: two samples of the time {times[order[same[0]]]}; take one of them out")
+            raise InputError(
+                "E-TIMES-REPEATED", f"{where}: two samples of the time {times[order[same[0]]]}; take one of them out"
+            )
         return cls(seconds, poses[order], origin, where)
 
     def after_origin(self, times: Sequence[Decimal]) -> np.ndarray:

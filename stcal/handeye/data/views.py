@@ -156,7 +156,10 @@ def pairs_of_views(
         A view in which no pose can be found; the message names it.
     """
     if len(views) != len(base_from_flange):
-        raise InputError(f"{where}: {len(base_from_flange)} poses of the flange and {len(views)} views; pairs needed")
+        raise InputError(
+            "E-POSES-COUNT",
+            f"{where}: {len(base_from_flange)} poses of the flange and {len(views)} views; pairs needed",
+        )
     names = names or tuple(f"pose {i}" for i in range(1, len(views) + 1))
     found = resect(views, names)
     return HandEyePoses(base_from_flange, found.camera_from_board, None, found.covariance, names, where)
@@ -184,7 +187,9 @@ def whitened(view: View, camera: Camera, camera_from_board: Rigid) -> tuple[np.n
 
 def _pose_of(view: View, camera: Camera, name: str) -> Minimum[Rigid, NormalEquations]:
     if len(view) < LEAST_CORNERS:
-        raise DegenerateError(f"{name}: {len(view)} corners of the board, {LEAST_CORNERS} needed; take the image out")
+        raise DegenerateError(
+            "E-VIEW-CORNERS", f"{name}: {len(view)} corners of the board, {LEAST_CORNERS} needed; take the image out"
+        )
     starts = _starts(view, camera.normalised_from_pixel(view.xy_px))
     if not starts:
         of = (
@@ -192,7 +197,7 @@ def _pose_of(view: View, camera: Camera, name: str) -> Minimum[Rigid, NormalEqua
             if view.normal is None
             else "the corners seen of each board are fewer than four or lie"
         )
-        raise DegenerateError(f"{name}: {of} on a line; take the image out")
+        raise DegenerateError("E-VIEW-CORNERS", f"{name}: {of} on a line; take the image out")
 
     def linearise(pose: Rigid) -> NormalEquations:
         if ((view.xyz_board @ pose.rotation[2] + pose.translation[2]) <= 0).any():

@@ -62,7 +62,9 @@ def check_conventions(
         what = max(gain, key=gain.__getitem__)
         if gain[what] > FAR_BETTER and given[1] > BETTER * found[what][1]:
             turn, shift = found[what]
-            raise InputError(f"{contradict}, but by {np.degrees(turn):.2g}° and {shift:.2g} mm {what}")
+            raise InputError(
+                "E-HANDEYE-CONVENTION", f"{contradict}, but by {np.degrees(turn):.2g}° and {shift:.2g} mm {what}"
+            )
         other = next(what for what in found if what.startswith(INVERTED))
         if gain[other] > DOUBTFUL and given[1] > found[other][1]:
             turn, shift = found[other]
@@ -72,7 +74,10 @@ def check_conventions(
         if max(turn, shift) > LOST:
             pair = "pair each pose of the board with that of the flange at the same moment"
             other = "check the camera file" if by_images else "look for another convention of rotations"
-            raise InputError(f"{contradict}, {max(turn, shift):.0%} of what they differ by; {pair}, and {other}")
+            raise InputError(
+                "E-HANDEYE-CONVENTION",
+                f"{contradict}, {max(turn, shift):.0%} of what they differ by; {pair}, and {other}",
+            )
     behind = loop.camera_from_board.translation[:, 2] <= 0
     if behind.all():
         return (

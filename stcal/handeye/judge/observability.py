@@ -103,25 +103,28 @@ def check(loop: Loop, setup: Setup, where: str, four_dof: bool) -> Observability
     """
     if len(loop) < LEAST_POSES:
         raise DegenerateError(
+            "E-HANDEYE-FEW-POSES",
             f"{where}: {len(loop)} poses, {LEAST_POSES} needed and 10 wanted; rotate the flange about two axes of its "
-            f"own, by {WANTED_DEG}° or more, and take more"
+            f"own, by {WANTED_DEG}° or more, and take more",
         )
     found = Observability.of(loop)
     if four_dof:
         turns = _list(np.degrees(found.turns_rad))
         if found.turns_rad[0] < LEAST_TURN:
             raise DegenerateError(
+                "E-HANDEYE-AXES",
                 f"{where}: the flange turns by {turns}° (RMS) about its principal axes; "
-                f"rotate it about {in_words(found.axes[0])} by {WANTED_DEG}° or more"
+                f"rotate it about {in_words(found.axes[0])} by {WANTED_DEG}° or more",
             )
         if not found.one_axis:
             raise DegenerateError(
+                "E-HANDEYE-AXES",
                 f"{where}: the flange turns by {turns}° (RMS) about its principal axes, "
-                "that of a robot of four axes about one only; leave four_dof out"
+                "that of a robot of four axes about one only; leave four_dof out",
             )
     elif found.useless:
         slides = f"; a robot of four axes cannot: with four_dof all but {FRAMES[setup].camera} along that axis is found"
-        raise DegenerateError(f"{where}: {found.missing()}{slides if found.one_axis else ''}")
+        raise DegenerateError("E-HANDEYE-AXES", f"{where}: {found.missing()}{slides if found.one_axis else ''}")
     return found
 
 
@@ -141,16 +144,18 @@ def require_scale(scale: float, sigma: float, loop: Loop, where: str) -> None:
     if scale_is_seen(scale, sigma, len(loop)):
         if not 1 / LARGEST_SCALE < scale < LARGEST_SCALE:
             raise DegenerateError(
+                "E-HANDEYE-BOARD-SCALE",
                 f"{where}: the board would be {scale:.4g} times as large as stated{unit_of(scale)}; correct the unit "
-                "of its size, or of the poses"
+                "of its size, or of the poses",
             )
         return
     place = (loop.stand_from_mount.inverse() if loop.inverted else loop.stand_from_mount).translation
     moved = float(np.sqrt(((place - place.mean(0)) ** 2).sum(1).mean()))
     raise DegenerateError(
+        "E-HANDEYE-BOARD-SCALE",
         f"{where}: the board's size is {scale:.2g} ± {sigma:.2g} times as stated by the motions of the flange, which "
         f"moves by {moved:.3g} mm (RMS): too little to tell; move it by a tenth of the board's distance or more, or "
-        "solve without the scale"
+        "solve without the scale",
     )
 
 

@@ -45,7 +45,9 @@ def closed_form(loop: Loop, method: str, unit_mm: float = 1000.0) -> tuple[Rigid
             *_split(eye, unit_mm), *_split(mount_from_stand, unit_mm), method=AX_ZB[method]
         )
     except cv2.error as error:
-        raise ConvergenceError(f"hand-eye: {method} fails in OpenCV ({error.err}); use another method") from error
+        raise ConvergenceError(
+            "E-HANDEYE-METHOD-FAILS", f"hand-eye: {method} fails in OpenCV ({error.err}); use another method"
+        ) from error
     return _rigid(r_x, t_x, unit_mm, method).inverse(), _rigid(r_z, t_z, unit_mm, method).inverse()
 
 
@@ -56,7 +58,8 @@ def _split(poses: Poses, unit_mm: float) -> tuple[list[np.ndarray], list[np.ndar
 def _rigid(rotation: np.ndarray, translation: np.ndarray, unit_mm: float, method: str) -> Rigid:
     if not (np.isfinite(rotation).all() and np.isfinite(translation).all() and np.linalg.det(rotation) > 0):
         raise ConvergenceError(
-            f"hand-eye: {method} returns no transform; the motions are too small or too alike for it"
+            "E-HANDEYE-METHOD-FAILS",
+            f"hand-eye: {method} returns no transform; the motions are too small or too alike for it",
         )
     u, _, vt = np.linalg.svd(rotation)
     return Rigid(u @ vt, unit_mm * translation.ravel())

@@ -31,7 +31,9 @@ def convex(motions: Motions, unit_mm: float = 1000.0) -> Rigid:
     x = smallest_largest(c, d, x)
     u, s, vt = np.linalg.svd(x[:9].reshape(3, 3, order="F"))
     if np.linalg.det(u @ vt) < 0 or s[2] < 0.1:
-        raise ConvergenceError("hand-eye: zhao finds no rotation; the motions are too small or too alike for it")
+        raise ConvergenceError(
+            "E-HANDEYE-METHOD-FAILS", "hand-eye: zhao finds no rotation; the motions are too small or too alike for it"
+        )
     return Rigid(u @ vt, unit_mm * x[9:])
 
 
@@ -92,7 +94,8 @@ def smallest_largest(c: np.ndarray, d: np.ndarray, x: np.ndarray) -> np.ndarray:
     bound = share @ level[active] - right @ np.linalg.lstsq(mean, right, rcond=None)[0]
     if errors.max() > (1 + 2 * GAP) * bound:
         raise ConvergenceError(
+            "E-HANDEYE-METHOD-FAILS",
             f"hand-eye: zhao's largest error is {np.sqrt(errors.max() / max(bound, 1e-300)):.4g} times its proven "
-            "bound; use another method"
+            "bound; use another method",
         )
     return x

@@ -39,8 +39,9 @@ class Bounds:
     def __post_init__(self):
         if not (0 < self.half_width < np.inf and np.isfinite(self.centre or 0).all()):
             raise InputError(
+                "E-EVOLUTION-OPTIONS",
                 f"differential evolution: bounds of half width {self.half_width:g} about {self.centre}; finite numbers "
-                "and a positive half width needed"
+                "and a positive half width needed",
             )
 
 
@@ -82,9 +83,10 @@ class EvolutionOptions:
             and 0 <= self.crossover <= 1
         ):
             raise InputError(
+                "E-EVOLUTION-OPTIONS",
                 f"differential evolution: population {self.population}, {self.generations} generations, F "
                 f"{self.factor:g}, CR {self.crossover:g}, λ {self.weight:g}; 4 to {MOST}, 0 to {MOST}, above 0 to 2, 0 "
-                "to 1, and a positive number needed"
+                "to 1, and a positive number needed",
             )
 
     def needs_closed_form(self) -> bool:

@@ -55,20 +55,23 @@ class Noise:
         for side in ("robot", "camera"):
             pair = getattr(self, f"{side}_rad"), getattr(self, f"{side}_mm")
             if (pair[0] is None) != (pair[1] is None):
-                raise InputError(f"noise: one of σ_rot and σ_trans of the {side} is given; both or none needed")
+                raise InputError(
+                    "E-SIGMA-INCOMPLETE", f"noise: one of σ_rot and σ_trans of the {side} is given; both or none needed"
+                )
             if pair[0] is not None and not (0 <= pair[0] <= MOST_RAD and 0 <= pair[1] <= MOST_MM):
                 raise InputError(
+                    "E-SIGMA-VALUE",
                     f"noise: σ of the {side} is {np.degrees(pair[0]):g}° and {pair[1]:g} mm; 0 to "
-                    f"{np.degrees(MOST_RAD):g}° and {MOST_MM:g} mm possible"
+                    f"{np.degrees(MOST_RAD):g}° and {MOST_MM:g} mm possible",
                 )
         for name, least in (("corner_px", 1e-9), ("board_mm", 0.0)):
             value = getattr(self, name)
             if value is not None and not (least <= value <= MOST_MM):
                 more = "more than 0, up to" if least else "0 to"
-                raise InputError(f"noise: {name} is {value:g}, {more} {MOST_MM:g} needed")
+                raise InputError("E-SIGMA-VALUE", f"noise: {name} is {value:g}, {more} {MOST_MM:g} needed")
         for unit, word in (("rad", "σ_rot"), ("mm", "σ_trans")):
             if getattr(self, f"robot_{unit}") == getattr(self, f"camera_{unit}") == 0:
-                raise InputError(f"noise: {word} of robot and camera are both 0; one of them must err")
+                raise InputError("E-SIGMA-VALUE", f"noise: {word} of robot and camera are both 0; one of them must err")
 
 
 @dataclass(frozen=True, slots=True, eq=False)

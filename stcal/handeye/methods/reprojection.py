@@ -178,8 +178,9 @@ def _adjusted(
     while True:
         if used.sum() < 3:
             raise DegenerateError(
+                "E-HANDEYE-DISAGREE",
                 f"hand-eye: {used.sum()} of {len(used)} poses agree, 3 needed; "
-                "check that poses and images belong together, and the conventions of both"
+                "check that poses and images belong together, and the conventions of both",
             )
         rows = np.flatnonzero(used)
         own = None if arm is None else arm[rows]

@@ -136,14 +136,16 @@ def _rows(given: RigPoses, used: tuple[np.ndarray, ...], outliers: np.ndarray) -
     for camera, own in zip(given.cameras, used, strict=True):
         if own.sum() < LEAST_VIEWS:
             raise DegenerateError(
+                "E-HANDEYE-DISAGREE",
                 f"camera {camera.name}: none of {len(own)} views agrees with the other cameras; check its images, "
-                "intrinsics, board and poses"
+                "intrinsics, board and poses",
             )
     rows = np.unique(np.concatenate([camera.rows[own] for camera, own in zip(given.cameras, used, strict=True)]))
     if len(rows) < 3:
         raise DegenerateError(
+            "E-HANDEYE-DISAGREE",
             f"{given.where}: {len(rows)} of {len(given) - int(outliers.sum())} poses of the robot agree, 3 needed; "
-            "check that poses and images belong together, and the conventions of both"
+            "check that poses and images belong together, and the conventions of both",
         )
     return rows
 

@@ -35,7 +35,9 @@ def robust(loop: Loop, with_scale: bool = False) -> tuple[Rigid, Rigid, float]:
     """
     m = len(loop)
     if m < 3:
-        raise DegenerateError(f"hand-eye: {m} poses, 3 needed; rotate the flange about two axes and take more")
+        raise DegenerateError(
+            "E-HANDEYE-FEW-POSES", f"hand-eye: {m} poses, 3 needed; rotate the flange about two axes and take more"
+        )
     candidates = [_linear(loop, np.arange(m)[None], with_scale)]
     rng = np.random.default_rng(SEED)
     if m > 3:
@@ -85,8 +87,9 @@ def about_one_axis(loop: Loop, mount_axis: np.ndarray, with_scale: bool = False)
     length = float(np.hypot(cosine, sine))
     if length < LEAST_LENGTH:
         raise DegenerateError(
+            "E-HANDEYE-AXES",
             "hand-eye: the flange turns about one axis at one place, so that the angle about it is open; move it "
-            "across the axis too, by a tenth of the board's distance or more"
+            "across the axis too, by a tenth of the board's distance or more",
         )
     scale = length if with_scale else 1.0
     about = Rotation.from_rotvec(np.arctan2(sine, cosine) * mount_axis)

@@ -112,5 +112,5 @@ class Rig:
 
     def _number(self, name: str) -> int:
         if name not in self.names:
-            raise InputError(f"rig: no camera {name!r}; one of {', '.join(self.names)} needed")
+            raise InputError("E-RIG-NO-CAMERA", f"rig: no camera {name!r}; one of {', '.join(self.names)} needed")
         return self.names.index(name)

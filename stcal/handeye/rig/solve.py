@@ -184,7 +184,9 @@ def _first(given: RigPoses, i: int, setup: Setup, options: RigOptions) -> "_Firs
     """Of one camera by itself; why it has none, where its images are too few or turn too little."""
     camera, pairs = given.cameras[i], given.pairs(i)
     if len(camera) < LEAST_POSES:
-        return DegenerateError(f"{pairs.where}: {len(camera)} images, {LEAST_POSES} needed; take more")
+        return DegenerateError(
+            "E-HANDEYE-FEW-POSES", f"{pairs.where}: {len(camera)} images, {LEAST_POSES} needed; take more"
+        )
     views, notes = camera.views, ()
     try:
         check(Loop.of(pairs, setup), setup, pairs.where, False)
@@ -241,8 +243,9 @@ def _require_one_board(given: RigPoses, known: dict[int, _First]) -> None:
     pair = f"{name} and {whom} see it {away} apart" if len(known) < 3 else f"{name} sees it {away} from {whom}"
     one = "both" if len(known) < 3 else name
     raise DegenerateError(
+        "E-RIG-CONTRADICTS",
         f"{given.where}: one board in one place needed, but {pair}; check images, intrinsics, board and poses of "
-        f"{one}, or leave one camera out"
+        f"{one}, or leave one camera out",
     )
 
 

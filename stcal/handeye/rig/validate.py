@@ -136,7 +136,7 @@ def _errors_without(
     try:
         rig = handeye_rig(kept, setup, options)
     except DegenerateError as error:
-        raise DegenerateError(f"without {', '.join(given.names[i] for i in out)}: {error}") from error
+        raise DegenerateError(error.code, f"without {', '.join(given.names[i] for i in out)}: {error}") from error
     found = []
     for i, camera in enumerate(given.cameras):
         held = np.flatnonzero(np.isin(camera.rows, out))

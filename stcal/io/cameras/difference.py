@@ -48,14 +48,17 @@ def camera_difference(one: Camera, two: Camera) -> CameraDifference:
     """
     if (one.width, one.height) != (two.width, two.height):
         raise InputError(
-            f"cameras of {one.width}×{one.height} and {two.width}×{two.height} px; files of one image size needed"
+            "E-CAMERA-SIZES-DIFFER",
+            f"cameras of {one.width}×{one.height} and {two.width}×{two.height} px; files of one image size needed",
         )
     pixels = image_grid(one)
     flat = pixels.reshape(-1, 2)
     first, second = rays(one, flat), rays(two, flat)
     good = np.isfinite(first).all(1) & np.isfinite(second).all(1)
     if good.sum() < LEAST_POINTS:
-        raise DegenerateError(f"{good.sum()} of {len(flat)} pixels have a ray in both cameras, {LEAST_POINTS} needed")
+        raise DegenerateError(
+            "E-CAMERA-NO-RAYS", f"{good.sum()} of {len(flat)} pixels have a ray in both cameras, {LEAST_POINTS} needed"
+        )
     unit = [ray / np.linalg.norm(ray, axis=1)[:, None] for ray in (first[good], second[good])]
     turn = Rigid(align_rigid(unit[1], unit[0]).rotation, np.zeros(3))
     for _ in range(STEPS):

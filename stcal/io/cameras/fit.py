@@ -87,7 +87,8 @@ def _rays(lens: ForeignLens, width: int, height: int) -> tuple[np.ndarray, np.nd
             pixels.append(seen[np.unique(np.minimum(at, count - 1))])
     if sum(map(len, rays)) < AZIMUTHS:
         raise InputError(
-            f"camera file {lens.source}: {lens.called} projects nearly nothing into {width}×{height} px; check it"
+            "E-CAMERA-NO-FIELD",
+            f"camera file {lens.source}: {lens.called} projects nearly nothing into {width}×{height} px; check it",
         )
     return np.concatenate(rays), np.concatenate(pixels), ends / len(around)
 

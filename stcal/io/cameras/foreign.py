@@ -80,7 +80,9 @@ def of_colmap(model: str, width: float, height: float, params, source: str) -> C
         return camera_from_colmap(model, width, height, numbers, source)
     _, count = COLMAP_FOREIGN[model]
     if len(numbers) != count:
-        raise InputError(f"camera file {source}: {len(numbers)} parameters for {model}, {count} needed")
+        raise InputError(
+            "E-CAMERA-COEFFICIENTS", f"camera file {source}: {len(numbers)} parameters for {model}, {count} needed"
+        )
     double = model.startswith("SIMPLE_")
     focal, rest = (numbers[:1] * 2, numbers[1:]) if double else (numbers[:2], numbers[2:])
     if model in ("SIMPLE_FISHEYE", "FISHEYE"):  # without distortion
@@ -88,7 +90,9 @@ def of_colmap(model: str, width: float, height: float, params, source: str) -> C
     camera_from_colmap("PINHOLE", width, height, [*focal, *rest[:2]], source)  # which refuses impossible values
     own, centre = np.array(rest[2:]), np.array(rest[:2]) - COLMAP_PIXEL_ORIGIN
     if not np.isfinite(own).all():
-        raise InputError(f"camera file {source}: a camera parameter is not a finite number; correct it")
+        raise InputError(
+            "E-CAMERA-NOT-FINITE", f"camera file {source}: a camera parameter is not a finite number; correct it"
+        )
 
     def project(rays: np.ndarray) -> np.ndarray:
         with np.errstate(all="ignore"):
@@ -131,7 +135,9 @@ def of_database(path: Path, choice: str) -> CameraModel | ForeignLens:
         return of_colmap(model, width, height, np.frombuffer(params, "<f8"), str(path))
     except (sqlite3.Error, KeyError, ValueError, TypeError) as error:
         reason = " ".join(str(error).split())[:100]
-        raise InputError(f"camera file {path}: no database of COLMAP ({reason}); check it") from error
+        raise InputError(
+            "E-CAMERA-UNREADABLE", f"camera file {path}: no database of COLMAP ({reason}); check it"
+        ) from error
 
 
 def one_of(names: list[str], choice: str, source: str) -> str:
@@ -143,11 +149,13 @@ def one_of(names: list[str], choice: str, source: str) -> str:
         None, an unknown one, or several and no choice.
     """
     if not names:
-        raise InputError(f"camera file {source}: no camera in it, 1 needed")
+        raise InputError("E-CAMERA-NONE", f"camera file {source}: no camera in it, 1 needed")
     if choice not in names and (choice or len(names) > 1):
         asked = f"no camera {choice}" if choice else f"{len(names)} cameras, 1 needed"
         shown = ", ".join(names[:12]) + (" …" if len(names) > 12 else "")
-        raise InputError(f"camera file {source}: {asked}; choose of {shown} with `stcal camera convert --name`")
+        raise InputError(
+            "E-CAMERA-SEVERAL", f"camera file {source}: {asked}; choose of {shown} with `stcal camera convert --name`"
+        )
     return choice or names[0]
 
 
@@ -163,7 +171,9 @@ def of_opencv(lens, given: np.ndarray, width: float, height: float, source: str)
         return camera_from_opencv(lens, given, False, width, height, source)
     camera_from_opencv(lens, given[:8], False, width, height, source)  # which refuses impossible values
     if not np.isfinite(given).all():
-        raise InputError(f"camera file {source}: a camera parameter is not a finite number; correct it")
+        raise InputError(
+            "E-CAMERA-NOT-FINITE", f"camera file {source}: a camera parameter is not a finite number; correct it"
+        )
     fx, fy, cx, cy = lens
     matrix, still = np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1]]), np.zeros(3)
 
@@ -188,7 +198,7 @@ def of_skewed(
     """
     camera = camera_from_opencv(lens, given, False, width, height, source)
     if not abs(skew) < abs(camera.focal[0]):
-        raise InputError(f"camera file {source}: skew {skew:g} px, less than fx needed; correct it")
+        raise InputError("E-CAMERA-SKEW", f"camera file {source}: skew {skew:g} px, less than fx needed; correct it")
     if abs(skew) <= SQUARE * abs(camera.focal[0]):
         return camera
     (fx, fy), (cx, cy) = camera.focal, camera.centre
@@ -221,12 +231,15 @@ def of_kalibr(lens: str, distortion: str, values: dict, source: str) -> ForeignL
     own = np.array(values.get("distortion_coeffs", []) if count else [], float)
     if numbers.shape != (first + 4,) or own.shape != (count,) or not np.isfinite([*numbers, *own]).all():
         raise InputError(
+            "E-CAMERA-COEFFICIENTS",
             f"camera file {source}: {lens} with {distortion} has {first + 4} intrinsics and {count} coefficients, "
-            f"finite numbers; {numbers.size} and {own.size} found"
+            f"finite numbers; {numbers.size} and {own.size} found",
         )
     shape, focal, centre = numbers[:first], numbers[first : first + 2], numbers[first + 2 :]
     if (focal <= 0).any():
-        raise InputError(f"camera file {source}: focal length {focal.tolist()}; positive numbers needed")
+        raise InputError(
+            "E-CAMERA-FOCAL", f"camera file {source}: focal length {focal.tolist()}; positive numbers needed"
+        )
     width, height = (int(side) for side in values.get("resolution", (0, 0)))
 
     def project(rays: np.ndarray) -> np.ndarray:
@@ -283,12 +296,16 @@ def of_splines(name: str, numbers: list[float], width: float, height: float, sou
     """
     found = SPLINED.fullmatch(name)
     if found is None:
-        raise InputError(f"camera file {source}: {name[:80]} is not splined in mrcal's words; write it anew with mrcal")
+        raise InputError(
+            "E-CAMERA-MODEL",
+            f"camera file {source}: {name[:80]} is not splined in mrcal's words; write it anew with mrcal",
+        )
     order, columns, rows, wide = (int(word) for word in found.groups())
     if columns <= MARGIN[order] + 1 or len(numbers) != 4 + 2 * columns * rows or not 0 < wide < 360:
         raise InputError(
+            "E-CAMERA-COEFFICIENTS",
             f"camera file {source}: {len(numbers)} intrinsics of {columns}×{rows} points; "
-            f"{4 + 2 * columns * rows} needed"
+            f"{4 + 2 * columns * rows} needed",
         )
     focal, centre = np.array(numbers[:2]), np.array(numbers[2:4])
     control = np.array(numbers[4:]).reshape(rows, columns, 2)
@@ -309,7 +326,7 @@ def of_splines(name: str, numbers: list[float], width: float, height: float, sou
 
 def refused(camera: CalibratedCamera, form: str, why: str) -> InputError:
     """What a form cannot hold."""
-    return InputError(f"{form} has no place for {why} of {camera.colmap_model}; write --form colmap")
+    return InputError("E-CAMERA-FORM", f"{form} has no place for {why} of {camera.colmap_model}; write --form colmap")
 
 
 def of_cahvor(numbers, width: float, height: float, source: str) -> CameraModel | ForeignLens:
@@ -327,10 +344,14 @@ def of_cahvor(numbers, width: float, height: float, source: str) -> CameraModel 
     P + μ (P − ζ o), with ζ = P · o, τ = |P|² / ζ² − 1 and μ = r0 + r1 τ + r2 τ².
     """
     if len(numbers) != 9:
-        raise InputError(f"camera file {source}: {len(numbers)} intrinsics of LENSMODEL_CAHVOR; 9 needed")
+        raise InputError(
+            "E-CAMERA-COEFFICIENTS", f"camera file {source}: {len(numbers)} intrinsics of LENSMODEL_CAHVOR; 9 needed"
+        )
     (fx, fy, cx, cy), (alpha, beta, *r) = numbers[:4], numbers[4:]
     if not np.isfinite(numbers).all():
-        raise InputError(f"camera file {source}: a camera parameter is not a finite number; correct it")
+        raise InputError(
+            "E-CAMERA-NOT-FINITE", f"camera file {source}: a camera parameter is not a finite number; correct it"
+        )
     if alpha == beta == 0:
         grown = 1 + r[0]
         k1, k2 = (r[1] / grown, r[2] / grown) if grown else (0.0, 0.0)

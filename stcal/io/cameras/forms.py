@@ -75,8 +75,9 @@ def from_kalibr(values: Mapping, choice: str, source: str) -> CameraModel | Fore
     lens, distortion = own.get("camera_model"), own.get("distortion_model", "none")
     if lens not in KALIBR or distortion not in ("radtan", "equidistant", "fov", "none"):
         raise InputError(
+            "E-CAMERA-MODEL",
             f"camera file {source}: {lens} with {distortion}; {', '.join(KALIBR)} with radtan, equidistant, fov or "
-            "none are read"
+            "none are read",
         )
     if lens != "pinhole" or distortion == "fov":
         return of_kalibr(lens, distortion, own, source)
@@ -101,15 +102,18 @@ def from_mrcal(text: str, source: str) -> CameraModel | ForeignLens:
         width, height = (float(v) for v in values["imagersize"])
     except (SyntaxError, ValueError, TypeError, KeyError, RecursionError, MemoryError) as error:
         reason = " ".join(str(error).split())[:100]
-        raise InputError(f"camera file {source}: not mrcal's form ({reason}); write it anew with mrcal") from error
+        raise InputError(
+            "E-CAMERA-UNREADABLE", f"camera file {source}: not mrcal's form ({reason}); write it anew with mrcal"
+        ) from error
     if str(lens).startswith("LENSMODEL_SPLINED"):
         return of_splines(lens, numbers, width, height, source)
     if lens == "LENSMODEL_CAHVOR":
         return of_cahvor(numbers, width, height, source)
     if lens not in MRCAL or len(numbers) != 4 + MRCAL[lens]:
         raise InputError(
+            "E-CAMERA-MODEL",
             f"camera file {source}: {lens} with {len(numbers)} intrinsics; {', '.join(MRCAL)}, CAHVOR and splined "
-            "ones are read: mrcal-convert-lensmodel makes one of another"
+            "ones are read: mrcal-convert-lensmodel makes one of another",
         )
     return of_opencv(numbers[:4], np.array(numbers[4:]), width, height, source)
 
@@ -132,9 +136,13 @@ def from_colmap_binary(content: bytes, choice: str, source: str) -> CameraModel 
             cameras[str(number)] = model, width, height, struct.unpack_from(f"<{length}d", content, at + 24)
             at += 24 + 8 * length
     except (struct.error, KeyError) as error:
-        raise InputError(f"camera file {source}: neither text nor a cameras.bin of known models; check it") from error
+        raise InputError(
+            "E-CAMERA-UNREADABLE", f"camera file {source}: neither text nor a cameras.bin of known models; check it"
+        ) from error
     if at != len(content) or not cameras:
-        raise InputError(f"camera file {source}: neither text nor COLMAP's cameras.bin; check it")
+        raise InputError(
+            "E-CAMERA-UNREADABLE", f"camera file {source}: neither text nor COLMAP's cameras.bin; check it"
+        )
     model, width, height, params = cameras[one_of(list(cameras), choice if choice.isdigit() else "", source)]
     return of_colmap(model, width, height, params, source)
 
@@ -157,7 +165,9 @@ def written(camera: CalibratedCamera, form: str, name: str) -> Written:
         A lens that the form cannot hold, with the form that can; a name that is no word.
     """
     if not re.fullmatch(r"[A-Za-z]\w*", name, re.ASCII):
-        raise InputError(f"camera name {name}: letters, digits and _ needed, a letter first, such as cam0")
+        raise InputError(
+            "E-CAMERA-NAME", f"camera name {name}: letters, digits and _ needed, a letter first, such as cam0"
+        )
     lost = ["the image's size"] if form == "zhang" else []
     if camera.covariance is not None and form not in SIGMA_FORMS:
         lost.append("σ and correlations of the parameters")

@@ -42,21 +42,24 @@ def from_mat(content: bytes, choice: str, source: str) -> CameraModel | ForeignL
         Version 7.3, which is HDF5; objects in place of structures; no camera, or several and no choice.
     """
     if content.startswith(HEADS[1]):
-        raise InputError(f"camera file {source}: of MATLAB 7.3 (HDF5); save it with '-v7'")
+        raise InputError("E-CAMERA-UNREADABLE", f"camera file {source}: of MATLAB 7.3 (HDF5); save it with '-v7'")
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", MatReadWarning)
             values = loadmat(io.BytesIO(content), simplify_cells=True)
     except Exception as error:  # what is damaged fails in many ways, names that are not bound among them
         reason = " ".join(str(error).split())[:150]
-        raise InputError(f"camera file {source}: not readable as a .mat file ({reason}); save it again") from error
+        raise InputError(
+            "E-CAMERA-UNREADABLE", f"camera file {source}: not readable as a .mat file ({reason}); save it again"
+        ) from error
     if all(name in values for name in BOUGUET):
         return _from_bouguet(values, source)
     found = dict(_structures({key: each for key, each in values.items() if not key.startswith("__")}, ""))
     if not found:
         raise InputError(
+            "E-CAMERA-CONTENT",
             f"camera file {source}: no structure of a camera; save toStruct(cameraParams), since objects of MATLAB "
-            "can be read by MATLAB alone"
+            "can be read by MATLAB alone",
         )
     return from_structure(found[one_of(list(found), choice, source)], source)
 
@@ -70,7 +73,9 @@ def from_structure(values: Mapping, source: str) -> CameraModel | ForeignLens:
         A fisheye lens; a field that is missing.
     """
     if "MappingCoefficients" in values:
-        raise InputError(f"camera file {source}: MATLAB's fisheye model is not supported; calibrate with another")
+        raise InputError(
+            "E-CAMERA-MODEL", f"camera file {source}: MATLAB's fisheye model is not supported; calibrate with another"
+        )
     matrix = _numbers(values, "K", source)
     if matrix is None:
         turned = _numbers(values, "IntrinsicMatrix", source)  # with the principal point in its last row
@@ -80,7 +85,10 @@ def from_structure(values: Mapping, source: str) -> CameraModel | ForeignLens:
     else:
         focal, centre = (_numbers(values, key, source, 2) for key in ("FocalLength", "PrincipalPoint"))
         if focal is None or centre is None:
-            raise InputError(f"camera file {source}: no K, IntrinsicMatrix or FocalLength; save toStruct(cameraParams)")
+            raise InputError(
+                "E-CAMERA-CONTENT",
+                f"camera file {source}: no K, IntrinsicMatrix or FocalLength; save toStruct(cameraParams)",
+            )
         (fx, fy), (cx, cy), own = focal, centre, _numbers(values, "Skew", source, 1)
         skew = 0.0 if own is None else own[0]
     size = _numbers(values, "ImageSize", source)
@@ -109,16 +117,20 @@ def _numbers(values: Mapping, key: str, source: str, count: int = 0) -> np.ndarr
     try:
         found = np.asarray(values[key], float)
     except (TypeError, ValueError) as error:
-        raise InputError(f"camera file {source}: {key} is no list of numbers; save it again") from error
+        raise InputError(
+            "E-CAMERA-CONTENT", f"camera file {source}: {key} is no list of numbers; save it again"
+        ) from error
     if (count and found.size != count) or (key in ("K", "IntrinsicMatrix") and found.size != 9):
-        raise InputError(f"camera file {source}: {key} of {found.size} numbers; {count or 9} needed")
+        raise InputError(
+            "E-CAMERA-COEFFICIENTS", f"camera file {source}: {key} of {found.size} numbers; {count or 9} needed"
+        )
     return found.ravel() if key not in ("K", "IntrinsicMatrix") else found
 
 
 def _known(values: Mapping, key: str, source: str, count: int) -> np.ndarray:
     found = _numbers(values, key, source, count)
     if found is None:
-        raise InputError(f"camera file {source}: {key} is empty; {count} numbers needed")
+        raise InputError("E-CAMERA-CONTENT", f"camera file {source}: {key} is empty; {count} numbers needed")
     return found
 
 
@@ -141,8 +153,9 @@ def mat(camera: CalibratedCamera, name: str) -> bytes:
     k = camera.distortion
     if camera.fisheye or k[5:].any():
         raise InputError(
+            "E-CAMERA-FORM",
             f"matlab has no place for {'the equidistant projection' if camera.fisheye else 'more than k1, k2, k3'} of "
-            f"{camera.colmap_model}; write --form colmap"
+            f"{camera.colmap_model}; write --form colmap",
         )
     (fx, fy), (cx, cy) = camera.focal, camera.centre + PIXEL_ORIGIN
     matrix = np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1]])
@@ -182,7 +195,9 @@ def from_zhang(rows: list[list[str]], source: str) -> CameraModel | ForeignLens:
     try:
         (fx, skew, fy, cx, cy), (k1, k2) = ([float(word) for word in row] for row in rows[:2])
     except ValueError as error:
-        raise InputError(f"camera file {source}: {' '.join(str(error).split())[:150]}; numbers needed") from error
+        raise InputError(
+            "E-CAMERA-CONTENT", f"camera file {source}: {' '.join(str(error).split())[:150]}; numbers needed"
+        ) from error
     return of_skewed([fx, fy, cx, cy], skew, np.array([k1, k2, 0.0, 0.0]), 0.0, 0.0, source)
 
 
@@ -190,7 +205,9 @@ def zhang(camera: CalibratedCamera, _: str) -> str:
     """Zhang's five numbers, and k1, k2."""
     if camera.fisheye or camera.distortion[2:].any():
         what = "the equidistant projection" if camera.fisheye else "more than k1, k2"
-        raise InputError(f"zhang has no place for {what} of {camera.colmap_model}; write --form colmap")
+        raise InputError(
+            "E-CAMERA-FORM", f"zhang has no place for {what} of {camera.colmap_model}; write --form colmap"
+        )
     (fx, fy), (cx, cy) = camera.focal.tolist(), camera.centre.tolist()
     k1, k2 = camera.distortion[:2].tolist()
     return f"{fx!r} 0 {fy!r} {cx!r} {cy!r}\n\n{k1!r} {k2!r}\n"

@@ -44,7 +44,7 @@ def from_calibration(root: ElementTree.Element, source: str) -> CameraModel:
     texts = {child.tag: (child.text or "").strip() for child in root}
     kind = texts.get("projection", root.get("type", "frame"))
     if kind not in KINDS:
-        raise InputError(f"camera file {source}: projection {kind}; frame and fisheye are read")
+        raise InputError("E-CAMERA-MODEL", f"camera file {source}: projection {kind}; frame and fisheye are read")
     v = {name: float(texts.get(name, 0) or 0) for name in NAMES}
     size = root.find("resolution")
     stated = texts if size is None else size.attrib
@@ -52,7 +52,8 @@ def from_calibration(root: ElementTree.Element, source: str) -> CameraModel:
     if v["b2"] or (v["k4"] and kind == "frame"):
         name = "b2" if v["b2"] else "k4"
         raise InputError(
-            f"camera file {source}: {name} is {v[name]:g}, without place in OpenCV's model; fit without it"
+            "E-CAMERA-MODEL",
+            f"camera file {source}: {name} is {v[name]:g}, without place in OpenCV's model; fit without it",
         )
     centre = width / 2 + v["cx"] - COLMAP_PIXEL_ORIGIN, height / 2 + v["cy"] - COLMAP_PIXEL_ORIGIN
     distortion = np.array([v["k1"], v["k2"], v["p2"], v["p1"], v["k3"], v["k4"]])
@@ -78,7 +79,9 @@ def from_cameras(root: ElementTree.Element, choice: str, source: str) -> CameraM
             name = sensor.get("label") or sensor.get("id") or str(number)
             sensors[name if name not in sensors else f"{name} {number}"] = (adjusted[-1], sensor.find("covariance"))
     if not sensors:
-        raise InputError(f"camera file {source}: no sensor with a calibration; export the cameras after alignment")
+        raise InputError(
+            "E-CAMERA-NONE", f"camera file {source}: no sensor with a calibration; export the cameras after alignment"
+        )
     own, covariance = sensors[one_of(list(sensors), choice, source)]
     camera = from_calibration(own, source)
     return camera if covariance is None else _with_covariance(camera, covariance, source)
@@ -89,13 +92,17 @@ def _with_covariance(camera: CameraModel, stated: ElementTree.Element, source: s
     try:
         matrix = np.array((stated.findtext("coeffs") or "").split(), float)
         if not names or set(names) - set(NAMES) or len(set(names)) < len(names) or len(matrix) != len(names) ** 2:
-            raise InputError(f"{len(names)} parameters, {len(matrix)} numbers")
+            raise InputError("E-CAMERA-COVARIANCE", f"{len(names)} parameters, {len(matrix)} numbers")
         matrix = matrix.reshape(len(names), -1)
         require_covariance(matrix, len(names), Rows(tuple(names)))
     except (InputError, ValueError) as error:
-        raise InputError(f"camera file {source}: <covariance>: {error}; export the cameras again") from error
+        raise InputError(
+            "E-CAMERA-COVARIANCE", f"camera file {source}: <covariance>: {error}; export the cameras again"
+        ) from error
     if "b2" in names:
-        raise InputError(f"camera file {source}: b2 was adjusted, without place in OpenCV's model; fit without it")
+        raise InputError(
+            "E-CAMERA-MODEL", f"camera file {source}: b2 was adjusted, without place in OpenCV's model; fit without it"
+        )
     camera = replace(camera, colmap_model=_model(camera.colmap_model, names))
     by_theirs = np.zeros((len(PARAMETER_NAMES), len(names)))
     for column, name in enumerate(names):

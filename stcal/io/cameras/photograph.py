@@ -59,12 +59,15 @@ def camera_of_photograph(path: str | Path) -> Photograph:
             (width, height), exif = image.size, image.getexif().get_ifd(ExifTags.IFD.Exif)
     except (OSError, ValueError, SyntaxError, UnidentifiedImageError, Image.DecompressionBombError) as error:
         reason = " ".join(str(error).split())[:100]
-        raise InputError(f"camera file {path}: no photograph that can be read ({reason}); give another") from error
+        raise InputError(
+            "E-CAMERA-UNREADABLE", f"camera file {path}: no photograph that can be read ({reason}); give another"
+        ) from error
     focal, told = _focal_px(exif, width, height)
     if focal is None:
         raise InputError(
+            "E-CAMERA-EXIF",
             f"camera file {path}: a photograph without focal length in its EXIF; give a camera file, or "
-            "`stcal-sfm calibrate-camera`"
+            "`stcal-sfm calibrate-camera`",
         )
     if exif.get(ExifTags.Base.ExifImageWidth, width) not in (width, height):
         told += f", of {exif[ExifTags.Base.ExifImageWidth]} px before it was made {width} px wide"

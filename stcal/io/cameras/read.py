@@ -40,9 +40,13 @@ def read_lens(path: str | Path, name: str = "") -> CameraModel | ForeignLens:
         database = path.is_file() and _starts_with(path, SQLITE)
         content = b"" if database else read_bytes(path, SETTINGS_BYTES)
     except OSError as error:
-        raise InputError(f"camera file {path}: {error.strerror or error}; give a readable file") from error
+        raise InputError(
+            "E-CAMERA-UNREADABLE", f"camera file {path}: {error.strerror or error}; give a readable file"
+        ) from error
     except ValueError as error:  # a NUL in the name
-        raise InputError(f"camera file {path}: not a text file; give cameras.txt, or OpenCV's YAML or XML") from error
+        raise InputError(
+            "E-CAMERA-UNREADABLE", f"camera file {path}: not a text file; give cameras.txt, or OpenCV's YAML or XML"
+        ) from error
     if database:
         return of_database(path, name)
     if matlab.is_mat(content):
@@ -52,7 +56,9 @@ def read_lens(path: str | Path, name: str = "") -> CameraModel | ForeignLens:
     try:
         text = content.decode("utf-8-sig")
     except ValueError as error:
-        raise InputError(f"camera file {path}: not a text file; give cameras.txt, or OpenCV's YAML or XML") from error
+        raise InputError(
+            "E-CAMERA-UNREADABLE", f"camera file {path}: not a text file; give cameras.txt, or OpenCV's YAML or XML"
+        ) from error
     try:
         if text.lstrip().startswith("<"):
             root = ElementTree.fromstring(text)
@@ -82,7 +88,8 @@ def read_lens(path: str | Path, name: str = "") -> CameraModel | ForeignLens:
     except (KeyError, ElementTree.ParseError, yaml.YAMLError, ValueError, TypeError, RecursionError) as error:
         reason = " ".join(str(error).split())[:150]
         raise InputError(
-            f"camera file {path}: neither COLMAP's cameras.txt nor OpenCV's YAML or XML ({reason}); check its form"
+            "E-CAMERA-UNREADABLE",
+            f"camera file {path}: neither COLMAP's cameras.txt nor OpenCV's YAML or XML ({reason}); check its form",
         ) from error
 
 
@@ -96,17 +103,18 @@ def _stated_covariance(text: str, names: list[str], path: Path) -> np.ndarray | 
     count = len(names)
     try:
         if len(stated[SIGMA]) != 1 or [len(row) for row in stated[CORRELATION]] != [count] * count:
-            raise InputError(f"a line of {count} σ and {count}×{count} correlations needed")
+            raise InputError("E-CAMERA-COVARIANCE", f"a line of {count} σ and {count}×{count} correlations needed")
         sigma, correlation = np.array(stated[SIGMA][0], float), np.array(stated[CORRELATION], float)
         if len(sigma) != count:
-            raise InputError(f"{len(sigma)} σ, {count} needed")
+            raise InputError("E-CAMERA-COVARIANCE", f"{len(sigma)} σ, {count} needed")
         _require_sigmas(sigma, correlation, names)
         covariance = correlation * np.outer(sigma, sigma)
         require_covariance(covariance, count, Rows(tuple(names)), definite=True)
     except (InputError, ValueError) as error:
         raise InputError(
+            "E-CAMERA-COVARIANCE",
             f"camera file {path}: SIGMA and CORRELATION state no covariance of its parameters: {error}; write it "
-            "again, or remove these comments"
+            "again, or remove these comments",
         ) from error
     return covariance
 
@@ -115,9 +123,13 @@ def _require_sigmas(sigma: np.ndarray, correlation: np.ndarray, names: list[str]
     """What their product does not show: a sign, and a scale."""
     for name, own, self_correlation in zip(names, sigma, np.diagonal(correlation), strict=True):
         if not 0 < own <= MAX_SIDE_PX:
-            raise InputError(f"σ of {name} is {own:g}, a positive number up to {MAX_SIDE_PX} needed")
+            raise InputError(
+                "E-CAMERA-COVARIANCE", f"σ of {name} is {own:g}, a positive number up to {MAX_SIDE_PX} needed"
+            )
         if not abs(self_correlation - 1) <= SQUARE_WITHIN:
-            raise InputError(f"correlation of {name} with itself is {self_correlation:g}, 1 needed")
+            raise InputError(
+                "E-CAMERA-COVARIANCE", f"correlation of {name} with itself is {self_correlation:g}, 1 needed"
+            )
 
 
 def _starts_with(path: Path, head: bytes) -> bool:
@@ -128,12 +140,14 @@ def _starts_with(path: Path, head: bytes) -> bool:
 def _from_colmap(rows: list[list[str]], name: str, path: Path) -> CameraModel | ForeignLens:
     cameras = {row[0]: row[1:] for row in rows}
     if len(cameras) < len(rows):
-        raise InputError(f"camera file {path}: two cameras of one number; correct it")
+        raise InputError("E-CAMERA-REPEATED", f"camera file {path}: two cameras of one number; correct it")
     model, *values = cameras[one_of(list(cameras), name if name.isdigit() else "", str(path))]
     try:
         width, height, *params = (float(value) for value in values)
     except ValueError as error:
-        raise InputError(f"camera file {path}: {' '.join(str(error).split())[:150]}; numbers needed") from error
+        raise InputError(
+            "E-CAMERA-CONTENT", f"camera file {path}: {' '.join(str(error).split())[:150]}; numbers needed"
+        ) from error
     return of_colmap(model, width, height, params, str(path))
 
 
@@ -144,24 +158,37 @@ def _from_opencv(values: dict, path: Path) -> CameraModel | ForeignLens:
     if "camera_matrix" not in values:
         if isinstance(values.get("intrinsics"), dict):
             return _from_industrial(values["intrinsics"], path)
-        raise InputError(f"camera file {path}: no camera_matrix; write it with cv2.FileStorage or as ROS camera_info")
+        raise InputError(
+            "E-CAMERA-CONTENT",
+            f"camera file {path}: no camera_matrix; write it with cv2.FileStorage or as ROS camera_info",
+        )
     matrix = np.asarray(values["camera_matrix"], float)
     if matrix.size != 9:
-        raise InputError(f"camera file {path}: camera_matrix of {matrix.size} numbers; 3×3 needed")
+        raise InputError(
+            "E-CAMERA-COEFFICIENTS", f"camera file {path}: camera_matrix of {matrix.size} numbers; 3×3 needed"
+        )
     matrix = matrix.reshape(3, 3)
     if (matrix[[1, 2, 2, 2], [0, 0, 1, 2]] != [0, 0, 0, 1]).any():
-        raise InputError(f"camera file {path}: camera_matrix is not [fx 0 cx; 0 fy cy; 0 0 1]; is it transposed?")
+        raise InputError(
+            "E-CAMERA-MATRIX", f"camera file {path}: camera_matrix is not [fx 0 cx; 0 fy cy; 0 0 1]; is it transposed?"
+        )
     if not abs(matrix[0, 1]) <= 1e-9 * abs(matrix[0, 0]) and np.isfinite(matrix[0, 0]):
-        raise InputError(f"camera file {path}: skew {matrix[0, 1]:g} is not supported; calibrate without skew")
+        raise InputError(
+            "E-CAMERA-SKEW", f"camera file {path}: skew {matrix[0, 1]:g} is not supported; calibrate without skew"
+        )
     model = values.get("distortion_model", "plumb_bob")
     given = np.asarray(values.get("distortion_coefficients", []), float).ravel()
     lens = [matrix[0, 0], matrix[1, 1], matrix[0, 2], matrix[1, 2]]
     # A missing size, or 0, is one the file does not state.
     sides = [values.get(f"image_{side}") for side in ("width", "height")]
     if any(isinstance(side, bool) for side in sides):
-        raise InputError(f"camera file {path}: image_width and image_height are {sides}; numbers of pixels needed")
+        raise InputError(
+            "E-CAMERA-SIZE", f"camera file {path}: image_width and image_height are {sides}; numbers of pixels needed"
+        )
     if model not in ("plumb_bob", "rational_polynomial", *EQUIDISTANT):
-        raise InputError(f"camera file {path}: distortion model {model!r} is not supported; use plumb_bob")
+        raise InputError(
+            "E-CAMERA-MODEL", f"camera file {path}: distortion model {model!r} is not supported; use plumb_bob"
+        )
     width, height = (float(side or 0) for side in sides)
     if model in EQUIDISTANT:
         return camera_from_opencv(lens, given, True, width, height, path)
@@ -172,7 +199,9 @@ def _from_industrial(values: dict, path: Path) -> CameraModel:
     """ROS-Industrial's: the form has no place for the distortion, which may be there all the same."""
     missing = [key for key in PARAMETER_NAMES[:4] if key not in values]
     if missing:
-        raise InputError(f"camera file {path}: intrinsics without {', '.join(missing)}; fx, fy, cx, cy needed")
+        raise InputError(
+            "E-CAMERA-CONTENT", f"camera file {path}: intrinsics without {', '.join(missing)}; fx, fy, cx, cy needed"
+        )
     flat = np.concatenate([np.array([values[key] for key in PARAMETER_NAMES[:4]], float), np.zeros(8)])
     return camera_model(flat, "OPENCV", None, None, path)
 

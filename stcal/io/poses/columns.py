@@ -99,7 +99,9 @@ def _all(table: Table, columns: list[str]) -> np.ndarray | None:
         return None
     if len(there) < len(columns):
         missing = next(column for column in columns if column not in table)
-        raise InputError(f"{table.where}: {', '.join(there)} without {missing}; all {len(columns)} needed")
+        raise InputError(
+            "E-TABLE-COLUMN-MISSING", f"{table.where}: {', '.join(there)} without {missing}; all {len(columns)} needed"
+        )
     return np.column_stack([table.numbers(column) for column in columns])
 
 
@@ -117,7 +119,10 @@ def _triple(table: Table, prefix: str, rotation: str | None) -> Turned | None:
             else:
                 convention = said_convention(rotation, what, table.where)
             if unit and convention.unit not in ("", unit) and "-" in (rotation or "") and _own_unit(rotation):
-                raise InputError(f"{table.where}: {found[0]} and --rotation {rotation} are of two units; correct one")
+                raise InputError(
+                    "E-OPTION-CONTRADICTS",
+                    f"{table.where}: {found[0]} and --rotation {rotation} are of two units; correct one",
+                )
             convention = Convention(convention.order, unit or convention.unit)
             values = np.column_stack([table.numbers(column) for column in found])
             turned, words = rotations(values, convention, places_of(table), table.where, triple in BY_AXIS)

@@ -40,20 +40,24 @@ def read_mapped(path: str | Path, columns: str | Path, what: str, quaternions: O
     try:
         text = read_bytes(path, TABLE_BYTES).decode("utf-8-sig" if form.encoding == "utf-8" else form.encoding)
     except OSError as error:
-        raise InputError(f"{where}: {error.strerror or error}; check the path") from error
+        raise InputError("E-FILE-UNREADABLE", f"{where}: {error.strerror or error}; check the path") from error
     except UnicodeDecodeError as error:
-        raise InputError(f"{where}: not {form.encoding} text; give `encoding` in {columns}") from error
+        raise InputError(
+            "E-TABLE-ENCODING", f"{where}: not {form.encoding} text; give `encoding` in {columns}"
+        ) from error
     used = [(i, line) for i, line in enumerate(text.splitlines(), 1) if i > form.skip_lines and line.strip()]
     used = [(i, line) for i, line in used if not line.lstrip().startswith(("#", "//"))]
     if len(used) < 1 + form.header:
-        raise InputError(f"{where}: no rows below {form.skip_lines} lines; check skip_lines in {columns}")
+        raise InputError(
+            "E-TABLE-EMPTY", f"{where}: no rows below {form.skip_lines} lines; check skip_lines in {columns}"
+        )
     cells = [(i, _cells(line, form.delimiter, f"{where}: line {i}")) for i, line in used]
     names = cells[0][1] if form.header else [str(k) for k in range(1, len(cells[0][1]) + 1)]
     rows = cells[1:] if form.header else cells
     for line, row in rows:
         if len(row) != len(names):
             wrong = f"{len(row)} cells, {len(names)} needed"
-            raise InputError(f"{where}: line {line}: {wrong}; check delimiter in {columns}")
+            raise InputError("E-COLUMNS-FILE", f"{where}: line {line}: {wrong}; check delimiter in {columns}")
     at = {ours: _place(own, names, f"{where}: {ours} = {own!r} of {columns}") for ours, own in form.columns.items()}
     taken = {*at.values(), *(k for k, name in enumerate(names) if not form.header or not name or name in at)}
     others = {name: k for k, name in enumerate(names) if k not in taken}
@@ -69,19 +73,20 @@ def _cells(line: str, delimiter: str, where: str) -> list[str]:
     try:
         return [cell.strip() for cell in next(csv.reader([line], delimiter=DELIMITERS[delimiter]))]
     except csv.Error as error:
-        raise InputError(f"{where}: {error}; correct it") from error
+        raise InputError("E-TABLE-CELLS", f"{where}: {error}; correct it") from error
 
 
 def _place(theirs: str | int, names: list[str], where: str) -> int:
     """Index of a column by its name, or by its number from 1."""
     if isinstance(theirs, int):
         if theirs > len(names):
-            raise InputError(f"{where}: there are {len(names)} columns; correct the number")
+            raise InputError("E-COLUMNS-FILE", f"{where}: there are {len(names)} columns; correct the number")
         return theirs - 1
     if names.count(theirs) != 1:
         shown = ", ".join(names)[:100]
         raise InputError(
-            f"{where}: {names.count(theirs)} columns of this name, one needed, or its number; there are {shown}"
+            "E-COLUMNS-FILE",
+            f"{where}: {names.count(theirs)} columns of this name, one needed, or its number; there are {shown}",
         )
     return names.index(theirs)
 

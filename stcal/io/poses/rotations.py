@@ -77,8 +77,9 @@ def convention_of(name: str) -> Convention:
     euler = bool(_ORDER.fullmatch(order)) and order[0] != order[1] != order[2]
     if not (known or euler) or unit not in ("", *ANGLES) or (order in QUATERNIONS and unit):
         raise InputError(
+            "E-OPTION-VALUE",
             f"--rotation {name}: unknown; rotvec, an order of axes (xyz … about fixed axes, ZYX … about turned ones), "
-            f"each also with -deg or -rad, wxyz, xyzw, {', '.join(ALIASES)}"
+            f"each also with -deg or -rad, wxyz, xyzw, {', '.join(ALIASES)}",
         )
     return Convention(order, unit)
 
@@ -94,11 +95,12 @@ def said_convention(rotation: str | None, what: str, where: str, count: int = 3)
     if rotation is None:
         likely = LIKELY["quaternions"] if count == len("wxyz") else LIKELY.get(what, "kuka-abc, ur-rotvec, xyz or ZYX")
         form = "quaternions" if count == len("wxyz") else "Euler angles in any order of axes or rotation vectors"
-        raise InputError(f"{where}: {what} may be {form}; give --rotation, like {likely}")
+        raise InputError("E-ROTATION-AMBIGUOUS", f"{where}: {what} may be {form}; give --rotation, like {likely}")
     found = convention_of(rotation)
     if found.count != count:
         raise InputError(
-            f"{where}: {what} are {count} numbers, --rotation {rotation} is of {found.count}; correct the option"
+            "E-OPTION-CONTRADICTS",
+            f"{where}: {what} are {count} numbers, --rotation {rotation} is of {found.count}; correct the option",
         )
     return found
 
@@ -121,8 +123,9 @@ def rotations(
         largest = float(np.abs(values).max())
         if largest <= 2 * np.pi * 1.01:
             raise InputError(
+                "E-ROTATION-AMBIGUOUS",
                 f"{where}: angles up to {largest:.3g} may be radians or degrees; give --rotation "
-                f"{convention.order}-rad or {convention.order}-deg, or name the columns _rad or _deg"
+                f"{convention.order}-rad or {convention.order}-deg, or name the columns _rad or _deg",
             )
         unit, guessed = "deg", True
     angles = values * ANGLES[unit]
@@ -170,7 +173,7 @@ def proper(rotation: np.ndarray, places: Sequence[str], where: str) -> np.ndarra
                 f"not a rotation: its axes are stretched by {size[i].min():.4g} to {size[i].max():.4g}, "
                 f"1 ± {UNIT_WITHIN:g} needed; correct it, or write more digits"
             )
-        raise InputError(f"{where}: {places[i]}: the 3×3 part is {what}{more}")
+        raise InputError("E-ROTATION-IMPROPER", f"{where}: {places[i]}: the 3×3 part is {what}{more}")
     return u @ vt
 
 
@@ -192,4 +195,7 @@ def require_finite(values: np.ndarray, places: Sequence[str], where: str) -> Non
     bad = np.flatnonzero(~np.isfinite(values.reshape(len(values), -1)).all(axis=1))
     if len(bad):
         more = f" (and {len(bad) - 1} more)" if len(bad) > 1 else ""
-        raise InputError(f"{where}: {places[bad[0]]}: a value that is not finite, numbers needed{more}; take it out")
+        raise InputError(
+            "E-TABLE-NUMBER",
+            f"{where}: {places[bad[0]]}: a value that is not finite, numbers needed{more}; take it out",
+        )

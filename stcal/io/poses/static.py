@@ -124,7 +124,9 @@ def ros1_launch(statics: Sequence[Static], said: Iterable[str] = ()) -> str:
     for each in statics:
         names = each.parent, each.child
         if spaced := [name for name in names if name.split() != [name]]:
-            raise InputError(f"frames: {spaced[0]!r} has white space, at which roslaunch splits; give another name")
+            raise InputError(
+                "E-FRAME-NAME", f"frames: {spaced[0]!r} has white space, at which roslaunch splits; give another name"
+            )
         words = [
             *plain_numbers(metres(each.pose), METRE_DIGITS),
             *plain_numbers(xyzw(each.pose), QUATERNION_DIGITS),

@@ -51,7 +51,9 @@ def true_pose(images: CalibrationImages, i: int, calibrated: CalibratedLayout) -
     """camera_from_obj of image i, by its board."""
     view = images.views[i]
     if view is None:
-        raise DegenerateError(f"{images.names[i]}: the board is not seen; a pose to compare with needs it")
+        raise DegenerateError(
+            "E-LOCATE-NO-BOARD", f"{images.names[i]}: the board is not seen; a pose to compare with needs it"
+        )
     seen = images.camera.normalised_from_pixel(view.xy_px)
     xy = view.xyz_board[:, :2]
     pose = refine_planar_pose(camera_from_plane(fit_homography(xy, seen)), xy, seen)

@@ -112,16 +112,18 @@ def calibrate(
         images.append(_image(name, view, found, own, rows, camera))
     if len(images) < MIN_IMAGES:
         raise DegenerateError(
+            "E-LAYOUT-FEW-IMAGES",
             f"layout: {len(images)} of {len(names)} images show board and tags, {MIN_IMAGES} needed"
-            + (f" ({left_out[0]})" if left_out else "")
+            + (f" ({left_out[0]})" if left_out else ""),
         )
     if symmetries:
         images = _turned_alike(images, symmetries)
     seen = np.array(sorted({int(row) for image in images for row in image.rows}))
     if plan.origin not in seen:
         raise DegenerateError(
+            "E-LAYOUT-UNLINKED",
             f"layout: tag {plan.tags[plan.origin][1]}, which holds the origin, is in none of {len(images)} images; "
-            "show it, or name another origin in the layout file"
+            "show it, or name another origin in the layout file",
         )
     images = [image.numbered(np.searchsorted(seen, image.rows)) for image in images]
     start = _median_corners(images, len(seen))
@@ -185,8 +187,9 @@ def _turned_alike(images: Sequence[ImageCorners], symmetries: Sequence[Rigid]) -
             best = int(np.argmin([np.abs(place[common] - there).sum() for place in places]))
         elif known:
             raise DegenerateError(
+                "E-LAYOUT-UNLINKED",
                 f"layout: {image.name} shares no tag with the other images, and the board looks the same turned; "
-                "show a tag of another image too, or use a board without symmetry"
+                "show a tag of another image too, or use a board without symmetry",
             )
         else:
             best = 0

@@ -46,7 +46,7 @@ class Settings:
 
     def __post_init__(self):
         if not 0 <= self.settle_s <= 60:
-            raise InputError(f"--settle-s {self.settle_s:g}: 0 to 60 s needed")
+            raise InputError("E-OPTION-RANGE", f"--settle-s {self.settle_s:g}: 0 to 60 s needed")
 
 
 def scene_folder(out: Path, scene: str) -> Path:
@@ -59,7 +59,7 @@ def scene_folder(out: Path, scene: str) -> Path:
     """
     folder = out / checked_name(scene, "scene")
     if folder.exists():
-        raise InputError(f"{folder}: exists; give another --scene")
+        raise InputError("E-OUTPUT-EXISTS", f"{folder}: exists; give another --scene")
     return folder
 
 
@@ -105,7 +105,9 @@ def capture(
             dark_share=float((image <= DARK).mean()),
         )
         if any(each.image == row.image for each in rows):
-            raise InputError(f"exposure {exposure:.6g} comes twice; take fewer --count, or a wider range")
+            raise InputError(
+                "E-EXPOSURES-VALUE", f"exposure {exposure:.6g} comes twice; take fewer --count, or a wider range"
+            )
         rows.append(row)
         images.append(image)
         if taken:

@@ -81,8 +81,9 @@ def exposure_times(shortest: float, longest: float, count: int) -> np.ndarray:
     """
     if not (0 < shortest <= longest < np.inf) or count < 1 or (count == 1 and shortest < longest):
         raise InputError(
+            "E-EXPOSURES-VALUE",
             f"exposures: {count} from {shortest:g} to {longest:g}; two or more, from a positive shortest time to a "
-            "longest that is not shorter, needed"
+            "longest that is not shorter, needed",
         )
     return np.geomspace(shortest, longest, count)
 
@@ -107,7 +108,9 @@ def find_scenes(path: str | Path) -> list[SceneFiles]:
     path = Path(path)
     if path.is_file():
         if path.suffix.lower() not in SUFFIXES:
-            raise InputError(f"exposures {path}: not an image; a folder or one of {', '.join(SUFFIXES)} needed")
+            raise InputError(
+                "E-IMAGE-UNREADABLE", f"exposures {path}: not an image; a folder or one of {', '.join(SUFFIXES)} needed"
+            )
         return [SceneFiles(path.stem, (ImageFile(path, path.name, TOP_GROUP),))]
     files, skipped = find_images(path)
     scenes = []

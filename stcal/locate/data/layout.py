@@ -132,8 +132,9 @@ def load_layout(path: str | Path) -> TargetLayout:
     open_places = [tag for tag, corners in zip(plan.tags, plan.corners_mm, strict=True) if np.isnan(corners).any()]
     if open_places:
         raise InputError(
+            "E-TAG-PLACE",
             f"{where}: tag {open_places[0][1]}: no place; x_mm, y_mm and size_mm or corners_mm needed, "
-            "or the file that `stcal locate calibrate` writes"
+            "or the file that `stcal locate calibrate` writes",
         )
     corners, stated = plan.corners_mm, data.covariance()
     if stated is None:
@@ -181,17 +182,23 @@ def _plan(data: TagsFile, where: str) -> LayoutPlan:
     ids = [tag.id for tag in data.tag]
     twice = [i for i in ids if ids.count(i) > 1]
     if twice:
-        raise InputError(f"{where}: id {twice[0]} occurs {ids.count(twice[0])} times; ids must differ, in all families")
+        raise InputError(
+            "E-TAG-REPEATED",
+            f"{where}: id {twice[0]} occurs {ids.count(twice[0])} times; ids must differ, in all families",
+        )
     origin = ids[0] if data.origin is None else data.origin
     if origin not in ids:
-        raise InputError(f"{where}: origin {origin}: no tag has this id; one of {', '.join(map(str, ids))} needed")
+        raise InputError(
+            "E-LAYOUT-ORIGIN", f"{where}: origin {origin}: no tag has this id; one of {', '.join(map(str, ids))} needed"
+        )
     corners = np.full((len(ids), 4, 2), np.nan)
     for row, tag in enumerate(data.tag):
         place = tag.corners(where)
         if place is not None:
             if np.linalg.det(np.diff(place[:3], axis=0)) <= 0:
                 raise InputError(
-                    f"{where}: tag {tag.id}: corners go round the wrong way; top left, top right, … needed"
+                    "E-TAG-CORNERS",
+                    f"{where}: tag {tag.id}: corners go round the wrong way; top left, top right, … needed",
                 )
             corners[row] = place
     size = np.array([np.nan if tag.size_mm is None else tag.size_mm for tag in data.tag])

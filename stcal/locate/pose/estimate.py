@@ -158,7 +158,7 @@ def locate(
         No minimum is reached.
     """
     if not len(seen):
-        raise DegenerateError(f"{where}: no tag of the layout; 1 needed")
+        raise DegenerateError("E-LOCATE-NO-TAG", f"{where}: no tag of the layout; 1 needed")
     problem = problem_of(seen, layout, camera, prior)
     start = PoseStack.of(_start(problem, where))
     keep, outliers, whole = np.arange(len(seen)), [], problem
@@ -176,14 +176,17 @@ def locate(
         if len(outliers) > MAX_OUTLIER_SHARE * len(seen):
             names = ", ".join(str(layout.tags[row][1]) for row in sorted(outliers))
             raise DegenerateError(
+                "E-LOCATE-CONTRADICTS",
                 f"{where}: {len(outliers)} of {len(seen)} tags contradict the others ({names}); check that layout and "
-                "camera file belong to the images"
+                "camera file belong to the images",
             )
         problem = whole.select((4 * keep[:, None] + np.arange(4)).ravel())
         start = found.poses[[0]]
     pose = _answer(problem, found, seen.rows[keep], tuple(outliers))
     if pose.sigma_rad() > MAX_SIGMA_RAD:
-        raise DegenerateError(f"{where}: its tags leave the rotation open; show more tags, or larger ones")
+        raise DegenerateError(
+            "E-LOCATE-OPEN", f"{where}: its tags leave the rotation open; show more tags, or larger ones"
+        )
     return pose
 
 
@@ -234,7 +237,9 @@ def _start(problem: PlanarProblem, where: str) -> Rigid:
         # Where all corners agree, none is wrong, and single tags have nothing to add.
         if np.isfinite(score[best]) and (sets is tags or len(tags) == 1 or off[best].max() < 2 * START_PX):
             return poses[best]
-    raise DegenerateError(f"{where}: no pose shows the tags' corners so; check layout, camera file and tags")
+    raise DegenerateError(
+        "E-LOCATE-NO-POSE", f"{where}: no pose shows the tags' corners so; check layout, camera file and tags"
+    )
 
 
 def _poses(problem: PlanarProblem, sets: list[slice]) -> Poses | None:

@@ -49,8 +49,9 @@ class PatentOptions:
     def __post_init__(self):
         if not (0 <= self.area_share < 1 and self.max_error_px > 0 and self.min_error_ratio >= 1):
             raise InputError(
+                "E-OPTION-RANGE",
                 f"patent: S_dis {self.area_share:g}, E_lim {self.max_error_px:g}, E_ratio {self.min_error_ratio:g}: "
-                "0 to less than 1, a positive number and 1 or more needed"
+                "0 to less than 1, a positive number and 1 or more needed",
             )
 
 
@@ -183,7 +184,7 @@ def locate_as_patent(
     known = [[k for k, tag in enumerate(tags.tags) if tag in rows] for tags in exposures]
     corners = [tags.corners_px[own] for tags, own in zip(exposures, known, strict=True)]
     if not any(known):
-        raise DegenerateError(f"{where}: no tag of the layout; 1 needed")
+        raise DegenerateError("E-LOCATE-NO-TAG", f"{where}: no tag of the layout; 1 needed")
     most = most_tags(corners)
     chosen = largest_area(corners, most, options.area_share)
     fared = {i: PatentExposure(i, len(own)) for i, own in enumerate(known)}
@@ -206,7 +207,9 @@ def locate_as_patent(
         if each.errors_px is not None and each.poses is not None and each.det_j is not None
     ]
     if not solved:
-        raise DegenerateError(f"{where}: no exposure shows the tags' corners so; check layout and camera file")
+        raise DegenerateError(
+            "E-LOCATE-NO-POSE", f"{where}: no exposure shows the tags' corners so; check layout and camera file"
+        )
     errors, (first, second), det_j, i = min(solved, key=lambda each: each[0][0])
     same = same_pose(first, second)
     verdict = gate(det_j, errors[0], errors[1] / max(errors[0], TINY_PX), same, options)

@@ -52,13 +52,14 @@ class VerdictOptions:
         odds = all(0 < value < 1 for value in (self.max_p, self.flip_odds))
         if not (odds and self.sigma_margin >= 1 and self.min_tags >= 1):
             raise InputError(
+                "E-OPTION-RANGE",
                 f"verdict: odds {self.max_p:g} and {self.flip_odds:g}, margin {self.sigma_margin:g}, {self.min_tags} "
-                "tags: odds between 0 and 1, a margin and a number of at least 1 needed"
+                "tags: odds between 0 and 1, a margin and a number of at least 1 needed",
             )
         limits = (self.max_sigma_deg, "°"), (self.max_sigma_mm or 0.0, " mm"), (self.min_spread_px, " px")
         for value, unit in limits:
             if not 0 <= value < np.inf:
-                raise InputError(f"verdict: limit {value:g}{unit}; a number of at least 0 needed")
+                raise InputError("E-OPTION-RANGE", f"verdict: limit {value:g}{unit}; a number of at least 0 needed")
 
 
 @dataclass(frozen=True, slots=True)

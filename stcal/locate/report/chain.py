@@ -71,7 +71,9 @@ class GoalChain:
         if not self.moving:
             return chain
         if scene not in self.flange:
-            raise InputError(f"robot poses: none of scene {scene}; add a row, or take its exposures away")
+            raise InputError(
+                "E-ROBOT-POSES-SCENE", f"robot poses: none of scene {scene}; add a row, or take its exposures away"
+            )
         return self.flange[scene] @ chain
 
     def without_pose(self, scenes: Sequence[str]) -> list[str]:
@@ -101,15 +103,20 @@ def read_chain(
     either = {MOVING: mounted.flange_from_camera, FIXED: mounted.base_from_camera}
     found = {name: matrix for name, matrix in either.items() if matrix is not None}
     if len(found) != 1:
-        raise InputError(f"{where}: {' and '.join(found) or 'neither'}; {MOVING} or {FIXED} needed")
+        raise InputError("E-HANDEYE-FILE", f"{where}: {' and '.join(found) or 'neither'}; {MOVING} or {FIXED} needed")
     [(name, matrix)] = found.items()
     covariance = np.zeros((6, 6)) if mounted.covariance is None else mounted.covariance
     mount = UncertainRigid(Rigid.from_matrix(matrix), covariance)
     moving = name == MOVING
     if moving and robot_poses is None:
-        raise InputError(f"{where}: the camera is on the flange; robot poses of the scenes (--robot-poses) needed")
+        raise InputError(
+            "E-OPTION-MISSING",
+            f"{where}: the camera is on the flange; robot poses of the scenes (--robot-poses) needed",
+        )
     if not moving and robot_poses is not None:
-        raise InputError(f"{where}: the camera is fixed; it needs no robot poses, leave --robot-poses away")
+        raise InputError(
+            "E-OPTION-NEEDS", f"{where}: the camera is fixed; it needs no robot poses, leave --robot-poses away"
+        )
     flange = read_robot_poses(robot_poses, quaternions, key) if robot_poses else {}
     return GoalChain(mount, moving, flange, _offset(offset))
 
@@ -130,8 +137,9 @@ def read_registered(registration: str | Path, offset: str | Path | None = None) 
     if read.covariance.shape != (6, 6) or off > ROTATION_WITHIN or np.linalg.det(linear) < 0:
         kind = read.method if read.method == "liu2017" else read.model
         raise InputError(
+            "E-REGISTER-FILE",
             f"{where}: b_from_a is no rigid motion ({kind}: RᵀR is {off:.2g} from 1); base_from_camera needs one, "
-            "register with --model rigid"
+            "register with --model rigid",
         )
     mount = UncertainRigid(Rigid.from_matrix(read.b_from_a), read.covariance)
     return GoalChain(mount, False, {}, _offset(offset), "registration file")
@@ -152,6 +160,9 @@ def read_robot_poses(path: str | Path, quaternions: Order = "wxyz", key: str = "
     found = {}
     for row, (name, pose) in enumerate(zip(table.text(key), poses, strict=True)):
         if name in found:
-            raise InputError(f"{table.where}: line {table.lines[row]}: scene {name} again; every scene once needed")
+            raise InputError(
+                "E-TABLE-ROW-REPEATED",
+                f"{table.where}: line {table.lines[row]}: scene {name} again; every scene once needed",
+            )
         found[name] = UncertainRigid(pose, np.zeros((6, 6)) if covariances is None else covariances[row])
     return found

@@ -72,9 +72,10 @@ def _require_standing(mount: Rigid, flange: Poses, seen: Poses) -> None:
         gain = own[0] / max(mm, 1e-9) * own[1] / max(rad, 1e-9)
         if mm < min(allowed[0], own[0] / BETTER) and rad < allowed[1] and gain > FAR_BETTER:
             raise InputError(
+                "E-LOCATE-VARIES",
                 f"robot poses and hand-eye: the target's pose in the base varies by {own[0]:.3g} mm and "
                 f"{np.degrees(own[1]):.3g}° (RMS of {len(seen)} scenes), but by {mm:.2g} mm and "
-                f"{np.degrees(rad):.2g}° if {reason}"
+                f"{np.degrees(rad):.2g}° if {reason}",
             )
 
 

@@ -87,7 +87,7 @@ def uncertain(each: Located) -> UncertainRigid:
     if each.pose is None:
         pose = camera_from_obj(each)
         if pose is None:
-            raise InputError(f"{each.name}: no pose; {each.verdict.decision}")
+            raise InputError("E-LOCATED-NO-POSE", f"{each.name}: no pose; {each.verdict.decision}")
         return UncertainRigid.exact(pose)
     return UncertainRigid(each.pose.camera_from_obj, each.pose.covariance)
 

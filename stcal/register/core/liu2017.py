@@ -57,12 +57,18 @@ class Liu2017Options:
 
     def __post_init__(self):
         if self.sample < 4:
-            raise InputError(f"liu2017: samples of {self.sample} points, 4 or more needed for twelve parameters")
+            raise InputError(
+                "E-LIU-OPTIONS", f"liu2017: samples of {self.sample} points, 4 or more needed for twelve parameters"
+            )
         if not 0 < self.share <= 1:
-            raise InputError(f"liu2017: share {self.share:g} of inliers; more than 0 and at most 1 needed")
+            raise InputError(
+                "E-LIU-OPTIONS", f"liu2017: share {self.share:g} of inliers; more than 0 and at most 1 needed"
+            )
         for name in ("limit_mm", "orthogonal_within", "tries"):
             if not getattr(self, name) > 0:
-                raise InputError(f"liu2017: {name} is {getattr(self, name):g}; a positive number needed")
+                raise InputError(
+                    "E-LIU-OPTIONS", f"liu2017: {name} is {getattr(self, name):g}; a positive number needed"
+                )
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -131,7 +137,8 @@ def liu2017(xyz_a: np.ndarray, xyz_b: np.ndarray, options: Liu2017Options, seed:
     count, size = len(xyz_a), options.sample
     if count <= size:
         raise DegenerateError(
-            f"liu2017: {count} point pairs, more than the {size} of a sample needed; lower it (--sample)"
+            "E-LIU-SAMPLE",
+            f"liu2017: {count} point pairs, more than the {size} of a sample needed; lower it (--sample)",
         )
     best, least, acceptable = None, np.inf, 0
     shares = np.full(options.tries, np.nan)
@@ -148,9 +155,10 @@ def liu2017(xyz_a: np.ndarray, xyz_b: np.ndarray, options: Liu2017Options, seed:
         tried = shares[np.isfinite(shares)]
         most = f"at most {100 * tried.max():.0f} %" if len(tried) else "none had an orthogonal 3×3 part"
         raise DegenerateError(
+            "E-LIU-SAMPLE",
             f"liu2017: no sample of {size} points leaves more than {100 * options.share:g} % of the others within "
             f"{options.limit_mm:g} mm in {options.tries} tries ({most}); a larger limit (--threshold-mm), a smaller "
-            "--share, another --sample, or the robust method needed"
+            "--share, another --sample, or the robust method needed",
         )
     return Liu2017Result(*best, acceptable, shares)
 

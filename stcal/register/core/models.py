@@ -318,7 +318,9 @@ def _moved(transform: Transform, origin: np.ndarray, step: np.ndarray) -> Transf
         return Rigid(rotation, there - rotation @ origin)
     scale, rotation = transform.scale * (1 + step[6]), turn @ transform.rigid.rotation
     if scale <= 0:
-        raise DegenerateError("registration: the scale is not determined; are the covariances true?")
+        raise DegenerateError(
+            "E-REGISTER-SCALE", "registration: the scale is not determined; are the covariances true?"
+        )
     return Similarity(scale, Rigid(rotation, there - scale * rotation @ origin))
 
 

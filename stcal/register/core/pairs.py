@@ -93,7 +93,9 @@ def read_pairs(path: str | Path | Table) -> Pairs:
         if there
     ]
     if len(given) > 1:
-        raise InputError(f"{table.where}: columns {' and '.join(given)}; only one of {KINDS} needed")
+        raise InputError(
+            "E-TABLE-COLUMNS-CONFLICT", f"{table.where}: columns {' and '.join(given)}; only one of {KINDS} needed"
+        )
     weights = covariances = None
     if given == ["weight"]:
         weights = _positive(table, "weight", table.numbers("weight"))
@@ -114,8 +116,9 @@ def _no_pair_twice(table: Table, rows: np.ndarray) -> None:
         first, again = sorted((int(order[same[0]]), int(order[same[0] + 1])))
         more = f" (and {len(same) - 1} more)" if len(same) > 1 else ""
         raise InputError(
+            "E-TABLE-ROW-REPEATED",
             f"{table.where}: line {table.lines[again]}: the same pair as on line {table.lines[first]}{more}; remove "
-            "it, or give one of them twice the weight"
+            "it, or give one of them twice the weight",
         )
 
 
@@ -124,8 +127,9 @@ def _positive(table: Table, name: str, values: np.ndarray) -> np.ndarray:
     if len(bad):
         more = f" (and {len(bad) - 1} more)" if len(bad) > 1 else ""
         raise InputError(
+            "E-SIGMA-VALUE",
             f"{table.where}: line {table.lines[bad[0]]}: {name} is {values[bad[0]]:g}, a positive number needed{more}; "
-            "remove a row to give it no weight"
+            "remove a row to give it no weight",
         )
     return values
 
@@ -133,7 +137,10 @@ def _positive(table: Table, name: str, values: np.ndarray) -> np.ndarray:
 def _covariances(table: Table) -> np.ndarray:
     missing = [name for name in COVARIANCE if name not in table]
     if missing:
-        raise InputError(f"{table.where}: {missing[0]} is missing; all {len(COVARIANCE)} columns cov_… or none needed")
+        raise InputError(
+            "E-TABLE-COLUMN-MISSING",
+            f"{table.where}: {missing[0]} is missing; all {len(COVARIANCE)} columns cov_… or none needed",
+        )
     full = np.empty((len(table), 3, 3))
     i, j = np.triu_indices(3)
     full[:, i, j] = full[:, j, i] = np.column_stack([table.numbers(name) for name in COVARIANCE])

@@ -104,13 +104,15 @@ def noise_of(n: int, weights: np.ndarray | None, covariances: np.ndarray | None)
         Both given, another shape, or weights and covariances that are not positive.
     """
     if weights is not None and covariances is not None:
-        raise InputError("registration: weights and covariances given; give only one of them")
+        raise InputError("E-REGISTER-WEIGHTS", "registration: weights and covariances given; give only one of them")
     if weights is None and covariances is None:
         return PointNoise()
     name = "weights" if covariances is None else "covariances"
     given = np.asarray(weights if covariances is None else covariances, float)
     if given.shape != (n,) and (name == "weights" or given.shape != (n, 3, 3)):
-        raise InputError(f"registration: {name} of shape {given.shape} for {n} point pairs; one for each needed")
+        raise InputError(
+            "E-ARRAY-SHAPE", f"registration: {name} of shape {given.shape} for {n} point pairs; one for each needed"
+        )
     matrices = given.ndim == 3
     _require_positive(given, name)
     if name == "weights":
@@ -128,4 +130,4 @@ def _require_positive(given: np.ndarray, name: str) -> None:
         bad = np.flatnonzero(~(np.isfinite(given) & (given > 0)))
         trouble = f"row {bad[0] + 1} has {given[bad[0]]:.3g}, a positive number needed" if len(bad) else None
     if trouble:
-        raise InputError(f"registration: {name}: {trouble}; leave a row out to give it no weight")
+        raise InputError("E-REGISTER-WEIGHTS", f"registration: {name}: {trouble}; leave a row out to give it no weight")

@@ -131,9 +131,10 @@ def _check_trust(model: Model, found: Consensus) -> None:
     agree = int(found.inliers.sum())
     if model.redundancy(agree) < LEAST_REDUNDANCY:
         raise DegenerateError(
+            "E-REGISTER-DISAGREE",
             f"registration: only {agree} of {len(found.inliers)} point pairs agree on one {model.name} transform, at "
             f"least {-(-(LEAST_REDUNDANCY + model.parameters) // 3)} needed to tell which are wrong; measure more "
-            "points"
+            "points",
         )
 
 
@@ -141,8 +142,9 @@ def _too_few_agree(model: Model, count: int, threshold: float | None) -> Degener
     within = "" if threshold is None else f" within {threshold:.4g} mm"
     larger = "" if threshold is None else ", or give a larger threshold"
     return DegenerateError(
+        "E-REGISTER-DISAGREE",
         f"registration: fewer than {model.needed} of {count} point pairs agree on one {model.name} transform{within}; "
-        f"check the order of the rows and the units{larger}"
+        f"check the order of the rows and the units{larger}",
     )
 
 

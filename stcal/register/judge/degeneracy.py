@@ -42,14 +42,16 @@ def check_extent(model: Model, xyz_a: np.ndarray, sigma_mm: float) -> None:
     length = spread[0] / np.sqrt(n)
     if off_line < needed:
         raise DegenerateError(
+            "E-POINTS-COLLINEAR",
             f"registration: the {n} points lie along a line, {off_line / np.sqrt(n):.4g} mm RMS off it ({length:.4g} "
-            f"mm along it); {needed / np.sqrt(n):.4g} mm needed at σ {sigma_mm:.4g} mm; measure points off the line"
+            f"mm along it); {needed / np.sqrt(n):.4g} mm needed at σ {sigma_mm:.4g} mm; measure points off the line",
         )
     if model.name == "affine" and spread[2] < needed:
         raise DegenerateError(
+            "E-POINTS-COPLANAR",
             f"registration: the {n} points lie in a plane, {spread[2] / np.sqrt(n):.4g} mm RMS off it ({length:.4g} mm "
             f"along it); {needed / np.sqrt(n):.4g} mm needed for the affine model at σ {sigma_mm:.4g} mm; measure "
-            "points off the plane, or use the rigid model"
+            "points off the plane, or use the rigid model",
         )
 
 
@@ -80,8 +82,9 @@ def check_supports(model: Model, xyz_a: np.ndarray, inliers: np.ndarray, sigma_m
     if len(alone):
         kind, first = "plane" if model.name == "affine" else "line", name(int(rows[alone[0]]))
         raise DegenerateError(
+            "E-REGISTER-DEGENERATE",
             f"registration: only {first} keeps the {len(rows)} points that agree off a {kind}, and any "
-            f"wrong point would fit there as well; measure more points off the {kind}"
+            f"wrong point would fit there as well; measure more points off the {kind}",
         )
 
 

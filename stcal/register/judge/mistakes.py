@@ -53,8 +53,10 @@ def check_units(xyz_a: np.ndarray, xyz_b: np.ndarray, seed: int) -> None:
         for by, small, large in ((factor, "a", "b"), (1 / factor, "b", "a")):
             if abs(ratio / by - 1) < UNIT_WITHIN:
                 raise InputError(
+                    "E-REGISTER-UNITS",
                     f"registration: distances in {large} are {max(ratio, 1 / ratio):.4g} times those in {small} "
-                    f"(median); is {small} in {name} (columns {small}x_{suffix}, {small}y_{suffix}, {small}z_{suffix})?"
+                    f"(median); is {small} in {name} (columns {small}x_{suffix}, {small}y_{suffix}, "
+                    f"{small}z_{suffix})?",
                 )
 
 
@@ -99,8 +101,9 @@ def mirrored_error(reflection: np.ndarray, agree: int, count: int, times: float)
     if turns[least] < NAMED_BELOW_RAD:
         advice = f"change {least}: the frames are then turned by only {np.degrees(turns[least]):.1f}°"
     return InputError(
+        "E-REGISTER-MIRRORED",
         f"registration: one of the frames is left-handed: mirrored, {agree} of {count} point pairs fit {times:.3g} "
-        f"times better; {advice}"
+        f"times better; {advice}",
     )
 
 

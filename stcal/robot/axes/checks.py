@@ -62,25 +62,29 @@ def require_like_nominal(where: str, frames: list[Rigid], nominal: Robot) -> Non
     best = min(reversed_, key=lambda flipped: reversed_[flipped])
     if mirrored < as_it_is / 2 and mirrored <= LIKELY * reversed_[best]:
         raise InputError(
+            "E-AXES-MIRRORED",
             f"{where}: the axes are the mirror image of robot {nominal.name}'s: positions of a left-handed frame (or "
-            "joints that count the other way); swap two columns of x, y, z or change the sign of one"
+            "joints that count the other way); swap two columns of x, y, z or change the sign of one",
         )
     if reversed_[best] < as_it_is / 2:
         named = ", ".join(str(i + 1) for i in best)
         raise InputError(
+            "E-AXES-SIGN",
             f"{where}: joint {named} counts against robot {nominal.name}'s; correct alpha in the robot file or "
-            "the sign of its values"
+            "the sign of its values",
         )
     apart, right = (_distances(z, o, nominal.prismatic).sum() for z, o in ((found, places), (wanted, origin[:, 0])))
     if right > 0 and not 1 / LIKE_SIZE < apart / right < LIKE_SIZE:
         raise InputError(
+            "E-AXES-UNITS",
             f"{where}: the axes lie {apart / right:.3g} times as far apart as robot {nominal.name}'s; check the unit "
-            "of x, y, z, and the lengths in the robot file"
+            "of x, y, z, and the lengths in the robot file",
         )
     for i in range(len(frames) - 1):
         angle, right = (np.degrees(np.arccos(np.clip(z[i] @ z[i + 1], -1, 1))) for z in (found, wanted))
         if abs(angle - right) > np.degrees(AGREES_RAD):
             raise InputError(
+                "E-AXES-ANGLE",
                 f"{where}: axes of joints {i + 1} and {i + 2} are {angle:.1f}° apart, {right:.1f}° in robot "
-                f"{nominal.name}; correct its alpha or theta, or the sign with which a joint counts"
+                f"{nominal.name}; correct its alpha or theta, or the sign with which a joint counts",
             )

@@ -129,7 +129,7 @@ def fit_axis(points: np.ndarray, moved: np.ndarray, arcs: list[Arc], prismatic: 
     """
     size = np.array([_spread(points[arc.rows]) for arc in arcs])
     if size.max() <= ROUNDING * max(np.abs(points).max(), 1.0) * 1e3:
-        raise DegenerateError(_on_axis(where, size.max()))
+        raise DegenerateError("E-AXES-UNDETERMINED", _on_axis(where, size.max()))
     use = list(np.flatnonzero(size >= FIRST_SIZE * size.max()))
     fit = _AxisFitting(points, [arcs[i] for i in use], prismatic, where)
     fit.solve(moved)
@@ -181,8 +181,9 @@ class _AxisFitting:
         """Start, Huber's iteration, gross points out, until nothing changes; ``moved`` : (m,) values of the joint."""
         if self.redundancy() < 1:
             raise DegenerateError(
+                "E-AXES-FEW",
                 f"{self.where}: {len(self.rows)} positions on {len(self.arcs)} arcs leave no redundancy; another "
-                "position or a second reflector needed"
+                "position or a second reflector needed",
             )
         if not self.started:
             self.start(moved[self.rows])
@@ -312,7 +313,7 @@ class _AxisFitting:
         unit = np.array([1 / self.size, 1 / self.size, 1.0, 1.0])[:p]
         u, s, vt = np.linalg.svd(root[:, None] * jacobian.reshape(2 * k, p) * unit, full_matrices=False)
         if s[-1] <= SINGULAR * s[0]:
-            raise DegenerateError(f"{self.where}: its arcs do not determine an axis; {LONGER}")
+            raise DegenerateError("E-AXES-UNDETERMINED", f"{self.where}: its arcs do not determine an axis; {LONGER}")
         return -(unit[:, None] * (vt.T / s) @ u.T * root).reshape(p, k, 2)
 
     def descend(self) -> None:
@@ -348,18 +349,20 @@ class _AxisFitting:
     def require_known(self) -> None:
         """Refuse an axis whose σ is beyond what its linear covariance can say."""
         if not self.prismatic and (self.means()[0] <= NEAR_AXIS * self.sigma()).all():
-            raise DegenerateError(_on_axis(self.where, self.size))
+            raise DegenerateError("E-AXES-UNDETERMINED", _on_axis(self.where, self.size))
         sigma = self.sigma() * np.linalg.norm(self.gain(), axis=2)
         direction, place = np.linalg.norm(sigma[:2]), np.linalg.norm(sigma[2:])
         if direction > WEAK_RAD or place > WEAK_RAD * self.size * 10:
             if self.size < STANDS_STILL_MM:
                 raise DegenerateError(
+                    "E-AXES-STILL",
                     f"{self.where}: its reflectors stay within {self.size:.3g} mm of one place while its values "
-                    "change; did it move, was every position read anew? if so, put a reflector off its axis"
+                    "change; did it move, was every position read anew? if so, put a reflector off its axis",
                 )
             raise DegenerateError(
+                "E-AXES-UNDETERMINED",
                 f"{self.where}: σ of the direction of its axis is {np.degrees(direction):.2g}° and of its place "
-                f"{place:.2g} mm, {np.degrees(WEAK_RAD):.1f}° and {WEAK_RAD * self.size * 10:.2g} mm needed; {LONGER}"
+                f"{place:.2g} mm, {np.degrees(WEAK_RAD):.1f}° and {WEAK_RAD * self.size * 10:.2g} mm needed; {LONGER}",
             )
 
     def orient(self, moved: np.ndarray) -> None:
@@ -382,8 +385,9 @@ class _AxisFitting:
         wrong = np.flatnonzero((off > allowed) & (self.weights > 0))
         if len(wrong):
             raise InputError(
+                "E-AXES-JOINT-VALUES",
                 f"{self.where}: the motion seen is off its values by up to {off[wrong].max() * shown:.3g} "
-                f"{unit}; check the column's unit, the coupling in the robot file, and that positions and rows match"
+                f"{unit}; check the column's unit, the coupling in the robot file, and that positions and rows match",
             )
         if turned:
             self.frame = Rigid(self.frame.rotation * [1, -1, -1], self.frame.translation)

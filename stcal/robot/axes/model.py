@@ -99,7 +99,8 @@ def robot_from_sweeps(
     data = data if virtual is None else virtual.data
     if nominal.tree is not None:
         raise InputError(
-            f"robot {nominal.name} is a tree of joints; the axis method takes one arm at a time: give its file"
+            "E-ROBOT-TREE",
+            f"robot {nominal.name} is a tree of joints; the axis method takes one arm at a time: give its file",
         )
     arcs, notes = find_arcs(data, nominal, still_rad)
     notes = [*data.notes, *notes]

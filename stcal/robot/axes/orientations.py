@@ -81,7 +81,9 @@ def ring(length_mm: float) -> np.ndarray:
         A length out of range.
     """
     if not SHORTEST_MM <= length_mm <= LONGEST_MM:
-        raise InputError(f"--orientations {length_mm:g}: {SHORTEST_MM:g} to {LONGEST_MM:g} mm needed, auto or off")
+        raise InputError(
+            "E-OPTION-RANGE", f"--orientations {length_mm:g}: {SHORTEST_MM:g} to {LONGEST_MM:g} mm needed, auto or off"
+        )
     return length_mm * UNIT_PLACES
 
 
@@ -95,7 +97,8 @@ def virtual_reflectors(data: Measurements, places: np.ndarray) -> VirtualReflect
     """
     if data.rotations is None or data.positions is None:
         raise InputError(
-            f"{data.where}: no orientations; columns of a rotation needed for --orientations, or leave it out"
+            "E-MEASURED-NO-ORIENTATION",
+            f"{data.where}: no orientations; columns of a rotation needed for --orientations, or leave it out",
         )
     m, k = len(data), len(places)
     about = places - places.mean(axis=0)

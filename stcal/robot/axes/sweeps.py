@@ -44,7 +44,9 @@ def find_arcs(data: Measurements, robot: Robot, still_rad: float = STILL_RAD) ->
         No positions, a joint that is never swept, or a reflector that does not move.
     """
     if data.positions is None:
-        raise InputError(f"{data.where}: distances only; columns x_mm, y_mm, z_mm needed for the axis method")
+        raise InputError(
+            "E-MEASURED-DISTANCES", f"{data.where}: distances only; columns x_mm, y_mm, z_mm needed for the axis method"
+        )
     _require_motion(data)
     kinematic = data.q @ robot.coupling.T
     still = np.where(robot.prismatic, STILL_MM, still_rad)
@@ -71,9 +73,10 @@ def find_arcs(data: Measurements, robot: Robot, still_rad: float = STILL_RAD) ->
             missing.append(str(j + 1))
     if missing:
         raise InputError(
+            "E-AXES-NO-SWEEP",
             f"{data.where}: joint {', '.join(missing)} is never swept: no rows of one reflector differ in that joint "
             "alone, 3 or more positions needed; measure its sweep, and if the controller couples joints, give "
-            "`coupling` in the robot file"
+            "`coupling` in the robot file",
         )
     return arcs, notes
 
@@ -90,9 +93,10 @@ def _require_motion(data: Measurements) -> None:
         moved = np.linalg.norm(points - np.median(points, axis=0), axis=1)
         if len(points) > 1 and np.quantile(moved, 0.9) < NOT_MOVED_MM:
             raise InputError(
+                "E-TARGET-STILL",
                 f"{data.where}: {called(target)} does not move: 90 % of its {len(points)} positions lie within "
                 f"{np.quantile(moved, 0.9):.3g} mm while the joints move; a reflector on the flange, and each "
-                "row's own measurement needed"
+                "row's own measurement needed",
             )
 
 

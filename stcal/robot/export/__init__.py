@@ -42,7 +42,7 @@ def require_form(form: str) -> None:
         With those there are.
     """
     if form not in FORMS:
-        raise InputError(f"--export {form}: unknown; one of {', '.join(FORMS)} needed")
+        raise InputError("E-OPTION-FORM", f"--export {form}: unknown; one of {', '.join(FORMS)} needed")
 
 
 def exported(
@@ -79,7 +79,7 @@ def exported(
     where, own = f"--export {form}={path}", FORMS[form]
     rows = np.flatnonzero(result.found.usable)
     if not len(rows):
-        raise InputError(f"{where}: none of {len(result)} rows is reached; nothing to write")
+        raise InputError("E-EXPORT-UNREACHED", f"{where}: none of {len(result)} rows is reached; nothing to write")
     if pulses_per_deg is not None and form == "yaskawa":
         _require_pulses(pulses_per_deg, robot, where)
     notes = []
@@ -95,7 +95,7 @@ def exported(
     else:
         reason = own.refuses(points)
         if reason:
-            raise InputError(f"{where}: {reason}; joint values of robot {robot.name} do not fit")
+            raise InputError("E-ROBOT-MISMATCH", f"{where}: {reason}; joint values of robot {robot.name} do not fit")
         head.append("joint values that the controller must be told")
     gone = np.flatnonzero(~result.found.usable)
     if len(gone):
@@ -104,7 +104,7 @@ def exported(
         head.append(f"left out, as they are not reached: {len(gone)} lines, the first {result.targets.lines[gone[0]]}")
     text = own.write(points, [ascii_text(line) for line in head])
     if not _same(own.read(text), points, form):
-        raise StcalError(f"{where}: the file does not give the points back; use another form")
+        raise StcalError("E-EXPORT-READ-BACK", f"{where}: the file does not give the points back; use another form")
     return Exported(text, tuple(f"{where}: {note}" for note in [f"{len(rows)} points, {wanted}", *notes]))
 
 
@@ -125,14 +125,16 @@ def _poses(result: Compensated, rows: np.ndarray, where: str) -> tuple[Poses, st
     """Of the nominal robot at the compensated joint values; and of which tool they are."""
     if result.controller is None:
         raise InputError(
+            "E-COMPENSATE-POSES",
             f"{where}: poses of compensated points are those of the nominal robot; give its file with --nominal, or "
-            "joint values with --export-as joints"
+            "joint values with --export-as joints",
         )
     targets = result.targets[rows]
     if len(names := sorted(set(targets.tools))) > 1:
         raise InputError(
+            "E-EXPORT-TOOLS",
             f"{where}: poses of {len(names)} tools, {', '.join(map(repr, names))}; a file for each, or --export-as "
-            "joints, needed"
+            "joints, needed",
         )
     x, y, z = result.controller.tool(names[0]).translation
     said = f"poses in the robot's base, of the tool at {x:.3f}, {y:.3f}, {z:.3f} mm on the flange"
@@ -142,7 +144,9 @@ def _poses(result: Compensated, rows: np.ndarray, where: str) -> tuple[Poses, st
 def _require_pulses(pulses: Sequence[float], robot: Robot, where: str) -> None:
     if len(pulses) != len(robot.rows) or not all(np.isfinite(p) and p != 0 for p in pulses):
         raise InputError(
-            f"{where}: --pulses-per-deg has {len(pulses)} numbers; {len(robot.rows)}, one for each joint, not 0, needed"
+            "E-OPTION-VALUE",
+            f"{where}: --pulses-per-deg has {len(pulses)} numbers; {len(robot.rows)}, one for each joint, not 0, "
+            "needed",
         )
 
 

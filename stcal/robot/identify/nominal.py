@@ -49,7 +49,7 @@ def adjusted(text: str) -> Adjusted:
     """
     words = {word.strip() for word in text.split(",")}
     if not words <= {"base", "tool", "zeros", "geometry", "all"}:
-        raise InputError(f"--adjust {text}: base,tool, zeros, geometry or all needed")
+        raise InputError("E-OPTION-VALUE", f"--adjust {text}: base,tool, zeros, geometry or all needed")
     if "all" in words or {"zeros", "geometry"} <= words:
         return "all"
     return "zeros" if "zeros" in words else "geometry" if "geometry" in words else "base,tool"

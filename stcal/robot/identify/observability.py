@@ -70,7 +70,8 @@ class ObservabilityIndices:
         sigma = np.sort(np.asarray(singular_values, float).ravel())[::-1]
         if not len(sigma) or not np.isfinite(sigma).all() or sigma[-1] < 0 or count < 1:
             raise InputError(
-                f"observability: {len(sigma)} singular values of {count} poses; at least one of each, none negative"
+                "E-ARRAY-SHAPE",
+                f"observability: {len(sigma)} singular values of {count} poses; at least one of each, none negative",
             )
         first, last = float(sigma[0]), float(sigma[-1])
         if last == 0:

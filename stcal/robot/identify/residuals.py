@@ -86,7 +86,7 @@ def observed(data: Measurements, kind: Kind | None = None) -> Observed:
     held = "distance" if data.distances is not None else "position" if data.rotations is None else "pose"
     kind = kind or held
     if WIDTH[kind] > WIDTH[held]:
-        raise InputError(f"{data.where}: {held}s were measured, {kind}s cannot be had from them")
+        raise InputError("E-MEASURED-KIND", f"{data.where}: {held}s were measured, {kind}s cannot be had from them")
     rows, none = np.arange(len(data)), np.zeros(0)
     if kind != "distance":
         return Observed(kind, data, rows, rows, none)

@@ -79,10 +79,11 @@ class IdentifyOptions:
     def __post_init__(self):
         for name, value, most in (("sigma_mm", self.sigma_mm, 1e3), ("sigma_rad", self.sigma_rad, 1.0)):
             if value is not None and not 1e-12 <= value <= most:
-                raise InputError(f"{name} is {value:g}; a number above 0, up to {most:g}, needed")
+                raise InputError("E-OPTION-RANGE", f"{name} is {value:g}; a number above 0, up to {most:g}, needed")
         if self.model == "auto" and self.folds < LEAST_FOLDS:
             raise InputError(
-                f"folds is {self.folds}: models are compared by rows held out; {LEAST_FOLDS} or more folds needed"
+                "E-OPTION-RANGE",
+                f"folds is {self.folds}: models are compared by rows held out; {LEAST_FOLDS} or more folds needed",
             )
 
 

@@ -209,8 +209,9 @@ def _still_joints(robot: Robot, data: Measurements, partial: bool) -> None:
         prismatic = robot.joints[i - 1].type == "prismatic"
         if move < (STILL_MM if prismatic else STILL_RAD) and not partial:
             raise DegenerateError(
+                "E-IDENTIFY-UNMOVED",
                 f"{data.where}: joint {i} never moved, so that its axis is not seen; measure with other values of "
-                f"q{i}, or keep its nominal values with --partial"
+                f"q{i}, or keep its nominal values with --partial",
             )
 
 
@@ -220,8 +221,9 @@ def _enough(seen: Observed, state: State, rows: NominalRows) -> None:
     if numbers <= seeks:
         needed = seeks // WIDTH[seen.kind] + 1
         raise DegenerateError(
+            "E-IDENTIFY-FEW",
             f"{seen.data.where}: {len(seen)} {seen.kind}s give {numbers} numbers for {seeks} parameters; "
-            f"{needed} or more needed, better twice that"
+            f"{needed} or more needed, better twice that",
         )
 
 
@@ -330,10 +332,11 @@ def _undetermined(solution: Solution, names: list[str], seen: Observed, partial:
     if not partial:
         first = ", ".join(found[:4]) + (" …" if len(found) > 4 else "")
         raise DegenerateError(
+            "E-IDENTIFY-UNDETERMINED",
             f"{seen.data.where}: the data determine {solution.rank()} of {len(names) - expected - solution.count} "
             "parameters, open are "
             f"{first}; measure more varied poses (`stcal robot design`), or keep the nominal values of these with "
-            "--partial"
+            "--partial",
         )
     return found
 

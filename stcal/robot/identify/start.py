@@ -67,9 +67,10 @@ def start(robot: Robot, data: Measurements, fit: Fit = BOTH) -> State:
     if misfit > FITS * extent:
         if fit != BOTH and _placed(robot, data, tools)[1] <= FITS * extent:
             raise InputError(
+                "E-IDENTIFY-MISFIT",
                 f"{data.where}: robot {robot.name} as its file stands misses the measurements by {misfit:.3g} mm RMS, "
                 f"{FITS:.0%} of their spread of {extent:.3g} mm allowed; it fits with base and tool fitted to them "
-                "(base-tool)"
+                "(base-tool)",
             )
         _explain(robot, data, tools, misfit, extent)
     if data.rotations is not None:
@@ -85,8 +86,9 @@ def _carried(robot: Robot, data: Measurements, named: list[str]) -> None:
     if missing:
         target = f"target {missing[0]}" if missing[0] else "the tool of rows without a target"
         raise InputError(
+            "E-ROBOT-TREE",
             f"{data.where}: robot {robot.name} is a tree, and its file does not say which joint carries {target}; give "
-            + ("it a [[target]] with joint" if missing[0] else "[tool] joint")
+            + ("it a [[target]] with joint" if missing[0] else "[tool] joint"),
         )
 
 
@@ -104,15 +106,17 @@ def _with_stations(robot: Robot, data: Measurements) -> State:
             station = align_rigid(part.points(), tips_of(state, part).translation)
         except DegenerateError as error:
             raise DegenerateError(
+                "E-STATION-FEW",
                 f"{data.where}: station {name}: {own.sum()} positions do not show where it stands; 3 or more off one "
-                "line needed, or leave them out"
+                "line needed, or leave them out",
             ) from error
         off = part.points() - (station @ tips_of(state, part)).translation
         misfit, extent = float(np.sqrt((off**2).sum(1).mean())), _extent(part)
         if misfit > FITS * extent:
             raise InputError(
+                "E-IDENTIFY-STATION",
                 f"{data.where}: station {name}: its rows miss the robot by {misfit:.3g} mm RMS as the rows of station "
-                f"{first} place it, {FITS:.0%} of their spread of {extent:.3g} mm allowed; check column station"
+                f"{first} place it, {FITS:.0%} of their spread of {extent:.3g} mm allowed; check column station",
             )
         stations[name] = station
     return replace(state, stations=stations)
@@ -128,15 +132,19 @@ def _extent(data: Measurements) -> float:
 def _moves(data: Measurements) -> None:
     if data.positions is None:
         if np.ptp(data.lengths()[0]) < STILL_MM:
-            raise DegenerateError(f"{data.where}: all distances are equal; positions apart from one another needed")
+            raise DegenerateError(
+                "E-IDENTIFY-UNDETERMINED",
+                f"{data.where}: all distances are equal; positions apart from one another needed",
+            )
         return
     for name in sorted(set(data.targets)):
         own = data.positions[[t == name for t in data.targets]]
         moved = float(np.linalg.norm(np.ptp(own, axis=0)))
         if moved < STILL_MM and len(own) > 1:
             raise DegenerateError(
+                "E-IDENTIFY-UNMOVED",
                 f"{data.where}: target {name or 'of all rows'} never moved ({moved:.2g} mm over {len(own)} rows, more "
-                f"than {STILL_MM} mm needed); was it on the robot, were positions read anew?"
+                f"than {STILL_MM} mm needed); was it on the robot, were positions read anew?",
             )
 
 
@@ -170,8 +178,9 @@ def _off_a_line(data: Measurements) -> None:
     extents = np.linalg.svd(data.points() - data.points().mean(0), compute_uv=False)
     if len(extents) < 2 or extents[1] <= STILL_MM:
         raise DegenerateError(
+            "E-IDENTIFY-UNDETERMINED",
             f"{data.where}: all positions lie on one line (within {STILL_MM} mm), so that it is not seen where the "
-            "instrument stands; move joints that take the target off it"
+            "instrument stands; move joints that take the target off it",
         )
 
 
@@ -191,8 +200,9 @@ def _base_and_points(
         base = given or align_rigid(positions, flange @ points[rows])
     except DegenerateError as error:
         raise DegenerateError(
+            "E-IDENTIFY-UNDETERMINED",
             f"{where}: by the robot file all joint values put the target on one line, so that it is not seen how the "
-            "instrument stands about it; move other joints, or give the tool in the robot file if it is off the axis"
+            "instrument stands about it; move other joints, or give the tool in the robot file if it is off the axis",
         ) from error
     moving = (rows[:, None] == np.arange(len(points)))[:, None, :, None]
     spread = np.linalg.norm(positions - positions.mean(0), axis=1).max()
@@ -254,8 +264,10 @@ def _explain(robot: Robot, data: Measurements, tools: dict[str, Rigid], misfit: 
     says += f"{FITS:.0%} of their spread of {extent:.3g} mm allowed; "
     reason = min(found, key=lambda guess: found[guess])
     if found[reason] < min(EXPLAINS * misfit / extent, FITS):
-        raise InputError(f"{says}it would fit if {reason}")
-    raise InputError(f"{says}check D-H rows and convention, the order and zero of joints, coupling, and units")
+        raise InputError("E-IDENTIFY-MISFIT", f"{says}it would fit if {reason}")
+    raise InputError(
+        "E-IDENTIFY-MISFIT", f"{says}check D-H rows and convention, the order and zero of joints, coupling, and units"
+    )
 
 
 def _guesses(robot: Robot, data: Measurements, tools: dict[str, Rigid]) -> Iterator[tuple[str, Robot, Measurements]]:

@@ -29,7 +29,9 @@ def oriented(table: Table, rotation: str | None = None) -> tuple[Poses | None, t
     """
     turned = None if table.has_rotation() else read_rotations(table, rotation=rotation)
     if rotation is not None and (turned is None or turned.stated):
-        raise InputError(f"{table.where}: no columns of angles that --rotation {rotation} is of; leave it out")
+        raise InputError(
+            "E-OPTION-NEEDS", f"{table.where}: no columns of angles that --rotation {rotation} is of; leave it out"
+        )
     if turned is None:
         return table.poses() if table.has_rotation() else None, (), ()
     columns = ", ".join(turned.columns)

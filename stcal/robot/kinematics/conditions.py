@@ -40,11 +40,11 @@ class Conditions:
         if self.approach is not None:
             freeze(self, "approach", (None, None), "approach")
             for value in self.approach[~np.isin(self.approach, DIRECTIONS)]:
-                raise InputError(f"approach is {value:g}; 1, -1 or 0 needed")
+                raise InputError("E-APPROACH-VALUE", f"approach is {value:g}; 1, -1 or 0 needed")
         if self.payload_kg is not None:
             freeze(self, "payload_kg", (None,), "payload")
             for value in self.payload_kg[(self.payload_kg < 0) | (self.payload_kg > MOST_KG)]:
-                raise InputError(f"payload is {value:g} kg; 0 … {MOST_KG:g} needed")
+                raise InputError("E-PAYLOAD-VALUE", f"payload is {value:g} kg; 0 … {MOST_KG:g} needed")
 
     def __getitem__(self, index) -> "Conditions":
         """Of the joint vectors at a mask, slice or list."""
@@ -85,7 +85,7 @@ def loaded(payload_kg: ArrayLike | None, count: int) -> Conditions:
         return USUAL
     values = np.asarray(payload_kg, float)
     if values.shape not in ((), (count,)):
-        raise InputError(f"payload: shape {values.shape}, one number or ({count},) needed")
+        raise InputError("E-ARRAY-SHAPE", f"payload: shape {values.shape}, one number or ({count},) needed")
     return Conditions(np.broadcast_to(values, (count,)))
 
 
@@ -115,8 +115,9 @@ def _approach(table: Table, joints: int) -> np.ndarray | None:
             values[:, i] = table.numbers(name)
             for row in np.flatnonzero(~np.isin(values[:, i], DIRECTIONS)).tolist():
                 raise InputError(
+                    "E-APPROACH-VALUE",
                     f"{table.where}: line {table.lines[row]}: {name} is {values[row, i]:g}; 1 (joint {i + 1} came from "
-                    "below), -1 (from above) or 0 (not known) needed"
+                    "below), -1 (from above) or 0 (not known) needed",
                 )
     return values
 
@@ -125,9 +126,14 @@ def _carried(table: Table, payload_kg: float | None) -> Conditions:
     if PAYLOAD not in table:
         return loaded(payload_kg, len(table))
     if payload_kg is not None:
-        raise InputError(f"{table.where}: a column {PAYLOAD}, and --payload-kg {payload_kg:g}; leave one of them out")
+        raise InputError(
+            "E-OPTION-CONFLICT",
+            f"{table.where}: a column {PAYLOAD}, and --payload-kg {payload_kg:g}; leave one of them out",
+        )
     values = table.numbers(PAYLOAD)
     for line, value in zip(table.lines, values.tolist(), strict=True):
         if not 0 <= value <= MOST_KG:
-            raise InputError(f"{table.where}: line {line}: {PAYLOAD} is {value:g}; 0 … {MOST_KG:g} needed")
+            raise InputError(
+                "E-PAYLOAD-VALUE", f"{table.where}: line {line}: {PAYLOAD} is {value:g}; 0 … {MOST_KG:g} needed"
+            )
     return Conditions(values)

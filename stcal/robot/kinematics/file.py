@@ -61,13 +61,15 @@ class _ElasticityFile(Strict):
         """Of ``count`` joints."""
         for key, values in self:
             if isinstance(values, list) and len(values) != count:
-                raise InputError(f"{where}: {key} has {len(values)} entries, {count} needed, one for each joint")
+                raise InputError(
+                    "E-ROBOT-ENTRIES", f"{where}: {key} has {len(values)} entries, {count} needed, one for each joint"
+                )
         none = np.zeros(count)
         compliance = np.column_stack([self.axis_rad_per_Nm or none, self.across_rad_per_Nm or none])
         moment = np.array(self.moment_Nm or np.zeros((count, 3)))
         periodic = np.array(self.periodic_rad or np.zeros((count, 4)))
         if not 0 <= self.payload_kg <= MOST_KG:
-            raise InputError(f"{where}: payload_kg is {self.payload_kg:g}; 0 … {MOST_KG:g} needed")
+            raise InputError("E-PAYLOAD-VALUE", f"{where}: payload_kg is {self.payload_kg:g}; 0 … {MOST_KG:g} needed")
         centre = np.array(self.payload_centre_mm)
         load = self.payload_kg, centre
         hysteresis = np.array(self.hysteresis_rad or none)
@@ -114,11 +116,11 @@ def load_robot(path: str | Path) -> Robot:
     n = len(rows)
     coupling = np.eye(n).tolist() if data.coupling is None else data.coupling
     if len(coupling) != n or any(len(row) != n for row in coupling):
-        raise InputError(f"{where}: coupling: {n} rows of {n} numbers needed for {n} joints")
+        raise InputError("E-ROBOT-COUPLING", f"{where}: coupling: {n} rows of {n} numbers needed for {n} joints")
     names = [t.name for t in data.target]
     for name in names:
         if names.count(name) > 1:
-            raise InputError(f"{where}: target {name} occurs twice; names must differ")
+            raise InputError("E-ROBOT-TARGET", f"{where}: target {name} occurs twice; names must differ")
     tools = {"": data.tool.rigid(f"{where}: tool")}
     tools |= {t.name: t.rigid(f"{where}: target {t.name}") for t in data.target}
     base = data.base.rigid(f"{where}: base")
@@ -135,22 +137,26 @@ def _tree(data: _RobotFile, where: str) -> Tree | None:
     for i, joint in enumerate(data.joint):
         if joint.after is None and joint.mount is not None:
             raise InputError(
-                f"{where}: joint {i + 1}: mount without after; the number of the joint that carries it needed"
+                "E-ROBOT-BRANCH",
+                f"{where}: joint {i + 1}: mount without after; the number of the joint that carries it needed",
             )
         if joint.after is not None:
             if not 0 <= joint.after <= i:
-                raise InputError(f"{where}: joint {i + 1}: after is {joint.after}, 0 (the base) … {i} needed")
+                raise InputError(
+                    "E-ROBOT-BRANCH", f"{where}: joint {i + 1}: after is {joint.after}, 0 (the base) … {i} needed"
+                )
             mounts[i] = joint.after - 1, (joint.mount or PoseEntry()).rigid(f"{where}: joint {i + 1}: mount")
     if 0 in mounts:
         raise InputError(
-            f"{where}: joint 1: after is for joints that begin another branch; leave it out, and give base"
+            "E-ROBOT-BRANCH",
+            f"{where}: joint 1: after is for joints that begin another branch; leave it out, and give base",
         )
     carriers = {}
     for name, each in [("", data.tool), *((t.name, t) for t in data.target)]:
         if each.joint is not None:
             if not 1 <= each.joint <= n:
                 what = f"target {name}" if name else "tool"
-                raise InputError(f"{where}: {what}: joint is {each.joint}, 1 … {n} needed")
+                raise InputError("E-ROBOT-BRANCH", f"{where}: {what}: joint is {each.joint}, 1 … {n} needed")
             carriers[name] = each.joint - 1
     return Tree(mounts, carriers) if mounts or carriers else None
 
@@ -159,10 +165,12 @@ def _joint(j: _JointFile, where: str) -> Joint:
     mine, other = ("deg", "mm") if j.type == "revolute" else ("mm", "deg")
     for end in ("min", "max"):
         if getattr(j, f"{end}_{other}") is not None:
-            raise InputError(f"{where}: {end}_{other} at a {j.type} joint; {end}_{mine} needed")
+            raise InputError("E-ROBOT-LIMITS", f"{where}: {end}_{other} at a {j.type} joint; {end}_{mine} needed")
     lower, upper = getattr(j, f"min_{mine}"), getattr(j, f"max_{mine}")
     if lower is not None and upper is not None and lower >= upper:
-        raise InputError(f"{where}: min_{mine} {lower:g} is not below max_{mine} {upper:g}; swap or correct them")
+        raise InputError(
+            "E-ROBOT-LIMITS", f"{where}: min_{mine} {lower:g} is not below max_{mine} {upper:g}; swap or correct them"
+        )
     unit = np.pi / 180 if mine == "deg" else 1.0
     return Joint(
         j.type,

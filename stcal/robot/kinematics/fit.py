@@ -41,8 +41,9 @@ def require_convention(where: str, targets: Sequence[str], flange: np.ndarray, s
     if found is not None:
         reading, left = found
         raise InputError(
+            "E-ROBOT-ORIENTATIONS",
             f"{where}: orientations miss the robot by {np.degrees(own):.3g}° RMS, {np.degrees(TURNED_RAD):.2g}° "
-            f"allowed; they would fit to {np.degrees(left):.2g}° if quaternions were {reading.held}; {reading.remedy}"
+            f"allowed; they would fit to {np.degrees(left):.2g}° if quaternions were {reading.held}; {reading.remedy}",
         )
 
 

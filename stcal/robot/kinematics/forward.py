@@ -152,7 +152,8 @@ def _loaded(chain: Chain) -> int:
     """The joint behind which a load hangs."""
     if chain.grown is not None and "" not in chain.grown.tree.carriers:
         raise InputError(
-            "the robot is a tree of joints, and its file does not say which carries the load; give [tool] joint"
+            "E-ROBOT-TREE",
+            "the robot is a tree of joints, and its file does not say which carries the load; give [tool] joint",
         )
     return chain.carrier("")
 
@@ -185,7 +186,7 @@ def deflections(chain: Chain, q: np.ndarray, conditions: Conditions = USUAL) -> 
 
 def _elasticity(chain: Chain) -> Elasticity:
     if chain.elasticity is None:
-        raise InputError("the robot is rigid; elasticity needed")
+        raise InputError("E-ROBOT-RIGID", "the robot is rigid; elasticity needed")
     return chain.elasticity
 
 
@@ -347,7 +348,7 @@ def _from_base_to_tool(robot: Robot, tool: str) -> Chain:
 def _joint_vectors(q: ArrayLike, n: int) -> np.ndarray:
     values = np.atleast_2d(np.asarray(q, float))
     if values.ndim != 2 or values.shape[1] != n:
-        raise InputError(f"joint values: shape {values.shape}, (m, {n}) needed for {n} joints")
+        raise InputError("E-ARRAY-SHAPE", f"joint values: shape {values.shape}, (m, {n}) needed for {n} joints")
     if not np.isfinite(values).all():
-        raise InputError("joint values: hold values that are not finite")
+        raise InputError("E-ARRAY-NOT-FINITE", "joint values: hold values that are not finite")
     return values

@@ -126,10 +126,10 @@ def inverse(
         return _in_sequence(problem, poses)
     near = np.asarray(near, float)
     if near.shape not in ((n,), (m, n)):
-        raise InputError(f"reference joint values: shape {near.shape}, ({n},) or ({m}, {n}) needed")
+        raise InputError("E-ARRAY-SHAPE", f"reference joint values: shape {near.shape}, ({n},) or ({m}, {n}) needed")
     near = np.broadcast_to(near, (m, n)) / problem.unit
     if not np.isfinite(near).all():
-        raise InputError("reference joint values: hold values that are not finite")
+        raise InputError("E-ARRAY-NOT-FINITE", "reference joint values: hold values that are not finite")
     q, ok = _from_near(problem, poses, near)
     beyond = np.zeros(m, bool)
     rest = np.flatnonzero(~ok)
@@ -213,8 +213,9 @@ def _refuse_redundant(problem: InverseProblem) -> None:
     n = len(problem.unit)
     if n > 6:
         raise InputError(
+            "E-ROBOT-REDUNDANT",
             f"robot {problem.robot.name}: {n} joints reach a pose in endlessly many ways; "
-            "give the joint values to stay near to (columns q1_deg …)"
+            "give the joint values to stay near to (columns q1_deg …)",
         )
 
 

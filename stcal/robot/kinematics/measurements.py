@@ -100,7 +100,9 @@ class Measurements:
     def __getitem__(self, index) -> "Measurements":
         """Rows by a mask, slice or list; not for distances, which refer to one another."""
         if self.distances is not None:
-            raise InputError(f"{self.where}: distances refer to other rows, so that rows cannot be taken out")
+            raise InputError(
+                "E-MEASURED-DISTANCES", f"{self.where}: distances refer to other rows, so that rows cannot be taken out"
+            )
         rows = np.arange(len(self))[index]
         optional = {name: getattr(self, name) for name in ("positions", "rotations", "covariance", "common")}
         return replace(
@@ -122,7 +124,9 @@ class Measurements:
     def own_covariance(self) -> np.ndarray:
         """(m, 6, 6) of what each pose errs by itself."""
         if self.covariance is None:
-            raise InputError(f"{self.where}: poses without covariance; columns of it needed")
+            raise InputError(
+                "E-MEASURED-NO-COVARIANCE", f"{self.where}: poses without covariance; columns of it needed"
+            )
         if self.common is None:
             return self.covariance
         return self.covariance - self.common @ np.swapaxes(self.common, 1, 2)
@@ -130,19 +134,21 @@ class Measurements:
     def points(self) -> np.ndarray:
         """(m, 3) positions as measured, mm."""
         if self.positions is None:
-            raise InputError(f"{self.where}: distances only; columns x_mm, y_mm, z_mm needed")
+            raise InputError("E-MEASURED-DISTANCES", f"{self.where}: distances only; columns x_mm, y_mm, z_mm needed")
         return self.positions
 
     def poses(self) -> Poses:
         """world_from_tool as measured."""
         if self.rotations is None:
-            raise InputError(f"{self.where}: positions without orientation; {ORIENTATION} needed")
+            raise InputError(
+                "E-MEASURED-NO-ORIENTATION", f"{self.where}: positions without orientation; {ORIENTATION} needed"
+            )
         return Poses(self.rotations, self.points())
 
     def lengths(self) -> tuple[np.ndarray, np.ndarray]:
         """(m,) distances as measured, mm, and (m,) the rows that they start from."""
         if self.distances is None or self.from_row is None:
-            raise InputError(f"{self.where}: positions, not distances; column distance_mm needed")
+            raise InputError("E-MEASURED-KIND", f"{self.where}: positions, not distances; column distance_mm needed")
         return self.distances, self.from_row
 
 
@@ -203,13 +209,16 @@ def read_measurements(
         return _usable(data, table)
     if not table.has("distance", LENGTHS):
         raise InputError(
+            "E-MEASURED-KIND",
             f"{table.where}: neither x_mm, y_mm, z_mm nor distance_mm; what was measured is needed; "
-            f"the header is {table.header()}"
+            f"the header is {table.header()}",
         )
     distances = table.quantity("distance", LENGTHS)
     within(table, "distance", distances, "mm")
     if rotation is not None:
-        raise InputError(f"{table.where}: --rotation {rotation}, but distances have no orientation; leave it out")
+        raise InputError(
+            "E-OPTION-NEEDS", f"{table.where}: --rotation {rotation}, but distances have no orientation; leave it out"
+        )
     seen = {"distances": distances, "from_row": _from_rows(table), "notes": unread(table, own)}
     return Measurements(table.where, table.lines, q, targets, **seen, conditions=conditions)
 
@@ -224,8 +233,9 @@ def within(table: Table, name: str, values: np.ndarray, unit: str) -> None:
     bad = np.flatnonzero((np.abs(values).reshape(len(values), -1) > FARTHEST[unit]).any(axis=1))
     if len(bad):
         raise InputError(
+            "E-VALUE-TOO-FAR",
             f"{table.where}: line {table.lines[bad[0]]}: {name} is beyond {FARTHEST[unit]:.4g} {unit}; correct it, or "
-            "remove the line"
+            "remove the line",
         )
 
 
@@ -236,8 +246,9 @@ def _in_reach(data: Measurements, robot: Robot) -> None:
     worst = int(away.argmax())
     if away[worst] > 2 * reach + LONGEST_TOOL_MM:
         raise InputError(
+            "E-MEASURED-REACH",
             f"{data.where}: line {data.lines[worst]}: position is {away[worst]:.4g} mm from the middle of the others, "
-            f"robot {robot.name} reaches {reach:.4g} mm; correct it, or the unit of x, y, z"
+            f"robot {robot.name} reaches {reach:.4g} mm; correct it, or the unit of x, y, z",
         )
 
 
@@ -265,7 +276,7 @@ def _usable(data: Measurements, table: Table) -> Measurements:
     ]
     keep = ~(undecided | copies)
     if not keep.any():
-        raise InputError(f"{data.where}: {notes[0]}")
+        raise InputError("E-MEASURED-REACH", f"{data.where}: {notes[0]}")
     return replace(data[keep], notes=(*notes, *data.notes)) if notes else data
 
 
@@ -274,7 +285,8 @@ def joint_values(table: Table, robot: Robot) -> np.ndarray:
     n = len(robot.rows)
     if any(name.startswith(f"q{n + 1}_") for name in table.columns):
         raise InputError(
-            f"{table.where}: a column q{n + 1}_…, but robot {robot.name} has {n} joints; give its own file"
+            "E-ROBOT-MISMATCH",
+            f"{table.where}: a column q{n + 1}_…, but robot {robot.name} has {n} joints; give its own file",
         )
     columns = []
     for i, joint in enumerate(robot.joints, 1):
@@ -283,8 +295,9 @@ def joint_values(table: Table, robot: Robot) -> np.ndarray:
         far = np.flatnonzero(np.abs(values) > 2 * np.pi * MAX_TURNS)
         if joint.type == "revolute" and len(far) and table.unit(f"q{i}", units) == "rad":
             raise InputError(
+                "E-JOINT-VALUE",
                 f"{table.where}: line {table.lines[far[0]]}: q{i}_rad is {values[far[0]]:g}, over {MAX_TURNS} turns; "
-                f"if these are degrees call the column q{i}_deg"
+                f"if these are degrees call the column q{i}_deg",
             )
         within(table, f"q{i}", values, "mm" if units is LENGTHS else "rad")
         columns.append(values)
@@ -298,5 +311,8 @@ def _from_rows(table: Table) -> np.ndarray:
     rows = table.numbers("from_row")
     for i, row in enumerate(rows):
         if row != int(row) or not 1 <= row <= len(rows):
-            raise InputError(f"{table.where}: line {table.lines[i]}: from_row is {row:g}, 1 … {len(rows)} needed")
+            raise InputError(
+                "E-MEASURED-FROM-ROW",
+                f"{table.where}: line {table.lines[i]}: from_row is {row:g}, 1 … {len(rows)} needed",
+            )
     return rows.astype(int) - 1

@@ -126,7 +126,10 @@ class Elasticity:
             object.__setattr__(self, name, frozen(getattr(self, name), shape, f"elasticity: {name}"))
         length = float(np.linalg.norm(self.gravity))
         if length == 0:
-            raise InputError("elasticity: gravity is [0, 0, 0]; a direction in the base needed, such as [0, 0, -1]")
+            raise InputError(
+                "E-ROBOT-ELASTICITY",
+                "elasticity: gravity is [0, 0, 0]; a direction in the base needed, such as [0, 0, -1]",
+            )
         object.__setattr__(self, "gravity", frozen(self.gravity / length, (3,), "elasticity: gravity"))
 
 
@@ -156,7 +159,8 @@ class Tree:
         for joint, (after, _) in self.mounts.items():
             if not -1 <= after < joint:
                 raise InputError(
-                    f"joint {joint + 1} is carried by joint {after + 1}; 0 (the base) or one that comes before needed"
+                    "E-ROBOT-BRANCH",
+                    f"joint {joint + 1} is carried by joint {after + 1}; 0 (the base) or one that comes before needed",
                 )
 
     def after(self, joint: int) -> int:
@@ -222,15 +226,20 @@ class Robot:
         n = len(self.rows)
         if len(self.joints) != n or n == 0:
             raise InputError(
-                f"robot {self.name}: {n} rows and {len(self.joints)} joints, one row for each joint needed"
+                "E-ROBOT-ENTRIES",
+                f"robot {self.name}: {n} rows and {len(self.joints)} joints, one row for each joint needed",
             )
         coupling = np.eye(n) if self.coupling is None else self.coupling  # None: not given
         object.__setattr__(self, "coupling", frozen(coupling, (n, n), f"robot {self.name}: coupling"))
         if np.linalg.cond(self.coupling) > 1e6:
-            raise InputError(f"robot {self.name}: the coupling matrix cannot be inverted; a regular matrix needed")
+            raise InputError(
+                "E-ROBOT-COUPLING",
+                f"robot {self.name}: the coupling matrix cannot be inverted; a regular matrix needed",
+            )
         if self.elasticity is not None and len(self.elasticity.moment) != n:
             raise InputError(
-                f"robot {self.name}: elasticity of {len(self.elasticity.moment)} joints, {n} needed, as many as rows"
+                "E-ROBOT-ENTRIES",
+                f"robot {self.name}: elasticity of {len(self.elasticity.moment)} joints, {n} needed, as many as rows",
             )
 
     @property
@@ -246,7 +255,7 @@ class Robot:
         """flange_from_tool of the tool ``name``; InputError where there is none."""
         if name not in self.tools:
             known = ", ".join(repr(t) for t in self.tools)
-            raise InputError(f"robot {self.name}: no tool {name!r}; there are {known}")
+            raise InputError("E-ROBOT-NO-TOOL", f"robot {self.name}: no tool {name!r}; there are {known}")
         return self.tools[name]
 
     def loaded(self, payload_kg: float) -> "Robot":
@@ -383,7 +392,9 @@ class Chain:
         if self.grown is None:
             return tuple(range(len(self)))
         if self.grown.flange_joint is None:
-            raise InputError("the robot is a tree of joints, which has no one flange; a robot file of one arm needed")
+            raise InputError(
+                "E-ROBOT-TREE", "the robot is a tree of joints, which has no one flange; a robot file of one arm needed"
+            )
         return self.grown.tree.path(self.grown.flange_joint)
 
 

@@ -98,7 +98,7 @@ def load_urdf(
     try:
         content = read_bytes(path, SETTINGS_BYTES)
     except OSError as error:
-        raise InputError(f"{where}: {error.strerror or error}; check the path") from error
+        raise InputError("E-FILE-UNREADABLE", f"{where}: {error.strerror or error}; check the path") from error
     return read_urdf(content, where, from_link, to_link, convention)
 
 
@@ -114,13 +114,13 @@ def read_urdf(
     elements = root.findall("joint")
     joints = {joint.child: joint for joint in (_read_joint(each, where) for each in elements)}
     if len(joints) < len(elements):
-        raise InputError(f"{where}: a link is the child of two joints; a tree needed")
+        raise InputError("E-URDF-LINKS", f"{where}: a link is the child of two joints; a tree needed")
     links = [link.get("name", "") for link in root.findall("link")]
     links = list(dict.fromkeys([*links, *joints, *(joint.parent for joint in joints.values())]))
     given = [to_link] if isinstance(to_link, str) else list(to_link)
     for option, name in (("--from-link", from_link), *(("--to-link", name) for name in given)):
         if name and name not in links:
-            raise InputError(f"{where}: {option} {name}: no such link; there are {_few(links)}")
+            raise InputError("E-URDF-LINKS", f"{where}: {option} {name}: no such link; there are {_few(links)}")
     start = from_link or _root(joints, links, where)
     ends = {name if given[1:] else "": name for name in given} if any(given) else _tools(joints, start, where)
     paths = {name: _path(joints, start, end, where) for name, end in ends.items()}
@@ -148,20 +148,27 @@ def require_near(found: Poses, wanted: Poses) -> None:
     far = max(SAME_MM, 1e-12 * float(np.abs(wanted.translation).max()))
     if off[3:].max() > far or off[:3].max() > SAME_RAD:
         raise StcalError(
+            "E-ROBOT-READ-BACK",
             f"{WHAT}: the rows lead elsewhere, by {off[3:].max():.2g} mm and {off[:3].max():.2g} rad; {far:.2g} mm and "
-            f"{SAME_RAD:g} rad allowed"
+            f"{SAME_RAD:g} rad allowed",
         )
 
 
 def _require_chain(path: list[_UrdfJoint], start: str, end: str, where: str) -> None:
     moving = [joint for joint in path if joint.kind != "fixed"]
     if not moving:
-        raise InputError(f"{where}: no joint from {start} to {end} moves; other --from-link or --to-link needed")
+        raise InputError(
+            "E-URDF-LINKS", f"{where}: no joint from {start} to {end} moves; other --from-link or --to-link needed"
+        )
     for joint in moving:
         if joint.kind not in MOVING:
-            raise InputError(f"{where}: joint {joint.name} is {joint.kind}; fixed, {', '.join(MOVING)} are read")
+            raise InputError(
+                "E-URDF-JOINT", f"{where}: joint {joint.name} is {joint.kind}; fixed, {', '.join(MOVING)} are read"
+            )
         if joint.mimics:
-            raise InputError(f"{where}: joint {joint.name} mimics {joint.mimics}; joints of their own needed")
+            raise InputError(
+                "E-URDF-JOINT", f"{where}: joint {joint.name} mimics {joint.mimics}; joints of their own needed"
+            )
 
 
 def _robot_of(paths: dict[str, list[_UrdfJoint]], name: str, convention: Convention) -> Robot:
@@ -239,15 +246,15 @@ def _limited(joint: _UrdfJoint) -> Joint:
 
 def _parsed(content: bytes, where: str) -> ElementTree.Element:
     if b"<!ENTITY" in content:
-        raise InputError(f"{where}: defines entities of XML; write their values out")
+        raise InputError("E-URDF-ENTITIES", f"{where}: defines entities of XML; write their values out")
     try:
         root = ElementTree.fromstring(content)
     except (ElementTree.ParseError, ValueError, LookupError) as error:
-        raise InputError(f"{where}: not XML ({error}); correct it") from error
+        raise InputError("E-URDF-INVALID", f"{where}: not XML ({error}); correct it") from error
     if root.tag != "robot":
-        raise InputError(f"{where}: begins with <{root.tag}>, <robot> needed")
+        raise InputError("E-URDF-CONTENT", f"{where}: begins with <{root.tag}>, <robot> needed")
     if any("xacro" in str(element.tag) for element in root.iter()):
-        raise InputError(f"{where}: has macros of xacro; expand it first: xacro FILE > robot.urdf")
+        raise InputError("E-URDF-XACRO", f"{where}: has macros of xacro; expand it first: xacro FILE > robot.urdf")
     return root
 
 
@@ -257,18 +264,20 @@ def _read_joint(element: ElementTree.Element, where: str) -> _UrdfJoint:
     parts = {part.tag: part.attrib for part in element}
     parent, child = parts.get("parent", {}).get("link"), parts.get("child", {}).get("link")
     if not (name and parent and child):
-        raise InputError(f"{where}: its name, parent or child is missing; all three needed")
+        raise InputError("E-URDF-CONTENT", f"{where}: its name, parent or child is missing; all three needed")
     origin = parts.get("origin", {})
     place, turn = _three(origin.get("xyz", "0 0 0"), where), _three(origin.get("rpy", "0 0 0"), where)
     axis = _three(parts.get("axis", {}).get("xyz", "1 0 0"), where)
     length = float(np.linalg.norm(axis))
     if not length > 1e-9:
-        raise InputError(f"{where}: its axis has no direction; correct it")
+        raise InputError("E-URDF-CONTENT", f"{where}: its axis has no direction; correct it")
     limit, unit = None, METRE_MM if kind == "prismatic" else 1.0
     if "limit" in parts and kind != "continuous":
         ends = _three(" ".join([*(parts["limit"].get(end, "0") for end in ("lower", "upper")), "0"]), where)[:2]
         if ends[0] > ends[1]:
-            raise InputError(f"{where}: lower limit {ends[0]:g} is above upper {ends[1]:g}; swap or correct them")
+            raise InputError(
+                "E-URDF-LIMITS", f"{where}: lower limit {ends[0]:g} is above upper {ends[1]:g}; swap or correct them"
+            )
         if ends[0] < ends[1]:
             limit = (float(ends[0] * unit), float(ends[1] * unit))
     mimics = parts.get("mimic", {}).get("joint", "")
@@ -282,7 +291,7 @@ def _three(text: str, where: str) -> np.ndarray:
     except ValueError:
         values = np.zeros(0)
     if values.shape != (3,) or not np.isfinite(values).all() or np.abs(values).max() > UNLIMITED:
-        raise InputError(f"{where}: {text!r}: finite numbers up to {UNLIMITED:g} needed")
+        raise InputError("E-URDF-CONTENT", f"{where}: {text!r}: finite numbers up to {UNLIMITED:g} needed")
     return values
 
 
@@ -298,7 +307,9 @@ def _z_to(axis: np.ndarray) -> Rigid:
 def _root(joints: dict[str, _UrdfJoint], links: list[str], where: str) -> str:
     roots = [link for link in links if link not in joints]
     if len(roots) != 1:
-        raise InputError(f"{where}: {len(roots)} links are no joint's child; one root needed, or --from-link")
+        raise InputError(
+            "E-URDF-LINKS", f"{where}: {len(roots)} links are no joint's child; one root needed, or --from-link"
+        )
     return roots[0]
 
 
@@ -329,7 +340,7 @@ def _tools(joints: dict[str, _UrdfJoint], start: str, where: str) -> dict[str, s
     if not branches and TOOL0 in ends:
         return {"": TOOL0}
     every = [link for link in joints if link not in below] if branches else ends
-    raise InputError(f"{where}: several links may be the tool; give --to-link, one of {_few(every)}")
+    raise InputError("E-URDF-LINKS", f"{where}: several links may be the tool; give --to-link, one of {_few(every)}")
 
 
 def _path(joints: dict[str, _UrdfJoint], start: str, end: str, where: str) -> list[_UrdfJoint]:
@@ -337,7 +348,8 @@ def _path(joints: dict[str, _UrdfJoint], start: str, end: str, where: str) -> li
     while end != start:
         if end not in joints or len(found) > len(joints):
             raise InputError(
-                f"{where}: no joints lead from link {start} to the tool; other --from-link, --to-link needed"
+                "E-URDF-LINKS",
+                f"{where}: no joints lead from link {start} to the tool; other --from-link, --to-link needed",
             )
         found.append(joints[end])
         end = joints[end].parent

@@ -46,8 +46,9 @@ def robot_urdf(robot: Robot) -> str:
     """
     if robot.elasticity is not None:
         raise InputError(
+            "E-ROBOT-ELASTICITY",
             f"robot {robot.name}: a URDF has no place for its elasticity; remove [elasticity] for the axes alone, or "
-            "export compensated points (`stcal robot compensate --export`)"
+            "export compensated points (`stcal robot compensate --export`)",
         )
     chain = replace(robot, world_from_base=Rigid()).chain()
     root = ElementTree.Element("robot", name=robot.name)

@@ -174,8 +174,9 @@ def compensate(identified: Robot, targets: Targets, nominal: Robot | None = None
     """
     if nominal is not None and _built(nominal) != _built(identified):
         raise InputError(
+            "E-ROBOT-MISMATCH",
             f"nominal robot {nominal.name} and identified robot {identified.name}: joints of different number, type or "
-            "order; files of the same robot needed"
+            "order; files of the same robot needed",
         )
     if nominal is None:
         return _without_nominal(identified, targets)
@@ -225,8 +226,9 @@ def _rigid(robot: Robot, targets: Targets) -> tuple[str, ...]:
 def _without_nominal(identified: Robot, targets: Targets) -> Compensated:
     if targets.poses is None:
         raise InputError(
+            "E-TARGETS-NO-POSES",
             f"{targets.where}: joint values without poses; only the nominal robot knows which poses they command, "
-            "give its file with --nominal"
+            "give its file with --nominal",
         )
     confirmed, doubts = on_targets(identified, targets)
     found, none = joints_of(identified, targets, targets.poses, targets.q), np.zeros(0)

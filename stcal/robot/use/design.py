@@ -119,19 +119,22 @@ class DesignOptions:
     def __post_init__(self):
         if self.count < 1 or self.candidates <= self.count:
             raise InputError(
-                f"design: {self.count} poses of {self.candidates} candidates; more candidates than poses needed"
+                "E-DESIGN-OPTIONS",
+                f"design: {self.count} poses of {self.candidates} candidates; more candidates than poses needed",
             )
         if not (1e-9 <= self.sigma_mm <= 1e4 and 1e-12 <= self.sigma_rad <= 4):
             raise InputError(
+                "E-SIGMA-VALUE",
                 f"design: σ of {self.sigma_mm:g} mm and {self.sigma_rad:g} rad; positive numbers needed, "
-                "1e-9 to 1e4 mm and 1e-12 to 4 rad"
+                "1e-9 to 1e4 mm and 1e-12 to 4 rad",
             )
         if self.box is not None and (
             len(self.box) != 6 or any(not a < b for a, b in zip(self.box[:3], self.box[3:], strict=True))
         ):
             shown = ",".join(f"{v:g}" for v in self.box)
             raise InputError(
-                f"design: box {shown}; xmin,ymin,zmin,xmax,ymax,zmax needed, each minimum below its maximum"
+                "E-DESIGN-OPTIONS",
+                f"design: box {shown}; xmin,ymin,zmin,xmax,ymax,zmax needed, each minimum below its maximum",
             )
 
 
@@ -175,8 +178,9 @@ def design(robot: Robot, options: DesignOptions | None = None) -> PoseDesign:
     needed = -(-seen // rows.shape[1])
     if options.count < needed:
         raise DegenerateError(
+            "E-DESIGN-FEW",
             f"design: {options.count} poses with {rows.shape[1]} values each for {seen} parameters; "
-            f"at least {needed} needed, some tens advisable"
+            f"at least {needed} needed, some tens advisable",
         )
     chosen, exchanges = choose(rows, options.count)
     sets = [rng.choice(len(q), options.count, replace=False) for _ in range(RANDOM_SETS)]
@@ -208,8 +212,9 @@ def _candidates(robot: Robot, options: DesignOptions, rng: np.random.Generator) 
     open_ended = robot.prismatic & ~np.isfinite(high - low)
     if open_ended.any():
         raise InputError(
+            "E-ROBOT-LIMITS",
             f"robot {robot.name}: joint {np.flatnonzero(open_ended)[0] + 1} is prismatic without limits; "
-            "min_mm and max_mm needed"
+            "min_mm and max_mm needed",
         )
     low = np.where(np.isfinite(low), low, np.where(np.isfinite(high), high - 2 * np.pi, -np.pi))
     high = np.where(np.isfinite(high), high, low + 2 * np.pi)
@@ -219,8 +224,9 @@ def _candidates(robot: Robot, options: DesignOptions, rng: np.random.Generator) 
         if options.box is not None and drawn >= DRAWS * options.candidates:
             shown = ",".join(f"{v:g}" for v in options.box)
             raise InputError(
+                "E-DESIGN-BOX",
                 f"design: of {drawn} random joint vectors {count} bring the tool into the box {shown} mm, "
-                f"{options.candidates} needed; widen it (it is in the robot's base) or ask for fewer candidates"
+                f"{options.candidates} needed; widen it (it is in the robot's base) or ask for fewer candidates",
             )
         q = rng.uniform(low, high, (options.candidates, len(low)))
         drawn += len(q)

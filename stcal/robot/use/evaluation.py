@@ -175,7 +175,10 @@ def evaluate(robots: Mapping[str, Robot], data: Measurements, refit: Refit = "ba
     named = {name: replace(robot, name=name) for name, robot in robots.items()}
     for name, robot in named.items():
         if len(robot.rows) != data.q.shape[1]:
-            raise InputError(f"{data.where}: {data.q.shape[1]} joint values, robot {name} has {len(robot.rows)} joints")
+            raise InputError(
+                "E-ROBOT-MISMATCH",
+                f"{data.where}: {data.q.shape[1]} joint values, robot {name} has {len(robot.rows)} joints",
+            )
     seen = observed(data, None if data.positions is None else "position")
     _enough(seen, fit)
     states, wrong = _fitted(list(named.values()), data, seen, fit)
@@ -194,8 +197,9 @@ def _enough(seen: Observed, fit: Fit) -> None:
     numbers, seeks = WIDTH[seen.kind] * len(seen), _parameters(seen, fit)
     if numbers <= seeks:
         raise DegenerateError(
+            "E-IDENTIFY-FEW",
             f"{seen.data.where}: {len(seen)} {seen.kind}s give {numbers} numbers for {seeks} parameters of "
-            f"{' and '.join(sorted(fit))}; {seeks // WIDTH[seen.kind] + 1} or more needed, or fit less (--refit)"
+            f"{' and '.join(sorted(fit))}; {seeks // WIDTH[seen.kind] + 1} or more needed, or fit less (--refit)",
         )
 
 

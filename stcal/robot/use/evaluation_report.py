@@ -40,7 +40,7 @@ def names_of(files: Sequence[Path]) -> list[str]:
     stems, whole = [file.stem for file in files], [str(file) for file in files]
     if len(set(whole)) < len(whole):
         again = next(name for name in whole if whole.count(name) > 1)
-        raise InputError(f"--robot {again}: given twice; give each file once")
+        raise InputError("E-OPTION-REPEATED", f"--robot {again}: given twice; give each file once")
     return stems if len(set(stems)) == len(stems) else whole
 
 

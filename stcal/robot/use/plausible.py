@@ -65,8 +65,9 @@ def robots_apart(identified: Robot, nominal: Robot) -> str:
     )
     if apart > FITS * reach:
         raise InputError(
+            "E-ROBOT-MISMATCH",
             f"{said}, {FITS * reach:.3g} mm allowed, {FITS:.0%} of the reach: files of the same robot needed; check "
-            "units, D-H rows, convention and coupling of both"
+            "units, D-H rows, convention and coupling of both",
         )
     return f"{said}, more than arms are off their drawing ({USUAL:.0%} of the reach): are both files of this robot?"
 
@@ -103,7 +104,7 @@ def on_targets(robot: Robot, targets: Targets) -> tuple[bool, tuple[str, ...]]:
 def position_misfit_mm(robot: Robot, targets: Targets) -> float:
     """By how much (RMS) joint values miss the positions of the poses beside them."""
     if targets.poses is None:
-        raise InputError(f"{targets.where}: joint values without poses; columns x_mm … qz needed")
+        raise InputError("E-TARGETS-NO-POSES", f"{targets.where}: joint values without poses; columns x_mm … qz needed")
     return _rms(poses_of(robot, targets, targets.joints()).translation - targets.poses.translation)
 
 
@@ -122,8 +123,9 @@ def _explain(robot: Robot, targets: Targets, poses: Poses, q: np.ndarray, own: f
         left, turn = _rms(off[:, 3:]), _rms(off[:, :3])
         if left < min(FITS * reach, EXPLAINS * own) and turn < TURNED_RAD:
             raise InputError(
+                "E-ROBOT-MISMATCH",
                 f"{targets.where}: joint values of robot {robot.name} lead {own:.4g} mm (RMS) away from their poses, "
-                f"{FITS * reach:.3g} mm allowed, {FITS:.0%} of the reach; but {left:.3g} mm if {reason}"
+                f"{FITS * reach:.3g} mm allowed, {FITS:.0%} of the reach; but {left:.3g} mm if {reason}",
             )
 
 

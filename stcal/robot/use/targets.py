@@ -79,7 +79,9 @@ class Targets:
     def joints(self) -> np.ndarray:
         """(m, n) commanded joint values, rad or mm; refused where there are none."""
         if self.q is None:
-            raise InputError(f"{self.where}: poses without joint values; columns q1_deg … needed")
+            raise InputError(
+                "E-TARGETS-NO-JOINTS", f"{self.where}: poses without joint values; columns q1_deg … needed"
+            )
         return self.q
 
 
@@ -121,20 +123,26 @@ def read_targets(
     has_poses = table.has("x", LENGTHS)
     if not has_poses and not has_joints:
         raise InputError(
+            "E-TARGETS-NO-POSES",
             f"{table.where}: neither poses x_mm … qz nor joint values q1_deg …; commanded poses are needed; "
-            f"the header is {table.header()}"
+            f"the header is {table.header()}",
         )
     poses, columns, said = oriented(table, rotation) if has_poses else (None, (), ())
     if rotation is not None and not has_poses:
-        raise InputError(f"{table.where}: --rotation {rotation}, but no positions with angles; leave it out")
+        raise InputError(
+            "E-OPTION-NEEDS", f"{table.where}: --rotation {rotation}, but no positions with angles; leave it out"
+        )
     if has_poses and poses is None:
-        raise InputError(f"{table.where}: positions without orientation; {ORIENTATION} needed")
+        raise InputError(
+            "E-TARGETS-NO-ORIENTATION", f"{table.where}: positions without orientation; {ORIENTATION} needed"
+        )
     tools = targets_of(table)
     for line, tool in zip(table.lines, tools, strict=True):
         if tool not in robot.tools:
             known = ", ".join(repr(name) for name in robot.tools)
             raise InputError(
-                f"{table.where}: line {line}: target {tool!r} is not in robot {robot.name}; there are {known}"
+                "E-ROBOT-NO-TOOL",
+                f"{table.where}: line {line}: target {tool!r} is not in robot {robot.name}; there are {known}",
             )
     if poses is not None:
         within(table, "position", poses.translation, "mm")

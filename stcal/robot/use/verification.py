@@ -151,8 +151,9 @@ def _names(table: Table, sets: tuple[str, ...], commanded: np.ndarray) -> tuple[
         for line, key in zip(table.lines, zip(sets, names, strict=True), strict=True):
             if key in seen:
                 raise InputError(
+                    "E-TABLE-ROW-REPEATED",
                     f"{table.where}: line {line}: pose {key[1]} of set {key[0]} stands on line {seen[key]} already; "
-                    "give the sets different names"
+                    "give the sets different names",
                 )
             seen[key] = line
         return names
@@ -195,8 +196,9 @@ def verify(data: MeasuredPoses) -> Verification:
     missing = {group: tuple(name for name in every if name not in own) for group, own in rows.items()}
     if len(common) < 3:
         raise InputError(
+            "E-VERIFY-FEW",
             f"{data.where}: {len(common)} poses in {'all of the sets ' if len(rows) > 1 else ''}{', '.join(rows)}; "
-            "at least 3 needed; are the commanded positions of the sets the same?"
+            "at least 3 needed; are the commanded positions of the sets the same?",
         )
     index = {group: np.array([own[name] for name in common]) for group, own in rows.items()}
     first = next(iter(index.values()))
@@ -205,8 +207,9 @@ def verify(data: MeasuredPoses) -> Verification:
         if off.max() > SAME_MM:
             k = int(off.argmax())
             raise InputError(
+                "E-VERIFY-COMMANDED",
                 f"{data.where}: pose {common[k]} is commanded {off[k]:.4g} mm apart in sets {next(iter(index))} and "
-                f"{group} (line {data.lines[own[k]]}); the same commands needed"
+                f"{group} (line {data.lines[own[k]]}); the same commands needed",
             )
     sets = tuple(_set_result(data, group, own) for group, own in index.items())
     at = data.commanded[first]
@@ -227,7 +230,9 @@ def _set_result(data: MeasuredPoses, name: str, rows: np.ndarray) -> SetResult:
         wanted_squares += float(wanted @ wanted)
         pairs += i
     if wanted_squares == 0:
-        raise InputError(f"{data.where}: set {name}: all commanded positions are the same; different ones needed")
+        raise InputError(
+            "E-VERIFY-ALIKE", f"{data.where}: set {name}: all commanded positions are the same; different ones needed"
+        )
     return SetResult(
         name=name,
         error_mm=error,

@@ -80,7 +80,7 @@ def calibrate(
     try:
         calibrated = (chain_singly if published else chain_faces)(faces, target, options.reference_face)
     except MappingError as error:  # a face without a frame may be why
-        raise MappingError("; ".join([str(error), *notes])) from error
+        raise MappingError(error.code, "; ".join([str(error), *notes])) from error
     factor = image_sigma_factor(models, camera)
     metric = [_placed(m, scales[m.group], calibrated) for m in models if m.group in calibrated.target_from_group]
     joint = None

@@ -98,15 +98,17 @@ def _ways(faces: Sequence[FaceInGroup], target: TargetDesign, reference: str) ->
     seen = {each.face for each in faces}
     if reference not in seen:
         raise MappingError(
+            "E-FACE-REFERENCE",
             f"reference face {reference}: not mapped in any group; add a group that shows it, or choose one of "
-            f"{', '.join(sorted(seen)) or 'none'} with --reference-face"
+            f"{', '.join(sorted(seen)) or 'none'} with --reference-face",
         )
     chains = {face_id: _chains(faces, reference, face_id) for face_id in sorted(seen)}
     unlinked = [face_id for face_id, found in chains.items() if not found]
     if unlinked:
         raise MappingError(
+            "E-FACE-UNLINKED",
             f"face {', '.join(unlinked)}: never linked to reference face {reference}; "
-            f"add a group that shows it together with {reference} or a face that is linked"
+            f"add a group that shows it together with {reference} or a face that is linked",
         )
     return chains
 

@@ -68,13 +68,16 @@ def with_unmapped(
     names = " and ".join(f"{face.id}:{circle}" for circle in missing)
     if len(common) < MIN_PLACING:
         raise DegenerateError(
+            "E-FACE-FRAME-CIRCLES",
             f"face {face.id}: frame circle {names} not mapped, and {len(common)} other circles, {MIN_PLACING} needed; "
-            "add views that show it"
+            "add views that show it",
         )
     try:
         model_from_known = align_rigid(np.array([xyz[c] for c in common]), np.array([known[c] for c in common]))
     except DegenerateError as error:
-        raise DegenerateError(f"face {face.id}: frame circle {names} not mapped; add views that show it") from error
+        raise DegenerateError(
+            "E-FACE-FRAME-CIRCLES", f"face {face.id}: frame circle {names} not mapped; add views that show it"
+        ) from error
     return dict(xyz) | {circle: model_from_known @ known[circle] for circle in missing}
 
 
@@ -115,7 +118,9 @@ def face_frame(face: FaceDesign, xyz: dict[str, np.ndarray], kind: FrameKind, to
     """
     if missing := missing_frame_circles(face, xyz):
         names = " and ".join(f"{face.id}:{circle}" for circle in missing)
-        raise DegenerateError(f"face {face.id}: frame circle {names} not mapped; add views that show it")
+        raise DegenerateError(
+            "E-FACE-FRAME-CIRCLES", f"face {face.id}: frame circle {names} not mapped; add views that show it"
+        )
     frames = face_frames(face, tuple(xyz), np.array(list(xyz.values()))[None], kind, towards)
     return Rigid(frames.rotation[0], frames.translation[0])
 
@@ -133,7 +138,9 @@ def face_frames(
     across = along_y - (along_y * axis_x).sum(1, keepdims=True) * axis_x
     length = np.linalg.norm(across, axis=1, keepdims=True)
     if (length[:, 0] < 1e-6 * np.linalg.norm(along_y, axis=1)).any():
-        raise DegenerateError(f"face {face.id}: its frame circles are mapped in one line; check their labels")
+        raise DegenerateError(
+            "E-FACE-COLLINEAR", f"face {face.id}: its frame circles are mapped in one line; check their labels"
+        )
     axis_y = across / length
     return Poses(np.stack([axis_x, axis_y, np.cross(axis_x, axis_y)], axis=2), origin)
 

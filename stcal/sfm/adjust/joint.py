@@ -296,8 +296,9 @@ def _minimise(blocks: list[Block], shared: Shared, setting: Setting) -> tuple[li
     move = max(_largest_move(a, last.shared, b, beyond.shared) for a, b in zip(last.blocks, beyond.blocks, strict=True))
     if not move <= MAX_MOVE_PX:  # not a number either
         raise ConvergenceError(
+            "E-NO-MINIMUM",
             f"joint adjustment: projections still move by {move:.1g} px in the last of at most {MAX_STEPS} steps; "
-            "compare with --solve chain and look at the outliers"
+            "compare with --solve chain and look at the outliers",
         )
     return list(last.blocks), last.shared, float(move)
 
@@ -308,8 +309,9 @@ def _block(model: MetricModel, board: BoardDesign, labels: tuple[CircleLabel, ..
     circles = np.array([i for i, label in enumerate(model.labels) if isinstance(label, CircleLabel)], int)
     if len(dots) < MIN_DOTS:
         raise ScaleError(
+            "E-SCALE-FEW-DOTS",
             f"group {model.group}: {len(dots)} board dots in the joint adjustment, {MIN_DOTS} needed; "
-            "photograph the board with the faces"
+            "photograph the board with the faces",
         )
     design = board.places_mm(model.labels[i] for i in dots)
     return Block(

@@ -41,16 +41,19 @@ class AdjustOptions:
             ("frame", self.frame, get_args(FrameKind)),
         ):
             if value not in choices:
-                raise InputError(f"{what} {value!r}: not a choice; use {' or '.join(choices)}")
+                raise InputError("E-OPTION-VALUE", f"{what} {value!r}: not a choice; use {' or '.join(choices)}")
         if self.flatness_mm is not None and not LEAST <= self.flatness_mm <= MOST_FLATNESS_MM:
             raise InputError(
-                f"--flatness {self.flatness_mm:g}: a σ in mm, {LEAST:g} to {MOST_FLATNESS_MM:g} needed, or off"
+                "E-OPTION-RANGE",
+                f"--flatness {self.flatness_mm:g}: a σ in mm, {LEAST:g} to {MOST_FLATNESS_MM:g} needed, or off",
             )
         if self.solve == "paper" and (self.eccentricity or self.frame != "three-point"):
             raise InputError(
-                "--solve paper: three-point frames without eccentricity, as published; leave --frame out, or use chain"
+                "E-OPTION-CONFLICT",
+                "--solve paper: three-point frames without eccentricity, as published; leave --frame out, or use chain",
             )
         if self.refine_camera and self.solve != "joint":
             raise InputError(
-                f"--refine-camera: part of the joint adjustment, the solve is {self.solve}; use --solve joint"
+                "E-OPTION-NEEDS",
+                f"--refine-camera: part of the joint adjustment, the solve is {self.solve}; use --solve joint",
             )

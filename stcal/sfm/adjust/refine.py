@@ -76,8 +76,9 @@ def refine(
         if change <= SETTLED_PX:
             return Refined(model, rounds, tuple(outliers))
     raise ConvergenceError(
+        "E-NO-MINIMUM",
         f"group {model.group}: the eccentricity still changes by {change:.2g} px after {MAX_ROUNDS} rounds, "
-        f"{SETTLED_PX:g} needed; check the radii in the target and board files"
+        f"{SETTLED_PX:g} needed; check the radii in the target and board files",
     )
 
 
@@ -85,9 +86,10 @@ def _require_few(outliers: list[Outlier], observations: int, group: str) -> None
     """Outliers are few, or the model is wrong and not they."""
     if len(outliers) > MAX_OUTLIER_SHARE * observations:
         raise MappingError(
+            "E-GROUP-CONTRADICTS",
             f"group {group}: more than {100 * MAX_OUTLIER_SHARE:.0f} % of {observations} observations contradict the "
             f"others, first {outliers[0].image} {outliers[0].label} by {outliers[0].residual_px:.1f} px; "
-            "check that the camera file belongs to the images, and that nothing but the camera moved"
+            "check that the camera file belongs to the images, and that nothing but the camera moved",
         )
 
 
@@ -106,8 +108,9 @@ def eccentricity_px(model: GroupModel, camera: Camera, radius_mm: dict[Label, fl
         except DegenerateError as error:
             what = "the board" if key == "board" else f"face {key}"
             raise MappingError(
+                "E-GROUP-FEW-CIRCLES",
                 f"group {model.group}: {what}: {len(members)} circles mapped, 3 off one line needed for its plane; "
-                f"add views that show {what}"
+                f"add views that show {what}",
             ) from error
     radius = np.array([radius_mm[label] for label in model.labels]) / mm_per_unit
     rotation = np.stack([pose.rotation for pose in model.camera_from_model])[model.image_index]

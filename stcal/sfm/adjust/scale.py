@@ -71,8 +71,9 @@ def find_scale(model: WorldModel, board: BoardDesign, by_rows: bool = False) -> 
     where = f"group {model.group}: scale"
     if len(members) < MIN_DOTS:
         raise ScaleError(
+            "E-SCALE-FEW-DOTS",
             f"{where}: {len(members)} board dots mapped, {MIN_DOTS} needed; photograph the board with the faces; "
-            "check that the camera file belongs to the images and the board file to the board"
+            "check that the camera file belongs to the images and the board file to the board",
         )
     labels = [model.labels[i] for i in members]
     cells = dot_cells(labels)
@@ -81,7 +82,9 @@ def find_scale(model: WorldModel, board: BoardDesign, by_rows: bool = False) -> 
     try:
         board_from_world = align_similarity(xyz_board, xyz_world)
     except DegenerateError as error:
-        raise ScaleError(f"{where}: the mapped board dots lie in one line; show more rows of the board") from error
+        raise ScaleError(
+            "E-SCALE-COLLINEAR", f"{where}: the mapped board dots lie in one line; show more rows of the board"
+        ) from error
     spread = np.sqrt(((xyz_board - xyz_board.mean(0)) ** 2).sum())
     mean_ratio, rows = _by_rows(xyz_board, xyz_world, cells[:, 0])
     if by_rows:

@@ -120,7 +120,8 @@ def budget_of_run(run: SavedRun, statement: Statement | None = None) -> Budget:
     """
     if run.faces.solve != "joint" or not run.faces.eccentricity:
         raise InputError(
-            f"run {run.folder}: solved by {run.faces.solve}, which states no covariance; run again with --solve joint"
+            "E-BUDGET-NO-COVARIANCE",
+            f"run {run.folder}: solved by {run.faces.solve}, which states no covariance; run again with --solve joint",
         )
     again = adjusted_run(run)
     found = contributions_of(again.state)

@@ -92,10 +92,15 @@ def against_stated(budget: Budget, path: Path) -> LengthTest:
         where = f"{table.where}: line {line}"
         for name in pair:
             if name not in places:
-                raise InputError(f"{where}: no circle {name} in the run; give one such as {joint.labels[0]}")
+                raise InputError(
+                    "E-BUDGET-LENGTHS", f"{where}: no circle {name} in the run; give one such as {joint.labels[0]}"
+                )
         if pair[0] == pair[1] or value <= 0 or own < 0:
-            raise InputError(f"{where}: {pair[0]} to {pair[1]}, {value:g} ± {own:g} mm; a length between two circles "
-                             "needed, and a σ of 0 or more")  # fmt: skip
+            raise InputError(
+                "E-BUDGET-LENGTHS",
+                f"{where}: {pair[0]} to {pair[1]}, {value:g} ± {own:g} mm; a length between two circles needed, "
+                "and a σ of 0 or more",
+            )
         i, j = places[pair[0]], places[pair[1]]
         measured, standard = _measured(budget, i, j)
         expanded = COVERAGE_FACTOR * float(np.hypot(standard, own))
@@ -117,7 +122,9 @@ def against_run(budget: Budget, other: Budget, folder: Path, boards: Sequence[Bo
     own, its = (_places(each.joint, both) for each in (budget, other))
     pairs = longest_of(both, budget.joint.xyz_model[own])
     if not pairs:
-        raise InputError(f"run {folder}: {len(both)} circles in common, 2 needed; give a run of the same target")
+        raise InputError(
+            "E-BUDGET-LENGTHS", f"run {folder}: {len(both)} circles in common, 2 needed; give a run of the same target"
+        )
     shared = SHARED if _same(*boards) else ("target_expansion",)
     found = []
     for i, j in pairs:

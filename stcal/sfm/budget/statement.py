@@ -75,10 +75,13 @@ def fields_of(given: Sequence[str]) -> dict[str, str]:
     for text in given:
         name, sign, value = (part.strip() for part in text.partition("="))
         if not sign or not name:
-            raise InputError(f"--field {text!r}: NAME=VALUE needed, such as operator='A. Smith'")
+            raise InputError("E-OPTION-VALUE", f"--field {text!r}: NAME=VALUE needed, such as operator='A. Smith'")
         if name in found:
-            raise InputError(f"--field {name}: given twice; give it once")
+            raise InputError("E-OPTION-REPEATED", f"--field {name}: given twice; give it once")
         if len(name) > 60 or len(value) > LONGEST:
-            raise InputError(f"--field {name[:20]}: {len(text)} characters; up to 60 for a name, {LONGEST} for a value")
+            raise InputError(
+                "E-OPTION-VALUE",
+                f"--field {name[:20]}: {len(text)} characters; up to 60 for a name, {LONGEST} for a value",
+            )
         found[name] = value
     return found

@@ -145,7 +145,10 @@ def require_model(colmap_model: str) -> None:
         With those there are.
     """
     if colmap_model not in COLMAP_MODELS:
-        raise InputError(f"camera model {colmap_model}: not supported; use one of {', '.join(COLMAP_MODELS)} or {AUTO}")
+        raise InputError(
+            "E-CAMERA-MODEL",
+            f"camera model {colmap_model}: not supported; use one of {', '.join(COLMAP_MODELS)} or {AUTO}",
+        )
 
 
 def of_chosen_model(
@@ -205,7 +208,9 @@ def first_size(files: list[ImageFile]) -> tuple[int, int]:
         except (InputError, OSError):
             continue
         return width, height
-    raise InputError(f"no readable image among {len(files)}, first {files[0].name}; check the files")
+    raise InputError(
+        "E-IMAGES-NONE-READABLE", f"no readable image among {len(files)}, first {files[0].name}; check the files"
+    )
 
 
 def _detect(
@@ -244,12 +249,14 @@ def require_views(views: Sequence[ImageObservations], files: int, skipped: Seque
     why = "".join(f"; {s.name}: {s.reason}" for s in skipped[:1])
     if not views:
         raise DetectionError(
+            "E-BOARD-NOT-FOUND",
             f"camera: no board recognised in {files} images{why}; check the board file (rows, columns, polarity, "
-            "radius) and keep a third of the dots in view at least"
+            "radius) and keep a third of the dots in view at least",
         )
     raise DegenerateError(
+        "E-CALIBRATE-FEW-VIEWS",
         f"camera: {len(views)} of {files} images show the board, {MIN_VIEWS} needed, 10 and more advised{why}; "
-        "add views in which it is tilted by 20° to 40°"
+        "add views in which it is tilted by 20° to 40°",
     )
 
 
@@ -263,15 +270,17 @@ def require_determined(result: Intrinsics, views: Sequence[ImageObservations]) -
     relative = float((result.sigma()[0] / result.camera.focal[0]).max())
     if relative > MAX_FOCAL_SIGMA:
         raise DegenerateError(
+            "E-CALIBRATE-UNDETERMINED",
             f"camera: focal length determined to {100 * relative:.2g} % by {len(views)} views, "
             f"{100 * MAX_FOCAL_SIGMA:.0f} % needed (largest angle between boards {_spread_deg(result):.0f}°); "
-            "add views in which the board is tilted by 20° to 40°, about different axes"
+            "add views in which the board is tilted by 20° to 40°, about different axes",
         )
     rms = residual_rms_px(result)
     if rms > MAX_RESIDUAL_PX:
         raise DegenerateError(
+            "E-CALIBRATE-MISFIT",
             f"camera: dots are {rms:.1f} px RMS from where {result.colmap_model} puts them, {MAX_RESIDUAL_PX:g} px "
-            "allowed; choose a --model with more parameters, check the board file, use images of one focus and zoom"
+            "allowed; choose a --model with more parameters, check the board file, use images of one focus and zoom",
         )
 
 

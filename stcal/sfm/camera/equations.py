@@ -277,8 +277,9 @@ def minimum(state: State, setting: Setting) -> State:
         move = found.linear.largest_move(found.linear.step(START_DAMPING)[0])
         if not move < CREEPING_PX:
             raise ConvergenceError(
+                "E-NO-MINIMUM",
                 f"camera: projections still move by {move:.1g} px after {found.steps} steps, {CREEPING_PX:g} px "
-                "needed; look at the images, add views that fill the image and are tilted, or choose a simpler --model"
+                "needed; look at the images, add views that fill the image and are tilted, or choose a simpler --model",
             )
     return found.state
 

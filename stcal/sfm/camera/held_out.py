@@ -156,7 +156,10 @@ def choose_model(
 
 
 def _too_few(count: int) -> StcalError:
-    return DegenerateError(f"--model auto: {count} views, {MIN_TRAINING + 1} needed; add views, or choose a --model")
+    return DegenerateError(
+        "E-CALIBRATE-FEW-VIEWS",
+        f"--model auto: {count} views, {MIN_TRAINING + 1} needed; add views, or choose a --model",
+    )
 
 
 def _row(model: str, outcome: HeldOut | None, squares: dict[str, np.ndarray], best: str, why: str) -> Candidate:

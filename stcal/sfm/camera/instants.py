@@ -127,8 +127,9 @@ def _by_instant(names: Sequence[str], sightings: Sequence[Sighting]) -> list[dic
         if each.instant in own[each.camera]:
             both = f"{own[each.camera][each.instant].view.name} and {each.view.name}"
             raise InputError(
+                "E-RIG-INSTANT",
                 f"rig: camera {names[each.camera]}: {both} are both of one instant; one image of each camera and "
-                "instant needed"
+                "instant needed",
             )
         own[each.camera][each.instant] = each
     return own
@@ -136,9 +137,10 @@ def _by_instant(names: Sequence[str], sightings: Sequence[Sighting]) -> list[dic
 
 def _alone(names: Sequence[str], own: Sequence[Mapping[str, Sighting]], rest: list[str], k: int) -> DegenerateError:
     return DegenerateError(
+        "E-RIG-UNLINKED",
         f"rig: camera {names[k]} shares no instant with {', '.join(rest)}: its images, such as {next(iter(own[k]))}, "
         "show the board when theirs do not, or have other names; add images of one instant, named alike in both "
-        "folders, that show the board"
+        "folders, that show the board",
     )
 
 
@@ -179,9 +181,10 @@ def _where(
     as_good = [relations[i] for i in np.flatnonzero(middle < limit)]
     if len(turns) > 1 and any(np.median(_off_px(camera, each @ expected, own[:, None])) > limit for each in as_good):
         raise DegenerateError(
+            "E-RIG-TURNED",
             f"rig: camera {name}: {len(seen)} shared instants do not tell which way round it saw the board, which "
             "looks the same after a turn; add instants with the board turned and tilted, or use a board with one "
-            "larger dot"
+            "larger dot",
         )
     return _Where(relations[best], off[best].argmin(axis=1).tolist(), least[best].tolist(), limit)
 

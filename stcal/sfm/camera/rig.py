@@ -84,7 +84,7 @@ def calibrate_rig(cameras: Mapping[str, CameraCalibration], board: BoardDesign, 
         A camera shares no instant with the rest, or no minimum is reached.
     """
     if len(cameras) < 2:
-        raise InputError(f"rig: {len(cameras)} camera, 2 needed; calibrate one without --rig")
+        raise InputError("E-RIG-CAMERAS", f"rig: {len(cameras)} camera, 2 needed; calibrate one without --rig")
     names, alone = tuple(cameras), tuple(cameras.values())
     sightings = [each for k, camera in enumerate(alone) for each in _sightings(k, camera)]
     together = gathered(names, [each.intrinsics.camera for each in alone], sightings, board, unique)

@@ -75,8 +75,9 @@ def projection_jacobian(camera: Camera, colmap_model: str) -> np.ndarray:
         ideal = camera.normalised_from_pixel(image_grid(camera))
     except ConvergenceError as error:
         raise DegenerateError(
+            "E-CAMERA-FOLDED",
             "camera: the distortion folds over inside the image, where no dots are; add views that fill the image "
-            "to its corners, or choose a --model with fewer parameters"
+            "to its corners, or choose a --model with fewer parameters",
         ) from error
     jacobian = camera.parameter_jacobian(ideal) @ intrinsic_basis(colmap_model)
     x, y = ideal.T

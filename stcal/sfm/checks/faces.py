@@ -72,7 +72,7 @@ def _adjusted(models: Sequence[MetricModel], board, camera, flatness_mm) -> Join
 
 
 def _unfixed(models: Sequence[MetricModel]) -> DegenerateError:
-    return DegenerateError(f"{len(models)} groups do not fix the target; add images")
+    return DegenerateError("E-GROUPS-UNFIXED", f"{len(models)} groups do not fix the target; add images")
 
 
 def _difference(a: Rigid, b: Rigid) -> np.ndarray:

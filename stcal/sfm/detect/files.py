@@ -112,7 +112,7 @@ def detect_files(
     images, skipped = _without_copies([f for f in found if f is not None], forms)
     if not images:
         first = skipped[0]
-        raise InputError(f"no usable image among {len(files)}: {first.name}: {first.reason}")
+        raise InputError("E-IMAGES-NONE-USABLE", f"no usable image among {len(files)}: {first.name}: {first.reason}")
     return DetectionResult(tuple(images), tuple(skipped), camera)
 
 
@@ -127,7 +127,9 @@ def sized_by(camera_model: CameraModel, files: list[ImageFile]) -> tuple[Camera,
             continue
         camera_model.require_inside(width, height, file.name)
         return camera_model.sized(width, height), "the first readable image"
-    raise InputError(f"no readable image among {len(files)}, first {files[0].name}; check the files")
+    raise InputError(
+        "E-IMAGES-NONE-READABLE", f"no readable image among {len(files)}, first {files[0].name}; check the files"
+    )
 
 
 def _fingerprint(
@@ -187,7 +189,7 @@ def _stored(file: ImageFile, cache: Path, key: str, content: bytes) -> DetectedI
     save(path, content)
     found = _load(file, path, reused=False)
     if found is None:
-        raise InputError(f"{path}: written, and cannot be read again; check the disk")
+        raise InputError("E-OUTPUT-READ-BACK", f"{path}: written, and cannot be read again; check the disk")
     return found
 
 
@@ -398,7 +400,8 @@ def require_upright(images: tuple[DetectedImage, ...]) -> None:
     if mirrored and len(mirrored) > len(upright):
         first = mirrored[0]
         raise DetectionError(
+            "E-FACES-MIRRORED",
             f"{len(mirrored)} of {len(mirrored) + len(upright)} images with a face are mirrored, first "
             f"{first.file.name}: face {', '.join(first.detection.mirrored)} is seen as in a mirror; turn the images "
-            "back, or use the files that the camera wrote"
+            "back, or use the files that the camera wrote",
         )

@@ -34,7 +34,10 @@ def draw_overlay(
     """
     picture = cv2.imdecode(np.frombuffer(thumbnail, np.uint8), cv2.IMREAD_COLOR)
     if picture is None:
-        raise InputError(f"{observations.name}: its small picture in cache/ is damaged; remove that folder, run again")
+        raise InputError(
+            "E-RUN-DAMAGED",
+            f"{observations.name}: its small picture in cache/ is damaged; remove that folder, run again",
+        )
     if picture.shape[1] < MIN_WIDTH_PX:  # room for the labels of small circles
         picture, scale = cv2.resize(picture, None, fx=2, fy=2, interpolation=cv2.INTER_CUBIC), 2 * scale
     size = max(0.4, picture.shape[1] / 2800)

@@ -83,9 +83,10 @@ class PublishedPattern:
             return cls._of(target)
         except (LookupError, ValueError) as error:
             raise InputError(
+                "E-TARGET-NOT-PUBLISHED",
                 f"target {target.name}: not read by the rules of Zhang & Wei (2017) ({error}); --solve paper needs "
                 "faces with large circles along X, Y and the diagonal, a small one beside the origin on each axis, and "
-                "a small one beside the diagonal's last whose direction names the face; use joint or chain"
+                "a small one beside the diagonal's last whose direction names the face; use joint or chain",
             ) from error
 
     @classmethod

@@ -50,7 +50,9 @@ def diagnose(
         A damaged run, one of another version, or a folder of photographs that does not exist.
     """
     if images is not None and not images.is_dir():
-        raise InputError(f"image folder {images}: not a folder; give the folder of the run's images with --images")
+        raise InputError(
+            "E-IMAGES-FOLDER", f"image folder {images}: not a folder; give the folder of the run's images with --images"
+        )
     ids = image_ids(run.observations)
     models = read_model(run.folder / "target_model", run.observations, ids, run.corrected_px).in_mm()
     mapped = {name for model in models for name in model.images}
@@ -58,7 +60,7 @@ def diagnose(
         findings = [*_files(run), *_images(run, mapped), *_circles(run), *_faces(run)]
         files, circles = run.report["summary"]["files"], run.faces.circles
     except (KeyError, TypeError) as error:
-        raise InputError(f"run {run.folder}: of another version ({error}); run it again") from error
+        raise InputError("E-RUN-VERSION", f"run {run.folder}: of another version ({error}); run it again") from error
     jobs = _jobs(run, images or run.images, models, circles)
     examined = _side_by_side(_examine, [(job,) for job in jobs], "examine", workers, progress)
     options = _try_options(run, jobs, examined, workers, progress)
@@ -219,7 +221,7 @@ def _try(job: _Job, tried: list[OptionTrial]) -> dict[str, set[str]]:
     """Labels that each option finds; for an image without a pose those known, if they are enough to place it."""
     image, problem = _decoded(job)
     if image is None:
-        raise InputError(problem)
+        raise InputError("E-RUN-IMAGES", problem)
     found = {}
     for trial in tried:
         labels = labels_found(image, job.camera, job.target, job.board, trial.options, job.expected)

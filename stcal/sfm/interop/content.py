@@ -30,7 +30,7 @@ PAIRED = ("matches", "two_view_geometries")
 
 def damaged(path: Path, sign: str) -> InputError:
     """A database that is not as it should be."""
-    return InputError(f"{path}: damaged ({sign}); make the run again")
+    return InputError("E-RUN-DAMAGED", f"{path}: damaged ({sign}); make the run again")
 
 
 def require_whole(database: Path, copy: sqlite3.Connection) -> None:
@@ -148,7 +148,9 @@ def _require_camera(database: Path, copy: sqlite3.Connection, run: SavedRun) -> 
     own = colmap_camera(run.camera)
     wanted = (own.model.value, own.width, own.height, np.asarray(own.params, float).tobytes())
     if copy.execute("SELECT model, width, height, params FROM cameras").fetchall() != [wanted]:
-        raise InputError(f"{database}: its camera is not that of {run.folder / 'cameras.txt'}; run again")
+        raise InputError(
+            "E-RUN-DATABASE", f"{database}: its camera is not that of {run.folder / 'cameras.txt'}; run again"
+        )
 
 
 def _require_keypoints(database: Path, copy: sqlite3.Connection, run: SavedRun, ids: dict[str, int]) -> None:
@@ -160,16 +162,17 @@ def _require_keypoints(database: Path, copy: sqlite3.Connection, run: SavedRun, 
         cols, data = keypoints.get(ids[image.name], (2, b""))
         xy = from_colmap_px(np.frombuffer(data or b"", np.float32).reshape(-1, cols or 2)[:, :2])
         if names.get(image.name) != ids[image.name] or len(xy) != len(expected):
-            raise InputError(f"{database}: its keypoints of {image.name} are {labels}; run again")
+            raise InputError("E-RUN-DATABASE", f"{database}: its keypoints of {image.name} are {labels}; run again")
         off = np.abs(xy - expected).max(initial=0)
         if not off <= KEYPOINT_TOLERANCE_PX:
             raise InputError(
+                "E-RUN-DATABASE",
                 f"{database}: its keypoints of {image.name} are {labels} (up to {off:.3g} px off, "
-                f"{KEYPOINT_TOLERANCE_PX:g} allowed); run again"
+                f"{KEYPOINT_TOLERANCE_PX:g} allowed); run again",
             )
     if len(names) > len(ids):
         other = next(name for name in names if name not in ids)
-        raise InputError(f"{database}: its images, with {other}, are {labels}; run again")
+        raise InputError("E-RUN-DATABASE", f"{database}: its images, with {other}, are {labels}; run again")
 
 
 def _require_matches(database: Path, copy: sqlite3.Connection, run: SavedRun, ids: dict[str, int]) -> None:
@@ -187,7 +190,7 @@ def _require_matches(database: Path, copy: sqlite3.Connection, run: SavedRun, id
             if not np.array_equal(matches, match_labels(a, b)):
                 wrong = [f"{a.labels[i]} with {b.labels[j]}" for i, j in matches.tolist() if a.labels[i] != b.labels[j]]
                 what = f"match {wrong[0]}" if wrong else "do not match all that have the same label"
-                raise InputError(f"{database}: {table}: {a.name} and {b.name} {what}; run again")
+                raise InputError("E-RUN-DATABASE", f"{database}: {table}: {a.name} and {b.name} {what}; run again")
         if whole and found != wanted:
             count = f"{len(found)} pairs of images, the {len(wanted)} of {run.folder / 'labels.csv'} needed"
-            raise InputError(f"{database}: {table}: {count}; run again")
+            raise InputError("E-RUN-DATABASE", f"{database}: {table}: {count}; run again")

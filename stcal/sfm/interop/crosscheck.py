@@ -74,7 +74,9 @@ def crosscheck_run(
     require_report(saved)  # before minutes of mapping
     with added_results(saved.folder) as stage:
         if read_json(saved.folder / "report.json", "", AGAIN) != saved.report:
-            raise InputError(f"run {saved.folder}: other results took their place meanwhile; cross-check it again")
+            raise InputError(
+                "E-RUN-REPLACED", f"run {saved.folder}: other results took their place meanwhile; cross-check it again"
+            )
         check = crosscheck(saved, colmap, tolerances, timeout_s, progress)
         write_report(stage, judged(saved.report | {"crosscheck": check.model_dump()}), saved.folder)
     return check
@@ -153,15 +155,17 @@ def _native_model(folder: Path, group: str, native: NativeColmap, run: SavedRun,
         found = find_models(folder)
     except InputError as error:
         raise MappingError(
+            "E-COLMAP-NO-MODEL",
             f"group {group}: native COLMAP {native.version} makes no model from the run's initial pair; "
-            "see `stcal-sfm pairs` for the gate that stops it"
+            "see `stcal-sfm pairs` for the gate that stops it",
         ) from error
     try:
         path = max(found, key=lambda each: open_model(each).num_reg_images())
         return path, read_model(path, run.observations, ids, run.corrected_px)
     except InputError as error:
         raise MappingError(
-            f"group {group}: what native COLMAP {native.version} made of the run's database is of no use: {error}"
+            "E-COLMAP-NO-MODEL",
+            f"group {group}: what native COLMAP {native.version} made of the run's database is of no use: {error}",
         ) from error
 
 
@@ -175,8 +179,9 @@ def _own(folder: Path, place: Path, names, pair, group: str, run: SavedRun, ids)
     reconstruction = seeded_mapping(folder / "ours.db", place / "own", names, pair)
     if reconstruction is None:
         raise MappingError(
+            "E-COLMAP-NO-MODEL",
             f"group {group}: pycolmap makes no model from the run's initial pair alone (the run registered its own "
-            "relative pose); there is nothing to cross-check"
+            "relative pose); there is nothing to cross-check",
         )
     written = place / "own-model"
     written.mkdir()

@@ -62,7 +62,7 @@ def export_database(database: Path, out: Path, schema: str, run: SavedRun | None
     if os.path.lexists(out):
         raise _exists(out)
     if not out.parent.is_dir():
-        raise InputError(f"{out}: no folder {out.parent}; make it, or give another place")
+        raise InputError("E-OUTPUT-FOLDER", f"{out}: no folder {out.parent}; make it, or give another place")
     with closing(_open_unchanged(database)) as source, closing(sqlite3.connect("")) as copy:
         _copy(database, source, copy)
         _require_expressible(database, copy, wanted)
@@ -74,7 +74,9 @@ def export_database(database: Path, out: Path, schema: str, run: SavedRun | None
             try:
                 _write(copy, partial, wanted)
             except sqlite3.Error as error:
-                raise InputError(f"{out}: cannot be written ({error}); check the folder's space and rights") from error
+                raise InputError(
+                    "E-OUTPUT-UNWRITABLE", f"{out}: cannot be written ({error}); check the folder's space and rights"
+                ) from error
             with closing(_open_unchanged(partial)) as written:
                 _require_schema(written, wanted)
                 _require_same_content(source, written, wanted)
@@ -121,7 +123,7 @@ def _open_unchanged(path: Path) -> sqlite3.Connection:
         with path.open("rb") as stream:
             header = stream.read(20)
     except OSError as error:
-        raise InputError(f"{path}: {error.strerror or error}; give a readable database") from error
+        raise InputError("E-FILE-UNREADABLE", f"{path}: {error.strerror or error}; give a readable database") from error
     if not header.startswith(HEADER):
         raise damaged(path, "not an SQLite database")
     beside = [name for name in (f"{path.name}{suffix}" for suffix in SIDE_FILES) if path.with_name(name).exists()]
@@ -150,7 +152,7 @@ def _copy(database: Path, source: sqlite3.Connection, copy: sqlite3.Connection) 
 
 
 def _in_use(path: Path, sign: str) -> InputError:
-    return InputError(f"{path}: in use by another program ({sign}); close it, or make the run again")
+    return InputError("E-FILE-IN-USE", f"{path}: in use by another program ({sign}); close it, or make the run again")
 
 
 def table_differences(found: dict[str, SchemaTable], wanted: Schema) -> list[str]:
@@ -230,7 +232,7 @@ def _count(connection: sqlite3.Connection, select: str) -> int:
 
 def _no_place(database: Path, wanted: Schema, what: str, since: str | None = None) -> InputError:
     remedy = f"give --schema {since} or later" if since else "no version known here has it"
-    return InputError(f"{database}: {what}: schema {wanted.name} has no place for it; {remedy}")
+    return InputError("E-SCHEMA-NO-PLACE", f"{database}: {what}: schema {wanted.name} has no place for it; {remedy}")
 
 
 def _shared_columns(table: SchemaTable) -> str:
@@ -261,7 +263,9 @@ def _require_schema(written: sqlite3.Connection, wanted: Schema) -> None:
     if version != wanted.user_version:
         differences.append(f"user_version is {version} in place of {wanted.user_version}")
     if differences:
-        raise StcalError(f"export for {wanted.name}: {differences[0]}; nothing is written; please report this")
+        raise StcalError(
+            "E-EXPORT-READ-BACK", f"export for {wanted.name}: {differences[0]}; nothing is written; please report this"
+        )
 
 
 def _require_same_content(source: sqlite3.Connection, written: sqlite3.Connection, wanted: Schema) -> None:
@@ -270,14 +274,18 @@ def _require_same_content(source: sqlite3.Connection, written: sqlite3.Connectio
         for row, (ours, theirs) in enumerate(zip_longest(_rows(source, table), _rows(written, table)), start=1):
             if ours != theirs:
                 raise StcalError(
+                    "E-EXPORT-READ-BACK",
                     f"export for {wanted.name}: row {row} of {table.name} differs from the database; nothing is "
-                    "written; see that no other program is at the database, and try again"
+                    "written; see that no other program is at the database, and try again",
                 )
         for name in table.column_names():
             if name not in SOURCE.tables[table.name].column_names():
                 filled = _count(written, f"SELECT 1 FROM {table.name} WHERE {name} NOT NULL")
                 if filled:
-                    raise StcalError(f"export for {wanted.name}: {table.name}.{name} is not empty in {filled} rows")
+                    raise StcalError(
+                        "E-EXPORT-LOST",
+                        f"export for {wanted.name}: {table.name}.{name} is not empty in {filled} rows",
+                    )
 
 
 def _publish(partial: Path, out: Path) -> None:
@@ -293,7 +301,7 @@ def _publish(partial: Path, out: Path) -> None:
 
 
 def _exists(out: Path) -> InputError:
-    return InputError(f"{out}: exists, and is not overwritten; move it away, or give another name")
+    return InputError("E-OUTPUT-EXISTS", f"{out}: exists, and is not overwritten; move it away, or give another name")
 
 
 def _summary(copy: sqlite3.Connection, out: Path, wanted: Schema) -> Exported:

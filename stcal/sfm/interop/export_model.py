@@ -82,7 +82,7 @@ def export_model(run: str | Path, out: str | Path, kind: str) -> ExportedModel:
     """
     out = Path(out)
     if kind not in get_args(ModelFormat):
-        raise InputError(f"format {kind}: unknown; give one of {', '.join(get_args(ModelFormat))}")
+        raise InputError("E-OPTION-FORM", f"format {kind}: unknown; give one of {', '.join(get_args(ModelFormat))}")
     labels = out / "labels.csv" if kind in FOLDERS else out.with_name(f"{out.name}.labels.csv")
     _require_free(out, labels, kind)
     saved = load_run(run)
@@ -127,28 +127,33 @@ def export_model(run: str | Path, out: str | Path, kind: str) -> ExportedModel:
 def _require_free(out: Path, labels: Path, kind: str) -> None:
     above = next(folder for folder in out.absolute().parents if os.path.lexists(folder))
     if not above.is_dir():
-        raise InputError(f"{out}: {above} is a file; give another place")
+        raise InputError("E-OUTPUT-FOLDER", f"{out}: {above} is a file; give another place")
     empty = kind in FOLDERS and out.is_dir() and not any(out.iterdir())
     for path in (out, labels):
         if os.path.lexists(path) and not (path == out and empty):
             wanted = "a new or empty folder" if kind in FOLDERS else "a new file"
-            raise InputError(f"{path}: exists, and nothing is overwritten; give {wanted} for {kind}")
+            raise InputError("E-OUTPUT-EXISTS", f"{path}: exists, and nothing is overwritten; give {wanted} for {kind}")
 
 
 def _labelled_points(run: SavedRun) -> tuple[pycolmap.Reconstruction, list[_Point]]:
     """The run's model, its points coloured, and the points by ascending id."""
     path = run.folder / TARGET_MODEL
     if not path.is_dir():
-        raise InputError(f"run {run.folder}: of another version, no {TARGET_MODEL}; run it again")
+        raise InputError("E-RUN-VERSION", f"run {run.folder}: of another version, no {TARGET_MODEL}; run it again")
     reconstruction = open_model(path)
     native = colmap_camera(run.camera)
     if [camera.params.tolist() for camera in reconstruction.cameras.values()] != [native.params.tolist()]:
-        raise InputError(f"model {path}: its camera is not that of the run's cameras.txt; run it again")
+        raise InputError(
+            "E-MODEL-NOT-OF-RUN", f"model {path}: its camera is not that of the run's cameras.txt; run it again"
+        )
     place = {image.name: i for i, image in enumerate(run.observations)}
     image_of = {}
     for image_id, image in reconstruction.images.items():
         if image.name not in place or not image.has_pose:
-            raise InputError(f"model {path}: image {image.name} is not as in the run's labels.csv; run it again")
+            raise InputError(
+                "E-MODEL-NOT-OF-RUN",
+                f"model {path}: image {image.name} is not as in the run's labels.csv; run it again",
+            )
         i = place[image.name]
         image_of[image_id] = run.observations[i]
         require_keypoints(path, image, run.observations[i].labels, run.corrected_px[i])
@@ -158,7 +163,10 @@ def _labelled_points(run: SavedRun) -> tuple[pycolmap.Reconstruction, list[_Poin
         views = tuple((element.image_id, element.point2D_idx) for element in point.track.elements)
         names = {image_of[image_id].labels[k] for image_id, k in views}
         if len(names) != 1:
-            raise InputError(f"model {path}: point {point_id} is of {len(names)} labels, 1 needed; run it again")
+            raise InputError(
+                "E-MODEL-NOT-OF-RUN",
+                f"model {path}: point {point_id} is of {len(names)} labels, 1 needed; run it again",
+            )
         label = names.pop()
         groups = {image_of[image_id].group for image_id, _ in views}
         colour = BOARD_RGB if isinstance(label, DotLabel) else rgb[label.face]

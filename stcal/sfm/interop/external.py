@@ -47,8 +47,9 @@ def faces_from_models(read: Sequence[ReadModel], run: SavedRun, solve: Chained =
     for source in read:
         if not source.camera.same_as(read[0].camera):
             raise InputError(
+                "E-MODEL-CAMERAS",
                 f"models {read[0].path}, {source.path}: different cameras; keep the intrinsics fixed in the mapper, "
-                "or give one model at a time"
+                "or give one model at a time",
             )
         if not source.camera.same_as(run.camera):
             notes.append(
@@ -78,7 +79,7 @@ def faces_from_models(read: Sequence[ReadModel], run: SavedRun, solve: Chained =
     try:
         calibration = calibrate(ordered, read[0].camera, run.target, run.board, options)
     except MappingError as error:
-        raise MappingError("; ".join([str(error), *notes])) from error
+        raise MappingError(error.code, "; ".join([str(error), *notes])) from error
     return replace(calibration, notes=(*notes, *calibration.notes))
 
 

@@ -80,7 +80,8 @@ def require_fit(path: Path, views: Mapping[str, View], camera: Camera, report: R
         if row is None or row.observations != len(view.labels) or not len(view.labels):
             known = 0 if row is None else row.observations
             raise InputError(
-                f"model {path}: image {image} shows {len(view.labels)} points, {known} by report.json; run it again"
+                "E-MODEL-NOT-OF-RUN",
+                f"model {path}: image {image} shows {len(view.labels)} points, {known} by report.json; run it again",
             )
         limit = (1 + ROUNDING) * max(row.max_px, 0.0) + ROUNDING_PX
         off = view.off_px(camera)
@@ -90,7 +91,10 @@ def require_fit(path: Path, views: Mapping[str, View], camera: Camera, report: R
             where = far if np.isfinite(off[k]) else "behind the camera"
             worst = off[k] / limit, f"{view.labels[k]} in {image} is {where}"
     if worst[1]:
-        raise InputError(f"model {path}: {worst[1]}; is it mirrored, or was a point or a pose moved? Run it again")
+        raise InputError(
+            "E-MODEL-NOT-OF-RUN",
+            f"model {path}: {worst[1]}; is it mirrored, or was a point or a pose moved? Run it again",
+        )
     _require_places(path, views, report)
 
 
@@ -99,12 +103,15 @@ def _require_places(path: Path, views: Mapping[str, View], report: ReportOfModel
     known = {camera.image: camera for camera in report.scene.cameras}
     missing = sorted(known.keys() ^ views.keys())
     if missing:
-        raise InputError(f"model {path}: image {missing[0]} is not in both model and report.json; run it again")
+        raise InputError(
+            "E-MODEL-NOT-OF-RUN", f"model {path}: image {missing[0]} is not in both model and report.json; run it again"
+        )
     for image, view in views.items():
         apart = np.linalg.norm(view.camera_from_target.inverse().translation - known[image].position_mm)
         turned = np.abs(view.camera_from_target.rotation - known[image].axes).max()
         if not (apart <= SAME_PLACE_MM and turned <= SAME_AXES):
             raise InputError(
+                "E-MODEL-NOT-OF-RUN",
                 f"model {path}: image {image}: its camera is {apart:.3g} mm from where report.json has it (axes differ "
-                f"by {turned:.2g}), {SAME_PLACE_MM:g} mm allowed; run it again"
+                f"by {turned:.2g}), {SAME_PLACE_MM:g} mm allowed; run it again",
             )

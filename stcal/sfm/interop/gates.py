@@ -83,14 +83,16 @@ def run_gates(run: SavedRun, group: str | None = None) -> dict[str, list[PairGat
     """
     ranked = ranked_pairs(run)
     if group is not None and group not in ranked:
-        raise InputError(f"group {group}: not in run {run.folder}; give one of {', '.join(ranked)}")
+        raise InputError("E-RUN-NO-GROUP", f"group {group}: not in run {run.folder}; give one of {', '.join(ranked)}")
     found = {}
     for name in ranked if group is None else [group]:
         names = {image for score in ranked[name] for image in (score.first, score.second)}
         images = [image for image in run.observations if image.name in names]
         if len(images) < len(names):
             missing = names - {image.name for image in images}
-            raise InputError(f"{run.folder / 'report.json'}: no image {min(missing)} in labels.csv; run it again")
+            raise InputError(
+                "E-RUN-DAMAGED", f"{run.folder / 'report.json'}: no image {min(missing)} in labels.csv; run it again"
+            )
         found[name] = group_gates(images, ranked[name], run.camera, run.options.pairs)
     return found
 
@@ -121,7 +123,9 @@ def ranked_pairs(run: SavedRun) -> dict[str, list[PairScore]]:
             for group in run.report["groups"]
         }
     except (KeyError, TypeError, ValueError) as error:
-        raise InputError(f"{run.folder / 'report.json'}: no ranked pairs ({error}); run it again") from error
+        raise InputError(
+            "E-RUN-DAMAGED", f"{run.folder / 'report.json'}: no ranked pairs ({error}); run it again"
+        ) from error
 
 
 def group_gates(

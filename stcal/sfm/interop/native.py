@@ -44,12 +44,17 @@ def find_colmap(path: Path | None = None) -> NativeColmap:
     found = shutil.which("colmap" if path is None else str(path))
     if found is None:
         where = "on the PATH" if path is None else f"at {path} that can be executed"
-        raise InputError(f"native COLMAP: no program {where}; {INSTALL}, or give its path with --colmap")
+        raise InputError(
+            "E-COLMAP-PROGRAM", f"native COLMAP: no program {where}; {INSTALL}, or give its path with --colmap"
+        )
     program = Path(found)
     text = _answer(program, "help")
     version = re.search(r"COLMAP\s+v?(\d+\.\d+(?:\.\d+)?)", text)
     if version is None:
-        raise InputError(f"native COLMAP: {program} does not say a COLMAP version; {INSTALL}, or give another --colmap")
+        raise InputError(
+            "E-COLMAP-PROGRAM",
+            f"native COLMAP: {program} does not say a COLMAP version; {INSTALL}, or give another --colmap",
+        )
     options = re.findall(r"--([\w.]+)", _answer(program, "mapper", "-h"))
     return NativeColmap(program, version[1], frozenset(options))
 
@@ -65,8 +70,9 @@ def require_listable(names: list[str]) -> None:
     for name in names:
         if name != name.strip(" "):
             raise InputError(
+                "E-IMAGE-NAME-SPACES",
                 f"image {name!r}: native COLMAP lists images without the spaces at their names' ends and would not "
-                "find it; rename the image or its folder, and run again"
+                "find it; rename the image or its folder, and run again",
             )
 
 
@@ -98,9 +104,11 @@ def map_natively(
     (folder / "mapper.log").write_text(output, encoding="utf-8")
     what = f"native COLMAP: `{native.program} mapper`"
     if code is None:
-        raise MappingError(f"{what} still runs after {timeout_s:g} s; raise --timeout, or look at the program")
+        raise MappingError(
+            "E-COLMAP-TIMEOUT", f"{what} still runs after {timeout_s:g} s; raise --timeout, or look at the program"
+        )
     if code != 0:
-        raise MappingError(f"{what} {_end(code, output)}; check the program")
+        raise MappingError("E-COLMAP-FAILED", f"{what} {_end(code, output)}; check the program")
 
 
 def _answer(program: Path, *words: str) -> str:
@@ -108,7 +116,10 @@ def _answer(program: Path, *words: str) -> str:
     code, output = _run([str(program), *words], ASK_SECONDS)
     if code != 0:
         how = f"does not end in {ASK_SECONDS:g} s" if code is None else _end(code, output)
-        raise InputError(f"native COLMAP: `{program} {' '.join(words)}` {how}; {INSTALL}, or give another --colmap")
+        raise InputError(
+            "E-COLMAP-PROGRAM",
+            f"native COLMAP: `{program} {' '.join(words)}` {how}; {INSTALL}, or give another --colmap",
+        )
     return output
 
 
@@ -132,7 +143,9 @@ def _run(command: list[str], timeout_s: float, **environment: str) -> tuple[int 
             start_new_session=True,
         )
     except OSError as error:
-        raise InputError(f"native COLMAP: {command[0]} cannot be started ({error.strerror}); {INSTALL}") from error
+        raise InputError(
+            "E-COLMAP-PROGRAM", f"native COLMAP: {command[0]} cannot be started ({error.strerror}); {INSTALL}"
+        ) from error
     pipe = process.stdout
     assert pipe is not None  # it was asked for
     try:

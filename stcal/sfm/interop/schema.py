@@ -250,7 +250,7 @@ def find_schema(name: str) -> Schema:
         Not the name of a schema.
     """
     if name not in SCHEMAS:
-        raise InputError(f"schema {name}: unknown; give one of {', '.join(SCHEMAS)}")
+        raise InputError("E-OPTION-VALUE", f"schema {name}: unknown; give one of {', '.join(SCHEMAS)}")
     return SCHEMAS[name]
 
 
@@ -267,5 +267,7 @@ def schema_of_version(version: str) -> str:
     name = _SAME_TABLES.get(minor, minor)
     if name not in SCHEMAS:
         known = ", ".join([*SCHEMAS, *_SAME_TABLES])
-        raise InputError(f"COLMAP {version}: its database schema is not known; use a release of {known}")
+        raise InputError(
+            "E-COLMAP-VERSION", f"COLMAP {version}: its database schema is not known; use a release of {known}"
+        )
     return name

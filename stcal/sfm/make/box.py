@@ -59,7 +59,7 @@ def size_of(text: str) -> tuple[float, float, float]:
     try:
         width, height, depth = map(float, text.split(","))
     except ValueError as error:
-        raise InputError(f"--size {text}: W,H,D in mm needed, such as 120,120,100") from error
+        raise InputError("E-OPTION-VALUE", f"--size {text}: W,H,D in mm needed, such as 120,120,100") from error
     if not all(1 <= side <= 1e5 for side in (width, height, depth)):
-        raise InputError(f"--size {text}: sides of 1 mm to 100 m needed")
+        raise InputError("E-OPTION-RANGE", f"--size {text}: sides of 1 mm to 100 m needed")
     return width, height, depth

@@ -65,7 +65,8 @@ class MakeOptions:
             width, height, focal = self.camera.width, self.camera.height, self.camera.focal
         if not (width and height):
             raise InputError(
-                f"camera file {self.camera and self.camera.source} states no image size; add it to the file"
+                "E-CAMERA-SIZE",
+                f"camera file {self.camera and self.camera.source} states no image size; add it to the file",
             )
         return Camera(width, height, focal, [(width - 1) / 2, (height - 1) / 2], np.zeros(COEFFICIENTS))
 
@@ -111,16 +112,18 @@ def make_target(options: MakeOptions, progress: Callable[[int, int], None] | Non
         radius = float(np.ceil(suits / RADIUS_STEP_MM - 1e-9) * RADIUS_STEP_MM)
     if radius < least:
         raise InputError(
+            "E-MAKE-RADIUS",
             f"--radius-mm {radius:g}: at {options.distance_mm:g} mm this camera sees circles well from {least:.2f} mm "
-            "on; larger circles, a nearer camera or more pixels needed"
+            "on; larger circles, a nearer camera or more pixels needed",
         )
     camera = options.ideal_camera()
     most = diameter_limits_px(camera.width * camera.height, EllipseOptions())[1]
     largest = 2 * LARGE * radius * float(np.sqrt(camera.focal.prod())) / options.distance_mm
     if largest * FARTHER > most:
         raise InputError(
+            "E-MAKE-RADIUS",
             f"radius {LARGE * radius:g} mm is {largest:.0f} px in the image, at most {most / FARTHER:.0f} px are "
-            "sought; smaller circles or a camera farther away needed"
+            "sought; smaller circles or a camera farther away needed",
         )
     pattern, cases = _named(options, radius, progress)
     return Made(options, pattern, _board(options, least), radius, least, cases)
@@ -138,8 +141,9 @@ def _named(options: MakeOptions, radius_mm: float, progress: Callable[[int, int]
             return pattern, cases
     face, gone = failed[0]
     raise InputError(
+        "E-MAKE-UNNAMED",
         f"face {face}: not named with circles {', '.join(gone)} hidden, as in {len(failed)} of {cases} cases; "
-        f"{ATTEMPTS} patterns tried; another --seed or more --circles needed"
+        f"{ATTEMPTS} patterns tried; another --seed or more --circles needed",
     )
 
 

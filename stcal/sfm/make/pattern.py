@@ -50,7 +50,8 @@ def make_pattern(
     """
     if circles < LEAST_CIRCLES:
         raise InputError(
-            f"--circles {circles}: {LEAST_CIRCLES} needed, {MIN_CIRCLES} name a face and {HIDDEN} may be hidden"
+            "E-MAKE-CIRCLES",
+            f"--circles {circles}: {LEAST_CIRCLES} needed, {MIN_CIRCLES} name a face and {HIDDEN} may be hidden",
         )
     rng = np.random.default_rng(seed)
     faces: list[FaceDesign] = []
@@ -65,13 +66,15 @@ def make_pattern(
                 break
         if best is None:
             raise InputError(
+                "E-MAKE-ROOM",
                 f"face {side.name}: no room for {circles} circles of {radius_mm:.3g} and {LARGE * radius_mm:.3g} mm on "
-                f"{side.width:g} × {side.height:g} mm; fewer --circles, a smaller --radius-mm, or a larger --size"
+                f"{side.width:g} × {side.height:g} mm; fewer --circles, a smaller --radius-mm, or a larger --size",
             )
         if least > circles - HIDDEN - 1:
             raise InputError(
+                "E-MAKE-CIRCLES",
                 f"face {side.name}: {least} of {circles} circles fit another reading too, at most "
-                f"{circles - HIDDEN - 1} may; more --circles, a smaller --radius-mm, or another --seed"
+                f"{circles - HIDDEN - 1} may; more --circles, a smaller --radius-mm, or another --seed",
             )
         faces.append(best)
         likeness = max(likeness, least)

@@ -80,7 +80,7 @@ def write_database(
     except RuntimeError as error:
         remove_database(partial)
         raise InputError(
-            f"database {path}: cannot be written ({error}); check the folder's space and rights"
+            "E-OUTPUT-UNWRITABLE", f"database {path}: cannot be written ({error}); check the folder's space and rights"
         ) from error
     for suffix in ("-wal", "-shm"):
         Path(f"{path}{suffix}").unlink(missing_ok=True)

@@ -69,8 +69,9 @@ def map_group(
         reconstruction = _own_mapping(database, names, ids, pairs[0])
     if reconstruction is None:
         raise MappingError(
+            "E-MAPPING-NO-MODEL",
             f"group {group[0].group}: no model from the pair {pairs[0].first}, {pairs[0].second} "
-            f"({pairs[0].shared} circles in common); add views between the two, or change --max-angle"
+            f"({pairs[0].shared} circles in common); add views between the two, or change --max-angle",
         )
     model, outliers = labelled_model(reconstruction, group, ids, camera)
     _require_agreement(model, group)
@@ -100,9 +101,10 @@ def _require_agreement(model: WorldModel, group: list[ImageObservations]) -> Non
     wanted = sum(n >= 2 for n in count.values())
     if len(model.labels) < MIN_AGREEMENT * wanted:
         raise MappingError(
+            "E-MAPPING-DISAGREE",
             f"group {model.group}: {len(model.labels)} of {wanted} circles agree between the images to "
             f"{MAX_REPROJECTION_PX:g} px, {MIN_AGREEMENT * wanted:.0f} needed; "
-            "check that the camera file belongs to the images, and that nothing but the camera moved"
+            "check that the camera file belongs to the images, and that nothing but the camera moved",
         )
 
 

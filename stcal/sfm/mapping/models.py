@@ -108,8 +108,9 @@ def write_reconstruction(reconstruction: pycolmap.Reconstruction, folder: Path, 
         same = False
     if not same:
         raise InputError(
+            "E-OUTPUT-READ-BACK",
             f"model {folder}: what stands in its files is not what was written; check the folder's space and rights, "
-            "or give another place"
+            "or give another place",
         )
 
 
@@ -164,8 +165,9 @@ def find_models(folder: str | Path) -> list[Path]:
         found = [p for p in inner if any(os.path.exists(p / f"images.{kind}") for kind in ("bin", "txt"))]
     if not found:
         raise InputError(
+            "E-MODEL-UNREADABLE",
             f"model {folder}: no COLMAP model (cameras, images and points3D as .bin or .txt) there; "
-            "give the folder that the mapper or the GUI wrote"
+            "give the folder that the mapper or the GUI wrote",
         )
     return found
 
@@ -184,7 +186,9 @@ def read_model(
     reconstruction = open_model(path)
     cameras = list(reconstruction.cameras.values())
     if len(cameras) != 1:
-        raise InputError(f"model {path}: {len(cameras)} cameras, 1 needed; map the exported database as it is")
+        raise InputError(
+            "E-MODEL-CAMERAS", f"model {path}: {len(cameras)} cameras, 1 needed; map the exported database as it is"
+        )
     native = cameras[0]
     camera = camera_from_colmap(native.model.name, native.width, native.height, list(native.params), path)
     place = {image.name: i for i, image in enumerate(observations)}
@@ -200,8 +204,9 @@ def read_model(
                 else "give the run that the model's database came from"
             )
             raise InputError(
+                "E-MODEL-NOT-OF-RUN",
                 f"model {path}: image {image.name} is not of this run ({observations[0].name} … "
-                f"{observations[-1].name}); {remedy}"
+                f"{observations[-1].name}); {remedy}",
             )
         i = place[image.name]
         require_keypoints(path, image, observations[i].labels, corrected_px[i])
@@ -216,7 +221,7 @@ def read_model(
             _require_fit(path, model, camera.sized(0, 0))
             groups.append(model)
     if not groups:
-        raise InputError(f"model {path}: no image with a pose and labelled points; map again")
+        raise InputError("E-MODEL-EMPTY", f"model {path}: no image with a pose and labelled points; map again")
     named = {p.point3D_id for image in reconstruction.images.values() for p in image.points2D if p.has_point3D()}
     absent = len(named - set(reconstruction.points3D))
     return ReadModel(path, camera.sized(0, 0), tuple(groups), unlabelled, split, absent)
@@ -241,7 +246,9 @@ def open_model(path: Path) -> pycolmap.Reconstruction:
         return pycolmap.Reconstruction(str(path))
     except (RuntimeError, ValueError, IndexError, OverflowError, OSError) as error:
         reason = " ".join(str(error).split())[-150:]
-        raise InputError(f"model {path}: damaged or incomplete ({reason}); write or copy it again") from error
+        raise InputError(
+            "E-MODEL-UNREADABLE", f"model {path}: damaged or incomplete ({reason}); write or copy it again"
+        ) from error
 
 
 class _Walk:
@@ -337,15 +344,17 @@ def require_keypoints(path: Path, image: pycolmap.Image, labels: Sequence[str], 
     xy = from_colmap_px(np.array([point.xy for point in image.points2D]).reshape(-1, 2))
     if len(xy) != len(corrected_px):
         raise InputError(
+            "E-MODEL-NOT-OF-RUN",
             f"model {path}: image {image.name} has {len(xy)} keypoints, the run {len(corrected_px)}; "
-            "give the run that the model's database came from"
+            "give the run that the model's database came from",
         )
     off = np.abs(xy - corrected_px).max(axis=1, initial=0.0)
     if not (off <= KEYPOINT_TOLERANCE_PX).all():
         k = int(np.argmax(off))
         raise InputError(
+            "E-MODEL-NOT-OF-RUN",
             f"model {path}: image {image.name}: keypoint {k} ({labels[k]}) is {off[k]:.4f} px off the run's, "
-            f"{KEYPOINT_TOLERANCE_PX:g} allowed; give the run that the model's database came from"
+            f"{KEYPOINT_TOLERANCE_PX:g} allowed; give the run that the model's database came from",
         )
 
 
@@ -357,9 +366,10 @@ def _require_fit(path: Path, model: GroupModel, camera: Camera) -> None:
     if not rms <= MAX_RMS_PX:
         k = int(np.argmax(residual))
         raise InputError(
+            "E-MODEL-MISFIT",
             f"model {path}: group {model.group}: keypoints are {rms:.3g} px RMS off the images of their points, "
             f"{MAX_RMS_PX:g} allowed, most of all {model.labels[model.point_index[k]]} in "
-            f"{model.images[model.image_index[k]]}; adjust its bundle, or write or copy it again"
+            f"{model.images[model.image_index[k]]}; adjust its bundle, or write or copy it again",
         )
 
 
@@ -375,8 +385,9 @@ def pose_of_image(path: Path, image: pycolmap.Image) -> Rigid:
     length = math.hypot(*pose.rotation.quat)  # of any numbers, without a warning
     if not (abs(length - 1) <= MAX_LENGTH_ERROR and np.isfinite(pose.translation).all()):
         raise InputError(
+            "E-MODEL-POSE",
             f"model {path}: image {image.name}: no pose (quaternion of length {length:.4g}, 1 needed; translation "
-            f"{pose.translation.tolist()}); write or copy it again"
+            f"{pose.translation.tolist()}); write or copy it again",
         )
     pose.rotation.normalize()
     return rigid_from_colmap(pose)
@@ -421,7 +432,9 @@ def _group_model(path: Path, group: str, images, reconstruction, point_label) ->
     xyz = np.array([reconstruction.point3D(chosen[label]).xyz for label in labels])
     if not np.isfinite(xyz).all():
         lost = labels[int(np.argmin(np.isfinite(xyz).all(axis=1)))]
-        raise InputError(f"model {path}: point {chosen[lost]} ({lost}) is not finite; write or copy it again")
+        raise InputError(
+            "E-MODEL-POSE", f"model {path}: point {chosen[lost]} ({lost}) is not finite; write or copy it again"
+        )
     model = WorldModel(
         group=group,
         images=tuple(o.name for o, _, _ in images),

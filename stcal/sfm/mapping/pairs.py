@@ -36,7 +36,10 @@ class PairOptions:
 
     def __post_init__(self):
         if self.max_angle_rad is not None and not 0 < self.max_angle_rad <= np.pi:
-            raise InputError(f"option max_angle_rad {self.max_angle_rad:g}: more than 0, up to π needed; give another")
+            raise InputError(
+                "E-OPTION-RANGE",
+                f"option max_angle_rad {self.max_angle_rad:g}: more than 0, up to π needed; give another",
+            )
 
     def limit_rad(self) -> float:
         """The limit in force."""
@@ -67,7 +70,9 @@ class PairScore:
             None was found.
         """
         if self.second_from_first is None:
-            raise MappingError(f"pair {self.first}, {self.second}: no relative pose; take another pair")
+            raise MappingError(
+                "E-MAPPING-NO-PAIR", f"pair {self.first}, {self.second}: no relative pose; take another pair"
+            )
         return self.second_from_first
 
 
@@ -90,7 +95,7 @@ def rank_pairs(
         scores.remove(over[-1])
         return [replace(over[-1], verdict=f"chosen: the smallest {OVER_LIMIT}, none is under it"), *scores]
     if not scores or scores[0].verdict != "usable":
-        raise MappingError(_no_pair(group, scores, options))
+        raise MappingError("E-MAPPING-NO-PAIR", _no_pair(group, scores, options))
     return [replace(scores[0], verdict="chosen"), *scores[1:]]
 
 

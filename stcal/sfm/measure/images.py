@@ -148,8 +148,9 @@ def measure(
     if not result.images:
         last = result.left_out[-1]
         raise DetectionError(
+            "E-MEASURE-NONE",
             f"no face of the target measured in {len(files)} images, first {last.name}: "
-            f"{last.reason}; check target.toml (radii, polarity), faces.json and the exposure"
+            f"{last.reason}; check target.toml (radii, polarity), faces.json and the exposure",
         )
     return result
 

@@ -33,7 +33,8 @@ def start_pose(
     if not by_size or len(faces[by_size[0]]) < MIN_CIRCLES:
         seen = f"{len(faces[by_size[0]])} of face {by_size[0]}" if by_size else "0"
         raise DegenerateError(
-            f"{where}: {seen} circles seen, {MIN_CIRCLES} of one face needed; show one face as a whole"
+            "E-MEASURE-FEW-CIRCLES",
+            f"{where}: {seen} circles seen, {MIN_CIRCLES} of one face needed; show one face as a whole",
         )
     for face_id in by_size:
         rows, plane = faces[face_id], target.target_from_plane[face_id]
@@ -53,7 +54,7 @@ def start_pose(
             reason = "its circles would be behind the camera; check their labels"
             continue
         return PoseStack.of(pose), plane
-    raise DegenerateError(f"{where}: face {by_size[0]}: {reason}; show all of its circles")
+    raise DegenerateError("E-MEASURE-AMBIGUOUS", f"{where}: face {by_size[0]}: {reason}; show all of its circles")
 
 
 def minima_without_outliers(problem: PoseProblem, start: PoseStack, plane: Rigid, names: list[CircleLabel], where: str):
@@ -77,7 +78,8 @@ def minima_without_outliers(problem: PoseProblem, start: PoseStack, plane: Rigid
         keep = keep[~bad]
         if len(outliers) > MAX_OUTLIER_SHARE * len(names) or len(keep) < MIN_CIRCLES:
             raise DegenerateError(
+                "E-MEASURE-CONTRADICTS",
                 f"{where}: {len(outliers)} of {len(names)} circles contradict the others, first {outliers[0].label} by "
-                f"{outliers[0].residual_px:.2g} px; check that camera file, faces.json and images belong together"
+                f"{outliers[0].residual_px:.2g} px; check that camera file, faces.json and images belong together",
             )
         start = found.poses

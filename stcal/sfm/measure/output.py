@@ -49,7 +49,10 @@ def poses_csv(result: MeasureResult, joints: Table | None = None) -> tuple[str, 
         names = {each.name for each in result.images}
         missing += [f"{name}: in {where}, but without a pose" for name in rows if name not in names]
         if len(rows.keys() & names) == 0:
-            raise InputError(f"{where}: none of its images was measured; names are like {result.images[0].name}")
+            raise InputError(
+                "E-IMAGES-UNMATCHED",
+                f"{where}: none of its images was measured; names are like {result.images[0].name}",
+            )
     return stream.getvalue(), tuple(missing)
 
 
@@ -58,13 +61,18 @@ def _joint_cells(joints: Table, header: list[str]) -> tuple[list[str], dict[str,
     more = [name for name in joints.columns if name != IMAGE]
     taken = [name for name in more if name in header]
     if taken:
-        raise InputError(f"{joints.where}: column {taken[0]} is measured here; leave it out")
+        raise InputError(
+            "E-TABLE-COLUMNS-CONFLICT", f"{joints.where}: column {taken[0]} is measured here; leave it out"
+        )
     names = joints.text(IMAGE)
     cells = [joints.columns[name] for name in more]
     rows: dict[str, list[str]] = {}
     for i, name in enumerate(names):
         if name in rows:
-            raise InputError(f"{joints.where}: line {joints.lines[i]}: image {name} a second time; every image once")
+            raise InputError(
+                "E-TABLE-ROW-REPEATED",
+                f"{joints.where}: line {joints.lines[i]}: image {name} a second time; every image once",
+            )
         rows[name] = [c[i] if isinstance(c, list) else repr(float(c[i])) for c in cells]
     return more, rows
 

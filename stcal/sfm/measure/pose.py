@@ -54,8 +54,9 @@ class PoseOptions:
         factor = 1.0 if self.sigma_factor is None else self.sigma_factor
         if not (0 < self.flip_odds < 1 and self.sigma_margin >= 1 and np.isfinite(factor) and factor > 0):
             raise InputError(
+                "E-OPTION-RANGE",
                 f"flip odds {self.flip_odds:g}, σ margin {self.sigma_margin:g}, σ factor {factor:g}: odds between "
-                "0 and 1, a margin of at least 1 and a positive factor needed"
+                "0 and 1, a margin of at least 1 and a positive factor needed",
             )
 
     def needed(self, chi2_per_dof: float) -> float:
@@ -154,15 +155,20 @@ def pose_from_circles(
     found, keep, outliers = minima_without_outliers(problem, start, plane, names, where)
     problem, names = problem.select(keep), [names[i] for i in keep]
     if len(names) < MIN_CIRCLES:
-        raise DegenerateError(f"{where}: {len(names)} circles left, {MIN_CIRCLES} needed; show more of a face")
+        raise DegenerateError(
+            "E-MEASURE-FEW-CIRCLES", f"{where}: {len(names)} circles left, {MIN_CIRCLES} needed; show more of a face"
+        )
     pose = _answer(problem, found, names, outliers, plane, options)
     if np.sqrt(np.diag(pose.covariance)[:3].max()) > MAX_SIGMA_RAD:
         if pose.chi2_per_redundancy() > OUTLIER**2:  # what leaves the rotation open are the residuals
             raise DegenerateError(
+                "E-MEASURE-CONTRADICTS",
                 f"{where}: its circles contradict each other, χ²/dof {pose.chi2_per_redundancy():.2g}; check their "
-                "labels, and that camera file, faces.json and images belong together"
+                "labels, and that camera file, faces.json and images belong together",
             )
-        raise DegenerateError(f"{where}: its circles leave the rotation open; show more of a face, off one line")
+        raise DegenerateError(
+            "E-MEASURE-OPEN", f"{where}: its circles leave the rotation open; show more of a face, off one line"
+        )
     return pose
 
 
@@ -173,13 +179,19 @@ def _problem(labels, centre_px, covariance_px2, target: TargetCircles, camera, o
     used = [i for i, label in enumerate(labels) if isinstance(label, CircleLabel)]
     used.sort(key=lambda i: target.place.get(labels[i], -1))
     if len({labels[i] for i in used}) < len(used):
-        raise InputError(f"{where}: a label twice; every circle is seen once")
+        raise InputError("E-LABEL-REPEATED", f"{where}: a label twice; every circle is seen once")
     unknown = [labels[i] for i in used if labels[i] not in target.place]
     if unknown:
-        raise InputError(f"{where}: circle {unknown[0]} is not in the calibrated target; give the target's own labels")
+        raise InputError(
+            "E-LABEL-UNKNOWN",
+            f"{where}: circle {unknown[0]} is not in the calibrated target; give the target's own labels",
+        )
     fault = first_fault(noise, OF_PIXEL, definite=True)
     if fault is not None:
-        raise InputError(f"{where}: covariance of the centre of {labels[fault.row]}: {fault.reason}; correct it")
+        raise InputError(
+            "E-COVARIANCE-VALUE",
+            f"{where}: covariance of the centre of {labels[fault.row]}: {fault.reason}; correct it",
+        )
     place = np.array([target.place[labels[i]] for i in used], int)
     rows = (3 * place[:, None] + np.arange(3)).ravel()
     factor = target.sigma_factor if options.sigma_factor is None else options.sigma_factor
@@ -323,7 +335,9 @@ def measured_pose(
     known = [i for i, label in enumerate(image.labels) if label in target.place]
     if not known:
         seen = ", ".join(image.face_ids())
-        return DetectionError(f"{image.name}: " + (f"face {seen} is not calibrated" if seen else NO_FACE))
+        return DetectionError(
+            "E-MEASURE-NO-FACE", f"{image.name}: " + (f"face {seen} is not calibrated" if seen else NO_FACE)
+        )
     own = image.select(known)
     try:
         return pose_from_circles(

@@ -81,7 +81,8 @@ class MeasureServer(ThreadingHTTPServer):
         except (OSError, OverflowError) as error:
             reason = getattr(error, "strerror", None) or error
             raise InputError(
-                f"--host {options.host} --port {options.port}: cannot be listened at: {reason}; give another"
+                "E-SERVICE-ADDRESS",
+                f"--host {options.host} --port {options.port}: cannot be listened at: {reason}; give another",
             ) from error
 
     @property
@@ -155,7 +156,7 @@ class _Handler(BaseHTTPRequestHandler):
         try:
             answer = self.server.service.answer(data, name, sequence)
         except Exception as error:  # a mistake of ours must not end the connection without an answer
-            answer = refusal(500, f"{type(error).__name__}: not answered")
+            answer = refusal(500, "E-SERVICE-FAILED", f"{type(error).__name__}: not answered")
         self._send(answer)
 
     def do_GET(self) -> None:
@@ -178,7 +179,7 @@ class _Handler(BaseHTTPRequestHandler):
     def _refuse(self, code: int, reason: str) -> None:
         """And end the connection, whose rest is unknown."""
         self.close_connection = True
-        self._send(refusal(code, reason))
+        self._send(refusal(code, "E-SERVICE-REQUEST", reason))
         with suppress(OSError):
             self.connection.shutdown(socket.SHUT_WR)
             self.connection.settimeout(LINGER_S)

@@ -48,9 +48,9 @@ class Answer:
     text: str
 
 
-def refusal(code: int, reason: str) -> Answer:
-    """The answer that says why there is none."""
-    return Answer(code, json.dumps({"error": reason}, ensure_ascii=False))
+def refusal(code: int, kind: str, reason: str) -> Answer:
+    """The answer that says why there is none; ``kind`` is the code of the error, like ``E-IMAGE-SIZE``."""
+    return Answer(code, json.dumps({"error": reason, "code": kind}, ensure_ascii=False))
 
 
 class MeasureService:
@@ -96,12 +96,14 @@ class MeasureService:
         Answer
             200 and the poses file of ``measure`` of this image; 422 and the same where it gives no pose, with the
             reason among those left out; 400 for what is no image of this camera, 503 where too many wait, 500 where
-            the process ended: ``{"error": …}``.
+            the process ended: ``{"error": …, "code": …}``.
         """
         if fault := name_fault(name) or name_fault(sequence):
-            return refusal(REFUSED, f"name: {fault}; give that of the image alone")
+            return refusal(REFUSED, "E-SERVICE-NAME", f"name: {fault}; give that of the image alone")
         if not name or max(len(name), len(sequence)) > LONGEST_NAME:
-            return refusal(REFUSED, f"name: empty or longer than {LONGEST_NAME} characters; give a shorter one")
+            return refusal(
+                REFUSED, "E-SERVICE-NAME", f"name: empty or longer than {LONGEST_NAME} characters; give a shorter one"
+            )
         if not sequence:
             return self._measured(data, name, ())[0]
         own = self._sequence(sequence)
@@ -127,12 +129,14 @@ class MeasureService:
             place = min(range(len(self._waiting)), key=self._waiting.__getitem__)
             if self._waiting[place] >= WAITING:
                 reason = f"{WAITING} images wait for each of {len(self._waiting)} processes; send it again later"
-                return refusal(BUSY, f"{name}: {reason}"), recent
+                return refusal(BUSY, "E-SERVICE-BUSY", f"{name}: {reason}"), recent
             self._waiting[place] += 1
         try:
             return self._processes[place].call(_answer, data, name, recent)
         except BrokenExecutor:
-            return refusal(FAILED, f"{name}: the process that measured it ended; send it again"), recent
+            return refusal(
+                FAILED, "E-WORKER-DIED", f"{name}: the process that measured it ended; send it again"
+            ), recent
         finally:
             with self._guard:
                 self._waiting[place] -= 1
@@ -169,7 +173,8 @@ def _answer(data: bytes, name: str, recent: tuple[Rigid, ...]) -> tuple[Answer, 
         own = tracker.model
         if (own.width or width, own.height or height) != (width, height):
             raise InputError(
-                f"{name}: {width}×{height} px, camera {own.width}×{own.height} px; send it as the camera took it"
+                "E-IMAGE-SIZE",
+                f"{name}: {width}×{height} px, camera {own.width}×{own.height} px; send it as the camera took it",
             )
         image = decode(data, name)
         try:
@@ -178,7 +183,7 @@ def _answer(data: bytes, name: str, recent: tuple[Rigid, ...]) -> tuple[Answer, 
         except ConvergenceError as error:
             found = Skipped(name, str(error), "distortion")
     except InputError as error:
-        return refusal(REFUSED, str(error)), recent
+        return refusal(REFUSED, error.code, str(error)), recent
     result = result_of([found], tracker.target, MeasureOptions(tracker.pose_options), tracker.prior)
     content = poses_file(result).content()
     text = json.dumps(content, ensure_ascii=False, allow_nan=False)

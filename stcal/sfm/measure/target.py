@@ -62,12 +62,14 @@ class TargetCircles:
         try:
             require_covariance(self.covariance, 3 * c, Rows.of(self.labels, "xyz"))
         except InputError as error:
-            raise InputError(f"circles' covariance: {error}; make the run again") from error
+            raise InputError(error.code, f"circles' covariance: {error}; make the run again") from error
         object.__setattr__(self, "place", {label: i for i, label in enumerate(self.labels)})
         if len(self.place) < c or not (self.radius > 0).all():
-            raise InputError("circles: a label twice, or a radius that is not positive; correct them")
+            raise InputError(
+                "E-LABEL-REPEATED", "circles: a label twice, or a radius that is not positive; correct them"
+            )
         if not (np.isfinite(self.sigma_factor) and self.sigma_factor > 0):
-            raise InputError(f"σ factor {self.sigma_factor}: a positive number needed")
+            raise InputError("E-OPTION-RANGE", f"σ factor {self.sigma_factor}: a positive number needed")
         normal, planes = np.zeros((c, 3)), {}
         for face_id in dict.fromkeys(label.face for label in self.labels):
             rows = [i for i, label in enumerate(self.labels) if label.face == face_id]
@@ -76,7 +78,7 @@ class TargetCircles:
             try:
                 axis = fit_plane(self.xyz[rows]).normal
             except DegenerateError as error:
-                raise DegenerateError(f"face {face_id}: {error}") from error
+                raise DegenerateError(error.code, f"face {face_id}: {error}") from error
             normal[rows] = axis
             across = np.linalg.svd(axis[None])[2][1:]
             turn = np.column_stack([across[0], np.cross(axis, across[0]), axis])
@@ -126,7 +128,9 @@ def read_target(path: str | Path, design: TargetDesign) -> TargetCircles:
         target = TargetCircles(labels, xyz, radius, covariance, factor, notes, design)
     except (InputError, DegenerateError, LookupError, TypeError, ValueError, AttributeError) as error:
         reason = f"no {error}" if isinstance(error, KeyError) else str(error)[:150]
-        raise InputError(f"faces {path}: not the faces.json of a run ({reason}); give RUN/faces.json") from error
+        raise InputError(
+            "E-FACES-FILE", f"faces {path}: not the faces.json of a run ({reason}); give RUN/faces.json"
+        ) from error
     _require_design(target, design, path)
     return target
 
@@ -137,7 +141,7 @@ def _joint(faces: FacesFile, labels: tuple[CircleLabel, ...]) -> np.ndarray | No
     if joint is None:
         return None
     if sorted(joint.labels) != sorted(labels):
-        raise InputError("its joint covariance is not of its circles")
+        raise InputError("E-COVARIANCE-SHAPE", "its joint covariance is not of its circles")
     rows = (3 * np.array([joint.labels.index(label) for label in labels])[:, None] + np.arange(3)).ravel()
     return joint.matrix()[np.ix_(rows, rows)]
 
@@ -160,11 +164,14 @@ def _require_design(target: TargetCircles, design: TargetDesign, path: Path) -> 
     radius = design.radius_of()
     for label, own in zip(target.labels, target.radius, strict=True):
         if label not in radius:
-            raise InputError(f"faces {path}: circle {label} is not in target {design.name}; give its own --target")
+            raise InputError(
+                "E-FACES-DESIGN", f"faces {path}: circle {label} is not in target {design.name}; give its own --target"
+            )
         if abs(own - radius[label]) > SAME_RADIUS_MM:
             raise InputError(
+                "E-FACES-DESIGN",
                 f"faces {path}: circle {label} has radius {own:g} mm, {radius[label]:g} mm in target {design.name}; "
-                "give the target.toml of that run"
+                "give the target.toml of that run",
             )
     for face in design.faces:
         own = [i for i, label in enumerate(face.labels()) if label in target.place]
@@ -175,6 +182,7 @@ def _require_design(target: TargetCircles, design: TargetDesign, path: Path) -> 
         off = float(np.sqrt(((align_rigid(xyz, flat) @ flat - xyz) ** 2).sum(1).mean()))
         if off > SAME_DESIGN_MM:
             raise InputError(
+                "E-FACES-DESIGN",
                 f"faces {path}: face {face.id} is {off:.3g} mm RMS off that of target {design.name}, "
-                f"{SAME_DESIGN_MM:g} mm allowed; give the target.toml of that run"
+                f"{SAME_DESIGN_MM:g} mm allowed; give the target.toml of that run",
             )

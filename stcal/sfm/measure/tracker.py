@@ -88,7 +88,7 @@ class Tracker:
         ellipses: EllipseOptions | None = None,
     ):
         if target.design is None:
-            raise InputError("target: circles without a design; read it with stcal.sfm.read_target")
+            raise InputError("E-FACES-DESIGN", "target: circles without a design; read it with stcal.sfm.read_target")
         self.target, self.design, self.board = target, target.design, board
         self.model, self.pose_options, self.ellipses = camera, pose or PoseOptions(), ellipses or EllipseOptions()
         self.prior = None if camera.covariance is None else CameraPrior(camera.colmap_model, camera.covariance)
@@ -151,7 +151,9 @@ class Tracker:
 
     def _camera_of(self, image: np.ndarray, name: str) -> Camera:
         if image.ndim != 2 or image.dtype not in (np.uint8, np.uint16):
-            raise InputError(f"{name}: {image.dtype} of shape {image.shape}; a grey image of 8 or 16 bits needed")
+            raise InputError(
+                "E-IMAGE-TYPE", f"{name}: {image.dtype} of shape {image.shape}; a grey image of 8 or 16 bits needed"
+            )
         height, width = image.shape
         if self.camera is None:
             if not (self.model.width and self.model.height):
@@ -159,8 +161,9 @@ class Tracker:
             self.camera = self.model.sized(width, height)
         if (width, height) != (self.camera.width, self.camera.height):
             raise InputError(
+                "E-IMAGE-SIZE",
                 f"{name}: {width}×{height} px, camera {self.camera.width}×{self.camera.height} px; "
-                "give images as the camera took them"
+                "give images as the camera took them",
             )
         return self.camera
 

@@ -26,15 +26,17 @@ def nominal_poses(target: TargetDesign, faces: Path | None) -> dict[str, Rigid]:
             return reference_target().rough_poses()
         if missing := [face.id for face in target.faces if face.id not in rough]:
             raise InputError(
+                "E-TARGET-ROUGH-POSE",
                 f"target {target.name}: the design does not say where {_faces(missing)}; add {ROUGH_KEYS} to each "
-                "[[face]] of the target file, be it rough, or to `plan` give --faces, the faces.json of an earlier run"
+                "[[face]] of the target file, be it rough, or to `plan` give --faces, the faces.json of an earlier run",
             )
         return rough
     poses = read_result(faces, FacePoses, "faces", "give RUN/faces.json, the faces.json of a run").poses()
     missing = [face.id for face in target.faces if face.id not in poses]
     if missing:
         raise InputError(
-            f"{faces}: no face {missing[0]} of target {target.name}; give a run that shows all of its faces"
+            "E-TARGET-NO-FACE",
+            f"{faces}: no face {missing[0]} of target {target.name}; give a run that shows all of its faces",
         )
     return {face.id: poses[face.id] for face in target.faces}
 

@@ -73,9 +73,13 @@ class PlanOptions:
 
     def __post_init__(self):
         if self.images < MIN_IMAGES:
-            raise InputError(f"plan: {self.images} images in each group, {MIN_IMAGES} needed; plan for more")
+            raise InputError(
+                "E-OPTION-RANGE", f"plan: {self.images} images in each group, {MIN_IMAGES} needed; plan for more"
+            )
         if self.camera is not None and not (self.camera.width and self.camera.height):
-            raise InputError(f"plan: camera file {self.camera.source} states no image size; add it to the file")
+            raise InputError(
+                "E-CAMERA-SIZE", f"plan: camera file {self.camera.source} states no image size; add it to the file"
+            )
 
 
 @dataclass(frozen=True, slots=True)
@@ -113,7 +117,9 @@ def pairs_of_faces(text: str, target: TargetDesign) -> tuple[tuple[str, str], ..
     names = [name.strip() for name in text.split(",")]
     for name in names:
         if name not in known:
-            raise InputError(f"--groups: {name!r} is no pair of faces; use such as {', '.join(list(known)[:3])}")
+            raise InputError(
+                "E-OPTION-VALUE", f"--groups: {name!r} is no pair of faces; use such as {', '.join(list(known)[:3])}"
+            )
     return tuple(known[name] for name in names)
 
 
@@ -148,14 +154,16 @@ def plan(
     """
     if (dots := board.rows * board.columns) > MAX_DOTS:
         raise InputError(
+            "E-PLAN-TOO-LARGE",
             f"plan: board of {board.rows}×{board.columns} = {dots} dots, up to {MAX_DOTS} possible; plan with "
-            "fewer dots over the same area, the σ of the faces hardly change"
+            "fewer dots over the same area, the σ of the faces hardly change",
         )
     scene = _scene(options, target, board, nominal)
     if dots > FINE_DOTS and (centres := dots * options.images * len(scene.groups)) > MAX_CENTRES:
         raise InputError(
+            "E-PLAN-TOO-LARGE",
             f"plan: {dots} dots in {options.images * len(scene.groups)} images are {centres} centres, up to "
-            f"{MAX_CENTRES} possible; plan fewer images, or fewer dots over the same area"
+            f"{MAX_CENTRES} possible; plan fewer images, or fewer dots over the same area",
         )
     setup, models = _setup(scene, options, board), _models(scene, options)
     whole = forecast(models, setup)
@@ -239,7 +247,8 @@ def _linked(reference: str, pairs: list[tuple[str, ...]]) -> set[str]:
     if len(linked) < 2 or planned - linked:
         apart = ", ".join(sorted(planned - linked)) or "any other face"
         raise InputError(
-            f"plan: no group links face {apart} to reference face {reference}; add a group that shows one of each"
+            "E-PLAN-UNLINKED",
+            f"plan: no group links face {apart} to reference face {reference}; add a group that shows one of each",
         )
     return linked
 

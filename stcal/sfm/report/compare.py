@@ -97,11 +97,14 @@ def compare(run: str | Path, truth: str | Path) -> CompareFile:
     known = read_result(truth, TruthFile, "truth", REMEDY)
     if found.reference_face != known.reference_face:
         raise InputError(
+            "E-COMPARE-REFERENCE",
             f"reference face {found.reference_face} in the run, {known.reference_face} in the truth; "
-            f"run again with --reference-face {known.reference_face}"
+            f"run again with --reference-face {known.reference_face}",
         )
     if not known.target_from_face.keys() & found.target_from_face.keys():
-        raise InputError(f"run {run}, truth {truth}: no face in common; give the truth of the same target")
+        raise InputError(
+            "E-COMPARE-NO-FACE", f"run {run}, truth {truth}: no face in common; give the truth of the same target"
+        )
     _require_one_unit(f"run {run}, truth {truth}", found, known)
     faces = {
         face_id: _face(face_id, found, known) for face_id in known.target_from_face if face_id in found.target_from_face
@@ -134,8 +137,9 @@ def _require_one_unit(where: str, found: Answer, known: TruthFile) -> None:
             for name, small, large in (("truth", true, own), ("run", own, true)):
                 if unit != "mm" and small > 0 and abs(large / small / factor - 1) < OF_A_UNIT:
                     raise InputError(
+                        "E-COMPARE-UNITS",
                         f"{where}: distances between {what} are {own / true:.4g} times those of the truth, 1 ± "
-                        f"{OF_A_UNIT:g} expected; if the {name} is in {unit}, multiply its lengths by {factor:g}"
+                        f"{OF_A_UNIT:g} expected; if the {name} is in {unit}, multiply its lengths by {factor:g}",
                     )
 
 

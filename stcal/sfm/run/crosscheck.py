@@ -35,7 +35,9 @@ class Tolerances:
     def __post_init__(self):
         for name, value in asdict(self).items():
             if value is not None and not 0 <= value < np.inf:
-                raise InputError(f"tolerance {name} {value:g}: a number of 0 or more needed; give another")
+                raise InputError(
+                    "E-OPTION-RANGE", f"tolerance {name} {value:g}: a number of 0 or more needed; give another"
+                )
 
 
 def allowed_text(tolerances: Tolerances) -> str:

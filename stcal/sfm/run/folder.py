@@ -155,9 +155,14 @@ def report_again(run: Path, pdf: bool, out: Path | None = None) -> ReportAgain:
         Not a finished run, a damaged file in it, a file that cannot be written, or no WeasyPrint.
     """
     if not (run / RUN_MARKER).is_file():
-        raise InputError(f"run {run}: not a run's folder (no {RUN_MARKER}); give the --out of a finished run")
+        raise InputError(
+            "E-RUN-FOLDER", f"run {run}: not a run's folder (no {RUN_MARKER}); give the --out of a finished run"
+        )
     if out is not None and out.suffix.lower() == ".pdf":
-        raise InputError(f"--out {out}: the page is HTML; give {out.with_suffix('.html')}, and --pdf for {out.name}")
+        raise InputError(
+            "E-OUTPUT-SUFFIX",
+            f"--out {out}: the page is HTML; give {out.with_suffix('.html')}, and --pdf for {out.name}",
+        )
     if pdf:
         require_pdf()
     if out is not None:
@@ -176,7 +181,7 @@ def _page_and_pdf(run: Path, pdf: bool, out: Path) -> tuple[tuple[Path, ...], in
     try:
         checked(report, ReportFile)
     except InputError as error:
-        raise InputError(f"{path}: damaged, or of another version ({error}); run it again") from error
+        raise InputError("E-RUN-DAMAGED", f"{path}: damaged, or of another version ({error}); run it again") from error
     with _as_written(path):
         shown = shown_overlays(report)
         overlays = {name: there.read_bytes() for name in shown if (there := overlay_path(run, name)).is_file()}
@@ -206,7 +211,7 @@ def _residuals(run: Path, names: list[str]) -> dict[str, Residuals]:
                 own = [float(row[key]) for key in ("x_px", "y_px", "residual_x_px", "residual_y_px")]
                 rows[row["image"]].append(own)
     except (LookupError, TypeError, ValueError, csv.Error) as error:
-        raise InputError(f"{path}: damaged, or of another version ({error}); run it again") from error
+        raise InputError("E-RUN-DAMAGED", f"{path}: damaged, or of another version ({error}); run it again") from error
     return {name: np.array(own).reshape(-1, 4) for name, own in rows.items()}
 
 
@@ -216,10 +221,12 @@ def _as_written(path: Path) -> Iterator[None]:
     try:
         yield
     except OSError as error:
-        raise InputError(f"{error.filename}: {error.strerror or error}; the report needs it, run it again") from error
+        raise InputError(
+            "E-RUN-DAMAGED", f"{error.filename}: {error.strerror or error}; the report needs it, run it again"
+        ) from error
     except (LookupError, TypeError, ValueError, AttributeError, StcalError) as error:
         reason = f"no {error}" if isinstance(error, KeyError) else error
-        raise InputError(f"{path}: damaged, or of another version ({reason}); run it again") from error
+        raise InputError("E-RUN-DAMAGED", f"{path}: damaged, or of another version ({reason}); run it again") from error
 
 
 def require_report(saved: SavedRun) -> None:
@@ -227,7 +234,10 @@ def require_report(saved: SavedRun) -> None:
     with _as_written(saved.folder / "report.json"):
         _report_page(saved.folder, {key: value for key, value in saved.report.items() if key != "crosscheck"})
     if not os.access(saved.folder, os.W_OK):
-        raise InputError(f"run {saved.folder}: cannot be written to, and the comparison goes into its report; copy it")
+        raise InputError(
+            "E-OUTPUT-UNWRITABLE",
+            f"run {saved.folder}: cannot be written to, and the comparison goes into its report; copy it",
+        )
 
 
 def _corrected_px(models: Mapping[str, GroupModel], observations: list[ImageObservations]) -> list[np.ndarray]:

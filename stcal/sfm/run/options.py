@@ -72,7 +72,9 @@ class RunOptions:
 
     def __post_init__(self):
         if self.compare not in (None, *get_args(Compare)):
-            raise InputError(f"compare {self.compare!r}: not a choice; use {' or '.join(get_args(Compare))}")
+            raise InputError(
+                "E-OPTION-VALUE", f"compare {self.compare!r}: not a choice; use {' or '.join(get_args(Compare))}"
+            )
 
     def adjustment(self, target: TargetDesign) -> AdjustOptions:
         """What of it the adjustment is asked for, decided.

@@ -43,8 +43,9 @@ def require_comparable(options: AdjustOptions) -> None:
     """
     if options.solve != "joint" or not options.eccentricity:
         raise InputError(
+            "E-OPTION-CONFLICT",
             f"--compare paper: compares the joint adjustment, the solve is {options.solve}"
-            f"{'' if options.eccentricity else ' without eccentricity'}; leave --solve and --no-eccentricity out"
+            f"{'' if options.eccentricity else ' without eccentricity'}; leave --solve and --no-eccentricity out",
         )
 
 
@@ -100,7 +101,7 @@ def _jointly(result: RunResult) -> CalibratedTarget:
     """The run's own target with three-point frames."""
     joint = result.calibration.joint
     if joint is None:
-        raise InputError("--compare paper: no joint adjustment to compare with; leave --solve out")
+        raise InputError("E-OPTION-CONFLICT", "--compare paper: no joint adjustment to compare with; leave --solve out")
     return calibrated_target(joint, result.target, result.target_design, "three-point")
 
 

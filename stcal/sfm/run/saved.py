@@ -77,7 +77,9 @@ class SavedRun:
             return checked(self.report, part)
         except InputError as error:
             path = self.folder / "report.json"
-            raise InputError(f"{path}: damaged, or of another version ({error}); run it again") from error
+            raise InputError(
+                "E-RUN-DAMAGED", f"{path}: damaged, or of another version ({error}); run it again"
+            ) from error
 
     def adjusted_camera(self, own: ReportCamera) -> CalibratedCamera:
         """The camera of the run's final model: as refined where it was, else as given; ``own`` : the report's."""
@@ -107,17 +109,23 @@ def load_run(folder: str | Path) -> SavedRun:
     """
     folder = Path(folder)
     if not (folder / RUN_MARKER).is_file():
-        raise InputError(f"run {folder}: not a run's folder (no {RUN_MARKER}); give the --out of a finished run")
+        raise InputError(
+            "E-RUN-FOLDER", f"run {folder}: not a run's folder (no {RUN_MARKER}); give the --out of a finished run"
+        )
     complete_interrupted(folder)
     needed = (CAMERA, TARGET, BOARD, "labels.csv", "database.db", "report.json", "faces.json")
     missing = [name for name in needed if not (folder / name).is_file()]
     if missing == ["faces.json"]:
         raise InputError(
+            "E-RUN-NO-FACES",
             f"run {folder}: no faces.json: of the board alone, or of another version; for faces, run it on photographs "
-            "that show them"
+            "that show them",
         )
     if missing:
-        raise InputError(f"run {folder}: unfinished, or of another version: no {', '.join(missing)}; run it again")
+        raise InputError(
+            "E-RUN-UNFINISHED",
+            f"run {folder}: unfinished, or of another version: no {', '.join(missing)}; run it again",
+        )
     marker, faces, report = (read_json(folder / n, "", AGAIN) for n in (RUN_MARKER, "faces.json", "report.json"))
     camera = read_camera(folder / CAMERA).calibrated(0, 0)
     target, board = load_target(folder / TARGET), load_board(folder / BOARD)
@@ -165,7 +173,7 @@ def _as_written(path: Path) -> Iterator[None]:
         yield
     except (OSError, LookupError, TypeError, ValueError, AttributeError, csv.Error, StcalError) as error:
         reason = f"no {error}" if isinstance(error, KeyError) else error
-        raise InputError(f"{path}: damaged, or of another version ({reason}); run it again") from error
+        raise InputError("E-RUN-DAMAGED", f"{path}: damaged, or of another version ({reason}); run it again") from error
 
 
 def _labels(path: Path, names: list[tuple[str, str, int]], camera: Camera, known: Collection[str]):

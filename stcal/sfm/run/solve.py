@@ -82,7 +82,7 @@ def usable_groups(
                         f"it lies beside the folders of groups ({others}): move it into the one it belongs to, or "
                         f"leave it out with --exclude {group[0].name}"
                     )
-                raise MappingError(f"group {name}: {count}, 2 needed{why}; {remedy}")
+                raise MappingError("E-GROUP-FEW-IMAGES", f"group {name}: {count}, 2 needed{why}; {remedy}")
             require_usable(group, board_alone)
         except MappingError as error:
             errors.append(error)
@@ -90,7 +90,7 @@ def usable_groups(
             usable[name] = group
     if not usable:
         deeper = [f"; {each.name}: {each.reason}" for each in skipped if HOLDS_IMAGES in each.reason]
-        errors[0].args = (f"{errors[0]}{''.join(deeper[:1])}",)
+        errors[0].append("".join(deeper[:1]))
         raise errors[0]
     return usable, [_left_out(error) for error in errors]
 
@@ -132,16 +132,21 @@ def require_usable(group: list[ImageObservations], board_alone: bool = False) ->
     """
     where = f"group {group[0].group}"
     if len(group) < 2:
-        raise MappingError(f"{where}: 1 usable image ({group[0].name}), 2 needed; add photographs from other places")
+        raise MappingError(
+            "E-GROUP-FEW-IMAGES",
+            f"{where}: 1 usable image ({group[0].name}), 2 needed; add photographs from other places",
+        )
     if not board_alone and not any(image.face_ids() for image in group):
         raise MappingError(
+            "E-GROUP-NO-FACE",
             f"{where}: no face of the target recognised in {len(group)} images; look at the overlays, "
-            "check target.toml (radii, polarity) and the exposure; of the board alone, use --board-only"
+            "check target.toml (radii, polarity) and the exposure; of the board alone, use --board-only",
         )
     if not any(isinstance(label, DotLabel) for image in group for label in image.labels):
         raise MappingError(
+            "E-GROUP-NO-BOARD",
             f"{where}: no board recognised in {len(group)} images; keep the whole board in view, "
-            "check board.toml (rows, columns, pitch_mm, radius_mm, polarity)"
+            "check board.toml (rows, columns, pitch_mm, radius_mm, polarity)",
         )
 
 
@@ -303,7 +308,7 @@ def solve_groups(
                 )
                 find_scale(solution.model, board)
             except (MappingError, ScaleError, ConvergenceError, DegenerateError) as error:
-                error.args = (f"{error}{pitch_hint(group, board)}",)
+                error.append(pitch_hint(group, board))
                 errors.append(error)
             else:
                 solutions.append(solution)

@@ -139,7 +139,7 @@ def _writable(out: Path) -> Iterator[None]:
 
 
 def _unwritable(out: Path, error: OSError) -> InputError:
-    return InputError(f"output folder {out}: {error.strerror or error}; give a writable folder")
+    return InputError("E-OUTPUT-UNWRITABLE", f"output folder {out}: {error.strerror or error}; give a writable folder")
 
 
 def complete_interrupted(out: Path) -> None:
@@ -183,21 +183,25 @@ def remove(path: Path) -> None:
 
 def _require_ours(out: Path) -> None:
     if out.exists() and not out.is_dir():
-        raise InputError(f"output {out}: not a folder; give a new folder with --out")
+        raise InputError("E-OUTPUT-FOLDER", f"output {out}: not a folder; give a new folder with --out")
     ours = (CACHE, UNFINISHED)  # of a run that was ended while it claimed the folder
     if (
         out.is_dir()
         and not (out / RUN_MARKER).exists()
         and any(path.name not in ours and not path.name.startswith(RUN_MARKER) for path in out.iterdir())
     ):
-        raise InputError(f"output folder {out}: not empty and not of an earlier run; give a new folder with --out")
+        raise InputError(
+            "E-OUTPUT-EXISTS", f"output folder {out}: not empty and not of an earlier run; give a new folder with --out"
+        )
     _require_no_links(out)
 
 
 def _require_no_links(out: Path) -> None:
     for name in (UNFINISHED, ADDED, READY, CACHE):
         if (out / name).is_symlink():
-            raise InputError(f"output folder {out}: {name} in it is a link; remove it, a run writes through none")
+            raise InputError(
+                "E-OUTPUT-LINK", f"output folder {out}: {name} in it is a link; remove it, a run writes through none"
+            )
 
 
 def _require_no_inputs(out: Path, inputs: Mapping[str, object]) -> None:
@@ -206,8 +210,9 @@ def _require_no_inputs(out: Path, inputs: Mapping[str, object]) -> None:
     for word, given in inputs.items():
         if isinstance(given, str | Path) and place in (own := real_place(given), *own.parents):
             raise InputError(
+                "E-OUTPUT-IS-INPUT",
                 f"{word} {given}: lies in the output folder {out}, whose files this run replaces; copy it elsewhere, "
-                "or give another --out"
+                "or give another --out",
             )
 
 
@@ -226,7 +231,8 @@ def _locked(out: Path) -> Iterator[None]:
         except (OSError, ValueError):
             holder = "another process"
         raise InputError(
-            f"output folder {out}: {holder} is writing a run there; wait for its end, or give another --out"
+            "E-OUTPUT-IN-USE",
+            f"output folder {out}: {holder} is writing a run there; wait for its end, or give another --out",
         ) from error
     except OSError as error:
         raise _unwritable(out, error) from error
@@ -269,4 +275,4 @@ def _leave(folder: RunFolder, content: MarkerFile, error: BaseException) -> None
     elif not any(folder.stage.iterdir()):
         remove(folder.stage)
     elif isinstance(error, StcalError):
-        error.args = (f"{error}; the earlier results stay, {folder.stage} holds what this run made",)
+        error.append(f"; the earlier results stay, {folder.stage} holds what this run made")

@@ -52,18 +52,23 @@ def verify(run: str | Path) -> VerifyFile:
     """
     run = Path(run)
     if not (run / RUN_MARKER).is_file():
-        raise InputError(f"run {run}: not a run's folder (no {RUN_MARKER}); give the --out of a finished run")
+        raise InputError(
+            "E-RUN-FOLDER", f"run {run}: not a run's folder (no {RUN_MARKER}); give the --out of a finished run"
+        )
     complete_interrupted(run)
     before = digest_of(run / RUN_MARKER)
     content = read_json(run / RUN_MARKER, "run", AGAIN)
     try:
         marker = checked(content, MarkerFile)
     except InputError as error:
-        raise InputError(f"run {run / RUN_MARKER}: damaged, or of another version ({error}); {AGAIN}") from error
+        raise InputError(
+            "E-RUN-DAMAGED", f"run {run / RUN_MARKER}: damaged, or of another version ({error}); {AGAIN}"
+        ) from error
     if marker.sha256 is None:
         raise InputError(
+            "E-RUN-UNFINISHED",
             f"run {run}: no hashes in {RUN_MARKER}, it is unfinished or of a version that kept none "
-            f"(stcal {marker.version}); {AGAIN}"
+            f"(stcal {marker.version}); {AGAIN}",
         )
     found = {name for name in files_below(run) if name.split("/")[0] not in NO_RESULTS}
     missing = sorted(marker.sha256.keys() - found)
@@ -73,7 +78,7 @@ def verify(run: str | Path) -> VerifyFile:
         if name in found and known != (own_digest(content) if name == RUN_MARKER else digest_of(run / name))
     )
     if digest_of(run / RUN_MARKER) != before:
-        raise InputError(f"run {run}: other results took their place meanwhile; verify it again")
+        raise InputError("E-RUN-REPLACED", f"run {run}: other results took their place meanwhile; verify it again")
     others = sorted(_printable(name) for name in found - marker.sha256.keys())
     added = [name for name in others if name.split("/")[0] in OWN]
     return VerifyFile(
@@ -108,7 +113,7 @@ def require_whole(result: VerifyFile) -> None:
     """
     if faults := result.faults():
         remedy = "verify it with that version" if result.whole else "take a copy that is whole"
-        raise InputError(f"run {result.run}: {'; '.join(faults)}; {AGAIN}, or {remedy}")
+        raise InputError("E-RUN-CHANGED", f"run {result.run}: {'; '.join(faults)}; {AGAIN}, or {remedy}")
 
 
 def _listed(kind: str, names: Sequence[str]) -> list[str]:

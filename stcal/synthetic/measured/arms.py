@@ -132,4 +132,6 @@ def arm_at(rng: np.random.Generator, base_from_flange: Poses, sigma_rad: float, 
         if np.abs(off).max() < REACHED:
             return TrueArm(robot, parameters, q)
         q += np.linalg.solve(jacobian(robot, q), off[:, :, None])[:, :, 0]
-    raise ConvergenceError(f"arm: a pose of the flange is missed by {np.abs(off).max():.2g}; take others")
+    raise ConvergenceError(
+        "E-NO-MINIMUM", f"arm: a pose of the flange is missed by {np.abs(off).max():.2g}; take others"
+    )

@@ -62,7 +62,8 @@ def calibrate(
         if not given.left_out:
             raise
         name, reason = given.left_out[0]
-        raise type(error)(f"{error}; {len(given.left_out)} left out before, first {name}: {reason}") from error
+        error.append(f"; {len(given.left_out)} left out before, first {name}: {reason}")
+        raise
 
 
 def _outcome(

@@ -117,7 +117,9 @@ def read_input(
         found, arm = read_arm(poses, robot, quaternions)
         return _from_images(source, found, poses, camera, board, workers, progress, None, arm)
     if robot is not None:
-        raise InputError("--with-kinematics: only with a folder of images, in which the arm is seen to err")
+        raise InputError(
+            "E-OPTION-NEEDS", "--with-kinematics: only with a folder of images, in which the arm is seen to err"
+        )
     _require_no_images(source, poses, camera, board)
     _require_timed(source, timing)
     if isinstance(source, Table):
@@ -135,7 +137,7 @@ def _all_three(source: Path, poses: Path | None, camera: Path | None, board: Pat
     images = {"--poses": poses, "--camera": camera, "--board": board}
     missing = [name for name, path in images.items() if path is None]
     if poses is None or camera is None or board is None:
-        raise InputError(f"image folder {source}: {', '.join(missing)} needed with images")
+        raise InputError("E-OPTION-MISSING", f"image folder {source}: {', '.join(missing)} needed with images")
     return poses, camera, board
 
 
@@ -143,39 +145,45 @@ def _require_no_images(source: Source, poses: Path | None, camera: Path | None, 
     images = {"--poses": poses, "--camera": camera, "--board": board}
     extra = [name for name, path in images.items() if path is not None]
     if isinstance(source, Path) and not source.exists():
-        raise InputError(f"{source}: does not exist; a file of poses or a folder of images needed")
+        raise InputError("E-FILE-UNREADABLE", f"{source}: does not exist; a file of poses or a folder of images needed")
     if extra:
         what = f"{source} is a file of poses"
         if not isinstance(source, Path):
             what = f"{source.where if isinstance(source, Table) else source.pairs.where} are poses"
-        raise InputError(f"{', '.join(extra)}: only with a folder of images; {what}")
+        raise InputError("E-OPTION-NEEDS", f"{', '.join(extra)}: only with a folder of images; {what}")
 
 
 def _require_by_name(timing: Timing) -> None:
     if timing.offset or timing.image_times is not None:
         raise InputError(
+            "E-OPTION-CONFLICT",
             "--time-offset, --image-times: not with --with-kinematics, whose joint values belong to images by name; "
-            "name the images in the column image"
+            "name the images in the column image",
         )
 
 
 def _require_timed(source: Source, timing: Timing) -> None:
     """Options of times go with images, or with poses of both sides in files of their own."""
     if timing.image_times is not None:
-        raise InputError("--image-times: only with a folder of images; poses have their times beside them")
+        raise InputError(
+            "E-OPTION-NEEDS", "--image-times: only with a folder of images; poses have their times beside them"
+        )
     if timing.offset and not (isinstance(source, Told) and source.timed is not None):
         where = (
             source.where if isinstance(source, Table) else source if isinstance(source, Path) else source.pairs.where
         )
         raise InputError(
+            "E-OPTION-NEEDS",
             f"{where}: --time-offset needs the robot's poses as a stream with times; give --a and --b, or images and "
-            "--poses, each with times"
+            "--poses, each with times",
         )
 
 
 def _require_unsaid(said: Said, where: str) -> None:
     if said.options():
-        raise InputError(f"{where}: tables whose columns say all; leave {', '.join(said.options())} out")
+        raise InputError(
+            "E-OPTION-NEEDS", f"{where}: tables whose columns say all; leave {', '.join(said.options())} out"
+        )
 
 
 def setup_of(said: Said, told: str | None, where: str) -> Setup:
@@ -187,7 +195,9 @@ def setup_of(said: Said, told: str | None, where: str) -> Setup:
         Both say, but not the same.
     """
     if said.setup and told and said.setup != told:
-        raise InputError(f"{where}: of a setup {told}, --setup {said.setup}; leave the option out")
+        raise InputError(
+            "E-OPTION-CONTRADICTS", f"{where}: of a setup {told}, --setup {said.setup}; leave the option out"
+        )
     name = said.setup or told or SETUPS[0]
     return "eye-to-hand" if name == "eye-to-hand" else "eye-in-hand"
 
@@ -214,8 +224,9 @@ def _about_mm(pairs: HandEyePoses, setup: Setup) -> tuple[HandEyePoses, float]:
     scale = start.robust(Loop.of(pairs, setup), True)[2]
     if not scale > 0:
         raise DegenerateError(
+            "E-HANDEYE-MODEL-SCALE",
             f"{pairs.where}: the model's lengths do not follow the robot's motions; check that images and poses belong "
-            "together, and move the flange farther"
+            "together, and move the flange farther",
         )
     seen = pairs.camera_from_board
     return replace(pairs, camera_from_board=Poses(seen.rotation, scale * seen.translation)), scale
@@ -271,7 +282,9 @@ def photographed(
     left_out += [*late.items(), *_without_partner(files, rows, missing, robot.file)]
     if not views:
         first = f"{found.skipped[0].name}: {found.skipped[0].reason}"
-        raise InputError(f"image folder {source}: the board is in none of {len(with_pose)} images: {first}")
+        raise InputError(
+            "E-IMAGES-NO-BOARD", f"image folder {source}: the board is in none of {len(with_pose)} images: {first}"
+        )
     seen = Views(found.camera, tuple(View(v.xyz_board, v.xy_px, v.covariance_px2, v.normal) for v in views.values()))
     at = np.array([rows[name] for name in views])
     prior = camera_prior(refinable(model.calibrated(found.camera.width, found.camera.height)))
@@ -337,8 +350,9 @@ def _rows_of_images(
     rows, missing, how = robot.pairing([file.name for file in files])
     if not rows:
         raise InputError(
+            "E-POSES-UNMATCHED",
             f"{robot.where}: no row is of an image in {source}: {robot.images[0]} … there, {files[0].name} … here; "
-            "correct them"
+            "correct them",
         )
     return rows, missing, how
 

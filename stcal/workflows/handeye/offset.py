@@ -30,11 +30,15 @@ def at_offset(
     timed = given.timed
     if timed is None:
         raise InputError(
+            "E-POSES-UNTIMED",
             f"{given.where}: --time-offset needs times of both, of the robot's poses (a column time_s, or TUM) and of "
-            "the images (their names, or --image-times)"
+            "the images (their names, or --image-times)",
         )
     if options.four_dof:
-        raise InputError("--time-offset: not with --four-dof, whose motions do not tell it; leave one of them out")
+        raise InputError(
+            "E-OPTION-CONFLICT",
+            "--time-offset: not with --four-dof, whose motions do not tell it; leave one of them out",
+        )
     pairs, views, notes = given.pairs, given.views, ()
     if options.symmetries:
         mended = repair(pairs, setup, options.symmetries, views)

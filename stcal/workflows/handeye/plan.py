@@ -80,8 +80,9 @@ def _taken(robot: Robot, given: HandEyeInput) -> tuple[np.ndarray, tuple[str, ..
     what = f"robot {robot.name}: reaches {len(flange) - len(beyond)} of the {len(flange)} poses taken"
     if len(beyond) > (1 - LEAST_REACHED) * len(flange):
         raise InputError(
+            "E-PLAN-ROBOT",
             f"{what}, first not {beyond[0]}; give the robot's own file, in whose base and flange (no tool) the "
-            "poses are"
+            "poses are",
         )
     notes = (f"{what}, not {', '.join(beyond)}: do its lengths and limits hold for this arm?",) if beyond else ()
     return found.q[np.flatnonzero(found.usable)[-1]], notes

@@ -37,11 +37,9 @@ def calibrate_rig(
         rig = handeye_rig(poses, setup, options)
     except StcalError as error:
         out = [(each.name, *one) for each, own in zip(given.files.cameras, given.left_out, strict=True) for one in own]
-        if not out:
-            raise
-        raise type(error)(
-            f"{error}; {len(out)} left out before, first {out[0][0]}: {out[0][1]}: {out[0][2]}"
-        ) from error
+        if out:
+            error.append(f"; {len(out)} left out before, first {out[0][0]}: {out[0][1]}: {out[0][2]}")
+        raise
     poses, options = same_numbering(poses, setup, given.symmetries), replace(options, symmetries=())
     notes, held_out, factor = given.notes, None, 1.0
     if validation.repeats and (validation.held_out or len(poses) > LEAST_LEFT):

@@ -58,7 +58,7 @@ def read_rig(
         try:
             seen = photographed(each.images, robot, each.camera, design, workers, named, timing)
         except InputError as error:
-            raise InputError(f"camera {each.name}: {error}") from error
+            raise InputError(error.code, f"camera {each.name}: {error}") from error
         cameras.append(seen)
     flange, names, rows = _shared([(seen.robot, seen) for seen in cameras])
     every = tuple(
@@ -95,7 +95,10 @@ def _of_camera(robot: RobotPoses, images: Path, files: RigFiles) -> RobotPoses:
         return robot
     own = [i for i, image in enumerate(robot.images) if image.partition("/")[0] == images.name]
     if not own:
-        raise InputError(f"{robot.where}: no row is of an image in {images}: {robot.images[0]} … there; correct them")
+        raise InputError(
+            "E-POSES-UNMATCHED",
+            f"{robot.where}: no row is of an image in {images}: {robot.images[0]} … there; correct them",
+        )
     return replace(
         robot,
         images=tuple(robot.images[i].partition("/")[2] for i in own),

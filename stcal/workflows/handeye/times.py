@@ -69,7 +69,7 @@ def robot_at_images(robot: RobotPoses, names: Sequence[str], timing: Timing | No
     seconds = stream.after_origin([images[name] for name in known])
     taken = taken_at(stream, seconds, timing.tolerance_s)
     if not taken.kept.any():
-        raise InputError(f"{robot.where}: no image has a pose: {known[0]}: {taken.why[0]}")
+        raise InputError("E-POSES-UNMATCHED", f"{robot.where}: no image has a pose: {known[0]}: {taken.why[0]}")
     kept = [known[i] for i in np.flatnonzero(taken.kept)]
     more = "" if robot.covariance is None else "; its covariances are of other times and not used"
     found = replace(
@@ -110,7 +110,7 @@ def _times_of_images(names: Sequence[str], timing: Timing) -> dict[str, Decimal]
     table = read_table(timing.image_times, "image times")
     stated = dict(zip(table.text("image"), table.text("time_s"), strict=True))
     if len(stated) < len(table):
-        raise InputError(f"{table.where}: an image in two rows; one each needed")
+        raise InputError("E-TABLE-ROW-REPEATED", f"{table.where}: an image in two rows; one each needed")
     found = {}
     for name in names:
         alone = name.rsplit("/", 1)[-1]
@@ -119,10 +119,15 @@ def _times_of_images(names: Sequence[str], timing: Timing) -> dict[str, Decimal]
             continue
         time = time_of(text)
         if time is None:
-            raise InputError(f"{table.where}: time_s of {name} is {text!r}, a number of seconds needed")
+            raise InputError(
+                "E-TABLE-NUMBER", f"{table.where}: time_s of {name} is {text!r}, a number of seconds needed"
+            )
         found[name] = time
     if not found:
-        raise InputError(f"{table.where}: no row is of an image: {next(iter(stated))} … there, {names[0]} … here")
+        raise InputError(
+            "E-POSES-UNMATCHED",
+            f"{table.where}: no row is of an image: {next(iter(stated))} … there, {names[0]} … here",
+        )
     return found
 
 
@@ -130,9 +135,12 @@ def _require_times(robot: RobotPoses, images: dict[str, Decimal] | None, samples
     """Say which side has none."""
     if images is None:
         raise InputError(
+            "E-IMAGE-NAME-TIME",
             f"image {names[0]}: its name is no time, for poses of the robot by time ({robot.file}); name images by "
-            "seconds (1689.25.png), or give --image-times"
+            "seconds (1689.25.png), or give --image-times",
         )
     if samples is None or not isinstance(samples, list) or None in samples:
         first = f", but {robot.images[0]} …" if robot.images else ""
-        raise InputError(f"{robot.where}: no times of its poses{first}; give a column time_s, or a TUM trajectory")
+        raise InputError(
+            "E-POSES-UNTIMED", f"{robot.where}: no times of its poses{first}; give a column time_s, or a TUM trajectory"
+        )

@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
-from stcal.errors import InputError
 from stcal.handeye.data.robot_poses import read_robot_poses
+from tests.outcome import fails_with
 
 POSE = "x: 0.1\ny: -0.2\nz: 0.3\nqw: 0.6\nqx: 0.0\nqy: 0.8\nqz: 0\n"
 
@@ -28,7 +28,7 @@ def test_a_folder_of_poses_by_name(folder):
     )
     rows, missing = found.rows(["a/0.png", "a/10.png", "a/7.png"])
     assert (rows, missing) == ({"a/0.png": 0, "a/10.png": 2}, ("1",))
-    with pytest.raises(InputError, match=r"1\.yaml: 1 may be a/1\.png or b/1\.png; give its path"):
+    with fails_with("E-IMAGE-NAME-AMBIGUOUS … 1.yaml … 1 … a/1.png … b/1.png"):
         found.rows(["a/1.png", "b/1.png"])
 
 
@@ -46,37 +46,37 @@ def test_a_list_of_images_and_poses(folder, under):
 @pytest.mark.parametrize(
     ("text", "message"),
     [
-        (POSE.replace("z: 0.3", "z: .nan"), r"poses: 1\.yaml: z is nan, a finite number needed"),
-        (POSE.replace("z: 0.3\n", ""), r"1\.yaml: z is None, a finite number needed"),
-        (POSE.replace("0.8", "'0.8'"), r"1\.yaml: qy is '0\.8', a finite number needed"),
-        (POSE.replace("0.8", "0.9"), r"1\.yaml: quaternion of length 1\.082, 1 ± 0\.001 needed"),
-        ("[1, 2]", r"1\.yaml: x is None"),
-        ("{", r"1\.yaml: not YAML \(.*\); correct it"),
+        (POSE.replace("z: 0.3", "z: .nan"), "E-POSE-VALUE … poses … 1.yaml … nan"),
+        (POSE.replace("z: 0.3\n", ""), "E-POSE-VALUE … 1.yaml … None"),
+        (POSE.replace("0.8", "'0.8'"), "E-POSE-VALUE … 1.yaml … qy … '0.8'"),
+        (POSE.replace("0.8", "0.9"), "E-QUATERNION-LENGTH … 1.yaml … 1.082 … 0.001"),
+        ("[1, 2]", "E-POSE-VALUE … 1.yaml … None"),
+        ("{", "E-YAML-INVALID … 1.yaml"),
     ],
 )
 def test_a_bad_pose_is_named(folder, text, message):
     (folder / "1.yaml").write_text(text)
-    with pytest.raises(InputError, match=message):
+    with fails_with(message):
         read_robot_poses(folder)
 
 
 @pytest.mark.parametrize(
     ("text", "message"),
     [
-        ("data: 3\n", r"no list of pairs `image:` and `pose:`"),
-        ("- {image: a.png}\n", r"no list of pairs"),
-        ("- {image: a.png, pose: 1.yaml}\n- {image: a.png, pose: 0.yaml}\n", r"1\.yaml and 0\.yaml: both are of image"),
-        ("- {image: a.png, pose: nowhere.yaml}\n", r"nowhere\.yaml: No such file"),
+        ("data: 3\n", "E-ROBOT-POSES-FORM … `image:` … `pose:`"),
+        ("- {image: a.png}\n", "E-ROBOT-POSES-FORM"),
+        ("- {image: a.png, pose: 1.yaml}\n- {image: a.png, pose: 0.yaml}\n", "E-POSE-REPEATED … 1.yaml and 0.yaml"),
+        ("- {image: a.png, pose: nowhere.yaml}\n", "E-FILE-UNREADABLE … nowhere.yaml"),
     ],
 )
 def test_a_bad_list_is_said(folder, text, message):
     (folder / "list.yaml").write_text(text)
-    with pytest.raises(InputError, match=message):
+    with fails_with(message):
         read_robot_poses(folder / "list.yaml")
 
 
 def test_an_empty_folder_is_said(tmp_path):
-    with pytest.raises(InputError, match=r"a folder without \*\.yaml; a CSV file, or"):
+    with fails_with("E-ROBOT-POSES-FORM"):
         read_robot_poses(tmp_path)
 
 
@@ -85,12 +85,12 @@ def test_two_rows_of_one_image_are_said(tmp_path):
     header = "image," + ",".join(f"base_from_flange_{c}" for c in ("x_m", "y_m", "z_m", "qw", "qx", "qy", "qz"))
     (tmp_path / "poses.csv").write_text(f"{header}\n0.png,{row}\ng/0.png,{row}\n")
     found = read_robot_poses(tmp_path / "poses.csv")
-    with pytest.raises(InputError, match=r"line 2 and line 3: both are of image 'g/0\.png'"):
+    with fails_with("E-POSE-REPEATED … line 2 and line 3 … 'g/0.png'"):
         found.rows(["g/0.png"])
 
 
 def test_the_order_of_columns_is_no_matter_of_yaml(folder):
-    with pytest.raises(InputError, match="--quaternions xyzw is of a CSV file's columns"):
+    with fails_with("E-OPTION-NEEDS … --quaternions … xyzw"):
         read_robot_poses(folder, "xyzw")
 
 

@@ -10,13 +10,13 @@ from hypothesis import example, given
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
-from stcal.errors import InputError
 from stcal.geometry.rigid import Rigid
 from stcal.handeye import HandEye
 from stcal.handeye.report.export import FORMS, ROS_FORMS, exported, opencv_yaml, ros_yaml, tree, urdf_joint
 from stcal.handeye.report.export.ros import read_urdf
 from stcal.io.poses.static import read_messages
 from stcal.io.poses.text import program_name
+from tests.outcome import fails_with
 
 angle, length = st.floats(-3.1, 3.1), st.floats(-3000, 3000)
 
@@ -77,7 +77,7 @@ def test_opencv(setup, tmp_path):
 
 
 def test_frames_of_the_same_name_are_refused():
-    with pytest.raises(InputError, match="both 'tool0'"):
+    with fails_with("E-FRAME-NAME … 'tool0'"):
         ros_yaml(result_of(Rigid()), "tool0", "tool0")
 
 
@@ -192,7 +192,7 @@ def test_moveit_is_an_argument_list_of_roslaunch():
     words = node.get("args").split()
     assert [float(word) for word in words[:7]] == pytest.approx([0.1, 0.2, -0.3, 0, 0, 0.5, 0.75**0.5], abs=1e-12)
     assert words[7:] == ["flange", "camera_optical_frame"]
-    with pytest.raises(InputError, match="'tool 0' has white space"):
+    with fails_with("E-FRAME-NAME … 'tool 0'"):
         exported(result_of(Rigid()), "moveit", parent="tool 0")
 
 
@@ -218,7 +218,7 @@ def test_the_covariance_is_stated(form):
 
 
 def test_a_form_that_is_none_is_refused():
-    with pytest.raises(InputError, match="--export staubli: unknown; one of ros2, "):
+    with fails_with("E-OPTION-FORM … --export … staubli … ros2"):
         exported(result_of(POSE), "staubli")
 
 

@@ -1,7 +1,6 @@
 """``stcal handeye rig`` as a user types it."""
 
 import json
-import shutil
 import sys
 
 import cv2
@@ -13,6 +12,8 @@ from stcal.geometry.rigid import Poses, Rigid
 from stcal.handeye.data.robot_poses import read_robot_poses
 from stcal.synthetic.measured.handeye import FLANGE_FROM_CAMERA
 from tests.handeye.rig.photographed import LEFT_FROM, photographed_rig, write_poses
+from tests.outcome import ended
+from tests.shared import own_copy
 
 INPUT = 2
 
@@ -25,7 +26,7 @@ def drawn(tmp_path_factory):
 @pytest.fixture
 def files(drawn, tmp_path):
     """A copy that a test may change."""
-    return shutil.copytree(drawn.parent, tmp_path / "rig")
+    return own_copy(drawn.parent, tmp_path / "rig")
 
 
 @pytest.fixture
@@ -34,10 +35,7 @@ def rig(monkeypatch, capsys):
 
     def call(*arguments):
         monkeypatch.setattr(sys, "argv", ["stcal", "handeye", "rig", *map(str, arguments), "--workers", "1"])
-        with pytest.raises(SystemExit) as end:
-            main()
-        output = capsys.readouterr()
-        return end.value.code or 0, output.out, output.err
+        return ended(main, capsys)
 
     return call
 

@@ -6,7 +6,6 @@ import numpy as np
 import pytest
 from scipy.stats import chi2
 
-from stcal.errors import DegenerateError, InputError
 from stcal.geometry.rigid import Poses, Rigid
 from stcal.handeye import Noise, RigCamera, RigOptions, RigPoses, View, Views, handeye_rig
 from stcal.handeye.data.loop import Loop
@@ -15,6 +14,7 @@ from stcal.handeye.methods.rig_bundle import RigBundle, RigCorners
 from stcal.handeye.rig.solve import alone, of_places
 from stcal.io.camera import CalibratedCamera, camera_prior, intrinsic_basis
 from stcal.synthetic.measured.handeye_rig import NAMES, RigTruth, simulated_rig
+from tests.outcome import fails_with
 
 ROBOT, PX, BOARD = (3e-4, 0.1), (0.1, 0.2, 0.1), 0.03
 STATED = RigOptions(noise=Noise(*ROBOT, board_mm=BOARD))
@@ -183,14 +183,12 @@ def with_views(given: RigPoses, i: int, views: Views) -> RigPoses:
     return replace(given, cameras=tuple(cameras))
 
 
-@pytest.mark.parametrize(
-    ("cameras", "said"), [(3, "right sees it 1.. mm and 5.6.° from left, up"), (2, "left and right see it 1.. mm")]
-)
+@pytest.mark.parametrize(("cameras", "said"), [(3, "E-RIG-CONTRADICTS"), (2, "E-RIG-CONTRADICTS")])
 @pytest.mark.parametrize("setup", SETUPS)
 def test_another_board_is_named(setup, cameras, said):
     truth = simulated_rig(np.random.default_rng(3), 12, setup, cameras, ROBOT, PX, BOARD)
     given = seen_elsewhere(truth, 1, Rigid.exp([0, 0, 0.1, 150, 20, 0]))
-    with pytest.raises(DegenerateError, match=said):
+    with fails_with(said):
         handeye_rig(given, setup)
 
 
@@ -229,13 +227,13 @@ def test_a_pose_of_the_robot_that_is_wrong_is_left_out_for_all():
 def test_what_is_not_a_rig_is_refused():
     truth = simulated_rig(np.random.default_rng(1), 4, "eye-in-hand", 1)
     (camera,) = truth.given.cameras
-    with pytest.raises(InputError, match="each of its own name"):
+    with fails_with("E-RIG-CAMERAS"):
         RigPoses(truth.given.base_from_flange, (camera, camera))
-    with pytest.raises(InputError, match="two images of one pose"):
+    with fails_with("E-RIG-INSTANT"):
         RigCamera("left", camera.views, np.zeros(4, int), camera.images)
-    with pytest.raises(InputError, match="a row that none of 3 poses has"):
+    with fails_with("E-RIG-ROW … 3"):
         RigPoses(truth.given.base_from_flange[:3], (camera,))
-    with pytest.raises(InputError, match="no camera 'right'"):
+    with fails_with("E-RIG-NO-CAMERA … 'right'"):
         handeye_rig(truth.given, "eye-in-hand").camera("right")
-    with pytest.raises(DegenerateError, match="camera left: 2 images, 3 needed"):
+    with fails_with("E-HANDEYE-FEW-POSES … camera left: 2 … 3"):
         handeye_rig(replace(truth.given, cameras=(camera[[0, 1]],)), "eye-in-hand")

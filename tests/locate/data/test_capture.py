@@ -13,6 +13,7 @@ from stcal.io import device as module
 from stcal.io.device import OpenCVSource, SimulatedSource
 from stcal.locate.data.capture import Settings, capture, scene_folder
 from stcal.locate.data.exposures import find_scenes
+from tests.outcome import fails_with
 
 
 class Driver:
@@ -73,20 +74,20 @@ def test_what_was_really_set_is_written(driver, tmp_path):
 
 def test_a_camera_that_refuses_says_so_and_nothing_is_written(driver, tmp_path):
     for name, value, said in (
-        ("takes_exposure", False, "its driver takes no exposure 10; give exposures in its unit"),
-        ("ends_after", 4, "gives no image any more"),
+        ("takes_exposure", False, "E-DEVICE-SETTING … 10"),
+        ("ends_after", 4, "E-DEVICE-NO-IMAGE"),
     ):
         before = getattr(driver, name)
         setattr(driver, name, value)
-        with pytest.raises(InputError, match=said):
+        with fails_with(said):
             capture(OpenCVSource("0"), [10.0, 20.0], tmp_path / "a", Settings(None, 0.0))
         setattr(driver, name, before)
         assert not (tmp_path / "a").exists()
     driver.takes_gain = False
-    with pytest.raises(InputError, match="takes no gain"):
+    with fails_with("E-DEVICE-SETTING"):
         OpenCVSource("0", 3.0)
     driver.opened = False
-    with pytest.raises(InputError, match="camera 0: cannot be opened"):
+    with fails_with("E-DEVICE-OPEN … camera 0"):
         OpenCVSource("0")
 
 
@@ -97,7 +98,7 @@ def test_a_simulated_camera_is_as_bright_as_its_exposure(tmp_path):
         image, really = source.expose(exposure, 0.0)
         assert really == exposure
         assert image.mean() == pytest.approx(grey, abs=0.1)
-    with pytest.raises(InputError, match="an image needed to simulate a camera"):
+    with fails_with("E-IMAGE-UNREADABLE"):
         SimulatedSource(tmp_path / "none.png").expose(1.0, 0.0)
 
 
@@ -121,5 +122,5 @@ def test_the_command_writes_a_scene_that_run_reads(tmp_path):
 
 @pytest.mark.parametrize("name", ["", "../a", "a/b", ".hidden"])
 def test_names_that_are_no_folder(tmp_path, name):
-    with pytest.raises(InputError, match="letters, digits"):
+    with fails_with("E-DEVICE-NAME"):
         scene_folder(tmp_path, name)

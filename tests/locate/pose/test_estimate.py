@@ -6,7 +6,6 @@ import numpy as np
 import pytest
 
 from stcal.boards.tags import Tags
-from stcal.errors import DegenerateError
 from stcal.geometry.camera import Camera
 from stcal.geometry.rigid import Poses, Rigid
 from stcal.io.camera import CameraPrior
@@ -14,6 +13,7 @@ from stcal.locate.pose.estimate import SeenTags, covering_both, locate
 from stcal.locate.pose.merge import merge
 from stcal.locate.pose.verdict import VerdictOptions, judge
 from stcal.synthetic.measured.tags import CAMERA, CornerNoise, example_layout, random_pose, simulated_exposures
+from tests.outcome import fails_with
 
 SIX = (0, 1, 2, 3, 4, 5)
 LAYOUT = example_layout()
@@ -137,7 +137,7 @@ def test_two_tags_that_contradict_are_rejected():
 
 def test_no_tag_is_refused():
     empty = SeenTags(np.zeros(0, int), np.zeros((0, 4, 2)), np.zeros((0, 4, 2, 2)), np.zeros(0))
-    with pytest.raises(DegenerateError, match="no tag"):
+    with fails_with("E-LOCATE-NO-TAG"):
         locate(empty, LAYOUT, CAMERA)
 
 

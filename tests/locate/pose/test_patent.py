@@ -4,11 +4,12 @@ import numpy as np
 import pytest
 
 from stcal.boards.tags import Tags
-from stcal.errors import DegenerateError, InputError
+from stcal.errors import DegenerateError
 from stcal.geometry.rigid import Rigid
 from stcal.locate.data.exposures import exposure_times
 from stcal.locate.pose.patent import PatentOptions, gate, largest_area, locate_as_patent, most_tags, triangulated_area
 from stcal.synthetic.measured.tags import CAMERA, CornerNoise, example_layout, simulated_exposures
+from tests.outcome import fails_with
 
 LAYOUT = example_layout(1e-6)
 TRUTH = Rigid.exp([0.4, -0.1, 0.2, 10, 5, 600.0])
@@ -20,9 +21,9 @@ def tag_at(x: float, y: float, side: float = 10.0) -> np.ndarray:
 
 def test_exposure_times_are_a_geometric_series():
     assert np.allclose(exposure_times(1.0, 16.0, 5), [1, 2, 4, 8, 16])
-    with pytest.raises(InputError, match="shortest"):
+    with fails_with("E-EXPOSURES-VALUE"):
         exposure_times(0.0, 1.0, 3)
-    with pytest.raises(InputError, match="two or more"):
+    with fails_with("E-EXPOSURES-VALUE"):
         exposure_times(1.0, 2.0, 1)
 
 
@@ -68,7 +69,7 @@ def test_the_exposure_with_the_smallest_error_is_kept():
 
 def test_a_step_can_be_replaced():
     def refuse(xy, seen):
-        raise DegenerateError("no")
+        raise DegenerateError("E-TEST", "no")
 
     tags = simulated_exposures(LAYOUT, TRUTH, np.random.default_rng(0))
     with pytest.raises(DegenerateError, match="no exposure shows"):
@@ -95,7 +96,7 @@ def test_the_gate(det_j, error, ratio, same, reasons):
 
 def test_without_tags_there_is_no_pose():
     empty = Tags((), np.zeros((0, 4, 2)), np.zeros((0, 4, 2, 2)))
-    with pytest.raises(DegenerateError, match="no tag"):
+    with fails_with("E-LOCATE-NO-TAG"):
         locate_as_patent([empty], LAYOUT, CAMERA)
 
 

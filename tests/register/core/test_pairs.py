@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
-from stcal.errors import InputError
 from stcal.register import read_pairs
+from tests.outcome import fails_with
 
 HEAD = "ax_mm,ay_mm,az_mm,bx_mm,by_mm,bz_mm"
 ROWS = ["0,0,0,10,20,30", "1,0,0,11,20,30", "0,2,0,10,22,30", "0,0,3.5,10,20,33.5"]
@@ -51,25 +51,25 @@ def test_noise_of_three_kinds(written):
 @pytest.mark.parametrize(
     ("rows", "head", "message"),
     [
-        ([*ROWS, "1,2,nan,4,5,6"], HEAD, r"line 6: az_mm is 'nan', a finite number needed"),
-        ([*ROWS, "1,2,3,4,much,6"], HEAD, r"line 6: by_mm is 'much'"),
-        ([*ROWS, "1,2,3,4,5"], HEAD, r"line 6: 5 cells, 6 needed"),
-        ([*ROWS, "", ROWS[1]], HEAD, r"line 7: the same pair as on line 3; remove it"),
-        ([*ROWS, ROWS[1], ROWS[1]], HEAD, r"line [67]: the same pair as on line [36] \(and 1 more\)"),
-        (ROWS, HEAD.replace("bz_mm", "z_mm"), r"no such column, bz_mm or bz_m"),
-        (with_cells([1, 2, 0, 4]), HEAD + ",weight", r"line 4: weight is 0, a positive number needed"),
-        (with_cells([1, -2, -1, 4]), HEAD + ",sigma_mm", r"line 3: sigma is -2.*\(and 1 more\)"),
-        (with_cells(["1,1"] * 4), HEAD + ",sigma_mm,weight", r"columns weight and sigma; only one of"),
-        (with_cells(["1,2"] * 4), HEAD + ",cov_x_x,cov_x_y", r"cov_x_z is missing; all 6 columns"),
+        ([*ROWS, "1,2,nan,4,5,6"], HEAD, "E-TABLE-NUMBER … 6 … az_mm … 'nan'"),
+        ([*ROWS, "1,2,3,4,much,6"], HEAD, "E-TABLE-NUMBER … 6 … by_mm … 'much'"),
+        ([*ROWS, "1,2,3,4,5"], HEAD, "E-TABLE-CELLS … 6 … 5 … 6"),
+        ([*ROWS, "", ROWS[1]], HEAD, "E-TABLE-ROW-REPEATED … 7 … 3"),
+        ([*ROWS, ROWS[1], ROWS[1]], HEAD, "E-TABLE-ROW-REPEATED … 6"),
+        (ROWS, HEAD.replace("bz_mm", "z_mm"), "E-TABLE-COLUMN-MISSING … no such column … bz_mm or bz_m"),
+        (with_cells([1, 2, 0, 4]), HEAD + ",weight", "E-SIGMA-VALUE … 4 … weight … 0"),
+        (with_cells([1, -2, -1, 4]), HEAD + ",sigma_mm", "E-SIGMA-VALUE … 3 … sigma … -2 … (and 1 more)"),
+        (with_cells(["1,1"] * 4), HEAD + ",sigma_mm,weight", "E-TABLE-COLUMNS-CONFLICT … weight and sigma"),
+        (with_cells(["1,2"] * 4), HEAD + ",cov_x_x,cov_x_y", "E-TABLE-COLUMN-MISSING … cov_x_z … 6"),
         (
             with_cells(["1,0,0,1,0,1"] * 3 + ["1,2,0,1,0,1"]),
             f"{HEAD},{COV}",
-            r"line 5: covariance: correlation 2 of x and y",
+            "E-TABLE-COVARIANCE … 5 … 2",
         ),
     ],
 )
 def test_bad_files(written, rows, head, message):
-    with pytest.raises(InputError, match=message):
+    with fails_with(message):
         read_pairs(written(rows, head))
 
 

@@ -47,7 +47,7 @@ def test_a_fold_that_cannot_be_fitted_is_left_out():
 
     def sometimes(rows):
         if 0 not in rows:
-            raise DegenerateError("without the first")
+            raise DegenerateError("E-TEST", "without the first")
         return align_rigid(s.xyz_b[rows], s.xyz_a[rows])
 
     found = held_out(sometimes, s.xyz_a, s.xyz_b, s.clean, 4, 4, 0)

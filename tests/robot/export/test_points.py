@@ -7,7 +7,6 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from stcal.errors import InputError, StcalError
 from stcal.geometry.rigid import Rigid
 from stcal.io.table import POSE, pose_cells
 from stcal.robot.export import exported
@@ -19,6 +18,7 @@ from stcal.robot.kinematics.model import DHRow, Joint, Robot
 from stcal.robot.use.compensation import compensate, joint_cells, joint_columns
 from stcal.robot.use.targets import read_targets
 from stcal.synthetic.measured.arms import joint_vectors, made
+from tests.outcome import fails_with
 
 PULSES = (1000.0, -1234.5, 800.0, 900.0, 1100.0, 500.0)
 NUMBER = r"-?\d+\.\d+"
@@ -131,15 +131,15 @@ def test_what_is_said_and_left_out(case):
 
 
 def test_refusals(case):
-    with pytest.raises(InputError, match="--export abc: unknown; one of yaskawa, fanuc, kuka, abb, ur needed"):
+    with fails_with("E-OPTION-FORM … --export … abc"):
         case.text("abc")
-    with pytest.raises(InputError, match="--pulses-per-deg has 2 numbers; 6, one for each joint, not 0, needed"):
+    with fails_with("E-OPTION-VALUE … --pulses-per-deg … 2 … 6"):
         case.text("yaskawa", pulses=(1.0, 2.0))
     alone = compensate(case.real, read_targets(case.path, case.real))
-    with pytest.raises(InputError, match="give its file with --nominal"):
+    with fails_with("E-COMPENSATE-POSES … --nominal"):
         exported(alone, case.real, "ur", case.folder / "a", "poses")
     unreached = replace(case.result, found=replace(case.result.found, status=("unreachable",) * 6))
-    with pytest.raises(InputError, match="none of 6 rows is reached"):
+    with fails_with("E-EXPORT-UNREACHED … 6"):
         exported(unreached, case.real, "ur", case.folder / "a")
 
 
@@ -149,7 +149,7 @@ def test_poses_of_two_tools_are_refused(case, tmp_path):
     rows = [[tool, *joint_cells(robot, q)] for tool, q in zip(("", "ball"), case.q, strict=False)]
     path.write_text("\n".join(",".join(row) for row in [["target", *joint_columns(robot)], *rows]) + "\n")
     result = compensate(robot, read_targets(path, robot), robot)
-    with pytest.raises(InputError, match="poses of 2 tools, '', 'ball'; a file for each"):
+    with fails_with("E-EXPORT-TOOLS … 2 … '', 'ball'"):
         exported(result, robot, "kuka", path, "poses")
     assert "line 3, target ball" in exported(result, robot, "kuka", path).text
 
@@ -172,9 +172,9 @@ def test_prismatic_joints(tmp_path):
     assert re.search(r"J3 = 120\.500000000  mm,\n\tJ4 = -22\.918311805 deg\n\};", fanuc)
     abb = lines(exported(result, SCARA, "abb", path).text, r"\[\[" + six(*[""] * 6) + r"\]")
     assert np.abs(abb - np.pad(shown, ((0, 0), (0, 2)))).max() < 1e-8
-    with pytest.raises(InputError, match="4 joints, 1 prismatic; six that turn needed"):
+    with fails_with("E-ROBOT-MISMATCH … 4 … 1"):
         exported(result, SCARA, "ur", path)
-    with pytest.raises(InputError, match="1 prismatic joints have no pulses"):
+    with fails_with("E-ROBOT-MISMATCH … 1"):
         exported(result, SCARA, "yaskawa", path, pulses_per_deg=(1, 1, 1, 1))
 
 
@@ -190,7 +190,7 @@ def test_a_file_that_differs_is_not_written(case, form, wanted, monkeypatch):
         return f"{text[: last.start()]}{float(last[0]) + 1.25:.2f}{text[last.end() :]}"
 
     monkeypatch.setitem(FORMS, form, replace(own, write=wrong))
-    with pytest.raises(StcalError, match="does not give the points back"):
+    with fails_with("E-EXPORT-READ-BACK"):
         case.text(form, wanted, PULSES if wanted == "joints" else None)
 
 

@@ -5,7 +5,6 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from stcal.errors import ConvergenceError
 from stcal.geometry.rigid import Rigid
 from stcal.robot.identify import adjustment
 from stcal.robot.identify.adjustment import Weighting, huber_limit, solve
@@ -14,6 +13,7 @@ from stcal.robot.identify.result import IdentifyOptions
 from stcal.robot.identify.solve import identify
 from stcal.robot.kinematics.example import mh80
 from stcal.synthetic.measured.arms import joint_vectors, made, measured, placed
+from tests.outcome import fails_with
 
 WEIGHTING = Weighting(0.05, 2e-4)
 
@@ -83,5 +83,5 @@ def test_no_minimum_within_the_steps_is_an_error(case, monkeypatch):
     monkeypatch.setattr(adjustment, "MAX_STEPS", 1)
     count = jacobian(state, seen).shape[2]
     far = moved(state, np.full(count, 0.05), seen.kind)
-    with pytest.raises(ConvergenceError, match="identification: no minimum after 1 steps"):
+    with fails_with("E-NO-MINIMUM … identification … 1"):
         solve(far, seen, WEIGHTING)

@@ -6,7 +6,6 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from stcal.errors import InputError
 from stcal.geometry.rigid import Rigid
 from stcal.io.table import COVARIANCE, POSE, common_columns, pose_cells
 from stcal.robot.kinematics.example import mh80
@@ -16,6 +15,7 @@ from stcal.robot.kinematics.measurements import read_measurements
 from stcal.robot.use.compensation import joint_cells, joint_columns
 from stcal.robot.use.targets import read_targets
 from stcal.synthetic.measured.arms import joint_vectors, made, measured, placed
+from tests.outcome import fails_with
 
 WPR, ABC, OPEN = ("w_deg", "p_deg", "r_deg"), ("a_deg", "b_deg", "c_deg"), ("rx_deg", "ry_deg", "rz_deg")
 ORDER = {WPR: "xyz", ABC: "ZYX", OPEN: "XYZ"}
@@ -67,13 +67,13 @@ def test_angles_are_orientations(data, names, rotation):
 
 def test_an_open_convention_is_refused_and_a_needless_one_too(data):
     for read in (read_measurements, read_targets):
-        with pytest.raises(InputError, match=r"rx, ry, rz may be Euler angles .* give --rotation, like ur-rotvec"):
+        with fails_with("E-ROTATION-AMBIGUOUS … rx, ry, rz … --rotation … ur-rotvec"):
             read(data.write("data.csv", OPEN), mh80())
         for names in (POSE[3:], ()):
-            with pytest.raises(InputError, match=r"no columns of angles that --rotation yaskawa is of; leave it out"):
+            with fails_with("E-OPTION-NEEDS … --rotation … yaskawa"):
                 read(data.write("data.csv", names), mh80(), rotation="yaskawa")
     (data.folder / "d.csv").write_text("q1_deg,distance_mm\n1,2\n")
-    with pytest.raises(InputError, match="distances have no orientation"):
+    with fails_with("E-OPTION-NEEDS"):
         read_measurements(data.folder / "d.csv", _one_joint(), rotation="yaskawa")
 
 

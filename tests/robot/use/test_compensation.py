@@ -20,6 +20,7 @@ from stcal.robot.kinematics.model import Joint
 from stcal.robot.use.compensation import compensate, compensated_csv, compensation_file
 from stcal.robot.use.targets import read_targets
 from stcal.synthetic.measured.arms import elastic, joint_vectors, made
+from tests.outcome import fails_with
 
 JOINTS = [f"q{i}_deg" for i in range(1, 7)]
 FEW = 6
@@ -140,7 +141,7 @@ def test_every_tool_by_its_name(case):
         wanted, reached = forward(case.nominal, case.q[own], name), forward(case.real, result.found.q[own], name)
         np.testing.assert_allclose(reached.translation, wanted.translation, atol=1e-8)
     rows[3][0] = "cube"
-    with pytest.raises(InputError, match=r"line 5: target 'cube' is not in robot MH80; there are '', 'ball'"):
+    with fails_with("E-ROBOT-NO-TOOL … 5 … 'cube' … MH80 … '', 'ball'"):
         compensate(case.real, read_targets(case.write(["target", *JOINTS], rows), case.real), case.nominal)
 
 
@@ -220,14 +221,14 @@ def test_a_long_way_near_a_singularity_is_told(case):
 
 
 def test_bad_targets_are_named(case):
-    with pytest.raises(InputError, match="neither poses x_mm … qz nor joint values"):
+    with fails_with("E-TARGETS-NO-POSES … x_mm"):
         read_targets(case.write(["a", "b"], [["1", "2"]]), case.real)
-    with pytest.raises(InputError, match="positions without orientation"):
+    with fails_with("E-TARGETS-NO-ORIENTATION"):
         read_targets(case.write(["x_mm", "y_mm", "z_mm"], [["1", "2", "3"]]), case.real)
-    with pytest.raises(InputError, match="give its file with --nominal"):
+    with fails_with("E-TARGETS-NO-POSES … --nominal"):
         compensate(case.real, read_targets(case.write(JOINTS, case.joint_rows()), case.real))
     shorter = replace(case.nominal, rows=case.nominal.rows[:5], joints=case.nominal.joints[:5], coupling=None)
-    with pytest.raises(InputError, match="files of the same robot needed"):
+    with fails_with("E-ROBOT-MISMATCH"):
         compensate(case.real, read_targets(case.write(list(POSE), case.pose_rows()), case.real), shorter)
 
 

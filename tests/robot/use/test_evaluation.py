@@ -7,7 +7,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from stcal.errors import DegenerateError, InputError
 from stcal.geometry.rigid import Rigid
 from stcal.robot.identify.result import IdentifyOptions
 from stcal.robot.identify.solve import identify
@@ -19,6 +18,7 @@ from stcal.robot.use.evaluation import Figures, evaluate
 from stcal.robot.use.evaluation_report import evaluated_csv, evaluated_text, evaluation_file, evaluation_page, names_of
 from stcal.robot.use.verification import read_measured, verify
 from stcal.synthetic.measured.arms import joint_vectors, made, measured, placed
+from tests.outcome import fails_with
 from tests.robot.identify.test_solve import rokae
 
 BASE, TOOL = Rigid.exp([0.1, -0.05, 2.1, 2500.0, -900.0, 400.0]), Rigid.exp([0, 0.1, 0, 220, 60, 150])
@@ -192,23 +192,23 @@ def test_another_arm_is_refused_in_one_line():
     other = Robot(
         "other", "standard", (DHRow(0, np.pi / 2, 300, 0), DHRow(400, 0, 0, 0), DHRow(350, 0, 0, 0)), (Joint(),) * 3
     )
-    with pytest.raises(InputError, match=r"6 joint values, robot b has 3 joints"):
+    with fails_with("E-ROBOT-MISMATCH … 6 … 3"):
         evaluate({"a": arm(), "b": other}, data)
     rows = tuple(replace(row, alpha=-row.alpha) for row in mh80().rows)
-    with pytest.raises(InputError, match=r"robot b misses the measurements by .* mm RMS, 5% of their spread"):
+    with fails_with("E-IDENTIFY-MISFIT"):
         evaluate({"a": arm(), "b": replace(mh80(), rows=rows)}, data)
-    with pytest.raises(InputError, match=r"robot a as its file stands misses .*; it fits with base and tool fitted"):
+    with fails_with("E-IDENTIFY-MISFIT"):
         evaluate({"a": mh80()}, data, "none")
-    with pytest.raises(InputError, match=r"robot a: no tool 'ball'"):
+    with fails_with("E-ROBOT-NO-TOOL … 'ball'"):
         evaluate({"a": arm()}, replace(data, targets=("ball",) * 40), "base")
-    with pytest.raises(DegenerateError, match=r"3 positions give 9 numbers for 9 parameters of base and tool"):
+    with fails_with("E-IDENTIFY-FEW … 3 … position … 9 … 9 … base and tool"):
         evaluate({"a": arm()}, data[:3])
 
 
 def test_files_are_called_by_their_names():
     assert names_of([Path("a/robot.toml"), Path("a/made.toml")]) == ["robot", "made"]
     assert names_of([Path("a/robot.toml"), Path("b/robot.toml")]) == ["a/robot.toml", "b/robot.toml"]
-    with pytest.raises(InputError, match="given twice"):
+    with fails_with("E-OPTION-REPEATED"):
         names_of([Path("a.toml"), Path("a.toml")])
 
 

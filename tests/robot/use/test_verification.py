@@ -7,9 +7,9 @@ import numpy as np
 import pytest
 
 from stcal.cli.main import main
-from stcal.errors import InputError
 from stcal.geometry.rigid import Rigid
 from stcal.robot.use.verification import MeasuredPoses, read_measured, verification_file, verified_text, verify
+from tests.outcome import fails_with
 
 HEAD = "set,commanded_x_mm,commanded_y_mm,commanded_z_mm,x_mm,y_mm,z_mm"
 COMMANDED = np.array([[0, 0, 0], [30, 0, 0], [0, 40, 0], [0, 0, 50], [60, 80, 0]], float)
@@ -88,10 +88,10 @@ def test_poses_by_name_in_any_order(tmp_path):
     after = [f"{n},{row}" for n, row in zip(names, lines_of("after"), strict=True)][::-1]
     result = verify(read_measured(written(tmp_path, before + after, head)))
     np.testing.assert_allclose(result.sets[1].error_mm, [0.1, -0.1, 0.2, 0.0], atol=1e-9)
-    with pytest.raises(InputError, match=r"line 7: pose a of set before stands on line 2 already"):
+    with fails_with("E-TABLE-ROW-REPEATED … 7 … before … 2"):
         read_measured(written(tmp_path, [*before, before[0]], head))
     moved = [row.replace("after,30", "after,31") for row in after]
-    with pytest.raises(InputError, match=r"pose b is commanded 1 mm apart in sets before and after"):
+    with fails_with("E-VERIFY-COMMANDED … 1 … before … after"):
         verify(read_measured(written(tmp_path, before + moved, head)))
 
 
@@ -103,16 +103,16 @@ def test_the_same_command_twice_is_two_poses(tmp_path):
 
 
 def test_too_few_and_other_units_are_named(tmp_path):
-    with pytest.raises(InputError, match="2 poses in before; at least 3 needed"):
+    with fails_with("E-VERIFY-FEW … 2 … before"):
         verify(read_measured(written(tmp_path, lines_of("before")[:2])))
     inches = written(tmp_path, lines_of("before"), HEAD.replace(",x_mm,y_mm,z_mm", ",x_in,y_in,z_in"))
     [warning] = verify(read_measured(inches)).warnings()
     assert "times the commanded ones; check units" in warning
     assert verify(read_measured(written(tmp_path, lines_of("before")))).warnings() == []
     still = [f"before,1,2,3,{i},0,0" for i in range(4)]
-    with pytest.raises(InputError, match="all commanded positions are the same"):
+    with fails_with("E-VERIFY-ALIKE"):
         verify(read_measured(written(tmp_path, still)))
-    with pytest.raises(InputError, match="commanded_x_mm"):
+    with fails_with("E-TABLE-COLUMN-MISSING … commanded_x_mm"):
         read_measured(written(tmp_path, ["1,2,3"], "x_mm,y_mm,z_mm"))
 
 

@@ -1,7 +1,6 @@
 """The uncertainty budget of a small run: sums, statements, and what it refuses."""
 
 import json
-import shutil
 from dataclasses import replace
 
 import numpy as np
@@ -14,6 +13,7 @@ from stcal.sfm.budget.sources import correction
 from stcal.sfm.budget.statement import FIELDS, statement_of
 from stcal.sfm.run.saved import load_run
 from tests.outcome import INPUT, assert_error
+from tests.shared import own_copy
 
 STATEMENT = """
 [fields]
@@ -151,7 +151,7 @@ def test_command(stcal_sfm, small_run, tmp_path):
 
 def test_a_changed_run_is_named(stcal_sfm, small_run, tmp_path):
     copy = tmp_path / "run"
-    shutil.copytree(small_run, copy)
+    own_copy(small_run, copy)
     (copy / "report.html").write_text("x")
     code, text, _ = stcal_sfm("budget", copy)
     assert code == 0
@@ -160,7 +160,7 @@ def test_a_changed_run_is_named(stcal_sfm, small_run, tmp_path):
 
 def test_a_failed_check_is_said(stcal_sfm, small_run, tmp_path):
     copy = tmp_path / "run"
-    shutil.copytree(small_run, copy)
+    own_copy(small_run, copy)
     report = json.loads((copy / "report.json").read_text())
     title = report["checks"][1]["title"]
     report["checks"][1]["verdict"] = "failed"
@@ -182,18 +182,18 @@ def test_a_failed_check_is_said(stcal_sfm, small_run, tmp_path):
 def test_statements_that_are_none(stcal_sfm, small_run, tmp_path, content, words):
     path = tmp_path / "lab.toml"
     path.write_text(content)
-    assert_error(stcal_sfm("budget", small_run, "--statement", path), INPUT, str(path), words)
+    assert_error(stcal_sfm("budget", small_run, "--statement", path), INPUT, "E-TOML-CONTENT", str(path), words)
 
 
 def test_fields_that_are_none(stcal_sfm, small_run):
-    assert_error(stcal_sfm("budget", small_run, "--field", "operator"), INPUT, "NAME=VALUE needed")
+    assert_error(stcal_sfm("budget", small_run, "--field", "operator"), INPUT, "E-OPTION-VALUE")
     twice = ("--field", "a=1", "--field", "a=2")
-    assert_error(stcal_sfm("budget", small_run, *twice), INPUT, "--field a: given twice")
+    assert_error(stcal_sfm("budget", small_run, *twice), INPUT, "E-OPTION-REPEATED", "--field")
 
 
 def test_a_chain_has_no_budget(stcal_sfm, small_run, tmp_path):
     copy = tmp_path / "run"
-    shutil.copytree(small_run, copy)
+    own_copy(small_run, copy)
     faces = json.loads((copy / "faces.json").read_text())
     (copy / "faces.json").write_text(json.dumps(faces | {"solve": "chain"}))
-    assert_error(stcal_sfm("budget", copy), INPUT, "solved by chain, which states no covariance", "--solve joint")
+    assert_error(stcal_sfm("budget", copy), INPUT, "E-BUDGET-NO-COVARIANCE", "chain", "--solve")

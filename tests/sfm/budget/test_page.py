@@ -32,6 +32,6 @@ def test_page_and_pdf(stcal_sfm, small_run, tmp_path, monkeypatch):
 
 
 def test_a_pdf_stands_beside_a_page(stcal_sfm, small_run, tmp_path):
-    assert_error(stcal_sfm("budget", small_run, "--pdf"), INPUT, "give that with --report FILE.html")
+    assert_error(stcal_sfm("budget", small_run, "--pdf"), INPUT, "E-OPTION-NEEDS", "--report", "FILE.html")
     words = ("--report", tmp_path / "budget.pdf", "--pdf")
-    assert_error(stcal_sfm("budget", small_run, *words), INPUT, "the page is HTML")
+    assert_error(stcal_sfm("budget", small_run, *words), INPUT, "E-OUTPUT-SUFFIX")

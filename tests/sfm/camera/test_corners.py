@@ -8,9 +8,9 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from stcal.boards.design import ChessboardDesign, TagLayout
-from stcal.errors import InputError
 from stcal.workflows.calibrate_camera import calibrate_camera_by_corners, corner_grid
 from tests.boards.drawn import chessboard_mm, photograph
+from tests.outcome import fails_with
 
 FOCAL, CENTRE = (1500.0, 1490.0), (610.0, 440.0)
 CHESSBOARD = 'type = "chessboard"\nrows = 7\ncolumns = 10\nsquare_mm = 12.0\n'
@@ -51,12 +51,12 @@ def test_a_chessboard_gives_the_camera_with_its_sigma(photographs, tmp_path, stc
 def test_corners_are_dots_without_extent():
     grid = corner_grid(ChessboardDesign(4, 6, 25.0, 0.02))
     assert (grid.rows, grid.columns, grid.pitch_mm, grid.sigma_mm) == (4, 6, 25.0, 0.02)
-    with pytest.raises(InputError, match="tags; a board of dots, a chessboard or a ChArUco board needed"):
+    with fails_with("E-BOARD-TYPE … tags"):
         corner_grid(TagLayout((("DICT_4X4_50", 1),), np.zeros((1, 4, 2))))
 
 
 def test_a_folder_without_the_board(photographs, tmp_path):
-    with pytest.raises(InputError, match="does not exist"):
+    with fails_with("E-IMAGES-FOLDER … does not exist"):
         calibrate_camera_by_corners(tmp_path / "none", ChessboardDesign(7, 10, 12.0))
 
 

@@ -5,7 +5,7 @@ import re
 import numpy as np
 import pytest
 
-from stcal.errors import DegenerateError, InputError
+from stcal.errors import DegenerateError
 from stcal.geometry.camera import Camera
 from stcal.sfm.camera import held_out as module
 from stcal.sfm.camera.calibrate import judged, of_chosen_model, require_model
@@ -15,6 +15,7 @@ from stcal.sfm.camera.intrinsics import adjust_intrinsics
 from stcal.sfm.camera.report import calibration_page
 from stcal.sfm.camera.text import calibration_text
 from stcal.sfm.camera.views import closed_form, start_camera
+from tests.outcome import fails_with
 from tests.sfm.camera.test_intrinsics import BOARD, TRUE, calibrated, views_of
 
 FISHEYE = Camera(2592, 1728, [1100.0, 1098.0], [1301.0, 859.0], [0.02, -0.01, 0, 0, 0.003, 0, 0, 0], True)
@@ -107,7 +108,7 @@ def test_a_model_that_fails_says_why(monkeypatch):
 
     def failing(views, board, start, model, *more):
         if model == "PINHOLE":
-            raise DegenerateError("no minimum")
+            raise DegenerateError("E-TEST", "no minimum")
         return own(views, board, start, model, *more)
 
     monkeypatch.setattr(module, "adjust_intrinsics", failing)
@@ -119,7 +120,7 @@ def test_a_model_that_fails_says_why(monkeypatch):
 def test_too_few_views_to_choose(monkeypatch):
     few(monkeypatch)
     views = views_of(np.random.default_rng(3), count=3)
-    with pytest.raises(DegenerateError, match="--model auto: 3 views, 4 needed; add views, or choose a --model"):
+    with fails_with("E-CALIBRATE-FEW-VIEWS … --model … 3 … 4 … --model"):
         choose_model(views, BOARD, known_of(views, TRUE), 1)
 
 
@@ -132,7 +133,7 @@ def test_where_no_perspective_lens_fits_the_wide_one_begins(monkeypatch):
     def calibrate(model):
         asked.append(model)
         if model == "OPENCV":
-            raise DegenerateError("camera: dots are 40 px RMS from where OPENCV puts them")
+            raise DegenerateError("E-TEST", "camera: dots are 40 px RMS from where OPENCV puts them")
         return judged(known_of(views, FISHEYE), views, (), 1, True, BOARD)
 
     result = of_chosen_model(calibrate, BOARD, 1)
@@ -143,14 +144,14 @@ def test_where_no_perspective_lens_fits_the_wide_one_begins(monkeypatch):
 
 def test_where_neither_fits_the_first_reason_is_given():
     def calibrate(model):
-        raise DegenerateError(f"{model} does not fit")
+        raise DegenerateError("E-TEST", f"{model} does not fit")
 
     with pytest.raises(DegenerateError, match="OPENCV does not fit"):
         of_chosen_model(calibrate, BOARD, 1)
 
 
 def test_unknown_models_are_refused():
-    with pytest.raises(InputError, match=r"camera model BEST: not supported; use one of .* or auto"):
+    with fails_with("E-CAMERA-MODEL … BEST … auto"):
         require_model("BEST")
 
 

@@ -24,6 +24,7 @@ from stcal.sfm.camera.views import board_views, closed_form, start_camera
 from stcal.sfm.data.centres import Centres
 from stcal.sfm.data.observations import ImageObservations
 from stcal.sfm.detect.sightings import BoardSighting, ImageDetection
+from tests.outcome import fails_with
 
 TRUE = Camera(2592, 1728, [2790.0, 2784.0], [1301.0, 859.0], [-0.06, 0.045, 1.5e-4, -1e-4, 0, 0, 0, 0])
 BOARD = reference_board()
@@ -156,7 +157,7 @@ def test_closed_form_finds_the_focal_length():
 
 def test_boards_of_one_direction_are_refused():
     views = views_of(np.random.default_rng(1), count=6, tilt_deg=0.02)
-    with pytest.raises(DegenerateError, match=r"focal length determined to .* by 6 views, 1 % needed.*tilted"):
+    with fails_with("E-CALIBRATE-UNDETERMINED … 6 … 1"):
         require_determined(calibrated(views), views)
 
 

@@ -6,11 +6,11 @@ import numpy as np
 import pytest
 
 from stcal.design import reference_board, reference_target
-from stcal.errors import InputError
 from stcal.io.camera import read_camera
 from stcal.io.images import find_images
 from stcal.sfm.detect.circles.ellipses import EllipseOptions
 from stcal.sfm.detect.files import detect_files
+from tests.outcome import fails_with
 
 IMAGE = "12/IMG_1000.jpg"
 
@@ -70,5 +70,5 @@ def test_a_copy_and_a_file_that_is_no_image_are_named(detected):
 def test_no_usable_file_is_an_error(detected):
     detect, folder, _ = detected
     (folder / IMAGE).write_bytes(b"not an image")
-    with pytest.raises(InputError, match=f"no usable image among 1: {IMAGE}: "):
+    with fails_with("E-IMAGES-NONE-USABLE … 1 … 12/IMG_1000.jpg"):
         detect()

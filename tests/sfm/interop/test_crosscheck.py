@@ -20,7 +20,6 @@ from pathlib import Path
 import pytest
 
 from stcal.cli.main import main_sfm
-from stcal.errors import InputError, MappingError
 from stcal.io.saving import RUN_MARKER
 from stcal.sfm.interop import native
 from stcal.sfm.interop.crosscheck import crosscheck, mapper_options
@@ -31,7 +30,8 @@ from stcal.sfm.run.crosscheck import Tolerances
 from stcal.sfm.run.folder import write_report
 from stcal.sfm.run.saved import load_run
 from stcal.sfm.run.verify import verify
-from tests.outcome import COMPUTATION, INPUT, INTERRUPTED, assert_error, lines_of
+from tests.outcome import COMPUTATION, INPUT, INTERRUPTED, assert_error, fails_with, lines_of
+from tests.shared import own_copy
 
 INSTALL = "install it with `sudo apt-get install colmap`"
 
@@ -45,7 +45,7 @@ def state_of(folder) -> dict[str, str]:
 @pytest.fixture
 def own_run(small_run, tmp_path):
     """A copy of the small run to add to."""
-    return shutil.copytree(small_run, tmp_path / "run", ignore=shutil.ignore_patterns("cache"))
+    return own_copy(small_run, tmp_path / "run", ignore=shutil.ignore_patterns("cache"))
 
 
 @pytest.fixture(autouse=True)
@@ -80,7 +80,7 @@ def command(*arguments) -> list[str]:
 def checked(small_run, colmap, tmp_path_factory):
     """A run that was cross-checked: its folder, its state before, and what the command said."""
     run = tmp_path_factory.mktemp("checked") / "run"
-    shutil.copytree(small_run, run, ignore=shutil.ignore_patterns("cache"))
+    own_copy(small_run, run, ignore=shutil.ignore_patterns("cache"))
     before = state_of(run)
     out, err = StringIO(), StringIO()
     with pytest.MonkeyPatch.context() as patch, redirect_stdout(out), redirect_stderr(err):
@@ -308,7 +308,7 @@ def refused(refused_page_and_all, no_page):
 def test_no_native_program(own_run, stcal_sfm, tmp_path, monkeypatch):
     monkeypatch.setenv("PATH", str(tmp_path))
     outcome = stcal_sfm("crosscheck", own_run)
-    assert_error(outcome, INPUT, "native COLMAP: no program on the PATH", INSTALL, "or give its path with --colmap")
+    assert_error(outcome, INPUT, "E-COLMAP-PROGRAM", "on the PATH", INSTALL, "--colmap")
 
 
 def test_no_program_there(refused, tmp_path):
@@ -430,7 +430,7 @@ def test_a_child_that_outlives_the_mapper(refused, tmp_path):
 def test_a_mapper_that_prints_without_end(tmp_path):
     """A disk's worth in an hour; only the end is kept."""
     found = NativeColmap(program(tmp_path, "exec yes 0123456789"), "3.8", frozenset())
-    with pytest.raises(MappingError, match=r"still runs after 0\.3 s"):
+    with fails_with("E-COLMAP-TIMEOUT … 0.3"):
         map_natively(found, tmp_path / "no.db", tmp_path / "place", ["a"], {}, 0.3)
     log = (tmp_path / "place" / "mapper.log").read_bytes()
     assert len(log) == native.MAX_OUTPUT
@@ -586,7 +586,7 @@ def test_a_database_with_other_images(own_run, refused, tmp_path):
 
 def test_a_run_that_is_none(own_run, stcal_sfm, tmp_path):
     for place in (tmp_path / "nothing", own_run / "faces.json", tmp_path):
-        assert_error(stcal_sfm("crosscheck", place), INPUT, f"run {place}: not a run's folder")
+        assert_error(stcal_sfm("crosscheck", place), INPUT, "E-RUN-FOLDER", f"{place}")
 
 
 SPOILT_REPORTS = {
@@ -642,7 +642,7 @@ def test_no_room_for_temporary_files(own_run, refused, tmp_path, monkeypatch):
 def test_a_name_that_a_list_cannot_hold(own_run, tmp_path):
     saved = load_run(own_run)
     odd = replace(saved.observations[0], name=" 12/IMG_1000.jpg")
-    with pytest.raises(InputError, match=r"image ' 12/IMG_1000.jpg': .* rename the image or its folder"):
+    with fails_with("E-IMAGE-NAME-SPACES … ' 12/IMG_1000.jpg'"):
         crosscheck(replace(saved, observations=(odd, *saved.observations[1:])), never(tmp_path))
     require_listable([*image_ids(saved.observations), "12/ inner space.jpg"])
 
@@ -657,5 +657,5 @@ def test_a_limit_that_is_none(own_run, stcal_sfm, option, value):
 
 def test_a_tolerance_that_is_none():
     for value in (-1.0, float("nan"), float("inf")):
-        with pytest.raises(InputError, match=r"tolerance camera_mdeg .*: a number of 0 or more needed"):
+        with fails_with("E-OPTION-RANGE … camera_mdeg"):
             Tolerances(camera_mdeg=value)

@@ -22,6 +22,7 @@ from stcal.sfm.interop.export import FORMS, export_run
 from stcal.sfm.interop.export.content import content_of
 from stcal.sfm.interop.export.solids import EDGES
 from stcal.sfm.run.saved import load_run
+from tests.outcome import fails_with
 
 AGAIN_MM = 1e-9
 """Doubles in their shortest text, by way of metres and quaternions."""
@@ -277,23 +278,23 @@ def test_a_library_that_is_missing_is_named(small_run, tmp_path, monkeypatch, fo
 @pytest.mark.parametrize(
     ("name", "form", "root", "said"),
     [
-        ("box.stl", "", "target", r"suffix \.stl; one of \.urdf, .* needed, or --form"),
-        ("box", "", "target", r"suffix missing"),
-        ("box.csv", "stl", "target", r"--form stl: unknown; one of urdf, "),
-        ("box.csv", "", "my box", r"--name 'my box': a word"),
-        ("box.csv", "", "", r"--name '': a word"),
-        ("no/box.csv", "", "target", r"no folder .*; make it"),
+        ("box.stl", "", "target", "E-OUTPUT-SUFFIX … .stl … --form"),
+        ("box", "", "target", "E-OUTPUT-SUFFIX … missing"),
+        ("box.csv", "stl", "target", "E-OPTION-FORM … --form … stl … urdf"),
+        ("box.csv", "", "my box", "E-FRAME-NAME … --name … 'my box'"),
+        ("box.csv", "", "", "E-FRAME-NAME … --name … ''"),
+        ("no/box.csv", "", "target", "E-OUTPUT-FOLDER"),
     ],
 )
 def test_refused(small_run, tmp_path, name, form, root, said):
-    with pytest.raises(InputError, match=said):
+    with fails_with(said):
         export_run(small_run, tmp_path / name, form, root)
 
 
 def test_nothing_is_overwritten(small_run, tmp_path):
     path = tmp_path / "box.urdf"
     path.write_text("mine", encoding="utf-8")
-    with pytest.raises(InputError, match="exists, and nothing is overwritten"):
+    with fails_with("E-OUTPUT-EXISTS"):
         export_run(small_run, path)
     assert path.read_text(encoding="utf-8") == "mine"
 

@@ -17,6 +17,7 @@ from stcal.sfm.make.design import MakeOptions, make_target
 from stcal.sfm.make.hidden import unnamed_cases
 from stcal.sfm.make.pattern import HIDDEN, LARGE, LEAST_CIRCLES, make_pattern
 from stcal.synthetic.designs import face_of_drawing, second_design
+from tests.outcome import fails_with
 
 SIZE = (130.0, 110.0, 100.0)
 
@@ -81,9 +82,7 @@ def test_a_pattern_that_is_not_always_named_is_drawn_anew(monkeypatch):
     options = MakeOptions((130.0, 120.0, 110.0), circles=LEAST_CIRCLES, width=1296)
     with monkeypatch.context() as once:
         once.setattr(design, "ATTEMPTS", 1)
-        with pytest.raises(
-            InputError, match=r"not named with circles .* hidden, as in 1 of 420 cases; 1 patterns tried"
-        ):
+        with fails_with("E-MAKE-UNNAMED … 1 … 420 … 1"):
             make_target(options)
     assert make_target(options).cases == 5 * 84
 
@@ -135,14 +134,14 @@ def test_another_seed_makes_another_pattern():
 @pytest.mark.parametrize(
     ("options", "said"),
     [
-        (MakeOptions(SIZE, radius_mm=1.0), r"--radius-mm 1: at 1000 mm this camera sees circles well from 2\.28 mm on"),
-        (MakeOptions(SIZE, radius_mm=60.0, distance_mm=500.0), "px are sought"),
-        (MakeOptions(SIZE, circles=8), "--circles 8: 9 needed, 6 name a face and 3 may be hidden"),
-        (MakeOptions(SIZE, circles=40, radius_mm=9.0), "face front: no room for 40 circles of 9 and 14.4 mm"),
+        (MakeOptions(SIZE, radius_mm=1.0), "E-MAKE-RADIUS … --radius-mm … 1 … 1000 … 2.28"),
+        (MakeOptions(SIZE, radius_mm=60.0, distance_mm=500.0), "E-MAKE-RADIUS"),
+        (MakeOptions(SIZE, circles=8), "E-MAKE-CIRCLES … --circles … 8 … 9 … 6 … 3"),
+        (MakeOptions(SIZE, circles=40, radius_mm=9.0), "E-MAKE-ROOM … front … 40 … 9 … 14.4"),
     ],
 )
 def test_what_cannot_be_made_is_refused(options, said):
-    with pytest.raises(InputError, match=said):
+    with fails_with(said):
         make_target(options)
 
 
@@ -155,15 +154,15 @@ def test_sizes_are_three_lengths(size):
 @pytest.mark.parametrize(
     ("outline", "said"),
     [
-        ("[[-5, -5], [90, -5], [90, 90], [-5, 90]]", "reaches over outline_mm"),
-        ("[[-50, -50], [-50, -50], [190, 190]]", "the same corner twice"),
-        ("[[-50, -50], [190, 190]]", "outline_mm"),
+        ("[[-5, -5], [90, -5], [90, 90], [-5, 90]]", "E-TARGET-OUTLINE … outline_mm"),
+        ("[[-50, -50], [-50, -50], [190, 190]]", "E-TARGET-OUTLINE"),
+        ("[[-50, -50], [190, 190]]", "E-TOML-CONTENT … outline_mm"),
     ],
 )
 def test_outlines_that_do_not_fit_are_refused(tmp_path, outline, said):
     text = target_toml(second_design()[0]).replace("circles = [", f"outline_mm = {outline}\ncircles = [", 1)
     (tmp_path / "target.toml").write_text(text)
-    with pytest.raises(InputError, match=said):
+    with fails_with(said):
         load_target(tmp_path / "target.toml")
 
 
@@ -177,5 +176,5 @@ def test_the_command_keeps_a_board_and_replaces_nothing(tmp_path, capsys):
     assert (tmp_path / "board.toml").read_text() == before
     assert load_board(tmp_path / "board.toml").rows == 5
     assert load_target(tmp_path / "target.toml").rough_poses().keys() == {"front", "right", "back", "left", "top"}
-    with pytest.raises(InputError, match="exists"):
+    with fails_with("E-OUTPUT-EXISTS"):
         command(tmp_path, "130,110,100")

@@ -16,7 +16,6 @@ import cv2
 import numpy as np
 import pytest
 
-from stcal.errors import InputError
 from stcal.geometry.rigid import Rigid
 from stcal.io.camera import read_camera
 from stcal.io.design import board_toml, target_toml
@@ -24,7 +23,8 @@ from stcal.io.images import decode
 from stcal.sfm.detect import files
 from stcal.synthetic.observe import image_circles
 from stcal.synthetic.render import encode, render
-from tests.outcome import COMPUTATION, INPUT, INTERRUPTED, assert_error, lines_of
+from tests.outcome import COMPUTATION, INPUT, INTERRUPTED, assert_error, fails_with, lines_of
+from tests.shared import own_copy
 
 CHAIN = ("--solve", "chain")
 """For what is seen before faces are adjusted together, which takes half of a small run's time."""
@@ -80,25 +80,25 @@ def blacken(small, scene, group: str, board: bool, count: int) -> None:
 def test_missing_folder(small_set, stcal_sfm):
     small = small_set()
     small.images.rmdir()
-    assert_error(stcal_sfm(*small.arguments()), INPUT, str(small.images), "does not exist; give a folder")
+    assert_error(stcal_sfm(*small.arguments()), INPUT, "E-IMAGES-FOLDER", str(small.images), "does not exist")
 
 
 def test_a_file_in_place_of_the_folder(small_set, stcal_sfm):
     small = small_set()
     outcome = stcal_sfm("run", small.camera, "--camera", small.camera, "--out", small.out)
-    assert_error(outcome, INPUT, str(small.camera), "not a folder; give a folder")
+    assert_error(outcome, INPUT, "E-IMAGES-FOLDER", str(small.camera), "not a folder")
 
 
 def test_empty_folder(small_set, stcal_sfm):
     small = small_set()
     (small.images / "12").mkdir()
-    assert_error(stcal_sfm(*small.arguments()), INPUT, str(small.images), "no image", f"put them into {small.images}/")
+    assert_error(stcal_sfm(*small.arguments()), INPUT, "E-IMAGES-NONE", str(small.images), f"{small.images}")
 
 
 def test_the_folder_above_the_right_one(small_set, stcal_sfm):
     small = small_set("12")
     outcome = stcal_sfm("run", small.folder, "--camera", small.camera, "--out", small.folder.parent / "out")
-    assert_error(outcome, INPUT, "no image", "images lie in <group>/ directly", "put them into")
+    assert_error(outcome, INPUT, "E-IMAGES-NONE", "images lie in <group>/ directly")
 
 
 SPOILT = {
@@ -115,7 +115,7 @@ def test_no_image_is_left(small_set, stcal_sfm, case):
     small = small_set("12")
     for path in (small.images / "12").iterdir():
         path.write_bytes(spoil(path.read_bytes()))
-    assert_error(stcal_sfm(*small.arguments()), INPUT, "no usable image among 4: 12/IMG_1000.jpg:", *parts)
+    assert_error(stcal_sfm(*small.arguments()), INPUT, "E-IMAGES-NONE-USABLE", "4", "12/IMG_1000.jpg", *parts)
 
 
 def test_all_images_of_another_size(small_set, stcal_sfm):
@@ -124,7 +124,7 @@ def test_all_images_of_another_size(small_set, stcal_sfm):
         for i in range(4):
             small.image(i, group).write_bytes(encoded(".jpg", pixels(small.image(i, group))[::2, ::2]))
     parts = ("12/IMG_1000.jpg", "648×432 px", "1296×864 px", "use images as the camera took them")
-    assert_error(stcal_sfm(*small.arguments()), INPUT, *parts)
+    assert_error(stcal_sfm(*small.arguments()), INPUT, "E-IMAGES-NONE-USABLE", *parts)
     assert results_in(small.out) == []
 
 
@@ -292,13 +292,13 @@ def test_a_face_that_is_never_linked(small_set, other_pair_scene, stcal_sfm):
 def test_a_reference_face_that_is_never_seen(small_set, stcal_sfm):
     small = small_set("12")
     outcome = stcal_sfm(*small.arguments("--reference-face", "3"))
-    assert_error(outcome, COMPUTATION, "reference face 3: not mapped in any group", "choose one of 1, 2")
+    assert_error(outcome, COMPUTATION, "E-FACE-REFERENCE", "3", "1, 2")
 
 
 def test_a_reference_face_that_does_not_exist(small_set, stcal_sfm):
     small = small_set("12")
     outcome = stcal_sfm(*small.arguments("--reference-face", "9"))
-    assert_error(outcome, INPUT, "no face 9; the design has 1, 2, 3, 4, 5")
+    assert_error(outcome, INPUT, "E-TARGET-NO-FACE", "9", "1, 2, 3, 4, 5")
 
 
 def still(first: np.ndarray, scene) -> list[np.ndarray]:
@@ -324,7 +324,7 @@ def test_a_camera_that_did_not_move(small_set, small_scene, stcal_sfm, photograp
     for i, picture in enumerate(pictures):
         small.image(i).write_bytes(encoded(".jpg", picture))
     parts = ("group 12: no initial pair", "the camera did not move", "take the photographs from different places")
-    assert_error(stcal_sfm(*small.arguments()), COMPUTATION, *parts)
+    assert_error(stcal_sfm(*small.arguments()), COMPUTATION, "E-MAPPING-NO-PAIR", *parts)
     assert results_in(small.out) == []
 
 
@@ -389,7 +389,7 @@ def test_impossible_toml(small_set, stcal_sfm, case):
 def test_missing_toml(small_set, stcal_sfm, kind):
     small = small_set("12")
     outcome = stcal_sfm(*small.arguments(f"--{kind}", small.folder / "no.toml"))
-    assert_error(outcome, INPUT, str(small.folder / "no.toml"), "`stcal-sfm init DIR` writes one")
+    assert_error(outcome, INPUT, "E-FILE-UNREADABLE", str(small.folder / "no.toml"), "`stcal-sfm init DIR` writes one")
 
 
 CAMERAS = {
@@ -427,7 +427,7 @@ def test_a_camera_of_opencv_for_larger_images(small_set, stcal_sfm):
     path.write_text(opencv_yaml(5580, 2592, 1728, []), encoding="utf-8")
     outcome = stcal_sfm(*small.arguments("--camera", path))
     parts = ("(2592, 1728) px is outside of 12/IMG_1000.jpg (1296×864 px)", "use the camera file that belongs")
-    assert_error(outcome, INPUT, f"camera file {path}", *parts)
+    assert_error(outcome, INPUT, "E-CAMERA-CENTRE", f"{path}", *parts)
 
 
 @pytest.mark.slow
@@ -444,7 +444,7 @@ def test_another_camera_than_took_the_images(small_set, stcal_sfm):
 def test_no_pair_within_the_limit(small_set, stcal_sfm):
     small = small_set("12")
     outcome = stcal_sfm(*small.arguments("--max-angle", 5))
-    assert_error(outcome, COMPUTATION, "group 12: no initial pair", "of 1° to 5° (measured", "raise --max-angle")
+    assert_error(outcome, COMPUTATION, "E-MAPPING-NO-PAIR", "12:", "1", "5", "--max-angle")
 
 
 # --- the output ---
@@ -455,7 +455,7 @@ def test_a_foreign_folder_is_refused_and_left_alone(small_set, stcal_sfm):
     small.out.mkdir()
     (small.out / "faces.json").write_text("mine", encoding="utf-8")
     outcome = stcal_sfm(*small.arguments())
-    assert_error(outcome, INPUT, str(small.out), "not empty and not of an earlier run; give a new folder with --out")
+    assert_error(outcome, INPUT, "E-OUTPUT-EXISTS", str(small.out), "--out")
     assert [p.name for p in small.out.iterdir()] == ["faces.json"]
     assert (small.out / "faces.json").read_text(encoding="utf-8") == "mine"
 
@@ -463,7 +463,7 @@ def test_a_foreign_folder_is_refused_and_left_alone(small_set, stcal_sfm):
 def test_the_images_as_output_are_refused(small_set, stcal_sfm):
     small = small_set("12", detected=False)
     outcome = stcal_sfm("detect", small.images, "--camera", small.camera, "--out", small.images)
-    assert_error(outcome, INPUT, str(small.images), "give a new folder with --out")
+    assert_error(outcome, INPUT, "E-OUTPUT-EXISTS", str(small.images), "--out")
     assert len(list(small.images.rglob("*"))) == 5
 
 
@@ -478,9 +478,9 @@ def test_a_file_as_output(small_set, stcal_sfm, below):
 
 def test_a_wrong_folder_of_images_costs_no_earlier_result(small_set, small_run, stcal_sfm):
     small = small_set()
-    shutil.copy(small_run / "faces.json", small.out)
+    own_copy(small_run / "faces.json", small.out)
     outcome = stcal_sfm("run", small.folder / "imagse", "--camera", small.camera, "--out", small.out)
-    assert_error(outcome, INPUT, "imagse", "does not exist")
+    assert_error(outcome, INPUT, "E-IMAGES-FOLDER", "imagse", "does not exist")
     assert results_in(small.out) == ["faces.json"]
 
 
@@ -555,7 +555,9 @@ def test_a_truth_that_is_none(small_run, small_dataset, stcal_sfm, tmp_path, cas
 def test_an_unfinished_run_is_not_compared(small_set, stcal_sfm):
     small = small_set()
     outcome = stcal_sfm("compare", small.out, small.folder / "truth.json")
-    assert_error(outcome, INPUT, str(small.out / "faces.json"), "No such file", "give a finished run")
+    assert_error(
+        outcome, INPUT, "E-FILE-UNREADABLE", str(small.out / "faces.json"), "No such file", "give a finished run"
+    )
 
 
 # --- a real process ---
@@ -576,7 +578,7 @@ def test_a_real_process_exits_alike(small_set):
 
 def test_debug_lets_the_error_through(small_set, stcal_sfm):
     small = small_set()
-    with pytest.raises(InputError, match="image folder"):
+    with fails_with("E-IMAGES-NONE"):
         stcal_sfm(*small.arguments("--debug"))
 
 

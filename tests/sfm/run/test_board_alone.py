@@ -1,7 +1,6 @@
 """Photographs of the board alone: λ and its residuals, as in Zhang & Wei's table 1."""
 
 import json
-import shutil
 from dataclasses import replace
 
 import numpy as np
@@ -14,6 +13,7 @@ from stcal.sfm.detect.board_alone import _is_symmetry, _numbered
 from stcal.sfm.detect.sightings import PlaneView
 from tests.sfm.conftest import SmallSet
 from tests.sfm.run.test_bad_input import COMPUTATION, INPUT, blacken
+from tests.shared import own_copy
 
 BOARD = reference_board()
 
@@ -22,7 +22,7 @@ BOARD = reference_board()
 def hidden(small_dataset, small_scene, tmp_path_factory):
     """The small set with the target painted over."""
     own = SmallSet(tmp_path_factory.mktemp("alone") / "set")
-    shutil.copytree(small_dataset, own.folder)
+    own_copy(small_dataset, own.folder)
     for group in ("12", "14"):
         blacken(own, small_scene, group, board=False, count=4)
     return own

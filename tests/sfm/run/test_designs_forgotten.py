@@ -5,11 +5,11 @@ from dataclasses import replace
 import pytest
 
 from stcal.design import reference_board, reference_target
-from stcal.errors import InputError
 from stcal.io.design import board_toml, load_target, target_toml
 from stcal.sfm.data.pitch import measured_pitch_mm, pitch_hint
 from stcal.sfm.detect.ambiguity import likeness_notes
 from stcal.synthetic.scene import second_design
+from tests.outcome import fails_with
 
 pytestmark = pytest.mark.usefixtures("no_page")
 
@@ -112,7 +112,7 @@ def test_faces_of_one_pattern_end_a_command(stcal_sfm, tmp_path):
     twice = replace(target, faces=(*target.faces, replace(target.faces[1], id="6")))
     path = tmp_path / "target.toml"
     path.write_text(target_toml(twice))
-    with pytest.raises(InputError, match="faces 2 and 6 have the same pattern"):
+    with fails_with("E-TARGET-LIKENESS … 2 … 6"):
         load_target(path)
     code, _, err = stcal_sfm("plan", "--target", path)
     assert code == 2

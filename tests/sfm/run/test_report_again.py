@@ -17,12 +17,13 @@ from stcal.sfm.run.transaction import added_results
 from stcal.sfm.run.verify import verify
 from tests.outcome import INPUT, assert_error
 from tests.report.browser import faults, opened, show, sideways_px
+from tests.shared import own_copy
 
 
 @pytest.fixture
 def own(small_run, tmp_path):
     """A copy of the small run to write to."""
-    return shutil.copytree(small_run, tmp_path / "run", ignore=shutil.ignore_patterns("cache"))
+    return own_copy(small_run, tmp_path / "run", ignore=shutil.ignore_patterns("cache"))
 
 
 def test_the_same_files_make_the_same_page(own, small_run, stcal_sfm, monkeypatch):
@@ -67,15 +68,15 @@ def test_photographs_that_are_gone_are_counted(own, tmp_path, stcal_sfm):
 
 
 def test_what_cannot_be_made_is_said_in_one_line(own, tmp_path, stcal_sfm):
-    assert_error(stcal_sfm("report", tmp_path), INPUT, "not a run's folder", "give the --out of a finished run")
-    assert_error(stcal_sfm("report", own, "--out", tmp_path / "a.pdf"), INPUT, "a.html, and --pdf for a.pdf")
-    assert_error(stcal_sfm("report", own, "--out", own / "report.html"), INPUT, "is a file of run", "give another name")
+    assert_error(stcal_sfm("report", tmp_path), INPUT, "E-RUN-FOLDER", "--out")
+    assert_error(
+        stcal_sfm("report", own, "--out", tmp_path / "a.pdf"), INPUT, "E-OUTPUT-SUFFIX", "a.html", "--pdf", "a.pdf"
+    )
+    assert_error(stcal_sfm("report", own, "--out", own / "report.html"), INPUT, "E-OUTPUT-IS-INPUT", "run")
     content = json.loads((own / "report.json").read_text())
     del content["faces"]
     (own / "report.json").write_text(json.dumps(content))
-    assert_error(
-        stcal_sfm("report", own), INPUT, "report.json: damaged, or of another version", "faces", "run it again"
-    )
+    assert_error(stcal_sfm("report", own), INPUT, "E-RUN-DAMAGED", "report.json", "faces")
     assert (own / "report.html").exists()
 
 
@@ -89,7 +90,7 @@ def test_what_cannot_be_made_is_said_in_one_line(own, tmp_path, stcal_sfm):
 def test_a_page_that_cannot_be_made_leaves_the_earlier_one(own, stcal_sfm, name, old, new):
     text, before = (own / name).read_text(), (own / "report.html").read_bytes()
     (own / name).write_text(text.replace(old, new, 1))
-    assert_error(stcal_sfm("report", own), INPUT, f"{name}: damaged, or of another version", "run it again")
+    assert_error(stcal_sfm("report", own), INPUT, "E-RUN-DAMAGED", f"{name}")
     assert (own / "report.html").read_bytes() == before
 
 

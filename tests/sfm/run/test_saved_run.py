@@ -19,6 +19,7 @@ from stcal.sfm.run.options import RunOptions
 from stcal.sfm.run.saved import load_run
 from stcal.sfm.run.transaction import run_folder
 from tests.outcome import INPUT, assert_error
+from tests.shared import own_copy
 
 FRAME = ("id", "ids", "origin", "x", "y")
 UNLABELLED = "12/IMG_1001.jpg"
@@ -42,10 +43,10 @@ SPECIAL = ("refine_camera", "compare", "board_only")
 def written(small_dataset, small_run, tmp_path_factory):
     """A run with options of its own, one image in the middle grey, that shows no circle; and the same read back."""
     folder = tmp_path_factory.mktemp("written")
-    shutil.copytree(small_dataset, folder / "data")
+    own_copy(small_dataset, folder / "data")
     (folder / "run").mkdir()
-    shutil.copytree(small_run / "cache", folder / "run" / "cache")
-    shutil.copy(small_run / "stcal-run.json", folder / "run")
+    own_copy(small_run / "cache", folder / "run" / "cache")
+    own_copy(small_run / "stcal-run.json", folder / "run")
     grey(folder / "data" / "images" / UNLABELLED)
     options = RunOptions("chain", "three-point", True, "2", "sparse", PairOptions(np.radians(40)), workers=1)
     data = folder / "data"
@@ -126,7 +127,7 @@ def test_options_that_are_all_other_than_the_defaults(small_run, tmp_path, monke
     monkeypatch.chdir(tmp_path)
     with run_folder("new", MarkerFile.of("some images", OTHER), {}):
         pass
-    own = shutil.copytree(small_run, tmp_path / "run")
+    own = own_copy(small_run, tmp_path / "run")
     shutil.copy(tmp_path / "new" / "stcal-run.json", own)
     saved = load_run(own)
     assert saved.options == OTHER
@@ -139,7 +140,7 @@ def test_options_that_are_all_other_than_the_defaults(small_run, tmp_path, monke
 @pytest.fixture
 def own_run(small_run, tmp_path):
     """A copy of the small run to spoil."""
-    return shutil.copytree(small_run, tmp_path / "run", ignore=shutil.ignore_patterns("cache", "overlays"))
+    return own_copy(small_run, tmp_path / "run", ignore=shutil.ignore_patterns("cache", "overlays"))
 
 
 def edit(path, change) -> None:
@@ -160,23 +161,23 @@ def test_a_file_is_missing(own_run, stcal_sfm, name):
     (own_run / name).unlink()
     outcome = stcal_sfm(*faces_of(own_run))
     if name == "faces.json":
-        assert_error(outcome, INPUT, f"run {own_run}: no faces.json: of the board alone, or of another version")
+        assert_error(outcome, INPUT, "E-RUN-NO-FACES", f"{own_run}", "faces.json")
     else:
-        assert_error(outcome, INPUT, f"run {own_run}: unfinished, or of another version: no {name}; run it again")
+        assert_error(outcome, INPUT, "E-RUN-UNFINISHED", f"{own_run}", f"{name}")
 
 
 def test_not_a_run(own_run, tmp_path, stcal_sfm):
     (own_run / "stcal-run.json").unlink()
     for path in (own_run, tmp_path / "nothing", tmp_path / "run" / "faces.json"):
         outcome = stcal_sfm("faces", own_run / "models", "--run", path)
-        assert_error(outcome, INPUT, f"run {path}: not a run's folder (no stcal-run.json); give the --out of a")
+        assert_error(outcome, INPUT, "E-RUN-FOLDER", f"{path}", "stcal-run.json", "--out")
 
 
 def test_a_folder_of_detections_only(small_set, stcal_sfm):
     small = small_set("12")
     stcal_sfm("detect", small.images, "--camera", small.camera, "--out", small.out, "--workers", 1)
     outcome = stcal_sfm("faces", small.out, "--run", small.out)
-    assert_error(outcome, INPUT, str(small.out), "no cameras.txt, target.toml, ", "run it again")
+    assert_error(outcome, INPUT, "E-RUN-UNFINISHED", str(small.out), "cameras.txt, target.toml")
 
 
 @pytest.mark.parametrize("name", ["stcal-run.json", "report.json", "faces.json"])
@@ -201,7 +202,7 @@ def test_a_file_that_is_no_json_object(own_run, stcal_sfm, name, content):
 def test_a_run_of_before_a_key_was_written(own_run, stcal_sfm, name, key):
     edit(own_run / name, lambda content: content.pop(key))
     parts = (str(own_run / name), "of another version", f"no '{key}'", "run it again")
-    assert_error(stcal_sfm(*faces_of(own_run)), INPUT, *parts)
+    assert_error(stcal_sfm(*faces_of(own_run)), INPUT, "E-RUN-DAMAGED", *parts)
 
 
 WRONG = {
@@ -253,7 +254,7 @@ def test_a_value_that_no_run_writes(own_run, stcal_sfm, case):
     name, change, part = WRONG[case]
     edit(own_run / name, change)
     parts = (f"{own_run / name}: damaged, or of another version", part, "run it again")
-    assert_error(stcal_sfm(*faces_of(own_run)), INPUT, *parts)
+    assert_error(stcal_sfm(*faces_of(own_run)), INPUT, "E-RUN-DAMAGED", *parts)
 
 
 def rows(change):
@@ -298,7 +299,7 @@ def test_labels_that_are_not_the_database_s(own_run, stcal_sfm, case):
     spoil, part = LABELS[case]
     spoil(own_run / "labels.csv")
     parts = (f"{own_run / 'labels.csv'}: damaged, or of another version (", part, "run it again")
-    assert_error(stcal_sfm(*faces_of(own_run)), INPUT, *parts)
+    assert_error(stcal_sfm(*faces_of(own_run)), INPUT, "E-RUN-DAMAGED", *parts)
 
 
 @pytest.mark.parametrize(

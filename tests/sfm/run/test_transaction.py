@@ -13,6 +13,7 @@ from stcal.io.saving import RUN_MARKER
 from stcal.sfm.run.marker import MarkerFile
 from stcal.sfm.run.options import RunOptions
 from stcal.sfm.run.transaction import READY, RESULTS, complete, run_folder
+from tests.outcome import fails_with
 
 MARKER = MarkerFile.of("images", RunOptions())
 
@@ -32,7 +33,7 @@ def make(out, text, **names):
 def fail(out):
     with run_folder(out, MARKER, {}) as folder:
         write(folder.stage, "new", names=("detections.csv",))
-        raise DetectionError("nothing found")
+        raise DetectionError("E-TEST", "nothing found")
 
 
 def content(out):
@@ -113,7 +114,7 @@ def test_two_runs_into_one_folder_are_refused_and_a_dead_one_holds_nothing(tmp_p
     command = [sys.executable, "-c", HOLD, tmp_path / "run"]
     with subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True) as other:
         assert other.stdout.readline() == "held\n"
-        with pytest.raises(InputError, match=rf"process {other.pid} on .* is writing a run there; wait for its end"):
+        with fails_with("E-OUTPUT-IN-USE"):
             make(tmp_path / "run", "new")
         other.kill()
     make(tmp_path / "run", "new")
@@ -126,7 +127,7 @@ def test_inputs_in_the_folder_are_refused_and_stay(tmp_path, inside):
     given = tmp_path / "run" / inside
     before = content(tmp_path / "run")
     claim = run_folder(tmp_path / "run", MARKER, {"images": tmp_path / "elsewhere", "--target": given})
-    with pytest.raises(InputError, match=r"--target .*: lies in the output folder .*copy it elsewhere"):
+    with fails_with("E-OUTPUT-IS-INPUT … --target"):
         claim.__enter__()
     assert content(tmp_path / "run") == before
 

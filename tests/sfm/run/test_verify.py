@@ -16,7 +16,8 @@ from stcal.sfm.run.options import RunOptions
 from stcal.sfm.run.saved import load_run
 from stcal.sfm.run.transaction import added_results, run_folder
 from stcal.sfm.run.verify import require_whole, verified_text, verify
-from tests.outcome import INPUT, assert_error
+from tests.outcome import INPUT, assert_error, fails_with
+from tests.shared import own_copy
 
 MARKER = MarkerFile.of("images", RunOptions())
 
@@ -88,7 +89,7 @@ def test_another_version_is_named(made, monkeypatch):
     monkeypatch.setattr(stcal, "__version__", "9.9")
     result = verify(made)
     assert result.whole
-    with pytest.raises(InputError, match=rf"made by stcal {MARKER.version}, this is 9\.9; run it again, or verify it"):
+    with fails_with("E-RUN-CHANGED … 0.1.0 … 9.9 … run it again … verify it"):
         require_whole(result)
 
 
@@ -119,39 +120,39 @@ def test_a_command_that_fails_adds_nothing(made):
 
 def test_a_run_and_an_addition_wait_for_each_other(made):
     """The same process counts as another one here: each claim opens the lock anew."""
-    with added_results(made), pytest.raises(InputError, match=r"process \d+ on .* is writing a run there"):
+    with added_results(made), fails_with("E-OUTPUT-IN-USE"):
         run_folder(made, MARKER, {}).__enter__()
-    with run_folder(made, MARKER, {}), pytest.raises(InputError, match=r"process \d+ on .* is writing a run there"):
+    with run_folder(made, MARKER, {}), fails_with("E-OUTPUT-IN-USE"):
         added_results(made).__enter__()
 
 
 def test_no_run_begins_while_a_crosscheck_maps(small_run, tmp_path, monkeypatch):
-    run = shutil.copytree(small_run, tmp_path / "run")
+    run = own_copy(small_run, tmp_path / "run")
 
     def meanwhile(*_):
         with run_folder(run, MARKER, {}):
             pytest.fail("a run began")
 
     monkeypatch.setattr(interop, "crosscheck", meanwhile)
-    with pytest.raises(InputError, match=r"process \d+ on .* is writing a run there"):
+    with fails_with("E-OUTPUT-IN-USE"):
         interop.crosscheck_run(load_run(run), None, Tolerances(), 60)
     assert verify(run).whole
 
 
 def test_a_run_of_an_earlier_version_has_no_hashes_and_gets_none(made, stcal_sfm):
     edit_marker(made, lambda content: content.pop("sha256"))
-    assert_error(stcal_sfm("verify", made), INPUT, "unfinished or of a version that kept none", "run it again")
+    assert_error(stcal_sfm("verify", made), INPUT, "E-RUN-UNFINISHED", "run it again")
     with added_results(made) as stage:
         (stage / "compare.json").write_text("x")
     assert (made / "compare.json").read_text() == "x"
-    assert_error(stcal_sfm("verify", made), INPUT, "no hashes in stcal-run.json")
+    assert_error(stcal_sfm("verify", made), INPUT, "E-RUN-UNFINISHED", "stcal-run.json")
     edit_marker(made, lambda content: content.update(sha256=3))
-    assert_error(stcal_sfm("verify", made), INPUT, RUN_MARKER, "damaged, or of another version (sha256: 3: ")
-    assert_error(stcal_sfm("verify", made / "models"), INPUT, "not a run's folder")
+    assert_error(stcal_sfm("verify", made), INPUT, "E-RUN-DAMAGED", RUN_MARKER, "sha256: 3:")
+    assert_error(stcal_sfm("verify", made / "models"), INPUT, "E-RUN-FOLDER")
 
 
 def test_the_command_and_compare(small_run, small_dataset, tmp_path, stcal_sfm):
-    run = shutil.copytree(small_run, tmp_path / "run")
+    run = own_copy(small_run, tmp_path / "run")
     code, text, _ = stcal_sfm("verify", run)
     assert code == 0
     assert text.splitlines()[0].endswith(": whole")
@@ -159,9 +160,9 @@ def test_the_command_and_compare(small_run, small_dataset, tmp_path, stcal_sfm):
     code, text, _ = stcal_sfm("compare", run, truth)
     assert (code, text.splitlines()[-1]) == (0, f"as JSON: {run / 'compare.json'}")
     with added_results(run):
-        assert_error(stcal_sfm("compare", run, truth), INPUT, "is writing a run there")
+        assert_error(stcal_sfm("compare", run, truth), INPUT, "E-OUTPUT-IN-USE")
     for name in ("faces.json", "compare.json"):
         (run / name).write_bytes((run / name).read_bytes() + b" ")
     outcome = stcal_sfm("verify", run, "--json", tmp_path / "found.json")
-    assert_error(outcome, INPUT, f"run {run}: 2 changed (compare.json …); run it again")
+    assert_error(outcome, INPUT, "E-RUN-CHANGED", f"{run}", "compare.json")
     assert json.loads((tmp_path / "found.json").read_text())["changed"] == ["compare.json", "faces.json"]

@@ -1,11 +1,11 @@
 """Watching a folder: a run after each change, nothing said twice, and an end where nothing comes."""
 
-import shutil
-
 import pytest
 
-from stcal.errors import DegenerateError, InputError
+from stcal.errors import DegenerateError
 from stcal.workflows.watch import WatchOptions, watch
+from tests.outcome import fails_with
+from tests.shared import own_copy
 
 
 def watched(data, folder, out, sleep, **options):
@@ -63,7 +63,7 @@ def test_advice_comes_with_the_run(small_dataset, tmp_path):
 @pytest.mark.slow
 def test_advice_that_cannot_be_given_is_told(small_dataset, tmp_path, monkeypatch):
     def none(*_):
-        raise DegenerateError("no view")
+        raise DegenerateError("E-TEST", "no view")
 
     monkeypatch.setattr("stcal.workflows.watch.advise", none)
     (update,) = watched(small_dataset, small_dataset / "images", tmp_path / "run", lambda _: None)
@@ -73,15 +73,15 @@ def test_advice_that_cannot_be_given_is_told(small_dataset, tmp_path, monkeypatc
 def test_an_empty_folder_ends_and_none_is_an_error(small_dataset, tmp_path):
     (tmp_path / "images").mkdir()
     assert list(watched(small_dataset, tmp_path / "images", tmp_path / "run", lambda _: None)) == []
-    with pytest.raises(InputError, match="not there"):
+    with fails_with("E-IMAGES-FOLDER"):
         next(watched(small_dataset, tmp_path / "nowhere", tmp_path / "run", lambda _: None))
-    with pytest.raises(InputError, match="positive times"):
+    with fails_with("E-OPTION-RANGE"):
         WatchOptions(interval_s=0)
 
 
 def test_a_folder_that_is_no_runs_is_refused(small_dataset, tmp_path):
     other = tmp_path / "mine"
     other.mkdir()
-    shutil.copy(small_dataset / "target.toml", other / "notes.txt")
-    with pytest.raises(InputError, match="mine"):
+    own_copy(small_dataset / "target.toml", other / "notes.txt")
+    with fails_with("E-OUTPUT-EXISTS … mine"):
         next(watched(small_dataset, small_dataset / "images", other, lambda _: None))

@@ -33,12 +33,16 @@ def load_npy(data: bytes, where: str) -> np.ndarray:
     except DAMAGED as error:
         raise _damaged(where, error) from error
     if kind.hasobject or kind.kind not in "iuf":
-        raise InputError(f"{where}: an array of {kind}, numbers needed; save it with np.save of a float array")
+        raise InputError(
+            "E-NUMPY-CONTENT", f"{where}: an array of {kind}, numbers needed; save it with np.save of a float array"
+        )
     left, needed = len(data) - stream.tell(), int(np.prod([int(n) for n in shape], dtype=object)) * kind.itemsize
     if left != needed:
-        raise InputError(f"{where}: {left} bytes of numbers, {needed} needed by its head; save it again")
+        raise InputError(
+            "E-NUMPY-UNREADABLE", f"{where}: {left} bytes of numbers, {needed} needed by its head; save it again"
+        )
     if not shape or not needed:
-        raise InputError(f"{where}: an array of shape {shape}; poses needed")
+        raise InputError("E-NUMPY-CONTENT", f"{where}: an array of shape {shape}; poses needed")
     try:
         return np.array(np.load(io.BytesIO(data), allow_pickle=False), dtype=float)
     except DAMAGED as error:
@@ -59,7 +63,9 @@ def load_npz(data: bytes, where: str) -> tuple[dict[str, Any], tuple[str, ...]]:
             members = [each for each in archive.infolist() if each.filename.endswith(".npy")]
             size = sum(each.file_size for each in members)
             if size > TABLE_BYTES:
-                raise InputError(f"{where}: {size / MB:.0f} MB unpacked, at most {TABLE_BYTES // MB} MB are read")
+                raise InputError(
+                    "E-FILE-TOO-LARGE", f"{where}: {size / MB:.0f} MB unpacked, at most {TABLE_BYTES // MB} MB are read"
+                )
             for each in members:
                 with archive.open(each) as stream:
                     content = stream.read(TABLE_BYTES + 1)
@@ -74,7 +80,7 @@ def load_npz(data: bytes, where: str) -> tuple[dict[str, Any], tuple[str, ...]]:
     except (zipfile.BadZipFile, zlib.error, NotImplementedError, RuntimeError, *DAMAGED) as error:
         raise _damaged(where, error) from error
     if not found:
-        raise InputError(f"{where}: no arrays of numbers; save it with np.savez")
+        raise InputError("E-NUMPY-CONTENT", f"{where}: no arrays of numbers; save it with np.savez")
     return found, tuple(other)
 
 
@@ -91,4 +97,6 @@ def _texts(content: bytes) -> list[str]:
 
 
 def _damaged(where: str, error: Exception) -> InputError:
-    return InputError(f"{where}: not a file of NumPy ({' '.join(str(error).split())[:80]}); save it again")
+    return InputError(
+        "E-NUMPY-UNREADABLE", f"{where}: not a file of NumPy ({' '.join(str(error).split())[:80]}); save it again"
+    )

@@ -47,7 +47,10 @@ def read_text(text: str, where: str) -> Content:
             cells = line.split(maxsplit=9)
             row = _floats(cells[1:8]) if len(cells) == 10 else None
             if row is None:
-                raise InputError(f"{where}: line {i}: not `id qw qx qy qz tx ty tz camera name`; export the model anew")
+                raise InputError(
+                    "E-MODEL-UNREADABLE",
+                    f"{where}: line {i}: not `id qw qx qy qz tx ty tz camera name`; export the model anew",
+                )
             rows.append(row)
             names.append(cells[9].strip())
             places.append(f"line {i}")
@@ -66,7 +69,7 @@ def read_binary(path: Path, where: str) -> Content:
     try:
         data = read_bytes(path, MODEL_BYTES)
     except OSError as error:
-        raise InputError(f"{where}: {error.strerror or error}; give a readable model") from error
+        raise InputError("E-MODEL-UNREADABLE", f"{where}: {error.strerror or error}; give a readable model") from error
     rows, names, at = [], [], 8
     try:
         (count,) = struct.unpack_from("<Q", data, 0)
@@ -83,13 +86,15 @@ def read_binary(path: Path, where: str) -> Content:
         if at != len(data):
             raise ValueError(f"{len(data) - at} bytes too many")
     except (struct.error, ValueError) as error:
-        raise InputError(f"{where}: not a COLMAP model's images.bin ({error}); export the model anew") from error
+        raise InputError(
+            "E-MODEL-UNREADABLE", f"{where}: not a COLMAP model's images.bin ({error}); export the model anew"
+        ) from error
     return _content(rows, names, [f"image {name}" for name in names], where)
 
 
 def _content(rows: list, names: list[str], places: list[str], where: str) -> Content:
     if not rows:
-        raise InputError(f"{where}: a model without images; map them first")
+        raise InputError("E-MODEL-EMPTY", f"{where}: a model without images; map them first")
     require_each_once(names, places, where)
     values = np.array(rows, dtype=float)
     require_finite(values, places, where)

@@ -66,7 +66,9 @@ def read_columns(table: Table, text: str, key: str, said: Said) -> Content | Non
     roles = [side.frames.role for side in sides if side.frames is not None]
     if len(set(roles)) < len(roles):
         both = ", ".join(side.frames.name for side in sides if side.frames is not None)
-        raise InputError(f"{table.where}: columns of {both}; one of each side needed, take the others out")
+        raise InputError(
+            "E-POSES-MIXED", f"{table.where}: columns of {both}; one of each side needed, take the others out"
+        )
     return Content(TABLE, tuple(sides))
 
 
@@ -120,7 +122,9 @@ def _messages(table: Table) -> list[_Message]:
                 turned = tuple(f"{head}{axis}" for axis in "wxyz")
                 missing = [name for name in (*place, *turned) if name not in table]
                 if missing:
-                    raise InputError(f"{table.where}: {column} without {missing[0]}; export the whole pose")
+                    raise InputError(
+                        "E-TABLE-COLUMN-MISSING", f"{table.where}: {column} without {missing[0]}; export the whole pose"
+                    )
                 found.append(_Message(match["of"], place, turned))
     return found
 
@@ -141,12 +145,16 @@ def _of_messages(table: Table, messages: Sequence[_Message], names: tuple[str, .
     if len(sides) > 1 and (None in roles or len(set(roles)) < len(roles)):
         topics = ", ".join(each.of for each in messages)
         raise InputError(
+            "E-POSES-MIXED",
             f"{table.where}: poses of {len(messages)} topics, {topics}; export the robot's and the camera's each to a "
-            "file of its own, and give --a and --b"
+            "file of its own, and give --a and --b",
         )
     for column in ("field.header.frame_id", "header.frame_id", "field.child_frame_id", "child_frame_id"):
         if column in table and len(found := sorted(set(table.text(column)))) > 1:
-            raise InputError(f"{table.where}: {column} is {', '.join(found[:3])}; export the rows of one of them alone")
+            raise InputError(
+                "E-POSES-MIXED",
+                f"{table.where}: {column} is {', '.join(found[:3])}; export the rows of one of them alone",
+            )
     return Content("ROS bag export", tuple(sides))
 
 
@@ -172,7 +180,9 @@ def _place(table: Table, prefix: str) -> tuple[np.ndarray, Unit | None] | None:
                 values = np.column_stack([table.numbers(column) for column in found])
                 return values, Unit(unit, "by the columns", True)
             if found and form == "{}":
-                raise InputError(f"{table.where}: {', '.join(found)} alone; x, y and z in one unit needed")
+                raise InputError(
+                    "E-TABLE-COLUMN-MISSING", f"{table.where}: {', '.join(found)} alone; x, y and z in one unit needed"
+                )
         columns = [find_column(table, prefix, form.format(axis)) for axis in "xyz"]
         found = [column for column in columns if column is not None]
         if len(found) == len("xyz"):

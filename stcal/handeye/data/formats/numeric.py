@@ -53,14 +53,17 @@ def read_numbers(text: str, said: Said, where: str) -> Content | None:
     odd = next((line for line in lines if line.values and len(line.values) != width), None)
     if odd is not None:
         raise InputError(
-            f"{where}: line {odd.number}: {len(odd.values)} numbers, {width} in most other lines; correct it"
+            "E-MATRIX-ROWS",
+            f"{where}: line {odd.number}: {len(odd.values)} numbers, {width} in most other lines; correct it",
         )
     if width == 4:
         return _blocks(lines, where)
     if labels_alone:
         return None
     if width in (12, 3):
-        raise InputError(f"{where}: {width} numbers in a line, as of a matrix 3×4 or 3×3; 4×4 needed: add 0 0 0 1")
+        raise InputError(
+            "E-MATRIX-ROWS", f"{where}: {width} numbers in a line, as of a matrix 3×4 or 3×3; 4×4 needed: add 0 0 0 1"
+        )
     if width not in (6, 7, TUM, MATRIX):
         return None
     values, places = np.array([line.values for line in lines]), tuple(f"line {line.number}" for line in lines)
@@ -110,12 +113,18 @@ def _blocks(lines: list[Line], where: str) -> Content | None:
                 starts.append(line.number)
             rows.append(line.values)
         if line.label and len(rows) % 4 > (1 if line.values else 0):
-            raise InputError(f"{where}: line {line.number}: a name after {len(rows) % 4} rows of a matrix, 4 needed")
+            raise InputError(
+                "E-MATRIX-ROWS", f"{where}: line {line.number}: a name after {len(rows) % 4} rows of a matrix, 4 needed"
+            )
     if len(rows) % 4:
         three = "; matrices 3×4 need a row 0 0 0 1 each" if len(rows) % 3 == 0 else ""
-        raise InputError(f"{where}: {len(rows)} rows of 4 numbers, 4 for each matrix needed{three}; correct them")
+        raise InputError(
+            "E-MATRIX-ROWS", f"{where}: {len(rows)} rows of 4 numbers, 4 for each matrix needed{three}; correct them"
+        )
     if names and len(names) != len(starts):
-        raise InputError(f"{where}: {len(starts)} matrices and {len(names)} names; one each needed, or none")
+        raise InputError(
+            "E-NAMES-COUNT", f"{where}: {len(starts)} matrices and {len(names)} names; one each needed, or none"
+        )
     places = tuple(f"line {number}" for number in starts)
     require_each_once(names, places[: len(names)], where)
     rotation, translation = of_matrices(np.array(rows).reshape(-1, 4, 4), places, where)

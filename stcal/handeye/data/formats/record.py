@@ -144,14 +144,18 @@ class Said:
                 given = [each for each in own if each[:2] == (role, option)] if equals else option in whole
                 if given:
                     raise InputError(
-                        f"--{option.replace('_', '-')} {value}: given twice; one for each of robot and camera"
+                        "E-OPTION-REPEATED",
+                        f"--{option.replace('_', '-')} {value}: given twice; one for each of robot and camera",
                     )
                 if not equals:
                     whole[option] = role
                 elif role in ROLES:
                     own.append(("robot" if role == "robot" else "camera", option, name))
                 else:
-                    raise InputError(f"--{option.replace('_', '-')} {value}: robot= or camera= needed before the name")
+                    raise InputError(
+                        "E-OPTION-VALUE",
+                        f"--{option.replace('_', '-')} {value}: robot= or camera= needed before the name",
+                    )
         return cls(whole.get("rotation"), whole.get("length_unit"), tuple(frames), setup, tuple(own))
 
     def of(self, role: Role) -> "Said":
@@ -170,14 +174,16 @@ class Said:
     def __post_init__(self):
         unknown = [name for name in self.frames if name not in EVERY_FRAME]
         if unknown:
-            raise InputError(f"--poses-are {unknown[0]}: unknown; {', '.join(EVERY_FRAME)} needed")
+            raise InputError("E-OPTION-VALUE", f"--poses-are {unknown[0]}: unknown; {', '.join(EVERY_FRAME)} needed")
         units = [value for value in (self.length_unit, *(v for _, n, v in self.own if n == "length_unit")) if value]
         wrong = [value for value in units if value not in LENGTHS]
         if wrong:
-            raise InputError(f"--length-unit {wrong[0]}: unknown; {', '.join(LENGTHS)} needed")
+            raise InputError("E-OPTION-VALUE", f"--length-unit {wrong[0]}: unknown; {', '.join(LENGTHS)} needed")
         roles = [Frames(name, "").role for name in self.frames]
         if len(set(roles)) < len(roles):
-            raise InputError(f"--poses-are {', '.join(self.frames)}: one of each of robot and camera at most")
+            raise InputError(
+                "E-OPTION-VALUE", f"--poses-are {', '.join(self.frames)}: one of each of robot and camera at most"
+            )
 
     def frames_of(self, role: Role) -> str | None:
         """What poses of this role are said to be."""
@@ -198,7 +204,9 @@ def of_matrices(matrices: np.ndarray, places: Sequence[str], where: str) -> tupl
         i = bad[0]
         turned = " (the last column is: the matrix is transposed)" if not matrices[i, :3, 3].any() else ""
         row = " ".join(f"{v:g}" for v in matrices[i, 3])
-        raise InputError(f"{where}: {places[i]}: last row {row}, 0 0 0 1 needed{turned}; correct it")
+        raise InputError(
+            "E-MATRIX-LAST-ROW", f"{where}: {places[i]}: last row {row}, 0 0 0 1 needed{turned}; correct it"
+        )
     return proper(matrices[:, :3, :3], places, where), matrices[:, :3, 3]
 
 
@@ -207,5 +215,7 @@ def require_each_once(names: Sequence[str], places: Sequence[str], where: str, k
     first: dict[str, str] = {}
     for name, place in zip(names, places, strict=True):
         if name in first:
-            raise InputError(f"{where}: {first[name]} and {place}: both are of {kind}{name!r}; one row needed")
+            raise InputError(
+                "E-POSE-REPEATED", f"{where}: {first[name]} and {place}: both are of {kind}{name!r}; one row needed"
+            )
         first[name] = place

@@ -120,7 +120,7 @@ def _of_array(array: np.ndarray, said: Said, place: str, where: str) -> One | No
     if array.shape == (16,):
         array = array.reshape(4, 4)
     if array.shape in ((3, 4), (12,)):
-        raise InputError(f"{where}: {place}: a matrix 3×4, 4×4 needed; add the row 0 0 0 1")
+        raise InputError("E-MATRIX-ROWS", f"{where}: {place}: a matrix 3×4, 4×4 needed; add the row 0 0 0 1")
     if array.shape == (4, 4):
         rotation, translation = of_matrices(array[None], (place,), where)
         return One(rotation[0], translation[0], MATRICES)
@@ -142,12 +142,12 @@ def _of_parts(value: Mapping, said: Said, place: str, where: str) -> One | None:
         at, unit, form = [at["x"], at["y"], at["z"]], ROS, "ROS messages"
     translation = numbers(at)
     if translation is None or translation.size != len("xyz"):
-        raise InputError(f"{where}: {place}: a translation of three numbers needed; correct it")
+        raise InputError("E-POSE-VALUE", f"{where}: {place}: a translation of three numbers needed; correct it")
     require_finite(translation.reshape(1, 3), (place,), where)
     if isinstance(turn, Mapping) and {"x", "y", "z", "w"} <= turn.keys():
         wxyz = numbers([turn["w"], turn["x"], turn["y"], turn["z"]])
         if wxyz is None:
-            raise InputError(f"{where}: {place}: a quaternion of four numbers needed; correct it")
+            raise InputError("E-POSE-VALUE", f"{where}: {place}: a quaternion of four numbers needed; correct it")
         rotation, turned = of_quaternions(wxyz[None], (place,), where), "quaternions x, y, z, w by name"
         return One(rotation[0], translation.ravel(), turned, unit, form)
     array = numbers(turn)
@@ -155,7 +155,9 @@ def _of_parts(value: Mapping, said: Said, place: str, where: str) -> One | None:
         rotation = proper(array.reshape(1, 3, 3), (place,), where)
         return One(rotation[0], translation.ravel(), "3×3 matrices", unit, form)
     if array is None or array.size not in (3, 4):
-        raise InputError(f"{where}: {place}: {turn_key} is no rotation; 3×3, a quaternion or three angles needed")
+        raise InputError(
+            "E-POSE-VALUE", f"{where}: {place}: {turn_key} is no rotation; 3×3, a quaternion or three angles needed"
+        )
     values = array.reshape(1, -1)
     if turn_key == "rvec":
         rotation, turned = rotations(values, Convention(ROTATION_VECTOR, "rad"), (place,), where)
@@ -171,7 +173,7 @@ def _of_scalars(value: Mapping, place: str, where: str) -> One | None:
         return None
     row = numbers([value[key] for key in keys])
     if row is None:
-        raise InputError(f"{where}: {place}: {', '.join(keys)} must be numbers; correct them")
+        raise InputError("E-POSE-VALUE", f"{where}: {place}: {', '.join(keys)} must be numbers; correct them")
     require_finite(row[None], (place,), where)
     rotation = of_quaternions(row[None, 3:], (place,), where)
     return One(rotation[0], row[:3], "quaternions by name", Unit("m", "as in ROS"), "ROS-Industrial poses")

@@ -46,7 +46,8 @@ def read_content(path: Path, said: Said, key: str = "image", quaternions: Order 
     found = _read(path, said, key, quaternions)
     if found is not None and quaternions != "wxyz" and found.form != TABLE:
         raise InputError(
-            f"{path}: --quaternions {quaternions} is of a CSV file's columns, not of {found.form}; leave it out"
+            "E-OPTION-NEEDS",
+            f"{path}: --quaternions {quaternions} is of a CSV file's columns, not of {found.form}; leave it out",
         )
     return found
 
@@ -61,7 +62,7 @@ def _read(path: Path, said: Said, key: str, quaternions: Order) -> Content | Non
             return colmap.read_binary(path, where)
         data = read_bytes(path, TABLE_BYTES)
     except OSError as error:
-        raise InputError(f"{where}: {error.strerror or error}; check the path") from error
+        raise InputError("E-FILE-UNREADABLE", f"{where}: {error.strerror or error}; check the path") from error
     if data.startswith(NPY):
         return _required(read_tree(load_npy(data, where), "NumPy array", said, where), where)
     if data.startswith(NPZ):
@@ -97,13 +98,13 @@ def _of_text(text: str, path: Path, said: Said, key: str, quaternions: Order) ->
         return None
     found = read_tree(value, "YAML", said, where)
     if found is None:
-        raise NotToldError(f"{where}: no poses found in it; {KNOWN} needed")
+        raise NotToldError("E-POSES-NOT-FOUND", f"{where}: no poses found in it; {KNOWN} needed")
     return found
 
 
 def _required(found: Content | None, where: str) -> Content:
     if found is None:
-        raise NotToldError(f"{where}: no poses found in it; {KNOWN} needed")
+        raise NotToldError("E-POSES-NOT-FOUND", f"{where}: no poses found in it; {KNOWN} needed")
     return found
 
 
@@ -123,13 +124,17 @@ def _json(text: str):
 def _yaml(text: str, where: str):
     """YAML; several documents, as ``rostopic echo`` prints messages, are a list."""
     if len(text.encode("utf-8")) > SETTINGS_BYTES:
-        raise InputError(f"{where}: {len(text) // MB} MB of YAML, at most {SETTINGS_BYTES // MB} MB are read")
+        raise InputError(
+            "E-FILE-TOO-LARGE", f"{where}: {len(text) // MB} MB of YAML, at most {SETTINGS_BYTES // MB} MB are read"
+        )
     headless = re.sub(r"\A\s*%YAML:?\s*[\d.]+\s*\n", "", text)
     parts = [part for part in re.split(r"^---[ \t]*$", headless, flags=re.MULTILINE) if part.strip()]
     try:
         found = [load_yaml(part) for part in parts]
     except (yaml.YAMLError, ValueError, RecursionError) as error:
-        raise NotToldError(f"{where}: not YAML ({' '.join(str(error).split())[:100]}); {KNOWN} needed") from error
+        raise NotToldError(
+            "E-YAML-INVALID", f"{where}: not YAML ({' '.join(str(error).split())[:100]}); {KNOWN} needed"
+        ) from error
     return found[0] if len(found) == 1 else found
 
 
@@ -143,17 +148,21 @@ def _of_folder(folder: Path, said: Said) -> Content | None:
         content = read_content(file, said)
         if content is None or len(content.sides) != 1 or len(content.sides[0]) != 1:
             count = "no pose" if content is None else f"{sum(len(side) for side in content.sides)} poses"
-            raise InputError(f"{folder}: {file.name}: {count}, one in each file needed; take it out of the folder")
+            raise InputError(
+                "E-POSES-COUNT", f"{folder}: {file.name}: {count}, one in each file needed; take it out of the folder"
+            )
         read.append((file, content))
     kinds = {content.form for _, content in read}
     if len(kinds) > 1:
-        raise InputError(f"{folder}: files of {len(kinds)} kinds: {', '.join(sorted(kinds))}; one needed")
+        raise InputError(
+            "E-POSES-MIXED", f"{folder}: files of {len(kinds)} kinds: {', '.join(sorted(kinds))}; one needed"
+        )
     sides = [content.sides[0] for _, content in read]
     names, places = tuple(file.stem for file in files), tuple(file.name for file in files)
     require_each_once(names, places, str(folder))
     turned = {(side.turned, side.unit) for side in sides}
     if len(turned) > 1:
-        raise InputError(f"{folder}: rotations or units written in {len(turned)} ways; one needed")
+        raise InputError("E-POSES-MIXED", f"{folder}: rotations or units written in {len(turned)} ways; one needed")
     joined = Side(
         [side.rotation[0] for side in sides],  # type: ignore[arg-type]
         [side.translation[0] for side in sides],  # type: ignore[arg-type]

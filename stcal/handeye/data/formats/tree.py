@@ -40,7 +40,10 @@ def read_tree(value: Any, form: str, said: Said, where: str) -> Content | None:
     """
     if isinstance(value, Mapping):
         if "parameters" in value and "transform" in value:
-            raise InputError(f"{where}: the result of an easy_handeye calibration; give its samples, NAME.samples")
+            raise InputError(
+                "E-POSES-NOT-FOUND",
+                f"{where}: the result of an easy_handeye calibration; give its samples, NAME.samples",
+            )
         if (found := easy_handeye(value, said, where)) is not None:
             return found
         if (found := _of_keys(value, form, said, where)) is not None:
@@ -71,7 +74,7 @@ def easy_handeye(value: Mapping, said: Said, where: str) -> Content | None:
             return None
         for i, sample in enumerate(samples, 1):
             if "robot" not in sample or seen not in sample:
-                raise InputError(f"{where}: sample {i}: robot and {seen} needed; take it out")
+                raise InputError("E-POSE-INCOMPLETE", f"{where}: sample {i}: robot and {seen} needed; take it out")
         lists = [[each["robot"] for each in samples], [each[seen] for each in samples]]
     else:
         return None
@@ -91,7 +94,9 @@ def easy_handeye(value: Mapping, said: Said, where: str) -> Content | None:
     for each, of in zip(lists, frames, strict=True):
         side = _listed(each if isinstance(each, list) else [], said, where, of, "sample")
         if side is None:
-            raise InputError(f"{where}: samples of easy_handeye without transforms; take samples, and save them")
+            raise InputError(
+                "E-POSES-NOT-FOUND", f"{where}: samples of easy_handeye without transforms; take samples, and save them"
+            )
         sides.append(side)
     return Content("easy_handeye samples", _same_count(sides, where), setup)
 
@@ -119,16 +124,20 @@ def _of_keys(value: Mapping, form: str, said: Said, where: str) -> Content | Non
     roles = [frames.role for frames in named.values()]
     if len(set(roles)) < len(roles):
         keys = ", ".join(key for each in parts.values() for key in each)
-        raise InputError(f"{where}: {keys}: more than one set of the same poses; leave one of each side in the file")
+        raise InputError(
+            "E-POSES-MIXED", f"{where}: {keys}: more than one set of the same poses; leave one of each side in the file"
+        )
     sides = []
     for name, each in parts.items():
         side = _of_parts(each, said, where, named[name])
         if side is None:
             keys = ", ".join(each)
-            raise InputError(f"{where}: {keys}: no poses; 4×4 matrices, or rotations and translations, needed")
+            raise InputError(
+                "E-POSES-NOT-FOUND", f"{where}: {keys}: no poses; 4×4 matrices, or rotations and translations, needed"
+            )
         sides.append(side)
     if names and len(names) != len(sides[0]):
-        raise InputError(f"{where}: {len(names)} names of {len(sides[0])} poses; one each needed")
+        raise InputError("E-NAMES-COUNT", f"{where}: {len(names)} names of {len(sides[0])} poses; one each needed")
     if names:
         sides = [_renamed(side, names, where) for side in sides]
     opencv = any("2" in key for each in parts.values() for key in each)
@@ -140,20 +149,23 @@ def _of_parts(parts: dict[str, Any], said: Said, where: str, frames: Frames) -> 
     if len(parts) == 1:
         return _side_of(next(iter(parts.values())), said, where, frames)
     if len(parts) != 2:
-        raise InputError(f"{where}: {', '.join(parts)}: more than one set of the same poses; leave one in the file")
+        raise InputError(
+            "E-POSES-MIXED", f"{where}: {', '.join(parts)}: more than one set of the same poses; leave one in the file"
+        )
     arrays = {}
     for key, value in parts.items():
         array = numbers([_flat(each) for each in value] if isinstance(value, list) else value)
         if array is None:
-            raise InputError(f"{where}: {key}: not as many numbers for each pose; correct it")
+            raise InputError("E-POSES-COUNT", f"{where}: {key}: not as many numbers for each pose; correct it")
         arrays[key] = array
     keys = sorted(arrays, key=lambda key: (-arrays[key].size, not key.lower().startswith("r")))
     sizes = [arrays[key].size for key in keys]
     count = 1 if sizes[1] == len("xyz") else len(arrays[keys[1]])
     if sizes[1] != len("xyz") * count or sizes[0] % count or sizes[0] // count not in (3, 4, 9):
         raise InputError(
+            "E-POSES-SHAPE",
             f"{where}: {keys[0]} of shape {arrays[keys[0]].shape}, {keys[1]} of {arrays[keys[1]].shape}; a rotation of "
-            "9, 4 or 3 numbers and a translation of 3 for each pose needed"
+            "9, 4 or 3 numbers and a translation of 3 for each pose needed",
         )
     turn, at = (arrays[key].reshape(count, -1) for key in keys)
     places = tuple(f"pose {i}" for i in range(1, len(at) + 1))
@@ -208,7 +220,10 @@ def _of_pairs(value: Sequence[Mapping], form: str, said: Said, where: str) -> Co
             other.append(str(key))
             continue
         if role in sides:
-            raise InputError(f"{where}: {sides[role][0]} and {key}: poses of one side twice; leave one in the file")
+            raise InputError(
+                "E-POSE-REPEATED",
+                f"{where}: {sides[role][0]} and {key}: poses of one side twice; leave one in the file",
+            )
         sides[role] = (key, frames or Frames(FRAMES[role][0], "by default", False))
     if not sides:
         return None
@@ -218,10 +233,13 @@ def _of_pairs(value: Sequence[Mapping], form: str, said: Said, where: str) -> Co
     for key, frames in sides.values():
         for i, each in enumerate(value, 1):
             if key not in each:
-                raise InputError(f"{where}: pose {i}: {key} is missing, which pose 1 has; add it, or take the pose out")
+                raise InputError(
+                    "E-POSE-INCOMPLETE",
+                    f"{where}: pose {i}: {key} is missing, which pose 1 has; add it, or take the pose out",
+                )
         side = _listed([each[key] for each in value], said, where, frames, "pose")
         if side is None:
-            raise InputError(f"{where}: {key}: not a pose in every entry; correct it")
+            raise InputError("E-POSE-VALUE", f"{where}: {key}: not a pose in every entry; correct it")
         read.append(_renamed(side, tuple(names), where) if named else side)
     moveit = {key for key, _ in sides.values()} == MOVEIT
     if moveit:
@@ -251,7 +269,9 @@ def _side_of(value: Any, said: Said, where: str, frames: Frames | None) -> Side 
     if array is None:
         return _listed(value, said, where, frames, "pose") if isinstance(value, list) else None
     if array.ndim == 3 and array.shape[1:] == (3, 4):
-        raise InputError(f"{where}: {len(array)} matrices 3×4, 4×4 needed; add the row 0 0 0 1 to each")
+        raise InputError(
+            "E-MATRIX-ROWS", f"{where}: {len(array)} matrices 3×4, 4×4 needed; add the row 0 0 0 1 to each"
+        )
     if array.shape == (4, 4) or array.shape == (16,):
         array = array.reshape(1, 4, 4)
     if array.ndim == 2 and array.shape[1] == 16:
@@ -277,7 +297,9 @@ def _listed(values: Sequence, said: Said, where: str, frames: Frames | None, wha
         if single is None and not found:
             return None
         if single is None:
-            raise InputError(f"{where}: {place}: no pose like the one before it; correct it, or take it out")
+            raise InputError(
+                "E-POSE-VALUE", f"{where}: {place}: no pose like the one before it; correct it, or take it out"
+            )
         found.append(single)
     return _side(found, places, where, frames) if found else None
 
@@ -285,7 +307,10 @@ def _listed(values: Sequence, said: Said, where: str, frames: Frames | None, wha
 def _side(found: Sequence[One], places: tuple[str, ...], where: str, frames: Frames | None = None) -> Side:
     units = {(each.unit.name if each.unit else "", each.turned) for each in found}
     if len(units) > 1:
-        raise InputError(f"{where}: poses of {len(units)} kinds: {'; '.join(sorted(t for _, t in units))}; one needed")
+        raise InputError(
+            "E-POSES-MIXED",
+            f"{where}: poses of {len(units)} kinds: {'; '.join(sorted(t for _, t in units))}; one needed",
+        )
     names = tuple(each.name for each in found)
     if not all(names):
         names = ()
@@ -297,5 +322,5 @@ def _side(found: Sequence[One], places: tuple[str, ...], where: str, frames: Fra
 def _same_count(sides: list[Side], where: str) -> tuple[Side, ...]:
     if len({len(side) for side in sides}) > 1:
         counts = " and ".join(f"{len(side)} of {side.frames.name if side.frames else 'one side'}" for side in sides)
-        raise InputError(f"{where}: {counts}; pairs needed")
+        raise InputError("E-POSES-COUNT", f"{where}: {counts}; pairs needed")
     return tuple(sides)

@@ -85,7 +85,7 @@ def require_form(form: str) -> None:
         With those there are.
     """
     if form not in FORMS:
-        raise InputError(f"--export {form}: unknown; one of {', '.join(FORMS)} needed")
+        raise InputError("E-OPTION-FORM", f"--export {form}: unknown; one of {', '.join(FORMS)} needed")
 
 
 def exported(
@@ -122,5 +122,7 @@ def exported(
         off = own.pose.inverse() @ wanted.pose
         same_names = (own.parent, own.child) == (wanted.parent, wanted.child)
         if not same_names or off.angle_rad() > SAME_RAD or np.abs(off.translation).max() > SAME_MM:
-            raise StcalError(f"--export {form}: the file does not give the transform back; use another form")
+            raise StcalError(
+                "E-EXPORT-READ-BACK", f"--export {form}: the file does not give the transform back; use another form"
+            )
     return text

@@ -64,9 +64,9 @@ def require_frame_names(*names: str) -> None:
     given = [name for name in names if name]
     for name in given:
         if not name.isprintable():
-            raise InputError(f"frames: {name!r} has control characters; give a name in letters")
+            raise InputError("E-FRAME-NAME", f"frames: {name!r} has control characters; give a name in letters")
         if given.count(name) > 1:
-            raise InputError(f"frames: parent and child are both {name!r}; two names needed")
+            raise InputError("E-FRAME-NAME", f"frames: parent and child are both {name!r}; two names needed")
 
 
 def said_of(result: HandEye) -> list[str]:

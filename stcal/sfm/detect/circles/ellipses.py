@@ -66,7 +66,9 @@ class EllipseOptions:
         for name, (low, high) in OPTION_RANGES.items():
             value = getattr(self, name)
             if value is not None and not low <= value <= high:
-                raise InputError(f"option {name} {value:g}: {low:g} to {high:g} possible; give another")
+                raise InputError(
+                    "E-OPTION-RANGE", f"option {name} {value:g}: {low:g} to {high:g} possible; give another"
+                )
 
 
 @dataclass(frozen=True, slots=True, eq=False)

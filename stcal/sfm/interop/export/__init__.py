@@ -76,11 +76,11 @@ def export_run(run: str | Path, path: str | Path, form: str = "", name: str = RO
     path = Path(path)
     form = form or form_of(path)
     if form not in FORMS:
-        raise InputError(f"--form {form}: unknown; one of {', '.join(FORMS)} needed")
+        raise InputError("E-OPTION-FORM", f"--form {form}: unknown; one of {', '.join(FORMS)} needed")
     if os.path.lexists(path):
-        raise InputError(f"{path}: exists, and nothing is overwritten; give a new file")
+        raise InputError("E-OUTPUT-EXISTS", f"{path}: exists, and nothing is overwritten; give a new file")
     if not path.parent.is_dir():
-        raise InputError(f"{path}: no folder {path.parent}; make it, or give another place")
+        raise InputError("E-OUTPUT-FOLDER", f"{path}: no folder {path.parent}; make it, or give another place")
     content = content_of(load_run(run), name)
     write = FORMS[form].write
     if write is not None:
@@ -105,5 +105,8 @@ def form_of(path: Path) -> str:
     """
     suffixes = {form.suffix: name for name, form in FORMS.items()}
     if path.suffix.lower() not in suffixes:
-        raise InputError(f"{path}: suffix {path.suffix or 'missing'}; one of {', '.join(suffixes)} needed, or --form")
+        raise InputError(
+            "E-OUTPUT-SUFFIX",
+            f"{path}: suffix {path.suffix or 'missing'}; one of {', '.join(suffixes)} needed, or --form",
+        )
     return suffixes[path.suffix.lower()]

@@ -136,7 +136,7 @@ def content_of(run: SavedRun, root: str) -> Content:
         The name is none, two frames would have the same one, or the run's report is of another version.
     """
     if not root.isprintable() or root.split() != [root]:
-        raise InputError(f"--name {root!r}: a word of visible characters without spaces needed")
+        raise InputError("E-FRAME-NAME", f"--name {root!r}: a word of visible characters without spaces needed")
     report = run.report_as(_Report)
     faces, scene = run.faces, report.scene
     circles = tuple(
@@ -165,7 +165,9 @@ def content_of(run: SavedRun, root: str) -> Content:
     names = [root, *(each.child for each in content.statics())]
     twice = sorted({name for name in names if names.count(name) > 1})
     if twice:
-        raise InputError(f"frames: {twice[0]} is the name of two; rename a face or a circle of the target")
+        raise InputError(
+            "E-FRAME-NAME", f"frames: {twice[0]} is the name of two; rename a face or a circle of the target"
+        )
     return content
 
 

@@ -1,0 +1,90 @@
+"""The page of all errors, docs/reference/errors.md: each code with its sentences, as they stand in the source.
+
+.venv/bin/python scripts/errors.py [--check]
+
+`--check` writes nothing, and exits with 1 where the page differs. A changed sentence is read in the page's diff.
+"""
+
+import argparse
+import ast
+import re
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+
+ROOT = Path(__file__).resolve().parents[1]
+PAGE = ROOT / "docs" / "reference" / "errors.md"
+CODE = re.compile(r"E(-[A-Z]+)+")
+HEAD = """# Errors
+
+Every error is one line on standard error: what is wrong, where, what was measured, what is needed, and what to do. The
+exit code is 2 where an input is at fault, 3 where a computation could not deliver, 4 where a result failed its checks.
+
+Each error also has a code, which stays when its sentence is reworded. `--debug` prints it behind the traceback,
+`--json -` writes `{"error": …, "code": …}`, and so does `stcal-sfm measure --serve`. In Python it is
+`StcalError.code`. Below, `{…}` stands for what the message fills in.
+
+This page is made by `scripts/errors.py`.
+"""
+
+
+def sentence(node: ast.expr) -> str:
+    """The text of a message, with `{…}` for what is filled in."""
+    match node:
+        case ast.Constant(value=str(text)):
+            return text
+        case ast.JoinedStr(values=values):
+            return "".join(sentence(value) for value in values)
+        case ast.FormattedValue(value=value):
+            return sentence(value)
+        case ast.BinOp(left=left, op=ast.Add(), right=right) if isinstance(left, ast.JoinedStr):
+            return sentence(left) + sentence(right)
+        case ast.IfExp(body=one, orelse=other):
+            return f"{sentence(one)} / {sentence(other)}"
+        case ast.Name(id=name) | ast.Attribute(attr=name) | ast.Call(func=ast.Name(id=name)):
+            return f"{{{name}}}"
+    return "{…}"
+
+
+def errors_in(source: str) -> Iterator[tuple[str, str, str]]:
+    """(class, code, sentence) of each error that a module makes: calls with a code and a text, in this order."""
+    for node in ast.walk(ast.parse(source)):
+        if not isinstance(node, ast.Call):
+            continue
+        for code, text in zip(node.args, node.args[1:], strict=False):
+            if isinstance(code, ast.Constant) and CODE.fullmatch(str(code.value)):
+                yield ast.unparse(node.func), str(code.value), sentence(text)
+
+
+def all_errors() -> list[tuple[str, str, str]]:
+    """:func:`errors_in` of all modules of the package."""
+    sources = (path.read_text(encoding="utf-8") for path in sorted((ROOT / "stcal").rglob("*.py")))
+    return [error for source in sources for error in errors_in(source)]
+
+
+def page() -> str:
+    """The page, made anew."""
+    sentences: dict[str, set[str]] = {}
+    for _, code, text in all_errors():
+        sentences.setdefault(code, set()).add(text)
+    parts = [HEAD]
+    for code, texts in sorted(sentences.items()):
+        parts.append(f"\n## {code}\n\n" + "".join(f"- {_literal(text)}\n" for text in sorted(texts)))
+    return "".join(parts)
+
+
+def _literal(text: str) -> str:
+    return f"`` {text} ``" if "`" in text else f"`{text}`"
+
+
+def main() -> None:
+    arguments = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    arguments.add_argument("--check", action="store_true", help="write nothing, exit with 1 where the page differs")
+    made = page()
+    if arguments.parse_args().check:
+        sys.exit(int(PAGE.read_text(encoding="utf-8") != made))
+    PAGE.write_text(made, encoding="utf-8")
+
+
+if __name__ == "__main__":
+    main()
