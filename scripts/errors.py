@@ -49,6 +49,8 @@ def sentence(node: ast.expr) -> str:
 def errors_in(source: str) -> Iterator[tuple[str, str, str]]:
     """(class, code, sentence) of each error that a module makes: calls with a code and a text, in this order."""
     for node in ast.walk(ast.parse(source)):
+        if isinstance(node, ast.Tuple):  # code, text = "E-…", f"…"
+            node = ast.Call(ast.Name("InputError"), node.elts, [])
         if not isinstance(node, ast.Call):
             continue
         for code, text in zip(node.args, node.args[1:], strict=False):

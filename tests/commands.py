@@ -106,7 +106,12 @@ _ALL = "--json >all.json --report >page.html"
 CALLS = (
     Call("sfm run", f"{_SET} --out ~run", 3.5),
     Call("sfm run", f"{_SET} --out +new", 9.0),
+    Call("sfm run", f"{_SET} --out ~run --board-only", 3.0),
+    Call("sfm run", f"{_SET} --out ~run --solve paper", 4.0),
+    Call("sfm run", f"{_SET} --out ~run --frame three-point", 4.0),
+    Call("sfm run", f"{_SET} --out ~run --compare paper", 6.0),
     Call("sfm detect", f"{_SET} --out ~detected", 1.5),
+    Call("sfm detect", f"{_SET} --out ~detected --solve paper", 2.0),
     Call("sfm init", "+design"),
     Call("sfm design", "+own --size 130,120,110 --circles 9 --images 2 --width 1296", 6.0),
     Call("sfm draw", "@data/target.toml --out >target.pdf", 2.0),
@@ -133,6 +138,7 @@ CALLS = (
     Call("sfm export", "@run +box.txt --form ros2"),
     Call("sfm crosscheck", "@run --colmap @no-colmap", code=2),
     Call("sfm faces", "@run/models --run @run --out +faces.json", 1.0),
+    Call("sfm faces", "@run/models --run @run --out +faces.json --solve paper", 1.0),
     Call("sfm faces", "@model-txt --run @run --out +faces.json", 1.0),
     Call("sfm pairs", "@run --json >pairs.json"),
     Call("sfm doctor", "@run --images @data/images --json >doctor.json --workers 1", 1.5),
@@ -212,6 +218,14 @@ CALLS = (
     ),
     Call(
         "handeye",
+        "@handeye/poses.csv --splits 0 --method de --de-bounds-deg closed-form,10 --de-bounds-mm closed-form,20",
+    ),
+    *(
+        Call("handeye", f"@handeye/poses.csv --splits 0 --method {name}")
+        for name in ("de-polished", "tsai-lenz", "zhao")
+    ),
+    Call(
+        "handeye",
         "@handeye/images --poses @handeye/robot.csv --camera @handeye/cameras.txt --board @handeye/board.toml "
         "--splits 0 --refine-camera --camera-out >cameras.txt --out >h.json --workers 1",
         3.0,
@@ -245,5 +259,12 @@ CALLS = (
     Call("locate run", f"@locate/scenes {_LOCATE} --method patent --workers 1", 1.0),
     Call("register", "@register/pairs.csv --folds 2 --out >all.json --report >page.html", 1.5),
     Call("register", "@register/pairs.csv --model similarity --method least-squares --folds 0"),
+    Call("register", "@register/pairs.csv --model affine --method least-squares --folds 0"),
+    Call(
+        "register",
+        "@register/pairs.csv --folds 0 --method liu2017 --sample 6 --tries 200 --threshold-mm 5 --share 0.3 "
+        "--orthogonality 0.01 --report >liu.html",
+        1.0,
+    ),
     Call("register", "@register/arm.csv --robot @robot/robot.toml --identified >r.toml --out >all.json --folds 0", 2.0),
 )

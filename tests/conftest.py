@@ -38,7 +38,10 @@ SAMPLE = Path(__file__).parent / "data" / "sample"
 
 
 # How long examples take is the machine's, and no fault of a test.
-settings.register_profile("all", deadline=None, suppress_health_check=[HealthCheck.too_slow])
+# Examples are the same each time but where `scripts/full` draws a seed.
+settings.register_profile(
+    "all", deadline=None, derandomize="STCAL_SEED" not in os.environ, suppress_health_check=[HealthCheck.too_slow]
+)
 settings.register_profile("quick", settings.get_profile("all"), max_examples=20)
 settings.load_profile("all")
 typer.main.get_command = cache(typer.main.get_command)  # of hundreds of calls here, each would build the tree anew

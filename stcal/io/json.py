@@ -30,25 +30,29 @@ def mistake(reason: object) -> PydanticCustomError:
     return PydanticCustomError(WITHOUT_VALUE, "{reason}", {"reason": str(reason)})
 
 
-def first_mistake(error: ValidationError, missing: str = "key missing; add it") -> str:
-    """``place: reason``, and how many more there are; ``missing`` : what is said of a key that is not there."""
+def first_mistake(error: ValidationError, where: str = "", missing: str = "key missing; add it") -> InputError:
+    """Returns the error that names the first mistake, ``where: place: reason``, and how many more there are.
+
+    ``missing`` : what is said of a key that is not there.
+    """
     first = error.errors()[0]
     place = ".".join(str(part + 1 if isinstance(part, int) else part) for part in first["loc"])
     place = " ".join(place.split())  # a quoted TOML key may hold a line break
     if first["type"] == "extra_forbidden":
-        reason = "unknown key; remove it or correct its spelling"
+        code, reason = "E-KEY-UNKNOWN", "unknown key; remove it or correct its spelling"
     elif first["type"] == "missing":
-        reason = missing
+        code, reason = "E-KEY-MISSING", missing
     elif first["type"] == WITHOUT_VALUE:
-        reason = first["msg"]
+        code, reason = "E-KEY-VALUE", first["msg"]
     elif first["type"] == "string_pattern_mismatch":
-        reason = f"{first['input'][:LONGEST]!r}: spaces, colons, commas, slashes and line breaks are not allowed"
+        name = first["input"][:LONGEST]
+        code, reason = "E-KEY-NAME", f"{name!r}: spaces, colons, commas, slashes and line breaks are not allowed"
     else:
         shown = " ".join(repr(first["input"]).split())
         shown = shown if len(shown) <= LONGEST else shown[: LONGEST - 1] + "…"
-        reason = f"{shown}: {first['msg'][0].lower()}{first['msg'][1:]}"
+        code, reason = "E-KEY-VALUE", f"{shown}: {first['msg'][0].lower()}{first['msg'][1:]}"
     more = f" (and {error.error_count() - 1} more)" if error.error_count() > 1 else ""
-    return f"{place}: {reason}{more}" if place else reason + more
+    return InputError(code, ": ".join(part for part in (where, place, reason + more) if part))
 
 
 class Part(BaseModel):
@@ -196,7 +200,7 @@ def checked(content: dict[str, Any], model: type[F]) -> F:
         return model.model_validate(content, extra="ignore")
     except ValidationError as error:
         key = error.errors()[0]["loc"][-1:]
-        raise InputError("E-JSON-CONTENT", first_mistake(error, f"no {str(*key)!r}")) from error
+        raise first_mistake(error, missing=f"no {str(*key)!r}") from error
 
 
 def read_result(path: str | Path, model: type[F], what: str, remedy: str) -> F:
@@ -205,4 +209,4 @@ def read_result(path: str | Path, model: type[F], what: str, remedy: str) -> F:
     try:
         return checked(content, model)
     except InputError as error:
-        raise InputError("E-JSON-CONTENT", f"{what} {path}: {error}; {remedy}") from error
+        raise InputError(error.code, f"{what} {path}: {error}; {remedy}") from error

@@ -8,12 +8,14 @@ import tempfile
 import time
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
+from functools import cache
 from multiprocessing.connection import Connection, wait
 from pathlib import Path
 
 from stcal.parallel import ONE_THREAD
+from tests.commands import Call
 from tests.fuzzing.cases import Judged, judged, judged_option
-from tests.fuzzing.judged import LONGEST_S, failures, hashes, in_process, lay_out
+from tests.fuzzing.judged import LONGEST_S, Outcome, failures, hashes, in_process, lay_out
 
 LONGEST_WAIT_S = 4 * LONGEST_S + 20
 MOST_MEMORY = 8 << 30
@@ -57,8 +59,7 @@ def mistaken(stock: Path, folder: Path, name: str) -> Judged:
     from tests.fuzzing.mistakes import MISTAKES, told
 
     mistake = MISTAKES[name]
-    lay_out(stock, folder, mistake.call, earlier=False)
-    valid = in_process(mistake.call, "stcal", folder)
+    valid = _on_good_data(stock, folder, mistake.call)
     read, _ = lay_out(stock, folder, mistake.call, earlier=False)
     mistake.edit(read)
     before = hashes(folder)
@@ -73,6 +74,12 @@ def mistaken(stock: Path, folder: Path, name: str) -> Judged:
     return Judged(
         name, f"{mistake.call.command}: {name}", tuple(found), outcome.code, outcome.seconds, mistake.call.command
     )
+
+
+@cache
+def _on_good_data(stock: Path, folder: Path, call: Call) -> Outcome:
+    lay_out(stock, folder, call, earlier=False)
+    return in_process(call, "stcal", folder)
 
 
 @dataclass(slots=True)

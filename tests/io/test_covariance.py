@@ -65,7 +65,7 @@ def test_files_name_the_place_and_not_the_numbers(case):
     class Read(Part):
         faces: dict[str, PoseCovariance]
 
-    with fails_with("E-JSON-CONTENT … 2:"):
+    with fails_with("E-KEY-VALUE … 2"):
         checked({"faces": {"1": np.eye(6).tolist(), "2": NONE[case][0].tolist()}}, Read)
 
 

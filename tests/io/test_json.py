@@ -58,14 +58,14 @@ def test_a_key_that_is_no_part_of_the_file_is_not_written():
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        ({"format": "stcal example 2"}, "E-JSON-CONTENT … 'stcal example 2' … 'stcal example 1'"),
-        ({"rows": [{"name": "a", "value": float("nan")}]}, "E-JSON-CONTENT … 1."),
-        ({"rows": [{"name": "a"}]}, "E-JSON-CONTENT … 1. … 'value'"),
-        ({"rows": [{"name": 3, "value": 1}]}, "E-JSON-CONTENT … 1. … 3:"),
-        ({"poses": {"1": np.diag([2.0, 1, 1, 1])}}, "E-JSON-CONTENT … 1:"),
-        ({"poses": {"1": "abc"}}, "E-JSON-CONTENT … 1: … 'abc'"),
-        ({"middle": [1, 2]}, "E-JSON-CONTENT … 1 … 2 … 2 … 3"),
-        ({"middle": [1, 2, float("inf")]}, "E-JSON-CONTENT"),
+        ({"format": "stcal example 2"}, "E-KEY-VALUE … 'stcal example 2' … 'stcal example 1'"),
+        ({"rows": [{"name": "a", "value": float("nan")}]}, "E-KEY-VALUE … 1."),
+        ({"rows": [{"name": "a"}]}, "E-KEY-MISSING … 1. … 'value'"),
+        ({"rows": [{"name": 3, "value": 1}]}, "E-KEY-VALUE … 1. … 3"),
+        ({"poses": {"1": np.diag([2.0, 1, 1, 1])}}, "E-KEY-VALUE … 1"),
+        ({"poses": {"1": "abc"}}, "E-KEY-VALUE … 1 … 'abc'"),
+        ({"middle": [1, 2]}, "E-KEY-VALUE … 1 … 2 … 2 … 3"),
+        ({"middle": [1, 2, float("inf")]}, "E-KEY-VALUE"),
     ],
 )
 def test_the_place_and_the_reason_are_named(change, message):

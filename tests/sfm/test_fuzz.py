@@ -1,6 +1,7 @@
 """Cases of `scripts/studies/fuzz_study.py`: spoiled inputs of every command, and mistakes that must be told."""
 
 import json
+import os
 
 import numpy as np
 import pytest
@@ -13,7 +14,11 @@ from tests.fuzzing.mistakes import MISTAKES, call_of
 from tests.fuzzing.mutations import BY_SUFFIX
 from tests.fuzzing.pool import mistaken, went_through
 
-SEED, CASES, PARTS = 20, 360, 6
+SEED = int(os.environ.get("STCAL_SEED", "20"))
+"""`scripts/full` draws another one each time."""
+CASES, PARTS = 360, 30
+IN_SAMPLE = range(0, PARTS, 4)
+"""Parts that `.ci/run` judges."""
 
 
 def spoiled(stock, folder, numbers, both=True) -> list[Judged]:
@@ -53,8 +58,9 @@ def test_the_cases_are_of_every_command_but_long_ones():
     assert len(left_out) < len(COMMANDS) // 4
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("part", range(PARTS))
+@pytest.mark.parametrize(
+    "part", [pytest.param(n, marks=pytest.mark.slow if n in IN_SAMPLE else pytest.mark.full) for n in range(PARTS)]
+)
 def test_whatever_comes_in_is_judged(stock, tmp_path, part):
     assert len(spoiled(stock, tmp_path / "case", range(part, CASES, PARTS))) == CASES // PARTS
 

@@ -62,8 +62,8 @@ def test_joint_values_beside_it(tmp_path):
         (SA, MAP.replace("= 4", "= 9"), "E-COLUMNS-FILE … 5"),
         (SA, MAP.replace("= 2", "= 20", 1), "E-TABLE-EMPTY … 20 … skip_lines"),
         (SA.replace("-2\t", "-2 "), MAP, "E-COLUMNS-FILE … 5 … 4 cells, 5 needed"),
-        (SA, MAP.replace('"tab"', '"bar"'), "E-TOML-CONTENT"),
-        (SA, "[columns]\n", "E-TOML-CONTENT"),
+        (SA, MAP.replace('"tab"', '"bar"'), "E-KEY-VALUE"),
+        (SA, "[columns]\n", "E-KEY-VALUE"),
     ],
 )
 def test_mistakes_are_named(tmp_path, text, columns, words):

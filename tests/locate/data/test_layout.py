@@ -62,14 +62,14 @@ def test_a_plan_may_leave_places_open(tmp_path):
         (TAG.format(1) + TAG.format(1).replace("4x4", "5x5"), "E-TAG-REPEATED … 1 … 2"),
         ("origin = 9\n" + TAG.format(1), "E-LAYOUT-ORIGIN … 9"),
         (TAG.format(1) + "corners_mm = [[0, 0], [0, 9], [9, 9], [9, 0]]\n", "E-TAG-CORNERS"),
-        (TAG.format(1).replace("4x4_50", "9x9_50"), "E-TOML-CONTENT"),
-        ("covariance_mm2 = [[1.0]]\n" + PLACED.format(1, 0, 0, 0), "E-TOML-CONTENT … covariance_mm2 … 8"),
+        (TAG.format(1).replace("4x4_50", "9x9_50"), "E-KEY-VALUE"),
+        ("covariance_mm2 = [[1.0]]\n" + PLACED.format(1, 0, 0, 0), "E-KEY-VALUE … covariance_mm2 … 8"),
         (
             "covariance_mm2 = ["
             + ", ".join(str([0.0] * k + [-1.0 if k else 1.0]) for k in range(8))
             + "]\n"
             + PLACED.format(1, 0, 0, 0),
-            "E-TOML-CONTENT … covariance_mm2 … -1 … 0 … 1",
+            "E-KEY-VALUE … covariance_mm2 … -1 … 0 … 1",
         ),
     ],
 )

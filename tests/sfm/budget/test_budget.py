@@ -182,7 +182,7 @@ def test_a_failed_check_is_said(stcal_sfm, small_run, tmp_path):
 def test_statements_that_are_none(stcal_sfm, small_run, tmp_path, content, words):
     path = tmp_path / "lab.toml"
     path.write_text(content)
-    assert_error(stcal_sfm("budget", small_run, "--statement", path), INPUT, "E-TOML-CONTENT", str(path), words)
+    assert_error(stcal_sfm("budget", small_run, "--statement", path), INPUT, str(path), words)
 
 
 def test_fields_that_are_none(stcal_sfm, small_run):
@@ -196,4 +196,4 @@ def test_a_chain_has_no_budget(stcal_sfm, small_run, tmp_path):
     own_copy(small_run, copy)
     faces = json.loads((copy / "faces.json").read_text())
     (copy / "faces.json").write_text(json.dumps(faces | {"solve": "chain"}))
-    assert_error(stcal_sfm("budget", copy), INPUT, "E-BUDGET-NO-COVARIANCE", "chain", "--solve")
+    assert_error(stcal_sfm("budget", copy), INPUT, "solved by chain, which states no covariance", "--solve joint")

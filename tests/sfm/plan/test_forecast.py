@@ -456,7 +456,7 @@ def test_plan_out_of_reach(stcal_sfm):
     [
         (None, "E-TARGET-ROUGH-POSE … rough_pose … origin_mm … --faces"),
         ("nothing", "E-JSON-INVALID"),
-        ('{"unit": "m", "target_from_face": {}}', "E-JSON-CONTENT … unit: 'm'"),
+        ('{"unit": "m", "target_from_face": {}}', "E-KEY-VALUE … 'm'"),
         ('{"target_from_face": {}}', "E-TARGET-NO-FACE … top"),
     ],
 )
