@@ -26,7 +26,7 @@ COMMANDS = {
     "types": f'NODE_OPTIONS="${{NODE_OPTIONS:-}} --max-semi-space-size=128" {PROGRAMS}/basedpyright',
     "site": f"{PYTHON} scripts/build_site.py",
     "wheel": "scripts/try_wheel",
-    "tests": f"{PYTHON} -m pytest -n logical --dist worksteal",
+    "tests": f"{PYTHON} -m pytest -n auto --dist worksteal",
 }
 
 

@@ -14,6 +14,7 @@ from filelock import FileLock
 
 CAPABILITIES, ANY_FILE = 0x20080522, 0b110
 """Version of Linux's interface, and the bits of CAP_DAC_OVERRIDE and CAP_DAC_READ_SEARCH."""
+OF_READERS = ("lock", ".db-wal", ".db-shm")
 T = TypeVar("T")
 
 
@@ -56,15 +57,15 @@ class Once:
 
 
 def stamps(folder: Path) -> dict[str, tuple[int, int]]:
-    """Size and time of every file below a folder; locks are taken by readers too."""
-    files = (path for path in folder.rglob("*") if path.is_file() and path.name != "lock")
+    """Size and time of every file below a folder, but for those that readers make: locks, and SQLite's files."""
+    files = (path for path in folder.rglob("*") if path.is_file() and not path.name.endswith(OF_READERS))
     return {str(path.relative_to(folder)): ((s := path.stat()).st_size, s.st_mtime_ns) for path in files}
 
 
 def protect(folder: Path) -> None:
     """Take away the write bits of all files below a folder but locks."""
     for path in folder.rglob("*"):
-        if path.is_file() and path.name != "lock":
+        if path.is_file() and not path.name.endswith(OF_READERS):
             path.chmod(0o444)
 
 

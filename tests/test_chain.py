@@ -187,6 +187,7 @@ def test_photographs_to_a_compensated_arm_and_tags_to_its_base(cell):
         assert chdtrc(6, mahalanobis) > 1e-3
 
 
+@pytest.mark.full
 def test_photographs_to_joint_values_in_one_command(cell):
     """Photographs of sweeps and of other poses, one of them without joint values: 0.5 mm and 1 mrad of every axis are
     found, and targets are reached to what rows held out say."""

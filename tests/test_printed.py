@@ -5,6 +5,7 @@ import tempfile
 
 import pytest
 
+from tests.levels import sampled
 from tests.scripts import load_script
 
 printed = load_script("printed")
@@ -50,8 +51,7 @@ def test_every_stored_file_is_of_a_block_and_every_script_is_there():
     assert [c for c in commands.values() if not (printed.ROOT / shlex.split(c)[0]).is_file()] == []
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("name", QUICK)
+@pytest.mark.parametrize("name", sampled(QUICK, kept=(2,)))
 def test_quick_scripts_print_the_same_again(name, shared_data):
     """To one unit of the last digit shown: another processor rounds otherwise."""
     (command,) = {block.command for block in marked() if printed.name_of(block.command) == name}

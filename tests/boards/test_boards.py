@@ -12,6 +12,7 @@ from stcal.design import BoardDesign
 from stcal.errors import InputError
 from stcal.geometry.plane import apply_homography
 from tests.boards.drawn import IMAGE_FROM_MM, chessboard_mm, photograph
+from tests.levels import sampled
 
 CORNER_PX = 0.12
 """cv2 warps in steps of 1/32 px, here of a third; blur and 1.5 grey values of noise do the rest (0.08 px seen)."""
@@ -24,12 +25,13 @@ def turn(degrees: float) -> np.ndarray:
     return about @ np.array([[c, -s, 0], [s, c, 0], [0, 0, 1]]) @ np.linalg.inv(about) @ IMAGE_FROM_MM
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize(
-    ("rows", "columns"),
-    [(5, 8), *(pytest.param(*size, marks=pytest.mark.slow) for size in ((6, 6), (6, 7), (7, 7), (6, 8)))],
+    ("rows", "columns", "degrees"),
+    sampled(
+        [(*size, degrees) for size in ((5, 8), (6, 6), (6, 7), (7, 7), (6, 8)) for degrees in (170, 0, 90, -100)],
+        kept=(0, 5, 10, 15, 17),
+    ),
 )
-@pytest.mark.parametrize("degrees", [170, *(pytest.param(d, marks=pytest.mark.slow) for d in (0, 90, -100))])
 def test_chessboard_corners_are_numbered(rows, columns, degrees):
     board = ChessboardDesign(rows, columns, 20.0)
     sheet, first = chessboard_mm(rows, columns, 20.0)
@@ -50,6 +52,7 @@ def spoiled(grey: np.ndarray, blur_px: float, contrast: float, noise: float) -> 
     return np.clip(noisy, 0, 255).astype(np.uint8)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("blur_px", "contrast", "noise", "enlarged"),
     [
@@ -75,6 +78,7 @@ def test_chessboards_out_of_focus_dim_and_noisy(blur_px, contrast, noise, enlarg
     assert np.sqrt((error**2).mean()) < 0.3 * enlarged
 
 
+@pytest.mark.slow
 def test_a_steep_chessboard_is_found():
     """65° off its normal, seen from 1.2 m: squares of 17 × 8 px at the far edge."""
     board = ChessboardDesign(6, 9, 20.0)
@@ -91,6 +95,7 @@ def test_a_steep_chessboard_is_found():
     assert min(errors) < 3 * CORNER_PX
 
 
+@pytest.mark.slow
 def test_noise_is_no_chessboard():
     grey = np.random.default_rng(2).integers(0, 255, (480, 640)).astype(np.uint8)
     assert find_chessboard(grey, "a", ChessboardDesign(5, 8, 20.0)) is None

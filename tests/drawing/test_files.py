@@ -54,6 +54,7 @@ def test_svg_has_the_target_in_mm(files):
     assert_is_the_target(circles)
 
 
+@pytest.mark.slow
 def test_dxf_has_the_target_in_mm(files):
     ezdxf = importlib.import_module("ezdxf")
     drawing = ezdxf.readfile(draw(files / "target.toml", files / "target.dxf").path)
@@ -80,6 +81,7 @@ def test_dxf_has_black_areas_as_closed_lines(files):
         np.testing.assert_allclose(np.linalg.norm(xy - np.roll(xy, 1, axis=0), axis=1), 12.5)
 
 
+@pytest.mark.slow
 def test_pages_of_a_pdf_have_the_size_of_the_paper(files):
     for paper in ("Letter",):
         drawn = draw(files / "target.toml", files / f"{paper}.pdf", paper.lower())
@@ -90,6 +92,7 @@ def test_pages_of_a_pdf_have_the_size_of_the_paper(files):
             assert sorted([sheet.width, sheet.height]) == sorted(PAPERS[paper])
 
 
+@pytest.mark.slow
 def test_a_pdf_is_the_same_again():
     sheets = paper_sheets(board_parts(reference_board(), 10.0), "A4", "board")
     assert pdf(sheets) == pdf(sheets)

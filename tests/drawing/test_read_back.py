@@ -48,6 +48,7 @@ def seen_ways(image, places):
     yield seen, {name: apply_homography(homography, xy) for name, xy in places.items()}, camera
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("target", [reference_target(), second_design()[0]], ids=["bright", "dark"])
 def test_faces_are_read_back(target: TargetDesign, tmp_path):
     """Every page of the PDF, drawn by another program: all circles of its face named, at their places."""

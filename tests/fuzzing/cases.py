@@ -1,7 +1,6 @@
 """Cases of a seed: which command, which of its files, and what is done to it; seed and number make a case."""
 
 import os
-import shutil
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -10,6 +9,7 @@ import numpy as np
 from tests.commands import CALLS, PLACES, Call, options_of
 from tests.fuzzing.judged import failures, hashes, in_process, lay_out
 from tests.fuzzing.mutations import REFUSED, mutations_of, not_permitted, pick
+from tests.shared import own_copy
 
 UNREAD = ("report.html", "detections.csv", "overlays", "compare.json", "no-colmap", "cache")
 """Of a run's folder: read by people alone, or by the next run alone."""
@@ -133,7 +133,7 @@ def _other_camera(stock: Path, read: Path, rng: np.random.Generator) -> None:
     """The same camera in another of its forms, in some of the cases; the name stays."""
     place = read / "data/cameras.txt"
     if place.exists() and rng.random() < 0.7:
-        shutil.copy(pick(rng, sorted((stock / "cameras").iterdir())), place)
+        own_copy(pick(rng, sorted((stock / "cameras").iterdir())), place)
 
 
 def _option(call: Call, rng: np.random.Generator) -> tuple[tuple[str, ...], str]:

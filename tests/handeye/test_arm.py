@@ -43,6 +43,7 @@ def test_the_slope_is_that_of_the_poses():
     assert np.abs(arm.slope(np.full(24, 1e-3)) - slope).max() > 0.1
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("setup", [SETUPS[0], pytest.param(SETUPS[1], marks=pytest.mark.slow)])
 def test_what_the_arm_errs_is_found(setup):
     """Poses held out are missed by what robot and corners scatter, 0.02 mm and 0.1 px, in place of millimetres."""
@@ -58,7 +59,7 @@ def test_what_the_arm_errs_is_found(setup):
     assert found.sigma["arm_mm"] == pytest.approx(OFF[1], rel=0.8)
 
 
-@pytest.mark.slow
+@pytest.mark.full
 def test_sigma_is_honest_with_an_arm_that_errs():
     """240 numbers of χ²: their mean lies within 1 ± 4 √(2 / 240) by chance; σ of groups are estimated of few values."""
     squared = []
@@ -126,6 +127,7 @@ def test_photographs_and_joint_values(command, photographed, tmp_path):
     assert "The arm" in page.read_text()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("more", "says"),
     [

@@ -63,6 +63,7 @@ def drawn(kind: str, folder):
     return found
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("kind", "said"),
     [

@@ -298,8 +298,8 @@ def test_many_outliers_make_the_setup_suspect():
     assert any(note.startswith("5 of 15 poses contradict the others: with so many look first") for note in found.notes)
 
 
-@pytest.mark.parametrize("moved", [pytest.param(False, marks=pytest.mark.slow), True])
-@pytest.mark.parametrize("sets", [1, pytest.param(40, marks=pytest.mark.slow)])
+@pytest.mark.parametrize("moved", [pytest.param(False, marks=pytest.mark.full), True])
+@pytest.mark.parametrize("sets", [1, pytest.param(40, marks=pytest.mark.full)])
 def test_a_board_that_was_moved_half_way_is_said(moved, sets):
     """By 5° and 30 mm, every other pose: too many for outliers. Without, no such note for 40 sets in a row."""
     said = 0

@@ -11,6 +11,7 @@ from stcal.handeye import HandEyeOptions, Views, handeye, pairs_of_views, splits
 from stcal.handeye.choose import BY_VIEWS, Candidate, choose
 from stcal.io.camera import CalibratedCamera, camera_prior
 from stcal.synthetic.measured.handeye import CAMERA, simulated, simulated_views
+from tests.levels import sampled
 
 ROBOT = (5e-4, 0.2)
 """σ of a common arm: rad, mm."""
@@ -35,8 +36,7 @@ def off_mm(found, truth):
     return np.linalg.norm(found.mount_from_camera.translation - truth.mount_from_camera.translation)
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("seed", range(3))
+@pytest.mark.parametrize("seed", sampled(range(3)))
 def test_files_that_are_right_are_trusted(seed):
     truth = simulated_views(np.random.default_rng(seed), 14, "eye-in-hand", ROBOT, 0.1)
     found = chosen(truth)
@@ -47,7 +47,7 @@ def test_files_that_are_right_are_trusted(seed):
     assert 0.5 * ROBOT[1] < found.held_out.board_mm.mean() < 4 * ROBOT[1]
 
 
-@pytest.mark.slow
+@pytest.mark.full
 def test_a_camera_file_that_is_wrong_is_found_out():
     camera = Camera(1280, 1024, [1478.0, 1478.0], [655.5, 500.5], np.zeros(8))  # 2 %, 16 px, and no distortion
     truth = simulated_views(np.random.default_rng(5), 14, "eye-in-hand", ROBOT, 0.1)
@@ -69,6 +69,7 @@ def test_a_board_of_another_size_is_found_out():
     assert "% larger than stated" in found.sentence
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("scale", "name"), [(1.0, "pose"), (1.02, "pose + scale")])
 def test_poses_alone_are_chosen_among_too(scale, name):
     truth = simulated(np.random.default_rng(7), 16, "eye-in-hand", ROBOT, (5e-4, 0.2))
@@ -86,6 +87,7 @@ def test_one_split_is_enough():
     assert found.held_out.rows.shape == (1, 1)
 
 
+@pytest.mark.slow
 def test_answers_that_contradict_widen_sigma(monkeypatch):
     """Two that predict alike, of which one is 5 mm off by σ that are a hundredth of that."""
     truth = simulated(np.random.default_rng(9), 12, "eye-in-hand", ROBOT)

@@ -61,6 +61,7 @@ CHANCE = 5.8
 """Squared, over 6: F with 6 and 70 degrees of freedom (σ come from a dozen poses) exceeds it once in 10 000 times."""
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("setup", "splits"), [("eye-in-hand", 4), pytest.param("eye-to-hand", 15, marks=pytest.mark.slow)]
 )
@@ -102,6 +103,7 @@ def test_outliers_are_named_by_line(command, tmp_path):
     assert in_sigmas(data, "flange_from_camera", FLANGE_FROM_CAMERA) < CHANCE
 
 
+@pytest.mark.slow
 def test_all_methods_are_compared(command, tmp_path):
     truth = simulated(np.random.default_rng(6), 12, **NOISE)
     everything, page = tmp_path / "all.json", tmp_path / "page.html"
@@ -446,6 +448,7 @@ def test_errors_of_the_poses_that_agree_are_told_apart(command, tmp_path):
     assert errors["agreeing"]["translation_mm"] < 0.7 * errors["translation_mm"]
 
 
+@pytest.mark.slow
 def test_splits_that_hold_out_nothing_but_outliers(command, tmp_path):
     """There is no error of agreeing poses then, and no empty mean."""
 
@@ -533,6 +536,7 @@ def test_what_is_no_bounds_of_differential_evolution(command, tmp_path, words, s
     assert (code, said in error) == (INPUT, True)
 
 
+@pytest.mark.slow
 def test_strict_ends_as_failed_where_use_is_advised_against(command, tmp_path):
     """Five of sixteen poses are other rows'; without the option exit code 0, and with it for good poses too."""
     truth = simulated(np.random.default_rng(5), 16, **NOISE)

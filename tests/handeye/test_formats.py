@@ -21,6 +21,7 @@ def truth():
     return simulated(np.random.default_rng(5), 12, **NOISE)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", FORMATS)
 def test_every_format_gives_the_same_answer(command, tmp_path, truth, name):  # noqa: F811
     own, other = tmp_path / "own.json", tmp_path / "other.json"
@@ -111,6 +112,7 @@ def test_options_that_a_table_does_not_need(command, tmp_path, truth):  # noqa: 
     assert "tables whose columns say all; leave --length-unit out" in err
 
 
+@pytest.mark.slow
 def test_a_folder_of_zivid_beside_images(command, tmp_path):  # noqa: F811
     seen = looks(np.random.default_rng(11), 3, np.array([70, 50]), 0.4)
     toml = 'type = "chessboard"\nrows = 6\ncolumns = 8\nsquare_mm = 20\n'

@@ -30,6 +30,7 @@ def with_more(truth, planned, rng):
     return HandEyePoses(*(Poses.of([*old, *new]) for old, new in zip(pairs, measured, strict=True)))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("setup", SETUPS)
 def test_sigma_comes_out_as_planned(setup):
     """The information of poses within a degree and a few mm of those planned: 10 %. Errors of X are then within what

@@ -39,6 +39,7 @@ def taken(tmp_path):
     return poses_file(tmp_path / "poses.csv", truth), tmp_path / "robot.toml"
 
 
+@pytest.mark.slow
 def test_poses_and_joint_values_are_named(plan, taken, tmp_path):
     poses, robot_file = taken
     code, shown, _ = plan(
@@ -61,6 +62,7 @@ def test_poses_and_joint_values_are_named(plan, taken, tmp_path):
     assert "q6_deg" in shown
 
 
+@pytest.mark.slow
 def test_a_robot_that_does_not_reach_the_poses_taken_is_refused(plan, taken):
     poses, robot_file = taken
     arm = mh80()
@@ -70,6 +72,7 @@ def test_a_robot_that_does_not_reach_the_poses_taken_is_refused(plan, taken):
     assert "reaches 0 of the 8 poses taken, first not line 2; give the robot's own file" in error
 
 
+@pytest.mark.slow
 def test_a_limit_that_some_poses_taken_pass_is_noted(plan, taken):
     """The limit is halfway between the second and third value of the first joint."""
     poses, robot_file = taken

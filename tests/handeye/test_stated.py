@@ -12,6 +12,7 @@ BAD = (8e-3, 3.0)
 STATED = Noise(np.radians(0.02), 0.1)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("noise", [STATED, Noise(0.0, 0.0)])
 @pytest.mark.parametrize("seed", [0, pytest.param(1, marks=pytest.mark.slow)])
 def test_a_bad_robot_is_called_so_by_its_corners(noise, seed):
@@ -34,7 +35,7 @@ def test_a_bad_robot_is_called_so_by_its_poses(camera):
     assert off < 3 * np.sqrt(np.trace(told.covariance[3:, 3:]))
 
 
-@pytest.mark.slow
+@pytest.mark.full
 @pytest.mark.parametrize("setup", ["eye-in-hand", "eye-to-hand"])
 def test_a_robot_as_stated_is_believed(setup):
     """Of 20 sets one may be doubted by a chance of 1 in 100."""
@@ -54,6 +55,7 @@ def test_errors_of_a_stated_pair_widen_sigma():
     np.testing.assert_allclose(np.diag(told.covariance), np.diag(right.covariance), rtol=0.5)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("setup", ["eye-in-hand", "eye-to-hand"])
 @pytest.mark.parametrize("seed", range(3))
 def test_the_other_setup_is_named_where_it_predicts_better(setup, seed):

@@ -29,6 +29,7 @@ def squared(truth: StreamTruth) -> tuple[float, float]:
     return off_s**2 / found.sigma_s**2, float(off @ np.linalg.solve(result.covariance, off)) / 6
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("setup", SETUPS)
 @pytest.mark.parametrize("offset_s", [0.023, -0.31])
 def test_the_offset_is_found(setup, offset_s):
@@ -41,7 +42,7 @@ def test_the_offset_is_found(setup, offset_s):
     assert f"taken at t {'+' if offset_s > 0 else '-'} {1e3 * abs(found.seconds):.2f} ms of the robot's" in words
 
 
-@pytest.mark.slow
+@pytest.mark.full
 @pytest.mark.parametrize("setup", SETUPS)
 def test_the_offset_knows_its_error(setup):
     """120 trials with σ estimated of 20 images: χ² of one number and of six, once in 10⁴ beyond, with a tail of t."""
@@ -54,6 +55,7 @@ def test_the_offset_knows_its_error(setup):
         assert 0.9 * low < value < 1.15 * high
 
 
+@pytest.mark.slow
 def test_without_the_offset_the_answer_is_worse():
     """A third of a second at 100 mm/s."""
     truth = simulated_stream(np.random.default_rng(6), 20, offset_s=0.1)

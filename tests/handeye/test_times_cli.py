@@ -49,6 +49,7 @@ def off(data: dict, truth: StreamTruth) -> np.ndarray:
     return found.difference(Poses.of([truth.mount_from_camera]))[0]
 
 
+@pytest.mark.slow
 def test_the_offset_is_found_and_used(command, tmp_path):
     truth = simulated_stream(np.random.default_rng(7), 16)
     files = two_files(tmp_path, truth)

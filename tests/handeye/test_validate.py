@@ -72,7 +72,7 @@ def test_errors_at_the_board():
         assert board == pytest.approx(on_board, abs=0.6)
 
 
-@pytest.mark.slow
+@pytest.mark.full
 def test_solutions_of_parts_scatter_as_sigma_says():
     """40 splits of 20 poses: six numbers each, of which 20/5 · 6 are independent, so that one set's ratio scatters by
     1/√(2·24) = 14 %, the mean of eight by 5 %; three times that. σ that are three times too small are put right."""
@@ -90,6 +90,7 @@ def test_solutions_of_parts_scatter_as_sigma_says():
     assert np.isnan(scatter(handeye(truth.pairs, truth.setup, "li"), held_out))
 
 
+@pytest.mark.slow
 def test_compare_lists_every_method():
     truth = simulated_views(np.random.default_rng(3), 10, robot=(3e-4, 0.1), corner_px=0.1)
     found = compare(truth.pairs, views=truth.views, rows=splits(10, 3, 2))

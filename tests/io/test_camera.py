@@ -338,6 +338,7 @@ WRONG = {
 # fmt: on
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("case", WRONG)
 def test_a_wrong_file_is_named_in_one_line(tmp_path, case):
     content, message = WRONG[case]

@@ -45,6 +45,7 @@ def run(monkeypatch, capsys):
     return call
 
 
+@pytest.mark.slow
 def test_json_and_page(run, tmp_path):
     a, b = points()
     b[4] += [0, 9, 0]
@@ -103,6 +104,7 @@ def test_models(run, tmp_path, model):
     assert json.loads((tmp_path / "o.json").read_text())["model"] == model
 
 
+@pytest.mark.slow
 def test_methods_and_threshold(run, tmp_path):
     a, b = points(60)
     b[7] += [0, 4, 0]
@@ -347,6 +349,7 @@ def test_a_transform_stands_where_the_kinematics_do_not(run, tmp_path, robot_pai
     assert "robot" not in json.loads(out.read_text())
 
 
+@pytest.mark.slow
 def test_the_published_method_takes_its_numbers(run, tmp_path):
     a, b = points(60)
     b[:6] += 3.0

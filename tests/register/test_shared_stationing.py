@@ -74,6 +74,7 @@ def test_files_for_the_command(script, data, tmp_path):
     np.testing.assert_allclose(forward(read, q).translation, values[:, :3], atol=1e-3)
 
 
+@pytest.mark.full
 def test_the_page_has_what_the_script_prints(script, data, capsys):
     """Every row of the table of stations, to the last digit that is shown, where another processor rounds alike."""
     _, stations, robot = data

@@ -70,6 +70,7 @@ def keys(chrome, canvas) -> None:
     canvas.send_keys(Keys.ARROW_LEFT, Keys.ARROW_UP)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("turn", [drag, touch, keys])
 def test_the_scene_turns(opened_page, turn):
     canvas = opened_page.find_element(By.CSS_SELECTOR, ".turn canvas")
@@ -109,6 +110,7 @@ def images(chrome) -> list[str]:
     return [row.find_element(By.CSS_SELECTOR, "td").text for row in rows]
 
 
+@pytest.mark.slow
 def test_tables_sort_at_a_click(opened_page):
     table = "#residuals > .scroll"
     assert images(opened_page) == NAMES

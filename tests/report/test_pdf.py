@@ -37,6 +37,7 @@ def words(pdf: bytes, command: str = "pdftotext", *options: str) -> str:
     return made.stdout.decode()
 
 
+@pytest.mark.slow
 def test_a_page_is_printed_on_a4_with_numbers_and_its_title():
     pdf = pdf_of(page(150))
     text = words(pdf, "pdftotext", "-layout").split("\f")[:-1]
@@ -55,6 +56,7 @@ def test_what_paper_cannot_do_is_not_printed():
         assert gone not in text
 
 
+@pytest.mark.slow
 def test_a_heading_does_not_end_a_sheet():
     """Wherever the second section begins, its first lines are on the sheet of its heading."""
     for rows in range(20, 60, 3):

@@ -75,6 +75,7 @@ def test_every_name_is_there_and_no_other():
         robot.nothing  # noqa: B018
 
 
+@pytest.mark.slow
 def test_an_import_loads_nothing_heavy():
     """0.1 s on a quiet machine; what it must not load takes 0.3 s and more."""
     heavy = ("matplotlib", "scipy", "numpy", "pydantic", "cv2", "typer")

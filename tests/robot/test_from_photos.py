@@ -102,6 +102,7 @@ def swept(cell):
     return work.from_measured("views", cell.measured(q), joint_table(q, names), mh80(), wanted(cell.about(12)))
 
 
+@pytest.mark.slow
 def test_each_model_errs_less_than_the_one_before(swept):
     drawn, axes, same, held = (figures.rms for figures in swept.errors.values())
     assert drawn > 5 * held  # 0.5 mm and 1 mrad, of which base and tool take up a part
@@ -117,7 +118,7 @@ def test_rows_and_photographs_without_partner_are_named_with_their_number(swept)
     assert "a/lost.png" in alone[1]
 
 
-@pytest.mark.slow
+@pytest.mark.full
 def test_the_sigma_at_the_targets_is_that_of_the_errors_there():
     """Of 20 arms. All targets of an arm share the target's depth, which errs most: the mean is about that of 20 squares
     of normal numbers, 1 ± 0.32."""
@@ -138,6 +139,7 @@ def test_targets_among_the_rows_are_known_as_these_are(cell, swept):
     assert cell.missed(swept) < 9
 
 
+@pytest.mark.slow
 def test_the_story_tells_errors_sigma_and_moves(swept):
     said = story(swept)
     moves = np.abs(np.degrees(swept.moves())).max(axis=0)
@@ -151,6 +153,7 @@ def test_the_story_tells_errors_sigma_and_moves(swept):
     assert "\N{GREEK CAPITAL LETTER SIGMA}" not in page
 
 
+@pytest.mark.slow
 def test_files_are_read_by_the_next_step(tmp_path, swept):
     save_folder(tmp_path / "arm", files_of(swept))
     steps = {"poses": "csv", "axes": "toml", "identified": "toml", "compensated": "csv"}
@@ -162,6 +165,7 @@ def test_files_are_read_by_the_next_step(tmp_path, swept):
     np.testing.assert_allclose(q, swept.compensated.found.q, atol=1e-10)  # nine decimals of a degree
 
 
+@pytest.mark.slow
 def test_without_sweeps_the_axis_method_is_left_out_with_its_reason(cell):
     q = cell.about(40)
     found = work.from_measured("views", cell.measured(q), joint_table(q), mh80())
@@ -179,6 +183,7 @@ def test_without_sweeps_the_axis_method_is_left_out_with_its_reason(cell):
     assert found.errors["as drawn"].rms > 5 * found.errors["identified, the same rows"].rms
 
 
+@pytest.mark.slow
 def test_an_axis_that_is_not_found_does_not_end_the_rest(cell, monkeypatch):
     def unsettled(*_, **__):
         raise ConvergenceError("E-TEST", "joint 2: no minimum; measure a longer sweep")

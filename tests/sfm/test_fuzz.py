@@ -52,6 +52,7 @@ def test_a_case_of_every_command_and_kind_of_file_is_judged(stock, tmp_path):
     assert len(found) < 2 * len(first)
 
 
+@pytest.mark.slow
 def test_the_cases_are_of_every_command_but_long_ones():
     left_out = set(COMMANDS) - {command for _, command in shortest_first()}
     assert [c.command for c in CALLS if c.command in left_out and c.seconds <= BRIEF_S] == []

@@ -7,6 +7,8 @@ import time
 
 import pytest
 
+from tests.levels import sampled
+
 SFM = (sys.executable, "-P", "-c", "from stcal.cli.entry import main_sfm; main_sfm()")
 SFM_SAYING_ON = (*SFM[:-1], "from stcal.cli.entry import main_sfm; print('on', flush=True); main_sfm()")
 ENDS = [(signal.SIGTERM, "terminated", 143), (signal.SIGINT, "interrupted", 130)]
@@ -74,6 +76,7 @@ signal.pause()
     assert (found.returncode, found.stderr) == (7, "")
 
 
+@pytest.mark.slow
 def test_sigterm_while_a_process_starts_waits_until_that_has_what_it_begins_with():
     """The server has forked it, and it reads from this process what to do: cut off there, it would print a stack."""
     begin = """
@@ -97,9 +100,10 @@ list(run_parallel(abs, [(-1,), (-2,)], 2))
     assert (found.returncode, found.stderr) == (7, "")
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("seconds", [0.5, 2.0, 5.0])
-@pytest.mark.parametrize(("number", "said", "code"), ENDS)
+@pytest.mark.parametrize(
+    ("number", "said", "code", "seconds"),
+    sampled([(*end, seconds) for end in ENDS for seconds in (0.5, 2.0, 5.0)], kept=(1, 5)),
+)
 def test_during_a_run(small_set, number, said, code, seconds):
     """Earlier results stay, no process of it is left that still writes, and the next run goes through."""
     small = small_set("12", "14", detected=False)

@@ -37,7 +37,7 @@ def bound(truth, noise):
     return np.linalg.inv(np.einsum("mai,maj->ij", slope, np.linalg.solve(spread, slope)))[:6, :6]
 
 
-@pytest.mark.slow
+@pytest.mark.full
 @pytest.mark.parametrize("setup", SETUPS)
 @pytest.mark.parametrize("stated", [True, False])
 def test_pose_error_reaches_the_bound_and_knows_it(setup, stated):
@@ -77,7 +77,7 @@ def test_the_robot_is_estimated_where_the_camera_is_known():
     assert found.sigma["camera_mm"] == 0.3
 
 
-@pytest.mark.slow
+@pytest.mark.full
 @pytest.mark.parametrize(("count", "low", "high"), [(3, 0.7, 1.3), (4, 0.7, 1.15)])
 def test_few_poses_state_what_they_can_know(count, low, high):
     """All σ estimated from 6 or 12 redundancies: heavy tails, so 200 draws tell their RMS to some 10 %; caution may

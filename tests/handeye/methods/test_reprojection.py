@@ -76,10 +76,10 @@ def test_derivatives_of_the_corners(setup):
             assert np.abs(slope - numeric).max() <= 1e-5 * max(np.abs(slope).max(), 1)
 
 
-@pytest.mark.slow
+@pytest.mark.full
 @pytest.mark.parametrize(
     ("setup", "count"),
-    [("eye-in-hand", 2), *(pytest.param(setup, 20, marks=pytest.mark.slow) for setup in SETUPS)],
+    [("eye-in-hand", 2), *(pytest.param(setup, 20, marks=pytest.mark.full) for setup in SETUPS)],
 )
 def test_reprojection_knows_its_error(setup, count):
     """20 trials of 6 numbers scatter by 1/√240 = 6.5 %; σ of 12 robot poses by 1/√(2·20·30) = 3 %, and it is

@@ -155,6 +155,7 @@ def test_overlays_of_the_worst_a_usual_and_the_best(outcome, tmp_path):
     assert page.count("<image href") == 3
 
 
+@pytest.mark.slow
 def test_an_image_that_is_gone_is_said_and_no_error(outcome, tmp_path):
     whole = with_images(outcome, tmp_path)
     name = overlays(whole)[0][0].title.removeprefix("worst: ")
@@ -196,6 +197,7 @@ def test_a_chart_of_many_poses_has_room():
     assert chart.panels[0].bars[4][4] == f"pose 5: {turn[4]:.4f}°"
 
 
+@pytest.mark.slow
 def test_the_page_is_the_same_twice(outcome, tmp_path):
     whole = with_images(outcome, tmp_path)
     assert outcome_page(whole) == outcome_page(whole)

@@ -86,6 +86,7 @@ LINK = Rigid([[0, 0, 1], [-1, 0, 0], [0, -1, 0]], [0, 0, 0])
 """REP 103: the line of sight, Z of the optical frame, is X of the link; its X, to the right, is the link's -Y."""
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("setup", ["eye-in-hand", "eye-to-hand"])
 @pytest.mark.parametrize("form", FORMS)
 @given(st.tuples(angle, angle, angle, length, length, length))

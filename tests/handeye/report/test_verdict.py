@@ -29,7 +29,7 @@ def word_of(outcome: Outcome, title: str) -> str:
     return found
 
 
-@pytest.mark.slow
+@pytest.mark.full
 def test_honest_poses_are_good():
     """Sixteen poses of a robot and a camera that err as stated: by chance an outlier is found in one of a hundred
     calibrations, and two groups in another; of 40, more than 4 in one of 10 000."""
@@ -53,6 +53,7 @@ def test_few_poses_ask_for_care():
     assert "Motions of the flange" in [each.title for each in found.reasons()]
 
 
+@pytest.mark.slow
 def test_small_turns_are_named_with_the_axes_to_turn_about():
     """Turns of 2°: the camera's place is known ten times worse than a pose."""
     outcome = outcome_of(16, 5)
@@ -107,6 +108,7 @@ def test_notes_weigh(note, word):
     )
 
 
+@pytest.mark.slow
 def test_the_share_of_the_transform_is_that_of_predictions():
     """σ at the board by the covariance, against where transforms drawn from it put the board."""
     outcome = outcome_of(12, 3)

@@ -90,6 +90,7 @@ def test_poses_in_files_of_their_own_are_shared_where_they_are_equal(rig, files)
     assert "no errors on poses held out are known" in shown
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("old", "new", "said"),
     [
@@ -119,6 +120,7 @@ def test_what_it_reads_is_not_written_over(rig, files):
     assert code == INPUT
 
 
+@pytest.mark.slow
 def test_images_of_one_camera_that_are_not_of_the_board_are_named(rig, files):
     for path in (files / "right").iterdir():
         cv2.imwrite(str(path), np.full((600, 800), 200, np.uint8))

@@ -48,7 +48,8 @@ def errors(truth: RigTruth, options: RigOptions | None = None) -> tuple[list[flo
     return own, between, [float(every @ np.linalg.solve(rig.covariance, every)) / len(every)]
 
 
-@pytest.mark.parametrize("count", [1, pytest.param(40, marks=pytest.mark.slow)])
+@pytest.mark.slow
+@pytest.mark.parametrize("count", [1, pytest.param(40, marks=pytest.mark.full)])
 @pytest.mark.parametrize("setup", SETUPS)
 def test_a_rig_knows_its_error(setup, count):
     """χ² of trials with σ estimated, each camera at four fifths of the poses: once in 10⁴ beyond. All cameras of a
@@ -62,6 +63,7 @@ def test_a_rig_knows_its_error(setup, count):
         assert 0.9 * low < np.mean(kind) < 1.15 * high
 
 
+@pytest.mark.slow
 def test_derivatives_of_a_rig():
     """Against central differences: of all shared unknowns, every ninth of the board's and the robot's."""
     truth = simulated_rig(np.random.default_rng(5), 4, "eye-to-hand", 2, ROBOT)
@@ -89,6 +91,7 @@ def test_derivatives_of_a_rig():
             assert np.abs(slope - numeric).max() <= 1e-5 * max(np.abs(slope).max(), 1)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("setup", SETUPS)
 def test_one_camera_is_the_special_case(setup):
     """The same adjustment as `stcal handeye` makes by method reprojection."""
@@ -101,6 +104,7 @@ def test_one_camera_is_the_special_case(setup):
     assert own.residuals == pytest.approx(single.residuals, abs=1e-9)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("setup", SETUPS)
 def test_together_cameras_are_known_better_than_alone(setup):
     """With the robot's σ as they are; of two cameras a third of the variance is common, but no more than all of it."""
@@ -114,6 +118,7 @@ def test_together_cameras_are_known_better_than_alone(setup):
     assert np.linalg.norm(np.sqrt(np.diag(covariance)[3:])) < 0.8 * np.linalg.norm(apart_mm)
 
 
+@pytest.mark.slow
 def test_σ_of_the_robot_is_one_for_all():
     truth = simulated_rig(np.random.default_rng(6), 20, "eye-in-hand", 2, ROBOT, PX, BOARD)
     rig = handeye_rig(truth.given, "eye-in-hand")
@@ -134,6 +139,7 @@ def test_a_camera_with_two_images_is_found_by_the_others():
     assert np.sqrt(np.diag(found.covariance)[3:]).max() < 0.5
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("factor", [1.003, 1.01, 1.1])
 @pytest.mark.parametrize("i", [0, 1])
 def test_intrinsics_that_are_wrong_are_named(factor, i):
@@ -146,6 +152,7 @@ def test_intrinsics_that_are_wrong_are_named(factor, i):
     assert [note.partition(":")[0] for note in notes if NOT_FIT in note] == [NAMES[i]]
 
 
+@pytest.mark.slow
 def test_intrinsics_that_are_wrong_are_mended():
     """Off by 3 σ of what is stated of them; then solved for."""
     truth = simulated_rig(np.random.default_rng(8), 15, "eye-to-hand", 2, ROBOT, (0.1, 0.1, 0.1), BOARD)
@@ -192,6 +199,7 @@ def test_another_board_is_named(setup, cameras, said):
         handeye_rig(given, setup)
 
 
+@pytest.mark.slow
 def test_a_board_that_was_moved_a_little_is_named():
     truth = simulated_rig(np.random.default_rng(3), 12, "eye-in-hand", 3, ROBOT, PX, BOARD)
     given = seen_elsewhere(truth, 1, Rigid.exp([0, 0, 0.003, 3, 1, 0]))
@@ -201,6 +209,7 @@ def test_a_board_that_was_moved_a_little_is_named():
     assert of_places(NAMES, [single[0], None, single[2]]) == ()
 
 
+@pytest.mark.slow
 def test_an_image_of_another_moment_is_left_out():
     """One of 12 images of the second camera, taken 2 mm later."""
     truth = simulated_rig(np.random.default_rng(9), 12, "eye-in-hand", 2, ROBOT, PX, BOARD)
@@ -214,6 +223,7 @@ def test_an_image_of_another_moment_is_left_out():
     assert any("right/5.png contradicts the others" in note for note in rig.all_notes())
 
 
+@pytest.mark.slow
 def test_a_pose_of_the_robot_that_is_wrong_is_left_out_for_all():
     truth = simulated_rig(np.random.default_rng(11), 12, "eye-to-hand", 2, (2e-4, 0.05), PX)
     flange = list(truth.given.base_from_flange)

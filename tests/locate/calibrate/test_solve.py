@@ -74,6 +74,7 @@ def test_the_adjustment_is_better_than_the_published_way():
     assert np.mean(ours) < 0.95 * np.mean(theirs)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("corner", "tag"), [pytest.param(0.4, 0.0, marks=pytest.mark.slow), (0.2, 0.5)])
 def test_what_print_and_lens_add_is_found(corner, tag):
     found = [calibrate(PLAN, *views(10, seed, corner, tag), CAMERA).adjusted for seed in range(4)]

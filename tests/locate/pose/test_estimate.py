@@ -23,7 +23,7 @@ def error_of(pose, truth: Rigid) -> np.ndarray:
     return Poses.of([pose.camera_from_obj]).difference(Poses.of([truth]))[0]
 
 
-@pytest.mark.slow
+@pytest.mark.full
 @pytest.mark.parametrize(
     ("shown", "layout", "shared"),
     [

@@ -73,6 +73,7 @@ def test_a_target_that_stands_still_shows_the_mistake(name, count):
             judged(flange, seen, mount)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("count", [1, 2, 3, 12])
 @pytest.mark.parametrize("turn_rad", [0.0, 0.02, 0.5])
 @pytest.mark.parametrize("moves", [0.0, 3.0, 200.0])

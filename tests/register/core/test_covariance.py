@@ -9,6 +9,7 @@ from stcal.register.core.covariance import covariance_of, kept_share, kept_varia
 from stcal.register.core.models import MODELS
 from stcal.register.core.problem import PointNoise, Problem, noise_of
 from stcal.synthetic.measured.point_pairs import SIGMA_MM, make_scene, parameter_error
+from tests.levels import sampled
 from tests.outcome import fails_with
 
 RIGID = MODELS["rigid"]
@@ -36,16 +37,17 @@ def calibration(trials: int, n: int, share=0.0, given=False, **options) -> float
 
 
 # χ²₆/6 has a standard deviation of 0.58; the mean of 60 trials one of 0.075, and 0.28 is nearly 4 of these.
-@pytest.mark.slow
 @pytest.mark.parametrize(
     ("share", "options"),
-    [
-        (0, {}),
-        (0.3, {}),
-        (0.3, {"given": True}),
-        (0, {"threshold_mm": 3 * SIGMA_MM}),
-        (0, {"method": "least-squares"}),
-    ],
+    sampled(
+        [
+            (0.3, {}),
+            (0, {}),
+            (0.3, {"given": True}),
+            (0, {"threshold_mm": 3 * SIGMA_MM}),
+            (0, {"method": "least-squares"}),
+        ]
+    ),
 )
 def test_the_covariance_is_calibrated(share, options):
     assert calibration(60, 40, share, **options) == pytest.approx(1, abs=0.28)

@@ -32,7 +32,7 @@ def test_another_scale_is_named_with_its_sigma(scale):
     assert register(a, scale * b + noise, model="similarity").notes == ()
 
 
-@pytest.mark.slow
+@pytest.mark.full
 def test_one_scale_is_rarely_called_two():
     """One in 10 000 by each of two tests: of 300 sets, two have a chance of 1 in 600."""
     said = 0

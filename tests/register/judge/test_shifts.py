@@ -51,13 +51,14 @@ def test_the_covariance_holds_either_group():
     assert error @ np.linalg.solve(clean.covariance[3:, 3:], error) > 30
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("wrong", [0, 5])
 def test_clean_rows_and_few_wrong_ones_are_not_two_groups(wrong):
     for seed in range(20):
         assert not any(SAID in note for note in register(*pairs(seed, wrong), folds=0).notes)
 
 
-@pytest.mark.slow
+@pytest.mark.full
 def test_study_of_two_groups(capsys):
     """Shifts of 0.7 mm at σ 0.15 mm: of 60 one at most is wrong in silence (1 of 600); of clean sets none is told."""
     study = load_script("two_groups_study")

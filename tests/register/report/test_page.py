@@ -114,6 +114,7 @@ def test_page_of_three_points():
     assert 'class="alarm"' in page  # what three points do not tell is said
 
 
+@pytest.mark.slow
 def test_page_of_a_plane():
     rng = np.random.default_rng(0)
     a = rng.uniform(-200, 200, (30, 3)) * [1, 1, 0]
@@ -127,6 +128,7 @@ def test_the_same_page_twice():
     assert registration_page(found_of()) == registration_page(found_of.__wrapped__())
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("count", "tolerance"), [(40, 0.35), pytest.param(100, 0.25, marks=pytest.mark.slow)])
 def test_sigma_of_the_transform_by_place(count, tolerance):
     """By Monte Carlo: the spread of the fitted transform at a point far from the others."""
@@ -144,6 +146,7 @@ def test_sigma_of_the_transform_by_place(count, tolerance):
     np.testing.assert_allclose(np.std(seen, axis=0), np.sqrt(np.mean(np.square(stated), axis=0)), rtol=tolerance)
 
 
+@pytest.mark.slow
 def test_thousands_of_outliers_are_told_in_few_lines_and_labels(monkeypatch):
     """The farthest by line, the others by their number; the lengths of all residuals are computed once a page, not once
     a row."""

@@ -126,7 +126,7 @@ def axis_error(frame: Rigid, z: np.ndarray, origin: np.ndarray, sliding: bool) -
     return np.array([-direction[1], direction[0], *place[:2]])[: 2 if sliding else 4]
 
 
-@pytest.mark.slow
+@pytest.mark.full
 @pytest.mark.parametrize(("name", "rests"), [("MH80", 1), ("coupled", 2), ("SCARA", 1)])
 def test_errors_of_the_axes_are_as_large_as_their_covariance(name, rests):
     nominal = NOMINALS[name]()
@@ -187,6 +187,7 @@ def test_leaving_out_a_row_is_fitting_without_it(instants):
         assert np.abs(found - [p.distance for p in whole.pairs]).max() > 1e-4
 
 
+@pytest.mark.slow
 def test_influence_is_leaving_out(monkeypatch):
     """Of 240 instants: linear, which neglects the square of what a row at an arc's end weighs."""
     nominal = mh80()
@@ -210,6 +211,7 @@ def rows_of(joint: int) -> slice:
     return slice(3 * (1 + SWEEP * joint), 3 * (1 + SWEEP * (joint + 1)))
 
 
+@pytest.mark.slow
 def test_a_value_in_another_joints_column_is_named_not_the_axis():
     data = measured(arm(mh80()), sweep_values(mh80(), SWEEP), SIGMA, 2)
     q, wrong = np.array(data.q), slice(rows_of(2).start + 21, rows_of(2).start + 24)
@@ -406,6 +408,7 @@ def test_denavit_and_hartenberg_is_refused_for_the_nearly_parallel_pair(fanuc):
     assert normal > 100
 
 
+@pytest.mark.slow
 def test_command(fanuc, tmp_path):
     folder, result = fanuc
     names = {key: tmp_path / f"axes.{key}" for key in ("toml", "json", "html")}
@@ -460,6 +463,7 @@ def posed(robot: Robot, q: np.ndarray, sigma: float = 0.0, seed: int = 0) -> Mea
     )
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("places", [ring(LENGTH_MM), np.add(UNEVEN, [30.0, 50, -100])], ids=PLACES)
 def test_orientations_give_the_pose_of_the_target_too(places):
     nominal = mh80()
@@ -485,7 +489,7 @@ def test_the_length_is_that_at_which_both_errors_are_alike():
         robot_from_sweeps(data, mh80(), places=ring(0.1))
 
 
-@pytest.mark.slow
+@pytest.mark.full
 @pytest.mark.parametrize("places", PLACES.values(), ids=PLACES)
 def test_orientations_help_and_their_covariance_is_true(places):
     """40 trials of 6 axes of 4 parameters: the mean square over σ² scatters by √(2/960) = 5 %, and by more since axes
@@ -509,6 +513,7 @@ def test_orientations_help_and_their_covariance_is_true(places):
     assert with_them < 0.9 * without
 
 
+@pytest.mark.slow
 def test_the_command_takes_orientations(tmp_path):
     true = arm(mh80())
     data = posed(true, sweep_values(true, 5), SIGMA)

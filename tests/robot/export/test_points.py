@@ -62,6 +62,7 @@ def six(*heads: str, between: str = ",", end: str = "") -> str:
     return between.join(f"{head}({NUMBER}){end}" for head in heads)
 
 
+@pytest.mark.slow
 def test_joint_values(case):
     degrees = np.degrees(case.told)
     kuka = lines(case.text("kuka"), r"DECL GLOBAL E6AXIS XP\d+=\{" + six(*(f"A{k} " for k in range(1, 7))) + r"\}")
@@ -194,6 +195,7 @@ def test_a_file_that_differs_is_not_written(case, form, wanted, monkeypatch):
         case.text(form, wanted, PULSES if wanted == "joints" else None)
 
 
+@pytest.mark.slow
 def test_command_line(case, stcal_robot, tmp_path):
     robots = ("--robot", case.folder / "identified.toml", "--nominal", case.folder / "nominal.toml")
     made_ = ("--export", f"kuka={tmp_path / 'new' / 'a.dat'}", "--export", f"yaskawa={tmp_path / 'b.jbi'}")

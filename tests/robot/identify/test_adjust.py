@@ -26,6 +26,7 @@ def zeros_off(seed: int = 0):
     return true, measured(true, joint_vectors(true, 30, rng), rng)
 
 
+@pytest.mark.slow
 def test_zeros_alone_are_found_and_nothing_else_moves():
     true, data = zeros_off()
     found = identify(mh80(), data, IdentifyOptions(adjust="zeros"))
@@ -47,6 +48,7 @@ def test_fewer_poses_do_for_zeros():
     assert identify(mh80(), data, IdentifyOptions(adjust="zeros", folds=0)).rank == 16
 
 
+@pytest.mark.slow
 def test_what_is_kept_costs_held_out_error():
     rng = np.random.default_rng(1)
     true = placed(made(mh80(), rng), WORLD, {"": TOOL})
@@ -61,6 +63,7 @@ def test_what_is_kept_costs_held_out_error():
     assert np.sqrt(np.nanmean(kept.all_held_out.position_mm**2)) == pytest.approx(errors["all"], rel=1e-6)
 
 
+@pytest.mark.slow
 def test_fixed_dimensions_stay_and_are_said(tmp_path):
     rng = np.random.default_rng(2)
     true = placed(made(mh80(), rng), WORLD, {"": TOOL})

@@ -8,6 +8,7 @@ import pytest
 from stcal.robot.identify.result import IdentifyOptions
 from stcal.robot.identify.solve import identify
 from stcal.robot.kinematics.example import mh80
+from tests.levels import sampled
 from tests.scripts import load_script
 
 study = load_script("wrong_rows_study")
@@ -22,6 +23,7 @@ def of(text: str):
     return next(case for case in study.CASES if case.title() == text)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("text", ["position | 40 | 25% | 1–50", "position | 40 | 10% | 5", "pose | 40 | 25% | 1"])
 def test_wrong_rows_of_few_are_named_and_do_no_harm(text):
     """What is identified is then what the good rows tell, to rounding: their Huber weights are 1 nearly all."""
@@ -31,8 +33,7 @@ def test_wrong_rows_of_few_are_named_and_do_no_harm(text):
         assert good_called_wrong == 0
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("case", study.CASES, ids=lambda case: case.title())
+@pytest.mark.parametrize("case", sampled(study.CASES, kept=(0,)), ids=[case.title() for case in study.CASES])
 def test_wrong_rows_over_many_draws(case):
     """One draw in a hundred has a row that is off by little beside its leverage; of 30 none, or one."""
     found = kept(case, range(100, 130))

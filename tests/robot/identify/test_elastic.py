@@ -37,6 +37,7 @@ def elsewhere(found: Identified, true: Robot) -> float:
     return float(np.sqrt(((seen.translation - really.translation) ** 2).sum(1).mean()))
 
 
+@pytest.mark.slow
 def test_an_elastic_arm_is_told_and_predicted():
     """Rigid, it is off by 0.15 mm and more at new joint values; its σ of 0.05 mm per coordinate comes out."""
     true, data = drawn(60, 0)
@@ -52,6 +53,7 @@ def test_an_elastic_arm_is_told_and_predicted():
     assert found.covariance.shape == rigid.covariance.shape
 
 
+@pytest.mark.slow
 def test_of_a_rigid_arm_the_rigid_model_is_taken():
     data = drawn(60, 1, 0.0)[1]
     found = identify(mh80(), data, IdentifyOptions(model="auto", folds=4, repeats=1))
@@ -60,6 +62,7 @@ def test_of_a_rigid_arm_the_rigid_model_is_taken():
     assert not found.gain.beyond_chance
 
 
+@pytest.mark.slow
 def test_of_a_rigid_arm_the_elastic_model_finds_hardly_anything():
     """σ of what is not there become small, and the errors are as those of the rigid model."""
     true, data = drawn(60, 1, 0.0)
@@ -91,6 +94,7 @@ def test_the_elasticity_of_the_file_stays_where_a_rigid_arm_is_asked_for():
     assert elsewhere(found, true) < 0.08
 
 
+@pytest.mark.slow
 def test_wrong_rows_are_named_beside_elasticity():
     true, data = drawn(60, 0)
     positions = np.array(data.points())
@@ -144,6 +148,7 @@ def sag_error(found: Robot, true: Robot, mass: float) -> float:
     return float(np.sqrt(((by - does) ** 2).sum() / (does**2).sum()))
 
 
+@pytest.mark.slow
 def test_rows_with_two_payloads_tell_how_compliant_the_arm_is():
     """Of an arm 1.6 times as heavy as usual what 100 kg do (0.4 mm) is known to a sixth from positions of 0.05 mm, and
     not at all where it is taken as usual."""
@@ -159,6 +164,7 @@ def test_rows_with_two_payloads_tell_how_compliant_the_arm_is():
     assert sag_error(without.robot, true, 100.0) > 0.4
 
 
+@pytest.mark.slow
 def test_the_payload_of_all_rows_is_that_of_the_identified_file():
     true, nominal, data = carrying(60, 6, (40.0,))
     found = identify(nominal, data, IdentifyOptions(model="elastic", folds=0))
@@ -223,6 +229,7 @@ def approached(rows: int, seed: int, size_rad: float):
     return half, replace(data, rotations=None)
 
 
+@pytest.mark.slow
 def test_hysteresis_is_found_where_rows_say_from_where_joints_came():
     """0.15 mrad (half of it) at up to 2 m is 0.3 mm: joints 1 to 3 to a tenth of it, by 60 positions of 0.05 mm."""
     half, data = approached(60, 8, 1.5e-4)
@@ -239,6 +246,7 @@ def test_hysteresis_is_found_where_rows_say_from_where_joints_came():
     assert "the direction from which joint" in rigid.left[0].what
 
 
+@pytest.mark.slow
 def test_where_nothing_says_from_where_joints_came_there_is_no_hysteresis():
     _, data = approached(60, 8, 1.5e-4)
     found = identify(mh80(), replace(data, conditions=USUAL), IdentifyOptions(model="elastic", folds=0))

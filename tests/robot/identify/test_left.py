@@ -28,6 +28,7 @@ def left_of(true: Robot, data: Measurements, kind):
     return left(state, true.world_from_base, seen, NOISE, jacobian(state, seen))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("kind", "sets"), [("position", 200), ("pose", 100), ("distance", 60)])
 def test_clean_sets_say_nothing(kind, sets):
     """At 1 %; of 200 sets five or more once in twenty runs, and 5 % are asked for."""
@@ -35,7 +36,7 @@ def test_clean_sets_say_nothing(kind, sets):
     assert len(said) <= 0.025 * sets
 
 
-@pytest.mark.slow
+@pytest.mark.full
 @pytest.mark.parametrize("kind", ["position", "pose"])
 def test_clean_sets_that_were_identified_say_nothing(kind):
     options = replace(QUICK, observe=kind)
@@ -114,6 +115,7 @@ def test_of_too_few_rows_nothing_is_told():
     assert left_of(true, data, "position") is None
 
 
+@pytest.mark.slow
 def test_identify_says_it_in_notes_file_and_page():
     true, data = bent(5, 80, 3, lambda q, _: 3e-4 * np.cos(q[:, 2] + 1))
     nominal = replace(mh80(), tools=true.tools)
@@ -130,7 +132,7 @@ def test_identify_says_it_in_notes_file_and_page():
     assert "Nothing is seen that the residuals go with" in identified_page(clean, mh80())
 
 
-@pytest.mark.slow
+@pytest.mark.full
 def test_sigma_of_base_and_tool_is_that_of_their_errors():
     draws, squares = 40, []
     for seed in range(draws):

@@ -32,6 +32,7 @@ X, Y = (each.ravel() for each in np.meshgrid(np.linspace(900, 1500, 12), np.lins
 SURFACE = np.column_stack([X, Y, 700 + 30 * np.sin(X / 100)])
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("places", "observe", "rank"),
     [(LINE, "pose", 25), (LINE, "position", 15), (SURFACE, "position", 24), (SURFACE, "distance", 18)],
@@ -52,6 +53,7 @@ def test_partial_solves_whatever_is_seen(places, observe, rank):
         assert np.sqrt(((own - tip) ** 2).sum(1).mean()) < 0.05
 
 
+@pytest.mark.slow
 def test_what_is_open_is_said_first():
     _, data = at_one_orientation(LINE)
     with fails_with("E-IDENTIFY-UNDETERMINED … 25 … 30 … --partial"):

@@ -31,6 +31,7 @@ def test_six_poses_for_thirty_parameters_are_said():
     assert "times that at the measured rows" in found.notes[-1]
 
 
+@pytest.mark.slow
 def test_few_poses_are_said():
     found = identify(mh80(), drawn(8, 0.6, 0)[1])
     assert any("48 numbers for 30 parameters: σ estimated from so few" in note for note in found.notes)
@@ -51,7 +52,7 @@ def test_forty_rows_over_the_ranges_are_not_warned_of(observe):
     assert found.predicted.elsewhere() < 2.5
 
 
-@pytest.mark.slow
+@pytest.mark.full
 @pytest.mark.parametrize(("rows", "share", "observe"), [(12, 0.6, "pose"), (40, 0.1, "position"), (40, 0.3, "pose")])
 def test_the_sigma_elsewhere_holds(rows, share, observe):
     """Mean square error over the ranges, over σ², of 20 arms: 1, with few degrees of freedom each (a dozen directions

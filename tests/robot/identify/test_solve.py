@@ -37,6 +37,7 @@ def simulated(seed: int, count: int, sigma_mm: float = 0.05, sigma_rad: float = 
     return true, measured(true, joint_vectors(true, count, rng), rng, sigma_mm, sigma_rad, names)
 
 
+@pytest.mark.slow
 def test_without_noise_the_arm_is_found_exactly():
     true, data = simulated(1, 40, 0, 0)
     found = identify(mh80(), data, QUICK)
@@ -48,6 +49,7 @@ def test_without_noise_the_arm_is_found_exactly():
     assert found.nominal_mm.mean() > 0.3
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("kind", "rank"), [("pose", 30), ("position", 27), ("distance", 21)])
 def test_ranks_are_those_of_a_six_axis_arm(kind, rank):
     _, data = simulated(2, 45)
@@ -56,6 +58,7 @@ def test_ranks_are_those_of_a_six_axis_arm(kind, rank):
     assert found.ranks == {"pose": 30, "position": 27, "distance": 21}
 
 
+@pytest.mark.slow
 def test_rows_base_and_tools_make_the_poses_of_the_minimal_parameters():
     _, data = simulated(3, 40, targets=("N1", "N2"))
     found = identify(mh80(), data, QUICK)
@@ -81,6 +84,7 @@ def exact_state():
     return identify(mh80(), simulated(4, 40, 0, 0, targets=("a", "b"))[1], QUICK).state
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", ["pose", "position", "distance"])
 def test_derivatives_are_those_of_differences(exact_state, kind):
     # without noise: with residuals w the logarithm of a rotation turns by w / 2 more
@@ -112,7 +116,7 @@ def test_held_out_error_is_that_of_new_poses():
     assert found.held_out.position_mm.mean() > found.fitted_mm.mean()
 
 
-@pytest.mark.slow
+@pytest.mark.full
 def test_the_covariance_is_true_beside_errors():
     """Three positions of 60 off by 2 mm, forty σ: with Huber's weight alone each would pull like the worst honest one,
     and the mean would be 1.2 to 1.3."""
@@ -170,7 +174,7 @@ def in_common(data, rng, count=5):
     )
 
 
-@pytest.mark.slow
+@pytest.mark.full
 @pytest.mark.parametrize("kind", ["pose", "position"])
 def test_common_errors_of_poses_are_in_the_covariance(kind):
     """Known to be common they are found and taken out; taken for noise they make it too large."""
@@ -220,6 +224,7 @@ def test_three_thousand_poses_are_no_trouble():
     assert min(own) < 400 * min(plain)
 
 
+@pytest.mark.slow
 def test_an_outlier_is_named_and_does_no_harm():
     _, data = simulated(6, 50)
     positions = data.positions.copy()
@@ -244,6 +249,7 @@ def test_many_outliers_do_not_pass_for_noise():
     assert found.weighting.sigma_mm > 0.04
 
 
+@pytest.mark.slow
 def test_report_and_json_hold_the_result():
     _, data = simulated(7, 40)
     found = identify(mh80(), data, IdentifyOptions(folds=2, repeats=1))
@@ -256,6 +262,7 @@ def test_report_and_json_hold_the_result():
     assert f"{content['held_out']['mean_mm']:.4f}" in html
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("spoil", "kind", "words"),
     [
@@ -273,6 +280,7 @@ def test_data_that_cannot_be_right_are_named(spoil, kind, words):
         identify(mh80(), spoil(data), QUICK)
 
 
+@pytest.mark.slow
 def test_an_arm_whose_rows_are_singular_is_identified():
     rows = (*mh80().rows[:4], DHRow(0, 0, 0, 0), DHRow(0, 0, 175, 0))  # the last three axes on one line
     arm = Robot("singular", "standard", rows, (Joint(),) * 6)

@@ -74,6 +74,7 @@ def test_derivatives_are_those_of_differences():
         assert np.abs(derivative[:, :, k] - by_difference).max() < 1e-5 * max(np.abs(by_difference).max(), 1)
 
 
+@pytest.mark.slow
 def test_derivatives_of_an_elastic_tree_are_those_of_differences():
     """At a thousandth of usual deflections: torques are those on the rigid tree. The last are second derivatives."""
     rng = np.random.default_rng(3)
@@ -148,7 +149,7 @@ def test_rows_of_an_elastic_tree_keep_its_deflections(convention):
         assert np.abs(by_chain.difference(by_rows)[:, 3:]).max() < 1e-2
 
 
-@pytest.mark.slow
+@pytest.mark.full
 @pytest.mark.parametrize("share", [0.0, 1.0])
 def test_auto_tells_elastic_trees_from_rigid_ones(share):
     """RMS of the tips at new joint values is 0.11 mm by a rigid model of the elastic tree."""
@@ -183,6 +184,7 @@ def test_joints_are_drawn_with_the_rows_that_they_move():
     assert points == [12] * 2 + [8] * 3 + [4] * 9  # torso; left arm as far as the elbow; left hand, right arm
 
 
+@pytest.mark.slow
 def test_two_arms_are_identified_together():
     rng = np.random.default_rng(4)
     nominal = two_arms()
@@ -206,7 +208,7 @@ def test_two_arms_are_identified_together():
     assert np.abs(away / mount.sigma[3:]).max() < 5
 
 
-@pytest.mark.slow
+@pytest.mark.full
 def test_covariance_of_a_tree_is_honest():
     """NEES of what the covariance says of the tips over 40 draws: χ² of 3 a place."""
     nominal, total, count = two_arms(), 0.0, 0

@@ -80,6 +80,7 @@ def test_poses_alone_need_no_nominal_robot(case):
     np.testing.assert_allclose(forward(case.real, result.found.q).translation, case.poses.translation[:FEW], atol=1e-8)
 
 
+@pytest.mark.slow
 def test_joint_values_beside_poses_choose_the_branch(case):
     flipped = case.q + np.array([0, 0, 0, np.pi, 0, np.pi])
     flipped[:, 4] *= -1
@@ -93,6 +94,7 @@ def test_joint_values_beside_poses_choose_the_branch(case):
     assert np.abs(found.q - flipped)[inside].max() < 0.1
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("by", ["poses", "joint values"])
 def test_a_tool_that_the_nominal_file_lacks_is_the_identified_ones(case, by):
     """Poses are commanded of one tool: as if both files had it."""
@@ -111,6 +113,7 @@ def test_a_tool_that_the_nominal_file_lacks_is_the_identified_ones(case, by):
     )
 
 
+@pytest.mark.slow
 def test_poses_of_the_nominal_files_tool_are_told_by_their_joint_values(case):
     """Poses of the flange, with the joint values that the controller has there: the identified tool is not theirs."""
     bare = replace(case.nominal, tools={"": Rigid()})
@@ -182,6 +185,7 @@ def test_limits_of_the_controller_are_respected(case):
     assert "beyond the limits" in result.notes()[0]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("nominal", [True, False])
 def test_a_joint_at_its_limit_does_not_turn_the_wrist_over(case, nominal):
     """J4 commanded to its limit, beyond which this arm would have to take it: J4 + 180° with the wrist bent the other
@@ -240,6 +244,7 @@ def run(monkeypatch, capsys, *arguments) -> tuple[int, str, str]:
     return caught.value.code, out.out, out.err
 
 
+@pytest.mark.slow
 def test_command_line(case, monkeypatch, capsys):
     path = case.write(list(POSE), case.pose_rows()[:FEW])
     files = {k: case.folder / f"new/out.{k}" for k in ("csv", "json", "html")}
@@ -271,6 +276,7 @@ def loaded_rows(case, mass):
     return read_targets(case.write([*POSE, "payload_kg"], rows), case.real)
 
 
+@pytest.mark.slow
 def test_each_row_is_compensated_for_its_payload(tmp_path):
     case = Case(tmp_path)
     bent = elastic(case.real, np.random.default_rng(4))
@@ -285,6 +291,7 @@ def test_each_row_is_compensated_for_its_payload(tmp_path):
     assert [row.payload_kg for row in compensation_file(result, bent).poses[:2]] == [0.0, 80.0]
 
 
+@pytest.mark.slow
 def test_a_payload_of_a_rigid_robot_is_said_to_do_nothing(tmp_path):
     case = Case(tmp_path)
     case.write([*POSE], case.pose_rows()[:FEW])

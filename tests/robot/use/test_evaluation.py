@@ -114,6 +114,7 @@ def test_the_better_robot_is_named_with_its_error(pair):
     assert "true is better than nominal: mean error " in evaluated_text(pair)
 
 
+@pytest.mark.slow
 def test_equal_robots_are_told_apart_seldom():
     """Files that are off alike, by chance: at 5 %, of 60 pairs more than eight once in 200 runs."""
     true, named = arm(), 0
@@ -146,6 +147,7 @@ def test_wrong_rows_are_named_and_not_fitted_to():
     assert float(plain[4]) > 3 > 0.2 > float(robust[6])
 
 
+@pytest.mark.slow
 def test_clean_rows_are_hardly_ever_wrong():
     robots = [arm(seed) for seed in range(40)]
     assert sum(evaluate({"a": robot}, seen(robot, seed)).wrong.sum() for seed, robot in enumerate(robots)) == 0
@@ -174,6 +176,7 @@ def test_the_identified_robot_is_better_on_the_other_half():
     assert Figures.of(result.robots[1].errors_mm).rms < 0.15
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("refit", REFITS)
 def test_distances_have_their_own_errors(refit):
     true = arm()
@@ -241,6 +244,7 @@ def test_residuals_in_the_base_do_not_depend_on_where_the_instrument_stands():
     assert one == pytest.approx(other, abs=1e-6)
 
 
+@pytest.mark.slow
 def test_file_and_page(pair):
     content = evaluation_file(pair).content()
     json.dumps(content, allow_nan=False)
@@ -253,6 +257,7 @@ def test_file_and_page(pair):
         assert said in page
 
 
+@pytest.mark.slow
 def test_command(tmp_path, stcal_robot):
     true, data = arm(), seen(arm(), 12, 40, poses=True)
     (tmp_path / "true.toml").write_text(robot_toml(true))

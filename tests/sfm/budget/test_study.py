@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 from scipy.stats import chi2
 
+from tests.levels import sampled
 from tests.scripts import load_script
 
 study = load_script("budget_study")
@@ -29,7 +30,9 @@ def source_of(stated, key):
     return next(each for each in stated.budget.sources if each.key == key)
 
 
-@pytest.mark.parametrize("which", ["circle_centres", "dot_centres", "board_dots", "flatness", "intrinsics"])
+@pytest.mark.parametrize(
+    "which", sampled(["circle_centres", "dot_centres", "board_dots", "flatness", "intrinsics"], kept=(2,))
+)
 def test_errors_of_one_input_are_as_its_contribution_says(fixed, which):
     """eᵀC⁻¹e of positions, rotations and distances; the board's dots erring as the run takes them to. σ of the centres
     and σ₀ are estimated, to 2 %."""
@@ -56,6 +59,7 @@ def test_a_change_of_scale_is_foretold(fixed, which):
             assert spread == pytest.approx(own * row.contributions[which], rel=0.03)
 
 
+@pytest.mark.full
 @pytest.mark.parametrize("refined", [False, True])
 def test_errors_of_all_inputs_together(refined):
     case = study.case_of(refined)

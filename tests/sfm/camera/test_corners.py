@@ -34,6 +34,7 @@ def photographs(tmp_path_factory):
     return folder
 
 
+@pytest.mark.slow
 def test_a_chessboard_gives_the_camera_with_its_sigma(photographs, tmp_path, stcal_sfm):
     (tmp_path / "board.toml").write_text(CHESSBOARD, encoding="utf-8")
     out = tmp_path / "cameras.txt"
@@ -60,6 +61,7 @@ def test_a_folder_without_the_board(photographs, tmp_path):
         calibrate_camera_by_corners(tmp_path / "none", ChessboardDesign(7, 10, 12.0))
 
 
+@pytest.mark.slow
 def test_a_measured_charuco_board(shared_data, tmp_path, stcal_sfm):
     """Mako camera, whose makers of the set state fx 1352, fy 1356 px: another calibration, to some per cent."""
     images = shared_data("charuco_handeye/test_set_charuco/images")

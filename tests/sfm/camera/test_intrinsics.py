@@ -66,8 +66,8 @@ def error(result, truth=TRUE) -> np.ndarray:
     return model_parameters(result.camera, result.colmap_model) - model_parameters(truth, result.colmap_model)
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("count", [3, pytest.param(40, marks=pytest.mark.slow)])
+@pytest.mark.full
+@pytest.mark.parametrize("count", [3, pytest.param(40, marks=pytest.mark.full)])
 def test_truth_within_predicted_sigma(count):
     # Of 40 calibrations from nothing the normalised squared error of 8 parameters scatters by 8 % about 1.
     squares, factors = [], []
@@ -134,6 +134,7 @@ def test_rational_model_knows_projections_though_not_its_coefficients():
     assert 0.001 < moved < 0.5
 
 
+@pytest.mark.slow
 def test_intrinsics_that_are_held_stay_and_the_poses_follow():
     wrong = replace(TRUE, focal=[2795.0, 2784.0])
     views = views_of(np.random.default_rng(8), count=6)

@@ -70,7 +70,7 @@ def test_two_lenses_are_where_they_are_within_their_sigma(pair, rig):
     assert min(rig.shared) == 8
 
 
-@pytest.mark.slow
+@pytest.mark.full
 @pytest.mark.parametrize("count", [2, 3])
 def test_errors_of_many_rigs_are_as_large_as_their_sigma(count):
     """Mean χ² of 6 rigs: over 6 numbers for each place it scatters by 0.24, of intrinsics by 0.17 with two cameras."""

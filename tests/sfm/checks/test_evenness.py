@@ -82,7 +82,7 @@ def test_chance_alone_is_suspected_as_rarely_as_promised(group):
     assert verdicts.count("suspicious") < 4
 
 
-@pytest.mark.slow
+@pytest.mark.full
 def test_rendered_circles_with_a_darker_half_are_suspected(sample, tmp_path):
     """Whole runs on photographs: one half of every circle 10 % darker, and as they were."""
     study = load_script("envelope_study")

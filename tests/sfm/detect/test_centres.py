@@ -12,6 +12,7 @@ from stcal.geometry.conic import circle_image_offset
 from stcal.sfm.detect.circles.centres import measure_centres
 from stcal.sfm.detect.circles.ellipses import Ellipses
 from stcal.synthetic import degrade
+from tests.levels import sampled
 
 CAMERA = Camera(400, 300, [1400.0, 1400.0], [199.5, 149.5], [-0.15, 0.1, 1e-3, -5e-4, 0, 0, 0, 0])
 
@@ -303,24 +304,28 @@ def test_sigma_is_right_whatever_spreads_the_noise(radius, bright, before, noise
     assert 0.85 < error_over_sigma(radius, bright, before, noise, after, repeats=4) < 1.15
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("bright", [True, False])
-@pytest.mark.parametrize("radius", [6, 8, 12, 20, 30])
+CONDITIONS = [
+    *((as_it_is, noise, as_it_is) for noise in (1, 5, 20)),
+    *((as_it_is, 2, as_jpeg(quality)) for quality in (50, 60, 75, 85, 95)),
+    (lambda image: degrade.defocused(image, 2.0), 2, as_it_is),
+    (moved, 2, as_it_is),
+    (moved, 2, as_jpeg(75)),
+]
+
+
 @pytest.mark.parametrize(
-    ("before", "noise", "after"),
-    [
-        *((as_it_is, noise, as_it_is) for noise in (1, 5, 20)),
-        *((as_it_is, 2, as_jpeg(quality)) for quality in (50, 60, 75, 85, 95)),
-        (lambda image: degrade.defocused(image, 2.0), 2, as_it_is),
-        (moved, 2, as_it_is),
-        (moved, 2, as_jpeg(75)),
-    ],
+    ("radius", "bright", "before", "noise", "after"),
+    sampled(
+        [(radius, bright, *how) for radius in (6, 8, 12, 20, 30) for bright in (True, False) for how in CONDITIONS],
+        kept=range(0, 110, 7),  # of each radius, each condition and both polarities
+    ),
 )
 def test_sigma_is_right_in_all_conditions(radius, bright, before, noise, after):
     """576 coordinates: 3 % of chance, σ's own included 5 %."""
     assert 0.85 < error_over_sigma(radius, bright, before, noise, after, repeats=8) < 1.2
 
 
+@pytest.mark.slow
 def test_a_circle_alone_has_the_larger_sigma_of_a_noise_hardly_known():
     """Six degrees of freedom: without the factor for them it would be 1.15."""
     apart = error_over_sigma(12, True, as_it_is, 3, as_it_is, repeats=3, together=1)

@@ -368,6 +368,7 @@ def test_images_that_moved_or_are_gone(patient, tmp_path):
         found(tmp_path / "nowhere")
 
 
+@pytest.mark.slow
 def test_the_command(patient, stcal_sfm, tmp_path):
     patient.hide(FIRST, "2:2", "2:7", "board:3:4", "board:3:5")
     patient.run()

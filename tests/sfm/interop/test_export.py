@@ -229,6 +229,7 @@ def content_of_gltf(path) -> tuple[dict, bytes]:
     return tree, raw[28 + length :]
 
 
+@pytest.mark.slow
 def test_recording(files, faces, small_run):
     """What the viewer's own program finds in it; its numbers are single."""
     found = subprocess.run(

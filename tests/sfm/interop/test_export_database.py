@@ -215,7 +215,7 @@ def first_group(run) -> tuple[list[str], tuple[int, int]]:
 
 def mapped(database, folder, names, pair) -> pycolmap.Reconstruction:
     folder.mkdir()
-    own = shutil.copy(database, folder / "database.db")  # pycolmap changes what it opens
+    own = own_copy(database, folder / "database.db")  # pycolmap changes what it opens
     models = pycolmap.incremental_mapping(str(own), str(folder), str(folder), pipeline_options(names, pair))
     assert len(models) == 1
     return models[0]

@@ -27,6 +27,7 @@ def made():
     return make_target(MakeOptions(SIZE, circles=LEAST_CIRCLES, distance_mm=800.0, width=2592))
 
 
+@pytest.mark.slow
 def test_each_face_is_named_with_any_three_circles_hidden(made):
     """All cases: by the finder in made views, which the maker has run, and by the naming alone."""
     target = made.pattern.target
@@ -49,6 +50,7 @@ def test_no_four_circles_are_alike_in_two_readings(made):
             assert in_common(face, other, mirrored=True) == 0
 
 
+@pytest.mark.slow
 def test_likeness_is_found_where_there_is_some(made):
     """A face beside itself, turned and mirrored; and the cases of hidden circles fail."""
     face = made.pattern.target.faces[0]
@@ -64,6 +66,7 @@ def test_likeness_is_found_where_there_is_some(made):
     assert len(failed) == cases == 168
 
 
+@pytest.mark.slow
 def test_a_symmetric_design_fails_the_cases_of_hidden_circles():
     """Ten circles of two sizes in rows that a half turn takes to themselves, but for one."""
     x, y = np.meshgrid(np.arange(5) * 20.0, [0.0, 20.0])
@@ -77,6 +80,7 @@ def test_a_symmetric_design_fails_the_cases_of_hidden_circles():
     assert len(failed) < 0.2 * cases
 
 
+@pytest.mark.slow
 def test_a_pattern_that_is_not_always_named_is_drawn_anew(monkeypatch):
     """Nine circles leave six, which is all that a face needs: of such patterns one in a few fails a case."""
     options = MakeOptions((130.0, 120.0, 110.0), circles=LEAST_CIRCLES, width=1296)
@@ -166,6 +170,7 @@ def test_outlines_that_do_not_fit_are_refused(tmp_path, outline, said):
         load_target(tmp_path / "target.toml")
 
 
+@pytest.mark.slow
 def test_the_command_keeps_a_board_and_replaces_nothing(tmp_path, capsys):
     (tmp_path / "board.toml").write_text('rows = 5\ncolumns = 6\npitch_mm = 40\nradius_mm = 10\npolarity = "dark"\n')
     before = (tmp_path / "board.toml").read_text()

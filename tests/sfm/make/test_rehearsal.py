@@ -7,7 +7,7 @@ import pytest
 from tests.scripts import load_script
 
 
-@pytest.mark.slow
+@pytest.mark.full
 def test_a_made_target_is_simulated_calibrated_and_compared(tmp_path, monkeypatch, capsys):
     """Every circle named rightly, errors as the run states them; smaller images than the study's."""
     study = load_script("own_target")

@@ -578,6 +578,7 @@ for folder in json.load(sys.stdin):
 """
 
 
+@pytest.mark.slow
 def test_damaged_files_neither_crash_nor_hang_nor_eat_memory(saved, tmp_path):
     """Each file cut at its start, its end and at random places, and with counts of up to 2⁶⁴: pycolmap alone reads on
     behind the end, for hours or into all memory. In a process of its own, with a limit on both."""
@@ -769,6 +770,7 @@ for place in map(Path, sys.argv[2:]):
 """
 
 
+@pytest.mark.slow
 def test_a_model_that_the_disk_does_not_take_is_said(small_run, tmp_path):
     """No file may grow beyond a limit: COLMAP's writers go on without a word."""
     places = [tmp_path / f"{kind}-{limit}" for kind in ("binary", "text") for limit in (1000, 10_000_000)]

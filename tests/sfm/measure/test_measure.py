@@ -27,6 +27,7 @@ from stcal.sfm.measure.report import measure_page
 from stcal.sfm.measure.target import TargetCircles, read_target
 from stcal.synthetic.measured.image_poses import face_view, faces_view, is_flipped, known_target, pose_error, see, view
 from stcal.synthetic.scene import SceneOptions, make_scene
+from tests.levels import FULL
 from tests.outcome import fails_with
 from tests.sfm.truth import true_poses
 from tests.shared import own_copy
@@ -92,9 +93,9 @@ def test_errors_of_single_faces_are_as_predicted(scene, known, count):
     assert flipped == 0
 
 
-@pytest.mark.slow
+@pytest.mark.full
 @pytest.mark.parametrize("count", COUNTS)
-@pytest.mark.parametrize("faces", [pytest.param(("1", "2"), marks=SLOW), ("1", "4", "5")])
+@pytest.mark.parametrize("faces", [pytest.param(("1", "2"), marks=pytest.mark.full), ("1", "4", "5")])
 def test_errors_of_several_faces_are_as_predicted(scene, known, faces, count):
     square, fit, ambiguous, flipped = squared_errors(scene, known, count, [faces], NOISE_PX, (0, 20))
     wider = np.sqrt(MANY / count)
@@ -123,9 +124,11 @@ def test_without_the_targets_own_covariance_the_errors_would_be_too_large(scene,
     ("count", "noise_px", "tilt_deg", "distance_mm", "at_most"),
     [
         (30, 0.3, (0, 65), (600, 4000), 0.75),
-        pytest.param(400, 0.1, (0, 65), (600, 1500), 0.03, marks=SLOW),  # as noisy as real photographs: hardly any
+        pytest.param(
+            400, 0.1, (0, 65), (600, 1500), 0.03, marks=pytest.mark.full
+        ),  # as noisy as real photographs: hardly any
         pytest.param(400, 0.3, (0, 65), (600, 4000), 0.75, marks=SLOW),  # 15 times the noise, far: many, but not all
-        pytest.param(400, 0.3, (0, 10), (1000, 3000), 0.97, marks=SLOW),  # frontal, far and noisy: most
+        pytest.param(400, 0.3, (0, 10), (1000, 3000), 0.97, marks=FULL),  # frontal, far and noisy: most
     ],
 )
 def test_no_flipped_pose_is_certain(scene, known, count, noise_px, tilt_deg, distance_mm, at_most):
@@ -135,7 +138,7 @@ def test_no_flipped_pose_is_certain(scene, known, count, noise_px, tilt_deg, dis
     assert square.mean() < 1.6  # where a face is frontal the errors are no Gaussian
 
 
-@pytest.mark.slow
+@pytest.mark.full
 def test_flipped_poses_would_be_returned_without_the_ambiguity(scene, known):
     """The test above can fail: in such views the likelier of the two poses is now and then the wrong one."""
     rng = np.random.default_rng(3)
@@ -370,6 +373,7 @@ def mean_squared_error(result, truth: dict) -> float:
     return float(np.mean(square))
 
 
+@pytest.mark.slow
 def test_rendered_images_are_measured_as_predicted(measured, small_dataset):
     """χ²(6)/6 of one draw is below 2.8 but once in a hundred."""
     assert len(measured.images) == 1
@@ -377,7 +381,7 @@ def test_rendered_images_are_measured_as_predicted(measured, small_dataset):
     assert 0.2 < mean_squared_error(measured, json.loads((small_dataset / "truth.json").read_text())) < 2.8
 
 
-@pytest.mark.slow
+@pytest.mark.full
 def test_the_shared_rendered_set(shared_data, tmp_path):
     """The whole chain on images of another program: calibrated, then measured. Its README says that one face in eight
     is 2 of its own σ off, and this is in the poses: 2² = 4."""

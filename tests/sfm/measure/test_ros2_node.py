@@ -95,6 +95,7 @@ def ros_image(pixels, encoding, pad=16):
     )
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("encoding", ["mono8", "mono16"])
 def test_poses_are_published(node_module, server, small_dataset, encoding):
     FakeNode.url = server.url

@@ -73,6 +73,7 @@ def said(server, raw: bytes) -> bytes:
     return b"".join(parts)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("sequence", [False, True])
 def test_the_answers_are_those_of_measure(server, photographs, small_dataset, known, small_scene, sequence):
     options = MeasureOptions(sequence=sequence, workers=1)
@@ -88,6 +89,7 @@ def test_the_answers_are_those_of_measure(server, photographs, small_dataset, kn
         }
 
 
+@pytest.mark.slow
 def test_many_at_once_are_not_mixed_up(server, photographs):
     jobs = [(name, data, i) for i in range(3) for name, data in photographs.items()]
     with ThreadPoolExecutor(4) as clients:
@@ -126,6 +128,7 @@ def rubbish(photograph: bytes) -> dict[str, tuple[bytes, str, int, str]]:
     }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", list(rubbish(b"")))
 def test_rubbish(server, photographs, kind):
     name, photograph = next(iter(photographs.items()))
@@ -161,12 +164,14 @@ def test_broken_requests(server, raw, code):
     assert b"Python" not in head
 
 
+@pytest.mark.slow
 def test_a_client_that_leaves_costs_nothing(server, photographs):
     name, photograph = next(iter(photographs.items()))
     assert said(server, b"POST /measure HTTP/1.1\r\nHost: x\r\nContent-Length: 500000\r\n\r\nshort") == b""
     assert post(server, photograph, f"?name={name}")[0] == 200
 
 
+@pytest.mark.slow
 def test_no_answer_holds_a_path(server, photographs, small_run, tmp_path):
     root = str(tmp_path.parent.parent)
     every = [json.dumps(post(server, *rubbish(next(iter(photographs.values())))[kind][:2])) for kind in rubbish(b"")]
@@ -198,6 +203,7 @@ def test_status(server):
     assert content["max_megabytes"] == 4
 
 
+@pytest.mark.slow
 def test_a_process_that_is_ended_is_replaced(known, photographs):
     service = MeasureService(Setting(*known), 1)
     service.start()
@@ -266,6 +272,7 @@ def test_what_belongs_to_a_folder_is_refused(small_run, stcal_sfm, words, other)
     )
 
 
+@pytest.mark.slow
 def test_the_command_serves_this_machine_until_interrupted(small_run, photographs):
     words = ["measure", "--serve", "--port", 0, "--workers", 1, "--camera", small_run / "cameras.txt"]
     words += ["--faces", small_run / "faces.json", "--target", small_run / "target.toml"]

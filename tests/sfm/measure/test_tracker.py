@@ -63,6 +63,7 @@ def off_sigmas(pose, other):
     return np.abs(np.r_[step[:3], other.camera_from_target.translation - pose.camera_from_target.translation] / sigma)
 
 
+@pytest.mark.slow
 def test_a_followed_pose_is_that_of_a_search(film, frames, target, model):
     follower, searcher = (Tracker(target, model[1], film.board) for _ in range(2))
     for i in range(IMAGES):
@@ -139,6 +140,7 @@ def test_a_target_without_design_is_refused(target, model):
         Tracker(bare, model[1])
 
 
+@pytest.mark.slow
 def test_measure_follows_a_folder(film, target, model):
     folder, camera = model
     together = measure(folder / "images", camera, target, film.target, film.board, MeasureOptions(sequence=True))

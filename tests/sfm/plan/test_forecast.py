@@ -106,9 +106,9 @@ def require_chi2(errors: np.ndarray, covariance: np.ndarray):
     assert low < square < high, square / errors.size
 
 
-@pytest.mark.slow
+@pytest.mark.full
 @pytest.mark.parametrize(
-    ("common", "draws"), [(0.0, 5), *(pytest.param(*p, marks=SLOW) for p in ((0.0, 60), (0.99, 25)))]
+    ("common", "draws"), [(0.0, 5), *(pytest.param(*p, marks=pytest.mark.full) for p in ((0.0, 60), (0.99, 25)))]
 )
 def test_forecast_is_the_spread_of_simulations(exact, common, draws):
     setup, models = setup_of(exact, common=common), models_of(exact)
@@ -350,6 +350,7 @@ def test_advise_of_a_run_starts_from_its_own_sigma(small_run):
         assert np.sqrt(np.diag(covariance)) == pytest.approx(np.sqrt(np.diag(stated[face])), rel=0.03)
 
 
+@pytest.mark.slow
 def test_advise_command(stcal_sfm, small_run, tmp_path, coarse):
     code, text, _ = stcal_sfm("advise", small_run, "--count", 1, "--json", tmp_path / "advice.json")
     content = json.loads((tmp_path / "advice.json").read_text())
@@ -517,6 +518,7 @@ def test_dots_reduced_first_are_the_same_as_cameras_first(exact, monkeypatch, co
     assert (dots.sigma0, dots.redundancy) == (cameras.sigma0, cameras.redundancy)
 
 
+@pytest.mark.slow
 def test_a_fine_board_is_planned():
     """2500 dots in 8 images; with fewer dots on the same area the σ rise by no more than the root of their number."""
     fine = replace(

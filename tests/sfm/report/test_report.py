@@ -407,6 +407,7 @@ def crosscheck(differences: list[str]) -> dict:
     }
 
 
+@pytest.mark.slow
 def test_the_crosscheck_is_a_section_of_its_own():
     page = report_html(make() | {"crosscheck": crosscheck([])}, OVERLAYS)
     parsed = Page(page)

@@ -747,6 +747,7 @@ def test_a_camera_of_opencv_without_a_size(small_set, small_run, stcal_sfm):
     same_centres(found, expected, 1e-5)
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("no_page")
 def test_a_second_run_does_only_what_changed(small_set, small_run, stcal_sfm):
     small = small_set("14")

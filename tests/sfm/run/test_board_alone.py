@@ -28,6 +28,7 @@ def hidden(small_dataset, small_scene, tmp_path_factory):
     return own
 
 
+@pytest.mark.slow
 def test_the_board_alone_gives_scale_and_residuals(hidden, stcal_sfm):
     code, text, _ = stcal_sfm(*hidden.arguments())
     assert code == 0
@@ -48,12 +49,14 @@ def test_the_board_alone_gives_scale_and_residuals(hidden, stcal_sfm):
     assert (code, "no faces.json: of the board alone" in error) == (INPUT, True)
 
 
+@pytest.mark.slow
 def test_the_published_method_knows_the_board_alone(hidden, stcal_sfm):
     code, text, _ = stcal_sfm(*hidden.arguments("--solve", "paper"))
     assert code == 0
     assert "the board alone" in text
 
 
+@pytest.mark.slow
 def test_a_target_in_view_is_asked_for(small_set, small_scene, stcal_sfm):
     """Dark circles are sought and bright ones in view: the file is wrong, unless that does not matter."""
     small = small_set("12", detected=False)

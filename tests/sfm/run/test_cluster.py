@@ -18,6 +18,7 @@ from stcal.io.spread import run_on_images, spread
 from stcal.parallel import run_parallel
 from stcal.sfm import RunOptions, run
 from stcal.workflows import cluster
+from tests.levels import sampled
 from tests.outcome import fails_with
 
 RESULTS = ("faces.json", "labels.csv", "detections.csv")
@@ -69,7 +70,7 @@ def test_jobs_go_to_an_executor_a_few_at_a_time():
     assert found == {i: i * i for i in range(50)}
 
 
-@pytest.mark.slow
+@pytest.mark.full
 @pytest.mark.parametrize("send", [False, True])
 def test_a_run_by_an_executor_is_the_same(small_dataset, expected, tmp_path, send):
     executor = Here()
@@ -108,6 +109,7 @@ def test_paths_go_to_workers_from_the_root(tmp_path, monkeypatch):
         }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("answer", [None, b"", b"HTTP/1.0 404 no\r\n\r\n" * 9])
 def test_no_scheduler_is_one_line(monkeypatch, answer):
     """Nobody listens; somebody listens and says nothing; or something."""
@@ -170,8 +172,7 @@ def killing(process):
     return progress, killed
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("send", [False, True])
+@pytest.mark.parametrize("send", sampled([False, True]))
 def test_a_run_by_a_cluster_that_loses_a_worker_is_the_same(small_dataset, expected, tmp_path, send):
     with two_workers(tmp_path) as (address, _, workers):
         progress, killed = killing(workers[0])

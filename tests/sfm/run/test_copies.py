@@ -48,6 +48,7 @@ def test_sixteen_bits_and_a_picture_without_noise_are_the_same_photograph(sharp)
     assert not same_photograph(smooth, np.roll(smooth, 1, axis=1))
 
 
+@pytest.mark.slow
 def test_png_and_jpeg_of_one_photograph_are_one_view(stcal_sfm, small_set):
     small = small_set("12")
     cv2.imwrite(str(small.image(1).with_suffix(".png")), cv2.imread(str(small.image(1)), cv2.IMREAD_GRAYSCALE))

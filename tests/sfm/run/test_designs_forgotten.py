@@ -37,6 +37,7 @@ def test_the_reference_target_is_said_and_named_in_an_error(stcal_sfm, two_image
     assert err.rstrip().endswith(TARGET_ASSUMED)
 
 
+@pytest.mark.slow
 def test_the_reference_board_is_said_and_named_in_an_error(stcal_sfm, two_images, tmp_path):
     target = tmp_path / "target.toml"
     target.write_text(target_toml(second_design()[0]))
@@ -47,6 +48,7 @@ def test_the_reference_board_is_said_and_named_in_an_error(stcal_sfm, two_images
     assert err.rstrip().endswith(BOARD_ASSUMED)
 
 
+@pytest.mark.slow
 def test_measure_and_calibrate_camera_name_what_they_assumed(stcal_sfm, small_set, small_run, tmp_path):
     small = small_set("12", detected=False)
     for i in (1, 2, 3):
@@ -83,6 +85,7 @@ def test_images_tell_the_pitch(small_result):
     assert measured_pitch_mm([image.select([]) for image in images], board) is None
 
 
+@pytest.mark.slow
 def test_a_run_with_another_pitch_names_the_measured_one(stcal_sfm, small_set):
     small = small_set("12", detected=False)
     board = small.folder / "board.toml"

@@ -35,6 +35,7 @@ def files(small):
     return "--target", small.folder / "target.toml", "--board", small.folder / "board.toml"
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("no_page")
 def test_a_failed_check_names_its_image_and_the_option_that_takes_it_out(with_a_stray, stcal_sfm):
     """Exit code 0 as ever, 4 with --strict, and 0 again with what the first remedy says."""

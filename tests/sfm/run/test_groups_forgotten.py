@@ -7,6 +7,7 @@ import pytest
 pytestmark = pytest.mark.usefixtures("no_page")
 
 
+@pytest.mark.slow
 def test_images_without_folders_are_said_to_be_one_group_and_lost_boards_are_counted(stcal_sfm, small_set, tmp_path):
     small = small_set("12", "14")
     for group in ("12", "14"):

@@ -204,7 +204,7 @@ def measured(count: int) -> dict:
     return json.loads(subprocess.run(command, check=True, capture_output=True, text=True).stdout)
 
 
-@pytest.mark.slow
+@pytest.mark.full
 def test_2000_images_cost_no_more_each_than_40():
     """Processor time per image within 3×, database and memory linear: what is quadratic would be 50× here."""
     small, large = measured(40), measured(2000)

@@ -18,6 +18,7 @@ def compared(small_dataset, tmp_path_factory):
     return run(data / "images", data / "cameras.txt", out, *files, RunOptions(workers=1, compare="paper"))
 
 
+@pytest.mark.slow
 def test_each_step_is_worth_something(compared, small_result):
     """1.1 megapixels: the eccentricity moves faces by some 50 µm, contours by more; σ is a few."""
     rows = {row.method: row for row in compared.comparison.rows}
@@ -46,6 +47,7 @@ def test_the_comparison_is_in_the_report(compared):
     assert "+ centres of blurred edges" in page
 
 
+@pytest.mark.slow
 def test_the_published_method_is_settled_whole(small_set, stcal_sfm):
     data = small_set("12", "14")
     code, text, _ = stcal_sfm(*data.arguments("--solve", "paper"))
@@ -77,6 +79,7 @@ def test_what_contradicts_the_published_method_is_refused(small_set, stcal_sfm):
         RunOptions(compare="x")
 
 
+@pytest.mark.slow
 def test_another_design_is_compared_without_the_published_row(tmp_path, shared_data):
     data = shared_data("stereo_target/white_block")
     designs = data / "target.toml", data / "board.toml"

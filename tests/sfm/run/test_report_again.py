@@ -46,6 +46,7 @@ def test_a_pdf_goes_with_the_page_that_it_was_made_of(own, stcal_sfm, monkeypatc
     assert verify(own).whole
 
 
+@pytest.mark.slow
 def test_into_a_file_of_ones_own(own, tmp_path, stcal_sfm):
     before = (own / RUN_MARKER).read_bytes()
     code, out, _ = stcal_sfm("report", own, "--pdf", "--out", tmp_path / "for the lab.html")
@@ -123,6 +124,7 @@ def test_residuals_of_the_table_are_those_of_the_report_and_of_the_page(small_ru
         ]
 
 
+@pytest.mark.slow
 def test_the_page_of_a_run_in_a_browser(small_run):
     with opened() as chrome:
         for width in (1280, 400):

@@ -110,6 +110,7 @@ with run_folder(sys.argv[1], MarkerFile.of("images", RunOptions()), {}):
 """
 
 
+@pytest.mark.slow
 def test_two_runs_into_one_folder_are_refused_and_a_dead_one_holds_nothing(tmp_path):
     command = [sys.executable, "-c", HOLD, tmp_path / "run"]
     with subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True) as other:

@@ -151,6 +151,7 @@ EULER = "x_mm,y_mm,z_mm"
 TUM = "1.5 0.1 0.2 0.3 0 0 0 1\n"
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("text", "parts"),
     [

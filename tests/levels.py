@@ -1,0 +1,16 @@
+"""Levels of tests, see CONTRIBUTING: a sample of many cases is `slow`, the rest is `full`."""
+
+from collections.abc import Collection, Iterable
+
+import pytest
+
+
+def sampled(cases: Iterable, kept: Collection[int] = (0,)) -> list:
+    """Cases for ``pytest.mark.parametrize``, of which `.ci/run` takes those at the places ``kept``."""
+    return [
+        pytest.param(*(case if isinstance(case, tuple) else (case,)), marks=pytest.mark.slow if i in kept else FULL)
+        for i, case in enumerate(cases)
+    ]
+
+
+FULL = pytest.mark.full
