@@ -4,13 +4,12 @@ from collections.abc import Collection, Iterable
 
 import pytest
 
+SLOW, FULL = pytest.mark.slow, pytest.mark.full
+
 
 def sampled(cases: Iterable, kept: Collection[int] = (0,)) -> list:
     """Cases for ``pytest.mark.parametrize``, of which `.ci/run` takes those at the places ``kept``."""
     return [
-        pytest.param(*(case if isinstance(case, tuple) else (case,)), marks=pytest.mark.slow if i in kept else FULL)
+        pytest.param(*(case if isinstance(case, tuple) else (case,)), marks=SLOW if i in kept else FULL)
         for i, case in enumerate(cases)
     ]
-
-
-FULL = pytest.mark.full

@@ -13,6 +13,7 @@ from tests.fuzzing.judged import EARLIER, OUT, Outcome, failures, hashes, in_pro
 from tests.fuzzing.mistakes import MISTAKES, call_of
 from tests.fuzzing.mutations import BY_SUFFIX
 from tests.fuzzing.pool import mistaken, went_through
+from tests.levels import sampled
 
 SEED = int(os.environ.get("STCAL_SEED", "20"))
 """`scripts/full` draws another one each time."""
@@ -59,9 +60,7 @@ def test_the_cases_are_of_every_command_but_long_ones():
     assert len(left_out) < len(COMMANDS) // 4
 
 
-@pytest.mark.parametrize(
-    "part", [pytest.param(n, marks=pytest.mark.slow if n in IN_SAMPLE else pytest.mark.full) for n in range(PARTS)]
-)
+@pytest.mark.parametrize("part", sampled(range(PARTS), kept=IN_SAMPLE))
 def test_whatever_comes_in_is_judged(stock, tmp_path, part):
     assert len(spoiled(stock, tmp_path / "case", range(part, CASES, PARTS))) == CASES // PARTS
 
@@ -82,8 +81,11 @@ def test_a_mistake_is_told(stock, tmp_path, name):
     assert mistaken(stock, tmp_path / "case", name).failures == ()
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("number", range(len(CALLS)), ids=[call.command for call in CALLS])
+@pytest.mark.parametrize(  # the demo runs from the wheel, too
+    "number",
+    sampled(range(len(CALLS)), kept=[i for i, call in enumerate(CALLS) if call.command != "sfm demo"]),
+    ids=[call.command for call in CALLS],
+)
 def test_calls_go_through(stock, tmp_path, number):
     assert went_through(stock, tmp_path / "case", number).failures == ()
 

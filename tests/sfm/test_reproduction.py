@@ -5,7 +5,7 @@ import pytest
 from tests.scripts import load_script
 
 
-@pytest.mark.slow
+@pytest.mark.full
 def test_a_trial_of_the_published_calibration(tmp_path, capsys):
     """2 megapixels: a part of the accuracy of 18, the same order of the methods."""
     study = load_script("reproduce_paper")

@@ -46,6 +46,7 @@ def test_faces_are_right_within_their_sigma(rendered):
             assert row["translation_um"] < 20, face_id
 
 
+@pytest.mark.full
 def test_the_camera_is_found(rendered):
     """Parameters within their σ and correlations: χ² of eight has 26 with p = 0.001."""
     _, data = rendered

@@ -48,7 +48,7 @@ def test_fewer_poses_do_for_zeros():
     assert identify(mh80(), data, IdentifyOptions(adjust="zeros", folds=0)).rank == 16
 
 
-@pytest.mark.slow
+@pytest.mark.full
 def test_what_is_kept_costs_held_out_error():
     rng = np.random.default_rng(1)
     true = placed(made(mh80(), rng), WORLD, {"": TOOL})

@@ -33,7 +33,7 @@ def test_wrong_rows_of_few_are_named_and_do_no_harm(text):
         assert good_called_wrong == 0
 
 
-@pytest.mark.parametrize("case", sampled(study.CASES, kept=(0,)), ids=[case.title() for case in study.CASES])
+@pytest.mark.parametrize("case", sampled(study.CASES, kept=()), ids=[case.title() for case in study.CASES])
 def test_wrong_rows_over_many_draws(case):
     """One draw in a hundred has a row that is off by little beside its leverage; of 30 none, or one."""
     found = kept(case, range(100, 130))

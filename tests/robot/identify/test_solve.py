@@ -137,7 +137,7 @@ def test_the_covariance_is_true_beside_errors():
     assert np.mean(errors) == pytest.approx(1, abs=3 * np.sqrt(2 / 27 / draws))
 
 
-@pytest.mark.slow
+@pytest.mark.full
 def test_the_covariance_is_true():
     """30 positions: σ of the noise and of the arm's dimensions are estimated from little."""
     draws, errors, rows = 40, [], []
@@ -204,7 +204,7 @@ def test_a_flat_direction_is_no_failure():
     assert 0.3 < parameters < 2.2  # of 21 squares
 
 
-@pytest.mark.slow
+@pytest.mark.full
 def test_three_thousand_poses_are_no_trouble():
     """Ratio of processor time within one run, to one least-squares solution of that size: 40 to 60 measured
     (`scripts/bench_robot.py`), which are 0.3 s; linear in the number of poses."""

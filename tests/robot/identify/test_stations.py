@@ -34,7 +34,7 @@ def drawn(kind: str, rows: int = 60, second: int = 25, seed: int = 0) -> Measure
     return replace(data, positions=positions, rotations=rotations, stations=names)
 
 
-@pytest.mark.slow
+@pytest.mark.full
 @pytest.mark.parametrize("kind", ["position", "pose"])
 def test_two_stations_are_as_good_as_one_but_for_six_numbers(kind):
     data = drawn(kind)
