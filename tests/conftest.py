@@ -53,6 +53,11 @@ def pytest_configure(config):
         settings.load_profile("quick")
 
 
+def pytest_collection_modifyitems(items):
+    """Tests of whole chains, which lie in the upper folders, first: no process is left alone with them at the end."""
+    items.sort(key=lambda item: len(item.path.parts))
+
+
 @pytest.fixture(scope="session", autouse=True)
 def plain_rights():
     """The rights of a plain user, also where the superuser runs the tests, so that shared data cannot be written to."""

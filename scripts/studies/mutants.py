@@ -1,15 +1,14 @@
 """Whether the tests find faults: the package with one fault at a time, and the share of faults that a test finds.
 
 .venv/bin/python scripts/studies/mutants.py draw FILE [--count 150] [--seed 1]
-.venv/bin/python -m pytest -m "not full" -n 2 --cov=stcal --cov-context=test --cov-report= --junitxml build/tests.xml
+.venv/bin/python -m pytest -n 2 --cov=stcal --cov-context=test --cov-report= --junitxml build/tests.xml
 .venv/bin/python scripts/studies/mutants.py run FILE [--seconds 60] [--marked "not full"]
 
 `draw` writes faults that cosmic-ray makes: other operators, comparisons, numbers, loops that do not run. They are
 spread over all folders of the package; a fault changes one line of a function's body, no message and no annotation.
-`run` applies each to a copy of the repository and runs the tests that reach its line, the shortest first, until one
-fails or they have taken `--seconds`. Where no coverage is known (`.coverage`, and `build/tests.xml` for the times of
-tests), the tests of the same folder are taken. Results are added to the file; a second call goes on where the first
-ended.
+`run` applies each to a copy of the repository and runs the tests that reach its line by `.coverage`, and those of its
+folder and the folders above that the coverage was not measured with: of both the shortest (by `build/tests.xml`) that
+together take `--seconds`, until one fails. Results are added to the file; a second call goes on where the first ended.
 Needs `pip install "stcal[mutants]"`.
 """
 
@@ -23,6 +22,7 @@ import subprocess
 import sys
 import tempfile
 from collections import Counter
+from collections.abc import Iterable
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from queue import Queue
@@ -44,6 +44,7 @@ ALSO = (
 ALSO += ("ReplaceBreakWithContinue", "ReplaceContinueWithBreak", "ZeroIterationForLoop")
 NEVER = ("BitOr", "BitAnd", "BitXor", "Shift", "Is", "Pow", "FloorDiv", "Invert")
 """In names of operators: of annotations and sets, or faults of types rather than of values."""
+PYTEST = (sys.executable, "-m", "pytest", "-p", "no:randomly")
 START_S = 40.0
 """That a test process may take before its first test."""
 
@@ -120,25 +121,13 @@ class Choice:
     def __init__(self, marked: str):
         from coverage import CoverageData
 
-        words = [
-            sys.executable,
-            "-m",
-            "pytest",
-            "--collect-only",
-            "-qq",
-            "-m",
-            marked,
-            "-p",
-            "no:randomly",
-            "-o",
-            "addopts=",
-        ]
-        words += ["--import-mode=importlib", "-q"]
+        words = [*PYTEST, "--collect-only", "-q", "-m", marked, "-o", "addopts=", "--import-mode=importlib"]
         printed = subprocess.run(words, cwd=ROOT, capture_output=True, text=True, check=False).stdout
         self.tests = [line for line in printed.splitlines() if "::" in line]
         self.data = CoverageData(str(ROOT / ".coverage"))
         if (ROOT / ".coverage").exists():
             self.data.read()
+        self.measured = {context.rpartition("|")[0] for context in self.data.measured_contexts()}
         self.taken: dict[str, float] = {}
         times = ROOT / "build" / "tests.xml"
         for case in ElementTree.parse(times).iter("testcase") if times.exists() else ():
@@ -147,19 +136,17 @@ class Choice:
 
     def of(self, fault: dict, seconds: float) -> list[str]:
         """Tests that reach the line, then those of the same folders, the shortest first, for so many seconds."""
-        known = set(self.tests)
         by_line = self.data.contexts_by_lineno(str(ROOT / fault["path"]))
         lines = range(fault["line"] - 3, fault["line"] + 1)  # a statement over several lines is counted at its first
-        reach = {c.rpartition("|")[0] for line in lines for c in by_line.get(line, ())} & known
-        folder = "tests/" + str(Path(fault["path"]).parent.relative_to("stcal"))
-        unknown = [t for t in self.tests if t.startswith(folder) and t not in self.taken]
-        chosen, total = [], 0.0
-        for test in [*sorted(reach, key=lambda t: self.taken.get(t, 1.0)), *unknown]:
-            total += self.taken.get(test, 2.0)
-            if total > seconds and chosen:
-                break
-            chosen.append(test)
-        return chosen
+        reach = {c.rpartition("|")[0] for line in lines for c in by_line.get(line, ())} & set(self.tests)
+        folders = {str(Path("tests") / f) for f in Path(fault["path"]).relative_to("stcal").parents}
+        beside = [t for t in self.tests if str(Path(t.partition("::")[0]).parent) in folders and t not in self.measured]
+        return [*self._shortest(reach, seconds), *self._shortest(beside, seconds)]
+
+    def _shortest(self, tests: Iterable[str], seconds: float) -> list[str]:
+        chosen = sorted(tests, key=lambda t: self.taken.get(t, 1.0))
+        total = np.cumsum([self.taken.get(t, 1.0) for t in chosen])
+        return chosen[: max(1, int(np.sum(total <= seconds)))]
 
 
 def copy_of(place: Path) -> Path:
@@ -180,12 +167,14 @@ def judge(fault: dict, choice: Choice, root: Path, seconds: float) -> dict:
     if not tests:
         return fault | {"outcome": "no test", "by": ""}
     apply(fault, root)
-    words = [sys.executable, "-m", "pytest", "-x", "-q", "-m", "", "-p", "no:cacheprovider", "--tb=line"]
+    words = [*PYTEST, "-x", "-q", "-m", "", "-p", "no:cacheprovider", "--tb=line"]
     limit = START_S + 5 * seconds
+    environment = os.environ | {"PYTHONPATH": str(root)}  # for programs that tests start, too
     try:
         with tempfile.TemporaryDirectory() as scratch:
+            words += [f"--basetemp={scratch}/tests", *tests]
             ended = subprocess.run(
-                [*words, f"--basetemp={scratch}/tests", *tests], cwd=root, capture_output=True, text=True, timeout=limit
+                words, cwd=root, env=environment, capture_output=True, text=True, timeout=limit, check=False
             )
         outcome = "survived" if ended.returncode == 0 else "killed"
         by = next((line for line in ended.stdout.splitlines() if line.startswith(("FAILED", "ERROR"))), "")

@@ -8,6 +8,7 @@ import time
 import pytest
 
 from tests.levels import sampled
+from tests.shared import own_copy
 
 SFM = (sys.executable, "-P", "-c", "from stcal.cli.entry import main_sfm; main_sfm()")
 SFM_SAYING_ON = (*SFM[:-1], "from stcal.cli.entry import main_sfm; print('on', flush=True); main_sfm()")
@@ -104,11 +105,11 @@ list(run_parallel(abs, [(-1,), (-2,)], 2))
     ("number", "said", "code", "seconds"),
     sampled([(*end, seconds) for end in ENDS for seconds in (0.5, 2.0, 5.0)], kept=(1, 5)),
 )
-def test_during_a_run(small_set, number, said, code, seconds):
+def test_during_a_run(small_set, small_run, number, said, code, seconds):
     """Earlier results stay, no process of it is left that still writes, and the next run goes through."""
     small = small_set("12", "14", detected=False)
+    own_copy(small_run, small.out)
     command = [*SFM, *map(str, small.arguments()), "--workers", "2"]
-    subprocess.run(command, check=True, capture_output=True)
     before = (small.out / "faces.json").read_bytes()
     for path in (small.out / "cache").glob("*.npz"):
         path.unlink()
